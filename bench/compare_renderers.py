@@ -23,7 +23,7 @@ from brewster.environments.assets import Assets
 from brewster.render.analytic import render
 from brewster.render.mitsuba.renderer import trace
 from brewster.render.rays import rough_glass
-from brewster.render.sample import LAYERS, LightSample
+from brewster.render.sample import LAYERS, LinearSample
 from brewster.scene.camera import Camera
 from brewster.scene.glass import Glazing, Pane
 from brewster.scene.scene import Scene
@@ -47,21 +47,25 @@ FAR = {"behind": Side(map=STREET), "front": Side(map=ROOM)}
 NEAR = {"behind": Side(map=STREET, plane=NEAR_PAINTING), "front": Side(map=DOME, plane=FAR_PAINTING)}
 SCENES = {
     "single, far": Scene(camera=CAMERA, **FAR),
-    "single, paper orders": Scene(camera=CAMERA, orders="paper", **FAR),
+    "single, truncated orders": Scene(camera=CAMERA, orders="truncated", **FAR),
     "tinted, dome": Scene(
         camera=CAMERA, glass=Glazing(panes=(TINTED,)), behind=Side(map=STREET), front=Side(map=DOME)
     ),
     "double": Scene(camera=CAMERA, glass=Glazing(panes=(CLEAR, CLEAR), gap_mm=12), **FAR),
     "double tinted, near": Scene(camera=CAMERA, glass=Glazing(panes=(TINTED, TINTED), gap_mm=12), **NEAR),
-    "double, paper orders, near": Scene(
-        camera=CAMERA, orders="paper", glass=Glazing(panes=(THICK, CLEAR), gap_mm=12), **NEAR
+    "double, truncated orders, near": Scene(
+        camera=CAMERA, orders="truncated", glass=Glazing(panes=(THICK, CLEAR), gap_mm=12), **NEAR
     ),
-    "wedge": Scene(camera=CAMERA, samples=64, glass=Glazing(panes=(Pane(wedge_deg=0.2),)), **FAR),
+    "wedge": Scene(camera=CAMERA, samples_per_pixel=64, glass=Glazing(panes=(Pane(wedge_deg=0.2),)), **FAR),
     "near planes on both sides": Scene(camera=CAMERA, glass=Glazing(panes=(THICK,)), **NEAR),
     "lens, far": Scene(camera=LENS, **FAR),
-    "lens, near": Scene(camera=LENS, samples=256, glass=Glazing(panes=(THICK,)), **NEAR),
-    "rough 0.05": Scene(camera=CAMERA, samples=256, glass=Glazing(panes=(Pane(roughness=0.05),)), **FAR),
-    "rough 0.2": Scene(camera=CAMERA, samples=256, glass=Glazing(panes=(Pane(roughness=0.2),)), **FAR),
+    "lens, near": Scene(camera=LENS, samples_per_pixel=256, glass=Glazing(panes=(THICK,)), **NEAR),
+    "rough 0.05": Scene(
+        camera=CAMERA, samples_per_pixel=256, glass=Glazing(panes=(Pane(roughness=0.05),)), **FAR
+    ),
+    "rough 0.2": Scene(
+        camera=CAMERA, samples_per_pixel=256, glass=Glazing(panes=(Pane(roughness=0.2),)), **FAR
+    ),
     "45 degrees": Scene(
         camera=CAMERA.model_copy(update={"heading_deg": 45.0, "position_mm": (-700.0, 0.0, 700.0)}), **FAR
     ),
@@ -90,13 +94,13 @@ def compare(scene: Scene, assets: Assets, samples: int) -> list[str]:
         ours = render(scene, assets), render(_reseeded(scene, 1), assets)
     polarised = scene.camera.heading_deg > 30  # elsewhere, s and p hardly differ
     theirs = tuple(
-        trace(_reseeded(scene, seed), assets, noise=0, max_samples=samples, polarised=polarised)
+        trace(_reseeded(scene, seed), assets, noise_threshold=0, max_samples=samples, polarised=polarised)
         for seed in (2, 3)
     )
     return [_row(name, ours, theirs) for name in LAYERS]
 
 
-def _row(name: str, ours: tuple[LightSample, ...], theirs: tuple[LightSample, ...]) -> str:
+def _row(name: str, ours: tuple[LinearSample, ...], theirs: tuple[LinearSample, ...]) -> str:
     """Ratio of the means - 1 with its standard error, PSNR, and squared error over that expected from noise."""
     a1, a2, b1, b2 = (getattr(sample, name).double() for sample in (*ours, *theirs))
     a, b = (a1 + a2) / 2, (b1 + b2) / 2

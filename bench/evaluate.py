@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from brewster import Photo
-from brewster.evaluate.runner import SCORES_FILE
+from brewster.evaluate.score_log import SCORES_FILE
 from brewster.srgb import to_encoded
 
 OUT = Path("out/bench/evaluate")

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import tempfile
 import time
+from functools import partial
 from pathlib import Path
 
 import torch
@@ -20,11 +21,12 @@ from torch.nn.functional import avg_pool2d
 
 from brewster.environments.assets import Assets
 from brewster.environments.catalog import BUILTIN_CATALOG
+from brewster.executors import SerialExecutor
 from brewster.render.analytic import render
 from brewster.render.mitsuba.renderer import trace
-from brewster.render.sample import LAYERS, LightSample
+from brewster.render.sample import LAYERS, LinearSample
 from brewster.rendered.generation.job import RenderJob, build
-from brewster.rendered.generation.workers import SerialExecutor
+from brewster.rendered.generation.workers import TaskRunner
 from brewster.scene.camera import Camera
 from brewster.scene.glass import Glazing
 from brewster.scene.recipe import read_scene_recipe
@@ -47,7 +49,7 @@ SCENES = {
 }
 
 
-def relative_error(sample: LightSample, reference: LightSample) -> float:
+def relative_error(sample: LinearSample, reference: LinearSample) -> float:
     """relMSE, averaged over the five images."""
     errors = []
     for name in LAYERS:
@@ -56,7 +58,7 @@ def relative_error(sample: LightSample, reference: LightSample) -> float:
     return float(sum(errors) / len(errors))
 
 
-def render_reference(scene: Scene, assets: Assets) -> LightSample:
+def render_reference(scene: Scene, assets: Assets) -> LinearSample:
     """Renders a scene at four times the width and height, and averages blocks of 4 x 4 pixels."""
     camera = scene.camera.model_copy(
         update={"width": 4 * scene.camera.width, "height": 4 * scene.camera.height}
@@ -66,7 +68,7 @@ def render_reference(scene: Scene, assets: Assets) -> LightSample:
 
 
 def measure_mitsuba(
-    scene: Scene, assets: Assets, reference: LightSample, *, denoise: bool
+    scene: Scene, assets: Assets, reference: LinearSample, *, denoise: bool
 ) -> tuple[float, float, int, bool]:
     """Doubles the rays until the error is at most TARGET_ERROR or the next run would exceed MAX_CPU_S.
 
@@ -74,10 +76,10 @@ def measure_mitsuba(
         CPU-seconds at TARGET_ERROR, the last error, the last rays per pixel, and whether the seconds are extrapolated.
     """
     samples = 4
-    trace(scene, assets, noise=0, max_samples=samples, denoise=denoise)  # compiles the kernels
+    trace(scene, assets, noise_threshold=0, max_samples=samples, denoise=denoise)  # compiles the kernels
     while True:
         start = time.process_time()
-        traced = trace(scene, assets, noise=0, max_samples=samples, denoise=denoise)
+        traced = trace(scene, assets, noise_threshold=0, max_samples=samples, denoise=denoise)
         spent, error = time.process_time() - start, relative_error(traced, reference)
         if error <= TARGET_ERROR:
             return spent, error, samples, False
@@ -118,7 +120,13 @@ def cost_per_sample() -> None:
         with tempfile.TemporaryDirectory() as folder:
             job = RenderJob(Path(folder) / "set", recipe, BUILTIN_CATALOG, 7, "analytic", ())
             start = time.process_time()
-            build(job, range(count), SerialExecutor(job), shards=False, report=lambda _: None)
+            build(
+                job,
+                range(count),
+                SerialExecutor(partial(TaskRunner, job)),
+                shards=False,
+                report=lambda _: None,
+            )
             print(f"| {count} | {(time.process_time() - start) / count:.2f} |", flush=True)
 
 

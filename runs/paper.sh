@@ -35,7 +35,7 @@ else
     syn=recipes/train/kontext.toml real=recipes/train/kontext-real.toml set=sets/paper count=1000
     benchmarks=(--benchmark "real20=$BREWSTER_DATA/real20" --benchmark "nature20=$BREWSTER_DATA/nature20"
         --benchmark "sir2=$BREWSTER_DATA/SIR2")
-    options=(--paper) quality=() workers=()
+    options=(--protocol paper) quality=() workers=()
 fi
 cd "$root"
 

@@ -30,6 +30,7 @@ RECIPES = Path(__file__).parents[1] / "recipes"
 hypothesis.settings.register_profile("shared machine", deadline=None)
 hypothesis.settings.load_profile("shared machine")
 
+BROWSER_TIMEOUT_MS = 120_000  # long, because the machine may be slow
 SLOW_SECONDS = 1800
 """The time limit of a test marked as slow; that of the others is in pyproject.toml."""
 
@@ -62,7 +63,7 @@ def _network_off(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture
-def random() -> np.random.Generator:
+def rng() -> np.random.Generator:
     return np.random.default_rng(7)
 
 
@@ -84,7 +85,7 @@ def mitsuba():
     try:
         with warnings.catch_warnings(
             action="ignore", category=RuntimeWarning
-        ):  # about LLVM: see the fixture `compiled`
+        ):  # about LLVM: see the fixture `requires_llvm`
             mitsuba = variant.load()
     except MissingExtra as error:
         pytest.skip(str(error))
@@ -95,7 +96,7 @@ def mitsuba():
 
 
 @pytest.fixture
-def compiled(mitsuba):
+def requires_llvm(mitsuba):
     """Skips the test if Mitsuba's kernels cannot be compiled."""
     from brewster.render.mitsuba import variant  # noqa: PLC0415
 
@@ -115,6 +116,46 @@ def chromium():
         browser = playwright.chromium.launch(executable_path=program, args=["--no-sandbox"])
         yield browser
         browser.close()
+
+
+@pytest.fixture(scope="module")
+def page_link(model):
+    """The link to a server of the page with two models."""
+    from web_servers import serve_process  # noqa: PLC0415  (imports FastAPI)
+
+    with serve_process("--model", model, "--token", "auto") as link:
+        yield link
+
+
+@pytest.fixture
+def open_page(chromium, page_link):
+    """Opens the page; an error in its scripts, or a request to another server, fails the test."""
+    contexts, failures, requested = [], [], []
+
+    def open_page(**kwargs):
+        context = chromium.new_context(
+            **{"viewport": {"width": 1100, "height": 760}, "accept_downloads": True, **kwargs}
+        )
+        contexts.append(context)
+        context.set_default_timeout(BROWSER_TIMEOUT_MS)
+        page = context.new_page()
+        page.on("pageerror", lambda error: failures.append(str(error)))
+        page.on(
+            "console",
+            lambda message: failures.append(message.text) if "Content Security" in message.text else None,
+        )
+        page.on("request", lambda request: requested.append(request.url))
+        page.goto(page_link)
+        page.wait_for_selector("#model option", state="attached")  # the scripts have run
+        assert "token" not in page.url
+        return page
+
+    yield open_page
+    for context in contexts:
+        context.close()
+    assert not failures
+    here = page_link.partition("?")[0]
+    assert [url for url in requested if not url.startswith((here, "blob:"))] == []
 
 
 @pytest.fixture(scope="session")
@@ -143,14 +184,14 @@ def run_without_model(run):
 
 
 @pytest.fixture
-def recipe(tmp_path, monkeypatch, random):
+def recipe(tmp_path, monkeypatch, rng):
     """The tiny training recipe, with three photos as training data."""
     from brewster.training.recipe import read_recipe  # noqa: PLC0415  (imports torch)
 
     folder = tmp_path / "data" / "photos" / "permissive"
     folder.mkdir(parents=True)
     for index in range(3):
-        picture = np.kron(random.integers(0, 256, (5, 7, 3)), np.ones((20, 20, 1))).astype(np.uint8)
+        picture = np.kron(rng.integers(0, 256, (5, 7, 3)), np.ones((20, 20, 1))).astype(np.uint8)
         Photo.from_array(picture, encoding="srgb").save(folder / f"{index}.png")
     monkeypatch.setenv("BREWSTER_DATA", str(tmp_path / "data"))
     return read_recipe(RECIPES / "train/tiny.toml")

@@ -9,13 +9,13 @@ from threading import Event
 import torch
 
 from brewster.errors import DeviceError, RecipeError
-from brewster.render.sample import LAYERS, LightSample
+from brewster.render.sample import LAYERS, LinearSample
 
 
 def render(scene, assets):
     """Random colours that depend on the scene only."""
     generator = torch.Generator().manual_seed(1000 * scene.seed + scene.index)
-    return LightSample(scene, **{layer: torch.rand(3, 16, 24, generator=generator) for layer in LAYERS})
+    return LinearSample(scene, **{layer: torch.rand(3, 16, 24, generator=generator) for layer in LAYERS})
 
 
 def slow(scene, assets):

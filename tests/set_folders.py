@@ -1,10 +1,12 @@
 """Helpers for tests of rendered sets: jobs with a fake renderer, and the content of folders."""
 
 import hashlib
+from functools import partial
 
 from brewster.environments.catalog import BUILTIN_CATALOG
+from brewster.executors import SerialExecutor
 from brewster.rendered.generation.job import RenderJob, build
-from brewster.rendered.generation.workers import SerialExecutor
+from brewster.rendered.generation.workers import TaskRunner
 from brewster.scene.recipe import read_scene_recipe
 
 
@@ -16,7 +18,13 @@ def render_set(out, count=4, first=0, executor=SerialExecutor, shards=False, **j
     """Renders a set. Returns the results of its samples."""
     results = []
     job = make_job(out, **job_values)
-    build(job, range(first, first + count), executor(job), shards=shards, report=results.append)
+    build(
+        job,
+        range(first, first + count),
+        executor(partial(TaskRunner, job)),
+        shards=shards,
+        report=results.append,
+    )
     return results
 
 

@@ -17,10 +17,10 @@ class SyntheticAssets:
     def __init__(self, **pictures):
         self.pictures = {"white": np.ones((16, 32, 3), np.float32), **pictures}
 
-    def map_light(self, environment):
+    def map_radiance(self, environment):
         return self.pictures[environment.source.file] * np.float32(environment.luminance)
 
-    def plane_light(self, plane):
+    def plane_radiance(self, plane):
         return self.pictures[plane.source.file] * np.float32(plane.luminance)
 
 
@@ -147,13 +147,13 @@ def random_scenes(draw, **fixed):
     heading, pitch = draw(st.floats(-30, 30)), draw(st.floats(-15, 15))
     values = {
         "seed": draw(st.integers(0, 99)),
-        "samples": draw(st.integers(1, 5)),
-        "orders": draw(st.sampled_from(["all", "paper"])),
+        "samples_per_pixel": draw(st.integers(1, 5)),
+        "orders": draw(st.sampled_from(["all", "truncated"])),
         "behind": draw(st.sampled_from(SIDES)),
         "front": draw(st.sampled_from(SIDES)),
         "panes": [
             {
-                "index": draw(st.floats(1.3, 2)),
+                "refractive_index": draw(st.floats(1.3, 2)),
                 "thickness_mm": draw(st.floats(1, 20)),
                 "absorption_per_m": tint,
                 "roughness": 0.1 if kind == "rough" else 0.0,

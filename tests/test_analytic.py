@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from brewster.errors import RecipeError
 from brewster.render import analytic
 from brewster.render.analytic import render
-from brewster.render.rays.layered_glass import all_orders, paper_orders
+from brewster.render.rays.layered_glass import total_throughput, truncated_throughput
 from brewster.scene.camera import axes
 from brewster.scene.glass import Glazing, Pane
 from brewster.scene.world import Side
@@ -34,11 +34,11 @@ examples_25, examples_10 = (settings(without_shrinking, max_examples=count) for 
 UNIFORM_SIDES = {"far": map_side(), "dome": map_side(radius_mm=3000.0), "near": plane_side()}
 
 
-def closed_form(scene, throughput_of=all_orders):
+def closed_form(scene, throughput_of=total_throughput):
     """Transmittance and reflectance at the centre of every pixel, (3, H, W) or (1, H, W)."""
     cosine = torch.from_numpy(-pixel_directions(scene.camera) @ np.array([0, 0, 1]))
     throughput = throughput_of(scene.glass, cosine)
-    layers = throughput.transmitted, throughput.reflected
+    layers = throughput.transmittance, throughput.reflectance
     return [layer.reshape(-1, *cosine.shape).float() for layer in layers]
 
 
@@ -63,15 +63,15 @@ def test_the_photo_is_the_sum_of_its_two_layers(scene):
 @examples_10
 @given(random_scenes(orders="all"))
 def test_the_choice_of_orders_changes_the_layers_and_not_the_photo(scene):
-    complete, paper = (
-        render(scene.model_copy(update={"orders": orders}), ASSETS) for orders in ("all", "paper")
+    complete, truncated = (
+        render(scene.model_copy(update={"orders": orders}), ASSETS) for orders in ("all", "truncated")
     )
     for name in ("photo", "background", "mirror"):
-        assert torch.equal(getattr(complete, name), getattr(paper, name))
+        assert torch.equal(getattr(complete, name), getattr(truncated, name))
     tolerance = 1e-6 * float(complete.photo.max()) + 1e-9
     for name in ("transmission", "reflection"):
-        assert (getattr(paper, name) <= getattr(complete, name) + tolerance).all()
-    assert paper.reflection.sum() < complete.reflection.sum() or (
+        assert (getattr(truncated, name) <= getattr(complete, name) + tolerance).all()
+    assert truncated.reflection.sum() < complete.reflection.sum() or (
         not scene.front.map and not scene.front.plane
     )
 
@@ -104,10 +104,10 @@ def test_glass_with_index_one_is_invisible(side, count, aperture_mm):
     }
     scene = make_scene(
         camera=camera_towards_glass(15, 5, aperture_mm=aperture_mm),
-        panes=[{"index": 1.0, "thickness_mm": 20.0}] * count,
+        panes=[{"refractive_index": 1.0, "thickness_mm": 20.0}] * count,
         behind=sides[side],
         front=sides[side],
-        samples=4,
+        samples_per_pixel=4,
     )
     sample = render(scene, ASSETS)
     torch.testing.assert_close(sample.transmission, sample.background, rtol=1e-4, atol=1e-4)
@@ -118,11 +118,11 @@ def test_glass_with_index_one_is_invisible(side, count, aperture_mm):
 
 @pytest.mark.parametrize("side", sorted(UNIFORM_SIDES))
 @pytest.mark.parametrize("aperture_mm", [0.0, 20.0])
-@pytest.mark.parametrize("orders", ["all", "paper"])
+@pytest.mark.parametrize("orders", ["all", "truncated"])
 def test_in_uniform_light_every_pixel_equals_the_closed_form(side, aperture_mm, orders):
     panes = [
         {"thickness_mm": 6.0, "absorption_per_m": (4.0, 1.5, 20.0)},
-        {"index": 1.7, "absorption_per_m": (2.0, 9.0, 1.0)},
+        {"refractive_index": 1.7, "absorption_per_m": (2.0, 9.0, 1.0)},
     ]
     scene = make_scene(
         camera=camera_towards_glass(30, aperture_mm=aperture_mm, focus_mm=800),
@@ -130,10 +130,12 @@ def test_in_uniform_light_every_pixel_equals_the_closed_form(side, aperture_mm, 
         behind=UNIFORM_SIDES[side],
         front=UNIFORM_SIDES[side],
         orders=orders,
-        samples=16,
+        samples_per_pixel=16,
     )
     sample = render(scene, ASSETS)
-    transmittance, reflectance = closed_form(scene, all_orders if orders == "all" else paper_orders)
+    transmittance, reflectance = closed_form(
+        scene, total_throughput if orders == "all" else truncated_throughput
+    )
     torch.testing.assert_close(sample.transmission, transmittance, rtol=2e-3, atol=0)
     torch.testing.assert_close(sample.reflection, reflectance, rtol=1e-2, atol=0)
     assert float(sample.reflection.mean() / reflectance.mean()) == pytest.approx(1, abs=2e-3)
@@ -148,7 +150,7 @@ def test_far_light_has_no_ghost_in_parallel_glass():
         panes=[{"thickness_mm": 30.0}, {}],
         front=map_side("mottled"),
         behind=map_side("mottled", heading_deg=90),
-        samples=1,
+        samples_per_pixel=1,
     )
     sample = render(scene, ASSETS)
     transmittance, reflectance = closed_form(scene)
@@ -162,7 +164,7 @@ def test_content_behind_a_thick_pane_appears_nearer_by_a_third_of_its_thickness(
         camera=camera_towards_glass(0, distance_mm=1000, fov_deg=10, width=48, height=48),
         panes=[{"thickness_mm": 90.0}],
         behind=plane_side("mottled", distance_mm=500, width_mm=100),
-        orders="paper",
+        orders="truncated",
     )
     sample = render(scene, ASSETS)
     area_ratio = float(sample.transmission.sum() / sample.background.sum()) / 0.96**2
@@ -172,7 +174,11 @@ def test_content_behind_a_thick_pane_appears_nearer_by_a_third_of_its_thickness(
 def test_a_wedge_deflects_rays_by_half_its_angle():
     light = SyntheticAssets(sun=map_with_bright_texel(256, 128, 0))
     scene = make_scene(
-        camera={"fov_deg": 10}, panes=[{"wedge_deg": 2.0}], behind=map_side("sun"), orders="paper", samples=64
+        camera={"fov_deg": 10},
+        panes=[{"wedge_deg": 2.0}],
+        behind=map_side("sun"),
+        orders="truncated",
+        samples_per_pixel=64,
     )
     sample = render(scene, light)
     (deflected_x, _), (straight_x, _) = centroid(sample.transmission), centroid(sample.background)
@@ -186,7 +192,7 @@ def test_a_very_small_wedge_renders_like_parallel_glass():
             panes=[{"wedge_deg": wedge_deg}],
             behind=map_side("soft", heading_deg=40),
             front=map_side("soft"),
-            samples=256,
+            samples_per_pixel=256,
         )
         for wedge_deg in (0.0, 1e-6)
     )
@@ -216,7 +222,7 @@ def test_a_camera_that_turns_right_sees_a_map_move_left(heading_deg):
     for rotation_deg in (0, 5):
         camera = camera_towards_glass(heading_deg + rotation_deg, fov_deg=30)
         scene = make_scene(
-            camera=camera, glass=glass, behind=map_side("sun", heading_deg=heading_deg), samples=16
+            camera=camera, glass=glass, behind=map_side("sun", heading_deg=heading_deg), samples_per_pixel=16
         )
         positions.append(centroid(render(scene, light).background))
     half_texel = 360 / 128 / 2
@@ -250,7 +256,7 @@ PLANE_POSITIONS = st.fixed_dictionaries(
     {
         "distance_mm": st.floats(100, 3000),
         "offset": st.tuples(st.floats(-0.4, 0.4), st.floats(-0.4, 0.4)),
-        "turn_deg": st.tuples(st.floats(-60, 60), st.floats(-20, 20)),
+        "angles_deg": st.tuples(st.floats(-60, 60), st.floats(-20, 20)),
         "glass_deg": st.tuples(st.floats(-180, 180), st.floats(-20, 20)),
         "camera_deg": st.tuples(st.floats(-30, 30), st.floats(-10, 10)),
         "is_behind": st.booleans(),
@@ -289,8 +295,8 @@ def test_a_plane_appears_where_pinhole_geometry_projects_it(drawn):
         "distance_mm": distance_mm,
         "width_mm": length * 0.06,
         "offset_mm": tuple(offset),
-        "heading_deg": drawn["turn_deg"][0],
-        "pitch_deg": drawn["turn_deg"][1],
+        "heading_deg": drawn["angles_deg"][0],
+        "pitch_deg": drawn["angles_deg"][1],
     }
     which = "behind" if drawn["is_behind"] else "front"
     scene = empty.model_copy(update={"behind": Side(), "front": Side(), which: plane_side("square", **plane)})
@@ -326,7 +332,7 @@ def test_a_sun_of_one_texel_does_not_flicker(texels):
     for tenth in range(10):
         rotation_deg = tenth / 10 * fov_deg / 32
         camera = camera_towards_glass(rotation_deg, rotation_deg / 2, fov_deg=fov_deg, width=32, height=32)
-        sample = render(make_scene(camera=camera, behind=map_side("sun"), samples=36), light)
+        sample = render(make_scene(camera=camera, behind=map_side("sun"), samples_per_pixel=36), light)
         energies.append(float(sample.background.sum()))
     assert max(energies) / min(energies) < 1.01
 
@@ -342,16 +348,16 @@ GLASS_KINDS = {
 
 @pytest.mark.parametrize("kind", sorted(GLASS_KINDS))
 def test_the_same_scene_gives_the_same_bytes(kind):
-    one, other = (render(make_scene(**GLASS_KINDS[kind], samples=4), ASSETS) for _ in range(2))
+    one, other = (render(make_scene(**GLASS_KINDS[kind], samples_per_pixel=4), ASSETS) for _ in range(2))
     for first, second in zip(one.layers().values(), other.layers().values(), strict=True):
         assert first.numpy().tobytes() == second.numpy().tobytes()
 
 
 @pytest.mark.parametrize("kind", sorted(GLASS_KINDS))
 def test_the_result_does_not_depend_on_the_batch_size(kind, monkeypatch):
-    one_batch = render(make_scene(**GLASS_KINDS[kind], samples=4), ASSETS)
+    one_batch = render(make_scene(**GLASS_KINDS[kind], samples_per_pixel=4), ASSETS)
     monkeypatch.setattr(analytic, "_CPU_BATCH_RAYS", 100)
-    many_batches = render(make_scene(**GLASS_KINDS[kind], samples=4), ASSETS)
+    many_batches = render(make_scene(**GLASS_KINDS[kind], samples_per_pixel=4), ASSETS)
     for first, second in zip(one_batch.layers().values(), many_batches.layers().values(), strict=True):
         if kind == "rough":  # orders end by their mean weight over a batch
             assert float(first.mean()) == pytest.approx(float(second.mean()), rel=2e-3)
@@ -360,7 +366,7 @@ def test_the_result_does_not_depend_on_the_batch_size(kind, monkeypatch):
 
 
 def test_another_index_changes_the_random_numbers_and_not_the_means():
-    scene = make_scene(panes=[{"wedge_deg": 0.5}], behind=map_side("mottled"), samples=16)
+    scene = make_scene(panes=[{"wedge_deg": 0.5}], behind=map_side("mottled"), samples_per_pixel=16)
     one, other = (render(scene.model_copy(update={"index": index}), ASSETS).background for index in (0, 1))
     assert not torch.equal(one, other)
     assert float(one.mean()) == pytest.approx(float(other.mean()), rel=2e-3)
@@ -369,8 +375,8 @@ def test_another_index_changes_the_random_numbers_and_not_the_means():
 @pytest.mark.parametrize(
     "glass",
     [
-        Glazing(frame_mm=(500.0, 400.0)),
-        Glazing(panes=(Pane(thickness_mm=20),), radii_mm=(300.0, -300.0), frame_mm=(80.0, 80.0)),
+        Glazing(opening_mm=(500.0, 400.0)),
+        Glazing(panes=(Pane(thickness_mm=20),), radii_mm=(300.0, -300.0), opening_mm=(80.0, 80.0)),
     ],
     ids=["framed", "curved"],
 )

@@ -25,9 +25,9 @@ def sphere_mean(values):
     return (values.mean(axis=1) * solid_angle).sum() / solid_angle.sum()
 
 
-def sky(random):
+def sky(rng):
     """A map without lamps: (32, 64, 3), with a maximum of about three times the mean in one texel."""
-    texels = random.uniform(0.2, 1.8, (HEIGHT, WIDTH, 3)).astype(np.float32)
+    texels = rng.uniform(0.2, 1.8, (HEIGHT, WIDTH, 3)).astype(np.float32)
     texels[8, 9] = 3
     return texels
 
@@ -49,15 +49,15 @@ def folder(tmp_path):
     return tmp_path / "maps"
 
 
-def map_light(folder, name, data, **values):
+def map_radiance(folder, name, data, **values):
     (folder / name).write_bytes(data)
-    return Assets([folder]).map_light(EnvironmentMap(source=AssetSource(file=name), **values))
+    return Assets([folder]).map_radiance(EnvironmentMap(source=AssetSource(file=name), **values))
 
 
-def plane_light(folder, name, data, **values):
+def plane_radiance(folder, name, data, **values):
     (folder / name).write_bytes(data)
     plane = Plane(source=AssetSource(file=name), distance_mm=1000, width_mm=1000, **values)
-    return Assets([folder]).plane_light(plane)
+    return Assets([folder]).plane_radiance(plane)
 
 
 def check_message(error, name, *words):
@@ -71,19 +71,19 @@ def check_message(error, name, *words):
 # --- maps
 
 
-def test_a_map_has_the_mean_luminance_of_the_scene(folder, random):
-    texels = sky(random)
-    light = map_light(folder, "sky.exr", exr_of(texels * 37), luminance=2.5)
+def test_a_map_has_the_mean_luminance_of_the_scene(folder, rng):
+    texels = sky(rng)
+    light = map_radiance(folder, "sky.exr", exr_of(texels * 37), luminance=2.5)
     assert light.dtype == np.float32
     assert sphere_mean(luminance(light)) == pytest.approx(2.5, rel=1e-4)
     np.testing.assert_allclose(light / light.mean(), texels / texels.mean(), rtol=1e-4)
 
 
-def test_lamps_are_excluded_from_the_mean_but_not_from_the_light(folder, random):
-    texels = sky(random)
-    plain = map_light(folder, "plain.exr", exr_of(texels))
+def test_lamps_are_excluded_from_the_mean_but_not_from_the_light(folder, rng):
+    texels = sky(rng)
+    plain = map_radiance(folder, "plain.exr", exr_of(texels))
     texels[20, 30] = 1e5
-    lit = map_light(folder, "lamp.exr", exr_of(texels))
+    lit = map_radiance(folder, "lamp.exr", exr_of(texels))
     # In the mean, the lamp counts with ten times the mean in one of 2048 texels.
     assert sphere_mean(luminance(lit)) > 10
     mean = sphere_mean(np.minimum(luminance(texels), 10 * sphere_mean(luminance(texels))))
@@ -92,20 +92,20 @@ def test_lamps_are_excluded_from_the_mean_but_not_from_the_light(folder, random)
     assert np.median(lit / plain) < 1.01
 
 
-def test_negative_values_are_set_to_zero(folder, random):
-    texels = sky(random)
+def test_negative_values_are_set_to_zero(folder, rng):
+    texels = sky(rng)
     texels[3, 4] = -5
-    light = map_light(folder, "gamut.exr", exr_of(texels))
+    light = map_radiance(folder, "gamut.exr", exr_of(texels))
     assert light.min() == 0
     assert not light[3, 4].any()
 
 
-def test_builtin_maps_need_no_folder(monkeypatch, random):
+def test_builtin_maps_need_no_folder(monkeypatch, rng):
     calls = []
     monkeypatch.setitem(
-        assets_module.ENVIRONMENTS, "street", lambda seed, height: calls.append((seed, height)) or sky(random)
+        assets_module.ENVIRONMENTS, "street", lambda seed, height: calls.append((seed, height)) or sky(rng)
     )
-    light = Assets().map_light(EnvironmentMap(source=AssetSource(file="builtin:street:7"), luminance=3))
+    light = Assets().map_radiance(EnvironmentMap(source=AssetSource(file="builtin:street:7"), luminance=3))
     assert sphere_mean(luminance(light)) == pytest.approx(3, rel=1e-4)
     assert calls == [(7, assets_module.BUILTIN_HEIGHT)]
 
@@ -115,7 +115,7 @@ def test_builtin_maps_need_no_folder(monkeypatch, random):
 )
 def test_maps_that_are_not_built_in_are_refused(name):
     with pytest.raises(RecipeError, match="is not built in") as error:
-        Assets().map_light(EnvironmentMap(source=AssetSource(file=name)))
+        Assets().map_radiance(EnvironmentMap(source=AssetSource(file=name)))
     check_message(error, name, "street, room, night")
 
 
@@ -124,98 +124,98 @@ def test_maps_that_are_not_built_in_are_refused(name):
 
 def test_a_missing_file_is_named_with_the_folders_that_were_searched(folder):
     with pytest.raises(RecipeError, match="was not found") as error:
-        Assets([folder]).map_light(EnvironmentMap(source=AssetSource(file="gone.hdr")))
+        Assets([folder]).map_radiance(EnvironmentMap(source=AssetSource(file="gone.hdr")))
     check_message(error, "gone.hdr", str(folder), "--maps")
     with pytest.raises(RecipeError, match="no folder"):
-        Assets().map_light(EnvironmentMap(source=AssetSource(file="gone.hdr")))
+        Assets().map_radiance(EnvironmentMap(source=AssetSource(file="gone.hdr")))
 
 
-def test_another_file_of_the_same_name_is_refused(folder, random):
-    data = hdr_of(sky(random))
+def test_another_file_of_the_same_name_is_refused(folder, rng):
+    data = hdr_of(sky(rng))
     (folder / "sky.hdr").write_bytes(data)
     correct, wrong = hashlib.sha256(data).hexdigest(), hashlib.sha256(b"").hexdigest()
     assets = Assets([folder])
-    assets.map_light(EnvironmentMap(source=AssetSource(file="sky.hdr", sha256=correct)))
+    assets.map_radiance(EnvironmentMap(source=AssetSource(file="sky.hdr", sha256=correct)))
     with pytest.raises(RecipeError, match="not the file that the scene was drawn with") as error:
-        assets.map_light(
+        assets.map_radiance(
             EnvironmentMap(source=AssetSource(file="sky.hdr", sha256=wrong))
         )  # the cached map of the other file is not used
     check_message(error, str(folder / "sky.hdr"), wrong)
 
 
-def test_the_folder_with_the_right_file_is_found(tmp_path, folder, random):
-    first, second = (hdr_of(sky(random)) for _ in range(2))
+def test_the_folder_with_the_right_file_is_found(tmp_path, folder, rng):
+    first, second = (hdr_of(sky(rng)) for _ in range(2))
     (tmp_path / "sky.hdr").write_bytes(first)
     (folder / "sky.hdr").write_bytes(second)
     assets = Assets([tmp_path, folder])
     lights = [
-        assets.map_light(EnvironmentMap(source=AssetSource(file="sky.hdr", sha256=sha256)))
+        assets.map_radiance(EnvironmentMap(source=AssetSource(file="sky.hdr", sha256=sha256)))
         for sha256 in (hashlib.sha256(first).hexdigest(), hashlib.sha256(second).hexdigest(), "")
     ]
     assert not np.array_equal(lights[0], lights[1])
     assert np.array_equal(lights[0], lights[2])
 
 
-def test_a_file_that_cannot_be_read_is_named(folder, random, monkeypatch):
+def test_a_file_that_cannot_be_read_is_named(folder, rng, monkeypatch):
     def refuse(_path):
         raise PermissionError(13, "Permission denied")
 
     monkeypatch.setattr(type(folder), "read_bytes", refuse)
     (folder / "sky.hdr").write_text("")
     with pytest.raises(RecipeError, match="Permission denied") as error:
-        Assets([folder]).map_light(EnvironmentMap(source=AssetSource(file="sky.hdr")))
+        Assets([folder]).map_radiance(EnvironmentMap(source=AssetSource(file="sky.hdr")))
     check_message(error, "sky.hdr")
 
 
 @pytest.mark.parametrize("kind", [hdr_of, exr_of])
-def test_a_map_that_is_not_twice_as_wide_as_high_is_refused(folder, random, kind):
+def test_a_map_that_is_not_twice_as_wide_as_high_is_refused(folder, rng, kind):
     with pytest.raises(UnsupportedPhoto, match="60 x 32") as error:
-        map_light(folder, "narrow.hdr", kind(sky(random)[:, :60]))
+        map_radiance(folder, "narrow.hdr", kind(sky(rng)[:, :60]))
     check_message(error, "narrow.hdr", "twice as wide")
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf])
-def test_texels_that_are_not_finite_are_refused(folder, random, value):
-    texels = sky(random)
+def test_texels_that_are_not_finite_are_refused(folder, rng, value):
+    texels = sky(rng)
     texels[5, 6, 1] = value
     with pytest.raises(UnsupportedPhoto, match="infinite or NaN") as error:
-        map_light(folder, "broken.exr", exr_of(texels))
+        map_radiance(folder, "broken.exr", exr_of(texels))
     check_message(error, "broken.exr")
 
 
 def test_a_black_map_is_refused(folder):
     with pytest.raises(UnsupportedPhoto, match="black") as error:
-        map_light(folder, "night.hdr", hdr_of(np.zeros((HEIGHT, WIDTH, 3), np.float32)))
+        map_radiance(folder, "night.hdr", hdr_of(np.zeros((HEIGHT, WIDTH, 3), np.float32)))
     check_message(error, "night.hdr")
 
 
-def test_an_ordinary_photo_saved_as_a_map_is_refused(folder, random):
+def test_an_ordinary_photo_saved_as_a_map_is_refused(folder, rng):
     """The maximum of an HDR map is in few texels, but here it is in an eighth of them."""
-    encoded = (sky(random) / 2).clip(0, 1)
+    encoded = (sky(rng) / 2).clip(0, 1)
     encoded[:4] = 1
     with pytest.raises(UnsupportedPhoto, match="clipped") as error:
-        map_light(folder, "photo.hdr", hdr_of(to_linear(encoded)))
+        map_radiance(folder, "photo.hdr", hdr_of(to_linear(encoded)))
     check_message(error, "photo.hdr", "use it as a picture")
 
 
-def test_a_map_with_one_sun_is_not_clipped(folder, random):
-    texels = sky(random)
+def test_a_map_with_one_sun_is_not_clipped(folder, rng):
+    texels = sky(rng)
     texels[10, 10:12] = 5000
-    assert map_light(folder, "sun.hdr", hdr_of(texels)).max() > 1000
+    assert map_radiance(folder, "sun.hdr", hdr_of(texels)).max() > 1000
 
 
 @pytest.mark.parametrize("damage", ["empty", "cut", "header", "other"])
-def test_a_corrupt_map_is_refused_by_name(folder, random, damage):
-    data = hdr_of(sky(random))
+def test_a_corrupt_map_is_refused_by_name(folder, rng, damage):
+    data = hdr_of(sky(rng))
     bad = {"empty": b"", "cut": data[:-900], "header": data.replace(b"-Y", b"?Y"), "other": b"<html>"}[damage]
     with pytest.raises(PhotoError) as error:
-        map_light(folder, "bad.hdr", bad)
+        map_radiance(folder, "bad.hdr", bad)
     check_message(error, "bad.hdr")
 
 
-def test_an_exr_that_ends_early_is_refused_by_name(folder, random):
+def test_an_exr_that_ends_early_is_refused_by_name(folder, rng):
     with pytest.raises(UnreadablePhoto) as error:
-        map_light(folder, "bad.exr", exr_of(sky(random))[:-900])
+        map_radiance(folder, "bad.exr", exr_of(sky(rng))[:-900])
     check_message(error, "bad.exr")
 
 
@@ -223,7 +223,7 @@ def test_an_exr_that_ends_early_is_refused_by_name(folder, random):
 
 
 def test_a_picture_has_the_mean_luminance_of_the_scene(folder):
-    light = plane_light(folder, "a.png", file_of(smooth(), "PNG"), luminance=4)
+    light = plane_radiance(folder, "a.png", file_of(smooth(), "PNG"), luminance=4)
     assert light.shape == (48, 64, 3)
     assert light.dtype == np.float32
     assert luminance(light).mean() == pytest.approx(4, rel=2e-3)
@@ -235,8 +235,8 @@ def test_highlights_raise_whites_and_nothing_else(folder):
     picture = smooth() // 2 + 40
     picture[:6, :6] = 255
     data = file_of(picture, "PNG")
-    plain = plane_light(folder, "a.png", data)
-    raised = plane_light(folder, "a.png", data, highlight_boost=9)
+    plain = plane_radiance(folder, "a.png", data)
+    raised = plane_radiance(folder, "a.png", data, highlight_boost=9)
     factor = raised / plain
     np.testing.assert_allclose(factor[:6, :6], 10, rtol=1e-5)
     np.testing.assert_allclose(factor[6:], 1, rtol=1e-6)
@@ -247,7 +247,7 @@ def test_near_whites_are_raised_less_than_whites_and_keep_their_hue(folder):
     greys = np.linspace(150, 255, 64).astype(np.uint8)
     picture = np.broadcast_to(greys[:, None] * np.array([1, 0.9, 0.5]), (16, 64, 3)).astype(np.uint8)
     data = file_of(picture, "PNG")
-    factor = plane_light(folder, "a.png", data, highlight_boost=5) / plane_light(folder, "a.png", data)
+    factor = plane_radiance(folder, "a.png", data, highlight_boost=5) / plane_radiance(folder, "a.png", data)
     np.testing.assert_allclose(factor, np.broadcast_to(factor[..., :1], factor.shape), rtol=1e-5)
     assert (np.diff(factor[0, :, 0]) >= -1e-6).all()
     assert factor[0, 0, 0] == pytest.approx(1)
@@ -255,21 +255,21 @@ def test_near_whites_are_raised_less_than_whites_and_keep_their_hue(folder):
 
 
 def test_a_black_picture_is_dark_and_finite(folder):
-    light = plane_light(folder, "a.png", file_of(np.zeros((8, 8, 3), np.uint8), "PNG"), highlight_boost=3)
+    light = plane_radiance(folder, "a.png", file_of(np.zeros((8, 8, 3), np.uint8), "PNG"), highlight_boost=3)
     assert not light.any()
 
 
 @pytest.mark.parametrize(("data", "error"), [(b"", UnreadablePhoto), (b"<html>", UnreadablePhoto)])
 def test_a_file_that_is_no_picture_is_refused_by_name(folder, data, error):
     with pytest.raises(error) as caught:
-        plane_light(folder, "photo.jpg", data)
+        plane_radiance(folder, "photo.jpg", data)
     check_message(caught, "photo.jpg")
 
 
 def test_a_picture_whose_pixels_are_missing_is_refused_by_name(folder):
     data = file_of(smooth(), "JPEG")
     with pytest.raises(UnreadablePhoto) as caught:
-        plane_light(folder, "photo.jpg", data[: len(data) // 2])
+        plane_radiance(folder, "photo.jpg", data[: len(data) // 2])
     check_message(caught, "photo.jpg")
 
 
@@ -277,46 +277,46 @@ def test_builtin_paintings_and_no_others():
     def plane(name):
         return Plane(source=AssetSource(file=name), distance_mm=1, width_mm=1)
 
-    assert Assets().plane_light(plane("builtin:painting:3")).shape == (512, 768, 3)
+    assert Assets().plane_radiance(plane("builtin:painting:3")).shape == (512, 768, 3)
     with pytest.raises(RecipeError, match="is not built in") as error:
-        Assets().plane_light(plane("builtin:street:3"))
+        Assets().plane_radiance(plane("builtin:street:3"))
     check_message(error, "builtin:street:3", "painting")
 
 
 # --- memory
 
 
-def test_the_cache_has_a_maximum_size_and_keeps_the_most_recently_used_maps(folder, random, monkeypatch):
-    one = sky(random).nbytes
+def test_the_cache_has_a_maximum_size_and_keeps_the_most_recently_used_maps(folder, rng, monkeypatch):
+    one = sky(rng).nbytes
     monkeypatch.setattr(assets_module, "_MAX_CACHE_BYTES", 2 * one)
     opened = []
     monkeypatch.setattr(Photo, "open", classmethod(lambda _cls, data: opened.append(data) or _original(data)))
     for name in "abc":
-        (folder / f"{name}.hdr").write_bytes(hdr_of(sky(random)))
+        (folder / f"{name}.hdr").write_bytes(hdr_of(sky(rng)))
     assets = Assets([folder])
 
     def read(name):
         before = len(opened)
-        assets.map_light(EnvironmentMap(source=AssetSource(file=f"{name}.hdr")))
+        assets.map_radiance(EnvironmentMap(source=AssetSource(file=f"{name}.hdr")))
         return len(opened) - before
 
     assert [read(name) for name in "ababacacb"] == [1, 1, 0, 0, 0, 1, 0, 0, 1]
 
 
-def test_a_map_larger_than_the_cache_is_cached_alone(folder, random, monkeypatch):
+def test_a_map_larger_than_the_cache_is_cached_alone(folder, rng, monkeypatch):
     monkeypatch.setattr(assets_module, "_MAX_CACHE_BYTES", 10)
-    (folder / "a.hdr").write_bytes(hdr_of(sky(random)))
+    (folder / "a.hdr").write_bytes(hdr_of(sky(rng)))
     assets = Assets([folder])
-    first = assets.map_light(EnvironmentMap(source=AssetSource(file="a.hdr")))
+    first = assets.map_radiance(EnvironmentMap(source=AssetSource(file="a.hdr")))
     (folder / "a.hdr").unlink()
-    assert np.array_equal(assets.map_light(EnvironmentMap(source=AssetSource(file="a.hdr"))), first)
+    assert np.array_equal(assets.map_radiance(EnvironmentMap(source=AssetSource(file="a.hdr"))), first)
 
 
-def test_the_luminance_of_the_scene_does_not_change_the_cached_map(folder, random):
-    (folder / "a.hdr").write_bytes(hdr_of(sky(random)))
+def test_the_luminance_of_the_scene_does_not_change_the_cached_map(folder, rng):
+    (folder / "a.hdr").write_bytes(hdr_of(sky(rng)))
     assets = Assets([folder])
     bright, dim = (
-        assets.map_light(EnvironmentMap(source=AssetSource(file="a.hdr"), luminance=value))
+        assets.map_radiance(EnvironmentMap(source=AssetSource(file="a.hdr"), luminance=value))
         for value in (8, 0.5)
     )
     np.testing.assert_allclose(bright, 16 * dim, rtol=1e-6)

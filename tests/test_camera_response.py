@@ -13,7 +13,7 @@ from hypothesis.extra import numpy as arrays
 from brewster.errors import UnsupportedPhoto
 from brewster.photo import Photo
 from brewster.render.camera_response import develop, encode_jpeg, to_uint8, with_jpeg
-from brewster.render.sample import LAYERS, LightSample
+from brewster.render.sample import LAYERS, LinearSample
 from brewster.scene.scene import CameraResponse, Scene
 from brewster.srgb import REC709_LUMINANCE, to_encoded, to_linear
 
@@ -26,7 +26,7 @@ PICTURES = arrays.arrays(np.float32, SHAPE, elements=LIGHT, fill=st.nothing()) |
 BALANCES = ["grey-world", "white-patch", "grey-edge"]
 RESPONSES = st.builds(
     CameraResponse,
-    exposure=st.floats(0.01, 1),
+    target_luminance=st.floats(0.01, 1),
     white_balance=st.sampled_from(["none", *BALANCES]),
     white_balance_strength=st.floats(0, 1),
     contrast=st.floats(-0.5, 0.9),
@@ -36,7 +36,7 @@ RESPONSES = st.builds(
 def sample_of(photo, reflection=None, mirror=None, seed=0, index=0, **response):
     photo = torch.as_tensor(photo, dtype=torch.float32)
     reflection = photo * 0.25 if reflection is None else torch.as_tensor(reflection)
-    return LightSample(
+    return LinearSample(
         Scene(seed=seed, index=index, camera_response=CameraResponse(**response)),
         photo=photo,
         transmission=photo - reflection,
@@ -52,7 +52,7 @@ def random_image(shape=(3, 40, 56), low=0.02, high=0.5):
 
 def exposed(light, developed, ev=None):
     """Light with the recorded exposure and white balance, before clipping."""
-    gains = torch.tensor(developed.white_balance).view(3, 1, 1)
+    gains = torch.tensor(developed.white_balance_gains).view(3, 1, 1)
     return light * gains * 2 ** (developed.exposure_ev if ev is None else ev)
 
 
@@ -66,7 +66,7 @@ def mean_luminance(light):
 @some
 @given(PICTURES, st.floats(0.01, 1), st.sampled_from(["none", *BALANCES]))
 def test_the_mean_of_any_image_is_the_target_if_it_is_reachable(picture, target, balance):
-    sample = sample_of(picture, exposure=target, white_balance=balance)
+    sample = sample_of(picture, target_luminance=target, white_balance=balance)
     developed = develop(sample)
     layers = (("photo", developed.exposure_ev), ("mirror", developed.mirror_exposure_ev))
     for name, ev in layers:
@@ -78,8 +78,8 @@ def test_the_mean_of_any_image_is_the_target_if_it_is_reachable(picture, target,
 def test_a_black_image_stays_black_and_is_not_exposed():
     for balance in ("none", *BALANCES):
         developed = develop(sample_of(torch.zeros(3, 4, 5), white_balance=balance))
-        assert developed.exposure_ev == developed.mirror_exposure_ev == developed.overexposed == 0
-        assert developed.white_balance == (1, 1, 1)
+        assert developed.exposure_ev == developed.mirror_exposure_ev == developed.overexposed_fraction == 0
+        assert developed.white_balance_gains == (1, 1, 1)
         assert not any(layer.any() for layer in developed.layers().values())
 
 
@@ -87,22 +87,22 @@ def test_lamps_do_not_change_the_exposure():
     room = torch.full((3, 20, 20), 0.1)
     lit = room.clone()
     lit[:, 0, :4] = 1e6
-    exposures = [develop(sample_of(picture, exposure=0.4)).exposure_ev for picture in (room, lit)]
+    exposures = [develop(sample_of(picture, target_luminance=0.4)).exposure_ev for picture in (room, lit)]
     assert exposures == pytest.approx([2, 2], abs=0.03)
 
 
 def test_an_unreachable_target_does_not_raise_the_exposure_without_limit():
     half_black = torch.zeros(3, 4, 4)
     half_black[:, :2] = 0.5
-    developed = develop(sample_of(half_black, exposure=0.9))
+    developed = develop(sample_of(half_black, target_luminance=0.9))
     assert developed.exposure_ev == pytest.approx(1, abs=0.02)
 
 
-def test_the_overexposed_share_counts_pixels_that_clip_in_any_channel():
+def test_the_overexposed_fraction_counts_pixels_that_clip_in_any_channel():
     picture = torch.full((3, 10, 10), 0.01)
     picture[0, :2] = 100
     picture[1, 1:3] = 100
-    assert develop(sample_of(picture, exposure=0.25)).overexposed == 0.3
+    assert develop(sample_of(picture, target_luminance=0.25)).overexposed_fraction == 0.3
 
 
 # --- all layers alike
@@ -112,7 +112,7 @@ def test_the_overexposed_share_counts_pixels_that_clip_in_any_channel():
 @given(PICTURES, RESPONSES)
 def test_the_same_light_has_the_same_value_in_every_layer(picture, response):
     sample = sample_of(picture, **response.model_dump())
-    alike = LightSample(sample.scene, *[sample.photo] * 5)
+    alike = LinearSample(sample.scene, *[sample.photo] * 5)
     layers = develop(alike).layers()
     assert list(layers) == list(LAYERS)
     for layer in layers.values():
@@ -129,14 +129,14 @@ def test_the_recorded_settings_reproduce_the_pictures(picture, response):
     sample = sample_of(picture, **response.model_dump())
     developed = develop(sample)
     recorded = tomllib.loads(tomli_w.dumps(developed.camera_settings()))
-    assert recorded["white_balance"] == list(developed.white_balance)
+    assert recorded["white_balance_gains"] == list(developed.white_balance_gains)
     for name in LAYERS:
         ev = recorded["mirror_exposure_ev" if name == "mirror" else "exposure_ev"]
         encoded = to_encoded(exposed(getattr(sample, name), developed, ev).clamp(0, 1))
         smooth = encoded**2 * (3 - 2 * encoded)
         expected = encoded + response.contrast * (smooth - encoded)
         torch.testing.assert_close(developed.layers()[name], expected, atol=2e-6, rtol=0)
-    assert recorded["overexposed"] == pytest.approx(
+    assert recorded["overexposed_fraction"] == pytest.approx(
         (exposed(sample.photo, developed) >= 1).any(0).float().mean().item(), abs=1e-6
     )
 
@@ -178,20 +178,20 @@ CAST = torch.tensor([1.4, 1.0, 0.6]).view(3, 1, 1)
 def test_grey_world_makes_the_means_equal_and_keeps_luminance(red, blue, seed):
     picture = torch.rand((3, 12, 12), generator=torch.Generator().manual_seed(seed)) * 0.5 + 0.25
     picture *= torch.tensor([red, 1, blue]).view(3, 1, 1)
-    sample = sample_of(picture, white_balance="grey-world", exposure=0.1)
+    sample = sample_of(picture, white_balance="grey-world", target_luminance=0.1)
     developed = develop(sample)
-    assert max(developed.white_balance) < 3
+    assert max(developed.white_balance_gains) < 3
     balanced = to_linear(developed.photo_encoded).mean((1, 2))
     torch.testing.assert_close(balanced, balanced.mean().expand(3), atol=0, rtol=1e-3)
-    gains = torch.tensor(developed.white_balance).view(3, 1, 1)
+    gains = torch.tensor(developed.white_balance_gains).view(3, 1, 1)
     assert mean_luminance(picture / 4 * gains) == pytest.approx(mean_luminance(picture / 4), rel=1e-3)
 
 
 @pytest.mark.parametrize("balance", BALANCES)
 def test_every_white_balance_removes_a_colour_cast(balance):
     grey = random_image((1, 40, 56)).expand(3, 40, 56)
-    developed = develop(sample_of(grey * CAST, white_balance=balance, exposure=0.2))
-    gains = torch.tensor(developed.white_balance).view(3, 1, 1)
+    developed = develop(sample_of(grey * CAST, white_balance=balance, target_luminance=0.2))
+    gains = torch.tensor(developed.white_balance_gains).view(3, 1, 1)
     torch.testing.assert_close(gains * CAST / (gains * CAST)[1], torch.ones(3, 1, 1), atol=1e-3, rtol=0)
 
 
@@ -199,9 +199,9 @@ def test_every_white_balance_removes_a_colour_cast(balance):
 def test_white_balance_of_any_strength_keeps_luminance(strength):
     picture = random_image((3, 40, 56)) * CAST
     developed = develop(
-        sample_of(picture, white_balance="grey-world", white_balance_strength=strength, exposure=0.01)
+        sample_of(picture, white_balance="grey-world", white_balance_strength=strength, target_luminance=0.01)
     )
-    gains = torch.tensor(developed.white_balance).view(3, 1, 1)
+    gains = torch.tensor(developed.white_balance_gains).view(3, 1, 1)
     assert mean_luminance(picture * gains) == pytest.approx(mean_luminance(picture), rel=1e-3)
 
 
@@ -211,7 +211,7 @@ def test_half_the_strength_is_half_the_correction_in_stops(balance):
         np.log2(
             develop(
                 sample_of(random_image() * CAST, white_balance=balance, white_balance_strength=s)
-            ).white_balance
+            ).white_balance_gains
         )
         for s in (1, 0.5, 0)
     )
@@ -227,7 +227,8 @@ def test_clipped_lamps_do_not_affect_the_white_balance(balance):
     lit[2, 3:5, 3:5] = 1e5
     lit[:, 10:14, 10:20] = 1e5
     plain, with_lamps = (
-        develop(sample_of(each, white_balance=balance, exposure=0.3)).white_balance for each in (picture, lit)
+        develop(sample_of(each, white_balance=balance, target_luminance=0.3)).white_balance_gains
+        for each in (picture, lit)
     )
     assert plain == pytest.approx(with_lamps, abs=0.01)
 
@@ -237,14 +238,14 @@ def test_clipped_lamps_do_not_affect_the_white_balance(balance):
 @example(np.array([0.001, 0.1, 0.1], np.float32).reshape(3, 1, 1), "grey-world", 1.0)
 def test_gains_are_between_a_third_and_three(picture, balance, strength):
     developed = develop(sample_of(picture, white_balance=balance, white_balance_strength=strength))
-    assert all(0.3333 <= gain <= 3 for gain in developed.white_balance)
+    assert all(0.3333 <= gain <= 3 for gain in developed.white_balance_gains)
 
 
 # --- noise
 
 
 def flat(level, **response):
-    return sample_of(torch.full((3, 200, 200), level), exposure=level, **response)
+    return sample_of(torch.full((3, 200, 200), level), target_luminance=level, **response)
 
 
 @pytest.mark.parametrize("level", [0.2, 0.6])

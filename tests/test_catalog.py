@@ -17,18 +17,18 @@ from picture_files import exif_block, file_of, smooth
 KINDS = ["JPEG", "PNG", "TIFF", "WEBP", "AVIF", "GIF"]
 
 
-def encoded_map(random, height=16, width=32):
-    texels = random.uniform(0.2, 1.8, (height, width, 3)).astype(np.float32)
+def encoded_map(rng, height=16, width=32):
+    texels = rng.uniform(0.2, 1.8, (height, width, 3)).astype(np.float32)
     texels[3, 4] = 5  # the sun: a map whose maximum is in many texels is refused as clipped
     return Photo.from_array(texels, encoding="linear").encode("hdr")
 
 
 @pytest.fixture
-def maps(tmp_path, random):
+def maps(tmp_path, rng):
     folder = tmp_path / "maps"
     folder.mkdir()
     for name in ("b.hdr", "a.hdr", "c.HDR"):
-        (folder / name).write_bytes(encoded_map(random))
+        (folder / name).write_bytes(encoded_map(rng))
     return folder
 
 
@@ -115,10 +115,10 @@ def test_a_missing_folder_is_an_error(tmp_path):
         read_catalog([tmp_path / "gone"], [])
 
 
-def test_unusable_files_are_skipped_and_reported(maps, photos, random):
-    complete = encoded_map(random)
+def test_unusable_files_are_skipped_and_reported(maps, photos, rng):
+    complete = encoded_map(rng)
     (maps / "cut.hdr").write_bytes(complete[:-100])
-    (maps / "square.hdr").write_bytes(encoded_map(random, 16, 16))
+    (maps / "square.hdr").write_bytes(encoded_map(rng, 16, 16))
     (photos / "empty.jpg").write_bytes(b"")
     (photos / "page.png").write_bytes(b"<html>")
     (photos / "folder.webp").mkdir()
@@ -153,11 +153,11 @@ def test_the_order_of_the_file_system_does_not_matter(maps, photos, monkeypatch)
     assert found[0] == found[1]
 
 
-def test_of_two_files_with_one_name_that_in_the_first_folder_is_used(maps, tmp_path, random):
+def test_of_two_files_with_one_name_that_in_the_first_folder_is_used(maps, tmp_path, rng):
     other = tmp_path / "other"
     other.mkdir()
-    (other / "a.hdr").write_bytes(encoded_map(random, 32, 64))
-    (other / "d.hdr").write_bytes(encoded_map(random, 32, 64))
+    (other / "a.hdr").write_bytes(encoded_map(rng, 32, 64))
+    (other / "d.hdr").write_bytes(encoded_map(rng, 32, 64))
     widths = {
         folders: [asset.width for asset in read_catalog(folders, [])[0].maps]
         for folders in ((maps, other), (other, maps))

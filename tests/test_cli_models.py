@@ -10,6 +10,7 @@ import pytest
 from brewster import Photo, Separator
 from brewster.cli.extras import CORE, EXTRAS
 from brewster.models import zoo
+from brewster.models.large_models import LARGE
 from cli_helpers import image_bytes
 
 ROOT = Path(__file__).parents[1]
@@ -31,11 +32,24 @@ def model_zoo(model, monkeypatch, tmp_path):
 def test_models_are_listed_with_licence_and_damage(run_without_model, model_zoo):
     code, out, _ = run_without_model("models", "list")
     assert code == 0
-    assert [line.split()[0] for line in out.decode().splitlines()] == ["compact", "research"]
+    lines = [line for line in out.decode().splitlines() if not line.startswith(" ")]
+    assert [line.split()[0] for line in lines] == ["compact", "research", *LARGE]
     assert b"damaged" in out
     rows = json.loads(run_without_model("models", "list", "--json")[1])
     assert rows[0]["licence"] == "Apache-2.0"
     assert rows[1]["error"]
+    assert [row["name"] for row in rows[2:]] == list(LARGE)
+
+
+def test_large_models_are_listed_with_size_memory_licence_and_access(run_without_model, model_zoo):
+    text = run_without_model("models", "list")[1].decode()
+    windowseat, kontext = (
+        text.split(f"\n{name} ")[1].split("\nklein")[0] for name in ("windowseat", "kontext")
+    )
+    assert "41 GB  Apache-2.0\n" in windowseat
+    assert "reflection derived; 24 GiB GPU memory (nf4)" in windowseat
+    assert "Non-Commercial License (not for commercial use)" in kontext
+    assert "gated: accept the licence" in kontext
 
 
 def test_a_model_has_a_card_and_a_path(run_without_model, model_zoo, model):
@@ -147,8 +161,15 @@ def test_a_run_prints_its_progress_and_exports_a_model_that_separates(
         (folder / f"{index}.png").write_bytes(image_bytes(120, 90, "png", seed=index))
     monkeypatch.setenv("BREWSTER_DATA", str(tmp_path / "data"))
     recipe = ROOT / "recipes" / "train" / "tiny.toml"
-    code, out, err = run_without_model("train", recipe)
-    assert (code, out) == (0, b"")
+    code, out, err = run_without_model("train", recipe, "--json")
+    assert code == 0
+    events = [json.loads(line) for line in out.splitlines()]
+    assert [(event["event"], event.get("step")) for event in events] == [
+        ("start", 0), ("report", 3), ("report", 6), ("end", None),
+    ]  # fmt: skip
+    logged = [json.loads(line) for line in (tmp_path / "out" / "tiny" / "log.jsonl").read_text().splitlines()]
+    assert [event["metrics"].keys() | {"step"} for event in events[1:3]] == [line.keys() for line in logged]
+    assert events[-1]["model"] == "out/tiny/model.onnx"
     progress_lines = [
         line.split(",")[0].rsplit(maxsplit=1)[0] for line in err.splitlines() if line.startswith("step")
     ]
@@ -156,7 +177,10 @@ def test_a_run_prints_its_progress_and_exports_a_model_that_separates(
     run = tmp_path / "out" / "tiny"
     names = {path.name for path in run.iterdir()}
     file_names = {name for name in names if not name.startswith("events.out.tfevents.")}  # of TensorBoard
-    assert file_names == {"checkpoint.pt", "log.jsonl", "model.onnx", "samples.png"}
+    assert file_names == {"checkpoint.pt", "log.jsonl", "model.onnx", "results.png", "samples.png"}
+    _, out, err = run_without_model("train", recipe)
+    assert out == b""
+    assert err.startswith("the run in out/tiny is complete at step 6 of 6, after 0.")
     photo = Photo.from_array(np.full((50, 70, 3), 128, np.uint8), encoding="srgb")
     assert Separator.load(str(run / "model.onnx"))(photo).transmission.size == (70, 50)
 

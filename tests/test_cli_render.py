@@ -55,7 +55,7 @@ def test_a_set_is_rendered_with_preview_and_each_scene_can_be_rendered_again(
 ):
     """Uses the real renderer and small environments; large ones take seconds each."""
     monkeypatch.setattr(assets, "BUILTIN_HEIGHT", 32)
-    options = ("--recipe", "tiny", "--count", 2, "--seed", 7, "--size", "48x32", "--orders", "paper")
+    options = ("--recipe", "tiny", "--count", 2, "--seed", 7, "--size", "48x32", "--orders", "truncated")
     code, out, err = run_without_model("render", "set", *options, "--workers", 0, "--json", "--preview")
     assert code == 0, err
     assert [(line["index"], line["status"]) for line in json_lines(out)] == [(0, "rendered"), (1, "rendered")]
@@ -63,7 +63,7 @@ def test_a_set_is_rendered_with_preview_and_each_scene_can_be_rendered_again(
     assert {path.name for path in (tmp_path / "set" / "000001").iterdir()} == set(store.SAMPLE_FILES)
     assert Photo.open(tmp_path / "set" / "000001" / "photo.jpg").size == (48, 32)
     assert Photo.open(tmp_path / "set" / "preview.png").size == (800, 240)
-    assert parquet.read_table(tmp_path / "set" / "index.parquet")["orders"].to_pylist() == ["paper"] * 2
+    assert parquet.read_table(tmp_path / "set" / "index.parquet")["orders"].to_pylist() == ["truncated"] * 2
     for index in ("000000", "000001"):
         assert (
             run_without_model("render", "--scene", f"set/{index}/scene.toml", "-o", f"again/{index}")[0] == 0

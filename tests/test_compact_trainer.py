@@ -12,7 +12,7 @@ from brewster.training.checkpoint import Checkpoint
 from brewster.training.compact.trainer import CompactTrainer, train, validate
 from brewster.training.losses import separation_loss
 from brewster.training.recipe import with_value
-from brewster.training.streams import open_stream
+from brewster.training.streams import held_out_mixtures, open_stream
 
 RECIPES = Path(__file__).parents[1] / "recipes"
 
@@ -45,7 +45,7 @@ def test_without_training_data_the_network_keeps_its_initial_weights(rendered, t
 def test_a_photo_that_equals_its_ground_truth_has_a_finite_score():
     photo = torch.rand(1, 3, 32, 32)
     better, worse = (
-        validate(lambda _, given=given: given, {"plain": [(photo, photo)]})["gain_db_plain"]
+        validate(lambda _, given=given: given, {"plain": [(photo, photo)]})["psnr_gain_db_plain"]
         for given in (photo, 1 - photo)
     )
     assert better == 0
@@ -123,3 +123,18 @@ def test_a_run_starts_from_the_mean_of_the_ema_weights_of_its_checkpoints(recipe
         trainer.initialize()
         assert all((value == mean).all() for value in trainer.network.state_dict().values())
         assert all((value == mean).all() for value in trainer.ema_weights.values())
+
+
+def test_held_out_mixtures_do_not_depend_on_seed_and_distributions_of_the_recipe(recipe):
+    recipe = with_value(recipe, "data.held_out", ["2.png"])
+    other = with_value(with_value(recipe, "seed", 99), "mix.reflection_ratio_log", [1.0, 2.0])
+    one, two = (held_out_mixtures(given)(0, 3, 64) for given in (recipe, other))
+    assert torch.equal(one.photo_encoded, two.photo_encoded)
+    assert torch.equal(one.transmission_encoded, two.transmission_encoded)
+
+
+def test_320_held_out_mixtures_are_validated(recipe, monkeypatch):
+    monkeypatch.setattr("brewster.training.compact.trainer._HELD_OUT_SIDE_PX", 32)
+    pairs = CompactTrainer(with_value(recipe, "data.held_out", ["2.png"]))._validation_pairs
+    assert pairs.keys() == {"mixtures", "plain"}
+    assert sum(map(len, pairs.values())) == 320

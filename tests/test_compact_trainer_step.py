@@ -27,7 +27,7 @@ def make_trainer(recipe):
     """Returns a function that makes a compact trainer: by default 64 px, no weight decay, no warm-up."""
 
     def build(**changes):
-        plain = {"steps": 100, "sizes": [(0.0, 64)], "weight_decay": 0.0, "warmup_steps": 1}
+        plain = {"steps": 100, "image_size_schedule": [(0.0, 64)], "weight_decay": 0.0, "warmup_steps": 1}
         return CompactTrainer(recipe.model_copy(update=plain | changes), hard_batch)
 
     return build
@@ -93,8 +93,8 @@ def test_a_large_gradient_is_clipped_to_norm_one(make_trainer):
 
 @pytest.mark.parametrize(("step", "decay"), [(0, 2 / 11), (99, 0.75)])
 def test_the_moving_average_has_the_decay_of_the_recipe_and_a_smaller_one_at_first(make_trainer, step, decay):
-    """After n steps the decay is (n + 1) / (n + 10), at most `average_decay`."""
-    trainer = make_trainer(average_decay=0.75, decay_share=0.0, learning_rate=0.1, encoder_learning_rate=0.1)
+    """After n steps the decay is (n + 1) / (n + 10), at most `ema_decay`."""
+    trainer = make_trainer(ema_decay=0.75, decay_share=0.0, learning_rate=0.1, encoder_learning_rate=0.1)
     before = {name: value.clone() for name, value in trainer.ema_weights.items()}
     trainer.training_step(step)
     for name, new in copy_parameters(trainer.network).items():
@@ -112,9 +112,9 @@ def test_the_exported_network_has_the_ema_weights(make_trainer):
 
 def test_the_loss_is_the_sum_of_its_parts(make_trainer):
     metrics = make_trainer().training_step(0)
-    assert metrics["edges"] > 0
+    assert metrics["loss_edges"] > 0
     assert metrics["loss"] == pytest.approx(
-        sum(metrics[name] for name in ("transmission", "reflection", "edges", "psnr")), rel=1e-5
+        sum(metrics[f"loss_{name}"] for name in ("transmission", "reflection", "edges", "log_mse")), rel=1e-5
     )
 
 
@@ -150,7 +150,7 @@ def test_training_times_are_logit_normal_with_the_recipes_mean_and_deviation(mak
     """The shift for the resolution adds a constant to the logit: it changes the mean alone."""
     usual = logits(make_lora_trainer())
     assert usual.std().item() == pytest.approx(1, rel=0.15)
-    trainer = make_lora_trainer(logit_mean=0.7, logit_deviation=0.2)
+    trainer = make_lora_trainer(logit_mean=0.7, logit_std=0.2)
     assert logits(trainer).std().item() == pytest.approx(0.2, rel=0.15)
     assert logits(trainer).mean().item() - usual.mean().item() == pytest.approx(0.7, abs=0.2)
 

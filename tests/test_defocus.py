@@ -104,7 +104,7 @@ def test_defocus_by_convolution_equals_monte_carlo_integration(incidence_deg):
                 panes=[{"wedge_deg": wedge_deg}],
                 behind=map_side("soft", heading_deg=60),
                 front=map_side("soft"),
-                samples=196,
+                samples_per_pixel=196,
             ),
             ASSETS,
         )
@@ -127,7 +127,7 @@ def test_a_near_picture_is_sharp_in_the_focus_plane():
             make_scene(
                 camera=camera_towards_glass(0, aperture_mm=60, focus_mm=focus_mm),
                 behind=plane_side("line", distance_mm=504, width_mm=1600),
-                samples=64,
+                samples_per_pixel=64,
             ),
             ASSETS,
         ).background

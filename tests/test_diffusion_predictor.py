@@ -11,8 +11,8 @@ import torch
 
 from brewster import Photo, Separator
 from brewster.errors import DeviceError, DownloadError, ModelError, PhotoError
+from brewster.inference.assessment import RECONSTRUCTION_ERROR_LIMIT
 from brewster.inference.diffusion_predictor import DiffusionPredictor
-from brewster.inference.separator import RECONSTRUCTION_ERROR_LIMIT
 from brewster.models.diffusion.adapter.lora import LORA_FILE, add_lora, lora_parameters, save_lora
 from brewster.models.diffusion.backbones import TINY_PREFIX, tiny
 from brewster.models.diffusion.panels import PanelLayout
@@ -82,7 +82,7 @@ def test_a_colour_shift_of_the_model_does_not_reach_the_layers(tint):
     shifted = np.abs(to_linear(to_encoded(0.7 * photo.linear()) + tint) - 0.7 * photo.linear()).mean()
     assert error < max(0.004, shifted / 2)
     assert result.reconstruction_error == pytest.approx(abs(tint), abs=0.004)
-    assert result.doubtful == (abs(tint) > RECONSTRUCTION_ERROR_LIMIT)
+    assert (result.assessment.verdict == "doubtful") == (abs(tint) > RECONSTRUCTION_ERROR_LIMIT)
 
 
 def test_confidence_falls_with_the_reconstruction_error():
@@ -154,7 +154,7 @@ def test_without_a_reflection_panel_the_reflection_is_what_was_removed():
     result = Separator(DiffusionPredictor(FakePipeline(panels=("T",), budget_px=96 * 96)))(photo)
     np.testing.assert_allclose(result.reflection.linear(), 0.3 * photo.linear(), atol=0.02)
     assert result.reconstruction_error is None
-    assert not result.doubtful
+    assert result.assessment.verdict != "doubtful"
     assert not result.confidence.pixels.any()  # a confidence needs a reconstruction or several samples
 
 

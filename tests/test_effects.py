@@ -12,9 +12,9 @@ from brewster.training.data.sample_rng import SampleRng
 
 
 @pytest.fixture
-def scene(random):
+def scene(rng):
     """Returns an encoded image of smooth blobs and a hard edge, (3, 64, 64)."""
-    coarse = torch.from_numpy(random.random((1, 3, 5, 5), np.float32))
+    coarse = torch.from_numpy(rng.random((1, 3, 5, 5), np.float32))
     smooth = torch.nn.functional.interpolate(coarse, (64, 64), mode="bicubic")[0].clamp(0, 1)
     smooth[:, :, 40:] *= 0.4
     return (smooth * 255).round() / 255
@@ -49,11 +49,25 @@ def test_a_ghost_keeps_the_mean_of_a_flat_image():
     torch.testing.assert_close(effects.ghost(SampleRng(1, 0, 0), flat, 0.7, 5.0), flat)
 
 
-def test_blur_keeps_light_and_removes_detail(scene):
+@pytest.mark.parametrize("sigma_px", [2.0, 7.0])
+def test_blur_keeps_light_and_removes_detail(scene, sigma_px):
     for disc in (False, True):
-        soft = effects.blur(scene, 2.0, disc=disc)
+        soft = effects.blur(scene, sigma_px, disc=disc)
+        assert soft.shape == scene.shape
         assert soft.mean().item() == pytest.approx(scene.mean().item(), rel=0.03)
         assert soft.diff(dim=2).abs().max() < 0.5 * scene.diff(dim=2).abs().max()
+
+
+def test_blur_has_the_standard_deviation_asked_for():
+    point = torch.zeros(3, 96, 96)
+    point[:, 48, 48] = 1
+    distance = torch.arange(96) - 48.0
+    for sigma_px in (1.0, 4.0, 7.0, 9.0):
+        for disc in (False, True):
+            row = effects.blur(point, sigma_px, disc=disc)[0].sum(dim=0)
+            centre = (row * distance).sum() / row.sum()
+            deviation = ((row * (distance - centre).square()).sum() / row.sum()).sqrt().item()
+            assert deviation == pytest.approx(sigma_px, rel=0.2)
 
 
 def test_lamps_are_far_brighter_than_their_glow():

@@ -1,19 +1,24 @@
 """A complete evaluation: reads folders and writes the output files."""
 
+import csv
 import io
 import json
+import re
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from benchmark_folders import paint
 from brewster import Photo
 from brewster.benchmarks.registry import Benchmark, read_benchmark
-from brewster.errors import BrewsterError, PhotoError
+from brewster.errors import BrewsterError, DownloadError, PhotoError
 from brewster.evaluate.config import EvaluationConfig
 from brewster.evaluate.evaluation import evaluate
 from brewster.evaluate.methods import IdentityBaseline, ModelMethod, PredictionFolder
+from brewster.metrics import METRICS
 
 QUICK = EvaluationConfig(metrics=("psnr", "ssim", "psnr_region"))
 
@@ -42,7 +47,15 @@ def test_an_evaluation_writes_results_tables_and_a_report(real20, methods, tmp_p
     assert written == results
     assert results["tables"]["real20"]["theirs"]["psnr"]["mean"] > 30
     names = {path.name for path in (tmp_path / "out").iterdir()}
-    assert names == {"results.json", "tables.md", "table.tex", "table.csv", "report.html", "scores.jsonl"}
+    assert names == {
+        "results.json",
+        "scores.csv",
+        "tables.md",
+        "table.tex",
+        "table.csv",
+        "report.html",
+        "scores.jsonl",
+    }
     text = (tmp_path / "out" / "tables.md").read_text()
     assert text.index("theirs") < text.index("not measured here")
     assert (tmp_path / "out" / "report.html").read_text().count("<article") == 2
@@ -146,6 +159,77 @@ def test_a_missing_prediction_is_reported_in_results_tables_and_report(real20, m
     assert "no prediction for real20/2" in results["pictures"][1]["errors"]["theirs"]
     assert "no prediction for real20/2" in (tmp_path / "out" / "tables.md").read_text()
     assert "no prediction for real20/2" in (tmp_path / "out" / "report.html").read_text()
+
+
+def test_a_metric_without_weights_does_not_stop_the_run_and_is_added_later(
+    real20, methods, tmp_path, monkeypatch
+):
+    def prepare():
+        if not weights:
+            raise DownloadError("the weights are missing", "expected a network", "connect")
+
+    weights, calls = [], []
+
+    def measure(case):
+        calls.append(case)
+        return 0.5
+
+    late = replace(METRICS["lpips"], name="late", title="Late", score=measure, prepare=prepare)
+    monkeypatch.setitem(METRICS, "late", late)
+    config = EvaluationConfig(metrics=("psnr", "late"))
+    first = evaluate(real20, [IdentityBaseline(), methods[2]], config, tmp_path / "out")
+    assert "the weights are missing" in first["unavailable"]["late"]
+    assert set(first["tables"]["real20"]["theirs"]) == {"psnr"}
+    assert not calls
+    assert "late is not computed: the weights are missing" in (tmp_path / "out" / "tables.md").read_text()
+    weights.append("found")
+    monkeypatch.setitem(
+        METRICS, "psnr", replace(METRICS["psnr"], score=lambda _: pytest.fail("scored again"))
+    )
+    second = evaluate(real20, [IdentityBaseline(), methods[2]], config, tmp_path / "out")
+    assert not second["unavailable"]
+    assert second["tables"]["real20"]["theirs"]["psnr"] == first["tables"]["real20"]["theirs"]["psnr"]
+    assert second["tables"]["real20"]["theirs"]["late"]["mean"] == 0.5
+    assert len(calls) == 4
+    evaluate(real20, [IdentityBaseline(), methods[2]], config, tmp_path / "out")
+    assert len(calls) == 4
+
+
+def test_the_report_links_each_file_at_full_size(real20, methods, tmp_path):
+    evaluate(real20, methods, QUICK, tmp_path / "out")
+    page = (tmp_path / "out" / "report.html").read_text()
+    links = set(re.findall('data-full="([^"]+)"', page))
+    assert {"../real20/blended/1.png", "../theirs/1.png", "../stored/real20/1.reflection.png"} <= links
+    for link in links:
+        assert (tmp_path / "out" / link).resolve().is_file(), link
+
+
+def test_resized_images_are_written_at_their_size_for_the_report(real20, tmp_path):
+    evaluate(real20, [IdentityBaseline()], EvaluationConfig(metrics=("psnr",), size=8), tmp_path / "out")
+    page = (tmp_path / "out" / "report.html").read_text()
+    assert 'data-full="pictures/real20/1/photo.png"' in page
+    assert Photo.open(tmp_path / "out" / "pictures" / "real20" / "1" / "photo.png").size == (12, 8)
+
+
+def test_a_mirrored_prediction_gives_a_remark(tmp_path, random):
+    photo = random.integers(0, 256, (40, 60, 3)).astype(np.uint8)
+    for path in ("real20/blended", "real20/transmission_layer", "good", "bad"):
+        flipped = photo[:, ::-1].copy() if path == "bad" else photo
+        Photo.from_array(flipped, encoding="srgb").save(tmp_path / path / "46.png")
+    parts = read_benchmark("real20", tmp_path / "real20")
+    folders = [PredictionFolder(name, tmp_path / name) for name in ("good", "bad")]
+    results = evaluate(parts, [IdentityBaseline(), *folders], QUICK, tmp_path / "out")
+    assert "remark" not in results["methods"]["good"]
+    remark = results["methods"]["bad"]["remark"]
+    assert remark == "1 image of 1 not registered with the photo: real20/46 is mirrored left to right"
+
+
+def test_scores_csv_has_a_line_for_each_image_method_and_metric(real20, methods, tmp_path):
+    results = evaluate(real20, methods, QUICK, tmp_path / "out")
+    rows = list(csv.DictReader((tmp_path / "out" / "scores.csv").read_text().splitlines()))
+    assert len({(row["image"], row["method"], row["metric"]) for row in rows}) == len(rows) == 2 * 3 * 3
+    (row,) = (row for row in rows if (row["image"], row["method"], row["metric"]) == ("2", "pane", "psnr"))
+    assert float(row["value"]) == results["pictures"][1]["scores"]["pane"]["psnr"]
 
 
 @pytest.fixture

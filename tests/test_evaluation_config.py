@@ -54,4 +54,10 @@ def test_every_setting_is_described():
 
 
 def test_by_default_every_metric_but_the_second_ssim_is_measured():
-    assert set(METRICS) - set(EvaluationConfig().metrics) == {"ssim_gaussian"}
+    assert set(METRICS) - set(EvaluationConfig().metrics) == {
+        "ssim_gaussian",
+        "ssim_clipped",
+        "psnr_channels",
+        "dists",
+        "niqe",
+    }

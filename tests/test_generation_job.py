@@ -6,6 +6,7 @@ import os
 import shutil
 import subprocess
 import sys
+from functools import partial
 from pathlib import Path
 
 import filelock
@@ -14,9 +15,10 @@ from pyarrow import parquet
 
 import brewster
 from brewster.errors import DeviceError, TargetError
+from brewster.executors import SerialExecutor
 from brewster.rendered import store
 from brewster.rendered.generation import job as job_module
-from brewster.rendered.generation.workers import SerialExecutor
+from brewster.rendered.generation.workers import TaskRunner
 from set_folders import hashes, make_job, names, render_set, statuses
 
 
@@ -196,7 +198,9 @@ def test_other_maps_are_another_job(four_samples):
     smaller = job.catalog.model_copy(update={"maps": job.catalog.maps[1:]})
     with pytest.raises(TargetError, match="its catalog is"):
         job_module.build(
-            job_module.RenderJob(**{**vars(job), "catalog": smaller}), range(4), SerialExecutor(job)
+            job_module.RenderJob(**{**vars(job), "catalog": smaller}),
+            range(4),
+            SerialExecutor(partial(TaskRunner, job)),
         )
 
 

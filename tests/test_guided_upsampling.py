@@ -13,8 +13,8 @@ def downsample(image, factor):
 
 
 @pytest.fixture
-def sharp_scene_and_soft_reflection(random):
-    scene = np.kron(random.random((40, 60, 3)), np.ones((4, 4, 1))).astype(np.float32) * 0.5
+def sharp_scene_and_soft_reflection(rng):
+    scene = np.kron(rng.random((40, 60, 3)), np.ones((4, 4, 1))).astype(np.float32) * 0.5
     y, x = np.mgrid[0:1:160j, 0:1:240j]
     soft = 0.3 * np.exp(-((x - 0.4) ** 2 + (y - 0.5) ** 2) * 12)[..., None].astype(np.float32)
     return scene, np.broadcast_to(soft, scene.shape)
@@ -39,31 +39,31 @@ def test_a_soft_reflection_is_removed_and_sharp_detail_is_kept(sharp_scene_and_s
 
 
 @pytest.mark.parametrize("gain", [0.7, 1.25])
-def test_without_a_reflection_the_scene_does_not_appear_in_the_reflection(random, gain):
-    photo = np.kron(random.random((20, 30, 3)), np.ones((8, 8, 1))).astype(np.float32) * 0.7
+def test_without_a_reflection_the_scene_does_not_appear_in_the_reflection(rng, gain):
+    photo = np.kron(rng.random((20, 30, 3)), np.ones((8, 8, 1))).astype(np.float32) * 0.7
     small = downsample(photo, 4)
     transmission, reflected = fit(small, gain * small, np.zeros_like(small)).apply(photo, 0, 160)
     assert not reflected.any()
     assert psnr(as_bytes(transmission), as_bytes(gain * photo)) > 38
 
 
-def test_without_upsampling_the_prediction_is_unchanged(random):
-    photo, transmission, fraction = (random.random((33, 47, 3), np.float32) for _ in range(3))
+def test_without_upsampling_the_prediction_is_unchanged(rng):
+    photo, transmission, fraction = (rng.random((33, 47, 3), np.float32) for _ in range(3))
     reflection = fraction * photo
     layers = fit(photo, transmission, reflection).apply(photo, 0, 33)
     np.testing.assert_allclose(layers, (transmission, reflection), atol=1e-5)
 
 
-def test_an_unchanged_photo_is_kept_bit_equal_even_where_its_light_is_negative(random):
-    photo = random.random((64, 48, 3), np.float32) * 3 - 0.5
+def test_an_unchanged_photo_is_kept_bit_equal_even_where_its_light_is_negative(rng):
+    photo = rng.random((64, 48, 3), np.float32) * 3 - 0.5
     small = np.clip(downsample(photo, 4), 0, 1)
     transmission, reflection = fit(small, small, np.zeros_like(small)).apply(photo, 0, 64)
     assert (transmission == photo).all()
     assert (reflection == 0).all()
 
 
-def test_no_reflection_is_brighter_than_the_photo(random):
-    photo = random.random((20, 20, 3), np.float32)
+def test_no_reflection_is_brighter_than_the_photo(rng):
+    photo = rng.random((20, 20, 3), np.float32)
     photo[:5] = 0
     _, reflection = fit(photo, photo, np.full_like(photo, 0.2)).apply(photo, 0, 20)
     assert (reflection <= photo).all()
@@ -106,7 +106,7 @@ def test_fine_detail_of_the_reflection_is_replaced_by_the_generated_transmission
     assert override.weight[8:-8, 8:-8].min() > 0.9
 
 
-def test_without_fine_reflections_the_photo_keeps_its_detail(random):
-    detail = random.random((40, 60, 3), np.float32)
+def test_without_fine_reflections_the_photo_keeps_its_detail(rng):
+    detail = rng.random((40, 60, 3), np.float32)
     soft = np.full_like(detail, 0.2)
     assert GeneratedOverride.weighted_by_detail(detail, soft).weight.max() < 1e-3

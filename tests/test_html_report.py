@@ -92,6 +92,7 @@ def results(names=("a", "b"), method="compact", errors=None):
             "nature20": {"title": "Nature20", "pictures": len(names), "expected": [20]}
             | {"remarks": ["found 2 images, expected 20"], "refused": ["c.png has no partner"]}
         },
+        "unavailable": {},
         "unmeasured": [],
         "selections": {
             "nature20": {"title": "Nature20", "pictures": len(names)},
@@ -331,8 +332,8 @@ def test_images_keep_their_orientation_and_their_values(page):
     assert abs(photo[-200:].astype(int) - 90).max() <= 6
 
 
-def test_images_are_downscaled_like_photo_resized(page, random):
-    photo = random.integers(0, 255, (501, 733, 3)).astype(np.uint8)
+def test_images_are_downscaled_like_photo_resized(page, rng):
+    photo = rng.integers(0, 255, (501, 733, 3)).astype(np.uint8)
     expected = Photo.from_array(Photo.from_array(photo, encoding="srgb").resized(480, 328), encoding="linear")
     made = pictures(page(cases=[make_tiles("a", size=(501, 733), photo=photo)]))["photo, a"]
     difference = abs(made.pixels.astype(int) - Photo.open(expected.encode("webp")).pixels)
@@ -366,8 +367,8 @@ def test_a_downscaled_error_map_averages_the_errors():
     assert (error_map(prediction, truth) == COLOUR_MAP[24 * len(COLOUR_MAP) // MAX_ERROR]).all()
 
 
-def test_error_maps_are_embedded_losslessly(page, random):
-    truth, photo = random.integers(0, 255, (2, 40, 60, 3)).astype(np.uint8)
+def test_error_maps_are_embedded_losslessly(page, rng):
+    truth, photo = rng.integers(0, 255, (2, 40, 60, 3)).astype(np.uint8)
     made = pictures(page(cases=[make_tiles("a", photo=photo, ground_truth=truth)]))
     assert (made["error of the photo, a"].pixels == error_map(photo, truth)).all()
 

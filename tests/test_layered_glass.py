@@ -10,15 +10,15 @@ from hypothesis import strategies as st
 
 from brewster.render.analytic import render
 from brewster.render.rays.layered_glass import (
-    all_orders,
     enumerate_orders,
     fresnel,
     ghost_distance_mm,
+    in_plane_shifts_mm,
     internal_transmittance,
-    lateral_shifts_mm,
     order_throughputs,
-    paper_orders,
     refracted_cosine,
+    total_throughput,
+    truncated_throughput,
 )
 from brewster.render.rays.rough_glass import _reflectances
 from brewster.scene.glass import Glazing, Pane
@@ -29,7 +29,7 @@ COSINES = st.floats(0.05, 1)
 INDICES = st.floats(1, 2)
 TINTS = st.tuples(*[st.floats(0, 100)] * 3)
 PANES = st.lists(
-    st.builds(Pane, index=INDICES, thickness_mm=st.floats(1, 50), absorption_per_m=TINTS),
+    st.builds(Pane, refractive_index=INDICES, thickness_mm=st.floats(1, 50), absorption_per_m=TINTS),
     min_size=1,
     max_size=3,
 )
@@ -57,14 +57,16 @@ def surface_reflectances(cosine, index_in, index_out):
 
 def pane_throughputs(pane, cosine):
     """T and R of one clear pane for s- and p-polarised light: all orders as a geometric series."""
-    return [((1 - r) / (1 + r), 2 * r / (1 + r)) for r in surface_reflectances(cosine, 1, pane.index)]
+    return [
+        ((1 - r) / (1 + r), 2 * r / (1 + r)) for r in surface_reflectances(cosine, 1, pane.refractive_index)
+    ]
 
 
 def test_a_pane_of_ordinary_glass_reflects_about_eight_percent():
-    throughput = all_orders(Glazing(), float64(1))
-    assert float(throughput.reflected) == pytest.approx(0.08 / 1.04, rel=1e-9)
-    assert float(throughput.reflected) == pytest.approx(0.0769, abs=5e-5)
-    assert float(throughput.transmitted) == pytest.approx(0.96 / 1.04, rel=1e-9)
+    throughput = total_throughput(Glazing(), float64(1))
+    assert float(throughput.reflectance) == pytest.approx(0.08 / 1.04, rel=1e-9)
+    assert float(throughput.reflectance) == pytest.approx(0.0769, abs=5e-5)
+    assert float(throughput.transmittance) == pytest.approx(0.96 / 1.04, rel=1e-9)
 
 
 @pytest.mark.parametrize("index", [1.1, 1.5, 2.4])
@@ -98,39 +100,41 @@ def test_beyond_the_critical_angle_all_light_inside_the_glass_is_reflected():
 @given(PANES, COSINES)
 def test_clear_glass_loses_no_light(panes, cosine):
     clear = glazing(pane.model_copy(update={"absorption_per_m": (0.0, 0.0, 0.0)}) for pane in panes)
-    throughput = all_orders(clear, float64(cosine))
-    assert float(throughput.transmitted + throughput.reflected) == pytest.approx(1, abs=1e-9)
+    throughput = total_throughput(clear, float64(cosine))
+    assert float(throughput.transmittance + throughput.reflectance) == pytest.approx(1, abs=1e-9)
 
 
 @examples_40
 @given(PANES, COSINES)
 def test_tinted_glass_adds_no_light(panes, cosine):
-    throughput = all_orders(glazing(panes), float64(cosine))
-    assert (throughput.transmitted >= 0).all()
-    assert (throughput.reflected >= 0).all()
-    assert (throughput.transmitted + throughput.reflected <= 1 + 1e-9).all()
+    throughput = total_throughput(glazing(panes), float64(cosine))
+    assert (throughput.transmittance >= 0).all()
+    assert (throughput.reflectance >= 0).all()
+    assert (throughput.transmittance + throughput.reflectance <= 1 + 1e-9).all()
 
 
 @examples_40
 @given(PANES, COSINES)
 def test_a_stack_has_the_same_transmittance_from_both_sides(panes, cosine):
-    from_front, from_behind = (all_orders(glazing(stack), float64(cosine)) for stack in (panes, panes[::-1]))
-    torch.testing.assert_close(from_front.transmitted, from_behind.transmitted, rtol=1e-9, atol=1e-12)
+    from_front, from_behind = (
+        total_throughput(glazing(stack), float64(cosine)) for stack in (panes, panes[::-1])
+    )
+    torch.testing.assert_close(from_front.transmittance, from_behind.transmittance, rtol=1e-9, atol=1e-12)
 
 
 @examples_40
 @given(COSINES, st.floats(1.01, 2.5), st.floats(1.01, 2.5))
 def test_double_glazing_follows_the_adding_formula(cosine, first, second):
-    panes = [Pane(index=first), Pane(index=second)]
+    panes = [Pane(refractive_index=first), Pane(refractive_index=second)]
     transmittance = reflectance = 0.0
     for (t1, r1), (t2, r2) in zip(
         pane_throughputs(panes[0], cosine), pane_throughputs(panes[1], cosine), strict=True
     ):
         transmittance += t1 * t2 / (1 - r1 * r2) / 2
         reflectance += (r1 + t1**2 * r2 / (1 - r1 * r2)) / 2
-    throughput = all_orders(glazing(panes), float64(cosine))
-    assert float(throughput.transmitted) == pytest.approx(transmittance, rel=1e-6)
-    assert float(throughput.reflected) == pytest.approx(reflectance, rel=1e-6)
+    throughput = total_throughput(glazing(panes), float64(cosine))
+    assert float(throughput.transmittance) == pytest.approx(transmittance, rel=1e-6)
+    assert float(throughput.reflectance) == pytest.approx(reflectance, rel=1e-6)
 
 
 def test_absorption_follows_the_beer_lambert_law():
@@ -138,10 +142,10 @@ def test_absorption_follows_the_beer_lambert_law():
     internal = np.exp([-0.4, 0, -0.1])
     np.testing.assert_allclose(internal_transmittance(pane, float64(1)), internal, rtol=1e-9)
     np.testing.assert_allclose(
-        paper_orders(glazing([pane]), float64(1)).transmitted, 0.96**2 * internal, rtol=1e-9
+        truncated_throughput(glazing([pane]), float64(1)).transmittance, 0.96**2 * internal, rtol=1e-9
     )
     np.testing.assert_allclose(
-        all_orders(glazing([pane]), float64(1)).transmitted,
+        total_throughput(glazing([pane]), float64(1)).transmittance,
         0.96**2 * internal / (1 - (0.04 * internal) ** 2),
         rtol=1e-9,
     )
@@ -155,7 +159,9 @@ def test_absorption_follows_the_beer_lambert_law():
 
 
 def orders_of(panes, cosine):
-    return enumerate_orders(tuple(float(sum(fresnel(float64(cosine), pane.index))) / 2 for pane in panes))
+    return enumerate_orders(
+        tuple(float(sum(fresnel(float64(cosine), pane.refractive_index))) / 2 for pane in panes)
+    )
 
 
 @settings(max_examples=40, phases=[Phase.generate], deadline=None, database=None)
@@ -164,10 +170,14 @@ def test_the_throughputs_of_the_orders_sum_to_the_closed_form(panes, cosine):
     table = orders_of(panes, cosine)
     throughputs = order_throughputs(glazing(panes), float64(cosine), table)
     for closed, is_included, max_error in (
-        (all_orders(glazing(panes), float64(cosine)), lambda _: True, 1e-12),
-        (paper_orders(glazing(panes), float64(cosine)), lambda order: order.in_paper, 6e-3),
+        (total_throughput(glazing(panes), float64(cosine)), lambda _: True, 1e-12),
+        (
+            truncated_throughput(glazing(panes), float64(cosine)),
+            lambda order: order.in_truncated_layers,
+            6e-3,
+        ),
     ):
-        for behind, expected in ((True, closed.transmitted), (False, closed.reflected)):
+        for behind, expected in ((True, closed.transmittance), (False, closed.reflectance)):
             total = sum(
                 throughput
                 for throughput, order in zip(throughputs, table, strict=True)
@@ -182,8 +192,8 @@ def test_little_light_is_added_to_the_last_order(count):
     """For ordinary glass, the enumerated orders contain all but 0.1 % of the incident light."""
     panes = [Pane()] * count
     table = enumerate_orders((0.04,) * count)
-    closed = all_orders(glazing(panes), float64(1))
-    for behind, total in ((True, closed.transmitted), (False, closed.reflected)):
+    closed = total_throughput(glazing(panes), float64(1))
+    for behind, total in ((True, closed.transmittance), (False, closed.reflectance)):
         enumerated = sum(
             order.count * 0.04 ** sum(order.reflections) * 0.96 ** sum(order.transmissions)
             for order in table
@@ -200,7 +210,7 @@ def test_one_pane_has_three_reflected_and_two_transmitted_orders():
     assert [order.reflections for order in table] == [(0,), (1,), (1,), (2,), (3,)]
     assert [order.transmissions for order in table] == [(2,), (0,), (2,), (2,), (2,)]
     assert [order.count for order in table] == [1] * 5
-    assert [order.in_paper for order in table] == [True, True, False, False, False]
+    assert [order.in_truncated_layers for order in table] == [True, True, False, False, False]
 
 
 def test_each_order_of_one_pane_is_a_term_of_the_geometric_series():
@@ -217,13 +227,13 @@ def test_each_order_of_one_pane_is_a_term_of_the_geometric_series():
 
 def test_in_double_glazing_the_papers_reflection_never_enters_the_last_pane():
     table = enumerate_orders((0.04, 0.04))
-    assert sum(order.behind and order.in_paper for order in table) == 1
+    assert sum(order.behind and order.in_truncated_layers for order in table) == 1
     reflected = [order for order in table if not order.behind]
     brightest = [order.traversals for order in reflected[:4]]
     assert brightest == [(0, 0, 0), (2, 0, 0), (2, 2, 0), (2, 2, 2)]
-    assert [order.in_paper for order in reflected[:4]] == [True, True, True, False]
+    assert [order.in_truncated_layers for order in reflected[:4]] == [True, True, True, False]
     for order in reflected:
-        assert order.in_paper == (order.transmissions[1] == 0)
+        assert order.in_truncated_layers == (order.transmissions[1] == 0)
 
 
 # --- ghosts
@@ -235,12 +245,15 @@ def test_the_ghost_distance_matches_the_textbook_formula():
     assert ghost_distance_mm(Pane(thickness_mm=6), 45) == pytest.approx(expected, rel=1e-9)
     assert ghost_distance_mm(Pane(thickness_mm=6), 45) == pytest.approx(4.5356, abs=1e-4)
     assert ghost_distance_mm(Pane(), 0) == 0
-    assert ghost_distance_mm(Pane(index=1.0), 60) == pytest.approx(8 * math.sin(math.radians(60)), rel=1e-9)
+    assert ghost_distance_mm(Pane(refractive_index=1.0), 60) == pytest.approx(
+        8 * math.sin(math.radians(60)), rel=1e-9
+    )
 
 
-def test_lateral_shifts_follow_snells_law_in_glass_and_are_unrefracted_in_the_gap():
-    first, gap, second = lateral_shifts_mm(
-        Glazing(panes=(Pane(thickness_mm=3), Pane(thickness_mm=8, index=2)), gap_mm=16), float64(0.5)
+def test_in_plane_shifts_follow_snells_law_in_glass_and_are_unrefracted_in_the_gap():
+    first, gap, second = in_plane_shifts_mm(
+        Glazing(panes=(Pane(thickness_mm=3), Pane(thickness_mm=8, refractive_index=2)), gap_mm=16),
+        float64(0.5),
     )
     sine = math.sin(math.radians(60))
     assert float(first) == pytest.approx(3 * math.tan(math.asin(sine / 1.5)), rel=1e-9)
@@ -260,7 +273,9 @@ def render_mirrored_line(incidence_deg, thickness_mm):
         width_mm=20 / math.cos(slant) ** 2,
         offset_mm=(away * math.tan(slant) + 10 / 64 / math.cos(slant) ** 2, 0),
     )
-    scene = make_scene(camera=camera, panes=[{"thickness_mm": thickness_mm}], front=line, samples=25)
+    scene = make_scene(
+        camera=camera, panes=[{"thickness_mm": thickness_mm}], front=line, samples_per_pixel=25
+    )
     columns = render(scene, ASSETS).reflection.mean((0, 1)).numpy()
     return columns, scene.camera.pixel_rad * (before + away) / math.cos(slant)
 

@@ -143,8 +143,8 @@ def test_folders_with_equal_last_names_have_unique_log_keys(recipe, tmp_path):
     train(with_value(recipe, "data.validate_on", folders), tmp_path / "run", ignore_step)
     logged = json.loads((tmp_path / "run" / "log.jsonl").read_text().splitlines()[0])
     assert {name for name in logged if name.startswith("gain")} == {
-        "gain_db_one/real",
-        "gain_db_two/real",
+        "psnr_gain_db_one/real",
+        "psnr_gain_db_two/real",
     }
 
 
@@ -154,16 +154,67 @@ def test_a_run_writes_a_log_and_an_image_of_samples(recipe, tmp_path):
     assert Photo.open(tmp_path / "run" / "samples.png").size[0] == 960
 
 
-def test_a_run_of_another_recipe_is_not_resumed(recipe, tmp_path):
-    train(recipe.model_copy(update={"steps": 1, "learning_rate": 1e-4}), tmp_path, ignore_step)
-    with pytest.raises(RecipeError, match="another recipe"):
-        train(recipe, tmp_path, ignore_step)
+def test_a_refused_resume_names_the_values_that_differ(recipe, tmp_path):
+    run(CountingTrainer(recipe), tmp_path, ignore_step)
+    other = with_value(with_value(recipe, "mix.veil", [0.0, 0.5]), "learning_rate", 0.01)
+    with pytest.raises(
+        RecipeError,
+        match=r"learning_rate was 0\.001, is 0\.01, mix\.veil was \[0\.0, 0\.1\], is \[0\.0, 0\.5\]; .* may change: steps,",
+    ):
+        run(CountingTrainer(other), tmp_path, ignore_step)
 
 
-def test_a_run_can_be_made_longer(recipe, tmp_path):
-    train(recipe.model_copy(update={"steps": 1}), tmp_path, ignore_step)
-    train(recipe.model_copy(update={"steps": 2, "report_every": 1}), tmp_path, ignore_step)
-    assert logged_steps(tmp_path) == [1, 2]
+def test_a_run_can_be_made_longer_but_not_shorter(recipe, tmp_path):
+    trainer = CountingTrainer(recipe.model_copy(update={"steps": 3}))
+    run(trainer, tmp_path, ignore_step)
+    longer = CountingTrainer(recipe.model_copy(update={"steps": 5, "report_every": 1}))
+    run(longer, tmp_path, ignore_step)
+    assert longer.steps == [0, 1, 2, 3, 4]
+    assert logged_steps(tmp_path) == [3, 4, 5]
+    with pytest.raises(RecipeError, match="has 5 completed steps, but the recipe has steps = 3"):
+        run(trainer, tmp_path, ignore_step)
+
+
+def test_a_resumed_run_is_announced_and_its_seconds_go_on(recipe, tmp_path, monkeypatch):
+    """The clock advances by one second at each step; the process is away for an hour."""
+    now, starts = [0.0], []
+    monkeypatch.setattr("brewster.training.loop.time.monotonic", lambda: now[0])
+
+    def tick(step, steps, metrics, logged):
+        now[0] += 1
+        if step == 5 and now[0] < 100:
+            raise Killed
+
+    def start(*values):
+        starts.append(values)
+
+    often = recipe.model_copy(update={"report_every": 1, "checkpoint_every": 2})
+    with pytest.raises(Killed):
+        run(CountingTrainer(often), tmp_path, tick, start)
+    now[0] = 3600.0
+    run(CountingTrainer(often), tmp_path, tick, start)
+    lines = [json.loads(line) for line in (tmp_path / "log.jsonl").read_text().splitlines()]
+    assert starts == [(0, 6, 0.0), (4, 6, 3.0)]
+    assert [line["seconds"] for line in lines] == [0, 1, 2, 3, 3, 4]
+
+
+def test_a_checkpoint_without_seconds_is_resumed(recipe, tmp_path):
+    path, starts = tmp_path / "checkpoint.pt", []
+    torch.save({"step": 6, "recipe": recipe.model_dump_json(), "steps": []}, path)
+    run(CountingTrainer(recipe), tmp_path, ignore_step, lambda *values: starts.append(values))
+    assert starts == [(6, 6, 0.0)]
+
+
+def test_the_curves_are_drawn_at_each_report(recipe, tmp_path):
+    pictures = []
+
+    def read(step, steps, metrics, logged):
+        if logged:
+            pictures.append((tmp_path / "results.png").read_bytes())
+
+    run(CountingTrainer(recipe), tmp_path, read)
+    assert len(set(pictures)) == 2
+    assert Photo.open(tmp_path / "results.png").size[0] > 800  # two panels: loss and gain
 
 
 def test_a_resumed_run_logs_every_step_once(recipe, tmp_path):

@@ -108,9 +108,9 @@ def test_a_run_writes_a_log_pictures_and_a_folder_for_diffusers(recipe, tmp_path
     assert json.loads((place / "recipe.json").read_text())["backbone"] == "tiny:kontext"
     (line,) = (tmp_path / "log.jsonl").read_text().splitlines()
     assert json.loads(line).keys() == {
-        "step", "loss", "panel_I", "panel_T", "panel_R", "gain_db_training", "seconds",
+        "step", "loss", "loss_panel_I", "loss_panel_T", "loss_panel_R", "psnr_gain_db_training", "seconds",
     }  # fmt: skip
-    assert Photo.open(tmp_path / "samples.png").size == (6 * 240, 160)
+    assert Photo.open(tmp_path / "samples.png").size == (6 * 240, 20 + 20 + 160)
 
 
 def test_a_checkpoint_contains_the_lora_and_no_weights_of_the_base(make_trainer):
@@ -168,17 +168,17 @@ def test_small_validation_photos_get_small_panels(make_trainer, tmp_path, monkey
     trainer = make_trainer()
     data = trainer.recipe.data.model_copy(update={"validate_on": (Path("small"),)})
     scores, image = make_trainer(data=data, panels=["T", "R"], budget_px=2 * 32 * 16).validate()
-    assert scores.keys() == {"gain_db_small"}
-    assert image.shape == (160, 5 * 240, 3)
+    assert scores.keys() == {"psnr_gain_db_small"}
+    assert image.shape == (20 + 20 + 160, 5 * 240, 3)
 
 
 def test_a_panel_of_weight_zero_has_no_loss_and_the_others_share_its_weight(make_trainer):
     equal, uneven = make_trainer(), make_trainer(panel_weights={"I": 0, "T": 3, "R": 1})
     before, after = equal.training_step(0), uneven.training_step(0)
-    assert after["panel_I"] == 0
-    assert after["panel_T"] == pytest.approx(before["panel_T"] * 3 * 3 / 4)
-    assert after["panel_R"] == pytest.approx(before["panel_R"] * 3 / 4)
-    assert after["loss"] == pytest.approx(after["panel_T"] + after["panel_R"])
+    assert after["loss_panel_I"] == 0
+    assert after["loss_panel_T"] == pytest.approx(before["loss_panel_T"] * 3 * 3 / 4)
+    assert after["loss_panel_R"] == pytest.approx(before["loss_panel_R"] * 3 / 4)
+    assert after["loss"] == pytest.approx(after["loss_panel_T"] + after["loss_panel_R"])
 
 
 def test_the_loss_of_a_batch_is_the_mean_of_its_samples(make_trainer):
@@ -218,7 +218,7 @@ def test_two_processes_train_the_lora_of_one_process_with_the_whole_batch(recipe
         torch.testing.assert_close(ends[1][name], tensor, atol=1e-6, rtol=0)
     one, two = (json.loads((tmp_path / place / "log.jsonl").read_text()) for place in ("one", "two"))
     assert one["loss"] == pytest.approx(two["loss"], abs=2e-5)
-    assert one["gain_db_training"] == pytest.approx(two["gain_db_training"], abs=1e-3)
+    assert one["psnr_gain_db_training"] == pytest.approx(two["psnr_gain_db_training"], abs=1e-3)
 
 
 def test_data_and_machine_are_checked_before_anything_is_loaded(recipe, tmp_path, monkeypatch):
@@ -277,7 +277,7 @@ def test_validation_is_divided_among_the_processes(make_trainer, monkeypatch):
         trainer.validate()
     (gains, rows), (other_gains, other_rows) = parts
     assert [bool(gain) for gain in gains] == [True, False, True]
-    assert (gains + other_gains).mean().item() == pytest.approx(scores["gain_db_training"])
+    assert (gains + other_gains).mean().item() == pytest.approx(scores["psnr_gain_db_training"])
     whole = torch.cat(list(rows + other_rows), dim=1).clamp(0, 1).permute(1, 2, 0)
     assert torch.equal(whole, image)
 

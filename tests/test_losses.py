@@ -51,12 +51,14 @@ def test_fine_stripes_count_at_the_finest_scale_only_and_as_edges():
 
 
 def test_the_logarithm_of_the_squared_error_is_limited_at_30_db():
-    assert loss_of(transmission_error=0.1)["psnr"] == pytest.approx(0.02 * math.log(0.01 + 0.001), rel=1e-4)
-    assert loss_of()["psnr"] == pytest.approx(0.02 * math.log(0.001), rel=1e-4)
+    assert loss_of(transmission_error=0.1)["log_mse"] == pytest.approx(
+        0.02 * math.log(0.01 + 0.001), rel=1e-4
+    )
+    assert loss_of()["log_mse"] == pytest.approx(0.02 * math.log(0.001), rel=1e-4)
 
 
 def test_the_loss_has_four_parts():
-    assert loss_of().keys() == {"transmission", "reflection", "edges", "psnr"}
+    assert loss_of().keys() == {"transmission", "reflection", "edges", "log_mse"}
 
 
 def test_a_tenth_of_the_error_is_a_gain_of_twenty_decibels():

@@ -12,7 +12,8 @@ from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
 import brewster.metrics
 from brewster.errors import BrewsterError
-from brewster.metrics import METRICS, Metric, find_metric, psnr, ssim
+from brewster.metrics import METRICS, Metric, find_metric, linear_error, psnr, psnr_of_channels, ssim
+from brewster.srgb import to_linear
 
 GAUSSIAN = {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False, "data_range": 255}
 SCIKIT_ARGUMENTS = {"uniform": {"channel_axis": 2}, "gaussian": {"channel_axis": 2, **GAUSSIAN}}
@@ -37,14 +38,14 @@ def test_ssim_equals_scikit_image_with_either_window(one, other, window):
 
 @pytest.mark.parametrize("window", SCIKIT_ARGUMENTS)
 @pytest.mark.parametrize("size", [(11, 11), (11, 40), (40, 12), (33, 47)])
-def test_ssim_equals_scikit_image_at_any_size_and_near_white(random, size, window):
-    one, other = random.integers(230, 256, (2, *size, 3), np.uint8)
+def test_ssim_equals_scikit_image_at_any_size_and_near_white(rng, size, window):
+    one, other = rng.integers(230, 256, (2, *size, 3), np.uint8)
     expected = structural_similarity(other, one, **SCIKIT_ARGUMENTS[window])
     assert ssim(one, other, window=window) == pytest.approx(expected, abs=1e-9)
 
 
-def test_equal_images_have_infinite_psnr_and_an_ssim_of_one(random):
-    image = random.integers(0, 256, (12, 12, 3), np.uint8)
+def test_equal_images_have_infinite_psnr_and_an_ssim_of_one(rng):
+    image = rng.integers(0, 256, (12, 12, 3), np.uint8)
     assert psnr(image, image) == float("inf")
     assert ssim(image, image) == ssim(image, image, window="gaussian") == pytest.approx(1)
 
@@ -63,8 +64,8 @@ def test_two_uniform_images_have_the_ssim_of_their_means():
         assert ssim(black, white, window=window) == pytest.approx(constant / (255**2 + constant))
 
 
-def test_images_may_have_any_memory_layout(random):
-    one, other = random.integers(0, 256, (2, 20, 26, 3), np.uint8)
+def test_images_may_have_any_memory_layout(rng):
+    one, other = rng.integers(0, 256, (2, 20, 26, 3), np.uint8)
     for a, b in ((one[::-1, ::2], other[::-1, ::2]), (one.transpose(1, 0, 2), other.transpose(1, 0, 2))):
         assert psnr(a, b) == psnr(a.copy(), b.copy())
         assert ssim(a, b) == pytest.approx(ssim(a.copy(), b.copy()), abs=1e-12)
@@ -93,8 +94,8 @@ def test_ssim_in_a_region_is_the_mean_of_the_map_of_scikit_image(one, other, mas
             ssim(one, other, window=window, region=mask)
 
 
-def test_psnr_in_a_region_ignores_all_other_pixels(random):
-    truth = random.integers(0, 200, (9, 9, 3), np.uint8)
+def test_psnr_in_a_region_ignores_all_other_pixels(rng):
+    truth = rng.integers(0, 200, (9, 9, 3), np.uint8)
     image, region = truth.copy(), np.zeros((9, 9), bool)
     image[:3] += np.uint8(10)
     region[:3, 2:5] = True
@@ -146,6 +147,34 @@ def test_an_image_smaller_than_the_window_is_refused(window, side):
     with pytest.raises(ValueError, match=f"at least {side}x{side} pixels, not {side - 1}x20"):
         ssim(*np.zeros((2, side - 1, 20, 3), np.uint8), window=window)
     assert ssim(*np.zeros((2, side, side, 3), np.uint8), window=window) == 1
+
+
+# --- linear light and channels
+
+
+def test_the_linear_error_is_the_rms_of_the_light(random):
+    prediction, truth = random.integers(0, 256, (2, 9, 12, 3)).astype(np.uint8)
+    light, true_light = (to_linear(image / 255) for image in (prediction, truth))
+    assert linear_error(prediction, truth) == pytest.approx(
+        ((light - true_light) ** 2).mean() ** 0.5, rel=1e-5
+    )
+    black, white = np.zeros((2, 2, 3), np.uint8), np.full((2, 2, 3), 255, np.uint8)
+    assert linear_error(black, white) == pytest.approx(1)
+    assert linear_error(white, white) == 0
+    region = np.array([[True, False], [False, False]])
+    black[0, 0] = 255
+    assert linear_error(black, white, region=region) == 0
+    assert linear_error(black, white) == pytest.approx(0.75**0.5)
+
+
+def test_the_psnr_of_channels_is_the_mean_of_three_psnrs(random):
+    prediction, truth = random.integers(0, 256, (2, 9, 12, 3)).astype(np.uint8)
+    prediction[..., 0] = truth[..., 0] // 2
+    channels = [np.repeat(image[..., i : i + 1], 3, 2) for i in range(3) for image in (prediction, truth)]
+    expected = np.mean([psnr(*channels[i : i + 2]) for i in (0, 2, 4)])
+    assert psnr_of_channels(prediction, truth) == pytest.approx(expected)
+    assert psnr_of_channels(prediction, truth) >= psnr(prediction, truth)
+    assert psnr_of_channels(truth, truth) == float("inf")
 
 
 # --- the table

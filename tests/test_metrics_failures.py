@@ -30,11 +30,11 @@ def brighten(image, gain):
 @pytest.fixture
 def scene():
     """Background, photo and reflection; only the right half of the pane has a reflection."""
-    random = np.random.default_rng(7)
-    background_light = random.uniform(0.05, 0.4, (SIDE, SIDE, 3))
+    rng = np.random.default_rng(7)
+    background_light = rng.uniform(0.05, 0.4, (SIDE, SIDE, 3))
     background_light[WHITE] = 0.8
     reflection_light = np.zeros_like(background_light)
-    reflection_light[:, SIDE // 2 :] = random.uniform(0.1, 0.3, (SIDE, SIDE // 2, 3))
+    reflection_light[:, SIDE // 2 :] = rng.uniform(0.1, 0.3, (SIDE, SIDE // 2, 3))
     return (
         encode(background_light),
         encode(TRANSMITTANCE * background_light + reflection_light),

@@ -43,8 +43,8 @@ def test_edge_pixels_are_repeated_beyond_the_border():
     assert not reflection_region(photo, truth, threshold=16.1 / 255).any()
 
 
-def test_a_higher_threshold_marks_fewer_pixels(random):
-    photo, truth = random.integers(0, 256, (2, 30, 30, 3), np.uint8)
+def test_a_higher_threshold_marks_fewer_pixels(rng):
+    photo, truth = rng.integers(0, 256, (2, 30, 30, 3), np.uint8)
     shares = [reflection_region(photo, truth, threshold=t).mean() for t in (0, DEFAULT_THRESHOLD, 0.5, 1)]
     assert shares == sorted(shares, reverse=True)
     assert (shares[0], shares[-1]) == (1, 0)

@@ -30,36 +30,36 @@ IMAGES = {"white": WHITE, "red right": RED_RIGHT, "red top": RED_TOP, "ramp": RA
 class SyntheticAssets:
     """Assets without files: the entry of `IMAGES` with the source's name."""
 
-    def map_light(self, lit):
+    def map_radiance(self, lit):
         return IMAGES[lit.source.file] * np.float32(lit.luminance)
 
-    def plane_light(self, plane):
+    def plane_radiance(self, plane):
         return IMAGES[plane.source.file] * np.float32(plane.luminance)
 
 
-def around(name="white", **more):
+def map_side(name="white", **more):
     return Side(map=EnvironmentMap(source=AssetSource(file=name), **more))
 
 
-def board(name, **more):
+def plane_side(name, **more):
     return Side(plane=Plane(source=AssetSource(file=name), **{"distance_mm": 1000, "width_mm": 1200, **more}))
 
 
 def a_scene(**more):
     camera = {"width": 32, "height": 32, "fov_deg": 20, "position_mm": (0, 0, 500), **more.pop("camera", {})}
-    return Scene(camera=Camera(**camera), **{"behind": around(), "front": around(), **more})
+    return Scene(camera=Camera(**camera), **{"behind": map_side(), "front": map_side(), **more})
 
 
 def traced(scene, **more):
-    return trace(scene, SyntheticAssets(), **{"noise": 0.01, "max_samples": 512, **more})
+    return trace(scene, SyntheticAssets(), **{"noise_threshold": 0.01, "max_samples": 512, **more})
 
 
-def render_image(scene, side, glass, samples=64):
+def render_image(scene, side, glass_mode, samples=64):
     """Renders one image (H, W, 3)."""
     mitsuba = variant.load()
     with renderer._active_variant(mitsuba, variant.probe().variant):
         mi_scene = MitsubaSceneBuilder(mitsuba, scene, SyntheticAssets()).scene_dict(
-            behind=side == "behind", glass=glass
+            behind=side == "behind", glass_mode=glass_mode
         )
         return np.array(mitsuba.render(mitsuba.load_dict(mi_scene), spp=samples))
 
@@ -81,22 +81,22 @@ def pane_reflectances(incidence_deg, index=1.5):
 
 
 def test_glass_with_index_one_is_invisible():
-    sample = traced(a_scene(behind=around("mottled"), glass=Glazing(panes=(Pane(index=1.0),))))
+    sample = traced(a_scene(behind=map_side("mottled"), glass=Glazing(panes=(Pane(refractive_index=1.0),))))
     assert sample.photo.shape == (3, 32, 32)
     assert float((sample.transmission - sample.background).abs().max()) < 0.02
     assert float(sample.reflection.abs().max()) == 0
 
 
 def test_a_pane_of_ordinary_glass_reflects_about_eight_percent():
-    sample = traced(a_scene(camera=at(0)), noise=0.003, max_samples=4096)
+    sample = traced(a_scene(camera=at(0)), noise_threshold=0.003, max_samples=4096)
     s, _ = pane_reflectances(0)
     assert float(sample.reflection.mean()) == pytest.approx(s, rel=0.02)
     assert float(sample.transmission.mean()) == pytest.approx(1 - s, rel=0.002)
     assert float(sample.photo.mean()) == pytest.approx(1, abs=0.003)
 
 
-def test_the_papers_layers_are_the_first_reflection_and_the_path_without_reflection():
-    sample = traced(a_scene(camera=at(0), orders="paper"), noise=0.002)
+def test_truncated_layers_are_the_first_reflection_and_the_path_without_reflection():
+    sample = traced(a_scene(camera=at(0), orders="truncated"), noise_threshold=0.002)
     assert float(sample.reflection.mean()) == pytest.approx(0.04, rel=0.001)
     assert float(sample.transmission.mean()) == pytest.approx(0.96**2, rel=0.003)
 
@@ -107,25 +107,25 @@ def test_absorption_in_tinted_panes_follows_the_beer_lambert_law():
         Pane(thickness_mm=5, absorption_per_m=(0, 0, 20)),
     )
     light = render_image(
-        a_scene(camera=at(0), glass=Glazing(panes=panes, gap_mm=10)), "behind", "paper_transmission"
+        a_scene(camera=at(0), glass=Glazing(panes=panes, gap_mm=10)), "behind", "truncated_transmission"
     )
     np.testing.assert_allclose(light.mean((0, 1)), 0.96**4 * np.exp([-0.4, 0, -0.2]), rtol=0.01)
 
 
-def test_polarised_light_follows_the_closed_form_at_brewsters_angle(compiled):
+def test_polarised_light_follows_the_closed_form_at_brewsters_angle(requires_llvm):
     """Mitsuba's colour variants average s and p at each surface, which is wrong by an eighth at this angle."""
     camera = {**at(56.31), "width": 16, "height": 16}
-    sample = traced(a_scene(camera=camera), polarised=True, noise=0.01)
+    sample = traced(a_scene(camera=camera), polarised=True, noise_threshold=0.01)
     s, p = pane_reflectances(56.31)
     assert float(sample.reflection.mean()) == pytest.approx((s + p) / 2, rel=0.02)
 
 
-def test_s_and_p_light_each_follow_the_closed_form(compiled, mitsuba):
+def test_s_and_p_light_each_follow_the_closed_form(requires_llvm, mitsuba):
     camera = {**at(56.31), "width": 16, "height": 16}
     with renderer._active_variant(mitsuba, renderer._variant(polarised=True)):
         mi_scene = MitsubaSceneBuilder(
             mitsuba, a_scene(camera=camera), SyntheticAssets(), channel=0
-        ).scene_dict(behind=False, glass="full")
+        ).scene_dict(behind=False, glass_mode="full")
         mi_scene["integrator"] = {"type": "stokes", "nested": mi_scene["integrator"]}
         stokes = np.array(mitsuba.render(mitsuba.load_dict(mi_scene), spp=4096)).mean((0, 1))
     intensity, difference = stokes[1], abs(stokes[4])
@@ -142,21 +142,21 @@ def red_half(image):
 
 
 def test_the_right_half_of_a_plane_appears_on_the_right_of_the_image():
-    scene = a_scene(behind=board("red right"), front=board("red right"))
+    scene = a_scene(behind=plane_side("red right"), front=plane_side("red right"))
     assert (
         red_half(render_image(scene, "behind", "none"))
-        == red_half(render_image(scene, "behind", "paper_transmission"))
+        == red_half(render_image(scene, "behind", "truncated_transmission"))
         == "right"
     )
     assert (
         red_half(render_image(scene, "front", "mirror"))
-        == red_half(render_image(scene, "front", "paper_reflection"))
+        == red_half(render_image(scene, "front", "truncated_reflection"))
         == "left"
     )
 
 
 def test_the_top_half_of_a_plane_appears_at_the_top_of_the_image():
-    scene = a_scene(behind=board("red top"), front=board("red top"))
+    scene = a_scene(behind=plane_side("red top"), front=plane_side("red top"))
     assert (
         red_half(render_image(scene, "behind", "none"))
         == red_half(render_image(scene, "front", "mirror"))
@@ -168,7 +168,7 @@ def test_the_top_half_of_a_plane_appears_at_the_top_of_the_image():
 def test_the_left_edge_of_a_map_is_at_its_heading_and_a_mirror_shows_the_map_behind_the_camera(radius_mm):
     """A map's centre is opposite its heading; seen by a camera that faces it, its right half is at -x."""
     rotated, unrotated = (
-        around("red right", heading_deg=heading, radius_mm=radius_mm) for heading in (180, 0)
+        map_side("red right", heading_deg=heading, radius_mm=radius_mm) for heading in (180, 0)
     )
     scene = a_scene(behind=rotated, front=unrotated)
     assert red_half(render_image(scene, "behind", "none")) == "right"
@@ -178,17 +178,19 @@ def test_the_left_edge_of_a_map_is_at_its_heading_and_a_mirror_shows_the_map_beh
 @pytest.mark.parametrize("radius_mm", [math.inf, 3000])
 @pytest.mark.parametrize("behind", [True, False])
 def test_a_map_emits_the_light_of_its_texels_on_its_own_side_only(
-    radius_mm, behind, random, compiled, mitsuba
+    radius_mm, behind, rng, requires_llvm, mitsuba
 ):
-    side = around("mottled", heading_deg=37, radius_mm=radius_mm)
+    side = map_side("mottled", heading_deg=37, radius_mm=radius_mm)
     glass = Glazing(heading_deg=-20, pitch_deg=10)
     scene = a_scene(behind=side, front=side, glass=glass, camera={"position_mm": (100, 0, 500)})
-    directions = random.normal(size=(3, 4000))
+    directions = rng.normal(size=(3, 4000))
     directions /= np.linalg.norm(directions, axis=0)
     to_glass = np.array(axes(glass.heading_deg, glass.pitch_deg))
     with renderer._active_variant(mitsuba, variant.COMPILED):
         mi_scene = mitsuba.load_dict(
-            MitsubaSceneBuilder(mitsuba, scene, SyntheticAssets()).scene_dict(behind=behind, glass="none")
+            MitsubaSceneBuilder(mitsuba, scene, SyntheticAssets()).scene_dict(
+                behind=behind, glass_mode="none"
+            )
         )
         intersection = mi_scene.ray_intersect(
             mitsuba.Ray3f(mitsuba.Point3f(0), mitsuba.Vector3f((to_glass @ directions).astype("f4")))
@@ -207,21 +209,23 @@ def test_a_map_emits_the_light_of_its_texels_on_its_own_side_only(
 
 
 def test_a_plane_hides_the_map_behind_it():
-    plane = board("white", luminance=0.5).plane
-    light = render_image(a_scene(behind=Side(map=around().map, plane=plane)), "behind", "none")
+    plane = plane_side("white", luminance=0.5).plane
+    light = render_image(a_scene(behind=Side(map=map_side().map, plane=plane)), "behind", "none")
     np.testing.assert_allclose(light, 0.5, atol=1e-3)
 
 
 def test_the_back_of_a_plane_between_camera_and_glass_is_black_in_the_light_of_both_sides():
-    plane = board("white", distance_mm=300, width_mm=1000).plane
-    scene = a_scene(front=Side(map=around().map, plane=plane))
+    plane = plane_side("white", distance_mm=300, width_mm=1000).plane
+    scene = a_scene(front=Side(map=map_side().map, plane=plane))
     assert render_image(scene, "behind", "full").max() == render_image(scene, "front", "full").max() == 0
 
 
-@pytest.mark.parametrize(("side", "glass"), [("behind", "full"), ("behind", "none"), ("front", "mirror")])
-def test_a_frame_is_an_opening_in_a_black_wall(side, glass):
-    scene = a_scene(glass=Glazing(frame_mm=(200, 44)), camera={"position_mm": (0, 0, 250)})
-    light = render_image(scene, side, glass)[..., 0]
+@pytest.mark.parametrize(
+    ("side", "glass_mode"), [("behind", "full"), ("behind", "none"), ("front", "mirror")]
+)
+def test_a_frame_is_an_opening_in_a_black_wall(side, glass_mode):
+    scene = a_scene(glass=Glazing(opening_mm=(200, 44)), camera={"position_mm": (0, 0, 250)})
+    light = render_image(scene, side, glass_mode)[..., 0]
     assert (light > 0.5).sum(axis=0).tolist() == [16] * 32
 
 
@@ -232,20 +236,22 @@ def test_a_lens_refracts_light_according_to_the_lensmakers_equation(radii_mm):
     a and b are the distances of the camera and of the plane from the lens, f is its focal length.
     """
     near, far = 400.0, 150.0
-    glass = Glazing(panes=(Pane(thickness_mm=6.0),), radii_mm=radii_mm, frame_mm=(40.0, 40.0))
+    glass = Glazing(panes=(Pane(thickness_mm=6.0),), radii_mm=radii_mm, opening_mm=(40.0, 40.0))
     camera = {"position_mm": (0, 0, near), "fov_deg": 2.0}
-    scene = a_scene(glass=glass, behind=board("ramp", distance_mm=far, width_mm=100), camera=camera)
+    scene = a_scene(glass=glass, behind=plane_side("ramp", distance_mm=far, width_mm=100), camera=camera)
     r1, r2 = radii_mm
     power = 0.5 * (1 / r1 - 1 / r2 + 0.5 * 6 / (1.5 * r1 * r2))
-    assert slope(render_image(scene, "behind", "paper_transmission"), near) * 100 / 0.96**2 == pytest.approx(
-        1 + far / near - far * power, abs=0.02
-    )
+    assert slope(
+        render_image(scene, "behind", "truncated_transmission"), near
+    ) * 100 / 0.96**2 == pytest.approx(1 + far / near - far * power, abs=0.02)
 
 
 def test_the_mirror_image_of_a_lens_is_that_of_its_first_surface():
     """A sphere's focal length is half its radius: a ray at height y meets a plane at y (1 + b / a + 2 b / r)."""
-    glass = Glazing(panes=(Pane(thickness_mm=20),), radii_mm=(300.0, 1000.0), frame_mm=(100.0, 100.0))
-    scene = a_scene(glass=glass, front=board("ramp", distance_mm=1000, width_mm=4000), camera={"fov_deg": 2})
+    glass = Glazing(panes=(Pane(thickness_mm=20),), radii_mm=(300.0, 1000.0), opening_mm=(100.0, 100.0))
+    scene = a_scene(
+        glass=glass, front=plane_side("ramp", distance_mm=1000, width_mm=4000), camera={"fov_deg": 2}
+    )
     assert -slope(render_image(scene, "front", "mirror"), 500) * 4000 == pytest.approx(
         1 + 1000 / 500 + 2000 / 300, rel=0.01
     )
@@ -262,8 +268,8 @@ def slope(image, distance_mm):
     [
         Glazing(panes=(Pane(wedge_deg=5.0),)),
         Glazing(panes=(Pane(wedge_deg=1.0, thickness_mm=50), Pane()), gap_mm=1.0),
-        Glazing(radii_mm=(100.0, -100.0), frame_mm=(80.0, 80.0)),
-        Glazing(radii_mm=(50.0, 60.0), frame_mm=(80.0, 80.0)),
+        Glazing(radii_mm=(100.0, -100.0), opening_mm=(80.0, 80.0)),
+        Glazing(radii_mm=(50.0, 60.0), opening_mm=(80.0, 80.0)),
     ],
     ids=["knife's edge", "panes that touch", "lens without edge", "sphere too small"],
 )
@@ -273,7 +279,7 @@ def test_impossible_glass_is_refused(glass):
 
 
 def test_the_same_seed_gives_the_same_bytes_and_another_seed_gives_other_bytes():
-    scene = a_scene(behind=around("mottled"), front=around("mottled"))
+    scene = a_scene(behind=map_side("mottled"), front=map_side("mottled"))
     first, repeated, reseeded = (
         traced(s, max_samples=16) for s in (scene, scene, scene.model_copy(update={"seed": 1}))
     )
@@ -284,11 +290,12 @@ def test_the_same_seed_gives_the_same_bytes_and_another_seed_gives_other_bytes()
 
 
 def test_the_noise_is_at_most_the_requested_one():
-    scene = a_scene(behind=around("mottled"), front=around("mottled"))
+    scene = a_scene(behind=map_side("mottled"), front=map_side("mottled"))
     errors = []
-    for noise in (0.05, 0.005):
+    for noise_threshold in (0.05, 0.005):
         one, other = (
-            traced(scene.model_copy(update={"seed": n}), noise=noise, max_samples=4096) for n in (1, 2)
+            traced(scene.model_copy(update={"seed": n}), noise_threshold=noise_threshold, max_samples=4096)
+            for n in (1, 2)
         )
         difference = (one.photo - other.photo).mean(0).abs() / one.photo.mean(0)
         errors.append(float(difference.mean()) * math.sqrt(math.pi) / 2)  # E|a - b| = 2 sigma / sqrt(pi)

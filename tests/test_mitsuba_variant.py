@@ -17,7 +17,7 @@ from test_mitsuba_renderer import SyntheticAssets, a_scene
 with warnings.catch_warnings(record=True) as caught:
     warnings.simplefilter("always")
     scene = a_scene(camera={"width": 16, "height": 16})
-    light = float(trace(scene, SyntheticAssets(), noise=0.01, max_samples=64).photo.mean())
+    light = float(trace(scene, SyntheticAssets(), noise_threshold=0.01, max_samples=64).photo.mean())
 assert abs(light - 1) < 0.01, light
 import mitsuba
 from brewster.errors import DeviceError
@@ -61,7 +61,7 @@ def test_without_a_working_llvm_the_scalar_variant_renders_and_no_llvm_is_loaded
     assert variant.INSTALL_LLVM in error
 
 
-def test_the_llvm_of_the_pip_package_comes_first_and_compiles(compiled):
+def test_the_llvm_of_the_pip_package_comes_first_and_compiles(requires_llvm):
     packaged = variant._packaged_llvm()
     if not packaged:
         pytest.skip(f"the LLVM of the pip package is not installed; run: {variant.INSTALL_LLVM}")
@@ -83,7 +83,7 @@ def test_the_llvm_of_the_pip_package_comes_first_and_compiles(compiled):
     assert done.stdout.split() == ["llvm_ad_rgb", os.path.basename(packaged[0])]  # noqa: PTH119
 
 
-def test_exceptions_of_other_libraries_are_caught_when_the_llvm_of_the_package_is_loaded(compiled):
+def test_exceptions_of_other_libraries_are_caught_when_the_llvm_of_the_package_is_loaded(requires_llvm):
     """If the C++ runtime of the package were in the global scope, the process would end."""
     program = """
 import numpy

@@ -11,12 +11,12 @@ from brewster.training.data.mixtures import InterleavedStream, MixRecipe, Mixtur
 from brewster.training.data.sample_rng import SampleRng
 
 NO_EFFECTS = MixRecipe(
-    crop=(1, 1), temperature=(0, 0), background_map_probability=0, background_level_log=(0.1, 0.1),
-    highlight_boost=(0, 0), shadow_probability=0, no_glass_probability=0, partial_probability=0, transmittance=(1, 1),
-    veil_probability=0, reflection_map_probability=0, reflection_ratio_log=(0.5, 0.5),
-    reflection_contrast_log=(1, 1), lamp_probability=0, sign_probability=0, sharp_probability=1,
-    ghost_probability=0, falloff_probability=0, edge_probability=0, exposure=(1, 1), overexposed_probability=0,
-    gamma_log=(1, 1), contrast=(0, 0), noise=(0, 0), jpeg_probability=0,
+    crop=(1, 1), temperature=(0, 0), background_map_probability=0, background_level=(0.1, 0.1),
+    highlight_boost=(0, 0), shadow_probability=0, background_blur_probability=0, no_glass_probability=0, partial_probability=0, transmittance=(1, 1),
+    veil_probability=0, reflection_map_probability=0, reflection_ratio=(0.5, 0.5),
+    reflection_contrast=(1, 1), lamp_probability=0, sign_probability=0, sharp_probability=1,
+    ghost_probability=0, falloff_probability=0, edge_probability=0, softness_probability=0, target_luminance=(1, 1), overexposed_probability=0,
+    gamma=(1, 1), contrast=(0, 0), noise=(0, 0), jpeg_probability=0,
 )  # fmt: skip
 MANY_EFFECTS = MixRecipe(
     background_map_probability=0.5, shadow_probability=0.5, partial_probability=0.5, veil_probability=0.5,
@@ -26,14 +26,14 @@ MANY_EFFECTS = MixRecipe(
 
 
 @pytest.fixture
-def photos(random):
-    coarse = [np.kron(random.integers(20, 200, (6, 8, 3)), np.ones((16, 16, 1))) for _ in range(4)]
+def photos(rng):
+    coarse = [np.kron(rng.integers(20, 200, (6, 8, 3)), np.ones((16, 16, 1))) for _ in range(4)]
     return [torch.from_numpy(image.astype(np.uint8)) for image in coarse]
 
 
 @pytest.fixture
-def maps(random):
-    return [torch.from_numpy(random.random((3, 32, 64), np.float32) * 4).half() for _ in range(2)]
+def maps(rng):
+    return [torch.from_numpy(rng.random((3, 32, 64), np.float32) * 4).half() for _ in range(2)]
 
 
 def test_light_adds_up_in_linear_light(photos):
@@ -47,7 +47,7 @@ def test_light_adds_up_in_linear_light(photos):
 
 
 def test_the_reflection_has_the_strength_of_the_recipe(photos):
-    recipe = NO_EFFECTS.model_copy(update={"reflection_ratio_log": (0.25, 0.25)})
+    recipe = NO_EFFECTS.model_copy(update={"reflection_ratio": (0.25, 0.25)})
     batch = Mixtures(photos, [], recipe, seed=1)(0, 8, 64)
     ratio = to_linear(batch.reflection_encoded).mean() / to_linear(batch.transmission_encoded).mean()
     assert ratio.item() == pytest.approx(0.25, rel=0.15)
@@ -92,15 +92,32 @@ def test_lamps_are_added_to_the_reflection_alone(photos):
 
 def test_a_reflection_that_is_not_sharp_is_blurred_and_keeps_its_light(photos):
     _, _, mirrored = layers_of(photos)
-    _, _, blurred = layers_of(photos, sharp_probability=0.0, blur_px_log=(4.0, 4.0))
+    _, _, blurred = layers_of(photos, sharp_probability=0.0, blur_px=(4.0, 4.0))
     edges = [layer.diff(dim=3).square().mean() for layer in (mirrored, blurred)]
     assert edges[1] < edges[0] / 2
     assert to_linear(blurred).mean().item() == pytest.approx(to_linear(mirrored).mean().item(), rel=0.1)
 
 
+def test_a_soft_photo_is_blurred_like_its_layers(photos):
+    sharp = layers_of(photos)
+    soft = layers_of(photos, softness_probability=1.0, softness_px=(1.5, 1.5))
+    for before, after in zip(sharp, soft, strict=True):
+        assert after.diff(dim=3).abs().max() < before.diff(dim=3).abs().max() / 2
+    photo, transmission, reflection = map(to_linear, soft)
+    unclipped = photo < 0.95
+    torch.testing.assert_close((transmission + reflection)[unclipped], photo[unclipped], atol=0.02, rtol=0)
+
+
+def test_a_background_out_of_focus_is_blurred_and_its_reflection_is_not(photos):
+    _, behind, mirrored = layers_of(photos)
+    _, blurred, same = layers_of(photos, background_blur_probability=1.0, background_blur_px=(8.0, 8.0))
+    assert blurred.diff(dim=3).abs().max() < behind.diff(dim=3).abs().max() / 2
+    assert same.diff(dim=3).abs().max() > mirrored.diff(dim=3).abs().max() / 2
+
+
 @pytest.mark.parametrize(
     "changes",
-    [{"ghost_probability": 1.0}, {"sign_probability": 1.0}, {"reflection_contrast_log": (1.6, 1.6)}],
+    [{"ghost_probability": 1.0}, {"sign_probability": 1.0}, {"reflection_contrast": (1.6, 1.6)}],
     ids=lambda changes: next(iter(changes)),
 )
 def test_ghosts_signs_and_contrast_change_the_reflection_alone(photos, changes):
@@ -119,8 +136,8 @@ def test_shadows_and_highlights_change_the_background(photos, changes):
 
 
 def test_a_warmer_light_has_more_red_and_less_blue(photos):
-    _, plain, _ = layers_of(photos, reflection_ratio_log=(1e-6, 1e-6))
-    _, warm, _ = layers_of(photos, reflection_ratio_log=(1e-6, 1e-6), temperature=(0.3, 0.3))
+    _, plain, _ = layers_of(photos, reflection_ratio=(1e-6, 1e-6))
+    _, warm, _ = layers_of(photos, reflection_ratio=(1e-6, 1e-6), temperature=(0.3, 0.3))
     unclipped = (warm < 0.95).all(dim=1) & (plain > 0.05).all(dim=1)
     for channel, gain in enumerate((math.exp(0.3), 1, math.exp(-0.3))):
         ratio = to_linear(warm[:, channel][unclipped]) / to_linear(plain[:, channel][unclipped])
@@ -128,7 +145,7 @@ def test_a_warmer_light_has_more_red_and_less_blue(photos):
 
 
 def test_exposure_limits_the_photos_mean(photos):
-    photo, behind, mirrored = layers_of(photos, exposure=(0.05, 0.05))
+    photo, behind, mirrored = layers_of(photos, target_luminance=(0.05, 0.05))
     plain = layers_of(photos)
     assert to_linear(photo).mean(dim=(1, 2, 3)).tolist() == pytest.approx([0.05] * 4, rel=0.03)
     for dark, layer in zip((behind, mirrored), plain[1:], strict=True):
@@ -137,7 +154,7 @@ def test_exposure_limits_the_photos_mean(photos):
 
 
 def test_the_tone_curve_is_a_power_then_an_s_and_the_same_for_all_layers(photos):
-    power = layers_of(photos, gamma_log=(1.2, 1.2))
+    power = layers_of(photos, gamma=(1.2, 1.2))
     s_shaped = layers_of(photos, contrast=(0.4, 0.4))
     for plain, by_power, by_s in zip(layers_of(photos)[1:], power[1:], s_shaped[1:], strict=True):
         torch.testing.assert_close(by_power, plain**1.2, atol=1e-5, rtol=0)

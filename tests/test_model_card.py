@@ -89,7 +89,15 @@ def test_pairs_and_their_share_are_listed():
 
 
 def test_settings_and_scores_are_listed():
-    text = card(scores={"step": 4000, "loss": 0.25, "panel_T": 0.1, "gain_db_nature": -1.234, "seconds": 9.9})
+    text = card(
+        scores={
+            "step": 4000,
+            "loss": 0.25,
+            "loss_panel_T": 0.1,
+            "psnr_gain_db_nature": -1.234,
+            "seconds": 9.9,
+        }
+    )
     assert "| steps, batch | 4000, 1 |" in text
     assert "| PSNR gain over the input, nature, dB | -1.234 |" in text
     assert "| loss, panel T | 0.1 |" in text

@@ -58,14 +58,14 @@ def profile(curve: bytes, colourants: tuple[tuple[float, ...], ...] | None) -> b
     return head.ljust(68, b"\0") + struct.pack(">3i", 63190, 65536, 54061) + bytes(48) + body
 
 
-def table_profile(points: int = 33) -> bytes:
+def lut_profile(points: int = 33) -> bytes:
     """Returns an ICC profile with a table (lut16Type) from RGB to Lab and without a matrix.
 
-    Its tone curve has the exponent 1.8, and its primaries are `TABLE_PRIMARIES`.
+    Its tone curve has the exponent 1.8, and its primaries are `LUT_PRIMARIES`.
     """
     grid = np.linspace(0, 1, points)
     rgb = np.stack(np.meshgrid(grid, grid, grid, indexing="ij"), axis=-1)
-    xyz = rgb**1.8 @ np.array(TABLE_PRIMARIES) / (0.9642, 1.0, 0.8249)
+    xyz = rgb**1.8 @ np.array(LUT_PRIMARIES) / (0.9642, 1.0, 0.8249)
     root = np.where(xyz > (6 / 29) ** 3, np.cbrt(xyz), xyz / (3 * (6 / 29) ** 2) + 4 / 29)
     lightness, red, yellow = (
         116 * root[..., 1] - 16,
@@ -90,7 +90,7 @@ def table_profile(points: int = 33) -> bytes:
     return head + struct.pack(">I", 2) + rows + body
 
 
-TABLE_PRIMARIES = (
+LUT_PRIMARIES = (
     (0.35, 0.20, 0.05),
     (0.42, 0.68, 0.09),
     (0.1942, 0.12, 0.6849),
@@ -109,7 +109,7 @@ def photo_of(pixels: np.ndarray, icc: bytes | None) -> Photo:
     return Photo(pixels, None, FileInfo(bits=8 * pixels.dtype.itemsize, icc=icc))
 
 
-def ramp(dtype: type, channels: int = 3) -> np.ndarray:
+def all_code_values(dtype: type, channels: int = 3) -> np.ndarray:
     """Returns every value of the dtype, in another order in each channel."""
     count = np.iinfo(dtype).max + 1
     order = np.random.default_rng(1)
@@ -118,7 +118,7 @@ def ramp(dtype: type, channels: int = 3) -> np.ndarray:
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
 def test_srgb_is_decoded_by_its_curve_and_every_value_round_trips(dtype: type) -> None:
-    photo = photo_of(ramp(dtype), None)
+    photo = photo_of(all_code_values(dtype), None)
     formula = srgb.to_linear(photo.pixels / np.iinfo(dtype).max)
     np.testing.assert_allclose(photo.linear(), formula, atol=1e-7)
     assert np.array_equal(photo.with_linear(photo.linear()).pixels, photo.pixels)
@@ -136,7 +136,7 @@ def test_new_light_is_rounded_to_the_nearest_value(dtype: type) -> None:
 @pytest.mark.parametrize("name", PROFILES)
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
 def test_unchanged_light_is_bit_equal_with_every_profile(name: str, dtype: type) -> None:
-    photo = photo_of(ramp(dtype), PROFILES[name])
+    photo = photo_of(all_code_values(dtype), PROFILES[name])
     assert np.array_equal(photo.with_linear(photo.linear()).pixels, photo.pixels)
 
 
@@ -225,7 +225,7 @@ def test_other_profiles_are_not_recognised_as_srgb(icc: bytes) -> None:
 
 
 def test_the_tone_curve_of_a_grey_profile_is_applied() -> None:
-    photo = photo_of(ramp(np.uint8, channels=1), profile(GAMMA, None))
+    photo = photo_of(all_code_values(np.uint8, channels=1), profile(GAMMA, None))
     formula = (photo.pixels[..., 0] / 255) ** (round(2.2 * 256) / 256)
     np.testing.assert_allclose(photo.linear()[..., 1], formula, atol=1e-6)
     assert np.array_equal(photo.with_linear(photo.linear()).pixels, photo.pixels)
@@ -298,21 +298,21 @@ def test_all_parametric_functions_of_icc_agree_with_littlecms(function: int, cou
     assert np.abs(ours - np.asarray(expected)).max() <= 1.5
 
 
-def light_by_table(pixels: np.ndarray) -> np.ndarray:
-    """Returns the linear Rec.709 light of pixels with the table profile, by its formula."""
+def light_by_lut(pixels: np.ndarray) -> np.ndarray:
+    """Returns the linear Rec.709 light of pixels with the LUT profile, by its formula."""
     rec709 = np.array(((0.43607, 0.22249, 0.01392), (0.38515, 0.71687, 0.09708), (0.14307, 0.06061, 0.71410)))
-    return (pixels / np.iinfo(pixels.dtype).max) ** 1.8 @ np.array(TABLE_PRIMARIES) @ np.linalg.inv(rec709)
+    return (pixels / np.iinfo(pixels.dtype).max) ** 1.8 @ np.array(LUT_PRIMARIES) @ np.linalg.inv(rec709)
 
 
 @pytest.mark.parametrize(
     ("container", "dtype", "tolerance"), [("png", np.uint8, 0.01), ("tiff", np.uint16, 0.006)]
 )
 def test_a_lut_profile_is_converted_and_its_colours_are_written(container, dtype, tolerance) -> None:
-    random = np.random.default_rng(8).integers(0, np.iinfo(dtype).max + 1, (24, 24, 3)).astype(dtype)
-    data = photo_of(random, table_profile()).encode(container)
+    noise = np.random.default_rng(8).integers(0, np.iinfo(dtype).max + 1, (24, 24, 3)).astype(dtype)
+    data = photo_of(noise, lut_profile()).encode(container)
     photo = Photo.open(data)
     assert photo.pixels.dtype == dtype
-    np.testing.assert_allclose(photo.linear(), light_by_table(random), atol=tolerance)
+    np.testing.assert_allclose(photo.linear(), light_by_lut(noise), atol=tolerance)
     assert photo.file_info.icc == PROFILES["Display P3"]
     again = Photo.open(photo.with_linear(photo.linear()).encode())
     assert again.file_info.container == container
@@ -321,19 +321,19 @@ def test_a_lut_profile_is_converted_and_its_colours_are_written(container, dtype
 
 
 def test_a_pil_image_with_a_lut_profile_is_read_as_its_file_is() -> None:
-    random = np.random.default_rng(9).integers(0, 256, (16, 16, 3), np.uint8)
-    data = photo_of(random, table_profile()).encode("png")
+    noise = np.random.default_rng(9).integers(0, 256, (16, 16, 3), np.uint8)
+    data = photo_of(noise, lut_profile()).encode("png")
     assert np.array_equal(Photo.open(Image.open(io.BytesIO(data))).pixels, Photo.open(data).pixels)
 
 
 def test_white_in_a_lut_profile_stays_white() -> None:
-    white = Photo.open(photo_of(np.full((4, 4, 3), 255, np.uint8), table_profile()).encode("png"))
+    white = Photo.open(photo_of(np.full((4, 4, 3), 255, np.uint8), lut_profile()).encode("png"))
     assert white.srgb_8bit().min() >= 254
 
 
 @pytest.mark.parametrize(
     "icc",
-    [table_profile()[:100_000], table_profile().replace(b"mft2", b"mftX")],
+    [lut_profile()[:100_000], lut_profile().replace(b"mft2", b"mftX")],
     ids=["truncated", "unknown"],
 )
 def test_a_damaged_lut_profile_is_refused(icc: bytes) -> None:
@@ -345,7 +345,7 @@ def test_a_damaged_lut_profile_is_refused(icc: bytes) -> None:
 @pytest.mark.parametrize(("dtype", "channels"), [(np.uint8, 1), (np.float32, 3)])
 def test_a_lut_profile_is_refused_for_grey_and_for_floats(dtype: type, channels: int) -> None:
     with pytest.raises(UnsupportedPhoto, match="RGB of 8 or 16 bits"):
-        convert_to_display_p3(np.ones((4, 4, channels), dtype), FileInfo(icc=table_profile()))
+        convert_to_display_p3(np.ones((4, 4, channels), dtype), FileInfo(icc=lut_profile()))
 
 
 @pytest.mark.parametrize(

@@ -16,8 +16,8 @@ NAMES = ("photo", "transmission", "background", "reflection", "mirror")
 HEADER = {"scene": 'seed = 7\nrecipe = "Fenêtre"\n', "software": "brewster 0.1.0"}
 
 
-def random_layers(random, names=NAMES):
-    return {name: (random.random((6, 9, 3), np.float32) * 4).astype(np.float32) for name in names}
+def random_layers(rng, names=NAMES):
+    return {name: (rng.random((6, 9, 3), np.float32) * 4).astype(np.float32) for name in names}
 
 
 def read_part(data, **options):
@@ -49,22 +49,22 @@ def test_values_beyond_half_precision_are_clipped():
     assert (read_layers(write_layers({"photo": image}, {}))["photo"] == 65504).all()
 
 
-def test_layers_are_separate_in_any_order(random):
-    layers = random_layers(random)
+def test_layers_are_separate_in_any_order(rng):
+    layers = random_layers(rng)
     again = read_layers(write_layers(layers, HEADER))
     assert list(again) == sorted(NAMES)
     for name in NAMES:
         np.testing.assert_allclose(again[name], layers[name], rtol=1e-3)
 
 
-def test_the_same_layers_give_the_same_bytes_in_any_order(random):
-    layers = random_layers(random)
+def test_the_same_layers_give_the_same_bytes_in_any_order(rng):
+    layers = random_layers(rng)
     reversed_layers = {name: layers[name] for name in reversed(NAMES)}
     assert write_layers(layers, HEADER) == write_layers(reversed_layers, dict(reversed(HEADER.items())))
 
 
-def test_other_programs_read_named_compressed_half_layers_and_the_text(random):
-    data = write_layers(random_layers(random), HEADER)
+def test_other_programs_read_named_compressed_half_layers_and_the_text(rng):
+    data = write_layers(random_layers(rng), HEADER)
     exr = pytest.importorskip("OpenEXR")
     part = read_part(data, separate_channels=True)
     assert sorted(part.channels) == sorted(f"{name}.{channel}" for name in NAMES for channel in "RGB")
@@ -75,7 +75,7 @@ def test_other_programs_read_named_compressed_half_layers_and_the_text(random):
     assert b"mirror.B\0\1\0\0\0" in data  # the channel list of the file: pixel type 1 is half
 
 
-def test_a_layer_name_may_have_dots_and_other_channels_are_ignored(random):
+def test_a_layer_name_may_have_dots_and_other_channels_are_ignored(rng):
     exr = pytest.importorskip("OpenEXR")
     half = np.ones((4, 5), np.float16)
     channels = {f"left.photo.{channel}": half for channel in "RGB"} | {"photo.Z": half, "depth.R": half}
@@ -85,26 +85,26 @@ def test_a_layer_name_may_have_dots_and_other_channels_are_ignored(random):
 
 
 @pytest.mark.parametrize("damage", [b"", b"not an image", None])
-def test_a_damaged_file_is_refused(damage, random):
-    data = write_layers(random_layers(random), HEADER)
+def test_a_damaged_file_is_refused(damage, rng):
+    data = write_layers(random_layers(rng), HEADER)
     with pytest.raises(UnreadablePhoto, match="complete"):
         read_layers(data[: len(data) // 2] if damage is None else damage)
 
 
-def test_an_exr_without_layers_is_refused(random):
-    photo = Photo.from_array(random.random((4, 4, 3), np.float32), encoding="linear")
+def test_an_exr_without_layers_is_refused(rng):
+    photo = Photo.from_array(rng.random((4, 4, 3), np.float32), encoding="linear")
     with pytest.raises(UnreadablePhoto, match=r"the channels B, G, R; .*name\.R"):
         read_layers(photo.encode("exr"))
 
 
-def test_attributes_that_exr_would_drop_are_refused(random):
+def test_attributes_that_exr_would_drop_are_refused(rng):
     with pytest.raises(UnsupportedPhoto, match="named version"):
-        write_layers(random_layers(random), {**HEADER, "version": "0.1.0"})
+        write_layers(random_layers(rng), {**HEADER, "version": "0.1.0"})
 
 
-def test_without_openexr_the_error_names_the_extra(monkeypatch, random):
-    data = write_layers(random_layers(random), {})
+def test_without_openexr_the_error_names_the_extra(monkeypatch, rng):
+    data = write_layers(random_layers(rng), {})
     monkeypatch.setitem(sys.modules, "OpenEXR", None)
-    for call in (lambda: read_layers(data), lambda: write_layers(random_layers(random), {})):
+    for call in (lambda: read_layers(data), lambda: write_layers(random_layers(rng), {})):
         with pytest.raises(MissingExtra, match="pip install"):
             call()

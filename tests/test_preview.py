@@ -1,5 +1,6 @@
 """The preview: its maps, and the formula with which the browser computes the layers."""
 
+import gzip
 import json
 import math
 from pathlib import Path
@@ -9,9 +10,10 @@ import pytest
 
 from brewster import Photo
 from brewster.inference import Separator
+from brewster.inference.guided_upsampling import upsample_rows
 from brewster.options import Options
 from brewster.srgb import to_encoded, to_linear
-from brewster.web.preview import MAX_PREVIEW_PIXELS, preview
+from brewster.web.preview import MAX_PREVIEW_PIXELS, TILE_PX, PhotoCache, photo_tile, preview
 from cli_helpers import image_bytes
 from picture_files import exif_block, file_of, smooth
 from web_servers import form, make_app, pane, request
@@ -25,19 +27,31 @@ class Maps:
     def __init__(self, data):
         line, rest = data.split(b"\n", 1)
         self.head = json.loads(line)
-        count = self.head["width"] * self.head["height"]
-        shape = self.head["height"], self.head["width"]
-        parts = np.split(np.frombuffer(rest, np.uint8), np.cumsum([3, 6, 3]) * count)
-        self.photo, self.reflection = (parts[index].reshape(*shape, 3) for index in (0, 2))
-        low, high = self.head["range"]
-        numbers = parts[1].view("<u2").reshape(*shape, 3)
-        self.transmission = low + numbers / 65535 * (high - low)
-        self.confidence_map = parts[3].reshape(shape)
+        self.shape = self.head["height"], self.head["width"]
+        at = 3 * math.prod(self.shape)
+        self.photo = np.frombuffer(rest[:at], np.uint8).reshape(*self.shape, 3)
+        self.maps = {}
+        for row in self.head["maps"]:
+            shape = row["height"], row["width"], row["channels"]
+            numbers = np.frombuffer(rest, "<u2", math.prod(shape), at).reshape(shape)
+            at += numbers.nbytes
+            low, high = row["range"]
+            self.maps[row["name"]] = (low + numbers / 65535 * (high - low)).astype(np.float32)
+        assert at == len(rest)
+
+    def upsampled(self, name):
+        return upsample_rows(self.maps[name], 0, self.shape[0], self.shape)
 
     def at(self, strength):
         """Transmission and reflection as 8-bit codes, computed as in light.js."""
-        photo, reflection = to_linear(self.photo / 255), to_linear(self.reflection / 255)
-        layers = photo + strength * (self.transmission - photo), np.minimum(strength * reflection, photo)
+        photo = to_linear(self.photo / 255)
+        change, reflection = (
+            self.upsampled(f"{layer}_slope") * photo + self.upsampled(f"{layer}_offset")
+            for layer in ("change", "reflection")
+        )
+        if "weight" in self.maps:
+            change += self.upsampled("weight") * (self.upsampled("generated") - photo - change)
+        layers = photo + strength * change, np.minimum(strength * reflection, photo)
         return [np.rint(255 * to_encoded(layer.clip(0, 1))) for layer in layers]
 
 
@@ -63,7 +77,8 @@ def test_the_formula_of_the_browser_equals_the_separation_of_the_server(compact_
         difference = np.abs(layer.pixels.astype(int) - ours)
         assert difference.max() <= 2
         assert difference.mean() < 0.2
-    assert np.abs(separation.confidence.pixels[..., 0].astype(int) - mixture.confidence_map).max() <= 1
+    shown = np.rint(255 * mixture.upsampled("confidence"))
+    assert np.abs(separation.confidence.pixels - shown).max() <= 1
 
 
 def out_of_range(tile):
@@ -130,11 +145,56 @@ def test_a_wide_gamut_photo_is_shown_in_srgb():
     assert maps.photo[0, 0, 0] > 240  # the red primary of P3 is outside sRGB
 
 
-def test_a_photo_brighter_than_white_is_clipped_to_the_range():
+def test_a_photo_brighter_than_white_is_shown_white():
     light = Photo.from_array(np.full((20, 30, 3), 3.0, np.float32), encoding="linear")
-    maps = maps_of(light.encode("tiff"))
-    assert maps.photo.min() == 255
-    assert math.isclose(maps.transmission.max(), maps.head["range"][1])
+    assert maps_of(light.encode("tiff")).photo.min() == 255
+
+
+def tiles_of(photo, level):
+    """All tiles of a level as one array."""
+    size = [-(-side // (1 << level)) for side in photo.size]
+    columns, rows = (-(-side // TILE_PX) for side in size)
+    return np.vstack(
+        [np.hstack([photo_tile(photo, level, x, y).pixels for x in range(columns)]) for y in range(rows)]
+    )
+
+
+def test_the_tiles_of_level_zero_are_the_pixels_of_the_photo_and_others_are_means():
+    photo = Photo.open(image_bytes(1100, 700, "png"))
+    assert (tiles_of(photo, 0) == photo.pixels).all()
+    half = tiles_of(photo, 1)
+    assert half.shape == (350, 550, 3)
+    expected = 255 * to_encoded(photo.resized(550, 350))
+    assert np.abs(half - expected).max() <= 1
+    assert tiles_of(photo, 3).shape == (88, 138, 3)
+
+
+@pytest.mark.parametrize("address", [(0, 3, 0), (0, 0, 2), (0, -1, 0), (-1, 0, 0), (9, 0, 0), (60, 0, 0)])
+def test_there_are_no_tiles_outside_the_photo(address):
+    assert photo_tile(Photo.open(image_bytes(1100, 700, "png")), *address) is None
+
+
+def test_the_cache_drops_the_photos_that_were_not_used_for_the_longest_time():
+    photos = {name: Photo(np.zeros((10, 10, 3), np.uint8)) for name in "abc"}
+    cache = PhotoCache(max_bytes=600)
+    cache.put("a", photos["a"])
+    cache.put("b", photos["b"])
+    assert cache.get("a") is photos["a"]
+    cache.put("c", photos["c"])
+    assert (cache.get("a"), cache.get("b"), cache.get("c")) == (photos["a"], None, photos["c"])
+    cache.put("large", large := Photo(np.zeros((100, 100, 3), np.uint8)))
+    assert (cache.get("c"), cache.get("large")) == (None, large)
+
+
+def test_tiles_are_served_until_the_photo_is_dropped_and_again_after_it_was_sent_again():
+    app = make_app()
+    assert request(app, "GET", f"/tile/{'0' * 64}/0/0/0").status_code == 404
+    for path in ("/preview", "/photo"):
+        sent = request(app, "POST", path, **form(image_bytes(60, 40, "png")))
+        assert sent.headers["Brewster-Size"] == "60x40"
+        tile = request(app, "GET", f"/tile/{sent.headers['Brewster-Photo']}/0/0/0")
+        assert Photo.open(tile.content).size == (60, 40)
+    assert request(app, "GET", f"/tile/{sent.headers['Brewster-Photo']}/0/1/0").status_code == 404
 
 
 def test_progress_reaches_the_end():
@@ -146,7 +206,7 @@ def test_progress_reaches_the_end():
 
 def test_the_preview_route_returns_the_maps_and_refuses_invalid_files():
     response = request(make_app(), "POST", "/preview", **form(image_bytes(60, 40, "png"), quality="draft"))
-    assert Maps(response.content).head["full"] == [60, 40]
+    assert Maps(gzip.decompress(response.content)).head["full"] == [60, 40]
     refused = request(make_app(), "POST", "/preview", **form(b"no picture"))
     assert refused.status_code == 422
     assert "no picture" in refused.json()["error"]

@@ -10,7 +10,8 @@ from pathlib import Path
 import pytest
 
 from brewster.errors import DeviceError, MissingExtra
-from brewster.rendered.generation import ray_cluster
+from brewster.executors import ray_cluster
+from brewster.rendered.generation.workers import TaskRunner
 from set_folders import hashes, make_job, render_set, statuses
 
 TESTS = Path(__file__).parent
@@ -18,9 +19,9 @@ TESTS = Path(__file__).parent
 LOCAL = """
 import sys
 from pathlib import Path
-from brewster.rendered.generation.ray_cluster import RayExecutor
+from brewster.executors.ray_cluster import RayExecutor
 from set_folders import render_set
-results = render_set(Path(sys.argv[1]), count=9, executor=lambda job: RayExecutor(job, "local", 2), renderer=sys.argv[2])
+results = render_set(Path(sys.argv[1]), count=9, executor=lambda create_runner: RayExecutor(create_runner, "local", 2), renderer=sys.argv[2])
 print([(result.index, result.status) for result in sorted(results, key=lambda result: result.index)])
 """
 
@@ -29,8 +30,10 @@ import os, sys
 os.environ["RAY_USAGE_STATS_ENABLED"] = "0"
 from pathlib import Path
 from ray.cluster_utils import Cluster
+from functools import partial
 from brewster.rendered.generation.job import build
-from brewster.rendered.generation.ray_cluster import RayExecutor
+from brewster.rendered.generation.workers import TaskRunner
+from brewster.executors.ray_cluster import RayExecutor
 from set_folders import make_job
 nodes = Cluster(initialize_head=True, head_node_args={"num_cpus": 1, "include_dashboard": False})
 lost_node = nodes.add_node(num_cpus=1)
@@ -43,7 +46,7 @@ def report(result):
     if len(done) == 8:
         nodes.remove_node(lost_node, allow_graceful=False)
 
-build(job, range(40), RayExecutor(job, nodes.address), report=report)
+build(job, range(40), RayExecutor(partial(TaskRunner, job), nodes.address), report=report)
 print(len(set(done)))
 nodes.shutdown()
 """
@@ -51,7 +54,8 @@ nodes.shutdown()
 
 def run_in_process(code, *args):
     """Runs code in a process. The nodes of Ray import the fake renderer from PYTHONPATH."""
-    environment = {**os.environ, "PYTHONPATH": str(TESTS), "RAY_USAGE_STATS_ENABLED": "0"}
+    paths = os.pathsep.join([str(TESTS), os.environ.get("PYTHONPATH", "")])
+    environment = {**os.environ, "PYTHONPATH": paths, "RAY_USAGE_STATS_ENABLED": "0"}
     return subprocess.run(
         [sys.executable, "-c", code, *map(str, args)],
         env=environment,
@@ -69,9 +73,9 @@ def test_without_ray_the_error_has_the_command_that_installs_it(tmp_path, monkey
 
 
 def test_an_executor_does_not_import_ray_before_it_is_used(tmp_path):
-    code = "import sys, brewster.rendered.generation.ray_cluster; assert 'ray' not in sys.modules"
+    code = "import sys, brewster.executors.ray_cluster; assert 'ray' not in sys.modules"
     subprocess.run([sys.executable, "-c", code], check=True)
-    assert not ray_cluster.RayExecutor(make_job(tmp_path)).is_busy()
+    assert not ray_cluster.RayExecutor(partial(TaskRunner, make_job(tmp_path))).is_busy()
 
 
 @pytest.mark.slow

@@ -67,7 +67,7 @@ def test_a_change_that_is_not_allowed_is_refused_and_the_key_named(key_path, val
 
 def test_training_images_grow_at_the_shares_of_the_run_in_the_recipe():
     recipe = read_recipe(FOLDER / "train/tiny.toml")
-    assert (recipe.steps, recipe.sizes) == (6, [(0.0, 64), (0.5, 96)])
+    assert (recipe.steps, recipe.image_size_schedule) == (6, [(0.0, 64), (0.5, 96)])
     assert [recipe.size_at(step) for step in range(6)] == [64, 64, 64, 96, 96, 96]
 
 
@@ -99,11 +99,11 @@ def test_the_path_of_a_scene_recipe_is_relative_to_the_recipe(tmp_path):
             'network is "lite3"; expected one of the networks: lite2-unet',
         ),
         (("weight_decay = 1e-4", "weight_decay = inf"), "weight_decay"),
-        (("[[0.0, 64], [0.5, 96]]", "[]"), "sizes"),
-        (("[[0.0, 64], [0.5, 96]]", "[[0.1, 64]]"), "sizes is .*; .* start at 0"),
-        (("[[0.0, 64], [0.5, 96]]", "[[0.0, 64], [0.0, 96]]"), "sizes is .*; .* increase"),
-        (("[[0.0, 64], [0.5, 96]]", "[[0.0, 96], [0.5, 64]]"), "sizes is .*; .* increase"),
-        (("[[0.0, 64], [0.5, 96]]", "[[0.0, 50]]"), r"sizes\.0\.1 is 50; .* multiple of 32"),
+        (("[[0.0, 64], [0.5, 96]]", "[]"), "image_size_schedule"),
+        (("[[0.0, 64], [0.5, 96]]", "[[0.1, 64]]"), "image_size_schedule is .*; .* start at 0"),
+        (("[[0.0, 64], [0.5, 96]]", "[[0.0, 64], [0.0, 96]]"), "image_size_schedule is .*; .* increase"),
+        (("[[0.0, 64], [0.5, 96]]", "[[0.0, 96], [0.5, 64]]"), "image_size_schedule is .*; .* increase"),
+        (("[[0.0, 64], [0.5, 96]]", "[[0.0, 50]]"), r"image_size_schedule\.0\.1 is 50; .* multiple of 32"),
         (
             ('["photos/permissive"]', "[]"),
             r"\[data\] are inconsistent; expected at least one of photos, pairs and rendered",
@@ -134,7 +134,7 @@ def test_the_path_of_a_scene_recipe_is_relative_to_the_recipe(tmp_path):
             r"\[data\.rendered\] are inconsistent; .* exactly one of the two",
         ),
         (
-            ("[mix]", '[data.rendered]\nsets = ["a"]\norders = "paper"\nseed = 0\n[mix]'),
+            ("[mix]", '[data.rendered]\nsets = ["a"]\norders = "truncated"\nseed = 0\n[mix]'),
             r"\[data\.rendered\] are inconsistent; expected no orders, seed: ",
         ),
         (
@@ -158,10 +158,10 @@ def test_the_path_of_a_scene_recipe_is_relative_to_the_recipe(tmp_path):
         (("[mix]", "[mix]\nsparkle = 1"), r"no key mix\.sparkle"),
         (("[mix]", "[mix]\ncrop = [1, 0.45]"), r"mix\.crop is \[1, 0.45\]; expected low <= high"),
         (
-            ("[mix]", "[mix]\nreflection_ratio_log = [0, 2]"),
-            r"mix\.reflection_ratio_log\.0 is 0; .* above 0",
+            ("[mix]", "[mix]\nreflection_ratio = [0, 2]"),
+            r"mix\.reflection_ratio\.0 is 0; .* above 0",
         ),
-        (("[mix]", "[mix]\ngamma_log = [1.2, 0.8]"), r"mix\.gamma_log is .* expected low <= high"),
+        (("[mix]", "[mix]\ngamma = [1.2, 0.8]"), r"mix\.gamma is .* expected low <= high"),
         (("[mix]", "[mix]\nnoise = [0, nan]"), r"mix\.noise"),
         (("[mix]", "[mix]\nno_glass_probability = 1.5"), r"mix\.no_glass_probability"),
         (("[mix]", "[mix]\nveil_probability = -0.1"), r"mix\.veil_probability"),
@@ -209,7 +209,7 @@ def test_the_path_of_a_prompt_is_relative_to_the_recipe(tmp_path):
     [
         (("rank = 16", "rank = 0"), "rank is 0"),
         (("rank = 16", "rnk = 16"), "no key rnk .*; did you mean rank"),
-        (("rank = 16", "sizes = [[0.0, 64]]"), "no key sizes"),
+        (("rank = 16", "image_size_schedule = [[0.0, 64]]"), "no key image_size_schedule"),
         (('"int8"', '"int3"'), 'quantise is "int3"; .*; did you mean "int8"'),
         (('"kontext"', '"tiny:kontext"'), "are inconsistent; expected no quantise: a toy backbone"),
         (('["I", "T", "R"]', '["I", "T", "Q"]'), r"panels\.2"),

@@ -32,7 +32,7 @@ def problems(tmp_path):
 def test_all_problems_are_reported_at_once_with_file_key_value_and_what_is_allowed(problems):
     text = """
 name = "mine"
-samples = 0
+samples_per_pixel = 0
 [glass]
 double_probability = 2
 thickness_mm = [5, 4]
@@ -43,7 +43,7 @@ contrast = [0, 1]
 """
     assert problems(text) == [
         "mine.toml: about is missing; expected a string; add it.",
-        "mine.toml: samples is 0; expected an integer, above 0; compare with docs/recipes.md.",
+        "mine.toml: samples_per_pixel is 0; expected an integer, above 0; compare with docs/recipes.md.",
         "mine.toml: glass.double_probability is 2; expected a number, from 0 to 1; compare with docs/recipes.md.",
         (
             "mine.toml: glass.thickness_mm is [5, 4]; expected low <= high, but low is 5 and high is 4; compare with"
@@ -66,11 +66,13 @@ def test_a_key_in_the_wrong_table_is_named_with_its_own(problems):
 
 
 def test_a_misspelt_choice_is_corrected_and_an_unknown_key_lists_the_known_ones(problems):
-    lines = problems('name = "mine"\nabout = ""\norders = "papr"\n[glass]\nsparkle = true')
+    lines = problems('name = "mine"\nabout = ""\norders = "truncatd"\n[glass]\nsparkle = true')
     assert lines[1].endswith(
-        'orders is "papr"; expected a string, one of "all", "paper"; did you mean "paper"?'
+        'orders is "truncatd"; expected a string, one of "all", "truncated"; did you mean "truncated"?'
     ) or (
-        lines[0].endswith('orders is "papr"; expected a string, one of "all", "paper"; did you mean "paper"?')
+        lines[0].endswith(
+            'orders is "truncatd"; expected a string, one of "all", "truncated"; did you mean "truncated"?'
+        )
     )
     assert any("expected a key of [glass], one of double_probability, gap_mm" in line for line in lines)
 
@@ -97,13 +99,13 @@ def test_an_error_with_several_problems_survives_another_process(problems, tmp_p
 
 
 def test_the_command_prints_a_line_for_each_problem(run_without_model, tmp_path):
-    (tmp_path / "mine.toml").write_text("samples = 0")
+    (tmp_path / "mine.toml").write_text("samples_per_pixel = 0")
     code, out, err = run_without_model("render", "out", "--recipe", "mine.toml")
     assert (code, out) == (1, b"")
     assert [line.split(";")[0] for line in err.splitlines()] == [
         "error: mine.toml: name is missing",
         "error: mine.toml: about is missing",
-        "error: mine.toml: samples is 0",
+        "error: mine.toml: samples_per_pixel is 0",
     ]
 
 

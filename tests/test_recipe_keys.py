@@ -25,7 +25,7 @@ class Inner(FrozenModel):
 class Outer(FrozenModel):
     """A recipe."""
 
-    length_mm_log: LogRange = (1.0, 2.0)
+    length_mm: LogRange = (1.0, 2.0)
     """A length,
     over two lines."""
     shares: Annotated[list[Share], Field(min_length=1), KeyNote(allowed="all different")]
@@ -40,10 +40,10 @@ def keys(model):
 
 def test_a_key_has_type_allowed_values_unit_default_and_meaning():
     found = keys(Outer)
-    assert list(found) == ["length_mm_log", "shares", "inner.width_px", "inner.mode"]
-    length = found["length_mm_log"]
+    assert list(found) == ["length_mm", "shares", "inner.width_px", "inner.mode"]
+    length = found["length_mm"]
     assert (length.kind, length.unit, length.default) == ("range [low, high]", "mm", (1.0, 2.0))
-    assert length.allowed == "each above 0, sampled uniformly in the logarithm"
+    assert length.allowed == "each above 0, sampled log-uniformly"
     assert length.meaning == "A length, over two lines."
     shares = found["shares"]
     assert (shares.kind, shares.default) == ("list of numbers", REQUIRED)
@@ -63,7 +63,7 @@ def test_tables_are_listed_with_what_they_are_about():
     ("path", "words"),
     [
         (["shares", 3], "a number, from 0 to 1"),
-        (["length_mm_log", 1], "a number, above 0"),
+        (["length_mm", 1], "a number, above 0"),
         (["inner", "mode"], 'a string, one of "fast", "slow"'),
         (["inner", "width_px"], "an integer, at least 16"),
     ],

@@ -17,15 +17,8 @@ from benchmark_folders import (
 )
 from brewster.benchmarks import registry
 from brewster.benchmarks.pairing import natural_key
-from brewster.benchmarks.registry import (
-    BENCHMARKS,
-    PAPER_SEED,
-    Benchmark,
-    Case,
-    ImageFile,
-    paper_draw,
-    read_benchmark,
-)
+from brewster.benchmarks.registry import BENCHMARKS, Benchmark, Case, ImageFile, read_benchmark
+from brewster.benchmarks.selection import PAPER_SEED, paper_draw, with_unique_names
 from brewster.errors import PhotoError, UnreadablePhoto
 from brewster.photo import Photo
 from picture_files import exif_block, file_of, smooth
@@ -149,6 +142,24 @@ def test_a_folder_of_pairs_has_the_name_of_its_folder_but_never_that_of_a_known_
     read = only("pairs", repacked(tmp_path / folder, ["a"]))
     assert (read.name, read.title) == (name, folder.rstrip("/"))
     assert read.cases[0].benchmark == name
+
+
+def test_a_folder_with_sets_gives_one_benchmark_for_each_set(tmp_path):
+    for name in ("nature", "real"):
+        repacked(tmp_path / "all" / name, ["a"])
+    (tmp_path / "all" / "notes").mkdir()
+    read = read_benchmark("pairs", tmp_path / "all")
+    assert [(part.name, part.cases[0].benchmark) for part in read] == [("nature", "nature"), ("real", "real")]
+
+
+def test_equal_names_get_the_name_of_the_parent_folder(tmp_path):
+    folders = [repacked(tmp_path / parent / "test", ["a"]) for parent in ("one", "two")]
+    read = [only("pairs", folder) for folder in folders]
+    unique = with_unique_names(
+        [*read, only("pairs", repacked(tmp_path / "mine", ["a"]))], [*folders, tmp_path]
+    )
+    assert [part.name for part in unique] == ["one-test", "two-test", "mine"]
+    assert [part.cases[0].benchmark for part in unique] == ["one-test", "two-test", "mine"]
 
 
 def test_a_folder_has_its_name_also_as_the_current_folder(tmp_path, monkeypatch):

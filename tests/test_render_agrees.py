@@ -15,7 +15,7 @@ SCENE = make_scene(
     panes=[{"thickness_mm": 12.0, "absorption_per_m": (20.0, 5.0, 30.0)}],
     behind=plane_side("mottled", width_mm=900),
     front=plane_side("mottled", width_mm=400, offset_mm=(420.0, 0.0)),
-    samples=64,
+    samples_per_pixel=64,
 )
 RUNS = 4
 
@@ -30,7 +30,10 @@ def traced_layers():
     ):
         patch.setattr(renderer, "_variant", lambda polarised: "scalar_rgb")
         try:
-            samples = [renderer.trace(scene, ASSETS, noise=0.02, max_samples=512).layers() for scene in seeds]
+            samples = [
+                renderer.trace(scene, ASSETS, noise_threshold=0.02, max_samples=512).layers()
+                for scene in seeds
+            ]
         except MissingExtra as error:
             pytest.skip(f"Mitsuba cannot be used: {error}")
     return {name: torch.stack([sample[name] for sample in samples]).double() for name in samples[0]}

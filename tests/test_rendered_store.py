@@ -12,7 +12,7 @@ from pyarrow import parquet
 from brewster import Photo
 from brewster.errors import RecipeError, TargetError
 from brewster.photo import read_layers
-from brewster.render.sample import LAYERS, LightSample
+from brewster.render.sample import LAYERS, LinearSample
 from brewster.rendered import store
 from brewster.rendered.generation import preview
 from brewster.scene.recipe import read_scene_recipe
@@ -56,10 +56,10 @@ def test_only_the_photo_has_the_quality_of_the_scene(scene):
 
 def test_statistics_compare_the_luminance_of_the_layers(scene):
     grey = render(scene, None).map(lambda layer: torch.full_like(layer, 0.5))
-    mirrored = LightSample(**{**vars(grey), "reflection": grey.reflection * 0.1})
+    mirrored = LinearSample(**{**vars(grey), "reflection": grey.reflection * 0.1})
     found = store.statistics(mirrored, store.develop(mirrored))
     assert found["reflection_to_transmission"] == pytest.approx(0.1)
-    assert found["overexposed"] == 0
+    assert found["overexposed_fraction"] == 0
 
 
 def test_folders_and_shards_read_alike(four_samples, tmp_path):
@@ -150,7 +150,7 @@ def test_the_index_has_a_row_with_the_parameters_of_each_sample(four_samples, mo
     for row, entry in zip(table, store.read_set(four_samples), strict=True):
         _, scene = store.open_sample(entry)
         pane = scene.glass.panes[0]
-        assert (row["thickness_mm"], row["refractive_index"]) == (pane.thickness_mm, pane.index)
+        assert (row["thickness_mm"], row["refractive_index"]) == (pane.thickness_mm, pane.refractive_index)
         assert row["panes"] == len(scene.glass.panes)
         assert row["absorption_blue_per_m"] == pane.absorption_per_m[2]
         assert row["front_map_file"] == (scene.front.map and scene.front.map.source.file)

@@ -26,9 +26,29 @@ def test_the_table_has_the_papers_layout(results):
     assert widths == [12] * 5
 
 
-def test_the_average_has_one_more_digit(results):
+def test_the_average_has_as_many_digits_as_the_benchmarks(results):
     row = next(line for line in to_latex(results).splitlines() if line.startswith("A"))
-    assert row.endswith(r"& \textbf{21.500} & \textbf{0.1234} \\")
+    assert row.endswith(r"& \textbf{21.50} & \textbf{0.123} \\")
+
+
+def test_intervals_are_printed_on_demand(results):
+    assert "18.50" not in to_latex(results)
+    text = to_latex(results, intervals=True)
+    assert r"20.00 {\scriptsize [18.50, 21.25]}" in text
+    assert r"0.200 &" in text  # LPIPS has no interval here
+
+
+def test_only_the_packages_that_the_table_uses_are_named(results):
+    assert to_latex(results).startswith("% brewster evaluate; needs \\usepackage{multirow}\n")
+    for part in ("selections", "tables", "differences"):
+        results[part] = {key: results[part][key] for key in ("real20", "average")}
+    assert to_latex(results).startswith("% brewster evaluate\n")
+    means = {"A": 21.5, "B": 20.0, "C": 19.0, "D": 18.0}
+    results["methods"] = {key: {} for key in means}
+    results["tables"] = {
+        key: {name: {"psnr": entry(mean)} for name, mean in means.items()} for key in results["tables"]
+    }
+    assert to_latex(results).startswith("% brewster evaluate; needs \\usepackage[normalem]{ulem}\n")
 
 
 def test_the_best_three_are_marked_but_not_the_worst(results):

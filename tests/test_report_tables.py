@@ -6,7 +6,7 @@ import re
 
 import pytest
 
-from brewster.evaluate.report.tables import overview, ranking, to_csv, to_markdown
+from brewster.evaluate.report.tables import overview, ranking, to_csv, to_markdown, to_terminal
 from known_results import METRICS, entry, known_results
 
 
@@ -61,6 +61,23 @@ def test_csv_has_a_line_for_every_mean_and_every_difference(results):
         "20.0",
     )
     assert [row["than"] for row in rows if row["set"] == "average"].count("input (unprocessed)") == 2
+
+
+@pytest.mark.parametrize("width", [40, 60, 80, 200])
+def test_the_tables_fit_the_terminal(results, width):
+    results["metrics"] = {f"psnr{i}": METRICS["psnr"] for i in range(12)}
+    name = "a method with a name of many words, quality best"
+    results["methods"] = {"input (unprocessed)": {}, name: {}, f"{name} 2": {}}
+    row = {f"psnr{i}": entry(20.0 + i, low=18.0, high=21.0) for i in range(12)}
+    results["tables"] = {key: dict.fromkeys(results["methods"], row) for key in results["tables"]}
+    text = to_terminal(results, width)
+    assert max(map(len, text.splitlines())) <= width
+    for i in range(12):
+        assert f"{20 + i}.00" in text
+    assert "18.00" not in text
+    assert "31.00 (18.00 to 21.00)" in to_terminal(results, width, intervals=True)
+    shown = [line for line in text.splitlines() if line.startswith("a me")]
+    assert len({re.split(" {2,}", line)[0] for line in shown}) == 2  # shortened names stay different
 
 
 def test_a_method_with_errors_is_not_in_the_ranking(results):

@@ -10,7 +10,7 @@ from brewster.errors import BrewsterError
 from brewster.evaluate.config import EvaluationConfig
 from brewster.evaluate.methods import IdentityBaseline, PredictionFolder
 from brewster.evaluate.results import summarise
-from brewster.evaluate.runner import ScoreRow
+from brewster.evaluate.score_log import ScoreRow
 
 PSNR = EvaluationConfig(metrics=("psnr",))
 

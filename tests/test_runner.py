@@ -18,7 +18,8 @@ from brewster.benchmarks.registry import read_benchmark
 from brewster.errors import BrewsterError, PhotoError, TargetError
 from brewster.evaluate.config import EvaluationConfig
 from brewster.evaluate.methods import IdentityBaseline, MethodOutput, ModelMethod, PredictionFolder
-from brewster.evaluate.runner import SCORES_FILE, score
+from brewster.evaluate.runner import score
+from brewster.evaluate.score_log import SCORES_FILE
 from other_processes import children, is_alive, wait_for
 
 QUICK = EvaluationConfig(metrics=("psnr", "ssim"))
@@ -100,8 +101,10 @@ def test_a_changed_photo_ground_truth_or_setting_is_scored_again(real20, tmp_pat
     score(real20, [fake], QUICK, tmp_path / "out")
     assert fake.requested == ["2"]
     fake = FakeMethod()
-    score(real20, [fake], replace(QUICK, metrics=("psnr",)), tmp_path / "out")
+    score(real20, [fake], replace(QUICK, thresholds=(0.2,)), tmp_path / "out")
     assert fake.requested == NAMES
+    score(real20, [fake], replace(QUICK, thresholds=(0.2,), metrics=("psnr",)), tmp_path / "out")
+    assert fake.requested == NAMES  # the log has this column
 
 
 def test_other_metrics_do_not_run_the_model_again(real20, model, tmp_path, monkeypatch):

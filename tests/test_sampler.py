@@ -100,31 +100,33 @@ def test_a_picture_behind_the_glass_fills_the_view():
     recipe = changed(
         "vitrine",
         camera={"width": 24, "height": 16, "pinhole_probability": 1.0},
-        behind={"relative_width": (1.05, 1.5), "turn_deg": (0.0, 0.0)},
+        behind={"relative_width": (1.05, 1.5), "heading_deg": (0.0, 0.0)},
     )
     for index in range(12):
         scene = drawn(recipe, index)
         white = SyntheticAssets(**{scene.behind.plane.source.file: ASSETS.pictures["white"][:, :24]})
-        scene = scene.model_copy(update={"front": Scene().front, "samples": 4})
+        scene = scene.model_copy(update={"front": Scene().front, "samples_per_pixel": 4})
         sample = render(scene, white)
         assert float(sample.background.min()) > 0.99 * scene.behind.plane.luminance
         assert float(sample.transmission.min()) > 0.4 * scene.behind.plane.luminance
 
 
 def test_the_camera_distance_is_within_the_range_of_the_recipe(fifty):
-    nearest, farthest = read_scene_recipe("window").camera.distance_mm_log
+    nearest, farthest = read_scene_recipe("window").camera.distance_mm
     for scene in fifty["window"]:
         assert 0.9 * nearest < scene.camera_above_glass_mm < 1.1 * farthest
 
 
 def test_rough_glass_gets_more_rays():
-    asked = changed("tiny", glass={"rough_probability": 1.0}).model_copy(update={"rough_samples": 77})
-    assert drawn(asked, 0).samples == 77
+    asked = changed("tiny", glass={"rough_probability": 1.0}).model_copy(
+        update={"rough_samples_per_pixel": 77}
+    )
+    assert drawn(asked, 0).samples_per_pixel == 77
     assert drawn(asked, 0).glass.is_rough
 
 
 def test_categories_are_respected_and_a_map_without_one_fits_everywhere():
-    asked = changed("window", behind={"map_probability": 1.0, "maps": ("indoor",)})
+    asked = changed("window", behind={"map_probability": 1.0, "map_categories": ("indoor",)})
     rooms = {drawn(asked, index).behind.map.source.file for index in range(20)}
     assert rooms <= {f"builtin:room:{number}" for number in range(8)}
     plain = Catalog(maps=(Asset(source=AssetSource(file="a.hdr"), width=4096, height=2048),))
@@ -137,7 +139,7 @@ def test_a_recipe_of_pictures_needs_pictures():
 
 
 def test_a_recipe_of_maps_needs_maps_that_are_sharp_enough():
-    asked = changed("window", behind={"map_probability": 1.0, "picture_probability": 0.0})
+    asked = changed("window", behind={"map_probability": 1.0, "plane_probability": 0.0})
     for catalog in (
         Catalog(pictures=BUILTIN_CATALOG.pictures),
         Catalog(maps=(Asset(source=AssetSource(file="a.hdr"), width=64, height=32),)),
@@ -170,8 +172,8 @@ def test_panes_pinholes_and_focus_come_as_often_as_their_probabilities_say(share
         "window",
         glass={"double_probability": share},
         camera={"pinhole_probability": share, "focus_on_front_probability": share},
-        behind={"map_probability": 1.0, "dome_probability": 0.0, "picture_probability": 0.0},
-        front={"picture_probability": 1.0},
+        behind={"map_probability": 1.0, "dome_probability": 0.0, "plane_probability": 0.0},
+        front={"plane_probability": 1.0},
     )
     scenes = [drawn(recipe, index) for index in range(12)]
     assert {len(scene.glass.panes) for scene in scenes} == {1 + share}
@@ -202,22 +204,22 @@ def test_the_paper_recipe_draws_its_three_setups_in_their_shares(paper_scenes):
 
     def kind(side):
         assert (side.map is None) != (side.plane is None)
-        return "picture" if side.map is None else "map"
+        return "plane" if side.map is None else "map"
 
     counts = Counter((kind(scene.behind), kind(scene.front)) for scene in paper_scenes)
-    assert set(counts) == {("map", "map"), ("map", "picture"), ("picture", "map")}
+    assert set(counts) == {("map", "map"), ("map", "plane"), ("plane", "map")}
     assert counts["map", "map"] / 600 == pytest.approx(0.5, abs=0.06)
-    assert counts["map", "picture"] / 600 == pytest.approx(0.25, abs=0.055)
+    assert counts["map", "plane"] / 600 == pytest.approx(0.25, abs=0.055)
 
 
 def test_the_paper_recipe_has_the_glass_and_the_orders_of_the_paper(paper_scenes):
     glasses = [scene.glass for scene in paper_scenes]
     panes = [pane for glass in glasses for pane in glass.panes]
-    assert {scene.orders for scene in paper_scenes} == {"paper"}
-    assert all(1.45 <= pane.index <= 1.65 for pane in panes)
+    assert {scene.orders for scene in paper_scenes} == {"truncated"}
+    assert all(1.45 <= pane.refractive_index <= 1.65 for pane in panes)
     assert all(3 <= pane.thickness_mm <= 6 or 10 <= pane.thickness_mm <= 40 for pane in panes)
-    assert min(pane.index for pane in panes) < 1.46
-    assert max(pane.index for pane in panes) > 1.64
+    assert min(pane.refractive_index for pane in panes) < 1.46
+    assert max(pane.refractive_index for pane in panes) > 1.64
     for share, low, high in (
         (sum(glass.is_rough for glass in glasses), 0.06, 0.14),
         (sum(len(glass.panes) == 2 for glass in glasses), 0.1, 0.2),
@@ -235,4 +237,4 @@ def test_setups_need_a_share_above_zero():
     with pytest.raises(RecipeError, match="a share above 0 for at least one of the setups"):
         validated(SceneRecipe, values | {"setups": {"map|map": 0.0}}, source="x", reference="y")
     with pytest.raises(RecipeError, match="setups"):
-        validated(SceneRecipe, values | {"setups": {"picture|picture": 1.0}}, source="x", reference="y")
+        validated(SceneRecipe, values | {"setups": {"plane|plane": 1.0}}, source="x", reference="y")

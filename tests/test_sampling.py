@@ -110,7 +110,7 @@ def test_every_argument_changes_the_image(tiny_model):
 def test_a_seed_gives_the_same_image_alone_and_in_a_batch(tiny_model):
     condition = image_8bit(*SIZE)
     alone = sample_with_brewster(tiny_model, condition, seeds=[3, 4, 5])
-    batched = sample_with_brewster(tiny_model, condition, seeds=[3, 4, 5], batch_size=2)
+    batched = sample_with_brewster(tiny_model, condition, seeds=[3, 4, 5], batch=2)
     torch.testing.assert_close(alone, batched, atol=5e-5, rtol=0)
     assert torch.equal(sample_with_brewster(tiny_model, condition, seeds=[4]), alone[1:2])
     assert (alone[0] - alone[1]).abs().max() > 0.01

@@ -1,5 +1,7 @@
 """The scores of one case agree with scikit-image and with direct calls of the metrics."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
@@ -11,7 +13,18 @@ from brewster.evaluate.config import EvaluationConfig
 from brewster.evaluate.methods import IdentityBaseline, MethodOutput
 from brewster.evaluate.runner import score
 from brewster.evaluate.scoring import GroundTruth, Scorer
-from brewster.metrics import METRICS, Lpips, Metric, kept_reflection, lpips, psnr, removed_content, ssim
+from brewster.metrics import (
+    METRICS,
+    Lpips,
+    Metric,
+    kept_reflection,
+    linear_error,
+    lpips,
+    psnr,
+    psnr_of_channels,
+    removed_content,
+    ssim,
+)
 from set_folders import render_set
 
 
@@ -187,7 +200,13 @@ def test_features_are_computed_once_for_each_image(triplet, monkeypatch):
 def test_every_metric_gives_the_score_of_its_function(data, monkeypatch):
     """A direct call of each function shows that no row of METRICS has the function of another."""
     monkeypatch.setenv("BREWSTER_DATA", str(data))
-    names = tuple(name for name, metric in METRICS.items() if metric.of == "transmission")
+    others = (
+        "dists",
+        "niqe",
+    )  # test_metrics_dists.py and test_metrics_naturalness.py: weights, and larger images
+    names = tuple(
+        name for name, metric in METRICS.items() if metric.of == "transmission" and name not in others
+    )
     truth, scorer = open_case(data / "real/dev/nature", EvaluationConfig(metrics=names, size=96), "nature20")
     photo, background = truth.images["photo"], truth.images["transmission"]
     region = truth.region(0.08)
@@ -199,6 +218,9 @@ def test_every_metric_gives_the_score_of_its_function(data, monkeypatch):
         "psnr_region": pytest.approx(psnr(photo, background, region=region), abs=1e-6),
         "ssim_region": pytest.approx(ssim(photo, background, region=region), abs=1e-6),
         "lpips_region": pytest.approx(lpips(photo, background, region=region), abs=1e-6),
+        "linear_error": pytest.approx(linear_error(photo, background), abs=1e-6),
+        "psnr_channels": pytest.approx(psnr_of_channels(photo, background), abs=1e-6),
+        "ssim_clipped": pytest.approx(ssim(photo, background, window="gaussian"), abs=1e-3),
     }
 
 
@@ -227,3 +249,14 @@ def test_lpips_features_are_computed_once_for_each_image(data, monkeypatch):
     scorer.score(MethodOutput(truth.photo))
     scorer.score(MethodOutput(truth.photo))
     assert len(seen) == 3
+
+
+def test_the_border_is_not_scored(triplet):
+    config = EvaluationConfig(metrics=("psnr", "ssim"))
+    truth, scorer = open_case(triplet, config)
+    spoilt = truth.images["transmission"].copy()
+    spoilt[:4], spoilt[-4:], spoilt[:, :4], spoilt[:, -4:] = 0, 255, 0, 255
+    prediction = MethodOutput(Photo.from_array(spoilt, encoding="srgb"))
+    _, without_border = open_case(triplet, replace(config, border=4))
+    assert scorer.score(prediction)["psnr"] < 40
+    assert without_border.score(prediction) == {"psnr": 100, "ssim": 1}

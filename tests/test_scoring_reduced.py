@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from brewster import Photo
-from brewster.evaluate.scoring import downscale
+from brewster.evaluate.resizing import downscale
 
 
 @pytest.mark.parametrize(

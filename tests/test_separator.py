@@ -1,4 +1,3 @@
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -127,14 +126,6 @@ def test_positive_and_negative_differences_do_not_cancel_in_the_residual():
 
     photo = Photo.from_array(light, encoding="linear")
     assert Separator(brightness_dependent)(photo).residual == pytest.approx(0.1, abs=0.01)
-
-
-@pytest.mark.parametrize(
-    ("reconstruction_error", "doubtful"), [(None, False), (0.0, False), (0.05, False), (0.07, True)]
-)
-def test_a_separation_with_a_large_reconstruction_error_is_doubtful(reconstruction_error, doubtful):
-    separation = Separator(identity_backend)(random_image(8, 8), encoding="srgb")
-    assert replace(separation, reconstruction_error=reconstruction_error).doubtful == doubtful
 
 
 def test_confidence_falls_where_the_flipped_prediction_disagrees():

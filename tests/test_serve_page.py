@@ -1,6 +1,5 @@
 """The page, tested in a real browser with a real server."""
 
-import base64
 import io
 import zipfile
 from pathlib import Path
@@ -12,81 +11,10 @@ from brewster import Photo
 from brewster.photo.file_info import FileInfo
 from brewster.srgb import to_encoded, to_linear
 from cli_helpers import image_bytes
+from page_helpers import canvas, difference, downloaded, settle, share, upload
 from picture_files import exif_block, file_of, smooth
-from web_servers import serve_process
 
-TIMEOUT_MS = 120_000  # long, because the machine may be slow
 MIXTURE = Path(__file__).parent / "pictures" / "mixture-coffee-rocket.jpg"
-
-
-@pytest.fixture(scope="module")
-def link(model):
-    with serve_process("--model", model, "--token", "auto") as link:
-        yield link
-
-
-@pytest.fixture
-def open_page(chromium, link):
-    """Opens the page; an error in its scripts, or a request to another server, fails the test."""
-    contexts, failures, requested = [], [], []
-
-    def open_page(**kwargs):
-        context = chromium.new_context(
-            **{"viewport": {"width": 1100, "height": 760}, "accept_downloads": True, **kwargs}
-        )
-        contexts.append(context)
-        context.set_default_timeout(TIMEOUT_MS)
-        page = context.new_page()
-        page.on("pageerror", lambda error: failures.append(str(error)))
-        page.on(
-            "console",
-            lambda message: failures.append(message.text) if "Content Security" in message.text else None,
-        )
-        page.on("request", lambda request: requested.append(request.url))
-        page.goto(link)
-        page.wait_for_selector("#model option", state="attached")  # the scripts have run
-        assert "token" not in page.url
-        return page
-
-    yield open_page
-    for context in contexts:
-        context.close()
-    assert not failures
-    here = link.partition("?")[0]
-    assert [url for url in requested if not url.startswith((here, "blob:"))] == []
-
-
-def upload(page, *files):
-    """Adds files (name, bytes), and waits until all are done and the current one is shown or has failed."""
-    page.set_input_files("#files", [{"name": name, "mimeType": "", "buffer": data} for name, data in files])
-    page.wait_for_selector("#photos:not(:has(.waiting, .working)) li")
-    page.wait_for_selector("glass-compare:not([hidden]), #error:not([hidden])")
-    settle(page)
-
-
-def settle(page):
-    page.evaluate("() => new Promise(done => requestAnimationFrame(() => requestAnimationFrame(done)))")
-
-
-def canvas(page, side):
-    """The pixels of one of the two compared pictures."""
-    value = page.evaluate("side => document.querySelector('glass-compare')[side].toDataURL()", side)
-    return Photo.open(base64.b64decode(value.partition(",")[2])).pixels
-
-
-def downloaded(page, press):
-    with page.expect_download() as waiting:
-        press()
-    return waiting.value.suggested_filename, Path(waiting.value.path()).read_bytes()
-
-
-def difference(one, other):
-    assert one.shape == other.shape
-    return np.abs(one.astype(int) - other.astype(int))
-
-
-def share(page):
-    return int(page.get_by_role("slider", name="Line").get_attribute("aria-valuenow"))
 
 
 def test_a_photo_is_uploaded_compared_and_downloaded_with_the_bytes_of_the_command_line(
@@ -108,7 +36,7 @@ def test_a_photo_is_uploaded_compared_and_downloaded_with_the_bytes_of_the_comma
     page.mouse.up()
     assert share(page) < 40
 
-    page.get_by_label("Strength").fill("0.6")
+    page.get_by_label("Strength", exact=True).fill("0.6")
     settle(page)
     assert page.locator("#amount").inner_text() == "60 %"
     run_without_model(photo, "--strength", "0.6", "--device", "cpu", "--layers", "transmission,confidence")
@@ -116,8 +44,9 @@ def test_a_photo_is_uploaded_compared_and_downloaded_with_the_bytes_of_the_comma
         page.get_by_label(layer.capitalize(), exact=True).check()
         settle(page)
         (made,) = tmp_path.glob(f"*.{layer}.*")
-        shown = Photo.open(made).srgb_8bit()
-        assert np.median(difference(canvas(page, "right"), shown)) <= 1  # JPEG differs more at edges
+        if layer == "transmission":  # the confidence is shown in colours
+            shown = Photo.open(made).srgb_8bit()
+            assert np.median(difference(canvas(page, "right"), shown)) <= 1  # JPEG differs more at edges
         name, data = downloaded(page, page.get_by_role("button", name=f"Download {layer}").click)
         assert (name, data) == (made.name, made.read_bytes())
 
@@ -127,7 +56,7 @@ def test_the_layers_on_the_page_are_those_of_the_server_to_two_code_values(open_
     page = open_page()
     upload(page, ("window.png", data))
     for strength in (0.3, 1):
-        page.get_by_label("Strength").fill(str(strength))
+        page.get_by_label("Strength", exact=True).fill(str(strength))
         for layer in ("transmission", "reflection"):
             page.get_by_label(layer.capitalize(), exact=True).check()
             settle(page)
@@ -214,12 +143,38 @@ def test_a_phone_shows_everything_without_horizontal_scrolling(open_page):
     assert share(page) > before + 20
 
 
+def test_the_confidence_is_shown_as_colours_over_the_grey_photo_with_a_legend(open_page):
+    page = open_page()
+    upload(page, ("window.png", image_bytes(90, 60, "png")))
+    assert not page.locator("#legend").is_visible()
+    page.get_by_label("Confidence", exact=True).check()
+    settle(page)
+    assert page.locator("#legend").inner_text().split() == ["certain", "uncertain"]
+    shown = canvas(page, "right")
+    assert (
+        np.ptp(shown.astype(int), axis=2).max() <= 2
+    )  # the pane is certain everywhere, so the photo is grey
+    colours = page.evaluate("""async () => {
+        const { Layers, draw } = await import("/page/light.js");
+        const map = { width: 3, height: 1, channels: 1, values: Float32Array.of(1, 0.5, 0) };
+        const preview = { full: [3, 1], width: 3, height: 1, photo: new Uint8Array(9).fill(128), maps: { confidence: map } };
+        const canvas = document.createElement("canvas");
+        draw(canvas, Layers.ofPreview(preview), "confidence", 1);
+        return Array.from(canvas.getContext("2d").getImageData(0, 0, 3, 1).data);
+    }""")
+    certain, middle, unknown = np.reshape(colours, (3, 4))[:, :3].astype(int)
+    assert list(certain) == [128, 128, 128]
+    assert np.ptp(middle) > 60
+    assert np.ptp(unknown) > 60
+    assert middle @ [2, 7, 1] > unknown @ [2, 7, 1] + 100  # the order is visible without colours
+
+
 def test_zoom_and_pan_move_both_sides_together(open_page):
     """At strength 0 both sides show the same ramp, so an offset between the sides would be visible as a step."""
     page = open_page()
     ramp = np.repeat(np.linspace(20, 220, 240).astype(np.uint8)[None, :, None], 120, axis=0)
     upload(page, ("a.png", file_of(ramp, "png")))
-    page.get_by_label("Strength").fill("0")
+    page.get_by_label("Strength", exact=True).fill("0")
     page.get_by_role("button", name="Zoom in").click()
     before = row(page)
     stage = page.locator("glass-compare").bounding_box()
@@ -252,7 +207,11 @@ def test_a_file_that_is_not_a_photo_shows_an_error_and_can_be_retried_or_removed
     page = open_page()
     upload(page, ("holiday.jpg", b"not a picture"), ("window.png", image_bytes(90, 60, "png")))
     assert page.get_by_role("heading", name="holiday.jpg could not be separated").is_visible()
-    assert "no known image format" in page.get_by_role("alert").inner_text()
+    alert = page.get_by_role("alert")
+    assert "not a photo, or it is damaged" in alert.inner_text()
+    assert "no known image format" not in alert.inner_text()
+    page.get_by_text("Message of the server").click()
+    assert "no known image format" in alert.inner_text()
     assert page.get_by_role("button", name="Download transmission").is_disabled()
     assert page.get_by_role("button", name="Download all").is_enabled()
     page.get_by_role("button", name="Try again").click()
@@ -261,7 +220,7 @@ def test_a_file_that_is_not_a_photo_shows_an_error_and_can_be_retried_or_removed
     page.wait_for_selector("glass-compare:not([hidden])")
     assert page.get_by_role("listitem").count() == 1
     page.get_by_role("button", name="Remove window.png").click()
-    assert page.evaluate("document.activeElement.id") == "choose"
+    assert page.evaluate("document.activeElement.id") == "undo-remove"
 
 
 def test_many_photos_are_downloaded_as_one_zip_with_unique_names(open_page, run):
@@ -281,6 +240,7 @@ def test_many_photos_are_downloaded_as_one_zip_with_unique_names(open_page, run)
         *(f"{name}.{layer}.png" for name in ("a", "2-a") for layer in ("transmission", "reflection")),
         "ä.transmission.jpg",
         "ä.reflection.jpg",
+        "brewster-report.txt",
     ]
     for (_, photo), name in zip(
         photos, ("a.transmission.png", "2-a.transmission.png", "ä.transmission.jpg"), strict=True
@@ -376,7 +336,7 @@ def test_the_focus_moves_to_the_next_button_when_its_button_disappears(open_page
 def test_a_photo_that_is_not_done_shows_its_own_strength(open_page):
     page = open_page()
     upload(page, ("a.png", image_bytes(90, 60, "png")))
-    page.get_by_label("Strength").fill("0.3")
+    page.get_by_label("Strength", exact=True).fill("0.3")
     hold_requests(page, "**/preview?*")
     page.set_input_files("#files", [{"name": "b.png", "mimeType": "", "buffer": image_bytes(90, 60, "png")}])
     page.locator(".pick").nth(1).click()
@@ -385,7 +345,9 @@ def test_a_photo_that_is_not_done_shows_its_own_strength(open_page):
 
 def test_a_photo_that_fails_is_left_out_of_the_zip_and_its_error_is_shown(open_page):
     page = open_page()
-    upload(page, *((f"{name}.png", image_bytes(90, 60, "png", seed)) for seed, name in enumerate("abc")))
+    photos = ((f"{name}.png", image_bytes(90, 60, "png", seed)) for seed, name in enumerate("abc"))
+    upload(page, *photos, ("none.png", b"no photo"))
+    assert page.locator("#summary").inner_text() == "4 photos: 3 done, 1 failed"
 
     def refuse(route):
         if b'"b.png"' in route.request.post_data_buffer:
@@ -395,8 +357,14 @@ def test_a_photo_that_fails_is_left_out_of_the_zip_and_its_error_is_shown(open_p
 
     page.route("**/separate?*", refuse)
     _, data = downloaded(page, page.get_by_role("button", name="Download all").click)
-    names = zipfile.ZipFile(io.BytesIO(data)).namelist()
+    archive = zipfile.ZipFile(io.BytesIO(data))
+    *names, report = archive.namelist()
     assert [name[0] for name in names] == ["a", "a", "c", "c"]
+    text = archive.read(report).decode()
+    assert "2 done, 2 failed" in text
+    assert "a.png -> a.transmission.png, a.reflection.png (strength 100 %)" in text
+    assert "b.png: failed. Its layers cannot be written." in text
+    assert "none.png: failed. This file is not a photo, or it is damaged." in text
     alert = page.locator("#export-error")
     assert alert.inner_text() == "b.png is not in the zip. Its layers cannot be written."
     page.locator(".pick").nth(1).click()

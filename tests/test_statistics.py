@@ -45,33 +45,33 @@ def test_missing_values_are_not_counted():
     assert estimate_one([make_stratum([np.nan, np.nan])]) is None
 
 
-def test_intervals_agree_with_normal_intervals_for_normal_values(random):
-    values = random.normal(20, 3, 400)
+def test_intervals_agree_with_normal_intervals_for_normal_values(rng):
+    values = rng.normal(20, 3, 400)
     estimated = estimate_one([make_stratum(values)])
     half = 1.96 * values.std(ddof=1) / np.sqrt(400)
     assert estimated.high - estimated.mean == pytest.approx(half, rel=0.06)
     assert estimated.mean - estimated.low == pytest.approx(half, rel=0.06)
 
 
-def test_intervals_contain_the_true_mean_in_95_percent_of_the_cases(random):
+def test_intervals_contain_the_true_mean_in_95_percent_of_the_cases(rng):
     """The coverage of a percentile bootstrap is slightly below 95 % for 60 values."""
     covered = 0
     for i in range(200):
-        estimated = estimate_one([make_stratum(random.normal(0, 1, 60), name=str(i))])
+        estimated = estimate_one([make_stratum(rng.normal(0, 1, 60), name=str(i))])
         covered += estimated.low <= 0 <= estimated.high
     assert 0.90 <= covered / 200 <= 0.99
 
 
-def test_ten_equal_images_of_each_scene_do_not_narrow_the_interval(random):
-    scenes = random.normal(0, 1, 20)
+def test_ten_equal_images_of_each_scene_do_not_narrow_the_interval(rng):
+    scenes = rng.normal(0, 1, 20)
     one = estimate_one([make_stratum(scenes)])
     ten = estimate_one([make_stratum(np.repeat(scenes, 10), scenes=[str(i // 10) for i in range(200)])])
     assert ten.high - ten.low == pytest.approx(one.high - one.low, rel=0.05)
 
 
-def test_the_interval_of_a_benchmark_does_not_depend_on_the_order_of_its_images(random):
-    values, scenes = random.normal(0, 1, 12), [f"s{i % 4}" for i in range(12)]
-    order = random.permutation(12)
+def test_the_interval_of_a_benchmark_does_not_depend_on_the_order_of_its_images(rng):
+    values, scenes = rng.normal(0, 1, 12), [f"s{i % 4}" for i in range(12)]
+    order = rng.permutation(12)
     a = estimate_one([make_stratum(values, scenes)])
     b = estimate_one([make_stratum(values[order], [scenes[i] for i in order])])
     assert a.low == pytest.approx(b.low)
@@ -85,9 +85,9 @@ def test_the_mean_is_in_its_interval_and_the_interval_between_minimum_and_maximu
     assert estimated.mean == pytest.approx(np.mean(values), abs=1e-9)
 
 
-def test_paired_differences_have_narrower_intervals_than_the_means(random):
-    baseline = random.normal(22, 5, 50)
-    values = np.stack([baseline, baseline + random.normal(0.5, 0.1, 50)], axis=1)
+def test_paired_differences_have_narrower_intervals_than_the_means(rng):
+    baseline = rng.normal(22, 5, 50)
+    values = np.stack([baseline, baseline + rng.normal(0.5, 0.1, 50)], axis=1)
     series = [("input", "psnr"), ("ours", "psnr")]
     (row,) = differences([make_stratum(values)], series, {"psnr": True})
     assert (row.method, row.than, row.metric) == ("ours", "input", "psnr")

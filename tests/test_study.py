@@ -171,7 +171,7 @@ def test_an_invalid_description_is_refused_with_the_key_of_the_error(tmp_path):
     for change, message in (
         ({"pairs": "many"}, "pairs: "),
         ({"unknown": 1}, "unknown: "),
-        ({"format": 2}, "format 2"),
+        ({"format": 1}, "format 1"),
     ):
         (study.folder / "study.json").write_text(json.dumps(text | change))
         with pytest.raises(BrewsterError, match=message):
@@ -191,7 +191,7 @@ def test_catch_pictures_are_clearly_degraded_outputs(tmp_path):
         assert catch.spoilt not in outputs
 
 
-def test_degrading_preserves_the_mean_of_dark_and_light_pictures(random):
+def test_degrading_preserves_the_mean_of_dark_and_light_pictures(rng):
     for level in (20, 128, 235):
         flat = np.full((60, 80, 3), level, np.uint8)
         spoilt = degrade(flat, 1)

@@ -78,6 +78,9 @@ def press(page, key):
 def begin(page):
     page.get_by_role("checkbox").check()
     page.get_by_role("button", name="Begin").click()
+    expect(page.get_by_text("Practice: not counted").first).to_be_visible()
+    press(page, "1")
+    expect(page.get_by_text("Pair 1 of 4", exact=True).first).to_be_visible()
     page.wait_for_selector(READY)
 
 
@@ -86,6 +89,7 @@ def test_the_whole_study_works_with_the_keyboard_only(open_page, url, store):
     page.wait_for_selector("#invitation:not([hidden])")
     for key in ("Tab", "Space", "Tab", "Enter"):
         page.keyboard.press(key)
+    press(page, "2")  # the practice pair
     for trial, key in enumerate(["1", "2", "3", "ArrowLeft"]):
         expect(page.get_by_text(f"Pair {trial + 1} of 4", exact=True).first).to_be_visible()
         press(page, key)
@@ -95,6 +99,9 @@ def test_the_whole_study_works_with_the_keyboard_only(open_page, url, store):
     given = [answer.choice for answer in answers.values()]
     assert given == ["left", "similar", "right", "left"]
     assert all(0.3 < answer.seconds < 60 for answer in answers.values())
+    shown = answers[0].conditions
+    assert (shown.viewport_width, shown.viewport_height, shown.pixel_ratio) == (1280, 720, 1)
+    assert (shown.theme, shown.pointer, shown.view, shown.flips) == ("light", "fine", "all", 0)
 
 
 def test_a_participant_continues_on_another_device_with_the_personal_link_only(open_page, url):
@@ -162,6 +169,81 @@ def test_zoom_and_pan_apply_to_all_three_pictures_and_are_reset_for_new_ones(ope
     expect(page.get_by_text("Pair 2 of 4").first).to_be_visible()
     page.wait_for_selector(READY)
     assert transforms() == whole
+
+
+def test_full_size_is_kept_for_the_next_pair(open_page, url):
+    page = open_page(url, viewport={"width": 500, "height": 500})  # the pictures have 240 px
+    begin(page)
+    full = page.locator("[data-zoom=full]")
+
+    def picture_width():
+        return page.locator(".left img").bounding_box()["width"]
+
+    page.keyboard.press("f")
+    assert picture_width() == pytest.approx(240, abs=1)
+    press(page, "2")
+    expect(page.get_by_text("Pair 2 of 4").first).to_be_visible()
+    page.wait_for_selector(READY)
+    assert picture_width() == pytest.approx(240, abs=1)
+    expect(full).to_have_attribute("aria-pressed", "true")
+    page.keyboard.press("+")
+    expect(full).to_have_attribute("aria-pressed", "false")
+
+
+def test_results_can_be_swapped_in_place_at_a_larger_size(open_page, url, store):
+    page = open_page(url, viewport={"width": 1280, "height": 800})
+    begin(page)
+
+    def visible():
+        return [side for side in ("left", "photo", "right") if page.locator(f".{side} .frame").is_visible()]
+
+    width = page.locator(".left .frame").bounding_box()["width"]
+    page.keyboard.press("d")
+    assert visible() == ["left", "right"]
+    assert page.locator(".left .frame").bounding_box()["width"] > 1.4 * width
+    for key, side in (("x", "left"), ("x", "right"), ("x", "left"), ("p", "photo"), ("b", "right")):
+        page.keyboard.press(key)
+        assert visible() == [side]
+    assert page.locator(".right .frame").bounding_box()["width"] > 1.7 * width
+    assert page.evaluate("document.querySelector('main').scrollHeight <= innerHeight")
+    press(page, "3")
+    expect(page.get_by_text("Pair 2 of 4").first).to_be_visible()
+    ((_, answers),) = store.all_answers()
+    assert (answers[0].conditions.view, answers[0].conditions.flips) == ("single", 4)
+
+
+def test_the_last_answer_can_be_undone_also_after_the_last_trial(open_page, url, store):
+    page = open_page(url)
+    begin(page)
+    undo = page.get_by_role("button", name="Undo the last answer")
+    expect(undo).to_be_hidden()
+    press(page, "1")
+    expect(page.get_by_text("Pair 2 of 4").first).to_be_visible()
+    page.wait_for_selector(READY)
+    undo.click()
+    expect(page.get_by_text("Pair 1 of 4", exact=True).first).to_be_visible()
+    page.wait_for_selector(READY)
+    expect(undo).to_be_hidden()
+    for trial in range(4):
+        expect(page.get_by_text(f"Pair {trial + 1} of 4", exact=True).first).to_be_visible()
+        press(page, "3")
+    expect(page.get_by_role("heading", name="Thank you.")).to_be_visible()
+    undo.click()
+    expect(page.get_by_text("Pair 4 of 4", exact=True).first).to_be_visible()
+    ((_, answers),) = store.all_answers()
+    assert sorted(answers) == [0, 1, 2]
+    assert (answers[0].choice, answers[0].withdrawn) == ("right", ("left",))
+
+
+def test_the_surround_is_the_same_grey_in_both_themes_and_a_narrow_window_is_warned(open_page, url):
+    colours = []
+    for theme, width in (("light", 1280), ("dark", 800)):
+        page = open_page(url, color_scheme=theme, viewport={"width": width, "height": 800})
+        page.wait_for_selector("#invitation:not([hidden])")
+        colours.append(page.evaluate("getComputedStyle(document.body).backgroundColor"))
+        warning = page.get_by_text(f"This window is {width} pixels wide").first
+        expect(warning).to_be_visible() if width < 900 else expect(warning).to_be_hidden()
+    assert colours == ["rgb(107, 107, 107)"] * 2
 
 
 def test_an_answer_without_acknowledgement_is_sent_again(open_page, url, store):

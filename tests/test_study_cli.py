@@ -74,8 +74,8 @@ def test_create_exits_with_1_for_wrong_files_and_with_2_for_wrong_arguments(
     assert not (tmp_path / "study").exists()
 
 
-def test_report_prints_tables_and_writes_all_files(run_without_model, study, random):
-    add_answers(study, 12, random)
+def test_report_prints_tables_and_writes_all_files(run_without_model, study, rng):
+    add_answers(study, 12, rng)
     code, out, err = run_without_model("study", "report", "study")
     assert code == 0
     assert "### ours and RDNet" in out.decode()
@@ -86,6 +86,34 @@ def test_report_prints_tables_and_writes_all_files(run_without_model, study, ran
     # replaces the first report
     code, out, _ = run_without_model("study", "report", "study", "--json", "--min-seconds", 99)
     assert json.loads(out)["excluded"] == {"failed": 0, "fast": 12}
+
+
+def test_progress_lists_participants_without_results(run_without_model, study, random):
+    add_answers(study, 2, random)
+    code, out, _ = run_without_model("study", "progress", "study", "--max-failed", 0.5)
+    assert code == 0
+    text = out.decode()
+    assert text.startswith(
+        "2 participants, 2 complete, 0 excluded by the rule so far; 8 answers, 2 to 2 for each comparison."
+    )
+    assert "8 of 8" in text
+    assert not re.search(r"\b(win|lose|ours|RDNet)\b", text)
+    found = json.loads(run_without_model("study", "progress", "study", "--json")[1])
+    assert [row["median_seconds"] for row in found["rows"]] == [4, 4]
+
+
+def test_create_uses_only_the_inputs_of_a_list(run_without_model, folders, tmp_path):
+    (tmp_path / "list.txt").write_text("real/2.png\n\nnature/1\n")
+    assert run_without_model("study", "create", "study", *folders, "--list", "list.txt")[0] == 0
+    comparisons = read_study(tmp_path / "study").description.comparisons
+    assert {(row.dataset, row.name) for row in comparisons} == {("real", "2"), ("nature", "1")}
+    for text, message in (
+        ("real/3\n", "has no picture for these names of the list: real/3"),
+        ("\n", "is empty"),
+    ):
+        (tmp_path / "list.txt").write_text(text)
+        code, _, err = run_without_model("study", "create", "other", *folders, "--list", "list.txt")
+        assert (code, message in err) == (1, True)
 
 
 def test_report_without_answers_or_without_a_study_is_an_error(run_without_model, study):
@@ -195,8 +223,8 @@ def test_report_without_answers_creates_no_database(run_without_model, study):
 @pytest.mark.skipif(
     os.geteuid() == 0 and not shutil.which("setpriv"), reason="root writes to read-only folders"
 )
-def test_a_read_only_study_is_reported_into_another_folder(study, random, tmp_path):
-    add_answers(study, 3, random)
+def test_a_read_only_study_is_reported_into_another_folder(study, rng, tmp_path):
+    add_answers(study, 3, rng)
     study.folder.chmod(0o555)
     without_root_rights = ["setpriv", "--inh-caps=-all", "--bounding-set=-all"] if os.geteuid() == 0 else []
     command = [*without_root_rights, sys.executable, "-m", "brewster", "study", "report", str(study.folder)]

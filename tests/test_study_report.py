@@ -30,6 +30,7 @@ from brewster.user_study.report.statistics import (
     intraclass_correlation,
     rates,
     resampled_counts,
+    sign_flip_test,
 )
 from brewster.user_study.report.tables import to_csv, to_latex, to_markdown
 from brewster.user_study.store import Participant, StoredAnswer
@@ -138,12 +139,30 @@ def test_the_simulated_intraclass_correlation_is_estimated():
     assert intraclass_correlation(np.tile([0.0, 3, 0], (5, 1))) is None
 
 
+def test_the_sign_flip_test_rejects_equal_methods_in_5_percent_of_studies():
+    """400 studies of 12 participants whose probabilities of win and lose are equal on average: within three standard errors."""
+    rng, studies = np.random.default_rng(8), 400
+    probabilities = rng.dirichlet(np.array([0.4, 0.2, 0.4]) * 19, (12, studies))
+    counts = rng.multinomial(20, probabilities)[:, :, None].astype(float)
+    p_values = sign_flip_test(counts, np.ones((studies, 1)), resamples=1000)[:, 0]
+    assert abs((p_values <= 0.05).mean() - 0.05) < 3 * np.sqrt(0.05 * 0.95 / studies)
+
+
+def test_the_p_value_of_unanimous_participants_is_that_of_all_exchanges():
+    """Of the 2^n exchanges of n participants, two are as extreme: all or none exchanged."""
+    for participants in (6, 8):
+        counts = np.tile([5.0, 1, 0], (participants, 1, 1, 1))
+        (p_values,) = sign_flip_test(counts, np.ones((1, 1)))
+        assert p_values == pytest.approx([2 / 2**participants] * 4, abs=0.01)
+    assert sign_flip_test(np.tile([2.0, 1, 2], (6, 1, 1, 1)), np.ones((1, 1))).min() == 1
+
+
 # --- strengths
 
 
 @pytest.mark.parametrize("methods", [2, 3, 5])
-def test_strengths_equal_those_of_choix(random, methods):
-    wins = random.integers(1, 30, (methods, methods)) + random.integers(0, 2, (methods, methods)) / 2
+def test_strengths_equal_those_of_choix(rng, methods):
+    wins = rng.integers(1, 30, (methods, methods)) + rng.integers(0, 2, (methods, methods)) / 2
     games = [
         (a, b) for a in range(methods) for b in range(methods) if a != b for _ in range(int(2 * wins[a, b]))
     ]
@@ -156,8 +175,8 @@ def test_the_difference_of_two_strengths_is_the_logit_of_the_win_rate():
     assert np.diff(strengths(np.array([[0, 30.0], [10, 0]]))) == pytest.approx([-np.log(3)])
 
 
-def test_strengths_of_many_tables_are_those_of_each(random):
-    tables = random.integers(1, 20, (6, 4, 4)).astype(float)
+def test_strengths_of_many_tables_are_those_of_each(rng):
+    tables = rng.integers(1, 20, (6, 4, 4)).astype(float)
     tables[2, 0] = 0  # the first method never wins
     together = strengths(tables)
     assert np.isnan(together[2]).all()
@@ -183,9 +202,9 @@ def test_alpha_of_the_example_of_krippendorff_is_reproduced():
     assert alpha(ratings) == pytest.approx(0.743, abs=5e-4)
 
 
-def test_alpha_is_1_for_agreement_0_for_chance_and_none_where_undefined(random):
+def test_alpha_is_1_for_agreement_0_for_chance_and_none_where_undefined(rng):
     assert alpha(np.array([[4.0, 0, 0], [0, 3, 0]])) == 1
-    assert alpha(random.multinomial(20, RATES, 2000).astype(float)) == pytest.approx(0, abs=0.01)
+    assert alpha(rng.multinomial(20, RATES, 2000).astype(float)) == pytest.approx(0, abs=0.01)
     assert alpha(np.array([[4.0, 0, 0], [5, 0, 0]])) is None
     assert alpha(np.array([[1.0, 0, 0], [0, 1, 0]])) is None
 
@@ -298,6 +317,12 @@ def test_the_files_of_a_report_agree_with_each_other(hundred_participants, tmp_p
     assert json.loads((tmp_path / "report.json").read_text()) == results
     assert Photo.open(tmp_path / "plot.png").size[0] > 800
     lines = list(csv.DictReader(io.StringIO((tmp_path / "answers.csv").read_text())))
+    catches = [line for line in lines if line["kind"] == "catch"]
+    assert len(lines) - len(catches) == results["everyone"]["answers"]
+    assert sum(line["choice"] != line["expected"] for line in catches) == results["everyone"]["failed"]
+    for line in lines:
+        if line["kind"] == "comparison" and line["outcome"] != "tie":
+            assert line[line["choice"]] == line["first" if line["outcome"] == "win" else "second"]
     wins = [
         line["outcome"] for line in lines if line["second"] == "DSIT" and line["dataset"] == "real"
     ].count("win")
@@ -333,6 +358,16 @@ def test_without_answers_there_is_no_report(hundred_participants):
     study, *_ = hundred_participants
     with pytest.raises(BrewsterError, match="no answers yet"):
         summarise(study, [], ExclusionRule())
+
+
+def test_few_participants_are_named_and_rows_without_answers_are_left_out(hundred_participants):
+    study, _, results = hundred_participants
+    one_answer = participant_answers(number=1, votes={0: 0}, seconds=9.0)
+    text = to_markdown(summarise(study, [one_answer], ExclusionRule()))
+    assert "| too few participants | 1 | 1" in re.sub(" +", " ", text)
+    assert "nature" not in text
+    assert "| -" not in text
+    assert re.search(r"\| Average .*\| p < 0\.001 +\| 90 ", to_markdown(results))
 
 
 def test_one_participant_gives_rates_without_intervals(hundred_participants):

@@ -71,7 +71,7 @@ def test_only_number_token_date_and_trials_of_a_participant_are_stored(store):
         columns = [row[1] for row in database.execute("PRAGMA table_info(participants)")]
         ((day,),) = database.execute("SELECT consented_on FROM participants").fetchall()
     database.close()
-    assert columns == ["number", "token", "consented_on", "trials"]
+    assert columns == ["number", "token", "consented_on", "trials", "practice"]
     assert re.fullmatch(r"\d{4}-\d\d-\d\d", day)
 
 

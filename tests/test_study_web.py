@@ -2,6 +2,7 @@
 
 import re
 from contextlib import closing
+from dataclasses import asdict
 
 import numpy as np
 import pytest
@@ -57,7 +58,10 @@ def test_a_participant_who_agrees_gets_a_link_and_all_trials(app, store):
     link = admit_participant(app)
     state = request(app, "GET", f"{link}/trial").json()
     for trial in range(8):
-        assert state == {"trial": trial, "trials": 8, "width": 24, "height": 18}
+        assert state["practice"] is None or trial == 0
+        assert state | {"practice": None} == {
+            "trial": trial, "trials": 8, "width": 24, "height": 18, "practice": None, "last": trial - 1 if trial else None,
+        }  # fmt: skip
         response = post_answer(app, link, trial, "similar").json()
         assert response["kept"] == "similar"
         state = response["next"]
@@ -78,9 +82,13 @@ def test_the_pictures_of_a_trial_are_those_that_were_drawn(app, store, study):
 
 def test_no_response_contains_a_method_a_dataset_or_a_file_name(app, store, study):
     link = admit_participant(app)
-    paths = ["/", link, f"{link}/trial", "/invitation", "/openapi.json"]
+    paths = ["/", link, f"{link}/trial", "/invitation", "/privacy", "/openapi.json"]
     paths += [f"/page/{name}" for name in ("study.js", "study.css", "pan_zoom.js", "style.css")]
-    paths += [f"{link}/pictures/{trial}/{side}" for trial in range(8) for side in ("photo", "left", "right")]
+    paths += [
+        f"{link}/pictures/{trial}/{side}"
+        for trial in ("practice", *range(8))
+        for side in ("photo", "left", "right")
+    ]
     responses = [request(app, "GET", path) for path in paths] + [
         post_answer(app, link, 0),
         post_answer(app, link, 99),
@@ -101,6 +109,52 @@ def test_an_answer_sent_twice_is_stored_once(app, store):
     assert (again["kept"], again["next"]["trial"]) == ("left", 1)
     ((_, answers),) = store.all_answers()
     assert len(answers) == 1
+
+
+def test_the_practice_pair_has_a_known_answer_and_its_pictures(app, store, study):
+    link = admit_participant(app)
+    practice = request(app, "GET", f"{link}/trial").json()["practice"]
+    trial = store.participant(link.removeprefix("/s/")).practice
+    assert practice == {"width": 24, "height": 18, "expected": trial.expected}
+    better = getattr(trial, practice["expected"])
+    assert better in {catch.good for catch in study.description.catch_pool}
+    assert {trial.left, trial.right} - {better} <= {catch.spoilt for catch in study.description.catch_pool}
+    for side in ("photo", "left", "right"):
+        shown = request(app, "GET", f"{link}/pictures/practice/{side}").content
+        assert shown == study.picture_file(getattr(trial, side)).read_bytes()
+
+
+def test_only_the_last_answer_can_be_withdrawn_and_a_second_withdrawal_changes_nothing(app, store):
+    link = admit_participant(app)
+    for trial in range(2):
+        post_answer(app, link, trial, "left")
+    refused = request(app, "POST", f"{link}/withdrawals", json={"trial": 0})
+    assert (refused.status_code, "only the last answer" in refused.json()["error"]) == (422, True)
+    for _ in range(2):
+        state = request(app, "POST", f"{link}/withdrawals", json={"trial": 1}).json()
+        assert (state["trial"], state["last"]) == (1, 0)
+    assert post_answer(app, link, 1, "right").json()["kept"] == "right"
+    ((_, answers),) = store.all_answers()
+    assert [(answer.choice, answer.withdrawn) for answer in answers.values()] == [
+        ("left", ()),
+        ("right", ("left",)),
+    ]
+
+
+def test_viewing_conditions_are_stored_and_others_are_refused(app, store):
+    conditions = {
+        "viewport_width": 1280, "viewport_height": 800, "pixel_ratio": 1.5, "picture_width": 417, "theme": "dark",
+        "pointer": "fine", "view": "single", "flips": 3, "zoomed": False,
+    }  # fmt: skip
+    link = admit_participant(app)
+    given = {"trial": 0, "choice": "left", "seconds": 2}
+    for wrong in ({"theme": "red"}, {"viewport_width": -1}, {"user_agent": "x"}):
+        body = given | {"conditions": conditions | wrong}
+        assert request(app, "POST", f"{link}/answers", json=body).status_code == 422
+    request(app, "POST", f"{link}/answers", json=given | {"conditions": conditions})
+    ((_, answers),) = store.all_answers()
+    assert asdict(answers[0].conditions) == conditions
+    assert re.fullmatch(r"20\d\d-\d\d-\d\dT\d\d:\d\d:\d\d\+00:00", answers[0].answered_at)
 
 
 @pytest.mark.parametrize(
@@ -188,7 +242,10 @@ def test_all_assets_of_the_page_are_served_locally(app):
     page = request(app, "GET", "/").text
     links = re.findall(r'(?:src|href)="([^"]+)"', page)
     assert len(links) >= 4
-    assert all(link.startswith("/page/") and request(app, "GET", link).status_code == 200 for link in links)
+    assert all(
+        link.startswith(("/page/", "/privacy")) and request(app, "GET", link).status_code == 200
+        for link in links
+    )
 
 
 def test_an_answer_that_cannot_be_written_is_not_acknowledged_and_can_be_sent_again(app, store):

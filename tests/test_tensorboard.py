@@ -18,13 +18,13 @@ def read(folder):
 def test_metrics_and_the_image_are_read_back_at_their_steps(tmp_path):
     event_log = TensorBoardLog(tmp_path, 0)
     for step in (3, 6):
-        event_log.log(step, {"loss": 1 / step, "gain_db_real/dev": -2.5}, torch.full((4, 6, 3), 0.5))
+        event_log.log(step, {"loss": 1 / step, "psnr_gain_db_real/dev": -2.5}, torch.full((4, 6, 3), 0.5))
     events = read(tmp_path)
     assert [(event.step, event.value) for event in events.Scalars("loss")] == [
         (3, pytest.approx(1 / 3)),
         (6, pytest.approx(1 / 6)),
     ]
-    assert events.Scalars("gain_db_real/dev")[0].value == -2.5
+    assert events.Scalars("psnr_gain_db_real/dev")[0].value == -2.5
     shown = events.Images(IMAGE_TAG)
     assert [(event.step, event.width, event.height) for event in shown] == [(3, 6, 4), (6, 6, 4)]
 

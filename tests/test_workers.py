@@ -11,27 +11,28 @@ import pytest
 import torch
 
 from brewster.errors import DeviceError, RecipeError, TargetError
+from brewster.executors import ProcessExecutor, SerialExecutor, local
 from brewster.rendered import store
 from brewster.rendered.generation import workers
 from brewster.rendered.generation.job import RenderTask
-from brewster.rendered.generation.workers import ProcessExecutor, SerialExecutor, render_again
+from brewster.rendered.generation.workers import render_again
 from other_processes import children, is_alive, started, wait_for
 from set_folders import hashes, make_job, names, render_set, statuses
 
 TESTS = Path(__file__).parent
 
 
-def two_workers(render_job):
-    return ProcessExecutor(render_job, 2)
+def two_workers(create_runner):
+    return ProcessExecutor(create_runner, 2)
 
 
 def start_blocking_run(out, count):
     """Starts a run in a process of its own, with a worker that never finishes sample 2."""
     code = f"""
 from pathlib import Path
-from brewster.rendered.generation.workers import ProcessExecutor
+from brewster.executors import ProcessExecutor
 from set_folders import render_set
-render_set(Path({str(out)!r}), {count}, renderer="blocking", executor=lambda job: ProcessExecutor(job, 1))
+render_set(Path({str(out)!r}), {count}, renderer="blocking", executor=lambda create_runner: ProcessExecutor(create_runner, 1))
 """
     environment = {**os.environ, "FAKE_WAIT": "1"}
     return started([sys.executable, "-c", code], cwd=TESTS, stderr=subprocess.PIPE, env=environment)
@@ -76,7 +77,7 @@ def test_ctrl_c_stops_all_workers_and_leaves_no_partial_files(tmp_path):
 
 
 def test_a_sample_that_kills_every_worker_fails_and_the_others_are_rendered(tmp_path, monkeypatch):
-    monkeypatch.setattr(workers, "MAX_ATTEMPTS", 1)
+    monkeypatch.setattr(local, "MAX_ATTEMPTS", 1)
     results = render_set(tmp_path / "set", renderer="crashing", executor=partial(ProcessExecutor, count=1))
     assert statuses(results) == {0: "rendered", 1: "rendered", 2: "failed", 3: "rendered"}
     assert "its worker died 1 times (exit code -9)" in next(
@@ -134,4 +135,4 @@ def test_a_task_that_is_tried_again_renders_missing_samples_only(tmp_path):
     before = (tmp_path / "000000").stat().st_ino
     assert [result.status for result in runner(task)] == ["rendered", "rendered"]
     assert (tmp_path / "000000").stat().st_ino == before
-    assert not SerialExecutor(job).is_busy()
+    assert not SerialExecutor(partial(workers.TaskRunner, job)).is_busy()

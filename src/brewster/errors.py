@@ -4,7 +4,9 @@
     |-- PhotoError             a photo cannot be read, interpreted or written
     |   |-- UnreadablePhoto    the file is not an image, is empty or is truncated
     |   |-- UnsupportedPhoto   an unsupported kind of image (five channels, animation, NaN)
-    |   `-- PhotoTooLarge      the image has more pixels than the limit
+    |   |-- PhotoTooLarge      the image has more pixels than the limit
+    |   `-- MaskError          a mask cannot be read, or does not fit its photo
+    |-- ManifestError          a list of photos is not a table of paths
     |-- TargetError            an output file cannot be written, for example because it exists
     |-- ModelError             a model is unknown, damaged, or has the wrong inputs
     |-- DeviceError            the requested device is not available
@@ -57,6 +59,14 @@ class UnsupportedPhoto(PhotoError):
 
 class PhotoTooLarge(PhotoError):
     """The image has more pixels than the limit."""
+
+
+class ManifestError(BrewsterError):
+    """A manifest, which lists the photos of a batch, is not a CSV or Parquet table of paths."""
+
+
+class MaskError(PhotoError):
+    """A mask cannot be read, is not grey, or has another size than its photo."""
 
 
 class TargetError(BrewsterError):

@@ -21,6 +21,7 @@ import platformdirs
 
 from brewster.errors import TargetError
 from brewster.image_formats import format_of
+from brewster.remote_path import Location, RemotePath
 
 DEFAULT_MAX_PIXELS = 200_000_000
 """The default limit. Larger images are refused before they are decoded: a small file can expand to a very large image."""
@@ -36,11 +37,11 @@ _PNG_LAYERS = ("confidence",)  # grey maps are always PNG, whatever the format o
 class SeparationPaths:
     """An image to separate and the paths of its layers: `folder/name.layer.suffix`."""
 
-    source: Path
-    folder: Path
+    source: Location
+    folder: Location
     name: str
 
-    def target(self, layer: str, suffix: str | None = None) -> Path:
+    def target(self, layer: str, suffix: str | None = None) -> Location:
         """Returns the path of a layer.
 
         The default suffix is that of the source, or .png if brewster does not write the format of the source.
@@ -52,7 +53,7 @@ class SeparationPaths:
         )
 
 
-def find(sources: Iterable[Path], output_folder: Path | None = None) -> list[SeparationPaths]:
+def find(sources: Iterable[Location], output_folder: Location | None = None) -> list[SeparationPaths]:
     """Returns the images in files and folders, each once, in a stable order.
 
     Layers are written next to their image, or below `output_folder`, which mirrors the tree of each input folder.
@@ -67,32 +68,57 @@ def find(sources: Iterable[Path], output_folder: Path | None = None) -> list[Sep
     Raises:
         TargetError: the layers of two images would have the same path.
     """
+    return name_layers(pair for source in sources for pair in images_in(source, output_folder))
+
+
+def images_in(source: Location, output_folder: Location | None = None) -> Iterator[tuple[Location, Location]]:
+    """Yields the images in a file or folder, each with the folder of its layers. See `find`."""
+    for image in _image_files(source):
+        yield image, _output_folder(image, source, output_folder)
+
+
+def name_layers(images: Iterable[tuple[Location, Location]]) -> list[SeparationPaths]:
+    """Returns the paths of images, each with the folder of its layers. Each image is included once. See `find`.
+
+    Raises:
+        TargetError: the layers of two images would have the same path.
+    """
     found: dict[str, SeparationPaths] = {}
-    counts: dict[Path, Counter[str]] = {}
-    for source in sources:
-        for image in _image_files(source):
-            parent = image.parent
-            if parent not in counts:
-                counts[parent] = _name_counts(parent)
-            subfolder = Path() if image == source else parent.relative_to(source)
-            folder = parent if output_folder is None else output_folder / subfolder
-            paths = SeparationPaths(image, folder, _layer_name(image, counts[parent]))
-            found.setdefault(_absolute(image), paths)
+    counts: dict[Location, Counter[str]] = {}
+    for image, folder in images:
+        parent = image.parent
+        if parent not in counts:
+            counts[parent] = _name_counts(parent)
+        found.setdefault(_absolute(image), SeparationPaths(image, folder, _layer_name(image, counts[parent])))
     _check_unique_targets(found.values())
     return list(found.values())
 
 
-def write_atomically(path: Path, data: bytes, *, overwrite: bool = False, source: Path | None = None) -> None:
+def _output_folder(image: Location, source: Location, output_folder: Location | None) -> Location:
+    """Returns the folder for the layers of an image that was found in `source`."""
+    if output_folder is None:
+        return image.parent
+    return (
+        output_folder if image == source else output_folder.joinpath(*image.parent.relative_to(source).parts)
+    )
+
+
+def write_atomically(
+    path: Location, data: bytes, *, overwrite: bool = False, source: Location | None = None
+) -> None:
     """Writes a file atomically and creates its folder where needed.
 
     The bytes are written to a hidden file in the same folder and flushed to the disk. Then the file is renamed. So
-    a full disk or Ctrl-C leaves no partial file.
+    a full disk or Ctrl-C leaves no partial file. In an object store, the file is written with one upload.
 
     Raises:
         TargetError: the file exists and `overwrite` is False, the file is the `source`, or it cannot be written.
     """
     _check_not_source(path, source)
     try:
+        if isinstance(path, RemotePath):
+            path.write_bytes(data, overwrite=overwrite)
+            return
         with _temporary(path) as part:
             path.parent.mkdir(parents=True, exist_ok=True)
             _check_writable(path, overwrite)
@@ -175,11 +201,20 @@ def _sync(path: Path) -> None:
         os.close(file)
 
 
-def _image_files(source: Path) -> Iterator[Path]:
-    if _is_folder(source):
+def _image_files(source: Location) -> Iterator[Location]:
+    if isinstance(source, RemotePath):
+        yield from [source] if format_of(source) else _remote_images(source)
+    elif _is_folder(source):
         yield from walk(source, _is_input)
     else:
         yield source
+
+
+def _remote_images(folder: RemotePath) -> Iterator[RemotePath]:
+    for path in folder.walk_files():
+        hidden = any(part.startswith(".") for part in path.relative_to(folder).parts)
+        if _is_input(path) and not hidden:
+            yield path
 
 
 def walk(folder: Path, is_included: Callable[[Path], bool]) -> Iterator[Path]:
@@ -209,16 +244,16 @@ def _walk(folder: Path, is_included: Callable[[Path], bool], visited: set[tuple[
             yield entry
 
 
-def _absolute(path: Path) -> str:
-    """Returns the absolute path. Links are not resolved: two links to one file are two images."""
-    return os.path.abspath(path)  # noqa: PTH100
+def _absolute(path: Location) -> str:
+    """Returns the absolute path or the URL. Links are not resolved: two links to one file are two images."""
+    return str(path) if isinstance(path, RemotePath) else os.path.abspath(path)  # noqa: PTH100
 
 
 def _is_folder(path: Path) -> bool:
     return os.path.isdir(path)  # noqa: PTH112  (Path.is_dir raises without permission)
 
 
-def _name_counts(folder: Path) -> Counter[str]:
+def _name_counts(folder: Location) -> Counter[str]:
     """Counts the stems and the full names of the images in a folder."""
     try:
         images = [path for path in folder.iterdir() if _is_input(path)]
@@ -227,12 +262,12 @@ def _name_counts(folder: Path) -> Counter[str]:
     return Counter(name for path in images for name in (path.stem, path.name))
 
 
-def _layer_name(image: Path, counts: Counter[str]) -> str:
+def _layer_name(image: Location, counts: Counter[str]) -> str:
     others = counts[image.stem] - _is_input(image)
     return image.name if others > 0 else image.stem
 
 
-def _is_input(path: Path) -> bool:
+def _is_input(path: Location) -> bool:
     """Returns whether a file has an image suffix, is not hidden, and is not a layer that brewster has written."""
     is_result = Path(path.stem).suffix.lstrip(".") in LAYERS
     return format_of(path) is not None and not path.name.startswith(".") and not is_result
@@ -251,14 +286,30 @@ def _check_unique_targets(found: Iterable[SeparationPaths]) -> None:
             )
 
 
-def _check_not_source(path: Path, source: Path | None) -> None:
+def _check_not_source(path: Location, source: Location | None) -> None:
     with contextlib.suppress(OSError):  # a file that does not exist is not the same file
-        if source is not None and path.samefile(source):
+        if source is not None and is_same_file(path, source):
             raise TargetError(
                 f"{path} is the input image itself",
                 "expected another path, because input files are never changed",
                 "choose another name",
             )
+
+
+def is_same_file(path: Location, other: Location) -> bool:
+    """Whether both are one file. Links and hard links are followed.
+
+    Raises:
+        OSError: one of the files does not exist.
+    """
+    if isinstance(path, Path) and isinstance(other, Path):
+        return path.samefile(other)
+    return path == other
+
+
+def exists(path: Location) -> bool:
+    """Whether a file, a folder or a link exists at the path."""
+    return path.exists() if isinstance(path, RemotePath) else os.path.lexists(path)
 
 
 def _check_writable(path: Path, overwrite: bool) -> None:
@@ -312,7 +363,7 @@ _REMEDIES = {
 _DEFAULT_REMEDY = ("expected a writable file", "choose another folder with -o")
 
 
-def _target_error(path: Path, error: OSError) -> TargetError:
+def _target_error(path: Location, error: OSError) -> TargetError:
     expected, cure = _REMEDIES.get(error.errno or 0, _DEFAULT_REMEDY)
     return TargetError(f"{path} was not written ({error.strerror or error})", expected, cure)
 

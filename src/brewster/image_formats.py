@@ -6,7 +6,7 @@ To add a format, add a row here. A format with a new `library` also needs a read
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
+from pathlib import PurePath
 from typing import Final, Literal, final
 
 FormatName = Literal["jpeg", "png", "tiff", "webp", "avif", "heic", "exr", "hdr"]
@@ -152,6 +152,6 @@ SUFFIXES: Final = {suffix: row for row in _ROWS for suffix in row.suffixes}
 """All formats by file name suffix, in lower case."""
 
 
-def format_of(path: Path) -> ImageFormat | None:
+def format_of(path: PurePath) -> ImageFormat | None:
     """Returns the format for the suffix of a file name, or None if the suffix is unknown."""
     return SUFFIXES.get(path.suffix.lower())

@@ -12,7 +12,7 @@ import inspect
 import re
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import Any, Final, Literal, TypeVar, final
 
 from brewster.errors import BrewsterError
@@ -28,6 +28,8 @@ Quantisation = Literal["int8", "float8", "nf4"]
 
 DIFFUSION_OPTIONS: Final = ("base", "quantise", "steps", "average", "plain")
 """The options of diffusion models only."""
+
+_CALL_OPTIONS: Final = ("strength", "quality", "mask", "additive", "max_pixels")
 
 _Function = TypeVar("_Function", bound=Callable[..., Any])
 
@@ -62,6 +64,12 @@ class Options:
     quality: Quality = field(
         default="standard",
         metadata=_field_metadata("Number and size of the input scales: draft is fastest, best is slowest."),
+    )
+    mask: Path | None = field(
+        default=None,
+        metadata=_field_metadata(
+            "A grey image of the size of the photo that scales the strength: white is separated, black stays unchanged."
+        ),
     )
     additive: bool = field(
         default=False,
@@ -133,7 +141,7 @@ class Options:
 
     def call_options(self) -> dict[str, Any]:
         """Returns the keywords for calling a `Separator`."""
-        return {name: getattr(self, name) for name in ("strength", "quality", "additive", "max_pixels")}
+        return {name: getattr(self, name) for name in _CALL_OPTIONS}
 
     def container(self, layer: str, source_format: str) -> str:
         """Returns the file format of a layer. `source_format` is the format of the photo. Confidence is always PNG."""
@@ -143,7 +151,7 @@ class Options:
             source_format = "tiff"
         return self.format or source_format
 
-    def suffix(self, layer: str, source: Path) -> str | None:
+    def suffix(self, layer: str, source: PurePath) -> str | None:
         """Returns the suffix of a layer's file, or None if it is the suffix of the source."""
         image_format = format_of(source)
         source_format = image_format.name if image_format else ""

@@ -36,6 +36,9 @@ SIR2_TREES: Final[dict[str, tuple[str, ...]]] = {
 }
 """subset of SIR2 -> the meaning of each folder level, from the folder of the subset to the folder of a shot."""
 
+_SPLIT_PREFIX: Final = re.compile(r"^(?:train|val|test)_\d+_", re.IGNORECASE)
+"""The start of the folder names of OpenRR-5k, such as val_300_blended: a split and its number of images."""
+
 _KINDS: Final = ("focus", "thick")
 """The two series of SIR2's controlled scenes: the focus of the camera varies, or the thickness of the glass."""
 
@@ -112,6 +115,31 @@ def find_roles(folder: Path) -> dict[str, Path]:
     return _find_subfolders(folder, lambda name: roles.get(re.sub(r"[\s-]+", "_", name.lower()), ""))
 
 
+def find_numbered_splits(folder: Path) -> dict[str, dict[str, Path]]:
+    """Returns split -> role -> subfolder for names such as val_300_blended; the split is then "val_300".
+
+    Raises:
+        PhotoError: the folder cannot be read.
+    """
+    roles = {name: role for role, names in ROLES.items() for name in names}
+    splits: dict[str, dict[str, Path]] = defaultdict(dict)
+    for path in list_folder(folder)[0]:
+        prefix = _SPLIT_PREFIX.match(path.name)
+        role = roles.get(path.name[prefix.end() :].lower()) if prefix else None
+        if prefix and role:
+            splits[prefix[0].rstrip("_").lower()][role] = path
+    return dict(splits)
+
+
+def find_sets(folder: Path) -> list[Path]:
+    """Returns the subfolders that contain pairs, in natural order.
+
+    Raises:
+        PhotoError: a folder cannot be read.
+    """
+    return [path for path in list_folder(folder)[0] if {"photo", "transmission"} <= find_roles(path).keys()]
+
+
 def find_split(folder: Path) -> Path:
     """Returns the folder itself if it contains pairs, else its only subfolder with pairs, such as train, val or test.
 
@@ -130,13 +158,15 @@ def find_split(folder: Path) -> Path:
     return splits[0] if splits else folder
 
 
-def read_folders(folder: Path) -> FolderListing:
+def read_folders(folder: Path, roles: Mapping[str, Path] | None = None) -> FolderListing:
     """Returns the groups of a folder with one subfolder per role. The file stems must be equal; suffixes may differ.
+
+    `roles` is role -> subfolder, as `find_roles` returns it by default.
 
     Raises:
         PhotoError: a folder is missing, empty or unreadable, or two folders have the same role.
     """
-    roles = find_roles(folder)
+    roles = find_roles(folder) if roles is None else roles
     by_name: dict[str, dict[str, list[Path]]] = defaultdict(lambda: defaultdict(list))
     ignored: list[Path] = []
     for role in ROLES:

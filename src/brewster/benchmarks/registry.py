@@ -4,7 +4,7 @@ for benchmark in read_benchmark("sir2", Path("SIR2")):
     print(benchmark.title, len(benchmark.cases), *benchmark.remarks, *benchmark.excluded)
 
 The module `pairing` groups the files by name. This module makes a `Case` of each group, compares the image sizes in the
-file headers, checks the number of cases, and draws the paper's subset. `excluded` lists the files that cannot be used.
+file headers, and checks the number of cases. `excluded` lists the files that cannot be used.
 """
 
 from __future__ import annotations
@@ -13,18 +13,18 @@ import difflib
 import os
 import re
 import tarfile
-from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from random import Random
 from typing import Final, final
 
 from brewster.benchmarks.pairing import (
     SIR2_TREES,
     FolderListing,
     ImageGroup,
+    find_numbered_splits,
     find_roles,
+    find_sets,
     find_split,
     find_subsets,
     join_names,
@@ -34,9 +34,6 @@ from brewster.benchmarks.pairing import (
 )
 from brewster.errors import MissingExtra, PhotoError, UnreadablePhoto
 from brewster.photo import read_size
-
-PAPER_SEED: Final = 181
-"""The seed of `paper_draw`. The value is arbitrary; 181 is also the number of images in the paper's average."""
 
 _RENDERED_FILES: Final = ("photo.jpg", "background.jpg", "reflection.jpg")
 _MAX_SCENES: Final = 20
@@ -154,34 +151,6 @@ def read_benchmark(name: str, folder: Path) -> list[Benchmark]:
     return BENCHMARKS[name].read(name, folder)
 
 
-def paper_draw(benchmark: Benchmark, seed: int = PAPER_SEED) -> tuple[Case, ...]:
-    """Draws the cases of the paper's protocol.
-
-    The paper does not publish its draw. This function draws one case of each scene with
-    `Random(f"{seed}/{benchmark}/{scene}").choice(...)` from the cases in natural order of their names. The draw of a scene
-    therefore does not depend on the other scenes.
-
-    Returns:
-        One random case of each scene of Postcard or SolidObject; all cases of any other benchmark.
-
-    Raises:
-        PhotoError: the file names do not identify the scenes.
-    """
-    if benchmark.name not in BENCHMARKS or not BENCHMARKS[benchmark.name].scene_pattern:
-        return benchmark.cases
-    scenes: dict[str, list[Case]] = defaultdict(list)
-    for case in benchmark.cases:
-        scenes[case.scene].append(case)
-    if any(case.scene == case.name for case in benchmark.cases):
-        raise PhotoError(
-            f"names such as {benchmark.cases[0].name!r} do not identify the scenes of {benchmark.title}",
-            "expected file names that begin with the scene, because the paper's protocol draws one case of each scene",
-            "use the original folders of SIR2, or run without --paper",
-        )
-    rng = {scene: Random(f"{seed}/{benchmark.name}/{scene}") for scene in sorted(scenes, key=natural_key)}  # noqa: S311
-    return tuple(rng[scene].choice(scenes[scene]) for scene in rng)
-
-
 # --- readers of the layouts
 
 
@@ -189,7 +158,16 @@ def _read_pairs(name: str, folder: Path) -> list[Benchmark]:
     return [_from_listing(name, folder, read_folders(folder))]
 
 
+def _read_sets(name: str, folder: Path) -> list[Benchmark]:
+    """Reads a folder of pairs, or one benchmark for each subfolder with pairs."""
+    sets = [] if "photo" in find_roles(folder) else find_sets(folder)
+    return [benchmark for path in sets or [folder] for benchmark in _read_pairs(name, path)]
+
+
 def _read_split(name: str, folder: Path) -> list[Benchmark]:
+    complete = [roles for roles in find_numbered_splits(folder).values() if "transmission" in roles]
+    if len(complete) == 1:
+        return [_from_listing(name, folder, read_folders(folder, complete[0]))]
     return [_from_listing(name, folder, read_folders(find_split(folder)))]
 
 
@@ -311,7 +289,7 @@ def _make_benchmark(name: str, folder: Path, cases: Sequence[Case], listing: Fol
     valid = tuple(
         case for case in sorted(cases, key=lambda case: natural_key(case.name)) if case.name not in unusable
     )
-    title = layout.title or _folder_name(folder)
+    title = layout.title or folder_name(folder)
     return Benchmark(
         _benchmark_name(name, folder),
         title,
@@ -348,12 +326,18 @@ def _benchmark_name(name: str, folder: Path) -> str:
     """
     if BENCHMARKS[name].title:
         return name
-    safe = re.sub(r"[^A-Za-z0-9_.-]+", "-", _folder_name(folder)).strip("-.") or name
+    safe = safe_name(folder_name(folder)) or name
     is_taken = safe == "average" or (safe in BENCHMARKS and BENCHMARKS[safe].title)
     return f"{name}-{safe}" if is_taken else safe
 
 
-def _folder_name(folder: Path) -> str:
+def safe_name(text: str) -> str:
+    """Returns the text with each run of other characters than letters, digits, ".", "_" and "-" as one "-"."""
+    return re.sub(r"[^A-Za-z0-9_.-]+", "-", text).strip("-.")
+
+
+def folder_name(folder: Path) -> str:
+    """Returns the name of a folder, which may be given as "." or with a link, which is not resolved."""
     return Path(os.path.abspath(folder)).name  # noqa: PTH100  (do not resolve links)
 
 
@@ -391,7 +375,7 @@ BENCHMARKS: Final[dict[str, BenchmarkLayout]] = {
     "solidobject": BenchmarkLayout("SIR2 SolidObject", (200,), _read_subset, r"\d+(?=[-_].)"),
     "wildscene": BenchmarkLayout("SIR2 Wildscene", (101, 55), _read_subset),
     "openrr": BenchmarkLayout("OpenRR", (), _read_split),
-    "pairs": BenchmarkLayout("", (), _read_pairs),
+    "pairs": BenchmarkLayout("", (), _read_sets),
     "rendered": BenchmarkLayout("", (), _read_rendered),
 }
 """name -> layout of the benchmarks that `read_benchmark` supports. docs/evaluation.md describes the folders."""

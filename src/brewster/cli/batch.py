@@ -27,6 +27,7 @@ from brewster.cli.terminal import (
 )
 from brewster.image_formats import ImageFormat, format_of
 from brewster.options import Options
+from brewster.remote_path import location
 
 if TYPE_CHECKING:
     from brewster.inference import FileResult, SeparationTask
@@ -65,8 +66,8 @@ def _plan_single_output(photos: Sequence[str], output: str | None, options: Opti
         )
     if output not in (None, "-"):
         _check_format(format_of(Path(output)), options)
-    source = _StandardStream() if photos[0] == "-" else Path(photos[0])
-    target = _StandardStream() if output in (None, "-") else Path(output)
+    source = _StandardStream() if photos[0] == "-" else location(photos[0])
+    target = _StandardStream() if output in (None, "-") else location(output)
     return SeparationTask(source, {options.layers[0]: target})
 
 
@@ -163,10 +164,11 @@ class BatchCommand:
                 if result.error:
                     interrupts.raise_pending()  # a Ctrl-C that Python dropped may have caused the error
                 results.append(result)
-                self._print_result(result)
+                self.print_result(result)
                 interrupts.raise_pending()
 
-    def _print_result(self, result: FileResult) -> None:
+    def print_result(self, result: FileResult) -> None:
+        """Prints the line of a result: JSON on standard output, or a status line on standard error."""
         outputs = ", ".join(result.outputs.values())
         if self.as_json:
             write_out(_json_line(result))
@@ -177,12 +179,10 @@ class BatchCommand:
         if result.status == "skipped":
             print_status(f"{result.source}: skipped, all of its layers exist (--overwrite replaces them)")
         elif result.status == "separated":
-            print_status(f"{result.source} -> {outputs} ({sum(result.seconds.values()):.1f} s)")
-            if result.doubtful:
-                print_status(
-                    f"{result.source}: doubtful, the generated photo differs from the input "
-                    f"(reconstruction error {result.reconstruction_error:.2f}): check the layers"
-                )
+            verdict = result.assessment.verdict if result.assessment else ""
+            hint = ": check the layers" if verdict == "doubtful" else ""
+            seconds = sum(result.seconds.values())
+            print_status(f"{result.source} -> {outputs} ({seconds:.1f} s, {verdict}{hint})")
 
     def _print_summary(self, results: Sequence[FileResult]) -> None:
         counts: Counter[str] = Counter(result.status for result in results)
@@ -191,8 +191,13 @@ class BatchCommand:
             print_status(", ".join(f"{counts[status]} {status}" for status in order if counts[status]))
         for result in results:
             if result.error:
-                has_source = result.error.startswith(f"{result.source} ")
-                print_error(result.error if has_source else f"{result.source}: {result.error}")
+                print_error(error_text(result))
+
+
+def error_text(result: FileResult) -> str:
+    """Returns the error message of a photo, which begins with its path."""
+    has_source = str(result.error).startswith(f"{result.source} ")
+    return str(result.error) if has_source else f"{result.source}: {result.error}"
 
 
 def _json_line(result: FileResult) -> bytes:

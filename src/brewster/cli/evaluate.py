@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import os
+import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,6 +14,7 @@ import click
 
 from brewster.cli.extras import require_extra
 from brewster.cli.terminal import interrupts, print_error, print_status, progress, write_out
+from brewster.errors import BrewsterError
 from brewster.options import Device, Quality
 
 if TYPE_CHECKING:
@@ -19,7 +22,12 @@ if TYPE_CHECKING:
     from brewster.evaluate.config import EvaluationConfig
     from brewster.evaluate.methods import Method
     from brewster.evaluate.results import Results
-    from brewster.evaluate.runner import ScoreRow
+    from brewster.evaluate.score_log import ScoreRow
+
+
+_NATIVE: Final = "native"
+_CASES_PER_WORKER: Final = 25
+"""A worker process imports torch and loads the weights of LPIPS, which takes as long as it takes to score some images."""
 
 
 @final
@@ -72,19 +80,19 @@ class _NumberList(click.ParamType[tuple[float, ...]]):
 
 
 @final
-class _Size(click.ParamType[int]):
+class _Size(click.ParamType["int | str"]):
     """`native`, or a number of pixels."""
 
     name = "native|420|512"
 
-    def convert(self, value: object, param: click.Parameter | None, ctx: click.Context | None) -> int | None:  # type: ignore[override]
-        """The number of pixels, or None for `native`.
+    def convert(self, value: object, param: click.Parameter | None, ctx: click.Context | None) -> int | str:
+        """The number of pixels, or `native`.
 
         Raises:
             click.BadParameter: the value is neither `native` nor a positive integer.
         """
-        if value == "native":
-            return None
+        if value == _NATIVE:
+            return _NATIVE
         if not str(value).isdecimal() or int(str(value)) < 1:
             self.fail(f"{value!r} is neither native nor a positive number of pixels.", param, ctx)
         return int(str(value))
@@ -129,19 +137,23 @@ class _Size(click.ParamType[int]):
 @click.option(
     "--metrics",
     metavar="NAME,...",
-    help="The metrics to compute; by default, all except ssim_gaussian. A metric is skipped if the benchmark has no ground truth for it.",
+    help="The metrics to compute; by default those of the protocol. docs/evaluation.md lists them. A metric is skipped if the "
+    "benchmark has no ground truth for it.",
+)
+@click.option(
+    "--protocol",
+    type=click.Choice(
+        ["brewster", "paper", "xreflection", "windowseat", "ERRNet", "ntire2026"], case_sensitive=False
+    ),
+    default="brewster",
+    show_default=True,
+    help="The choices of a paper or contest: metrics, sizes, border and subsets. The report lists them with their sources. "
+    "paper: also report one image per scene of Postcard and SolidObject, chosen at random with a fixed seed.",
 )
 @click.option(
     "--size",
     type=_Size(),
-    default="native",
-    show_default=True,
-    help="First downscale larger images, both photo and ground truth, so that their shorter side has this number of pixels.",
-)
-@click.option(
-    "--paper",
-    is_flag=True,
-    help="Also report the paper's protocol, with one image per scene of Postcard and SolidObject, chosen at random with a fixed seed.",
+    help="First downscale larger images, both photo and ground truth, so that their shorter side has this number of pixels; by default as in the protocol.",
 )
 @click.option(
     "--region-threshold",
@@ -167,9 +179,7 @@ class _Size(click.ParamType[int]):
 @click.option(
     "--workers",
     type=click.IntRange(min=1),
-    default=1,
-    show_default=True,
-    help="The number of processes that compute scores.",
+    help="The number of processes that compute scores; by default one for each processor, and fewer for less than 50 images.",
 )
 @click.option(
     "--pictures",
@@ -178,6 +188,14 @@ class _Size(click.ParamType[int]):
     show_default=True,
     metavar="NUMBER",
     help="The number of images of each benchmark that the report shows: those with the worst scores of the first method.",
+)
+@click.option(
+    "--intervals", is_flag=True, help="Print 95 % confidence intervals in the terminal and in table.tex."
+)
+@click.option(
+    "--export",
+    type=click.Choice(["ntire2026"]),
+    help="After scoring, also write the zip files that a contest takes, for each method: ntire2026 for openrr=FOLDER.",
 )
 @click.option("--json", "as_json", is_flag=True, help="Print the results as JSON instead of the tables.")
 @click.option("--quiet", is_flag=True, help="Print only errors, and no tables.")
@@ -190,8 +208,8 @@ class _Size(click.ParamType[int]):
 def evaluate(context: click.Context, /, *, dry_run: bool, **options: Any) -> None:  # noqa: ANN401  (the fields of _EvaluateCommand)
     """Score methods on benchmarks, with the unprocessed input as baseline.
 
-    The tables are printed on standard output. The output folder gets results.json (the scores of every image),
-    tables.md, table.tex, table.csv and report.html. To resume an interrupted run, run the same command again.
+    The tables are printed on standard output. The output folder gets results.json and scores.csv (the scores of every
+    image), tables.md (also intervals and differences), table.tex, table.csv and report.html. To resume an interrupted run, run the same command again.
 
     Photos and ground truth are paired by file name. If a photo has no ground truth, or if a method fails on it, it is
     listed, all other photos are scored, and the exit code is 1.
@@ -211,13 +229,15 @@ class _EvaluateCommand:
     predictions: tuple[tuple[str, str], ...]
     out: Path
     metrics: str | None
-    size: int | None
-    paper: bool
+    protocol: str
+    size: int | str | None
     thresholds: tuple[float, ...] | None
     quality: Quality
     device: Device
-    workers: int
+    workers: int | None
     pictures: int
+    intervals: bool
+    export: str | None
     as_json: bool
     quiet: bool
 
@@ -258,33 +278,63 @@ class _EvaluateCommand:
                 methods,
                 config,
                 self.out,
-                workers=self.workers,
+                workers=self.workers or _default_workers(total // len(methods)),
                 max_report_cases=self.pictures,
+                intervals=self.intervals,
                 on_progress=on_progress,
             )
         if self.as_json:
             write_out(f"{json.dumps(results)}\n".encode())
         elif not self.quiet:
-            print_tables(results)
-            print_status(f"the results are in {self.out}; {self.out / REPORT_FILE} shows the images")
+            print_tables(results, intervals=self.intervals)
+            print_status(
+                f"the results are in {self.out}; {self.out / REPORT_FILE} shows the images, and tables.md has intervals and differences"
+            )
+        if self.export:
+            self._export(methods)
         return print_failures(results, quiet=self.quiet) and is_complete
+
+    def _export(self, methods: Sequence[Method]) -> None:
+        from brewster.evaluate.methods import BASELINE  # noqa: PLC0415
+        from brewster.evaluate.submission import export_ntire2026  # noqa: PLC0415
+
+        folders = [Path(folder) for name, folder in self.benchmarks if name == "openrr"]
+        if len(folders) != 1:
+            raise BrewsterError(
+                f"--export {self.export} needs one benchmark openrr, not {len(folders)}",
+                "expected --benchmark openrr=FOLDER with the folders val_300_blended and test_100_blended",
+                "add the benchmark, or leave out --export",
+            )
+        for method in methods:
+            if method.name != BASELINE:
+                out = self.out / "export" / method.name
+                for path in export_ntire2026(
+                    folders[0], method, out, on_progress=lambda _: interrupts.raise_pending()
+                ):
+                    print_status(f"wrote {path}")
 
     def _read_benchmarks(self) -> list[Benchmark]:
         from brewster.benchmarks.registry import read_benchmark  # noqa: PLC0415
+        from brewster.benchmarks.selection import with_unique_names  # noqa: PLC0415
 
-        return [
-            benchmark for name, folder in self.benchmarks for benchmark in read_benchmark(name, Path(folder))
+        read = [
+            (benchmark, Path(folder))
+            for name, folder in self.benchmarks
+            for benchmark in read_benchmark(name, Path(folder))
         ]
+        return with_unique_names([part for part, _ in read], [folder for _, folder in read])
 
     def _config(self) -> EvaluationConfig:
-        from brewster.evaluate.config import EvaluationConfig  # noqa: PLC0415
+        from brewster.evaluate.protocols import protocol_config  # noqa: PLC0415
 
-        values: dict[str, Any] = {"size": self.size, "quality": self.quality, "paper": self.paper}
+        values: dict[str, Any] = {"quality": self.quality}
+        if self.size is not None:
+            values["size"] = None if self.size == _NATIVE else self.size
         if self.metrics is not None:
             values["metrics"] = tuple(name.strip() for name in self.metrics.split(","))
         if self.thresholds is not None:
             values["thresholds"] = self.thresholds
-        return EvaluationConfig(**values)
+        return protocol_config(self.protocol.lower(), **values)
 
     def _methods(self) -> list[Method]:
         from brewster.evaluate.methods import IdentityBaseline, ModelMethod, PredictionFolder  # noqa: PLC0415
@@ -316,11 +366,17 @@ def print_remarks(benchmarks: Sequence[Benchmark], *, quiet: bool) -> bool:
     return not any(benchmark.excluded for benchmark in benchmarks)
 
 
-def print_tables(results: Results) -> None:
-    """Prints the tables on standard output."""
-    from brewster.evaluate.report.tables import overview  # noqa: PLC0415
+def print_tables(results: Results, *, intervals: bool = False) -> None:
+    """Prints the tables on standard output. They fit the width of the terminal."""
+    from brewster.evaluate.report.tables import to_terminal  # noqa: PLC0415
 
-    write_out(overview(results).encode(errors=_ENCODE_ERRORS))
+    width = shutil.get_terminal_size((100, 24)).columns
+    write_out(to_terminal(results, width, intervals=intervals).encode(errors=_ENCODE_ERRORS))
+
+
+def _default_workers(case_count: int) -> int:
+    processors = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return max(1, min(processors, case_count // _CASES_PER_WORKER))
 
 
 def print_failures(results: Results, *, quiet: bool) -> bool:
@@ -331,9 +387,15 @@ def print_failures(results: Results, *, quiet: bool) -> bool:
         print_status(remark)
     for name in results["unmeasured"]:
         print_status(f"{name} was not computed: no image has the ground truth that it needs")
+    for name, reason in results["unavailable"].items():
+        print_error(f"{name} was not computed: {reason}")
+    if results["unavailable"]:
+        print_status(
+            "run the same command again to add the missing metrics; all other scores are kept in scores.jsonl"
+        )
     for error in failures(results):
         print_error(error)
     count = sum(len(picture["errors"]) for picture in results["pictures"])
     if count:
         print_error(f"{count} {'prediction' if count == 1 else 'predictions'} could not be scored")
-    return not count
+    return not count and not results["unavailable"]

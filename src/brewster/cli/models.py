@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import json
+from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, cast
 
 import click
 
@@ -13,10 +14,15 @@ from brewster.cli.terminal import print_error, print_out, print_status
 from brewster.errors import BrewsterError, ModelError
 from brewster.files import write_atomically
 from brewster.models import zoo
+from brewster.models.large_models import LARGE
+
+if TYPE_CHECKING:
+    from brewster.models.diffusion.panels import Panel
 
 _JSON = click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 _NAME = click.argument("name", default="compact")
 _CARD_FILE = "README.md"
+_CHECKPOINT_SUFFIXES = (".pt", ".ckpt")
 
 
 @click.group
@@ -27,14 +33,78 @@ def models() -> None:
 @models.command("list")
 @_JSON
 def list_models(*, as_json: bool) -> None:
-    """List the models that are installed with brewster."""
+    """List the models that are installed with brewster, and large models that are downloaded at first use.
+
+    A line has the name, the size of the file or download, the licence, and for a large model its GPU memory (with the
+    format of the weights), what it gives, and how to get it. Sizes and memory of large models are estimates.
+    """
     rows = [describe(model) for model in zoo.MODELS.values()]
     if as_json:
-        print_out(json.dumps(rows))
+        print_out(json.dumps([*rows, *map(asdict, LARGE.values())]))
         return
     for row in rows:
         size = f"{row['bytes'] / 1e6:.1f} MB" if row["error"] is None else "damaged"
         print_out(f"{row['name']:20} {size:>10}  {row['licence']}")
+    for model in LARGE.values():
+        encoder = f" and {model.text_encoder_gb:g} GB for the prompt" if model.text_encoder_gb else ""
+        use = "" if model.is_commercial else " (not for commercial use)"
+        print_out(f"{model.name:20} {model.download_gb:>7g} GB  {model.licence}{use}")
+        print_out(
+            f"{'':33}{model.gives}; {model.memory_gib:g} GiB GPU memory ({model.memory_format}){encoder}"
+        )
+        print_out(f"{'':33}{model.access}; huggingface.co/{model.hub_id}")
+
+
+@models.command("import")
+@click.argument("source")
+@click.argument("folder", type=click.Path(path_type=Path))
+@click.option(
+    "--base",
+    metavar="MODEL",
+    default="kontext",
+    show_default=True,
+    help="The base for which the model was trained: a name from `brewster models list`, a folder or a hub id.",
+)
+@click.option(
+    "--prompt",
+    metavar="TEXT",
+    help="For a LoRA: the prompt with which it was trained. It is encoded once, with the text encoder of the base.",
+)
+@click.option(
+    "--panels",
+    metavar="PANELS",
+    default="T",
+    show_default=True,
+    help="For a LoRA: what it generates, separated by commas: T is the transmission, R the reflection, I the photo.",
+)
+@click.option(
+    "--device",
+    type=click.Choice(["cpu", "cuda"]),
+    default="cpu",
+    show_default=True,
+    help="For a LoRA: the device that encodes the prompt.",
+)
+def import_model(
+    *, source: str, folder: Path, base: str, prompt: str | None, panels: str, device: str
+) -> None:
+    """Convert a model of another program to a FOLDER that --model opens.
+
+    SOURCE is a LoRA for kontext, klein or qwen (a .safetensors file, or a folder or hub id with one) with the keys of
+    peft, diffusers, kohya's sd-scripts or ComfyUI; or the checkpoint GenSIRR.pt.
+    """
+    require_extra("large", "importing a model")
+    if Path(source).suffix in _CHECKPOINT_SUFFIXES:
+        from brewster.models.diffusion import gensirr  # noqa: PLC0415  (imports torch)
+
+        gensirr.convert(Path(source), folder, base=base)
+    else:
+        if not prompt:
+            raise click.UsageError("A LoRA needs --prompt: the prompt with which it was trained.")
+        from brewster.models.diffusion.adapter.importer import import_lora  # noqa: PLC0415  (imports torch)
+
+        names = cast("tuple[Panel, ...]", tuple(panels.split(",")))
+        import_lora(source, folder, base=base, prompt=prompt, panels=names, device=device)
+    print_status(f"{source} -> {folder}; use it with: --model {folder}")
 
 
 @models.command

@@ -6,6 +6,7 @@ import json
 import os
 from collections import Counter
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, final
 
@@ -24,7 +25,8 @@ from brewster.cli.terminal import (
 )
 
 if TYPE_CHECKING:
-    from brewster.rendered.generation.job import Executor, RenderJob, RenderResult
+    from brewster.executors import Executor
+    from brewster.rendered.generation.job import RenderJob, RenderResult
     from brewster.scene.recipe import SceneRecipe
 
 _MITSUBA_PACKAGES: Final = frozenset({"mitsuba", "mitsuba-oidn"})
@@ -102,7 +104,7 @@ class _Size(click.ParamType[tuple[int, int]]):
 )
 @click.option(
     "--orders",
-    type=click.Choice(["all", "paper"]),
+    type=click.Choice(["all", "truncated"]),
     help="The light paths in T and R: all of them (then I = T + R), or only the one path per layer that the paper uses; by default, the value in the recipe.",
 )
 @click.option(
@@ -253,15 +255,17 @@ class _RenderCommand:
             recipe = recipe.model_copy(update={"camera": camera})
         return recipe.model_copy(update={"orders": self.orders}) if self.orders else recipe
 
-    def _executor(self, job: RenderJob) -> Executor:
-        from brewster.rendered.generation.workers import ProcessExecutor, SerialExecutor  # noqa: PLC0415
+    def _executor(self, job: RenderJob) -> Executor[RenderResult]:
+        from brewster.executors import ProcessExecutor, SerialExecutor  # noqa: PLC0415
+        from brewster.rendered.generation.workers import TaskRunner  # noqa: PLC0415
 
+        create_runner = partial(TaskRunner, job)
         if self.cluster:
-            from brewster.rendered.generation.ray_cluster import RayExecutor  # noqa: PLC0415
+            from brewster.executors.ray_cluster import RayExecutor  # noqa: PLC0415
 
-            return RayExecutor(job, self.cluster, self.workers)
+            return RayExecutor(create_runner, self.cluster, self.workers)
         workers = min(_MAX_WORKERS, os.cpu_count() or 1) if self.workers is None else self.workers
-        return ProcessExecutor(job, workers) if workers else SerialExecutor(job)
+        return ProcessExecutor(create_runner, workers) if workers else SerialExecutor(create_runner)
 
 
 @final
@@ -276,8 +280,7 @@ class _RenderPrinter:
         """Prints one line for a sample that was rendered or failed."""
         self.counts[result.status] += 1
         if self._as_json:
-            row = {name: value for name, value in asdict(result).items() if name != "fatal"}
-            write_out(f"{json.dumps(row)}\n".encode())
+            write_out(f"{json.dumps(asdict(result))}\n".encode())
         if result.error:
             print_error(f"sample {result.index}: {result.error}")
         elif result.status == "rendered" and not self._quiet:

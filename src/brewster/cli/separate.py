@@ -5,16 +5,20 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Callable
+from pathlib import Path
 from types import NoneType
-from typing import Any, Literal, TypeVar, cast, get_args, get_origin, get_type_hints
+from typing import Any, Final, Literal, TypeVar, cast, get_args, get_origin, get_type_hints
 
 import click
 from click.core import ParameterSource
 
+from brewster.cli.archive import ArchiveCommand
 from brewster.cli.batch import BatchCommand, is_single_output, plan
 from brewster.cli.terminal import standard_output
 from brewster.errors import BrewsterError
 from brewster.options import Options
+
+_METAVARS: Final[dict[object, str]] = {int: "NUMBER", float: "NUMBER", Path | None: "FILE"}
 
 _Command = TypeVar("_Command", bound=Callable[..., Any])
 
@@ -79,7 +83,7 @@ def _option(field: dataclasses.Field[Any], hint: object) -> Callable[[_Command],
         type=_param_type(hint, field),
         default=default,
         show_default=default is not None,
-        metavar="NUMBER" if hint in (int, float) else None,
+        metavar=_METAVARS.get(hint),
         help=description,
     )
 
@@ -90,6 +94,8 @@ def _param_type(hint: object, field: dataclasses.Field[Any]) -> click.ParamType[
         return _param_type(get_args(hint)[0], field)
     if hint is float:
         return _RangedNumber(low, high)
+    if hint is Path:
+        return click.Path(exists=True, dir_okay=False, path_type=Path)
     if hint is int:
         return click.IntRange(low, high)
     if get_origin(hint) is tuple:
@@ -112,6 +118,19 @@ def _param_type(hint: object, field: dataclasses.Field[Any]) -> click.ParamType[
 @click.option("--quiet", is_flag=True, help="Print only errors.")
 @click.option("--dry-run", is_flag=True, help="Print the planned files, and write nothing.")
 @click.option("--overwrite", is_flag=True, help="Replace existing layers.")
+@click.option(
+    "--workers",
+    type=click.IntRange(min=1),
+    help="Separate in this number of processes, each with one thread; with --cluster local, on this number of processors.",
+)
+@click.option(
+    "--cluster",
+    metavar="local|ADDRESS",
+    help="Separate on a Ray cluster, and write the index; its nodes must share the folder -o, or -o is a URL.",
+)
+@click.option(
+    "--index", is_flag=True, help="Write index.parquet into the folder -o: a table with a row for each photo."
+)
 @click.pass_context
 def separate(
     context: click.Context,
@@ -123,11 +142,15 @@ def separate(
     quiet: bool,
     dry_run: bool,
     overwrite: bool,
+    workers: int | None,
+    cluster: str | None,
+    index: bool,
     **values: object,
 ) -> None:
     """Separate photographs taken through glass into transmission and reflection.
 
-    PHOTO is an image file, a folder of image files, or - for standard input. The layers of photo.jpg are written next
+    PHOTO is an image file, a folder of image files, a table of paths (.csv or .parquet, with the column path), the URL of one
+    of these in an object store (s3://bucket/folder), or - for standard input. The layers of photo.jpg are written next
     to it as photo.transmission.jpg and photo.reflection.jpg, or into the output folder, which mirrors the tree below an
     input folder. If the target is standard output or an image file, only one layer is written: by default the
     transmission, else the one that --layers selects.
@@ -142,11 +165,29 @@ def separate(
         options = Options(**cast("dict[str, Any]", values))
     except BrewsterError as error:
         raise click.UsageError(str(error)) from error
+    if (workers or cluster or index) and not dry_run:
+        _check_archive_output(single_output, output, needs_folder=bool(cluster or index))
+        archive = ArchiveCommand(
+            options, output, cluster, workers, index=index, overwrite=overwrite, as_json=as_json, quiet=quiet
+        )
+        context.exit(0 if archive.run(photos) else 1)
     tasks = plan(photos, output, options)
     if single_output and output in (None, "-") and not dry_run:
         _reject_shared_output(as_json=as_json)
     batch = BatchCommand(options, overwrite=overwrite, dry_run=dry_run, as_json=as_json, quiet=quiet)
     context.exit(0 if batch.run(tasks) else 1)
+
+
+def _check_archive_output(single_output: bool, output: str | None, *, needs_folder: bool) -> None:
+    """Checks that the layers are files, in a folder if there is an index.
+
+    Raises:
+        click.UsageError: there is a single output, or no folder.
+    """
+    if single_output or (needs_folder and not output):
+        raise click.UsageError(
+            "With --cluster, --workers and --index, layers are files: give a folder with -o."
+        )
 
 
 def _reject_shared_output(*, as_json: bool) -> None:

@@ -6,6 +6,7 @@ import contextlib
 import ipaddress
 import json
 import re
+from collections.abc import Callable
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Final
@@ -27,12 +28,33 @@ _WARNING: Final = (
 )
 
 
+def rule_options(command: Callable[..., None]) -> Callable[..., None]:
+    """Adds the options of the exclusion rule to a command."""
+    seconds = click.option(
+        "--min-seconds",
+        type=click.FloatRange(0),
+        default=1.5,
+        show_default=True,
+        metavar="SECONDS",
+        help="The minimum median time per trial; participants with a shorter one are excluded.",
+    )
+    failed = click.option(
+        "--max-failed",
+        type=click.FloatRange(0, 1),
+        default=0.25,
+        show_default=True,
+        metavar="FRACTION",
+        help="The maximum fraction of failed catch trials; participants who fail more are excluded.",
+    )
+    return failed(seconds(command))
+
+
 @click.group
 def study() -> None:
     """Run a user study that asks which of two results people prefer: blind, random pairs with catch trials.
 
     `create` makes a study from folders of outputs, `plan` computes the required number of participants, `serve` serves
-    the page for participants, and `report` evaluates their answers. docs/study.md defines all terms.
+    the page for participants, `progress` shows how far they are, and `report` evaluates their answers. docs/study.md defines all terms.
     """
 
 
@@ -60,6 +82,13 @@ def study() -> None:
     multiple=True,
     metavar="NAME",
     help="Use only this dataset; repeatable. The report lists the datasets in this order.",
+)
+@click.option(
+    "--list",
+    "list_file",
+    type=click.Path(path_type=Path, dir_okay=False, exists=True),
+    metavar="FILE",
+    help="Use only the inputs in this text file, one per line: real/12 for picture 12 of the dataset real, or 12 without datasets.",
 )
 @click.option("--all-pairs", is_flag=True, help="Compare each method with every other method.")
 @click.option(
@@ -92,6 +121,7 @@ def create(
     inputs: Path,
     methods: tuple[tuple[str, str], ...],
     datasets: tuple[str, ...],
+    list_file: Path | None,
     all_pairs: bool,
     pairs: int | None,
     catch_trials: int | None,
@@ -107,7 +137,7 @@ def create(
     """
     from brewster.user_study.create import CATCH_POOL_SIZE, DEFAULT_CONSENT, StudyOptions  # noqa: PLC0415  (imports pyvips)
     from brewster.user_study.create import create as freeze  # noqa: PLC0415
-    from brewster.user_study.folders import find_pictures  # noqa: PLC0415
+    from brewster.user_study.folders import find_pictures, select_pictures  # noqa: PLC0415
 
     folders = {name: Path(folder) for name, folder in methods}
     if len(folders) < len(methods):
@@ -116,11 +146,19 @@ def create(
             "expected a different name for each method",
             "rename one of the methods",
         )
-    text = DEFAULT_CONSENT if consent is None else _read_consent(consent)
+    text = DEFAULT_CONSENT if consent is None else _read_text(consent)
+    names = [] if list_file is None else _read_list(list_file)
     options = StudyOptions(
-        datasets=datasets, pairs=pairs, catches=catch_trials, all_pairs=all_pairs, seed=seed, consent=text
+        datasets=datasets,
+        names=names,
+        pairs=pairs,
+        catches=catch_trials,
+        all_pairs=all_pairs,
+        seed=seed,
+        consent=text,
     )
-    total = len(find_pictures(inputs, datasets)) * (1 + len(folders)) + CATCH_POOL_SIZE
+    pictures = select_pictures(find_pictures(inputs, datasets), options.names, inputs)
+    total = len(pictures) * (1 + len(folders)) + CATCH_POOL_SIZE
     with progress(total, shown=True) as update_progress:
         description = freeze(
             out, inputs, folders, options, lambda done: update_progress(done, "copying")
@@ -132,7 +170,14 @@ def create(
     print_status(f"next: brewster study serve {out}")
 
 
-def _read_consent(path: Path) -> str:
+def _read_list(path: Path) -> list[str]:
+    names = [line.strip() for line in _read_text(path).splitlines() if line.strip()]
+    if not names:
+        raise BrewsterError(f"{path} is empty", "expected one input per line", "add inputs to the list")
+    return names
+
+
+def _read_text(path: Path) -> str:
     try:
         return path.read_text("utf-8").strip()
     except (OSError, UnicodeDecodeError) as error:
@@ -230,22 +275,7 @@ def serve(
     metavar="FOLDER",
     help="The folder for the report; by default STUDY/report.",
 )
-@click.option(
-    "--max-failed",
-    type=click.FloatRange(0, 1),
-    default=0.25,
-    show_default=True,
-    metavar="FRACTION",
-    help="The maximum fraction of failed catch trials; participants who fail more are excluded.",
-)
-@click.option(
-    "--min-seconds",
-    type=click.FloatRange(0),
-    default=1.5,
-    show_default=True,
-    metavar="SECONDS",
-    help="The minimum median time per trial; participants with a shorter one are excluded.",
-)
+@rule_options
 @click.option("--json", "as_json", is_flag=True, help="Print the results as JSON instead of the tables.")
 def report(folder: Path, *, out: Path | None, max_failed: float, min_seconds: float, as_json: bool) -> None:
     """Evaluate the answers, both without the excluded participants and with all participants.
@@ -268,6 +298,24 @@ def report(folder: Path, *, out: Path | None, max_failed: float, min_seconds: fl
     write(results, frozen_study, answers, out)
     write_out((json.dumps(results) + "\n" if as_json else overview(results)).encode())
     print_status(f"the report is in {out}")
+
+
+@study.command("progress")
+@click.argument("folder", metavar="STUDY", type=_FOLDER)
+@rule_options
+@click.option("--json", "as_json", is_flag=True, help="Print JSON.")
+def show_progress(folder: Path, *, max_failed: float, min_seconds: float, as_json: bool) -> None:
+    """Print how many trials each participant has answered, without any result. The server may run at the same time."""
+    from brewster.user_study.report.participants import ExclusionRule  # noqa: PLC0415
+    from brewster.user_study.report.progress import progress_text, summarise_progress  # noqa: PLC0415
+    from brewster.user_study.store import AnswerStore  # noqa: PLC0415
+    from brewster.user_study.study import read_study  # noqa: PLC0415
+
+    frozen_study = read_study(folder)
+    with contextlib.closing(AnswerStore(frozen_study, read_only=True)) as store:
+        records = list(store.all_answers())
+    found = summarise_progress(frozen_study.description, records, ExclusionRule(max_failed, min_seconds))
+    write_out((json.dumps(found) + "\n" if as_json else progress_text(found)).encode())
 
 
 @study.command

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import json
 import os
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, final
 
 import click
 
 from brewster.cli.extras import require_extra
-from brewster.cli.terminal import interrupts, print_out, print_status, progress
+from brewster.cli.terminal import interrupts, print_out, print_status, progress, standard_output
 from brewster.errors import RecipeError, TargetError
 
 if TYPE_CHECKING:
@@ -25,7 +27,7 @@ if TYPE_CHECKING:
     "out",
     metavar="FOLDER",
     type=click.Path(path_type=Path),
-    help="The folder for the checkpoint, the log, sample images and the trained model (model.onnx or the folder lora); by default out/NAME for NAME.toml.",
+    help="The folder for the checkpoint, the log, its curves, sample images and the trained model (model.onnx or the folder lora); by default out/NAME for NAME.toml.",
 )
 @click.option(
     "--plan",
@@ -50,6 +52,12 @@ if TYPE_CHECKING:
     show_default=True,
     help="The device to train on. auto is the GPU; without one, a large backbone is refused, because it takes weeks on a CPU.",
 )
+@click.option(
+    "--json",
+    "as_json",
+    is_flag=True,
+    help="Print one line of JSON for each event on standard output: start, report (the metrics of a line of the log), end.",
+)
 @click.option("--quiet", is_flag=True, help="Print only errors.")
 def train(
     *,
@@ -59,13 +67,14 @@ def train(
     gpu_name: str | None,
     show_recipe: str | None,
     device: str,
+    as_json: bool,
     quiet: bool,
 ) -> None:
     """Train a model with the settings of RECIPE, a TOML file.
 
     The environment variable BREWSTER_DATA is the path of the data folder. To resume an interrupted run from its last
-    checkpoint, run the same command again: the final weights are the same. With torchrun, a large backbone is trained
-    on several GPUs (data parallel).
+    checkpoint, run the same command again: the final weights are the same. To make a run longer, raise `steps` in the
+    recipe and run the command again. With torchrun, a large backbone is trained on several GPUs (data parallel).
     """
     require_extra("train", "training")
     if show_recipe:
@@ -87,21 +96,64 @@ def train(
     from brewster.training.trainers import open_trainer  # noqa: PLC0415
 
     trainer = open_trainer(parsed, device)
-    quiet = quiet or not is_main_process()
-    with progress(parsed.steps, shown=not quiet) as update_progress:
+    printer = _TrainingPrinter(
+        as_json=as_json and is_main_process(), quiet=quiet or not is_main_process(), folder=out
+    )
+    shares_terminal = as_json and standard_output.stream.isatty()
+    with progress(parsed.steps, shown=not printer.quiet and not shares_terminal) as update_progress:
 
         def on_progress(step: int, steps: int, metrics: Mapping[str, float], is_logged: bool) -> None:
             interrupts.raise_pending()
             update_progress(step, f"loss {metrics['loss']:.4f}")
-            if is_logged and not quiet:
-                line = ", ".join(f"{name} {value:.4g}" for name, value in metrics.items())
-                print_status(f"step {step} of {steps}: {line}")
+            if is_logged:
+                printer.report(step, steps, metrics)
 
-        run(trainer, out, on_progress)
+        run(trainer, out, on_progress, printer.start)
     if is_main_process():
-        model = trainer.export(out)
-        if not quiet:
-            print_status(f"the model is in {model}")
+        printer.end(trainer.export(out))
+
+
+@final
+@dataclass(frozen=True)
+class _TrainingPrinter:
+    """Prints the events of a run: as JSON on standard output, and as text on standard error."""
+
+    as_json: bool
+    quiet: bool
+    folder: Path
+
+    def start(self, step: int, steps: int, seconds: float) -> None:
+        """Prints how many steps an earlier run completed, if any, and how long they took."""
+        text = f"step {step} of {steps}, after {seconds / 60:.1f} minutes of training"
+        if step == steps:
+            text = f"the run in {self.folder} is complete at {text}: to make it longer, raise steps in the recipe"
+        elif step:
+            text = f"resuming the run in {self.folder} from {text}"
+        self._print(
+            text if step else "",
+            event="start",
+            step=step,
+            steps=steps,
+            seconds=seconds,
+            folder=str(self.folder),
+        )
+
+    def report(self, step: int, steps: int, metrics: Mapping[str, float]) -> None:
+        """Prints the metrics of a line of the log."""
+        line = ", ".join(f"{name} {value:.4g}" for name, value in metrics.items())
+        self._print(
+            f"step {step} of {steps}: {line}", event="report", step=step, steps=steps, metrics=dict(metrics)
+        )
+
+    def end(self, model: Path) -> None:
+        """Prints the path of the trained model."""
+        self._print(f"the model is in {model}", event="end", model=str(model))
+
+    def _print(self, text: str, **event: object) -> None:
+        if self.as_json:
+            print_out(json.dumps(event))
+        if text and not self.quiet:
+            print_status(text)
 
 
 def _show_recipe(name: str) -> None:

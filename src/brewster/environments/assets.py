@@ -1,7 +1,7 @@
 """Loads the environment maps and pictures of scenes: files by name and sha256, and built-in sources.
 
 assets = Assets([Path("hdri"), Path("photos")])
-assets.map_light(EnvironmentMap(source=AssetSource(file="builtin:street:7")))  # (H, 2 H, 3) float32
+assets.map_radiance(EnvironmentMap(source=AssetSource(file="builtin:street:7")))  # (H, 2 H, 3) float32
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ class Assets:
         self._folders = tuple(folders)
         self._cache: OrderedDict[tuple[str, str, str], Float32] = OrderedDict()
 
-    def map_light(self, environment: EnvironmentMap) -> Float32:
+    def map_radiance(self, environment: EnvironmentMap) -> Float32:
         """Returns the radiance of a lat-long map, (H, 2 H, 3).
 
         It is scaled to the mean luminance in the scene. The mean is computed with values clipped at ten times the mean,
@@ -52,7 +52,7 @@ class Assets:
         )
         return light
 
-    def plane_light(self, plane: Plane) -> Float32:
+    def plane_radiance(self, plane: Plane) -> Float32:
         """Returns the radiance of a picture, (H, W, 3), with brighter highlights (see `Plane.highlight_boost`).
 
         The file is decoded with its colour profile, or as sRGB.

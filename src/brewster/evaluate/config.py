@@ -5,13 +5,15 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import Final, final
 
-from brewster.benchmarks.registry import PAPER_SEED
+from brewster.benchmarks.selection import PAPER_SEED
 from brewster.errors import BrewsterError
 from brewster.evaluate.statistics import RESAMPLES
 from brewster.metrics import DEFAULT_THRESHOLD, IDENTICAL_DB, METRICS, Metric, find_metric
 from brewster.options import Quality
 
-DEFAULT_METRICS: Final = tuple(name for name in METRICS if name != "ssim_gaussian")
+_ON_REQUEST: Final = ("ssim_gaussian", "ssim_clipped", "psnr_channels", "dists", "niqe")
+DEFAULT_METRICS: Final = tuple(name for name in METRICS if name not in _ON_REQUEST)
+"""All metrics except other definitions of PSNR and SSIM, and those of single contests (DISTS needs a download of 528 MiB)."""
 
 
 @final
@@ -25,6 +27,12 @@ class EvaluationConfig:
     quality: Quality = "standard"
     thresholds: tuple[float, ...] = (DEFAULT_THRESHOLD,)
     """Thresholds of the reflection region, as fractions of full scale, between 0 and 1. Each one has its own columns."""
+    multiple: int = 1
+    """Photo and ground truth are resized so that their sides are multiples of this number of px."""
+    border: int = 0
+    """The width in px of the border that is not scored."""
+    protocol: str = "brewster"
+    """The name of a protocol, a key of `brewster.evaluate.protocols.PROTOCOLS`. It selects what reports say about it."""
     paper: bool = False
     """Whether to report the paper's subset (one case of each scene) too, and to average over it."""
 
@@ -52,6 +60,17 @@ class EvaluationConfig:
                 "expected a shorter side of 1 px or more",
                 "choose a larger number",
             )
+        if self.multiple < 1 or self.border < 0:
+            raise BrewsterError(
+                f"the sides are multiples of {self.multiple} px, and the border has {self.border} px",
+                "expected multiples of 1 px or more, and a border of 0 px or more",
+                "choose larger numbers",
+            )
+
+    @property
+    def resizes(self) -> bool:
+        """Whether photo and ground truth may be resized."""
+        return self.size is not None or self.multiple > 1
 
     def columns(self) -> dict[str, Metric]:
         """Returns column -> metric. With several thresholds, a metric of the region has one column per threshold."""
@@ -74,7 +93,7 @@ class EvaluationConfig:
     def describe(self) -> list[str]:
         """Returns one or more sentences for each setting."""
         size = (
-            "Images are compared at the size of the ground truth; nothing is resized."
+            f"Images are compared at the size of the ground truth{'' if self.resizes else '; nothing is resized'}."
             if self.size is None
             else f"If the shorter side is longer than {self.size} px, photo and ground truth are downscaled to it before any "
             "method runs, by area means in linear light. Smaller images keep their size."
@@ -83,6 +102,8 @@ class EvaluationConfig:
         quality = f'Models run as in the command "brewster PHOTO", at quality "{self.quality}".'
         return [
             size,
+            *([_ROUNDED.format(self.multiple)] if self.multiple > 1 else []),
+            *([_BORDER.format(self.border)] if self.border else []),
             _VALUES,
             _PAIRS,
             _BASELINE,
@@ -94,6 +115,8 @@ class EvaluationConfig:
         ]
 
 
+_ROUNDED: Final = "Photo and ground truth are resized to sides that are multiples of {} px, by bicubic interpolation of the 8-bit values."
+_BORDER: Final = "The outermost {} pixels of all images are not scored."
 _VALUES: Final = (
     "Metrics are computed on 8-bit sRGB values with three channels. Grey images are repeated in all channels, alpha is "
     "dropped, and embedded profiles are converted. The border is included unless the definition of the metric says otherwise."

@@ -10,31 +10,47 @@ from __future__ import annotations
 import hashlib
 import json
 import math
+import os
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Final, final
+from urllib.parse import quote
 
-from brewster.benchmarks.registry import Benchmark, Case
+from brewster.benchmarks.pairing import join_names
+from brewster.benchmarks.registry import Benchmark, Case, ImageFile
 from brewster.errors import BrewsterError, PhotoError
 from brewster.evaluate.config import EvaluationConfig
-from brewster.evaluate.methods import BASELINE, Method, MethodOutput, PredictionFolder, check_names
+from brewster.evaluate.methods import (
+    BASELINE,
+    Method,
+    MethodOutput,
+    ModelMethod,
+    PredictionFolder,
+    check_names,
+)
 from brewster.evaluate.report.html_report import write_report
 from brewster.evaluate.report.images import CaseImages, CaseTiles, method_tiles, photo_tiles, to_tiles
 from brewster.evaluate.report.latex import to_latex
 from brewster.evaluate.report.published import read_published
 from brewster.evaluate.report.published import to_markdown as published_to_markdown
-from brewster.evaluate.report.tables import to_csv, to_markdown
+from brewster.evaluate.report.tables import scores_to_csv, to_csv, to_markdown
+from brewster.evaluate.resizing import resize
 from brewster.evaluate.results import Results, paper_draws, summarise
-from brewster.evaluate.runner import RowId, ScoreCallback, ScoreRow, get_prediction, score
-from brewster.evaluate.scoring import GroundTruth, downscale
+from brewster.evaluate.runner import ScoreCallback, find_unavailable, get_prediction, score
+from brewster.evaluate.score_log import RowId, ScoreRow
+from brewster.evaluate.scoring import GroundTruth
 from brewster.files import write_atomically
 from brewster.metrics import IDENTICAL_DB
 from brewster.photo import Photo
 
+_BROWSER_SUFFIXES: Final = (".png", ".jpg", ".jpeg", ".webp", ".avif", ".gif", ".bmp")
 RESULTS_FILE, REPORT_FILE, INPUTS_FOLDER = "results.json", "report.html", "inputs"
+SCORES_TABLE_FILE: Final = "scores.csv"
+PICTURES_FOLDER: Final = "pictures"
+"""The folder of full-size copies for the report, of images that a browser cannot open in the user's own folders."""
 MAX_REPORT_CASES: Final = 50
 """The default maximum of cases per benchmark in the report."""
 
@@ -47,11 +63,13 @@ def evaluate(
     *,
     workers: int = 1,
     max_report_cases: int = MAX_REPORT_CASES,
+    intervals: bool = False,
     on_progress: ScoreCallback = lambda _done, _total, _row: None,
 ) -> Results:
-    """Scores the methods. Writes results.json, tables.md, table.tex, table.csv and report.html into `out`.
+    """Scores the methods. Writes results.json, scores.csv, tables.md, table.tex, table.csv and report.html into `out`.
 
-    With `config.size`, it also writes the downscaled photos into `out`/inputs. Each image is read and decoded once, with
+    A metric whose weights are missing is left out, and "unavailable" in the results says why; the next run adds it. If photos
+    are resized, it also writes them into `out`/inputs. Each image is read and decoded once, with
     three exceptions. Exclusive methods read the cases again. The report reads the images of a case again if the benchmark
     has more than `max_report_cases` cases, or if an earlier run scored the case.
 
@@ -63,6 +81,7 @@ def evaluate(
         workers: the number of processes that score in parallel.
         max_report_cases: the maximum of cases of each benchmark in the report. They are the cases with the worst scores of
             the first method that is not the baseline.
+        intervals: whether table.tex has the confidence intervals.
         on_progress: called after each new row.
 
     Returns:
@@ -77,17 +96,25 @@ def evaluate(
     cases = [case for part in benchmarks for case in part.cases]
     with TemporaryDirectory(prefix="brewster-report-") as folder:
         complete = frozenset(part.name for part in benchmarks if len(part.cases) <= max_report_cases)
-        tiles = _TileCache(Path(folder), complete, config, out / INPUTS_FOLDER)
+        tiles = _TileCache(Path(folder), complete, config, out, {method.name: method for method in methods})
+        unavailable = find_unavailable(benchmarks, methods, config, out)
         rows = score(
-            benchmarks, methods, config, out, workers=workers, on_progress=on_progress, on_case_scored=tiles
+            benchmarks,
+            methods,
+            config,
+            out,
+            workers=workers,
+            unavailable=unavailable,
+            on_progress=on_progress,
+            on_case_scored=tiles,
         )
-        if config.size:
-            _write_missing_inputs(cases, config.size, out / INPUTS_FOLDER)
-        results = summarise(benchmarks, methods, config, rows)
+        if config.resizes:
+            _write_missing_inputs(cases, config, out / INPUTS_FOLDER)
+        results = summarise(benchmarks, methods, config, rows, unavailable)
         for method in methods:
             if remarks := list(_method_remarks(method, cases, rows)):
                 results["methods"][method.name]["remark"] = "; ".join(remarks)
-        _write_tables(results, out)
+        _write_tables(results, out, intervals=intervals)
         write_report(results, _report_cases(cases, methods, rows, max_report_cases, tiles), out / REPORT_FILE)
     return results
 
@@ -124,7 +151,7 @@ def check(benchmarks: Sequence[Benchmark], methods: Sequence[Method], config: Ev
 
 
 def _method_remarks(method: Method, cases: Sequence[Case], rows: Sequence[ScoreRow]) -> Iterator[str]:
-    """Yields a remark if predictions of a folder equal the ground truth, or if images in the folder belong to no case."""
+    """Yields remarks on a folder: predictions that equal the ground truth, are flipped or shifted, or belong to no case."""
     if not isinstance(method, PredictionFolder):
         return
     identical = [row for row in rows if row.scores.get("psnr") == IDENTICAL_DB]
@@ -132,6 +159,10 @@ def _method_remarks(method: Method, cases: Sequence[Case], rows: Sequence[ScoreR
     copied = [row for row in identical if row.method == method.name and row.id[:2] not in unchanged]
     if copied:
         yield f"the predictions equal the ground truth for {_count_images(len(copied))}: check the folder"
+    misregistered = [row for row in rows if row.method == method.name and row.registration]
+    if misregistered:
+        named = join_names([f"{row.benchmark}/{row.case} is {row.registration}" for row in misregistered])
+        yield f"{_count_images(len(misregistered))} of {len(cases)} not registered with the photo: {named}"
     if unmatched := method.count_unmatched(cases):
         yield f"{_count_images(unmatched)} in the folder {'matches' if unmatched == 1 else 'match'} no case"
 
@@ -140,8 +171,8 @@ def _count_images(count: int) -> str:
     return f"{count} {'image' if count == 1 else 'images'}"
 
 
-def _write_missing_inputs(cases: Sequence[Case], size: int, folder: Path) -> None:
-    """Writes the downscaled photos of the cases that this run did not decode.
+def _write_missing_inputs(cases: Sequence[Case], config: EvaluationConfig, folder: Path) -> None:
+    """Writes the resized photos of the cases that this run did not decode.
 
     Skips unreadable photos, because their rows have the error.
     """
@@ -149,19 +180,20 @@ def _write_missing_inputs(cases: Sequence[Case], size: int, folder: Path) -> Non
         path = _input_path(folder, case)
         if not path.exists():
             with suppress(PhotoError):
-                downscale(Photo.open(case.photo.read()), size).save(path)
+                resize(Photo.open(case.photo.read()), config).save(path)
 
 
 def _input_path(folder: Path, case: Case) -> Path:
     return folder / case.benchmark / f"{case.name}.png"
 
 
-def _write_tables(results: Results, out: Path) -> None:
+def _write_tables(results: Results, out: Path, *, intervals: bool) -> None:
     tables = {
         RESULTS_FILE: json.dumps(results, indent=1, allow_nan=False) + "\n",
         "tables.md": f"{to_markdown(results)}\n{published_to_markdown(read_published())}",
-        "table.tex": to_latex(results),
+        "table.tex": to_latex(results, intervals=intervals),
         "table.csv": to_csv(results),
+        SCORES_TABLE_FILE: scores_to_csv(results),
     }
     for name, text in tables.items():
         write_atomically(out / name, text.encode(errors="backslashreplace"), overwrite=True)
@@ -173,7 +205,7 @@ def _write_tables(results: Results, out: Path) -> None:
 @final
 @dataclass(frozen=True)
 class _TileCache:
-    """Writes the tiles of the report and the downscaled photos while a case is decoded.
+    """Writes the tiles of the report and the resized photos while a case is decoded.
 
     It stores the tiles of `benchmarks`, of which the report shows all cases. They are stored in files, because worker
     processes create them, and because memory must not grow with the number of cases.
@@ -182,16 +214,17 @@ class _TileCache:
     folder: Path
     benchmarks: frozenset[str]
     config: EvaluationConfig
-    inputs: Path
+    out: Path
+    methods: Mapping[str, Method]
 
     def __call__(self, truth: GroundTruth, predictions: Mapping[str, MethodOutput]) -> None:
-        """Stores the tiles and the downscaled photo of a case. `score` calls this after it has scored the case."""
+        """Stores the tiles and the resized photo of a case. `score` calls this after it has scored the case."""
         case = truth.case
-        if self.config.size:
-            truth.photo.save(_input_path(self.inputs, case), overwrite=True)
+        if self.config.resizes:
+            truth.photo.save(_input_path(self.out / INPUTS_FOLDER, case), overwrite=True)
         if case.benchmark not in self.benchmarks:
             return
-        images = _case_images(truth, predictions, self.config)
+        images = self.images(truth, predictions)
         width, height = truth.photo.size
         tiles = {BASELINE: photo_tiles(images)}
         tiles |= {name: method_tiles(images, name) for name in predictions if name != BASELINE}
@@ -209,6 +242,51 @@ class _TileCache:
                 return None
             width, height, tiles[method] = json.loads(path.read_bytes())
         return CaseTiles(case.benchmark, case.name, (width, height), tiles.pop(BASELINE), tiles)
+
+    def images(self, truth: GroundTruth, predictions: Mapping[str, MethodOutput]) -> CaseImages:
+        """Returns the images of a case for the report, with links to files at full size."""
+        others = {name: output for name, output in predictions.items() if name != BASELINE}
+        return CaseImages(
+            benchmark=truth.case.benchmark,
+            name=truth.case.name,
+            photo=truth.images["photo"],
+            ground_truth=truth.images["transmission"],
+            region=truth.region(self.config.thresholds[0]),
+            predictions={name: output.transmission.srgb_8bit() for name, output in others.items()},
+            reflections={
+                name: output.reflection.srgb_8bit() for name, output in others.items() if output.reflection
+            },
+            reflection_ground_truth=truth.images.get("reflection"),
+            links=dict(self._links(truth, others)),
+        )
+
+    def _links(
+        self, truth: GroundTruth, predictions: Mapping[str, MethodOutput]
+    ) -> Iterator[tuple[tuple[str, str], str]]:
+        case = truth.case
+        sources = {"photo": case.photo, "transmission": case.ground_truth, "reflection": case.reflection}
+        for layer, image in truth.images.items():
+            source = None if self.config.resizes else sources[layer]
+            yield (layer, ""), self._link(case, source, Photo.from_array(image, encoding="srgb"), layer)
+        for name, output in predictions.items():
+            method = self.methods[name]
+            files = method.files(case) if isinstance(method, ModelMethod | PredictionFolder) else {}
+            for layer, photo in (("transmission", output.transmission), ("reflection", output.reflection)):
+                if photo:
+                    source = ImageFile(files[layer]) if layer in files else None
+                    yield (layer, name), self._link(case, source, photo, f"{name}.{layer}")
+
+    def _link(self, case: Case, source: ImageFile | None, photo: Photo, name: str) -> str:
+        """Returns the URL of a file, relative to the report. Writes a PNG file if a browser cannot open the source."""
+        path = source.path if source and source.span is None else None
+        if path is None or path.suffix.lower() not in _BROWSER_SUFFIXES:
+            path = self.out / PICTURES_FOLDER / case.benchmark / case.name / f"{name}.png"
+            write_atomically(path, photo.encode("png", depth=8), overwrite=True)
+        try:
+            relative = os.path.relpath(path, self.out)
+        except ValueError:  # on Windows, a path on another drive
+            return path.resolve().as_uri()
+        return quote(relative.replace(os.sep, "/"))
 
     def _path(self, case: Case, method: str) -> Path:
         name = json.dumps([case.benchmark, case.name, method])
@@ -239,25 +317,7 @@ def _report_cases(
         except PhotoError:
             continue  # the row of the case has this error, and the tables show it
         predictions = {method.name: get_prediction(truth, method, row) for method, row in method_rows.items()}
-        yield to_tiles(_case_images(truth, predictions, tiles.config))
-
-
-def _case_images(
-    truth: GroundTruth, predictions: Mapping[str, MethodOutput], config: EvaluationConfig
-) -> CaseImages:
-    others = {name: output for name, output in predictions.items() if name != BASELINE}
-    return CaseImages(
-        benchmark=truth.case.benchmark,
-        name=truth.case.name,
-        photo=truth.images["photo"],
-        ground_truth=truth.images["transmission"],
-        region=truth.region(config.thresholds[0]),
-        predictions={name: output.transmission.srgb_8bit() for name, output in others.items()},
-        reflections={
-            name: output.reflection.srgb_8bit() for name, output in others.items() if output.reflection
-        },
-        reflection_ground_truth=truth.images.get("reflection"),
-    )
+        yield to_tiles(tiles.images(truth, predictions))
 
 
 def _worst_cases(

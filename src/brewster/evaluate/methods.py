@@ -164,7 +164,7 @@ class ModelMethod:
         separation = separator(photo, quality=self.quality)
         seconds = time.perf_counter() - started
         data = {}
-        for layer, path in self._files(case).items():
+        for layer, path in self.files(case).items():
             data[layer] = getattr(separation, layer).encode("png", depth=8)
             write_atomically(path, data[layer], overwrite=True)
         return replace(MethodOutput.decode(data), seconds=seconds)
@@ -175,7 +175,7 @@ class ModelMethod:
         Raises:
             PhotoError: a stored layer cannot be read.
         """
-        files = self._files(case)
+        files = self.files(case)
         if not all(path.is_file() for path in files.values()):
             return None
         return MethodOutput.decode({layer: _read(path) for layer, path in files.items()})
@@ -188,7 +188,8 @@ class ModelMethod:
 
         return fingerprint(self.model, device=self.device)
 
-    def _files(self, case: Case) -> dict[str, Path]:
+    def files(self, case: Case) -> dict[str, Path]:
+        """Returns layer -> file in which the prediction for a case is stored."""
         folder = self.folder / case.benchmark
         return {layer: folder / f"{case.name}.{layer}.png" for layer in ("transmission", "reflection")}
 
@@ -243,14 +244,10 @@ class PredictionFolder:
         Raises:
             PhotoError: a layer has no file or several, or a file cannot be read.
         """
-        return MethodOutput.decode(self._last_read.pop(case, {}) or self._read(case))
+        return self.cached(case)
 
-    def cached(self, case: Case) -> MethodOutput | None:
-        """Returns the same as `predict`, because the predictions are stored in the folder.
-
-        Raises:
-            PhotoError: a layer has no file or several, or a file cannot be read.
-        """
+    def cached(self, case: Case) -> MethodOutput:
+        """Returns the same as `predict`, and raises the same errors: the predictions are stored in the folder."""
         return MethodOutput.decode(self._last_read.pop(case, {}) or self._read(case))
 
     def _read(self, case: Case) -> dict[str, bytes]:

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, Final, final
 
 import numpy as np
 
 import brewster
-from brewster.benchmarks.registry import PAPER_SEED, Benchmark, Case, paper_draw
+from brewster.benchmarks.registry import Benchmark, Case
+from brewster.benchmarks.selection import PAPER_SEED, paper_draw
 from brewster.evaluate.config import DEFAULT_METRICS, EvaluationConfig
 from brewster.evaluate.methods import Method
-from brewster.evaluate.runner import ScoreRow
+from brewster.evaluate.protocols import describe_protocol
+from brewster.evaluate.score_log import ScoreRow
 from brewster.evaluate.statistics import Stratum, differences, estimate
 
 AVERAGE: Final = "average"
@@ -40,8 +42,11 @@ def summarise(
     methods: Sequence[Method],
     config: EvaluationConfig,
     rows: Sequence[ScoreRow],
+    unavailable: Mapping[str, str] | None = None,
 ) -> Results:
     """Returns the content of results.json. The order of the rows does not matter.
+
+    `unavailable` is column -> reason, for the columns that could not be computed.
 
     Raises:
         BrewsterError: the paper's draw is requested, but the file names of a benchmark do not identify its scenes.
@@ -63,6 +68,7 @@ def summarise(
     return {
         "brewster": brewster.__version__,
         "protocol": {
+            "name": config.protocol,
             "size": config.size or "native",
             "quality": config.quality,
             "region_thresholds": list(config.thresholds),
@@ -72,9 +78,16 @@ def summarise(
         "benchmarks": {part.name: _describe_benchmark(part) for part in benchmarks},
         "selections": {key: _describe_selection(key, group) for key, group in selections.items()},
         "methods": {method.name: method.about() for method in methods},
-        "unmeasured": [] if config.metrics == DEFAULT_METRICS else _unmeasured(config, measured),
+        "unavailable": dict(unavailable or {}),
+        "unmeasured": [
+            name
+            for name in ([] if config.metrics == DEFAULT_METRICS else _unmeasured(config, measured))
+            if name not in (unavailable or {})
+        ],
         "draw": {"seed": PAPER_SEED} | {part.key: [case.name for case in part.cases] for part in drawn},
-        "pictures": [_describe_case(case, method_names, by_id) for part in benchmarks for case in part.cases],
+        "pictures": [
+            _describe_case(case, method_names, by_id, columns) for part in benchmarks for case in part.cases
+        ],
         "tables": {key: _table(strata[key], series) for key in selections},
         "differences": {
             key: [
@@ -121,7 +134,7 @@ def _describe_selection(key: str, group: Sequence[Selection]) -> dict[str, Any]:
 
 def _choices(config: EvaluationConfig, averaged: Sequence[Selection]) -> list[str]:
     """Returns sentences: the settings, how the average is computed, and how it differs from that of the paper."""
-    choices = [*config.describe(), *([_AVERAGE_NOTE] if averaged else [])]
+    choices = [*describe_protocol(config), *config.describe(), *([_AVERAGE_NOTE] if averaged else [])]
     counts = {part.key.partition(":")[0]: len(part.cases) for part in averaged}
     if not config.paper or counts == PAPER_COUNTS:
         return choices
@@ -177,7 +190,10 @@ def _describe_benchmark(part: Benchmark) -> dict[str, Any]:
 
 
 def _describe_case(
-    case: Case, methods: Sequence[str], rows: Mapping[tuple[str, str, str], ScoreRow]
+    case: Case,
+    methods: Sequence[str],
+    rows: Mapping[tuple[str, str, str], ScoreRow],
+    columns: Collection[str],
 ) -> dict[str, Any]:
     case_rows = {method: rows[case.benchmark, case.name, method] for method in methods}
     scored = next((row for row in case_rows.values() if not row.error), None)
@@ -188,6 +204,10 @@ def _describe_case(
         "width": scored.width if scored else None,
         "height": scored.height if scored else None,
         "region_share": scored.region_share if scored else None,
-        "scores": {method: row.scores for method, row in case_rows.items() if not row.error},
+        "scores": {
+            method: {column: row.scores[column] for column in columns if column in row.scores}
+            for method, row in case_rows.items()
+            if not row.error
+        },
         "errors": {method: row.error for method, row in case_rows.items() if row.error},
     }

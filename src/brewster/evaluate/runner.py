@@ -3,7 +3,8 @@
     rows = score(read_benchmark("nature20", folder), [IdentityBaseline(), model], EvaluationConfig(), Path("out/evaluate"))
 
 The file `scores.jsonl` in the output folder has one line for each scored prediction. A later run reuses a line if its inputs
-have not changed. Each file of a case is read once: its bytes are hashed and, if a score is missing, decoded.
+have not changed, and adds the columns that it does not have, such as LPIPS after its weights were missing. Each file of a
+case is read once: its bytes are hashed and, if a score is missing, decoded.
 """
 
 from __future__ import annotations
@@ -11,61 +12,27 @@ from __future__ import annotations
 import hashlib
 import json
 import signal
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, replace
 from multiprocessing import get_context
 from pathlib import Path
-from typing import Any, Final, final
+from typing import final
 
 from brewster.benchmarks.registry import Benchmark, Case
-from brewster.errors import BrewsterError, TargetError
+from brewster.errors import BrewsterError
 from brewster.evaluate.config import EvaluationConfig
-from brewster.evaluate.methods import Method, MethodOutput, check_names
+from brewster.evaluate.methods import Method, MethodOutput, PredictionFolder, check_names
+from brewster.evaluate.score_log import SCORE_FORMAT_VERSION, SCORES_FILE, RowId, ScoreLog, ScoreRow, read_log
 from brewster.evaluate.scoring import CaseFiles, GroundTruth, Scorer
 from brewster.worker_setup import exit_with_parent, single_torch_thread
-
-SCORES_FILE: Final = "scores.jsonl"
-SCORE_FORMAT_VERSION: Final = 3
-"""Increase this version when the scores of a prediction or the fields of `ScoreRow` change. Rows of other versions are
-scored again. test_house_formats checks the scores."""
 
 ScoreCallback = Callable[[int, int, "ScoreRow"], None]
 """Called with (done, total, row) after each prediction that was scored."""
 
 CaseCallback = Callable[[GroundTruth, Mapping[str, MethodOutput]], None]
 """Called with (case, method -> new prediction) after a case is scored, in the process that scored it."""
-
-RowId = tuple[str, str, str]
-
-
-@final
-@dataclass(frozen=True)
-class ScoreRow:
-    """The scores of one method on one case, or the error. These are also the fields of a line of scores.jsonl.
-
-    `score_key` is a digest of all inputs of the scores, `prediction_key` of all inputs of the prediction. A score or a
-    prediction is reused if its key is unchanged. `digest` is the SHA-256 of the files of the prediction, if it has any.
-    """
-
-    benchmark: str
-    case: str
-    method: str
-    prediction_key: str
-    score_key: str
-    scores: dict[str, float | None] = field(default_factory=dict)
-    error: str | None = None
-    seconds: float | None = None
-    digest: str | None = None
-    width: int = 0
-    height: int = 0
-    region_share: float = 0.0
-
-    @property
-    def id(self) -> RowId:
-        """(benchmark, case, method)."""
-        return self.benchmark, self.case, self.method
 
 
 @final
@@ -85,6 +52,7 @@ def score(
     out: Path,
     *,
     workers: int = 1,
+    unavailable: Collection[str] = (),
     on_progress: ScoreCallback = lambda _done, _total, _row: None,
     on_case_scored: CaseCallback | None = None,
 ) -> list[ScoreRow]:
@@ -98,6 +66,7 @@ def score(
         config: the settings of the evaluation.
         out: the folder of scores.jsonl.
         workers: the number of processes that score in parallel.
+        unavailable: columns that are not computed now; see `find_unavailable`.
         on_progress: called after each new row.
         on_case_scored: called once for each case with new rows. With several workers, it must be picklable.
 
@@ -111,11 +80,12 @@ def score(
         TargetError: `out` cannot be written.
     """
     check_names(methods)
-    logged = _read_log(out / SCORES_FILE)
+    logged = read_log(out / SCORES_FILE)
     cases = {(case.benchmark, case.name): case for benchmark in benchmarks for case in benchmark.cases}
     ids = [(*case, method.name) for case in cases for method in methods]
-    _prepare_metrics(config, ids, logged)
-    log, rows = _ScoreLog(out / SCORES_FILE), dict[RowId, ScoreRow]()
+    for prepare, _ in _missing_metrics(config, ids, logged, unavailable):
+        prepare()
+    log, rows = ScoreLog(out / SCORES_FILE), dict[RowId, ScoreRow]()
 
     def log_rows(case_rows: Sequence[ScoreRow]) -> None:
         for row in case_rows:
@@ -124,7 +94,8 @@ def score(
                 log.write(row)
                 on_progress(len(rows), len(ids), row)
 
-    state = _WorkerState({method.name: method for method in methods}, config, on_case_scored)
+    columns = tuple(column for column in config.columns() if column not in unavailable)
+    state = _WorkerState({method.name: method for method in methods}, config, columns, on_case_scored)
     parallel_methods = [method.name for method in methods if not method.exclusive]
     _run_tasks(_tasks(cases.values(), parallel_methods, logged), state, log_rows, workers)
     for method in methods:
@@ -143,21 +114,45 @@ def _tasks(
     return [_ScoringTask(case, tuple(methods), logged_rows(case)) for case in cases] if methods else []
 
 
-def _prepare_metrics(
-    config: EvaluationConfig, ids: Sequence[RowId], logged: Mapping[RowId, ScoreRow]
-) -> None:
-    """Calls `Metric.prepare`, which loads the weights of LPIPS, for example.
+def find_unavailable(
+    benchmarks: Sequence[Benchmark], methods: Sequence[Method], config: EvaluationConfig, out: Path
+) -> dict[str, str]:
+    """Returns column -> reason, for the columns that cannot be computed on this machine, for example without weights.
 
-    It is called before the workers start, so that it runs once and its error stops the evaluation. It is not called for a
-    metric that has a score in every row of an earlier run.
+    A metric is not tried if the log in `out` has it for all cases and methods.
     """
-    columns: dict[Callable[[], object], set[str]] = {}
-    for column, metric in config.columns().items():
-        if metric.prepare:
-            columns.setdefault(metric.prepare, set()).add(column)
-    for prepare, names in columns.items():
-        if any(row_id not in logged or not names & logged[row_id].scores.keys() for row_id in ids):
+    logged = read_log(out / SCORES_FILE)
+    cases = [(case.benchmark, case.name) for benchmark in benchmarks for case in benchmark.cases]
+    ids = [(*case, method.name) for case in cases for method in methods]
+    unavailable = {}
+    for prepare, columns in _missing_metrics(config, ids, logged):
+        try:
             prepare()
+        except BrewsterError as error:
+            unavailable |= dict.fromkeys(columns, str(error))
+    return {column: unavailable[column] for column in config.columns() if column in unavailable}
+
+
+def _missing_metrics(
+    config: EvaluationConfig,
+    ids: Sequence[RowId],
+    logged: Mapping[RowId, ScoreRow],
+    unavailable: Collection[str] = (),
+) -> list[tuple[Callable[[], object], list[str]]]:
+    """Returns each `Metric.prepare`, which loads the weights of LPIPS, for example, and its columns.
+
+    It must be called before the workers start, so that it runs once. Metrics are left out if they are unavailable, or have a
+    score in every row of an earlier run.
+    """
+    columns: dict[Callable[[], object], list[str]] = {}
+    for column, metric in config.columns().items():
+        if metric.prepare and column not in unavailable:
+            columns.setdefault(metric.prepare, []).append(column)
+    return [
+        (prepare, names)
+        for prepare, names in columns.items()
+        if any(row_id not in logged or not set(names) <= {*logged[row_id].columns} for row_id in ids)
+    ]
 
 
 # --- one case
@@ -170,6 +165,7 @@ class _WorkerState:
 
     methods: Mapping[str, Method]
     config: EvaluationConfig
+    columns: tuple[str, ...]
     on_case_scored: CaseCallback | None
 
 
@@ -182,13 +178,13 @@ def _score_case(task: _ScoringTask, state: _WorkerState) -> list[ScoreRow]:
         rows = [ScoreRow(case.benchmark, case.name, name, "", "") for name in task.methods]
         return [_case_failed(row, error) for row in rows]
     rows = [_empty_row(files, state.methods[name], state.config, task.logged) for name in task.methods]
-    if all(_is_scored(row, task.logged) for row in rows):
+    if not any(_missing_columns(row, state, task.logged) for row in rows):
         return [task.logged[row.method] for row in rows]
     try:
         truth = GroundTruth.decode(files, state.config)
     except BrewsterError as error:
         return [
-            task.logged[row.method] if _is_scored(row, task.logged) else _case_failed(row, error)
+            _case_failed(row, error) if _missing_columns(row, state, task.logged) else task.logged[row.method]
             for row in rows
         ]
     return _score_rows(rows, truth, task, state)
@@ -200,7 +196,8 @@ def _score_rows(
     scorer, predictions = Scorer(truth, state.config), dict[str, MethodOutput]()
     scored = []
     for row in rows:
-        if _is_scored(row, task.logged):
+        columns = _missing_columns(row, state, task.logged)
+        if not columns:
             scored.append(task.logged[row.method])
             continue
         try:
@@ -212,7 +209,10 @@ def _score_rows(
             scored.append(_method_failed(row, f"{type(error).__name__}: {error}"))
         else:
             predictions[row.method] = prediction
-            scored.append(_scored_row(row, truth, scorer, prediction))
+            is_stored = isinstance(state.methods[row.method], PredictionFolder)
+            registration = scorer.registration(prediction) if is_stored else ""
+            new = _scored_row(replace(row, registration=registration), truth, scorer, prediction, columns)
+            scored.append(_merged(task.logged.get(row.method), new))
     if state.on_case_scored:
         state.on_case_scored(truth, predictions)
     return scored
@@ -224,10 +224,10 @@ def _empty_row(
     """Returns a row without scores, with the keys that show whether a row of an earlier run can be reused."""
     case = files.case
     photo, *ground_truths = files.digests()
-    # `paper` selects cases for the tables and changes no score. `quality` is a part of the keys of models, and does not
-    # affect other methods.
-    settings = asdict(config) | {"paper": None, "quality": None}
-    prediction_key = _digest(photo, config.size, method.key(case))
+    # `paper` selects cases for the tables, and `protocol` is a name: they change no score. `quality` is a part of the keys of
+    # models, and does not affect other methods. A row has its own list of columns.
+    settings = asdict(config) | dict.fromkeys(("metrics", "paper", "protocol", "quality"))
+    prediction_key = _digest(photo, config.size, config.multiple, method.key(case))
     score_key = _digest(prediction_key, ground_truths, settings, case.rendered, SCORE_FORMAT_VERSION)
     row = ScoreRow(case.benchmark, case.name, method.name, prediction_key, score_key)
     logged_row = logged.get(method.name)
@@ -236,21 +236,35 @@ def _empty_row(
     return row
 
 
-def _is_scored(row: ScoreRow, logged: Mapping[str, ScoreRow]) -> bool:
-    return row.method in logged and logged[row.method].score_key == row.score_key
+def _missing_columns(row: ScoreRow, state: _WorkerState, logged: Mapping[str, ScoreRow]) -> list[str]:
+    """Returns the columns that a row of an earlier run does not have, or all columns if its inputs have changed."""
+    old = logged.get(row.method)
+    known = old.columns if old and old.score_key == row.score_key else ()
+    return [column for column in state.columns if column not in known]
 
 
-def _scored_row(row: ScoreRow, truth: GroundTruth, scorer: Scorer, prediction: MethodOutput) -> ScoreRow:
+def _scored_row(
+    row: ScoreRow, truth: GroundTruth, scorer: Scorer, prediction: MethodOutput, columns: Sequence[str]
+) -> ScoreRow:
     width, height = truth.photo.size
     return replace(
         row,
-        scores=scorer.score(prediction),
+        scores=scorer.score(prediction, columns),
+        columns=tuple(columns),
         seconds=prediction.seconds,
         digest=prediction.digest,
         width=width,
         height=height,
         region_share=scorer.region_share,
     )
+
+
+def _merged(old: ScoreRow | None, new: ScoreRow) -> ScoreRow:
+    """Returns the new row with the scores of an earlier run, if the inputs have not changed."""
+    if old is None or old.score_key != new.score_key:
+        return new
+    seconds = old.seconds if new.seconds is None else new.seconds
+    return replace(new, scores=old.scores | new.scores, columns=(*old.columns, *new.columns), seconds=seconds)
 
 
 def get_prediction(truth: GroundTruth, method: Method, row: ScoreRow) -> MethodOutput:
@@ -330,51 +344,3 @@ def _initialize_worker(state: _WorkerState) -> None:
 def _score_case_in_worker(task: _ScoringTask) -> list[ScoreRow]:
     with single_torch_thread():
         return _score_case(task, _worker_state[0])
-
-
-# --- the log
-
-
-@final
-class _ScoreLog:
-    """The file scores.jsonl. The first call of `write` creates it."""
-
-    def __init__(self, path: Path) -> None:
-        self._path = path
-
-    def write(self, row: ScoreRow) -> None:
-        """Appends a line.
-
-        Raises:
-            TargetError: the file cannot be written.
-        """
-        try:
-            self._path.parent.mkdir(parents=True, exist_ok=True)
-            with self._path.open("ab+") as file:
-                file.write(self._missing_newline(file) + json.dumps(asdict(row)).encode() + b"\n")
-        except OSError as error:
-            raise TargetError(
-                f"{self._path} was not written ({error.strerror or error})",
-                "expected a writable output folder",
-                "free disk space or choose another folder with -o, and run again (the finished scores are saved)",
-            ) from error
-
-    def _missing_newline(self, file: Any) -> bytes:  # noqa: ANN401  (the type that open returns)
-        """Returns a newline if the file does not end with one: a killed run can leave an incomplete line."""
-        if not file.seek(0, 2):
-            return b""
-        file.seek(-1, 2)
-        return b"" if file.read(1) == b"\n" else b"\n"
-
-
-def _read_log(path: Path) -> dict[RowId, ScoreRow]:
-    """Returns the last row for each id. Skips rows with errors, incomplete lines and lines of other versions."""
-    rows = {}
-    for line in path.read_text(errors="replace").splitlines() if path.is_file() else ():
-        try:
-            row = ScoreRow(**json.loads(line))
-        except (ValueError, TypeError):
-            continue
-        if not row.error:
-            rows[row.id] = row
-    return rows

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Final, final
 
@@ -13,6 +13,8 @@ from brewster.benchmarks.registry import Case
 from brewster.errors import PhotoError
 from brewster.evaluate.config import EvaluationConfig
 from brewster.evaluate.methods import MethodOutput
+from brewster.evaluate.registration import find_misregistration
+from brewster.evaluate.resizing import resize
 from brewster.metrics import CachedImage, Comparison, Image, Metric, Region
 from brewster.photo import Photo
 
@@ -67,13 +69,13 @@ class GroundTruth:
 
     @classmethod
     def decode(cls, files: CaseFiles, config: EvaluationConfig) -> GroundTruth:
-        """Decodes the images of a case and downscales them to `config.size`.
+        """Decodes the images of a case and resizes them as `config` says.
 
         Raises:
             PhotoError: an image cannot be decoded, or the images differ in size.
         """
         case = files.case
-        photos = {role: downscale(Photo.open(data), config.size) for role, data in files.data.items()}
+        photos = {role: resize(Photo.open(data), config) for role, data in files.data.items()}
         for role, photo in photos.items():
             _check_size(
                 f"the {role} of {case.benchmark}/{case.name}",
@@ -104,7 +106,7 @@ class GroundTruth:
                     f"{name}'s {layer} of {self.case.benchmark}/{self.case.name}",
                     photo,
                     self.photo.size,
-                    "run the method on photos of that size (with --size, they are in the folder inputs)",
+                    "run the method on photos of that size (if photos are resized, they are in the folder inputs)",
                 )
 
 
@@ -114,7 +116,8 @@ class Scorer:
 
     def __init__(self, truth: GroundTruth, config: EvaluationConfig) -> None:
         self._truth, self._config = truth, config
-        self._cached_images = {role: CachedImage(image) for role, image in truth.images.items()}
+        self._images = {role: self._inside(image) for role, image in truth.images.items()}
+        self._cached_images = {role: CachedImage(image) for role, image in self._images.items()}
         self._regions: dict[float, Region] = {}
 
     @cached_property
@@ -122,39 +125,55 @@ class Scorer:
         """The fraction of pixels in the reflection region of the first threshold, 0 to 1."""
         return round(float(self._region(self._config.thresholds[0]).mean()), _DIGITS)
 
-    def score(self, prediction: MethodOutput) -> dict[str, float | None]:
-        """Returns column -> score.
+    def registration(self, prediction: MethodOutput) -> str:
+        """Returns how the transmission is flipped or shifted against the photo, "" if it is not."""
+        return find_misregistration(prediction.transmission.srgb_8bit(), self._truth.images["photo"])
+
+    def score(
+        self, prediction: MethodOutput, columns: Iterable[str] | None = None
+    ) -> dict[str, float | None]:
+        """Returns column -> score, for all columns of the evaluation or for some of them.
 
         A score is None if it is undefined, because the region is empty or the image is too small for the metric. There is
         no column if the metric compares a layer that the prediction or the ground truth does not have.
         """
-        layers = {"transmission": CachedImage(prediction.transmission.srgb_8bit())}
-        if prediction.reflection:
-            layers["reflection"] = CachedImage(prediction.reflection.srgb_8bit())
+        layers = {"transmission": prediction.transmission, "reflection": prediction.reflection}
+        comparisons = {
+            layer: Comparison(
+                CachedImage(self._inside(photo.srgb_8bit())),
+                self._cached_images[layer],
+                self._images["photo"],
+                self._images.get("reflection"),
+            )
+            for layer, photo in layers.items()
+            if photo and layer in self._cached_images
+        }
+        all_columns = self._config.columns()
         return {
-            column: _round_or_none(lambda column=column, metric=metric: self._compute(column, metric, layers))  # type: ignore[misc]
-            for column, metric in self._config.columns().items()
-            if self._applies(metric, layers)
+            column: _round_or_none(
+                lambda column=column: self._compute(column, all_columns[column], comparisons)  # type: ignore[misc]
+            )
+            for column in (all_columns if columns is None else columns)
+            if self._applies(all_columns[column], comparisons)
         }
 
-    def _applies(self, metric: Metric, layers: Mapping[str, CachedImage]) -> bool:
-        if metric.of == "rendered":
-            return self._truth.case.rendered
-        return metric.of in layers and metric.of in self._cached_images
+    def _applies(self, metric: Metric, comparisons: Mapping[str, Comparison]) -> bool:
+        return self._truth.case.rendered if metric.of == "rendered" else metric.of in comparisons
 
-    def _compute(self, column: str, metric: Metric, layers: Mapping[str, CachedImage]) -> float:
-        layer = "transmission" if metric.of == "rendered" else metric.of
-        images = self._truth.images
-        region = self._region(self._config.threshold(column)) if metric.where == "region" else None
-        return metric.score(
-            Comparison(
-                layers[layer], self._cached_images[layer], images["photo"], images.get("reflection"), region
-            )
-        )
+    def _compute(self, column: str, metric: Metric, comparisons: Mapping[str, Comparison]) -> float:
+        comparison = comparisons["transmission" if metric.of == "rendered" else metric.of]
+        if metric.where == "region":
+            comparison = replace(comparison, region=self._region(self._config.threshold(column)))
+        return metric.score(comparison)
+
+    def _inside(self, image: Image) -> Image:
+        """The part of an image that is scored. It has no pixels if the border covers the image."""
+        border = self._config.border
+        return image[border : len(image) - border, border : image.shape[1] - border] if border else image
 
     def _region(self, threshold: float) -> Region:
         if threshold not in self._regions:
-            self._regions[threshold] = self._truth.region(threshold)
+            self._regions[threshold] = self._inside(self._truth.region(threshold))
         return self._regions[threshold]
 
 
@@ -164,19 +183,6 @@ def _round_or_none(score: Callable[[], float]) -> float | None:
         return round(score(), _DIGITS)
     except ValueError:
         return None
-
-
-def downscale(photo: Photo, shorter: int | None) -> Photo:
-    """Downscales a photo by area means in linear light, so that its shorter side has `shorter` px.
-
-    Returns:
-        The downscaled photo, 8-bit sRGB. The photo itself if it is not larger, or if `shorter` is None.
-    """
-    if shorter is None or min(photo.size) <= shorter:
-        return photo
-    width, height = (round(side * shorter / min(photo.size)) for side in photo.size)
-    small = Photo.from_array(photo.resized(width, height), encoding="linear")
-    return Photo.from_array(small.srgb_8bit(), encoding="srgb")
 
 
 def _check_size(name: str, photo: Photo, size: tuple[int, int], suggestion: str) -> None:

@@ -10,6 +10,7 @@ Only one photo is in memory at a time. The model is loaded when the first photo 
 
 from __future__ import annotations
 
+import hashlib
 import os
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -19,10 +20,13 @@ from pathlib import Path
 from typing import Final, Literal, Protocol, final
 
 from brewster.errors import BrewsterError, PhotoError, TargetError
-from brewster.files import find, write_atomically
+from brewster.files import exists, images_in, is_same_file, name_layers, write_atomically
 from brewster.image_formats import SUFFIXES, format_of
+from brewster.inference.assessment import Assessment
+from brewster.inference.manifest import is_manifest, read_manifest
 from brewster.inference.separator import Separator
 from brewster.options import Options
+from brewster.remote_path import Location, RemotePath, location
 
 BatchProgressCallback = Callable[[int, str, float], None]
 """Called with the number of finished files, the name of the current file, and its completed fraction, 0 to 1.
@@ -52,16 +56,25 @@ class OutputStream(Protocol):
 @final
 @dataclass(frozen=True)
 class SeparationTask:
-    """One photo, and the target of each of its layers: a path or a stream."""
+    """One photo, and the target of each of its layers: a path, a URL or a stream."""
 
-    source: Path | InputStream
-    targets: Mapping[str, Path | OutputStream]
+    source: Location | InputStream
+    targets: Mapping[str, Location | OutputStream]
     """The target of each layer, by layer name (`transmission`, `reflection` or `confidence`)."""
 
     @property
     def name(self) -> str:
         """The path of the photo as the caller passed it, or `-` for a stream."""
         return _display_name(self.source)
+
+    def split(self) -> list[SeparationTask]:
+        """Returns this task, which has one item. See `brewster.executors.Task`."""
+        return [self]
+
+    def failed_results(self, reason: str) -> list[FileResult]:
+        """Returns the result if no worker could separate the photo."""
+        cure = "use fewer workers for each node, or a smaller photo"
+        return [_failed(FileResult(self.name), f"{reason}; expected a photo that fits into memory; {cure}.")]
 
 
 @final
@@ -78,6 +91,8 @@ class FileResult:
     model: str | None = None
     sha256: str | None = None
     """The digest of the model file."""
+    photo_sha256: str | None = None
+    """The digest of the photo's file."""
     device: str | None = None
     seconds: dict[str, float] = field(default_factory=dict)
     """Wall time of the steps `decode`, `network`, `detail` and `encode`."""
@@ -85,8 +100,10 @@ class FileResult:
     """See `Separation.residual`."""
     reconstruction_error: float | None = None
     """See `Separation.reconstruction_error`."""
-    doubtful: bool = False
-    """See `Separation.doubtful`."""
+    assessment: Assessment | None = None
+    """See `Separation.assessment`."""
+    reflection_is_derived: bool = False
+    """See `Separation.reflection_is_derived`."""
     error: str | None = None
     """The error message, or None."""
 
@@ -108,7 +125,8 @@ def separate_files(
     written atomically. If a photo fails, its result has the status `failed`, and the batch continues.
 
     Args:
-        sources: photos, or folders that are searched recursively for photos.
+        sources: photos, folders that are searched recursively for photos, and manifests (CSV or Parquet tables with
+            the column `path`). Each may be a URL of an object store, such as s3://bucket/folder.
         output: the folder for the layers. It mirrors the tree below each source folder. By default, each layer is
             written next to its photo.
         options: layers, strength, quality, format and so on, the same as the options of the command line.
@@ -122,6 +140,7 @@ def separate_files(
 
     Raises:
         PhotoError: the sources contain no photo.
+        ManifestError: a manifest is not a table, or a row of it is not a path.
         TargetError: the layers of two photos would have the same path.
         ModelError: the model does not exist or is damaged (raised during iteration).
         DeviceError: the requested device is not available (raised during iteration).
@@ -143,15 +162,23 @@ def plan_files(
 
     Raises:
         PhotoError: the sources contain no photo.
+        ManifestError: a manifest is not a table, or a row of it is not a path.
         TargetError: the layers of two photos would have the same path.
     """
-    paths = [Path(sources)] if isinstance(sources, str | os.PathLike) else [*map(Path, sources)]
+    given = [sources] if isinstance(sources, str | os.PathLike) else sources
+    paths = [location(source) for source in given]
+    folder = None if output is None else location(output)
+    images = (
+        pair
+        for source in paths
+        for pair in (read_manifest(source, folder) if is_manifest(source) else images_in(source, folder))
+    )
     tasks = [
         SeparationTask(
             found.source,
             {layer: found.target(layer, options.suffix(layer, found.source)) for layer in options.layers},
         )
-        for found in find(paths, None if output is None else Path(output))
+        for found in name_layers(images)
     ]
     if not tasks:
         raise PhotoError(
@@ -172,7 +199,7 @@ def separate_tasks(
     on_progress: BatchProgressCallback = lambda _done, _name, _fraction: None,
 ) -> Iterator[FileResult]:
     """Separates the photos of the tasks. Arguments, results and errors are those of `separate_files`."""
-    batch = _Batch(tasks, options, separator, overwrite=overwrite, dry_run=dry_run)
+    batch = BatchRunner(tasks, options, separator, overwrite=overwrite, dry_run=dry_run)
     for done, task in enumerate(tasks):
         on_progress(done, task.name, 0.0)
         yield batch.run(task, partial(on_progress, done, task.name))
@@ -180,25 +207,35 @@ def separate_tasks(
         raise batch.unexpected_error
 
 
-class _Batch:
-    """The settings of a batch, its lazily loaded model, and the first unexpected exception."""
+@final
+class BatchRunner:
+    """Separates the photos of a batch one by one: its settings, its lazily loaded model, its first unexpected exception.
+
+    Args:
+        tasks: the batch, whose photos are never overwritten.
+        options, separator, overwrite, dry_run: as in `separate_files`.
+    """
 
     def __init__(
         self,
-        tasks: Sequence[SeparationTask],
+        tasks: Iterable[SeparationTask],
         options: Options,
-        separator: Separator | None,
+        separator: Separator | None = None,
         *,
-        overwrite: bool,
-        dry_run: bool,
+        overwrite: bool = False,
+        dry_run: bool = False,
     ) -> None:
         self.unexpected_error: Exception | None = None
         self._options, self._separator = options, separator
         self._overwrite, self._dry_run = overwrite, dry_run
-        self._sources = {os.path.realpath(task.source) for task in tasks if isinstance(task.source, Path)}
+        self._sources = {_real_path(task.source) for task in tasks if isinstance(task.source, Location)}
 
     def run(self, task: SeparationTask, on_progress: Callable[[float], None]) -> FileResult:
-        """Separates one photo and returns the result, also for a failure."""
+        """Separates one photo and returns the result, also for a failure.
+
+        Raises:
+            ModelError, DeviceError: the model cannot be loaded.
+        """
         result = FileResult(task.name)
         try:
             targets = self._targets_to_write(task)
@@ -230,14 +267,14 @@ class _Batch:
             )
         return result
 
-    def _targets_to_write(self, task: SeparationTask) -> dict[str, Path | OutputStream]:
+    def _targets_to_write(self, task: SeparationTask) -> dict[str, Location | OutputStream]:
         """Returns the layers that must be written, with their targets.
 
         Raises:
             TargetError: a layer would replace a photo of the batch.
         """
         for target in task.targets.values():
-            if isinstance(target, Path) and self._is_source(target, task.source):
+            if isinstance(target, Location) and self._is_source(target, task.source):
                 raise TargetError(
                     f"{target} is itself a photo of the batch",
                     "expected another path, because photos of the batch are never overwritten",
@@ -246,14 +283,14 @@ class _Batch:
         return {
             layer: target
             for layer, target in task.targets.items()
-            if not isinstance(target, Path) or self._overwrite or not os.path.lexists(target)
+            if not isinstance(target, Location) or self._overwrite or not exists(target)
         }
 
-    def _is_source(self, target: Path, source: Path | InputStream) -> bool:
-        if os.path.realpath(target) in self._sources:
+    def _is_source(self, target: Location, source: Location | InputStream) -> bool:
+        if _real_path(target) in self._sources:
             return True
-        try:  # unlike realpath, samefile finds hard links
-            return isinstance(source, Path) and target.samefile(source)
+        try:  # unlike realpath, is_same_file finds hard links
+            return isinstance(source, Location) and is_same_file(target, source)
         except OSError:  # one of the two files does not exist
             return False
 
@@ -264,19 +301,22 @@ class _Batch:
         result: FileResult,
         on_progress: Callable[[float], None],
     ) -> None:
-        path = task.source if isinstance(task.source, Path) else None
-        photo = task.source if isinstance(task.source, Path) else task.source.read()
+        path = task.source if isinstance(task.source, Location) else None
+        photo = _content(task.source)
+        result.photo_sha256 = _sha256(photo)
         separation = separator(photo, on_progress=on_progress, **self._options.call_options())
         result.seconds, result.residual = dict(separation.seconds), separation.residual
-        result.reconstruction_error, result.doubtful = separation.reconstruction_error, separation.doubtful
+        result.assessment = separation.assessment
+        result.reconstruction_error = separation.reconstruction_error
+        result.reflection_is_derived = separation.reflection_is_derived
         started = time.perf_counter()
         for layer, target in task.targets.items():
-            target_format = format_of(target) if isinstance(target, Path) else None
+            target_format = format_of(target) if isinstance(target, Location) else None
             source_format = separation.photo.file_info.container
             container = target_format.name if target_format else self._options.container(layer, source_format)
             encoded = getattr(separation, layer).encode(container)
             on_progress(1.0)
-            if isinstance(target, Path):
+            if isinstance(target, Location):
                 write_atomically(target, encoded, overwrite=self._overwrite, source=path)
             else:
                 target.write(encoded)
@@ -284,8 +324,26 @@ class _Batch:
         result.seconds["encode"] = time.perf_counter() - started
 
 
+def _content(source: Location | InputStream) -> Path | bytes:
+    """Returns what a `Separator` reads: a local path, or the bytes of a URL or stream."""
+    if isinstance(source, Path):
+        return source
+    return source.read_bytes() if isinstance(source, RemotePath) else source.read()
+
+
+def _sha256(photo: Path | bytes) -> str | None:
+    try:
+        return hashlib.sha256(photo if isinstance(photo, bytes) else photo.read_bytes()).hexdigest()
+    except OSError:  # opening the photo raises the error
+        return None
+
+
+def _real_path(path: Location) -> str:
+    return str(path) if isinstance(path, RemotePath) else os.path.realpath(path)
+
+
 def _display_name(source_or_target: object) -> str:
-    return str(source_or_target) if isinstance(source_or_target, Path) else _STREAM_NAME
+    return str(source_or_target) if isinstance(source_or_target, Location) else _STREAM_NAME
 
 
 def _failed(result: FileResult, error: object) -> FileResult:

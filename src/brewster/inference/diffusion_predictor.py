@@ -17,6 +17,7 @@ from typing import Final, final
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch.nn import functional
 
 from brewster.errors import ModelError
 from brewster.inference.guided_upsampling import Floats, GeneratedOverride, upsample_rows
@@ -32,6 +33,8 @@ _SECOND_INPUT_SCALE: Final = 2
 """Side of the second input for quality "best" relative to the first. The second input is processed in tiles."""
 _MIN_SECOND_INPUT_SCALE: Final = 1.25
 """A second input with a smaller relative side adds almost no detail, so it is not used."""
+_SQUARE_TILE_OVERLAP: Final = 12
+"""Square tiles overlap by at least their side divided by this: 64 of 768 pixels, as in WindowSeat."""
 
 
 @final
@@ -42,7 +45,7 @@ class DiffusionPredictor(Predictor):
 
     Args:
         pipeline: the model.
-        steps: the number of sampling steps; by default those of the task (20 in the paper), and at most 4 for "draft".
+        steps: the number of sampling steps; by default those of the task (20 as in the paper), and at most 4 for "draft".
         average: the number of samples with different seeds whose mean is the prediction; the mean has less invented detail.
         plain: whether the transmission is the upsampled generated one, without the detail of the photo.
 
@@ -64,7 +67,7 @@ class DiffusionPredictor(Predictor):
                 "expected both to be at least 1",
                 "set them to 1 or more",
             )
-        if pipeline.task.objective == "one_step" and (steps not in (None, 1) or average > 1):
+        if pipeline.task.objective != "flow" and (steps not in (None, 1) or average > 1):
             raise ModelError(
                 f"steps = {steps}, average = {average} were set for a one-step model",
                 "expected neither, because it takes one step and is deterministic",
@@ -83,7 +86,7 @@ class DiffusionPredictor(Predictor):
             PhotoError: a side of the photo has fewer than 16 pixels, or its aspect ratio is too large.
         """
         task, multiple = self._pipeline.task, self._pipeline.backbone.multiple
-        coarse = task.fit(size, multiple).content
+        coarse = task.input_size(size, multiple)
         scale = min(_SECOND_INPUT_SCALE, size[0] / coarse[0])
         if quality != "best" or scale < _MIN_SECOND_INPUT_SCALE:
             return [coarse]
@@ -94,20 +97,18 @@ class DiffusionPredictor(Predictor):
     ) -> Prediction:
         """Returns the mean prediction over the inputs. The reconstruction error is that of the first input."""
         size, task_steps = inputs[-1].shape[:2], self._pipeline.task.steps
-        tile_sides = [max(inputs[0].shape), *(self._tile_px for _ in inputs[1:])]
+        tilings = [self._tiling(scaled_input.shape, is_first=i == 0) for i, scaled_input in enumerate(inputs)]
         tiles = [
-            len(tile_slices(scaled_input.shape[:2], **_tiling(side)))
-            for scaled_input, side in zip(inputs, tile_sides, strict=True)
+            len(tile_slices(scaled_input.shape[:2], **tiling))
+            for scaled_input, tiling in zip(inputs, tilings, strict=True)
         ]
         steps = self._steps or (min(_DRAFT_STEPS, task_steps) if quality == "draft" else task_steps)
         progress = _ProgressCounter(on_progress, sum(tiles))
         predictions = []
         with self._lock:  # two predictions at the same time would need twice the GPU memory
-            for scaled_input, side in zip(inputs, tile_sides, strict=True):
+            for scaled_input, tiling in zip(inputs, tilings, strict=True):
                 predictions.append(
-                    run_tiled(
-                        lambda tile: self._predict_tile(tile, steps, progress), scaled_input, **_tiling(side)
-                    )
+                    run_tiled(lambda tile: self._predict_tile(tile, steps, progress), scaled_input, **tiling)
                 )
         change, reflection, generated, spread, reconstruction_error = (
             np.mean([upsample_rows(map_, 0, size[0], size) for map_ in maps], axis=0)
@@ -127,6 +128,7 @@ class DiffusionPredictor(Predictor):
             confidence if self._has_confidence else np.zeros_like(confidence),
             override,
             mean_error,
+            reflection_is_derived="R" not in self._pipeline.task.layout.panels,
         )
 
     @property
@@ -138,11 +140,20 @@ class DiffusionPredictor(Predictor):
         """Whether a confidence can be computed, from the reconstruction error or from the spread of several samples."""
         return self._reconstructs_input or (len(self._seeds) > 1 and self._pipeline.task.objective == "flow")
 
-    @property
-    def _tile_px(self) -> int:
-        """The side of a square panel in pixels."""
+    def _tiling(self, shape: tuple[int, ...], *, is_first: bool) -> dict[str, int]:
+        """The side and the overlap of the tiles for an input of this shape (h, w, 3).
+
+        The first input is one tile, unless the task has square tiles. Those of other tasks have the area of a panel.
+        """
         task, multiple = self._pipeline.task, self._pipeline.backbone.multiple
-        return max(1, math.isqrt(task.budget_px // len(task.layout.panels)) // multiple) * multiple
+        if task.square_tiles:
+            side = min(*shape[:2], task.short_side_px or max(shape))
+            return {"tile_px": side, "overlap_px": side // _SQUARE_TILE_OVERLAP}
+        if is_first:
+            side = max(shape)
+        else:
+            side = max(1, math.isqrt(task.budget_px // len(task.layout.panels)) // multiple) * multiple
+        return {"tile_px": side, "overlap_px": side // 4}
 
     def _predict_tile(self, tile: Floats, steps: int, progress: _ProgressCounter) -> tuple[Floats, ...]:
         """Returns five maps (h, w, 3) for a tile (h, w, 3).
@@ -151,6 +162,12 @@ class DiffusionPredictor(Predictor):
         of the transmission over the samples, and the reconstruction error.
         """
         height, width, _ = tile.shape
+        short_side = self._pipeline.task.short_side_px
+        if short_side and min(height, width) < short_side:
+            size = tuple(round(side * short_side / min(height, width)) for side in (height, width))
+            enlarged = np.clip(_resize(tile, size, "bicubic"), 0, 1)
+            maps = self._predict_tile(enlarged, steps, progress)
+            return tuple(_resize(map_, (height, width), "bilinear") for map_ in maps)
         panel_fit = PanelFit((width, height), _round_up((width, height), self._pipeline.backbone.multiple))
         panel_input = torch.from_numpy(2 * to_encoded(tile) - 1).permute(2, 0, 1)[None]
         panels = self._pipeline(
@@ -210,8 +227,12 @@ def _to_linear_light(panels: torch.Tensor) -> NDArray[np.float32]:
     return light
 
 
-def _tiling(side: int) -> dict[str, int]:
-    return {"tile_px": side, "overlap_px": side // 4}
+def _resize(image: Floats, size: tuple[int, ...], mode: str) -> Floats:
+    """Resizes an image (h, w, 3) to this (height, width), with a low-pass filter if it is reduced."""
+    tensor = torch.from_numpy(image).permute(2, 0, 1)[None]
+    resized = functional.interpolate(tensor, size, mode=mode, antialias=True, align_corners=False)
+    result: Floats = resized[0].permute(1, 2, 0).numpy()
+    return result
 
 
 def _round_up(size: tuple[int, int], multiple: int) -> tuple[int, int]:

@@ -30,7 +30,7 @@ _DETAIL_EPSILON: Final = 1e-6
 
 @final
 @dataclass(frozen=True)
-class _LocalLinearMap:
+class _LocalLinearModel:
     """A layer as a local linear function of the photo: layer = slope * photo + offset, at low resolution."""
 
     slope: Float32[Floats, "h w 3"]
@@ -81,13 +81,18 @@ class GeneratedOverride:
 class GuidedUpsampler:
     """A separation fitted at low resolution. It is applied to the full photo in strips of rows."""
 
-    change: _LocalLinearMap
-    reflection: _LocalLinearMap
+    change: _LocalLinearModel
+    reflection: _LocalLinearModel | None
+    """None: the reflection is photo - transmission."""
     override: GeneratedOverride | None = None
 
     @classmethod
     def fit(
-        cls, photo: Floats, change: Floats, reflection: Floats, override: GeneratedOverride | None = None
+        cls,
+        photo: Floats,
+        change: Floats,
+        reflection: Floats | None,
+        override: GeneratedOverride | None = None,
     ) -> GuidedUpsampler:
         """Fits change and reflection as local linear functions of the photo.
 
@@ -96,20 +101,22 @@ class GuidedUpsampler:
         Args:
             photo: the photo.
             change: transmission - photo.
-            reflection: the reflection.
+            reflection: the reflection; None if it is photo - transmission.
             override: where a generated transmission replaces the fitted one.
         """
         mean = _box_mean(photo)
         variance = _box_mean(photo * photo) - mean**2 + _EPSILON
 
-        def fit_layer(layer: Floats) -> _LocalLinearMap:
+        def fit_layer(layer: Floats) -> _LocalLinearModel:
             """Fits a slope to each window and averages the slopes. The offset makes the fit exact at low resolution."""
             slope = _box_mean((_box_mean(photo * layer) - mean * _box_mean(layer)) / variance)
-            return _LocalLinearMap(slope, layer - slope * photo)
+            return _LocalLinearModel(slope, layer - slope * photo)
 
-        return cls(fit_layer(change), fit_layer(reflection), override)
+        return cls(fit_layer(change), None if reflection is None else fit_layer(reflection), override)
 
-    def apply(self, photo: Floats, top: int, height: int) -> tuple[Floats, Floats]:
+    def apply(
+        self, photo: Floats, top: int, height: int, weights: Floats | None = None
+    ) -> tuple[Floats, Floats]:
         """Returns transmission and reflection, each (n, W, 3), for n rows of the full photo.
 
         Negative values of the photo (colours outside Rec.709) limit the transmission from below: it is at least
@@ -119,6 +126,7 @@ class GuidedUpsampler:
             photo: the n rows of the photo, (n, W, 3) linear light.
             top: the index of the first of these rows.
             height: the number of rows of the full photo.
+            weights: a factor of the strength for each pixel, (n, W, 1) in 0..1; where it is 0, the transmission is the photo.
         """
         transmission = self.change.apply(photo, top, height)
         if self.override:
@@ -128,9 +136,16 @@ class GuidedUpsampler:
                 for map_ in (self.override.transmission, self.override.weight)
             )
             transmission += weight * (np.float32(self.override.strength) * (generated - photo) - transmission)
+        if weights is not None:
+            transmission *= weights
         transmission += photo
         np.maximum(transmission, np.minimum(photo, 0), out=transmission)
-        reflection = self.reflection.apply(photo, top, height)
+        if self.reflection is None:
+            reflection = photo - transmission
+        else:
+            reflection = self.reflection.apply(photo, top, height)
+            if weights is not None:
+                reflection *= weights
         return transmission, np.clip(reflection, 0, np.maximum(photo, 0), out=reflection)
 
 

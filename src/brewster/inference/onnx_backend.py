@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import Final, final
 
@@ -111,6 +112,9 @@ def _create_session(model: Path, data: bytes, device: str) -> ort.InferenceSessi
     """Creates a session on the device. If the libraries of the device do not load, ONNX Runtime uses the CPU."""
     options = ort.SessionOptions()
     options.log_severity_level = 3
+    # The usual variable for a share of the processors: Ray and our workers set it. ONNX Runtime ignores it.
+    threads = os.environ.get("OMP_NUM_THREADS", "").partition(",")[0]
+    options.intra_op_num_threads = int(threads) if threads.isdigit() else 0  # 0: one thread per core
     providers = dict.fromkeys([_PROVIDERS[device][0], "CPUExecutionProvider"])
     try:
         return ort.InferenceSession(data, options, list(providers), enable_fallback=0)

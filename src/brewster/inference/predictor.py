@@ -58,6 +58,8 @@ class Prediction:
     """A generated transmission, and where it replaces the result of guided upsampling."""
     reconstruction_error: float | None = None
     """Mean of |generated input - input|, sRGB-encoded, or None if the model does not generate the input."""
+    reflection_is_derived: bool = False
+    """Whether the reflection is photo - transmission in linear light, because the model predicts no reflection."""
 
 
 class Predictor(ABC):

@@ -23,6 +23,7 @@ from typing import TYPE_CHECKING, Final, final
 import numpy as np
 
 from brewster.errors import BrewsterError, MissingExtra, ModelError
+from brewster.inference.assessment import Assessment, assess
 from brewster.inference.guided_upsampling import Floats, GuidedUpsampler, upsample_rows
 from brewster.inference.onnx_backend import OnnxBackend
 from brewster.inference.predictor import (
@@ -35,14 +36,11 @@ from brewster.inference.predictor import (
 from brewster.inference.tiles import Backend
 from brewster.models.zoo import find_model, is_large
 from brewster.options import Options, Quality, Quantisation, document_options
-from brewster.photo import Encoding, Photo, Source
+from brewster.photo import Encoding, Mask, Photo, Source
 
 if TYPE_CHECKING:
     from brewster.models.diffusion.pipeline import DecompositionPipeline
 
-RECONSTRUCTION_ERROR_LIMIT: Final = 0.06
-"""A separation with a larger reconstruction error is doubtful. The value is chosen, not measured: about three times the
-error of encoding and decoding with the VAE of a diffusion model."""
 _WORKERS: Final = 2
 _WHITE_PERCENTILE: Final = 99.0
 """If this percentile of the photo is above 1, as in an EXR, the input of the network is divided by it."""
@@ -64,18 +62,15 @@ class Separation:
     """Mean of |photo - transmission - reflection| in linear light."""
     reconstruction_error: float | None
     """Mean of |generated input - input|, sRGB-encoded, or None if the model does not generate the input."""
+    assessment: Assessment
+    """What the model found in the photo, at strength 1, and how reliable the result is."""
     model: str
     sha256: str | None
     device: str
     seconds: dict[str, float] = field(compare=False)
     """Wall time of the steps `decode`, `network` and `detail`."""
-
-    @property
-    def doubtful(self) -> bool:
-        """Whether the generated input differs so much from the photo that the layers may show another scene."""
-        return (
-            self.reconstruction_error is not None and self.reconstruction_error > RECONSTRUCTION_ERROR_LIMIT
-        )
+    reflection_is_derived: bool = False
+    """Whether the reflection is photo - transmission in linear light, because the model predicts no reflection."""
 
     @cached_property
     def confidence(self) -> Photo:
@@ -160,6 +155,7 @@ class Separator:
         *,
         strength: float = Options.strength,
         quality: Quality = Options.quality,
+        mask: Source | None = Options.mask,
         additive: bool = Options.additive,
         encoding: Encoding | None = None,
         max_pixels: int = Options.max_pixels,
@@ -174,22 +170,22 @@ class Separator:
 
         Raises:
             PhotoError: the source cannot be read, or is too large.
+            MaskError: the mask cannot be read, is not grey, or has another size than the photo.
             BrewsterError: strength or quality is out of range.
         """
         _check_options(strength, quality)
         seconds: dict[str, float] = {}
         with _timed(seconds, "decode"):
             photo = Photo.open(source, encoding=encoding, max_pixels=max_pixels)
-            inputs = [photo.resized(*size) for size in self._predictor.input_sizes(photo.size, quality)]
-            white = np.float32(max(1.0, float(np.percentile(inputs[-1], _WHITE_PERCENTILE))))
-            inputs = [np.clip(scaled_input / white, 0, 1) for scaled_input in inputs]
+            weights = None if mask is None else Mask.open(mask, photo.size)
+            inputs, white = self._inputs(photo, quality)
         on_progress(0.0)
         with _timed(seconds, "network"):
             prediction = self._predictor(inputs, quality, lambda done: on_progress(_NETWORK_SHARE * done))
         with _timed(seconds, "detail"):
             upsampler = _fit_upsampler(inputs[-1], prediction, strength, white)
             transmission, reflection, residual = _upsample(
-                photo, upsampler, additive=additive, on_progress=on_progress
+                photo, upsampler, weights, additive=additive, on_progress=on_progress
             )
         return Separation(
             photo,
@@ -198,11 +194,46 @@ class Separator:
             prediction.confidence_map,
             residual,
             prediction.reconstruction_error,
+            _assess(inputs[-1], prediction),
             self.name,
             self.sha256,
             self.device,
             seconds,
+            prediction.reflection_is_derived,
         )
+
+    def fit(
+        self,
+        photo: Photo,
+        *,
+        quality: Quality = Options.quality,
+        on_progress: ProgressCallback = lambda _fraction: None,
+    ) -> tuple[GuidedUpsampler, Prediction, Assessment]:
+        """Predicts the layers of a photo, without computing them at full size.
+
+        Args:
+            photo: the photo.
+            quality: as in a call.
+            on_progress: as in a call.
+
+        Returns:
+            The upsampler at strength 1, which computes the layers of any rows of the photo; the prediction; and its
+            assessment.
+
+        Raises:
+            BrewsterError: quality is out of range.
+        """
+        _check_options(Options.strength, quality)
+        inputs, white = self._inputs(photo, quality)
+        prediction = self._predictor(inputs, quality, on_progress)
+        upsampler = _fit_upsampler(inputs[-1], prediction, Options.strength, white)
+        return upsampler, prediction, _assess(inputs[-1], prediction)
+
+    def _inputs(self, photo: Photo, quality: Quality) -> tuple[list[Floats], np.float32]:
+        """Returns the inputs of the model in 0..1, smallest first, and the white level by which they are divided."""
+        inputs = [photo.resized(*size) for size in self._predictor.input_sizes(photo.size, quality)]
+        white = np.float32(max(1.0, float(np.percentile(inputs[-1], _WHITE_PERCENTILE))))
+        return [np.clip(scaled_input / white, 0, 1) for scaled_input in inputs], white
 
 
 @document_options
@@ -213,6 +244,7 @@ def separate(
     device: str = Options.device,
     strength: float = Options.strength,
     quality: Quality = Options.quality,
+    mask: Source | None = Options.mask,
     additive: bool = Options.additive,
     encoding: Encoding | None = None,
     max_pixels: int = Options.max_pixels,
@@ -238,6 +270,7 @@ def separate(
         source,
         strength=strength,
         quality=quality,
+        mask=mask,
         additive=additive,
         encoding=encoding,
         max_pixels=max_pixels,
@@ -269,6 +302,11 @@ def _check_options(strength: float, quality: str) -> None:
         )
 
 
+def _assess(largest_input: Floats, prediction: Prediction) -> Assessment:
+    transmission = np.clip(largest_input + prediction.change, 0, 1)
+    return assess(largest_input, transmission, prediction.confidence_map, prediction.reconstruction_error)
+
+
 def _fit_upsampler(
     largest_input: Floats, prediction: Prediction, strength: float, white: np.float32
 ) -> GuidedUpsampler:
@@ -276,13 +314,17 @@ def _fit_upsampler(
     scale, override = np.float32(strength) * white, prediction.override
     if override:
         override = replace(override, transmission=white * override.transmission, strength=strength)
-    return GuidedUpsampler.fit(
-        white * largest_input, scale * prediction.change, scale * prediction.reflection, override
-    )
+    reflection = None if prediction.reflection_is_derived else scale * prediction.reflection
+    return GuidedUpsampler.fit(white * largest_input, scale * prediction.change, reflection, override)
 
 
 def _upsample(
-    photo: Photo, upsampler: GuidedUpsampler, *, additive: bool, on_progress: ProgressCallback
+    photo: Photo,
+    upsampler: GuidedUpsampler,
+    mask: Mask | None,
+    *,
+    additive: bool,
+    on_progress: ProgressCallback,
 ) -> tuple[Photo, Photo, float]:
     """Returns transmission, reflection and the mean residual. The layers are encoded like the photo, or as exact floats."""
     template = _float_template(photo) if additive else photo
@@ -290,7 +332,8 @@ def _upsample(
 
     def fill(rows: slice) -> float:
         linear = photo.linear_rows(rows.start, rows.stop)
-        layers = upsampler.apply(linear, rows.start, photo.size[1])
+        weights = None if mask is None else mask.rows(rows.start, rows.stop)
+        layers = upsampler.apply(linear, rows.start, photo.size[1], weights)
         stored = [template.stored_rows(layer, rows.start) for layer in layers]
         if additive:
             stored = _exact_sum_layers(template.stored_rows(linear, rows.start), stored[0])

@@ -3,8 +3,10 @@
     from brewster.metrics import METRICS, psnr, reflection_region
     psnr(prediction, truth, region=reflection_region(photo, truth))
 
-    fidelity     PSNR and SSIM
+    fidelity     PSNR, SSIM and the error in linear light
     perceptual   LPIPS; imports torch at its first use
+    dists        DISTS; imports torch at its first use
+    naturalness  NIQE, without ground truth
     region       the reflection region: pixels that the glass has visibly changed
     failures     removed content and remaining reflection, for rendered samples
 
@@ -14,14 +16,28 @@
 from __future__ import annotations
 
 import difflib
+import functools
 from collections.abc import Callable
 from typing import Final
 
+import numpy as np
+from numpy.typing import NDArray
+
 from brewster.errors import BrewsterError
+from brewster.metrics.dists import Dists, DistsFeatures
 from brewster.metrics.failures import kept_reflection, removed_content, removed_white
-from brewster.metrics.fidelity import Window, psnr, ssim
+from brewster.metrics.fidelity import (
+    Window,
+    linear_error,
+    mean_ssim,
+    psnr,
+    psnr_of_channels,
+    ssim,
+    ssim_map,
+)
 from brewster.metrics.metric import CachedImage, Comparison, Metric
-from brewster.metrics.perceptual import Features, Lpips, lpips
+from brewster.metrics.naturalness import niqe
+from brewster.metrics.perceptual import DifferenceMaps, Features, Lpips, lpips
 from brewster.metrics.region import DEFAULT_THRESHOLD, reflection_region
 from brewster.metrics.windows import Image, Region
 
@@ -31,6 +47,8 @@ __all__ = [
     "METRICS",
     "CachedImage",
     "Comparison",
+    "DifferenceMaps",
+    "Dists",
     "Features",
     "Image",
     "Lpips",
@@ -39,8 +57,11 @@ __all__ = [
     "Window",
     "find_metric",
     "kept_reflection",
+    "linear_error",
     "lpips",
+    "niqe",
     "psnr",
+    "psnr_of_channels",
     "reflection_region",
     "removed_content",
     "removed_white",
@@ -52,21 +73,64 @@ def _psnr(case: Comparison) -> float:
     return min(psnr(case.prediction.pixels, case.truth.pixels, region=case.region), IDENTICAL_DB)
 
 
+def _psnr_of_channels(case: Comparison) -> float:
+    return min(psnr_of_channels(case.prediction.pixels, case.truth.pixels), IDENTICAL_DB)
+
+
+def _linear_error(case: Comparison) -> float:
+    return linear_error(case.prediction.pixels, case.truth.pixels, region=case.region)
+
+
+def _uniform_map(case: Comparison) -> NDArray[np.float64]:
+    return ssim_map(case.prediction.pixels, case.truth.pixels)
+
+
+def _gaussian_map(case: Comparison) -> NDArray[np.float64]:
+    return ssim_map(case.prediction.pixels, case.truth.pixels, window="gaussian")
+
+
 def _ssim(case: Comparison) -> float:
-    return ssim(case.prediction.pixels, case.truth.pixels, region=case.region)
+    return mean_ssim(case.shared(_uniform_map), region=case.region)
 
 
 def _ssim_gaussian(case: Comparison) -> float:
-    return ssim(case.prediction.pixels, case.truth.pixels, window="gaussian", region=case.region)
+    return mean_ssim(case.shared(_gaussian_map), region=case.region)
+
+
+def _ssim_clipped(case: Comparison) -> float:
+    return mean_ssim(np.maximum(case.shared(_gaussian_map), 0), region=case.region)
 
 
 def _lpips(case: Comparison) -> float:
+    return case.shared(_lpips_difference).mean(region=case.region)
+
+
+def _lpips_difference(case: Comparison) -> DifferenceMaps:
     prediction, truth = (image.features(_lpips_features) for image in (case.prediction, case.truth))
-    return Lpips.load().distance(prediction, truth, region=case.region)
+    return Lpips.load().difference(prediction, truth)
 
 
 def _lpips_features(image: Image) -> Features:
-    return Lpips.load().features(image)
+    # The reflection of the baseline is black in every case; its features take as long as those of any image.
+    return Lpips.load().features(image) if image.any() else _lpips_features_of_black(image.shape)
+
+
+@functools.lru_cache(maxsize=4)
+def _lpips_features_of_black(shape: tuple[int, ...]) -> Features:
+    return Lpips.load().features(np.zeros(shape, np.uint8))
+
+
+def _dists(case: Comparison) -> float:
+    prediction, truth = (image.features(_dists_features) for image in (case.prediction, case.truth))
+    return Dists.load().distance(prediction, truth)
+
+
+def _dists_features(image: Image) -> DistsFeatures:
+    return Dists.load().features(image)
+
+
+def _niqe(case: Comparison) -> float:
+    return niqe(case.prediction.pixels)
 
 
 def _rendered_score(
@@ -91,6 +155,10 @@ _LPIPS: Final = "LPIPS 0.1 of AlexNet, 8-bit sRGB scaled to -1..1, at the size o
 _REGION: Final = (
     "the reflection region, where |photo - truth| / 255 in its largest channel, averaged over 7x7 pixels,"
     f" is above {DEFAULT_THRESHOLD} unless the report states another threshold"
+)
+_LINEAR: Final = (
+    "Root mean squared error of linear light (the inverse sRGB curve of the 8-bit values, in 0..1) over the three"
+    " channels of all pixels"
 )
 _GAIN: Final = "after one gain, the median of background over prediction where there is no reflection, in linear luminance"
 
@@ -153,6 +221,60 @@ _ROWS: Final = (
         "region",
         prepare=Lpips.load,
     ),
+    Metric(
+        "linear_error",
+        "Linear error",
+        "",
+        False,
+        4,
+        f"{_LINEAR}.",
+        "transmission",
+        _linear_error,
+    ),
+    Metric(
+        "dists",
+        "DISTS",
+        "",
+        False,
+        3,
+        "DISTS (Ding 2022): distance of structure and texture with VGG16, 8-bit sRGB scaled to 0..1, at the size of the"
+        " ground truth.",
+        "transmission",
+        _dists,
+        prepare=Dists.load,
+    ),
+    Metric(
+        "niqe",
+        "NIQE",
+        "",
+        False,
+        2,
+        "NIQE (Mittal 2013): distance between the local statistics of the prediction and of undistorted photographs, in"
+        " blocks of 96x96 pixels of the luma 0.299 R + 0.587 G + 0.114 B; the ground truth is not used.",
+        "transmission",
+        _niqe,
+    ),
+    Metric(
+        "psnr_channels",
+        "PSNR (channel mean)",
+        "dB",
+        True,
+        2,
+        "The mean of 10 log10(255^2 / MSE) of red, green and blue of 8-bit sRGB, over all pixels, as in the code of ERRNet"
+        " and XReflection.",
+        "transmission",
+        _psnr_of_channels,
+    ),
+    Metric(
+        "ssim_clipped",
+        "SSIM (clipped)",
+        "",
+        True,
+        3,
+        "As SSIM (Gaussian), but negative local values count as 0, as in the package pyiqa.",
+        "transmission",
+        _ssim_clipped,
+    ),
     Metric("psnr_reflection", "PSNR of R", "dB", True, 2, f"{_PSNR} of all pixels.", "reflection", _psnr),
     Metric("ssim_reflection", "SSIM of R", "", True, 3, f"Mean local SSIM, {_UNIFORM}.", "reflection", _ssim),
     Metric(
@@ -165,6 +287,16 @@ _ROWS: Final = (
         "reflection",
         _lpips,
         prepare=Lpips.load,
+    ),
+    Metric(
+        "linear_error_reflection",
+        "Linear error of R",
+        "",
+        False,
+        4,
+        f"{_LINEAR}.",
+        "reflection",
+        _linear_error,
     ),
     Metric(
         "removed_content",

@@ -1,4 +1,4 @@
-"""PSNR and SSIM of 8-bit sRGB images, as papers on reflection removal define them.
+"""PSNR, SSIM and the linear-light error of 8-bit sRGB images, as papers on reflection removal define them.
 
 SSIM (Z. Wang et al., IEEE Trans. Image Proc. 13, 2004; K1 0.01, K2 0.03, range 255) is computed per RGB channel, and
 its map is averaged over the positions where the whole window is inside the image. Two windows are in use:
@@ -26,12 +26,15 @@ from brewster.metrics.windows import (
     check_images,
     check_region,
     gaussian_means,
+    mean_inside,
 )
+from brewster.srgb import to_linear
 
 Window = Literal["uniform", "gaussian"]
 
 _LUMINANCE_CONSTANT: Final = (0.01 * 255) ** 2
 _CONTRAST_CONSTANT: Final = (0.03 * 255) ** 2
+_LINEAR: Final = to_linear(np.arange(256, dtype=np.float32) / 255)
 _STRIP_ROWS: Final = 32
 _WINDOW_SIDES: Final[dict[Window, int]] = {"uniform": BOX_SIDE, "gaussian": 2 * GAUSSIAN_RADIUS + 1}
 
@@ -49,11 +52,42 @@ def psnr(prediction: Image, truth: Image, *, region: Region | None = None) -> fl
     """
     check_images(prediction, truth)
     difference = prediction.astype(np.int32) - truth
-    if region is not None:
-        check_region(region, prediction.shape[:2])
-        difference = difference[region]
-    mse = np.mean(difference * difference)
+    mse = mean_inside(difference * difference, region)
     return float(10 * np.log10(255**2 / mse)) if mse else float("inf")
+
+
+def psnr_of_channels(prediction: Image, truth: Image) -> float:
+    """The mean of the PSNR of red, green and blue, as the code of ERRNet (util/index.py) and XReflection computes it.
+
+    It is never below `psnr`, which takes one mean squared error over all channels.
+
+    Returns:
+        The mean in dB; infinity if a channel is equal in both images. Higher is better.
+
+    Raises:
+        ValueError: the images are not uint8 (H, W, 3) or differ in shape.
+    """
+    check_images(prediction, truth)
+    difference = prediction.astype(np.int32) - truth
+    mse = (difference * difference).mean(axis=(0, 1))
+    return float(np.mean(10 * np.log10(255**2 / mse))) if mse.all() else float("inf")
+
+
+def linear_error(prediction: Image, truth: Image, *, region: Region | None = None) -> float:
+    """The root mean squared error in linear light, in 0..1: sqrt(mean((L(prediction) - L(truth))^2)).
+
+    L is the inverse of the sRGB curve (IEC 61966-2-1). The mean is over the three channels of all pixels, or of the
+    pixels in `region`, bool (H, W). Unlike errors of encoded values, it is proportional to the wrong amount of light.
+
+    Returns:
+        The error, 0 for equal images. Lower is better.
+
+    Raises:
+        ValueError: the images are not uint8 (H, W, 3) or differ in shape; the region is empty or of another shape.
+    """
+    check_images(prediction, truth)
+    difference = _LINEAR[prediction] - _LINEAR[truth]
+    return float(mean_inside(difference * difference, region) ** 0.5)
 
 
 def ssim(
@@ -71,25 +105,39 @@ def ssim(
         ValueError: the images are not uint8 (H, W, 3), differ in shape, or are smaller than the window; the
             region is empty, of another shape, or has only pixels without a value.
     """
+    return mean_ssim(ssim_map(prediction, truth, window=window), region=region)
+
+
+def mean_ssim(values: NDArray[np.float64], *, region: Region | None = None) -> float:
+    """The mean of a map of `ssim_map`, over all its pixels or over those in `region`, bool (H, W).
+
+    Raises:
+        ValueError: the region is empty, of another shape, or has only pixels without a value.
+    """
+    if region is None:
+        return float(np.mean(values))
+    border = (region.shape[0] - values.shape[0]) // 2
+    check_region(region, (values.shape[0] + 2 * border, values.shape[1] + 2 * border))
+    inside = region[border : border + values.shape[0], border : border + values.shape[1]]
+    if not inside.any():
+        raise ValueError(
+            f"all pixels of the region are within {border} pixels of the border, where SSIM has no value"
+        )
+    return float(mean_inside(values, inside))
+
+
+def ssim_map(prediction: Image, truth: Image, *, window: Window = "uniform") -> NDArray[np.float64]:
+    """The local SSIM, (H - side + 1, W - side + 1, 3) for a window of `side` pixels.
+
+    Raises:
+        ValueError: the images are not uint8 (H, W, 3), differ in shape, or are smaller than the window.
+    """
     check_images(prediction, truth)
     side = _WINDOW_SIDES[window]
     height, width = prediction.shape[:2]
     if min(height, width) < side:
         raise ValueError(f"SSIM needs at least {side}x{side} pixels, not {height}x{width}")
-    values = _ssim_map(prediction, truth, window)
-    if region is not None:
-        check_region(region, (height, width))
-        border = side // 2
-        values = values[region[border : height - border, border : width - border]]
-        if not values.size:
-            raise ValueError(
-                f"all pixels of the region are within {border} pixels of the border, where SSIM has no value"
-            )
-    return float(np.mean(values))
-
-
-def _ssim_map(prediction: Image, truth: Image, window: Window) -> NDArray[np.float64]:
-    """The SSIM map, (H - side + 1, W - side + 1, 3), computed in strips that fit the processor's cache."""
+    # Strips of rows fit the processor's cache.
     windowed_ssim, strip_height = _WINDOWED_SSIM[window], _STRIP_ROWS + _WINDOW_SIDES[window] - 1
     tops = range(0, len(prediction) - _WINDOW_SIDES[window] + 1, _STRIP_ROWS)
     return np.concatenate(
@@ -135,8 +183,8 @@ def _ssim_formula(
     contrast = _CONTRAST_CONSTANT * pixel_count * (pixel_count - sample_covariance)
     numerator = (2 * mean_product + luminance) * (2 * (pixel_count * products - mean_product) + contrast)
     denominator = (mean_squares + luminance) * (pixel_count * squares - mean_squares + contrast)
-    ssim_map: NDArray[np.float64] = numerator / denominator
-    return ssim_map
+    values: NDArray[np.float64] = numerator / denominator
+    return values
 
 
 _WINDOWED_SSIM: Final[dict[Window, Callable[[Image, Image], NDArray[np.float64]]]] = {

@@ -9,6 +9,7 @@ from typing import Any, Literal, TypeVar, cast, final
 from brewster.metrics.windows import Image, Region
 
 _Features = TypeVar("_Features")
+_Shared = TypeVar("_Shared")
 
 
 @final
@@ -42,6 +43,16 @@ class Comparison:
     """The ground truth of the reflection; None if the case has none."""
     region: Region | None = None
     """The pixels to score, for a metric whose `where` is "region"; otherwise None."""
+    _shared: dict[Callable[[Comparison], Any], Any] = field(default_factory=dict, repr=False)
+
+    def shared(self, compute: Callable[[Comparison], _Shared]) -> _Shared:
+        """The result of `compute` for this pair of images, which must not depend on the region.
+
+        It is computed once, and shared by all metrics that score the pair, inside a region or not.
+        """
+        if compute not in self._shared:
+            self._shared[compute] = compute(self)
+        return cast("_Shared", self._shared[compute])
 
 
 @final

@@ -11,6 +11,7 @@ definition and the weights are those of version 0.1 of the `lpips` package. Only
 from __future__ import annotations
 
 import functools
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, NamedTuple, final
 
@@ -63,6 +64,32 @@ class Features:
 
     maps: tuple[Map, ...]
     size: tuple[int, int]
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class DifferenceMaps:
+    """The weighted squared differences of the features of two images: five float32 maps (h, w).
+
+    `size` is the (height, width) of the images.
+    """
+
+    maps: tuple[Tensor, ...]
+    size: tuple[int, int]
+
+    def mean(self, *, region: Region | None = None) -> float:
+        """The distance, averaged over the whole maps or over a region; see `Lpips.distance`.
+
+        Raises:
+            ValueError: the region is empty or of another shape.
+        """
+        import torch  # noqa: PLC0415 - an extra
+
+        if region is None:
+            return float(sum(_mean(map_.numpy()) for map_ in self.maps))
+        check_region(region, self.size)
+        with torch.inference_mode():
+            return _mean(_upsampled(self.maps, self.size).numpy()[region])
 
 
 @final
@@ -127,6 +154,14 @@ class Lpips:
         Raises:
             ValueError: the images differ in size, or the region is empty or of another shape.
         """
+        return self.difference(one, other).mean(region=region)
+
+    def difference(self, one: Features, other: Features) -> DifferenceMaps:
+        """The five maps of `distance` before they are averaged, for several means of one pair.
+
+        Raises:
+            ValueError: the images differ in size.
+        """
         import torch  # noqa: PLC0415 - an extra
 
         if one.size != other.size:
@@ -136,10 +171,7 @@ class Lpips:
                 torch.einsum("c,chw->hw", head, (a - b).square_())
                 for head, a, b in zip(self.heads, one.maps, other.maps, strict=True)
             ]
-            if region is None:
-                return float(sum(_mean(map_.numpy()) for map_ in maps))
-            check_region(region, one.size)
-            return _mean(_upsampled(maps, one.size).numpy()[region])
+        return DifferenceMaps(tuple(maps), one.size)
 
 
 def lpips(prediction: Image, truth: Image, *, region: Region | None = None) -> float:
@@ -192,7 +224,7 @@ def _mean(values: NDArray[np.float32]) -> float:
     return float(values.mean(dtype=np.float64))
 
 
-def _upsampled(maps: list[Tensor], size: tuple[int, int]) -> Tensor:
+def _upsampled(maps: Sequence[Tensor], size: tuple[int, int]) -> Tensor:
     from torch.nn.functional import interpolate  # noqa: PLC0415 - an extra
 
     full = [interpolate(map_[None, None], size, mode="bilinear", align_corners=False)[0, 0] for map_ in maps]

@@ -28,7 +28,8 @@ def reflection_region(photo: Image, truth: Image, *, threshold: float = DEFAULT_
     check_images(photo, truth)
     if not 0 <= threshold <= 1:
         raise ValueError(f"the threshold must be in 0..1, not {threshold}")
-    largest = np.abs(photo.astype(np.int16) - truth).max(axis=2)
+    red, green, blue = np.moveaxis(np.abs(photo.astype(np.int16) - truth), 2, 0)
+    largest = np.maximum(np.maximum(red, green), blue)  # much faster than max(axis=2)
     sums = box_sums(np.pad(largest, BOX_SIDE // 2, mode="edge"))  # at most 49 * 255: int16 holds them exactly
     region: Region = sums > threshold * 255 * BOX_SIDE**2
     return region

@@ -1,9 +1,12 @@
-"""The weights of LPIPS. Its five linear layers ("heads") are part of brewster; AlexNet's weights are downloaded once.
+"""The networks of LPIPS and DISTS. The small weights of their channels are part of brewster; networks are downloaded once.
 
-The convolutions are those of torchvision's AlexNet (`features.0`, 3, 6, 8 and 10 of alexnet-owt-7be5be79.pth,
-BSD-3-Clause). Their ten tensors are stored as a state dict, `lpips_alexnet_features.pth`. It is searched for in
-the folder `brewster/weights` of the user's cache folder, then in the folder `weights` of BREWSTER_DATA. The digest of
-the values is always checked, because distances with other weights are not LPIPS.
+Both are networks of torchvision (BSD-3-Clause). They are searched for in the folder `brewster/weights` of the user's cache
+folder, then in the folder `weights` of BREWSTER_DATA, and are always checked, because distances with other weights are
+other metrics:
+
+    LPIPS   AlexNet: `features.0`, 3, 6, 8 and 10 of alexnet-owt-7be5be79.pth, stored as a state dict of ten tensors,
+            `lpips_alexnet_features.pth`. The digest of the values is checked.
+    DISTS   VGG16: the whole file, vgg16-397923af.pth (528 MiB). Its SHA-256 is checked.
 """
 
 from __future__ import annotations
@@ -20,7 +23,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from brewster.download import Downloader, RemoteFile
+from brewster.download import Downloader, RemoteFile, file_digest
 from brewster.errors import DownloadError, ModelError
 from brewster.files import cache_folder, write_atomically
 
@@ -39,6 +42,21 @@ TORCHVISION_ALEXNET: Final = RemoteFile(
     size=244_408_911,
     algorithm="sha256",
     digest="7be5be791159472b1fbf3c69796f7cb30dca7ad8466c2df70058c37116cdee02",
+)
+
+VGG16_FILE: Final = "vgg16-397923af.pth"
+
+TORCHVISION_VGG16: Final = RemoteFile(
+    f"https://download.pytorch.org/models/{VGG16_FILE}",
+    size=553_433_881,
+    algorithm="sha256",
+    digest="397923af8e79cdbb6a7127f12361acd7a2f83e06b05044ddf496e83de57a5bf0",
+)
+
+VGG16_TENSORS: Final = tuple(
+    f"features.{i}.{kind}"
+    for i in (0, 2, 5, 7, 10, 12, 14, 17, 19, 21, 24, 26, 28)
+    for kind in ("weight", "bias")
 )
 
 _LOAD_ERRORS: Final = (
@@ -69,12 +87,54 @@ def load_alexnet(
         DownloadError: there is no file, and the download fails.
         TargetError: the cache folder cannot be written.
     """
-    cached = cache_folder() / "weights" / WEIGHTS_FILE
+    path = _find(WEIGHTS_FILE)
+    if path:
+        return read_alexnet(path, digest)
+    return _fetch(remote, digest, _cached(WEIGHTS_FILE), downloader or Downloader())
+
+
+def load_vgg16(
+    remote: RemoteFile = TORCHVISION_VGG16, *, downloader: Downloader | None = None
+) -> list[Tensor]:
+    """VGG16's 26 tensors in the order of `VGG16_TENSORS`, float32: from the cache, BREWSTER_DATA, or downloaded.
+
+    Raises:
+        ModelError: the file is damaged, or is another file.
+        DownloadError: there is no file, and the download fails.
+        TargetError: the cache folder cannot be written.
+    """
+    import torch  # noqa: PLC0415 - an extra
+
+    path = _find(VGG16_FILE)
+    if not path:
+        path = _cached(VGG16_FILE)
+        try:
+            (downloader or Downloader()).fetch(remote, path)
+        except DownloadError as error:
+            raise DownloadError(
+                f"VGG16's weights for DISTS (528 MiB) could not be downloaded: {str(error).rstrip('.')}",
+                f"expected a network connection, or {VGG16_FILE} in the folder weights of BREWSTER_DATA",
+                "connect and try again, or leave DISTS out with --metrics",
+            ) from error
+    if (actual := file_digest(path, remote.algorithm)) != remote.digest:
+        raise ModelError(
+            f"{path} has the {remote.algorithm} {actual:.12}...",
+            f"expected {remote.digest:.12}..., the file {VGG16_FILE} of torchvision",
+            "delete the file, so that brewster downloads it again (528 MiB), or replace it with the correct one",
+        )
+    state = torch.load(path, map_location="cpu", weights_only=True)
+    return [state[name].float().contiguous() for name in VGG16_TENSORS]
+
+
+def _cached(name: str) -> Path:
+    return cache_folder() / "weights" / name
+
+
+def _find(name: str) -> Path | None:
+    """The file in the cache, else in BREWSTER_DATA; None if there is none."""
     data = os.environ.get("BREWSTER_DATA")
-    for path in (cached, *([Path(data) / "weights" / WEIGHTS_FILE] if data else [])):
-        if path.is_file():
-            return read_alexnet(path, digest)
-    return _fetch(remote, digest, cached, downloader or Downloader())
+    paths = [_cached(name), *([Path(data) / "weights" / name] if data else [])]
+    return next((path for path in paths if path.is_file()), None)
 
 
 def read_alexnet(path: Path, digest: str = DIGEST) -> dict[str, Tensor]:

@@ -54,6 +54,20 @@ def check_region(region: Region, size: tuple[int, int]) -> None:
         raise ValueError("the region is empty; a metric needs at least one pixel")
 
 
+def mean_inside(values: NDArray[Any], region: Region | None = None) -> float:
+    """The mean of values (H, W, 3), or of those in a region, bool (H, W).
+
+    Raises:
+        ValueError: the region is empty or of another shape.
+    """
+    if region is None:
+        return float(np.mean(values))
+    check_region(region, values.shape[:2])
+    # Sums over the channels first: indexing (H, W, 3) with a mask of pixels takes ten times as long.
+    sums = values[..., 0] + values[..., 1] + values[..., 2]
+    return float(np.sum(sums[region], dtype=np.float64) / (3 * np.count_nonzero(region)))
+
+
 def box_sums(values: _Values) -> _Values:
     """Sums over all complete 7x7 windows, (H - 6, W - 6, ...). Integer sums are exact if the dtype can hold them."""
     for axis in (0, 1):

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Final, final
 
 from brewster.errors import ModelError
+from brewster.models.large_models import LARGE
 
 _WEIGHTS: Final = Path(__file__).parent / "weights"
 
@@ -80,6 +81,8 @@ LARGE_MODELS: Final = {
 """Large models: name -> import path of the `Backbone` class. The path is text, because the import needs torch."""
 
 
+_LARGE_NAMES: Final = [name for name, model in LARGE.items() if model.is_opened_by_name]
+
 TINY_PREFIX: Final = "tiny:"
 """The prefix for the tiny version of a backbone: the same classes with few, random weights, for tests and demos."""
 
@@ -88,7 +91,7 @@ def is_large(name: str) -> bool:
     """Whether `name` is that of a large model or LoRA: a registered name, "tiny:" and a name, a folder, or a hub id."""
     if name in MODELS or Path(name).is_file():
         return False
-    return name in LARGE_MODELS or name.startswith(TINY_PREFIX) or Path(name).is_dir() or _is_hub_id(name)
+    return name in _LARGE_NAMES or name.startswith(TINY_PREFIX) or Path(name).is_dir() or _is_hub_id(name)
 
 
 def model_name(model: str) -> str:
@@ -131,10 +134,10 @@ def find_model(name: str) -> ModelFile:
         )
     if path.is_file():
         return ModelFile(path.stem, path, None, "unknown")
-    close = difflib.get_close_matches(name, (*MODELS, *LARGE_MODELS), n=1) if path.name == name else []
+    close = difflib.get_close_matches(name, (*MODELS, *_LARGE_NAMES), n=1) if path.name == name else []
     raise ModelError(
         f"there is no model {name!r}",
-        f"expected one of {', '.join((*MODELS, *LARGE_MODELS))}, an .onnx file, or the folder or hub id of a LoRA",
+        f"expected one of {', '.join((*MODELS, *_LARGE_NAMES))}, an .onnx file, or the folder or hub id of a LoRA",
         f"did you mean {close[0]}?"
         if close
         else "check the path, or print all models with: brewster models list",

@@ -10,12 +10,14 @@ from brewster.files import DEFAULT_MAX_PIXELS
 from brewster.photo.decode import read_size
 from brewster.photo.file_info import FileInfo
 from brewster.photo.hdr_formats import read_layers, write_layers
+from brewster.photo.mask import Mask
 from brewster.photo.photo import Encoding, Photo, Source
 
 __all__ = [
     "DEFAULT_MAX_PIXELS",
     "Encoding",
     "FileInfo",
+    "Mask",
     "Photo",
     "Source",
     "read_layers",

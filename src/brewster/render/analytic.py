@@ -24,18 +24,18 @@ from brewster.render.rays.defocus import defocus_blur, margin_px
 from brewster.render.rays.emitters import CameraView, Device, Rays, SideEmitters
 from brewster.render.rays.layered_glass import (
     ReflectionOrder,
-    all_orders,
     enumerate_orders,
     fresnel,
     ghost_distance_mm,
-    lateral_shifts_mm,
+    in_plane_shifts_mm,
     order_throughputs,
-    paper_orders,
+    total_throughput,
+    truncated_throughput,
 )
 from brewster.render.rays.rough_glass import trace_orders
 from brewster.render.rays.sobol import SobolPoints
 from brewster.render.rays.vectors import normalize
-from brewster.render.sample import LAYERS, LightSample
+from brewster.render.sample import LAYERS, LinearSample
 from brewster.scene.camera import axes, dot
 from brewster.scene.scene import Scene
 
@@ -72,7 +72,7 @@ class _PreparedScene:
     back: Tensor
 
 
-def render(scene: Scene, assets: Assets, device: Device = "cpu") -> LightSample:
+def render(scene: Scene, assets: Assets, device: Device = "cpu") -> LinearSample:
     """Renders the five images of a scene (the paper's section "Data Generation").
 
     Returns:
@@ -95,7 +95,7 @@ def render(scene: Scene, assets: Assets, device: Device = "cpu") -> LightSample:
             if _needs_monte_carlo(scene)
             else _render_deterministic(prepared)
         )
-    return LightSample(scene, **dict(zip(LAYERS, layers, strict=True)))
+    return LinearSample(scene, **dict(zip(LAYERS, layers, strict=True)))
 
 
 def ghost_distance_px(scene: Scene) -> float:
@@ -158,9 +158,9 @@ def _render_deterministic(prepared: _PreparedScene) -> list[Tensor]:
 
 
 def _grid_size(prepared: _PreparedScene) -> int:
-    """Rays per pixel and axis: ceil(3 * texels per pixel), at most sqrt(samples); textures are filtered to match."""
+    """Rays per pixel and axis: ceil(3 * texels per pixel), at most sqrt(samples_per_pixel); textures are filtered to match."""
     finest = max(side.emitters.texels_per_pixel() for side in (prepared.behind, prepared.front))
-    return min(max(1, math.ceil(3 * finest)), math.isqrt(prepared.scene.samples))
+    return min(max(1, math.ceil(3 * finest)), math.isqrt(prepared.scene.samples_per_pixel))
 
 
 def _pinhole_rays(
@@ -191,23 +191,23 @@ def _pinhole_rays(
 
 
 def _render_monte_carlo(prepared: _PreparedScene, device: Device) -> list[Tensor]:
-    """Traces `samples` random rays per pixel, over the pixel, the lens and the microfacets of rough glass.
+    """Traces `samples_per_pixel` random rays per pixel, over the pixel, the lens and the microfacets of rough glass.
 
     Returns:
         I, T, B, R and MR, (3, H, W) each.
     """
     scene, camera = prepared.scene, prepared.scene.camera
     count = camera.width * camera.height
-    sobol = SobolPoints(scene.seed, scene.index, count, scene.samples, device)
+    sobol = SobolPoints(scene.seed, scene.index, count, scene.samples_per_pixel, device)
     trace = _trace_rough if scene.glass.is_rough or scene.glass.is_wedged else _trace_smooth
     total = torch.zeros(5, 3, count, device=prepared.origin.device)
     for start in range(0, count, _CPU_BATCH_RAYS):
         pixels = slice(start, min(start + _CPU_BATCH_RAYS, count))
-        for sample in range(scene.samples):
+        for sample in range(scene.samples_per_pixel):
             sobol.start_sample(sample, pixels)
             rays = _thin_lens_rays(prepared, pixels, sobol)
             total[:, :, pixels] += torch.stack(trace(prepared, rays, sobol))
-    return list((total / scene.samples).view(5, 3, camera.height, camera.width))
+    return list((total / scene.samples_per_pixel).view(5, 3, camera.height, camera.width))
 
 
 def _thin_lens_rays(prepared: _PreparedScene, pixels: slice, sobol: SobolPoints) -> Rays:
@@ -224,7 +224,7 @@ def _thin_lens_rays(prepared: _PreparedScene, pixels: slice, sobol: SobolPoints)
         lens = _outer(prepared.right, x) + _outer(prepared.up, y)
         origin, direction = origin + lens, direction - lens / camera.focus_mm
     # Half the mean distance of the samples in a pixel: the average over the samples filters, too.
-    return Rays(origin, normalize(direction), 1 / (2 * math.sqrt(prepared.scene.samples)))
+    return Rays(origin, normalize(direction), 1 / (2 * math.sqrt(prepared.scene.samples_per_pixel)))
 
 
 def _outer(axis: Tensor, values: Tensor) -> Tensor:
@@ -236,20 +236,20 @@ def _trace_smooth(prepared: _PreparedScene, rays: Rays, _: SobolPoints | None = 
     glass = prepared.scene.glass
     point, mirrored = _mirror_at_first_surface(rays)
     cosine = mirrored[2]
-    complete = all_orders(glass, cosine)
-    in_layers = paper_orders(glass, cosine) if prepared.scene.orders == "paper" else complete
+    complete = total_throughput(glass, cosine)
+    in_layers = truncated_throughput(glass, cosine) if prepared.scene.orders == "truncated" else complete
     layers = []
-    for side, origin, direction, total_throughput, layer_throughput in (
-        (prepared.behind, rays.origin, rays.direction, complete.transmitted, in_layers.transmitted),
-        (prepared.front, point, mirrored, complete.reflected, in_layers.reflected),
+    for side, origin, direction, total_ratio, layer_ratio in (
+        (prepared.behind, rays.origin, rays.direction, complete.transmittance, in_layers.transmittance),
+        (prepared.front, point, mirrored, complete.reflectance, in_layers.reflectance),
     ):
         far = side.emitters.far_radiance(direction, rays.footprint_px)
         unattenuated = side.emitters.add_near(far, origin, direction, rays.footprint_px)
         if len(side.groups) > 1:
             total, layer = _shifted_orders(prepared, side, Rays(point, direction, rays.footprint_px), far)
         else:
-            total = total_throughput * unattenuated
-            layer = layer_throughput * unattenuated if in_layers is not complete else total
+            total = total_ratio * unattenuated
+            layer = layer_ratio * unattenuated if in_layers is not complete else total
         layers.append((total, layer, unattenuated))
     (transmitted, transmission, background), (reflected, reflection, mirror) = layers
     return [transmitted + reflected, transmission, background, reflection, mirror]
@@ -267,24 +267,24 @@ def _shifted_orders(
     """
     glass, direction = prepared.scene.glass, exiting.direction
     cosine = direction[2].abs()
-    shifts = lateral_shifts_mm(glass, cosine)
+    shifts = in_plane_shifts_mm(glass, cosine)
     in_plane = normalize(direction * direction.new_tensor([1, 1, 0])[:, None])
     surface = exiting.origin.clone()
     surface[2] = -side.depth_mm
     throughputs = iter(order_throughputs(glass, cosine, [order for group in side.groups for order in group]))
     total, layer = torch.zeros_like(direction), torch.zeros_like(direction)
     for group in side.groups:
-        exit_point = surface + in_plane * _lateral_shift(group[0], shifts)
+        exit_point = surface + in_plane * _in_plane_shift(group[0], shifts)
         radiance = side.emitters.add_near(far, exit_point, direction, exiting.footprint_px)
         weights = list(zip(group, throughputs, strict=False))
         total += sum((weight for _, weight in weights), torch.zeros_like(cosine)) * radiance
-        if prepared.scene.orders == "paper":
-            in_layer = (weight for order, weight in weights if order.in_paper)
+        if prepared.scene.orders == "truncated":
+            in_layer = (weight for order, weight in weights if order.in_truncated_layers)
             layer += sum(in_layer, torch.zeros_like(cosine)) * radiance
     return total, total if prepared.scene.orders == "all" else layer
 
 
-def _lateral_shift(order: ReflectionOrder, shifts: list[Tensor]) -> Tensor:
+def _in_plane_shift(order: ReflectionOrder, shifts: list[Tensor]) -> Tensor:
     return sum(
         (n * shift for n, shift in zip(order.traversals, shifts, strict=True)), torch.zeros_like(shifts[0])
     )
@@ -301,15 +301,15 @@ def _group_orders(scene: Scene, emitters: SideEmitters, *, behind: bool) -> list
     if not emitters.is_near:
         return []
     cosine = _min_cosine(scene)
-    reflectances = (float(sum(fresnel(cosine, pane.index))) / 2 for pane in scene.glass.panes)
+    reflectances = (float(sum(fresnel(cosine, pane.refractive_index))) / 2 for pane in scene.glass.panes)
     table = enumerate_orders(tuple(round(min(r, _MAX_TABLE_REFLECTANCE), 3) for r in reflectances))
-    shifts = lateral_shifts_mm(scene.glass, cosine)
+    shifts = in_plane_shifts_mm(scene.glass, cosine)
     pixel_mm = scene.camera.pixel_rad * (scene.camera_above_glass_mm + emitters.distance_mm)
     groups: list[tuple[float, list[ReflectionOrder]]] = []
     for order in table:
         if order.behind != behind:
             continue
-        shift_px = float(_lateral_shift(order, shifts) * cosine) / pixel_mm
+        shift_px = float(_in_plane_shift(order, shifts) * cosine) / pixel_mm
         for group_px, group in groups:
             if abs(shift_px - group_px) < _MERGE_DISTANCE_PX:
                 group.append(order)
@@ -332,7 +332,9 @@ def _trace_rough(prepared: _PreparedScene, rays: Rays, sobol: SobolPoints) -> li
     emitters = prepared.behind.emitters, prepared.front.emitters
     for exiting in trace_orders(prepared.scene.glass, rays, *emitters, sobol):
         sides[exiting.behind][0] += exiting.light
-        sides[exiting.behind][1] += exiting.light * (prepared.scene.orders == "all" or exiting.in_paper)
+        sides[exiting.behind][1] += exiting.light * (
+            prepared.scene.orders == "all" or exiting.in_truncated_layers
+        )
     (transmitted, transmission), (reflected, reflection) = sides[True], sides[False]
     point, mirrored = _mirror_at_first_surface(rays)
     background = prepared.behind.emitters.radiance(rays.origin, rays.direction, rays.footprint_px)

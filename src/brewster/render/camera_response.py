@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from torch import Generator, Tensor
 
 from brewster.photo import FileInfo, Photo
-from brewster.render.sample import LAYERS, LightSample
+from brewster.render.sample import LAYERS, LinearSample
 from brewster.scene.scene import CameraResponse, Scene
 from brewster.srgb import REC709_LUMINANCE, to_encoded
 
@@ -42,7 +42,7 @@ _MINKOWSKI_NORM: Final = 6
 class DevelopedSample:
     """The five images of a sample as photographs, sRGB-encoded float32 (3, H, W) in 0..1, and the camera settings.
 
-    `white_balance` holds the gains of red, green and blue. Light was multiplied by them and by 2 ** `exposure_ev`
+    `white_balance_gains` holds the gains of red, green and blue. Light was multiplied by them and by 2 ** `exposure_ev`
     (MR by 2 ** `mirror_exposure_ev`), then clipped and encoded.
     """
 
@@ -54,35 +54,35 @@ class DevelopedSample:
     mirror_encoded: Tensor
     exposure_ev: float
     mirror_exposure_ev: float
-    white_balance: tuple[float, float, float]
-    overexposed: float
-    """The share of the pixels of I in which at least one channel clips, 0..1."""
+    white_balance_gains: tuple[float, float, float]
+    overexposed_fraction: float
+    """The fraction of the pixels of I in which at least one channel clips, 0..1."""
 
     def layers(self) -> dict[str, Tensor]:
         """The five encoded images by name."""
         return {name: getattr(self, f"{name}_encoded") for name in LAYERS}
 
     def camera_settings(self) -> dict[str, Any]:
-        """Exposures, white balance and overexposed share, as TOML values."""
+        """Exposures, white balance gains and overexposed fraction, as TOML values."""
         return {
             "exposure_ev": self.exposure_ev,
             "mirror_exposure_ev": self.mirror_exposure_ev,
-            "white_balance": list(self.white_balance),
-            "overexposed": self.overexposed,
+            "white_balance_gains": list(self.white_balance_gains),
+            "overexposed_fraction": self.overexposed_fraction,
         }
 
 
-def develop(sample: LightSample) -> DevelopedSample:
+def develop(sample: LinearSample) -> DevelopedSample:
     """Applies exposure, white balance, noise and tone curve, as the scene's `camera_response` describes them.
 
     Exposure is rounded to a thousandth of a stop before it is applied, and gains to four decimals. So the recorded
     values are exactly the applied ones, and rounding errors of different devices do not change them.
     """
     response = sample.scene.camera_response
-    white_balance = _white_balance(sample.photo, response)
-    gains = sample.photo.new_tensor(white_balance).view(3, 1, 1)
-    ev = _exposure_ev(sample.photo * gains, response.exposure)
-    mirror_ev = _exposure_ev(sample.mirror * gains, response.exposure)
+    white_balance_gains = _white_balance_gains(sample.photo, response)
+    gains = sample.photo.new_tensor(white_balance_gains).view(3, 1, 1)
+    ev = _exposure_ev(sample.photo * gains, response.target_luminance)
+    mirror_ev = _exposure_ev(sample.mirror * gains, response.target_luminance)
     exposed = sample.map(lambda light: light * (gains * math.exp2(ev))).layers()
     exposed["photo"] = _add_noise(exposed["photo"], sample.scene)
     exposed["mirror"] = sample.mirror * (gains * math.exp2(mirror_ev))
@@ -91,8 +91,8 @@ def develop(sample: LightSample) -> DevelopedSample:
         **{f"{name}_encoded": _tone_curve(light, response.contrast) for name, light in exposed.items()},
         exposure_ev=ev,
         mirror_exposure_ev=mirror_ev,
-        white_balance=white_balance,
-        overexposed=round((exposed["photo"] >= 1).any(0).float().mean().item(), 6),
+        white_balance_gains=white_balance_gains,
+        overexposed_fraction=round((exposed["photo"] >= 1).any(0).float().mean().item(), 6),
     )
 
 
@@ -160,7 +160,7 @@ def _exposure_ev(light: Tensor, target: float) -> float:
 # --- white balance
 
 
-def _white_balance(photo: Tensor, response: CameraResponse) -> tuple[float, float, float]:
+def _white_balance_gains(photo: Tensor, response: CameraResponse) -> tuple[float, float, float]:
     """RGB gains that correct the illuminant's colour by the requested strength and keep its luminance.
 
     The colour is estimated on the exposed image, without pixels that clip in any channel, because a camera
@@ -168,7 +168,7 @@ def _white_balance(photo: Tensor, response: CameraResponse) -> tuple[float, floa
     """
     if response.white_balance == "none":
         return 1.0, 1.0, 1.0
-    exposed = (photo * math.exp2(_exposure_ev(photo, response.exposure))).clamp(0, 1)
+    exposed = (photo * math.exp2(_exposure_ev(photo, response.target_luminance))).clamp(0, 1)
     valid = (exposed < 1).all(0)
     colour = _ILLUMINANT_ESTIMATORS[response.white_balance](exposed, valid if valid.any() else ~valid)
     return _gains(colour, response.white_balance_strength)

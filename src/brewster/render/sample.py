@@ -15,7 +15,7 @@ LAYERS: Final = ("photo", "transmission", "background", "reflection", "mirror")
 
 
 @dataclass(frozen=True, eq=False)
-class LightSample:
+class LinearSample:
     """Five images of linear light, float32 (3, H, W), and the scene they were rendered from.
 
     `photo` is I, the view with all glass effects; `transmission` T and `reflection` R are its two layers;
@@ -33,6 +33,6 @@ class LightSample:
         """The five images by name."""
         return {name: getattr(self, name) for name in LAYERS}
 
-    def map(self, function: Callable[[Tensor], Tensor]) -> LightSample:
+    def map(self, function: Callable[[Tensor], Tensor]) -> LinearSample:
         """A sample with the function applied to each image."""
-        return LightSample(self.scene, **{name: function(layer) for name, layer in self.layers().items()})
+        return LinearSample(self.scene, **{name: function(layer) for name, layer in self.layers().items()})

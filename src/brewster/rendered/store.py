@@ -28,7 +28,7 @@ from brewster.files import TEMPORARY_PREFIX, atomic_path, discard, temporary_pat
 from brewster.photo import read_layers, write_layers
 from brewster.render.analytic import ghost_distance_px
 from brewster.render.camera_response import DevelopedSample, develop, encode_jpeg, luminance
-from brewster.render.sample import LAYERS, LightSample
+from brewster.render.sample import LAYERS, LinearSample
 from brewster.scene.recipe_file import validated
 from brewster.scene.scene import Scene
 
@@ -46,33 +46,33 @@ _CURE: Final = "delete this sample, and render the set again"
 # --- encoding a sample
 
 
-def _reflection_to_transmission(sample: LightSample, _: DevelopedSample) -> float:
+def _reflection_to_transmission(sample: LinearSample, _: DevelopedSample) -> float:
     reflected, transmitted = (
         luminance(layer.double().mean((1, 2))) for layer in (sample.reflection, sample.transmission)
     )
     return reflected / max(transmitted, 1e-12)
 
 
-STATISTICS: Final[dict[str, Callable[[LightSample, DevelopedSample], float]]] = {
+STATISTICS: Final[dict[str, Callable[[LinearSample, DevelopedSample], float]]] = {
     "reflection_to_transmission": _reflection_to_transmission,
-    "overexposed": lambda _, developed: developed.overexposed,
+    "overexposed_fraction": lambda _, developed: developed.overexposed_fraction,
     "ghost_px": lambda sample, _: ghost_distance_px(sample.scene),
 }
 """Statistics for the selection of samples, in every scene.toml and in the index: mean luminance of R / mean luminance of T;
 share of the pixels of I with a clipped channel; distance in px between the first two mirror images."""
 
 
-def statistics(sample: LightSample, developed: DevelopedSample) -> dict[str, float]:
+def statistics(sample: LinearSample, developed: DevelopedSample) -> dict[str, float]:
     """Returns the values of STATISTICS, rounded to six significant digits."""
     return {name: float(f"{measure(sample, developed):.6g}") for name, measure in STATISTICS.items()}
 
 
-SAMPLE_FORMAT: Final = 2
+SAMPLE_FORMAT: Final = 3
 """Version of the files of a sample. Increase it if the same job gives other files, so that no set contains samples of two
-versions (tests/test_house_formats.py). 2: scene.toml has [camera_response] and `highlight_boost`."""
+versions (tests/test_house_formats.py). 3: the keys of scene.toml have other names (`refractive_index`, `target_luminance` ...)."""
 
 
-def encode_sample(sample: LightSample, renderer: str) -> dict[str, bytes]:
+def encode_sample(sample: LinearSample, renderer: str) -> dict[str, bytes]:
     """Encodes a sample. Returns its files: name -> bytes.
 
     Raises:

@@ -15,14 +15,14 @@ from brewster.scene.values import FrozenModel, NonNegativeFloat, PositiveFloat
 Point = tuple[float, float, float]
 """World coordinates in mm: x to the right, y up, -z forward."""
 
-DEFAULT_INDEX = 1.5
+DEFAULT_REFRACTIVE_INDEX = 1.5
 
 
 class Pane(FrozenModel):
     """One sheet of glass. Its far surface is rotated by `wedge_deg` about the vertical axis."""
 
     thickness_mm: Annotated[float, Field(gt=0, le=200)] = 4.0
-    index: Annotated[float, Field(ge=1, le=3)] = DEFAULT_INDEX
+    refractive_index: Annotated[float, Field(ge=1, le=3)] = DEFAULT_REFRACTIVE_INDEX
     absorption_per_m: tuple[NonNegativeFloat, NonNegativeFloat, NonNegativeFloat] = (0.0, 0.0, 0.0)
     """Beer-Lambert absorption coefficients for red, green and blue."""
     roughness: Annotated[float, Field(ge=0, le=1)] = 0.0
@@ -33,7 +33,7 @@ class Pane(FrozenModel):
 class Glazing(FrozenModel):
     """Panes with equal air gaps between them, and their position.
 
-    `frame_mm` is the width and height of an opening in a black wall that holds the glass; None means that the glass
+    `opening_mm` is the width and height of an opening in a black wall that holds the glass; None means that the glass
     fills the view. `radii_mm` are the radii of curvature of the near and the far surface of a lens, positive where a
     surface is convex towards the camera. Only the Mitsuba renderer supports framed and curved glass.
     """
@@ -43,16 +43,16 @@ class Glazing(FrozenModel):
     position_mm: Point = (0.0, 0.0, 0.0)
     heading_deg: float = 0.0
     pitch_deg: Annotated[float, Field(ge=-80, le=80)] = 0.0
-    frame_mm: tuple[PositiveFloat, PositiveFloat] | None = None
+    opening_mm: tuple[PositiveFloat, PositiveFloat] | None = None
     radii_mm: tuple[float, float] | None = None
 
     @model_validator(mode="after")
     def _check_geometry(self) -> Glazing:
         if len(self.panes) > 1 and self.gap_mm == 0:
             raise ValueError("expected a gap_mm above 0 between several panes, but it is 0")
-        if self.radii_mm and (len(self.panes) > 1 or not all(self.radii_mm) or self.frame_mm is None):
+        if self.radii_mm and (len(self.panes) > 1 or not all(self.radii_mm) or self.opening_mm is None):
             raise ValueError(
-                "expected one pane, two radii other than 0 and a frame, because the glass is curved"
+                "expected one pane, two radii other than 0 and opening_mm, because the glass is curved"
             )
         return self
 
@@ -64,7 +64,7 @@ class Glazing(FrozenModel):
     @property
     def is_flat(self) -> bool:
         """Whether the glass is flat and fills the view, as the analytic renderer requires."""
-        return self.radii_mm is None and self.frame_mm is None
+        return self.radii_mm is None and self.opening_mm is None
 
     @property
     def is_rough(self) -> bool:

@@ -1,7 +1,7 @@
 """Scene recipes: distributions of the parameters of random scenes, read from TOML into frozen models.
 
-A `Range` is sampled uniformly, a `LogRange` uniformly in the logarithm. A `_probability` is the share of scenes that have
-the feature. The packaged recipes are the TOML files in the folder `recipes` next to this file.
+A `Range` is sampled uniformly, a `LogRange` log-uniformly (uniformly in the logarithm). A `_probability` is the share
+of scenes that have the feature. The packaged recipes are the TOML files in the folder `recipes` next to this file.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from brewster.scene.values import (
     Share,
 )
 
-Setup = Literal["map|map", "map|picture", "picture|map"]
+Setup = Literal["map|map", "map|plane", "plane|map"]
 """The kinds of content behind and in front of the glass (paper, figure on scene setups: HDR|HDR, HDR|LDR, LDR|HDR)."""
 
 _FOLDER: Final = Path(__file__).parent / "recipes"
@@ -49,36 +49,38 @@ class GlassRecipe(FrozenModel):
     """Probability of thick structural glass."""
     structural_thickness_mm: LogRange = (10.0, 40.0)
     """Thickness of a pane of structural glass."""
-    index: Range = (1.45, 1.65)
+    refractive_index: Range = (1.45, 1.65)
     """Refractive index, the same for all panes of a scene; at least 1."""
-    tints: Annotated[
-        tuple[tuple[NonNegativeFloat, NonNegativeFloat, NonNegativeFloat], ...], KeyNote(unit="1/m")
-    ] = ((4.0, 1.5, 2.5),)
+    absorption_per_m: tuple[tuple[NonNegativeFloat, NonNegativeFloat, NonNegativeFloat], ...] = (
+        (4.0, 1.5, 2.5),
+    )
     """Absorption coefficients for red, green and blue, one of which is drawn. They are larger for red
     and blue than for green, because clear float glass is slightly green."""
-    tint_strength_log: LogRange = (0.3, 2.0)
+    tint_strength: LogRange = (0.3, 2.0)
     """Factor on the absorption coefficients."""
     rough_probability: Share = 0.0
     """Probability of rough glass."""
-    roughness_log: LogRange = (0.01, 0.1)
+    roughness: LogRange = (0.01, 0.1)
     """GGX width (alpha) of the surfaces of rough glass: 0.05 is satin, 0.2 frosted."""
     wedge_probability: Share = 0.0
     """Probability of wedged panes, whose two surfaces are not parallel."""
-    wedge_deg_log: LogRange = (0.01, 0.3)
+    wedge_deg: LogRange = (0.01, 0.3)
     """Angle between the two surfaces of a wedged pane."""
     pitch_deg: Range = (0.0, 0.0)
     """Elevation of the normal of the glass above the horizon; 0 for upright glass."""
 
     @model_validator(mode="after")
     def _check_values(self) -> Self:
-        if self.index[0] < 1:
-            raise ValueError(f"expected an index of at least 1, but it starts at {self.index[0]:g}")
+        if self.refractive_index[0] < 1:
+            raise ValueError(
+                f"expected a refractive_index of at least 1, but it starts at {self.refractive_index[0]:g}"
+            )
         if self.gap_mm[0] <= 0 and self.double_probability:
             raise ValueError(
                 f"expected a gap_mm above 0 for double glazing, but it starts at {self.gap_mm[0]:g}"
             )
-        if not self.tints:
-            raise ValueError("expected at least one colour, but tints is empty")
+        if not self.absorption_per_m:
+            raise ValueError("expected at least one colour, but absorption_per_m is empty")
         return self
 
 
@@ -89,7 +91,7 @@ class CameraRecipe(FrozenModel):
     """Width of the image."""
     height: Pixels = 384
     """Height of the image."""
-    distance_mm_log: LogRange = (300.0, 3000.0)
+    distance_mm: LogRange = (300.0, 3000.0)
     """Distance of the camera from the glass."""
     incidence_deg: Range = (-35.0, 35.0)
     """Horizontal angle between the optical axis and the normal of the glass."""
@@ -99,7 +101,7 @@ class CameraRecipe(FrozenModel):
     """Horizontal field of view. For maps of low resolution, the lower limit is raised as `max_px_per_texel` requires."""
     pinhole_probability: Share = 0.7
     """Probability of a pinhole camera, which has no defocus."""
-    aperture_mm_log: LogRange = (1.0, 15.0)
+    aperture_mm: LogRange = (1.0, 15.0)
     """Aperture diameter of a camera with a lens."""
     focus_on_front_probability: Share = 0.15
     """Probability that the camera is focused on the mirrored content instead of the content behind the glass."""
@@ -110,32 +112,32 @@ class SideRecipe(FrozenModel):
 
     map_probability: Share = 1.0
     """Probability of an environment map. A side without a map has a picture."""
-    maps: tuple[str, ...] = ()
+    map_categories: tuple[str, ...] = ()
     """Categories of the maps, such as indoor, outdoor or night. Empty: all maps."""
     max_px_per_texel: PositiveFloat = 2.5
     """Largest width of a texel of the map in the image. It limits the choice of maps and the field of view."""
     dome_probability: Share = 0.0
     """Probability that the map is on a sphere (dome) of finite radius around the glass instead of at infinity."""
-    radius_mm_log: LogRange = (3000.0, 10_000.0)
+    radius_mm: LogRange = (3000.0, 10_000.0)
     """Radius of the dome."""
-    picture_probability: Share = 0.0
+    plane_probability: Share = 0.0
     """Probability of a picture on a plane, in front of the map if there is one."""
-    distance_mm_log: LogRange = (1000.0, 8000.0)
+    distance_mm: LogRange = (1000.0, 8000.0)
     """Distance of the picture behind the last pane; in [front], behind the camera."""
     relative_width: Range = (1.05, 1.5)
     """Width of the picture, divided by the width that exactly covers the view."""
-    turn_deg: Range = (0.0, 0.0)
+    heading_deg: Range = (0.0, 0.0)
     """Rotation of the picture about the vertical axis. The rotation about the horizontal axis has half this range."""
     highlight_boost: Range = (0.0, 0.0)
     """Extra brightness of clipped whites in a picture: the light of white is multiplied by 1 + highlight_boost."""
-    luminance_log: LogRange = (1.0, 1.0)
+    luminance: LogRange = (1.0, 1.0)
     """Mean luminance of the content. Only the ratio between the two sides has an effect, because the exposure is automatic."""
 
 
 class CameraResponseRecipe(FrozenModel):
     """The camera response: the conversion of linear light into an 8-bit photograph."""
 
-    exposure: LogRange = (0.2, 0.5)
+    target_luminance: LogRange = (0.2, 0.5)
     """Mean luminance of the photo I after exposure and clipping to 0..1."""
     white_balance: Annotated[tuple[WhiteBalance, ...], Field(min_length=1)] = (
         "none",
@@ -163,24 +165,24 @@ class SceneRecipe(FrozenModel):
     """The name of the recipe. The scenes depend on it: recipes with different names give different scenes for the same seed."""
     about: str
     """A description of the scenes."""
-    orders: Literal["all", "paper"] = "all"
-    """Light paths in T and R. all: all orders of reflection, so that I = T + R. paper: T contains only the
+    orders: Literal["all", "truncated"] = "all"
+    """Light paths in T and R. all: all orders of reflection, so that I = T + R. truncated: T contains only the
     path without a reflection, R only paths that do not enter the last pane."""
-    samples: PositiveInt = 8
+    samples_per_pixel: PositiveInt = 8
     """Rays per pixel of scenes that need Monte Carlo sampling (a wedged pane, or a lens and near content), and the maximum
     for other scenes without rough glass."""
-    rough_samples: PositiveInt = 16
+    rough_samples_per_pixel: PositiveInt = 16
     """Rays per pixel for scenes with rough glass."""
     setups: Annotated[
         dict[Setup, Share],
         KeyNote(
             "table of behind|front = share",
-            'keys "map|map", "map|picture", "picture|map"; shares from 0 to 1',
+            'keys "map|map", "map|plane", "plane|map"; shares from 0 to 1',
             replaces_constraints=True,
         ),
     ] = Field(default_factory=dict)
     """Relative shares of the kinds of content behind|in front of the glass, drawn together: an environment map, or a picture
-    alone. They replace map_probability and picture_probability of both sides. Empty: each side is drawn by itself."""
+    on a plane without a map. They replace map_probability and plane_probability of both sides. Empty: each side is drawn by itself."""
     glass: GlassRecipe = GlassRecipe()
     camera: CameraRecipe = CameraRecipe()
     behind: SideRecipe = SideRecipe()
@@ -199,7 +201,7 @@ class SceneRecipe(FrozenModel):
         """Returns the recipe whose two sides have exactly this kind of content."""
         behind, front = (
             side.model_copy(
-                update={"map_probability": float(kind == "map"), "picture_probability": float(kind != "map")}
+                update={"map_probability": float(kind == "map"), "plane_probability": float(kind != "map")}
             )
             for side, kind in zip((self.behind, self.front), setup.split("|"), strict=True)
         )

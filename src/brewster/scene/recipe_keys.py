@@ -24,7 +24,7 @@ REQUIRED: Final = object()
 """Stands for the default of a key that has no default."""
 
 _UNITS: Final = {"mm": "mm", "deg": "degrees", "px": "px", "per_m": "1/m", "px_per_texel": "px per texel"}
-_SUFFIX: Final = re.compile(rf"(?:^|_)({'|'.join(sorted(_UNITS, key=len, reverse=True))})(?:_log)?$")
+_SUFFIX: Final = re.compile(rf"(?:^|_)({'|'.join(sorted(_UNITS, key=len, reverse=True))})$")
 _KINDS: Final = {bool: "boolean", int: "integer", float: "number", str: "string", Path: "path"}
 
 

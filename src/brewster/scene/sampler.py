@@ -106,7 +106,7 @@ def _draw_once(recipe: SceneRecipe, catalog: Catalog, rng: _SceneRng, seed: int,
         index=index,
         version=__version__,
         orders=recipe.orders,
-        samples=recipe.rough_samples if glass.is_rough else recipe.samples,
+        samples_per_pixel=recipe.rough_samples_per_pixel if glass.is_rough else recipe.samples_per_pixel,
         glass=glass,
         camera=_focus_camera(recipe.camera, partial, behind, front),
         behind=behind,
@@ -118,21 +118,21 @@ def _draw_once(recipe: SceneRecipe, catalog: Catalog, rng: _SceneRng, seed: int,
 def _draw_glazing(recipe: GlassRecipe, rng: _SceneRng) -> Glazing:
     count = 2 if rng.bernoulli(recipe.double_probability) else 1
     structural = rng.bernoulli(recipe.structural_probability)
-    tint, strength = rng.choice(recipe.tints), rng.from_log_range(recipe.tint_strength_log)
-    rough = rng.from_log_range(recipe.roughness_log) if rng.bernoulli(recipe.rough_probability) else 0.0
+    tint, strength = rng.choice(recipe.absorption_per_m), rng.from_log_range(recipe.tint_strength)
+    rough = rng.from_log_range(recipe.roughness) if rng.bernoulli(recipe.rough_probability) else 0.0
     wedged = rng.bernoulli(recipe.wedge_probability)
     red, green, blue = (_six_digits(colour * strength) for colour in tint)
-    index = rng.from_range(recipe.index)
+    refractive_index = rng.from_range(recipe.refractive_index)
 
     def pane() -> Pane:
         return Pane(
             thickness_mm=rng.from_log_range(
                 recipe.structural_thickness_mm if structural else recipe.thickness_mm
             ),
-            index=index,
+            refractive_index=refractive_index,
             absorption_per_m=(red, green, blue),
             roughness=rough,
-            wedge_deg=rng.from_log_range(recipe.wedge_deg_log) * rng.choice((-1, 1)) if wedged else 0.0,
+            wedge_deg=rng.from_log_range(recipe.wedge_deg) * rng.choice((-1, 1)) if wedged else 0.0,
         )
 
     return Glazing(
@@ -144,14 +144,18 @@ def _draw_glazing(recipe: GlassRecipe, rng: _SceneRng) -> Glazing:
 
 def _choose_map(recipe: SideRecipe, camera: CameraRecipe, catalog: Catalog, rng: _SceneRng) -> Asset | None:
     """Draws a map with sufficient resolution for the widest view of the recipe. Returns None for a side without a map."""
-    candidates = [asset for asset in catalog.maps if not recipe.maps or asset.category in ("", *recipe.maps)]
+    candidates = [
+        asset
+        for asset in catalog.maps
+        if not recipe.map_categories or asset.category in ("", *recipe.map_categories)
+    ]
     sufficient = [asset for asset in candidates if _min_fov_deg(asset, recipe, camera) <= camera.fov_deg[1]]
-    if not rng.bernoulli(recipe.map_probability) or (not sufficient and recipe.picture_probability > 0):
+    if not rng.bernoulli(recipe.map_probability) or (not sufficient and recipe.plane_probability > 0):
         return None
     if not sufficient:
         raise RecipeError(
             f"none of {len(catalog.maps)} maps is suitable for the recipe",
-            f"expected categories {', '.join(recipe.maps) or 'any'}, and texels of at most {recipe.max_px_per_texel:g} px"
+            f"expected categories {', '.join(recipe.map_categories) or 'any'}, and texels of at most {recipe.max_px_per_texel:g} px"
             f" for a field of view of {camera.fov_deg[1]:g} degrees",
             "choose other or larger --maps, or a smaller --size",
         )
@@ -171,7 +175,7 @@ def _draw_camera(recipe: SceneRecipe, maps: list[tuple[SideRecipe, Asset | None]
     )
     heading, pitch = rng.from_range(ranges.incidence_deg), rng.from_range(ranges.pitch_deg)
     _, _, back = axes(heading, pitch)
-    distance_mm = rng.from_log_range(ranges.distance_mm_log) / max(back[2], 0.1)
+    distance_mm = rng.from_log_range(ranges.distance_mm) / max(back[2], 0.1)
     x, y, z = (_six_digits(distance_mm * part) for part in back)
     return Camera(
         position_mm=(x, y, z),
@@ -186,7 +190,7 @@ def _draw_camera(recipe: SceneRecipe, maps: list[tuple[SideRecipe, Asset | None]
 def _draw_side(recipe: SideRecipe, asset: Asset | None, partial: _PartialScene, base_mm: float) -> Side:
     """Draws a map, a picture, or both. The distance of the picture from the glass is `base_mm` plus the distance drawn."""
     rng = partial.rng
-    luminance = rng.from_log_range(recipe.luminance_log)
+    luminance = rng.from_log_range(recipe.luminance)
     environment_map = plane = None
     if asset:
         is_dome = rng.bernoulli(recipe.dome_probability)
@@ -194,10 +198,10 @@ def _draw_side(recipe: SideRecipe, asset: Asset | None, partial: _PartialScene, 
             source=asset.source,
             heading_deg=rng.from_range((0, 360)),
             luminance=luminance,
-            radius_mm=rng.from_log_range(recipe.radius_mm_log) if is_dome else math.inf,
+            radius_mm=rng.from_log_range(recipe.radius_mm) if is_dome else math.inf,
         )
-    if rng.bernoulli(recipe.picture_probability) or not asset:
-        plane = _draw_plane(recipe, partial, luminance, base_mm + rng.from_log_range(recipe.distance_mm_log))
+    if rng.bernoulli(recipe.plane_probability) or not asset:
+        plane = _draw_plane(recipe, partial, luminance, base_mm + rng.from_log_range(recipe.distance_mm))
     return Side(map=environment_map, plane=plane)
 
 
@@ -217,8 +221,8 @@ def _draw_plane(recipe: SideRecipe, partial: _PartialScene, luminance: float, di
         distance_mm=_six_digits(distance_mm),
         offset_mm=(_six_digits((left + right) / 2), _six_digits((bottom + top) / 2)),
         width_mm=_six_digits(cover * rng.from_range(recipe.relative_width)),
-        heading_deg=rng.from_range(recipe.turn_deg),
-        pitch_deg=rng.from_range(recipe.turn_deg) / 2,
+        heading_deg=rng.from_range(recipe.heading_deg),
+        pitch_deg=rng.from_range(recipe.heading_deg) / 2,
         luminance=luminance,
         highlight_boost=rng.from_range(recipe.highlight_boost),
     )
@@ -257,7 +261,7 @@ def _focus_camera(recipe: CameraRecipe, partial: _PartialScene, behind: Side, fr
     focused_side = front if rng.bernoulli(recipe.focus_on_front_probability) else behind
     is_pinhole, aperture = (
         rng.bernoulli(recipe.pinhole_probability),
-        rng.from_log_range(recipe.aperture_mm_log),
+        rng.from_log_range(recipe.aperture_mm),
     )
     distance_mm = _camera_in_glass_frame(camera, partial.glass)[2] + focused_side.distance_mm
     cosine = _to_glass_frame(axes(camera.heading_deg, camera.pitch_deg)[2], partial.glass)[2]
@@ -271,7 +275,7 @@ def _focus_camera(recipe: CameraRecipe, partial: _PartialScene, behind: Side, fr
 
 def _draw_camera_response(recipe: CameraResponseRecipe, rng: _SceneRng) -> CameraResponse:
     return CameraResponse(
-        exposure=rng.from_log_range(recipe.exposure),
+        target_luminance=rng.from_log_range(recipe.target_luminance),
         white_balance=rng.choice(recipe.white_balance),
         white_balance_strength=rng.from_range(recipe.white_balance_strength),
         contrast=rng.from_range(recipe.contrast),

@@ -27,7 +27,7 @@ WhiteBalance = Literal["none", "grey-world", "white-patch", "grey-edge"]
 class CameraResponse(FrozenModel):
     """The camera response: from linear light to a photograph. Exposure and gains are computed on I and applied to all layers."""
 
-    exposure: Annotated[float, Field(gt=0, le=1)] = 0.4
+    target_luminance: Annotated[float, Field(gt=0, le=1)] = 0.4
     """Mean luminance of I after exposure and clipping to 0..1."""
     white_balance: WhiteBalance = "none"
     white_balance_strength: Share = 1.0
@@ -44,7 +44,7 @@ class CameraResponse(FrozenModel):
 class Scene(FrozenModel):
     """Everything that a sample depends on: the same scene and version give the same bytes.
 
-    `orders` "all": T and R contain all light paths, so that I = T + R. "paper": T contains only the path without a
+    `orders` "all": T and R contain all light paths, so that I = T + R. "truncated": T contains only the path without a
     reflection, and R only the paths that do not enter the last pane (for one pane: the reflection at its first surface).
     """
 
@@ -53,8 +53,8 @@ class Scene(FrozenModel):
     index: Annotated[int, Field(ge=0)] = 0
     version: str = ""
     """The version of brewster that drew the scene."""
-    orders: Literal["all", "paper"] = "all"
-    samples: PositiveInt = 16
+    orders: Literal["all", "truncated"] = "all"
+    samples_per_pixel: PositiveInt = 16
     """Rays per pixel of scenes with rough or wedged glass, or with a lens and near content; the maximum for others."""
     glass: Glazing = Glazing()
     camera: Camera = Camera()

@@ -49,7 +49,7 @@ Range = Annotated[
 LogRange = Annotated[
     tuple[PositiveFloat, PositiveFloat],
     AfterValidator(_ascending),
-    KeyNote("range [low, high]", "sampled uniformly in the logarithm"),
+    KeyNote("range [low, high]", "sampled log-uniformly"),
 ]
 JpegQuality = Annotated[int, Field(ge=1, le=100)]
 JpegQualityRange = Annotated[

@@ -29,7 +29,7 @@ class EnvironmentMap(FrozenModel):
     heading_deg: float = 0.0
     """Heading of the left edge of the map."""
     luminance: NonNegativeFloat = 1.0
-    """Mean luminance over the sphere, in the arbitrary unit of the scene. Lamps hardly count (see `Assets.map_light`)."""
+    """Mean luminance over the sphere, in the arbitrary unit of the scene. Lamps hardly count (see `Assets.map_radiance`)."""
     radius_mm: Radius = math.inf
 
 

@@ -20,15 +20,16 @@ START_FRESH = "delete it to start again, or choose another folder with -o"
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """The state of a trainer after `step` steps, and its recipe as JSON.
+    """The state of a trainer after `step` steps and `seconds` of training, and its recipe as JSON.
 
     Batches and learning rates need no state, because they are functions of step and recipe. In the file, the keys of
-    `state` are at the same level as `step` and `recipe`.
+    `state` are at the same level as `step`, `recipe` and `seconds`.
     """
 
     step: int
     recipe: str
     state: Mapping[str, Any]
+    seconds: float = 0.0
 
     def write(self, path: Path) -> None:
         """Writes or replaces the file atomically: a killed process leaves either the old or the new checkpoint.
@@ -37,7 +38,7 @@ class Checkpoint:
             TargetError: the file cannot be written.
         """
         stream = io.BytesIO()
-        torch.save({"step": self.step, "recipe": self.recipe, **self.state}, stream)
+        torch.save({"step": self.step, "recipe": self.recipe, "seconds": self.seconds, **self.state}, stream)
         write_atomically(path, stream.getvalue(), overwrite=True)
 
     @classmethod
@@ -49,7 +50,9 @@ class Checkpoint:
         """
         try:
             state = dict(torch.load(path, map_location="cpu", weights_only=True))
-            return cls(state.pop("step"), state.pop("recipe"), state)
+            # Checkpoints of brewster 0.1.0 have no seconds.
+            step, recipe, seconds = state.pop("step"), state.pop("recipe"), state.pop("seconds", 0.0)
+            return cls(step, recipe, state, seconds)
         except (
             OSError,
             RuntimeError,

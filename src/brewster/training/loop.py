@@ -1,14 +1,15 @@
 """The training loop: `run(trainer, out, on_step)` starts or resumes a run of any `Trainer`.
 
 A step depends on the trainer's state and on (seed, step) only. On a CPU, a run that was killed and resumed therefore ends
-with bit-identical weights to an uninterrupted run (same machine, same number of threads).
+with bit-identical weights to an uninterrupted run (same machine, same number of threads). A run can be resumed with more steps: from then on, its learning rates and image sizes
+are those of the longer run.
 """
 
 from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing
 from pathlib import Path
 from typing import Any, Final, Protocol
@@ -22,16 +23,21 @@ from brewster.photo import Photo
 from brewster.srgb import to_linear
 from brewster.training.checkpoint import START_FRESH, Checkpoint, mismatch_as_model_error
 from brewster.training.distributed import is_main_process
+from brewster.training.plots import plot_log
 from brewster.training.recipe import TrainingRecipe
 from brewster.training.tensorboard import TensorBoardLog
 
 StepCallback = Callable[[int, int, Mapping[str, float], bool], None]
 """Called after every step with (step, steps, metrics, logged); `logged` is true if the metrics were written to the log."""
 
+StartCallback = Callable[[int, int, float], None]
+"""Called before the first step with (completed steps, steps, seconds); all but `steps` are 0 if the run is not resumed."""
+
 CHECKPOINT_FILE: Final = "checkpoint.pt"
 LOG_FILE: Final = "log.jsonl"
 SAMPLES_FILE: Final = "samples.png"
-_NOT_COMPARED: Final = {"start_from", "steps", "report_every", "checkpoint_every"}
+CURVES_FILE: Final = "results.png"
+_NOT_COMPARED: Final = ("steps", "report_every", "checkpoint_every", "start_from")
 """Recipe values that may change when a run is resumed."""
 
 
@@ -48,7 +54,7 @@ class Trainer(Protocol):
         ...
 
     def training_step(self, step: int) -> dict[str, float]:
-        """Trains on the batch of `step` (from 0). Returns the loss and its parts by name."""
+        """Trains on the batch of `step` (from 0). Returns `loss` and its terms, `loss_NAME`."""
         ...
 
     def state_dict(self) -> dict[str, Any]:
@@ -68,25 +74,32 @@ class Trainer(Protocol):
         ...
 
 
-def run(trainer: Trainer, out: Path, on_step: StepCallback) -> None:
+def run(
+    trainer: Trainer,
+    out: Path,
+    on_step: StepCallback,
+    on_start: StartCallback = lambda _completed, _steps, _seconds: None,
+) -> None:
     """Trains until the last step of the recipe; resumes from the checkpoint in `out` if there is one.
 
     Every `checkpoint_every` steps it writes `checkpoint.pt` into `out`. Every `report_every` steps it validates, appends a
-    line to `log.jsonl`, replaces `samples.png`, and writes both as TensorBoard events if tensorboard is installed. With
-    several processes, all of them validate, and only rank 0 writes files. If the recipe has no data (a count of 0), `run` takes no step, and the
-    trainer keeps its initial weights.
+    line to `log.jsonl`, replaces `samples.png` and the curves in `results.png`, and writes metrics and samples as TensorBoard
+    events. The logged `seconds` are those of the whole run: they include the time before an interruption, up to the
+    checkpoint. With several processes, all of them validate, and only rank 0 writes files. If the recipe has no data (a
+    count of 0), `run` takes no step, and the trainer keeps its initial weights.
 
     Raises:
-        RecipeError: `out` contains a run of another recipe.
+        RecipeError: `out` contains a run of another recipe, or a run with more steps.
         ModelError: a checkpoint is missing, damaged or of another network, or the loss is NaN or infinite.
         TargetError: `out` cannot be written to.
     """
     out.mkdir(parents=True, exist_ok=True)
     recipe = trainer.recipe
-    completed_steps = _resume_or_initialize(trainer, out / CHECKPOINT_FILE)
+    completed_steps, seconds_before = _resume_or_initialize(trainer, out / CHECKPOINT_FILE)
     if is_main_process():
         _truncate_log(completed_steps, out / LOG_FILE)
-    started, steps = time.monotonic(), 0 if recipe.data.is_empty else recipe.steps
+    on_start(completed_steps, recipe.steps, seconds_before)
+    started, steps = time.monotonic() - seconds_before, 0 if recipe.data.is_empty else recipe.steps
     with closing(TensorBoardLog(out, completed_steps)) as event_log:
         for step in range(completed_steps + 1, 1 + steps):
             metrics, is_last = trainer.training_step(step - 1), step == recipe.steps
@@ -97,57 +110,78 @@ def run(trainer: Trainer, out: Path, on_step: StepCallback) -> None:
                 metrics |= scores | {"seconds": time.monotonic() - started}
                 _append_log(out / LOG_FILE, {"step": step, **metrics})
                 _write_image(out / SAMPLES_FILE, image)
+                write_atomically(out / CURVES_FILE, plot_log(read_log(out)), overwrite=True)
                 event_log.log(step, metrics, image)
             if is_main_process() and (is_last or step % recipe.checkpoint_every == 0):
-                Checkpoint(step, recipe.model_dump_json(), trainer.state_dict()).write(out / CHECKPOINT_FILE)
+                seconds = time.monotonic() - started
+                checkpoint = Checkpoint(step, recipe.model_dump_json(), trainer.state_dict(), seconds)
+                checkpoint.write(out / CHECKPOINT_FILE)
             on_step(step, recipe.steps, metrics, logged)
 
 
-def read_last_metrics(folder: Path) -> dict[str, float]:
-    """Returns the last line of the log in `folder`, or an empty dict if there is no log."""
+def read_log(folder: Path) -> list[dict[str, float]]:
+    """Returns the lines of the log in `folder`: `step` and the metrics by name. The list is empty if there is no log."""
     log = folder / LOG_FILE
-    lines = log.read_text().splitlines() if log.exists() else []
-    return dict(json.loads(lines[-1])) if lines else {}
+    return [dict(json.loads(line)) for line in log.read_text().splitlines()] if log.exists() else []
 
 
-def _resume_or_initialize(trainer: Trainer, path: Path) -> int:
+def _resume_or_initialize(trainer: Trainer, path: Path) -> tuple[int, float]:
     """Restores the checkpoint at `path`, or initializes the trainer if there is none.
 
     Returns:
-        The number of completed steps.
+        The number of completed steps, and the seconds that they took.
     """
     if not path.exists():
         trainer.initialize()
-        return 0
+        return 0, 0.0
     checkpoint = _check_recipe(Checkpoint.read(path), trainer.recipe, path)
     with mismatch_as_model_error(path, START_FRESH):
         trainer.load_state_dict(checkpoint.state)
-    return checkpoint.step
+    return checkpoint.step, checkpoint.seconds
 
 
 def _check_recipe(checkpoint: Checkpoint, recipe: TrainingRecipe, path: Path) -> Checkpoint:
+    """Returns the checkpoint if its run can be resumed with the recipe."""
     before = _compared_values(checkpoint.recipe, recipe)
     now = _compared_values(recipe.model_dump_json(), recipe)
-    if before == now:
-        return checkpoint
-    changed = ", ".join(name for name in now if before and before.get(name) != now[name])
-    raise RecipeError(
-        f"{path} belongs to a run of another recipe{f' (different values: {changed})' if changed else ''}",
-        "expected the recipe with which the run started",
-        "choose another folder with -o",
-    )
+    if before != now:
+        # A run of a recipe with another schema has no values to compare.
+        names = [name for name in before | now if before and before.get(name) != now.get(name)]
+        changes = ", ".join(f"{name} was {before.get(name)}, is {now.get(name)}" for name in names)
+        raise RecipeError(
+            f"{path} belongs to a run of another recipe{f': {changes}' if changes else ''}",
+            f"expected the recipe with which the run started; only these values may change: {', '.join(_NOT_COMPARED)}",
+            "restore the values, or choose another folder with -o",
+        )
+    if checkpoint.step > recipe.steps:
+        raise RecipeError(
+            f"{path} has {checkpoint.step} completed steps, but the recipe has steps = {recipe.steps}",
+            f"expected steps of at least {checkpoint.step}: a run can be made longer, but not shorter",
+            "raise steps, or choose another folder with -o",
+        )
+    return checkpoint
 
 
 def _compared_values(text: str, recipe: TrainingRecipe) -> dict[str, object]:
     """Returns the values of a stored recipe that must be equal for a run to resume: all but `_NOT_COMPARED`.
 
-    A value that the stored recipe lacks, because it was added to the schema later, has its default. The result is empty if
-    the stored recipe is not valid.
+    The keys are paths such as "data.pairs_share". A value that the stored recipe lacks, because it was added to the schema
+    later, has its default. The result is empty if the stored recipe is not valid.
     """
     try:
-        return type(recipe).model_validate_json(text).model_dump(exclude=_NOT_COMPARED)
+        stored = type(recipe).model_validate_json(text)
     except ValidationError:
         return {}
+    return dict(_flatten(stored.model_dump(mode="json", exclude=set(_NOT_COMPARED))))
+
+
+def _flatten(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, object]]:
+    """Yields the path and the value of every key in nested tables."""
+    for name, value in values.items():
+        if isinstance(value, Mapping):
+            yield from _flatten(value, f"{prefix}{name}.")
+        else:
+            yield prefix + name, value
 
 
 def _append_log(path: Path, metrics: Mapping[str, float]) -> None:

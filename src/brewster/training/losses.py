@@ -21,8 +21,8 @@ _SCALES = (1, 4, 16)
 """Side of the averaging windows of the loss, in pixels."""
 _MAX_ADDED_SHARE = 0.05
 """A pixel counts as unchanged if the glass added less light than about this fraction of the photo's light."""
-_MSE_FLOOR = 1e-3
-"""Added to the mean squared error before the logarithm. For an image with a PSNR above 30 dB, the gradient decreases to 0."""
+_MSE_FLOOR = 1e-4
+"""Added to the mean squared error before the logarithm. For an image with a PSNR above 40 dB, the gradient decreases to 0."""
 
 
 def separation_loss(layers: Float[Tensor, "n 6 h w"], batch: TrainingBatch) -> dict[str, Tensor]:
@@ -34,7 +34,8 @@ def separation_loss(layers: Float[Tensor, "n 6 h w"], batch: TrainingBatch) -> d
       detail.
     - edges: mean absolute error of the transmission's gradients, so that edges of the reflection are removed
       (Zhang et al. 2018).
-    - psnr: logarithm of each image's mean squared error, so that easy images count as much as hard ones.
+    - log_mse: 0.02 times the logarithm of each image's mean squared error, so that easy images count as much as hard ones. It
+      is negative for small errors.
 
     Returns:
         The parts of the loss by name, each a scalar. The loss is their sum.
@@ -50,7 +51,7 @@ def separation_loss(layers: Float[Tensor, "n 6 h w"], batch: TrainingBatch) -> d
         "reflection": 0.3
         * (_multiscale_error(reflection - batch.reflection_encoded) * batch.reflection_weight).mean(),
         "edges": edges,  # type: ignore[dict-item]
-        "psnr": 0.02 * (squared + _MSE_FLOOR).log().mean(),
+        "log_mse": 0.04 * (squared + _MSE_FLOOR).log().mean(),
     }
 
 

@@ -62,7 +62,7 @@ def _known_network(name: str) -> str:
 
 
 Side = Annotated[int, Field(gt=0, multiple_of=MAX_STRIDE)]
-Sizes = Annotated[
+ImageSizeSchedule = Annotated[
     list[tuple[Share, Side]],
     Field(min_length=1),
     AfterValidator(_ascending_from_0),
@@ -112,12 +112,12 @@ class CompactRecipe(TrainingRecipe):
         str, AfterValidator(_known_network), KeyNote(allowed=f"one of {', '.join(NETWORKS)}")
     ] = DEFAULT_NETWORK
     """Name of the network in the table `NETWORKS` of `brewster.models.networks`."""
-    sizes: Sizes
+    image_size_schedule: ImageSizeSchedule
     """Side of the training images. Each entry is valid from the given share of the steps: `[0.5, 160]` sets sides of 160 px
     from half of the steps. Smaller images at the beginning make training faster."""
     encoder_learning_rate: PositiveFloat
     """Peak learning rate of the pretrained encoder."""
-    average_decay: Share
+    ema_decay: Share
     """Decay per step of the exponential moving average (EMA) of the weights. The exported model has the averaged weights."""
     precision: Literal["float32", "auto"] = "float32"
     """auto: bfloat16 if the processor supports it natively, except for depthwise convolutions and the head."""
@@ -133,7 +133,7 @@ class CompactRecipe(TrainingRecipe):
 
     def size_at(self, step: int) -> int:
         """Returns the side of the training images at this step in px, a multiple of 32."""
-        return [size for start, size in self.sizes if step >= start * self.steps][-1]
+        return [size for start, size in self.image_size_schedule if step >= start * self.steps][-1]
 
 
 class LoraRecipe(TrainingRecipe):
@@ -185,7 +185,7 @@ class LoraRecipe(TrainingRecipe):
     """Number of sampling steps of validation and separation, stored with the LoRA. Objective one_step: always 1 step."""
     logit_mean: float = 0.0
     """Mean of the logit-normal distribution of training times (Esser et al. 2024), before the resolution shift."""
-    logit_deviation: PositiveFloat = 1.0
+    logit_std: PositiveFloat = 1.0
     """Standard deviation of the logit-normal distribution of training times."""
     timestep_shift: PositiveFloat | None = None
     """Factor by which training times are shifted towards noise; 1 is no shift. Not set: the shift of the sampling schedule,
@@ -224,9 +224,9 @@ class LoraRecipe(TrainingRecipe):
                 " remove photos, maps and rendered.recipe"
             )
         if "T" not in self.panels or len(set(self.panels)) < len(self.panels):
-            raise ValueError(f"panels is {list(self.panels)}; each panel may occur once, and T is required")
+            raise ValueError(f"expected panels with T, each at most once, but panels is {list(self.panels)}")
         if self.quantise and self.backbone.startswith(TINY_PREFIX):
-            raise ValueError("a toy backbone (tiny:) cannot be quantised; remove quantise")
+            raise ValueError("expected no quantise: a toy backbone (tiny:) cannot be quantised")
         if self.prompt not in PROMPTS and not self.prompt.endswith(ENCODED_SUFFIX):
             raise ValueError(
                 f"expected one of the prompts {', '.join(PROMPTS)}, or a {ENCODED_SUFFIX} file,"

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
+from typing import Final
 
 import torch
 from torch import Tensor
@@ -19,10 +20,19 @@ from brewster.errors import RecipeError
 from brewster.scene.recipe import SceneRecipe, read_scene_recipe
 from brewster.training.data.data_recipe import DataRecipe, RenderedRecipe
 from brewster.training.data.image_loading import read_maps, read_pairs, read_photos, source_weights
-from brewster.training.data.mixtures import InterleavedStream, Mixtures, Pairs, Stream, TrainingBatch
+from brewster.training.data.mixtures import (
+    InterleavedStream,
+    MixRecipe,
+    Mixtures,
+    Pairs,
+    Stream,
+    TrainingBatch,
+)
 from brewster.training.data.online import OnlineRendered
 from brewster.training.data.rendered import CachedRendered, RenderedSets
 from brewster.training.recipe import CompactRecipe, data_folder
+
+_HELD_OUT_SEED: Final = 1811
 
 
 def open_stream(recipe: CompactRecipe, device: torch.device | str = "cpu") -> Stream:
@@ -56,7 +66,10 @@ def validation_pairs(data: DataRecipe) -> dict[str, list[tuple[Tensor, Tensor]]]
 
 
 def held_out_mixtures(recipe: CompactRecipe) -> Stream | None:
-    """Opens mixtures of the recipe's held-out photos and maps, with the distributions of training.
+    """Opens mixtures of the recipe's held-out photos and maps, for validation.
+
+    Their random numbers and distributions do not depend on the recipe: the seed is fixed, and all values are the defaults of
+    `MixRecipe`. The metrics of two runs with the same held-out files can therefore be compared.
 
     Returns:
         The stream, or None if the recipe has no `held_out` or no photos.
@@ -70,7 +83,7 @@ def held_out_mixtures(recipe: CompactRecipe) -> Stream | None:
         return None
     photos = read_photos(resolve_folders(data.photos), data.exclude, only=data.held_out)
     maps = read_maps(resolve_folders(data.maps), data.exclude, only=data.held_out)
-    return Mixtures(photos, maps, recipe.mix, seed=recipe.seed + 3)
+    return Mixtures(photos, maps, MixRecipe(), seed=_HELD_OUT_SEED)
 
 
 def _unique_names(folders: Sequence[Path]) -> list[str]:

@@ -47,9 +47,21 @@ def draw_trials(description: StudyDescription, number: int) -> tuple[Trial, ...]
     assigned = list(itertools.islice(sequence, number * pairs, (number + 1) * pairs))
     rng = Random(f"{description.seed}/participant/{number}")  # noqa: S311  (not a secret: the seed is published)
     trials = [_comparison_trial(description, comparison, flipped) for comparison, flipped in assigned]
-    trials += _catch_trials(description, {comparison for comparison, _ in assigned}, rng)
+    pool = _catch_pool(description, {comparison for comparison, _ in assigned}, rng)
+    trials += [_catch_trial(catch, i, rng) for i, catch in enumerate(pool[: description.catches])]
     rng.shuffle(trials)
     return tuple(trials)
+
+
+def draw_practice(description: StudyDescription, number: int) -> Trial:
+    """The practice trial of one participant: an output and its degraded copy.
+
+    Its pictures are those of a catch trial that the participant does not see otherwise, unless the study has too few.
+    """
+    seen = {trial.photo for trial in draw_trials(description, number)}
+    rng = Random(f"{description.seed}/practice/{number}")  # noqa: S311
+    pool = rng.sample(description.catch_pool, len(description.catch_pool))
+    return _catch_trial(min(pool, key=lambda catch: catch.photo in seen), 1, rng)
 
 
 def comparison_sequence(count: int, pairs: int, seed: int) -> Iterator[tuple[int, bool]]:
@@ -106,19 +118,19 @@ def _comparison_trial(description: StudyDescription, number: int, flipped: bool)
     return Trial(comparison.photo, left, right, number, flipped)
 
 
-def _catch_trials(description: StudyDescription, assigned: Collection[int], rng: Random) -> list[Trial]:
-    """The catch trials of a participant, alternating between the two kinds.
+def _catch_pool(description: StudyDescription, assigned: Collection[int], rng: Random) -> list[CatchTrial]:
+    """The pictures for catch trials in random order; those of photos that the participant does not see otherwise are first.
 
-    Photos that the participant does not see in another trial are used first. `assigned` contains the numbers of the
-    comparisons of the participant.
+    `assigned` contains the numbers of the comparisons of the participant.
     """
     photos = {description.comparisons[number].photo for number in assigned}
     pool = rng.sample(description.catch_pool, len(description.catch_pool))
     pool.sort(key=lambda catch: catch.photo in photos)
-    return [_catch_trial(catch, i, rng) for i, catch in enumerate(pool[: description.catches])]
+    return pool
 
 
 def _catch_trial(catch: CatchTrial, i: int, rng: Random) -> Trial:
+    """The catch trial number i; the two kinds alternate."""
     if i % 2 == 0:
         return Trial(catch.photo, catch.good, catch.good, expected="similar")
     if rng.random() < 0.5:

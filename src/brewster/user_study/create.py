@@ -22,7 +22,7 @@ from brewster.errors import BrewsterError, PhotoError, TargetError
 from brewster.files import atomic_path, write_atomically
 from brewster.photo import Photo
 from brewster.user_study.degrade import degrade
-from brewster.user_study.folders import Key, find_pictures, shorten_list
+from brewster.user_study.folders import Key, find_pictures, select_pictures, shorten_list
 from brewster.user_study.study import (
     PICTURES_FOLDER,
     CatchTrial,
@@ -43,8 +43,8 @@ answers.
 
 Taking part is voluntary. You can stop at any time, and continue later with your personal link.
 
-We store your choices, how long each took, and the date on which you agreed to take part. We store no name, no address \
-and nothing else about you or your device."""
+We store your choices with their times, the size and kind of your screen, and the date on which you agreed to take part. We \
+store no name and no address."""
 
 
 @final
@@ -54,6 +54,7 @@ class StudyOptions:
 
     Attributes:
         datasets: the datasets to use; all if empty.
+        names: the inputs to use, as "dataset/stem", or "stem" if there are no datasets; all if empty.
         pairs: number of comparisons for each participant. None means DEFAULT_PAIRS, or all if there are fewer.
         catches: number of catch trials for each participant. None means DEFAULT_CATCHES, or all if there are fewer.
         all_pairs: whether each method is compared with each other method, instead of the first method only.
@@ -62,6 +63,7 @@ class StudyOptions:
     """
 
     datasets: Sequence[str] = ()
+    names: Sequence[str] = ()
     pairs: int | None = None
     catches: int | None = None
     all_pairs: bool = False
@@ -103,7 +105,7 @@ def create(
         TargetError: `out` is not empty or cannot be written.
     """
     _require_empty(out)
-    files = _pair_pictures(inputs, methods, options.datasets)
+    files = _pair_pictures(inputs, methods, options)
     all_pairs = list(combinations(methods, 2))
     pairs = all_pairs if options.all_pairs else all_pairs[: len(methods) - 1]
     seed = secrets.randbelow(1 << 32) if options.seed is None else options.seed
@@ -134,7 +136,7 @@ def create(
 # --- checking the source files
 
 
-def _pair_pictures(inputs: Path, methods: Mapping[str, Path], datasets: Sequence[str]) -> _StudyFiles:
+def _pair_pictures(inputs: Path, methods: Mapping[str, Path], options: StudyOptions) -> _StudyFiles:
     if len(methods) < 2:
         raise BrewsterError(
             f"the number of methods is {len(methods)}",
@@ -142,8 +144,11 @@ def _pair_pictures(inputs: Path, methods: Mapping[str, Path], datasets: Sequence
             "add another --method NAME=FOLDER",
         )
     files = _StudyFiles(
-        find_pictures(inputs, datasets),
-        {name: find_pictures(path, datasets) for name, path in methods.items()},
+        select_pictures(find_pictures(inputs, options.datasets), options.names, inputs),
+        {
+            name: select_pictures(find_pictures(path, options.datasets), options.names, path)
+            for name, path in methods.items()
+        },
     )
     problems = [*_pairing_problems(files, inputs, methods), *_file_problems(files)]
     if problems:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import unicodedata
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Final
 
@@ -63,6 +63,32 @@ def find_pictures(folder: Path, datasets: Sequence[str] = ()) -> dict[Key, Path]
             found[name, stem].append(path)
     _require_unique_names(folder, found)
     return {key: paths[0] for key, paths in found.items()}
+
+
+def select_pictures(pictures: Mapping[Key, Path], names: Sequence[str], folder: Path) -> dict[Key, Path]:
+    """The pictures with these names, in the order of `pictures`; all of them if `names` is empty.
+
+    Args:
+        pictures: the result of `find_pictures`.
+        names: "dataset/stem" for each picture, or "stem" if there are no datasets. A suffix is allowed.
+        folder: the folder of the pictures, for the error message.
+
+    Raises:
+        BrewsterError: a name has no picture.
+    """
+    by_name = {"/".join(filter(None, key)): key for key in pictures}
+    stems = {
+        name: name.rpartition(".")[0] if f".{name.rpartition('.')[2]}".lower() in SUFFIXES else name
+        for name in map(_normalised, names)
+    }
+    keys = {name: by_name.get(name, by_name.get(stem)) for name, stem in stems.items()}
+    if missing := [name for name, key in keys.items() if key is None]:
+        raise BrewsterError(
+            f"{folder} has no picture for these names of the list: {shorten_list(missing)}",
+            f"expected names such as {', '.join(list(by_name)[:3])}",
+            "correct the list",
+        )
+    return {key: path for key, path in pictures.items() if not names or key in keys.values()}
 
 
 def shorten_list(items: Sequence[str]) -> str:

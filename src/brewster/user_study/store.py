@@ -6,8 +6,8 @@
 
 For each participant, the database contains a number, the token of the personal link, the date of the consent and the
 trials; it contains no name and no address. The trials are drawn once, at admission, and stored, so a later version of
-brewster cannot change them. The first answer to a trial is final: a second one, for example after a lost acknowledgement,
-changes nothing.
+brewster cannot change them. A second answer to a trial, for example after a lost acknowledgement, changes nothing. To change
+their last answer, participants withdraw it first; withdrawn answers are kept.
 """
 
 from __future__ import annotations
@@ -22,10 +22,12 @@ from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from threading import Lock
-from typing import Final, final
+from typing import Annotated, Final, Literal, final
+
+from pydantic import ConfigDict, Field, TypeAdapter
 
 from brewster.errors import BrewsterError, TargetError
-from brewster.user_study.assignment import CHOICES, Choice, Trial, draw_trials
+from brewster.user_study.assignment import CHOICES, Choice, Trial, draw_practice, draw_trials
 from brewster.user_study.study import ANSWERS_FILE, Study
 
 MAX_SECONDS: Final = 3600.0
@@ -33,31 +35,70 @@ MAX_SECONDS: Final = 3600.0
 _TIMEOUT_SECONDS: Final = 30.0
 _SCHEMA: Final = """
 CREATE TABLE IF NOT EXISTS participants (
-    number INTEGER PRIMARY KEY, token TEXT NOT NULL UNIQUE, consented_on TEXT NOT NULL, trials TEXT NOT NULL
+    number INTEGER PRIMARY KEY, token TEXT NOT NULL UNIQUE, consented_on TEXT NOT NULL, trials TEXT NOT NULL,
+    practice TEXT NOT NULL
 ) STRICT;
 CREATE TABLE IF NOT EXISTS answers (
     participant INTEGER NOT NULL REFERENCES participants, trial INTEGER NOT NULL, choice TEXT NOT NULL,
-    seconds REAL NOT NULL, PRIMARY KEY (participant, trial)
+    seconds REAL NOT NULL, answered_at TEXT NOT NULL, conditions TEXT NOT NULL, PRIMARY KEY (participant, trial)
 ) STRICT, WITHOUT ROWID;
+CREATE TABLE IF NOT EXISTS withdrawn (
+    participant INTEGER NOT NULL REFERENCES participants, trial INTEGER NOT NULL, choice TEXT NOT NULL,
+    seconds REAL NOT NULL, answered_at TEXT NOT NULL, conditions TEXT NOT NULL
+) STRICT;
 """
+
+Px = Annotated[int, Field(ge=0, le=100_000)]
 
 
 @final
 @dataclass(frozen=True)
 class Participant:
-    """A participant: the number, counted from 0, and the trials in order of presentation."""
+    """A participant: the number, counted from 0, the trials in order of presentation, and the practice trial."""
 
     number: int
     trials: tuple[Trial, ...]
+    practice: Trial | None = None
+
+
+@final
+@dataclass(frozen=True)
+class ViewingConditions:
+    """How the pictures of a trial were shown. Lengths are in CSS px; times `pixel_ratio`, they are in screen pixels.
+
+    `view` is the arrangement at the time of the answer: all three pictures, A and B, or one at a time. `flips` counts how often
+    the picture was replaced by another one in place; `zoomed` is true if the pictures were enlarged at any time.
+    """
+
+    __pydantic_config__ = ConfigDict(extra="forbid")
+
+    viewport_width: Px
+    viewport_height: Px
+    pixel_ratio: Annotated[float, Field(gt=0, le=100)]
+    picture_width: Px
+    theme: Literal["light", "dark"]
+    pointer: Literal["fine", "coarse"]
+    view: Literal["all", "pair", "single"]
+    flips: Annotated[int, Field(ge=0, le=100_000)]
+    zoomed: bool
+
+
+_CONDITIONS: Final = TypeAdapter(ViewingConditions | None)
 
 
 @final
 @dataclass(frozen=True)
 class StoredAnswer:
-    """A choice, and the seconds for which the pictures were shown before it."""
+    """A choice, and the seconds for which the pictures were shown before it.
+
+    `answered_at` is the time in UTC, ISO 8601. `withdrawn` has the choices that the participant withdrew before this one.
+    """
 
     choice: Choice
     seconds: float
+    answered_at: str = ""
+    conditions: ViewingConditions | None = None
+    withdrawn: tuple[Choice, ...] = ()
 
 
 @final
@@ -115,27 +156,70 @@ class AnswerStore:
                 return None
             token = secrets.token_urlsafe(24)
             trials = json.dumps([asdict(trial) for trial in draw_trials(self.study.description, number)])
+            practice = json.dumps(asdict(draw_practice(self.study.description, number)))
             today = datetime.now(UTC).date().isoformat()
-            database.execute("INSERT INTO participants VALUES (?, ?, ?, ?)", (number, token, today, trials))
+            database.execute(
+                "INSERT INTO participants VALUES (?, ?, ?, ?, ?)", (number, token, today, trials, practice)
+            )
         return token
 
     def participant(self, token: str) -> Participant | None:
         """The participant with this token, or None if the token is unknown."""
         with self._reading() as database:
             row = database.execute(
-                "SELECT number, trials FROM participants WHERE token = ?", (token,)
+                "SELECT number, trials, practice FROM participants WHERE token = ?", (token,)
             ).fetchone()
-        return None if row is None else Participant(row[0], _parse_trials(row[1]))
+        return (
+            None if row is None else Participant(row[0], _parse_trials(row[1]), Trial(**json.loads(row[2])))
+        )
 
     def next_trial(self, participant: Participant) -> int | None:
         """The index of the first trial without an answer, or None if all trials have one."""
-        with self._reading() as database:
-            rows = database.execute("SELECT trial FROM answers WHERE participant = ?", (participant.number,))
-            answered = {trial for (trial,) in rows}
+        answered = self._answered(participant)
         return next((trial for trial in range(len(participant.trials)) if trial not in answered), None)
 
+    def last_trial(self, participant: Participant) -> int | None:
+        """The index of the last trial with an answer, or None if there is no answer."""
+        return max(self._answered(participant), default=None)
+
+    def _answered(self, participant: Participant) -> set[int]:
+        with self._reading() as database:
+            rows = database.execute("SELECT trial FROM answers WHERE participant = ?", (participant.number,))
+            return {trial for (trial,) in rows}
+
+    def withdraw_answer(self, participant: Participant, trial: int) -> None:
+        """Withdraw the answer to the last answered trial, so that the trial can be answered again. The answer is kept.
+
+        Nothing is changed if the trial has no answer, for example because it was withdrawn already.
+
+        Raises:
+            BrewsterError: a later trial has an answer.
+            TargetError: the database cannot be written.
+        """
+        key = (participant.number, trial)
+        with self._writing() as database:
+            (last,) = database.execute(
+                "SELECT max(trial) FROM answers WHERE participant = ?", key[:1]
+            ).fetchone()
+            if last is not None and last > trial:
+                raise BrewsterError(
+                    f"trial {trial} is not the last one with an answer",
+                    f"expected trial {last}: only the last answer can be withdrawn",
+                    "load the page again",
+                )
+            database.execute(
+                "INSERT INTO withdrawn SELECT * FROM answers WHERE participant = ? AND trial = ?", key
+            )
+            database.execute("DELETE FROM answers WHERE participant = ? AND trial = ?", key)
+
     def record_answer(
-        self, participant: Participant, trial: int, choice: Choice, *, seconds: float
+        self,
+        participant: Participant,
+        trial: int,
+        choice: Choice,
+        *,
+        seconds: float,
+        conditions: ViewingConditions | None = None,
     ) -> Choice:
         """Store an answer, unless the trial already has one. The answer is synced to the disk on return.
 
@@ -144,6 +228,7 @@ class AnswerStore:
             trial: the index of the trial, from 0.
             choice: the participant's choice.
             seconds: for how long the pictures were shown, clipped to 0..MAX_SECONDS.
+            conditions: how the pictures were shown; None if it is unknown.
 
         Returns:
             The stored choice, which is that of the first answer.
@@ -159,10 +244,12 @@ class AnswerStore:
                 "load the page again",
             )
         seconds_shown = min(max(seconds, 0.0), MAX_SECONDS)
+        now = datetime.now(UTC).isoformat(timespec="seconds")
+        shown = _CONDITIONS.dump_json(conditions).decode()
         with self._writing() as database:
             database.execute(
-                "INSERT INTO answers VALUES (?, ?, ?, ?) ON CONFLICT DO NOTHING",
-                (participant.number, trial, choice, seconds_shown),
+                "INSERT INTO answers VALUES (?, ?, ?, ?, ?, ?) ON CONFLICT DO NOTHING",
+                (participant.number, trial, choice, seconds_shown, now, shown),
             )
             row = database.execute(
                 "SELECT choice FROM answers WHERE participant = ? AND trial = ?", (participant.number, trial)
@@ -173,14 +260,22 @@ class AnswerStore:
     def all_answers(self) -> Iterator[tuple[Participant, dict[int, StoredAnswer]]]:
         """Yield every participant, in order of number, and a dict of the answers by trial, which may be empty."""
         with self._reading() as database:
-            rows = database.execute("SELECT participant, trial, choice, seconds FROM answers").fetchall()
+            rows = database.execute("SELECT * FROM answers").fetchall()
+            earlier = database.execute(
+                "SELECT participant, trial, choice FROM withdrawn ORDER BY rowid"
+            ).fetchall()
             # read participants after answers: another process may admit participants in between
             participants = database.execute(
                 "SELECT number, trials FROM participants ORDER BY number"
             ).fetchall()
         answers: dict[int, dict[int, StoredAnswer]] = {number: {} for number, _ in participants}
-        for number, trial, choice, seconds in rows:
-            answers[number][trial] = StoredAnswer(choice, seconds)
+        withdrawn: dict[tuple[int, int], tuple[Choice, ...]] = {}
+        for number, trial, choice in earlier:
+            withdrawn[number, trial] = (*withdrawn.get((number, trial), ()), choice)
+        for number, trial, choice, seconds, answered_at, shown in rows:
+            conditions = _CONDITIONS.validate_json(shown)
+            before = withdrawn.get((number, trial), ())
+            answers[number][trial] = StoredAnswer(choice, seconds, answered_at, conditions, before)
         for number, trials in participants:
             yield Participant(number, _parse_trials(trials)), dict(sorted(answers[number].items()))
 

@@ -24,7 +24,7 @@ from brewster.files import write_atomically
 DESCRIPTION_FILE: Final = "study.json"
 PICTURES_FOLDER: Final = "pictures"
 ANSWERS_FILE: Final = "answers.sqlite"
-FORMAT_VERSION: Final = 1
+FORMAT_VERSION: Final = 2
 UNNAMED_DATASET: Final = ""
 """The name of the only dataset if the source folders have no subfolders."""
 

@@ -139,7 +139,7 @@ def _sigterm_as_sigint() -> Iterator[None]:
 
 
 async def _error_response(request: Request, error: Exception) -> Response:
-    """Any error as JSON, `{"error": message}`."""
+    """Any error as JSON, `{"error": message}`; `kind` is the class of a BrewsterError."""
     if isinstance(error, ClientDisconnect):
         return Response(status_code=499)  # the client does not read it
     if isinstance(error, HTTPException):
@@ -147,7 +147,8 @@ async def _error_response(request: Request, error: Exception) -> Response:
     if isinstance(error, RequestValidationError):
         return JSONResponse({"error": validation_message(error.errors())}, 422)
     if isinstance(error, BrewsterError):
-        return JSONResponse({"error": str(error)}, _STATUS_CODES.get(type(error), 422))
+        body = {"error": str(error), "kind": type(error).__name__}
+        return JSONResponse(body, _STATUS_CODES.get(type(error), 422))
     body = {"error": f"brewster has an internal error ({type(error).__name__}); please report it"}
     return JSONResponse(body, 500, SECURITY_HEADERS)  # Starlette sends this response outside LimitMiddleware
 

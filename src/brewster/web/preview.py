@@ -1,18 +1,23 @@
-"""Small maps of a separation, from which the browser computes the layers at any strength.
+"""What the page needs to show a separation at any strength, mask and zoom: a reduced photo, and the coefficients of its layers.
 
-The photo is reduced first and then separated in floating point, so the layers are not rounded or clipped. page/light.js
-computes, in linear light:
+The layers are local linear functions of the photo (inference/guided_upsampling.py). page/light.js applies them to the
+reduced photo and to tiles of the full photo, in linear light:
 
-    transmission = max(photo + strength x (transmission at strength 1 - photo), 0)
-    reflection   = min(strength x reflection at strength 1, photo)
+    change       = slope x photo + offset, upsampled to the position of the pixel
+    transmission = max(photo + strength x mask x change, 0)
+    reflection   = min(strength x mask x (slope x photo + offset), photo)
+
+`photo_tile` returns the tiles. Level 0 has the pixels of the photo; each further level halves the width and the height.
 """
 
 from __future__ import annotations
 
 import json
 import math
+from collections import OrderedDict
 from collections.abc import Callable
-from typing import Final
+from threading import Lock
+from typing import Any, Final, final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,12 +29,8 @@ from brewster.srgb import to_encoded
 
 MAX_PREVIEW_PIXELS: Final = 1_400_000
 """Larger photos are reduced to about this number of pixels, which is enough for a window."""
-
-RANGE_MIN, RANGE_MAX = -1.0, 2.0
-"""The linear light of the 16-bit values 0 and 65535 in the transmission map."""
-
-_SMALL_STRENGTH: Final = 1 / 64
-"""The strength of the separation. At this strength no layer is clipped, so the layers can be scaled to strength 1."""
+TILE_PX: Final = 512
+MAX_LEVEL: Final = 8
 
 
 def preview(
@@ -40,35 +41,90 @@ def preview(
     Args:
         separator: the model.
         photo: the photo at full size.
-        options: the options of the request; `strength` and `additive` are ignored.
+        options: the options of the request; only `quality` is used.
         on_progress: called with the completed fraction, 0 to 1.
 
     Returns:
-        One line of JSON with `width`, `height`, `full` (the width and height of the photo), `range` and `doubtful`, and
-        then four maps of width x height pixels, row by row: the photo (3 bytes for each pixel, sRGB), the transmission at strength 1 (3
-        little-endian 16-bit values, linear over `range`), the reflection at strength 1 (3 bytes, sRGB), and the confidence
-        (1 byte).
+        One line of JSON, then the reduced photo (3 bytes for each pixel, sRGB), and then maps of little-endian 16-bit
+        values, row by row. The JSON has `width` and `height` of the reduced photo, `full` (those of the photo),
+        `verdict`, and for each map `name`, `width`, `height`, `channels`, and the `range` of the values 0 to 65535.
 
     Raises:
         BrewsterError: `Separator` cannot separate the photo.
     """
+    upsampler, prediction, assessment = separator.fit(photo, quality=options.quality, on_progress=on_progress)
     width, height = _preview_size(photo.size)
-    small = photo.resized(width, height)
-    arguments = options.call_options() | {"strength": _SMALL_STRENGTH, "additive": False}
-    channels = photo.pixels.shape[2]  # one for a grey photo
-    reduced = Photo.from_array(small[..., :channels], encoding="linear")
-    layers = separator(reduced, on_progress=on_progress, **arguments)
-    transmission = small + (layers.transmission.linear() - small) / np.float32(_SMALL_STRENGTH)
-    reflection = layers.reflection.linear() / np.float32(_SMALL_STRENGTH)
-    head = {"width": width, "height": height, "full": photo.size, "range": (RANGE_MIN, RANGE_MAX)}
-    head["doubtful"] = layers.doubtful
-    maps = (
-        _to_srgb_bytes(small),
-        _to_uint16(transmission),
-        _to_srgb_bytes(reflection),
-        layers.confidence.pixels,
-    )
-    return b"".join((json.dumps(head).encode(), b"\n", *(array.tobytes() for array in maps)))
+    maps = {
+        "change_slope": upsampler.change.slope,
+        "change_offset": upsampler.change.offset,
+        "confidence": prediction.confidence_map,
+    }
+    if upsampler.reflection:
+        maps |= {
+            "reflection_slope": upsampler.reflection.slope,
+            "reflection_offset": upsampler.reflection.offset,
+        }
+    if upsampler.override:
+        maps |= {"generated": upsampler.override.transmission, "weight": upsampler.override.weight}
+    if photo.pixels.shape[2] == 1:  # the layers of a grey photo are grey
+        maps = {name: _luminance(map_) for name, map_ in maps.items()}
+    head = {
+        "width": width,
+        "height": height,
+        "full": photo.size,
+        "verdict": assessment.verdict,
+        "maps": [_describe(name, map_) for name, map_ in maps.items()],
+    }
+    codes = _to_srgb_bytes(photo.resized(width, height))
+    arrays = (codes, *map(_to_uint16, maps.values()))
+    on_progress(1.0)
+    return b"".join((json.dumps(head).encode(), b"\n", *(array.tobytes() for array in arrays)))
+
+
+def photo_tile(photo: Photo, level: int, column: int, row: int) -> Photo | None:
+    """The tile of a photo at a level, at most TILE_PX wide and high, in sRGB; None outside the photo.
+
+    A pixel of level n is the mean of 2**n x 2**n pixels of the photo, in linear light.
+    """
+    step, (width, height) = 1 << level, photo.size
+    left, top = TILE_PX * step * column, TILE_PX * step * row
+    if not (0 <= level <= MAX_LEVEL and 0 <= left < width and 0 <= top < height):
+        return None
+    stored = photo.pixels[top : top + TILE_PX * step, left : left + TILE_PX * step]
+    linear = photo.colour_space().to_linear(stored)
+    if step > 1:
+        linear = _block_means(linear, step)
+    return Photo(_to_srgb_bytes(linear))
+
+
+@final
+class PhotoCache:
+    """The decoded photos of the last requests by key, for the tiles. Thread-safe.
+
+    Args:
+        max_bytes: the maximum size of all photos together; the photos that were not used for the longest time are dropped.
+    """
+
+    def __init__(self, max_bytes: int = 400_000_000) -> None:
+        self.max_bytes, self._photos, self._lock = max_bytes, OrderedDict[str, Photo](), Lock()
+
+    def put(self, key: str, photo: Photo) -> None:
+        """Keep a photo; the photo that was kept last stays, whatever its size."""
+        with self._lock:
+            self._photos[key] = photo
+            self._photos.move_to_end(key)
+            while len(self._photos) > 1 and self._bytes() > self.max_bytes:
+                self._photos.popitem(last=False)
+
+    def get(self, key: str) -> Photo | None:
+        """The photo with this key, or None if it was dropped."""
+        with self._lock:
+            if key in self._photos:
+                self._photos.move_to_end(key)
+            return self._photos.get(key)
+
+    def _bytes(self) -> int:
+        return sum(photo.pixels.nbytes for photo in self._photos.values())
 
 
 def _preview_size(size: tuple[int, int]) -> tuple[int, int]:
@@ -76,12 +132,34 @@ def _preview_size(size: tuple[int, int]) -> tuple[int, int]:
     return max(1, round(size[0] * scale)), max(1, round(size[1] * scale))
 
 
+def _block_means(linear: NDArray[np.float32], step: int) -> NDArray[np.float32]:
+    """The means of blocks of step x step pixels. Blocks at the edges have fewer pixels."""
+    for axis in (0, 1):
+        starts = np.arange(0, linear.shape[axis], step)
+        counts = np.minimum(starts + step, linear.shape[axis]) - starts
+        sums = np.add.reduceat(linear, starts, axis=axis)
+        linear = sums / counts.reshape((-1, 1, 1) if axis == 0 else (1, -1, 1)).astype(np.float32)
+    return linear
+
+
+def _luminance(map_: NDArray[np.float32]) -> NDArray[np.float32]:
+    """The luminance of linear Rec.709 light, which a grey photo stores, or the map itself if it has one channel."""
+    if map_.shape[2] == 1:
+        return map_
+    return (map_ @ np.float32([0.2126, 0.7152, 0.0722]))[..., None]
+
+
+def _describe(name: str, map_: NDArray[np.float32]) -> dict[str, Any]:
+    height, width, channels = map_.shape
+    value_range = float(map_.min()), float(map_.max())
+    return {"name": name, "width": width, "height": height, "channels": channels, "range": value_range}
+
+
 def _to_srgb_bytes(linear: NDArray[np.float32]) -> NDArray[np.uint8]:
     return np.rint(255 * to_encoded(np.clip(linear, 0, 1))).astype(np.uint8)
 
 
-def _to_uint16(linear: NDArray[np.float32]) -> NDArray[np.uint16]:
-    scaled: NDArray[np.float32] = (np.clip(linear, RANGE_MIN, RANGE_MAX) - RANGE_MIN) / (
-        RANGE_MAX - RANGE_MIN
-    )
+def _to_uint16(map_: NDArray[np.float32]) -> NDArray[np.uint16]:
+    low, high = map_.min(), map_.max()
+    scaled: NDArray[np.float32] = (map_ - low) / max(high - low, np.float32(1e-12))
     return np.rint(65535 * scaled).astype(np.dtype("<u2"), copy=False)

@@ -20,7 +20,8 @@ from brewster.image_formats import SUFFIXES
 from brewster.options import Options
 
 FIELDS: Final = ("layers", "strength", "quality", "format", "additive", "model")
-"""The options that a client may set; the server sets the others."""
+"""The options that a client may set as text; the server sets the others."""
+_FILES: Final = ("photo", "mask")
 _OPTIONS: Final = TypeAdapter(Options)
 _MAX_NAME_BYTES: Final = 120
 _PHOTO_SCHEMA: Final = {
@@ -39,6 +40,7 @@ class SeparationRequest:
     name: str
     """The file name of the photo, as returned by `safe_name`."""
     options: Options
+    mask: bytes | None = None
 
     def target(self, layer: str, container: str) -> str:
         """The file name of a layer, equal to that of the command line; `container` is the format of the photo."""
@@ -70,7 +72,9 @@ async def read_form(request: Request, models: Sequence[str], max_pixels: int) ->
             415, "the body is not a form; send multipart/form-data with the photo in the field photo"
         )
     try:
-        form = await _InMemoryParser(request.headers, request.stream(), max_fields=32, max_files=1).parse()
+        form = await _InMemoryParser(
+            request.headers, request.stream(), max_fields=32, max_files=len(_FILES)
+        ).parse()
     except MultiPartException as error:
         raise HTTPException(
             400, f"the form cannot be read ({error.message.rstrip('.')}); send it again"
@@ -87,7 +91,11 @@ async def _build_request(form: FormData, options: Options) -> SeparationRequest:
     photo = form.get("photo")
     if not isinstance(photo, UploadFile):
         raise HTTPException(422, "the form contains no photo; send its file in the field photo")
-    return SeparationRequest(await photo.read(), safe_name(photo.filename or ""), options)
+    mask = form.get("mask")
+    if mask is not None and not isinstance(mask, UploadFile):
+        raise HTTPException(422, "the field mask contains no file; send the mask as an image file")
+    values = await mask.read() if mask else None
+    return SeparationRequest(await photo.read(), safe_name(photo.filename or ""), options, values)
 
 
 @final
@@ -100,7 +108,8 @@ class _InMemoryParser(MultiPartParser):
 def form_schema(models: Sequence[str]) -> dict[str, Any]:
     """The JSON schema of the form, for the OpenAPI document."""
     known = _OPTIONS.json_schema()["properties"]
-    fields = {"photo": _PHOTO_SCHEMA, **{name: _as_field(known[name]) for name in FIELDS}}
+    mask = {**_PHOTO_SCHEMA, "description": known["mask"]["description"]}
+    fields = {"photo": _PHOTO_SCHEMA, "mask": mask, **{name: _as_field(known[name]) for name in FIELDS}}
     description = "The model to use, one of `GET /models`."
     fields["model"] = known["model"] | {
         "default": models[0],
@@ -141,10 +150,12 @@ def validation_message(errors: Iterable[Any]) -> str:
 
 
 def _options(form: FormData, models: Sequence[str], max_pixels: int) -> Options:
-    texts = {name: [str(value) for value in form.getlist(name)] for name in form if name != "photo"}
+    texts = {name: [str(value) for value in form.getlist(name)] for name in form if name not in _FILES}
     unknown = [name for name in texts if name not in FIELDS]
     if unknown:
-        raise HTTPException(422, f"there is no field {unknown[0][:40]!r}; use photo, {', '.join(FIELDS)}")
+        raise HTTPException(
+            422, f"there is no field {unknown[0][:40]!r}; use {', '.join((*_FILES, *FIELDS))}"
+        )
     values_by_name: dict[str, Any] = {name: values[-1] for name, values in texts.items() if values[-1]}
     if "layers" in texts:
         values_by_name["layers"] = _ordered_layers(",".join(texts["layers"]).split(","))

@@ -8,10 +8,12 @@ The server fetches nothing by URL and writes nothing to the disk.
 
 from __future__ import annotations
 
+import gzip
+import hashlib
 import io
 import time
 import zipfile
-from collections.abc import Callable, Mapping
+from collections.abc import Awaitable, Callable, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal, final
@@ -28,9 +30,11 @@ from brewster.inference.predictor import ProgressCallback
 from brewster.photo import Photo
 from brewster.web.job_queue import JobProgress, JobQueue
 from brewster.web.model_cache import ModelCache, ModelRow
-from brewster.web.preview import preview
+from brewster.web.preview import PhotoCache, photo_tile, preview
 from brewster.web.request_schema import SeparationRequest, form_schema, read_form
 
+_GZIP_LEVEL: Final = 1  # higher levels save little more and take several times longer
+_TILE_HEADERS: Final = {"Cache-Control": "private, max-age=3600"}
 _EPOCH: Final = (1980, 1, 1, 0, 0, 0)  # the earliest date of zip; a fixed date makes the archive reproducible
 
 
@@ -40,6 +44,8 @@ class ErrorResponse(BaseModel):
 
     error: str
     """What happened, what was expected, and what to do."""
+    kind: str | None = None
+    """The class of the error in `brewster.errors`, such as UnreadablePhoto, if it has one."""
 
 
 @final
@@ -73,7 +79,7 @@ JobName = Annotated[
 
 
 def separation_router(model_cache: ModelCache, job_queue: JobQueue, *, max_pixels: int) -> APIRouter:
-    """The routes of the API, and the previews for the page.
+    """The routes of the API, and the previews and tiles for the page.
 
     Args:
         model_cache: the models that clients can choose.
@@ -98,10 +104,6 @@ def separation_router(model_cache: ModelCache, job_queue: JobQueue, *, max_pixel
         """
         return await run(request, job, _separate)
 
-    @router.post("/preview", include_in_schema=False)
-    async def preview_maps(request: Request, job: JobName = None) -> Response:
-        return await run(request, job, _preview)
-
     @router.get("/progress/{job}", responses={404: _ERROR})
     async def progress(job: str) -> JobProgress:
         """The progress of the job with this name. The status is 404 before the job begins and after its end."""
@@ -122,7 +124,33 @@ def separation_router(model_cache: ModelCache, job_queue: JobQueue, *, max_pixel
         """The version of the server and the number of its jobs."""
         return HealthResponse(jobs=job_queue.jobs, places=job_queue.workers + job_queue.max_waiting)
 
+    _add_page_routes(router, run)
     return router
+
+
+def _add_page_routes(
+    router: APIRouter, run: Callable[[Request, str | None, Handler], Awaitable[Response]]
+) -> None:
+    """Add the routes that only the page uses: the preview of a photo, and its tiles."""
+    photos = PhotoCache()
+
+    @router.post("/preview", include_in_schema=False)
+    async def preview_maps(request: Request, job: JobName = None) -> Response:
+        return await run(request, job, partial(_preview, photos))
+
+    @router.post("/photo", include_in_schema=False)
+    async def keep_photo(request: Request, job: JobName = None) -> Response:
+        return await run(request, job, partial(_keep_photo, photos))
+
+    @router.get("/tile/{key}/{level}/{column}/{row}", include_in_schema=False)
+    def tile(key: str, level: int, column: int, row: int) -> Response:
+        photo = photos.get(key)
+        found = None if photo is None else photo_tile(photo, level, column, row)
+        if found is None:
+            raise HTTPException(
+                404, "the server has dropped this photo, or it has no such tile; send it again"
+            )
+        return Response(found.encode("png"), media_type="image/png", headers=_TILE_HEADERS)
 
 
 def _separate(model_cache: ModelCache, form: SeparationRequest, on_progress: ProgressCallback) -> Response:
@@ -130,7 +158,7 @@ def _separate(model_cache: ModelCache, form: SeparationRequest, on_progress: Pro
     started = time.perf_counter()
     options = form.options
     separation = model_cache.separator(options.model)(
-        form.photo, on_progress=on_progress, **options.call_options()
+        form.photo, on_progress=on_progress, **options.call_options() | {"mask": form.mask}
     )
     files = {}
     for layer in options.layers:
@@ -146,20 +174,39 @@ def _separate(model_cache: ModelCache, form: SeparationRequest, on_progress: Pro
         "Brewster-SHA256": separation.sha256 or "",
         "Brewster-Device": separation.device,
         "Brewster-Residual": f"{separation.residual:.6f}",
+        "Brewster-Verdict": separation.assessment.verdict,
         "Brewster-Seconds": f"{time.perf_counter() - started:.4f}",
     }
+    if separation.reflection_is_derived:
+        headers["Brewster-Reflection"] = "derived"
     if separation.reconstruction_error is not None:
-        headers |= {
-            "Brewster-Reconstruction-Error": f"{separation.reconstruction_error:.6f}",
-            "Brewster-Doubtful": str(separation.doubtful).lower(),
-        }
+        headers["Brewster-Reconstruction-Error"] = f"{separation.reconstruction_error:.6f}"
     return Response(data, headers=headers, media_type=_media_type(name))
 
 
-def _preview(model_cache: ModelCache, form: SeparationRequest, on_progress: ProgressCallback) -> Response:
-    photo = Photo.open(form.photo, max_pixels=form.options.max_pixels)
+def _preview(
+    photos: PhotoCache, model_cache: ModelCache, form: SeparationRequest, on_progress: ProgressCallback
+) -> Response:
+    photo, headers = _open_photo(photos, form)
     maps = preview(model_cache.separator(form.options.model), photo, form.options, on_progress)
-    return Response(maps, media_type="application/octet-stream")
+    return Response(gzip.compress(maps, _GZIP_LEVEL, mtime=0), headers=headers, media_type="application/gzip")
+
+
+def _keep_photo(
+    photos: PhotoCache,
+    model_cache: ModelCache,  # noqa: ARG001
+    form: SeparationRequest,
+    on_progress: ProgressCallback,  # noqa: ARG001
+) -> Response:
+    return Response(headers=_open_photo(photos, form)[1])
+
+
+def _open_photo(photos: PhotoCache, form: SeparationRequest) -> tuple[Photo, dict[str, str]]:
+    """The decoded photo, which the cache keeps for the tiles, and the headers with its key and its size."""
+    photo = Photo.open(form.photo, max_pixels=form.options.max_pixels)
+    key = hashlib.sha256(form.photo).hexdigest()
+    photos.put(key, photo)
+    return photo, {"Brewster-Photo": key, "Brewster-Size": "{}x{}".format(*photo.size)}
 
 
 def _media_type(name: str) -> str:

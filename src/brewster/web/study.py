@@ -19,7 +19,7 @@ from starlette.exceptions import HTTPException
 
 from brewster.user_study import assignment
 from brewster.user_study.assignment import Choice
-from brewster.user_study.store import AnswerStore, Participant
+from brewster.user_study.store import AnswerStore, Participant, ViewingConditions
 from brewster.user_study.study import Study
 from brewster.web.application import page_response
 
@@ -51,24 +51,42 @@ class PersonalLink(_Strict):
     link: str
 
 
+class PracticeTrial(_Strict):
+    """The practice trial: the size of its pictures in px, and the choice that is correct. Its answer is not stored."""
+
+    width: int
+    height: int
+    expected: Choice
+
+
 class TrialResponse(_Strict):
     """The first trial without an answer, and the size of its pictures in px.
 
-    `trial` counts from 0 and is None if all trials have answers. `trials` is the number of all trials.
+    `trial` counts from 0 and is None if all trials have answers. `trials` is the number of all trials. `practice` is set as
+    long as there is no answer. `last` is the last trial with an answer, which can be withdrawn.
     """
 
     trial: int | None
     trials: int
     width: int | None = None
     height: int | None = None
+    practice: PracticeTrial | None = None
+    last: int | None = None
 
 
 class AnswerRequest(_Strict):
-    """An answer, and the seconds for which the pictures were shown."""
+    """An answer, the seconds for which the pictures were shown, and how they were shown."""
 
     trial: Annotated[int, Field(ge=0)]
     choice: Choice
     seconds: Annotated[float, Field(ge=0, allow_inf_nan=False)]
+    conditions: ViewingConditions | None = None
+
+
+class WithdrawalRequest(_Strict):
+    """The trial whose answer is withdrawn: the last one with an answer."""
+
+    trial: Annotated[int, Field(ge=0)]
 
 
 class AnswerResponse(_Strict):
@@ -99,8 +117,13 @@ def study_router(
     router.get("/s/{participant_token}", include_in_schema=False)(routes.begin)
     router.get("/s/{participant_token}/link")(routes.link)
     router.get("/s/{participant_token}/trial")(routes.next_trial)
+    router.get("/s/{participant_token}/pictures/practice/{side}", response_class=Response)(
+        routes.practice_picture
+    )
     router.get("/s/{participant_token}/pictures/{trial}/{side}", response_class=Response)(routes.picture)
     router.post("/s/{participant_token}/answers")(routes.answer)
+    router.post("/s/{participant_token}/withdrawals")(routes.withdraw)
+    router.get("/privacy", include_in_schema=False)(routes.privacy)
     return router
 
 
@@ -147,9 +170,19 @@ class _StudyRoutes:
         response.headers.update(_NOT_CACHED)
         return self._next(self._participant(participant_token))
 
+    def privacy(self) -> Response:
+        """The page that lists what the study stores about a participant."""
+        return page_response("privacy.html")
+
+    def practice_picture(self, participant_token: Token, side: Side) -> Response:
+        """A picture of the practice trial."""
+        return self._picture(_practice(self._participant(participant_token)), side)
+
     def picture(self, participant_token: Token, trial: int, side: Side) -> Response:
         """A picture of a trial."""
-        shown = _trial(self._participant(participant_token), trial)
+        return self._picture(_trial(self._participant(participant_token), trial), side)
+
+    def _picture(self, shown: assignment.Trial, side: Side) -> Response:
         try:
             data = self.study.picture_file(getattr(shown, side)).read_bytes()
         except FileNotFoundError as error:
@@ -160,11 +193,22 @@ class _StudyRoutes:
         return Response(data, media_type="image/png", headers=_CACHED)
 
     def answer(self, participant_token: Token, answer: Annotated[AnswerRequest, Body()]) -> AnswerResponse:
-        """Store an answer. The first answer to a trial is final; a second one changes nothing."""
+        """Store an answer. A second answer to a trial changes nothing, unless the first one was withdrawn."""
         participant = self._participant(participant_token)
         _trial(participant, answer.trial)
-        stored = self.store.record_answer(participant, answer.trial, answer.choice, seconds=answer.seconds)
+        stored = self.store.record_answer(
+            participant, answer.trial, answer.choice, seconds=answer.seconds, conditions=answer.conditions
+        )
         return AnswerResponse(kept=stored, next=self._next(participant))
+
+    def withdraw(
+        self, participant_token: Token, withdrawal: Annotated[WithdrawalRequest, Body()]
+    ) -> TrialResponse:
+        """Withdraw the last answer. Returns the trial, which can be answered again."""
+        participant = self._participant(participant_token)
+        _trial(participant, withdrawal.trial)
+        self.store.withdraw_answer(participant, withdrawal.trial)
+        return self._next(participant)
 
     def _link(self, participant_token: str) -> PersonalLink:
         return PersonalLink(link=f"/s/{participant_token}" + (f"?token={self.token}" if self.token else ""))
@@ -179,10 +223,29 @@ class _StudyRoutes:
 
     def _next(self, participant: Participant) -> TrialResponse:
         trial, count = self.store.next_trial(participant), len(participant.trials)
+        last = self.store.last_trial(participant)
         if trial is None:
-            return TrialResponse(trial=None, trials=count)
+            return TrialResponse(trial=None, trials=count, last=last)
         photo = self.study.picture(participant.trials[trial].photo)
-        return TrialResponse(trial=trial, trials=count, width=photo.width, height=photo.height)
+        return TrialResponse(
+            trial=trial,
+            trials=count,
+            width=photo.width,
+            height=photo.height,
+            practice=self._practice_trial(participant) if last is None else None,
+            last=last,
+        )
+
+    def _practice_trial(self, participant: Participant) -> PracticeTrial:
+        practice = _practice(participant)
+        photo = self.study.picture(practice.photo)
+        assert practice.expected
+        return PracticeTrial(width=photo.width, height=photo.height, expected=practice.expected)
+
+
+def _practice(participant: Participant) -> assignment.Trial:
+    assert participant.practice, "a participant of the store has a practice trial"
+    return participant.practice
 
 
 def _trial(participant: Participant, trial: int) -> assignment.Trial:

@@ -85,11 +85,8 @@ class _BoxRoom:
 
     def __init__(self, random: Generator) -> None:
         self.random = random
-        width_m, depth_m, self.height_m = (
-            random.uniform(3.5, 8),
-            random.uniform(3.5, 9),
-            random.uniform(2.4, 3.3),
-        )
+        ranges = (3.5, 8), (3.5, 9), (2.4, 3.3)
+        width_m, depth_m, self.height_m = (random.uniform(low, high) for low, high in ranges)
         self.floor = -random.uniform(1.2, 1.7)
         share = random.uniform(0.3, 0.7, 2)
         self.low = vector(-width_m * share[0], self.floor, -depth_m * share[1])
@@ -310,21 +307,13 @@ class _BoxRoom:
     def _sofa(self, foot: Floats, size: tuple[float, float, float], rotation: float) -> None:
         width_m, _, depth_m = size
         cloth = plain_painter(self.random, tint(self.random, self.random.uniform(0.05, 0.4), 0.6), 60, 0.2)
-        forward, sideways = (
-            vector(-np.sin(rotation), 0, np.cos(rotation)),
-            vector(np.cos(rotation), 0, np.sin(rotation)),
-        )
+        forward, sideways = _horizontal_axes(rotation)
         back = foot - forward * (depth_m / 2 - 0.1)
         self.quads += box(cloth, foot, (width_m, 0.42, depth_m), self.light, rotation)
         self.quads += box(cloth, back, (width_m, 0.85, 0.2), self.light, rotation)
         for side in (-1, 1):
-            self.quads += box(
-                cloth,
-                foot + sideways * side * (width_m / 2 - 0.08),
-                (0.16, 0.6, depth_m),
-                self.light,
-                rotation,
-            )
+            armrest = foot + sideways * side * (width_m / 2 - 0.08)
+            self.quads += box(cloth, armrest, (0.16, 0.6, depth_m), self.light, rotation)
         for offset in np.arange(-width_m / 2 + 0.45, width_m / 2 - 0.3, 0.6):
             cushion = plain_painter(self.random, tint(self.random, 0.35, 0.9), 60, 0.2)
             seat = back + sideways * offset + forward * 0.2 + UP * 0.42
@@ -359,10 +348,7 @@ class _BoxRoom:
     def _table(self, foot: Floats, size: tuple[float, float, float], rotation: float) -> None:
         random, (width_m, height_m, depth_m) = self.random, size
         wood = plain_painter(random, vector(0.35, 0.22, 0.12) * random.uniform(0.4, 1.6), 60, 0.2)
-        forward, sideways = (
-            vector(-np.sin(rotation), 0, np.cos(rotation)),
-            vector(np.cos(rotation), 0, np.sin(rotation)),
-        )
+        forward, sideways = _horizontal_axes(rotation)
         self.quads += box(wood, foot + UP * (height_m - 0.05), (width_m, 0.05, depth_m), self.light, rotation)
         for right in (-0.45, 0.45):
             for front in (-0.42, 0.42):
@@ -405,3 +391,9 @@ class _BoxRoom:
         self.quads += box(shade, foot + UP * 1.35, (0.36, 0.26, 0.36), self.light, 0.6)
         self.lamps.lamps.append(Lamp(foot + UP * 1.5, colour * 1.2))
         self.glows.append(Glow(foot + UP * 1.66, 0.03, colour * 400))
+
+
+def _horizontal_axes(rotation: float) -> tuple[Floats, Floats]:
+    """The forward and the sideways direction of a piece of furniture."""
+    cos, sin = np.cos(rotation), np.sin(rotation)
+    return vector(-sin, 0, cos), vector(cos, 0, sin)

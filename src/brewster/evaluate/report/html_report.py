@@ -2,7 +2,7 @@
 
     write_report(json.loads(Path("results.json").read_text()), cases, Path("report.html"))
 
-The template page.html contains the style, the controls and the viewer. This module adds the content, which is readable
+The template page.html contains the style and the controls, page.js the sorting and the viewer. This module adds the content, which is readable
 without JavaScript. It writes one case at a time, so that memory does not grow with the number of cases.
 """
 
@@ -29,6 +29,7 @@ from brewster.files import atomic_path
 Results = Mapping[str, Any]
 
 _TEMPLATE: Final = Path(__file__).with_name("page.html")
+_SCRIPT: Final = Path(__file__).with_name("page.js")
 _DASH: Final = "&ndash;"
 
 
@@ -53,13 +54,14 @@ def write_report(results: Results, cases: Iterable[CaseTiles], path: Path) -> No
 def _page(results: Results, cases: Iterable[CaseTiles]) -> Iterator[str]:
     """Yields the template with its comments <!--part--> replaced.
 
-    The last part is "data", because it needs the scores of all cases.
+    "data" follows "cases", because it needs the scores of all cases.
     """
     scores: list[Any] = []
-    parts = {
+    parts: dict[str, Iterable[str]] = {
         "results": _results(results),
         "cases": _cases(results, cases, scores),
         "data": _data(results, scores),
+        "script": [_SCRIPT.read_text("utf-8")],
     }
     for i, text in enumerate(re.split(r"<!--(\w+)-->", _TEMPLATE.read_text("utf-8"))):
         if i % 2:  # `re.split` alternates between text and the names of parts
@@ -119,6 +121,10 @@ def _problems(results: Results) -> Iterator[str]:
         for kind in ("refused", "remarks")
     )
     all_remarks = benchmark_remarks + remarks(results)
+    yield _note(
+        "Not computed, run again to add them",
+        [f"{name}: {reason}" for name, reason in results["unavailable"].items()],
+    )
     yield _note(_count(len(excluded), "file excluded"), excluded)
     yield _note(_count(len(all_remarks), "remark"), all_remarks)
     if not errors:
@@ -291,7 +297,7 @@ def _cases(results: Results, cases: Iterable[CaseTiles], scores: list[Any]) -> I
     colours = (f"<i style='background:rgb({red},{green},{blue})'></i>" for red, green, blue in COLOUR_MAP)
     yield (
         f"<p class=legend>Colours of error maps, in 8-bit levels: 0 <span>{''.join(colours)}</span> {MAX_ERROR} or more. "
-        f"The longer side of embedded images has at most {MAX_SIDE_PX} px.</p>\n"
+        f"The longer side of embedded images has at most {MAX_SIDE_PX} px; the viewer opens the files at full size.</p>\n"
     )
     for case in cases:
         entry = entries.get((case.benchmark, case.name), {"scores": {}, "errors": {}})
@@ -315,7 +321,8 @@ def _case(results: Results, case: CaseTiles, entry: Results) -> str:
     rows = [_row(results, entry, BASELINE, case.photo)]
     rows += [_row(results, entry, method, case.methods.get(method, "")) for method in others]
     return (
-        f'<article data-benchmark="{escape(case.benchmark)}" data-name="{escape(case.name)}">\n'
+        f'<article data-benchmark="{escape(case.benchmark)}" data-name="{escape(case.name)}" '
+        f'data-width="{case.size[0]}" data-height="{case.size[1]}">\n'
         f"<h3>{escape(case.name)}</h3><p>{' &middot; '.join(facts)} <span class=key></span></p>\n{''.join(rows)}</article>\n"
     )
 

@@ -63,7 +63,8 @@ class CaseImages:
     """The images of a case at full size, uint8 sRGB (H, W, 3), and the reflection region, bool (H, W).
 
     `predictions` is method -> transmission, without the baseline. `reflections` is method -> reflection, for the methods
-    that predict it.
+    that predict it. `links` is (layer, method) -> URL of the image at full size, relative to the page; the method is "" for
+    the layers "photo", "transmission" and "reflection" of the benchmark.
     """
 
     benchmark: str
@@ -74,6 +75,7 @@ class CaseImages:
     predictions: Mapping[str, Pixels]
     reflections: Mapping[str, Pixels] = field(default_factory=dict)
     reflection_ground_truth: Pixels | None = None
+    links: Mapping[tuple[str, str], str] = field(default_factory=dict)
 
 
 @final
@@ -99,9 +101,9 @@ def to_tiles(case: CaseImages) -> CaseTiles:
 def photo_tiles(case: CaseImages) -> str:
     """Returns HTML with the photo, its error map, the ground truth, the region and, if known, the true reflection."""
     tiles = [
-        _tile(case, "picture", "photo", encode_webp(case.photo)),
+        _tile(case, "picture", "photo", encode_webp(case.photo), ("photo", "")),
         _tile(case, "error", "error of the photo", encode_lossless(error_map(case.photo, case.ground_truth))),
-        _tile(case, "picture", "ground truth", encode_webp(case.ground_truth)),
+        _tile(case, "picture", "ground truth", encode_webp(case.ground_truth), ("transmission", "")),
         _tile(case, "region", "reflection region", overlay(case.region)),
     ]
     if case.reflection_ground_truth is not None:
@@ -111,6 +113,7 @@ def photo_tiles(case: CaseImages) -> str:
                 "reflection",
                 "ground truth of the reflection",
                 encode_webp(case.reflection_ground_truth),
+                ("reflection", ""),
             )
         )
     return "".join(tiles)
@@ -121,7 +124,7 @@ def method_tiles(case: CaseImages, method: str) -> str:
     tiles = []
     if method in case.predictions:
         prediction = case.predictions[method]
-        tiles.append(_tile(case, "picture", method, encode_webp(prediction)))
+        tiles.append(_tile(case, "picture", method, encode_webp(prediction), ("transmission", method)))
         tiles.append(
             _tile(
                 case, "error", f"error of {method}", encode_lossless(error_map(prediction, case.ground_truth))
@@ -129,18 +132,26 @@ def method_tiles(case: CaseImages, method: str) -> str:
         )
     if method in case.reflections:
         tiles.append(
-            _tile(case, "reflection", f"reflection by {method}", encode_webp(case.reflections[method]))
+            _tile(
+                case,
+                "reflection",
+                f"reflection by {method}",
+                encode_webp(case.reflections[method]),
+                ("reflection", method),
+            )
         )
     return "".join(tiles)
 
 
-def _tile(case: CaseImages, kind: str, caption: str, data: bytes) -> str:
-    """Returns HTML: an image as a button that opens the viewer. The arrow keys switch between images of one kind."""
+def _tile(case: CaseImages, kind: str, caption: str, data: bytes, full: tuple[str, str] | None = None) -> str:
+    """Returns HTML: an image as a button that opens the viewer, and a link to the file at full size, if there is one."""
     width, height = embedded_size(case.photo)
+    url = escape(case.links.get(full, "") if full else "")
+    title = f'<a href="{url}">{escape(caption)}</a>' if url else escape(caption)
     return (
-        f"<figure><button type=button data-kind={kind}><img width={width} height={height} loading=lazy "
+        f'<figure><button type=button data-kind={kind} data-full="{url}"><img width={width} height={height} loading=lazy '
         f'alt="{escape(caption)}, {escape(case.name)}" src="data:image/webp;base64,{base64.b64encode(data).decode()}">'
-        f"</button><figcaption>{escape(caption)}</figcaption></figure>"
+        f"</button><figcaption>{title}</figcaption></figure>"
     )
 
 

@@ -11,6 +11,10 @@ from brewster.evaluate.results import AVERAGE, Results
 _SIR2: Final = ("postcard", "solidobject", "wildscene")
 _MARKS: Final = ("\\textbf", "\\underline", "\\uuline")
 """The paper's marks for the best, the second and the third value of a column."""
+_PACKAGES: Final = {
+    "\\multirow": "\\usepackage{multirow}",
+    "\\uuline": "\\usepackage[normalem]{ulem}",
+}
 _DAGGER: Final = "$^\\dagger$"
 _ESCAPES: Final = str.maketrans(
     {letter: f"\\{letter}" for letter in "&%$#_{}"}
@@ -18,26 +22,31 @@ _ESCAPES: Final = str.maketrans(
 )
 
 
-def to_latex(results: Results) -> str:
+def to_latex(results: Results, *, intervals: bool = False) -> str:
     """Returns a table with one row per method and three metrics per benchmark. The average is the last column group.
 
     The best three values of a column are marked as in the paper, but the worst value has no mark. A dagger marks a mean
-    over fewer images than those of other methods. The table needs the LaTeX packages multirow and ulem.
+    over fewer images than those of other methods. With `intervals`, each mean has its 95 % interval. The first line names
+    the LaTeX packages that the table needs.
     """
-    metrics = [name for name in MAIN_METRICS if name in results["metrics"]]
+    metrics = [name for name in MAIN_METRICS if name in results["metrics"]] or list(results["metrics"])[:3]
     keys = _table_selections(results)
     if not metrics or not keys:
-        return "% PSNR, SSIM and LPIPS have no scores\n"
+        return "% there are no scores\n"
     columns = "|".join("c" * len(metrics) for _ in keys)
     titles = [_title(results, name) for name in metrics]
     rows = [
-        _line([_escape(method), *(cell for key in keys for cell in _cells(results, key, method, metrics))])
+        _line(
+            [
+                _escape(method),
+                *(cell for key in keys for cell in _cells(results, key, method, metrics, intervals)),
+            ]
+        )
         for method in results["methods"]
     ]
     note = f"{_DAGGER} mean over fewer images than in the other rows; do not compare"
     is_noted = any(_DAGGER in row for row in rows)
-    return "\n".join([
-        "% brewster evaluate; needs \\usepackage{multirow} and \\usepackage[normalem]{ulem}",
+    lines = [
         f"\\begin{{tabular}}{{l|{columns}}}",
         "\\hline",
         *_header_rows(results, keys, len(metrics)),
@@ -49,7 +58,11 @@ def to_latex(results: Results) -> str:
         *([_line([f"\\multicolumn{{{1 + len(metrics) * len(keys)}}}{{l}}{{{note}}}"])] if is_noted else []),
         "\\end{tabular}",
         "",
-    ])  # fmt: skip
+    ]
+    text = "\n".join(lines)
+    needed = [package for command, package in _PACKAGES.items() if command in text]
+    needs = f"; needs {' and '.join(dict.fromkeys(needed))}" if needed else ""
+    return f"% brewster evaluate{needs}\n{text}"
 
 
 def _table_selections(results: Results) -> list[str]:
@@ -109,21 +122,24 @@ def _title(results: Results, metric: str) -> str:
     return f"{about['title']}$\\{'uparrow' if about['higher_is_better'] else 'downarrow'}$"
 
 
-def _cells(results: Results, key: str, method: str, metrics: Iterable[str]) -> Iterator[str]:
-    """Yields the means with their marks. As in the paper, the average has one more digit."""
+def _cells(results: Results, key: str, method: str, metrics: Iterable[str], intervals: bool) -> Iterator[str]:
+    """Yields the means with their marks and, on request, their intervals."""
     table = results["tables"][key]
     for metric in metrics:
         about: dict[str, Any] = results["metrics"][metric]
-        about = about | {"digits": about["digits"] + (key == AVERAGE)}
-        if metric not in table[method]:
+        entry = table[method].get(metric)
+        if entry is None:
             yield "--"
             continue
-        text = f"{table[method][metric]['mean']:.{about['digits']}f}"
+        text = f"{entry['mean']:.{about['digits']}f}"
+        has_interval = intervals and entry["low"] is not None
+        ends = (f"{entry[end]:.{about['digits']}f}" for end in ("low", "high"))
+        interval = f" {{\\scriptsize [{', '.join(ends)}]}}" if has_interval else ""
         if not is_complete(table, method, metric):
-            yield f"{text}{_DAGGER}"
+            yield f"{text}{_DAGGER}{interval}"
             continue
         marks = dict(zip(ranking(table, metric, about)[:-1], _MARKS, strict=False))
-        yield f"{marks[text]}{{{text}}}" if text in marks else text
+        yield (f"{marks[text]}{{{text}}}" if text in marks else text) + interval
 
 
 def _escape(text: str) -> str:

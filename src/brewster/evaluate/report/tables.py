@@ -32,10 +32,73 @@ def to_markdown(results: Results) -> str:
 
 
 def overview(results: Results) -> str:
-    """Returns the tables without notes and settings, for the terminal."""
+    """Returns the tables as Markdown without notes and settings, for model cards."""
     return (
         "\n\n".join([_overview(results), *(_details(results, key) for key in results["selections"])]) + "\n"
     )
+
+
+def to_terminal(results: Results, width: int = 100, *, intervals: bool = False) -> str:
+    """Returns the means for a terminal with `width` columns: a table per selection, with one row per method.
+
+    A table that is too wide is continued below, and long names of methods are shortened. With `intervals`, each mean has its
+    95 % interval.
+    """
+    parts = [
+        f"{selection['title']} ({selection['pictures']} images)\n{_terminal_table(results, key, width, intervals)}"
+        for key, selection in results["selections"].items()
+    ]
+    return "\n\n".join(part for part in parts if part) + "\n"
+
+
+def _terminal_table(results: Results, key: str, width: int, intervals: bool) -> str:
+    table, image_count = results["tables"][key], results["selections"][key]["pictures"]
+    names = _shortened(list(results["methods"]), max(12, width // 3))
+    columns = []
+    for metric in results["metrics"]:
+        if any(metric in row for row in table.values()):
+            cells = [
+                _terminal_cell(results, metric, table[method].get(metric), image_count, intervals)
+                for method in results["methods"]
+            ]
+            columns.append([_heading(results, metric), *cells])
+    blocks, used = list[list[list[str]]](), width
+    for column in columns:
+        column_width = 2 + max(map(len, column))
+        if used + column_width > width:
+            blocks.append([["", *names]])
+            used = max(map(len, names))
+        blocks[-1].append(column)
+        used += column_width
+    return "\n".join(_aligned(block) for block in blocks)
+
+
+def _terminal_cell(
+    results: Results, metric: str, entry: Mapping[str, Any] | None, image_count: int, intervals: bool
+) -> str:
+    if entry is None:
+        return "-"
+    mean = _number(results, metric, entry["mean"])
+    count = f" ({entry['count']} of {image_count})" if entry["count"] != image_count else ""
+    return f"{mean}{_interval(results, metric, entry) if intervals else ''}{count}"
+
+
+def _shortened(names: list[str], width: int) -> list[str]:
+    """Returns the names with at most `width` characters. The middle of a longer one is left out, because ends differ."""
+    left, right = (width - 1) - (width - 1) // 2, (width - 1) // 2
+    return [name if len(name) <= width else f"{name[:left]}…{name[-right:]}" for name in names]
+
+
+def _aligned(columns: list[list[str]]) -> str:
+    widths = [max(map(len, column)) for column in columns]
+    lines = (
+        "  ".join(
+            cell.ljust(width) if not i else cell.rjust(width)
+            for i, (cell, width) in enumerate(zip(row, widths, strict=True))
+        )
+        for row in zip(*columns, strict=True)
+    )
+    return "\n".join(line.rstrip() for line in lines)
 
 
 def _overview(results: Results) -> str:
@@ -126,6 +189,7 @@ def _notes(results: Results) -> str:
         for text in (*part["remarks"], *(f"excluded: {reason}" for reason in part["refused"]))
     ]
     lines += [f"- {remark}" for remark in remarks(results)]
+    lines += [f"- {name} is not computed: {reason}" for name, reason in results["unavailable"].items()]
     lines += [
         f"- {name} is not scored: no image has the ground truth that it needs"
         for name in results["unmeasured"]
@@ -204,6 +268,19 @@ def to_csv(results: Results) -> str:
                 table.writerow([key, method, "", *_csv_cells(results, metric, entry)])
         for row in results["differences"][key]:
             table.writerow([key, row["method"], row["than"], *_csv_cells(results, row["metric"], row)])
+    return text.getvalue()
+
+
+def scores_to_csv(results: Results) -> str:
+    """Returns a CSV table in long form: one line for each image, method and metric with a score."""
+    text = io.StringIO()
+    table = csv.writer(text, lineterminator="\n")
+    table.writerow(["benchmark", "image", "scene", "method", "metric", "value"])
+    for image in results["pictures"]:
+        for method, scores in image["scores"].items():
+            for metric, value in scores.items():
+                if value is not None:
+                    table.writerow([image["benchmark"], image["name"], image["scene"], method, metric, value])
     return text.getvalue()
 
 

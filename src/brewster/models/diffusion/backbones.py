@@ -42,14 +42,14 @@ BACKBONES: Final[dict[str, type[Backbone]]] = {
 }
 """name -> Backbone class, for the models in `zoo.LARGE_MODELS`. The class has hub id, licence and architecture."""
 
-_INDEX_FILE: Final = "model_index.json"
+INDEX_FILE: Final = "model_index.json"
 _CONFIG_FILES: Final = {
     "transformer": "config.json",
     "vae": "config.json",
     "scheduler": "scheduler_config.json",
 }
-_BACKBONE_PATTERNS: Final = [_INDEX_FILE, *(f"{part}/*" for part in _CONFIG_FILES)]
-_TEXT_ENCODER_PATTERNS: Final = [_INDEX_FILE, "scheduler/*", "text_encoder*/*", "tokenizer*/*", "processor/*"]
+_BACKBONE_PATTERNS: Final = [INDEX_FILE, *(f"{part}/*" for part in _CONFIG_FILES)]
+_TEXT_ENCODER_PATTERNS: Final = [INDEX_FILE, "scheduler/*", "text_encoder*/*", "tokenizer*/*", "processor/*"]
 _STATISTICS_SPREAD: Final = 0.2
 """The spread of a tiny version's latent statistics around 0 and 1, so that tests detect code without normalisation."""
 
@@ -82,6 +82,8 @@ def load_backbone(
     disable_progress_bars_in_pipes()
     folder = _fetch_folder(source, _BACKBONE_PATTERNS)
     family, index = _family_in(folder)
+    if quantise == "nf4" and family.unquantised:
+        options["quantization_config"].llm_int8_skip_modules = list(family.unquantised)
     with explain_out_of_memory(_memory_hint(quantise)):
         vae = _load_part(folder, family, "vae", dtype=dtype, **_device_map(device))
         transformer = _load_part(folder, family, "transformer", dtype=dtype, **_device_map(device), **options)
@@ -120,10 +122,10 @@ def encode_prompt(source: str, text: str = PROMPT, *, device: str = "cpu") -> Pr
             )
     disable_progress_bars_in_pipes()
     folder = _fetch_folder(source, _TEXT_ENCODER_PATTERNS)
-    family, _ = _family_in(folder)
-    check_text_encoders(folder, _read_json(folder / _INDEX_FILE))
+    family, index = _family_in(folder)
+    check_text_encoders(folder, index)
     dtype, device = torch.bfloat16, text_encoder_device(folder, device)
-    pipeline_class = diffusers_class(family.classes["pipeline"])
+    pipeline_class = diffusers_class(index["_class_name"])
     with (
         explain_out_of_memory("close other programs, or pass an encoded prompt"),
         _translate_load_errors(folder),
@@ -205,7 +207,7 @@ def family_of(source: str) -> type[Backbone]:
     """
     if source in BACKBONES or source.startswith(TINY_PREFIX):
         return find_family(source.removeprefix(TINY_PREFIX))
-    return _family_in(fetch(source, [_INDEX_FILE]))[0]
+    return _family_in(fetch(source, [INDEX_FILE]))[0]
 
 
 def _load_tiny(source: str, device: str, quantise: str | None) -> Backbone:
@@ -226,10 +228,10 @@ def _fetch_folder(source: str, patterns: list[str]) -> Path:
 
 
 def _family_in(folder: Path) -> tuple[type[Backbone], dict[str, Any]]:
-    index = _read_json(folder / _INDEX_FILE)
+    index = _read_json(folder / INDEX_FILE)
     class_name = index.get("_class_name")
     for family in BACKBONES.values():
-        if family.classes["pipeline"] == class_name:
+        if class_name in (family.classes["pipeline"], *family.other_pipelines):
             return family, index
     raise ModelError(
         f"{folder} contains a {class_name}",

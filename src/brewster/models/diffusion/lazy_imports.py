@@ -14,6 +14,7 @@ from typing import Any
 import torch
 
 from brewster.errors import DeviceError, DownloadError, MissingExtra, ModelError
+from brewster.models.diffusion.download_notice import announce_download
 
 _CPU_MEMORY_ERROR = re.compile(r"out of memory|not enough memory|can't allocate memory", re.IGNORECASE)
 
@@ -82,6 +83,9 @@ def fetch(source: str, patterns: list[str]) -> Path:
         return Path(source)
     hub, errors = import_library("huggingface_hub"), import_library("huggingface_hub.errors")
     page = f"https://huggingface.co/{source}"
+    # If the hub cannot be asked, the download itself reports why, or finds the files in the cache.
+    with contextlib.suppress(errors.HfHubHTTPError, errors.HFValidationError, errors.DryRunError, OSError):
+        announce_download(hub, source, patterns)
     try:
         return Path(hub.snapshot_download(source, allow_patterns=patterns))
     except errors.GatedRepoError as error:

@@ -19,15 +19,23 @@ import torch
 from torch import Tensor
 
 from brewster.errors import DeviceError, ModelError
-from brewster.models.diffusion.adapter.lora import LORA_FILE, LoraMetadata, load_lora, read_lora_metadata
-from brewster.models.diffusion.backbones import BACKBONES, encode_prompt, family_of, load_backbone
+from brewster.models.diffusion.adapter.layouts import LAYOUTS, LoraLayout, layout_of
+from brewster.models.diffusion.adapter.lora import LORA_FILE, LoraMetadata
+from brewster.models.diffusion.backbones import (
+    BACKBONES,
+    INDEX_FILE,
+    encode_prompt,
+    family_of,
+    load_backbone,
+)
 from brewster.models.diffusion.families.family import Backbone
 from brewster.models.diffusion.lazy_imports import explain_out_of_memory, fetch
 from brewster.models.diffusion.memory import check_machine, choose_quantisation
 from brewster.models.diffusion.panels import PanelLayout, compose, conditioning_image, split
-from brewster.models.diffusion.prompt import PROMPT_FILE, PROMPTS, PromptEmbedding
+from brewster.models.diffusion.prompt import PROMPT_FILE, PROMPTS, PromptEmbedding, load_prompt
 from brewster.models.diffusion.sampling import euler, sample
-from brewster.models.diffusion.task import DecompositionTask
+from brewster.models.diffusion.task import TASK_FILE, DecompositionTask, load_task
+from brewster.models.large_models import LARGE
 from brewster.models.zoo import TINY_PREFIX, model_name
 from brewster.options import Quantisation
 
@@ -59,10 +67,9 @@ class DecompositionPipeline:
         seeds: Sequence[int] = (0,),
         on_progress: Callable[[int, int], None] | None = None,
     ) -> Mapping[str, Float[Tensor, "seeds 3 h w"]]:
-        """Generates the panels for a photo in [-1, 1].
+        """Generates the panels for a photo in [-1, 1], by default with the steps of the task.
 
-        The default of `steps` is that of the task. With the objective "one_step", `steps` and `seeds` have no effect, and
-        there is one prediction.
+        With the objectives "one_step" and "direct", `steps` and `seeds` have no effect, and there is one prediction.
         `on_progress(done, total)` is called after each step.
 
         Returns:
@@ -73,6 +80,8 @@ class DecompositionPipeline:
             DeviceError: out of memory; the message says what to reduce.
         """
         layout = self.task.layout
+        if self.task.objective == "direct":
+            return self._direct(photo, on_progress)
         if self.task.objective == "one_step":
             return split(self._one_step(photo, on_progress), layout)
         height, width = photo.shape[-2:]
@@ -107,6 +116,22 @@ class DecompositionPipeline:
             on_progress(1, 1)
         return image
 
+    @torch.no_grad()
+    def _direct(self, photo: Tensor, on_progress: Callable[[int, int], None] | None) -> dict[str, Tensor]:
+        """Transmission = photo - prediction, as latents (Zakarin et al. 2025). Each panel is decoded separately."""
+        backbone, task = self.backbone, self.task
+        with explain_out_of_memory(_MEMORY_HINT):
+            latents = backbone.encode(photo)
+            time = torch.full((len(latents),), task.time, device=latents.device)
+            prediction = backbone.predict(latents, backbone.no_condition(), time, self.prompt, task.guidance)
+            panels = {"I": latents, "T": latents - prediction}
+            images: dict[str, Tensor] = {
+                name: backbone.decode(panels[name]).clamp(-1, 1).cpu() for name in task.layout.panels
+            }
+        if on_progress:
+            on_progress(1, 1)
+        return images
+
 
 def one_step_latents(
     photo: Float[Tensor, "1 3 h w"], backbone: Backbone, layout: PanelLayout
@@ -131,7 +156,8 @@ def load_pipeline(
         base: the folder or hub id of the LoRA's base; by default the one used in training. Only for a LoRA.
         quantise: the quantisation of the base; by default the one used in training, or int8 or nf4 if only these fit into
             the GPU, and none on the CPU.
-        prompt: for a backbone without a LoRA: a name in `PROMPTS`, or the text itself.
+        prompt: for a backbone without a LoRA: a name in `PROMPTS`, or the text itself. A finetuned backbone with a
+            stored prompt uses that one.
 
     Raises:
         DownloadError: no access to a gated model, an invalid token, or no network connection.
@@ -140,9 +166,9 @@ def load_pipeline(
         MissingExtra: diffusers, torchao or bitsandbytes is not installed.
     """
     device_name = torch_device(device)
-    folder = _lora_folder(model)
-    if folder:
-        return _load_with_lora(model, folder, device, base, quantise)
+    lora = _find_lora(model)
+    if lora:
+        return _load_with_lora(model, lora, device, base, quantise)
     if base:
         raise ModelError(
             f"{model} is a backbone, and the base {base} was given for it",
@@ -153,11 +179,22 @@ def load_pipeline(
     quantise = quantise or choose_quantisation(model, device_name)
     check_machine(model, requested=device, device=device_name, quantise=quantise, with_text_encoders=True)
     # The prompt is encoded before the backbone is loaded, because memory may be too small for both.
-    embedding = encode_prompt(model, PROMPTS.get(prompt, prompt), device=device_name)
+    embedding, task = _prompt_and_task(model, PROMPTS.get(prompt, prompt), device_name)
     backbone = load_backbone(model, device=device_name, quantise=quantise)
-    return DecompositionPipeline(
-        backbone, embedding, DecompositionTask(PanelLayout(("T",))), model_name(model), digest
-    )
+    return DecompositionPipeline(backbone, embedding, task, model_name(model), digest)
+
+
+def _prompt_and_task(model: str, text: str, device: str) -> tuple[PromptEmbedding, DecompositionTask]:
+    """Those stored with a finetuned base, which has no text encoder; otherwise the encoded text, and panel T only."""
+    task = DecompositionTask(PanelLayout(("T",)))
+    if model in BACKBONES or model.startswith(TINY_PREFIX):
+        return encode_prompt(model, text, device=device), task
+    folder = fetch(model, [INDEX_FILE, PROMPT_FILE, TASK_FILE])
+    if (folder / TASK_FILE).is_file():
+        task = load_task(folder / TASK_FILE)
+    if (folder / PROMPT_FILE).is_file():
+        return load_prompt(folder / PROMPT_FILE, family_of(model).name), task
+    return encode_prompt(model, text, device=device), task
 
 
 def fingerprint(
@@ -177,13 +214,14 @@ def fingerprint(
         ModelError, DownloadError: the LoRA does not exist or is damaged.
         DeviceError: large models do not run on this device.
     """
-    folder = _lora_folder(model)
-    if folder is None:
+    lora = _find_lora(model)
+    if lora is None:
         quantisation = quantise or choose_quantisation(model, torch_device(device))
         parts = [_source_id(model), str(quantisation), PROMPTS.get(prompt, prompt)]
     else:
-        metadata = read_lora_metadata(folder)
-        weights = hashlib.sha256((folder / LORA_FILE).read_bytes()).hexdigest()
+        layout, folder = lora
+        metadata = layout.read_metadata(folder)
+        weights = hashlib.sha256((folder / layout.weights).read_bytes()).hexdigest()
         source = base or metadata.base
         quantisation = _base_quantisation(metadata, source, torch_device(device), quantise)
         parts = [weights, metadata.prompt_sha256, _source_id(source), str(quantisation)]
@@ -226,26 +264,32 @@ def torch_device(device: str) -> str:
     return _DEVICES[device] or ("cuda" if torch.cuda.is_available() else "cpu")
 
 
-def _lora_folder(model: str) -> Path | None:
-    """The folder of a LoRA, downloaded if it is on the hub; None for a backbone."""
-    if model in BACKBONES or model.startswith(TINY_PREFIX) or (Path(model) / "model_index.json").is_file():
+def _find_lora(model: str) -> tuple[LoraLayout, Path] | None:
+    """The layout and the folder of a LoRA, downloaded if it is on the hub; None for a backbone."""
+    if model in BACKBONES or model.startswith(TINY_PREFIX):
         return None
-    folder = fetch(model, [LORA_FILE, PROMPT_FILE])
-    if (folder / LORA_FILE).is_file():
-        return folder
-    if Path(model).is_dir():
+    source = LARGE[model].hub_id if model in LARGE else model
+    folder = fetch(source, [name for layout in LAYOUTS for name in layout.files])
+    if layout := layout_of(folder):
+        return layout, folder
+    if not (folder / INDEX_FILE).is_file():
         raise ModelError(
             f"{model} contains no model",
-            f"expected a LoRA ({LORA_FILE}) or a backbone in diffusers' layout (model_index.json)",
-            "pass the folder lora/ that brewster train wrote",
+            f"expected a LoRA ({LORA_FILE}) or a backbone in diffusers' layout ({INDEX_FILE})",
+            "pass the folder lora/ that brewster train wrote, or convert a LoRA with: brewster models import",
         )
     return None
 
 
 def _load_with_lora(
-    model: str, folder: Path, requested: str, base: str | None, quantise: Quantisation | None
+    model: str,
+    lora: tuple[LoraLayout, Path],
+    requested: str,
+    base: str | None,
+    quantise: Quantisation | None,
 ) -> DecompositionPipeline:
-    metadata, device = read_lora_metadata(folder), torch_device(requested)
+    layout, folder = lora
+    metadata, device = layout.read_metadata(folder), torch_device(requested)
     source = base or metadata.base
     if base is None and _is_local(source) and not Path(source).is_dir():
         raise ModelError(
@@ -263,7 +307,7 @@ def _load_with_lora(
     quantisation = _base_quantisation(metadata, source, device, quantise)
     check_machine(source, requested=requested, device=device, quantise=quantisation)
     backbone = load_backbone(source, device=device, quantise=quantisation)
-    metadata, prompt = load_lora(folder, backbone)
+    metadata, prompt = layout.load(folder, backbone)
     digest = fingerprint(model, device=requested, base=base, quantise=quantise)
     return DecompositionPipeline(backbone, prompt, metadata.task, model_name(model), digest)
 

@@ -2,19 +2,28 @@
 
 from __future__ import annotations
 
+import json
 import math
 from contextlib import suppress
-from dataclasses import dataclass, field
-from typing import Final, Literal, final
+from dataclasses import asdict, dataclass, field
+from functools import cache
+from pathlib import Path
+from typing import Annotated, Final, Literal, final
 
-from brewster.errors import PhotoError, RecipeError
+from pydantic import Field, TypeAdapter
+
+from brewster.errors import ModelError, PhotoError, RecipeError
+from brewster.files import write_atomically
 from brewster.models.diffusion.panels import PanelFit, PanelLayout, fit_panel
 from brewster.models.diffusion.sampling import GUIDANCE, STEPS
 
 Objective = Literal["flow", "one_step"]
+"""The objectives that brewster trains."""
 
 PAPER_PX: Final = 1536 * 512
 """The size of the paper's composite: three panels of 512 x 512 pixels."""
+TASK_FILE: Final = "task.json"
+"""The file with the task of a finetuned base, next to model_index.json."""
 
 
 @final
@@ -22,32 +31,49 @@ PAPER_PX: Final = 1536 * 512
 class DecompositionTask:
     """Which panels to generate, and how. All panels together have at most `budget_px` pixels.
 
-    `objective` is "flow" (from noise, in many steps) or "one_step" (from the photo, in one step). `guidance` is used
-    for separation; training may use another value. `steps`, `timestep_shift` and `last_sigma` define the sampling
-    schedule, see `Backbone.schedule`.
+    `objective` is "flow" (from noise, in many steps), "one_step" (from the photo, in one step) or "direct" (one
+    prediction at time `time`, without noise and without a conditioning image: transmission = photo - prediction, both
+    encoded; Zakarin et al. 2025). A direct task decodes each panel separately; its panel I is the encoded photo.
+    `guidance` is used for separation; training may use another value. `steps`, `timestep_shift` and `last_sigma` define
+    the sampling schedule, see `Backbone.schedule`.
+    `short_side_px` is the short side of the input, for models that were trained with one size; a smaller photo is
+    enlarged. With `square_tiles` the input is divided into squares of this side.
     """
 
     layout: PanelLayout = field(default_factory=PanelLayout)
     budget_px: int = PAPER_PX
-    objective: Objective = "flow"
+    objective: Objective | Literal["direct"] = "flow"
     guidance: float = GUIDANCE
-    steps: int = STEPS
-    timestep_shift: float | None = None
-    last_sigma: float | None = None
+    steps: Annotated[int, Field(ge=1)] = STEPS
+    timestep_shift: Annotated[float, Field(gt=0)] | None = None
+    last_sigma: Annotated[float, Field(gt=0, lt=1)] | None = None
+    time: Annotated[float, Field(gt=0, le=1)] = 1.0
+    short_side_px: Annotated[int, Field(ge=16)] | None = None
+    square_tiles: bool = False
 
     def __post_init__(self) -> None:
-        """Raises RecipeError for a task without T, because every separation needs a transmission, or for invalid numbers."""
+        """Raises RecipeError for a task without T, which every separation needs, or for a direct task with R."""
         if "T" not in self.layout.panels:
             raise RecipeError(
                 f"the panels are {list(self.layout.panels)}", "expected a list with T", "add T to the panels"
             )
-        shift_is_valid = self.timestep_shift is None or self.timestep_shift > 0
-        if self.steps < 1 or not shift_is_valid or not 0 < (self.last_sigma or 1) <= 1:
+        if self.objective == "direct" and "R" in self.layout.panels:
             raise RecipeError(
-                f"the task has steps = {self.steps}, timestep_shift = {self.timestep_shift}, last_sigma = {self.last_sigma}",
-                "expected at least 1 step, a shift above 0, and a last_sigma above 0 and at most 1",
-                "correct these values",
+                f"the panels of a direct task are {list(self.layout.panels)}",
+                "expected T, or I and T, because it generates no reflection",
+                "remove R from the panels",
             )
+
+    def input_size(self, size: tuple[int, int], multiple: int) -> tuple[int, int]:
+        """The (width, height) of the copy of a photo that is the input, never larger than the photo.
+
+        Raises:
+            PhotoError: see `fit`. With `short_side_px` every photo has an input size.
+        """
+        if self.short_side_px is None:
+            return self.fit(size, multiple).content
+        scale = min(1.0, self.short_side_px / min(size))
+        return round(scale * size[0]), round(scale * size[1])
 
     def fit(self, size: tuple[int, int], multiple: int) -> PanelFit:
         """The largest panel within the budget for a photo of this (width, height). A photo is never enlarged.
@@ -66,3 +92,33 @@ class DecompositionTask:
             f"expected at least {multiple} pixels a side, and a less extreme aspect ratio",
             "crop it, or use the compact model",
         )
+
+
+def save_task(task: DecompositionTask, path: Path) -> None:
+    """Writes a JSON file, and replaces an existing one.
+
+    Raises:
+        TargetError: the file cannot be written.
+    """
+    write_atomically(path, f"{json.dumps(asdict(task), indent=2)}\n".encode(), overwrite=True)
+
+
+def load_task(path: Path) -> DecompositionTask:
+    """Reads a file that `save_task` wrote.
+
+    Raises:
+        ModelError: the file cannot be read, or is not a valid task.
+    """
+    try:
+        return _validator().validate_json(path.read_bytes(), strict=True, extra="forbid")
+    except (OSError, ValueError, RecipeError) as error:
+        raise ModelError(
+            f"{path} cannot be read: {error}",
+            "expected the task of a model",
+            "copy or convert the model again",
+        ) from error
+
+
+@cache
+def _validator() -> TypeAdapter[DecompositionTask]:
+    return TypeAdapter(DecompositionTask)

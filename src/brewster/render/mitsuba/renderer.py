@@ -1,6 +1,6 @@
 """The reference renderer: path-traces the five images of any scene with an unmodified Mitsuba 3.
 
-    sample = trace(scene, Assets([Path("hdri")]), noise=0.01)
+    sample = trace(scene, Assets([Path("hdri")]), noise_threshold=0.01)
 
 It shares no optics code with the analytic renderer, so that each validates the other. Each image is lit from one side of
 the glass only; objects on the other side are black. Light is additive: I is the sum of the image lit from behind and the
@@ -24,7 +24,7 @@ from brewster.environments.assets import Assets
 from brewster.errors import DeviceError, MissingExtra
 from brewster.render.mitsuba.scene_builder import GlassMode, MitsubaSceneBuilder
 from brewster.render.mitsuba.variant import COMPILED, INSTALL_LLVM, load, probe
-from brewster.render.sample import LightSample
+from brewster.render.sample import LinearSample
 from brewster.scene.scene import Scene
 
 _POLARISED: Final = "llvm_ad_mono_polarized"
@@ -40,17 +40,17 @@ def trace(
     scene: Scene,
     assets: Assets,
     *,
-    noise: float = 0.02,
+    noise_threshold: float = 0.02,
     max_samples: int = 4096,
     denoise: bool = False,
     polarised: bool = False,
-) -> LightSample:
+) -> LinearSample:
     """Path-traces the five images of a scene in equal passes, until their noise is low enough.
 
     The error of an image is the mean over its pixels of standard error / (light + 1 % of the mean light); the standard
-    error comes from the variance between passes. An image is finished when its error is below `noise`, or after
+    error comes from the variance between passes. An image is finished when its error is below `noise_threshold`, or after
     `max_samples` rays per pixel. T and R are measured relative to I, their sum: the one that adds more error to I gets
-    the next pass. With the paper's orders T and R are rendered separately.
+    the next pass. With truncated orders T and R are rendered separately.
 
     Mitsuba's colour variants average s- and p-polarised light at every surface, which is wrong for glass with several
     surfaces. `polarised` traces each colour with the polarised variant, at several times the cost; rough surfaces in
@@ -59,7 +59,7 @@ def trace(
     Args:
         scene: what to render.
         assets: the source of its maps and pictures.
-        noise: the relative error below which an image is finished.
+        noise_threshold: the relative error below which an image is finished.
         max_samples: maximum number of rays per pixel and image.
         denoise: whether Intel Open Image Denoise filters the result.
         polarised: whether polarisation is traced.
@@ -79,7 +79,7 @@ def trace(
             MitsubaSceneBuilder(mi, scene, assets, channel)
             for channel in (range(3) if polarised else (None,))
         ]
-        return _render_layers(builders, noise, max_samples, denoise)
+        return _render_layers(builders, noise_threshold, max_samples, denoise)
 
 
 @contextmanager
@@ -106,26 +106,26 @@ def _variant(polarised: bool) -> str:
 
 
 def _render_layers(
-    builders: Sequence[MitsubaSceneBuilder], noise: float, max_samples: int, denoise: bool
-) -> LightSample:
+    builders: Sequence[MitsubaSceneBuilder], noise_threshold: float, max_samples: int, denoise: bool
+) -> LinearSample:
     scene = builders[0].scene
 
     def estimate(*images: tuple[bool, GlassMode]) -> list[_RunningEstimate]:
-        estimates = [_RunningEstimate(builders, behind, glass, max_samples) for behind, glass in images]
-        _converge(estimates, noise, max_samples)
+        estimates = [_RunningEstimate(builders, behind, mode, max_samples) for behind, mode in images]
+        _converge(estimates, noise_threshold, max_samples)
         return estimates
 
     lit_from_behind, lit_from_front = estimate((True, "full"), (False, "full"))
     estimates = {"transmission": lit_from_behind, "reflection": lit_from_front}
-    if scene.orders == "paper":
-        [estimates["transmission"]] = estimate((True, "paper_transmission"))
-        [estimates["reflection"]] = estimate((False, "paper_reflection"))
+    if scene.orders == "truncated":
+        [estimates["transmission"]] = estimate((True, "truncated_transmission"))
+        [estimates["reflection"]] = estimate((False, "truncated_reflection"))
     [background] = estimate((True, "none"))
     [mirror] = estimate((False, "mirror"))
     layers = {name: image.light for name, image in estimates.items()}
     layers["photo"] = lit_from_behind.light + lit_from_front.light
     layers |= {"background": background.light, "mirror": mirror.light}
-    return LightSample(scene, **{name: _to_tensor(light, denoise) for name, light in layers.items()})
+    return LinearSample(scene, **{name: _to_tensor(light, denoise) for name, light in layers.items()})
 
 
 def _to_tensor(light: NDArray[np.float64], denoise: bool) -> Tensor:
@@ -150,14 +150,15 @@ class _RunningEstimate:
     """An image rendered in passes: the mean of the passes so far, and the variance of this mean per pixel."""
 
     def __init__(
-        self, builders: Sequence[MitsubaSceneBuilder], behind: bool, glass: GlassMode, max_samples: int
+        self, builders: Sequence[MitsubaSceneBuilder], behind: bool, glass_mode: GlassMode, max_samples: int
     ) -> None:
         scene = builders[0].scene
         self._mi = builders[0].mi
         self._scenes = [
-            self._mi.load_dict(builder.scene_dict(behind=behind, glass=glass)) for builder in builders
+            self._mi.load_dict(builder.scene_dict(behind=behind, glass_mode=glass_mode))
+            for builder in builders
         ]
-        self._seed_key = scene.seed, scene.index, int(behind), get_args(GlassMode).index(glass)
+        self._seed_key = scene.seed, scene.index, int(behind), get_args(GlassMode).index(glass_mode)
         self.samples = _samples_per_pass(scene.camera.width * scene.camera.height, max_samples)
         self.passes = 0
         self._sum = np.zeros((scene.camera.height, scene.camera.width, 3))
@@ -195,8 +196,8 @@ def _samples_per_pass(pixels: int, max_samples: int) -> int:
     return next((samples for samples in (64, 16, 4) if samples <= limit), 1)
 
 
-def _converge(estimates: Sequence[_RunningEstimate], noise: float, max_samples: int) -> None:
-    """Adds passes until the error of the sum is at most `noise`; each pass is for the image with the largest error."""
+def _converge(estimates: Sequence[_RunningEstimate], noise_threshold: float, max_samples: int) -> None:
+    """Adds passes until the error of the sum is at most `noise_threshold`; each pass is for the image with the largest error."""
     for estimate in estimates:
         for _ in range(_MIN_PASSES):
             estimate.add_pass()
@@ -204,6 +205,6 @@ def _converge(estimates: Sequence[_RunningEstimate], noise: float, max_samples: 
         light = np.sum([image.light.mean(axis=2) for image in estimates], axis=0)
         scale = light + _RELATIVE_FLOOR * light.mean() + np.finfo(np.float32).tiny
         variances = [image.variance for image in estimates]
-        if (np.sqrt(np.sum(variances, axis=0)) / scale).mean() <= noise:
+        if (np.sqrt(np.sum(variances, axis=0)) / scale).mean() <= noise_threshold:
             return
         max(pending, key=lambda image: float((np.sqrt(image.variance) / scale).mean())).add_pass()

@@ -28,10 +28,10 @@ Doubles = NDArray[np.float64]
 Plugin = dict[str, Any]
 """A dictionary from which Mitsuba builds an object."""
 
-GlassMode = Literal["full", "paper_transmission", "paper_reflection", "mirror", "none"]
+GlassMode = Literal["full", "truncated_transmission", "truncated_reflection", "mirror", "none"]
 """How the glass is rendered.
 
-`full`: all orders; `paper_transmission`: without reflections (the paper's T); `paper_reflection`: no light enters the
+`full`: all orders; `truncated_transmission`: without reflections (the paper's T); `truncated_reflection`: no light enters the
 last pane (the paper's R); `mirror`: the first surface is a perfect mirror (MR); `none`: no glass (B).
 """
 
@@ -64,16 +64,16 @@ class MitsubaSceneBuilder:
         )
         _check_wedges(scene.glass, self._view_corners[:, 0])
 
-    def scene_dict(self, *, behind: bool, glass: GlassMode) -> Plugin:
+    def scene_dict(self, *, behind: bool, glass_mode: GlassMode) -> Plugin:
         """The whole scene, lit from one side of the glass; objects of the other side are black.
 
         Raises:
             RecipeError: a lens has no thickness somewhere in its frame.
         """
-        is_tinted = glass not in {"mirror", "none"} and any(
+        is_tinted = glass_mode not in {"mirror", "none"} and any(
             any(pane.absorption_per_m) for pane in self._glass.panes
         )
-        parts = [*self._surfaces(glass), *self._wall(), *self._emitters(behind)]
+        parts = [*self._surfaces(glass_mode), *self._wall(), *self._emitters(behind)]
         return {
             "type": "scene",
             "integrator": {
@@ -139,26 +139,26 @@ class MitsubaSceneBuilder:
 
     def _first_surface_corners(self) -> Doubles:
         """Points (4, 2) on the first surface: the corners of its frame, or of the view."""
-        if self._glass.frame_mm:
-            return np.array([(-1, -1), (-1, 1), (1, -1), (1, 1)]) * self._glass.frame_mm / 2
+        if self._glass.opening_mm:
+            return np.array([(-1, -1), (-1, 1), (1, -1), (1, 1)]) * self._glass.opening_mm / 2
         rays = np.array(self.scene.camera.corners()) @ self._to_glass.T
         corners: Doubles = (self._camera_position - rays * (self._camera_position[2] / rays[:, 2:]))[:, :2]
         return corners
 
     # The glass
 
-    def _surfaces(self, glass: GlassMode) -> Iterator[object]:
+    def _surfaces(self, glass_mode: GlassMode) -> Iterator[object]:
         """All surfaces, the one nearest to the camera first. A frame limits the first one; the others exceed the view."""
-        if glass == "none":
+        if glass_mode == "none":
             return
         if self._glass.radii_mm:
-            yield from self._lens(*self._glass.radii_mm, glass)
+            yield from self._lens(*self._glass.radii_mm, glass_mode)
             return
         height, max_half_size = 0.0, (self._half_extent_mm, self._half_extent_mm)
-        frame = self._glass.frame_mm
-        half_size = (frame[0] / 2, frame[1] / 2) if frame else max_half_size
+        opening = self._glass.opening_mm
+        half_size = (opening[0] / 2, opening[1] / 2) if opening else max_half_size
         for pane in self._glass.panes:
-            is_entered, material = self._material(pane, glass)
+            is_entered, material = self._material(pane, glass_mode)
             yield self._rectangle(np.eye(3), (0, 0, height), half_size, material)
             if not is_entered:
                 return
@@ -181,18 +181,22 @@ class MitsubaSceneBuilder:
         columns = -across, np.array((0, 1, 0)), np.array((-sine, 0, -cosine))
         return self._rectangle(columns, middle, ((high - low) / 2, self._half_extent_mm), material)
 
-    def _material(self, pane: Pane, glass: GlassMode) -> tuple[bool, Plugin]:
+    def _material(self, pane: Pane, glass_mode: GlassMode) -> tuple[bool, Plugin]:
         """Whether light enters the pane, and the materials of its surfaces and its interior."""
-        if glass == "mirror":
+        if glass_mode == "mirror":
             return False, {"bsdf": {"type": "conductor", "material": "none"}}
-        rough = {"alpha": pane.roughness, "distribution": "ggx"} if pane.roughness and pane.index > 1 else {}
+        rough = (
+            {"alpha": pane.roughness, "distribution": "ggx"}
+            if pane.roughness and pane.refractive_index > 1
+            else {}
+        )
         kind = "rough" if rough else ""
-        if glass == "paper_reflection" and pane is self._glass.panes[-1]:
+        if glass_mode == "truncated_reflection" and pane is self._glass.panes[-1]:
             # A conductor with k = 0 has the reflectance of glass, and no ray is spent on transmission.
-            index = {"type": "spectrum", "value": pane.index}
+            index = {"type": "spectrum", "value": pane.refractive_index}
             return False, {"bsdf": {"type": kind + "conductor", "eta": index, "k": 0.0, **rough}}
-        bsdf = {"type": kind + "dielectric", "int_ior": pane.index, "ext_ior": 1.0, **rough}
-        if glass == "paper_transmission":
+        bsdf = {"type": kind + "dielectric", "int_ior": pane.refractive_index, "ext_ior": 1.0, **rough}
+        if glass_mode == "truncated_transmission":
             bsdf["specular_reflectance"] = 0.0
         return True, {"bsdf": bsdf, **self._interior_medium(pane)}
 
@@ -214,9 +218,9 @@ class MitsubaSceneBuilder:
 
     def _wall(self) -> Iterator[Plugin]:
         """A black wall around the frame's opening, in the plane of the first surface: four rectangles."""
-        if not self._glass.frame_mm:
+        if not self._glass.opening_mm:
             return
-        right, top = self._glass.frame_mm[0] / 2, self._glass.frame_mm[1] / 2
+        right, top = self._glass.opening_mm[0] / 2, self._glass.opening_mm[1] / 2
         half_side, half_top = (_WALL_MM, _WALL_MM), (right, _WALL_MM)
         for sign in (-1, 1):
             yield self._rectangle(np.eye(3), (sign * (right + _WALL_MM), 0, 0), half_side, {"bsdf": _BLACK})
@@ -224,16 +228,16 @@ class MitsubaSceneBuilder:
 
     # A lens
 
-    def _lens(self, near_mm: float, far_mm: float, glass: GlassMode) -> Iterator[object]:
+    def _lens(self, near_mm: float, far_mm: float, glass_mode: GlassMode) -> Iterator[object]:
         """Two spherical surfaces as fine meshes with interpolated normals, inside black frame sides."""
         pane = self._glass.panes[0]
-        is_entered, material = self._material(pane, glass)
+        is_entered, material = self._material(pane, glass_mode)
         near, far = self._sphere(near_mm, 0.0), self._sphere(far_mm, -pane.thickness_mm)
         depth = near[0][..., 2] - far[0][..., 2]
         if depth.min() <= 0:
             raise RecipeError(
                 f"the lens is {depth.min():.3g} mm thick at its thinnest", "expected a thickness above 0 everywhere in the frame",
-                "increase thickness_mm or radii_mm, or reduce frame_mm",
+                "increase thickness_mm or radii_mm, or reduce opening_mm",
             )  # fmt: skip
         yield self._mesh(*near, material)
         if is_entered:
@@ -243,14 +247,14 @@ class MitsubaSceneBuilder:
 
     def _sphere(self, radius_mm: float, height: float) -> tuple[Doubles, Doubles]:
         """Points and normals towards the camera, (rows, columns, 3), of a surface whose centre is at z = `height`."""
-        half_width, half_height = np.array(self._glass.frame_mm) / 2
+        half_width, half_height = np.array(self._glass.opening_mm) / 2
         line = np.linspace(-1, 1, _LENS_GRID + 1)
         x, y = np.meshgrid(line * half_width, line * half_height)
         squared = radius_mm**2 - x**2 - y**2
         if squared.min() <= 0:
             raise RecipeError(
                 f"a sphere of {abs(radius_mm):g} mm does not fill the frame", "expected a radius above half the frame's diagonal",
-                "increase radii_mm or reduce frame_mm",
+                "increase radii_mm or reduce opening_mm",
             )  # fmt: skip
         rise = np.copysign(np.sqrt(squared), radius_mm)
         return np.stack([x, y, height - radius_mm + rise], axis=2), np.stack([x, y, rise], axis=2) / radius_mm
@@ -275,7 +279,7 @@ class MitsubaSceneBuilder:
 
     def _frame_sides(self, low: float, high: float) -> Iterator[Plugin]:
         """The frame's black inner sides, so that no light passes between frame and glass."""
-        right, top = np.array(self._glass.frame_mm) / 2
+        right, top = np.array(self._glass.opening_mm) / 2
         x, y, z = np.eye(3)
         middle, half = (low + high) / 2, (high - low) / 2
         for sign in (-1, 1):
@@ -295,7 +299,7 @@ class MitsubaSceneBuilder:
 
     def _plane(self, plane: Plane, behind: bool, *, is_lit: bool) -> Plugin:
         """A plane faces the glass; heading and pitch are those seen by an observer at the glass."""
-        picture = self._select_channel(self._assets.plane_light(plane))
+        picture = self._select_channel(self._assets.plane_radiance(plane))
         facing = 1 if behind else -1
         columns = np.array(axes(plane.heading_deg, plane.pitch_deg)) * (facing, 1, facing)
         half = plane.width_mm / 2, plane.width_mm / 2 * picture.shape[0] / picture.shape[1]
@@ -348,13 +352,13 @@ class MitsubaSceneBuilder:
 
     def _map_size(self, envmap: EnvironmentMap) -> tuple[int, int]:
         """Height and width of the map. A coarse one is enlarged by an odd factor: texel centres stay texel centres."""
-        height, width = self._assets.map_light(envmap).shape[:2]
+        height, width = self._assets.map_radiance(envmap).shape[:2]
         factor = math.ceil(_MIN_MAP_ROWS / height) // 2 * 2 + 1
         return factor * height, factor * width
 
     def _texels(self, envmap: EnvironmentMap, behind: bool, u: Doubles, v: Doubles) -> Floats:
         """The map's light at u and v, (rows, columns, 3); black on the other side of the glass."""
-        texels = sample_bilinear(self._select_channel(self._assets.map_light(envmap)), u, v)
+        texels = sample_bilinear(self._select_channel(self._assets.map_radiance(envmap)), u, v)
         azimuth, polar = 2 * math.pi * u + math.radians(envmap.heading_deg), math.pi * v[:, None]
         x, y, z = self._to_glass[2]
         above_glass = np.sin(polar) * (x * np.sin(azimuth) - z * np.cos(azimuth)) + y * np.cos(polar)

@@ -118,7 +118,7 @@ class SideEmitters:
         self._distribution: EnvmapDistribution | None = None
         self.radius_mm = side.map.radius_mm if side.map else math.inf
         self.envmap = (
-            MipmappedTexture(torch.from_numpy(assets.map_light(side.map)).to(device), wraps=True)
+            MipmappedTexture(torch.from_numpy(assets.map_radiance(side.map)).to(device), wraps=True)
             if side.map
             else None
         )
@@ -270,7 +270,7 @@ class SideEmitters:
 
 def _plane_emitter(plane: Plane, assets: Assets, behind: bool, device: Device) -> _PlaneEmitter:
     """Converts a plane to the glass frame. At heading 0 it faces the glass; a heading rotates it about the y axis."""
-    image = torch.from_numpy(assets.plane_light(plane)).to(device)
+    image = torch.from_numpy(assets.plane_radiance(plane)).to(device)
     facing = 1.0 if behind else -1.0
     mirrored = torch.tensor([facing, 1.0, facing], device=device)
     right, up, _ = (

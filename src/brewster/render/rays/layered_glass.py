@@ -42,7 +42,7 @@ def fresnel(cosine: Tensor, index: float) -> tuple[Tensor, Tensor]:
 def internal_transmittance(pane: Pane, cosine: Tensor) -> Tensor:
     """Share of the light left after one traversal of the pane, (3, ...) for RGB (Beer-Lambert law)."""
     absorption = torch.tensor(pane.absorption_per_m, dtype=cosine.dtype, device=cosine.device)
-    path_m = pane.thickness_mm / 1000 / refracted_cosine(cosine, pane.index)
+    path_m = pane.thickness_mm / 1000 / refracted_cosine(cosine, pane.refractive_index)
     return torch.exp(-absorption.view(3, *[1] * cosine.ndim) * path_m)
 
 
@@ -50,20 +50,20 @@ def internal_transmittance(pane: Pane, cosine: Tensor) -> Tensor:
 class Throughput:
     """Transmittance and reflectance of a glazing along a camera ray; each (3, ...) if tinted, else (...)."""
 
-    transmitted: Tensor
-    reflected: Tensor
+    transmittance: Tensor
+    reflectance: Tensor
 
 
-def all_orders(glazing: Glazing, cosine: Tensor) -> Throughput:
+def total_throughput(glazing: Glazing, cosine: Tensor) -> Throughput:
     """The sum of all orders in closed form; panes are combined by the adding method."""
     return _average_polarisations(
         [_combine([_slab(r, a) for r, a in panes]) for panes in _by_polarisation(glazing, cosine)]
     )
 
 
-def paper_orders(glazing: Glazing, cosine: Tensor) -> Throughput:
+def truncated_throughput(glazing: Glazing, cosine: Tensor) -> Throughput:
     """The paper's layers: T without any reflection, and R of all light that never enters the last pane."""
-    return _average_polarisations([_paper_layers(panes) for panes in _by_polarisation(glazing, cosine)])
+    return _average_polarisations([_truncated_layers(panes) for panes in _by_polarisation(glazing, cosine)])
 
 
 _TransmittanceReflectance = tuple[Tensor, Tensor]
@@ -76,7 +76,7 @@ def _by_polarisation(glazing: Glazing, cosine: Tensor) -> list[list[_SurfaceAndI
     interiors = [
         internal_transmittance(pane, cosine) if any(pane.absorption_per_m) else 1.0 for pane in glazing.panes
     ]
-    surfaces = [fresnel(cosine, pane.index) for pane in glazing.panes]
+    surfaces = [fresnel(cosine, pane.refractive_index) for pane in glazing.panes]
     return [[(r[which], a) for r, a in zip(surfaces, interiors, strict=True)] for which in (0, 1)]
 
 
@@ -104,7 +104,7 @@ def _combine(layers: list[_TransmittanceReflectance]) -> _TransmittanceReflectan
     return transmittance, reflectance
 
 
-def _paper_layers(panes: list[_SurfaceAndInterior]) -> _TransmittanceReflectance:
+def _truncated_layers(panes: list[_SurfaceAndInterior]) -> _TransmittanceReflectance:
     """Transmittance without any reflection, and reflectance without the light that enters the last pane."""
     transmittance: Tensor | float = 1.0
     for r, a in panes:
@@ -117,13 +117,13 @@ def _paper_layers(panes: list[_SurfaceAndInterior]) -> _TransmittanceReflectance
 
 
 def _average_polarisations(polarised: list[_TransmittanceReflectance]) -> Throughput:
-    (s_transmitted, s_reflected), (p_transmitted, p_reflected) = polarised
-    return Throughput((s_transmitted + p_transmitted) / 2, (s_reflected + p_reflected) / 2)
+    (s_transmittance, s_reflectance), (p_transmittance, p_reflectance) = polarised
+    return Throughput((s_transmittance + p_transmittance) / 2, (s_reflectance + p_reflectance) / 2)
 
 
 @dataclass(frozen=True)
 class ReflectionOrder:
-    """A set of `count` light paths through a parallel stack, with equal exit side, lateral shift and throughput.
+    """A set of `count` light paths through a parallel stack, with equal exit side, in-plane shift and throughput.
 
     `reflections` and `transmissions` at surfaces are counted per pane, `traversals` per layer: pane, gap, pane...
     `behind` is true for light that comes from behind the glass.
@@ -136,7 +136,7 @@ class ReflectionOrder:
     count: int
 
     @property
-    def in_paper(self) -> bool:
+    def in_truncated_layers(self) -> bool:
         """Whether the paper's T or R contains this order."""
         return sum(self.reflections) == 0 if self.behind else self.traversals[-1] == 0
 
@@ -211,7 +211,7 @@ def _weight(counts: tuple[_Counts, _Counts] | list[_Counts], reflectances: tuple
 def order_throughputs(glazing: Glazing, cosine: Tensor, table: Sequence[ReflectionOrder]) -> list[Tensor]:
     """The throughput of each order, (3, ...) or (...).
 
-    For each side they sum to `all_orders`: the last order of a side also gets the light of all fainter orders, so
+    For each side they sum to `total_throughput`: the last order of a side also gets the light of all fainter orders, so
     that no energy is lost.
     """
     interiors = [
@@ -220,7 +220,7 @@ def order_throughputs(glazing: Glazing, cosine: Tensor, table: Sequence[Reflecti
     ]
     polarised = [
         [(_powers(r), _powers(1 - r)) for r in surfaces]
-        for surfaces in zip(*(fresnel(cosine, pane.index) for pane in glazing.panes), strict=True)
+        for surfaces in zip(*(fresnel(cosine, pane.refractive_index) for pane in glazing.panes), strict=True)
     ]
     throughputs = []
     for order in table:
@@ -230,8 +230,8 @@ def order_throughputs(glazing: Glazing, cosine: Tensor, table: Sequence[Reflecti
         for power, exponent in zip(interiors, order.traversals[::2], strict=True):
             throughput = throughput * power(exponent) if power and exponent else throughput
         throughputs.append(throughput)
-    closed_form = all_orders(glazing, cosine)
-    for behind, total in ((True, closed_form.transmitted), (False, closed_form.reflected)):
+    closed_form = total_throughput(glazing, cosine)
+    for behind, total in ((True, closed_form.transmittance), (False, closed_form.reflectance)):
         side = [i for i, order in enumerate(table) if order.behind == behind]
         if side:
             throughputs[side[-1]] = throughputs[side[-1]] + (total - sum(throughputs[i] for i in side))
@@ -265,11 +265,11 @@ def _surface_throughput(
     return reduce(torch.mul, factors)
 
 
-def lateral_shifts_mm(glazing: Glazing, cosine: Tensor) -> list[Tensor]:
+def in_plane_shifts_mm(glazing: Glazing, cosine: Tensor) -> list[Tensor]:
     """Shift of a ray along the glass per traversal of each layer (pane, gap, pane...), in mm, (...) each."""
     shifts = []
     for pane in glazing.panes:
-        inside = refracted_cosine(cosine, pane.index)
+        inside = refracted_cosine(cosine, pane.refractive_index)
         shifts += [pane.thickness_mm * _tangent(inside), glazing.gap_mm * _tangent(cosine)]
     return shifts[:-1]
 
@@ -284,4 +284,4 @@ def ghost_distance_mm(pane: Pane, incidence_deg: float) -> float:
     2 t tan(theta_t) cos(theta_i), with the thickness t, the angle of incidence theta_i and that of refraction theta_t.
     """
     cosine = torch.tensor(math.cos(math.radians(incidence_deg)), dtype=torch.float64)
-    return float(2 * pane.thickness_mm * _tangent(refracted_cosine(cosine, pane.index)) * cosine)
+    return float(2 * pane.thickness_mm * _tangent(refracted_cosine(cosine, pane.refractive_index)) * cosine)

@@ -36,7 +36,7 @@ class Surface:
     height_mm: float
     normal: Tensor
     alpha: float
-    index: float
+    refractive_index: float
     glass_is_below: bool
     absorption: Tensor
     """Absorption of the pane that the surface belongs to, per mm, (3, 1)."""
@@ -60,10 +60,10 @@ class _PathState:
 
 @dataclass(frozen=True)
 class ExitingLight:
-    """The light of one order from one side, (3, N); `in_paper` says whether the paper's T or R contains it."""
+    """The light of one order from one side, (3, N); `in_truncated_layers` says whether the paper's T or R contains it."""
 
     behind: bool
-    in_paper: bool
+    in_truncated_layers: bool
     light: Tensor
 
 
@@ -79,8 +79,10 @@ def surfaces(glass: Glazing, like: Tensor) -> list[Surface]:
             wedge = torch.tensor(pane.wedge_deg if far else 0.0).deg2rad()
             normal = like.new_tensor([wedge.sin(), 0, wedge.cos()])[:, None]
             height -= pane.thickness_mm if far else 0.0
-            alpha = pane.roughness if pane.index > 1 else 0.0  # without refraction there is no scattering
-            stack.append(Surface(height, normal, alpha, pane.index, not far, absorption))
+            alpha = (
+                pane.roughness if pane.refractive_index > 1 else 0.0
+            )  # without refraction there is no scattering
+            stack.append(Surface(height, normal, alpha, pane.refractive_index, not far, absorption))
         height -= glass.gap_mm
     return stack
 
@@ -106,8 +108,8 @@ def trace_orders(
             is_behind = branch.surface > 0
             emitters = behind if is_behind else front
             light = _exit_radiance(branch, interaction, emitters, rays.footprint_px, sobol)
-            in_paper = branch.reflections == 0 if is_behind else not branch.entered_last_pane
-            yield ExitingLight(is_behind, in_paper, light)
+            in_truncated_layers = branch.reflections == 0 if is_behind else not branch.entered_last_pane
+            yield ExitingLight(is_behind, in_truncated_layers, light)
 
 
 def _mean_weight(path: _PathState) -> float:
@@ -152,7 +154,7 @@ def _interact(
     normal = surface.normal if path.down else -surface.normal
     wi = -path.direction
     facet = sample_visible_normal(wi, normal, surface.alpha, sobol.next_2d()) if surface.alpha else normal
-    index_in, index_out = (surface.index, 1.0) if in_glass else (1.0, surface.index)
+    index_in, index_out = (surface.refractive_index, 1.0) if in_glass else (1.0, surface.refractive_index)
     for reflects in (True, False):
         interaction = _SurfaceInteraction(wi, normal, surface.alpha, index_in, index_out, reflects, before)
         direction = _scattered_direction(interaction, facet)

@@ -1,7 +1,7 @@
-"""Renders sets: the job, the schedule of its tasks, and the lock. The executors are in `workers` and `ray_cluster`.
+"""Renders sets: the job, the schedule of its tasks, and the lock. The executors are in `brewster.executors`.
 
     job = RenderJob(Path("out/window"), read_scene_recipe("window"), read_catalog([], [])[0], seed=7)
-    build(job, range(1000), ProcessExecutor(job, 8))
+    build(job, range(1000), ProcessExecutor(partial(TaskRunner, job), 8))
 
 A sample depends only on (job, index). The process that renders it writes it atomically. So every existing sample is
 complete, a killed run needs no other state to resume, and memory and time per sample do not depend on the number of samples.
@@ -12,16 +12,17 @@ from __future__ import annotations
 import hashlib
 import tomllib
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager, contextmanager
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final, Literal, Protocol, final
+from typing import Any, Final, Literal, final
 
 import filelock
 import tomli_w
 
-from brewster.errors import BrewsterError, DeviceError, MissingExtra, TargetError
+from brewster.errors import DeviceError, MissingExtra, TargetError
+from brewster.executors import Executor, run_tasks
 from brewster.files import write_atomically
 from brewster.rendered import store
 from brewster.rendered.generation.preview import write_index
@@ -68,6 +69,10 @@ class RenderTask:
     kind: Literal["render", "pack"]
     indices: tuple[int, ...]
 
+    def split(self) -> list[RenderTask]:
+        """Returns a task for each index."""
+        return [RenderTask(self.kind, (index,)) for index in self.indices]
+
     def failed_results(self, reason: str) -> list[RenderResult]:
         """Returns the results if no worker could finish the task."""
         message = (
@@ -85,7 +90,7 @@ class RenderTask:
 class RenderResult:
     """The result for one sample. If packing fails, it is the result for the first sample of the block.
 
-    `kind` is the class name of the error. `fatal` is the error itself if it ends the run.
+    `kind` is the class name of the error.
     """
 
     index: int
@@ -93,35 +98,15 @@ class RenderResult:
     seconds: float = 0.0
     error: str | None = None
     kind: str | None = None
-    fatal: BrewsterError | None = None
 
 
 ResultCallback = Callable[[RenderResult], None]
 
 
-class Executor(AbstractContextManager[Any], Protocol):
-    """Runs a limited number of tasks at a time. On exit from the context, the running tasks are stopped."""
-
-    chunk_size: int
-    """Number of samples per task."""
-
-    def has_capacity(self) -> bool:
-        """Whether another task can be submitted now."""
-
-    def is_busy(self) -> bool:
-        """Whether any task is running."""
-
-    def submit(self, task: RenderTask) -> None:
-        """Starts a task."""
-
-    def wait(self) -> Sequence[RenderResult]:
-        """Waits until a task ends. Returns the results of finished tasks; none if a task is tried again."""
-
-
 def build(
     job: RenderJob,
     indices: range,
-    executor: Executor,
+    executor: Executor[RenderResult],
     *,
     shards: bool = False,
     report: ResultCallback = lambda _: None,
@@ -146,26 +131,12 @@ def build(
         store.remove_partial_files(job.out)
         try:
             with executor:
-                _run_tasks(
-                    _Schedule(job.out, indices, executor.chunk_size, shards=shards, report=report), executor
-                )
+                schedule = _Schedule(job.out, indices, executor.chunk_size, shards=shards, report=report)
+                for result in run_tasks(schedule.next, executor):
+                    schedule.record_result(result)
         finally:
             store.remove_partial_files(job.out)
         write_index(job.out)
-
-
-def _run_tasks(schedule: _Schedule, executor: Executor) -> None:
-    while True:
-        task = schedule.next() if executor.has_capacity() else None
-        if task:
-            executor.submit(task)
-        elif executor.is_busy():
-            for result in executor.wait():
-                if result.fatal:
-                    raise result.fatal
-                schedule.record_result(result)
-        else:
-            return
 
 
 @final

@@ -30,7 +30,7 @@ COLUMNS: Final = {
     "width": ("int64", "camera.width"),
     "height": ("int64", "camera.height"),
     "thickness_mm": ("float64", "glass.panes.0.thickness_mm"),
-    "refractive_index": ("float64", "glass.panes.0.index"),
+    "refractive_index": ("float64", "glass.panes.0.refractive_index"),
     "roughness": ("float64", "glass.panes.0.roughness"),
     "wedge_deg": ("float64", "glass.panes.0.wedge_deg"),
     "absorption_red_per_m": ("float64", "glass.panes.0.absorption_per_m.0"),

@@ -25,6 +25,7 @@ from brewster.training.data.mixtures import Stream, TrainingBatch
 from brewster.training.distributed import best_device
 from brewster.training.loop import StepCallback, run
 from brewster.training.losses import check_finite, psnr_gain_db, separation_loss, tone_ratio
+from brewster.training.plots import sample_sheet
 from brewster.training.recipe import CompactRecipe
 from brewster.training.streams import held_out_mixtures, open_stream, validation_pairs
 from brewster.worker_setup import single_torch_thread
@@ -34,10 +35,16 @@ ValidationPairs = Mapping[str, list[tuple[Tensor, Tensor]]]
 
 MODEL_FILE: Final = "model.onnx"
 _VALIDATION_SIDE_PX: Final = 384
-_HELD_OUT_MIXTURES: Final = 128
+_HELD_OUT_MIXTURES: Final = 320
 _HELD_OUT_SIDE_PX: Final = 192
 _MIN_VISIBLE_MSE: Final = 1e-4
 """Smallest mean squared difference of encoded photo and transmission with a visible reflection: a PSNR of 40 dB."""
+_SAMPLE_COLUMNS: Final = (
+    "photo (input)",
+    "ground truth of T",
+    "predicted transmission T",
+    "predicted reflection R",
+)
 _MAX_GRADIENT_NORM: Final = 1.0
 _START_FROM_CURE: Final = "train the recipe that writes it first, or correct start_from in this recipe"
 
@@ -133,7 +140,7 @@ class CompactTrainer:
         self.optimizer.load_state_dict(state["optimizer"])
 
     def training_step(self, step: int) -> dict[str, float]:
-        """Runs one step of AdamW on one batch. Returns the loss and its parts.
+        """Runs one step of AdamW on one batch. Returns `loss` and its terms, `loss_NAME`.
 
         Raises:
             ModelError: the loss is NaN or infinite. The last checkpoint is still valid.
@@ -145,7 +152,7 @@ class CompactTrainer:
         if norm.isfinite():  # otherwise skip the batch: one infinite gradient would destroy the weights
             self.optimizer.step()
             self._update_ema(step + 1)
-        return {"loss": loss.item(), **{name: part.item() for name, part in parts.items()}}
+        return {"loss": loss.item(), **{f"loss_{name}": part.item() for name, part in parts.items()}}
 
     def _compute_gradients(self, batch: TrainingBatch) -> dict[str, Tensor]:
         """Computes the gradient of the batch's mean loss for each parameter. Returns the parts of the loss.
@@ -181,7 +188,7 @@ class CompactTrainer:
         """Returns the metrics of the EMA network on the validation pairs, and an image of up to four predictions per folder."""
         network = self.ema_network()
         metrics = validate(network, self._validation_pairs, self._chunk_pool.map)
-        return metrics, _contact_sheet(network, self._validation_pairs or self._training_pairs())
+        return metrics, _draw_samples(network, self._validation_pairs or self._training_pairs())
 
     def export(self, folder: Path) -> Path:
         """Writes the EMA network to model.onnx in `folder`. Returns the path of the file.
@@ -217,7 +224,7 @@ class CompactTrainer:
 
     @torch.no_grad()
     def _update_ema(self, steps: int) -> None:
-        decay = min(self.recipe.average_decay, (steps + 1) / (steps + 10))
+        decay = min(self.recipe.ema_decay, (steps + 1) / (steps + 10))
         for name, value in self.network.state_dict().items():
             self.ema_weights[name].lerp_(value, 1 - decay)
 
@@ -233,7 +240,7 @@ def validate(
     """Computes the validation metrics of a network. Pairs are not resized. `map_` may be the `map` of a thread pool.
 
     Returns:
-        For each folder: gain_db_NAME, the mean PSNR gain over the input in dB; worse_NAME, the fraction of pairs whose
+        For each folder: psnr_gain_db_NAME, the mean PSNR gain over the input in dB; worse_NAME, the fraction of pairs whose
         prediction is worse than the input; tone_NAME, the mean `tone_ratio`, which is 1 if prediction and photo have the same
         exposure.
     """
@@ -246,24 +253,24 @@ def validate(
     metrics = {}
     for name, folder in filter(itemgetter(1), pairs.items()):
         gains, tones = zip(*map_(measure, folder), strict=True)
-        metrics[f"gain_db_{name}"] = sum(gains) / len(gains)
+        metrics[f"psnr_gain_db_{name}"] = sum(gains) / len(gains)
         metrics[f"worse_{name}"] = sum(gain < 0 for gain in gains) / len(gains)
         metrics[f"tone_{name}"] = sum(tones) / len(tones)
     return metrics
 
 
 @torch.no_grad()
-def _contact_sheet(network: nn.Module, pairs: ValidationPairs) -> Tensor:
-    """Returns an image, (H, 960, 3), sRGB-encoded, with one row for each of the first four pairs of every folder.
-
-    A row contains photo, ground truth, predicted transmission and predicted reflection.
-    """
+def _draw_samples(network: nn.Module, pairs: ValidationPairs) -> Tensor:
+    """Returns an image, (H, 960, 3), sRGB-encoded, with one row for each of the first four pairs of every folder."""
     rows = []
-    for photo, ground_truth in (pair for folder in pairs.values() for pair in folder[:4]):
-        layers = network(photo)
-        row = torch.cat([photo, ground_truth, layers[:, :3], layers[:, 3:]], dim=3)
-        rows.append(functional.interpolate(row, (160, 960), mode="bilinear", antialias=True)[0])
-    return torch.cat(rows, dim=1).permute(1, 2, 0)
+    for name, folder in pairs.items():
+        for number, (photo, ground_truth) in enumerate(folder[:4], start=1):
+            layers = network(photo)
+            gain = psnr_gain_db(layers[:, :3].clamp(0, 1), photo, ground_truth)
+            row = torch.cat([photo, ground_truth, layers[:, :3], layers[:, 3:]], dim=3)
+            images = functional.interpolate(row, (160, 960), mode="bilinear", antialias=True)[0]
+            rows.append((f"{name} {number}: PSNR gain {gain:+.2f} dB", images))
+    return sample_sheet(_SAMPLE_COLUMNS, rows)
 
 
 def _resize_pairs(folders: ValidationPairs, stride: int) -> dict[str, list[tuple[Tensor, Tensor]]]:

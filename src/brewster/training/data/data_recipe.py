@@ -27,7 +27,7 @@ class RenderedRecipe(FrozenModel):
     """How the photo is composed. light: T + R in linear light. 8-bit: a blend of 8-bit images, for comparison."""
     target: Target = "background"
     """What the network predicts behind the glass: the background B without glass, or the transmission T."""
-    orders: Literal["all", "paper"] | None = None
+    orders: Literal["all", "truncated"] | None = None
     """Replaces the key `orders` of the scene recipe. Not set: that of the scene recipe."""
     seed: Seed | None = None
     """Seed of the scenes. Not set: the seed of this recipe."""

@@ -24,10 +24,16 @@ if TYPE_CHECKING:
 def blur(image: Image, sigma_px: float, *, disc: bool) -> Image:
     """Blurs by defocus: with a Gaussian of this standard deviation, or with a disc, the shape of a lens aperture.
 
-    The disc has the same standard deviation along an axis, half of its radius. Its radius is at most 6 px.
+    The disc has the same standard deviation along an axis, half of its radius. A blur with a standard deviation of 6 px or more
+    is computed on a smaller copy of the image, because its cost grows with the standard deviation.
     """
+    reduction = int(sigma_px / 3)
+    if reduction > 1:
+        small = functional.interpolate(image[None], scale_factor=1 / reduction, mode="area")[0]
+        blurred = blur(small, sigma_px / reduction, disc=disc)
+        return functional.interpolate(blurred[None], image.shape[1:], mode="bilinear")[0]
     if disc:
-        return _filter(image, _disc(min(2 * sigma_px, 6.0)))
+        return _filter(image, _disc(2 * sigma_px))
     reach = max(1, round(3 * sigma_px))
     line = torch.exp(-((torch.arange(-reach, reach + 1) / max(sigma_px, 0.1)) ** 2) / 2)
     line = line / line.sum()

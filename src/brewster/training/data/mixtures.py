@@ -85,14 +85,18 @@ class MixRecipe(FrozenModel):
     """Colour temperature t of the light: the gains of red and blue are about exp(t) and exp(-t)."""
     background_map_probability: Share = 0.2
     """Probability that the background is a view of an environment map instead of a photo."""
-    background_level_log: LogRange = (0.03, 0.5)
+    background_level: LogRange = (0.03, 0.5)
     """Mean luminance of the background before the camera's exposure."""
     highlight_boost: Range = (0.0, 6.0)
     """White parts of a photo are multiplied by up to 1 + this value, because their true luminance was clipped."""
     shadow_probability: Share = 0.15
     """Probability of a hard shadow on the background."""
+    background_blur_probability: Share = 0.2
+    """Probability of a background that is out of focus. Without such backgrounds, a network takes all blur for a reflection."""
+    background_blur_px: LogRange = (0.5, 5.0)
+    """Standard deviation of the defocus blur of these backgrounds."""
 
-    no_glass_probability: Share = 0.12
+    no_glass_probability: Share = 0.15
     """Probability of a sample without glass, so that the network leaves plain photos unchanged."""
     partial_probability: Share = 0.12
     """Probability of glass that covers only a part of the image."""
@@ -105,9 +109,9 @@ class MixRecipe(FrozenModel):
 
     reflection_map_probability: Share = 0.4
     """Probability that the reflection is a view of an environment map instead of a photo."""
-    reflection_ratio_log: LogRange = (0.04, 2.0)
+    reflection_ratio: LogRange = (0.04, 2.0)
     """Mean luminance of the reflection without its lamps, divided by that of the background."""
-    reflection_contrast_log: LogRange = (0.8, 1.8)
+    reflection_contrast: LogRange = (0.8, 1.8)
     """Exponent on the luminance of the reflected scene. Values above 1 increase the contrast of its light sources."""
     lamp_probability: Share = 0.15
     """Probability of small lamps in the reflection."""
@@ -115,7 +119,7 @@ class MixRecipe(FrozenModel):
     """Probability of a sign with letters in the reflection."""
     sharp_probability: Share = 0.45
     """Probability of a reflection without defocus blur."""
-    blur_px_log: LogRange = (0.3, 5.0)
+    blur_px: LogRange = (0.3, 9.0)
     """Standard deviation of the defocus blur of the other reflections."""
     ghost_probability: Share = 0.4
     """Probability of a ghost: a displaced copy of the reflection from the second surface of the pane."""
@@ -128,13 +132,17 @@ class MixRecipe(FrozenModel):
     edge_probability: Share = 0.3
     """Probability of a reflection that ends at a straight edge, such as a frame."""
 
-    exposure: Range = (0.2, 0.55)
+    softness_probability: Share = 0.6
+    """Probability of a soft photo: background and reflection are both blurred by the lens, or enlarged from a smaller photo."""
+    softness_px: LogRange = (0.3, 1.6)
+    """Standard deviation of this blur, in pixels of the training image at any size."""
+    target_luminance: Range = (0.2, 0.55)
     """Mean luminance of the photo after exposure. A photo with a smaller mean is not brightened."""
-    overexposed_probability: Share = 0.2
+    overexposed_probability: Share = 0.3
     """Probability of an overexposed photo, in which a part of the background is white."""
-    overexposed_share: Range = (0.005, 0.15)
+    overexposed_share: Range = (0.005, 0.3)
     """Share of white pixels in an overexposed photo."""
-    gamma_log: LogRange = (0.8, 1.25)
+    gamma: LogRange = (0.8, 1.25)
     """Exponent on the encoded values."""
     contrast: Range = (-0.3, 0.5)
     """Strength of an S-shaped tone curve on the encoded values: 0 is none, negative values flatten it."""
@@ -175,7 +183,7 @@ class Mixtures:
         background = self._background(rng, size)
         reflection = self._reflection(rng, size) * background.mean()
         if rng.bernoulli(recipe.no_glass_probability):
-            return _expose_and_develop(rng, recipe, background, background, torch.zeros_like(background))
+            return self._take_photo(rng, background, background, torch.zeros_like(background))
         glass = effects.window(rng, size) if rng.bernoulli(recipe.partial_probability) else torch.ones(1)
         transmittance = rng.uniform(recipe.transmittance) * (1 + 0.02 * rng.normal(3, 1, 1))
         transmission, reflection = background * (1 + glass * (transmittance - 1)), reflection * glass
@@ -183,14 +191,24 @@ class Mixtures:
         if rng.bernoulli(recipe.veil_probability):
             photo = photo + glass * rng.uniform(recipe.veil) * photo.mean(dim=(1, 2), keepdim=True)
         target = transmission if recipe.target == "transmission" else background
-        return _expose_and_develop(rng, recipe, photo, target, reflection)
+        return self._take_photo(rng, photo, target, reflection)
+
+    def _take_photo(self, rng: SampleRng, *layers: Image) -> tuple[Image, Image, Image]:
+        """Applies the softness, the exposure and the tone curve of the camera to photo, target and reflection."""
+        if rng.bernoulli(self._recipe.softness_probability):
+            sigma_px = rng.log_uniform(self._recipe.softness_px)
+            layers = tuple(effects.blur(layer, sigma_px, disc=False) for layer in layers)
+        return _expose_and_develop(rng, self._recipe, *layers)
 
     def _background(self, rng: SampleRng, size: int) -> Image:
-        recipe = self._recipe
+        recipe, scale = self._recipe, size / _REFERENCE_SIZE
         view = self._view(rng, size, recipe.background_map_probability)
+        if rng.bernoulli(recipe.background_blur_probability):
+            sigma_px = rng.log_uniform(recipe.background_blur_px) * scale
+            view = effects.blur(view, sigma_px, disc=rng.bernoulli(0.5))
         if rng.bernoulli(recipe.shadow_probability):
             view = view * effects.shadow(rng, size)
-        level = rng.log_uniform(recipe.background_level_log)
+        level = rng.log_uniform(recipe.background_level)
         return view * _temperature(rng, recipe.temperature) * (level / _mean_without_highlights(view))
 
     def _reflection(self, rng: SampleRng, size: int) -> Image:
@@ -198,12 +216,12 @@ class Mixtures:
         recipe, scale = self._recipe, size / _REFERENCE_SIZE
         view = self._view(rng, size, recipe.reflection_map_probability)
         view = view / _mean_without_highlights(view)
-        view = view * (view.mean(dim=0) + 1e-4) ** (rng.log_uniform(recipe.reflection_contrast_log) - 1)
+        view = view * (view.mean(dim=0) + 1e-4) ** (rng.log_uniform(recipe.reflection_contrast) - 1)
         view = view / _mean_without_highlights(view) * _temperature(rng, recipe.temperature)
         if rng.bernoulli(recipe.sign_probability):
             view = effects.sign(rng, view)
         if not rng.bernoulli(recipe.sharp_probability):
-            view = effects.blur(view, rng.log_uniform(recipe.blur_px_log) * scale, disc=rng.bernoulli(0.5))
+            view = effects.blur(view, rng.log_uniform(recipe.blur_px) * scale, disc=rng.bernoulli(0.5))
         if rng.bernoulli(recipe.lamp_probability):
             view = view + effects.lamps(rng, size)
         if rng.bernoulli(recipe.ghost_probability):
@@ -212,7 +230,7 @@ class Mixtures:
             view = view * effects.falloff(rng, size)
         if rng.bernoulli(recipe.edge_probability):
             view = view * effects.edge(rng, size)
-        return view * rng.log_uniform(recipe.reflection_ratio_log)
+        return view * rng.log_uniform(recipe.reflection_ratio)
 
     def _view(self, rng: SampleRng, size: int, map_probability: float) -> Image:
         if self._maps and rng.bernoulli(map_probability):
@@ -274,11 +292,11 @@ def _expose_and_develop(rng: SampleRng, recipe: MixRecipe, *layers: Image) -> tu
 
     The photo is also given noise, rounded to 8 bits, and compressed as JPEG with the probability in the recipe.
     """
-    exposure = min(1.0, rng.uniform(recipe.exposure) / layers[0].clamp(max=1).mean().item())
+    exposure = min(1.0, rng.uniform(recipe.target_luminance) / layers[0].clamp(max=1).mean().item())
     if rng.bernoulli(recipe.overexposed_probability):
         white = _quantile(layers[1].amax(dim=0), 1 - rng.uniform(recipe.overexposed_share))
         exposure = max(exposure, 1 / (white + 1e-3))
-    gamma, contrast = rng.log_uniform(recipe.gamma_log), rng.uniform(recipe.contrast)
+    gamma, contrast = rng.log_uniform(recipe.gamma), rng.uniform(recipe.contrast)
 
     def develop(linear: Image) -> Image:
         encoded = to_encoded((linear * exposure).clamp(0, 1)) ** gamma

@@ -1,6 +1,6 @@
 """Writes the model card of a LoRA, a README.md for the hub: base, licence, prompt, use, data, settings, scores, limits.
 
-    write_card(Path("out/kontext/lora"), recipe, {"gain_db_nature": 1.2}, Kontext)
+    write_card(Path("out/kontext/lora"), recipe, {"psnr_gain_db_nature": 1.2}, Kontext)
 
 The card depends only on the recipe and the log. It contains no paths of the machine, so that equal runs give equal bytes.
 """
@@ -272,10 +272,12 @@ def _scores(scores: Mapping[str, float]) -> str:
 
 
 def _metric_title(name: str) -> str:
-    if name.startswith("gain_db_"):
-        return f"PSNR gain over the input, {name.removeprefix('gain_db_')}, dB"
+    if name.startswith("psnr_gain_db_"):
+        return f"PSNR gain over the input, {name.removeprefix('psnr_gain_db_')}, dB"
     return (
-        f"loss, panel {name.removeprefix('panel_')}" if name.startswith("panel_") else name.replace("_", " ")
+        f"loss, panel {name.removeprefix('loss_panel_')}"
+        if name.startswith("loss_panel_")
+        else name.replace("_", " ")
     )
 
 

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import importlib
 import importlib.util
+import itertools
 import json
 from collections.abc import Mapping, Sequence
 from functools import cached_property
@@ -40,7 +41,7 @@ from brewster.models.diffusion.pipeline import DecompositionPipeline
 from brewster.models.diffusion.prompt import PROMPTS, PromptEmbedding, load_prompt
 from brewster.training import distributed
 from brewster.training.data.sample_rng import SampleRng
-from brewster.training.loop import read_last_metrics
+from brewster.training.loop import read_log
 from brewster.training.lora.latents import (
     EncodedSample,
     LatentEncoder,
@@ -52,6 +53,7 @@ from brewster.training.lora.latents import (
 )
 from brewster.training.lora.model_card import write_card
 from brewster.training.losses import check_finite, psnr_gain_db
+from brewster.training.plots import sample_sheet
 from brewster.training.recipe import ENCODED_SUFFIX, LoraRecipe
 from brewster.training.streams import validation_pairs
 
@@ -155,7 +157,7 @@ class LoraTrainer:
         self._prompt = PromptEmbedding(self._family.name, **state["prompt"])
 
     def training_step(self, step: int) -> dict[str, float]:
-        """Runs one step of AdamW on one batch. Returns the loss and the part of each panel.
+        """Runs one step of AdamW on one batch. Returns `loss` and the term of each panel, `loss_panel_NAME`.
 
         Raises:
             ModelError: the loss is NaN or infinite. The last checkpoint is still valid.
@@ -174,7 +176,7 @@ class LoraTrainer:
         for group in self._optimizer.param_groups:
             group["lr"] = self.recipe.learning_rate * self.recipe.learning_rate_factor(step)
         self._optimizer.step()
-        return {"loss": loss.item(), **{name: part.item() for name, part in parts.items()}}
+        return {"loss": loss.item(), **{f"loss_{name}": part.item() for name, part in parts.items()}}
 
     @torch.no_grad()
     def validate(self) -> tuple[dict[str, float], Tensor]:
@@ -183,19 +185,24 @@ class LoraTrainer:
         The samples are divided among the processes, so that none waits for the others. All processes must call this.
         """
         samples = [layers for folder in self._validation_samples.values() for layers in folder]
-        columns = (3 + len(self.recipe.panels)) * _ROW_PX[1]
+        columns = [f"ground truth {panel}" for panel in "ITR"]
+        columns += [f"generated {panel}" for panel in self.recipe.panels]
         gains = torch.zeros(len(samples), device=self._device)
-        rows = torch.zeros(len(samples), 3, _ROW_PX[0], columns, device=self._device)
+        images = torch.zeros(len(samples), 3, _ROW_PX[0], len(columns) * _ROW_PX[1], device=self._device)
         for index in range(distributed.rank(), len(samples), distributed.world_size()):
-            gain, row = self._validate_sample(samples[index])
-            gains[index], rows[index] = gain, row.to(self._device)
-        distributed.all_reduce_sum([gains, rows])
-        folders = torch.split(gains.cpu(), [len(folder) for folder in self._validation_samples.values()])
-        means = {
-            f"gain_db_{name}": part.mean().item()
-            for name, part in zip(self._validation_samples, folders, strict=True)
-        }
-        return means, torch.cat(list(rows.cpu()), dim=1).clamp(0, 1).permute(1, 2, 0)
+            gain, image = self._validate_sample(samples[index])
+            gains[index], images[index] = gain, image.clamp(0, 1).to(self._device)
+        distributed.all_reduce_sum([gains, images])
+        results = iter(zip(gains.tolist(), images.cpu(), strict=True))
+        means, rows = {}, []
+        for name, folder in self._validation_samples.items():
+            part = list(itertools.islice(results, len(folder)))
+            means[f"psnr_gain_db_{name}"] = sum(gain for gain, _ in part) / len(part)
+            rows += [
+                (f"{name} {number}: PSNR gain {gain:+.2f} dB", image)
+                for number, (gain, image) in enumerate(part, start=1)
+            ]
+        return means, sample_sheet(columns, rows)
 
     def export(self, folder: Path) -> Path:
         """Writes LoRA, prompt, recipe and model card to `lora` in `folder`. Returns the path. diffusers can load the LoRA.
@@ -219,7 +226,8 @@ class LoraTrainer:
         )
         text = json.dumps(self.recipe.model_dump(mode="json"), indent=2)
         write_atomically(target / RECIPE_FILE, f"{text}\n".encode(), overwrite=True)
-        write_card(target, self.recipe, read_last_metrics(folder), type(self.backbone))
+        scores = read_log(folder)[-1:]
+        write_card(target, self.recipe, scores[0] if scores else {}, type(self.backbone))
         return target
 
     def separate(self, photo: Tensor, *, seed: int = 0) -> Mapping[str, Tensor]:
@@ -271,7 +279,7 @@ class LoraTrainer:
         if encoded.start is not None:
             return encoded.start, torch.ones(1)
         recipe, grid = self.recipe, encoded.composite
-        normal = recipe.logit_mean + recipe.logit_deviation * rng.normal(1)
+        normal = recipe.logit_mean + recipe.logit_std * rng.normal(1)
         sigma = self.backbone.shifted(
             normal.sigmoid(), grid.shape[2] * grid.shape[3], timestep_shift=recipe.timestep_shift
         )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from statistics import median
 from typing import Final, Literal, final
@@ -22,7 +22,8 @@ class ParticipantAnswers:
     """The answers of one participant.
 
     `votes` maps the number of a comparison to an index of OUTCOMES. `catches` is the number of answered catch trials,
-    `failed` is the number of wrong answers to them. `seconds` is the median time for a trial.
+    `failed` is the number of wrong answers to them. `seconds` is the median time for a trial. `trials` has the position of
+    each answered trial in the order of presentation, from 0, the trial, and its answer.
     """
 
     number: int
@@ -31,6 +32,7 @@ class ParticipantAnswers:
     failed: int
     seconds: float
     is_complete: bool
+    trials: Sequence[tuple[int, Trial, StoredAnswer]] = ()
 
 
 @final
@@ -71,6 +73,7 @@ def _participant_answers(participant: Participant, answers: Mapping[int, StoredA
         passed.count(False),
         median(answer.seconds for answer in answers.values()),
         len(answers) == len(participant.trials),
+        [(trial, participant.trials[trial], answer) for trial, answer in answers.items()],
     )
 
 

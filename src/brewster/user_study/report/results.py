@@ -9,8 +9,6 @@ All results are given twice: for the participants after the exclusion rule, and 
 
 from __future__ import annotations
 
-import csv
-import io
 import json
 import math
 from collections.abc import Sequence
@@ -23,17 +21,20 @@ from numpy.typing import NDArray
 import brewster
 from brewster.errors import BrewsterError
 from brewster.files import write_atomically
+from brewster.user_study.report.answers import answers_csv
 from brewster.user_study.report.bradley_terry import strengths
 from brewster.user_study.report.figure import plot
 from brewster.user_study.report.krippendorff import alpha
 from brewster.user_study.report.participants import OUTCOMES, ExclusionRule, ParticipantAnswers
 from brewster.user_study.report.statistics import (
+    MIN_PARTICIPANTS,
     agreement_bounds,
     bootstrap_interval,
     bootstrap_weights,
     intraclass_correlation,
     rates,
     resampled_counts,
+    sign_flip_test,
     with_agreement_bounds,
 )
 from brewster.user_study.report.tables import to_csv, to_latex, to_markdown
@@ -178,6 +179,7 @@ def _tables(study: Study, counts: Floats, pictures: Floats, weights: Floats) -> 
     means = rates(counts.sum(axis=0), pictures)
     ends = bootstrap_interval(rates(resampled_counts(weights, counts), pictures), len(counts))
     lows, highs = with_agreement_bounds(means, ends, agreement_bounds(counts, pictures))
+    p_values, sizes = sign_flip_test(counts, pictures), _participant_counts(counts)
     titles = {name: _dataset_title(name) for name in study.description.datasets} | AVERAGES
     answers = counts.sum(axis=(0, 3))
     return [
@@ -191,6 +193,8 @@ def _tables(study: Study, counts: Floats, pictures: Floats, weights: Floats) -> 
                     "title": title,
                     "pictures": int(pictures[i, j] if j < answers.shape[1] else pictures[i].sum()),
                     "answers": int(answers[i, j] if j < answers.shape[1] else answers[i].sum()),
+                    "participants": int(sizes[i, j]),
+                    "p": _round(p_values[i, j]) if sizes[i, j] >= MIN_PARTICIPANTS else None,
                     **{
                         name: _estimate(*(part[i, j, k] for part in (means, lows, highs)))
                         for k, name in enumerate((*OUTCOMES, "difference"))
@@ -201,6 +205,13 @@ def _tables(study: Study, counts: Floats, pictures: Floats, weights: Floats) -> 
         }
         for i, (first, second) in enumerate(study.pairs_of_methods)
     ]
+
+
+def _participant_counts(counts: Floats) -> Floats:
+    """Numbers of participants with an answer, for each row of a table: (pairs of methods, datasets + 3)."""
+    answered = counts.sum(axis=-1) > 0
+    pooled = answered.any(axis=-1).sum(axis=0)[:, None]
+    return np.concatenate([answered.sum(axis=0), np.repeat(pooled, len(AVERAGES), axis=1)], axis=1)
 
 
 def _strengths(study: Study, counts: Floats, weights: Floats) -> dict[str, Any]:
@@ -258,23 +269,8 @@ def write(results: Results, study: Study, participants: Sequence[ParticipantAnsw
         "report.md": to_markdown(results).encode(),
         "table.tex": to_latex(results).encode(),
         "table.csv": to_csv(results).encode(),
-        "answers.csv": _answers_csv(results, study, participants).encode(),
+        "answers.csv": answers_csv(study.description, participants, results["left_out"]).encode(),
         "plot.png": plot(results),
     }
     for name, data in files.items():
         write_atomically(out / name, data, overwrite=True)
-
-
-def _answers_csv(results: Results, study: Study, participants: Sequence[ParticipantAnswers]) -> str:
-    """One line for each answer to a comparison; the column `left_out` has the reason if the participant is excluded."""
-    text = io.StringIO()
-    table = csv.writer(text, lineterminator="\n")
-    table.writerow(["participant", "dataset", "name", "first", "second", "outcome", "left_out"])
-    for participant in participants:
-        reason = results["left_out"].get(str(participant.number), "")
-        for number, outcome in sorted(participant.votes.items()):
-            row = study.description.comparisons[number]
-            table.writerow(
-                [participant.number, row.dataset, row.name, *row.methods, OUTCOMES[outcome], reason]
-            )
-    return text.getvalue()

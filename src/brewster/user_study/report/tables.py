@@ -14,7 +14,9 @@ paper's Table 3 does; the rows below it are the unweighted mean of the datasets 
 Intervals are 95 % expanded percentile intervals of 10,000 bootstrap resamples of whole participants; if all answers \
 agree, they are those of Clopper and Pearson with one answer for each participant. They apply to other participants who \
 see these pictures; they do not apply to other pictures.
-Difference is win minus lose. Correlation is the intraclass correlation of the scores 1, 0, -1 (win, tie, lose) of a \
+Difference is win minus lose. N is the number of participants with an answer. The p-value is that of a two-sided randomisation \
+test of the difference, which exchanges wins and losses of whole participants; it is not corrected for the number of tests. With \
+fewer than 6 participants, no result can be significant at the 5 % level, and the table says "too few participants". Correlation is the intraclass correlation of the scores 1, 0, -1 (win, tie, lose) of a \
 participant, an input of `brewster study plan`.
 Strength is the parameter of a method in the Bradley-Terry model of all answers; a tie is half a win for each method, and \
 the mean is 0.
@@ -83,18 +85,30 @@ def _counts_line(group: Mapping[str, Any]) -> str:
 
 
 def _table(table: Mapping[str, Any]) -> str:
-    rows = [["", table["first"], "Tie", table["second"], "Difference", "Answers"]]
+    rows = [["", table["first"], "Tie", table["second"], "Difference", "Test", "N", "Answers"]]
     rows += [
-        [row["title"], *(_percent(row[name]) for name in ("win", "tie", "lose")), _percent(row["difference"], "+"), str(row["answers"])]
-        for row in table["rows"]
+        [
+            row["title"], *(_percent(row[name]) for name in ("win", "tie", "lose")), _percent(row["difference"], "+"),
+            _p_value(row["p"]), str(row["participants"]), str(row["answers"]),
+        ]
+        for row in _filled(table["rows"])
     ]  # fmt: skip
     correlation = "" if table["correlation"] is None else f"\n\nCorrelation: {table['correlation']:.3f}"
     return f"### {table['first']} and {table['second']}\n\n{_markdown_table(rows)}{correlation}"
 
 
+def _filled(rows: Iterable[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
+    """The rows with a rate. A dataset without answers has none, and neither has an average over it."""
+    return [row for row in rows if row["win"]["mean"] is not None]
+
+
+def _p_value(p: float | None) -> str:
+    if p is None:
+        return "too few participants"
+    return "p < 0.001" if p < 0.001 else f"p = {p:.3f}"
+
+
 def _percent(entry: Mapping[str, Any], sign: str = "") -> str:
-    if entry["mean"] is None:
-        return "-"
     mean = f"{100 * entry['mean']:{sign}.2f} %"
     return mean if entry["low"] is None else f"{mean} ({_interval_text(entry, sign)})"
 
@@ -133,8 +147,9 @@ def to_latex(results: Results) -> str:
     if not tables:
         return "% the rule excludes everyone\n"
     heads = [cell for table in tables for cell in (table["first"], "Tie", table["second"])]
-    keys = [key for key in results["study"]["datasets"] if len(results["study"]["datasets"]) > 1]
-    lines = [_latex_row(tables, key) for key in keys]
+    answered = {row["key"] for table in tables for row in _filled(table["rows"])}
+    datasets = results["study"]["datasets"]
+    lines = [_latex_row(tables, key) for key in datasets if len(datasets) > 1 and key in answered]
     return "\n".join([
         "% brewster study report; needs \\usepackage{booktabs}; below each rate its 95\\% interval",
         f"\\begin{{tabular}}{{c|{'|'.join('ccc' for _ in tables)}}}",
@@ -143,7 +158,7 @@ def to_latex(results: Results) -> str:
         "\\midrule",
         *lines,
         *(["\\midrule"] if lines else []),
-        _latex_row(tables, "/average"),
+        _latex_row(tables, "/average" if "/average" in answered else "/answers"),
         "\\bottomrule",
         "\\end{tabular}",
         "",
@@ -171,14 +186,30 @@ def to_csv(results: Results) -> str:
     """
     text = io.StringIO()
     table = csv.writer(text, lineterminator="\n")
-    table.writerow(["group", "first", "second", "key", "dataset", "rate", "mean", "low", "high", "answers"])
+    table.writerow(
+        [
+            "group",
+            "first",
+            "second",
+            "key",
+            "dataset",
+            "rate",
+            "mean",
+            "low",
+            "high",
+            "answers",
+            "participants",
+            "p",
+        ]
+    )
     for key in _GROUPS:
         for pair in results[key]["tables"]:
-            for row in pair["rows"]:
+            for row in _filled(pair["rows"]):
                 for name in ("win", "tie", "lose", "difference"):
                     ends = row[name].values()
                     columns = [key, pair["first"], pair["second"], row["key"], row["title"]]
-                    table.writerow([*columns, name, *ends, row["answers"]])
+                    p = row["p"] if name == "difference" else None
+                    table.writerow([*columns, name, *ends, row["answers"], row["participants"], p])
     return text.getvalue()
 
 

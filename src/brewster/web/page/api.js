@@ -1,38 +1,69 @@
-// The client of the HTTP API. A failed request throws an Error whose message can be shown to the user.
+// The client of the HTTP API. A failed request throws an Error whose message can be shown to the user; `details` is the
+// message of the server.
 
 const POLL_MS = 300;
 const MAX_RETRIES = 60; // maximum number of repetitions of a request while the queue of the server is full
 
-// Sends a photo with options to a path and returns the response. Until then, it calls `onProgress({state, ahead, share})`
-// repeatedly; `share` is the completed fraction.
+// What an error of the server means, by its kind; the message of the server is shown below it.
+const MEANINGS = {
+  UnreadablePhoto: "This file is not a photo, or it is damaged.",
+  UnsupportedPhoto: "This kind of image cannot be separated.",
+  PhotoTooLarge: "This photo has more pixels than the server accepts.",
+  MissingExtra: "The server cannot read this format, because a part of brewster is not installed.",
+};
+
+// Sends a photo with options to a path. Returns {blob, fileName, header(name)}. Until then, it calls `onProgress` repeatedly with one of
+//   {phase: "upload" | "download", loaded, total} in bytes, {phase: "waiting", ahead}, {phase: "working", share}
+// where `ahead` is the number of photos before this one, and `share` the completed fraction.
 export async function send(path, file, options, { signal, onProgress }) {
   const form = new FormData();
-  for (const [name, value] of Object.entries(options)) form.append(name, value);
+  for (const [name, value] of Object.entries(options)) {
+    if (value instanceof Blob) form.append(name, value, `${name}.png`);
+    else if (value !== null) form.append(name, value);
+  }
   form.append("photo", file, file.name);
   for (let tries = 0; ; tries++) {
     const job = randomJobName();
-    const watcher = pollProgress(job, onProgress);
-    const response = await fetch(`${path}?job=${job}`, { method: "POST", body: form, signal })
-      .catch((error) => throwNetworkError(error))
-      .finally(() => watcher.stop());
-    if (response.ok) return response;
-    if (response.status !== 503 || tries === MAX_RETRIES) throw new Error(await errorMessage(response));
-    onProgress({ state: "waiting", share: 0 });
-    await sleep(1000 * Number(response.headers.get("Retry-After") ?? 5), signal);
+    const request = await post(`${path}?job=${job}`, job, form, signal, onProgress);
+    if (request.status === 200) {
+      return { blob: request.response, fileName: fileNameOf(request), header: (name) => request.getResponseHeader(name) };
+    }
+    if (request.status === 0) throw await connectionError(file);
+    if (request.status !== 503 || tries === MAX_RETRIES) throw await serverError(request, file);
+    onProgress({ phase: "waiting", ahead: 0 });
+    await sleep(1000 * Number(request.getResponseHeader("Retry-After") ?? 5), signal);
   }
 }
 
 // Returns the available models.
 export async function models() {
-  const response = await fetch("models").catch(throwNetworkError);
-  if (!response.ok) throw new Error(await errorMessage(response));
+  const response = await fetch("models");
+  if (!response.ok) throw new Error(`status ${response.status}`);
   return response.json();
 }
 
-// The file name in the Content-Disposition header of a response.
-export function fileNameOf(response) {
-  const name = /filename\*=UTF-8''([^;]+)/.exec(response.headers.get("Content-Disposition") ?? "");
-  return name ? decodeURIComponent(name[1]) : "photo";
+// XMLHttpRequest reports the bytes of an upload, which fetch() does not. Resolves with the request; its status is 0 if there
+// was no response.
+function post(url, job, form, signal, onProgress) {
+  const request = new XMLHttpRequest();
+  let watcher = null;
+  const stopWatching = () => watcher?.stop();
+  return new Promise((resolve, reject) => {
+    const abort = () => (reject(signal.reason), request.abort()); // in this order: abort() fires loadend at once
+    if (signal.aborted) return abort();
+    signal.addEventListener("abort", abort, { once: true });
+    request.open("POST", url);
+    request.responseType = "blob";
+    request.upload.onprogress = ({ loaded, total }) => onProgress({ phase: "upload", loaded, total });
+    request.upload.onload = () => (watcher = pollProgress(job, onProgress));
+    request.onprogress = ({ loaded }) => {
+      stopWatching();
+      const total = Number(request.getResponseHeader("Content-Length"));
+      if (request.status === 200) onProgress({ phase: "download", loaded, total });
+    };
+    request.onloadend = () => (signal.removeEventListener("abort", abort), resolve(request));
+    request.send(form);
+  }).finally(stopWatching);
 }
 
 function pollProgress(job, onProgress) {
@@ -40,7 +71,8 @@ function pollProgress(job, onProgress) {
   async function poll() {
     const response = await fetch(`progress/${job}`).catch(() => null);
     const progress = timer && response?.ok ? await response.json() : null;
-    if (timer && progress) onProgress(progress); // not after stop(): a late report would overwrite the state "done"
+    // not after stop(): a late report would overwrite a later phase
+    if (timer && progress) onProgress({ phase: progress.state, ahead: progress.ahead, share: progress.share });
     if (timer) timer = setTimeout(poll, POLL_MS);
   }
   return {
@@ -51,16 +83,30 @@ function pollProgress(job, onProgress) {
   };
 }
 
-function throwNetworkError(error) {
-  if (error.name === "AbortError") throw error;
-  throw new Error("The server does not respond. Start it again if it was stopped, then try again.");
+function fileNameOf(request) {
+  const name = /filename\*=UTF-8''([^;]+)/.exec(request.getResponseHeader("Content-Disposition") ?? "");
+  return name ? decodeURIComponent(name[1]) : "photo";
 }
 
-async function errorMessage(response) {
-  const body = await response.json().catch(() => ({}));
-  const message = body.error ?? `the server returned status ${response.status}`;
-  return `${message[0].toUpperCase()}${message.slice(1).replace(/\.?$/, ".")}`;
+// Without a response, either the file cannot be read, or the server does not answer.
+async function connectionError(file) {
+  try {
+    await file.slice(0, 1).arrayBuffer();
+  } catch {
+    return new Error("The browser cannot read this file. It was moved, changed or deleted after it was added. Add it again.");
+  }
+  return new Error("The server does not respond. Start it again if it was stopped, then try again.");
 }
+
+async function serverError(request, file) {
+  const body = await request.response.text().then(JSON.parse).catch(() => ({}));
+  const message = sentence(body.error ?? `the server returned status ${request.status}`);
+  const isVideo = body.kind === "UnreadablePhoto" && file.type.startsWith("video/");
+  const meaning = isVideo ? "This is a video. Only photos can be separated." : MEANINGS[body.kind];
+  return Object.assign(new Error(meaning ?? message), { details: meaning ? message : "" });
+}
+
+const sentence = (text) => `${text[0].toUpperCase()}${text.slice(1).replace(/\.?$/, ".")}`;
 
 function randomJobName() {
   return Array.from(crypto.getRandomValues(new Uint8Array(16)), (byte) => byte.toString(16).padStart(2, "0")).join("");

@@ -1,146 +1,162 @@
-// The page that separates photos: the list of photos, their processing, and the view of the current photo.
+// The page that separates photos: its controls, and the view of the current photo.
 
 import "./compare.js";
-import { models, fileNameOf, send } from "./api.js";
-import { draw, readMaps } from "./light.js";
-import { createZip, readZip } from "./zip.js";
+import { models, send } from "./api.js";
+import { MAX_PHOTOS, describeAdded, readList, readTransfer, watchTransfers } from "./drop.js";
+import { exportAll, exportLayer, save } from "./export.js";
+import { Layers, draw, readPreview } from "./light.js";
+import { SeparationQueue } from "./queue.js";
+import { maskCodes, maskFile } from "./regions.js";
+import { createRow, fraction, progressText, setBar, showFile, statusText, summarise, updateRow, watchScrolling } from "./strip.js";
+import { TileSet } from "./tiles.js";
+import { createTools } from "./tools.js";
 
-const MAX_CONCURRENT = 2; // one photo is separated while the next one is uploaded
 const LAYER_DESCRIPTIONS = {
   transmission: "The scene behind the glass.",
   reflection: "The light that the glass reflects.",
-  confidence: "White: the separation is certain. Black: it is uncertain.",
+  confidence: "How certain the separation is. The file that you download is grey: white is certain.",
 };
-const TRANSPARENT_PIXEL = "data:image/gif;base64,R0lGODlhAQABAAAAACH5BAEKAAEALAAAAAABAAEAAAICTAEAOw==";
-const ZIP_LAYERS = "transmission,reflection"; // the layers in the zip of all photos
+const EXAMPLE = "page/example.jpg";
+const RETRY_MODELS_MS = 3000;
 
-const photos = []; // {file, row, state, share, ahead, error, strength, maps, mapSettings, controller, isSuperseded}
-let current = null; // the photo that is shown
-let shown = null; // the maps of the current photo
 const byId = (id) => document.getElementById(id);
 const compare = byId("compare");
+let shown = null; // the current photo: {preview, layers, mask: {list, codes}}
+let removed = null; // {photo, index} of the photo that was removed last
+let isPaintScheduled = false;
+let exporting = null; // the AbortController of the running download
 
 // --- settings
 
 const chosen = (name) => document.querySelector(`input[name=${name}]:checked`).value;
 const settings = () => ({ quality: chosen("quality"), model: byId("model").value });
-// Whether the maps of a photo were computed with the current settings.
-const hasCurrentMaps = (photo) => photo.mapSettings === JSON.stringify(settings());
+const queue = new SeparationQueue(settings, { onChange: refresh, onEnd: finish });
+const tools = createTools({ onEdit, onPaint: () => compare.paint(), saveMask, announce });
+compare.editor = tools.editor;
+
+function applySettings() {
+  queue.applySettings();
+  refresh();
+  show();
+}
+
+// The settings of a photo have changed, so its files have to be downloaded again.
+function change(photo, values) {
+  Object.assign(photo, values, { isSaved: false });
+  if (photo === queue.current) byId("strength").value = photo.strength;
+}
+
+function onEdit() {
+  change(queue.current, {});
+  paint();
+}
+
+async function saveMask() {
+  const { file, regions, size } = queue.current;
+  save(`${file.name.replace(/\.[^.]*$/, "")}.mask.png`, await maskFile(regions.list, ...size));
+}
+
+// Repeats the request until the server responds: nothing can be separated before.
+async function loadModels() {
+  for (;;) {
+    try {
+      byId("model").append(...(await models()).map(({ name }) => new Option(name)));
+      break;
+    } catch {
+      announce("The server does not respond. The page tries again.");
+      byId("status").textContent = byId("announcement").textContent;
+      await new Promise((resolve) => setTimeout(resolve, RETRY_MODELS_MS));
+    }
+  }
+  byId("model-field").hidden = byId("model").options.length < 2;
+  queue.isReady = true;
+  queue.startNext();
+}
 
 // --- adding and removing photos
 
-function add(files) {
-  for (const file of files) {
-    const photo = { file, state: "waiting", share: 0, ahead: 0, strength: 1 };
-    photo.row = newRow(photo);
-    photos.push(photo);
+const suffixes = byId("files").accept.split(",").filter((part) => part.startsWith("."));
+const isImage = (name) => suffixes.some((suffix) => name.toLowerCase().endsWith(suffix));
+const room = () => Math.max(0, MAX_PHOTOS - queue.photos.length);
+
+function add(found) {
+  for (const file of found.files) insert(queue.add(file));
+  if (!found.files.length && !found.others && !found.surplus) return;
+  announce(describeAdded(found));
+  if (found.others || found.surplus) showNote(describeAdded(found));
+  if (!found.files.length) return refresh();
+  if (queue.current === null) {
+    select(queue.photos[0]);
+    queue.current.row.querySelector("button").focus();
   }
-  if (!files.length) return;
-  byId("announcement").textContent = files.length === 1 ? `${files[0].name} was added` : `${files.length} photos were added`;
-  const isFirst = current === null;
-  if (isFirst) select(photos[0]);
-  if (isFirst) current.row.querySelector("button").focus();
   refresh();
-  startNext();
+  queue.startNext();
+}
+
+function insert(photo, next = null) {
+  photo.row = createRow(photo, { onSelect: () => select(photo), onRemove: () => remove(photo) }, next);
 }
 
 function remove(photo) {
-  photo.controller?.abort();
-  const index = photos.indexOf(photo);
   const hadFocus = photo.row.contains(document.activeElement) || byId("stage").contains(document.activeElement);
-  photos.splice(index, 1);
+  const index = queue.remove(photo);
+  removed = { photo, index };
   photo.row.remove();
-  if (photo === current) select(photos[Math.min(index, photos.length - 1)] ?? null);
-  if (hadFocus) (current?.row.querySelector("button") ?? byId("choose")).focus();
-  byId("announcement").textContent = `${photo.file.name} was removed`;
+  if (photo === queue.current) select(queue.photos[Math.min(index, queue.photos.length - 1)] ?? null);
+  showNote(`${photo.file.name} was removed.`);
   refresh();
-  startNext();
+  if (hadFocus) (queue.current ? queue.current.row.querySelector("button") : byId("undo-remove")).focus();
+  announce(`${photo.file.name} was removed`);
+  queue.startNext();
 }
 
-function newRow(photo) {
-  const row = document.createElement("li");
-  row.innerHTML = `<button type="button" class="pick"><img alt="" width="56" height="56"><span class="name"></span>
-    <span class="state"></span></button><button type="button" class="remove">×</button>`;
-  row.querySelector(".name").textContent = photo.file.name;
-  row.querySelector(".remove").setAttribute("aria-label", `Remove ${photo.file.name}`);
-  row.querySelector(".pick").addEventListener("click", () => select(photo));
-  row.querySelector(".remove").addEventListener("click", () => remove(photo));
-  showFile(row.querySelector("img"), photo.file);
-  byId("photos").append(row);
-  return row;
+function undoRemove() {
+  const { photo, index } = removed;
+  removed = null;
+  queue.restore(photo, index);
+  insert(photo, queue.photos[index + 1]?.row ?? null);
+  showNote("");
+  select(photo);
+  photo.row.querySelector("button").focus();
+  announce(`${photo.file.name} was added again`);
 }
 
-// Shows a file as the browser decodes it, or a transparent pixel if it cannot.
-function showFile(image, file) {
-  const url = URL.createObjectURL(file);
-  const done = () => URL.revokeObjectURL(url);
-  image.onload = done;
-  image.onerror = () => (done(), (image.src = TRANSPARENT_PIXEL), (image.onload = null));
-  image.src = url;
+// A note above the list, with a button while the photo that was removed last can be restored.
+function showNote(text) {
+  byId("removed-text").textContent = text;
+  byId("removed").hidden = !text && removed === null;
+  byId("undo-remove").hidden = removed === null;
 }
 
-// --- processing: a few photos at a time, the current photo first
-
-function startNext() {
-  const busy = photos.filter((photo) => photo.controller).length;
-  const waiting = photos.filter((photo) => photo.state === "waiting" && !photo.controller);
-  if (current && waiting.includes(current)) waiting.unshift(current);
-  for (const photo of [...new Set(waiting)].slice(0, MAX_CONCURRENT - busy)) separate(photo);
-}
-
-async function separate(photo) {
-  const requestSettings = settings();
-  photo.controller = new AbortController();
-  Object.assign(photo, { state: "waiting", share: 0, ahead: 0, error: null, isSuperseded: false });
-  const onProgress = (progress) => (Object.assign(photo, progress), refresh(photo));
+async function addExample() {
   try {
-    const response = await send("preview", photo.file, requestSettings, { signal: photo.controller.signal, onProgress });
-    photo.maps = await response.blob();
-    Object.assign(photo, { state: "done", mapSettings: JSON.stringify(requestSettings) });
-    announce(`${photo.file.name} is separated`);
-  } catch (error) {
-    const isStopped = error.name === "AbortError";
-    const previousState = hasCurrentMaps(photo) ? "done" : "waiting"; // the old maps are valid if the settings were reset
-    const state = isStopped && photo.isSuperseded ? previousState : "failed";
-    Object.assign(photo, { state, error: isStopped ? null : error.message });
-    if (photo.error) announce(`${photo.file.name} failed`);
+    const response = await fetch(EXAMPLE);
+    add(readList([new File([await response.blob()], "example.jpg", { type: "image/jpeg" })], isImage, room(), false));
+  } catch {
+    announce("The server does not respond. Start it again if it was stopped, then try again.");
   }
-  photo.controller = null;
-  if (!photos.includes(photo)) return;
-  if (photo.state === "done" && !hasCurrentMaps(photo)) photo.state = "waiting"; // the settings have changed since the request
-  refresh(photo);
-  if (photo === current) await show();
-  startNext();
-}
-
-function retry(photo) {
-  Object.assign(photo, { state: "waiting", error: null });
-  refresh(photo);
-  startNext();
-}
-
-// Called after a change of the settings. A photo is processed again unless its maps were computed with the new settings.
-function applySettings() {
-  for (const photo of photos) {
-    photo.controller?.abort();
-    Object.assign(photo, { state: hasCurrentMaps(photo) ? "done" : "waiting", error: null, isSuperseded: true });
-  }
-  refresh();
-  show();
-  startNext();
-}
-
-function announce(message) {
-  const done = photos.filter((photo) => photo.state === "done").length;
-  byId("announcement").textContent = photos.length > 1 ? `${message}, ${done} of ${photos.length} are done` : message;
 }
 
 // --- the current photo
 
+function finish(photo) {
+  if (photo.state === "done") announceResult(`${photo.file.name} is separated`);
+  if (photo.error) announceResult(`${photo.file.name} failed`);
+  if (photo === queue.current) show();
+}
+
+function announce(message) {
+  byId("announcement").textContent = message;
+}
+
+function announceResult(message) {
+  announce(queue.photos.length > 1 ? `${message}, ${queue.count("done")} of ${queue.photos.length} are done` : message);
+}
+
 function select(photo) {
-  current = photo;
-  shown = null;
-  for (const other of photos) other.row.querySelector(".pick").removeAttribute("aria-current");
+  queue.current = photo;
+  close();
+  for (const other of queue.photos) other.row.querySelector(".pick").removeAttribute("aria-current");
   if (photo) {
     photo.row.querySelector(".pick").setAttribute("aria-current", "true");
     photo.row.scrollIntoView({ block: "nearest", inline: "nearest" });
@@ -151,60 +167,99 @@ function select(photo) {
   }
   refresh();
   show();
-  startNext();
+  queue.startNext();
+}
+
+// Shows no photo.
+function close() {
+  shown = null;
+  compare.tiles?.close();
+  compare.tiles = null;
+  compare.isBefore = false;
+  byId("before").setAttribute("aria-pressed", false);
+  tools.show(null);
 }
 
 async function show() {
-  const photo = current;
+  const photo = queue.current;
   if (photo?.state !== "done") return;
-  const maps = readMaps(await photo.maps.arrayBuffer());
-  if (photo !== current) return; // another photo was selected in the meantime
-  shown = maps;
-  draw(compare.left, maps, "photo");
+  const preview = await readPreview(photo.preview);
+  if (photo !== queue.current || photo.state !== "done") return; // another photo was selected in the meantime
+  close();
+  shown = { preview, layers: Layers.ofPreview(preview), mask: { list: null, codes: null } };
+  draw(compare.left, shown.layers, "photo");
+  compare.fullSize = preview.full;
+  if (preview.full[0] > preview.width) compare.tiles = tilesOf(photo, preview);
+  tools.show(photo.regions, preview.full);
   refresh();
   paint();
 }
 
-let isPaintScheduled = false;
+// The tiles of a photo. If the server has dropped the photo, it is sent again, once for all tiles.
+function tilesOf(photo, preview) {
+  let sending = null;
+  const context = { signal: new AbortController().signal, onProgress() {} };
+  return new TileSet(preview, photo.key, {
+    resend: () => (sending ??= send("photo", photo.file, {}, context).finally(() => (sending = null))),
+    drawPhoto: (canvas, layers) => draw(canvas, layers, "photo"),
+    drawRight(canvas, layers, part) {
+      const [width, height] = preview.full.map((side) => side / 2 ** part.level);
+      draw(canvas, layers, chosen("view"), photo.strength, maskCodes(photo.regions.list, width, height, part));
+    },
+    onChange: () => compare.paint(),
+  });
+}
+
+// The mask of the regions at the size of the reduced photo.
+function currentMask() {
+  const { list } = queue.current.regions;
+  const { width, height } = shown.preview;
+  if (shown.mask.list !== list) shown.mask = { list, codes: maskCodes(list, width, height) };
+  return shown.mask.codes;
+}
 
 function paint() {
   byId("amount").textContent = `${Math.round(100 * byId("strength").value)} %`;
   byId("layer-description").textContent = LAYER_DESCRIPTIONS[chosen("view")];
+  byId("legend").hidden = chosen("view") !== "confidence";
   byId("download").textContent = `Download ${chosen("view")}`;
   if (!shown || isPaintScheduled) return;
   isPaintScheduled = true;
   requestAnimationFrame(() => {
     isPaintScheduled = false;
     if (!shown) return;
-    draw(compare.right, shown, chosen("view"), current.strength);
-    compare.show(current.file.name, chosen("view"));
+    draw(compare.right, shown.layers, chosen("view"), queue.current.strength, currentMask());
+    compare.version = `${chosen("view")} ${queue.current.strength} ${JSON.stringify(queue.current.regions.list)}`;
+    compare.show(queue.current.file.name, chosen("view"));
   });
 }
 
 function refresh(photo = null) {
-  for (const one of photo ? [photo] : photos) {
-    one.row.className = one.state;
-    one.row.querySelector(".state").textContent = shortStatus(one);
-  }
-  enable("all", exporting === null && photos.some((one) => one.state === "done"));
+  for (const one of photo ? [photo] : queue.photos) if (one.row) updateRow(one);
+  const { current } = queue;
+  enable("all", exporting === null && queue.count("done") > 0);
+  byId("summary").textContent = queue.photos.length ? summarise(queue) : "";
   if (photo && photo !== current) return;
   const hasPhoto = current !== null;
   byId("welcome").hidden = hasPhoto;
-  for (const id of ["stage", "strip", "panel", "add"]) byId(id).hidden = !hasPhoto;
+  for (const id of ["stage", "panel", "add"]) byId(id).hidden = !hasPhoto;
+  byId("strip").hidden = !hasPhoto && byId("removed").hidden;
   if (!hasPhoto) return;
   const isReady = current.state === "done" && shown !== null;
   const focusedPart = [byId("waiting"), byId("error")].find((part) => part.contains(document.activeElement));
-  compare.hidden = !isReady;
+  compare.hidden = byId("modes").hidden = !isReady;
   byId("error").hidden = current.state !== "failed";
   byId("waiting").hidden = isReady || current.state === "failed";
   if (focusedPart?.hidden) (isReady ? compare : byId(current.state === "failed" ? "retry" : "cancel")).focus();
   enable("download", isReady && exporting === null);
+  enable("copy", queue.photos.length > 1);
   byId("status").textContent = statusText(current);
-  if (current.state === "working") byId("bar").value = current.share;
-  else byId("bar").removeAttribute("value");
+  setBar(byId("bar"), fraction(current.progress));
   byId("error-title").textContent = current.error ? `${current.file.name} could not be separated` : "Cancelled";
-  byId("error-text").textContent = current.error ?? "";
-  byId("facts").textContent = isReady ? describeMaps(shown) : "";
+  byId("error-text").textContent = current.error?.message ?? "";
+  byId("error-details").hidden = !current.error?.details;
+  byId("error-message").textContent = current.error?.details ?? "";
+  byId("facts").textContent = isReady ? describePreview(shown.preview) : "";
 }
 
 // Uses aria-disabled: a button with the attribute `disabled` would lose the focus.
@@ -212,36 +267,32 @@ function enable(id, isEnabled) {
   byId(id).setAttribute("aria-disabled", !isEnabled);
 }
 
-function describeMaps({ full, width, height, doubtful }) {
-  const size = `${full.join(" × ")} pixels`;
-  const preview = full[0] === width ? "." : `, shown at ${width} × ${height}.`;
-  return size + preview + (doubtful ? " The model has changed the photo so much that the layers may be wrong. Check them." : "");
+const isEnabled = (button) => button.getAttribute("aria-disabled") !== "true";
+
+const VERDICTS = {
+  clear: "A reflection was found and removed.",
+  partial: "A reflection was found. Parts of it probably remain.",
+  "little found": "Little reflection was found.",
+  doubtful: "The layers may be wrong. Check them.",
+};
+
+function describePreview({ full, verdict }) {
+  return `${full.join(" × ")} pixels. ${VERDICTS[verdict]}`;
 }
 
-function shortStatus({ state, share, error }) {
-  if (state === "failed") return error ? "failed" : "cancelled";
-  return { done: "done", working: `${Math.round(100 * share)} %`, waiting: "waiting" }[state];
-}
-
-function statusText({ state, share, ahead }) {
-  if (state !== "waiting") return `Separating, ${Math.round(100 * share)} %`;
-  return ahead ? `Waiting, ${ahead} before this one` : "Waiting";
-}
-
-// --- downloads at full size, equal to the files of the command line
-
-let exporting = null;
+// --- downloads
 
 async function runExport(button, work) {
-  if (button.getAttribute("aria-disabled") === "true") return;
+  if (!isEnabled(button)) return;
   exporting = new AbortController();
   byId("export-error").hidden = true;
   byId("export").hidden = false;
   refresh();
   try {
-    const { name, blob, problem = "" } = await work(exporting.signal);
+    const { name, blob, problem, saved } = await work(exporting.signal);
     save(name, blob);
-    byId("announcement").textContent = `${name} is ready`;
+    for (const photo of saved) photo.isSaved = true;
+    announce(`${name} is ready`);
     showExportError(problem);
   } catch (error) {
     showExportError(error.name === "AbortError" ? "" : error.message);
@@ -257,86 +308,95 @@ function showExportError(problem) {
   byId("export-error").hidden = !problem;
 }
 
-const requestFullSize = (photo, layers, signal, onShare) =>
-  send("separate", photo.file, { layers, strength: photo.strength, ...settings() }, {
-    signal,
-    onProgress: ({ share }) => onShare(share),
-  });
-
-async function exportLayer(signal) {
-  const response = await requestFullSize(current, chosen("view"), signal, (share) => (byId("export-progress").value = share));
-  return { name: fileNameOf(response), blob: await response.blob() };
+// Shows the progress of a request. `which` names the photo if there are several.
+function showExportProgress(progress, which = "") {
+  byId("export-status").textContent = which + progressText(progress);
+  setBar(byId("export-progress"), fraction(progress));
 }
 
-// A photo that fails is left out, and its error is shown. If all photos fail, nothing is saved.
-async function exportAll(signal) {
-  const files = [];
-  const failed = [];
-  const done = photos.filter((photo) => photo.state === "done");
-  for (const [index, photo] of done.entries()) {
-    const onShare = (share) => (byId("export-progress").value = (index + share) / done.length);
-    onShare(0);
-    try {
-      const response = await requestFullSize(photo, ZIP_LAYERS, signal, onShare);
-      files.push(...readZip(await response.arrayBuffer()));
-    } catch (error) {
-      if (error.name === "AbortError") throw error;
-      failed.push(`${photo.file.name} is not in the zip. ${error.message}`);
-    }
-  }
-  const problem = failed.join(" ");
-  if (!files.length) throw new Error(problem);
-  return { name: "brewster.zip", blob: createZip(files), problem };
-}
+const downloadLayer = (signal) =>
+  exportLayer(queue.current, chosen("view"), settings(), { signal, onProgress: (progress) => showExportProgress(progress) });
 
-function save(name, blob) {
-  const link = document.createElement("a");
-  link.href = URL.createObjectURL(blob);
-  link.download = name;
-  link.click();
-  setTimeout(() => URL.revokeObjectURL(link.href), 60_000);
+function downloadAll(signal) {
+  let which = "";
+  const onPhoto = (index, count) => (which = count > 1 ? `Photo ${index + 1} of ${count}: ` : "");
+  const onProgress = (progress) => showExportProgress(progress, which);
+  return exportAll([...queue.photos], settings(), { signal, onPhoto, onProgress });
 }
 
 // --- event handlers
 
 byId("choose").addEventListener("click", () => byId("files").click());
 byId("add").addEventListener("click", () => byId("files").click());
-byId("files").addEventListener("change", () => {
-  add([...byId("files").files]);
-  byId("files").value = "";
-});
+byId("choose-folder").addEventListener("click", () => byId("folder").click());
+byId("example").addEventListener("click", addExample);
+for (const id of ["files", "folder"]) {
+  byId(id).addEventListener("change", () => {
+    add(readList(byId(id).files, isImage, room(), id === "folder"));
+    byId(id).value = "";
+  });
+}
 byId("strength").addEventListener("input", () => {
-  current.strength = Number(byId("strength").value);
+  change(queue.current, { strength: Number(byId("strength").value) });
   paint();
+});
+byId("copy").addEventListener("click", (event) => {
+  if (!isEnabled(event.currentTarget)) return;
+  const { strength, regions } = queue.current;
+  for (const photo of queue.photos) {
+    if (photo === queue.current) continue;
+    change(photo, { strength });
+    tools.copy(regions, photo.regions);
+  }
+  announce("The settings were copied to all photos.");
+});
+byId("reset").addEventListener("click", () => {
+  change(queue.current, { strength: 1 });
+  queue.current.regions.clear();
+  tools.update();
+  paint();
+});
+for (const input of document.querySelectorAll("input[name=mode]")) {
+  input.addEventListener("change", () => (compare.mode = chosen("mode")));
+}
+byId("before").addEventListener("click", toggleBefore);
+document.addEventListener("keydown", (event) => {
+  const isShortcut = event.key.toLowerCase() === "b" && !event.ctrlKey && !event.metaKey && !event.altKey;
+  if (isShortcut && shown && !event.target.closest("select")) toggleBefore();
 });
 for (const input of document.querySelectorAll("input[name=view]")) input.addEventListener("change", paint);
 for (const input of document.querySelectorAll("input[name=quality], #model")) input.addEventListener("change", applySettings);
-byId("cancel").addEventListener("click", () => {
-  if (current.controller) current.controller.abort();
-  else (current.state = "failed"), refresh(current);
-});
-byId("retry").addEventListener("click", () => retry(current));
-byId("discard").addEventListener("click", () => remove(current));
-byId("download").addEventListener("click", (event) => runExport(event.currentTarget, exportLayer));
-byId("all").addEventListener("click", (event) => runExport(event.currentTarget, exportAll));
+byId("cancel").addEventListener("click", () => queue.cancel(queue.current));
+byId("retry").addEventListener("click", () => queue.retry(queue.current));
+byId("discard").addEventListener("click", () => remove(queue.current));
+byId("undo-remove").addEventListener("click", undoRemove);
+byId("download").addEventListener("click", (event) => runExport(event.currentTarget, downloadLayer));
+byId("all").addEventListener("click", (event) => runExport(event.currentTarget, downloadAll));
 byId("stop-export").addEventListener("click", () => exporting?.abort());
 byId("panel").addEventListener("submit", (event) => event.preventDefault());
 
-document.addEventListener("paste", (event) => add([...event.clipboardData.files]));
-document.addEventListener("dragover", (event) => {
-  event.preventDefault();
-  document.body.classList.add("drag-over");
-});
-document.addEventListener("dragleave", (event) => {
-  if (!event.relatedTarget) document.body.classList.remove("drag-over");
-});
-document.addEventListener("drop", (event) => {
-  event.preventDefault();
-  document.body.classList.remove("drag-over");
-  add([...event.dataTransfer.files]);
+// Switches between the photo and the comparison.
+function toggleBefore() {
+  compare.isBefore = !compare.isBefore;
+  byId("before").setAttribute("aria-pressed", compare.isBefore);
+}
+
+watchTransfers(async (transfer) => {
+  try {
+    add(await readTransfer(transfer, isImage, room()));
+  } catch (error) {
+    announce(`The dropped files cannot be read (${error.message}).`);
+    showNote(byId("announcement").textContent);
+    refresh();
+  }
 });
 
+// Asks before the page is left with results that were not downloaded, or with photos that are being separated.
+window.addEventListener("beforeunload", (event) => {
+  const isAtRisk = ({ state, isSaved }) => (state === "done" && !isSaved) || state === "working" || state === "waiting";
+  if (queue.photos.some(isAtRisk)) event.preventDefault();
+});
+
+watchScrolling();
 paint();
-models()
-  .then((rows) => byId("model").append(...rows.map(({ name }) => new Option(name))))
-  .catch((error) => (byId("announcement").textContent = error.message));
+loadModels();

@@ -1,17 +1,26 @@
-// <glass-compare>: compares two images of the same size, separated by a movable line. Zoom and pan apply to both.
-// Draw on the canvases `left` and `right`, call `show(...)`, and call `paint()` after each change.
+// <glass-compare>: shows a photo and one of its layers with the same zoom and pan, separated by a movable line, next to each other,
+// or one at a time. Set `fullSize`, draw the reduced images on the canvases `left` and `right`, set `tiles` (a TileSet, or null),
+// and call `show(...)`; call `paint()` after each change. `editor` draws regions: see editor.js.
 
-const MAX_PIXEL_SIZE = 8; // maximum size of an image pixel in screen pixels
-const GRAB_DISTANCE = 28; // in CSS pixels: in a zoomed image, a pointer at most this far from the line drags the line
+const MAX_PIXEL_SIZE = 16; // maximum size of a photo pixel in screen pixels
+const SHARP_PIXEL_SIZE = 2; // photo pixels of at least this size are drawn as squares
+const GRAB_DISTANCE = 28; // in CSS pixels: a pointer at most this far from the line drags the line
 
 class GlassCompare extends HTMLElement {
   left = document.createElement("canvas");
   right = document.createElement("canvas");
+  fullSize = [1, 1]; // width and height of the photo
+  tiles = null;
+  editor = null;
+  version = ""; // changes when the right image changes
+  #mode = "slider";
+  #isBefore = false;
   #split = 0.5; // position of the line as a fraction of the visible width of the image
   #zoom = 1; // 1 shows the whole image
   #centre = { x: 0.5, y: 0.5 }; // the image point in the middle of the view, as fractions of width and height
+  #missingTiles = 0; // visible parts that are shown reduced until their tiles arrive
   #pointers = new Map();
-  #dragged = null; // what the pointer drags: "line" or "image"
+  #dragged = null; // what the pointer drags: "line", "image" or "region"
 
   connectedCallback() {
     this.tabIndex = 0;
@@ -21,24 +30,42 @@ class GlassCompare extends HTMLElement {
         aria-valuemin="0" aria-valuemax="100"></div>
       <span class="tag left" aria-hidden="true">Photo</span><span class="tag right" aria-hidden="true"></span>
       <div class="zoom" role="group" aria-label="Zoom">
-        <button type="button" data-by="0.5" aria-label="Zoom out">−</button>
-        <button type="button" data-by="0" aria-label="Show all">Fit</button>
-        <button type="button" data-by="2" aria-label="Zoom in">+</button></div>`;
+        <button type="button" data-by="0.5" aria-label="Zoom out"><span aria-hidden="true">−</span></button>
+        <output aria-label="Size of a photo pixel on the screen"></output>
+        <button type="button" data-by="2" aria-label="Zoom in"><span aria-hidden="true">+</span></button>
+        <button type="button" data-by="0">Fit</button>
+        <button type="button" data-by="full">1:1</button></div>`;
     this.canvas = this.querySelector("canvas");
     this.line = this.querySelector(".line");
-    for (const kind of ["pointerdown", "pointermove", "pointerup", "pointercancel", "wheel", "dblclick", "keydown"]) {
+    for (const kind of ["pointerdown", "pointermove", "pointerup", "pointercancel", "pointerleave", "wheel", "dblclick", "keydown"]) {
       this.addEventListener(kind, (event) => this[`_${kind}`](event), { passive: false });
     }
     for (const button of this.querySelectorAll("button")) {
-      button.addEventListener("click", () => this.zoomBy(Number(button.dataset.by)));
+      button.addEventListener("click", () => (button.dataset.by === "full" ? this.zoomToFull() : this.zoomBy(Number(button.dataset.by))));
     }
     new ResizeObserver(() => this.paint()).observe(this);
+  }
+
+  // "slider", "side" (next to each other) or "result" (the right image only).
+  set mode(mode) {
+    this.#mode = mode;
+    this.paint();
+  }
+
+  // Whether the photo is shown instead of the layer.
+  get isBefore() {
+    return this.#isBefore;
+  }
+
+  set isBefore(isBefore) {
+    this.#isBefore = isBefore;
+    this.paint();
   }
 
   // Sets the labels of both sides, visible and for screen readers.
   show(photo, layer) {
     this.setAttribute("aria-label", `${photo}: the photo on the left, its ${layer} on the right. `
-      + "Plus and minus zoom, 0 shows all, arrow keys move the picture.");
+      + "Plus and minus zoom, 0 shows all, 1 shows the pixels of the photo, B switches between photo and result, arrow keys move the picture.");
     this.querySelector(".right").textContent = layer[0].toUpperCase() + layer.slice(1);
     this.paint();
   }
@@ -48,34 +75,71 @@ class GlassCompare extends HTMLElement {
     [this.#split, this.#zoom, this.#centre] = [0.5, 1, { x: 0.5, y: 0.5 }];
   }
 
-  // Zooms by a factor around a point of the view, by default its middle. A factor of 0 shows the whole image.
-  zoomBy(factor, x = this.clientWidth / 2, y = this.clientHeight / 2) {
+  // Zooms by a factor around a point of a pane, by default its middle. A factor of 0 shows the whole image.
+  zoomBy(factor, point = null) {
+    const { width: viewWidth, height: viewHeight } = this.#panes()[0];
+    const { x, y } = point ?? { x: viewWidth / 2, y: viewHeight / 2 };
     const before = this.#placement();
-    const maxZoom = Math.max(1, (MAX_PIXEL_SIZE * this.left.width) / this.#fit().width / (window.devicePixelRatio || 1));
+    const maxZoom = Math.max(1, MAX_PIXEL_SIZE * this.#fullZoom());
     this.#zoom = factor === 0 ? 1 : Math.min(maxZoom, Math.max(1, this.#zoom * factor));
     const at = { x: (x - before.left) / before.width, y: (y - before.top) / before.height };
     const { width, height } = this.#placement();
-    this.#centre = { x: at.x - (x - this.clientWidth / 2) / width, y: at.y - (y - this.clientHeight / 2) / height };
+    this.#centre = { x: at.x - (x - viewWidth / 2) / width, y: at.y - (y - viewHeight / 2) / height };
     this.paint();
   }
 
-  // The size of the whole image in the view, in CSS pixels. Small images are enlarged by a factor of at most 2.
+  // One photo pixel is one screen pixel, around a point of a pane. Photos that are smaller than the view stay as large as they are.
+  zoomToFull(point = null) {
+    this.zoomBy(Math.max(1, this.#fullZoom()) / this.#zoom, point);
+  }
+
+  // The zoom at which one photo pixel is one screen pixel.
+  #fullZoom() {
+    return this.fullSize[0] / this.#fit().width / this.#density;
+  }
+
+  // The size of a photo pixel in screen pixels.
+  get #pixelSize() {
+    return this.#zoom / this.#fullZoom();
+  }
+
+  get #density() {
+    return window.devicePixelRatio || 1;
+  }
+
+  // The parts of the view that show an image, all of the same size: {side, x, y, width, height} in CSS pixels, and for the slider the
+  // horizontal limits `from` and `to` of what is shown in it.
+  #panes() {
+    const [width, height] = [this.clientWidth, this.clientHeight];
+    if (this.#mode === "side") {
+      const isWide = width >= height;
+      const size = isWide ? { width: width / 2, height } : { width, height: height / 2 };
+      return [{ side: "left", x: 0, y: 0, ...size }, { side: "right", x: isWide ? width / 2 : 0, y: isWide ? 0 : height / 2, ...size }];
+    }
+    return [{ side: "right", x: 0, y: 0, width, height }];
+  }
+
+  // The size of the whole image in a pane, in CSS pixels. Small images are enlarged by a factor of at most 2.
   #fit() {
+    const [{ width: viewWidth, height: viewHeight }] = this.#panes();
     const { width, height } = this.left;
-    const scale = Math.min(this.clientWidth / width, this.clientHeight / height, 2);
+    const scale = Math.min(viewWidth / width, viewHeight / height, 2);
     return { width: width * scale, height: height * scale };
   }
 
-  // The position and size of the image in the view, in CSS pixels. Limits the pan, so that the image covers the view.
+  // The position and size of the image in a pane, in CSS pixels. Limits the pan, so that the image covers the pane. The position
+  // is a whole number of screen pixels, so that at 1:1 each photo pixel is exactly one screen pixel.
   #placement() {
+    const [{ width: viewWidth, height: viewHeight }] = this.#panes();
     const fit = this.#fit();
     const [width, height] = [fit.width * this.#zoom, fit.height * this.#zoom];
     const start = (view, length, centre) =>
       length <= view ? (view - length) / 2 : Math.min(0, Math.max(view - length, view / 2 - centre * length));
-    const left = start(this.clientWidth, width, this.#centre.x);
-    const top = start(this.clientHeight, height, this.#centre.y);
-    this.#centre = { x: (this.clientWidth / 2 - left) / width, y: (this.clientHeight / 2 - top) / height };
-    return { left, top, width, height };
+    const round = (length) => Math.round(length * this.#density) / this.#density;
+    const left = start(viewWidth, width, this.#centre.x);
+    const top = start(viewHeight, height, this.#centre.y);
+    this.#centre = { x: (viewWidth / 2 - left) / width, y: (viewHeight / 2 - top) / height };
+    return { left: round(left), top: round(top), width, height };
   }
 
   // The left and right ends of the visible part of the image, and the position of the line, in CSS pixels.
@@ -85,28 +149,69 @@ class GlassCompare extends HTMLElement {
   }
 
   paint() {
-    if (!this.canvas || !this.clientWidth || !this.clientHeight) return;
-    const density = window.devicePixelRatio || 1;
+    if (!this.canvas || !this.clientWidth || !this.clientHeight || !this.left.width) return;
     const placement = this.#placement();
     const { line } = this.#visible(placement);
-    this.canvas.width = Math.round(this.clientWidth * density);
-    this.canvas.height = Math.round(this.clientHeight * density);
+    this.canvas.width = Math.round(this.clientWidth * this.#density);
+    this.canvas.height = Math.round(this.clientHeight * this.#density);
     const context = this.canvas.getContext("2d");
-    context.scale(density, density);
-    context.imageSmoothingEnabled = placement.width < 4 * this.left.width;
+    context.imageSmoothingEnabled = this.#pixelSize < SHARP_PIXEL_SIZE;
     context.imageSmoothingQuality = "high";
-    for (const [side, start, end] of [[this.left, 0, line], [this.right, line, this.clientWidth]]) {
-      context.save();
-      context.beginPath();
-      context.rect(start, 0, end - start, this.clientHeight);
-      context.clip();
-      if (side.width) context.drawImage(side, placement.left, placement.top, placement.width, placement.height);
-      context.restore();
+    const isSlider = this.#mode === "slider" && !this.#isBefore;
+    this.#missingTiles = 0;
+    for (const pane of this.#panes()) {
+      const side = this.#isBefore ? "left" : pane.side;
+      if (isSlider) {
+        this.#paintSide(context, "left", pane, placement, 0, line);
+        this.#paintSide(context, "right", pane, placement, line, pane.width);
+      } else this.#paintSide(context, side, pane, placement, 0, pane.width);
     }
+    this.#describe(isSlider, line);
+  }
+
+  // Draws one image in a pane, from `from` to `to` of its width: the reduced image, the tiles above it, and the regions.
+  #paintSide(context, side, pane, placement, from, to) {
+    const density = this.#density;
+    const [x0, x1] = [Math.round((pane.x + from) * density), Math.round((pane.x + to) * density)];
+    context.save();
+    context.beginPath();
+    context.rect(x0, pane.y * density, x1 - x0, pane.height * density);
+    context.clip();
+    const origin = { x: (pane.x + placement.left) * density, y: (pane.y + placement.top) * density };
+    const size = { width: placement.width * density, height: placement.height * density };
+    context.drawImage(this[side], origin.x, origin.y, size.width, size.height);
+    const pixel = size.width / this.fullSize[0];
+    if (this.tiles && pixel * this.fullSize[0] > this.left.width) {
+      const area = {
+        left: (from - placement.left) * density / pixel, right: (to - placement.left) * density / pixel,
+        top: -placement.top * density / pixel, bottom: (pane.height - placement.top) * density / pixel,
+      };
+      const { tiles, missing } = this.tiles.visible(side, this.tiles.levelFor(pixel), area, this.version);
+      this.#missingTiles += missing;
+      for (const tile of tiles) {
+        const [left, top] = [Math.round(origin.x + tile.left * pixel), Math.round(origin.y + tile.top * pixel)];
+        const [right, bottom] = [Math.round(origin.x + tile.right * pixel), Math.round(origin.y + tile.bottom * pixel)];
+        context.drawImage(tile.canvas, left, top, right - left, bottom - top);
+      }
+    }
+    this.editor?.paint(context, origin, size);
+    context.restore();
+  }
+
+  #describe(isSlider, line) {
+    const isSide = this.#mode === "side";
+    this.line.hidden = !isSlider;
     this.line.style.left = `${line}px`;
     this.line.setAttribute("aria-valuenow", Math.round(100 * this.#split));
     this.line.setAttribute("aria-valuetext", `${Math.round(100 * this.#split)} % photo`);
+    const [first, second] = [this.querySelector(".tag.left"), this.querySelector(".tag.right")];
+    first.hidden = !(isSlider || isSide || this.#isBefore);
+    second.hidden = this.#isBefore;
+    second.style.top = isSide && this.clientWidth < this.clientHeight ? `calc(50% + 0.75rem)` : "";
+    this.querySelector("output").textContent = `${Math.round(100 * this.#pixelSize)} %`;
+    this.setAttribute("aria-busy", this.#missingTiles > 0);
     this.classList.toggle("zoomed", this.#zoom > 1);
+    this.classList.toggle("editing", Boolean(this.editor?.isActive));
   }
 
   #moveLine(x) {
@@ -121,9 +226,35 @@ class GlassCompare extends HTMLElement {
     this.paint();
   }
 
+  // The position of a pointer in the view.
   #point(event) {
     const box = this.getBoundingClientRect();
     return { x: event.clientX - box.left, y: event.clientY - box.top };
+  }
+
+  // The same position in the pane that contains a point.
+  #inPane({ x, y }) {
+    const panes = this.#panes();
+    const pane = panes.findLast((one) => x >= one.x && y >= one.y) ?? panes[0];
+    return { x: x - pane.x, y: y - pane.y };
+  }
+
+  // The position in the photo that is shown at a point, in fractions of its longer side.
+  #inPhoto(point) {
+    const placement = this.#placement();
+    const { x, y } = this.#inPane(point);
+    const longer = Math.max(placement.width, placement.height);
+    return [(x - placement.left) / longer, (y - placement.top) / longer];
+  }
+
+  // What a pointer drags that goes down at a point. While regions are drawn, the line is dragged by its handle only.
+  #draggedAt(point, target) {
+    const hasLine = this.#mode === "slider" && !this.#isBefore;
+    const isNear = hasLine && Math.abs(point.x - this.#visible().line) < GRAB_DISTANCE;
+    if (this.editor?.isActive) {
+      return target === this.line && Math.abs(point.y - this.clientHeight / 2) < GRAB_DISTANCE ? "line" : "region";
+    }
+    return hasLine && (this.#zoom === 1 || isNear) ? "line" : "image";
   }
 
   _pointerdown(event) {
@@ -131,17 +262,22 @@ class GlassCompare extends HTMLElement {
     const point = this.#point(event);
     this.setPointerCapture(event.pointerId);
     this.#pointers.set(event.pointerId, point);
-    const isNear = Math.abs(point.x - this.#visible().line) < GRAB_DISTANCE;
-    this.#dragged = this.#zoom === 1 || isNear ? "line" : "image";
-    if (this.#dragged === "line" && this.#pointers.size === 1 && event.pointerType === "mouse") this.#moveLine(point.x);
+    if (this.#pointers.size > 1) return this.editor?.cancel(); // two fingers zoom
+    this.#dragged = this.#draggedAt(point, event.target);
+    if (this.#dragged === "region") this.editor.start(this.#inPhoto(point));
+    else if (this.#dragged === "line" && event.pointerType === "mouse") this.#moveLine(point.x);
   }
 
   _pointermove(event) {
     const before = this.#pointers.get(event.pointerId);
-    if (!before) return;
     const now = this.#point(event);
+    if (!before) {
+      if (this.editor?.isActive) this.editor.hover(this.#inPhoto(now));
+      return;
+    }
     this.#pointers.set(event.pointerId, now);
     if (this.#pointers.size === 2) this.#pinch(event.pointerId, before, now);
+    else if (this.#dragged === "region") this.editor.move(this.#inPhoto(now));
     else if (this.#dragged === "line") this.#moveLine(now.x);
     else this.#pan(now.x - before.x, now.y - before.y);
   }
@@ -149,29 +285,34 @@ class GlassCompare extends HTMLElement {
   #pinch(id, before, now) {
     const [other] = [...this.#pointers].filter(([key]) => key !== id).map(([, point]) => point);
     const distance = (point) => Math.hypot(point.x - other.x, point.y - other.y) || 1;
-    this.zoomBy(distance(now) / distance(before), (now.x + other.x) / 2, (now.y + other.y) / 2);
+    this.zoomBy(distance(now) / distance(before), this.#inPane({ x: (now.x + other.x) / 2, y: (now.y + other.y) / 2 }));
     this.#pan((now.x - before.x) / 2, (now.y - before.y) / 2);
     this.#dragged = "image";
   }
 
   _pointerup(event) {
-    this.#pointers.delete(event.pointerId);
+    if (this.#pointers.delete(event.pointerId) && this.#dragged === "region") this.editor.end();
   }
 
   _pointercancel(event) {
-    this.#pointers.delete(event.pointerId);
+    if (this.#pointers.delete(event.pointerId) && this.#dragged === "region") this.editor.cancel();
+  }
+
+  _pointerleave() {
+    if (this.editor?.isActive && !this.#pointers.size) this.editor.hover(null);
   }
 
   _wheel(event) {
     event.preventDefault();
-    const point = this.#point(event);
-    this.zoomBy(1.0015 ** -event.deltaY, point.x, point.y);
+    this.zoomBy(1.0015 ** -event.deltaY, this.#inPane(this.#point(event)));
   }
 
   _dblclick(event) {
-    if (event.target.closest(".zoom")) return;
-    const point = this.#point(event);
-    this.zoomBy(this.#zoom > 1 ? 0 : 3, point.x, point.y);
+    if (event.target.closest(".zoom") || this.editor?.isActive) return;
+    const point = this.#inPane(this.#point(event));
+    if (this.#zoom > 1) this.zoomBy(0);
+    else if (this.#fullZoom() > 1) this.zoomToFull(point);
+    else this.zoomBy(3, point);
   }
 
   _keydown(event) {
@@ -183,7 +324,9 @@ class GlassCompare extends HTMLElement {
     const onImage = { ArrowLeft: [60, 0], ArrowRight: [-60, 0], ArrowUp: [0, 60], ArrowDown: [0, -60] };
     const zooms = { "+": 1.5, "=": 1.5, "-": 1 / 1.5, 0: 0 };
     if (event.key in zooms) this.zoomBy(zooms[event.key]);
+    else if (event.key === "1") this.zoomToFull();
     else if (event.target === this.line && event.key in onLine) this.#moveLine(onLine[event.key]);
+    else if (event.target === this && this.editor?.isActive && this.editor.press(event)) this.paint();
     else if (event.target === this && event.key in onImage) this.#pan(...onImage[event.key]);
     else return;
     event.preventDefault();

@@ -10,6 +10,7 @@ export class PanZoom {
   #x = 0; // offsets of the left and upper edge, as fractions of the frame size: 0 or less
   #y = 0;
   #size = [1, 1];
+  #full = false; // whether one picture pixel is kept at one screen pixel, also for other pictures and frame sizes
   #pointers = new Map();
 
   constructor(box, frames) {
@@ -23,25 +24,40 @@ export class PanZoom {
         frame.addEventListener(end, (event) => this.#pointers.delete(event.pointerId));
       }
     }
-    new ResizeObserver(() => this.#paint()).observe(box);
+    new ResizeObserver(() => this.#resized()).observe(box);
   }
 
-  // Shows new pictures of this size in px, without zoom.
+  // Shows new pictures of this size in px, without zoom, or at full size if the earlier ones were shown at full size.
   reset(width, height) {
     this.#size = [width, height];
-    this.zoom("fit");
+    this.#scale = 1;
+    if (this.#full) this.zoom("full", true);
+    else this.zoom("fit");
   }
 
   // Zooms by the name of a button: in, out, fit or full.
-  zoom(kind) {
+  zoom(kind, keep = false) {
+    const full = kind === "full" && (keep || !this.#full);
     if (kind === "in") this.#zoomTo(this.#scale * ZOOM_STEP);
     else if (kind === "out") this.#zoomTo(this.#scale / ZOOM_STEP);
-    else this.#zoomTo(kind === "fit" || this.isFull ? 1 : this.#fullScale());
+    else this.#zoomTo(full ? this.#fullScale() : 1);
+    this.#full = full;
+    this.#paint();
   }
 
   // Whether one picture pixel is one screen pixel.
   get isFull() {
-    return this.#scale > 1 && Math.abs(this.#scale / this.#fullScale() - 1) < 1e-3;
+    return this.#full;
+  }
+
+  // Whether the pictures are larger than their frames.
+  get isZoomed() {
+    return this.#scale > 1;
+  }
+
+  #resized() {
+    if (this.#full) this.zoom("full", true);
+    else this.#paint();
   }
 
   // Handles a key. Returns true if the key zooms or pans.
@@ -66,6 +82,7 @@ export class PanZoom {
     this.#x = x - ((x - this.#x) * next) / this.#scale;
     this.#y = y - ((y - this.#y) * next) / this.#scale;
     this.#scale = next;
+    this.#full = false;
     this.#paint();
   }
 

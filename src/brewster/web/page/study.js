@@ -6,14 +6,19 @@ import { PanZoom } from "./pan_zoom.js";
 const PARTICIPANT_TOKEN = location.pathname.match(/^\/s\/([^/]+)/)?.[1];
 // In ms. Earlier answers are ignored, because they may be the second click of a double click in the previous trial.
 const MIN_ANSWER_DELAY = 300;
+const MIN_WIDTH = 900; // in CSS px; in a narrower window, pictures side by side are too small to compare
 const KEYS = { 1: "left", 2: "similar", 3: "right", ArrowLeft: "left", ArrowRight: "right" }; // the up and down arrows scroll
 
 const byId = (id) => document.getElementById(id);
 const sections = ["invitation", "trial", "finish", "error"];
 const frames = { left: frame("left"), photo: frame("photo"), right: frame("right") };
 const panZoom = new PanZoom(byId("pictures"), Object.values(frames));
+const captions = { left: "Result A", photo: "Photo", right: "Result B" };
 const preloaded = []; // the pictures of the next trial, held in memory
 let state = null; // the current trial, as returned by the server
+let practising = false; // whether the practice trial is shown
+let flips = 0; // how often another picture was shown in place during the trial
+let zoomed = false; // whether the pictures were enlarged during the trial
 let shownAt = null; // time at which its pictures were shown; null while no answer is accepted
 
 function frame(side) {
@@ -90,6 +95,59 @@ byId("agreement").addEventListener("submit", async (event) => {
 
 // --- a trial
 
+// --- window and arrangement
+
+function warnIfNarrow() {
+  byId("narrow-page").textContent = `This window is ${innerWidth} pixels wide. The pictures are easier to compare in a window of at least ${MIN_WIDTH} pixels: enlarge it, turn the device, or use a computer.`;
+  byId("narrow-trial").textContent = `Small window (${innerWidth} px): enlarge it if you can.`; // short, because it takes space from the pictures
+  for (const id of ["narrow-page", "narrow-trial"]) byId(id).hidden = innerWidth >= MIN_WIDTH;
+}
+
+const view = () => byId("pictures").dataset.view;
+const shownSide = () => Object.keys(frames).find((side) => frames[side].parentElement.classList.contains("shown"));
+
+function setView(name) {
+  byId("pictures").dataset.view = name;
+  byId("flip").hidden = name !== "single";
+  for (const button of byId("views").children) button.setAttribute("aria-pressed", button.dataset.view === name);
+  if (name === "single" && !shownSide()) showInPlace("left");
+}
+
+// Shows one picture in the place of all three.
+function showInPlace(side) {
+  flips += view() === "single" && shownSide() !== side;
+  for (const [name, element] of Object.entries(frames)) element.parentElement.classList.toggle("shown", name === side);
+  for (const button of byId("flip").children) button.setAttribute("aria-pressed", button.dataset.side === side);
+  if (view() !== "single") setView("single");
+  byId("announcement").textContent = captions[side];
+}
+
+const VIEW_KEYS = {
+  a: () => showInPlace("left"),
+  b: () => showInPlace("right"),
+  p: () => showInPlace("photo"),
+  x: () => showInPlace(view() === "single" && shownSide() === "left" ? "right" : "left"),
+  s: () => setView("all"),
+  d: () => setView("pair"),
+};
+
+// How the pictures are shown, in CSS px.
+function conditions() {
+  return {
+    viewport_width: innerWidth,
+    viewport_height: innerHeight,
+    pixel_ratio: devicePixelRatio,
+    picture_width: Math.round(frames.left.getBoundingClientRect().width),
+    theme: matchMedia("(prefers-color-scheme: dark)").matches ? "dark" : "light",
+    pointer: matchMedia("(pointer: coarse)").matches ? "coarse" : "fine",
+    view: view(),
+    flips,
+    zoomed: zoomed || panZoom.isZoomed,
+  };
+}
+
+// --- pictures
+
 const pictureUrl = (trial, side) => `/s/${PARTICIPANT_TOKEN}/pictures/${trial}/${side}`;
 
 async function loadPicture(source) {
@@ -109,25 +167,48 @@ async function loadPicture(source) {
   }
 }
 
-async function showTrial(next) {
+// Shows the practice trial before the first trial, then the trials.
+async function start(next) {
+  practising = Boolean(next.practice);
+  if (!practising) return showTrial(next);
   state = next;
+  byId("bar").value = 0;
+  await showPictures("practice", next.practice, "Practice: not counted");
+}
+
+async function showTrial(next) {
+  practising = false;
+  state = next;
+  byId("undo").hidden = next.last === null;
   if (next.trial === null) return finish(next);
-  const number = `Pair ${next.trial + 1} of ${next.trials}`;
-  byId("position").textContent = number;
   byId("bar").value = next.trial / next.trials;
+  await showPictures(next.trial, next, `Pair ${next.trial + 1} of ${next.trials}`);
+  preload(next);
+}
+
+// Shows the three pictures of a trial; then answers are accepted. `trial` is its number or "practice".
+async function showPictures(trial, { width, height }, title) {
+  byId("position").textContent = title;
   byId("trial").classList.add("waiting");
   show("trial");
   const sides = Object.keys(frames);
-  await Promise.all(sides.map((side) => loadPicture(pictureUrl(next.trial, side))));
-  byId("pictures").style.setProperty("--ratio", next.width / next.height);
-  byId("pictures").classList.toggle("tall", next.width < next.height);
-  for (const side of sides) frames[side].firstElementChild.src = pictureUrl(next.trial, side);
+  await Promise.all(sides.map((side) => loadPicture(pictureUrl(trial, side))));
+  byId("pictures").style.setProperty("--ratio", width / height);
+  byId("pictures").classList.toggle("tall", width < height);
+  for (const side of sides) frames[side].firstElementChild.src = pictureUrl(trial, side);
   await Promise.all(sides.map((side) => frames[side].firstElementChild.decode()));
-  panZoom.reset(next.width, next.height);
+  panZoom.reset(width, height);
+  if (view() === "single") showInPlace("left");
+  [flips, zoomed] = [0, panZoom.isZoomed];
   byId("trial").classList.remove("waiting");
   updateChoices(null, false);
-  byId("announcement").textContent = number;
+  byId("announcement").textContent = title;
   shownAt = performance.now();
+}
+
+// Loads the pictures of the trial after `next`.
+function preload(next) {
+  const sides = Object.keys(frames);
   preloaded.length = 0;
   const ahead = next.trial + 1 < next.trials ? sides.map((side) => loadPicture(pictureUrl(next.trial + 1, side))) : [];
   preloaded.push(...ahead.map((loading) => loading.catch(() => {}))); // an error is shown when the trial is shown
@@ -147,8 +228,30 @@ async function choose(choice) {
   shownAt = null;
   updateChoices(choice, true);
   try {
-    const answer = await send(`/s/${PARTICIPANT_TOKEN}/answers`, { trial: state.trial, choice, seconds });
+    if (practising) return await endPractice(choice);
+    const body = { trial: state.trial, choice, seconds, conditions: conditions() };
+    const answer = await send(`/s/${PARTICIPANT_TOKEN}/answers`, body);
     await showTrial(answer.next);
+  } catch (error) {
+    showError(error);
+  }
+}
+
+// Explains the practice pair, and shows the first trial.
+async function endPractice(choice) {
+  const better = state.practice.expected === "left" ? "A" : "B";
+  const text = `${choice === state.practice.expected ? "Yes" : "Look again at such differences"}: ${better} is better, because the other one was blurred. The study begins now.`;
+  await showTrial(state);
+  notice(text);
+  setTimeout(() => notice(""), 8000);
+}
+
+async function undo() {
+  if (state.last === null || (state.trial !== null && shownAt === null)) return; // an answer is being sent
+  shownAt = null;
+  try {
+    await showTrial(await send(`/s/${PARTICIPANT_TOKEN}/withdrawals`, { trial: state.last }));
+    byId("undo").hidden = true; // only one answer can be undone in a row
   } catch (error) {
     showError(error);
   }
@@ -170,11 +273,18 @@ addEventListener("keydown", (event) => {
   else if (event.key in KEYS && !event.shiftKey) {
     event.preventDefault();
     choose(KEYS[event.key]);
-  }
+  } else if (event.key.toLowerCase() in VIEW_KEYS && !event.repeat) VIEW_KEYS[event.key.toLowerCase()]();
 });
+
+for (const button of byId("views").children) button.addEventListener("click", () => setView(button.dataset.view));
+for (const button of byId("flip").children) button.addEventListener("click", () => showInPlace(button.dataset.side));
+for (const id of ["undo", "undo-last"]) byId(id).addEventListener("click", undo);
+addEventListener("resize", warnIfNarrow);
+warnIfNarrow();
 
 for (const button of byId("zoom").children) button.addEventListener("click", () => panZoom.zoom(button.dataset.zoom));
 byId("pictures").addEventListener("zoomed", () => {
+  zoomed ||= panZoom.isZoomed;
   document.querySelector("[data-zoom=full]").setAttribute("aria-pressed", panZoom.isFull);
 });
 
@@ -191,7 +301,7 @@ byId("copy").addEventListener("click", async () => {
 byId("retry").addEventListener("click", () => location.reload());
 
 try {
-  await (PARTICIPANT_TOKEN ? showTrial(await send(`/s/${PARTICIPANT_TOKEN}/trial`)) : showInvitation());
+  await (PARTICIPANT_TOKEN ? start(await send(`/s/${PARTICIPANT_TOKEN}/trial`)) : showInvitation());
 } catch (error) {
   showError(error);
 }

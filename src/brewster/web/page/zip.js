@@ -6,14 +6,31 @@ const CENTRAL = 0x02014b50;
 const END = 0x06054b50;
 const MAX_BYTES = 0xffffffff; // a zip without the ZIP64 extension is not larger
 
-// Creates a zip from files as returned by `readZip`. If a name is already used, a number is put before it.
+const CRC_TABLE = Uint32Array.from({ length: 256 }, (_, byte) => {
+  for (let bit = 0; bit < 8; bit++) byte = byte & 1 ? 0xedb88320 ^ (byte >>> 1) : byte >>> 1;
+  return byte;
+});
+
+// The CRC-32 of zip and PNG (ISO 3309). `crc` is the value for the preceding bytes.
+export function crc32(bytes, crc = 0) {
+  crc = ~crc;
+  for (let i = 0; i < bytes.length; i++) crc = CRC_TABLE[(crc ^ bytes[i]) & 0xff] ^ (crc >>> 8);
+  return ~crc >>> 0;
+}
+
+// Returns the files with unique names: if a name is already used, a number is put before it.
+export function withUniqueNames(files) {
+  const usedNames = new Set();
+  return files.map((file) => ({ ...file, name: uniqueName(file.name, usedNames) }));
+}
+
+// Creates a zip from files as returned by `readZip`. Their names must be unique.
 export function createZip(files) {
   const parts = [];
   const centralRecords = [];
-  const usedNames = new Set();
   let at = 0;
   for (const file of files) {
-    const name = new TextEncoder().encode(uniqueName(file.name, usedNames));
+    const name = new TextEncoder().encode(file.name);
     const common = commonFields(file, name.length);
     const local = concatenate(littleEndian([[4, LOCAL]]), common, littleEndian([[2, 0]]), name);
     const centralFields = [[2, 0], [2, 0], [2, 0], [2, 0], [4, 0], [4, at]];

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Final
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from brewster.errors import ModelError, TargetError
 from brewster.models.diffusion.adapter.lora import LORA_FILE, read_lora_metadata, read_prompt
@@ -34,8 +34,13 @@ def export_comfyui(folder: Path, target: Path) -> None:
     _check_target(target)
     metadata, tensors = read_lora_metadata(folder), read_tensors(folder / LORA_FILE)[0]
     layers = [name.removesuffix(_UP) for name in tensors if name.endswith(_UP)]
-    # safetensors refuses tensors that share memory, so each layer gets its own.
-    alphas = {layer + _ALPHA: torch.tensor(float(metadata.alpha)) for layer in layers}
+    # safetensors refuses tensors that share memory, so each layer gets its own. An imported layer has alpha = rank.
+    alphas = {
+        layer + _ALPHA: torch.tensor(
+            float(len(tensors[layer + _DOWN]) if metadata.imported else metadata.alpha)
+        )
+        for layer in layers
+    }
     write_tensors(target, tensors | alphas, {})
 
 
@@ -66,7 +71,7 @@ def export_merged(folder: Path, target: Path, base: str | None = None) -> None:
             "choose another base",
         )
     state = {name.removeprefix(_PREFIX): tensor for name, tensor in tensors.items()}
-    merge(backbone, state, metadata.alpha / metadata.rank)
+    merge(backbone, state, 1.0 if metadata.imported else metadata.alpha / metadata.rank)
     backbone.save(target)
     prompt.save(target / PROMPT_FILE)
 
@@ -78,9 +83,10 @@ def merge(backbone: Backbone, state: Mapping[str, Tensor], scale: float) -> None
     Raises:
         ModelError: the backbone has no such layer.
     """
-    targets = set(backbone.lora_targets())
+    modules = backbone.transformer.named_modules()
+    layers = {name for name, module in modules if isinstance(module, nn.Linear)}
     for layer in sorted(name.removesuffix(_UP) for name in state if name.endswith(_UP)):
-        if layer not in targets:
+        if layer not in layers:
             raise ModelError(
                 f"the base has no layer {layer}",
                 "expected the base with which the LoRA was trained",

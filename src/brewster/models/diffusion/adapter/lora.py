@@ -12,6 +12,7 @@ smaller than the rounding error of bf16.
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from fnmatch import fnmatchcase
@@ -24,6 +25,7 @@ from pydantic import Field, TypeAdapter, ValidationError
 from torch import Tensor, nn
 
 from brewster.errors import ModelError, RecipeError
+from brewster.models.diffusion.adapter.key_styles import LowRankLayer, check_shape, read_layers, to_state
 from brewster.models.diffusion.families.family import Backbone
 from brewster.models.diffusion.lazy_imports import import_library
 from brewster.models.diffusion.prompt import PROMPT_FILE, PromptEmbedding, load_prompt
@@ -55,6 +57,8 @@ class LoraMetadata:
     task: DecompositionTask
     prompt_sha256: str
     targets: tuple[str, ...] = ()
+    imported: bool = False
+    """Whether another program trained the LoRA. Then it may adapt any layers, each with its own rank up to `rank`."""
 
     def to_json(self) -> str:
         """The metadata as one line of JSON."""
@@ -145,6 +149,29 @@ def add_lora(
     return lora_parameters(backbone)
 
 
+def attach_layers(backbone: Backbone, layers: Mapping[str, LowRankLayer]) -> None:
+    """Adds a LoRA with these layers to a backbone for inference. Each layer has its own rank.
+
+    The weights are in the dtype in which the backbone computes, see `load_lora`.
+
+    Raises:
+        ModelError: the backbone already has a LoRA, or a layer is not in it or has another shape.
+        MissingExtra: peft is not installed.
+    """
+    if has_lora(backbone):
+        raise ModelError(
+            "the backbone already has a LoRA", "expected a backbone without a LoRA", "call remove_lora first"
+        )
+    modules = dict(backbone.transformer.named_modules())
+    for name, layer in layers.items():
+        check_shape(name, layer, modules.get(name))
+    peft = import_library("peft")
+    config = peft.LoraConfig(**_layer_settings(layers))
+    backbone.transformer.add_adapter(config, adapter_name=_ADAPTER_NAME)
+    _convert_for_inference(backbone)
+    peft.set_peft_model_state_dict(backbone.transformer, to_state(layers), adapter_name=_ADAPTER_NAME)
+
+
 def remove_lora(backbone: Backbone) -> None:
     """Removes the LoRA and so restores the base's predictions. Does nothing if there is no LoRA."""
     if has_lora(backbone):
@@ -229,6 +256,24 @@ def save_lora(
     return metadata
 
 
+def save_layers(
+    folder: Path, layers: Mapping[str, LowRankLayer], prompt: PromptEmbedding, metadata: LoraMetadata
+) -> None:
+    """Writes a LoRA of another program as `save_lora` writes those of brewster.
+
+    Raises:
+        TargetError: the folder cannot be written.
+    """
+    settings = {_PREFIX + name: value for name, value in _layer_settings(layers).items()}
+    tensors = {_PREFIX + name: tensor for name, tensor in to_state(layers).items()}
+    prompt.save(folder / PROMPT_FILE)
+    write_tensors(
+        folder / LORA_FILE,
+        tensors,
+        {_METADATA_KEY: metadata.to_json(), _PEFT_KEY: json.dumps(settings, sort_keys=True)},
+    )
+
+
 def read_lora_metadata(folder: Path) -> LoraMetadata:
     """The metadata of the LoRA in this folder. It names the backbone to load.
 
@@ -274,15 +319,22 @@ def load_lora(folder: Path, backbone: Backbone) -> tuple[LoraMetadata, PromptEmb
             f"load the backbone {metadata.backbone} for it",
         )
     prompt = read_prompt(folder, metadata)
+    if metadata.imported:
+        attach_layers(backbone, read_layers(state, backbone.transformer, backbone.name))
+        return metadata, prompt
     add_lora(backbone, rank=metadata.rank, alpha=metadata.alpha, targets=metadata.targets)
     try:
         load_lora_state(backbone, state)
     except ModelError:
         remove_lora(backbone)
         raise
+    _convert_for_inference(backbone)
+    return metadata, prompt
+
+
+def _convert_for_inference(backbone: Backbone) -> None:
     for parameter in lora_parameters(backbone):
         parameter.data = parameter.data.to(backbone.dtype)
-    return metadata, prompt
 
 
 def _read_lora(folder: Path) -> tuple[dict[str, Tensor], LoraMetadata]:
@@ -291,7 +343,7 @@ def _read_lora(folder: Path) -> tuple[dict[str, Tensor], LoraMetadata]:
         raise ModelError(
             f"{folder / LORA_FILE} was not written by brewster",
             f"expected a LoRA with the entry {_METADATA_KEY} in its metadata",
-            "use a LoRA that brewster train wrote",
+            "convert it: brewster models import SOURCE FOLDER --base BASE --prompt TEXT --panels T",
         )
     metadata = LoraMetadata.from_json(entries[_METADATA_KEY])
     return {name.removeprefix(_PREFIX): tensor for name, tensor in tensors.items()}, metadata
@@ -322,6 +374,20 @@ def _peft_settings(config: Any) -> str:  # noqa: ANN401 - peft's configuration
         "target_modules": sorted(config.target_modules),
     }
     return json.dumps({_PREFIX + name: value for name, value in settings.items()}, sort_keys=True)
+
+
+def _layer_settings(layers: Mapping[str, LowRankLayer]) -> dict[str, Any]:
+    """The settings of peft for layers of any rank. The names are regular expressions that match only the full name."""
+    ranks = {re.escape(name): layer.rank for name, layer in sorted(layers.items())}
+    rank = max(ranks.values())
+    pattern = {f"^{name}": value for name, value in ranks.items() if value != rank}
+    return {
+        "r": rank,
+        "lora_alpha": rank,
+        "target_modules": "|".join(ranks),
+        "rank_pattern": pattern,
+        "alpha_pattern": pattern,
+    }
 
 
 def _cuda_devices(backbone: Backbone) -> list[torch.device]:

@@ -79,6 +79,10 @@ class Backbone(ABC):
     tiny: ClassVar[Architecture]
     guided_by_embedding: ClassVar[bool]
     """True if the guidance scale is an input of the transformer; False for classifier-free guidance."""
+    other_pipelines: ClassVar[tuple[str, ...]] = ()
+    """Class names in diffusers of other pipelines for the same transformer, VAE and scheduler."""
+    unquantised: ClassVar[tuple[str, ...]] = ()
+    """Layers that stay in full precision with nf4."""
     text_encoder_requirements: ClassVar[tuple[str, ...]] = ()
     """Libraries that the text encoders need in addition to the extra `large`."""
     multiple: ClassVar[int] = 16
@@ -157,6 +161,8 @@ class Backbone(ABC):
     ) -> Float[Tensor, "n c h w"]:
         """The velocity (noise - latents of the image) at time sigma, float32; differentiable.
 
+        `condition` may be `no_condition()`.
+
         Raises:
             ModelError: the prompt lacks an embedding that this guidance needs.
         """
@@ -174,6 +180,10 @@ class Backbone(ABC):
     @abstractmethod
     def random_prompt(cls, transformer: Any, seed: int) -> PromptEmbedding:  # noqa: ANN401 - a transformer of diffusers
         """A random embedding with the shapes of a prompt, for tiny versions, which have no text encoder."""
+
+    def no_condition(self) -> Float[Tensor, "1 c 0 0"]:
+        """An encoded conditioning image without tokens, for `predict`."""
+        return torch.empty(1, self.channels, 0, 0, device=self.device)
 
     def noise(self, size: tuple[int, int], seed: int) -> Float[Tensor, "1 c h w"]:
         """The noise from which the diffusers pipeline starts for a composite of this (width, height) and seed.

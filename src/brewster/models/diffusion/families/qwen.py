@@ -35,6 +35,8 @@ class Qwen(ClassifierFreeBackbone):
     hub_id = "Qwen/Qwen-Image-Edit"
     licence = APACHE_2
     diffusers_usage = "but resizes the conditioning image to one megapixel, so that its panels differ from those in training"
+    other_pipelines = ("QwenImageEditPlusPipeline",)
+    unquantised = ("transformer_blocks.0.img_mod",)
     text_encoder_requirements = ("torchvision",)
     classes: ClassVar = {
         "pipeline": "QwenImageEditPipeline", "transformer": "QwenImageTransformer2DModel",
@@ -63,9 +65,11 @@ class Qwen(ClassifierFreeBackbone):
     def positions(self, latents: Tensor, condition: Tensor) -> list[list[tuple[int, int, int]]]:
         """For each sample, (frames, rows, columns) of the generated image and of the conditioning image.
 
-        The transformer computes the rotary position embedding from them, centred on each image.
+        The transformer computes the rotary position embedding from them, centred on each image. A conditioning image
+        without tokens is left out.
         """
-        shapes = [(1, int(grid.shape[2]), int(grid.shape[3])) for grid in (latents, condition)]
+        grids = (latents, condition) if condition.numel() else (latents,)
+        shapes = [(1, int(grid.shape[2]), int(grid.shape[3])) for grid in grids]
         return [shapes] * len(latents)
 
     @classmethod

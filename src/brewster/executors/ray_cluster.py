@@ -1,20 +1,17 @@
-"""Runs render tasks on a Ray cluster. All nodes write their samples into a shared folder.
-
-The nodes exchange only indices and results, no image data.
-"""
+"""Runs tasks on a Ray cluster. The nodes exchange only tasks and results: images are read and written by the workers."""
 
 from __future__ import annotations
 
 import importlib
 import os
+import secrets
 import socket
+from collections.abc import Callable
 from types import ModuleType, TracebackType
-from typing import Any, Final, Self, final
+from typing import Any, Final, Generic, Self, final
 
-from brewster.errors import DeviceError, MissingExtra
-from brewster.rendered.generation.job import RenderJob, RenderResult, RenderTask
-from brewster.rendered.generation.workers import MAX_ATTEMPTS, TaskRunner
-from brewster.worker_setup import single_torch_thread
+from brewster.errors import BrewsterError, DeviceError, MissingExtra
+from brewster.executors.local import MAX_ATTEMPTS, ResultT, Runner, Task
 
 LOCAL: Final = "local"
 _CONNECT_TIMEOUT_S: Final = 10.0
@@ -23,7 +20,7 @@ _TASKS_PER_CPU: Final = 2
 
 
 @final
-class RayExecutor:
+class RayExecutor(Generic[ResultT]):
     """Runs tasks on the Ray cluster at an address, or on a cluster of this machine only ("local").
 
     If a node is lost, its tasks are run on another node.
@@ -31,9 +28,11 @@ class RayExecutor:
 
     chunk_size = 4
 
-    def __init__(self, job: RenderJob, address: str = LOCAL, workers: int | None = None) -> None:
-        self._job, self._address, self._workers = job, address, workers
-        self._tasks: dict[Any, RenderTask] = {}
+    def __init__(
+        self, create_runner: Callable[[], Runner[ResultT]], address: str = LOCAL, workers: int | None = None
+    ) -> None:
+        self._create_runner, self._address, self._workers = create_runner, address, workers
+        self._tasks: dict[Any, Task[ResultT]] = {}
 
     def has_capacity(self) -> bool:
         """Whether more tasks can be submitted. The limit depends on the current number of nodes."""
@@ -44,26 +43,34 @@ class RayExecutor:
         """Whether any task is running."""
         return bool(self._tasks)
 
-    def submit(self, task: RenderTask) -> None:
+    def submit(self, task: Task[ResultT]) -> None:
         """Sends a task to the cluster."""
-        self._tasks[self._run_task.remote(self._job_ref, task)] = task
+        self._tasks[self._run_task.remote(self._run_id, self._create_runner_ref, task)] = task
 
-    def wait(self) -> list[RenderResult]:
-        """Returns the results of the next finished task; none if it was lost and its samples are tried again."""
+    def wait(self) -> list[ResultT]:
+        """Returns the results of the next finished task; none if it was lost and its items are tried again.
+
+        Raises:
+            BrewsterError: raised by the runner.
+        """
         (done, *_), _ = self._ray.wait(list(self._tasks), num_returns=1)
         task = self._tasks.pop(done)
         try:
-            results: list[RenderResult] = self._ray.get(done)
+            results: list[ResultT] = self._ray.get(done)
         except self._ray.exceptions.RayError as error:
+            cause = getattr(error, "cause", None)
+            if isinstance(cause, BrewsterError):
+                raise cause from error
             return self._handle_lost_task(task, type(error).__name__)
         return results
 
-    def _handle_lost_task(self, task: RenderTask, reason: str) -> list[RenderResult]:
-        """Submits each sample of a lost task as a task of its own, because one sample may be the cause."""
-        if len(task.indices) == 1:
+    def _handle_lost_task(self, task: Task[ResultT], reason: str) -> list[ResultT]:
+        """Submits each item of a lost task as a task of its own, because one item may be the cause."""
+        parts = task.split()
+        if len(parts) == 1:
             return task.failed_results(f"its process or node was lost {MAX_ATTEMPTS} times ({reason})")
-        for number in task.indices:
-            self.submit(RenderTask(task.kind, (number,)))
+        for part in parts:
+            self.submit(part)
         return []
 
     def __enter__(self) -> Self:
@@ -87,7 +94,8 @@ class RayExecutor:
                 "start one: ray start --head",
             ) from error
         self._run_task = self._ray.remote(max_retries=MAX_ATTEMPTS - 1, num_cpus=1)(_run_task)
-        self._job_ref = self._ray.put(self._job)
+        self._run_id = secrets.token_hex(8)
+        self._create_runner_ref = self._ray.put(self._create_runner)
         return self
 
     def __exit__(
@@ -105,7 +113,7 @@ def _ray() -> ModuleType:
     except ImportError as error:
         raise MissingExtra(
             "the package ray is not installed",
-            "expected it for rendering on a cluster",
+            "expected it, because --cluster needs it",
             "run: pip install 'brewster[cluster]'",
         ) from error
     # Ray prints lost processes on standard output, which is reserved for --json. There is no option to prevent this.
@@ -120,12 +128,12 @@ def _check_reachable(address: str) -> None:
         socket.create_connection((host, int(port)), timeout=_CONNECT_TIMEOUT_S).close()
 
 
-_runners: list[tuple[RenderJob, TaskRunner]] = []
-"""The job and the task runner of this process. They are reused for the next tasks, so that maps are read once."""
+_runners: dict[str, Runner[Any]] = {}
+"""The runner of this process by run. It is reused for the next tasks, so that a model or a map is read once."""
 
 
-def _run_task(job: RenderJob, task: RenderTask) -> list[RenderResult]:
-    if not _runners or _runners[0][0] != job:
-        _runners[:] = [(job, TaskRunner(job))]
-    with single_torch_thread():
-        return _runners[0][1](task)
+def _run_task(run_id: str, create_runner: Callable[[], Runner[Any]], task: Task[Any]) -> list[Any]:
+    if run_id not in _runners:
+        _runners.clear()
+        _runners[run_id] = create_runner()
+    return _runners[run_id](task)

@@ -1,0 +1,71 @@
+"""Measures how reliable the verdicts of `Separation.assessment` are, on photos with ground truth that no model was trained on.
+
+    BREWSTER_DATA=../shared/data .venv/bin/python bench/verdict.py [MODEL]
+
+Prints one row per dataset and verdict: the number of photos, the share that is closer to the ground truth after the separation,
+and the mean gain in PSNR.
+"""
+
+import os
+import sys
+from collections import defaultdict
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from brewster import Separator
+from brewster.benchmarks.registry import read_benchmark
+from brewster.metrics.fidelity import psnr
+from brewster.photo import Photo
+from brewster.training.recipe import read_recipe
+from brewster.training.streams import held_out_mixtures
+
+MIXTURES = 200
+SIZE_PX = 320
+EVERY = 7
+"""Of the many similar pairs of real/train, one in so many is measured."""
+RECIPE = Path(__file__).parents[1] / "recipes/train/compact-stage3.toml"
+
+Pair = tuple[Photo, NDArray[np.uint8]]
+
+
+def main(data: Path, model: str) -> None:
+    separator = Separator.load(model)
+    datasets = {
+        "dev Nature": read_pairs(data / "real/dev/nature"),
+        "dev Real": read_pairs(data / "real/dev/real"),
+        "real/train": read_pairs(data / "real/train", EVERY),
+        "held-out mixtures": mixtures(),
+    }
+    gains: defaultdict[tuple[str, str], list[float]] = defaultdict(list)
+    for name, pairs in datasets.items():
+        for photo, ground_truth in pairs:
+            separation = separator(photo)
+            before, after = (psnr(layer.pixels, ground_truth) for layer in (photo, separation.transmission))
+            for key in (name, "all"):
+                gains[separation.assessment.verdict, key].append(after - before)
+    print("| verdict | dataset | photos | better than the input | mean gain, dB |\n|---|---|---|---|---|")
+    for (verdict, name), values in sorted(gains.items()):
+        better = np.mean(np.array(values) > 0)
+        print(f"| {verdict} | {name} | {len(values)} | {better:.0%} | {np.mean(values):+.2f} |")
+
+
+def read_pairs(folder: Path, every: int = 1) -> Iterator[Pair]:
+    (benchmark,) = read_benchmark("pairs", folder)
+    for case in benchmark.cases[::every]:
+        yield Photo.open(case.photo.path), Photo.open(case.ground_truth.path).pixels
+
+
+def mixtures() -> Iterator[Pair]:
+    stream = held_out_mixtures(read_recipe(RECIPE))
+    for step in range(MIXTURES // 8):
+        batch = stream(step, 8, SIZE_PX)
+        for images in zip(batch.photo_encoded, batch.transmission_encoded, strict=True):
+            photo, ground_truth = ((255 * image).round().byte().permute(1, 2, 0).numpy() for image in images)
+            yield Photo.from_array(photo), ground_truth
+
+
+if __name__ == "__main__":
+    main(Path(os.environ["BREWSTER_DATA"]), sys.argv[1] if len(sys.argv) > 1 else "compact")

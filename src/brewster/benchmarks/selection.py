@@ -1,0 +1,66 @@
+"""The subset of a benchmark that the paper uses, and unique names for the benchmarks of a run."""
+
+from __future__ import annotations
+
+from collections import Counter, defaultdict
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from random import Random
+from typing import Final
+
+from brewster.benchmarks.pairing import natural_key
+from brewster.benchmarks.registry import BENCHMARKS, Benchmark, Case, folder_name, safe_name
+from brewster.errors import PhotoError
+
+PAPER_SEED: Final = 181
+"""The seed of `paper_draw`. The value is arbitrary; 181 is also the number of images in the paper's average."""
+
+
+def paper_draw(benchmark: Benchmark, seed: int = PAPER_SEED) -> tuple[Case, ...]:
+    """Draws the cases of the paper's protocol.
+
+    The paper does not publish its draw. This function draws one case of each scene with
+    `Random(f"{seed}/{benchmark}/{scene}").choice(...)` from the cases in natural order of their names. The draw of a scene
+    therefore does not depend on the other scenes.
+
+    Returns:
+        One random case of each scene of Postcard or SolidObject; all cases of any other benchmark.
+
+    Raises:
+        PhotoError: the file names do not identify the scenes.
+    """
+    if benchmark.name not in BENCHMARKS or not BENCHMARKS[benchmark.name].scene_pattern:
+        return benchmark.cases
+    scenes: dict[str, list[Case]] = defaultdict(list)
+    for case in benchmark.cases:
+        scenes[case.scene].append(case)
+    if any(case.scene == case.name for case in benchmark.cases):
+        raise PhotoError(
+            f"names such as {benchmark.cases[0].name!r} do not identify the scenes of {benchmark.title}",
+            "expected file names that begin with the scene, because the paper's protocol draws one case of each scene",
+            "use the original folders of SIR2, or another --protocol",
+        )
+    rng = {scene: Random(f"{seed}/{benchmark.name}/{scene}") for scene in sorted(scenes, key=natural_key)}  # noqa: S311
+    return tuple(rng[scene].choice(scenes[scene]) for scene in rng)
+
+
+def with_unique_names(benchmarks: Sequence[Benchmark], folders: Sequence[Path]) -> list[Benchmark]:
+    """Puts the name of the parent folder before names that occur twice, such as a/test and b/test.
+
+    Args:
+        benchmarks: the benchmarks of a run.
+        folders: the folder that each benchmark was read from.
+    """
+    counts = Counter(part.name for part in benchmarks)
+    return [
+        _renamed(part, f"{safe_name(folder_name(folder.parent))}-{part.name}")
+        if counts[part.name] > 1
+        else part
+        for part, folder in zip(benchmarks, folders, strict=True)
+    ]
+
+
+def _renamed(part: Benchmark, name: str) -> Benchmark:
+    cases = tuple(replace(case, benchmark=name) for case in part.cases)
+    return replace(part, name=name, title=f"{part.title} ({name})", cases=cases)

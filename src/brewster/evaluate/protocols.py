@@ -1,0 +1,130 @@
+"""Protocols by name: the choices of papers and contests that change the scores, each with its source.
+
+    config = protocol_config("xreflection", quality="best")
+
+A published row can be compared with a measured one only if both follow one protocol. Reports list the choices.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Final, final
+
+from brewster.errors import BrewsterError
+from brewster.evaluate.config import DEFAULT_METRICS, EvaluationConfig
+
+
+@final
+@dataclass(frozen=True)
+class ProtocolPreset:
+    """A row of PROTOCOLS: the settings of a protocol, and its choices as (choice, source)."""
+
+    title: str
+    choices: tuple[tuple[str, str], ...]
+    metrics: tuple[str, ...] = DEFAULT_METRICS
+    size: int | None = None
+    multiple: int = 1
+    border: int = 0
+    paper: bool = False
+
+    def settings(self) -> dict[str, Any]:
+        """The fields of `EvaluationConfig` that the protocol sets."""
+        return {name: getattr(self, name) for name in ("metrics", "size", "multiple", "border", "paper")}
+
+
+def protocol_config(name: str, **changes: Any) -> EvaluationConfig:  # noqa: ANN401  (the fields of EvaluationConfig)
+    """Returns the settings of a protocol. `changes` are fields of `EvaluationConfig` that replace or complete them.
+
+    Raises:
+        BrewsterError: there is no protocol of this name, or a value is invalid.
+    """
+    if name not in PROTOCOLS:
+        raise BrewsterError(
+            f"there is no protocol {name!r}", f"expected one of {', '.join(PROTOCOLS)}", "choose one of them"
+        )
+    settings: dict[str, Any] = {"protocol": name, **PROTOCOLS[name].settings(), **changes}
+    return EvaluationConfig(**settings)
+
+
+def describe_protocol(config: EvaluationConfig) -> list[str]:
+    """Returns sentences: the name of the protocol, its choices with their sources, and the settings that differ from it."""
+    preset = PROTOCOLS[config.protocol]
+    changed = [name for name, value in preset.settings().items() if getattr(config, name) != value]
+    lines = [f"Protocol {config.protocol}: {preset.title}."]
+    lines += [f"{choice} (source: {source})." for choice, source in preset.choices]
+    if changed:
+        lines.append(f"This run differs from the protocol {config.protocol} in: {', '.join(changed)}.")
+    return lines
+
+
+_PAPER: Final = "Guo et al., SIRR-LMM, arXiv 2601.07209"
+_DSR_DATASET: Final = "XReflection, xreflection/data/dsrnet_dataset.py, DSRTestDataset"
+_ERRNET: Final = "Wei et al., CVPR 2019, code of ERRNet"
+_OPENRR: Final = "repository OpenRR-5k, evaluate.py"
+
+PROTOCOLS: Final[dict[str, ProtocolPreset]] = {
+    "brewster": ProtocolPreset(
+        "all images of each benchmark at the size of the ground truth, with the border",
+        (("PSNR over all channels, SSIM with the uniform 7x7 window, LPIPS 0.1 with AlexNet", "brewster"),),
+    ),
+    "paper": ProtocolPreset(
+        "the tables of SIRR-LMM",
+        (
+            ("Real 20, Nature 20, SIR2 Postcard 20 and SolidObject 20, Wildscene 101; average over 181", _PAPER),
+            ("PSNR, SSIM and LPIPS of the transmission; LPIPS in the reflection region", f"{_PAPER}, section 5"),
+            ("Size, SSIM window, LPIPS backbone, threshold and draw are unknown, and are those of brewster", _PAPER),
+        ),
+        paper=True,
+    ),
+    "xreflection": ProtocolPreset(
+        "the validation of the toolbox XReflection, as for DSRNet, DSIT and RDNet",
+        (
+            ("Real20 at 420 px, Nature, and all of SIR2 Objects, Postcard and Wild", "XReflection, options/train_rdnet.yml"),
+            ("Photo and ground truth are resized to multiples of 32 px, by Pillow's bicubic filter", f"{_DSR_DATASET}.align"),
+            ("PSNR is the mean of the PSNR of the three channels", "XReflection, xreflection/metrics/psnr_ssim.py"),
+            ("SSIM has the uniform 7x7 window, per channel", "XReflection, xreflection/metrics/psnr_ssim.py"),
+            ("The average has the same weight for each image", "XReflection, xreflection/models/base_model.py"),
+            ("The filter that made the 420-px copy of Real20 is unknown; here area means in linear light", "brewster"),
+        ),
+        metrics=("psnr_channels", "ssim"),
+        size=420,
+        multiple=32,
+    ),
+    "windowseat": ProtocolPreset(
+        "the tables of WindowSeat, as far as they are documented",
+        (
+            ("Nature, Real and SIR2 500 (199 + 200 + 101)", "windowseat-reflection-removal, README, Reproducibility"),
+            ("A prediction is resized to the size of its photo before it is scored", "windowseat_inference.py"),
+            (
+                "SSIM window and LPIPS backbone are not confirmed, because windowseat_reproducibility.py was not available",
+                "brewster",
+            ),
+        ),
+        metrics=("psnr", "ssim", "ssim_gaussian", "lpips"),
+    ),
+    "errnet": ProtocolPreset(
+        "the test code of ERRNet",
+        (
+            ("Real 20, SIR2 Objects 200, Postcard 199, and Wild in the subset of 55", f"{_ERRNET}, section 5"),
+            ("Images keep their size", f"{_ERRNET}, data/reflect_dataset.py, CEILTestDataset"),
+            ("PSNR is the mean of the PSNR of the three channels", f"{_ERRNET}, util/index.py"),
+            ("SSIM has the uniform 7x7 window, per channel", f"{_ERRNET}, util/index.py"),
+            ("There is no LPIPS; LMSE and NCC are not computed here", f"{_ERRNET}, util/index.py"),
+        ),
+        metrics=("psnr_channels", "ssim"),
+    ),
+    "ntire2026": ProtocolPreset(
+        "the NTIRE 2026 challenge on reflection removal in the wild (arXiv 2604.10321)",
+        (
+            ("OpenRR-5k, val_300", "repository OpenRR-5k, README"),
+            ("4 pixels are removed at each border of prediction and ground truth", _OPENRR),
+            ("PSNR of RGB, SSIM of RGB with the Gaussian 11x11 window, negative local values as 0", f"{_OPENRR}, and pyiqa"),
+            ("LPIPS 0.1 with AlexNet, DISTS, and NIQE of the luma of YIQ", f"{_OPENRR}, and pyiqa"),
+            ("The script pairs files by sorted position; brewster pairs them by name", _OPENRR),
+            ("32 dB is the threshold for the human evaluation; the best on val was above 36 dB", "repository OpenRR-5k, README"),
+        ),
+        metrics=("psnr", "ssim_clipped", "lpips", "dists", "niqe"),
+        border=4,
+    ),
+}  # fmt: skip
+"""name -> protocol, for `brewster evaluate --protocol`."""

@@ -1,0 +1,94 @@
+"""The file scores.jsonl: one line for each scored prediction, from which a stopped run is resumed."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any, Final, final
+
+from brewster.errors import TargetError
+
+SCORES_FILE: Final = "scores.jsonl"
+SCORE_FORMAT_VERSION: Final = 4
+"""Increase this version when the scores of a prediction or the fields of `ScoreRow` change. Rows of other versions are
+scored again. test_house_formats checks the scores."""
+
+RowId = tuple[str, str, str]
+
+
+@final
+@dataclass(frozen=True)
+class ScoreRow:
+    """The scores of one method on one case, or the error. These are also the fields of a line of scores.jsonl.
+
+    `score_key` is a digest of all inputs of the scores, `prediction_key` of all inputs of the prediction. A score or a
+    prediction is reused if its key is unchanged. `columns` are the columns that were computed; one without a score does not
+    apply to the case. `registration` says how a stored prediction is flipped or shifted. `digest` is the SHA-256 of the files of the prediction, if it has any.
+    """
+
+    benchmark: str
+    case: str
+    method: str
+    prediction_key: str
+    score_key: str
+    scores: dict[str, float | None] = field(default_factory=dict)
+    columns: tuple[str, ...] = ()
+    error: str | None = None
+    seconds: float | None = None
+    digest: str | None = None
+    width: int = 0
+    height: int = 0
+    region_share: float = 0.0
+    registration: str = ""
+
+    @property
+    def id(self) -> RowId:
+        """(benchmark, case, method)."""
+        return self.benchmark, self.case, self.method
+
+
+@final
+class ScoreLog:
+    """The file scores.jsonl at `path`. The first call of `write` creates it."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+
+    def write(self, row: ScoreRow) -> None:
+        """Appends a line.
+
+        Raises:
+            TargetError: the file cannot be written.
+        """
+        try:
+            self._path.parent.mkdir(parents=True, exist_ok=True)
+            with self._path.open("ab+") as file:
+                file.write(self._missing_newline(file) + json.dumps(asdict(row)).encode() + b"\n")
+        except OSError as error:
+            raise TargetError(
+                f"{self._path} was not written ({error.strerror or error})",
+                "expected a writable output folder",
+                "free disk space or choose another folder with -o, and run again (the finished scores are saved)",
+            ) from error
+
+    def _missing_newline(self, file: Any) -> bytes:  # noqa: ANN401  (the type that open returns)
+        """Returns a newline if the file does not end with one: a killed run can leave an incomplete line."""
+        if not file.seek(0, 2):
+            return b""
+        file.seek(-1, 2)
+        return b"" if file.read(1) == b"\n" else b"\n"
+
+
+def read_log(path: Path) -> dict[RowId, ScoreRow]:
+    """Returns the last row for each id. Skips rows with errors, incomplete lines and lines of other versions."""
+    rows = {}
+    for line in path.read_text(errors="replace").splitlines() if path.is_file() else ():
+        try:
+            values = json.loads(line)
+            row = ScoreRow(**(values | {"columns": tuple(values["columns"])}))
+        except (ValueError, TypeError, LookupError):
+            continue
+        if not row.error:
+            rows[row.id] = row
+    return rows

@@ -1,0 +1,93 @@
+"""Packs predictions in the form that a contest takes.
+
+export_ntire2026(Path("OpenRR-5k"), method, Path("out/ntire2026"))  # [.../val_300_output.zip, .../test_100_output.zip]
+"""
+
+from __future__ import annotations
+
+import io
+import zipfile
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Final
+
+from brewster.benchmarks.pairing import find_numbered_splits, list_folder
+from brewster.benchmarks.registry import Case, ImageFile
+from brewster.errors import PhotoError
+from brewster.evaluate.methods import Method
+from brewster.files import write_atomically
+from brewster.image_formats import SUFFIXES
+from brewster.photo import Photo
+
+EXPORTS: Final = ("ntire2026",)
+"""The contests whose form `brewster evaluate --export` writes."""
+
+_JPEG_QUALITY: Final = 100
+"""The contest's script reads JPEG files only. At quality 100 without chroma subsampling, they are close to lossless."""
+_BENCHMARK: Final = "openrr"
+
+
+def export_ntire2026(
+    folder: Path, method: Method, out: Path, *, on_progress: Callable[[str], None] = lambda _name: None
+) -> list[Path]:
+    """Predicts all photos of the folders val_*_blended and test_*_blended of OpenRR-5k, and writes a zip file for each.
+
+    The README of OpenRR-5k asks for val_300_output.zip and test_100_output.zip with images only, and its evaluate.py reads
+    files "*.jpg" with the names of the photos. The predictions of "val" that an evaluation has stored are used again.
+
+    Args:
+        folder: the folder of OpenRR-5k.
+        method: the method. It must not fail on any photo.
+        out: the folder for the zip files.
+        on_progress: called with the name of each photo, before it is predicted.
+
+    Returns:
+        The paths of the zip files.
+
+    Raises:
+        PhotoError: the folder has no photos in the layout of OpenRR-5k, or a photo cannot be read.
+        BrewsterError: the method fails.
+        TargetError: a zip file cannot be written.
+    """
+    splits = {
+        name: roles["photo"]
+        for name, roles in find_numbered_splits(folder).items()
+        if "photo" in roles and not name.startswith("train")
+    }
+    if not splits:
+        raise PhotoError(
+            f"{folder} has no folder such as val_300_blended",
+            "expected the folders val_300_blended and test_100_blended of OpenRR-5k",
+            "give the path of their parent folder with --benchmark openrr=FOLDER",
+        )
+    paths = []
+    for split, photos in splits.items():
+        path = out / f"{split}_output.zip"
+        write_atomically(path, _packed(split, photos, method, on_progress), overwrite=True)
+        paths.append(path)
+    return paths
+
+
+def _packed(split: str, photos: Path, method: Method, on_progress: Callable[[str], None]) -> bytes:
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_STORED) as archive:
+        for path in list_folder(photos)[1]:
+            if path.suffix.lower() in SUFFIXES:
+                on_progress(path.stem)
+                # A fixed date, so that equal predictions give equal bytes.
+                entry = zipfile.ZipInfo(f"{path.stem}.jpg", (1980, 1, 1, 0, 0, 0))
+                archive.writestr(entry, _prediction(split, photos, path, method))
+    return buffer.getvalue()
+
+
+def _prediction(split: str, photos: Path, path: Path, method: Method) -> bytes:
+    # Photos of the test split have no ground truth. `Method` does not read it, so the photo takes its place.
+    benchmark = _BENCHMARK if split.startswith("val") else f"{_BENCHMARK}-{split}"
+    file = ImageFile(path)
+    case = Case(benchmark, path.stem, path.stem, f"{photos.name}/{path.stem}", file, file)
+    stored = method.cached(case) if split.startswith("val") else None
+    output = stored or method.predict(case, Photo.open(file.read()))
+    pixels = Photo.from_array(output.transmission.srgb_8bit(), encoding="srgb")
+    info = replace(pixels.file_info, jpeg_quality=_JPEG_QUALITY, subsampling="4:4:4")
+    return replace(pixels, file_info=info).encode("jpeg")

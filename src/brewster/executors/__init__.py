@@ -1,0 +1,13 @@
+"""Runs independent tasks in this process, in several processes, or on a Ray cluster. Knows nothing about the tasks."""
+
+from brewster.executors.local import (
+    MAX_ATTEMPTS,
+    Executor,
+    ProcessExecutor,
+    Runner,
+    SerialExecutor,
+    Task,
+    run_tasks,
+)
+
+__all__ = ["MAX_ATTEMPTS", "Executor", "ProcessExecutor", "Runner", "SerialExecutor", "Task", "run_tasks"]

@@ -1,0 +1,88 @@
+"""Assesses a separation without ground truth: how much light was removed, in which area, and how reliable the result is.
+
+bench/verdict.py measures, on photos with ground truth, how often and by how much the photos of each verdict improve.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final, Literal, final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from brewster.inference.guided_upsampling import Floats
+from brewster.srgb import to_encoded
+
+if TYPE_CHECKING:
+    from jaxtyping import Float32
+
+Verdict = Literal["clear", "partial", "little found", "doubtful"]
+"""clear: a reflection was found and removed with confidence. partial: a reflection was found, and parts of it probably remain.
+little found: the result is almost the photo. doubtful: the result may be worse than the photo."""
+
+RECONSTRUCTION_ERROR_LIMIT: Final = 0.06
+"""A separation with a larger reconstruction error is doubtful. The value is chosen, not measured: about three times the
+error of encoding and decoding with the VAE of a diffusion model."""
+_VISIBLE_CHANGE: Final = 0.03
+"""The smallest change of a pixel that counts as visible, sRGB-encoded."""
+_LITTLE_AREA: Final = 0.1
+_MIN_CLEAR_CONFIDENCE: Final = 0.75
+_MIN_PARTIAL_CONFIDENCE: Final = 0.55
+
+
+@final
+@dataclass(frozen=True)
+class Assessment:
+    """What a separation found."""
+
+    verdict: Verdict
+    removed_light: float
+    """The removed light divided by the light of the photo, both linear, 0..1."""
+    changed_area: float
+    """The fraction of pixels of the photo that changed visibly: by more than 0.03 in sRGB values of 0..1."""
+    confidence: float
+    """Mean confidence of the changed parts, 0..1, weighted by the change; 1 if nothing changed."""
+
+
+def assess(
+    photo: Float32[NDArray[np.float32], "h w 3"],
+    transmission: Float32[NDArray[np.float32], "h w 3"],
+    confidence_map: Float32[NDArray[np.float32], "h w 1"],
+    reconstruction_error: float | None = None,
+) -> Assessment:
+    """Assesses a separation.
+
+    Args:
+        photo: the photo in linear light.
+        transmission: the predicted transmission in linear light.
+        confidence_map: the confidence of the prediction, 0..1.
+        reconstruction_error: mean of |generated input - input|, sRGB-encoded, of a model that generates the input.
+    """
+    light = float(photo.sum(dtype=np.float64))
+    removed = float(np.maximum(photo - transmission, 0).sum(dtype=np.float64))
+    change = _encoded_change(photo, transmission)
+    total = float(change.sum(dtype=np.float64))
+    confidence = float((change * confidence_map[..., 0]).sum(dtype=np.float64)) / total if total else 1.0
+    removed_light = removed / light if light else 0.0
+    changed_area = float((change > _VISIBLE_CHANGE).mean())
+    verdict = _verdict(changed_area, confidence, reconstruction_error)
+    return Assessment(verdict, removed_light, changed_area, confidence)
+
+
+def _encoded_change(photo: Floats, transmission: Floats) -> Floats:
+    """Returns the largest change of the three channels of each pixel, sRGB-encoded, (h, w)."""
+    encoded = (to_encoded(np.clip(image, 0, 1)) for image in (photo, transmission))
+    change: Floats = np.abs(np.subtract(*encoded)).max(axis=2)
+    return change
+
+
+def _verdict(changed_area: float, confidence: float, reconstruction_error: float | None) -> Verdict:
+    if reconstruction_error is not None and reconstruction_error > RECONSTRUCTION_ERROR_LIMIT:
+        return "doubtful"
+    if changed_area < _LITTLE_AREA:
+        return "little found"
+    if confidence >= _MIN_CLEAR_CONFIDENCE:
+        return "clear"
+    is_unknown = confidence == 0  # the model does not estimate its confidence
+    return "partial" if is_unknown or confidence >= _MIN_PARTIAL_CONFIDENCE else "doubtful"

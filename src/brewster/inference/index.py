@@ -1,0 +1,143 @@
+"""The index of an archive: a Parquet table with one row for each photo, in the output folder.
+
+    import pandas
+    index = pandas.read_parquet("out/index.parquet")
+
+During a run, rows are written to small tables in the folder .brewster-index. At the end of the run they are merged into
+index.parquet, together with the rows of earlier runs. So a killed run loses no more than the rows of its last seconds.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+import io
+import time
+from collections.abc import Callable
+from typing import Any, Final, Self, final
+
+from brewster.errors import TargetError
+from brewster.files import exists, write_atomically
+from brewster.inference.batch import FileResult
+from brewster.inference.manifest import import_parquet
+from brewster.remote_path import Location
+
+INDEX_FILE: Final = "index.parquet"
+PARTS_FOLDER: Final = ".brewster-index"
+MAX_PART_ROWS: Final = 5000
+_PART_INTERVAL_S: Final = 30.0
+
+COLUMNS: Final[dict[str, tuple[str, Callable[[FileResult], object]]]] = {
+    "path": ("string", lambda result: result.source),
+    "sha256": ("string", lambda result: result.photo_sha256),
+    "status": ("string", lambda result: result.status),
+    "verdict": ("string", lambda result: result.assessment and result.assessment.verdict),
+    "confidence": ("float64", lambda result: result.assessment and result.assessment.confidence),
+    "removed_light": ("float64", lambda result: result.assessment and result.assessment.removed_light),
+    "residual": ("float64", lambda result: result.residual),
+    "seconds": ("float64", lambda result: sum(result.seconds.values()) if result.seconds else None),
+    "model_sha256": ("string", lambda result: result.sha256),
+    "outputs": ("strings", lambda result: list(result.outputs.values())),
+    "error": ("string", lambda result: result.error),
+}
+"""Name of a column -> its type and its value for a result."""
+
+
+@final
+class IndexWriter:
+    """Writes the index of an output folder. A context manager: on exit, all rows are merged into index.parquet.
+
+    Raises:
+        TargetError: the folder cannot be written to, or has another file named index.parquet.
+        MissingExtra: pyarrow is not installed.
+    """
+
+    def __init__(self, folder: Location) -> None:
+        self._index, self._parts_folder = folder / INDEX_FILE, folder / PARTS_FOLDER
+        self._parquet, self._arrow = import_parquet(str(self._index)), importlib.import_module("pyarrow")
+        self._run, self._part_count = f"{time.time_ns():020d}", 0
+        self._rows: list[FileResult] = []
+        if exists(self._index):
+            self._read(self._index)
+        self._write_part()  # an empty part, so that a folder without write access ends the run before the first photo
+
+    def append(self, result: FileResult) -> None:
+        """Adds the row of a result. If a part cannot be written, its rows are kept, and the next part includes them."""
+        self._rows.append(result)
+        is_due = time.monotonic() > self._written_at + _PART_INTERVAL_S
+        if is_due or len(self._rows) % MAX_PART_ROWS == 0:
+            with contextlib.suppress(TargetError):  # `close` raises it, if it remains
+                self._write_part()
+
+    def close(self) -> None:
+        """Merges the parts of this run and of killed runs into index.parquet, and deletes them.
+
+        Raises:
+            TargetError: the index cannot be written. The parts are kept, and the next run merges them.
+            UnreadablePhoto: the object store of the folder cannot be read.
+        """
+        self._write_part()
+        parts = sorted(path for path in self._parts_folder.iterdir() if path.suffix == ".parquet")
+        if not parts:
+            raise TargetError(
+                f"the folder {self._parts_folder} is empty",
+                "expected the rows of this run",
+                "run the same command again: finished files are kept, and no other program may change this folder",
+            )
+        tables = [self._read(path) for path in [*([self._index] if exists(self._index) else []), *parts]]
+        table = self._arrow.concat_tables(tables, promote_options="default").select(list(COLUMNS))
+        self._write(self._index, table.take(self._arrow.array(_last_rows(table), "int64")).sort_by("path"))
+        for part in parts:
+            part.unlink()
+        with contextlib.suppress(OSError):  # another run has parts in it
+            self._parts_folder.rmdir()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def _write_part(self) -> None:
+        self._written_at = time.monotonic()
+        columns = {
+            name: self._arrow.array([value(row) for row in self._rows], self._type(kind))
+            for name, (kind, value) in COLUMNS.items()
+        }
+        name = f"{self._run}-{self._part_count:06d}.parquet"
+        self._write(self._parts_folder / name, self._arrow.table(columns))
+        self._part_count += 1
+        self._rows.clear()
+
+    def _type(self, kind: str) -> Any:  # noqa: ANN401  (pyarrow has no types)
+        arrow = self._arrow
+        return arrow.list_(arrow.string()) if kind == "strings" else getattr(arrow, kind)()
+
+    def _write(self, path: Location, table: Any) -> None:  # noqa: ANN401
+        buffer = io.BytesIO()
+        self._parquet.write_table(table, buffer)
+        write_atomically(path, buffer.getvalue(), overwrite=True)
+
+    def _read(self, path: Location) -> Any:  # noqa: ANN401
+        try:
+            table = self._parquet.read_table(io.BytesIO(path.read_bytes()))
+            # An index of an earlier version may have fewer columns.
+            return table.select(
+                ["path", "status", *(COLUMNS.keys() & {*table.column_names} - {"path", "status"})]
+            )
+        except (OSError, ValueError, KeyError) as error:  # the errors of pyarrow are subclasses
+            raise TargetError(
+                f"{path} is not an index ({str(error).partition(chr(10))[0]})",
+                "expected no such file, or the index of an earlier run",
+                "move it to another folder, or choose another output folder",
+            ) from error
+
+
+def _last_rows(table: Any) -> list[int]:  # noqa: ANN401  (pyarrow has no types)
+    """Returns the number of the last row of each path. A skipped photo keeps the row of the run that separated it."""
+    last: dict[str, int] = {}
+    statuses = table.column("status").to_pylist()
+    for row, path in enumerate(table.column("path").to_pylist()):
+        if not (statuses[row] == "skipped" and path in last and statuses[last[path]] == "separated"):
+            last[path] = row
+    return list(last.values())

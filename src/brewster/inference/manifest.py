@@ -1,0 +1,127 @@
+"""Reads manifests: CSV or Parquet tables that list the photos of a batch in the column `path`.
+
+    path
+    1987/box-04/0017.tif
+    s3://scans/1987/box-04/0018.tif
+
+A relative path begins in the folder of the manifest. Below the output folder, layers are written to the same relative
+path. The layers of absolute paths and URLs are written to the whole path, without the root or the protocol:
+`OUT/scans/1987/box-04` for the second row. So the target of a photo does not depend on the other rows.
+"""
+
+from __future__ import annotations
+
+import csv
+import importlib
+import io
+import posixpath
+from collections.abc import Iterator
+from typing import Any, Final
+
+from brewster.errors import ManifestError, MissingExtra, UnreadablePhoto
+from brewster.remote_path import Location, RemotePath, location
+
+COLUMN: Final = "path"
+SUFFIXES: Final = (".csv", ".parquet")
+_EXPECTED: Final = f"expected a CSV or Parquet table with the column {COLUMN!r}"
+
+
+def is_manifest(source: Location) -> bool:
+    """Whether the name of the file has the suffix of a manifest."""
+    return source.suffix.lower() in SUFFIXES
+
+
+def read_manifest(
+    manifest: Location, output_folder: Location | None = None
+) -> Iterator[tuple[Location, Location]]:
+    """Yields each photo of a manifest with the folder for its layers. Files that do not exist are included.
+
+    Args:
+        manifest: the path of the table.
+        output_folder: see the module. By default, the layers are written next to their photo.
+
+    Raises:
+        ManifestError: the manifest cannot be read, is not a table, or has a row without a path in its folder.
+        MissingExtra: a Parquet table needs pyarrow; a URL needs the package of its store.
+    """
+    for number, text in enumerate(_paths(manifest), 1):
+        photo, mirrored = _photo(manifest, text, number)
+        yield photo, photo.parent if output_folder is None else output_folder.joinpath(*mirrored)
+
+
+def _photo(manifest: Location, text: object, number: int) -> tuple[Location, tuple[str, ...]]:
+    """Returns the photo of a row, and the parts of the folder for its layers below the output folder."""
+    if not isinstance(text, str) or not text.strip():
+        raise ManifestError(
+            f"row {number} of {manifest} has the path {text!r}",
+            "expected the path of a photo",
+            "correct the row",
+        )
+    photo = location(text)
+    if isinstance(photo, RemotePath) or photo.is_absolute():
+        return photo, photo.parent.parts[1:]
+    relative = posixpath.normpath(photo.as_posix())
+    if relative.startswith("../"):
+        raise ManifestError(
+            f"row {number} of {manifest} has the path {text}, which is outside the folder of the manifest",
+            "expected a relative path below this folder, an absolute path, or a URL",
+            "move the manifest, or write absolute paths",
+        )
+    return manifest.parent / relative, tuple(relative.split("/")[:-1])
+
+
+def _paths(manifest: Location) -> Iterator[object]:
+    try:
+        data = manifest.read_bytes()
+    except (OSError, UnreadablePhoto) as error:
+        reason = str(error) if isinstance(error, UnreadablePhoto) else error.strerror
+        raise ManifestError(f"{manifest} cannot be read ({reason})", _EXPECTED, "check its name") from error
+    return _csv_paths(manifest, data) if manifest.suffix.lower() == ".csv" else _parquet_paths(manifest, data)
+
+
+def _csv_paths(manifest: Location, data: bytes) -> Iterator[object]:
+    try:
+        rows = csv.DictReader(io.StringIO(data.decode("utf-8-sig"), newline=""), strict=True)
+        _check_columns(manifest, rows.fieldnames or [])
+        for row in rows:
+            yield row[COLUMN]
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise _not_a_table(manifest, error) from error
+
+
+def _parquet_paths(manifest: Location, data: bytes) -> Iterator[object]:
+    parquet = import_parquet(str(manifest))
+    try:
+        table = parquet.ParquetFile(io.BytesIO(data))
+        _check_columns(manifest, table.schema_arrow.names)
+        for batch in table.iter_batches(columns=[COLUMN]):
+            yield from batch.column(0).to_pylist()
+    except (OSError, ValueError) as error:  # the errors of pyarrow are subclasses
+        raise _not_a_table(manifest, error) from error
+
+
+def _check_columns(manifest: Location, names: list[str] | Any) -> None:  # noqa: ANN401
+    if COLUMN not in names:
+        found = ", ".join(map(repr, list(names)[:8])) or "none"
+        raise ManifestError(f"{manifest} has the columns {found}", _EXPECTED, f"name a column {COLUMN!r}")
+
+
+def _not_a_table(manifest: Location, error: Exception) -> ManifestError:
+    reason = str(error).partition("\n")[0][:120]
+    return ManifestError(f"{manifest} is not a table ({reason})", _EXPECTED, "check the file")
+
+
+def import_parquet(purpose: str) -> Any:  # noqa: ANN401  (pyarrow has no types)
+    """Imports `pyarrow.parquet`.
+
+    Raises:
+        MissingExtra: pyarrow is not installed.
+    """
+    try:
+        return importlib.import_module("pyarrow.parquet")
+    except ImportError as error:
+        raise MissingExtra(
+            "the package pyarrow is not installed",
+            f"expected it, because {purpose} is a Parquet table",
+            "run: pip install 'brewster[cluster]'",
+        ) from error

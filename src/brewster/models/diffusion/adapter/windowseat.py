@@ -1,0 +1,130 @@
+"""The layout of the published WindowSeat models (Zakarin et al. 2025, "Reflection Removal through Efficient Adaptation
+of Diffusion Transformers"): a peft LoRA of Qwen-Image-Edit that removes reflections in one step.
+
+    model_index.json                                    base_model and processing_resolution
+    transformer_lora/adapter_config.json                the settings of peft
+    transformer_lora/pytorch_lora_weights.safetensors
+    text_embeddings/state_dict.safetensors              prompt_embeds (n, tokens, width) and prompt_mask (n, tokens)
+
+The values of the task (time 0.499, latents minus prediction, square tiles, no guidance) are those of the published call.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any, Final
+
+from torch import Tensor
+
+from brewster.errors import ModelError
+from brewster.models.diffusion.adapter.key_styles import alpha_scale, read_layers
+from brewster.models.diffusion.adapter.lora import LoraMetadata, attach_layers
+from brewster.models.diffusion.families.family import Backbone
+from brewster.models.diffusion.families.qwen import Qwen
+from brewster.models.diffusion.panels import PanelLayout
+from brewster.models.diffusion.prompt import PromptEmbedding
+from brewster.models.diffusion.task import DecompositionTask
+from brewster.models.diffusion.tensors import read_tensors
+
+INDEX_FILE: Final = "model_index.json"
+CONFIG_FILE: Final = "transformer_lora/adapter_config.json"
+WEIGHTS_FILE: Final = "transformer_lora/pytorch_lora_weights.safetensors"
+PROMPT_FILE: Final = "text_embeddings/state_dict.safetensors"
+FILES: Final = (INDEX_FILE, CONFIG_FILE, WEIGHTS_FILE, PROMPT_FILE)
+
+_TIME: Final = 0.499
+_PROMPT_TEXT: Final = "WindowSeat's trained embedding"
+
+
+def read_metadata(folder: Path) -> LoraMetadata:
+    """The base, rank, task and prompt digest of the model in this folder. The quantisation is that of the published call.
+
+    Raises:
+        ModelError: a file is missing or damaged, or lacks a value.
+    """
+    index, config = _read_json(folder / INDEX_FILE), _read_json(folder / CONFIG_FILE)
+    try:
+        base, side = index["base_model"], int(index["processing_resolution"])
+        rank, alpha = int(config["r"]), int(config["lora_alpha"])
+    except (KeyError, TypeError, ValueError) as error:
+        raise ModelError(
+            f"{folder} lacks a setting of WindowSeat ({error!r})",
+            f"expected base_model and processing_resolution in {INDEX_FILE}, and r and lora_alpha in {CONFIG_FILE}",
+            "download the model again",
+        ) from error
+    if not isinstance(base, str):
+        raise ModelError(
+            f"base_model in {folder / INDEX_FILE} is {base!r}",
+            "expected a hub id",
+            "download the model again",
+        )
+    if side < Qwen.multiple or side % Qwen.multiple:
+        raise ModelError(
+            f"processing_resolution in {folder / INDEX_FILE} is {side}",
+            f"expected a multiple of {Qwen.multiple}",
+            "download the model again",
+        )
+    # Panel I is the encoded photo, decoded again. It separates the errors of the VAE from the change by the model.
+    task = DecompositionTask(
+        PanelLayout(("I", "T")),
+        budget_px=2 * side**2,
+        objective="direct",
+        guidance=1.0,
+        time=_TIME,
+        short_side_px=side,
+        square_tiles=True,
+    )
+    return LoraMetadata(Qwen.name, base, "nf4", rank, alpha, task, _read_prompt(folder).sha256)
+
+
+def load(folder: Path, backbone: Backbone) -> tuple[LoraMetadata, PromptEmbedding]:
+    """Adds the LoRA of this folder to its backbone.
+
+    Returns:
+        The metadata, and the trained prompt embedding.
+
+    Raises:
+        ModelError: a file is missing or damaged, or a weight belongs to no layer of the backbone.
+    """
+    metadata, prompt = read_metadata(folder), _read_prompt(folder)
+    tensors, _ = read_tensors(folder / WEIGHTS_FILE)
+    config = _read_json(folder / CONFIG_FILE)
+    attach_layers(backbone, read_layers(tensors, backbone.transformer, backbone.name, alpha_scale(config)))
+    return metadata, prompt
+
+
+def _read_prompt(folder: Path) -> PromptEmbedding:
+    """The first prompt embedding without its masked tokens, which the transformer would ignore."""
+    path = folder / PROMPT_FILE
+    tensors, _ = read_tensors(path)
+    if set(tensors) != {"prompt_embeds", "prompt_mask"} or tensors["prompt_embeds"].ndim != 3:
+        shapes = {name: tuple(tensor.shape) for name, tensor in tensors.items()}
+        raise ModelError(
+            f"{path} contains {shapes}",
+            "expected prompt_embeds (n, tokens, width) and prompt_mask (n, tokens)",
+            "download the model again",
+        )
+    tokens = _count_tokens(path, tensors["prompt_mask"][0] > 0)
+    return PromptEmbedding(Qwen.name, _PROMPT_TEXT, tensors["prompt_embeds"][:1, :tokens].contiguous())
+
+
+def _count_tokens(path: Path, mask: Tensor) -> int:
+    """The number of tokens that are not masked. They come first, so the position of each stays the same."""
+    count = int(mask.sum())
+    if count == 0 or not mask[:count].all():
+        raise ModelError(
+            f"prompt_mask in {path} masks tokens before the end, or all of them",
+            "expected padding at the end only",
+            "download the model again",
+        )
+    return count
+
+
+def _read_json(path: Path) -> dict[str, Any]:
+    try:
+        return dict(json.loads(path.read_text("utf-8")))
+    except (OSError, ValueError, TypeError) as error:
+        raise ModelError(
+            f"{path} cannot be read ({error})", "expected a JSON object", "download the model again"
+        ) from error

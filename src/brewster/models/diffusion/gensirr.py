@@ -1,0 +1,131 @@
+"""Converts the checkpoint of GenSIRR (Li et al. 2026, "Rectifying Latent Space for Generative Single-Image Reflection
+Removal") to a folder in diffusers' layout with its prompt and task.
+
+    convert(Path("GenSIRR.pt"), Path("gensirr"))        # then: brewster window.jpg --model gensirr
+
+GenSIRR is FLUX.1 Kontext with other weights of transformer and VAE, and a stored prompt embedding. Its published call takes 28
+steps with guidance 3.5 from sigma 1 to 0.001, and an input with a short side of 768 (or 512) pixels.
+"""
+
+from __future__ import annotations
+
+import pickle
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Final
+
+import torch
+from torch import Tensor, nn
+
+from brewster.errors import ModelError
+from brewster.models.diffusion.backbones import build
+from brewster.models.diffusion.families.family import Backbone
+from brewster.models.diffusion.families.kontext import Kontext
+from brewster.models.diffusion.panels import PanelLayout
+from brewster.models.diffusion.prompt import PROMPT_FILE, PromptEmbedding
+from brewster.models.diffusion.task import TASK_FILE, DecompositionTask, save_task
+from brewster.models.zoo import TINY_PREFIX
+
+SHORT_SIDE_PX: Final = 768
+_PREFIX: Final = "net_g."
+_PROMPT_TEXT: Final = "GenSIRR's stored embedding"
+_IGNORED: Final = ("text_encoder.",)
+"""Weights that inference does not use."""
+
+
+def convert(
+    checkpoint: Path, folder: Path, *, base: str = "kontext", short_side_px: int = SHORT_SIDE_PX
+) -> None:
+    """Reads the checkpoint and writes the folder. The weights keep their precision.
+
+    Args:
+        checkpoint: the file GenSIRR.pt.
+        folder: the folder to write.
+        base: "kontext", or "tiny:kontext" for tests.
+        short_side_px: the short side of the input: 768 or 512.
+
+    Raises:
+        ModelError: the file is not such a checkpoint, or its weights do not match the architecture of the base.
+        TargetError: the folder cannot be written.
+    """
+    if base.removeprefix(TINY_PREFIX) != Kontext.name:
+        raise ModelError(
+            f"the base {base} was given for GenSIRR", f"expected {Kontext.name}", "leave the base out"
+        )
+    state = _read_checkpoint(checkpoint)
+    prompt = _prompt(checkpoint, state)
+    architecture = Kontext.tiny if base.startswith(TINY_PREFIX) else Kontext.full_size
+    backbone = build(Kontext.name, architecture, device="meta")
+    _load(checkpoint, backbone, state)
+    backbone.save(folder)
+    prompt.save(folder / PROMPT_FILE)
+    task = DecompositionTask(
+        PanelLayout(("T",)),
+        budget_px=short_side_px**2,
+        guidance=3.5,
+        steps=28,
+        last_sigma=0.001,
+        short_side_px=short_side_px,
+    )
+    save_task(task, folder / TASK_FILE)
+
+
+def _read_checkpoint(path: Path) -> dict[str, Tensor]:
+    """The weights by name without the prefix net_g. Only tensors are read: the file cannot run code."""
+    try:
+        content: Any = torch.load(path, map_location="cpu", weights_only=True, mmap=True)
+    except (OSError, RuntimeError, ValueError, EOFError, pickle.UnpicklingError) as error:
+        raise ModelError(
+            f"{path} cannot be read ({' '.join(str(error).split())[:200]})",
+            "expected a checkpoint of GenSIRR that contains tensors only",
+            "download it again",
+        ) from error
+    module = content.get("module") if isinstance(content, dict) else None
+    if not isinstance(module, Mapping) or not any(str(key).startswith(_PREFIX) for key in module):
+        found = (
+            ", ".join(map(str, list(content)[:5])) if isinstance(content, Mapping) else type(content).__name__
+        )
+        raise ModelError(
+            f"{path} contains {found}",
+            f'expected a checkpoint of GenSIRR: weights {_PREFIX}... under "module"',
+            "use the file GenSIRR.pt",
+        )
+    return {key.removeprefix(_PREFIX): value for key, value in module.items() if key.startswith(_PREFIX)}
+
+
+def _prompt(path: Path, state: dict[str, Tensor]) -> PromptEmbedding:
+    """Removes the prompt from the state, and returns it."""
+    try:
+        embeds, pooled, ids = (
+            state.pop(f"cached_{name}") for name in ("prompt_embeds", "pooled_prompt_embeds", "text_ids")
+        )
+    except KeyError as error:
+        raise ModelError(
+            f"{path} lacks {error}", "expected the stored prompt embedding", "use the file GenSIRR.pt"
+        ) from error
+    if ids.count_nonzero():
+        raise ModelError(
+            f"{path} has position ids of the prompt that are not zero",
+            "expected zeros",
+            "use another checkpoint",
+        )
+    return PromptEmbedding(Kontext.name, _PROMPT_TEXT, embeds.detach().clone(), pooled.detach().clone())
+
+
+def _load(path: Path, backbone: Backbone, state: Mapping[str, Tensor]) -> None:
+    parts: dict[str, nn.Module] = {"transformer.": backbone.transformer, "vae.": backbone.vae}
+    unknown = [key for key in state if not key.startswith((*parts, *_IGNORED))]
+    if unknown:
+        raise ModelError(
+            f"{path} contains {unknown[0]}", f"expected only {', '.join(parts)}", "use the file GenSIRR.pt"
+        )
+    for prefix, part in parts.items():
+        weights = {key.removeprefix(prefix): value for key, value in state.items() if key.startswith(prefix)}
+        try:
+            part.load_state_dict(weights, strict=True, assign=True)
+        except RuntimeError as error:
+            raise ModelError(
+                f"{path} does not match the {prefix[:-1]} of {backbone.name}: {' '.join(str(error).split())[:200]}",
+                f"expected the weights of a {type(part).__name__}",
+                "use the file GenSIRR.pt",
+            ) from error

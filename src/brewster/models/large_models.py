@@ -1,0 +1,77 @@
+"""The table of large models: what `brewster models list` says of them before anything is downloaded. It needs no torch."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final, final
+
+_OPEN: Final = "no account needed"
+_GATED: Final = "gated: accept the licence on its page, then run `hf auth login`"
+
+
+@final
+@dataclass(frozen=True)
+class LargeModel:
+    """A row of the table. Sizes are computed from the numbers of parameters, not measured."""
+
+    name: str
+    hub_id: str
+    licence: str
+    is_commercial: bool
+    download_gb: float
+    """The transformer and the VAE in bfloat16, in GB; for a LoRA those of its base."""
+    memory_gib: float
+    """GPU memory for separation, in GiB, with the weights in `memory_format`."""
+    memory_format: str
+    gives: str
+    access: str = _OPEN
+    text_encoder_gb: float = 0
+    """The download of the text encoders, which encode a prompt once. 0 if the prompt is part of the model."""
+    base: str | None = None
+    """The hub id of the base of a LoRA or finetuned model."""
+    is_opened_by_name: bool = True
+    """Whether --model takes the name. Otherwise `brewster models import` converts the model first."""
+
+
+LARGE: Final = {
+    model.name: model
+    for model in (
+        LargeModel(
+            "windowseat", "huawei-bayerlab/windowseat-reflection-removal-v1-0", "Apache-2.0", is_commercial=True,
+            download_gb=41, memory_gib=24, memory_format="nf4", gives="transmission; reflection derived",
+            base="Qwen/Qwen-Image-Edit-2509",
+        ),
+        LargeModel(
+            "gensirr", "lime-j/GenSIRR", "none stated; its base: FLUX.1 [dev] Non-Commercial License",
+            is_commercial=False, download_gb=24, memory_gib=14, memory_format="int8",
+            gives="transmission; reflection derived",
+            access="download GenSIRR.pt, then run `brewster models import GenSIRR.pt FOLDER`",
+            base="black-forest-labs/FLUX.1-Kontext-dev", is_opened_by_name=False,
+        ),
+        LargeModel(
+            "kontext", "black-forest-labs/FLUX.1-Kontext-dev", "FLUX.1 [dev] Non-Commercial License",
+            is_commercial=False, download_gb=24, memory_gib=14, memory_format="int8",
+            gives="a base for LoRAs; without one, an edit by prompt", access=_GATED, text_encoder_gb=9.8,
+        ),
+        LargeModel(
+            "klein", "black-forest-labs/FLUX.2-klein-base-4B", "Apache-2.0", is_commercial=True,
+            download_gb=7.9, memory_gib=9, memory_format="bf16",
+            gives="a base for LoRAs; without one, an edit by prompt", text_encoder_gb=8,
+        ),
+        LargeModel(
+            "qwen", "Qwen/Qwen-Image-Edit", "Apache-2.0", is_commercial=True,
+            download_gb=41, memory_gib=14, memory_format="nf4",
+            gives="a base for LoRAs; without one, an edit by prompt", text_encoder_gb=16.6,
+        ),
+    )
+}  # fmt: skip
+"""name -> model."""
+
+
+def licence_of(hub_id: str) -> str:
+    """The licence of a repository on the hub, for a message before its download."""
+    titles = {model.hub_id: model.licence for model in LARGE.values()}
+    titles |= {
+        model.base: model.licence for model in LARGE.values() if model.base and model.base not in titles
+    }
+    return titles.get(hub_id, "see its page on the hub")

@@ -1,0 +1,84 @@
+"""A mask: a grey image of the size of a photo that scales the strength of its separation in each pixel.
+
+    mask = Mask.open("mask.png", photo.size)
+    mask.rows(0, 64)  # (64, W, 1) float32: 1 where the mask is white, 0 where it is black
+
+The stored values are weights, not light: they are not converted by a transfer curve or a colour profile.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Final, final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from brewster.errors import MaskError, PhotoError
+from brewster.photo.photo import Float32, Photo, Source, Stored
+
+_WHITE: Final = {"uint8": 255, "uint16": 65535, "float32": 1}
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Mask:
+    """The weights of the pixels of a photo. Immutable and thread-safe."""
+
+    values: Stored
+    """(H, W) uint8, uint16 or float32; white is 255, 65535 or 1."""
+
+    @classmethod
+    def open(cls, source: Source, size: tuple[int, int]) -> Mask:
+        """Opens a mask for a photo.
+
+        Args:
+            source: a path, the bytes of a file, a PIL image, or an array (H, W) of bool, uint8, uint16, or floats in 0..1.
+            size: the (width, height) of the photo, with its EXIF orientation applied.
+
+        Raises:
+            MaskError: the source cannot be read, has colours or transparent pixels, values outside 0..1, or another
+                size than the photo.
+        """
+        try:
+            photo = _open(source)
+        except PhotoError as error:
+            raise MaskError(
+                f"the mask cannot be read: {error.happened}", error.expected, error.cure
+            ) from error
+        pixels = photo.pixels
+        if photo.size != size:
+            raise MaskError(
+                f"the mask has {' x '.join(map(str, photo.size))} pixels",
+                f"expected {' x '.join(map(str, size))}, the size of the photo",
+                "resize the mask, or leave it out for this photo",
+            )
+        if (pixels != pixels[..., :1]).any():
+            raise MaskError("the mask has colours", "expected grey values", "convert the mask to grey")
+        if photo.alpha is not None and (photo.alpha != _WHITE[photo.alpha.dtype.name]).any():
+            raise MaskError(
+                "the mask has transparent pixels",
+                "expected white where the photo is separated, and black where it is not",
+                "flatten the layers of the mask",
+            )
+        values = np.ascontiguousarray(pixels[..., 0])
+        if values.dtype.kind == "f" and not (values.min() >= 0 and values.max() <= 1):
+            raise MaskError(
+                f"the mask has values from {values.min():g} to {values.max():g}",
+                "expected values from 0 to 1",
+                "scale the mask",
+            )
+        return cls(values)
+
+    def rows(self, top: int, bottom: int) -> Float32:
+        """Returns the weights of the rows `top` to `bottom` (exclusive): (n, W, 1) in 0..1."""
+        weights: NDArray[Any] = self.values[top:bottom, :, None] / np.float32(_WHITE[self.values.dtype.name])
+        return weights.astype(np.float32, copy=False)
+
+
+def _open(source: Source) -> Photo:
+    if not isinstance(source, np.ndarray):
+        return Photo.open(source)
+    array = np.uint8(255) * source if source.dtype == np.bool_ else source
+    # integers with the encoding srgb and floats with the encoding linear are stored unchanged
+    return Photo.from_array(array, encoding="linear" if array.dtype.kind == "f" else "srgb")

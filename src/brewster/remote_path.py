@@ -1,0 +1,174 @@
+"""Files in object stores, such as s3://bucket/scans/a.jpg or gs://bucket/scans/a.jpg, through fsspec.
+
+    photo = location("s3://bucket/scans/a.jpg")
+    data = photo.read_bytes()
+
+fsspec loads the package of the store (s3fs for S3, gcsfs for Google Cloud Storage), which has its own settings: for
+example AWS_PROFILE, FSSPEC_S3_ENDPOINT_URL, or the files in ~/.config/fsspec.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import importlib
+import os
+import re
+from collections.abc import Iterator
+from pathlib import Path, PurePosixPath
+from typing import Any, TypeAlias, final
+from urllib.parse import urlsplit
+from urllib.request import url2pathname
+
+from brewster.errors import BrewsterError, MissingExtra, TargetError, UnreadablePhoto
+
+_RETRY = "check the network and the credentials, and run the same command again: finished files are kept"
+
+
+@final
+class RemotePath(PurePosixPath):
+    """The URL of a file or folder in an object store, with the methods of `pathlib.Path` that brewster needs.
+
+    The parts of a URL are those of a path: empty parts, as in `s3://bucket/a//b.jpg`, are dropped.
+    """
+
+    def __str__(self) -> str:
+        return super().__str__().replace(":/", "://", 1)
+
+    def read_bytes(self) -> bytes:
+        """Returns the content of the file.
+
+        Raises:
+            UnreadablePhoto: the file does not exist, or the store fails.
+            MissingExtra: the package of the store is not installed.
+        """
+        store = self._store()
+        try:
+            return bytes(store.cat_file(str(self)))
+        except FileNotFoundError as error:
+            raise UnreadablePhoto(
+                f"{self} cannot be read (it does not exist)", "expected an image file", "check its name"
+            ) from error
+        except Exception as error:
+            raise UnreadablePhoto(
+                f"{self} cannot be read ({_reason(error)})", "expected a store that answers", _RETRY
+            ) from error
+
+    def write_bytes(self, data: bytes, *, overwrite: bool = False) -> None:
+        """Writes the file with one upload. In S3, GCS and Azure an upload is atomic.
+
+        Raises:
+            FileExistsError: the file exists and `overwrite` is False.
+            TargetError: the store fails, or does not allow it.
+            MissingExtra: the package of the store is not installed.
+        """
+        store = self._store()
+        try:
+            store.pipe_file(str(self), data, mode="overwrite" if overwrite else "create")
+        except FileExistsError as error:
+            raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST)) from error
+        except Exception as error:
+            raise TargetError(
+                f"{self} was not written ({_reason(error)})",
+                "expected a store that can be written to",
+                _RETRY,
+            ) from error
+
+    def exists(self) -> bool:
+        """Whether the file exists. False if the store fails: then reading or writing the file raises the error."""
+        store = self._store()
+        try:
+            return bool(store.exists(str(self)))
+        except Exception:  # noqa: BLE001  (each store has its own errors)
+            return False
+
+    def unlink(self) -> None:
+        """Deletes the file. Ignores errors: this is for temporary files."""
+        with contextlib.suppress(Exception):  # each store has its own errors
+            self._store().rm_file(str(self))
+
+    def rmdir(self) -> None:
+        """Does nothing: a folder in a store exists as long as it has files."""
+
+    def iterdir(self) -> Iterator[RemotePath]:
+        """Yields the files and folders in this folder; none if there are none or the store fails."""
+        store = self._store()
+        try:
+            names = store.ls(str(self), detail=False)
+        except Exception:  # noqa: BLE001  (each store has its own errors)
+            names = []
+        yield from (self / PurePosixPath(name).name for name in names)
+
+    def walk_files(self) -> list[RemotePath]:
+        """Returns all files below this folder, sorted.
+
+        Raises:
+            UnreadablePhoto: the store fails.
+        """
+        store = self._store()
+        try:
+            found = store.find(str(self))
+            root = store._strip_protocol(str(self))  # of the names that `find` returns
+        except Exception as error:
+            raise UnreadablePhoto(
+                f"{self} cannot be listed ({_reason(error)})", "expected a store that answers", _RETRY
+            ) from error
+        return sorted(self / str(name)[len(root) :].lstrip("/") for name in found)
+
+    def _store(self) -> Any:  # noqa: ANN401  (fsspec has no types)
+        return _store(self.parts[0].rstrip(":"))
+
+
+Location: TypeAlias = Path | RemotePath
+
+
+def location(text: str | os.PathLike[str]) -> Location:
+    """Returns the path for a path, a file:// URL, or the URL of an object store.
+
+    Raises:
+        BrewsterError: the protocol of the URL is unknown.
+        MissingExtra: the package of the store is not installed.
+    """
+    if isinstance(text, RemotePath | Path) or not re.match(r"[A-Za-z][\w+.-]+://", os.fspath(text)):
+        return text if isinstance(text, RemotePath) else Path(text)
+    url = os.fspath(text)
+    if url.startswith("file:"):
+        return Path(url2pathname(urlsplit(url).path))
+    path = RemotePath(url)
+    path._store()  # raises the errors now, and not for every photo
+    return path
+
+
+def _store(protocol: str) -> Any:  # noqa: ANN401  (fsspec has no types)
+    """Returns the file system of a protocol. Listings are not cached, because other nodes write files, too."""
+    try:
+        return importlib.import_module("fsspec").filesystem(protocol, use_listings_cache=False)
+    except ModuleNotFoundError as error:
+        if error.name == "fsspec":
+            raise MissingExtra(
+                "the package fsspec is not installed",
+                f"expected it, because {protocol}:// is an object store",
+                "run: pip install 'brewster[cluster]'",
+            ) from error
+        raise _missing_package(protocol, error) from error
+    except ImportError as error:
+        raise _missing_package(protocol, error) from error
+    except ValueError as error:
+        raise BrewsterError(
+            f"the protocol {protocol}:// is unknown",
+            "expected the path of a file or folder, or a URL such as s3://bucket/folder",
+            "correct the URL",
+        ) from error
+
+
+def _missing_package(protocol: str, error: ImportError) -> MissingExtra:
+    return MissingExtra(
+        f"{protocol}:// needs a package that is not installed ({error})",
+        "expected the package of this store: s3fs for s3://, gcsfs for gs://, adlfs for az://",
+        "install it with pip",
+    )
+
+
+def _reason(error: Exception) -> str:
+    first_line = str(error).partition("\n")[0]
+    return first_line or type(error).__name__

@@ -1,0 +1,110 @@
+"""Pictures of a run: results.png with the curves of the log, and the captioned sheet of sample predictions."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+import torch
+from torch import Tensor
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+
+CAPTION_PX: Final = 20
+"""Height of a line of text on a sheet of samples."""
+_PANELS: Final = {
+    "loss": "loss of the batch",
+    "loss_": "terms of the loss",
+    "psnr_gain_db_": "PSNR gain over the input, dB",
+    "worse_": "share of pairs worse than the input",
+    "tone_": "tone, prediction / photo",
+}
+"""Metric name, or its prefix -> title of the panel. Metrics with one prefix share a panel. Others have their own panel."""
+_MAX_COLUMNS: Final = 3
+_DPI: Final = 128  # a power of two: sides in inches, and therefore in pixels, are exact
+
+
+def plot_log(lines: Sequence[Mapping[str, float]]) -> bytes:
+    """Plots the metrics of a run against the training step.
+
+    Args:
+        lines: the lines of the log, at least one. Each has `step`; the first and the last may have different metrics.
+
+    Returns:
+        The plot as the bytes of a PNG file.
+    """
+    from matplotlib.figure import Figure  # noqa: PLC0415  (slow to import)
+
+    panels: dict[str, dict[str, str]] = {}
+    for name in dict.fromkeys(name for line in lines for name in line if name not in ("step", "seconds")):
+        title, label = _panel_of(name)
+        panels.setdefault(title, {})[name] = label
+    columns = min(_MAX_COLUMNS, len(panels))
+    rows = -(-len(panels) // columns)
+    figure = Figure(figsize=(4 * columns, 3.25 * rows), layout="constrained")
+    axes = figure.subplots(rows, columns, squeeze=False).flat
+    for axis, (title, metrics) in zip(axes, panels.items(), strict=False):
+        for name, label in metrics.items():
+            points = [(line["step"], line[name]) for line in lines if name in line]
+            axis.plot(*zip(*points, strict=True), marker="o", markersize=3, linewidth=1.4, label=label)
+        axis.set_title(title, fontsize=10)
+        axis.set_xlabel("training step", fontsize=9)
+        axis.tick_params(labelsize=8)
+        axis.grid(alpha=0.25)
+        if any(metrics.values()):
+            axis.legend(fontsize=8)
+    for axis in list(axes)[len(panels) :]:
+        axis.set_visible(False)
+    data = io.BytesIO()
+    figure.savefig(data, format="png", dpi=_DPI, metadata={"Software": None})
+    return data.getvalue()
+
+
+def sample_sheet(
+    columns: Sequence[str], rows: Sequence[tuple[str, Float[Tensor, "3 h w"]]]
+) -> Float[Tensor, "sheet_h w 3"]:
+    """Returns a sheet with a line of column titles, and for each row a line with its caption above its images.
+
+    Args:
+        columns: the titles of the images of a row. The images have equal widths.
+        rows: caption and images of each row, at least one. All have the same size. Values are sRGB-encoded, in 0..1.
+
+    Returns:
+        The sheet, (H, w, 3), sRGB-encoded, with H = CAPTION_PX + len(rows) (CAPTION_PX + h).
+    """
+    from matplotlib.figure import Figure  # noqa: PLC0415  (slow to import)
+
+    _, height, width = rows[0][1].shape
+    pitch = CAPTION_PX + height
+    sheet_height = CAPTION_PX + len(rows) * pitch
+    figure = Figure(figsize=(width / _DPI, sheet_height / _DPI), dpi=_DPI, facecolor="white")
+
+    def write(text: str, x: float, top: int, **style: Any) -> None:  # noqa: ANN401  (matplotlib)
+        y = 1 - (top + CAPTION_PX / 2) / sheet_height
+        figure.text(x, y, text, va="center", fontsize=7, color="#222222", parse_math=False, **style)
+
+    for column, title in enumerate(columns):
+        write(title, (column + 0.5) / len(columns), 0, ha="center", weight="bold")
+    for row, (caption, _) in enumerate(rows):
+        write(caption, 4 / width, CAPTION_PX + row * pitch)
+    drawn = io.BytesIO()
+    figure.savefig(drawn, format="rgba", dpi=_DPI)
+    pixels = np.frombuffer(drawn.getvalue(), np.uint8).reshape(sheet_height, width, 4)
+    sheet = torch.from_numpy(pixels[..., :3] / np.float32(255))
+    for row, (_, images) in enumerate(rows):
+        top = 2 * CAPTION_PX + row * pitch
+        sheet[top : top + height] = images.permute(1, 2, 0)
+    return sheet
+
+
+def _panel_of(name: str) -> tuple[str, str]:
+    """Returns the title of the panel of a metric, and the label of its curve, which is empty if it is alone."""
+    if name in _PANELS:
+        return _PANELS[name], ""
+    for prefix, title in _PANELS.items():
+        if prefix.endswith("_") and name.startswith(prefix):
+            return title, name.removeprefix(prefix).replace("_", " ")
+    return name.replace("_", " "), ""

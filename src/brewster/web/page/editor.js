@@ -1,0 +1,129 @@
+// Draws regions on <glass-compare> with a pointer or with the keyboard, and hatches what stays as it is.
+
+import { maskCodes } from "./regions.js";
+
+const KEY_STEP = 0.01; // of the longer side of the photo; five times as much with Shift
+const HATCH_PX = 8; // width of the dark and light stripes where the photo is not separated: visible on any photo
+const HATCH_OPACITY = 0.45;
+const HATCH_MAX_PX = 800; // longer side of the image of the hatching
+const MIN_STEP = 0.2; // distance of the points of a stroke, as a fraction of the brush radius
+
+export class RegionEditor {
+  isActive = false;
+  #drawn = null; // the region that is being drawn
+  #cursor = null; // position of the pointer or of the keyboard cursor, in fractions of the longer side
+  #hatching = document.createElement("canvas");
+  #hatchingOf = null; // the regions and the size of the hatching
+
+  // `tool()`: {shape, value, radius, feather} of the next region; `onChange(isDrawing)`: called when `list` has changed;
+  // `onAdd(region)`: called with each finished region; `announce(text)`: for screen readers.
+  constructor({ tool, onChange, onAdd, announce }) {
+    Object.assign(this, { tool, onChange, onAdd, announce });
+    this.regions = null; // the Regions of the current photo
+    this.size = [1, 1]; // width and height of the photo
+  }
+
+  // All regions, with the one that is being drawn.
+  get list() {
+    const list = this.regions?.list ?? [];
+    return this.#drawn ? [...list, this.#drawn] : list;
+  }
+
+  start(point) {
+    const { shape, ...rest } = this.tool();
+    this.#cursor = point;
+    this.#drawn = { shape, ...rest, points: shape === "rectangle" ? [point, point] : [point] };
+    this.onChange(true);
+  }
+
+  move(point) {
+    this.#cursor = point;
+    if (!this.#drawn) return;
+    const { shape, points, radius } = this.#drawn;
+    const [x, y] = points.at(-1);
+    if (shape === "brush" && Math.hypot(point[0] - x, point[1] - y) < MIN_STEP * radius) return;
+    this.#drawn = { ...this.#drawn, points: shape === "rectangle" ? [points[0], point] : [...points, point] };
+    this.onChange(true);
+  }
+
+  end() {
+    const region = this.#drawn;
+    this.#drawn = null;
+    if (region && isVisible(region)) this.onAdd(region);
+    else this.onChange(false);
+  }
+
+  cancel() {
+    if (!this.#drawn) return;
+    this.#drawn = null;
+    this.onChange(false);
+  }
+
+  hover(point) {
+    this.#cursor = point;
+    this.onChange(true);
+  }
+
+  // Handles a key: arrows move the cursor, space or Enter starts and ends a region, Escape cancels it. Returns whether it did.
+  press(event) {
+    const step = KEY_STEP * (event.shiftKey ? 5 : 1);
+    const steps = { ArrowLeft: [-step, 0], ArrowRight: [step, 0], ArrowUp: [0, -step], ArrowDown: [0, step] };
+    const longer = Math.max(...this.size);
+    const ends = this.size.map((side) => side / longer);
+    this.#cursor ??= ends.map((end) => end / 2);
+    if (event.key in steps) {
+      this.move(this.#cursor.map((at, i) => Math.min(ends[i], Math.max(0, at + steps[event.key][i]))));
+      this.onChange(true);
+    } else if (event.key === " " || event.key === "Enter") {
+      const isEnd = this.#drawn !== null;
+      isEnd ? this.end() : this.start(this.#cursor);
+      this.announce(isEnd ? "The region ends." : "The region begins. Move with the arrow keys, and press space again to end it.");
+    } else if (event.key === "Escape" && this.#drawn) this.cancel();
+    else return false;
+    return true;
+  }
+
+  // Draws the hatching and the cursor above an image at `origin` with `size`, in screen pixels.
+  paint(context, origin, size) {
+    if (!this.isActive) return;
+    this.#updateHatching();
+    if (this.list.length) context.drawImage(this.#hatching, origin.x, origin.y, size.width, size.height);
+    if (!this.#cursor) return;
+    const longer = Math.max(size.width, size.height);
+    const [x, y] = [origin.x + this.#cursor[0] * longer, origin.y + this.#cursor[1] * longer];
+    const { shape, radius } = this.tool();
+    for (const [style, width] of [["#000", 3], ["#fff", 1.5]]) {
+      context.beginPath();
+      context.lineWidth = width;
+      context.strokeStyle = style;
+      if (shape === "brush") context.arc(x, y, Math.max(2, radius * longer), 0, 2 * Math.PI);
+      else {
+        context.moveTo(x - 12, y), context.lineTo(x + 12, y);
+        context.moveTo(x, y - 12), context.lineTo(x, y + 12);
+      }
+      context.stroke();
+    }
+  }
+
+  #updateHatching() {
+    const { list } = this;
+    const scale = Math.min(1, HATCH_MAX_PX / Math.max(...this.size));
+    const [width, height] = this.size.map((side) => Math.max(1, Math.round(side * scale)));
+    const key = JSON.stringify([list, width, height]);
+    if (key === this.#hatchingOf) return;
+    this.#hatchingOf = key;
+    Object.assign(this.#hatching, { width, height });
+    const codes = maskCodes(list, width, height);
+    if (!codes) return;
+    const context = this.#hatching.getContext("2d");
+    const image = context.createImageData(width, height);
+    for (let i = 0; i < codes.length; i++) {
+      const isLight = (((i % width) + Math.floor(i / width)) / HATCH_PX) & 1;
+      image.data.fill(isLight ? 255 : 0, 4 * i, 4 * i + 3);
+      image.data[4 * i + 3] = HATCH_OPACITY * (255 - codes[i]);
+    }
+    context.putImageData(image, 0, 0);
+  }
+}
+
+const isVisible = ({ shape, points }) => shape === "brush" || points[0].some((at, i) => Math.abs(at - points[1][i]) > 1e-3);

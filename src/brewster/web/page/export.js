@@ -1,0 +1,70 @@
+// Downloads at full size, equal to the files of the command line, and the report in the zip of all photos.
+
+import { send } from "./api.js";
+import { maskFile } from "./regions.js";
+import { createZip, crc32, readZip, withUniqueNames } from "./zip.js";
+
+const ZIP_LAYERS = "transmission,reflection"; // the layers in the zip of all photos
+const REPORT_NAME = "brewster-report.txt";
+
+// Requests layers of a photo at full size. Returns {blob, fileName}, as `send`.
+async function requestLayers(photo, layers, settings, context) {
+  const mask = await maskFile(photo.regions.list, ...photo.size);
+  return send("separate", photo.file, { layers, strength: photo.strength, mask, ...settings }, context);
+}
+
+// Creates one layer of a photo. Returns {name, blob, problem, saved}; `saved` are the photos whose results it contains.
+export async function exportLayer(photo, layer, settings, context) {
+  const { blob, fileName } = await requestLayers(photo, layer, settings, context);
+  return { name: fileName, blob, problem: "", saved: [photo] };
+}
+
+// Creates a zip of the layers of all photos that are done, with a report that also lists the photos that failed. A photo that
+// fails now is left out, and `problem` describes it. `onPhoto(index, count)` is called before each photo.
+//
+// Throws an Error if all photos fail.
+export async function exportAll(photos, settings, { onPhoto, ...context }) {
+  const results = photos.map((photo) => ({ photo, files: [], error: photo.state === "failed" ? problemOf(photo) : null }));
+  const separated = results.filter(({ photo }) => photo.state === "done");
+  for (const [index, result] of separated.entries()) {
+    onPhoto(index, separated.length);
+    try {
+      const { blob } = await requestLayers(result.photo, ZIP_LAYERS, settings, context);
+      result.files = readZip(await blob.arrayBuffer());
+    } catch (error) {
+      if (error.name === "AbortError") throw error;
+      result.error = `${error.message} ${error.details ?? ""}`.trim();
+    }
+  }
+  const failed = separated.filter(({ error }) => error);
+  const problem = failed.map(({ photo, error }) => `${photo.file.name} is not in the zip. ${error}`).join(" ");
+  if (failed.length === separated.length) throw new Error(problem);
+  const files = withUniqueNames(results.flatMap((result) => result.files));
+  const report = new TextEncoder().encode(describeResults(results, files, settings));
+  const blob = createZip([...files, { name: REPORT_NAME, crc: crc32(report), data: report }]);
+  return { name: "brewster.zip", blob, problem, saved: separated.filter(({ error }) => !error).map(({ photo }) => photo) };
+}
+
+const problemOf = ({ error }) => (error ? `${error.message} ${error.details ?? ""}`.trim() : "It was cancelled.");
+
+// The text of the report. `files` are the files of all results in this order, with the names that they have in the zip.
+function describeResults(results, files, { model, quality }) {
+  const names = files.map(({ name }) => name);
+  const lines = results.map(({ photo, files: own, error }) => {
+    const strength = `strength ${Math.round(100 * photo.strength)} %${photo.regions.list.length ? ", with regions" : ""}`;
+    if (own.length) return `${photo.file.name} -> ${names.splice(0, own.length).join(", ")} (${strength})`;
+    return `${photo.file.name}: ${error ? `failed. ${error}` : "not separated yet"}`;
+  });
+  const done = results.filter((result) => result.files.length).length;
+  const counts = `${done} done, ${results.filter(({ error }) => error).length} failed`;
+  return [`brewster, model ${model}, quality ${quality}: ${counts}`, "", ...lines, ""].join("\n");
+}
+
+// Lets the browser save a file.
+export function save(name, blob) {
+  const link = document.createElement("a");
+  link.href = URL.createObjectURL(blob);
+  link.download = name;
+  link.click();
+  setTimeout(() => URL.revokeObjectURL(link.href), 60_000);
+}

@@ -1,0 +1,109 @@
+// The photos of the page and their separation: a few at a time, the current one first.
+
+import { send } from "./api.js";
+import { Regions } from "./regions.js";
+
+const MAX_CONCURRENT = 2; // one photo is separated while the next one is uploaded
+
+export class SeparationQueue {
+  photos = [];
+  current = null; // the photo that is shown
+  isReady = false; // whether the settings are known; nothing starts before that
+
+  // `settings()` returns the settings of the next request. `onChange(photo)` is called after each change of a photo, and
+  // `onEnd(photo)` when its separation has ended.
+  constructor(settings, { onChange, onEnd }) {
+    Object.assign(this, { settings, onChange, onEnd });
+  }
+
+  add(file) {
+    const photo = { file, state: "waiting", progress: null, error: null, strength: 1, regions: new Regions(), controller: null, isSaved: false };
+    this.photos.push(photo);
+    return photo;
+  }
+
+  // Removes a photo and stops its separation. Returns its index.
+  remove(photo) {
+    const index = this.photos.indexOf(photo);
+    this.photos.splice(index, 1);
+    this.#supersede(photo);
+    return index;
+  }
+
+  // Puts a removed photo back.
+  restore(photo, index) {
+    this.photos.splice(index, 0, photo);
+    if (photo.state !== "failed") photo.state = this.hasCurrentMaps(photo) ? "done" : "waiting";
+  }
+
+  // Whether the maps of a photo were computed with the current settings.
+  hasCurrentMaps(photo) {
+    return photo.mapSettings === JSON.stringify(this.settings());
+  }
+
+  // To be called after a change of the settings. A photo is separated again unless its maps belong to the new settings.
+  applySettings() {
+    for (const photo of this.photos) {
+      this.#supersede(photo);
+      Object.assign(photo, { state: this.hasCurrentMaps(photo) ? "done" : "waiting", error: null, isSaved: false });
+    }
+    this.startNext();
+  }
+
+  retry(photo) {
+    Object.assign(photo, { state: "waiting", error: null });
+    this.onChange(photo);
+    this.startNext();
+  }
+
+  cancel(photo) {
+    if (photo.controller) photo.controller.abort();
+    else photo.state = "failed";
+    this.onChange(photo);
+  }
+
+  count(state) {
+    return this.photos.filter((photo) => photo.state === state).length;
+  }
+
+  startNext() {
+    if (!this.isReady) return;
+    const busy = this.photos.filter((photo) => photo.controller).length;
+    const waiting = this.photos.filter((photo) => photo.state === "waiting" && !photo.controller);
+    if (waiting.includes(this.current)) waiting.unshift(this.current);
+    for (const photo of [...new Set(waiting)].slice(0, Math.max(0, MAX_CONCURRENT - busy))) this.#separate(photo);
+  }
+
+  #supersede(photo) {
+    photo.isSuperseded = true;
+    photo.controller?.abort();
+  }
+
+  async #separate(photo) {
+    const requestSettings = this.settings();
+    const { signal } = (photo.controller = new AbortController());
+    Object.assign(photo, { state: "waiting", progress: null, error: null, isSuperseded: false });
+    const onProgress = (progress) => {
+      Object.assign(photo, { progress, state: progress.phase === "waiting" ? "waiting" : "working" });
+      this.onChange(photo);
+    };
+    try {
+      const { blob, header } = await send("preview", photo.file, requestSettings, { signal, onProgress });
+      photo.preview = blob;
+      photo.key = header("Brewster-Photo"); // of the photo on the server, for its tiles
+      photo.size = header("Brewster-Size").split("x").map(Number);
+      Object.assign(photo, { state: "done", mapSettings: JSON.stringify(requestSettings), isSaved: false });
+    } catch (error) {
+      const isStopped = error.name === "AbortError";
+      const previousState = this.hasCurrentMaps(photo) ? "done" : "waiting"; // the old maps are valid if the settings were reset
+      const state = isStopped && photo.isSuperseded ? previousState : "failed";
+      Object.assign(photo, { state, error: isStopped ? null : error });
+    }
+    photo.controller = null;
+    if (!this.photos.includes(photo)) return;
+    if (photo.state === "done" && !this.hasCurrentMaps(photo)) photo.state = "waiting"; // the settings have changed since
+    this.onChange(photo);
+    this.onEnd(photo);
+    this.startNext();
+  }
+}

@@ -1,0 +1,157 @@
+// The regions of a photo: brush strokes and rectangles that say where it is separated, and how much. They are drawn into a mask
+// of any size, whose values scale the strength, as `--mask FILE` does on the command line.
+//
+// A region is {shape: "brush" | "rectangle", value, points, radius, feather}: `value` is the strength in it, 0 to 1, or null for the
+// eraser; positions and lengths are fractions of the longer side of the photo; a rectangle has two opposite corners.
+
+import { crc32 } from "./zip.js";
+
+const BAND_ROWS = 256; // rows of a mask that are computed at once for a file
+const PNG_SIGNATURE = [0x89, 0x50, 0x4e, 0x47, 0x0d, 0x0a, 0x1a, 0x0a];
+
+// The regions of a photo with their history.
+export class Regions {
+  #states;
+  #at;
+
+  constructor(regions = []) {
+    [this.#states, this.#at] = [[regions], 0];
+  }
+
+  get list() {
+    return this.#states[this.#at];
+  }
+
+  get canUndo() {
+    return this.#at > 0;
+  }
+
+  get canRedo() {
+    return this.#at < this.#states.length - 1;
+  }
+
+  add(region) {
+    this.#push([...this.list, region]);
+  }
+
+  clear() {
+    if (this.list.length) this.#push([]);
+  }
+
+  undo() {
+    this.#at = Math.max(0, this.#at - 1);
+  }
+
+  redo() {
+    this.#at = Math.min(this.#states.length - 1, this.#at + 1);
+  }
+
+  // Replaces all regions by those of another photo.
+  copyFrom(other) {
+    this.#push(other.list);
+  }
+
+  #push(state) {
+    this.#states = [...this.#states.slice(0, this.#at + 1), state];
+    this.#at = this.#states.length - 1;
+  }
+}
+
+// The mask outside all regions: 0 if the first region is separated, so that only the regions are; otherwise 1.
+const background = (list) => (list.length && list[0].value > 0 ? 0 : 1);
+
+// Returns the mask of regions as codes, 0 to 255, or null if there are no regions. The mask of the whole photo has `width` x `height`
+// pixels; `part` selects a part of it: {left, top, columns, rows}.
+export function maskCodes(list, width, height, part = { left: 0, top: 0, columns: width, rows: height }) {
+  if (!list.length) return null;
+  const outside = background(list);
+  const mask = new Float32Array(part.columns * part.rows).fill(outside);
+  for (const region of list) drawRegion(mask, region, region.value ?? outside, Math.max(width, height), part);
+  const codes = new Uint8Array(mask.length);
+  for (let i = 0; i < codes.length; i++) codes[i] = 255 * mask[i] + 0.5;
+  return codes;
+}
+
+function drawRegion(mask, region, value, scale, { left, top, columns, rows }) {
+  const points = region.points.map(([x, y]) => [x * scale - left - 0.5, y * scale - top - 0.5]);
+  const feather = Math.max(1, region.feather * scale); // at least one pixel: a smooth edge
+  const radius = region.shape === "brush" ? region.radius * scale : 0;
+  const reach = radius + feather / 2 + 1;
+  const limit = (values, end) => [
+    Math.max(0, Math.floor(Math.min(...values) - reach)), Math.min(end - 1, Math.ceil(Math.max(...values) + reach))];
+  const [x0, x1] = limit(points.map(([x]) => x), columns);
+  const [y0, y1] = limit(points.map(([, y]) => y), rows);
+  if (x0 > x1 || y0 > y1) return;
+  const width = x1 - x0 + 1;
+  const distances = new Float32Array(width * (y1 - y0 + 1)).fill(Infinity); // to the line or the rectangle, negative inside
+  const box = { x0, y0, x1, y1, width };
+  if (region.shape === "rectangle") measureRectangle(distances, points, box);
+  else for (let i = 0; i < points.length; i++) measureSegment(distances, points[Math.max(0, i - 1)], points[i], reach, box);
+  for (let y = y0, at = 0; y <= y1; y++) {
+    for (let x = x0, to = y * columns + x0; x <= x1; x++, to++, at++) {
+      const cover = Math.min(1, Math.max(0, 0.5 + (radius - distances[at]) / feather));
+      mask[to] += cover * (value - mask[to]);
+    }
+  }
+}
+
+// Lowers the distances to those to a line segment, within its reach.
+function measureSegment(distances, [ax, ay], [bx, by], reach, { x0, y0, x1, y1, width }) {
+  const [dx, dy] = [bx - ax, by - ay];
+  const squared = dx * dx + dy * dy || 1;
+  const [fromX, toX] = [Math.max(x0, Math.floor(Math.min(ax, bx) - reach)), Math.min(x1, Math.ceil(Math.max(ax, bx) + reach))];
+  const [fromY, toY] = [Math.max(y0, Math.floor(Math.min(ay, by) - reach)), Math.min(y1, Math.ceil(Math.max(ay, by) + reach))];
+  for (let y = fromY; y <= toY; y++) {
+    for (let x = fromX, at = (y - y0) * width + fromX - x0; x <= toX; x++, at++) {
+      const along = Math.min(1, Math.max(0, ((x - ax) * dx + (y - ay) * dy) / squared));
+      const [px, py] = [ax + along * dx - x, ay + along * dy - y];
+      const distance = Math.sqrt(px * px + py * py);
+      if (distance < distances[at]) distances[at] = distance;
+    }
+  }
+}
+
+// The signed distances to a rectangle.
+function measureRectangle(distances, [[ax, ay], [bx, by]], { x0, y0, x1, y1 }) {
+  const [left, end, top, bottom] = [Math.min(ax, bx), Math.max(ax, bx), Math.min(ay, by), Math.max(ay, by)];
+  for (let y = y0, at = 0; y <= y1; y++) {
+    const down = Math.max(top - y, y - bottom);
+    for (let x = x0; x <= x1; x++, at++) {
+      const across = Math.max(left - x, x - end);
+      const [right, below] = [Math.max(across, 0), Math.max(down, 0)];
+      distances[at] = Math.sqrt(right * right + below * below) + Math.min(Math.max(across, down), 0);
+    }
+  }
+}
+
+// The mask of regions as a grey 8-bit PNG file of the size of the photo (PNG specification, third edition), or null.
+export async function maskFile(list, width, height) {
+  if (!list.length) return null;
+  const compression = new CompressionStream("deflate");
+  const compressed = new Response(compression.readable).arrayBuffer();
+  const writer = compression.writable.getWriter();
+  for (let top = 0; top < height; top += BAND_ROWS) {
+    const rows = Math.min(BAND_ROWS, height - top);
+    const codes = maskCodes(list, width, height, { left: 0, top, columns: width, rows });
+    const lines = new Uint8Array(rows * (width + 1)); // each line begins with the filter type 0
+    for (let row = 0; row < rows; row++) lines.set(codes.subarray(row * width, (row + 1) * width), row * (width + 1) + 1);
+    await writer.write(lines);
+  }
+  await writer.close();
+  const header = new DataView(new ArrayBuffer(13));
+  header.setUint32(0, width);
+  header.setUint32(4, height);
+  header.setUint8(8, 8); // bits; the colour type 0 is grey
+  const parts = [chunk("IHDR", new Uint8Array(header.buffer)), chunk("IDAT", new Uint8Array(await compressed)), chunk("IEND", new Uint8Array())];
+  return new Blob([new Uint8Array(PNG_SIGNATURE), ...parts.flat()], { type: "image/png" });
+}
+
+function chunk(type, data) {
+  const name = new TextEncoder().encode(type);
+  const number = (value) => {
+    const view = new DataView(new ArrayBuffer(4));
+    view.setUint32(0, value);
+    return view;
+  };
+  return [number(data.length), name, data, number(crc32(data, crc32(name)))];
+}

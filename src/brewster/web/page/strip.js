@@ -1,0 +1,92 @@
+// The list of photos below the picture: a row for each photo with its state, the summary, and the buttons that scroll the list.
+
+const TRANSPARENT_PIXEL = "data:image/gif;base64,R0lGODlhAQABAAAAACH5BAEKAAEALAAAAAABAAEAAAICTAEAOw==";
+const byId = (id) => document.getElementById(id);
+
+export const megabytes = (bytes) => (bytes / 1e6).toFixed(bytes < 9.95e6 ? 1 : 0);
+
+// Creates the row of a photo and inserts it before `next`, or at the end.
+export function createRow(photo, { onSelect, onRemove }, next = null) {
+  const row = document.createElement("li");
+  row.innerHTML = `<button type="button" class="pick"><img alt="" width="56" height="56"><span class="name"></span>
+    <span class="state"></span></button><button type="button" class="remove"><span aria-hidden="true">×</span></button>`;
+  row.querySelector(".name").textContent = photo.file.name;
+  row.querySelector(".pick").title = photo.file.name;
+  row.querySelector(".remove").setAttribute("aria-label", `Remove ${photo.file.name}`);
+  row.querySelector(".pick").addEventListener("click", onSelect);
+  row.querySelector(".remove").addEventListener("click", onRemove);
+  showFile(row.querySelector("img"), photo.file);
+  byId("photos").insertBefore(row, next);
+  return row;
+}
+
+// Shows a file as the browser decodes it, or a transparent pixel if it cannot.
+export function showFile(image, file) {
+  const url = URL.createObjectURL(file);
+  const done = () => URL.revokeObjectURL(url);
+  image.onload = done;
+  image.onerror = () => (done(), (image.src = TRANSPARENT_PIXEL), (image.onload = null));
+  image.src = url;
+}
+
+export function updateRow(photo) {
+  photo.row.className = photo.state;
+  photo.row.querySelector(".state").textContent = shortStatus(photo);
+}
+
+function shortStatus({ state, progress, error }) {
+  if (state === "failed") return error ? "failed" : "cancelled";
+  if (state !== "working") return state;
+  if (progress.phase === "working") return `${Math.round(100 * progress.share)} %`;
+  return progress.phase === "upload" ? "sending" : "receiving";
+}
+
+// The state of a photo that is not done, in words.
+export function statusText({ state, progress }) {
+  if (state !== "working") return progress?.ahead ? `Waiting, ${progress.ahead} before this one` : "Waiting";
+  return progressText(progress);
+}
+
+export function progressText(progress) {
+  if (progress.phase === "waiting") return "Waiting for the server";
+  if (progress.phase === "working") return `Separating, ${Math.round(100 * progress.share)} %`;
+  const verb = progress.phase === "upload" ? "Sending" : "Receiving";
+  return `${verb} ${megabytes(progress.loaded)} of ${megabytes(progress.total)} MB`;
+}
+
+// The completed fraction of a phase, or null if it is unknown.
+export function fraction(progress) {
+  if (!progress || progress.phase === "waiting") return null;
+  return progress.phase === "working" ? progress.share : progress.total ? progress.loaded / progress.total : null;
+}
+
+// Sets the value of a <progress>; null shows that the end is unknown.
+export function setBar(bar, value) {
+  if (value === null) bar.removeAttribute("value");
+  else bar.value = value;
+}
+
+// "12 photos: 8 done, 4 failed"
+export function summarise(queue) {
+  const counts = ["done", "working", "waiting", "failed"].map((state) => [queue.count(state), state]);
+  const total = queue.photos.length;
+  const parts = counts.filter(([count]) => count).map(([count, state]) => `${count} ${state}`);
+  return `${total} ${total === 1 ? "photo" : "photos"}: ${parts.join(", ")}`;
+}
+
+// Shows the scroll buttons while the list is wider than the window.
+export function watchScrolling() {
+  const list = byId("photos");
+  const update = () => {
+    const end = list.scrollWidth - list.clientWidth;
+    for (const id of ["earlier", "later"]) byId(id).hidden = end <= 1;
+    byId("earlier").setAttribute("aria-disabled", list.scrollLeft <= 1);
+    byId("later").setAttribute("aria-disabled", list.scrollLeft >= end - 1);
+  };
+  for (const [id, direction] of [["earlier", -1], ["later", 1]]) {
+    byId(id).addEventListener("click", () => list.scrollBy({ left: direction * 0.8 * list.clientWidth, behavior: "smooth" }));
+  }
+  list.addEventListener("scroll", update);
+  new ResizeObserver(update).observe(list);
+  new MutationObserver(update).observe(list, { childList: true });
+}

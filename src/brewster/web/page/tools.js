@@ -1,0 +1,88 @@
+// The controls for regions: the tool, its size, feather and strength, undo and redo.
+
+import { RegionEditor } from "./editor.js";
+import { Regions } from "./regions.js";
+
+const byId = (id) => document.getElementById(id);
+const chosen = (name) => document.querySelector(`input[name=${name}]:checked`).value;
+const DESCRIPTIONS = {
+  move: "Mark where the photo is separated, or where it stays as it is.",
+  here: "Only the marked regions are separated, if this is the first region. Hatched parts stay as they are.",
+  protect: "The marked regions stay as they are.",
+  erase: "The eraser removes marks.",
+};
+
+// Creates the editor of regions and connects its controls. `onEdit()` is called when the regions of the current photo have changed,
+// `onPaint()` when only the drawing has, `saveMask()` to download the mask.
+export function createTools({ onEdit, onPaint, saveMask, announce }) {
+  const number = (id) => Number(byId(id).value);
+  const tool = () => ({
+    shape: chosen("shape"),
+    value: { here: number("region-strength"), protect: 0, erase: null }[chosen("tool")] ?? null,
+    radius: number("brush-size") / 2,
+    feather: number("feather"),
+  });
+  const editor = new RegionEditor({
+    tool,
+    announce,
+    onChange: onPaint,
+    onAdd: (region) => edit((regions) => regions.add(region)),
+  });
+
+  function edit(work) {
+    if (!editor.regions) return;
+    work(editor.regions);
+    update();
+    onEdit();
+  }
+
+  function update() {
+    const kind = chosen("tool");
+    editor.isActive = kind !== "move" && editor.regions !== null;
+    byId("tool-options").hidden = kind === "move";
+    byId("region-strength-field").hidden = kind !== "here";
+    byId("brush-size-field").hidden = chosen("shape") !== "brush";
+    byId("tool-description").textContent = DESCRIPTIONS[kind];
+    const { regions } = editor;
+    const hasRegions = Boolean(regions?.list.length);
+    for (const id of ["brush-size", "feather", "region-strength"]) byId(`${id}-amount`).textContent = `${Math.round(100 * number(id))} %`;
+    byId("region-actions").hidden = kind === "move" && !hasRegions && !regions?.canUndo && !regions?.canRedo;
+    const enabled = { undo: regions?.canUndo, redo: regions?.canRedo, "clear-regions": hasRegions, "save-mask": hasRegions };
+    for (const [id, isEnabled] of Object.entries(enabled)) byId(id).setAttribute("aria-disabled", !isEnabled);
+  }
+
+  const actions = {
+    undo: () => edit((regions) => regions.undo()),
+    redo: () => edit((regions) => regions.redo()),
+    "clear-regions": () => edit((regions) => regions.clear()),
+    "save-mask": saveMask,
+  };
+  for (const [id, act] of Object.entries(actions)) {
+    byId(id).addEventListener("click", () => byId(id).getAttribute("aria-disabled") === "true" || act());
+  }
+  for (const input of document.querySelectorAll("#regions input")) {
+    input.addEventListener("input", () => (update(), onPaint()));
+  }
+  document.addEventListener("keydown", (event) => {
+    if (!(event.ctrlKey || event.metaKey) || event.altKey || !editor.regions) return;
+    const key = event.key.toLowerCase();
+    if (key === "z") actions[event.shiftKey ? "redo" : "undo"]();
+    else if (key === "y") actions.redo();
+    else return;
+    event.preventDefault();
+  });
+  update();
+
+  return {
+    editor,
+    // Shows the regions of a photo with `size`, or none.
+    show(regions, size = [1, 1]) {
+      editor.cancel();
+      Object.assign(editor, { regions, size });
+      update();
+    },
+    // Applies the regions of one photo to another, or removes them.
+    copy: (from, to) => to.copyFrom(from ?? new Regions()),
+    update,
+  };
+}

@@ -1,0 +1,67 @@
+"""Writes tiny versions of published models with the file layouts and key names of the originals."""
+
+import json
+
+import torch
+from safetensors.torch import save_file
+from torch import nn
+
+from brewster.models.diffusion.backbones import tiny
+
+SIDE = 64
+"""The processing resolution of the tiny WindowSeat model."""
+TOKENS, ACTIVE_TOKENS = 9, 6
+
+
+def linear_layers(transformer):
+    return {name: module for name, module in transformer.named_modules() if isinstance(module, nn.Linear)}
+
+
+def random_pair(module, rank, generator):
+    """The matrices lora_A (rank, in) and lora_B (out, rank) of a layer, of similar size as its weights."""
+    down = torch.randn(rank, module.in_features, generator=generator) / module.in_features**0.5
+    return down, 0.3 * torch.randn(module.out_features, rank, generator=generator)
+
+
+def write_json(path, value):
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps(value))
+
+
+def write_qwen_edit_plus(folder):
+    """Writes a tiny Qwen-Image-Edit-2509: the folder names a QwenImageEditPlusPipeline."""
+    tiny("qwen", seed=1)[0].save(folder)
+    index = json.loads((folder / "model_index.json").read_text())
+    write_json(folder / "model_index.json", index | {"_class_name": "QwenImageEditPlusPipeline"})
+    return folder
+
+
+def write_windowseat(folder, base, *, dtype=torch.float32, **config):
+    """Writes a tiny WindowSeat model for a base, with ranks that differ between layers."""
+    generator = torch.Generator().manual_seed(5)
+    layers = linear_layers(tiny("qwen", seed=1)[0].transformer)
+    # Attention, feed-forward and modulation layers, and one layer outside of the blocks.
+    targets = [
+        name for name in layers if "attn.to_" in name or "_mod.1" in name or "mlp" in name or name == "img_in"
+    ]
+    ranks = {name: 2 if "attn.to_q" in name else 4 for name in targets}
+    weights = {}
+    for name in targets:
+        pair = random_pair(layers[name], ranks[name], generator)
+        for part, matrix in zip("AB", pair, strict=True):
+            weights[f"{name}.lora_{part}.default.weight"] = matrix.to(dtype)
+    settings = {
+        "peft_type": "LORA", "r": 4, "lora_alpha": 8, "target_modules": targets,
+        "rank_pattern": {name: rank for name, rank in ranks.items() if rank != 4}, "alpha_pattern": {},
+        "use_rslora": False, "init_lora_weights": True,
+    }  # fmt: skip
+    write_json(folder / "model_index.json", {"base_model": str(base), "processing_resolution": SIDE})
+    write_json(folder / "transformer_lora" / "adapter_config.json", settings | config)
+    save_file(weights, folder / "transformer_lora" / "pytorch_lora_weights.safetensors")
+    (folder / "text_embeddings").mkdir()
+    embeddings = {
+        "prompt_embeds": torch.randn(1, TOKENS, 32, generator=generator).to(dtype),
+        "prompt_mask": (torch.arange(TOKENS) < ACTIVE_TOKENS).long()[None],
+    }
+    save_file(embeddings, folder / "text_embeddings" / "state_dict.safetensors")
+    return folder

@@ -1,0 +1,377 @@
+"""Archives: the index, resumed runs, damaged and missing photos, stores that fail, several processes, a lost node."""
+
+import hashlib
+import os
+import re
+import subprocess
+import sys
+from functools import partial
+from pathlib import Path
+
+import fsspec
+import pyarrow
+import pytest
+from pyarrow import parquet
+
+from brewster.errors import ModelError, TargetError
+from brewster.executors import ProcessExecutor, SerialExecutor
+from brewster.files import discard
+from brewster.inference import FileResult, plan_files, separate_files
+from brewster.inference.archive import ArchiveRunner, separate_archive
+from brewster.inference.index import COLUMNS, INDEX_FILE, PARTS_FOLDER, IndexWriter
+from brewster.options import Options
+from brewster.remote_path import location
+from cli_helpers import image_bytes, json_lines, layer_files, list_files
+from set_folders import hashes
+
+TESTS = Path(__file__).parent
+NAMES = ("a.jpg", "b/c.jpg", "b/d.jpg")
+
+
+@pytest.fixture
+def options(model):
+    return Options(model=str(model))
+
+
+@pytest.fixture
+def store():
+    """The empty memory store."""
+    memory = fsspec.filesystem("memory")
+    memory.store.clear()
+    yield memory
+    memory.store.clear()
+
+
+@pytest.fixture(params=["folder", "store"])
+def root(request, tmp_path, store):
+    """A folder, or a folder in the memory store, with three photos in `in`."""
+    place = tmp_path if request.param == "folder" else location("memory://bucket")
+    for number, name in enumerate(NAMES):
+        path = place / "in" / name
+        if request.param == "folder":
+            path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(image_bytes(seed=number))
+    return place
+
+
+def run_archive(root, options, *, source=None, executor=SerialExecutor, index=True, **settings):
+    """Separates `in` or another source to `out`. Returns the status or the error of each photo by its name."""
+    out, results = root / "out", []
+    tasks = plan_files(source or root / "in", out, options)
+    writer = IndexWriter(out) if index else None
+    try:
+        with executor(partial(ArchiveRunner, options, **settings)) as running:
+            separate_archive(
+                tasks,
+                running,
+                report=lambda result: (results.append(result), writer and writer.append(result)),
+                **settings,
+            )
+    finally:
+        if writer:
+            writer.close()
+    return {Path(result.source).name: result.error or result.status for result in results}
+
+
+def read_index(root):
+    """Name of a photo -> its row."""
+    table = parquet.read_table(fsspec.open(str(root / "out" / INDEX_FILE)).open()).to_pylist()
+    assert [row["path"] for row in table] == sorted(row["path"] for row in table)
+    return {Path(row["path"]).name: row for row in table}
+
+
+def test_an_archive_has_the_bytes_of_a_batch_and_a_row_for_each_photo(root, options, tmp_path):
+    assert run_archive(root, options) == dict.fromkeys(("a.jpg", "c.jpg", "d.jpg"), "separated")
+    rows = read_index(root)
+    assert list(rows) == ["a.jpg", "c.jpg", "d.jpg"]
+    row, photo = rows["c.jpg"], root / "in/b/c.jpg"
+    assert row["path"] == str(photo)
+    assert row["sha256"] == hashlib.sha256(photo.read_bytes()).hexdigest()
+    assert row["model_sha256"] == hashlib.sha256(Path(options.model).read_bytes()).hexdigest()
+    assert row["outputs"] == [str(root / f"out/b/c.{layer}.jpg") for layer in ("transmission", "reflection")]
+    assert row["seconds"] > 0
+    assert 0 <= row["confidence"] <= 1
+    assert (row["status"], row["error"]) == ("separated", None)
+    (single,) = separate_files(photo, tmp_path / "plain", options)
+    for written, output in zip(row["outputs"], single.outputs.values(), strict=True):
+        assert location(written).read_bytes() == Path(output).read_bytes()
+    assert not (root / "out" / PARTS_FOLDER).exists()
+
+
+def test_a_run_is_resumed_and_rows_of_finished_photos_are_kept(root, options):
+    run_archive(root, options)
+    before = read_index(root)
+    (root / "out/b/c.reflection.jpg").unlink()
+    kept = (root / "out/b/c.transmission.jpg").read_bytes()
+    assert run_archive(root, options) == {"a.jpg": "skipped", "c.jpg": "separated", "d.jpg": "skipped"}
+    after = read_index(root)
+    assert {name: after[name] for name in ("a.jpg", "d.jpg")} == {
+        name: before[name] for name in ("a.jpg", "d.jpg")
+    }
+    assert after["c.jpg"]["outputs"] == before["c.jpg"]["outputs"]
+    assert (root / "out/b/c.transmission.jpg").read_bytes() == kept
+    assert set(run_archive(root, Options(model="no-such-model")).values()) == {"skipped"}
+    assert set(run_archive(root, options, overwrite=True).values()) == {"separated"}
+
+
+def test_missing_and_damaged_photos_of_a_manifest_are_rows_and_the_rest_is_separated(tmp_path, options):
+    (tmp_path / "scans").mkdir()
+    (tmp_path / "scans/good.jpg").write_bytes(image_bytes())
+    (tmp_path / "scans/damaged.jpg").write_bytes(image_bytes()[:500])
+    manifest = tmp_path / "list.csv"
+    manifest.write_text("path\nscans/missing.jpg\nscans/damaged.jpg\nscans/good.jpg\n")
+    results = run_archive(tmp_path, options, source=manifest)
+    assert results["good.jpg"] == "separated"
+    assert "missing.jpg cannot be read (No such file" in results["missing.jpg"]
+    rows = read_index(tmp_path)
+    assert {name: row["status"] for name, row in rows.items()} == {
+        "damaged.jpg": "failed",
+        "good.jpg": "separated",
+        "missing.jpg": "failed",
+    }
+    assert rows["missing.jpg"]["error"] == results["missing.jpg"]
+    assert list_files(tmp_path / "out") == sorted(
+        [INDEX_FILE, *(f"scans/{name}" for name in layer_files("good"))]
+    )
+    (tmp_path / "scans/missing.jpg").write_bytes(image_bytes())
+    results = run_archive(tmp_path, options, source=manifest)
+    assert (results["missing.jpg"], results["good.jpg"]) == ("separated", "skipped")
+    assert read_index(tmp_path)["missing.jpg"]["error"] is None
+
+
+def test_if_a_store_fails_in_the_middle_the_rest_is_separated_and_the_next_run_completes_it(
+    store, options, monkeypatch
+):
+    root, memory = location("memory://bucket"), type(store)
+    for name in ("a.jpg", "b.jpg", "c.jpg", "d.jpg"):
+        (root / "in" / name).write_bytes(image_bytes())
+    read, write = memory.cat_file, memory.pipe_file
+
+    def cat_file(self, path, *args, **kwargs):
+        if path.endswith("in/b.jpg"):
+            raise TimeoutError("read timed out")
+        return read(self, path, *args, **kwargs)
+
+    def pipe_file(self, path, *args, **kwargs):
+        if path.endswith("c.reflection.jpg"):
+            raise PermissionError("503 Slow Down")
+        return write(self, path, *args, **kwargs)
+
+    with monkeypatch.context() as failing:
+        failing.setattr(memory, "cat_file", cat_file)
+        failing.setattr(memory, "pipe_file", pipe_file)
+        results = run_archive(root, options)
+    assert (results["a.jpg"], results["d.jpg"]) == ("separated", "separated")
+    assert "memory://bucket/in/b.jpg cannot be read (read timed out)" in results["b.jpg"]
+    assert "c.reflection.jpg was not written (503 Slow Down)" in results["c.jpg"]
+    assert {name for name, row in read_index(root).items() if row["error"]} == {"b.jpg", "c.jpg"}
+    again = run_archive(root, options)
+    assert again == {"a.jpg": "skipped", "b.jpg": "separated", "c.jpg": "separated", "d.jpg": "skipped"}
+    assert {row["status"] for row in read_index(root).values()} == {"separated"}
+
+
+def test_a_store_that_cannot_be_written_to_ends_the_run_before_the_first_photo(store, monkeypatch, options):
+    root = location("memory://bucket")
+    (root / "in/a.jpg").write_bytes(image_bytes())
+
+    def refuse(*_, **__):
+        raise PermissionError("Access Denied")
+
+    monkeypatch.setattr(type(store), "pipe_file", refuse)
+    with pytest.raises(TargetError, match=r"memory://bucket/out/.* was not written \(Access Denied\)"):
+        run_archive(root, Options(model="no-such-model"))
+
+
+def test_a_folder_that_cannot_be_written_to_ends_the_run_before_the_first_photo(tmp_path):
+    (tmp_path / "in").mkdir()
+    (tmp_path / "in/a.jpg").write_bytes(image_bytes())
+    (tmp_path / "out").write_bytes(b"a file")
+    with pytest.raises(TargetError, match="was not written"):
+        run_archive(tmp_path, Options(model="no-such-model"))
+
+
+def test_rows_survive_a_killed_run_and_a_store_that_fails_for_a_while(store, monkeypatch):
+    folder = location("memory://bucket/out")
+    killed = IndexWriter(folder)
+    monkeypatch.setattr("brewster.inference.index.MAX_PART_ROWS", 2)
+    for name in "ab":
+        killed.append(FileResult(name))
+    later = IndexWriter(folder)
+    write = type(store).pipe_file
+
+    def refuse(*_, **__):
+        raise OSError("503 Slow Down")
+
+    monkeypatch.setattr(type(store), "pipe_file", refuse)
+    for name in "cd":
+        later.append(FileResult(name))
+    monkeypatch.setattr(type(store), "pipe_file", write)
+    later.append(FileResult("e", "skipped"))
+    later.close()
+    table = parquet.read_table(fsspec.open(str(folder / INDEX_FILE)).open())
+    assert table.column("path").to_pylist() == list("abcde")
+    assert not list((folder / PARTS_FOLDER).iterdir())
+
+
+def test_a_skipped_photo_replaces_the_row_of_a_failure_only(tmp_path):
+    for status in ("failed", "skipped", "separated", "skipped"):
+        with IndexWriter(tmp_path / "out") as index:
+            index.append(FileResult("a.jpg", status, photo_sha256=status))
+        seen = read_index(tmp_path)["a.jpg"]
+        assert seen["sha256"] == seen["status"]
+        assert status == "skipped" or seen["status"] == status
+    assert seen["status"] == "separated"
+
+
+def test_an_index_of_an_earlier_version_is_continued(tmp_path):
+    old = pyarrow.table({"path": ["a.jpg"], "status": ["separated"], "dropped": [1]})
+    parquet.write_table(old, tmp_path / INDEX_FILE)
+    with IndexWriter(tmp_path) as index:
+        index.append(FileResult("b.jpg"))
+    table = parquet.read_table(tmp_path / INDEX_FILE)
+    assert table.column_names == list(COLUMNS)
+    assert table.column("path").to_pylist() == ["a.jpg", "b.jpg"]
+
+
+def test_the_documentation_has_every_column_of_the_index():
+    section = (TESTS.parent / "docs/archives.md").read_text().split("## The index")[1].split("\n## ")[0]
+    assert re.findall(r"^\| `(\w+)`", section, re.M) == list(COLUMNS)
+
+
+def test_another_file_with_the_name_of_the_index_is_never_replaced(tmp_path):
+    (tmp_path / INDEX_FILE).write_bytes(b"something else")
+    with pytest.raises(TargetError, match=r"index\.parquet is not an index"):
+        IndexWriter(tmp_path)
+    assert list_files(tmp_path) == [INDEX_FILE]
+
+
+def test_layers_that_another_worker_has_written_in_the_meantime_are_kept(tmp_path, options, monkeypatch):
+    """A node that is cut off from the others continues, while its task is tried again on another node."""
+    (tmp_path / "in").mkdir()
+    (tmp_path / "in/a.jpg").write_bytes(image_bytes())
+    tasks = plan_files(tmp_path / "in", tmp_path / "out", options)
+    (tmp_path / "out").mkdir()
+    for layer in layer_files("a"):
+        (tmp_path / "out" / layer).write_bytes(b"written by the other node")
+    monkeypatch.setattr("brewster.inference.batch.exists", lambda path: False)
+    (result,) = ArchiveRunner(options, tmp_path / "out")(tasks[0])
+    assert (result.status, result.error) == ("skipped", None)
+    assert {(tmp_path / "out" / layer).read_bytes() for layer in layer_files("a")} == {
+        b"written by the other node"
+    }
+
+
+def test_a_photo_of_the_archive_is_never_replaced(tmp_path, options):
+    (tmp_path / "out").mkdir()
+    for name in ("a.jpg", "a.transmission.jpg"):
+        (tmp_path / "out" / name).write_bytes(image_bytes())
+    manifest = tmp_path / "out/list.csv"
+    manifest.write_text("path\na.jpg\na.transmission.jpg\n")
+    with pytest.raises(TargetError, match="is itself a photo of the batch"):
+        run_archive(tmp_path, options, source=manifest, overwrite=True)
+
+
+def test_a_node_without_the_output_folder_ends_the_run(tmp_path, options):
+    with pytest.raises(TargetError, match="does not exist on the node"):
+        ArchiveRunner(options, tmp_path / "not mounted")
+
+
+def test_two_processes_write_the_files_of_one_and_a_missing_model_ends_the_run(tmp_path, options):
+    (tmp_path / "in").mkdir()
+    for number in range(4):
+        (tmp_path / f"in/{number}.jpg").write_bytes(image_bytes(seed=number))
+    two = partial(ProcessExecutor, count=2)
+    assert set(run_archive(tmp_path, options, executor=two, index=False).values()) == {"separated"}
+    list(separate_files(tmp_path / "in", tmp_path / "plain", options))
+    assert hashes(tmp_path / "out") == hashes(tmp_path / "plain")
+    discard(tmp_path / "out")
+    with pytest.raises(ModelError, match="no-such-model"):
+        run_archive(tmp_path, Options(model="no-such-model"), executor=two)
+
+
+def test_the_command_writes_the_index_and_separates_urls(run, tmp_path, store):
+    photos = location("memory://bucket/in")
+    (photos / "a.jpg").write_bytes(image_bytes())
+    (photos / "b.jpg").write_bytes(b"not an image")
+    code, out, err = run("memory://bucket/in", "-o", "out", "--index", "--json")
+    assert code == 1
+    assert {line["source"]: line["status"] for line in json_lines(out)} == {
+        "memory://bucket/in/a.jpg": "separated",
+        "memory://bucket/in/b.jpg": "failed",
+    }
+    assert "error: memory://bucket/in/b.jpg: " in err
+    assert "1 failed, 1 separated" in err
+    assert {name: row["status"] for name, row in read_index(tmp_path).items()} == {
+        "a.jpg": "separated",
+        "b.jpg": "failed",
+    }
+    (photos / "b.jpg").unlink()
+    code, _, err = run("memory://bucket/in", "-o", "memory://bucket/out")
+    assert code == 0, err
+    layer = location("memory://bucket/out/a.transmission.jpg").read_bytes()
+    for target in ("clear.jpg", "memory://bucket/clear.jpg"):
+        code, _, err = run("memory://bucket/in/a.jpg", "-o", target)
+        assert (code, location(target).read_bytes()) == (0, layer), err
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [["--cluster", "local"], ["--index"], ["--workers", "2", "-o", "a.jpg"], ["--index", "-o", "-"]],
+)
+def test_the_command_needs_a_folder_for_the_layers_of_an_archive(run, tmp_path, arguments):
+    (tmp_path / "in.jpg").write_bytes(image_bytes())
+    code, _, err = run("in.jpg", *arguments)
+    assert code == 2
+    assert "give a folder with -o" in err
+
+
+LOSES_A_NODE = """
+import os, sys
+from functools import partial
+from pathlib import Path
+os.environ["RAY_USAGE_STATS_ENABLED"] = "0"
+from ray.cluster_utils import Cluster
+from brewster.executors.ray_cluster import RayExecutor
+from brewster.inference import plan_files
+from brewster.inference.archive import ArchiveRunner, separate_archive
+from brewster.inference.index import IndexWriter
+from brewster.options import Options
+root, options, done = Path(sys.argv[1]), Options(model=sys.argv[2]), []
+nodes = Cluster(initialize_head=True, head_node_args={"num_cpus": 1, "include_dashboard": False})
+lost_node = nodes.add_node(num_cpus=1)
+nodes.wait_for_nodes()
+with IndexWriter(root / "out") as index, RayExecutor(partial(ArchiveRunner, options, root / "out"), nodes.address) as executor:
+
+    def report(result):
+        index.append(result)
+        done.append(result.status)
+        if len(done) == 10:
+            nodes.remove_node(lost_node, allow_graceful=False)
+
+    separate_archive(plan_files(root / "in", root / "out", options), executor, report=report)
+nodes.shutdown()
+print(len(done), sorted(set(done) - {"skipped"}))
+"""
+
+
+@pytest.mark.slow
+def test_an_archive_is_complete_and_has_the_same_bytes_if_a_node_is_lost(tmp_path, model):
+    pytest.importorskip("ray")
+    (tmp_path / "in").mkdir()
+    for number in range(60):
+        (tmp_path / f"in/{number:02}.jpg").write_bytes(image_bytes(600, 400, seed=number))
+    paths = os.pathsep.join([str(TESTS), os.environ.get("PYTHONPATH", "")])
+    done = subprocess.run(
+        [sys.executable, "-c", LOSES_A_NODE, str(tmp_path), str(model)],
+        env={**os.environ, "PYTHONPATH": paths, "RAY_USAGE_STATS_ENABLED": "0"},
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=900,
+    )
+    assert done.stdout.strip().endswith("60 ['separated']"), done.stderr
+    rows = read_index(tmp_path)
+    assert len(rows) == 60
+    (tmp_path / "out" / INDEX_FILE).unlink()
+    list(separate_files(tmp_path / "in", tmp_path / "plain", Options(model=str(model))))
+    assert hashes(tmp_path / "out") == hashes(tmp_path / "plain")

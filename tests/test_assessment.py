@@ -1,0 +1,78 @@
+"""The assessment of a separation: what was removed, where, how reliably, and the verdict."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from brewster import Photo, Separator
+from brewster.inference.assessment import assess
+
+SIZE = (24, 32)
+
+
+def grey(value):
+    return np.full((*SIZE, 3), value, np.float32)
+
+
+def certain(value=1.0):
+    return np.full((*SIZE, 1), value, np.float32)
+
+
+def test_an_unchanged_photo_has_nothing_removed_and_full_confidence():
+    found = assess(grey(0.4), grey(0.4), certain(0.2))
+    assert (found.removed_light, found.changed_area, found.confidence) == (0, 0, 1)
+    assert found.verdict == "little found"
+
+
+def test_half_of_the_light_removed_from_a_quarter_of_the_photo():
+    transmission = grey(0.4)
+    transmission[:12, :16] = 0.2
+    confidence = certain(0.9)
+    confidence[12:] = 0.0  # where nothing changed
+    found = assess(grey(0.4), transmission, confidence)
+    assert found.removed_light == pytest.approx(1 / 8)
+    assert found.changed_area == pytest.approx(1 / 4)
+    assert found.confidence == pytest.approx(0.9)
+    assert found.verdict == "clear"
+
+
+def test_light_that_was_added_is_not_removed_light():
+    assert assess(grey(0.2), grey(0.3), certain()).removed_light == 0
+
+
+@pytest.mark.parametrize(("error", "is_doubtful"), [(None, False), (0.05, False), (0.07, True)])
+def test_a_large_reconstruction_error_is_doubtful(error, is_doubtful):
+    verdict = assess(grey(0.4), grey(0.2), certain(), error).verdict
+    assert (verdict == "doubtful") == is_doubtful
+
+
+def test_less_confidence_never_gives_a_better_verdict():
+    order = ["clear", "partial", "doubtful"]
+    verdicts = [
+        assess(grey(0.4), grey(0.2), certain(value)).verdict for value in (1, 0.8, 0.6, 0.4, 0.2, 0.1)
+    ]
+    ranks = [order.index(verdict) for verdict in verdicts]
+    assert ranks == sorted(ranks)
+    assert {"clear", "doubtful"} <= set(verdicts)
+
+
+@given(st.integers(0, 2**32 - 1))
+def test_every_number_is_a_fraction(seed):
+    random = np.random.default_rng(seed)
+    photo, transmission = random.random((2, 8, 9, 3), np.float32)
+    found = assess(photo, transmission, random.random((8, 9, 1), np.float32))
+    assert all(0 <= value <= 1 for value in (found.removed_light, found.changed_area, found.confidence))
+
+
+def test_a_black_photo_is_assessed():
+    assert assess(grey(0.0), grey(0.0), certain()).removed_light == 0
+
+
+def test_a_separation_has_the_assessment_of_the_full_prediction_at_any_strength():
+    separator = Separator(lambda tile: (tile * 0.5, tile * 0.5))
+    photo = Photo.from_array(grey(0.5), encoding="linear")
+    assessments = [separator(photo, strength=strength).assessment for strength in (0.2, 1.0)]
+    assert assessments[0] == assessments[1]
+    assert assessments[0].removed_light == pytest.approx(0.5, abs=0.01)
+    assert assessments[0].changed_area == 1

@@ -1,0 +1,82 @@
+"""The notice before a download: size, licence and free disk space."""
+
+import shutil
+from types import SimpleNamespace
+
+import huggingface_hub
+import pytest
+
+from brewster.errors import DownloadError
+from brewster.models.diffusion import download_notice
+from brewster.models.diffusion.backbones import BACKBONES
+from brewster.models.diffusion.lazy_imports import fetch
+from brewster.models.large_models import LARGE, licence_of
+
+
+@pytest.fixture
+def hub(monkeypatch, tmp_path):
+    """huggingface_hub with a cache in a temporary folder, which has to download two of three files."""
+    calls = []
+    files = [
+        SimpleNamespace(file_size=size, will_download=missing)
+        for size, missing in ((40_000_000_000, True), (250_000_000, True), (7_000_000_000, False))
+    ]
+
+    def snapshot_download(source, *, allow_patterns, dry_run=False):
+        calls.append("dry run" if dry_run else "download")
+        return files if dry_run else str(tmp_path)
+
+    monkeypatch.setattr(huggingface_hub, "snapshot_download", snapshot_download)
+    monkeypatch.setattr(huggingface_hub.constants, "HF_HUB_CACHE", str(tmp_path / "not" / "yet"))
+    return SimpleNamespace(calls=calls, files=files, free=lambda free: monkeypatch.setattr(
+        shutil, "disk_usage", lambda _: SimpleNamespace(free=free)
+    ))  # fmt: skip
+
+
+def test_size_and_licence_are_printed_before_the_download(hub, capsys):
+    hub.free(50_000_000_000)
+    fetch("Qwen/Qwen-Image-Edit-2509", ["*"])
+    assert hub.calls == ["dry run", "download"]
+    printed = capsys.readouterr()
+    assert printed.out == ""
+    assert "downloading 40.2 GB of Qwen/Qwen-Image-Edit-2509" in printed.err
+    assert "licence: Apache-2.0" in printed.err
+
+
+def test_a_download_that_does_not_fit_on_the_disk_is_refused(hub):
+    hub.free(41_000_000_000)
+    with pytest.raises(DownloadError, match=r"has 40\.2 GB to download, and 41\.0 GB are free in .*HF_HOME"):
+        fetch("Qwen/Qwen-Image-Edit-2509", ["*"])
+    assert hub.calls == ["dry run"]
+
+
+def test_small_and_cached_files_are_not_announced(hub, capsys):
+    hub.files[:2] = [SimpleNamespace(file_size=None, will_download=True)]
+    hub.free(0)
+    fetch("someone/model", ["*"])
+    assert hub.calls == ["dry run", "download"]
+    assert capsys.readouterr().err == ""
+
+
+def test_the_hub_that_cannot_be_asked_does_not_prevent_the_use_of_the_cache(monkeypatch, tmp_path):
+    def snapshot_download(source, *, allow_patterns, dry_run=False):
+        if dry_run:
+            raise huggingface_hub.errors.DryRunError("no network")
+        return str(tmp_path)
+
+    monkeypatch.setattr(huggingface_hub, "snapshot_download", snapshot_download)
+    assert fetch("someone/model", ["*"]) == tmp_path
+
+
+@pytest.mark.parametrize("name", list(BACKBONES))
+def test_the_table_agrees_with_the_backbones(name):
+    model, family = LARGE[name], BACKBONES[name]
+    assert (model.hub_id, model.licence) == (family.hub_id, family.licence.title)
+    assert model.is_commercial == family.licence.is_commercial
+
+
+def test_the_licence_of_a_base_is_that_of_its_owner():
+    assert licence_of("black-forest-labs/FLUX.1-Kontext-dev") == "FLUX.1 [dev] Non-Commercial License"
+    assert licence_of("Qwen/Qwen-Image-Edit-2509") == "Apache-2.0"
+    assert licence_of("someone/model") == "see its page on the hub"
+    assert download_notice.licence_of is licence_of

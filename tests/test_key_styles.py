@@ -1,0 +1,285 @@
+"""LoRAs of other programs. The oracle is stock diffusers wherever it reads the same file."""
+
+import json
+
+import pytest
+import torch
+from safetensors.torch import save_file
+
+from brewster import Separator
+from brewster.errors import ModelError, RecipeError
+from brewster.models.diffusion.adapter import importer
+from brewster.models.diffusion.adapter.importer import import_lora
+from brewster.models.diffusion.adapter.key_styles import LowRankLayer, alpha_scale, read_layers
+from brewster.models.diffusion.adapter.lora import LORA_FILE, load_lora, read_lora_metadata
+from brewster.models.diffusion.backbones import tiny
+from brewster.models.diffusion.pipeline import load_pipeline
+from brewster.models.diffusion.tensors import read_tensors
+from published_models import linear_layers, random_pair
+
+# Layers in diffusers, and the layer of the original code that contains them one after the other.
+BLOCK = "transformer_blocks.0."
+KONTEXT = {
+    "double_blocks.0.img_attn.qkv": [f"{BLOCK}attn.to_{part}" for part in "qkv"],
+    "double_blocks.0.txt_attn.qkv": [f"{BLOCK}attn.add_{part}_proj" for part in "qkv"],
+    "double_blocks.1.txt_mlp.0": ["transformer_blocks.1.ff_context.net.0.proj"],
+    "double_blocks.0.img_mod.lin": [f"{BLOCK}norm1.linear"],
+    "single_blocks.1.linear2": ["single_transformer_blocks.1.proj_out"],
+}
+KLEIN = {
+    "double_blocks.0.img_attn.qkv": [f"{BLOCK}attn.to_{part}" for part in "qkv"],
+    "double_blocks.0.txt_attn.proj": [f"{BLOCK}attn.to_add_out"],
+    "double_blocks.0.img_mlp.2": [f"{BLOCK}ff.linear_out"],
+    "single_blocks.0.linear1": ["single_transformer_blocks.0.attn.to_qkv_mlp_proj"],
+    "single_blocks.0.linear2": ["single_transformer_blocks.0.attn.to_out"],
+}
+QWEN = {name: [name] for name in (f"{BLOCK}attn.to_q", f"{BLOCK}attn.to_add_out", f"{BLOCK}img_mlp.net.2")}
+ORIGINAL = {"kontext": KONTEXT, "klein": KLEIN, "qwen": QWEN}
+
+
+def velocity(backbone, prompt):
+    generator = torch.Generator().manual_seed(0)
+    latents, condition = torch.randn(2, 1, backbone.channels, 2, 4, generator=generator)
+    return backbone.predict(latents, condition, torch.tensor([0.7]), prompt, 1.0)
+
+
+class Fused:
+    """A linear layer of the original code, which has the rows of several layers in diffusers."""
+
+    def __init__(self, layers):
+        self.in_features, self.out_features = (
+            layers[0].in_features,
+            sum(layer.out_features for layer in layers),
+        )
+
+
+def weights(name, *, original):
+    """Pairs of random matrices by layer, with ranks 2 and 3."""
+    layers, generator = linear_layers(tiny(name, seed=1)[0].transformer), torch.Generator().manual_seed(6)
+    table = (
+        ORIGINAL[name]
+        if original
+        else {target: [target] for parts in ORIGINAL[name].values() for target in parts}
+    )
+    return {
+        key: random_pair(Fused([layers[part] for part in parts]), 2 + index % 2, generator)
+        for index, (key, parts) in enumerate(table.items())
+    }
+
+
+def kohya(pairs, prefix="lora_unet_", *, flat=True, alpha=1.0):
+    tensors = {}
+    for name, (down, up) in pairs.items():
+        key = prefix + (name.replace(".", "_") if flat else name)
+        tensors |= {
+            f"{key}.lora_down.weight": down,
+            f"{key}.lora_up.weight": up,
+            f"{key}.alpha": torch.tensor(alpha),
+        }
+    return tensors
+
+
+def peft(pairs, prefix, adapter=""):
+    return {
+        f"{prefix}{name}.lora_{part}{adapter}.weight": matrix
+        for name, pair in pairs.items()
+        for part, matrix in zip("AB", pair, strict=True)
+    }
+
+
+STYLES = {
+    "diffusers": lambda name: peft(weights(name, original=False), "transformer."),
+    "kohya": lambda name: kohya(weights(name, original=True)),
+    "ComfyUI": lambda name: (
+        peft(weights(name, original=True), "diffusion_model.")
+        if name == "klein"  # stock diffusers ignores the other spelling
+        else kohya(weights(name, original=True), "diffusion_model.", flat=False)
+    ),
+}
+
+
+def imported(path, name, folder):
+    """The backbone with the imported LoRA, opened as a user opens it."""
+    import_lora(str(path), folder, base=f"tiny:{name}", prompt="remove the reflection", panels=("T",))
+    backbone, _ = tiny(name, seed=1)
+    load_lora(folder, backbone)
+    return backbone
+
+
+@pytest.mark.parametrize("style", list(STYLES))
+@pytest.mark.parametrize("name", list(ORIGINAL))
+def test_each_style_predicts_as_in_stock_diffusers(name, style, tmp_path):
+    backbone, prompt = tiny(name, seed=1)
+    plain = velocity(backbone, prompt)
+    path = tmp_path / "lora.safetensors"
+    save_file(STYLES[style](name), path)
+    backbone.pipeline().load_lora_weights(str(path))
+    expected = velocity(backbone, prompt)
+    assert (expected - plain).abs().max() > 1e-3
+    found = velocity(imported(path, name, tmp_path / "imported"), prompt)
+    torch.testing.assert_close(found, expected, atol=1e-5, rtol=0)
+
+
+@pytest.mark.parametrize(
+    ("prefix", "adapter"), [("base_model.model.", ""), ("", ".default"), ("transformer.", ".x")]
+)
+def test_the_styles_of_peft_predict_as_that_of_diffusers(prefix, adapter, tmp_path):
+    pairs = weights("kontext", original=False)
+    predictions = []
+    for index, tensors in enumerate((peft(pairs, "transformer."), peft(pairs, prefix, adapter))):
+        save_file(tensors, tmp_path / f"{index}.safetensors")
+        backbone = imported(tmp_path / f"{index}.safetensors", "kontext", tmp_path / str(index))
+        predictions.append(velocity(backbone, tiny("kontext", seed=1)[1]))
+    assert torch.equal(*predictions)
+
+
+def test_an_imported_lora_is_opened_by_model_and_by_diffusers(tmp_path):
+    path, folder = tmp_path / "lora.safetensors", tmp_path / "imported"
+    save_file(STYLES["kohya"]("klein"), path)
+    backbone = imported(path, "klein", folder)
+    _, prompt = tiny("klein", seed=1)
+    stock, _ = tiny("klein", seed=1)
+    stock.pipeline().load_lora_weights(folder)
+    torch.testing.assert_close(velocity(stock, prompt), velocity(backbone, prompt), atol=1e-5, rtol=0)
+    metadata = read_lora_metadata(folder)
+    assert (metadata.backbone, metadata.base, metadata.rank) == ("klein", "tiny:klein", 3)
+    assert metadata.task.layout.panels == ("T",)
+    pipeline = load_pipeline(str(folder))
+    assert pipeline.prompt.text == "remove the reflection"
+    assert Separator.load(str(folder), steps=1).name == "imported"
+
+
+def test_a_layer_of_several_is_split_by_rows_and_the_top_level_layer_is_not_mistaken(tmp_path):
+    """`linear1` is q, k, v and the MLP; stock diffusers assumes the sizes of the full model. `proj_out` occurs twice."""
+    transformer = tiny("kontext", seed=1)[0].transformer
+    layers, generator = linear_layers(transformer), torch.Generator().manual_seed(7)
+    single = "single_transformer_blocks.0."
+    parts = [f"{single}attn.to_q", f"{single}attn.to_k", f"{single}attn.to_v", f"{single}proj_mlp"]
+    pairs = {
+        "single_blocks.0.linear1": random_pair(Fused([layers[part] for part in parts]), 2, generator),
+        "final_layer.linear": random_pair(layers["proj_out"], 5, generator),
+        "final_layer.adaLN_modulation.1": random_pair(layers["norm_out.linear"], 2, generator),
+    }
+    save_file(kohya(pairs, alpha=4.0), tmp_path / "lora.safetensors")
+    found = imported(tmp_path / "lora.safetensors", "kontext", tmp_path / "imported")
+    expected, prompt = tiny("kontext", seed=1)
+    changes = {name: 4 / len(down) * up @ down for name, (down, up) in pairs.items()}
+    merged = dict(
+        zip(
+            parts,
+            changes["single_blocks.0.linear1"].split([layers[part].out_features for part in parts]),
+            strict=True,
+        )
+    )
+    shift, scale = changes["final_layer.adaLN_modulation.1"].chunk(2)
+    merged |= {"proj_out": changes["final_layer.linear"], "norm_out.linear": torch.cat([scale, shift])}
+    with torch.no_grad():
+        for name, change in merged.items():
+            expected.transformer.get_submodule(name).weight += change
+    torch.testing.assert_close(velocity(found, prompt), velocity(expected, prompt), atol=1e-5, rtol=0)
+    assert {
+        name.rsplit(".lora_A", 1)[0]
+        for name, _ in found.transformer.named_modules()
+        if name.endswith("lora_A")
+    } == set(merged)
+
+
+def test_weights_in_bf16_are_read_as_float32(tmp_path):
+    tensors = {key: value.bfloat16() for key, value in STYLES["diffusers"]("qwen").items()}
+    layers = read_layers(tensors, tiny("qwen", seed=1)[0].transformer, "qwen")
+    assert {matrix.dtype for layer in layers.values() for matrix in (layer.down, layer.up)} == {torch.float32}
+
+
+def test_alphas_come_from_the_metadata_of_diffusers_and_the_settings_of_peft(tmp_path):
+    pairs = weights("qwen", original=False)
+    layers = []
+    settings = {"r": 2, "lora_alpha": 4, "alpha_pattern": {f"{BLOCK}attn.to_q": 8}}
+    save_file(
+        peft(pairs, "transformer."),
+        tmp_path / "a.safetensors",
+        {
+            "lora_adapter_metadata": json.dumps(
+                {f"transformer.{key}": value for key, value in settings.items()}
+            )
+        },
+    )
+    (tmp_path / "peft").mkdir()
+    save_file(peft(pairs, "base_model.model."), tmp_path / "peft" / "adapter_model.safetensors")
+    (tmp_path / "peft" / "adapter_config.json").write_text(json.dumps(settings))
+    for index, source in enumerate((tmp_path / "a.safetensors", tmp_path / "peft")):
+        folder = tmp_path / f"imported{index}"
+        import_lora(str(source), folder, base="tiny:qwen", prompt="x", panels=("T",))
+        layers.append(read_tensors(folder / LORA_FILE)[0])
+    for name, (_, up) in pairs.items():
+        alpha = 8 if name.endswith("to_q") else 4
+        expected = up * alpha / up.shape[1]
+        for tensors in layers:
+            torch.testing.assert_close(tensors[f"transformer.{name}.lora_B.weight"], expected)
+
+
+def test_rank_stabilised_loras_have_their_own_scale():
+    assert alpha_scale({"lora_alpha": 8, "use_rslora": True})("x", 4) == 4
+    assert alpha_scale({"lora_alpha": 8})("x", 4) == 2
+    assert alpha_scale({})("x", 4) == 1
+    assert LowRankLayer(torch.zeros(3, 2), torch.zeros(5, 3)).rank == 3
+
+
+@pytest.mark.parametrize(
+    ("tensors", "message"),
+    [
+        ({"lora_unet_double_blocks_0_img_attn_qkv.lora_down.weight": torch.zeros(2, 32)}, "in the style of kohya, belongs to no layer of qwen"),
+        ({"transformer.x.dora_scale": torch.zeros(2)}, "has DoRA matrices"),
+        ({"lycoris_a.lokr_w1": torch.zeros(2)}, "has LoKr matrices"),
+        ({"lora_te1_text_model.lora_down.weight": torch.zeros(2, 2)}, "also changes a text encoder"),
+        ({f"transformer.{BLOCK}attn.to_q.lora_A.weight": torch.zeros(2, 32)}, "only one of two matrices"),
+        ({"weight": torch.zeros(2)}, "in the style of unknown"),
+        ({}, "contains no LoRA"),
+        (
+            {f"transformer.{BLOCK}attn.to_q.lora_A.weight": torch.zeros(2, 33), f"transformer.{BLOCK}attn.to_q.lora_B.weight": torch.zeros(32, 2)},
+            "expected a layer with 32 x 32 weights",
+        ),
+    ],
+)  # fmt: skip
+def test_what_is_not_understood_is_one_clear_sentence(tensors, message, tmp_path):
+    save_file(tensors, tmp_path / "lora.safetensors")
+    with pytest.raises(ModelError, match=message):
+        import_lora(
+            str(tmp_path / "lora.safetensors"), tmp_path / "out", base="tiny:qwen", prompt="x", panels=("T",)
+        )
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_folder_must_contain_one_file_and_panels_need_t(tmp_path):
+    with pytest.raises(ModelError, match=r"contains no such file; expected one \.safetensors file"):
+        import_lora(str(tmp_path), tmp_path / "out", base="tiny:qwen", prompt="x", panels=("T",))
+    with pytest.raises(RecipeError, match="expected a list with T"):
+        import_lora(str(tmp_path), tmp_path / "out", base="tiny:qwen", prompt="x", panels=("R",))
+
+
+def test_the_base_may_be_a_folder(tmp_path, monkeypatch):
+    backbone, prompt = tiny("qwen", seed=1)
+    backbone.save(tmp_path / "base")
+    monkeypatch.setattr(importer, "encode_prompt", lambda *_, **__: prompt)
+    save_file(STYLES["diffusers"]("qwen"), tmp_path / "lora.safetensors")
+    base = str(tmp_path / "base")
+    metadata = import_lora(
+        str(tmp_path / "lora.safetensors"), tmp_path / "out", base=base, prompt="x", panels=("T",)
+    )
+    assert (metadata.backbone, metadata.base) == ("qwen", base)
+
+
+def test_a_lora_and_a_checkpoint_are_imported(run_without_model, tmp_path):
+    matrices = {"A": torch.ones(2, 32), "B": torch.ones(32, 2)}
+    tensors = {
+        f"transformer.transformer_blocks.0.attn.to_q.lora_{part}.weight": m for part, m in matrices.items()
+    }
+    save_file(tensors, tmp_path / "lora.safetensors")
+    arguments = ("models", "import", "lora.safetensors", "imported", "--base", "tiny:kontext")
+    code, _, err = run_without_model(*arguments)
+    assert (code, "A LoRA needs --prompt" in err) == (2, True)
+    code, _, err = run_without_model(*arguments, "--prompt", "remove the reflection", "--panels", "T,R")
+    assert (code, "use it with: --model imported" in err) == (0, True)
+    assert read_lora_metadata(tmp_path / "imported").task.layout.panels == ("T", "R")
+    (tmp_path / "model.pt").write_bytes(b"nothing")
+    code, _, err = run_without_model("models", "import", "model.pt", "out")
+    assert (code, err.startswith("error: model.pt cannot be read")) == (1, True)

@@ -1,0 +1,85 @@
+"""Manifests: tables of paths, and files that are no such tables."""
+
+from pathlib import Path
+
+import pyarrow
+import pytest
+from pyarrow import parquet
+
+from brewster.errors import ManifestError, PhotoError
+from brewster.inference import plan_files
+from brewster.inference.manifest import read_manifest
+from brewster.remote_path import location
+from cli_helpers import image_bytes
+
+
+def write_manifest(path, *rows, column="path"):
+    """Writes a table in the format of the suffix."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    if path.suffix == ".csv":
+        path.write_text(
+            "\n".join([f"{column},year", *(f'"{row}",1987' for row in rows)]), encoding="utf-8-sig"
+        )
+    else:
+        parquet.write_table(pyarrow.table({"year": [1987] * len(rows), column: list(rows)}), path)
+    return path
+
+
+@pytest.mark.parametrize("suffix", [".csv", ".parquet", ".CSV"])
+def test_relative_paths_absolute_paths_and_urls_are_mirrored_below_the_output(tmp_path, suffix):
+    rows = ["box, 4/./a.jpg", "/scans/b.tif", "memory://bucket/1987/c.jpg", "d.jpg"]
+    manifest = write_manifest(tmp_path / f"list{suffix.lower()}", *rows)
+    manifest = manifest.rename(tmp_path / f"list{suffix}")
+    assert list(read_manifest(manifest, Path("out"))) == [
+        (tmp_path / "box, 4/a.jpg", Path("out/box, 4")),
+        (Path("/scans/b.tif"), Path("out/scans")),
+        (location("memory://bucket/1987/c.jpg"), Path("out/bucket/1987")),
+        (tmp_path / "d.jpg", Path("out")),
+    ]
+    assert [folder for _, folder in read_manifest(manifest)] == [
+        tmp_path / "box, 4",
+        Path("/scans"),
+        location("memory://bucket/1987"),
+        tmp_path,
+    ]
+
+
+def test_a_batch_accepts_manifests_and_missing_photos_are_tasks_too(tmp_path):
+    (tmp_path / "in").mkdir()
+    for name in ("a.jpg", "a.png", "unlisted.jpg"):
+        (tmp_path / "in" / name).write_bytes(image_bytes())
+    manifest = write_manifest(tmp_path / "list.parquet", "in/missing.jpg", "in/a.png", "in/a.png")
+    tasks = plan_files(manifest, tmp_path / "out")
+    assert [Path(task.name).name for task in tasks] == ["missing.jpg", "a.png"]
+    assert tasks[1].targets["transmission"] == tmp_path / "out/in/a.png.transmission.png"
+    with pytest.raises(PhotoError, match="there is no photo in"):
+        plan_files(write_manifest(tmp_path / "empty.csv"))
+
+
+@pytest.mark.parametrize("suffix", [".csv", ".parquet"])
+def test_a_file_that_is_not_a_table_is_refused(tmp_path, suffix):
+    path = tmp_path / f"list{suffix}"
+    with pytest.raises(ManifestError, match="cannot be read"):
+        plan_files(path)
+    path.write_bytes(image_bytes())
+    with pytest.raises(ManifestError, match=r"is not a table \(.+; expected a CSV or Parquet table"):
+        plan_files(path)
+    write_manifest(path, "a.jpg", column="file")
+    with pytest.raises(ManifestError, match=r"has the columns .*'file'.*; name a column 'path'"):
+        plan_files(path)
+
+
+def test_rows_that_are_not_paths_below_the_manifest_are_refused(tmp_path):
+    for rows, message in [
+        (["a.jpg", None], "row 2 of .* has the path None"),
+        ([" "], "row 1 of .* has the path ' '"),
+        (["../a.jpg"], "outside the folder of the manifest"),
+        (["b/../../a.jpg"], "outside the folder of the manifest"),
+        ([7], "row 1 of .* has the path 7"),
+    ]:
+        with pytest.raises(ManifestError, match=message):
+            plan_files(write_manifest(tmp_path / "list.parquet", *rows))
+    short = tmp_path / "short.csv"
+    short.write_text("year,path\n1987\n")
+    with pytest.raises(ManifestError, match=r"row 1 of .* has the path None"):
+        plan_files(short)

@@ -1,0 +1,36 @@
+"""The named protocols: their settings, their sources, and what a report says about them."""
+
+import pytest
+
+from brewster.errors import BrewsterError
+from brewster.evaluate.config import EvaluationConfig
+from brewster.evaluate.protocols import PROTOCOLS, describe_protocol, protocol_config
+
+
+@pytest.mark.parametrize("name", PROTOCOLS)
+def test_each_choice_of_a_protocol_has_a_source(name):
+    lines = describe_protocol(protocol_config(name))
+    assert lines[0].startswith(f"Protocol {name}: ")
+    assert len(lines) == 1 + len(PROTOCOLS[name].choices) > 1
+    assert all(choice and source for choice, source in PROTOCOLS[name].choices)
+
+
+def test_the_default_protocol_has_the_default_settings():
+    assert protocol_config("brewster") == EvaluationConfig()
+
+
+def test_the_contest_crops_the_border_and_scores_its_five_metrics():
+    config = protocol_config("ntire2026")
+    assert config.border == 4
+    assert config.metrics == ("psnr", "ssim_clipped", "lpips", "dists", "niqe")
+    assert any("outermost 4 pixels" in line for line in config.describe())
+
+
+def test_a_changed_setting_is_named():
+    lines = describe_protocol(protocol_config("xreflection", size=None, quality="best"))
+    assert lines[-1] == "This run differs from the protocol xreflection in: size."
+
+
+def test_an_unknown_protocol_is_an_error_with_the_known_names():
+    with pytest.raises(BrewsterError, match="expected one of brewster, paper, xreflection"):
+        protocol_config("ntire2020")

@@ -1,0 +1,107 @@
+"""Files in object stores. The store is fsspec's memory://, which behaves like S3 without a network."""
+
+import pickle
+import sys
+from pathlib import Path
+
+import pytest
+
+from brewster.errors import BrewsterError, MissingExtra, TargetError, UnreadablePhoto
+from brewster.files import find, write_atomically
+from brewster.remote_path import RemotePath, location
+
+fsspec = pytest.importorskip("fsspec")
+
+
+@pytest.fixture(autouse=True)
+def store():
+    """The empty memory store."""
+    memory = fsspec.filesystem("memory")
+    memory.store.clear()
+    yield memory
+    memory.store.clear()
+
+
+def fail(*_, **__):
+    raise OSError("503 Slow Down\nrequest 7")
+
+
+def test_a_url_has_the_operations_of_a_path():
+    path = RemotePath("s3://bucket/scans")
+    photo = path / "box 4" / "a.jpg"
+    assert str(photo) == "s3://bucket/scans/box 4/a.jpg"
+    assert (photo.name, photo.stem, photo.suffix) == ("a.jpg", "a", ".jpg")
+    assert photo.parent == RemotePath("s3://bucket/scans/box 4")
+    assert photo.relative_to(path).parts == ("box 4", "a.jpg")
+    assert pickle.loads(pickle.dumps(photo)) == photo
+    assert not isinstance(photo, Path)
+
+
+def test_a_location_is_a_path_or_a_url():
+    assert location("scans/a.jpg") == Path("scans/a.jpg")
+    assert location(Path("a")) == Path("a")
+    assert location("file:///scans/box%204/a.jpg") == Path("/scans/box 4/a.jpg")
+    assert str(location("memory://bucket/a.jpg")) == "memory://bucket/a.jpg"
+
+
+def test_a_protocol_that_is_unknown_or_not_installed_is_reported_before_any_photo(monkeypatch):
+    with pytest.raises(BrewsterError, match="the protocol nope:// is unknown"):
+        location("nope://bucket/a.jpg")
+    monkeypatch.setitem(sys.modules, "s3fs", None)
+    with pytest.raises(MissingExtra, match=r"s3:// needs a package that is not installed .*s3fs"):
+        location("s3://bucket/a.jpg")
+    monkeypatch.setitem(sys.modules, "fsspec", None)
+    with pytest.raises(MissingExtra, match=r"pip install 'brewster\[cluster\]'"):
+        location("memory://bucket/a.jpg")
+
+
+def test_a_file_in_a_store_is_written_once():
+    path = location("memory://bucket/a.jpg")
+    write_atomically(path, b"first")
+    with pytest.raises(TargetError, match=r"memory://bucket/a\.jpg was not written .*exists"):
+        write_atomically(path, b"second")
+    assert path.read_bytes() == b"first"
+    write_atomically(path, b"second", overwrite=True)
+    assert path.read_bytes() == b"second"
+    with pytest.raises(TargetError, match="is the input image itself"):
+        write_atomically(path, b"third", overwrite=True, source=path)
+
+
+def test_photos_in_a_store_are_found_like_those_in_a_folder(tmp_path):
+    names = ("b/c.png", "a.jpg", "b/c.jpg", ".hidden/d.jpg", "a.transmission.jpg", "notes.txt")
+    root = location("memory://bucket/in")
+    for name in names:
+        (root / name).write_bytes(b"")
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_bytes(b"")
+    output = location("memory://out")
+    remote = [
+        (str(found.source.relative_to(root)), str(found.target("reflection")))
+        for found in find([root], output)
+    ]
+    local = [
+        (found.source.relative_to(tmp_path).as_posix(), str(found.target("reflection")))
+        for found in find([tmp_path], output)
+    ]
+    assert remote == local
+    assert dict(remote)["b/c.png"] == "memory://out/b/c.png.reflection.png"
+    (single,) = find([root / "a.jpg"], tmp_path)
+    assert single.target("transmission") == tmp_path / "a.transmission.jpg"
+
+
+def test_errors_of_a_store_name_the_file_and_the_reason(store, monkeypatch):
+    path = location("memory://bucket/a.jpg")
+    with pytest.raises(UnreadablePhoto, match=r"memory://bucket/a.jpg cannot be read \(it does not exist\)"):
+        path.read_bytes()
+    for method in ("cat_file", "pipe_file", "find", "ls", "exists"):
+        monkeypatch.setattr(type(store), method, fail)
+    with pytest.raises(
+        UnreadablePhoto, match=r"cannot be read \(503 Slow Down\); expected a store that answers"
+    ):
+        path.read_bytes()
+    with pytest.raises(TargetError, match=r"was not written \(503 Slow Down\)"):
+        write_atomically(path, b"")
+    with pytest.raises(UnreadablePhoto, match="memory://bucket cannot be listed"):
+        find([path.parent])
+    assert not path.exists()
+    assert list(path.parent.iterdir()) == []

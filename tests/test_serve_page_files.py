@@ -1,0 +1,198 @@
+"""The page never loses files or results, and says what happens to them; tested in a real browser with a real server."""
+
+import io
+import zipfile
+
+import pytest
+
+from cli_helpers import image_bytes
+from page_helpers import downloaded, upload
+
+
+def add(page, *names, **kwargs):
+    data = image_bytes(90, 60, "png")
+    page.set_input_files(
+        "#files", [{"name": name, "mimeType": "", "buffer": data} for name in names], **kwargs
+    )
+
+
+def names_in_list(page):
+    return page.locator("#photos .name").all_inner_texts()
+
+
+def drop(page, *paths):
+    """Drops files and folders of the disk on the page, as a file manager does."""
+    session = page.context.new_cdp_session(page)
+    data = {"items": [], "files": [str(path) for path in paths], "dragOperationsMask": 1}
+    for kind in ("dragEnter", "dragOver", "drop"):
+        session.send("Input.dispatchDragEvent", {"type": kind, "x": 300, "y": 300, "data": data})
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """A folder with three photos in two levels, and a text file."""
+    for name in ("album/10.png", "album/9.png", "album/deep/1.png"):
+        path = tmp_path / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(image_bytes(60, 40, "png"))
+    (tmp_path / "album/notes.txt").write_text("no photo")
+    return tmp_path / "album"
+
+
+def test_a_dropped_folder_is_opened_and_its_other_files_are_counted(open_page, folder):
+    page = open_page()
+    drop(page, folder)
+    page.wait_for_selector("li.done >> nth=2")
+    assert names_in_list(page) == ["9.png", "10.png", "1.png"]
+    assert page.locator("#removed-text").inner_text() == "3 photos were added; 1 other file was left out."
+
+
+def test_a_folder_can_be_chosen(open_page, folder):
+    page = open_page()
+    page.set_input_files("#folder", str(folder))
+    page.wait_for_selector("li.done >> nth=2")
+    assert sorted(names_in_list(page)) == ["1.png", "10.png", "9.png"]
+
+
+def test_a_folder_with_more_photos_than_the_list_holds_says_how_many_are_left_out(open_page):
+    """The entries of a folder are simulated: a hundred thousand real files would take minutes."""
+    page = open_page()
+    found = page.evaluate("""async () => {
+        const { readTransfer, describeAdded } = await import("/page/drop.js");
+        let opened = 0;
+        const entries = Array.from({ length: 100_000 }, (_, index) => ({
+            name: `${index}.jpg`, isDirectory: false, file: (done) => (opened++, done(new File([], `${index}.jpg`))) }));
+        const batches = [...Array(1000).keys()].map((at) => entries.slice(100 * at, 100 * at + 100));
+        const folder = { isDirectory: true, createReader: () => ({ readEntries: (done) => done(batches.shift() ?? []) }) };
+        const transfer = { items: [{ kind: "file", webkitGetAsEntry: () => folder }] };
+        const found = await readTransfer(transfer, (name) => name.endsWith(".jpg"), 1000);
+        return [found.files.length, found.surplus, opened, describeAdded(found)];
+    }""")
+    assert found[:3] == [1000, 99_000, 1000]
+    assert "99000 more photos were left out" in found[3]
+
+
+def test_a_photo_that_is_added_before_the_models_are_known_is_separated_once(open_page):
+    page = open_page()
+    requests = []
+    page.on("request", lambda request: requests.append(request.url) if "/preview" in request.url else None)
+    held = []
+    page.route("**/models", lambda route: held.append(route))  # noqa: PLW0108  (Playwright wraps functions only)
+    page.reload()
+    page.wait_for_selector("#choose")
+    add(page, "a.png")
+    page.get_by_text("Waiting", exact=True).wait_for()
+    assert requests == []
+    held[0].continue_()
+    page.wait_for_selector("li.done")
+    assert len(requests) == 1
+
+
+def test_a_removed_photo_comes_back_to_its_place_with_its_result_and_strength(open_page):
+    page = open_page()
+    upload(page, *((name, image_bytes(90, 60, "png")) for name in ("a.png", "b.png", "c.png")))
+    page.locator(".pick").nth(1).click()
+    page.get_by_label("Strength", exact=True).fill("0.4")
+    page.get_by_role("button", name="Remove b.png").click()
+    assert names_in_list(page) == ["a.png", "c.png"]
+    page.get_by_role("button", name="Undo removal").click()
+    assert names_in_list(page) == ["a.png", "b.png", "c.png"]
+    assert page.locator("li").nth(1).get_attribute("class") == "done"  # it is not separated again
+    assert page.locator("#amount").inner_text() == "40 %"
+    for _ in range(3):
+        page.locator(".remove").first.click()
+    assert page.get_by_role("heading", name="What is behind the glass?").is_visible()
+    page.get_by_role("button", name="Undo removal").click()
+    assert names_in_list(page) == ["c.png"]
+
+
+def test_leaving_with_results_that_were_not_downloaded_asks(open_page):
+    page = open_page()
+    asked = []
+
+    def answer(dialog):
+        asked.append(dialog.type)
+        dialog.dismiss() if len(asked) == 1 else dialog.accept()
+
+    page.on("dialog", answer)
+    upload(page, ("a.png", image_bytes(90, 60, "png")))
+    page.get_by_label("Strength", exact=True).fill("0.9")  # the browser asks only after the page was used
+    page.evaluate("location.reload()")
+    page.wait_for_timeout(300)
+    assert asked == ["beforeunload"]
+    assert names_in_list(page) == ["a.png"]
+    downloaded(page, page.get_by_role("button", name="Download transmission").click)
+    page.wait_for_selector("#export", state="hidden")
+    page.reload()
+    assert asked == ["beforeunload"]
+    assert names_in_list(page) == []
+
+
+def test_the_bytes_of_the_upload_and_of_the_download_are_shown(open_page):
+    page = open_page()
+    phases = page.evaluate(
+        """async (bytes) => {
+        const { send } = await import("/page/api.js");
+        const phases = [];
+        const file = new File([new Uint8Array(bytes)], "a.png");
+        const context = { signal: new AbortController().signal, onProgress: (progress) => phases.push(progress) };
+        await send("separate", file, { layers: "transmission" }, context);
+        return phases;
+    }""",
+        list(image_bytes(300, 200, "png")),
+    )
+    for phase in ("upload", "download"):
+        ends = [progress for progress in phases if progress["phase"] == phase]
+        assert ends, phase
+        assert ends[-1]["loaded"] == ends[-1]["total"] > 500
+    texts = page.evaluate("""async () => {
+        const { progressText } = await import("/page/strip.js");
+        return [{ phase: "upload", loaded: 1_200_000, total: 5_000_000 }, { phase: "working", share: 0.351 },
+                { phase: "download", loaded: 12_000_000, total: 36_500_000 }].map(progressText);
+    }""")
+    assert texts == ["Sending 1.2 of 5.0 MB", "Separating, 35 %", "Receiving 12 of 37 MB"]
+
+
+def test_a_file_that_was_deleted_after_it_was_added_is_named_as_the_cause(open_page, tmp_path):
+    page = open_page()
+    path = tmp_path / "a.png"
+    path.write_bytes(image_bytes(90, 60, "png"))
+    page.route("**/preview?*", lambda route: None)  # so that the file is still needed later
+    page.set_input_files("#files", str(path))
+    page.get_by_role("button", name="Cancel").click()
+    path.unlink()
+    page.unroute("**/preview?*")
+    page.get_by_role("button", name="Try again").click()
+    page.get_by_text("The browser cannot read this file. It was moved, changed or deleted").wait_for()
+
+
+def test_the_settings_of_one_photo_are_copied_to_all_and_reset(open_page):
+    page = open_page()
+    upload(page, *((name, image_bytes(90, 60, "png")) for name in ("a.png", "b.png")))
+    page.get_by_label("Strength", exact=True).fill("0.3")
+    page.get_by_role("button", name="Copy to all photos").click()
+    page.locator(".pick").nth(1).click()
+    assert page.locator("#amount").inner_text() == "30 %"
+    page.get_by_role("button", name="Reset").click()
+    assert page.locator("#amount").inner_text() == "100 %"
+    _, data = downloaded(page, page.get_by_role("button", name="Download all").click)
+    report = zipfile.ZipFile(io.BytesIO(data)).read("brewster-report.txt").decode()
+    assert "(strength 30 %)" in report
+    assert "(strength 100 %)" in report
+
+
+def test_the_example_on_the_empty_page_is_separated(open_page):
+    page = open_page()
+    page.get_by_role("button", name="Try an example").click()
+    page.wait_for_selector("li.done")
+    assert names_in_list(page) == ["example.jpg"]
+    assert page.locator("#model-field").is_visible()  # the server has two models
+
+
+def test_a_long_list_of_photos_is_scrolled_with_buttons(open_page):
+    page = open_page()
+    upload(page, *((f"{number}.png", image_bytes(20, 20, "png")) for number in range(9)))
+    assert page.get_by_role("button", name="Earlier photos").is_disabled()
+    page.get_by_role("button", name="Later photos").click()
+    page.get_by_role("button", name="Earlier photos", disabled=False).wait_for()
+    assert page.evaluate("document.getElementById('photos').scrollLeft") > 0

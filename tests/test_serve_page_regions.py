@@ -1,0 +1,172 @@
+"""Regions on the page: pointer, touch and keyboard; the mask is that of the command line."""
+
+import math
+
+import numpy as np
+import pytest
+
+from brewster import Photo
+from cli_helpers import image_bytes
+from page_helpers import canvas, downloaded, settle, upload
+
+SIZE = 300, 200
+
+
+@pytest.fixture
+def page(open_page):
+    page = open_page()
+    upload(page, ("window.png", image_bytes(*SIZE, "png")))
+    return page
+
+
+def drag(page, start, end):
+    """Drags the mouse between two points of the photo, given in its pixels."""
+    points = [screen_point(page, point) for point in (start, end)]
+    page.mouse.move(*points[0])
+    page.mouse.down()
+    page.mouse.move(*points[1], steps=8)
+    page.mouse.up()
+    settle(page)
+
+
+def screen_point(page, point):
+    stage = page.locator("glass-compare").bounding_box()
+    scale = min(stage["width"] / SIZE[0], stage["height"] / SIZE[1], 2)
+    corner = (
+        stage[side] + (stage[length] - scale * size) / 2
+        for side, length, size in zip("xy", ("width", "height"), SIZE, strict=True)
+    )
+    return [edge + scale * at for edge, at in zip(corner, point, strict=True)]
+
+
+def saved_mask(page):
+    name, data = downloaded(page, page.get_by_role("button", name="Save the mask").click)
+    assert name == "window.mask.png"
+    mask = Photo.open(data)
+    assert (mask.size, mask.pixels.shape[2], mask.file_info.bits) == (SIZE, 1, 8)
+    return data, mask.pixels[..., 0]
+
+
+def set_slider(page, name, value):
+    page.get_by_label(name, exact=True).fill(str(value))
+
+
+def test_a_protected_rectangle_stays_the_photo_and_the_command_line_makes_the_same_bytes(page, run, tmp_path):
+    page.get_by_label("Not here").check()
+    page.get_by_label("Rectangle").check()
+    set_slider(page, "Feather", 0)
+    drag(page, (60, 50), (150, 120))
+    mask, values = saved_mask(page)
+    assert not values[54:116, 64:146].any()
+    outside = np.ones_like(values, bool)
+    outside[46:124, 56:154] = False
+    assert (values[outside] == 255).all()
+
+    photo, shown = canvas(page, "left"), canvas(page, "right")
+    assert (shown[54:116, 64:146] == photo[54:116, 64:146]).all()
+    assert (shown[outside] != photo[outside]).any()
+    _, made = downloaded(page, page.get_by_role("button", name="Download transmission").click)
+    (tmp_path / "mask.png").write_bytes(mask)
+    data = image_bytes(*SIZE, "png")
+    assert made == run("-", "--mask", "mask.png", stdin=data)[1]
+    assert (Photo.open(made).pixels[54:116, 64:146] == Photo.open(data).pixels[54:116, 64:146]).all()
+
+
+def test_here_separates_only_the_brushed_region_with_its_own_strength(page):
+    page.get_by_label("Here", exact=True).check()
+    set_slider(page, "Strength in the region", 0.5)
+    set_slider(page, "Brush size", 0.1)
+    set_slider(page, "Feather", 0.04)
+    drag(page, (80, 100), (220, 100))
+    _, values = saved_mask(page)
+    assert values[100, 80:220].min() == values.max() == 128  # half of 255, rounded up
+    assert not values[:70].any()
+    edge = values[70:100, 150].astype(int)  # from outside to inside
+    assert (np.diff(edge) >= 0).all()
+    assert len(np.unique(edge)) > 8  # a smooth edge, 12 pixels wide
+    radius = 0.05 * SIZE[0]
+    assert abs(edge[round(30 - radius)] - 64) <= 8  # half of the strength on the edge of the brush
+
+
+def test_the_eraser_and_undo_and_redo_restore_the_mask(page):
+    page.get_by_label("Not here").check()
+    drag(page, (60, 60), (120, 60))
+    _, first = saved_mask(page)
+    page.get_by_label("Eraser").check()
+    set_slider(page, "Brush size", 0.3)
+    drag(page, (40, 60), (140, 60))
+    _, erased = saved_mask(page)
+    assert erased.min() > 250 > first.min() == 0
+    page.keyboard.press("Control+z")
+    assert (saved_mask(page)[1] == first).all()
+    page.get_by_role("button", name="Redo").click()
+    assert (saved_mask(page)[1] == erased).all()
+    for _ in range(2):
+        page.get_by_role("button", name="Undo", exact=True).click()
+    assert page.get_by_role("button", name="Undo", exact=True).is_disabled()
+    assert page.get_by_role("button", name="Save the mask").is_disabled()
+    page.keyboard.press("Control+y")
+    page.get_by_role("button", name="Clear").click()
+    assert page.get_by_role("button", name="Save the mask").is_disabled()
+
+
+def test_regions_are_drawn_with_the_keyboard(page):
+    page.get_by_label("Not here").check()
+    page.get_by_label("Rectangle").check()
+    page.locator("glass-compare").focus()
+    page.keyboard.press("Space")  # in the middle of the photo
+    for key in ("Shift+ArrowRight", "Shift+ArrowDown", "ArrowDown"):
+        page.keyboard.press(key)
+    page.keyboard.press("Space")
+    _, values = saved_mask(page)
+    assert not values[105:112, 155:160].any()
+    assert values[90, 150] == values[110, 180] == 255
+    page.locator("glass-compare").focus()
+    page.keyboard.press("Space")
+    page.keyboard.press("Shift+ArrowLeft")
+    page.keyboard.press("Escape")
+    assert (saved_mask(page)[1] == values).all()
+
+
+def test_regions_are_drawn_with_a_finger_and_two_fingers_zoom(open_page):
+    page = open_page(viewport={"width": 390, "height": 844}, has_touch=True)
+    upload(page, ("window.png", image_bytes(*SIZE, "png")))
+    page.get_by_label("Not here").check()
+    page.evaluate("scrollTo(0, 0)")
+    finger = page.context.new_cdp_session(page)
+    stage = page.locator("glass-compare").bounding_box()
+
+    def touch(kind, *points):
+        at = [{"x": stage["x"] + x, "y": stage["y"] + y, "id": index} for index, (x, y) in enumerate(points)]
+        finger.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": at})
+
+    touch("touchStart", (150, 150))
+    touch("touchMove", (200, 170))
+    touch("touchMove", (240, 180))
+    touch("touchEnd")
+    _, values = saved_mask(page)
+    assert values.min() == 0
+    touch("touchStart", (150, 200))
+    touch("touchStart", (150, 200), (250, 200))
+    touch("touchMove", (100, 200), (300, 200))
+    touch("touchEnd")
+    assert (saved_mask(page)[1] == values).all()  # the second finger cancels the region
+    assert "zoomed" in page.locator("glass-compare").get_attribute("class")
+
+
+def test_regions_are_copied_to_photos_of_other_sizes_and_reset(page):
+    page.get_by_label("Not here").check()
+    drag(page, (150, 100), (150, 100))
+    upload(page, ("other.png", image_bytes(600, 400, "png")))
+    page.get_by_role("button", name="Copy to all photos").click()
+    page.locator(".pick").nth(1).click()
+    page.wait_for_selector("glass-compare:not([hidden])")
+    settle(page)
+    _, data = downloaded(page, page.get_by_role("button", name="Save the mask").click)
+    values = Photo.open(data).pixels[..., 0]
+    assert values.shape == (400, 600)
+    covered = (255 - values.astype(float)).sum() / 255
+    radius = 0.05 * 600
+    assert covered == pytest.approx(math.pi * radius**2, rel=0.1)
+    page.get_by_role("button", name="Reset").click()
+    assert page.get_by_role("button", name="Save the mask").is_disabled()

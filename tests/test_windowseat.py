@@ -1,0 +1,236 @@
+"""WindowSeat's published layout on a tiny Qwen-Image-Edit-2509, against the published arithmetic with stock diffusers."""
+
+import json
+import shutil
+
+import diffusers
+import huggingface_hub
+import numpy as np
+import peft
+import pytest
+import torch
+from safetensors.torch import load_file, save_file
+
+from brewster import Photo, Separator
+from brewster.errors import ModelError
+from brewster.inference.diffusion_predictor import DiffusionPredictor
+from brewster.models.diffusion.adapter.windowseat import CONFIG_FILE, INDEX_FILE, PROMPT_FILE, WEIGHTS_FILE
+from brewster.models.diffusion.backbones import load_backbone
+from brewster.models.diffusion.pipeline import fingerprint, load_pipeline
+from brewster.models.large_models import LARGE
+from brewster.srgb import to_encoded, to_linear
+from published_models import SIDE, write_qwen_edit_plus, write_windowseat
+
+
+@pytest.fixture(scope="module")
+def base(tmp_path_factory):
+    return write_qwen_edit_plus(tmp_path_factory.mktemp("qwen") / "Qwen-Image-Edit-2509")
+
+
+@pytest.fixture(scope="module")
+def model(base, tmp_path_factory):
+    """The published model; tests must not change it."""
+    return write_windowseat(tmp_path_factory.mktemp("windowseat") / "windowseat", base)
+
+
+@pytest.fixture
+def folder(model, tmp_path):
+    """The published model, which a test may change."""
+    return shutil.copytree(model, tmp_path / "windowseat")
+
+
+def random_image(width, height):
+    """An sRGB-encoded image with smooth colours, (1, 3, h, w) in [-1, 1]."""
+    coarse = torch.rand(1, 3, 4, 4, generator=torch.Generator().manual_seed(2))
+    size = (height, width)
+    return 1.6 * torch.nn.functional.interpolate(coarse, size, mode="bicubic").clamp(0, 1) - 0.8
+
+
+@torch.no_grad()
+def published_call(model, base, image):
+    """The published arithmetic: a peft adapter in a stock transformer, one pass with mask, z - v, decode."""
+    transformer = diffusers.QwenImageTransformer2DModel.from_pretrained(base, subfolder="transformer")
+    vae = diffusers.AutoencoderKLQwenImage.from_pretrained(base, subfolder="vae")
+    transformer.add_adapter(peft.LoraConfig.from_pretrained(model / "transformer_lora"))
+    missing, unexpected = transformer.load_state_dict(load_file(model / WEIGHTS_FILE), strict=False)
+    assert not unexpected
+    assert not any("lora" in name for name in missing)
+    embeddings = load_file(model / PROMPT_FILE)
+    mean, std = (
+        torch.tensor(values).view(1, -1, 1, 1, 1)
+        for values in (vae.config.latents_mean, vae.config.latents_std)
+    )
+    latents = (vae.encode(image[:, :, None]).latent_dist.mode() - mean) / std
+    channels, _, rows, columns = latents.shape[1:]
+    edit = diffusers.QwenImageEditPipeline
+    velocity = transformer(
+        hidden_states=edit._pack_latents(latents[:, :, 0], 1, channels, rows, columns),
+        timestep=torch.tensor([499.0]) / 1000,
+        encoder_hidden_states=embeddings["prompt_embeds"],
+        encoder_hidden_states_mask=embeddings["prompt_mask"] > 0,
+        img_shapes=[[(1, rows // 2, columns // 2)]],
+        guidance=None,
+        return_dict=False,
+    )[0]
+    velocity = edit._unpack_latents(velocity, 8 * rows, 8 * columns, 8)
+    return vae.decode((latents - velocity) * std + mean).sample[:, :, 0].clamp(-1, 1)
+
+
+def test_the_transmission_is_that_of_the_published_call(model, base):
+    image = random_image(SIDE, SIDE)
+    pipeline = load_pipeline(str(model))
+    panels = pipeline(image)
+    expected = published_call(model, base, image)
+    torch.testing.assert_close(panels["T"], expected, atol=1e-5, rtol=0)
+    plain = load_backbone(str(base))
+    assert (panels["I"] - plain.decode(plain.encode(image)).clamp(-1, 1)).abs().max() < 1e-5
+    assert (panels["T"] - panels["I"]).abs().mean() > 0.01  # the prediction does something
+    assert (pipeline.name, pipeline.backbone.name) == ("windowseat", "qwen")
+
+
+def test_the_lora_has_an_effect_and_its_alpha_is_applied(model, base, folder):
+    image = random_image(SIDE, SIDE)
+    config = json.loads((folder / CONFIG_FILE).read_text())
+    (folder / CONFIG_FILE).write_text(
+        json.dumps(config | {"use_rslora": True, "alpha_pattern": {"img_in": 3}})
+    )
+    changed = load_pipeline(str(folder))(image)["T"]
+    assert (changed - load_pipeline(str(model))(image)["T"]).abs().max() > 1e-3
+    torch.testing.assert_close(changed, published_call(folder, base, image), atol=1e-5, rtol=0)
+
+
+def test_a_square_photo_separates_as_published_with_a_derived_reflection(model, base):
+    image = random_image(SIDE, SIDE)
+    encoded = ((image[0].permute(1, 2, 0) + 1) / 2).numpy()
+    photo = Photo.from_array(to_linear(encoded).astype(np.float32), encoding="linear")
+    separation = Separator.load(str(model), plain=True)(photo)
+    expected = ((published_call(model, base, image)[0].permute(1, 2, 0) + 1) / 2).numpy()
+    assert np.abs(to_encoded(separation.transmission.linear()) - expected).max() < 1e-3
+    assert separation.reflection_is_derived
+    derived = np.maximum(photo.linear() - separation.transmission.linear(), 0)
+    np.testing.assert_allclose(separation.reflection.linear(), derived, atol=1e-5)
+    assert separation.reconstruction_error is not None
+    assert separation.confidence.pixels.any()
+
+
+@pytest.mark.parametrize(
+    ("size", "tiles"),
+    [((SIDE, SIDE), 1), ((2 * SIDE, SIDE), 3), ((5 * SIDE, SIDE), 6), ((40, 30), 2), ((256, 192), 2)],
+)
+def test_photos_of_any_shape_are_divided_into_squares_of_the_published_side(model, size, tiles):
+    pipeline = load_pipeline(str(model))
+    separator, shapes = Separator.load(str(model)), []
+    call = type(pipeline).__call__
+
+    def record(self, photo, **options):
+        shapes.append(tuple(photo.shape[-2:]))
+        return call(self, photo, **options)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(type(pipeline), "__call__", record)
+        separation = separator(
+            Photo.from_array(np.full((size[1], size[0], 3), 90, np.uint8), encoding="srgb")
+        )
+    assert separation.transmission.size == size
+    assert shapes == [(SIDE, SIDE)] * tiles
+
+
+def test_best_quality_adds_an_input_of_twice_the_size(model):
+    predictor = DiffusionPredictor(load_pipeline(str(model)))
+    assert predictor.input_sizes((640, 320), "standard") == [(128, 64)]
+    assert predictor.input_sizes((640, 320), "best") == [(128, 64), (256, 128)]
+    assert predictor.input_sizes((40, 30), "best") == [(40, 30)]
+
+
+def test_steps_and_averages_are_refused(model):
+    with pytest.raises(ModelError, match="one-step model"):
+        Separator.load(str(model), steps=4)
+
+
+def test_the_name_is_opened_from_the_hub_and_only_its_subfolders_are_fetched(
+    model, base, tmp_path, monkeypatch
+):
+    repository = tmp_path / f"models--{LARGE['windowseat'].hub_id.replace('/', '--')}"
+    shutil.copytree(model, repository / "snapshots" / ("1" * 40))
+    (repository / "refs").mkdir()
+    (repository / "refs" / "main").write_text("1" * 40)
+    monkeypatch.setattr(huggingface_hub.constants, "HF_HUB_OFFLINE", True)
+    monkeypatch.setattr(huggingface_hub.constants, "HF_HUB_CACHE", str(tmp_path))
+    patterns = []
+    fetch = huggingface_hub.snapshot_download
+    monkeypatch.setattr(
+        huggingface_hub,
+        "snapshot_download",
+        lambda *args, **options: patterns.append(options) or fetch(*args, **options),
+    )
+    separator = Separator.load("windowseat")
+    assert separator.name == "windowseat"
+    assert separator.sha256 == fingerprint(str(model))
+    asked = patterns[0]["allow_patterns"]
+    assert {INDEX_FILE, CONFIG_FILE, WEIGHTS_FILE, PROMPT_FILE} <= set(asked)
+    assert not any("*" in pattern for pattern in asked)
+
+
+def test_weights_in_bf16_are_read(base, tmp_path):
+    image = random_image(SIDE, SIDE)
+    model = write_windowseat(tmp_path / "bf16", base, dtype=torch.bfloat16)
+    panels = load_pipeline(str(model))(image)
+    torch.testing.assert_close(panels["T"], load_pipeline(str(model))(image)["T"], atol=0, rtol=0)
+    assert panels["T"].isfinite().all()
+
+
+def test_an_unexpected_key_is_an_error(folder):
+    weights = load_file(folder / WEIGHTS_FILE)
+    extra = {"transformer_blocks.9.attn.to_q.lora_A.default.weight": torch.zeros(4, 32)}
+    save_file(weights | extra, folder / WEIGHTS_FILE)
+    with pytest.raises(ModelError, match=r"style of peft, belongs to no layer of qwen"):
+        load_pipeline(str(folder))
+
+
+def test_a_matrix_of_another_size_is_an_error(folder):
+    weights = load_file(folder / WEIGHTS_FILE)
+    name = next(name for name in weights if "to_q.lora_A" in name)
+    save_file(weights | {name: torch.zeros(2, 31)}, folder / WEIGHTS_FILE)
+    with pytest.raises(ModelError, match=r"expected a layer with 32 x 32 weights"):
+        load_pipeline(str(folder))
+
+
+@pytest.mark.parametrize(
+    ("file", "change", "message"),
+    [
+        (INDEX_FILE, {"base_model": None}, "base_model .* is None; expected a hub id"),
+        (
+            INDEX_FILE,
+            {"processing_resolution": 70},
+            "processing_resolution .* is 70; expected a multiple of 16",
+        ),
+        (CONFIG_FILE, {"r": "many"}, "lacks a setting of WindowSeat"),
+    ],
+)
+def test_damaged_settings_are_model_errors(folder, file, change, message):
+    values = json.loads((folder / file).read_text())
+    (folder / file).write_text(json.dumps(values | change))
+    with pytest.raises(ModelError, match=message):
+        load_pipeline(str(folder))
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"prompt_mask": torch.zeros(1, 9)}, "masks tokens before the end, or all"),
+        ({"prompt_mask": torch.tensor([[0, 1, 1, 1, 1, 1, 1, 1, 1]])}, "masks tokens before the end"),
+        ({"more": torch.zeros(1)}, "expected prompt_embeds"),
+    ],
+)
+def test_damaged_embeddings_are_model_errors(folder, change, message):
+    save_file(load_file(folder / PROMPT_FILE) | change, folder / PROMPT_FILE)
+    with pytest.raises(ModelError, match=message):
+        load_pipeline(str(folder))
+
+
+def test_another_base_is_used_and_has_another_digest(model, base, tmp_path):
+    copy = shutil.copytree(base, tmp_path / "copy")
+    (copy / "note").write_text("another")
+    assert load_pipeline(str(model), base=str(copy)).sha256 != fingerprint(str(model))
+    with pytest.raises(ModelError, match="is a LoRA of qwen; expected a base of qwen, not of kontext"):
+        load_pipeline(str(model), base="tiny:kontext")
