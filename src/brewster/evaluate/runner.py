@@ -124,7 +124,7 @@ def find_unavailable(
     logged = read_log(out / SCORES_FILE)
     cases = [(case.benchmark, case.name) for benchmark in benchmarks for case in benchmark.cases]
     ids = [(*case, method.name) for case in cases for method in methods]
-    unavailable = {}
+    unavailable: dict[str, str] = {}
     for prepare, columns in _missing_metrics(config, ids, logged):
         try:
             prepare()

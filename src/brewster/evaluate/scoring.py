@@ -6,7 +6,7 @@ import hashlib
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Final, final
+from typing import Final, TypeVar, final
 
 from brewster import metrics
 from brewster.benchmarks.registry import Case
@@ -20,6 +20,8 @@ from brewster.photo import Photo
 
 _DIGITS: Final = 6
 """Decimal places of the scores in scores.jsonl and results.json."""
+
+Pixels = TypeVar("Pixels", Image, Region)
 
 
 @final
@@ -166,7 +168,7 @@ class Scorer:
             comparison = replace(comparison, region=self._region(self._config.threshold(column)))
         return metric.score(comparison)
 
-    def _inside(self, image: Image) -> Image:
+    def _inside(self, image: Pixels) -> Pixels:
         """The part of an image that is scored. It has no pixels if the border covers the image."""
         border = self._config.border
         return image[border : len(image) - border, border : image.shape[1] - border] if border else image

@@ -76,9 +76,9 @@ def preview(
         "maps": [_describe(name, map_) for name, map_ in maps.items()],
     }
     codes = _to_srgb_bytes(photo.resized(width, height))
-    arrays = (codes, *map(_to_uint16, maps.values()))
+    coefficients = (_to_uint16(map_).tobytes() for map_ in maps.values())
     on_progress(1.0)
-    return b"".join((json.dumps(head).encode(), b"\n", *(array.tobytes() for array in arrays)))
+    return b"".join((json.dumps(head).encode(), b"\n", codes.tobytes(), *coefficients))
 
 
 def photo_tile(photo: Photo, level: int, column: int, row: int) -> Photo | None:
@@ -138,7 +138,7 @@ def _block_means(linear: NDArray[np.float32], step: int) -> NDArray[np.float32]:
         starts = np.arange(0, linear.shape[axis], step)
         counts = np.minimum(starts + step, linear.shape[axis]) - starts
         sums = np.add.reduceat(linear, starts, axis=axis)
-        linear = sums / counts.reshape((-1, 1, 1) if axis == 0 else (1, -1, 1)).astype(np.float32)
+        linear = np.divide(sums, counts.reshape((-1, 1, 1) if axis == 0 else (1, -1, 1)), dtype=np.float32)
     return linear
 
 
@@ -146,7 +146,7 @@ def _luminance(map_: NDArray[np.float32]) -> NDArray[np.float32]:
     """The luminance of linear Rec.709 light, which a grey photo stores, or the map itself if it has one channel."""
     if map_.shape[2] == 1:
         return map_
-    return (map_ @ np.float32([0.2126, 0.7152, 0.0722]))[..., None]
+    return (map_ @ np.array([0.2126, 0.7152, 0.0722], np.float32))[..., None]
 
 
 def _describe(name: str, map_: NDArray[np.float32]) -> dict[str, Any]:
