@@ -1,51 +1,92 @@
 #!/usr/bin/env bash
 # The paper's method at the paper's size: FLUX.1 Kontext [dev], rank 16, 4,000 steps, one 24 GB card (RTX 4090).
-#     BREWSTER_DATA=/big/disk runs/paper.sh [FOLDER]        writes to FOLDER, by default out/kontext
-# Give the same command again to resume an interrupted run. runs/tiny.sh is the same experiment in two minutes on a CPU.
+#     BREWSTER_DATA=/big/disk runs/paper.sh [FOLDER]     writes to FOLDER, by default out/paper
+#     runs/paper.sh --tiny [FOLDER]                      the same experiment on toy twins: minutes on two CPU cores, offline
+# Give the same command again to resume an interrupted run. With --tiny, the generated panels are noise, but every step runs.
 #
 # First: pip install -c constraints.txt '.[render,train,large,evaluate]' bitsandbytes; agree to the licence at
 # https://huggingface.co/black-forest-labs/FLUX.1-Kontext-dev (not for commercial use), and run `hf auth login`.
-# The benchmarks are your own copies; docs/evaluation.md describes their layouts. recipes/train/kontext.toml validates on
-# real/dev/nature in BREWSTER_DATA, which can be any folder of pairs (blended/, transmission/).
+# In BREWSTER_DATA: photos/ (200 photos of people, animals and artworks), pairs/real and pairs/nature (the 89 + 200 training pairs),
+# real20, nature20 and SIR2 (the benchmarks; docs/evaluation.md describes their layouts), and real/dev/nature (any pairs, on
+# which training is validated).
 #
 # "est." marks estimates that were not measured: from `brewster train recipes/train/kontext.toml --plan`, or arithmetic.
 # runs/full_size_check.sh measures memory and time per step on your card.
 set -euo pipefail
 root="$(realpath "$(dirname "$0")/..")"
-out=$(realpath -m "${1:-$root/out/kontext}")
+tiny=false
+if [ "${1:-}" = --tiny ]; then tiny=true; shift; fi
+$tiny && default=$root/out/paper-tiny || default=$root/out/paper
+out=$(realpath -m "${1:-$default}")
 command -v brewster > /dev/null || export PATH="$PWD/.venv/bin:$PATH"
-: "${BREWSTER_DATA:?is not set; expected the folder of the data, with 10 GB free; export BREWSTER_DATA=/path/to/data}"
-BREWSTER_DATA="$(realpath "$BREWSTER_DATA")"
-export BREWSTER_DATA
+if $tiny; then
+    export BREWSTER_DATA="$out/data" OMP_NUM_THREADS=1 HF_HUB_OFFLINE=1
+    mkdir -p "$BREWSTER_DATA"
+    size=96x72 test_count=2 suffix=-tiny
+    assets=() syn=recipes/train/large-tiny.toml real=recipes/train/large-real-tiny.toml set=sets/tiny count=4
+    options=(--quality draft --metrics "psnr,ssim,removed_white,kept_reflection")
+    benchmarks=() quality=(--quality draft) workers=(--workers 0)
+else
+    : "${BREWSTER_DATA:?is not set; expected the folder of the data, with 20 GB free; export BREWSTER_DATA=/path/to/data}"
+    BREWSTER_DATA="$(realpath "$BREWSTER_DATA")"
+    export BREWSTER_DATA
+    size=640x480 test_count=40 suffix=""
+    assets=(--maps "$BREWSTER_DATA/hdri" --photos "$BREWSTER_DATA/photos")
+    syn=recipes/train/kontext.toml real=recipes/train/kontext-real.toml set=sets/paper count=1000
+    benchmarks=(--benchmark "real20=$BREWSTER_DATA/real20" --benchmark "nature20=$BREWSTER_DATA/nature20"
+        --benchmark "sir2=$BREWSTER_DATA/SIR2")
+    options=(--protocol paper) quality=() workers=()
+fi
 cd "$root"
-real20=${REAL20:-$BREWSTER_DATA/real20} nature20=${NATURE20:-$BREWSTER_DATA/nature20} sir2=${SIR2:-$BREWSTER_DATA/SIR2}
 
-# 1. Download environment maps: 170 HDR maps of Poly Haven, CC0, 4k.   est. 4 GB
-brewster assets pull polyhaven "$BREWSTER_DATA/hdri" --indoor 140 --outdoor 30 --resolution 4k
+# 1. Download environment maps: 170 HDR maps of Poly Haven, CC0, 4k (est. 4 GB). The paper also has 110 city maps of UrbanSky, which
+#    may not be redistributed: put your own copies into the same folder. With --tiny, the built-in environments are used.
+$tiny || brewster assets pull polyhaven "$BREWSTER_DATA/hdri" --indoor 140 --outdoor 30 --resolution 4k
 
-# 2. Render 1,000 samples with truncated orders of reflection, as in the paper (T is the path without any reflection).
-#    5 MB per sample, measured with the built-in environments, 5 GB in total; est. 2.5-4 CPU-seconds per sample
-#    (docs/rendering.md, scaled to this size): an hour on one core, 10 minutes on eight. Your own photos in front of the maps
-#    improve the data: --photos FOLDER.
-brewster render "$BREWSTER_DATA/sets/window" --recipe window --count 1000 --size 640x480 --orders truncated --seed 10 \
-    --maps "$BREWSTER_DATA/hdri"
+# 2. Render 1,000 samples for training, and others for testing: the paper's three set-ups, rough panes included, with the single
+#    light paths of the paper in T and R. 5 MB per sample. est. 2.5-4 CPU-seconds per sample, more for rough panes.
+render() { brewster render "$BREWSTER_DATA/$1" --recipe recipes/render/paper.toml --size "$size" --seed "$2" --count "$3" "${@:4}"; }
+render "$set" 10 "$count" "${assets[@]}" "${workers[@]}"
+render sets/test 11 "$test_count" --orders all "${assets[@]}" "${workers[@]}"  # orders all: I = T + R, for the failure metrics
 
-# 3. Estimate memory and time before anything is downloaded. The script stops here if training does not fit the card.
-#    est. 17.7 GiB: base in int8 11.2, activations 3.5, LoRA and AdamW 1.3, the rest 1.7
-brewster train recipes/train/kontext.toml --plan
+# With --tiny, two other rendered samples of another size are the stand-ins for the 289 real pairs.
+if $tiny; then
+    brewster render "$BREWSTER_DATA/sets/pairs" --recipe tiny --size 64x64 --seed 12 --count 2 --workers 0
+    mkdir -p "$BREWSTER_DATA"/pairs/tiny/{blended,transmission}
+    for number in 000000 000001; do
+        cp "$BREWSTER_DATA/sets/pairs/$number/photo.jpg" "$BREWSTER_DATA/pairs/tiny/blended/$number.jpg"
+        cp "$BREWSTER_DATA/sets/pairs/$number/transmission.jpg" "$BREWSTER_DATA/pairs/tiny/transmission/$number.jpg"
+    done
+fi
 
-# 4. Train. Downloads the base once (est. 34 GB in the hub's cache; 10 GB of it are the text encoders, which encode one prompt).
-#    est. 5.3 s per step on an RTX 4090, 5.9 hours in total. The checkpoint is est. 1 GB, the LoRA 344 MB.
-brewster train recipes/train/kontext.toml -o "$out"
+# 3. Estimate memory, download and time, and read the data, before anything is downloaded. The script stops here if training does
+#    not fit the card. est. 17.7 GiB: base in int8 11.2, activations 3.5, LoRA and AdamW 1.3, the rest 1.7
+brewster train "$syn" --plan
+brewster train "$real" --plan
+
+# 4. Train "syn" and "syn + real". Downloads the base once (est. 34 GB; 10 GB of it are the text encoders, which encode one prompt).
+#    est. 5.3 s per step on an RTX 4090, 5.9 hours for each of both. A checkpoint is est. 1 GB, a LoRA 344 MB.
+brewster train "$syn" -o "$out/syn"
+brewster train "$real" -o "$out/syn+real"
 
 # 5. Separate a photo.   est. 35 s per prediction of 20 steps
-brewster tests/pictures/mixture-coffee-rocket.jpg --model "$out/lora" -o "$out/separated" --overwrite
+brewster tests/pictures/mixture-coffee-rocket.jpg --model "$out/syn/lora" -o "$out/separated" --overwrite "${quality[@]}"
 
-# 6. Evaluate on 540 photos, est. 5-6 hours, with the unprocessed input and the compact model for comparison.
-brewster evaluate --benchmark "real20=$real20" --benchmark "nature20=$nature20" --benchmark "sir2=$sir2" \
-    --model compact --model "lora=$out/lora" --protocol paper -o "$out/evaluate"
+# 6. Evaluate both, the compact model, and the unprocessed input: Table 1 is table.tex. est. 5-6 hours for each model.
+#    The rendered test set measures the paper's failure case: white areas that are removed, and reflections that are kept.
+evaluate() { brewster evaluate "$@" --model compact --model "syn=$out/syn/lora" --model "syn+real=$out/syn+real/lora"; }
+evaluate --benchmark "rendered=$BREWSTER_DATA/sets/test" "${quality[@]}" \
+    --metrics psnr,ssim,removed_content,removed_white,kept_reflection -o "$out/failures"
+$tiny && benchmarks=(--benchmark "rendered=$BREWSTER_DATA/sets/test")
+evaluate "${benchmarks[@]}" "${options[@]}" -o "$out/evaluate"
+cp "$out/evaluate/table.tex" "$out/table1.tex"
 
-# 7. Write the model card with these scores, and list the files for the hub, 350 MB. Without --dry-run, the command uploads
+# 7. The paper's ablations on the large model: 8-bit blends, number of samples, prompts without training. est. 2-3 days.
+for ablation in large-mixing large-size prompt; do
+    brewster ablate "recipes/ablations/$ablation$suffix.toml" -o "$out/ablations/$ablation"
+done
+
+# 8. Write the model card with these scores, and list the files for the hub, 350 MB. Without --dry-run, the command uploads
 #    them as a private repository; with --public the repository is public, under the licence of the base.
-brewster models card "$out/lora" --scores "$out/evaluate/results.json" > "$out/card.md"
-brewster models push "$out/lora" "${REPO:-somebody/sees-through-glass}" --dry-run
+brewster models card "$out/syn/lora" --scores "$out/evaluate/results.json" > "$out/card.md"
+brewster models push "$out/syn/lora" "${REPO:-somebody/sees-through-glass}" --dry-run

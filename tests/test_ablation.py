@@ -4,6 +4,7 @@ import io
 import os
 import shutil
 import tomllib
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,26 +13,38 @@ from PIL import Image
 
 from benchmark_folders import paint
 from brewster.benchmarks.registry import read_benchmark
-from brewster.errors import RecipeError
+from brewster.errors import DownloadError, RecipeError
 from brewster.evaluate import ablation as module
 from brewster.evaluate.ablation import ablate, read_study
+from brewster.metrics import METRICS
 from brewster.training.recipe import read_recipe, with_value
 from cli_helpers import run_process
 
 RECIPES = Path(__file__).parents[1] / "recipes" / "ablations"
-STUDIES = [path for path in sorted(RECIPES.glob("*.toml")) if "base" in tomllib.loads(path.read_text())]
+STUDIES = [
+    path
+    for path in sorted(RECIPES.glob("*.toml"))
+    if "base" in tomllib.loads(path.read_text()) and not path.stem.endswith("-tiny")
+]
 
 
 def names(paths):
     return [path.stem for path in paths]
 
 
-TINY = {"prompt": "backbone-tiny.toml"}
+TINY = {
+    "prompt": "backbone-tiny.toml",
+    "large-mixing": "../train/large-tiny.toml",
+    "large-size": "../train/large-tiny.toml",
+}
 """study -> tiny base recipe, if it is not tiny.toml."""
+
+SMALL_STUDIES = [path for path in STUDIES if not path.stem.startswith("large-")]
+"""The studies that need no rendered set. runs/paper.sh --tiny runs those of the large model."""
 
 
 def test_every_ablation_of_the_paper_has_a_study():
-    assert names(STUDIES) == ["mixing", "orders", "pairs", "prompt", "size"]
+    assert names(STUDIES) == ["large-mixing", "large-size", "mixing", "orders", "pairs", "prompt", "size"]
 
 
 @pytest.mark.parametrize("path", STUDIES, ids=names(STUDIES))
@@ -44,7 +57,20 @@ def test_a_study_changes_one_value_of_both_the_full_and_the_tiny_recipe(path):
 
 
 def test_the_training_sizes_are_those_of_the_paper():
-    assert read_study(RECIPES / "size.toml").values == [0, 10, 50, 100, 300, 1000]
+    for name in ("size", "large-size"):
+        assert read_study(RECIPES / f"{name}.toml").values == [0, 10, 50, 100, 300, 1000]
+
+
+@pytest.mark.parametrize("name", ["large-mixing", "large-size", "prompt"])
+def test_every_ablation_of_the_large_model_has_a_tiny_variant(name):
+    full, tiny = (read_study(RECIPES / f"{stem}.toml") for stem in (name, f"{name}-tiny"))
+    assert tiny.key == full.key
+    base = read_recipe(tiny.base)
+    assert base.backbone == "tiny:kontext"
+    assert len({with_value(base, tiny.key, value).model_dump_json() for value in tiny.values}) >= 2
+    assert read_recipe(full.base).backbone == "kontext"
+    assert "lpips" in full.metrics
+    assert "lpips" not in tiny.metrics
 
 
 @pytest.mark.parametrize(
@@ -104,6 +130,20 @@ def test_values_are_compared_with_the_first_and_numbers_are_plotted(
     assert 0.005 < (plot < 128).mean() < 0.5
 
 
+def test_missing_weights_of_a_metric_are_reported_before_training(pairs, data, tmp_path, monkeypatch):
+    def refuse():
+        raise DownloadError("LPIPS has no weights", "expected a network connection", "connect")
+
+    def train(*_):
+        raise AssertionError("training started without the weights of LPIPS")
+
+    monkeypatch.setattr(module, "_train", train)
+    monkeypatch.setenv("BREWSTER_DATA", str(data))
+    monkeypatch.setitem(METRICS, "lpips", replace(METRICS["lpips"], prepare=refuse))
+    with pytest.raises(DownloadError, match="LPIPS has no weights"):
+        ablate(read_study(RECIPES / "size.toml"), pairs, tmp_path / "out")
+
+
 def test_values_that_are_not_numbers_are_not_plotted(without_training, pairs, data, tmp_path, monkeypatch):
     monkeypatch.setenv("BREWSTER_DATA", str(data))
     ablate(read_study(RECIPES / "mixing.toml"), pairs, tmp_path / "out")
@@ -135,7 +175,7 @@ def few_pairs(data, tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("path", STUDIES, ids=names(STUDIES))
+@pytest.mark.parametrize("path", SMALL_STUDIES, ids=names(SMALL_STUDIES))
 def test_every_study_runs_end_to_end_at_tiny_size(path, few_pairs, tmp_path):
     """Nothing is replaced: the study renders, trains on four real pairs, and evaluates."""
     environment = {**os.environ, "BREWSTER_DATA": str(few_pairs)}

@@ -1,9 +1,13 @@
 """The table of large backbones: loading of tiny versions from folders, and all errors for damaged or wrong folders."""
 
+import gc
+import importlib.util
 import json
 import shutil
+from types import SimpleNamespace
 
 import huggingface_hub
+import psutil
 import pytest
 import torch
 import transformers
@@ -13,6 +17,7 @@ from brewster.errors import DeviceError, DownloadError, ModelError
 from brewster.models.diffusion import backbones, lazy_imports
 from brewster.models.diffusion.adapter.lora import add_lora
 from brewster.models.diffusion.backbones import BACKBONES, build, encode_prompt, load_backbone, tiny
+from brewster.models.diffusion.memory import check_machine, choose_quantisation
 from brewster.models.diffusion.prompt import PROMPT
 
 
@@ -68,6 +73,7 @@ def test_full_size_architectures_need_no_memory_on_the_meta_device(name, billion
     backbone = build(name, device="meta", dtype=torch.bfloat16)
     parameters = sum(parameter.numel() for parameter in backbone.transformer.parameters())
     assert parameters / 1e9 == pytest.approx(billions, abs=0.005)
+    assert parameters == pytest.approx(backbone.parameters, rel=1e-3)
     assert len(backbone.lora_targets()) == targets
     assert backbone.dtype == torch.bfloat16
 
@@ -121,6 +127,16 @@ def test_a_base_that_was_silently_left_unquantised_is_refused(tiny_folders, monk
     monkeypatch.setattr(backbones, "_device_map", lambda device: {"device_map": {"": device}})
     with pytest.raises(ModelError, match=r"loaded as torch\.bfloat16; expected weights stored as int8"):
         load_backbone(str(tiny_folders / "kontext"), quantise="int8", dtype=torch.bfloat16)
+
+
+@pytest.mark.parametrize("name", list(BACKBONES))
+def test_a_base_computes_in_the_dtype_in_which_it_was_loaded(tiny_folders, name):
+    """bitsandbytes stores weights as integers, and diffusers may keep the first floating-point layer in float32."""
+    backbone = load_backbone(str(tiny_folders / name), dtype=torch.bfloat16)
+    first = next(backbone.transformer.parameters())
+    first.data = first.data.float()
+    assert backbone.transformer.dtype == torch.float32
+    assert backbone.dtype == torch.bfloat16
 
 
 def test_nf4_needs_an_nvidia_gpu():
@@ -197,8 +213,78 @@ def test_a_prompt_is_encoded_by_the_text_encoders_of_the_folder(text_encoder_fol
     prompt = encode_prompt(str(text_encoder_folders / name))
     assert (prompt.backbone, prompt.text) == (name, PROMPT)
     assert {key: tuple(tensor.shape) for key, tensor in prompt.tensors.items()} == shapes
+    assert {tensor.dtype for tensor in prompt.tensors.values()} == {torch.bfloat16}
     assert encode_prompt(str(text_encoder_folders / name)).sha256 == prompt.sha256
     assert not torch.equal(encode_prompt(str(text_encoder_folders / name), "a cat").embeds, prompt.embeds)
+
+
+def test_text_encoders_are_released_after_the_prompt_is_encoded(text_encoder_folders):
+    encode_prompt(str(text_encoder_folders / "kontext"))
+    loaded = [each for each in gc.get_objects() if type(each) is transformers.T5EncoderModel]
+    assert not [model for model in loaded if model.dtype == torch.bfloat16]
+
+
+def test_missing_text_encoders_are_named(tiny_folders, text_encoder_folders, tmp_path):
+    cure = r"set prompt to an encoded prompt"
+    with pytest.raises(ModelError, match=f"has no text_encoder.*; .*{cure}"):
+        encode_prompt(str(tiny_folders / "kontext"))
+    folder = shutil.copytree(text_encoder_folders / "klein", tmp_path / "klein")
+    shutil.rmtree(folder / "tokenizer")
+    with pytest.raises(ModelError, match=f"klein has no tokenizer; .*{cure}"):
+        encode_prompt(str(folder))
+
+
+@pytest.fixture
+def machine(monkeypatch, tmp_path):
+    """Sets the free memory and the free disk of this machine in GiB; by default both are large."""
+    monkeypatch.setattr(huggingface_hub.constants, "HF_HUB_CACHE", str(tmp_path / "none" / "yet"))
+    available = {"memory": 500.0, "disk": 500.0}
+    gib = 1 << 30
+    monkeypatch.setattr(
+        psutil, "virtual_memory", lambda: SimpleNamespace(available=available["memory"] * gib)
+    )
+    monkeypatch.setattr(
+        shutil, "disk_usage", lambda folder: SimpleNamespace(free=int(available["disk"] * gib))
+    )
+    monkeypatch.setattr(torch.cuda, "mem_get_info", lambda device: [int(available["memory"] * gib)] * 2)
+    return available
+
+
+def test_a_large_base_needs_a_gpu_unless_the_cpu_is_chosen(machine, tiny_folders):
+    with pytest.raises(DeviceError, match=r"finds no GPU, and kontext has 11\.9 billion .*--device cpu"):
+        check_machine("kontext", requested="auto", device="cpu")
+    check_machine("kontext", requested="cpu", device="cpu")
+    for small in ("tiny:kontext", str(tiny_folders / "kontext")):
+        check_machine(small, requested="auto", device="cpu")
+
+
+def test_the_quantisation_is_chosen_by_the_memory_of_the_gpu(machine, monkeypatch):
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: object())
+    chosen = {}
+    for machine["memory"] in (40, 24, 16, 12, 8):
+        chosen[machine["memory"]] = choose_quantisation("kontext", "cuda")
+    assert chosen == {40: None, 24: "int8", 16: "int8", 12: "nf4", 8: None}
+    machine["memory"] = 24
+    assert choose_quantisation("kontext", "cuda", "float8") == "float8"
+    assert choose_quantisation("klein", "cuda") is None
+    assert choose_quantisation("kontext", "cpu", "int8") is None
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    machine["memory"] = 12
+    assert choose_quantisation("kontext", "cuda") is None
+
+
+def test_memory_and_disk_are_checked_before_the_download(machine):
+    machine["memory"] = 40
+    with pytest.raises(DeviceError, match=r"kontext needs about 46\.\d GiB of memory on cpu, and 40\.0"):
+        check_machine("kontext", requested="cpu", device="cpu")
+    machine["memory"] = 16
+    with pytest.raises(DeviceError, match=r"about 25\.\d GiB of memory on cuda.*; choose quantise int8"):
+        check_machine("kontext", requested="auto", device="cuda")
+    check_machine("kontext", requested="auto", device="cuda", quantise="int8")
+    machine["disk"] = 30
+    check_machine("kontext", requested="auto", device="cuda", quantise="int8")
+    with pytest.raises(DownloadError, match=r"Kontext-dev needs about 34 GB on the disk, .* 32 GB free"):
+        check_machine("kontext", requested="auto", device="cuda", quantise="int8", with_text_encoders=True)
 
 
 def test_the_offline_error_of_huggingface_hub_is_explained(tmp_path, monkeypatch):

@@ -357,7 +357,7 @@ def test_json_has_the_result_of_each_photo(run, tmp_path, model):
     assert len(err.splitlines()) == 1
     model_keys = {"model", "sha256", "device", "seconds", "residual", "reconstruction_error", "assessment"}
     model_keys |= {"reflection_is_derived"}
-    keys = {"source", "status", "outputs", "error"} | model_keys
+    keys = {"source", "status", "outputs", "error", "photo_sha256"} | model_keys
     assert keys == set(separated) == set(failed)
     assert separated["outputs"] == {layer: f"a.{layer}.jpg" for layer in LAYERS}
     assert (separated["source"], separated["status"], separated["model"], separated["error"]) == (

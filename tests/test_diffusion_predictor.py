@@ -236,7 +236,7 @@ def test_the_base_and_the_device_of_a_lora_are_checked(lora, tmp_path):
         ({"base": None}, "metadata of the LoRA cannot be read"),
         ({"quantise": "int3"}, "metadata of the LoRA cannot be read"),
         ({"prompt_sha256": None}, "metadata of the LoRA cannot be read"),
-        ({"more": 1}, "metadata of the LoRA cannot be read"),
+        ({"more": 1}, "has the unknown key more; .*; update brewster"),
         ({"task": {"objective": "two"}}, "metadata of the LoRA cannot be read"),
         ({"task": {"budget_px": "18432"}}, "metadata of the LoRA cannot be read"),
         ({"task": {"layout": {"panels": ["I", "R"], "direction": "stacked"}}}, "expected a list with T"),

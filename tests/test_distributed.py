@@ -57,6 +57,7 @@ def test_two_processes_have_ranks_and_sum_each_tensor(tmp_path):
 import pathlib, torch
 from brewster.training import distributed
 distributed.initialize()
+assert distributed.from_main_process(distributed.rank) == 0
 assert distributed.world_size() == 2 and distributed.is_main_process() == (distributed.rank() == 0) and distributed.best_device() == torch.device("cpu")
 tensors = [torch.full((2,), 1.0 + distributed.rank()), torch.tensor(10.0 * distributed.rank())]
 distributed.all_reduce_sum(tensors)

@@ -211,8 +211,8 @@ def test_resized_images_are_written_at_their_size_for_the_report(real20, tmp_pat
     assert Photo.open(tmp_path / "out" / "pictures" / "real20" / "1" / "photo.png").size == (12, 8)
 
 
-def test_a_mirrored_prediction_gives_a_remark(tmp_path, random):
-    photo = random.integers(0, 256, (40, 60, 3)).astype(np.uint8)
+def test_a_mirrored_prediction_gives_a_remark(tmp_path, rng):
+    photo = rng.integers(0, 256, (40, 60, 3)).astype(np.uint8)
     for path in ("real20/blended", "real20/transmission_layer", "good", "bad"):
         flipped = photo[:, ::-1].copy() if path == "bad" else photo
         Photo.from_array(flipped, encoding="srgb").save(tmp_path / path / "46.png")

@@ -87,19 +87,41 @@ def test_every_command_of_the_paper_experiment_is_valid(tmp_path):
     recorder = f"import json, sys\nopen({str(calls)!r}, 'a').write(json.dumps(sys.argv[1:]) + chr(10))\n"
     stub.write_text(f"#!{sys.executable}\n{recorder}")
     stub.chmod(0o755)
-    for folder in ("hdri", "out"):
-        (tmp_path / folder).mkdir()
+    for folder in ("hdri", "photos", "out/evaluate"):
+        (tmp_path / folder).mkdir(parents=True)
+    (tmp_path / "out" / "evaluate" / "table.tex").touch()
     run_script("paper.sh", tmp_path / "out", path=stub.parent, BREWSTER_DATA=str(tmp_path))
     commands = [json.loads(line) for line in calls.read_text().splitlines()]
     assert [arguments[0] for arguments in commands] == [
-        "assets", "render", "train", "train", "tests/pictures/mixture-coffee-rocket.jpg", "evaluate", "models", "models",
+        "assets", "render", "render", "train", "train", "train", "train", "tests/pictures/mixture-coffee-rocket.jpg",
+        "evaluate", "evaluate", "ablate", "ablate", "ablate", "models", "models",
     ]  # fmt: skip
     for arguments in commands:
         parse(arguments)
     with pytest.raises(click.UsageError):
         parse([*commands[1], "--no-such-option"])
-    recipe = ROOT / "recipes/train/kontext.toml"
-    assert all((ROOT / arguments[1]).samefile(recipe) for arguments in commands if arguments[0] == "train")
+    recipes = {arguments[1] for arguments in commands if arguments[0] in ("train", "ablate")}
+    studies = {f"recipes/ablations/{name}.toml" for name in ("large-mixing", "large-size", "prompt")}
+    assert recipes == {"recipes/train/kontext.toml", "recipes/train/kontext-real.toml"} | studies
+    assert all((ROOT / name).is_file() for name in recipes)
+
+
+@pytest.mark.slow
+def test_the_tiny_paper_experiment_trains_evaluates_and_ablates(tmp_path):
+    output = run_script("paper.sh", "--tiny", tmp_path)
+    table = rows_by_first_cell(output)
+    assert {"input (unprocessed)", "compact", "syn", "syn+real"} <= table.keys()
+    assert "2 real pairs; panels of" in output
+    assert "\\begin{tabular}" in (tmp_path / "table1.tex").read_text()
+    results = json.loads((tmp_path / "failures" / "results.json").read_text())
+    assert {"removed_white", "kept_reflection"} <= results["metrics"].keys()
+    studies = {"large-mixing": "mixing 8-bit", "large-size": "count 0", "prompt": "prompt none"}
+    for name, label in studies.items():
+        assert label in (tmp_path / "ablations" / name / "tables.md").read_text()
+    assert (tmp_path / "ablations" / "large-size" / "plot.png").is_file()
+    loras = [(tmp_path / name / "lora" / FILES[1]).read_bytes() for name in ("syn", "syn+real")]
+    assert loras[0] != loras[1]
+    assert output.splitlines()[-1] == "nothing was sent"
 
 
 def parse(arguments):

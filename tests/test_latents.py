@@ -73,7 +73,7 @@ def test_panels_show_the_whole_sample_in_its_aspect_ratio(recipe, root, backbone
     samples = open_samples(lora_recipe)
     assert len(samples) == 3
     for number, entry in enumerate(read_set(root / "set")):
-        fit = fit_sample(samples[number].layers, backbone, lora_recipe)
+        fit = fit_sample(samples[number].layers, lora_recipe, backbone.multiple)
         panels = make_panels(samples[number].layers, fit)
         assert (fit.content, fit.panel) == ((24, 16), (32, 16))
         for letter, name in zip("ITR", ("photo", "transmission", "reflection"), strict=True):
@@ -173,6 +173,8 @@ def test_pairs_without_reflections_are_refused_where_r_is_a_panel(recipe):
     assert len(open_samples(recipe(pairs, panels=["I", "T"]))) == 1
     (sample,) = open_samples(recipe(pairs, reflections="difference"))
     assert sample.reflection_weight == Pairs.reflection_weight < 1
+    (other,) = open_samples(recipe(pairs, reflections="difference", derived_reflection_weight=0.7))
+    assert other.reflection_weight == 0.7
 
 
 def test_a_given_reflection_has_weight_one_and_a_missing_one_is_the_difference_in_light(recipe):
@@ -184,13 +186,27 @@ def test_a_given_reflection_has_weight_one_and_a_missing_one_is_the_difference_i
     assert difference == 138  # 188 is 1/2 in linear light and 137 is 1/4, so the difference is 1/4
 
 
-def test_a_sample_that_is_smaller_than_a_panel_is_refused_with_the_budget_that_fits(recipe, backbone):
-    lora_recipe = recipe(RENDERED, budget_px=10**6)
-    with pytest.raises(PhotoError, match="lower budget_px to 768"):
-        LatentEncoder(open_samples(lora_recipe), backbone, lora_recipe)
-    pair = recipe({"pairs": ["triplets"], "pairs_share": 1.0}, budget_px=10**6)
-    with pytest.raises(PhotoError, match="lower budget_px to"):
-        LatentEncoder(open_samples(pair), backbone, pair)
+def test_a_small_sample_gets_the_panels_that_it_gets_at_inference(recipe, backbone):
+    """The paper's syn + real: a budget for large rendered samples, and pairs that are smaller than its panels."""
+    mixed = recipe({**RENDERED, "pairs": ["large"], "pairs_share": 0.5}, budget_px=10**6)
+    samples = open_samples(mixed)
+    fits = samples.panel_fits(mixed, 16)
+    assert [fit.panel for fit in fits] == [(32, 16), *[(48, 32)] * 3]
+    assert fits[-1] == mixed.task.fit((48, 32), 16)
+    latents = LatentEncoder(samples, backbone, mixed)
+    shapes = {latents(SampleRng(1, step, 0)).composite.shape[2:] for step in range(20)}
+    assert shapes == {(1, 6), (2, 9)}
+    assert samples.description() == "3 rendered samples, 3 real pairs"
+
+
+def test_a_sample_with_a_side_of_fewer_than_16_pixels_is_refused(recipe, root):
+    for role in ("blended", "transmission"):
+        (root / "narrow" / role).mkdir(parents=True)
+        pixels = np.full((15, 60, 3), 99, np.uint8)
+        Photo.from_array(pixels, encoding="srgb").save(root / "narrow" / role / "a.png")
+    narrow = recipe({"pairs": ["narrow"], "pairs_share": 1.0}, reflections="difference")
+    with pytest.raises(PhotoError, match="60 x 15 pixels; expected at least 16 pixels a side"):
+        open_samples(narrow).panel_fits(narrow, 16)
 
 
 def test_too_few_rendered_samples_are_refused(recipe):

@@ -20,8 +20,9 @@ from brewster.models.diffusion.adapter.lora import (
     remove_lora,
     save_lora,
 )
-from brewster.models.diffusion.backbones import BACKBONES, tiny
+from brewster.models.diffusion.backbones import BACKBONES, build, load_backbone, tiny
 from brewster.models.diffusion.panels import PanelLayout
+from brewster.models.diffusion.prompt import load_prompt
 from brewster.models.diffusion.task import DecompositionTask
 from brewster.models.diffusion.tensors import read_tensors, write_tensors
 
@@ -99,13 +100,49 @@ def test_the_seed_determines_the_lora_and_the_global_random_state_is_unchanged(k
     assert not torch.equal(states[0][name], states[2][name])
 
 
-def test_on_a_bf16_base_the_lora_is_float32(kontext):
-    backbone, prompt = kontext
-    backbone.transformer.to(torch.bfloat16)
+@pytest.fixture
+def bf16_kontext():
+    family = BACKBONES["kontext"]
+    backbone = build("kontext", family.tiny, seed=1, dtype=torch.bfloat16)
+    return backbone, family.random_prompt(backbone.transformer, 1)
+
+
+def test_on_a_bf16_base_the_lora_is_float32(bf16_kontext):
+    backbone, prompt = bf16_kontext
     parameters = add_lora(backbone, rank=4)
     assert {parameter.dtype for parameter in parameters} == {torch.float32}
     assert backbone.dtype == torch.bfloat16
     assert velocity(backbone, prompt).isfinite().all()
+
+
+def test_a_lora_is_loaded_in_the_dtype_of_its_base(bf16_kontext, tmp_path):
+    backbone, prompt = bf16_kontext
+    plain = velocity(backbone, prompt)
+    expected = velocity(add_trained_lora(backbone), prompt)
+    save_lora(tmp_path, backbone, prompt, DecompositionTask())
+    remove_lora(backbone)
+    load_lora(tmp_path, backbone)
+    assert {tensor.dtype for tensor in lora_state(backbone).values()} == {torch.bfloat16}
+    assert (velocity(backbone, prompt) - expected).std() < 0.2 * (expected - plain).std()
+
+
+def test_targets_select_layers_by_their_names_and_are_stored(kontext, tmp_path):
+    backbone, prompt = kontext
+    targets = ["*.attn.to_?", "single_transformer_blocks.0.*"]
+    add_lora(backbone, rank=2, targets=targets)
+    adapted = {name.rsplit(".lora_", 1)[0] for name in lora_state(backbone)}
+    assert "transformer_blocks.0.attn.to_q" in adapted
+    assert "single_transformer_blocks.0.proj_out" in adapted
+    assert not any(name.startswith("transformer_blocks") and ".ff." in name for name in adapted)
+    assert "single_transformer_blocks.1.proj_out" not in adapted
+    before = velocity(backbone, prompt)
+    save_lora(tmp_path, backbone, prompt, DecompositionTask(), targets=targets)
+    fresh, _ = tiny("kontext", seed=1)
+    assert load_lora(tmp_path, fresh)[0].targets == tuple(targets)
+    torch.testing.assert_close(velocity(fresh, prompt), before, atol=1e-6, rtol=0)
+    remove_lora(fresh)
+    with pytest.raises(ModelError, match=r"matches the target 'to_q'; expected a name with wildcards"):
+        add_lora(fresh, targets=["to_q"])
 
 
 @pytest.mark.parametrize("alpha", [4, 16])
@@ -210,6 +247,10 @@ def test_a_damaged_missing_or_other_file_is_refused(kontext, tmp_path):
     write_tensors(path, tensors, {})
     with pytest.raises(ModelError, match="was not written by brewster"):
         read_lora_metadata(tmp_path)
+    newer = LoraMetadata("kontext", "x", None, 4, 4, DecompositionTask(), "abc").to_json()
+    write_tensors(path, tensors, {"brewster": newer.replace("{", '{"colour": 1, ', 1)})
+    with pytest.raises(ModelError, match=r"has the unknown key colour; .*; update brewster"):
+        read_lora_metadata(tmp_path)
     write_tensors(path, tensors, {"brewster": '{"rank": 4}'})
     with pytest.raises(ModelError, match="the metadata of the LoRA cannot be read"):
         read_lora_metadata(tmp_path)
@@ -228,7 +269,43 @@ def test_a_second_lora_and_saving_without_a_lora_are_refused(kontext, tmp_path):
         save_lora(tmp_path, backbone, tiny("klein")[1], DecompositionTask())
 
 
+@pytest.mark.parametrize("alpha", [4, 16])
+def test_an_exported_lora_gives_the_same_prediction_merged_and_from_the_file_for_comfyui(
+    tiny_model, tmp_path, run_without_model, alpha
+):
+    backbone, prompt = tiny_model
+    backbone.save(tmp_path / "base")
+    add_trained_lora(backbone, alpha=alpha)
+    save_lora(tmp_path / "lora", backbone, prompt, DecompositionTask(), base=str(tmp_path / "base"))
+    expected = velocity(backbone, prompt)
+    remove_lora(backbone)
+
+    file = tmp_path / "glass.safetensors"
+    assert run_without_model("models", "export", tmp_path / "lora", "-o", file)[0] == 0
+    tensors, _ = read_tensors(file)
+    for name, up in tensors.items():  # as ComfyUI reads it: W + alpha / rank * up @ down
+        layer, is_up, _ = name.partition(".lora_B.weight")
+        if is_up:
+            scale = tensors[f"{layer}.alpha"] / len(up[0])
+            target = backbone.transformer.get_submodule(layer.removeprefix("transformer."))
+            target.weight.data += scale * up @ tensors[f"{layer}.lora_A.weight"]
+    torch.testing.assert_close(velocity(backbone, prompt), expected, atol=1e-5, rtol=0)
+
+    merged = tmp_path / "merged"
+    assert (
+        run_without_model("models", "export", tmp_path / "lora", "--format", "merged", "-o", merged)[0] == 0
+    )
+    weights = load_backbone(str(merged)).transformer.state_dict()
+    for name, weight in backbone.transformer.state_dict().items():
+        torch.testing.assert_close(weights[name], weight.bfloat16().float(), atol=1e-2, rtol=1e-2)
+    assert load_prompt(merged / "prompt.safetensors", backbone.name).sha256 == prompt.sha256
+    code, _, err = run_without_model("models", "export", tmp_path / "lora", "-o", file)
+    assert code == 1
+    assert "exists already" in err
+
+
 def test_metadata_survives_a_round_trip_through_json():
-    task = DecompositionTask(PanelLayout(("T", "R"), "stacked"), 4096, "one_step", 1.0)
-    metadata = LoraMetadata("qwen", "Qwen/Qwen-Image-Edit", "int8", 16, 8, task, "abc")
+    layout = PanelLayout(("T", "R"), "stacked", white_space=False)
+    task = DecompositionTask(layout, 4096, "one_step", 1.0, 8, timestep_shift=3.0, last_sigma=0.001)
+    metadata = LoraMetadata("qwen", "Qwen/Qwen-Image-Edit", "int8", 16, 8, task, "abc", ("*.attn.*",))
     assert LoraMetadata.from_json(metadata.to_json()) == metadata

@@ -12,8 +12,8 @@ import tomli_w
 import torch
 
 import brewster.training.lora.trainer as trainer_module
-from brewster.errors import ModelError, RecipeError
-from brewster.models.diffusion.adapter.lora import LORA_FILE, load_lora, lora_state
+from brewster.errors import DeviceError, ModelError, RecipeError
+from brewster.models.diffusion.adapter.lora import LORA_FILE, load_lora, lora_state, read_lora_metadata
 from brewster.models.diffusion.backbones import tiny
 from brewster.models.diffusion.panels import conditioning_image, split
 from brewster.models.diffusion.sampling import GUIDANCE, STEPS, sample
@@ -218,6 +218,103 @@ def test_two_processes_train_the_lora_of_one_process_with_the_whole_batch(recipe
         torch.testing.assert_close(ends[1][name], tensor, atol=1e-6, rtol=0)
     one, two = (json.loads((tmp_path / place / "log.jsonl").read_text()) for place in ("one", "two"))
     assert one["loss"] == pytest.approx(two["loss"], abs=2e-5)
+    assert one["psnr_gain_db_training"] == pytest.approx(two["psnr_gain_db_training"], abs=1e-3)
+
+
+def test_data_and_machine_are_checked_before_anything_is_loaded(recipe, tmp_path, monkeypatch):
+    def refuse(*_, **__):
+        raise AssertionError("the backbone was loaded before the checks")
+
+    for name in ("load_backbone", "encode_prompt"):
+        monkeypatch.setattr(trainer_module, name, refuse)
+    with pytest.raises(RecipeError, match="gone"):
+        LoraTrainer(recipe(data={"rendered": {"sets": [tmp_path / "gone"]}}))
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    with pytest.raises(DeviceError, match=r'optimizer = "adamw8bit" was requested on cpu'):
+        LoraTrainer(recipe(optimizer="adamw8bit"))
+    with pytest.raises(DeviceError, match="torch finds no GPU, and kontext has"):
+        LoraTrainer(recipe(backbone="kontext"))
+    with pytest.raises(AssertionError, match="loaded before"):
+        LoraTrainer(recipe()).initialize()
+
+
+def test_the_prompt_is_encoded_before_the_backbone_is_loaded(recipe, monkeypatch):
+    calls = []
+    for name in ("encode_prompt", "load_backbone"):
+        original = getattr(trainer_module, name)
+        monkeypatch.setattr(
+            trainer_module,
+            name,
+            lambda *args, name=name, original=original, **options: (
+                calls.append(name) or original(*args, **options)
+            ),
+        )
+    LoraTrainer(recipe()).initialize()
+    assert calls == ["encode_prompt", "load_backbone"]
+
+
+def test_a_run_cannot_be_resumed_with_another_optimiser(recipe, tmp_path):
+    with pytest.raises(Killed):
+        train(recipe(), tmp_path, last=3)
+    assert json.loads(Checkpoint.read(tmp_path / "checkpoint.pt").recipe)["optimizer"] == "adamw"
+    trainer = open_trainer(recipe())
+    trainer.recipe = recipe(optimizer="adamw8bit")
+    with pytest.raises(RecipeError, match=r"another recipe \(different values: optimizer\)"):
+        run(trainer, tmp_path, kill_after(None))
+
+
+def test_validation_is_divided_among_the_processes(make_trainer, monkeypatch):
+    monkeypatch.setattr(trainer_module, "_VALIDATION_SAMPLES", 3)
+    trainer = make_trainer()
+    parts = []
+    monkeypatch.setattr(
+        distributed, "all_reduce_sum", lambda tensors: parts.append([t.clone() for t in tensors])
+    )
+    scores, _ = trainer.validate()
+    monkeypatch.setattr(distributed, "world_size", lambda: 2)
+    for rank in range(2):
+        monkeypatch.setattr(distributed, "rank", lambda rank=rank: rank)
+        trainer.validate()
+    (_, all_images), (gains, images), (other_gains, other_images) = parts
+    assert [bool(gain) for gain in gains] == [True, False, True]
+    assert (gains + other_gains).mean().item() == pytest.approx(scores["psnr_gain_db_training"])
+    assert torch.equal(images + other_images, all_images)
+
+
+def test_values_for_inference_are_stored_with_the_lora(make_trainer, tmp_path):
+    trainer = make_trainer(inference_steps=3, inference_guidance=2.5, white_space=False, targets=["*.attn.*"])
+    metadata = read_lora_metadata(trainer.export(tmp_path))
+    assert (metadata.task.steps, metadata.task.guidance) == (3, 2.5)
+    assert not metadata.task.layout.white_space
+    assert metadata.targets == ("*.attn.*",)
+    steps = []
+    monitor = trainer.backbone.transformer.register_forward_hook(lambda *_: steps.append(1))
+    trainer.separate(photo())
+    monitor.remove()
+    assert len(steps) == 3
+
+
+def test_the_learning_rate_falls_to_zero_in_the_last_share_of_the_steps(make_trainer):
+    def rates(**changes):
+        trainer, rates = make_trainer(warmup_steps=2, steps=8, **changes), []
+        for step in (0, 1, 4, 6, 7):
+            trainer.training_step(step)
+            rates.append(trainer._optimizer.param_groups[0]["lr"] / trainer.recipe.learning_rate)
+        return rates
+
+    assert rates() == [0.5, 1, 1, 1, 1]
+    assert rates(decay_share=0.5) == pytest.approx([0.5, 1, 1, 0.5, 0.1464], abs=1e-3)
+
+
+def test_the_timestep_shift_moves_training_times_towards_noise(make_trainer):
+    def sigma(**changes):
+        trainer = make_trainer(**changes)
+        rng = SampleRng(1, 0, 0)
+        return trainer._start_and_sigma(rng, trainer._latents(rng))[1].item()
+
+    none, shifted = sigma(timestep_shift=1.0), sigma(timestep_shift=3.0)
+    assert shifted == pytest.approx(3 * none / (1 + 2 * none))
+    assert sigma() not in (none, shifted)
 
 
 def test_a_batch_that_cannot_be_divided_is_refused(recipe, monkeypatch):

@@ -59,8 +59,8 @@ def test_a_grey_mask_is_the_same_as_a_lower_strength(photo, backend):
         assert np.abs(ours.astype(int) - theirs).max() <= 1
 
 
-def test_the_mask_and_the_strength_multiply_with_a_generated_override(random):
-    image, change = random.random((2, 20, 30, 3), np.float32)
+def test_the_mask_and_the_strength_multiply_with_a_generated_override(rng):
+    image, change = rng.random((2, 20, 30, 3), np.float32)
     weights = np.full((20, 30, 1), 0.5, np.float32)
 
     def apply(strength, weights=None):
@@ -70,7 +70,7 @@ def test_the_mask_and_the_strength_multiply_with_a_generated_override(random):
             image, 0, 20, weights
         )
 
-    weights_of_override = random.random((20, 30, 1), np.float32)
+    weights_of_override = rng.random((20, 30, 1), np.float32)
     for ours, theirs in zip(apply(0.8, weights), apply(0.4), strict=True):
         np.testing.assert_allclose(ours, theirs, atol=1e-5)
 

@@ -152,8 +152,8 @@ def test_an_image_smaller_than_the_window_is_refused(window, side):
 # --- linear light and channels
 
 
-def test_the_linear_error_is_the_rms_of_the_light(random):
-    prediction, truth = random.integers(0, 256, (2, 9, 12, 3)).astype(np.uint8)
+def test_the_linear_error_is_the_rms_of_the_light(rng):
+    prediction, truth = rng.integers(0, 256, (2, 9, 12, 3)).astype(np.uint8)
     light, true_light = (to_linear(image / 255) for image in (prediction, truth))
     assert linear_error(prediction, truth) == pytest.approx(
         ((light - true_light) ** 2).mean() ** 0.5, rel=1e-5
@@ -167,8 +167,8 @@ def test_the_linear_error_is_the_rms_of_the_light(random):
     assert linear_error(black, white) == pytest.approx(0.75**0.5)
 
 
-def test_the_psnr_of_channels_is_the_mean_of_three_psnrs(random):
-    prediction, truth = random.integers(0, 256, (2, 9, 12, 3)).astype(np.uint8)
+def test_the_psnr_of_channels_is_the_mean_of_three_psnrs(rng):
+    prediction, truth = rng.integers(0, 256, (2, 9, 12, 3)).astype(np.uint8)
     prediction[..., 0] = truth[..., 0] // 2
     channels = [np.repeat(image[..., i : i + 1], 3, 2) for i in range(3) for image in (prediction, truth)]
     expected = np.mean([psnr(*channels[i : i + 2]) for i in (0, 2, 4)])

@@ -35,9 +35,9 @@ def metric():
 
 
 @pytest.fixture
-def images(random):
-    first = random.integers(0, 256, (37, 50, 3)).astype(np.uint8)
-    change = random.integers(-60, 60, first.shape)
+def images(rng):
+    first = rng.integers(0, 256, (37, 50, 3)).astype(np.uint8)
+    change = rng.integers(-60, 60, first.shape)
     return first, np.clip(first + change, 0, 255).astype(np.uint8)
 
 

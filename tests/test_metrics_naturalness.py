@@ -17,8 +17,8 @@ def photo():
     return Photo.open(PHOTO).srgb_8bit()
 
 
-def test_noise_and_blur_raise_niqe(photo, random):
-    noisy = np.clip(photo + random.normal(0, 25, photo.shape), 0, 255).astype(np.uint8)
+def test_noise_and_blur_raise_niqe(photo, rng):
+    noisy = np.clip(photo + rng.normal(0, 25, photo.shape), 0, 255).astype(np.uint8)
     sums = sum(np.roll(photo.astype(int), (i, j), (0, 1)) for i in range(-3, 4) for j in range(-3, 4))
     assert 2 < niqe(photo) < 6
     assert niqe(noisy) > niqe(photo) + 1
@@ -30,11 +30,11 @@ def test_only_whole_blocks_count(photo):
     assert niqe(photo) == pytest.approx(niqe(photo[:rows, :columns]), abs=1e-9)
 
 
-def test_images_without_two_blocks_of_texture_have_no_niqe(photo, random):
+def test_images_without_two_blocks_of_texture_have_no_niqe(photo, rng):
     with pytest.raises(ValueError, match="two blocks of 96x96"):
         niqe(photo[:96, :191])
     with pytest.raises(ValueError, match="two blocks of 96x96"):
         niqe(np.full((200, 300, 3), 80, np.uint8))
     with pytest.raises(ValueError, match="uint8"):
         niqe(photo.astype(float))
-    assert niqe(random.integers(0, 256, (96, 192, 3)).astype(np.uint8)) > 10
+    assert niqe(rng.integers(0, 256, (96, 192, 3)).astype(np.uint8)) > 10

@@ -67,15 +67,15 @@ def test_a_toy_is_marked_as_one_and_names_no_base():
 
 
 def test_sets_are_listed_with_their_scenes_and_without_local_paths(tmp_path, monkeypatch):
-    render_set(tmp_path / "sets" / "window", count=3)
+    render_set(tmp_path / "sets" / "paper", count=3)
     monkeypatch.setenv("BREWSTER_DATA", str(tmp_path))
-    listed = "`sets/window` (3 samples of the scenes `tiny`, orders all)"
+    listed = "`sets/paper` (3 samples of the scenes `tiny`, orders all)"
     assert listed in card()
-    elsewhere = {"rendered": {"sets": [str(tmp_path / "sets" / "window")]}}
-    assert "`window` (3 samples" in card(data=elsewhere)
+    elsewhere = {"rendered": {"sets": [str(tmp_path / "sets" / "paper")]}}
+    assert "`paper` (3 samples" in card(data=elsewhere)
     assert str(tmp_path) not in card(data=elsewhere)
     monkeypatch.setenv("BREWSTER_DATA", str(tmp_path / "sets"))
-    assert "of the samples: `sets/window`." in card()
+    assert "of the samples: the first 1000 samples of `sets/paper`." in card()
 
 
 def test_pairs_and_their_share_are_listed():
@@ -135,6 +135,7 @@ def exported(tmp_path):
                 parameter.add_(0.05 * torch.randn(parameter.shape, generator=generator))
         save_lora(tmp_path / "lora", backbone, prompt, DecompositionTask(layout))
         changes = {"panels": list(layout.panels), "direction": layout.direction, "budget_px": 64 * 64 * 3}
+        changes["white_space"] = layout.white_space
         recipe = read_recipe(RECIPES / f"{name}.toml").model_copy(update=changes)
         write_card(tmp_path / "lora", recipe, {}, BACKBONES[name])
         picture = torch.randint(0, 256, (64, 64, 3), generator=generator, dtype=torch.uint8)
@@ -146,10 +147,33 @@ def exported(tmp_path):
     return export
 
 
+def run_example(folder, monkeypatch, name, **replaced):
+    """Runs the Python example for diffusers in the card of the LoRA in `folder`. Returns its T, (1, 3, h, w) in [-1, 1]."""
+    text = (folder / "lora" / "README.md").read_text()
+    (code,) = (block for block in re.findall(r"```python\n(.*?)```", text, re.S) if "diffusers" in block)
+    here = {BACKBONES[name].hub_id: "base", "cuda": "cpu", "photo.jpg": "photo.png", **replaced}
+    for there, local in here.items():
+        assert there in code
+        code = code.replace(there, local)
+    monkeypatch.chdir(folder)
+    made = {}
+    exec(compile(code, "README.md", "exec"), made)
+    return torch.from_numpy(np.array(made["transmission"])).permute(2, 0, 1)[None] / 127.5 - 1
+
+
+@pytest.mark.parametrize("name", ["kontext", "klein"])
+def test_the_python_example_runs_in_bfloat16_with_a_float32_prompt(exported, tmp_path, monkeypatch, name):
+    """As for a LoRA that was really trained: the base is bfloat16, the files of the LoRA are float32."""
+    expected = exported(name, PanelLayout())
+    picture = run_example(tmp_path, monkeypatch, name)
+    assert (picture - expected).abs().mean() < 0.5 * expected.std()
+
+
 @pytest.mark.parametrize(
     ("name", "layout"),
     [
         ("kontext", PanelLayout()),
+        ("kontext", PanelLayout(white_space=False)),
         ("kontext", PanelLayout(("T", "I", "R"), "stacked")),
         ("klein", PanelLayout(("T", "R"))),
     ],
@@ -158,16 +182,7 @@ def test_the_python_example_of_the_card_generates_the_same_picture(
     exported, tmp_path, monkeypatch, name, layout
 ):
     expected = exported(name, layout)
-    text = (tmp_path / "lora" / "README.md").read_text()
-    (code,) = (block for block in re.findall(r"```python\n(.*?)```", text, re.S) if "diffusers" in block)
-    here = {BACKBONES[name].hub_id: "base", "cuda": "cpu", "bfloat16": "float32", "photo.jpg": "photo.png"}
-    for there, local in here.items():
-        assert there in code
-        code = code.replace(there, local)
-    monkeypatch.chdir(tmp_path)
-    made = {}
-    exec(compile(code, "README.md", "exec"), made)
-    picture = torch.from_numpy(np.array(made["transmission"])).permute(2, 0, 1)[None] / 127.5 - 1
+    picture = run_example(tmp_path, monkeypatch, name, bfloat16="float32")
     torch.testing.assert_close(picture, expected, atol=1.1 / 255, rtol=0)
     assert expected.std() > 0.01
 

@@ -40,6 +40,7 @@ def test_the_conditioning_image_is_the_photo_and_white_space():
 def test_without_a_generated_photo_the_conditioning_image_is_the_photo():
     photo = torch.rand(1, 3, 4, 5)
     assert torch.equal(conditioning_image(photo, PanelLayout(("T", "R"))), photo)
+    assert torch.equal(conditioning_image(photo, PanelLayout(white_space=False)), photo)
 
 
 def test_the_papers_composite_is_three_squares_of_512_pixels():

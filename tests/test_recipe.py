@@ -177,7 +177,7 @@ def test_a_wrong_recipe_is_refused_and_the_key_named(tmp_path, change, message):
 
 def test_a_recipe_with_a_backbone_is_a_lora_recipe():
     large = {path.stem for path in RECIPES if isinstance(read_recipe(path), LoraRecipe)}
-    assert large == {"kontext", "klein", "qwen", "large-tiny"}
+    assert large == {"kontext", "kontext-real", "klein", "qwen", "large-tiny", "large-real-tiny"}
     assert isinstance(read_recipe(TINY), CompactRecipe)
 
 
@@ -221,7 +221,7 @@ def test_the_path_of_a_prompt_is_relative_to_the_recipe(tmp_path):
             "inconsistent; expected a weight above 0",
         ),
         (
-            ('sets = ["sets/window"]', 'recipe = "window"'),
+            ('sets = ["sets/paper"]', 'recipe = "window"'),
             "inconsistent; expected rendered sets and pairs only",
         ),
         (

@@ -10,8 +10,8 @@ from brewster.evaluate.resizing import resize, round_sides
 
 
 @pytest.mark.parametrize("size", [(540, 400), (95, 70), (33, 64), (127, 31)])
-def test_the_result_is_that_of_pillow(random, size):
-    pixels = random.integers(0, 256, (size[1], size[0], 3)).astype(np.uint8)
+def test_the_result_is_that_of_pillow(rng, size):
+    pixels = rng.integers(0, 256, (size[1], size[0], 3)).astype(np.uint8)
     width, height = (max(side // 32 * 32, min(side, 32)) for side in size)
     expected = np.asarray(Image.fromarray(pixels).resize((width, height)))
     ours = round_sides(Photo.from_array(pixels, encoding="srgb"), 32).srgb_8bit()

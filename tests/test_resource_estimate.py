@@ -1,5 +1,6 @@
 """Resource estimates, compared with values that were counted and measured elsewhere (facts of the project)."""
 
+import re
 from pathlib import Path
 
 import pytest
@@ -8,6 +9,7 @@ import torch
 from brewster.errors import DeviceError, ModelError
 from brewster.training.lora.resource_estimate import CARDS, GraphicsCard, estimate_resources, find_gpu
 from brewster.training.recipe import read_recipe, with_value
+from set_folders import render_set
 
 RECIPES = Path(__file__).parents[1] / "recipes" / "train"
 CARD = CARDS["RTX 4090"]
@@ -85,11 +87,45 @@ def test_an_unknown_backbone_has_no_estimate():
         estimate_resources(with_value(read_recipe(RECIPES / "klein.toml"), "backbone", "somebody/else"), CARD)
 
 
-def test_the_command_prints_the_estimate_and_trains_nothing(run_without_model, tmp_path):
-    code, out, _ = run_without_model("train", RECIPES / "large-tiny.toml", "--plan", "--gpu", "A100")
+def test_the_command_prints_the_estimate_and_trains_nothing(run_without_model, tmp_path, monkeypatch):
+    monkeypatch.delenv("BREWSTER_DATA", raising=False)
+    code, out, err = run_without_model("train", RECIPES / "large-tiny.toml", "--plan", "--gpu", "A100")
     assert code == 0
     assert b"A100" in out
+    assert "the data was not checked: BREWSTER_DATA is not set" in err
     assert list(tmp_path.iterdir()) == []
     code, _, err = run_without_model("train", RECIPES / "tiny.toml", "--plan")
     assert code != 0
     assert "train it without --plan" in err
+
+
+def test_the_plan_reads_the_data(run_without_model, tmp_path, monkeypatch):
+    monkeypatch.setenv("BREWSTER_DATA", str(tmp_path))
+    code, _, err = run_without_model("train", RECIPES / "large-tiny.toml", "--plan")
+    assert code == 1
+    assert "sets/tiny" in err
+    render_set(tmp_path / "sets" / "tiny", count=4)
+    code, out, _ = run_without_model("train", RECIPES / "large-tiny.toml", "--plan")
+    assert code == 0
+    assert re.search(rb"^data +4 rendered samples; panels of 32 x 16$", out, re.MULTILINE)
+
+
+def test_the_plan_lists_download_and_host_memory(klein):
+    assert re.search(r"host memory +11\.5 GiB, while the text encoders encode the prompt", klein.table())
+    assert re.search(r"download +16 GB, of them 8 GB text encoders", klein.table())
+    encoded = estimate_resources(with_value(klein.recipe, "prompt", "prompt.safetensors"), CARD)
+    assert re.search(r"download +8 GB, of them 0 GB text encoders", encoded.table())
+
+
+def test_white_space_and_the_optimiser_change_the_estimate():
+    recipe = read_recipe(RECIPES / "large-tiny.toml")
+    full, plain = (
+        estimate_resources(recipe, CARD),
+        estimate_resources(with_value(recipe, "white_space", False), CARD),
+    )
+    assert full.condition_tokens == 3 * plain.condition_tokens
+    eight_bit = estimate_resources(with_value(recipe, "optimizer", "adamw8bit"), CARD)
+    part = "LoRA and AdamW"
+    assert eight_bit.memory_gib[part] == pytest.approx(full.memory_gib[part] * 10 / 16)
+    attention = estimate_resources(with_value(recipe, "targets", ["*.attn.*"]), CARD)
+    assert 0 < attention.lora_parameters < full.lora_parameters

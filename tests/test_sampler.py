@@ -3,13 +3,16 @@
 import os
 import subprocess
 import sys
+from collections import Counter
+from pathlib import Path
 
 import pytest
 
 from brewster.environments.catalog import BUILTIN_CATALOG
 from brewster.errors import RecipeError
 from brewster.render.analytic import render
-from brewster.scene.recipe import RECIPES, read_scene_recipe
+from brewster.scene.recipe import RECIPES, SceneRecipe, read_scene_recipe
+from brewster.scene.recipe_file import validated
 from brewster.scene.sampler import Asset, Catalog, draw
 from brewster.scene.scene import Scene
 from brewster.scene.world import AssetSource
@@ -183,3 +186,55 @@ def test_a_logarithmic_range_has_its_median_at_the_geometric_mean():
     thick = sorted(drawn(recipe, index).glass.panes[0].thickness_mm for index in range(101))
     assert 1 <= thick[0] <= thick[-1] <= 100
     assert 4 < thick[50] < 25  # uniform, it would be 50
+
+
+PAPER = str(Path(__file__).parents[1] / "recipes" / "render" / "paper.toml")
+
+
+@pytest.fixture(scope="module")
+def paper_scenes():
+    recipe = read_scene_recipe(PAPER)
+    maps = (Asset(source=AssetSource(file="a.exr"), width=8192, height=4096),)
+    catalog = Catalog(maps=maps, pictures=BUILTIN_CATALOG.pictures)
+    return [draw(recipe, catalog, 10, index) for index in range(600)]
+
+
+def test_the_paper_recipe_draws_its_three_setups_in_their_shares(paper_scenes):
+    """HDR|HDR, HDR|LDR and LDR|HDR: exactly one kind of content on each side, and never two pictures."""
+
+    def kind(side):
+        assert (side.map is None) != (side.plane is None)
+        return "plane" if side.map is None else "map"
+
+    counts = Counter((kind(scene.behind), kind(scene.front)) for scene in paper_scenes)
+    assert set(counts) == {("map", "map"), ("map", "plane"), ("plane", "map")}
+    assert counts["map", "map"] / 600 == pytest.approx(0.5, abs=0.06)
+    assert counts["map", "plane"] / 600 == pytest.approx(0.25, abs=0.055)
+
+
+def test_the_paper_recipe_has_the_glass_and_the_orders_of_the_paper(paper_scenes):
+    glasses = [scene.glass for scene in paper_scenes]
+    panes = [pane for glass in glasses for pane in glass.panes]
+    assert {scene.orders for scene in paper_scenes} == {"truncated"}
+    assert all(1.45 <= pane.refractive_index <= 1.65 for pane in panes)
+    assert all(3 <= pane.thickness_mm <= 6 or 10 <= pane.thickness_mm <= 40 for pane in panes)
+    assert min(pane.refractive_index for pane in panes) < 1.46
+    assert max(pane.refractive_index for pane in panes) > 1.64
+    for share, low, high in (
+        (sum(glass.is_rough for glass in glasses), 0.06, 0.14),
+        (sum(len(glass.panes) == 2 for glass in glasses), 0.1, 0.2),
+        (sum(glass.panes[0].thickness_mm >= 10 for glass in glasses), 0.14, 0.26),
+        (sum(scene.camera.aperture_mm > 0 for scene in paper_scenes), 0.33, 0.47),
+    ):
+        assert low < share / 600 < high
+    fields = [scene.camera.fov_deg for scene in paper_scenes]
+    assert min(fields) < 25
+    assert max(fields) > 85
+
+
+def test_setups_need_a_share_above_zero():
+    values = read_scene_recipe(PAPER).model_dump(exclude_unset=True)
+    with pytest.raises(RecipeError, match="a share above 0 for at least one of the setups"):
+        validated(SceneRecipe, values | {"setups": {"map|map": 0.0}}, source="x", reference="y")
+    with pytest.raises(RecipeError, match="setups"):
+        validated(SceneRecipe, values | {"setups": {"plane|plane": 1.0}}, source="x", reference="y")

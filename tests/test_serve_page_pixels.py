@@ -1,6 +1,7 @@
 """At 1:1 the page shows the pixels of the photo and of its layers, tested in a real browser with a real server."""
 
 import base64
+import math
 
 import numpy as np
 import pytest
@@ -33,8 +34,10 @@ def view(page):
 
 
 def middle(pixels, shape):
-    """The middle of an image, with the shape of a view."""
-    top, left = (-round((view - full) / 2) for view, full in zip(shape[:2], pixels.shape[:2], strict=True))
+    """The middle of an image, with the shape of a view; a half pixel is rounded as on the page."""
+    top, left = (
+        -math.floor((view - full + 1) / 2) for view, full in zip(shape, pixels.shape[:2], strict=False)
+    )
     return pixels[top : top + shape[0], left : left + shape[1]]
 
 

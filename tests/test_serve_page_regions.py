@@ -132,11 +132,11 @@ def test_regions_are_drawn_with_a_finger_and_two_fingers_zoom(open_page):
     page = open_page(viewport={"width": 390, "height": 844}, has_touch=True)
     upload(page, ("window.png", image_bytes(*SIZE, "png")))
     page.get_by_label("Not here").check()
-    page.evaluate("scrollTo(0, 0)")
     finger = page.context.new_cdp_session(page)
-    stage = page.locator("glass-compare").bounding_box()
 
     def touch(kind, *points):
+        page.evaluate("scrollTo(0, 0)")
+        stage = page.locator("glass-compare").bounding_box()
         at = [{"x": stage["x"] + x, "y": stage["y"] + y, "id": index} for index, (x, y) in enumerate(points)]
         finger.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": at})
 

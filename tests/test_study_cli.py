@@ -88,8 +88,8 @@ def test_report_prints_tables_and_writes_all_files(run_without_model, study, rng
     assert json.loads(out)["excluded"] == {"failed": 0, "fast": 12}
 
 
-def test_progress_lists_participants_without_results(run_without_model, study, random):
-    add_answers(study, 2, random)
+def test_progress_lists_participants_without_results(run_without_model, study, rng):
+    add_answers(study, 2, rng)
     code, out, _ = run_without_model("study", "progress", "study", "--max-failed", 0.5)
     assert code == 0
     text = out.decode()

@@ -1,4 +1,4 @@
-"""Thread limits of workers. The exit with the parent is tested in the packages that start workers."""
+"""Thread limits of workers."""
 
 import contextlib
 

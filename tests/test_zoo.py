@@ -22,6 +22,11 @@ def test_a_misspelt_model_name_gets_a_suggestion():
         find_model("compct")
 
 
+def test_a_file_of_weights_is_refused_with_the_folder_to_pass():
+    with pytest.raises(ModelError, match=r"is a file of weights; .*--model out/kontext/lora"):
+        find_model("out/kontext/lora/pytorch_lora_weights.safetensors")
+
+
 def test_a_damaged_file_is_refused(tmp_path):
     broken = tmp_path / "compact.onnx"
     broken.write_bytes(MODELS["compact"].path.read_bytes()[:-1])

@@ -102,7 +102,7 @@ class Options:
     quantise: Quantisation | None = field(
         default=None,
         metadata=_field_metadata(
-            "For diffusion models: store the weights in 8 or 4 bits, for GPUs with little memory."
+            "For diffusion models: store the weights in 8 or 4 bits; by default, as in training, or as few as the GPU's memory requires."
         ),
     )
     steps: int | None = field(

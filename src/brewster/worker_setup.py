@@ -1,12 +1,9 @@
-"""Set-up of worker processes: one torch thread for reproducible results, and exit when the parent process ends."""
+"""Set-up of workers: one torch thread, for reproducible results."""
 
 from __future__ import annotations
 
-import os
-import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
-from multiprocessing import parent_process
 
 
 @contextmanager
@@ -20,15 +17,3 @@ def single_torch_thread() -> Iterator[None]:
         yield
     finally:
         torch.set_num_threads(previous_count)
-
-
-def exit_with_parent() -> None:
-    """Makes this process exit when its parent process ends, even if the parent is killed."""
-    threading.Thread(target=_wait_for_parent, daemon=True).start()
-
-
-def _wait_for_parent() -> None:
-    parent = parent_process()
-    if parent:
-        parent.join()
-        os._exit(1)

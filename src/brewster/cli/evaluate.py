@@ -295,7 +295,6 @@ class _EvaluateCommand:
         return print_failures(results, quiet=self.quiet) and is_complete
 
     def _export(self, methods: Sequence[Method]) -> None:
-        from brewster.evaluate.methods import BASELINE  # noqa: PLC0415
         from brewster.evaluate.submission import export_ntire2026  # noqa: PLC0415
 
         folders = [Path(folder) for name, folder in self.benchmarks if name == "openrr"]
@@ -305,13 +304,12 @@ class _EvaluateCommand:
                 "expected --benchmark openrr=FOLDER with the folders val_300_blended and test_100_blended",
                 "add the benchmark, or leave out --export",
             )
-        for method in methods:
-            if method.name != BASELINE:
-                out = self.out / "export" / method.name
-                for path in export_ntire2026(
-                    folders[0], method, out, on_progress=lambda _: interrupts.raise_pending()
-                ):
-                    print_status(f"wrote {path}")
+        for method in methods[1:]:  # the first one is the baseline
+            out = self.out / "export" / method.name
+            for path in export_ntire2026(
+                folders[0], method, out, on_progress=lambda _: interrupts.raise_pending()
+            ):
+                print_status(f"wrote {path}")
 
     def _read_benchmarks(self) -> list[Benchmark]:
         from brewster.benchmarks.registry import read_benchmark  # noqa: PLC0415

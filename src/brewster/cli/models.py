@@ -183,6 +183,44 @@ def push(*, folder: Path, repo_id: str, public: bool, message: str, dry_run: boo
         print_out(f"sent: {address}" if address else "nothing was sent")
 
 
+@models.command
+@click.argument("folder", type=click.Path(path_type=Path))
+@click.option(
+    "-o",
+    "--output",
+    "target",
+    required=True,
+    metavar="PATH",
+    type=click.Path(path_type=Path),
+    help="The file (comfyui) or the folder (merged) to write.",
+)
+@click.option(
+    "--format",
+    "target_format",
+    type=click.Choice(["comfyui", "merged"]),
+    default="comfyui",
+    show_default=True,
+    help="comfyui: one .safetensors file with the LoRA. merged: the base with the LoRA added to its weights, for diffusers.",
+)
+@click.option(
+    "--base",
+    metavar="FOLDER|ID",
+    help="For merged: the folder or hub id of the base model, if it has moved since training.",
+)
+def export(*, folder: Path, target: Path, target_format: str, base: str | None) -> None:
+    """Export the LoRA in FOLDER for other programs."""
+    require_extra("large", "exporting a LoRA")
+    from brewster.models.diffusion.adapter.export import export_comfyui, export_merged  # noqa: PLC0415
+
+    if target_format == "comfyui":
+        if base:
+            raise click.UsageError("--base is for --format merged: a LoRA file for ComfyUI has no base.")
+        export_comfyui(folder, target)
+    else:
+        export_merged(folder, target, base)
+    print_status(f"{folder} -> {target}")
+
+
 def describe(model: zoo.ModelFile) -> dict[str, Any]:
     """Returns the properties of a model as JSON values. `error` is the problem with its file, or None."""
     row = {"name": model.name, "path": str(model.path), "licence": model.licence, "sha256": model.sha256}

@@ -140,14 +140,12 @@ def _param_type(hint: object, field: dataclasses.Field[Any]) -> click.ParamType[
         return _param_type(get_args(hint)[0], field)
     if hint in (int, float):
         return (_RangedNumber if hint is float else click.IntRange)(low, high)
-    if hint == FormatName:
-        return _FormatChoice(get_args(hint))
     if hint is Path:
         return click.Path(exists=True, dir_okay=False, path_type=Path)
     if get_origin(hint) is tuple:
         return _ChoiceList(get_args(get_args(hint)[0]))
     if get_origin(hint) is Literal:
-        return click.Choice(get_args(hint))
+        return (_FormatChoice if hint == FormatName else click.Choice)(get_args(hint))
     return _ModelName() if field.name == "model" else click.STRING
 
 

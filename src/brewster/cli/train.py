@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -31,7 +32,7 @@ if TYPE_CHECKING:
 @click.option(
     "--plan",
     is_flag=True,
-    help="Do not train; estimate the memory and time that a recipe with a large backbone needs, and check that the memory of the GPU suffices.",
+    help="Do not train; estimate the memory, download and time that a recipe with a large backbone needs, and check the memory of the GPU and the data.",
 )
 @click.option(
     "--gpu",
@@ -43,6 +44,13 @@ if TYPE_CHECKING:
     "--show-recipe",
     metavar="NAME|FILE",
     help="Do not train; print a recipe as TOML with all defaults and a comment for each key. NAME is compact or lora; FILE is a recipe.",
+)
+@click.option(
+    "--device",
+    type=click.Choice(["auto", "cpu"]),
+    default="auto",
+    show_default=True,
+    help="The device to train on. auto is the GPU; without one, a large backbone is refused, because it takes weeks on a CPU.",
 )
 @click.option(
     "--json",
@@ -58,6 +66,7 @@ def train(
     plan: bool,
     gpu_name: str | None,
     show_recipe: str | None,
+    device: str,
     as_json: bool,
     quiet: bool,
 ) -> None:
@@ -86,7 +95,7 @@ def train(
     from brewster.training.loop import run  # noqa: PLC0415
     from brewster.training.trainers import open_trainer  # noqa: PLC0415
 
-    trainer = open_trainer(parsed)
+    trainer = open_trainer(parsed, device)
     printer = _TrainingPrinter(
         as_json=as_json and is_main_process(), quiet=quiet or not is_main_process(), folder=out
     )
@@ -172,6 +181,22 @@ def _print_plan(recipe: CompactRecipe | LoraRecipe, gpu_name: str | None) -> Non
     estimate = estimate_resources(recipe, gpu)
     print_out(estimate.table())
     estimate.check_fits()
+    _print_data(recipe)
+
+
+def _print_data(recipe: LoraRecipe) -> None:
+    """Reads the data of the recipe, as training does, and prints the number of samples and the sizes of their panels."""
+    if not os.environ.get("BREWSTER_DATA"):
+        print_status("the data was not checked: BREWSTER_DATA is not set")
+        return
+    from brewster.models.diffusion.backbones import family_of  # noqa: PLC0415
+    from brewster.training.lora.latents import open_samples  # noqa: PLC0415
+
+    samples = open_samples(recipe)
+    panels = [fit.panel for fit in samples.panel_fits(recipe, family_of(recipe.backbone).multiple)]
+    sizes = sorted(set(panels), key=lambda size: size[0] * size[1])
+    span = " to ".join(f"{width} x {height}" for width, height in dict.fromkeys((*sizes[:1], *sizes[-1:])))
+    print_out(f"{'data':24}{samples.description()}{f'; panels of {span}' if span else ''}")
 
 
 def _make_folder(folder: Path) -> None:

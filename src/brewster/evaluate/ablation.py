@@ -16,7 +16,7 @@ from typing import Annotated, Any, Final, final
 from pydantic import AfterValidator, Field
 
 from brewster.benchmarks.registry import Benchmark, read_benchmark
-from brewster.evaluate.config import EvaluationConfig
+from brewster.evaluate.config import DEFAULT_METRICS, EvaluationConfig
 from brewster.evaluate.evaluation import evaluate
 from brewster.evaluate.methods import IdentityBaseline, ModelMethod
 from brewster.evaluate.results import AVERAGE, Results
@@ -61,6 +61,8 @@ class AblationStudy(FrozenModel):
         KeyNote("table of name = folder", "at least 1 entry", replaces_constraints=True),
     ]
     """The benchmarks to score on: a name and a folder relative to BREWSTER_DATA for each."""
+    metrics: tuple[str, ...] = DEFAULT_METRICS
+    """The metrics to compute. Those of the reflection region need pairs, the failure metrics need rendered sets."""
 
     def label(self, value: Value) -> str:
         """The name of a value in tables: "mixing 8-bit"."""
@@ -115,6 +117,12 @@ def ablate(
         RecipeError: the base recipe, the key or a value is invalid, or data is missing.
         BrewsterError: as raised by training and `evaluate`.
     """
+    config = EvaluationConfig(metrics=study.metrics)
+    for metric in config.columns().values():
+        if (
+            metric.prepare
+        ):  # loads the weights of LPIPS: a download that fails must not fail after hours of training
+            metric.prepare()
     base = read_recipe(study.base)
     recipes = {study.label(value): with_value(base, study.key, value) for value in study.values}
     models = []
@@ -127,7 +135,7 @@ def ablate(
         models.append(
             ModelMethod(label, str(_train(recipe, folder, on_step)), out / "predictions" / folder.name)
         )
-    results = evaluate(benchmarks, [IdentityBaseline(), *models], EvaluationConfig(), out, workers=workers)
+    results = evaluate(benchmarks, [IdentityBaseline(), *models], config, out, workers=workers)
     numbers = [
         value for value in study.values if isinstance(value, int | float) and not isinstance(value, bool)
     ]

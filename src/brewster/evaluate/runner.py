@@ -26,7 +26,8 @@ from brewster.evaluate.config import EvaluationConfig
 from brewster.evaluate.methods import Method, MethodOutput, PredictionFolder, check_names
 from brewster.evaluate.score_log import SCORE_FORMAT_VERSION, SCORES_FILE, RowId, ScoreLog, ScoreRow, read_log
 from brewster.evaluate.scoring import CaseFiles, GroundTruth, Scorer
-from brewster.worker_setup import exit_with_parent, single_torch_thread
+from brewster.executors import exit_with_parent
+from brewster.worker_setup import single_torch_thread
 
 ScoreCallback = Callable[[int, int, "ScoreRow"], None]
 """Called with (done, total, row) after each prediction that was scored."""

@@ -6,7 +6,10 @@ import hashlib
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Final, TypeVar, final
+from typing import Any, Final, TypeVar, cast, final
+
+import numpy as np
+from numpy.typing import NDArray
 
 from brewster import metrics
 from brewster.benchmarks.registry import Case
@@ -18,10 +21,9 @@ from brewster.evaluate.resizing import resize
 from brewster.metrics import CachedImage, Comparison, Image, Metric, Region
 from brewster.photo import Photo
 
+_Array = TypeVar("_Array", bound=NDArray[Any])
 _DIGITS: Final = 6
 """Decimal places of the scores in scores.jsonl and results.json."""
-
-Pixels = TypeVar("Pixels", Image, Region)
 
 
 @final
@@ -168,10 +170,11 @@ class Scorer:
             comparison = replace(comparison, region=self._region(self._config.threshold(column)))
         return metric.score(comparison)
 
-    def _inside(self, image: Pixels) -> Pixels:
-        """The part of an image that is scored. It has no pixels if the border covers the image."""
+    def _inside(self, image: _Array) -> _Array:
+        """The part of an image or region that is scored. It has no pixels if the border covers the image."""
         border = self._config.border
-        return image[border : len(image) - border, border : image.shape[1] - border] if border else image
+        inside = np.s_[border : len(image) - border, border : image.shape[1] - border]
+        return cast("_Array", image[inside]) if border else image
 
     def _region(self, threshold: float) -> Region:
         if threshold not in self._regions:

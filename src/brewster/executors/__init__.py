@@ -7,7 +7,17 @@ from brewster.executors.local import (
     Runner,
     SerialExecutor,
     Task,
+    exit_with_parent,
     run_tasks,
 )
 
-__all__ = ["MAX_ATTEMPTS", "Executor", "ProcessExecutor", "Runner", "SerialExecutor", "Task", "run_tasks"]
+__all__ = [
+    "MAX_ATTEMPTS",
+    "Executor",
+    "ProcessExecutor",
+    "Runner",
+    "SerialExecutor",
+    "Task",
+    "exit_with_parent",
+    "run_tasks",
+]

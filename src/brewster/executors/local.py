@@ -11,17 +11,17 @@ from __future__ import annotations
 import os
 import signal
 import sys
+import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import dataclass
-from multiprocessing import connection, get_context, resource_tracker
+from multiprocessing import connection, get_context, parent_process, resource_tracker
 from multiprocessing.connection import Connection
 from multiprocessing.context import SpawnProcess
 from types import TracebackType
 from typing import Any, Final, Generic, Protocol, Self, TypeVar, final
 
 from brewster.errors import BrewsterError
-from brewster.worker_setup import exit_with_parent
 
 ResultT = TypeVar("ResultT")
 
@@ -250,3 +250,15 @@ def _worker_main(pipe: Connection, create_runner: Callable[[], Runner[Any]]) -> 
             except BrewsterError as error:
                 results = error
             pipe.send(results)
+
+
+def exit_with_parent() -> None:
+    """Makes this process exit when its parent process ends, even if the parent is killed."""
+    threading.Thread(target=_wait_for_parent, daemon=True).start()
+
+
+def _wait_for_parent() -> None:
+    parent = parent_process()
+    if parent:
+        parent.join()
+        os._exit(1)

@@ -45,7 +45,7 @@ class DiffusionPredictor(Predictor):
 
     Args:
         pipeline: the model.
-        steps: the number of sampling steps; by default those of the task (20 as in the paper), and 4 for "draft".
+        steps: the number of sampling steps; by default those of the task (20 as in the paper), and at most 4 for "draft".
         average: the number of samples with different seeds whose mean is the prediction; the mean has less invented detail.
         plain: whether the transmission is the upsampled generated one, without the detail of the photo.
 
@@ -96,13 +96,13 @@ class DiffusionPredictor(Predictor):
         self, inputs: Sequence[Floats], quality: Quality, on_progress: ProgressCallback
     ) -> Prediction:
         """Returns the mean prediction over the inputs. The reconstruction error is that of the first input."""
-        size = inputs[-1].shape[:2]
+        size, task_steps = inputs[-1].shape[:2], self._pipeline.task.steps
         tilings = [self._tiling(scaled_input.shape, is_first=i == 0) for i, scaled_input in enumerate(inputs)]
         tiles = [
             len(tile_slices(scaled_input.shape[:2], **tiling))
             for scaled_input, tiling in zip(inputs, tilings, strict=True)
         ]
-        steps = self._steps or (_DRAFT_STEPS if quality == "draft" else self._pipeline.task.steps)
+        steps = self._steps or (min(_DRAFT_STEPS, task_steps) if quality == "draft" else task_steps)
         progress = _ProgressCounter(on_progress, sum(tiles))
         predictions = []
         with self._lock:  # two predictions at the same time would need twice the GPU memory

@@ -134,6 +134,12 @@ def find_model(name: str) -> ModelFile:
             "to print the model card of a LoRA, run: brewster models card FOLDER",
         )
     path = Path(name)
+    if path.suffix == ".safetensors":
+        raise ModelError(
+            f"{name} is a file of weights",
+            "expected an .onnx file, or the folder or hub id of a LoRA",
+            f"pass the folder of the LoRA, which also has its prompt: --model {path.parent}",
+        )
     if path.is_file():
         return ModelFile(path.stem, path, None, "unknown")
     if exported := _run_model(name):

@@ -17,6 +17,7 @@ from brewster.scene.scene import WhiteBalance
 from brewster.scene.values import (
     FrozenModel,
     JpegQualityRange,
+    KeyNote,
     LogRange,
     NonNegativeFloat,
     Pixels,
@@ -25,6 +26,9 @@ from brewster.scene.values import (
     Range,
     Share,
 )
+
+Setup = Literal["map|map", "map|plane", "plane|map"]
+"""The kinds of content behind and in front of the glass (paper, figure on scene setups: HDR|HDR, HDR|LDR, LDR|HDR)."""
 
 _FOLDER: Final = Path(__file__).parent / "recipes"
 _REFERENCE: Final = "docs/recipes.md"
@@ -169,6 +173,16 @@ class SceneRecipe(FrozenModel):
     for other scenes without rough glass."""
     rough_samples_per_pixel: PositiveInt = 16
     """Rays per pixel for scenes with rough glass."""
+    setups: Annotated[
+        dict[Setup, Share],
+        KeyNote(
+            "table of behind|front = share",
+            'keys "map|map", "map|plane", "plane|map"; shares from 0 to 1',
+            replaces_constraints=True,
+        ),
+    ] = Field(default_factory=dict)
+    """Relative shares of the kinds of content behind|in front of the glass, drawn together: an environment map, or a picture
+    on a plane without a map. They replace map_probability and plane_probability of both sides. Empty: each side is drawn by itself."""
     glass: GlassRecipe = GlassRecipe()
     camera: CameraRecipe = CameraRecipe()
     behind: SideRecipe = SideRecipe()
@@ -176,6 +190,22 @@ class SceneRecipe(FrozenModel):
     front: SideRecipe = SideRecipe()
     """The content in front of the glass, which is visible in the reflection. It has the same keys as [behind]."""
     camera_response: CameraResponseRecipe = CameraResponseRecipe()
+
+    @model_validator(mode="after")
+    def _check_setups(self) -> Self:
+        if self.setups and not any(self.setups.values()):
+            raise ValueError("expected a share above 0 for at least one of the setups")
+        return self
+
+    def with_setup(self, setup: Setup) -> SceneRecipe:
+        """Returns the recipe whose two sides have exactly this kind of content."""
+        behind, front = (
+            side.model_copy(
+                update={"map_probability": float(kind == "map"), "plane_probability": float(kind != "map")}
+            )
+            for side, kind in zip((self.behind, self.front), setup.split("|"), strict=True)
+        )
+        return self.model_copy(update={"behind": behind, "front": front})
 
 
 def read_scene_recipe(name: str) -> SceneRecipe:

@@ -90,6 +90,9 @@ class _PartialScene:
 
 
 def _draw_once(recipe: SceneRecipe, catalog: Catalog, rng: _SceneRng, seed: int, index: int) -> Scene:
+    if recipe.setups:
+        setups, shares = zip(*recipe.setups.items(), strict=True)
+        recipe = recipe.with_setup(rng.choices(setups, shares)[0])
     glass = _draw_glazing(recipe.glass, rng)
     behind_map = _choose_map(recipe.behind, recipe.camera, catalog, rng)
     front_map = _choose_map(recipe.front, recipe.camera, catalog, rng)

@@ -12,8 +12,9 @@ from __future__ import annotations
 
 import atexit
 import os
-from collections.abc import Sequence
-from typing import Any, Final
+from collections.abc import Callable, Sequence
+from datetime import timedelta
+from typing import Any, Final, TypeVar
 
 import torch
 from torch import Tensor
@@ -23,7 +24,12 @@ from brewster.models.diffusion.lazy_imports import import_library
 
 _LAUNCHER_VARIABLES: Final = ("RANK", "LOCAL_RANK", "MASTER_ADDR", "MASTER_PORT")
 """The environment variables that a launcher sets for each process, in addition to WORLD_SIZE."""
+_TIMEOUT: Final = timedelta(hours=12)
+"""How long a process waits for the others. NCCL's default of ten minutes is shorter than the download of a base by rank 0."""
 _CURE: Final = "start them with torchrun --nproc_per_node"
+
+
+_Value = TypeVar("_Value")
 
 
 def initialize() -> None:
@@ -70,9 +76,9 @@ def is_main_process() -> bool:
     return rank() == 0
 
 
-def best_device() -> torch.device:
-    """Returns the GPU of this process, or the CPU if torch finds no GPU."""
-    if not torch.cuda.is_available():
+def best_device(requested: str = "auto") -> torch.device:
+    """Returns the GPU of this process, or the CPU if torch finds no GPU or `requested` is "cpu"."""
+    if requested == "cpu" or not torch.cuda.is_available():
         return torch.device("cpu")
     state = _partial_state()
     return torch.device(state.device) if state else torch.device("cuda")
@@ -88,12 +94,20 @@ def all_reduce_sum(tensors: Sequence[Tensor]) -> None:
             tensor.copy_(part.view_as(tensor))
 
 
+def from_main_process(create: Callable[[], _Value]) -> _Value:
+    """Calls `create` in the process of rank 0 only, and returns its result, which must be picklable, in all processes."""
+    values = [create() if is_main_process() else None]
+    if world_size() > 1:
+        import_library("accelerate.utils").broadcast_object_list(values, from_process=0)
+    return values[0]  # type: ignore[return-value]
+
+
 def _partial_state() -> Any | None:  # noqa: ANN401 - accelerate's state
     """Returns the state of accelerate, a singleton, or None for a single process."""
     if _expected_world_size() == 1:
         return None
     # Without cpu=True and without a GPU, accelerate creates no process group, and each process trains alone.
-    return import_library("accelerate").PartialState(cpu=not torch.cuda.is_available())
+    return import_library("accelerate").PartialState(cpu=not torch.cuda.is_available(), timeout=_TIMEOUT)
 
 
 def _expected_world_size() -> int:

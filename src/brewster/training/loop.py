@@ -85,8 +85,8 @@ def run(
     Every `checkpoint_every` steps it writes `checkpoint.pt` into `out`. Every `report_every` steps it validates, appends a
     line to `log.jsonl`, replaces `samples.png` and the curves in `results.png`, and writes metrics and samples as TensorBoard
     events. The logged `seconds` are those of the whole run: they include the time before an interruption, up to the
-    checkpoint. With several processes, only rank 0 writes files. If the recipe has no data (a count of 0), `run` takes no
-    step, and the trainer keeps its initial weights.
+    checkpoint. With several processes, all of them validate, and only rank 0 writes files. If the recipe has no data (a
+    count of 0), `run` takes no step, and the trainer keeps its initial weights.
 
     Raises:
         RecipeError: `out` contains a run of another recipe, or a run with more steps.
@@ -103,9 +103,10 @@ def run(
     with closing(TensorBoardLog(out, completed_steps)) as event_log:
         for step in range(completed_steps + 1, 1 + steps):
             metrics, is_last = trainer.training_step(step - 1), step == recipe.steps
-            logged = is_main_process() and (is_last or step % recipe.report_every == 0)
-            if logged:
-                scores, image = trainer.validate()
+            reports = is_last or step % recipe.report_every == 0
+            logged = reports and is_main_process()
+            scores, image = trainer.validate() if reports else ({}, None)
+            if logged and image is not None:
                 metrics |= scores | {"seconds": time.monotonic() - started}
                 _append_log(out / LOG_FILE, {"step": step, **metrics})
                 _write_image(out / SAMPLES_FILE, image)

@@ -5,6 +5,7 @@ Data paths in a recipe are relative to the folder in the environment variable BR
 
 from __future__ import annotations
 
+import math
 import os
 import tomllib
 from collections.abc import Iterator
@@ -17,7 +18,7 @@ from pydantic import AfterValidator, Field, model_validator
 from brewster.errors import RecipeError
 from brewster.models.diffusion.panels import Direction, Panel, PanelLayout
 from brewster.models.diffusion.prompt import PROMPTS
-from brewster.models.diffusion.sampling import GUIDANCE
+from brewster.models.diffusion.sampling import GUIDANCE, STEPS
 from brewster.models.diffusion.task import PAPER_PX, DecompositionTask, Objective
 from brewster.models.networks import DEFAULT_NETWORK, MAX_STRIDE, NETWORKS
 from brewster.models.zoo import TINY_PREFIX
@@ -33,13 +34,15 @@ from brewster.scene.values import (
     Share,
 )
 from brewster.training.data.data_recipe import DataRecipe
-from brewster.training.data.mixtures import MixRecipe
+from brewster.training.data.mixtures import MixRecipe, Pairs
 
 _REFERENCE: Final = "docs/recipes.md"
 
 _TEMPLATE_FOLDER: Final = Path(__file__).parent / "recipes"
 TEMPLATES: Final = tuple(sorted(path.stem for path in _TEMPLATE_FOLDER.glob("*.toml")))
 """The names of the packaged recipes, starting points for new recipes: one for the compact network, one for a LoRA."""
+
+Optimizer = Literal["adamw", "adamw8bit"]
 
 ENCODED_SUFFIX: Final = ".safetensors"
 """The file name suffix of an encoded prompt."""
@@ -85,6 +88,8 @@ class TrainingRecipe(FrozenModel):
     """Peak learning rate of AdamW."""
     warmup_steps: PositiveInt
     """Number of steps in which the learning rate rises linearly from 0 to its peak."""
+    decay_share: Share = 1.0
+    """Share of the steps, at the end, in which the learning rate falls to zero along a cosine. Before, it is constant."""
     weight_decay: NonNegativeFloat
     """Weight decay of AdamW."""
     report_every: PositiveInt
@@ -92,6 +97,12 @@ class TrainingRecipe(FrozenModel):
     checkpoint_every: PositiveInt
     """Number of steps between two checkpoints. A stopped run resumes from the last one."""
     data: DataRecipe
+
+    def learning_rate_factor(self, step: int) -> float:
+        """Returns the learning rate at this step (from 0) divided by its peak: a linear rise, then a cosine decay."""
+        warm = min(1.0, (step + 1) / self.warmup_steps)
+        remaining = (1 - step / self.steps) / max(self.decay_share, 1e-9)
+        return warm * (0.5 - 0.5 * math.cos(math.pi * min(1.0, remaining)))
 
 
 class CompactRecipe(TrainingRecipe):
@@ -108,8 +119,6 @@ class CompactRecipe(TrainingRecipe):
     """Peak learning rate of the pretrained encoder."""
     ema_decay: Share
     """Decay per step of the exponential moving average (EMA) of the weights. The exported model has the averaged weights."""
-    decay_share: Share = 1.0
-    """Share of the steps, at the end, in which the learning rate falls to zero along a cosine. Before, it is constant."""
     precision: Literal["float32", "auto"] = "float32"
     """auto: bfloat16 if the processor supports it natively, except for depthwise convolutions and the head."""
     start_from: tuple[Path, ...] = ()
@@ -141,12 +150,22 @@ class LoraRecipe(TrainingRecipe):
     """Rank of the LoRA matrices."""
     alpha: PositiveInt = 16
     """Scale of the LoRA: the product of its matrices is multiplied by alpha / rank."""
+    targets: tuple[str, ...] = ()
+    """Names of the linear layers that get LoRA matrices, such as "*.attn.*". * and ? are wildcards as in a shell. Empty: all
+    linear layers of the blocks."""
+    optimizer: Optimizer = "adamw"
+    """adamw: float32 moments. adamw8bit: moments in 8 bits, by bitsandbytes on CUDA; 0.5 GB less for the paper's LoRA."""
+    decay_share: Share = 0.0
+    """Share of the steps, at the end, in which the learning rate falls to zero along a cosine. Before, it is constant."""
     quantise: Quantisation | None = None
     """Quantisation of the frozen backbone. Not set: no quantisation."""
     panels: tuple[Panel, ...] = ("I", "T", "R")
     """The images that the model generates in one composite image: photo I, transmission T, reflection R. T is required."""
     direction: Direction = "side by side"
     """Arrangement of the panels in the composite image."""
+    white_space: bool = True
+    """Whether the conditioning image has white space for the panels T and R. false: it is the photo alone, with a third of the
+    tokens. The paper calls white space not necessary, but easier to train."""
     budget_px: PositiveInt = PAPER_PX
     """Largest number of pixels of all panels together."""
     panel_weights: Annotated[
@@ -160,16 +179,25 @@ class LoraRecipe(TrainingRecipe):
     """flow: flow matching, from noise to panels in many steps. one_step: from the photo to the panels in one step."""
     guidance: NonNegativeFloat = 1.0
     """Guidance scale during training. For backbones with classifier-free guidance, 1 means no guidance."""
+    inference_guidance: NonNegativeFloat = GUIDANCE
+    """Guidance scale of validation and separation, stored with the LoRA. It has no effect for the objective one_step."""
+    inference_steps: PositiveInt = STEPS
+    """Number of sampling steps of validation and separation, stored with the LoRA. Objective one_step: always 1 step."""
     logit_mean: float = 0.0
     """Mean of the logit-normal distribution of training times (Esser et al. 2024), before the resolution shift."""
     logit_std: PositiveFloat = 1.0
     """Standard deviation of the logit-normal distribution of training times."""
+    timestep_shift: PositiveFloat | None = None
+    """Factor by which training times are shifted towards noise; 1 is no shift. Not set: the shift of the sampling schedule,
+    which depends on the number of tokens."""
     flip: bool = True
     """Whether each sample is also used with left and right exchanged."""
     crops: Annotated[int, Field(ge=0)] = 0
     """Number of different crops of each sample, in addition to the uncropped sample."""
     reflections: Literal["given", "difference"] = "given"
     """R of real pairs. given: from the reflection image, which every pair must have. difference: R = I - T in linear light."""
+    derived_reflection_weight: NonNegativeFloat = Pairs.reflection_weight
+    """Weight of panel R in the loss of pairs whose reflection is the difference I - T; 1 is the weight of a given reflection."""
     prompt: str = "paper"
     """The name of a prompt, which the text encoder of the backbone encodes, or a .safetensors file with an encoded prompt,
     relative to this recipe."""
@@ -177,13 +205,15 @@ class LoraRecipe(TrainingRecipe):
     @property
     def layout(self) -> PanelLayout:
         """The arrangement of the panels."""
-        return PanelLayout(self.panels, self.direction)
+        return PanelLayout(self.panels, self.direction, self.white_space)
 
     @property
     def task(self) -> DecompositionTask:
-        """The task of the trained adapter. Its guidance is that of the paper, or that of training if the objective is one_step."""
-        guidance = GUIDANCE if self.objective == "flow" else self.guidance
-        return DecompositionTask(self.layout, self.budget_px, self.objective, guidance)
+        """The task of the trained adapter. Its guidance is that of inference, or that of training if the objective is one_step."""
+        guidance = self.inference_guidance if self.objective == "flow" else self.guidance
+        return DecompositionTask(
+            self.layout, self.budget_px, self.objective, guidance, steps=self.inference_steps
+        )
 
     @model_validator(mode="after")
     def _check_consistency(self) -> Self:

@@ -8,8 +8,10 @@ from brewster.training.loop import Trainer
 from brewster.training.recipe import CompactRecipe, LoraRecipe
 
 
-def open_trainer(recipe: CompactRecipe | LoraRecipe) -> Trainer:
+def open_trainer(recipe: CompactRecipe | LoraRecipe, device: str = "auto") -> Trainer:
     """Creates the trainer of a recipe, for `loop.run`. Joins the process group if there are several processes.
+
+    `device` is "auto" or "cpu". A large backbone is trained on a CPU only if "cpu" is chosen explicitly.
 
     Raises:
         RecipeError, PhotoError: data is missing or damaged, or the batch cannot be divided among the processes.
@@ -19,7 +21,7 @@ def open_trainer(recipe: CompactRecipe | LoraRecipe) -> Trainer:
     if isinstance(recipe, LoraRecipe):
         from brewster.training.lora.trainer import LoraTrainer  # noqa: PLC0415  (imports diffusers)
 
-        return LoraTrainer(recipe)
+        return LoraTrainer(recipe, device)
     if distributed.world_size() > 1:
         raise RecipeError(
             f"training of a compact network was started with {distributed.world_size()} processes",
@@ -28,4 +30,4 @@ def open_trainer(recipe: CompactRecipe | LoraRecipe) -> Trainer:
         )
     from brewster.training.compact.trainer import CompactTrainer  # noqa: PLC0415
 
-    return CompactTrainer(recipe)
+    return CompactTrainer(recipe, device=device)

@@ -86,9 +86,11 @@ def photo_tile(photo: Photo, level: int, column: int, row: int) -> Photo | None:
 
     A pixel of level n is the mean of 2**n x 2**n pixels of the photo, in linear light.
     """
+    if not 0 <= level <= MAX_LEVEL:
+        return None
     step, (width, height) = 1 << level, photo.size
     left, top = TILE_PX * step * column, TILE_PX * step * row
-    if not (0 <= level <= MAX_LEVEL and 0 <= left < width and 0 <= top < height):
+    if not (0 <= left < width and 0 <= top < height):
         return None
     stored = photo.pixels[top : top + TILE_PX * step, left : left + TILE_PX * step]
     linear = photo.colour_space().to_linear(stored)

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import contextlib
 import difflib
+import gc
 import importlib.util
 import json
 import pkgutil
@@ -32,6 +33,7 @@ from brewster.models.diffusion.lazy_imports import (
     import_library,
 )
 from brewster.models.diffusion.prompt import PROMPT, PromptEmbedding
+from brewster.models.diffusion.text_encoders import check_text_encoders, text_encoder_device
 from brewster.models.zoo import LARGE_MODELS, TINY_PREFIX
 from brewster.options import Quantisation
 
@@ -86,7 +88,7 @@ def load_backbone(
         vae = _load_part(folder, family, "vae", dtype=dtype, **_device_map(device))
         transformer = _load_part(folder, family, "transformer", dtype=dtype, **_device_map(device), **options)
     scheduler = _load_part(folder, family, "scheduler")
-    backbone = family(transformer, vae, scheduler, distilled=bool(index.get("is_distilled")))
+    backbone = family(transformer, vae, scheduler, distilled=bool(index.get("is_distilled")), dtype=dtype)
     _check_channels(backbone, folder)
     if quantise:
         _check_quantised(backbone, quantise)
@@ -98,15 +100,18 @@ def encode_prompt(source: str, text: str = PROMPT, *, device: str = "cpu") -> Pr
 
     For `source`, see `load_backbone`. A tiny version has no text encoder: its embedding is random, seeded by the text.
 
+    They are loaded in bfloat16, on `device` if its free memory suffices, otherwise on the CPU. Call this before
+    `load_backbone`: together with the base, most text encoders fit no consumer GPU.
+
     Returns:
-        The embedding on the CPU.
+        The embedding on the CPU, bfloat16; float32 for a tiny version.
 
     Raises:
         DownloadError, ModelError, DeviceError, MissingExtra: see `load_backbone`.
     """
     _check_device(device)
     if source.startswith(TINY_PREFIX):
-        seed = 0 if text == PROMPT else zlib.crc32(text.encode())
+        seed = 0 if text == PROMPT else zlib.crc32(text.encode()) or 1  # the sum of "" is 0
         return replace(tiny(source.removeprefix(TINY_PREFIX), seed)[1], text=text)
     for name in family_of(source).text_encoder_requirements:  # before the download, which may take an hour
         if importlib.util.find_spec(name) is None:
@@ -118,14 +123,23 @@ def encode_prompt(source: str, text: str = PROMPT, *, device: str = "cpu") -> Pr
     disable_progress_bars_in_pipes()
     folder = _fetch_folder(source, _TEXT_ENCODER_PATTERNS)
     family, index = _family_in(folder)
-    dtype = torch.float32 if device == "cpu" else torch.bfloat16
+    check_text_encoders(folder, index)
+    dtype, device = torch.bfloat16, text_encoder_device(folder, device)
     pipeline_class = diffusers_class(index["_class_name"])
-    with explain_out_of_memory('encode the prompt with device="cpu"'), _translate_load_errors(folder):
+    with (
+        explain_out_of_memory("close other programs, or pass an encoded prompt"),
+        _translate_load_errors(folder),
+    ):
         pipeline = pipeline_class.from_pretrained(
             folder, transformer=None, vae=None, dtype=dtype, local_files_only=True
         ).to(device)
         with torch.no_grad():
-            return family.embed(pipeline, text).to("cpu", dtype)
+            embedding = family.embed(pipeline, text).to("cpu", dtype)
+    del pipeline
+    gc.collect()  # modules refer to each other, so the text encoders would stay in memory while the base is loaded
+    if device != "cpu":
+        torch.cuda.empty_cache()
+    return embedding
 
 
 def tiny(name: str, seed: int = 0) -> tuple[Backbone, PromptEmbedding]:

@@ -121,6 +121,19 @@ def fetch(source: str, patterns: list[str]) -> Path:
         ) from error
 
 
+def is_cached(hub_id: str) -> bool:
+    """Whether the transformer of a model on the hub is in the cache, so that loading it downloads at most a few files.
+
+    Raises:
+        MissingExtra: huggingface_hub is not installed.
+    """
+    hub = import_library("huggingface_hub")
+    with contextlib.suppress(OSError, ValueError):
+        folder = Path(hub.snapshot_download(hub_id, allow_patterns=["transformer/*"], local_files_only=True))
+        return any(folder.glob("transformer/*.safetensors"))
+    return False
+
+
 def has_token() -> bool:
     """Whether huggingface_hub finds a token: in HF_TOKEN, or in the file that `hf auth login` writes.
 

@@ -33,12 +33,16 @@ WHITE: Final = 1.0
 class PanelLayout:
     """The panels of the composite in their order, and the direction in which they are concatenated.
 
+    `white_space` is whether the conditioning image has the size of the composite, with white space for the panels that
+    are to be generated. Otherwise it is the photo alone.
+
     Raises:
         RecipeError: there is no panel, a panel is unknown or repeated, or the direction is unknown.
     """
 
     panels: tuple[Panel, ...] = ("I", "T", "R")
     direction: Direction = "side by side"
+    white_space: bool = True
 
     def __post_init__(self) -> None:
         known = set(get_args(Panel))
@@ -54,6 +58,11 @@ class PanelLayout:
                 f"expected {' or '.join(map(repr, get_args(Direction)))}",
                 "choose one of them",
             )
+
+    @property
+    def has_white_space(self) -> bool:
+        """Whether the conditioning image contains white space: it is requested, and I is among the generated panels."""
+        return self.white_space and "I" in self.panels
 
     @property
     def axis(self) -> int:
@@ -105,14 +114,14 @@ def split(composite: Float[Tensor, "n c h w"], layout: PanelLayout) -> dict[str,
 def conditioning_image(photo: Float[Tensor, "n 3 h w"], layout: PanelLayout) -> Tensor:
     """The conditioning image: the photo in panel I, and white space in the other panels.
 
-    White space turns the task into inpainting, which makes training converge more easily (Text-to-image Model
-    Fine-tuning). If I is not among the generated panels, the photo alone is the conditioning
+    White space turns the task into inpainting, which "is not necessary, but it turns out easier to converge" (Text-to-image
+    Model Fine-tuning). Without white space, or if I is not among the generated panels, the photo alone is the conditioning
     image (Experimental Setup: "control image"). It has a third of the tokens.
 
     Returns:
-        (N, 3, H, W). Its size is that of the composite if I is a panel; otherwise it is the photo itself.
+        (N, 3, H, W). Its size is that of the composite if there is white space; otherwise it is the photo itself.
     """
-    if "I" not in layout.panels:
+    if not layout.has_white_space:
         return photo
     white = torch.full_like(photo, WHITE)
     return compose({name: photo if name == "I" else white for name in layout.panels}, layout)

@@ -30,6 +30,7 @@ from brewster.models.diffusion.backbones import (
 )
 from brewster.models.diffusion.families.family import Backbone
 from brewster.models.diffusion.lazy_imports import explain_out_of_memory, fetch
+from brewster.models.diffusion.memory import check_machine, choose_quantisation
 from brewster.models.diffusion.panels import PanelLayout, compose, conditioning_image, split
 from brewster.models.diffusion.prompt import PROMPT_FILE, PROMPTS, PromptEmbedding, load_prompt
 from brewster.models.diffusion.sampling import euler, sample
@@ -91,6 +92,7 @@ class DecompositionPipeline:
             size=layout.composite_size((width, height)),
             steps=self.task.steps if steps is None else steps,
             guidance=self.task.guidance,
+            timestep_shift=self.task.timestep_shift,
             last_sigma=self.task.last_sigma,
             seeds=seeds,
             on_progress=on_progress,
@@ -106,7 +108,7 @@ class DecompositionPipeline:
                 one_step_latents(photo, backbone, layout),
                 backbone.encode(conditioning_image(photo, layout)),
                 self.prompt,
-                steps=1,
+                sigmas=torch.tensor([1.0, 0.0]),
                 guidance=self.task.guidance,
             )
             image = backbone.decode(latents).clamp(-1, 1).cpu()
@@ -152,7 +154,8 @@ def load_pipeline(
         model: a LoRA by its folder or hub id, or a backbone by its name, folder or hub id.
         device: "auto" uses an NVIDIA or AMD GPU if torch finds one, otherwise the CPU.
         base: the folder or hub id of the LoRA's base; by default the one used in training. Only for a LoRA.
-        quantise: the quantisation of the base; by default the one used in training, and none on the CPU.
+        quantise: the quantisation of the base; by default the one used in training, or int8 or nf4 if only these fit into
+            the GPU, and none on the CPU.
         prompt: for a backbone without a LoRA: a name in `PROMPTS`, or the text itself. A finetuned backbone with a
             stored prompt uses that one.
 
@@ -165,17 +168,19 @@ def load_pipeline(
     device_name = torch_device(device)
     lora = _find_lora(model)
     if lora:
-        return _load_with_lora(model, lora, device_name, base, quantise)
+        return _load_with_lora(model, lora, device, base, quantise)
     if base:
         raise ModelError(
             f"{model} is a backbone, and the base {base} was given for it",
             f"expected a base only for a LoRA, which is a folder with {LORA_FILE}",
             "leave the base out",
         )
+    digest = fingerprint(model, device=device, quantise=quantise, prompt=prompt)
+    quantise = quantise or choose_quantisation(model, device_name)
+    check_machine(model, requested=device, device=device_name, quantise=quantise, with_text_encoders=True)
     # The prompt is encoded before the backbone is loaded, because memory may be too small for both.
     embedding, task = _prompt_and_task(model, PROMPTS.get(prompt, prompt), device_name)
     backbone = load_backbone(model, device=device_name, quantise=quantise)
-    digest = fingerprint(model, device=device, quantise=quantise, prompt=prompt)
     return DecompositionPipeline(backbone, embedding, task, model_name(model), digest)
 
 
@@ -211,13 +216,15 @@ def fingerprint(
     """
     lora = _find_lora(model)
     if lora is None:
-        parts = [_source_id(model), str(quantise), PROMPTS.get(prompt, prompt)]
+        quantisation = quantise or choose_quantisation(model, torch_device(device))
+        parts = [_source_id(model), str(quantisation), PROMPTS.get(prompt, prompt)]
     else:
         layout, folder = lora
         metadata = layout.read_metadata(folder)
         weights = hashlib.sha256((folder / layout.weights).read_bytes()).hexdigest()
-        quantisation = _base_quantisation(metadata, torch_device(device), quantise)
-        parts = [weights, metadata.prompt_sha256, _source_id(base or metadata.base), str(quantisation)]
+        source = base or metadata.base
+        quantisation = _base_quantisation(metadata, source, torch_device(device), quantise)
+        parts = [weights, metadata.prompt_sha256, _source_id(source), str(quantisation)]
     return hashlib.sha256("\0".join(parts).encode()).hexdigest()
 
 
@@ -236,10 +243,10 @@ def _source_id(source: str) -> str:
 
 
 def _base_quantisation(
-    metadata: LoraMetadata, device: str, quantise: Quantisation | None
+    metadata: LoraMetadata, base: str, device: str, quantise: Quantisation | None
 ) -> Quantisation | None:
-    """The requested quantisation; by default the one used in training, and none on the CPU."""
-    return quantise or (metadata.quantise if device != "cpu" else None)
+    """The requested quantisation; by default the one used in training, or a smaller one that fits; none on the CPU."""
+    return quantise or choose_quantisation(base, device, metadata.quantise)
 
 
 def torch_device(device: str) -> str:
@@ -277,12 +284,12 @@ def _find_lora(model: str) -> tuple[LoraLayout, Path] | None:
 def _load_with_lora(
     model: str,
     lora: tuple[LoraLayout, Path],
-    device: str,
+    requested: str,
     base: str | None,
     quantise: Quantisation | None,
 ) -> DecompositionPipeline:
     layout, folder = lora
-    metadata = layout.read_metadata(folder)
+    metadata, device = layout.read_metadata(folder), torch_device(requested)
     source = base or metadata.base
     if base is None and _is_local(source) and not Path(source).is_dir():
         raise ModelError(
@@ -297,10 +304,11 @@ def _load_with_lora(
             f"expected a base of {metadata.backbone}, not of {family.name}",
             "choose another base",
         )
-    backbone = load_backbone(source, device=device, quantise=_base_quantisation(metadata, device, quantise))
+    quantisation = _base_quantisation(metadata, source, device, quantise)
+    check_machine(source, requested=requested, device=device, quantise=quantisation)
+    backbone = load_backbone(source, device=device, quantise=quantisation)
     metadata, prompt = layout.load(folder, backbone)
-    device_name = "cpu" if device == "cpu" else "cuda"
-    digest = fingerprint(model, device=device_name, base=base, quantise=quantise)
+    digest = fingerprint(model, device=requested, base=base, quantise=quantise)
     return DecompositionPipeline(backbone, prompt, metadata.task, model_name(model), digest)
 
 

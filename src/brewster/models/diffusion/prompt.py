@@ -33,6 +33,7 @@ PROMPT: Final = (
 
 PROMPTS: Final[dict[str, str]] = {
     "paper": PROMPT,
+    "none": "",
     "generic": "Remove the reflection.",
     "detailed": (
         "This photograph was taken through a pane of glass. Remove everything that is mirrored in the glass: lamps,"
@@ -40,8 +41,8 @@ PROMPTS: Final[dict[str, str]] = {
         " not there, with the same framing, sharpness, colours and brightness, and change nothing else."
     ),
 }
-"""Prompts by name. "generic" and "detailed" are for a backbone without a LoRA (paper, Comparing to original Flux
-model). The paper shows results of such prompts without their texts, so brewster defines these texts."""
+"""Prompts by name. "none", "generic" and "detailed" are for a backbone without a LoRA (paper, Comparing to original
+Flux model). The paper shows results of such prompts without their texts, so brewster defines these texts."""
 
 PROMPT_FILE: Final = "prompt.safetensors"
 _FORMAT: Final = "brewster prompt 1"

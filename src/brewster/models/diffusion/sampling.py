@@ -39,6 +39,7 @@ def sample(
     size: tuple[int, int],
     steps: int = STEPS,
     guidance: float = GUIDANCE,
+    timestep_shift: float | None = None,
     last_sigma: float | None = None,
     seeds: Sequence[int] = (0,),
     batch: int = 1,
@@ -46,9 +47,9 @@ def sample(
 ) -> Float[Tensor, "seeds 3 h w"]:
     """Generates one composite per seed, of this (width, height) in pixels.
 
-    For `last_sigma`, see `Backbone.schedule`. The noise is drawn on the CPU, so a seed gives the same noise on every device. `batch` is the number of seeds that
-    are computed at once; the result depends on it only by rounding. `on_progress(done, total)` is called after
-    each step.
+    The noise is drawn on the CPU, so a seed gives the same noise on every device. `batch` is the number of seeds that
+    are computed at once; the result depends on it only by rounding. For `timestep_shift` and `last_sigma`, see
+    `Backbone.schedule`. `on_progress(done, total)` is called after each step.
 
     Returns:
         The composites in [-1, 1], float32, on the CPU. `.mean(0, keepdim=True)` averages them.
@@ -73,14 +74,16 @@ def sample(
         condition_latents = backbone.encode(condition)
         for chunk in chunks:
             noise = torch.cat([backbone.noise(size, seed) for seed in chunk])
+            sigmas = backbone.schedule(
+                noise.shape[2] * noise.shape[3], steps, timestep_shift=timestep_shift, last_sigma=last_sigma
+            )
             latents = euler(
                 backbone,
                 noise,
                 condition_latents,
                 prompt,
-                steps=steps,
+                sigmas=sigmas,
                 guidance=guidance,
-                last_sigma=last_sigma,
                 on_progress=report_step,
             )
             images.append(backbone.decode(latents).clamp(-1, 1).cpu())
@@ -93,21 +96,19 @@ def euler(
     condition: Float[Tensor, "1 c p q"],
     prompt: PromptEmbedding,
     *,
-    steps: int,
+    sigmas: Float[Tensor, " sigmas"],
     guidance: float,
-    last_sigma: float | None = None,
     on_progress: Callable[[], None] | None = None,
 ) -> Float[Tensor, "n c h w"]:
-    """Integrates the flow from sigma 1 to 0: x(next sigma) = x(sigma) + (next sigma - sigma) velocity, in float32.
+    """Integrates the flow along `sigmas`: x(next sigma) = x(sigma) + (next sigma - sigma) velocity, in float32.
 
-    `condition` is the encoded conditioning image. For `last_sigma`, see `Backbone.schedule`. `on_progress()` is called after each step.
+    `condition` is the encoded conditioning image. `on_progress()` is called after each step.
 
     Returns:
-        The latents at sigma 0.
+        The latents at the last sigma, usually 0.
     """
     latents = noise.to(backbone.device)
-    sigmas = backbone.schedule(latents.shape[2] * latents.shape[3], steps, last_sigma).to(latents.device)
-    for sigma, next_sigma in itertools.pairwise(sigmas):
+    for sigma, next_sigma in itertools.pairwise(sigmas.to(latents.device)):
         velocity = backbone.predict(latents, condition, sigma.expand(len(latents)), prompt, guidance)
         latents = latents + (next_sigma - sigma) * velocity
         if on_progress:

@@ -6,7 +6,6 @@ network = train(read_recipe(Path("recipes/train/compact.toml")), Path("out/compa
 from __future__ import annotations
 
 import json
-import math
 import os
 from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -72,14 +71,14 @@ def train(recipe: CompactRecipe, out: Path, on_step: StepCallback) -> nn.Module:
 class CompactTrainer:
     """The `Trainer` of a compact network. It holds the network, the EMA of its weights, and the optimiser AdamW.
 
-    A `stream` replaces the training data of the recipe.
+    A `stream` replaces the training data of the recipe. `device` is "auto" for the GPU if there is one, or "cpu".
 
     Raises:
         RecipeError, PhotoError: the data is missing or damaged.
     """
 
-    def __init__(self, recipe: CompactRecipe, stream: Stream | None = None) -> None:
-        self.recipe, self.device = recipe, best_device()
+    def __init__(self, recipe: CompactRecipe, stream: Stream | None = None, device: str = "auto") -> None:
+        self.recipe, self.device = recipe, best_device(device)
         self._entry = NETWORKS[recipe.network]
         self.stream = stream or open_stream(recipe, self.device)
         self._uses_bfloat16 = recipe.precision == "auto" and _has_bfloat16(self.device)
@@ -220,11 +219,8 @@ class CompactTrainer:
         return self._prefetched.pop(step).result()
 
     def _set_learning_rates(self, step: int) -> None:
-        warm = min(1.0, (step + 1) / self.recipe.warmup_steps)
-        remaining = (1 - step / self.recipe.steps) / max(self.recipe.decay_share, 1e-9)
-        cosine = 0.5 - 0.5 * math.cos(math.pi * min(1.0, remaining))
         for group in self.optimizer.param_groups:
-            group["lr"] = group["peak"] * warm * cosine
+            group["lr"] = group["peak"] * self.recipe.learning_rate_factor(step)
 
     @torch.no_grad()
     def _update_ema(self, steps: int) -> None:

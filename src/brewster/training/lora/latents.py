@@ -9,7 +9,7 @@ not in the key, because a run has one frozen VAE, and all crops of a sample have
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -23,12 +23,11 @@ from torch.nn import functional
 from brewster.benchmarks.pairing import ImageGroup, read_folders
 from brewster.errors import RecipeError
 from brewster.models.diffusion.families.family import Backbone
-from brewster.models.diffusion.panels import PanelFit, compose, conditioning_image, fit_panel
+from brewster.models.diffusion.panels import PanelFit, compose, conditioning_image
 from brewster.models.diffusion.pipeline import one_step_latents
 from brewster.photo import Photo
 from brewster.srgb import to_encoded, to_linear
 from brewster.training.data.image_loading import read_pairs
-from brewster.training.data.mixtures import Pairs
 from brewster.training.data.rendered import RenderedSets
 from brewster.training.data.sample_rng import SampleRng
 from brewster.training.recipe import LoraRecipe
@@ -83,11 +82,19 @@ class SampleSequence:
             return TrainingSample(self._rendered.sample(number))
         return self._pairs[number - self._first_pair]
 
-    def preloaded(self) -> Iterator[UInt8[Tensor, "h w 9"]]:
-        """Yields the layers of the first rendered sample and of every pair."""
-        if self._rendered:
-            yield self._rendered.sample(0)
-        yield from (pair.layers for pair in self._pairs)
+    def panel_fits(self, recipe: LoraRecipe, multiple: int) -> list[PanelFit]:
+        """Returns the panels of the first rendered sample and of every pair, to find unusable samples before training.
+
+        Raises:
+            RecipeError, PhotoError: a file is damaged or missing, or a sample is too small, see `fit_sample`.
+        """
+        first = [self._rendered.sample(0)] if self._rendered else []
+        return [fit_sample(layers, recipe, multiple) for layers in (*first, *(p.layers for p in self._pairs))]
+
+    def description(self) -> str:
+        """Returns the number of samples of each source in words."""
+        counts = {"rendered samples": self._first_pair, "real pairs": len(self._pairs)}
+        return ", ".join(f"{count} {name}" for name, count in counts.items() if count) or "no samples"
 
     def draw_index(self, rng: SampleRng) -> int:
         """Draws the index of a sample. With the probability `pairs_share` it is a pair."""
@@ -97,23 +104,17 @@ class SampleSequence:
 
 
 class LatentEncoder:
-    """Draws samples and encodes them. The encoded samples are cached.
-
-    Raises:
-        PhotoError: a pair, or the first rendered sample, is smaller than a panel.
-    """
+    """Draws samples and encodes them. The encoded samples are cached."""
 
     def __init__(self, samples: SampleSequence, backbone: Backbone, recipe: LoraRecipe) -> None:
         self._samples, self._backbone, self._recipe = samples, backbone, recipe
-        for layers in samples.preloaded():  # report small samples before training, not after an hour
-            fit_sample(layers, backbone, recipe)
         self._encoded = lru_cache(CACHE_SIZE)(self._encode)
 
     def __call__(self, rng: SampleRng) -> EncodedSample:
         """Draws a sample, whether it is mirrored, and its crop. Returns the encoded sample.
 
         Raises:
-            RecipeError, PhotoError: a file of the sample is missing or damaged, or the sample is smaller than a panel.
+            RecipeError, PhotoError: a file of the sample is missing or damaged, or the sample has a side of fewer than 16 pixels.
         """
         number = self._samples.draw_index(rng)
         mirrored = self._recipe.flip and rng.bernoulli(0.5)
@@ -122,7 +123,7 @@ class LatentEncoder:
 
     def _encode(self, number: int, mirrored: bool, crop: int) -> EncodedSample:
         sample, layout, encode = self._samples[number], self._recipe.layout, self._backbone.encode
-        fit = fit_sample(sample.layers, self._backbone, self._recipe)
+        fit = fit_sample(sample.layers, self._recipe, self._backbone.multiple)
         layers = sample.layers
         if crop:
             # The step is negative, so that these random numbers differ from those of every training step.
@@ -165,14 +166,16 @@ def make_panels(layers: UInt8[Tensor, "h w 9"], fit: PanelFit) -> dict[str, Floa
     return dict(zip("ITR", padded.chunk(3, dim=1), strict=True))
 
 
-def fit_sample(layers: Tensor, backbone: Backbone, recipe: LoraRecipe) -> PanelFit:
-    """Returns the size of the panels of a sample, and the position of the sample in them.
+def fit_sample(layers: Tensor, recipe: LoraRecipe, multiple: int) -> PanelFit:
+    """Returns the size of the panels of a sample, and the position of the sample in them, as for photos at inference.
+
+    A sample is never enlarged: a small one gets small panels.
 
     Raises:
-        PhotoError: the sample is smaller than a panel.
+        PhotoError: a side of the sample is smaller than `multiple`, or its aspect ratio is too extreme.
     """
     height, width, _ = layers.shape
-    return fit_panel((width, height), recipe.layout, budget_px=recipe.budget_px, multiple=backbone.multiple)
+    return recipe.task.fit((width, height), multiple)
 
 
 def open_samples(recipe: LoraRecipe) -> SampleSequence:
@@ -201,7 +204,8 @@ def _read_pairs(folder: Path, recipe: LoraRecipe) -> list[TrainingSample]:
     groups = sorted(read_folders(folder).groups, key=lambda group: group.photo)
     if "R" in recipe.panels and recipe.reflections == "given":
         _check_reflections(folder, groups)
-    return [_read_sample(group, *pair) for group, pair in zip(groups, pairs, strict=True)]
+    weight = recipe.derived_reflection_weight
+    return [_read_sample(group, *pair, weight) for group, pair in zip(groups, pairs, strict=True)]
 
 
 def _check_reflections(folder: Path, groups: Sequence[ImageGroup]) -> None:
@@ -214,9 +218,11 @@ def _check_reflections(folder: Path, groups: Sequence[ImageGroup]) -> None:
         )
 
 
-def _read_sample(group: ImageGroup, photo: Tensor, transmission: Tensor) -> TrainingSample:
+def _read_sample(
+    group: ImageGroup, photo: Tensor, transmission: Tensor, derived_weight: float
+) -> TrainingSample:
     if group.reflection is None:
-        return TrainingSample(layers_from_pair(photo, transmission), Pairs.reflection_weight)
+        return TrainingSample(layers_from_pair(photo, transmission), derived_weight)
     reflection = _read_image(group.reflection)
     if reflection.shape != photo.shape:
         raise RecipeError(

@@ -22,7 +22,6 @@ from brewster.models.diffusion.backbones import BACKBONES
 from brewster.models.diffusion.families.family import APACHE_2, Backbone, DiffusersUsage
 from brewster.models.diffusion.panels import fit_panel
 from brewster.models.diffusion.prompt import PROMPT, PROMPT_FILE, load_prompt
-from brewster.models.diffusion.sampling import GUIDANCE, STEPS
 from brewster.models.zoo import TINY_PREFIX
 from brewster.rendered.generation.job import RECORD_FILE
 from brewster.rendered.store import read_set
@@ -49,6 +48,9 @@ _LIMITS: Final = """## Limits
   takes fine detail from the photo instead, where the reflection allows it.
 - **Reconstruction error.** Colours and edges of the generated photo can differ from the input. `brewster` measures this error,
   uses it for the confidence, and flags a result with a large error.
+- **White areas.** The model can take a white area of the scene, such as a sign, for a highlight of a reflection and remove
+  it, or keep a white reflection as part of the scene. `brewster evaluate` measures both on rendered sets: removed white,
+  kept reflection.
 - It was trained only on the glass of its training data. Rain, dirt, and curved or patterned panes may fail.
 - Each seed gives a different result. The mean of several results contains less invented detail."""
 
@@ -181,7 +183,7 @@ def _diffusers_code(recipe: LoraRecipe, base: type[Backbone], usage: DiffusersUs
     x, y = corners["T"]
     make_input = (
         f'condition = Image.new("RGB", ({full_width}, {full_height}), "white")\ncondition.paste(photo, {corners["I"]})'
-        if "I" in corners
+        if recipe.layout.has_white_space
         else "condition = photo"
     )
     return f"""import torch
@@ -194,13 +196,13 @@ pipe = {base.classes["pipeline"]}.from_pretrained(
     dtype=torch.bfloat16, {usage.parts},
 ).to("cuda")
 pipe.load_lora_weights("lora")
-prompt = load_file("lora/{PROMPT_FILE}", device="cuda")
+prompt = {{name: tensor.to("cuda", torch.bfloat16) for name, tensor in load_file("lora/{PROMPT_FILE}").items()}}
 photo = Image.open("photo.jpg").convert("RGB").resize(({width}, {height}))  # for a square photo
 {make_input}
 composite = pipe(
     image=condition, prompt_embeds=prompt["embeds"], width={full_width}, height={full_height},
     {usage.options.format(area=full_width * full_height)}
-    num_inference_steps={STEPS}, guidance_scale={GUIDANCE}, generator=torch.Generator().manual_seed(0),
+    num_inference_steps={recipe.task.steps}, guidance_scale={recipe.task.guidance}, generator=torch.Generator().manual_seed(0),
 ).images[0]
 transmission = composite.crop(({x}, {y}, {x + width}, {y + height}))"""
 
@@ -243,11 +245,20 @@ def _settings(recipe: LoraRecipe) -> str:
         "panels": f"{' '.join(recipe.panels)}, {recipe.direction}, at most {recipe.budget_px} pixels together",
         "objective": "one step from the photo" if one_step else "flow matching",
         "guidance": f"{recipe.guidance:g} during training",
-        "inference": "one step" if one_step else f"{STEPS} steps at guidance {GUIDANCE:g}, by default",
-        "learning rate": f"{recipe.learning_rate:g} after {recipe.warmup_steps} steps, AdamW, weight decay {recipe.weight_decay:g}",
+        "inference": "one step"
+        if one_step
+        else f"{recipe.task.steps} steps at guidance {recipe.task.guidance:g}, by default",
+        "learning rate": f"{recipe.learning_rate:g} after {recipe.warmup_steps} steps, {_decay(recipe)}",
+        "optimiser": f"{'AdamW' if recipe.optimizer == 'adamw' else '8-bit AdamW'}, weight decay {recipe.weight_decay:g}",
+        "adapted layers": ", ".join(recipe.targets) or "all linear layers of the blocks",
+        "condition": "the photo and white space" if recipe.layout.has_white_space else "the photo",
         "quantisation of the base": recipe.quantise or "none",
     }
     return f"## Settings\n\n{_table(('setting', 'value'), rows)}\n\n`recipe.json` contains all settings."
+
+
+def _decay(recipe: LoraRecipe) -> str:
+    return f"cosine decay in the last {recipe.decay_share:.0%}" if recipe.decay_share else "then constant"
 
 
 def _scores(scores: Mapping[str, float]) -> str:

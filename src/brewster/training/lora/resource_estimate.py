@@ -17,26 +17,28 @@ import torch
 from torch.utils.flop_counter import FlopCounterMode
 
 from brewster.errors import DeviceError
+from brewster.models.diffusion.adapter.lora import select_targets
 from brewster.models.diffusion.backbones import build, find_family
 from brewster.models.diffusion.families.family import Backbone
+from brewster.models.diffusion.memory import GIB, weights_gib
 from brewster.models.diffusion.panels import fit_panel
 from brewster.models.diffusion.prompt import PromptEmbedding
 from brewster.models.zoo import TINY_PREFIX
-from brewster.training.recipe import LoraRecipe
+from brewster.options import Quantisation
+from brewster.training.recipe import ENCODED_SUFFIX, LoraRecipe
 
-_GIB: Final = 1 << 30
 _SQUARE_PHOTO_PX: Final = (4096, 4096)
 """A large square photo: its panels fill the pixel budget best."""
 _PROMPT_TOKENS: Final = 512
-_BYTES_PER_WEIGHT: Final = {None: 2.0, "int8": 1.01, "float8": 1.01, "nf4": 0.52}
-"""Bytes with the quantisation scales. The weights of FLUX.1 Kontext need 22.2, 11.2 (8 bits) and 5.8 GiB (4 bits)."""
-_BYTES_PER_LORA_WEIGHT: Final = 16
-"""Weight, gradient and two moments of AdamW, all float32. With 8-bit moments, a weight needs 10 bytes."""
+_BYTES_PER_LORA_WEIGHT: Final = {"adamw": 16, "adamw8bit": 10}
+"""Weight, gradient and two moments of AdamW; the moments are float32 or have 8 bits."""
 _HIDDEN_STATES_PER_BLOCK: Final = 36
 """Activations of one block, in hidden states, while gradient checkpointing recomputes it. Each block also stores its input,
 one hidden state."""
 _OVERHEAD_GIB: Final = 1.5
 """The CUDA context, and the activations of the VAE."""
+_HOST_OVERHEAD_GIB: Final = 4.0
+"""Host memory of Python, torch and the data. The base is loaded directly to the GPU."""
 _FORWARD_PASSES_PER_STEP: Final = 3
 """Forward pass, recomputation for gradient checkpointing, and backward pass. The backward pass costs as much as one forward
 pass, because the base has no weight gradients."""
@@ -81,6 +83,7 @@ class ResourceEstimate:
     lora_parameters: int
     memory_gib: dict[str, float]
     tflop: float
+    text_encoder_parameters: int
 
     @property
     def total_gib(self) -> float:
@@ -95,6 +98,8 @@ class ResourceEstimate:
     def table(self) -> str:
         """Returns the estimate as lines of name and value."""
         recipe, (width, height) = self.recipe, self.panel
+        encoders = 0 if recipe.prompt.endswith(ENCODED_SUFFIX) else 2 * self.text_encoder_parameters
+        download = 2 * self.parameters + self.memory_gib["VAE"] * GIB + encoders
         rows = {
             "backbone": f"{recipe.backbone}, {self.parameters / 1e9:.2f} billion parameters",
             "LoRA": f"rank {recipe.rank}, {self.lora_parameters / 1e6:.1f} million parameters",
@@ -102,6 +107,8 @@ class ResourceEstimate:
             "tokens": f"{self.generated_tokens} generated, {self.condition_tokens} condition, {_PROMPT_TOKENS} text",
             **{f"memory, {name}": f"{gib:.1f} GiB" for name, gib in self.memory_gib.items()},
             "memory": f"{self.total_gib:.1f} GiB of {self.card.memory_gib:g} on {self.card.name} (estimate)",
+            "host memory": f"{encoders / GIB + _HOST_OVERHEAD_GIB:.1f} GiB, while the text encoders encode the prompt (estimate)",
+            "download": f"{download / 1e9:.0f} GB, of them {encoders / 1e9:.0f} GB text encoders (estimate)",
             "per step": f"{self.tflop:.0f} TFLOP, {self.seconds:.1f} s (estimate)",
             "total": f"{recipe.steps} steps, {self.seconds * recipe.steps / 3600:.1f} hours (estimate)",
         }
@@ -122,9 +129,9 @@ class ResourceEstimate:
         )
 
     def _cure(self) -> str:
-        for quantise in ("int8", "nf4"):
-            weights = self.parameters * _BYTES_PER_WEIGHT[quantise] / _GIB
-            saved = self.memory_gib["base"] - weights
+        candidates: tuple[Quantisation, ...] = ("int8", "nf4")
+        for quantise in candidates:
+            saved = self.memory_gib["base"] - weights_gib(self.parameters, quantise)
             if saved > 0 and self.total_gib - saved <= self.card.memory_gib:
                 return f'set quantise = "{quantise}", which needs {self.total_gib - saved:.1f} GiB'
         return "lower budget_px or rank, or choose a smaller backbone (klein) or a larger card"
@@ -165,18 +172,18 @@ def estimate_resources(recipe: LoraRecipe, card: GraphicsCard) -> ResourceEstima
     fit = fit_panel(_SQUARE_PHOTO_PX, recipe.layout, budget_px=recipe.budget_px, multiple=backbone.multiple)
     tokens_per_panel = (fit.panel[0] // backbone.multiple) * (fit.panel[1] // backbone.multiple)
     generated_tokens = tokens_per_panel * len(recipe.panels)
-    condition_tokens = generated_tokens if "I" in recipe.panels else tokens_per_panel
+    condition_tokens = generated_tokens if recipe.layout.has_white_space else tokens_per_panel
     parameters, vae, lora_parameters = (
         _count_parameters(backbone),
         sum(each.numel() for each in backbone.vae.parameters()),
         _count_lora_parameters(backbone, recipe),
     )
     memory = {
-        "base": parameters * _BYTES_PER_WEIGHT[recipe.quantise] / _GIB,
-        "VAE": 2 * vae / _GIB,
-        "LoRA and AdamW": lora_parameters * _BYTES_PER_LORA_WEIGHT / _GIB,
+        "base": weights_gib(parameters, recipe.quantise),
+        "VAE": 2 * vae / GIB,
+        "LoRA and AdamW": lora_parameters * _BYTES_PER_LORA_WEIGHT[recipe.optimizer] / GIB,
         "activations": _activation_bytes(backbone, generated_tokens + condition_tokens + _PROMPT_TOKENS)
-        / _GIB,
+        / GIB,
         "rest": _OVERHEAD_GIB,
     }
     tflop = (
@@ -194,6 +201,7 @@ def estimate_resources(recipe: LoraRecipe, card: GraphicsCard) -> ResourceEstima
         lora_parameters,
         memory,
         tflop,
+        find_family(recipe.backbone.removeprefix(TINY_PREFIX)).text_encoder_parameters,
     )
 
 
@@ -203,7 +211,7 @@ def _local_gpu() -> GraphicsCard:
     speed = next(
         (card.tflops for name, card in CARDS.items() if name in found.name), CARDS["RTX 4090"].tflops
     )
-    return GraphicsCard(found.name, found.total_memory / _GIB, speed)
+    return GraphicsCard(found.name, found.total_memory / GIB, speed)
 
 
 def _meta_backbone(recipe: LoraRecipe) -> Backbone:
@@ -218,7 +226,7 @@ def _count_parameters(backbone: Backbone) -> int:
 
 
 def _count_lora_parameters(backbone: Backbone, recipe: LoraRecipe) -> int:
-    layers = map(backbone.transformer.get_submodule, backbone.lora_targets())
+    layers = map(backbone.transformer.get_submodule, select_targets(backbone, recipe.targets))
     return sum(recipe.rank * (layer.in_features + layer.out_features) for layer in layers)
 
 

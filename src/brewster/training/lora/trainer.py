@@ -12,8 +12,10 @@ from __future__ import annotations
 
 import importlib
 import importlib.util
+import itertools
 import json
 from collections.abc import Mapping, Sequence
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Final
 
@@ -21,16 +23,22 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from brewster.errors import RecipeError
+from brewster.errors import DeviceError, RecipeError
 from brewster.files import write_atomically
-from brewster.models.diffusion.adapter.lora import add_lora, load_lora_state, lora_state, save_lora
-from brewster.models.diffusion.backbones import encode_prompt, load_backbone
+from brewster.models.diffusion.adapter.lora import (
+    add_lora,
+    load_lora_state,
+    lora_parameters,
+    lora_state,
+    save_lora,
+)
+from brewster.models.diffusion.backbones import encode_prompt, family_of, load_backbone
 from brewster.models.diffusion.families.family import Backbone
 from brewster.models.diffusion.lazy_imports import explain_out_of_memory
+from brewster.models.diffusion.memory import check_machine
 from brewster.models.diffusion.panels import PanelFit, split
 from brewster.models.diffusion.pipeline import DecompositionPipeline
 from brewster.models.diffusion.prompt import PROMPTS, PromptEmbedding, load_prompt
-from brewster.models.diffusion.sampling import STEPS
 from brewster.training import distributed
 from brewster.training.data.sample_rng import SampleRng
 from brewster.training.loop import read_log
@@ -38,6 +46,7 @@ from brewster.training.lora.latents import (
     EncodedSample,
     LatentEncoder,
     SampleSequence,
+    fit_sample,
     layers_from_pair,
     make_panels,
     open_samples,
@@ -60,23 +69,60 @@ _MEMORY_CURE: Final = "lower budget_px or rank, quantise the base, or choose a s
 class LoraTrainer:
     """The `Trainer` of a LoRA: a frozen backbone, a float32 LoRA on it, and AdamW.
 
+    Everything that can be wrong with data and machine is checked first. The backbone is loaded at its first use, so that
+    `initialize` can release the text encoders before.
+
+    Args:
+        recipe: the settings.
+        device: "auto" for the GPU, or "cpu".
+
     Raises:
-        RecipeError, PhotoError: the data is missing, damaged or without reflections.
-        DownloadError, ModelError, DeviceError, MissingExtra: the backbone cannot be loaded.
+        RecipeError, PhotoError: the data is missing, damaged, too small, or without reflections.
+        DeviceError: there is no GPU and `device` is not "cpu", or memory or optimiser are not sufficient.
+        DownloadError, ModelError, MissingExtra: the backbone is unknown, or the disk is too small for its download.
     """
 
-    def __init__(self, recipe: LoraRecipe) -> None:
+    def __init__(self, recipe: LoraRecipe, device: str = "auto") -> None:
         _check_batch(recipe)
-        self.recipe = recipe
-        samples = open_samples(recipe)
-        self._validation_samples = _validation_samples(recipe, samples)
-        device = str(distributed.best_device())
-        self.backbone = load_backbone(recipe.backbone, device=device, quantise=recipe.quantise)
-        self._latents = LatentEncoder(samples, self.backbone, recipe)
-        self._parameters = add_lora(self.backbone, rank=recipe.rank, alpha=recipe.alpha, seed=recipe.seed)
-        self.backbone.transformer.enable_gradient_checkpointing()
-        self._optimizer = _create_optimizer(self._parameters, recipe)
+        self.recipe, self._device = recipe, str(distributed.best_device(device))
+        self._family = family_of(recipe.backbone)
+        self._samples = open_samples(recipe)
+        self._samples.panel_fits(recipe, self._family.multiple)
+        self._validation_samples = _validation_samples(recipe, self._samples)
+        _check_optimizer(recipe, self._device)
+        check_machine(
+            recipe.backbone,
+            requested=device,
+            device=self._device,
+            quantise=recipe.quantise,
+            with_text_encoders=not recipe.prompt.endswith(ENCODED_SUFFIX),
+        )
         self._prompt: PromptEmbedding | None = None
+
+    @cached_property
+    def backbone(self) -> Backbone:
+        """The frozen backbone with the LoRA. The first use loads it.
+
+        Raises:
+            DownloadError, ModelError, DeviceError, MissingExtra: it cannot be loaded.
+        """
+        recipe = self.recipe
+        backbone = load_backbone(recipe.backbone, device=self._device, quantise=recipe.quantise)
+        add_lora(backbone, rank=recipe.rank, alpha=recipe.alpha, seed=recipe.seed, targets=recipe.targets)
+        backbone.transformer.enable_gradient_checkpointing()
+        return backbone
+
+    @cached_property
+    def _latents(self) -> LatentEncoder:
+        return LatentEncoder(self._samples, self.backbone, self.recipe)
+
+    @cached_property
+    def _parameters(self) -> list[nn.Parameter]:
+        return lora_parameters(self.backbone)
+
+    @cached_property
+    def _optimizer(self) -> torch.optim.Optimizer:
+        return _create_optimizer(self._parameters, self.recipe)
 
     @property
     def prompt(self) -> PromptEmbedding:
@@ -85,12 +131,17 @@ class LoraTrainer:
         return self._prompt
 
     def initialize(self) -> None:
-        """Loads or encodes the prompt of the recipe. A text encoder is loaded only for this, and then released.
+        """Loads or encodes the prompt of the recipe, then loads the backbone.
+
+        Only rank 0 loads the text encoders, and releases them before the backbone is loaded.
 
         Raises:
-            DownloadError, ModelError, DeviceError, MissingExtra: the text encoder or the prompt cannot be loaded.
+            DownloadError, ModelError, DeviceError, MissingExtra: text encoder, prompt or backbone cannot be loaded.
         """
-        self._prompt = _load_prompt(self.recipe, self.backbone)
+        self._prompt = distributed.from_main_process(
+            lambda: _load_prompt(self.recipe, self._family, self._device)
+        )
+        _ = self.backbone
 
     def state_dict(self) -> dict[str, Any]:
         """Returns the LoRA, the state of the optimiser, and the prompt. The weights of the base are not included."""
@@ -103,7 +154,7 @@ class LoraTrainer:
         """Restores a state that `state_dict` returned."""
         load_lora_state(self.backbone, state["lora"])
         self._optimizer.load_state_dict(state["optimizer"])
-        self._prompt = PromptEmbedding(self.backbone.name, **state["prompt"])
+        self._prompt = PromptEmbedding(self._family.name, **state["prompt"])
 
     def training_step(self, step: int) -> dict[str, float]:
         """Runs one step of AdamW on one batch. Returns `loss` and the term of each panel, `loss_panel_NAME`.
@@ -123,23 +174,35 @@ class LoraTrainer:
         loss = check_finite(torch.stack(list(parts.values())).sum(), step)
         check_finite(nn.utils.clip_grad_norm_(self._parameters, _MAX_GRADIENT_NORM), step, "gradient")
         for group in self._optimizer.param_groups:
-            group["lr"] = self.recipe.learning_rate * min(1.0, (step + 1) / self.recipe.warmup_steps)
+            group["lr"] = self.recipe.learning_rate * self.recipe.learning_rate_factor(step)
         self._optimizer.step()
         return {"loss": loss.item(), **{f"loss_{name}": part.item() for name, part in parts.items()}}
 
     @torch.no_grad()
     def validate(self) -> tuple[dict[str, float], Tensor]:
-        """Returns the mean PSNR gain of the generated T over the photo in dB by folder, and an image of the panels."""
-        gains, rows = {}, []
-        for name, samples in self._validation_samples.items():
-            results = [self._validate_sample(layers) for layers in samples]
-            gains[f"psnr_gain_db_{name}"] = sum(gain for gain, _ in results) / len(results)
-            rows += [
-                (f"{name} {number}: PSNR gain {gain:+.2f} dB", row.clamp(0, 1))
-                for number, (gain, row) in enumerate(results, start=1)
-            ]
+        """Returns the mean PSNR gain of the generated T over the photo in dB by folder, and an image of the panels.
+
+        The samples are divided among the processes, so that none waits for the others. All processes must call this.
+        """
+        samples = [layers for folder in self._validation_samples.values() for layers in folder]
         columns = [f"ground truth {panel}" for panel in "ITR"]
-        return gains, sample_sheet([*columns, *(f"generated {panel}" for panel in self.recipe.panels)], rows)
+        columns += [f"generated {panel}" for panel in self.recipe.panels]
+        gains = torch.zeros(len(samples), device=self._device)
+        images = torch.zeros(len(samples), 3, _ROW_PX[0], len(columns) * _ROW_PX[1], device=self._device)
+        for index in range(distributed.rank(), len(samples), distributed.world_size()):
+            gain, image = self._validate_sample(samples[index])
+            gains[index], images[index] = gain, image.clamp(0, 1).to(self._device)
+        distributed.all_reduce_sum([gains, images])
+        results = iter(zip(gains.tolist(), images.cpu(), strict=True))
+        means, rows = {}, []
+        for name, folder in self._validation_samples.items():
+            part = list(itertools.islice(results, len(folder)))
+            means[f"psnr_gain_db_{name}"] = sum(gain for gain, _ in part) / len(part)
+            rows += [
+                (f"{name} {number}: PSNR gain {gain:+.2f} dB", image)
+                for number, (gain, image) in enumerate(part, start=1)
+            ]
+        return means, sample_sheet(columns, rows)
 
     def export(self, folder: Path) -> Path:
         """Writes LoRA, prompt, recipe and model card to `lora` in `folder`. Returns the path. diffusers can load the LoRA.
@@ -151,24 +214,29 @@ class LoraTrainer:
         base, quantise = self.recipe.backbone, self.recipe.quantise
         if Path(base).is_dir():
             base = str(Path(base).resolve())
-        save_lora(target, self.backbone, self.prompt, self.recipe.task, base=base, quantise=quantise)
+        targets = self.recipe.targets
+        save_lora(
+            target,
+            self.backbone,
+            self.prompt,
+            self.recipe.task,
+            base=base,
+            quantise=quantise,
+            targets=targets,
+        )
         text = json.dumps(self.recipe.model_dump(mode="json"), indent=2)
         write_atomically(target / RECIPE_FILE, f"{text}\n".encode(), overwrite=True)
         scores = read_log(folder)[-1:]
         write_card(target, self.recipe, scores[0] if scores else {}, type(self.backbone))
         return target
 
-    def separate(self, photo: Tensor, *, steps: int = STEPS, seed: int = 0) -> Mapping[str, Tensor]:
-        """Generates the panels of a photo of the size of a panel, (1, 3, h, w) in [-1, 1].
-
-        `steps` is ignored for the objective one_step.
+    def separate(self, photo: Tensor, *, seed: int = 0) -> Mapping[str, Tensor]:
+        """Generates the panels of a photo of the size of a panel, (1, 3, h, w) in [-1, 1], as at inference.
 
         Raises:
             DeviceError: the GPU is out of memory. The message lists the values to lower.
         """
-        return DecompositionPipeline(self.backbone, self.prompt, self.recipe.task)(
-            photo, steps=steps, seeds=[seed]
-        )
+        return DecompositionPipeline(self.backbone, self.prompt, self.recipe.task)(photo, seeds=[seed])
 
     def _compute_gradients(self, step: int) -> dict[str, Tensor]:
         """Accumulates the gradients of the slots that this process computes. Returns the parts of the loss."""
@@ -212,7 +280,9 @@ class LoraTrainer:
             return encoded.start, torch.ones(1)
         recipe, grid = self.recipe, encoded.composite
         normal = recipe.logit_mean + recipe.logit_std * rng.normal(1)
-        sigma = self.backbone.shifted(normal.sigmoid(), grid.shape[2] * grid.shape[3])
+        sigma = self.backbone.shifted(
+            normal.sigmoid(), grid.shape[2] * grid.shape[3], timestep_shift=recipe.timestep_shift
+        )
         return rng.normal(*grid.shape), sigma
 
     def _panel_weights(self) -> dict[str, float]:
@@ -221,9 +291,8 @@ class LoraTrainer:
         return {panel: weight / sum(named.values()) for panel, weight in named.items()}
 
     def _validation_panels(self, layers: Tensor) -> tuple[dict[str, Tensor], PanelFit]:
-        """Returns the panels of a validation sample. If the sample is small, the panels are smaller than in training."""
-        height, width, _ = layers.shape
-        fit = self.recipe.task.fit((width, height), self.backbone.multiple)
+        """Returns the panels of a validation sample, and their size."""
+        fit = fit_sample(layers, self.recipe, self.backbone.multiple)
         return make_panels(layers, fit), fit
 
     def _validate_sample(self, layers: Tensor) -> tuple[float, Tensor]:
@@ -249,16 +318,27 @@ def _check_batch(recipe: LoraRecipe) -> None:
         )
 
 
-def _load_prompt(recipe: LoraRecipe, backbone: Backbone) -> PromptEmbedding:
+def _check_optimizer(recipe: LoraRecipe, device: str) -> None:
+    if recipe.optimizer == "adamw8bit" and not (
+        device.startswith("cuda") and importlib.util.find_spec("bitsandbytes")
+    ):
+        raise DeviceError(
+            f'optimizer = "adamw8bit" was requested on {device}',
+            "expected an NVIDIA GPU and bitsandbytes, which computes it",
+            'set optimizer = "adamw", or run: pip install bitsandbytes',
+        )
+
+
+def _load_prompt(recipe: LoraRecipe, family: type[Backbone], device: str) -> PromptEmbedding:
     if recipe.prompt.endswith(ENCODED_SUFFIX):
-        return load_prompt(Path(recipe.prompt), backbone.name)
-    return encode_prompt(recipe.backbone, PROMPTS[recipe.prompt])
+        return load_prompt(Path(recipe.prompt), family.name)
+    return encode_prompt(recipe.backbone, PROMPTS[recipe.prompt], device=device)
 
 
 def _create_optimizer(parameters: Sequence[nn.Parameter], recipe: LoraRecipe) -> torch.optim.Optimizer:
-    """Returns AdamW. Its moments have 8 bits on CUDA if bitsandbytes is installed."""
+    """Returns the optimiser of the recipe. The recipe in a checkpoint records it."""
     options: dict[str, Any] = {"lr": recipe.learning_rate, "weight_decay": recipe.weight_decay}
-    if parameters[0].is_cuda and importlib.util.find_spec("bitsandbytes"):
+    if recipe.optimizer == "adamw8bit":
         optimizer = importlib.import_module("bitsandbytes.optim").AdamW8bit(parameters, **options)
         assert isinstance(optimizer, torch.optim.Optimizer)
         return optimizer

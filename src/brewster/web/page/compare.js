@@ -122,7 +122,7 @@ class GlassCompare extends HTMLElement {
   // The size of the whole image in a pane, in CSS pixels. Small images are enlarged by a factor of at most 2.
   #fit() {
     const [{ width: viewWidth, height: viewHeight }] = this.#panes();
-    const { width, height } = this.left;
+    const [width, height] = this.fullSize; // not those of the reduced image, whose aspect ratio is rounded
     const scale = Math.min(viewWidth / width, viewHeight / height, 2);
     return { width: width * scale, height: height * scale };
   }

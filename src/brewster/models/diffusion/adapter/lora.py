@@ -13,14 +13,15 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
+from fnmatch import fnmatchcase
 from functools import cache
 from pathlib import Path
 from typing import Annotated, Any, Final, final
 
 import torch
-from pydantic import Field, TypeAdapter
+from pydantic import Field, TypeAdapter, ValidationError
 from torch import Tensor, nn
 
 from brewster.errors import ModelError, RecipeError
@@ -45,7 +46,7 @@ _ADAPTER_NAME: Final = "default"
 class LoraMetadata:
     """The metadata of a LoRA: backbone, base and its quantisation, rank, alpha, task, and the digest of the prompt.
 
-    `base` is a hub id, a folder, or a name in the table of backbones.
+    `base` is a hub id, a folder, or a name in the table of backbones. For `targets`, see `select_targets`.
     """
 
     backbone: str
@@ -55,6 +56,7 @@ class LoraMetadata:
     alpha: Annotated[int, Field(ge=1)]
     task: DecompositionTask
     prompt_sha256: str
+    targets: tuple[str, ...] = ()
     imported: bool = False
     """Whether another program trained the LoRA. Then it may adapt any layers, each with its own rank up to `rank`."""
 
@@ -71,7 +73,21 @@ class LoraMetadata:
         """
         try:
             return _metadata_validator().validate_json(text, strict=True, extra="forbid")
-        except (ValueError, RecipeError) as error:
+        except ValidationError as error:
+            problem = error.errors()[0]
+            key = ".".join(map(str, problem["loc"]))
+            if problem["type"] in {"extra_forbidden", "unexpected_keyword_argument"}:
+                raise ModelError(
+                    f"the metadata of the LoRA has the unknown key {key}",
+                    "expected the keys that this version of brewster knows",
+                    "update brewster: a newer version wrote the LoRA",
+                ) from error
+            raise ModelError(
+                f"the metadata of the LoRA cannot be read: {f'{key}: ' if key else ''}{problem['msg']}",
+                "expected metadata that brewster wrote",
+                "copy the folder again, or save the LoRA again",
+            ) from error
+        except RecipeError as error:
             raise ModelError(
                 f"the metadata of the LoRA cannot be read: {error}",
                 "expected metadata that brewster wrote",
@@ -84,14 +100,37 @@ def _metadata_validator() -> TypeAdapter[LoraMetadata]:
     return TypeAdapter(LoraMetadata)
 
 
-def add_lora(backbone: Backbone, *, rank: int = 16, alpha: int = 16, seed: int = 0) -> list[nn.Parameter]:
-    """Adds a LoRA to every linear layer of the blocks. Its B matrices are zero, so predictions do not change yet.
+def select_targets(backbone: Backbone, patterns: Sequence[str] = ()) -> list[str]:
+    """The full names of the linear layers of the blocks that match a pattern; without patterns, of all of them.
+
+    In a pattern, * and ? are wildcards as in a shell: "*.attn.*" selects the layers of the attention.
+
+    Raises:
+        ModelError: a pattern matches no layer.
+    """
+    names = backbone.lora_targets()
+    for pattern in patterns:
+        if not any(fnmatchcase(name, pattern) for name in names):
+            raise ModelError(
+                f"no linear layer of {backbone.name} matches the target {pattern!r}",
+                f"expected a name with wildcards, such as *.attn.*, that matches layers such as {names[0]}",
+                "correct targets, or leave it out to adapt all linear layers of the blocks",
+            )
+    return [name for name in names if not patterns or any(fnmatchcase(name, each) for each in patterns)]
+
+
+def add_lora(
+    backbone: Backbone, *, rank: int = 16, alpha: int = 16, seed: int = 0, targets: Sequence[str] = ()
+) -> list[nn.Parameter]:
+    """Adds a LoRA to the linear layers of the blocks; for `targets` see `select_targets`.
+
+    Its B matrices are zero, so predictions do not change yet.
 
     Returns:
         The parameters to train.
 
     Raises:
-        ModelError: the backbone already has a LoRA, or the rank is less than 1.
+        ModelError: the backbone already has a LoRA, the rank is less than 1, or a target matches no layer.
         MissingExtra: peft is not installed.
     """
     if rank < 1:
@@ -101,17 +140,17 @@ def add_lora(backbone: Backbone, *, rank: int = 16, alpha: int = 16, seed: int =
             "the backbone already has a LoRA", "expected a backbone without a LoRA", "call remove_lora first"
         )
     peft = import_library("peft")
-    config = peft.LoraConfig(r=rank, lora_alpha=alpha, target_modules=backbone.lora_targets())
+    config = peft.LoraConfig(r=rank, lora_alpha=alpha, target_modules=select_targets(backbone, targets))
     with torch.random.fork_rng(devices=_cuda_devices(backbone)):
         torch.manual_seed(seed)
-        backbone.transformer.add_adapter(config, adapter_name=_ADAPTER_NAME)
-    # peft creates the LoRA in the dtype of the base, which may be bf16.
-    import_library("diffusers.training_utils").cast_training_params(backbone.transformer, torch.float32)
+        _add_adapter(backbone, config)
     return lora_parameters(backbone)
 
 
 def attach_layers(backbone: Backbone, layers: Mapping[str, LowRankLayer]) -> None:
-    """Adds a LoRA with these layers to a backbone. Each layer has its own rank. The weights are float32.
+    """Adds a LoRA with these layers to a backbone for inference. Each layer has its own rank.
+
+    The weights are in the dtype in which the backbone computes, see `load_lora`.
 
     Raises:
         ModelError: the backbone already has a LoRA, or a layer is not in it or has another shape.
@@ -126,8 +165,8 @@ def attach_layers(backbone: Backbone, layers: Mapping[str, LowRankLayer]) -> Non
         check_shape(name, layer, modules.get(name))
     peft = import_library("peft")
     config = peft.LoraConfig(**_layer_settings(layers))
-    backbone.transformer.add_adapter(config, adapter_name=_ADAPTER_NAME)
-    import_library("diffusers.training_utils").cast_training_params(backbone.transformer, torch.float32)
+    _add_adapter(backbone, config)
+    _convert_for_inference(backbone)
     peft.set_peft_model_state_dict(backbone.transformer, to_state(layers), adapter_name=_ADAPTER_NAME)
 
 
@@ -175,10 +214,11 @@ def save_lora(
     *,
     base: str = "",
     quantise: Quantisation | None = None,
+    targets: Sequence[str] = (),
 ) -> LoraMetadata:
     """Writes a folder with the LoRA, in a file that diffusers can load, and the prompt. The bytes are reproducible.
 
-    By default `base` is the backbone's hub id.
+    By default `base` is the backbone's hub id. `targets` are those of `add_lora`.
 
     Returns:
         The metadata that is stored in the file.
@@ -204,6 +244,7 @@ def save_lora(
         config.lora_alpha,
         task,
         prompt.sha256,
+        tuple(targets),
     )
     tensors = {_PREFIX + name: tensor for name, tensor in lora_state(backbone).items()}
     prompt.save(folder / PROMPT_FILE)
@@ -257,7 +298,9 @@ def read_prompt(folder: Path, metadata: LoraMetadata) -> PromptEmbedding:
 
 
 def load_lora(folder: Path, backbone: Backbone) -> tuple[LoraMetadata, PromptEmbedding]:
-    """Adds the LoRA of a folder to its backbone.
+    """Adds the LoRA of a folder to its backbone for inference, in the dtype in which the backbone computes.
+
+    A float32 LoRA on a bf16 base converts the activations of every layer twice.
 
     Returns:
         The metadata of the LoRA, and its prompt.
@@ -277,13 +320,19 @@ def load_lora(folder: Path, backbone: Backbone) -> tuple[LoraMetadata, PromptEmb
     if metadata.imported:
         attach_layers(backbone, read_layers(state, backbone.transformer, backbone.name))
         return metadata, prompt
-    add_lora(backbone, rank=metadata.rank, alpha=metadata.alpha)
+    add_lora(backbone, rank=metadata.rank, alpha=metadata.alpha, targets=metadata.targets)
     try:
         load_lora_state(backbone, state)
     except ModelError:
         remove_lora(backbone)
         raise
+    _convert_for_inference(backbone)
     return metadata, prompt
+
+
+def _convert_for_inference(backbone: Backbone) -> None:
+    for parameter in lora_parameters(backbone):
+        parameter.data = parameter.data.to(backbone.dtype)
 
 
 def _read_lora(folder: Path) -> tuple[dict[str, Tensor], LoraMetadata]:
@@ -323,6 +372,12 @@ def _peft_settings(config: Any) -> str:  # noqa: ANN401 - peft's configuration
         "target_modules": sorted(config.target_modules),
     }
     return json.dumps({_PREFIX + name: value for name, value in settings.items()}, sort_keys=True)
+
+
+def _add_adapter(backbone: Backbone, config: Any) -> None:  # noqa: ANN401 - peft's configuration
+    """Adds a LoRA with random A matrices, float32. peft creates it in the dtype of the base, which may be bf16."""
+    backbone.transformer.add_adapter(config, adapter_name=_ADAPTER_NAME)
+    import_library("diffusers.training_utils").cast_training_params(backbone.transformer, torch.float32)
 
 
 def _layer_settings(layers: Mapping[str, LowRankLayer]) -> dict[str, Any]:

@@ -7,6 +7,7 @@ one token of the transformer and 16 x 16 pixels of the image, and a panel is a b
 from __future__ import annotations
 
 import inspect
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -87,7 +88,25 @@ class Backbone(ABC):
     multiple: ClassVar[int] = 16
     """The sides of a panel must be multiples of this, in pixels."""
 
-    def __init__(self, transformer: Any, vae: Any, scheduler: Any, *, distilled: bool = False) -> None:  # noqa: ANN401
+    parameters: ClassVar[int]
+    """The number of parameters of the full-size transformer."""
+    text_encoder_parameters: ClassVar[int]
+    """The number of parameters of all text encoders together."""
+
+    def __init__(
+        self,
+        transformer: Any,  # noqa: ANN401
+        vae: Any,  # noqa: ANN401
+        scheduler: Any,  # noqa: ANN401
+        *,
+        distilled: bool = False,
+        dtype: torch.dtype | None = None,
+    ) -> None:
+        """`dtype` is the one in which the transformer computes, by default that of its parameters.
+
+        It cannot be read from a quantised transformer: with nf4, only a few float32 layers are floating-point.
+        """
+        self.dtype: torch.dtype = dtype or transformer.dtype
         self.transformer = transformer.eval().requires_grad_(False)
         self.vae = vae.eval().requires_grad_(False)
         self.scheduler = scheduler
@@ -99,13 +118,6 @@ class Backbone(ABC):
         device = self.transformer.device
         assert isinstance(device, torch.device)
         return device
-
-    @property
-    def dtype(self) -> torch.dtype:
-        """The dtype in which the transformer computes."""
-        dtype = self.transformer.dtype
-        assert isinstance(dtype, torch.dtype)
-        return dtype
 
     @property
     def channels(self) -> int:
@@ -196,26 +208,46 @@ class Backbone(ABC):
         slope = (config.max_shift - config.base_shift) / (high - low)
         return float(config.base_shift + slope * (tokens - low))
 
-    def shifted(self, sigma: Tensor, tokens: int, steps: int = 20) -> Tensor:
-        """Shifts times in (0, 1] towards noise, as the sampling schedule does. Used in training."""
+    def shifted(
+        self, sigma: Tensor, tokens: int, steps: int = 20, *, timestep_shift: float | None = None
+    ) -> Tensor:
+        """Shifts times in (0, 1] towards noise. Used in training.
+
+        The default is the shift of the sampling schedule. A given `timestep_shift` s replaces it: s sigma / (1 + (s - 1) sigma).
+        """
         scheduler = self.scheduler
-        if scheduler.config.use_dynamic_shifting:
+        if timestep_shift is None and scheduler.config.use_dynamic_shifting:
             shifted = scheduler.time_shift(self.shift(tokens, steps), 1.0, sigma)
             assert isinstance(shifted, Tensor)
             return shifted
-        return scheduler.shift * sigma / (1 + (scheduler.shift - 1) * sigma)  # type: ignore[no-any-return]
+        factor = scheduler.shift if timestep_shift is None else timestep_shift
+        return factor * sigma / (1 + (factor - 1) * sigma)
 
-    def schedule(self, tokens: int, steps: int, last_sigma: float | None = None) -> Float[Tensor, " sigmas"]:
+    def schedule(
+        self,
+        tokens: int,
+        steps: int,
+        *,
+        timestep_shift: float | None = None,
+        last_sigma: float | None = None,
+    ) -> Float[Tensor, " sigmas"]:
         """The sigmas of the scheduler of diffusers: steps + 1 decreasing values from 1 to 0.
 
-        Before the shift, the last one before 0 is `last_sigma`, by default 1 / steps.
+        Before the shift towards noise, they are evenly spaced from 1 to `last_sigma`, by default 1 / steps, and then 0.
+        The default of `timestep_shift` is the shift of the scheduler, see `shift`; for a value s see `shifted`.
         """
         # A shift does not change sigma 1, but stretching to `shift_terminal` would divide 0 by 0.
         if steps == 1:
             return torch.tensor([1.0, 0.0])
         scheduler = type(self.scheduler).from_config(self.scheduler.config)
-        dynamic = {"mu": self.shift(tokens, steps)} if scheduler.config.use_dynamic_shifting else {}
-        scheduler.set_timesteps(sigmas=np.linspace(1.0, last_sigma or 1 / steps, steps), **dynamic)
+        options = {}
+        if scheduler.config.use_dynamic_shifting:
+            # The exponential shift by mu is the shift by the factor exp(mu).
+            mu = self.shift(tokens, steps) if timestep_shift is None else math.log(timestep_shift)
+            options["mu"] = mu
+        elif timestep_shift is not None:
+            scheduler.set_shift(timestep_shift)
+        scheduler.set_timesteps(sigmas=np.linspace(1.0, last_sigma or 1 / steps, steps), **options)
         sigmas = scheduler.sigmas
         assert isinstance(sigmas, Tensor)
         return sigmas

@@ -61,6 +61,9 @@ class Klein(ClassifierFreeBackbone):
         "scheduler": _SCHEDULER,
     }  # fmt: skip
 
+    parameters = 3_876_000_000
+    text_encoder_parameters = 4_022_000_000  # Qwen3-4B
+
     def statistics(self) -> tuple[Tensor, Tensor]:
         """See `Backbone.statistics`: the running statistics of the VAE's batch norm, one value per packed channel."""
         norm = self.vae.bn

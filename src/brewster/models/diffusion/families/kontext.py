@@ -67,6 +67,8 @@ class Kontext(Backbone):
         "scheduler": _SCHEDULER,
     }  # fmt: skip
     guided_by_embedding = True
+    parameters = 11_901_000_000
+    text_encoder_parameters = 4_885_000_000  # T5-XXL encoder 4.762, CLIP-L 0.123
 
     def statistics(self) -> tuple[Tensor, Tensor]:
         """See `Backbone.statistics`: (1, 1, 1, 1), because FLUX.1's VAE has one shift and one scale for all channels."""

@@ -52,6 +52,9 @@ class Qwen(ClassifierFreeBackbone):
         "scheduler": _SCHEDULER,
     }  # fmt: skip
 
+    parameters = 20_430_000_000
+    text_encoder_parameters = 8_292_000_000  # Qwen2.5-VL-7B
+
     def statistics(self) -> tuple[Tensor, Tensor]:
         """See `Backbone.statistics`: one value per channel of the VAE, repeated for the four cells of a patch."""
         config, device = self.vae.config, self.vae.device

@@ -1,0 +1,104 @@
+"""Exports a LoRA: as one file for ComfyUI, or merged into its base.
+
+export_comfyui(Path("out/kontext/lora"), Path("glass.safetensors"))
+export_merged(Path("out/kontext/lora"), Path("kontext-glass"))
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Final
+
+import torch
+from torch import Tensor, nn
+
+from brewster.errors import ModelError, TargetError
+from brewster.models.diffusion.adapter.lora import LORA_FILE, read_lora_metadata, read_prompt
+from brewster.models.diffusion.backbones import load_backbone
+from brewster.models.diffusion.families.family import Backbone
+from brewster.models.diffusion.prompt import PROMPT_FILE
+from brewster.models.diffusion.tensors import read_tensors, write_tensors
+
+_PREFIX: Final = "transformer."
+_DOWN, _UP, _ALPHA = ".lora_A.weight", ".lora_B.weight", ".alpha"
+
+
+def export_comfyui(folder: Path, target: Path) -> None:
+    """Writes the LoRA as one file with the keys that ComfyUI reads: those of diffusers, and alpha for each layer.
+
+    Raises:
+        ModelError: the LoRA is missing or damaged, or was not written by brewster.
+        TargetError: `target` exists or cannot be written.
+    """
+    _check_target(target)
+    metadata, tensors = read_lora_metadata(folder), read_tensors(folder / LORA_FILE)[0]
+    layers = [name.removesuffix(_UP) for name in tensors if name.endswith(_UP)]
+    # safetensors refuses tensors that share memory, so each layer gets its own. An imported layer has alpha = rank.
+    alphas = {
+        layer + _ALPHA: torch.tensor(
+            float(len(tensors[layer + _DOWN]) if metadata.imported else metadata.alpha)
+        )
+        for layer in layers
+    }
+    write_tensors(target, tensors | alphas, {})
+
+
+def export_merged(folder: Path, target: Path, base: str | None = None) -> None:
+    """Adds the LoRA to the weights of its base, and writes the result as a folder in diffusers' layout, in bfloat16.
+
+    The sums are computed in float32 on the CPU. The folder also gets the encoded prompt, but no text encoders. It is for
+    programs that cannot load a LoRA; brewster itself needs the LoRA, which also contains its panels.
+
+    Args:
+        folder: the folder of the LoRA.
+        target: the folder to write.
+        base: the folder or hub id of the base, if it has moved since training.
+
+    Raises:
+        ModelError: the LoRA or its base is missing or damaged, or they do not match.
+        DownloadError: the base cannot be downloaded.
+        TargetError: `target` exists or cannot be written.
+    """
+    _check_target(target)
+    metadata = read_lora_metadata(folder)
+    prompt, tensors = read_prompt(folder, metadata), read_tensors(folder / LORA_FILE)[0]
+    backbone = load_backbone(base or metadata.base, dtype=torch.bfloat16)
+    if backbone.name != metadata.backbone:
+        raise ModelError(
+            f"{folder} is a LoRA of {metadata.backbone}",
+            f"expected a base of {metadata.backbone}, not of {backbone.name}",
+            "choose another base",
+        )
+    state = {name.removeprefix(_PREFIX): tensor for name, tensor in tensors.items()}
+    merge(backbone, state, 1.0 if metadata.imported else metadata.alpha / metadata.rank)
+    backbone.save(target)
+    prompt.save(target / PROMPT_FILE)
+
+
+@torch.no_grad()
+def merge(backbone: Backbone, state: Mapping[str, Tensor], scale: float) -> None:
+    """Replaces the weight W of each adapted layer by W + scale B A (Hu et al. 2021). `state` is that of `lora_state`.
+
+    Raises:
+        ModelError: the backbone has no such layer.
+    """
+    modules = backbone.transformer.named_modules()
+    layers = {name for name, module in modules if isinstance(module, nn.Linear)}
+    for layer in sorted(name.removesuffix(_UP) for name in state if name.endswith(_UP)):
+        if layer not in layers:
+            raise ModelError(
+                f"the base has no layer {layer}",
+                "expected the base with which the LoRA was trained",
+                "choose another base",
+            )
+        weight = backbone.transformer.get_submodule(layer).weight
+        change = scale * state[layer + _UP].float() @ state[layer + _DOWN].float()
+        weight.copy_(weight.float() + change.to(weight.device))
+
+
+def _check_target(target: Path) -> None:
+    if target.exists():
+        raise TargetError(
+            f"{target} exists already", "expected a new file or folder", "choose another target"
+        )
