@@ -163,7 +163,7 @@ def test_a_file_that_was_deleted_after_it_was_added_is_named_as_the_cause(open_p
     path.unlink()
     page.unroute("**/preview?*")
     page.get_by_role("button", name="Try again").click()
-    page.get_by_text("The browser cannot read this file. It was moved, changed or deleted").wait_for()
+    page.get_by_text("The photo was not sent. The file was moved, changed or deleted").wait_for()
 
 
 def test_the_settings_of_one_photo_are_copied_to_all_and_reset(open_page):

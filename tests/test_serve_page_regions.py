@@ -156,7 +156,7 @@ def test_regions_are_drawn_with_a_finger_and_two_fingers_zoom(open_page):
 
 def test_regions_are_copied_to_photos_of_other_sizes_and_reset(page):
     page.get_by_label("Not here").check()
-    drag(page, (150, 100), (150, 100))
+    drag(page, (100, 60), (100, 60))
     upload(page, ("other.png", image_bytes(600, 400, "png")))
     page.get_by_role("button", name="Copy to all photos").click()
     page.locator(".pick").nth(1).click()

@@ -28,7 +28,7 @@ export async function send(path, file, options, { signal, onProgress }) {
     if (request.status === 200) {
       return { blob: request.response, fileName: fileNameOf(request), header: (name) => request.getResponseHeader(name) };
     }
-    if (request.status === 0) throw await connectionError(file);
+    if (request.status === 0) throw await connectionError();
     if (request.status !== 503 || tries === MAX_RETRIES) throw await serverError(request, file);
     onProgress({ phase: "waiting", ahead: 0 });
     await sleep(1000 * Number(request.getResponseHeader("Retry-After") ?? 5), signal);
@@ -88,14 +88,11 @@ function fileNameOf(request) {
   return name ? decodeURIComponent(name[1]) : "photo";
 }
 
-// Without a response, either the file cannot be read, or the server does not answer.
-async function connectionError(file) {
-  try {
-    await file.slice(0, 1).arrayBuffer();
-  } catch {
-    return new Error("The browser cannot read this file. It was moved, changed or deleted after it was added. Add it again.");
-  }
-  return new Error("The server does not respond. Start it again if it was stopped, then try again.");
+// Without a response, either the server does not respond, or the file cannot be read: browsers do not report which.
+async function connectionError() {
+  const response = await fetch("health").catch(() => null);
+  if (!response) return new Error("The server does not respond. Start it again if it was stopped, then try again.");
+  return new Error("The photo was not sent. The file was moved, changed or deleted after it was added, or the connection broke. Add it again.");
 }
 
 async function serverError(request, file) {

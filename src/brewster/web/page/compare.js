@@ -127,19 +127,17 @@ class GlassCompare extends HTMLElement {
     return { width: width * scale, height: height * scale };
   }
 
-  // The position and size of the image in a pane, in CSS pixels. Limits the pan, so that the image covers the pane. The position
-  // is a whole number of screen pixels, so that at 1:1 each photo pixel is exactly one screen pixel.
+  // The position and size of the image in a pane, in CSS pixels. Limits the pan, so that the image covers the pane.
   #placement() {
     const [{ width: viewWidth, height: viewHeight }] = this.#panes();
     const fit = this.#fit();
     const [width, height] = [fit.width * this.#zoom, fit.height * this.#zoom];
     const start = (view, length, centre) =>
       length <= view ? (view - length) / 2 : Math.min(0, Math.max(view - length, view / 2 - centre * length));
-    const round = (length) => Math.round(length * this.#density) / this.#density;
     const left = start(viewWidth, width, this.#centre.x);
     const top = start(viewHeight, height, this.#centre.y);
     this.#centre = { x: (viewWidth / 2 - left) / width, y: (viewHeight / 2 - top) / height };
-    return { left: round(left), top: round(top), width, height };
+    return { left, top, width, height };
   }
 
   // The left and right ends of the visible part of the image, and the position of the line, in CSS pixels.
@@ -150,7 +148,10 @@ class GlassCompare extends HTMLElement {
 
   paint() {
     if (!this.canvas || !this.clientWidth || !this.clientHeight || !this.left.width) return;
-    const placement = this.#placement();
+    // a whole number of screen pixels, so that at 1:1 each photo pixel is exactly one screen pixel
+    const round = (length) => Math.round(length * this.#density) / this.#density;
+    const { left, top, width, height } = this.#placement();
+    const placement = { left: round(left), top: round(top), width, height };
     const { line } = this.#visible(placement);
     this.canvas.width = Math.round(this.clientWidth * this.#density);
     this.canvas.height = Math.round(this.clientHeight * this.#density);
