@@ -66,7 +66,7 @@ MODELS: Final = {
         ModelFile(
             "compact",
             _WEIGHTS / "compact.onnx",
-            "7f297bafce586d1c37b8c69c77602629ddcc3e485a3eaf9fc85afc2d3b57d9d1",
+            "95cf2afcc0f9624bdaa472e3491ee5fa60f9007f9512d7f8f4a997d7b587a37c",
             "Apache-2.0",
         ),
     )

@@ -73,7 +73,7 @@ that the pane lets through: photo = T + R in linear light."""
 class MixRecipe(FrozenModel):
     """Distributions of mixtures of photos: a background behind glass plus a reflection, in linear light.
 
-    `recipes/train/compact-stage5.toml` uses the defaults, except for the crop. Luminances are linear. Lengths in pixels refer to an image of 256 px
+    `recipes/train/compact-stage4.toml` uses the defaults, except for the crop. Luminances are linear. Lengths in pixels refer to an image of 256 px
     and scale with the size of the training images.
     """
 
