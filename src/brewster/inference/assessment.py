@@ -27,8 +27,8 @@ error of encoding and decoding with the VAE of a diffusion model."""
 _VISIBLE_CHANGE: Final = 0.03
 """The smallest change of a pixel that counts as visible, sRGB-encoded."""
 _LITTLE_AREA: Final = 0.1
-_MIN_CLEAR_CONFIDENCE: Final = 0.75
-_MIN_PARTIAL_CONFIDENCE: Final = 0.55
+_MIN_CLEAR_CONFIDENCE: Final = 0.6
+_MIN_PARTIAL_CONFIDENCE: Final = 0.2
 
 
 @final
