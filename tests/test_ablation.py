@@ -32,11 +32,7 @@ def names(paths):
     return [path.stem for path in paths]
 
 
-TINY = {
-    "prompt": "backbone-tiny.toml",
-    "large-mixing": "../train/large-tiny.toml",
-    "large-size": "../train/large-tiny.toml",
-}
+TINY = {"prompt": "backbone-tiny.toml"}
 """study -> tiny base recipe, if it is not tiny.toml."""
 
 SMALL_STUDIES = [path for path in STUDIES if not path.stem.startswith("large-")]
@@ -49,8 +45,12 @@ def test_every_ablation_of_the_paper_has_a_study():
 
 @pytest.mark.parametrize("path", STUDIES, ids=names(STUDIES))
 def test_a_study_changes_one_value_of_both_the_full_and_the_tiny_recipe(path):
-    study = read_study(path)
-    for base in (read_recipe(study.base), read_recipe(RECIPES / TINY.get(path.stem, "tiny.toml"))):
+    full, variant = read_study(path), path.with_stem(f"{path.stem}-tiny")
+    tiny = (
+        read_study(variant) if variant.is_file() else full.model_copy(update={"base": RECIPES / "tiny.toml"})
+    )
+    for study in (full, tiny):
+        base = read_recipe(study.base)
         recipes = [with_value(base, study.key, value) for value in study.values]
         assert base in recipes
         assert len({recipe.model_dump_json() for recipe in recipes}) == len(study.values)
@@ -155,10 +155,12 @@ def test_prompts_are_compared_on_a_backbone_without_training(pairs, data, tmp_pa
     monkeypatch.setenv("BREWSTER_DATA", str(data))
     study = read_study(RECIPES / "prompt.toml").model_copy(update={"base": RECIPES / "backbone-tiny.toml"})
     results = ablate(study, pairs, tmp_path / "out")
-    assert list(results["methods"]) == ["input (unprocessed)", "prompt generic", "prompt detailed"]
+    assert list(results["methods"]) == [
+        "input (unprocessed)", "prompt none", "prompt generic", "prompt detailed",
+    ]  # fmt: skip
     assert not (tmp_path / "out" / "prompt-generic" / "checkpoint.pt").exists()
     means = [row["psnr"]["mean"] for row in results["tables"]["real20"].values()]
-    assert len(set(means)) == 3
+    assert len(set(means)) == 4
 
 
 @pytest.fixture

@@ -89,7 +89,7 @@ def test_the_converted_model_predicts_as_the_published_call(model):
 
 def test_the_schedule_of_the_task_differs_from_that_of_kontext(model):
     backbone = load_pipeline(str(model)).backbone
-    published, usual = backbone.schedule(16, 28, 0.001), backbone.schedule(16, 28)
+    published, usual = backbone.schedule(16, 28, last_sigma=0.001), backbone.schedule(16, 28)
     assert len(published) == len(usual) == 29
     assert published[0] == usual[0] == 1
     assert published[-2] < 0.01 < usual[-2]

@@ -142,7 +142,7 @@ def test_folders_with_equal_last_names_have_unique_log_keys(recipe, tmp_path):
     folders = [Path("one/real"), Path("two/real"), Path("one/real")]
     train(with_value(recipe, "data.validate_on", folders), tmp_path / "run", ignore_step)
     logged = json.loads((tmp_path / "run" / "log.jsonl").read_text().splitlines()[0])
-    assert {name for name in logged if name.startswith("gain")} == {
+    assert {name for name in logged if name.startswith("psnr_gain")} == {
         "psnr_gain_db_one/real",
         "psnr_gain_db_two/real",
     }

@@ -259,7 +259,7 @@ def test_a_run_cannot_be_resumed_with_another_optimiser(recipe, tmp_path):
     assert json.loads(Checkpoint.read(tmp_path / "checkpoint.pt").recipe)["optimizer"] == "adamw"
     trainer = open_trainer(recipe())
     trainer.recipe = recipe(optimizer="adamw8bit")
-    with pytest.raises(RecipeError, match=r"another recipe \(different values: optimizer\)"):
+    with pytest.raises(RecipeError, match="another recipe: optimizer was adamw, is adamw8bit"):
         run(trainer, tmp_path, kill_after(None))
 
 

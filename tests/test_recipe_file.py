@@ -12,7 +12,9 @@ from brewster.scene.recipe_file import commented_toml, read_toml
 from brewster.scene.recipe_keys import recipe_keys
 from brewster.training.recipe import TEMPLATES, LoraRecipe, read_recipe, read_template
 
-TRAINING = sorted((Path(__file__).parents[1] / "recipes").glob("**/*.toml"))
+_FOLDER = Path(__file__).parents[1] / "recipes"
+SCENES = sorted(_FOLDER.glob("render/*.toml"))
+TRAINING = sorted(path for path in _FOLDER.glob("**/*.toml") if path not in SCENES)
 
 
 @pytest.fixture
@@ -112,7 +114,7 @@ def test_the_command_prints_a_line_for_each_problem(run_without_model, tmp_path)
 # --- recipes as text
 
 
-@pytest.mark.parametrize("name", RECIPES)
+@pytest.mark.parametrize("name", [*RECIPES, *map(str, SCENES)])
 def test_a_scene_recipe_that_is_printed_and_read_is_the_same(name):
     recipe = read_scene_recipe(name)
     assert SceneRecipe.model_validate(tomllib.loads(commented_toml(recipe))) == recipe
