@@ -127,7 +127,7 @@ def test_a_run_starts_from_the_mean_of_the_ema_weights_of_its_checkpoints(recipe
 
 def test_held_out_mixtures_do_not_depend_on_seed_and_distributions_of_the_recipe(recipe):
     recipe = with_value(recipe, "data.held_out", ["2.png"])
-    other = with_value(with_value(recipe, "seed", 99), "mix.reflection_ratio_log", [1.0, 2.0])
+    other = with_value(with_value(recipe, "seed", 99), "mix.reflection_ratio", [1.0, 2.0])
     one, two = (held_out_mixtures(given)(0, 3, 64) for given in (recipe, other))
     assert torch.equal(one.photo_encoded, two.photo_encoded)
     assert torch.equal(one.transmission_encoded, two.transmission_encoded)

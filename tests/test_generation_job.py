@@ -209,7 +209,7 @@ def test_a_set_grows_across_versions_until_its_samples_change(four_samples, tmp_
     monkeypatch.setattr(brewster, "__version__", "99")
     assert statuses(render_set(tmp_path / "set", count=5))[4] == "rendered"
     monkeypatch.setattr(store, "SAMPLE_FORMAT", 99)
-    with pytest.raises(TargetError, match="its format is 2, and 99 was requested"):
+    with pytest.raises(TargetError, match="its format is 3, and 99 was requested"):
         render_set(tmp_path / "set")
 
 

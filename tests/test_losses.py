@@ -50,11 +50,11 @@ def test_fine_stripes_count_at_the_finest_scale_only_and_as_edges():
         assert parts["edges"] == pytest.approx(0.2, rel=1e-5)
 
 
-def test_the_logarithm_of_the_squared_error_is_limited_at_30_db():
+def test_the_logarithm_of_the_squared_error_is_limited_at_40_db():
     assert loss_of(transmission_error=0.1)["log_mse"] == pytest.approx(
-        0.02 * math.log(0.01 + 0.001), rel=1e-4
+        0.04 * math.log(0.01 + 0.0001), rel=1e-4
     )
-    assert loss_of()["log_mse"] == pytest.approx(0.02 * math.log(0.001), rel=1e-4)
+    assert loss_of()["log_mse"] == pytest.approx(0.04 * math.log(0.0001), rel=1e-4)
 
 
 def test_the_loss_has_four_parts():

@@ -200,7 +200,7 @@ def push(*, folder: Path, repo_id: str, public: bool, message: str, dry_run: boo
     type=click.Choice(["comfyui", "merged"]),
     default="comfyui",
     show_default=True,
-    help="comfyui: one .safetensors file with the LoRA. merged: the base with the LoRA added to its weights, for diffusers.",
+    help="The kind of export. comfyui: one .safetensors file with the LoRA. merged: the base with the LoRA added to its weights, for diffusers.",
 )
 @click.option(
     "--base",

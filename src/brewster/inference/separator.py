@@ -11,7 +11,6 @@ photo at full size.
 
 from __future__ import annotations
 
-import math
 import time
 from collections import deque
 from collections.abc import Iterable, Iterator
@@ -26,6 +25,7 @@ import numpy as np
 import brewster
 from brewster.errors import BrewsterError, MissingExtra, ModelError
 from brewster.inference.assessment import Assessment, assess
+from brewster.inference.full_size import upsample_layers
 from brewster.inference.guided_upsampling import Floats, GuidedUpsampler
 from brewster.inference.onnx_backend import OnnxBackend
 from brewster.inference.predictor import (
@@ -47,7 +47,6 @@ if TYPE_CHECKING:
 
 PROGRAM: Final = "brewster"
 """The name under which the metadata of layers record this program."""
-_WORKERS: Final = 2
 _WHITE_PERCENTILE: Final = 99.0
 """If this percentile of the photo is above 1, as in an EXR, the input of the network is divided by it."""
 _NETWORK_SHARE: Final = 0.6
@@ -207,8 +206,12 @@ class Separator:
             prediction = self._predictor(inputs, quality, lambda done: on_progress(_NETWORK_SHARE * done))
         with _timed(seconds, "detail"):
             upsampler = _fit_upsampler(inputs[-1], prediction, strength, white)
-            transmission, reflection, residual = _upsample(
-                photo, upsampler, weights, additive=additive, on_progress=on_progress
+            transmission, reflection, residual = upsample_layers(
+                photo,
+                upsampler,
+                weights,
+                additive=additive,
+                on_progress=lambda done: on_progress(_NETWORK_SHARE + (1 - _NETWORK_SHARE) * done),
             )
         step = history_step(self.name, strength=strength, quality=quality, additive=additive)
         step |= {"sha256": self.sha256[:12]} if self.sha256 else {}
@@ -356,61 +359,6 @@ def _fit_upsampler(
         override = replace(override, transmission=white * override.transmission, strength=strength)
     reflection = None if prediction.reflection_is_derived else scale * prediction.reflection
     return GuidedUpsampler.fit(white * largest_input, scale * prediction.change, reflection, override)
-
-
-def _upsample(
-    photo: Photo,
-    upsampler: GuidedUpsampler,
-    mask: Mask | None,
-    *,
-    additive: bool,
-    on_progress: ProgressCallback,
-) -> tuple[Photo, Photo, float]:
-    """Returns transmission, reflection and the mean residual. The layers are encoded like the photo, or as exact floats."""
-    template = _float_template(photo) if additive else photo
-    canvases = [np.empty(template.pixels.shape, template.pixels.dtype) for _ in range(2)]
-
-    def fill(rows: slice) -> float:
-        linear = photo.linear_rows(rows.start, rows.stop)
-        weights = None if mask is None else mask.rows(rows.start, rows.stop)
-        layers = upsampler.apply(linear, rows.start, photo.size[1], weights)
-        stored = [template.stored_rows(layer, rows.start) for layer in layers]
-        if additive:
-            stored = _exact_sum_layers(template.stored_rows(linear, rows.start), stored[0])
-        for canvas, layer in zip(canvases, stored, strict=True):
-            canvas[rows] = layer
-        return 0.0 if additive else float(np.abs(linear - layers[0] - layers[1]).sum(dtype=np.float64))
-
-    strips, residual_sum = list(photo.strips()), 0.0
-    with ThreadPoolExecutor(_WORKERS) as pool:
-        for done, strip_residual in enumerate(pool.map(fill, strips), 1):
-            residual_sum += strip_residual
-            on_progress(_NETWORK_SHARE + (1 - _NETWORK_SHARE) * done / len(strips))
-    transmission, reflection = (template.with_pixels(canvas) for canvas in canvases)
-    return transmission, reflection, residual_sum / (math.prod(photo.size) * 3)
-
-
-def _float_template(photo: Photo) -> Photo:
-    """Returns a black photo of the same size, 32-bit floats in linear light, with the alpha and EXIF of the photo."""
-    file_info = replace(
-        photo.file_info, container="tiff", bits=32, compression=None, icc=None, primaries=None, header=None
-    )
-    alpha = photo.alpha
-    if alpha is not None and alpha.dtype.kind == "u":
-        alpha = alpha / np.float32(np.iinfo(alpha.dtype).max)
-    black = np.broadcast_to(np.float32(0), photo.pixels.shape)
-    return Photo(black, alpha, file_info)
-
-
-def _exact_sum_layers(photo: Floats, transmission: Floats) -> list[Floats]:
-    """Returns transmission and reflection whose float sum is bit-equal to the photo.
-
-    They are not negative where the photo is not negative.
-
-    At least one of the two differences is exact (Sterbenz 1974), which makes the sum exact.
-    """
-    reflection = photo - np.minimum(transmission, photo)
-    return [photo - reflection, reflection]
 
 
 @contextmanager
