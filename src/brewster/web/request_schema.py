@@ -88,6 +88,9 @@ async def read_form(request: Request, models: Sequence[str], max_pixels: int) ->
 
 
 async def _build_request(form: FormData, options: Options) -> SeparationRequest:
+    for name in _FILES:
+        if len(form.getlist(name)) > 1:
+            raise HTTPException(400, f"the form contains more than one file {name}; send one")
     photo = form.get("photo")
     if not isinstance(photo, UploadFile):
         raise HTTPException(422, "the form contains no photo; send its file in the field photo")
