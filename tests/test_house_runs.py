@@ -43,8 +43,9 @@ def rows_by_first_cell(table):
 
 def test_the_tiny_experiment_renders_trains_separates_and_evaluates(tmp_path):
     output = run_script("tiny.sh", tmp_path)
+    tables = (tmp_path / "evaluate" / "tables.md").read_text()
     scores = {
-        method: [float(score) for score in rows_by_first_cell(output)[method][0].split(" / ")]
+        method: [float(score) for score in rows_by_first_cell(tables.partition("###")[0])[method][0].split(" / ")]
         for method in ("input (unprocessed)", "compact", "lora")
     }
     assert all(psnr > 5 and ssim > 0 for psnr, ssim in scores.values())
@@ -55,7 +56,7 @@ def test_the_tiny_experiment_renders_trains_separates_and_evaluates(tmp_path):
         assert made.size == Photo.open(ROOT / "tests/pictures/mixture-coffee-rocket.jpg").size
     card = (tmp_path / "card.md").read_text()
     assert "**This is a toy.**" in card
-    assert rows_by_first_cell(card.partition("## Measured")[2])["lora"] == rows_by_first_cell(output)["lora"]
+    assert rows_by_first_cell(card.partition("## Measured")[2])["lora"] == rows_by_first_cell(tables.partition("###")[0])["lora"]
     assert {path.name for path in (tmp_path / "lora").iterdir()} == set(FILES)
     assert output.splitlines()[-1] == "nothing was sent"
 
@@ -109,7 +110,7 @@ def test_every_command_of_the_paper_experiment_is_valid(tmp_path):
 @pytest.mark.slow
 def test_the_tiny_paper_experiment_trains_evaluates_and_ablates(tmp_path):
     output = run_script("paper.sh", "--tiny", tmp_path)
-    table = rows_by_first_cell(output)
+    table = rows_by_first_cell((tmp_path / "evaluate" / "tables.md").read_text())
     assert {"input (unprocessed)", "compact", "syn", "syn+real"} <= table.keys()
     assert "2 real pairs; panels of" in output
     assert "\\begin{tabular}" in (tmp_path / "table1.tex").read_text()
