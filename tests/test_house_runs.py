@@ -45,7 +45,9 @@ def test_the_tiny_experiment_renders_trains_separates_and_evaluates(tmp_path):
     output = run_script("tiny.sh", tmp_path)
     tables = (tmp_path / "evaluate" / "tables.md").read_text()
     scores = {
-        method: [float(score) for score in rows_by_first_cell(tables.partition("###")[0])[method][0].split(" / ")]
+        method: [
+            float(score) for score in rows_by_first_cell(tables.partition("###")[0])[method][0].split(" / ")
+        ]
         for method in ("input (unprocessed)", "compact", "lora")
     }
     assert all(psnr > 5 and ssim > 0 for psnr, ssim in scores.values())
@@ -56,7 +58,10 @@ def test_the_tiny_experiment_renders_trains_separates_and_evaluates(tmp_path):
         assert made.size == Photo.open(ROOT / "tests/pictures/mixture-coffee-rocket.jpg").size
     card = (tmp_path / "card.md").read_text()
     assert "**This is a toy.**" in card
-    assert rows_by_first_cell(card.partition("## Measured")[2])["lora"] == rows_by_first_cell(tables.partition("###")[0])["lora"]
+    assert (
+        rows_by_first_cell(card.partition("## Measured")[2])["lora"]
+        == rows_by_first_cell(tables.partition("###")[0])["lora"]
+    )
     assert {path.name for path in (tmp_path / "lora").iterdir()} == set(FILES)
     assert output.splitlines()[-1] == "nothing was sent"
 
