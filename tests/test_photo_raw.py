@@ -16,6 +16,9 @@ from brewster.photo.colour import colour_space_of
 from picture_files import CAMERA_NEUTRAL, dng_file, exif_block, file_of, mosaic, pil, smooth
 
 rawpy = pytest.importorskip("rawpy")
+pytestmark = pytest.mark.filterwarnings(
+    "ignore:rawpy is being used in a process:RuntimeWarning"
+)  # bench/mutants.py
 
 
 def developed(data, space):
