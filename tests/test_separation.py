@@ -39,7 +39,7 @@ def separate(app, photo=SMALL, name="window.png", **fields):
 
 
 def error_of(response):
-    assert set(response.json()) - {"kind"} == {"error"}
+    assert {"error"} <= set(response.json()) <= {"error", "kind"}
     return response.json()["error"]
 
 
