@@ -114,7 +114,7 @@ def test_no_file_name_breaks_the_response(app, name):
     if response.status_code == 200:
         (disposition,) = response.headers.get_list("content-disposition")
         assert disposition.isprintable()
-        file_name = unquote(disposition.partition("''")[2])
+        file_name = unquote(disposition.partition("UTF-8''")[2])
         assert file_name.endswith(".zip")
         assert not set(file_name) & set('/\\\r\n"')
 

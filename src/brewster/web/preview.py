@@ -153,8 +153,13 @@ def _luminance(map_: NDArray[np.float32]) -> NDArray[np.float32]:
 
 def _describe(name: str, map_: NDArray[np.float32]) -> dict[str, Any]:
     height, width, channels = map_.shape
-    value_range = float(map_.min()), float(map_.max())
-    return {"name": name, "width": width, "height": height, "channels": channels, "range": value_range}
+    return {"name": name, "width": width, "height": height, "channels": channels, "range": _range(map_)}
+
+
+def _range(map_: NDArray[np.float32]) -> tuple[float, float]:
+    """The values of 0 and 65535. They are at least 1 apart: smaller steps are not visible, and compress badly."""
+    low = float(map_.min())
+    return low, max(float(map_.max()), low + 1)
 
 
 def _to_srgb_bytes(linear: NDArray[np.float32]) -> NDArray[np.uint8]:
@@ -162,6 +167,6 @@ def _to_srgb_bytes(linear: NDArray[np.float32]) -> NDArray[np.uint8]:
 
 
 def _to_uint16(map_: NDArray[np.float32]) -> NDArray[np.uint16]:
-    low, high = map_.min(), map_.max()
-    scaled: NDArray[np.float32] = (map_ - low) / max(high - low, np.float32(1e-12))
+    low, high = _range(map_)
+    scaled: NDArray[np.float32] = (map_ - np.float32(low)) / np.float32(high - low)
     return np.rint(65535 * scaled).astype(np.dtype("<u2"), copy=False)
