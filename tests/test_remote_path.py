@@ -41,6 +41,8 @@ def test_a_location_is_a_path_or_a_url():
     assert location("scans/a.jpg") == Path("scans/a.jpg")
     assert location(Path("a")) == Path("a")
     assert location("file:///scans/box%204/a.jpg") == Path("/scans/box 4/a.jpg")
+    assert location("file://localhost/scans/a.jpg") == Path("/scans/a.jpg")
+    assert location("file://server/scans/a.jpg") == Path("//server/scans/a.jpg")
     assert str(location("memory://bucket/a.jpg")) == "memory://bucket/a.jpg"
 
 

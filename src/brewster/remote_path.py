@@ -17,7 +17,6 @@ import re
 from collections.abc import Iterator
 from pathlib import Path, PurePosixPath
 from typing import Any, TypeAlias, final
-from urllib.parse import urlsplit
 from urllib.request import url2pathname
 
 from brewster.errors import BrewsterError, MissingExtra, TargetError, UnreadablePhoto
@@ -133,10 +132,16 @@ def location(text: str | os.PathLike[str]) -> Location:
         return text if isinstance(text, RemotePath) else Path(text)
     url = os.fspath(text)
     if url.startswith("file:"):
-        return Path(url2pathname(urlsplit(url).path))
+        return Path(path_of_file_url(url))
     path = RemotePath(url)
     path._store()  # raises the errors now, and not for every photo
     return path
+
+
+def path_of_file_url(url: str) -> str:
+    """Returns the local path of a file:// URL. The host is empty, localhost, or a Windows server (RFC 8089)."""
+    path = url.removeprefix("file://").removeprefix("localhost")
+    return url2pathname(path if path.startswith("/") else f"//{path}")
 
 
 def _store(protocol: str) -> Any:  # noqa: ANN401  (fsspec has no types)

@@ -15,7 +15,6 @@ from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, final
-from urllib.request import url2pathname
 
 import click
 
@@ -33,7 +32,7 @@ from brewster.files import LAYER_FORMATS, find_videos
 from brewster.image_formats import WRITABLE, ImageFormat, format_of
 from brewster.models import zoo
 from brewster.options import Options
-from brewster.remote_path import location
+from brewster.remote_path import location, path_of_file_url
 
 if TYPE_CHECKING:
     from brewster.inference import FileResult, SeparationTask
@@ -52,10 +51,7 @@ def local_path(text: str) -> str:
         return text
     if len(text) > 2 and text[0] == text[-1] and text[0] in "'\"":
         text = text[1:-1]
-    if text.startswith("file://"):
-        path = text.removeprefix("file://").removeprefix("localhost")
-        text = url2pathname(path if path.startswith("/") else f"//{path}")  # a share of a Windows server
-    return text
+    return path_of_file_url(text) if text.startswith("file://") else text
 
 
 def skipped_videos(photos: Sequence[str]) -> str | None:
