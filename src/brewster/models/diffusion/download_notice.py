@@ -33,7 +33,7 @@ def announce_download(hub: Any, source: str, patterns: list[str]) -> None:  # no
     if size < _MIN_ANNOUNCED_BYTES:
         return
     cache = Path(hub.constants.HF_HUB_CACHE)
-    free = _free_bytes(cache)
+    free = free_disk_bytes(cache)
     if free < size + _RESERVE_BYTES:
         raise DownloadError(
             f"{source} has {size / 1e9:.1f} GB to download, and {free / 1e9:.1f} GB are free in {cache}",
@@ -46,6 +46,7 @@ def announce_download(hub: Any, source: str, patterns: list[str]) -> None:  # no
     sys.stderr.flush()
 
 
-def _free_bytes(folder: Path) -> int:
+def free_disk_bytes(folder: Path) -> int:
+    """The free bytes of the disk that has the folder, or will have it: of its nearest existing parent."""
     existing = next(parent for parent in (folder, *folder.absolute().parents) if parent.exists())
     return shutil.disk_usage(existing).free

@@ -6,7 +6,6 @@ check_machine("kontext", requested="auto", device="cuda", quantise="int8")
 from __future__ import annotations
 
 import importlib.util
-import shutil
 from pathlib import Path
 from typing import Final
 
@@ -14,6 +13,7 @@ import torch
 
 from brewster.errors import DeviceError, DownloadError
 from brewster.models.diffusion.backbones import BACKBONES, family_of
+from brewster.models.diffusion.download_notice import free_disk_bytes
 from brewster.models.diffusion.families.family import Backbone
 from brewster.models.diffusion.lazy_imports import import_library, is_cached
 from brewster.models.zoo import TINY_PREFIX
@@ -136,11 +136,10 @@ def _check_memory(source: str, weights: int, device: str, quantise: Quantisation
 
 def _check_disk(hub_id: str, parameters: int) -> None:
     cache = Path(import_library("huggingface_hub.constants").HF_HUB_CACHE)
-    existing = next(folder for folder in (cache, *cache.parents) if folder.is_dir())
-    free, needed = shutil.disk_usage(existing).free, parameters * _FILE_BYTES_PER_WEIGHT
+    free, needed = free_disk_bytes(cache), parameters * _FILE_BYTES_PER_WEIGHT
     if needed > free:
         raise DownloadError(
-            f"{hub_id} needs about {needed / 1e9:.0f} GB on the disk, and {existing} has {free / 1e9:.0f} GB free",
+            f"{hub_id} needs about {needed / 1e9:.0f} GB on the disk, and {cache} has {free / 1e9:.0f} GB free",
             "expected enough free disk for the download",
             "free disk space, or set HF_HOME to a folder on a larger disk",
         )
