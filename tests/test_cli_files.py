@@ -2,13 +2,14 @@
 
 import nturl2path
 import sys
+import urllib.request
 from pathlib import Path
 
 import numpy as np
 import pytest
 from click.shell_completion import ShellComplete
 
-from brewster import Photo, remote_path
+from brewster import Photo
 from brewster.cli import batch, cli
 from brewster.photo import contact_sheet
 from cli_helpers import error_lines, image_bytes, layer_files, list_files
@@ -42,7 +43,7 @@ def test_an_existing_file_keeps_its_name_even_if_it_has_quotes(tmp_path, monkeyp
     ],
 )
 def test_addresses_of_windows_become_its_paths(address, path, monkeypatch):
-    monkeypatch.setattr(remote_path, "url2pathname", nturl2path.url2pathname)
+    monkeypatch.setattr(urllib.request, "url2pathname", nturl2path.url2pathname)
     assert batch.local_path(address).removeprefix("\\\\?\\") == path
 
 

@@ -17,7 +17,6 @@ import re
 from collections.abc import Iterator
 from pathlib import Path, PurePosixPath
 from typing import Any, TypeAlias, final
-from urllib.request import url2pathname
 
 from brewster.errors import BrewsterError, MissingExtra, TargetError, UnreadablePhoto
 
@@ -140,6 +139,8 @@ def location(text: str | os.PathLike[str]) -> Location:
 
 def path_of_file_url(url: str) -> str:
     """Returns the local path of a file:// URL. The host is empty, localhost, or a Windows server (RFC 8089)."""
+    from urllib.request import url2pathname  # noqa: PLC0415  (imports http.client: slow, and every command imports this module)
+
     path = url.removeprefix("file://").removeprefix("localhost")
     return url2pathname(path if path.startswith("/") else f"//{path}")
 
