@@ -9,15 +9,14 @@ The stored values are weights, not light: they are not converted by a transfer c
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Final, final
+from typing import Any, final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from brewster.errors import MaskError, PhotoError
+from brewster.photo.in_memory import WHITE_LEVELS
 from brewster.photo.photo import Float32, Photo, Source, Stored
-
-_WHITE: Final = {"uint8": 255, "uint16": 65535, "float32": 1}
 
 
 @final
@@ -55,7 +54,7 @@ class Mask:
             )
         if (pixels != pixels[..., :1]).any():
             raise MaskError("the mask has colours", "expected grey values", "convert the mask to grey")
-        if photo.alpha is not None and (photo.alpha != _WHITE[photo.alpha.dtype.name]).any():
+        if photo.alpha is not None and (photo.alpha != WHITE_LEVELS[photo.alpha.dtype.name]).any():
             raise MaskError(
                 "the mask has transparent pixels",
                 "expected white where the photo is separated, and black where it is not",
@@ -72,7 +71,9 @@ class Mask:
 
     def rows(self, top: int, bottom: int) -> Float32:
         """Returns the weights of the rows `top` to `bottom` (exclusive): (n, W, 1) in 0..1."""
-        weights: NDArray[Any] = self.values[top:bottom, :, None] / np.float32(_WHITE[self.values.dtype.name])
+        weights: NDArray[Any] = self.values[top:bottom, :, None] / np.float32(
+            WHITE_LEVELS[self.values.dtype.name]
+        )
         return weights.astype(np.float32, copy=False)
 
 

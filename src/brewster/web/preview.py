@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from brewster.inference import Separator
 from brewster.options import Options
 from brewster.photo import Photo
-from brewster.srgb import to_encoded
+from brewster.srgb import REC709_LUMINANCE, to_encoded
 
 MAX_PREVIEW_PIXELS: Final = 1_400_000
 """Larger photos are reduced to about this number of pixels, which is enough for a window."""
@@ -148,7 +148,7 @@ def _luminance(map_: NDArray[np.float32]) -> NDArray[np.float32]:
     """The luminance of linear Rec.709 light, which a grey photo stores, or the map itself if it has one channel."""
     if map_.shape[2] == 1:
         return map_
-    return (map_ @ np.array([0.2126, 0.7152, 0.0722], np.float32))[..., None]
+    return (map_ @ np.array(REC709_LUMINANCE, np.float32))[..., None]
 
 
 def _describe(name: str, map_: NDArray[np.float32]) -> dict[str, Any]:

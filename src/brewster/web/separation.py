@@ -203,8 +203,8 @@ def _keep_photo(
 
 def _open_photo(photos: PhotoCache, form: SeparationRequest) -> tuple[Photo, dict[str, str]]:
     """The decoded photo, which the cache keeps for the tiles, and the headers with its key and its size."""
-    photo = Photo.open(form.photo, max_pixels=form.options.max_pixels)
     key = hashlib.sha256(form.photo).hexdigest()
+    photo = photos.get(key) or Photo.open(form.photo, max_pixels=form.options.max_pixels)
     photos.put(key, photo)
     return photo, {"Brewster-Photo": key, "Brewster-Size": "{}x{}".format(*photo.size)}
 
