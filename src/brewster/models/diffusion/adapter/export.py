@@ -14,11 +14,11 @@ import torch
 from torch import Tensor, nn
 
 from brewster.errors import ModelError, TargetError
-from brewster.models.diffusion.adapter.lora import LORA_FILE, read_lora_metadata, read_prompt
+from brewster.models.diffusion.adapter.lora import read_lora, read_prompt
 from brewster.models.diffusion.backbones import load_backbone
 from brewster.models.diffusion.families.family import Backbone
 from brewster.models.diffusion.prompt import PROMPT_FILE
-from brewster.models.diffusion.tensors import read_tensors, write_tensors
+from brewster.models.diffusion.tensors import write_tensors
 
 _PREFIX: Final = "transformer."
 _DOWN, _UP, _ALPHA = ".lora_A.weight", ".lora_B.weight", ".alpha"
@@ -32,7 +32,8 @@ def export_comfyui(folder: Path, target: Path) -> None:
         TargetError: `target` exists or cannot be written.
     """
     _check_target(target)
-    metadata, tensors = read_lora_metadata(folder), read_tensors(folder / LORA_FILE)[0]
+    state, metadata = read_lora(folder)
+    tensors = {_PREFIX + name: tensor for name, tensor in state.items()}
     layers = [name.removesuffix(_UP) for name in tensors if name.endswith(_UP)]
     # safetensors refuses tensors that share memory, so each layer gets its own. An imported layer has alpha = rank.
     alphas = {
@@ -61,8 +62,8 @@ def export_merged(folder: Path, target: Path, base: str | None = None) -> None:
         TargetError: `target` exists or cannot be written.
     """
     _check_target(target)
-    metadata = read_lora_metadata(folder)
-    prompt, tensors = read_prompt(folder, metadata), read_tensors(folder / LORA_FILE)[0]
+    state, metadata = read_lora(folder)
+    prompt = read_prompt(folder, metadata)
     backbone = load_backbone(base or metadata.base, dtype=torch.bfloat16)
     if backbone.name != metadata.backbone:
         raise ModelError(
@@ -70,7 +71,6 @@ def export_merged(folder: Path, target: Path, base: str | None = None) -> None:
             f"expected a base of {metadata.backbone}, not of {backbone.name}",
             "choose another base",
         )
-    state = {name.removeprefix(_PREFIX): tensor for name, tensor in tensors.items()}
     merge(backbone, state, 1.0 if metadata.imported else metadata.alpha / metadata.rank)
     backbone.save(target)
     prompt.save(target / PROMPT_FILE)

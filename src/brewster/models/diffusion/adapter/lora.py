@@ -135,10 +135,7 @@ def add_lora(
     """
     if rank < 1:
         raise ModelError(f"the rank is {rank}", "expected at least 1", "use 16 as in the paper")
-    if has_lora(backbone):
-        raise ModelError(
-            "the backbone already has a LoRA", "expected a backbone without a LoRA", "call remove_lora first"
-        )
+    _check_no_lora(backbone)
     peft = import_library("peft")
     config = peft.LoraConfig(r=rank, lora_alpha=alpha, target_modules=select_targets(backbone, targets))
     with torch.random.fork_rng(devices=_cuda_devices(backbone)):
@@ -156,10 +153,7 @@ def attach_layers(backbone: Backbone, layers: Mapping[str, LowRankLayer]) -> Non
         ModelError: the backbone already has a LoRA, or a layer is not in it or has another shape.
         MissingExtra: peft is not installed.
     """
-    if has_lora(backbone):
-        raise ModelError(
-            "the backbone already has a LoRA", "expected a backbone without a LoRA", "call remove_lora first"
-        )
+    _check_no_lora(backbone)
     modules = dict(backbone.transformer.named_modules())
     for name, layer in layers.items():
         check_shape(name, layer, modules.get(name))
@@ -168,6 +162,13 @@ def attach_layers(backbone: Backbone, layers: Mapping[str, LowRankLayer]) -> Non
     _add_adapter(backbone, config)
     _convert_for_inference(backbone)
     peft.set_peft_model_state_dict(backbone.transformer, to_state(layers), adapter_name=_ADAPTER_NAME)
+
+
+def _check_no_lora(backbone: Backbone) -> None:
+    if has_lora(backbone):
+        raise ModelError(
+            "the backbone already has a LoRA", "expected a backbone without a LoRA", "call remove_lora first"
+        )
 
 
 def remove_lora(backbone: Backbone) -> None:
@@ -236,21 +237,11 @@ def save_lora(
             "encode it for this backbone",
         )
     config = backbone.transformer.peft_config[_ADAPTER_NAME]
-    metadata = LoraMetadata(
-        backbone.name,
-        base or backbone.hub_id,
-        quantise,
-        config.r,
-        config.lora_alpha,
-        task,
-        prompt.sha256,
-        tuple(targets),
-    )
-    tensors = {_PREFIX + name: tensor for name, tensor in lora_state(backbone).items()}
-    prompt.save(folder / PROMPT_FILE)
-    write_tensors(
-        folder / LORA_FILE, tensors, {_METADATA_KEY: metadata.to_json(), _PEFT_KEY: _peft_settings(config)}
-    )
+    source, rank, alpha = base or backbone.hub_id, config.r, config.lora_alpha
+    metadata = LoraMetadata(backbone.name, source, quantise, rank, alpha, task, prompt.sha256, tuple(targets))
+    # Without lora_alpha, diffusers assumes that alpha equals the rank.
+    settings = {"r": rank, "lora_alpha": alpha, "target_modules": sorted(config.target_modules)}
+    _write(folder, lora_state(backbone), settings, prompt, metadata)
     return metadata
 
 
@@ -262,14 +253,22 @@ def save_layers(
     Raises:
         TargetError: the folder cannot be written.
     """
-    settings = {_PREFIX + name: value for name, value in _layer_settings(layers).items()}
-    tensors = {_PREFIX + name: tensor for name, tensor in to_state(layers).items()}
+    _write(folder, to_state(layers), _layer_settings(layers), prompt, metadata)
+
+
+def _write(
+    folder: Path,
+    state: Mapping[str, Tensor],
+    settings: Mapping[str, Any],
+    prompt: PromptEmbedding,
+    metadata: LoraMetadata,
+) -> None:
+    """Writes prompt and weights. `settings` are those that diffusers reads from the file."""
+    tensors = {_PREFIX + name: tensor for name, tensor in state.items()}
+    prefixed = {_PREFIX + name: value for name, value in settings.items()}
     prompt.save(folder / PROMPT_FILE)
-    write_tensors(
-        folder / LORA_FILE,
-        tensors,
-        {_METADATA_KEY: metadata.to_json(), _PEFT_KEY: json.dumps(settings, sort_keys=True)},
-    )
+    entries = {_METADATA_KEY: metadata.to_json(), _PEFT_KEY: json.dumps(prefixed, sort_keys=True)}
+    write_tensors(folder / LORA_FILE, tensors, entries)
 
 
 def read_lora_metadata(folder: Path) -> LoraMetadata:
@@ -278,7 +277,7 @@ def read_lora_metadata(folder: Path) -> LoraMetadata:
     Raises:
         ModelError: the LoRA is missing or damaged, or was not written by brewster.
     """
-    return _read_lora(folder)[1]
+    return read_lora(folder)[1]
 
 
 def read_prompt(folder: Path, metadata: LoraMetadata) -> PromptEmbedding:
@@ -309,7 +308,7 @@ def load_lora(folder: Path, backbone: Backbone) -> tuple[LoraMetadata, PromptEmb
         ModelError: the LoRA belongs to another backbone, its weights do not match the rank in its metadata, a file is
             damaged, the prompt does not belong to it, or the backbone already has a LoRA.
     """
-    state, metadata = _read_lora(folder)
+    state, metadata = read_lora(folder)
     if metadata.backbone != backbone.name:
         raise ModelError(
             f"{folder} is a LoRA of {metadata.backbone}",
@@ -335,7 +334,12 @@ def _convert_for_inference(backbone: Backbone) -> None:
         parameter.data = parameter.data.to(backbone.dtype)
 
 
-def _read_lora(folder: Path) -> tuple[dict[str, Tensor], LoraMetadata]:
+def read_lora(folder: Path) -> tuple[dict[str, Tensor], LoraMetadata]:
+    """The weights of the LoRA in this folder, as `lora_state` names them, and its metadata.
+
+    Raises:
+        ModelError: the LoRA is missing or damaged, or was not written by brewster.
+    """
     tensors, entries = read_tensors(folder / LORA_FILE)
     if _METADATA_KEY not in entries:
         raise ModelError(
@@ -362,16 +366,6 @@ def _check_weights(expected: Mapping[str, Tensor], actual: Mapping[str, Tensor])
                 f"expected {tuple(expected[name].shape)}",
                 "use the rank and the backbone with which it was trained",
             )
-
-
-def _peft_settings(config: Any) -> str:  # noqa: ANN401 - peft's configuration
-    """The LoRA settings that diffusers reads. Without them, diffusers assumes that alpha equals the rank."""
-    settings = {
-        "r": config.r,
-        "lora_alpha": config.lora_alpha,
-        "target_modules": sorted(config.target_modules),
-    }
-    return json.dumps({_PREFIX + name: value for name, value in settings.items()}, sort_keys=True)
 
 
 def _add_adapter(backbone: Backbone, config: Any) -> None:  # noqa: ANN401 - peft's configuration
