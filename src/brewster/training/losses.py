@@ -34,7 +34,7 @@ def separation_loss(layers: Float[Tensor, "n 6 h w"], batch: TrainingBatch) -> d
       detail.
     - edges: mean absolute error of the transmission's gradients, so that edges of the reflection are removed
       (Zhang et al. 2018).
-    - log_mse: 0.02 times the logarithm of each image's mean squared error, so that easy images count as much as hard ones. It
+    - log_mse: 0.04 times the logarithm of each image's mean squared error, so that easy images count as much as hard ones. It
       is negative for small errors.
 
     Returns:
