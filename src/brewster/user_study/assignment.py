@@ -53,12 +53,12 @@ def draw_trials(description: StudyDescription, number: int) -> tuple[Trial, ...]
     return tuple(trials)
 
 
-def draw_practice(description: StudyDescription, number: int) -> Trial:
-    """The practice trial of one participant: an output and its degraded copy.
+def draw_practice(description: StudyDescription, number: int, trials: Sequence[Trial]) -> Trial:
+    """The practice trial of the participant with these trials: an output and its degraded copy.
 
     Its pictures are those of a catch trial that the participant does not see otherwise, unless the study has too few.
     """
-    seen = {trial.photo for trial in draw_trials(description, number)}
+    seen = {trial.photo for trial in trials}
     rng = Random(f"{description.seed}/practice/{number}")  # noqa: S311
     pool = rng.sample(description.catch_pool, len(description.catch_pool))
     return _catch_trial(min(pool, key=lambda catch: catch.photo in seen), 1, rng)

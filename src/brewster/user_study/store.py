@@ -155,8 +155,9 @@ class AnswerStore:
             if max_participants is not None and number >= max_participants:
                 return None
             token = secrets.token_urlsafe(24)
-            trials = json.dumps([asdict(trial) for trial in draw_trials(self.study.description, number)])
-            practice = json.dumps(asdict(draw_practice(self.study.description, number)))
+            drawn = draw_trials(self.study.description, number)
+            trials = json.dumps([asdict(trial) for trial in drawn])
+            practice = json.dumps(asdict(draw_practice(self.study.description, number, drawn)))
             today = datetime.now(UTC).date().isoformat()
             database.execute(
                 "INSERT INTO participants VALUES (?, ?, ?, ?, ?)", (number, token, today, trials, practice)
