@@ -188,7 +188,7 @@ def _role_files(folder: Path, role: str, roles: Mapping[str, Path]) -> tuple[lis
             f"expected a subfolder with the name {join_names(ROLES[role], ' or ')}",
             "rename the subfolder, or give the path of its parent folder",
         )
-    images, others = _image_files(roles[role])
+    images, others = image_files(roles[role])
     if not images:
         raise PhotoError(
             f"{roles[role]} contains no images",
@@ -253,7 +253,7 @@ def _read_branches(
 
 def _read_shot(root: Path, folder: Path, labels: Mapping[str, str]) -> FolderListing:
     by_name: dict[str, dict[str, list[Path]]] = defaultdict(lambda: defaultdict(list))
-    images, others = _image_files(folder)
+    images, others = image_files(folder)
     for image in images:
         letters = _ROLE_LETTER.findall(image.stem)
         if len(letters) == 1:
@@ -307,7 +307,7 @@ def _exclusion_reason(root: Path, files: _FilesByRole) -> str:
     return ""
 
 
-def _image_files(folder: Path) -> tuple[list[Path], list[Path]]:
+def image_files(folder: Path) -> tuple[list[Path], list[Path]]:
     """Returns the image files in a folder, in natural order, and everything else in it."""
     folders, files = list_folder(folder)
     images = [path for path in files if path.suffix.lower() in SUFFIXES]

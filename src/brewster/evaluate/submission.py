@@ -12,16 +12,12 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
-from brewster.benchmarks.pairing import find_numbered_splits, list_folder
+from brewster.benchmarks.pairing import find_numbered_splits, image_files
 from brewster.benchmarks.registry import Case, ImageFile
 from brewster.errors import PhotoError
 from brewster.evaluate.methods import Method
 from brewster.files import write_atomically
-from brewster.image_formats import SUFFIXES
 from brewster.photo import Photo
-
-EXPORTS: Final = ("ntire2026",)
-"""The contests whose form `brewster evaluate --export` writes."""
 
 _JPEG_QUALITY: Final = 100
 """The contest's script reads JPEG files only. At quality 100 without chroma subsampling, they are close to lossless."""
@@ -72,12 +68,11 @@ def export_ntire2026(
 def _packed(split: str, photos: Path, method: Method, on_progress: Callable[[str], None]) -> bytes:
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w", zipfile.ZIP_STORED) as archive:
-        for path in list_folder(photos)[1]:
-            if path.suffix.lower() in SUFFIXES:
-                on_progress(path.stem)
-                # A fixed date, so that equal predictions give equal bytes.
-                entry = zipfile.ZipInfo(f"{path.stem}.jpg", (1980, 1, 1, 0, 0, 0))
-                archive.writestr(entry, _prediction(split, photos, path, method))
+        for path in image_files(photos)[0]:
+            on_progress(path.stem)
+            # A fixed date, so that equal predictions give equal bytes.
+            entry = zipfile.ZipInfo(f"{path.stem}.jpg", (1980, 1, 1, 0, 0, 0))
+            archive.writestr(entry, _prediction(split, photos, path, method))
     return buffer.getvalue()
 
 

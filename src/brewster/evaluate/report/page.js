@@ -152,22 +152,22 @@
   function planeOf(button) {
     const plane = document.createElement("div");
     plane.className = "plane";
-    for (const image of button.querySelectorAll("img")) plane.append(copyOf(image, image.src));
+    for (const image of button.querySelectorAll("img")) plane.append(copyOf(image.src));
     if (button.dataset.full) {
-      const full = copyOf(button.querySelector("img"), button.dataset.full);
+      const full = copyOf(button.dataset.full);
       full.addEventListener("error", () => { full.remove(); missing.hidden = false; });
       plane.append(full);
     }
     const region = current.buttons.find(item => item.dataset.kind === "region");
     if (region && region !== button) {
-      const tint = copyOf(region.querySelector("img:last-child"), region.querySelector("img:last-child").src);
+      const tint = copyOf(region.querySelector("img:last-child").src);
       tint.className = "tint";
       plane.append(tint);
     }
     return plane;
   }
 
-  function copyOf(image, source) {
+  function copyOf(source) {
     const copy = new Image();
     copy.alt = "";
     copy.draggable = false;
