@@ -112,7 +112,7 @@ async def run(study):
     participants = Participants(server.port)
     started = time.perf_counter()
     sessions = [asyncio.create_task(participants.take_part(number)) for number in range(PARTICIPANTS)]
-    total = PARTICIPANTS * (study.description.pairs + study.description.catches)
+    total = PARTICIPANTS * (study.description.pairs + study.description.catch_trials)
     for kill in range(1, KILLS + 1):
         while len(participants.acknowledged) < total * kill / (KILLS + 1):
             await asyncio.sleep(0.01)

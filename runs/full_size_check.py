@@ -1,7 +1,7 @@
 """Measures memory and time of training and inference at the paper's size on the local GPU; estimates them without a GPU.
 
 The architectures are real and the weights random: nothing is downloaded, and only memory and time are meaningful. The base is
-filled and quantised layer by layer, so that the card never holds the whole base in 16 bits. On larger cards, memory is limited
+filled and quantized layer by layer, so that the card never holds the whole base in 16 bits. On larger cards, memory is limited
 to that of the paper's 24 GB card. full_size_check.sh runs this script.
 """
 
@@ -19,7 +19,7 @@ from torch import nn
 
 from brewster.errors import DeviceError
 from brewster.models.diffusion.adapter.lora import add_lora
-from brewster.models.diffusion.backbones import build, find_family
+from brewster.models.diffusion.backbones.registry import build, find_backbone_class
 from brewster.models.diffusion.lazy_imports import import_library
 from brewster.models.diffusion.panels import PanelLayout, conditioning_image
 from brewster.models.diffusion.prompt import PromptEmbedding
@@ -48,7 +48,7 @@ class Row:
     """Results of one backbone; None for values that were not measured."""
 
     backbone: str
-    quantise: str | None
+    quantization: str | None
     kind: str
     card: str
     parameters: float | None = None
@@ -68,12 +68,12 @@ class Row:
 # --- measured
 
 
-def measure(name, quantise, device, *, is_tiny):
+def measure(name, quantization, device, *, is_tiny):
     """Trains for a few steps, then separates one photo."""
     panel, prompt_tokens, rank = ((32, 32), 8, 2) if is_tiny else (PANEL, PROMPT_TOKENS, RANK)
-    row = Row(name, quantise, "toy twin, not full size" if is_tiny else "measured", gpu_name(device))
+    row = Row(name, quantization, "tiny version, not full size" if is_tiny else "measured", gpu_name(device))
     try:
-        backbone = random_backbone(name, quantise, device, is_tiny=is_tiny)
+        backbone = random_backbone(name, quantization, device, is_tiny=is_tiny)
         prompt = random_prompt(backbone, prompt_tokens)
         row.parameters = count_parameters(backbone.transformer) / 1e9
         row.base_gib = allocated(device)
@@ -87,18 +87,18 @@ def measure(name, quantise, device, *, is_tiny):
     return row
 
 
-def random_backbone(name, quantise, device, *, is_tiny):
+def random_backbone(name, quantization, device, *, is_tiny):
     """Creates a backbone with random weights on the device. The peak memory is its final size."""
-    size = find_family(name).tiny if is_tiny else None
+    size = find_backbone_class(name).tiny if is_tiny else None
     dtype = torch.float32 if device == "cpu" else torch.bfloat16
     backbone = build(name, size, device="meta", dtype=dtype)
     fill_randomly(backbone.vae, device, None)
-    fill_randomly(backbone.transformer, device, quantise)
+    fill_randomly(backbone.transformer, device, quantization)
     return backbone
 
 
-def fill_randomly(part, device, quantise):
-    torchao = import_library("torchao.quantization") if quantise else None
+def fill_randomly(part, device, quantization):
+    torchao = import_library("torchao.quantization") if quantization else None
     for module in part.modules():
         for name, parameter in list(module.named_parameters(recurse=False)):
             value = torch.empty(parameter.shape, dtype=parameter.dtype, device=device).normal_(0, 0.02)
@@ -208,7 +208,7 @@ def cap_memory():
 # --- estimated, where there is no GPU
 
 
-def estimate(name, quantise):
+def estimate(name, quantization):
     """Returns the estimate of `brewster train --plan` for the recipe of this name on the paper's card."""
     from brewster.training.lora.resource_estimate import CARDS, estimate_resources  # noqa: PLC0415  (its libraries may be missing)
     from brewster.training.recipe import read_recipe  # noqa: PLC0415
@@ -218,9 +218,9 @@ def estimate(name, quantise):
     resources = estimate_resources(recipe, card)
     # A training step costs three passes: forward, recomputation for gradient checkpointing, backward.
     forward_s = resources.seconds / 3 / recipe.batch_size
-    passes = STEPS * (1 if find_family(name).guided_by_embedding else 2)
+    passes = STEPS * (1 if find_backbone_class(name).guided_by_embedding else 2)
     return Row(
-        name, quantise, "ESTIMATED from meta tensors, not measured", card.name,
+        name, quantization, "ESTIMATED from meta tensors, not measured", card.name,
         parameters=resources.parameters / 1e9, lora=resources.lora_parameters / 1e6,
         tokens=f"{resources.generated_tokens}, {resources.condition_tokens}, {PROMPT_TOKENS}", base_gib=resources.memory_gib["base"] + resources.memory_gib["VAE"],
         learning_gib=resources.total_gib, step_s=resources.seconds, steps_h=resources.seconds * PAPER_STEPS / 3600,
@@ -232,7 +232,10 @@ def estimate(name, quantise):
 
 
 def table(rows):
-    lines = [["", *(f"{row.backbone}, {row.quantise or 'bf16'}" for row in rows)], ["---"] * (len(rows) + 1)]
+    lines = [
+        ["", *(f"{row.backbone}, {row.quantization or 'bf16'}" for row in rows)],
+        ["---"] * (len(rows) + 1),
+    ]
     lines += [[title, *(format_cell(getattr(row, name)) for row in rows)] for name, title in TITLES.items()]
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
@@ -249,7 +252,7 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--out", type=Path, default=Path("out/full_size"))
     parser.add_argument(
-        "--tiny", action="store_true", help="run the same code on toy twins; a CPU is sufficient"
+        "--tiny", action="store_true", help="run the same code on tiny versions; a CPU is sufficient"
     )
     options = parser.parse_args()
     warnings.filterwarnings("ignore", message=".*get_apply_tensor_subclass.*")
@@ -257,11 +260,11 @@ def main():
     if has_gpu:
         cap_memory()
     rows = []
-    for name, quantise in CASES:
+    for name, quantization in CASES:
         if has_gpu or options.tiny:
-            rows.append(measure(name, quantise, "cuda" if has_gpu else "cpu", is_tiny=options.tiny))
+            rows.append(measure(name, quantization, "cuda" if has_gpu else "cpu", is_tiny=options.tiny))
         else:
-            rows.append(estimate(name, quantise))
+            rows.append(estimate(name, quantization))
         gc.collect()
         if has_gpu:
             torch.cuda.empty_cache()

@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
 # The paper's method at the paper's size: FLUX.1 Kontext [dev], rank 16, 4,000 steps, one 24 GB card (RTX 4090).
 #     BREWSTER_DATA=/big/disk runs/paper.sh [FOLDER]     writes to FOLDER, by default out/paper
-#     runs/paper.sh --tiny [FOLDER]                      the same experiment on toy twins: minutes on two CPU cores, offline
+#     runs/paper.sh --tiny [FOLDER]                      the same experiment on tiny versions: minutes on two CPU cores, offline
 # Give the same command again to resume an interrupted run. With --tiny, the generated panels are noise, but every step runs.
 #
 # First: pip install -c constraints.txt '.[render,train,large,evaluate]' bitsandbytes; agree to the licence at
@@ -23,7 +23,7 @@ if $tiny; then
     export BREWSTER_DATA="$out/data" OMP_NUM_THREADS=1 HF_HUB_OFFLINE=1
     mkdir -p "$BREWSTER_DATA"
     size=96x72 test_count=2 suffix=-tiny
-    assets=() syn=recipes/train/large-tiny.toml real=recipes/train/large-real-tiny.toml set=sets/tiny count=4
+    assets=() syn=recipes/train/lora-tiny.toml real=recipes/train/lora-real-tiny.toml set=sets/tiny count=4
     options=(--quality draft --metrics "psnr,ssim,removed_white,kept_reflection")
     benchmarks=() quality=(--quality draft) workers=(--workers 0)
 else
@@ -81,8 +81,8 @@ $tiny && benchmarks=(--benchmark "rendered=$BREWSTER_DATA/sets/test")
 evaluate "${benchmarks[@]}" "${options[@]}" -o "$out/evaluate"
 cp "$out/evaluate/table.tex" "$out/table1.tex"
 
-# 7. The paper's ablations on the large model: 8-bit blends, number of samples, prompts without training. est. 2-3 days.
-for ablation in large-mixing large-size prompt; do
+# 7. The paper's ablations on the diffusion model: 8-bit blends, number of samples, prompts without training. est. 2-3 days.
+for ablation in lora-blend-space lora-size prompt; do
     brewster ablate "recipes/ablations/$ablation$suffix.toml" -o "$out/ablations/$ablation"
 done
 

@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
 # The paper's method from beginning to end on a toy backbone: one or two minutes on two CPU cores, offline.
 #     runs/tiny.sh [FOLDER]        writes to FOLDER, by default out/tiny
-# The toy twin has random weights, and its LoRA is trained for six steps. All parts are tested, but the generated panels are noise.
+# The tiny version has random weights, and its LoRA is trained for six steps. All parts are tested, but the generated panels are noise.
 # runs/paper.sh is the same experiment at the paper's size.
 set -euo pipefail
 root="$(realpath "$(dirname "$0")/..")"
@@ -14,8 +14,8 @@ export BREWSTER_DATA="$out" OMP_NUM_THREADS=1 HF_HUB_OFFLINE=1
 brewster render "$out/sets/tiny" --recipe tiny --count 4 --workers 0 --quiet
 brewster render "$out/sets/test" --recipe tiny --first 4 --count 2 --workers 0 --quiet
 
-# 2. Train a LoRA of rank 4 on a toy twin of FLUX.1 Kontext, from [I, white, white] to [I, T, R].
-brewster train recipes/train/large-tiny.toml -o "$out"
+# 2. Train a LoRA of rank 4 on a tiny version of FLUX.1 Kontext, from [I, white, white] to [I, T, R].
+brewster train recipes/train/lora-tiny.toml -o "$out"
 
 # 3. Separate a photo, with the same tiling, colour handling and guided upsampling as for other models.
 brewster tests/pictures/mixture-coffee-rocket.jpg --model "$out/lora" --quality draft -o "$out/separated" --overwrite

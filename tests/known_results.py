@@ -24,16 +24,17 @@ def entry(mean, count=20, low=None, high=None):
 
 
 def known_results():
-    selections = {key: {"title": key.title(), "pictures": 20} for key in SETS}
-    selections["average"] = {"title": "Average", "pictures": 100}
+    selections = {key: {"title": key.title(), "cases": 20} for key in SETS}
+    selections["average"] = {"title": "Average", "cases": 100}
     table = {
         "input (unprocessed)": {"psnr": entry(20.0, low=18.5, high=21.25), "lpips": entry(0.2)},
         "A_b|c": {"psnr": entry(21.5), "lpips": entry(0.1234)},
     }
-    pair = {"method": "A_b|c", "than": "input (unprocessed)"}
+    pair = {"method": "A_b|c", "reference": "input (unprocessed)"}
     rows = [
-        pair | {"metric": "psnr", "mean": 1.5, "low": -0.25, "high": 3.0, "better": 15, "count": 20},
-        pair | {"metric": "lpips", "mean": -0.0766, "low": None, "high": None, "better": 20, "count": 20},
+        pair | {"metric": "psnr", "mean": 1.5, "low": -0.25, "high": 3.0, "improved_count": 15, "count": 20},
+        pair
+        | {"metric": "lpips", "mean": -0.0766, "low": None, "high": None, "improved_count": 20, "count": 20},
     ]
     return {
         "protocol": {"choices": ["Nothing is resized."]},
@@ -43,13 +44,13 @@ def known_results():
             "real20": {
                 "title": "Real20",
                 "remarks": ["found 19 images, expected 20"],
-                "refused": ["x.png has no partner"],
+                "excluded": ["x.png has no partner"],
             }
         },
         "methods": {"input (unprocessed)": {}, "A_b|c": {"remark": "2 images in the folder match no case"}},
         "unavailable": {"dists": "no weights"},
         "unmeasured": ["removed_white"],
-        "pictures": [{"errors": {"A_b|c": "A_b|c failed on real20/3"}}],
+        "cases": [{"errors": {"A_b|c": "A_b|c failed on real20/3"}}],
         "tables": dict.fromkeys(selections, table),
         "differences": dict.fromkeys(selections, rows),
     }

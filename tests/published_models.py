@@ -6,7 +6,7 @@ import torch
 from safetensors.torch import save_file
 from torch import nn
 
-from brewster.models.diffusion.backbones import tiny
+from brewster.models.diffusion.backbones.registry import tiny
 
 SIDE = 64
 """The processing resolution of the tiny WindowSeat model."""

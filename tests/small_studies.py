@@ -15,7 +15,7 @@ from brewster.user_study.study import (
 
 
 def make_description(
-    pictures=20, *, methods=("ours", "RDNet"), datasets=("real", "nature"), pairs=8, catches=2, seed=7
+    pictures=20, *, methods=("ours", "RDNet"), datasets=("real", "nature"), pairs=8, catch_trials=2, seed=7
 ):
     """A description without picture files, with `pictures` photos in each dataset; compares the first method with each other."""
     photos = [(dataset, str(i)) for dataset in datasets for i in range(pictures)]
@@ -36,7 +36,7 @@ def make_description(
         brewster="0",
         seed=seed,
         pairs=pairs,
-        catches=catches,
+        catch_trials=catch_trials,
         consent="The consent text.",
         methods=tuple(methods),
         datasets=tuple(datasets),

@@ -32,15 +32,23 @@ def names(paths):
     return [path.stem for path in paths]
 
 
-TINY = {"prompt": "backbone-tiny.toml"}
+TINY = {"prompt": "no-lora-tiny.toml"}
 """study -> tiny base recipe, if it is not tiny.toml."""
 
-SMALL_STUDIES = [path for path in STUDIES if not path.stem.startswith("large-")]
-"""The studies that need no rendered set. runs/paper.sh --tiny runs those of the large model."""
+SMALL_STUDIES = [path for path in STUDIES if not path.stem.startswith("lora-")]
+"""The studies that need no rendered set. runs/paper.sh --tiny runs those of the diffusion model."""
 
 
 def test_every_ablation_of_the_paper_has_a_study():
-    assert names(STUDIES) == ["large-mixing", "large-size", "mixing", "orders", "pairs", "prompt", "size"]
+    assert names(STUDIES) == [
+        "blend-space",
+        "lora-blend-space",
+        "lora-size",
+        "orders",
+        "pairs",
+        "prompt",
+        "size",
+    ]
 
 
 @pytest.mark.parametrize("path", STUDIES, ids=names(STUDIES))
@@ -57,11 +65,11 @@ def test_a_study_changes_one_value_of_both_the_full_and_the_tiny_recipe(path):
 
 
 def test_the_training_sizes_are_those_of_the_paper():
-    for name in ("size", "large-size"):
+    for name in ("size", "lora-size"):
         assert read_study(RECIPES / f"{name}.toml").values == [0, 10, 50, 100, 300, 1000]
 
 
-@pytest.mark.parametrize("name", ["large-mixing", "large-size", "prompt"])
+@pytest.mark.parametrize("name", ["lora-blend-space", "lora-size", "prompt"])
 def test_every_ablation_of_the_large_model_has_a_tiny_variant(name):
     full, tiny = (read_study(RECIPES / f"{stem}.toml") for stem in (name, f"{name}-tiny"))
     assert tiny.key == full.key
@@ -123,7 +131,7 @@ def test_values_are_compared_with_the_first_and_numbers_are_plotted(
     labels = [f"count {count}" for count in (0, 10, 50, 100, 300, 1000)]
     assert list(results["methods"]) == ["input (unprocessed)", *labels]
     assert [values[0] for values in calls] == labels
-    compared = {(row["method"], row["than"]) for row in results["differences"]["real20"]}
+    compared = {(row["method"], row["reference"]) for row in results["differences"]["real20"]}
     assert ("count 300", "count 0") in compared
     plot = np.asarray(Image.open(io.BytesIO((tmp_path / "out" / "plot.png").read_bytes())).convert("L"))
     assert plot.shape[1] > plot.shape[0] > 300
@@ -146,14 +154,14 @@ def test_missing_weights_of_a_metric_are_reported_before_training(pairs, data, t
 
 def test_values_that_are_not_numbers_are_not_plotted(without_training, pairs, data, tmp_path, monkeypatch):
     monkeypatch.setenv("BREWSTER_DATA", str(data))
-    ablate(read_study(RECIPES / "mixing.toml"), pairs, tmp_path / "out")
+    ablate(read_study(RECIPES / "blend-space.toml"), pairs, tmp_path / "out")
     assert not (tmp_path / "out" / "plot.png").exists()
-    assert (tmp_path / "out" / "mixing-8-bit" / "model.onnx").is_file()
+    assert (tmp_path / "out" / "blend_space-srgb" / "model.onnx").is_file()
 
 
 def test_prompts_are_compared_on_a_backbone_without_training(pairs, data, tmp_path, monkeypatch):
     monkeypatch.setenv("BREWSTER_DATA", str(data))
-    study = read_study(RECIPES / "prompt.toml").model_copy(update={"base": RECIPES / "backbone-tiny.toml"})
+    study = read_study(RECIPES / "prompt.toml").model_copy(update={"base": RECIPES / "no-lora-tiny.toml"})
     results = ablate(study, pairs, tmp_path / "out")
     assert list(results["methods"]) == [
         "input (unprocessed)", "prompt none", "prompt generic", "prompt detailed",

@@ -1,4 +1,4 @@
-"""The table of large backbones: loading of tiny versions from folders, and all errors for damaged or wrong folders."""
+"""The table of diffusion backbones: loading of tiny versions from folders, and all errors for damaged or wrong folders."""
 
 import gc
 import importlib.util
@@ -14,10 +14,11 @@ import transformers
 from tokenizers.pre_tokenizers import ByteLevel
 
 from brewster.errors import DeviceError, DownloadError, ModelError
-from brewster.models.diffusion import backbones, lazy_imports
+from brewster.models.diffusion import lazy_imports
 from brewster.models.diffusion.adapter.lora import add_lora
-from brewster.models.diffusion.backbones import BACKBONES, build, encode_prompt, load_backbone, tiny
-from brewster.models.diffusion.memory import check_machine, choose_quantisation
+from brewster.models.diffusion.backbones import registry
+from brewster.models.diffusion.backbones.registry import BACKBONES, build, encode_prompt, load_backbone, tiny
+from brewster.models.diffusion.memory import check_machine, choose_quantization
 from brewster.models.diffusion.prompt import PROMPT
 
 
@@ -73,7 +74,7 @@ def test_full_size_architectures_need_no_memory_on_the_meta_device(name, billion
     backbone = build(name, device="meta", dtype=torch.bfloat16)
     parameters = sum(parameter.numel() for parameter in backbone.transformer.parameters())
     assert parameters / 1e9 == pytest.approx(billions, abs=0.005)
-    assert parameters == pytest.approx(backbone.parameters, rel=1e-3)
+    assert parameters == pytest.approx(backbone.parameter_count, rel=1e-3)
     assert len(backbone.lora_targets()) == targets
     assert backbone.dtype == torch.bfloat16
 
@@ -109,24 +110,24 @@ def test_a_panel_encoded_separately_differs_from_that_panel_of_the_composite():
     )
 
 
-@pytest.mark.parametrize("quantise", ["int8", "float8"])
-def test_a_quantised_base_predicts_nearly_the_same_and_trains_a_lora(tiny_folders, quantise):
+@pytest.mark.parametrize("quantization", ["int8", "float8"])
+def test_a_quantized_base_predicts_nearly_the_same_and_trains_a_lora(tiny_folders, quantization):
     plain, prompt = tiny("kontext", seed=1)
-    quantised = load_backbone(str(tiny_folders / "kontext"), quantise=quantise, dtype=torch.bfloat16)
-    weight = quantised.transformer.transformer_blocks[0].attn.to_q.weight
+    quantized = load_backbone(str(tiny_folders / "kontext"), quantization=quantization, dtype=torch.bfloat16)
+    weight = quantized.transformer.transformer_blocks[0].attn.to_q.weight
     assert type(weight) not in {torch.Tensor, torch.nn.Parameter}
     expected = velocity(plain, prompt)
-    assert (velocity(quantised, prompt) - expected).std() < 0.2 * expected.std()
-    parameters = add_lora(quantised, rank=2)
-    velocity(quantised, prompt).square().mean().backward()
+    assert (velocity(quantized, prompt) - expected).std() < 0.2 * expected.std()
+    parameters = add_lora(quantized, rank=2)
+    velocity(quantized, prompt).square().mean().backward()
     assert any(parameter.grad.abs().max() > 0 for parameter in parameters)
     assert {parameter.dtype for parameter in parameters} == {torch.float32}
 
 
-def test_a_base_that_was_silently_left_unquantised_is_refused(tiny_folders, monkeypatch):
-    monkeypatch.setattr(backbones, "_device_map", lambda device: {"device_map": {"": device}})
+def test_a_base_that_was_silently_left_unquantized_is_refused(tiny_folders, monkeypatch):
+    monkeypatch.setattr(registry, "_device_map", lambda device: {"device_map": {"": device}})
     with pytest.raises(ModelError, match=r"loaded as torch\.bfloat16; expected weights stored as int8"):
-        load_backbone(str(tiny_folders / "kontext"), quantise="int8", dtype=torch.bfloat16)
+        load_backbone(str(tiny_folders / "kontext"), quantization="int8", dtype=torch.bfloat16)
 
 
 @pytest.mark.parametrize("name", list(BACKBONES))
@@ -141,18 +142,18 @@ def test_a_base_computes_in_the_dtype_in_which_it_was_loaded(tiny_folders, name)
 
 def test_nf4_needs_an_nvidia_gpu():
     with pytest.raises(
-        DeviceError, match='nf4 does not run on cpu; expected an NVIDIA GPU; use quantise="int8"'
+        DeviceError, match='nf4 does not run on cpu; expected an NVIDIA GPU; use quantization="int8"'
     ):
-        load_backbone("kontext", quantise="nf4")
+        load_backbone("kontext", quantization="nf4")
 
 
 def test_unknown_names_get_suggestions():
     with pytest.raises(ModelError, match="did you mean kontext"):
         tiny("kontxt")
     with pytest.raises(
-        ModelError, match="there is no quantisation 'int2'; expected one of int8, float8, nf4"
+        ModelError, match="there is no quantization 'int2'; expected one of int8, float8, nf4"
     ):
-        load_backbone("kontext", quantise="int2")
+        load_backbone("kontext", quantization="int2")
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="this machine has a GPU")
@@ -258,19 +259,19 @@ def test_a_large_base_needs_a_gpu_unless_the_cpu_is_chosen(machine, tiny_folders
         check_machine(small, requested="auto", device="cpu")
 
 
-def test_the_quantisation_is_chosen_by_the_memory_of_the_gpu(machine, monkeypatch):
+def test_the_quantization_is_chosen_by_the_memory_of_the_gpu(machine, monkeypatch):
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: object())
     chosen = {}
     for machine["memory"] in (40, 24, 16, 12, 8):
-        chosen[machine["memory"]] = choose_quantisation("kontext", "cuda")
+        chosen[machine["memory"]] = choose_quantization("kontext", "cuda")
     assert chosen == {40: None, 24: "int8", 16: "int8", 12: "nf4", 8: None}
     machine["memory"] = 24
-    assert choose_quantisation("kontext", "cuda", "float8") == "float8"
-    assert choose_quantisation("klein", "cuda") is None
-    assert choose_quantisation("kontext", "cpu", "int8") is None
+    assert choose_quantization("kontext", "cuda", "float8") == "float8"
+    assert choose_quantization("klein", "cuda") is None
+    assert choose_quantization("kontext", "cpu", "int8") is None
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
     machine["memory"] = 12
-    assert choose_quantisation("kontext", "cuda") is None
+    assert choose_quantization("kontext", "cuda") is None
 
 
 def test_memory_and_disk_are_checked_before_the_download(machine):
@@ -278,13 +279,15 @@ def test_memory_and_disk_are_checked_before_the_download(machine):
     with pytest.raises(DeviceError, match=r"kontext needs about 46\.\d GiB of memory on cpu, and 40\.0"):
         check_machine("kontext", requested="cpu", device="cpu")
     machine["memory"] = 16
-    with pytest.raises(DeviceError, match=r"about 25\.\d GiB of memory on cuda.*; choose quantise int8"):
+    with pytest.raises(DeviceError, match=r"about 25\.\d GiB of memory on cuda.*; choose quantization int8"):
         check_machine("kontext", requested="auto", device="cuda")
-    check_machine("kontext", requested="auto", device="cuda", quantise="int8")
+    check_machine("kontext", requested="auto", device="cuda", quantization="int8")
     machine["disk"] = 30
-    check_machine("kontext", requested="auto", device="cuda", quantise="int8")
+    check_machine("kontext", requested="auto", device="cuda", quantization="int8")
     with pytest.raises(DownloadError, match=r"Kontext-dev needs about 34 GB on the disk, .* 32 GB free"):
-        check_machine("kontext", requested="auto", device="cuda", quantise="int8", with_text_encoders=True)
+        check_machine(
+            "kontext", requested="auto", device="cuda", quantization="int8", with_text_encoders=True
+        )
 
 
 def test_the_offline_error_of_huggingface_hub_is_explained(tmp_path, monkeypatch):
@@ -382,6 +385,6 @@ def test_out_of_memory_while_loading_says_what_to_reduce(folder, monkeypatch):
     def raise_error(*_, **__):
         raise torch.OutOfMemoryError("CUDA out of memory.")
 
-    monkeypatch.setattr(backbones, "_load_part", raise_error)
-    with pytest.raises(DeviceError, match='use quantise="int8", a smaller backbone'):
+    monkeypatch.setattr(registry, "_load_part", raise_error)
+    with pytest.raises(DeviceError, match='use quantization="int8", a smaller backbone'):
         load_backbone(str(folder))

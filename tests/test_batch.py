@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from brewster import Photo, Separator
-from brewster.errors import ModelError, PhotoError, TargetError
+from brewster.errors import ModelError, OutputError, PhotoError
 from brewster.inference import SeparationTask, plan_files, separate_files, separate_tasks
 from brewster.options import Options
 from cli_helpers import LAYERS, image_bytes, layer_files, list_files
@@ -38,7 +38,7 @@ def test_a_folder_is_mirrored_and_a_damaged_photo_does_not_stop_the_batch(photo_
         layer_files("a") + [f"c/{name}" for name in layer_files("d")]
     )
     first = batch_results[0]
-    assert (first.model, first.sha256, first.device) == ("pane", "0" * 64, "cpu")
+    assert (first.model, first.model_sha256, first.device) == ("pane", "0" * 64, "cpu")
     assert first.outputs == {layer: str(tmp_path / f"out/a.{layer}.jpg") for layer in LAYERS}
     assert set(first.seconds) == {"decode", "network", "detail", "encode"}
     assert first.residual == pytest.approx(0, abs=0.01)
@@ -99,7 +99,7 @@ def test_names_and_sources_are_checked_before_the_first_photo_is_separated(tmp_p
         (tmp_path / name).mkdir()
     for name in ("x", "y"):
         (tmp_path / name / "a.jpg").write_bytes(image_bytes())
-    with pytest.raises(TargetError, match="would both be written"):
+    with pytest.raises(OutputError, match="would both be written"):
         separate_files([tmp_path / "x/a.jpg", tmp_path / "y/a.jpg"], tmp_path / "out")
     with pytest.raises(PhotoError, match="there is no photo in"):
         plan_files(tmp_path / "empty")

@@ -355,7 +355,15 @@ def test_json_has_the_result_of_each_photo(run, tmp_path, model):
     separated, failed = json_lines(out)
     assert code == 1
     assert len(err.splitlines()) == 1
-    model_keys = {"model", "sha256", "device", "seconds", "residual", "reconstruction_error", "assessment"}
+    model_keys = {
+        "model",
+        "model_sha256",
+        "device",
+        "seconds",
+        "residual",
+        "reconstruction_error",
+        "assessment",
+    }
     model_keys |= {"reflection_is_derived"}
     keys = {"source", "status", "outputs", "error", "photo_sha256"} | model_keys
     assert keys == set(separated) == set(failed)
@@ -366,7 +374,7 @@ def test_json_has_the_result_of_each_photo(run, tmp_path, model):
         "pane",
         None,
     )
-    assert len(separated["sha256"]) == 64
+    assert len(separated["model_sha256"]) == 64
     assert separated["device"]
     assert set(separated["seconds"]) == {"decode", "network", "detail", "encode"}
     assert separated["residual"] == pytest.approx(0, abs=0.01)

@@ -76,7 +76,7 @@ def test_photos_without_ground_truth_are_listed_and_the_others_are_scored(
     paint(tmp_path / "pairs" / "transmission" / "5.png", 5)
     code, out, err = run_without_model("evaluate", "--benchmark", benchmark, "--json", *QUICK_OPTIONS)
     assert code == 1
-    assert len(json.loads(out)["pictures"]) == 3
+    assert len(json.loads(out)["cases"]) == 3
     messages = error_lines(err)
     assert any("4.png" in line for line in messages)
     assert any("blended/5:" in line and "resized by the factor 0.5" in line for line in messages)
@@ -140,7 +140,7 @@ def test_several_thresholds_and_a_smaller_size_are_evaluated(run_without_model, 
     results = json.loads(out)
     assert code == 0
     assert list(results["metrics"]) == ["psnr", "psnr_region@0.01", "psnr_region@0.03"]
-    assert {(row["width"], row["height"]) for row in results["pictures"]} == {(18, 12)}
+    assert {(row["width"], row["height"]) for row in results["cases"]} == {(18, 12)}
 
 
 def test_scores_of_the_development_pairs_equal_those_of_scikit_image(run_without_model, data, tmp_path):

@@ -10,7 +10,7 @@ import pytest
 from brewster import Photo, Separator
 from brewster.cli.extras import CORE, EXTRAS
 from brewster.models import zoo
-from brewster.models.large_models import LARGE
+from brewster.models.diffusion_models import DIFFUSION_MODELS
 from cli_helpers import image_bytes
 
 ROOT = Path(__file__).parents[1]
@@ -33,12 +33,12 @@ def test_models_are_listed_with_licence_and_damage(run_without_model, model_zoo)
     code, out, _ = run_without_model("models", "list")
     assert code == 0
     lines = [line for line in out.decode().splitlines() if not line.startswith(" ")]
-    assert [line.split()[0] for line in lines] == ["compact", "research", *LARGE]
+    assert [line.split()[0] for line in lines] == ["compact", "research", *DIFFUSION_MODELS]
     assert b"damaged" in out
     rows = json.loads(run_without_model("models", "list", "--json")[1])
     assert rows[0]["licence"] == "Apache-2.0"
     assert rows[1]["error"]
-    assert [row["name"] for row in rows[2:]] == list(LARGE)
+    assert [row["name"] for row in rows[2:]] == list(DIFFUSION_MODELS)
 
 
 def test_large_models_are_listed_with_size_memory_licence_and_access(run_without_model, model_zoo):

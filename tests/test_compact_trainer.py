@@ -118,8 +118,8 @@ def test_a_run_starts_from_the_mean_of_the_ema_weights_of_its_checkpoints(recipe
     for path, value in zip(starts, (1.0, 3.0), strict=True):
         same = {name: torch.full_like(weights, value) for name, weights in given.state["average"].items()}
         replace(given, state=given.state | {"average": same}).write(path)
-    for start_from, mean in ((starts[:1], 1), (starts, 2)):
-        trainer = CompactTrainer(recipe.model_copy(update={"start_from": start_from}))
+    for init_checkpoints, mean in ((starts[:1], 1), (starts, 2)):
+        trainer = CompactTrainer(recipe.model_copy(update={"init_checkpoints": init_checkpoints}))
         trainer.initialize()
         assert all((value == mean).all() for value in trainer.network.state_dict().values())
         assert all((value == mean).all() for value in trainer.ema_weights.values())

@@ -57,20 +57,22 @@ def test_the_encoder_has_its_own_learning_rate(make_trainer):
 
 
 @pytest.mark.parametrize(
-    ("step", "decay_share", "share"),
+    ("step", "learning_rate_decay_share", "share"),
     [(0, 1.0, 1), (50, 1.0, 0.5), (75, 1.0, 0.1464), (50, 0.5, 1), (75, 0.5, 0.5), (99, 0.5, 0.00099)],
 )
 def test_the_learning_rate_falls_along_a_cosine_over_the_last_share_of_the_run(
-    make_trainer, step, decay_share, share
+    make_trainer, step, learning_rate_decay_share, share
 ):
-    trainer = make_trainer(learning_rate=1e-3, encoder_learning_rate=1e-4, decay_share=decay_share)
+    trainer = make_trainer(
+        learning_rate=1e-3, encoder_learning_rate=1e-4, learning_rate_decay_share=learning_rate_decay_share
+    )
     trainer.training_step(step)
     rates = [group["lr"] for group in trainer.optimizer.param_groups]
     assert rates == pytest.approx([1e-4 * share, 1e-3 * share], rel=0.01)
 
 
 def test_the_learning_rate_rises_linearly_during_warm_up(make_trainer):
-    trainer = make_trainer(learning_rate=1e-3, warmup_steps=4, decay_share=0.0)
+    trainer = make_trainer(learning_rate=1e-3, warmup_steps=4, learning_rate_decay_share=0.0)
     rates = []
     for step in range(5):
         trainer.training_step(step)
@@ -94,7 +96,9 @@ def test_a_large_gradient_is_clipped_to_norm_one(make_trainer):
 @pytest.mark.parametrize(("step", "decay"), [(0, 2 / 11), (99, 0.75)])
 def test_the_moving_average_has_the_decay_of_the_recipe_and_a_smaller_one_at_first(make_trainer, step, decay):
     """After n steps the decay is (n + 1) / (n + 10), at most `ema_decay`."""
-    trainer = make_trainer(ema_decay=0.75, decay_share=0.0, learning_rate=0.1, encoder_learning_rate=0.1)
+    trainer = make_trainer(
+        ema_decay=0.75, learning_rate_decay_share=0.0, learning_rate=0.1, encoder_learning_rate=0.1
+    )
     before = {name: value.clone() for name, value in trainer.ema_weights.items()}
     trainer.training_step(step)
     for name, new in copy_parameters(trainer.network).items():
@@ -118,19 +122,19 @@ def test_the_loss_is_the_sum_of_its_parts(make_trainer):
     )
 
 
-# --- a LoRA on a large backbone
+# --- a LoRA on a diffusion backbone
 
 
 @pytest.fixture
 def make_lora_trainer(tmp_path):
-    """Returns a function that makes a LoRA trainer on the toy twin of kontext."""
+    """Returns a function that makes a LoRA trainer on the tiny version of kontext."""
     render_set(tmp_path / "tiny", count=1)
 
     def build(**changes):
         values = {
-            "backbone": "tiny:kontext", "rank": 2, "alpha": 2, "budget_px": 3 * 32 * 16, "seed": 1, "steps": 6,
+            "backbone": "tiny:kontext", "rank": 2, "alpha": 2, "max_composite_pixels": 3 * 32 * 16, "seed": 1, "steps": 6,
             "batch_size": 1, "learning_rate": 1e-3, "warmup_steps": 4, "weight_decay": 0.0, "report_every": 6,
-            "checkpoint_every": 6, "data": {"rendered": {"sets": [tmp_path / "tiny"], "target": "transmission"}},
+            "checkpoint_every": 6, "data": {"rendered": {"datasets": [tmp_path / "tiny"], "target": "transmission"}},
         }  # fmt: skip
         trainer = LoraTrainer(LoraRecipe.model_validate(values | changes))
         trainer.initialize()
@@ -141,7 +145,7 @@ def make_lora_trainer(tmp_path):
 
 def logits(trainer, count=150):
     """Returns the logits of the training times, log(t / (1 - t))."""
-    encoded = trainer._latents(SampleRng(1, 0, 0))
+    encoded = trainer._encoded_samples(SampleRng(1, 0, 0))
     times = [trainer._start_and_sigma(SampleRng(2, number, 0), encoded)[1] for number in range(count)]
     return torch.cat(times).double().logit()
 
@@ -173,7 +177,7 @@ def test_a_loras_large_gradient_is_clipped_and_its_learning_rate_warms_up(make_l
 def test_the_exact_velocity_has_no_loss(make_lora_trainer, monkeypatch):
     """At time t, a sample is (1 - t) composite + t noise. Its velocity is noise - composite."""
     trainer = make_lora_trainer()
-    composite = trainer._latents(SampleRng(1, 0, 0)).composite
+    composite = trainer._encoded_samples(SampleRng(1, 0, 0)).composite
 
     def exact(latents, condition, sigma, prompt, guidance):
         return (latents - composite) / sigma
@@ -186,11 +190,11 @@ def test_the_exact_velocity_has_no_loss(make_lora_trainer, monkeypatch):
 
 def test_the_loss_of_a_reflection_is_scaled_by_its_weight(make_lora_trainer, monkeypatch):
     trainer = make_lora_trainer()
-    encoded = trainer._latents(SampleRng(1, 0, 0))
+    encoded = trainer._encoded_samples(SampleRng(1, 0, 0))
     parts = []
     for weight in (1.0, 0.25):
         monkeypatch.setattr(
-            trainer, "_latents", lambda rng, weight=weight: replace(encoded, reflection_weight=weight)
+            trainer, "_encoded_samples", lambda rng, weight=weight: replace(encoded, reflection_weight=weight)
         )
         parts.append({name: part.item() for name, part in trainer._losses(SampleRng(1, 0, 0)).items()})
     whole, quarter = parts

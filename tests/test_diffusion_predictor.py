@@ -14,23 +14,23 @@ from brewster.errors import DeviceError, DownloadError, ModelError, PhotoError
 from brewster.inference.assessment import RECONSTRUCTION_ERROR_LIMIT
 from brewster.inference.diffusion_predictor import DiffusionPredictor
 from brewster.models.diffusion.adapter.lora import LORA_FILE, add_lora, lora_parameters, save_lora
-from brewster.models.diffusion.backbones import TINY_PREFIX, tiny
+from brewster.models.diffusion.backbones.registry import TINY_PREFIX, tiny
 from brewster.models.diffusion.panels import PanelLayout
 from brewster.models.diffusion.pipeline import fingerprint, load_pipeline
 from brewster.models.diffusion.task import DecompositionTask
 from brewster.models.diffusion.tensors import read_tensors, write_tensors
 from brewster.srgb import to_encoded, to_linear
 
-SMALL_BUDGET_PX = 3 * 48 * 32
+SMALL_COMPOSITE_PIXELS = 3 * 48 * 32
 
 
 class FakePipeline:
     """A pipeline with T = 0.7 I and R = 0.3 I. It adds the constant `tint` to all encoded panels."""
 
-    backbone = SimpleNamespace(multiple=16)
+    backbone = SimpleNamespace(size_divisor=16)
 
-    def __init__(self, tint=0.0, panels=("I", "T", "R"), budget_px=3 * 96 * 96):
-        self.task = DecompositionTask(PanelLayout(panels), budget_px)
+    def __init__(self, tint=0.0, panels=("I", "T", "R"), max_composite_pixels=3 * 96 * 96):
+        self.task = DecompositionTask(PanelLayout(panels), max_composite_pixels)
         self.tint, self.calls = tint, []
 
     def __call__(self, photo, *, steps, seeds, on_progress):
@@ -69,7 +69,11 @@ def lora(tmp_path_factory):
         for parameter in lora_parameters(backbone):
             parameter.normal_(0, 0.1, generator=torch.Generator().manual_seed(3))
     save_lora(
-        folder, backbone, prompt, DecompositionTask(budget_px=SMALL_BUDGET_PX), base=f"{TINY_PREFIX}kontext"
+        folder,
+        backbone,
+        prompt,
+        DecompositionTask(max_composite_pixels=SMALL_COMPOSITE_PIXELS),
+        base_model=f"{TINY_PREFIX}kontext",
     )
     return folder
 
@@ -113,7 +117,7 @@ def test_the_detail_of_the_photo_is_kept_unless_plain_is_set():
     fine[::2] *= 1.1  # lines of one pixel, which a panel of 96 px cannot resolve
     photo = Photo.from_array(fine, encoding="linear")
     guided, plain = (
-        Separator(DiffusionPredictor(FakePipeline(), plain=plain))(photo).transmission.linear()
+        Separator(DiffusionPredictor(FakePipeline(), no_guided_upsampling=plain))(photo).transmission.linear()
         for plain in (False, True)
     )
     contrast = [np.abs(np.diff(layer[100:-100], axis=0)).mean() / np.abs(np.diff(fine[100:-100], axis=0)).mean()
@@ -126,7 +130,7 @@ def test_drafts_take_few_steps_and_best_uses_tiles():
     calls = {}
     for quality in ("draft", "standard", "best"):
         pipeline = FakePipeline()
-        Separator(DiffusionPredictor(pipeline, average=2))(smooth_photo(400, 300), quality=quality)
+        Separator(DiffusionPredictor(pipeline, ensemble_size=2))(smooth_photo(400, 300), quality=quality)
         calls[quality] = pipeline.calls
     assert calls["draft"] == [((80, 112), 4, 2)]
     assert calls["standard"] == [((80, 112), 20, 2)]
@@ -137,7 +141,9 @@ def test_drafts_take_few_steps_and_best_uses_tiles():
 
 @pytest.mark.parametrize(("width", "height"), [(16, 16), (17, 40), (30, 20), (90, 21), (171, 16), (1000, 60)])
 def test_photos_of_any_shape_keep_their_size(width, height):
-    result = Separator(DiffusionPredictor(FakePipeline(budget_px=3 * 128 * 128)))(smooth_photo(width, height))
+    result = Separator(DiffusionPredictor(FakePipeline(max_composite_pixels=3 * 128 * 128)))(
+        smooth_photo(width, height)
+    )
     assert result.transmission.size == result.reflection.size == (width, height)
     np.testing.assert_allclose(result.transmission.linear(), 0.7 * result.photo.linear(), atol=0.02)
 
@@ -151,7 +157,7 @@ def test_a_photo_that_is_smaller_than_a_token_is_refused_with_the_smallest_size(
 
 def test_without_a_reflection_panel_the_reflection_is_what_was_removed():
     photo = smooth_photo(100, 80)
-    result = Separator(DiffusionPredictor(FakePipeline(panels=("T",), budget_px=96 * 96)))(photo)
+    result = Separator(DiffusionPredictor(FakePipeline(panels=("T",), max_composite_pixels=96 * 96)))(photo)
     np.testing.assert_allclose(result.reflection.linear(), 0.3 * photo.linear(), atol=0.02)
     assert result.reconstruction_error is None
     assert result.assessment.verdict != "doubtful"
@@ -187,7 +193,7 @@ def test_progress_rises_with_tiles_and_steps():
     assert len(progress) > 7 * 20
 
 
-@pytest.mark.parametrize("options", [{"steps": 0}, {"average": 0}])
+@pytest.mark.parametrize("options", [{"steps": 0}, {"ensemble_size": 0}])
 def test_zero_steps_and_zero_averages_are_refused(options):
     with pytest.raises(ModelError, match="expected both to be at least 1"):
         DiffusionPredictor(FakePipeline(), **options)
@@ -215,10 +221,12 @@ def test_a_backbone_without_a_lora_generates_the_transmission_only():
 
 
 def test_the_base_and_the_device_of_a_lora_are_checked(lora, tmp_path):
-    with pytest.raises(ModelError, match="is a LoRA of kontext; expected a base of kontext, not of klein"):
-        load_pipeline(str(lora), base="tiny:klein")
-    with pytest.raises(ModelError, match="is a backbone, and the base tiny:kontext was given"):
-        load_pipeline("tiny:klein", base="tiny:kontext")
+    with pytest.raises(
+        ModelError, match="is a LoRA of kontext; expected a base model of kontext, not of klein"
+    ):
+        load_pipeline(str(lora), base_model="tiny:klein")
+    with pytest.raises(ModelError, match="is a backbone, and the base model tiny:kontext was given"):
+        load_pipeline("tiny:klein", base_model="tiny:kontext")
     with pytest.raises(DeviceError, match="do not run on coreml; expected one of auto, cuda, rocm, cpu"):
         load_pipeline(str(lora), device="coreml")
     with pytest.raises(ModelError, match=f"contains no model; expected a LoRA .{LORA_FILE}"):
@@ -233,12 +241,12 @@ def test_the_base_and_the_device_of_a_lora_are_checked(lora, tmp_path):
     [
         ({"rank": "4"}, "metadata of the LoRA cannot be read"),
         ({"alpha": 0}, "metadata of the LoRA cannot be read"),
-        ({"base": None}, "metadata of the LoRA cannot be read"),
-        ({"quantise": "int3"}, "metadata of the LoRA cannot be read"),
+        ({"base_model": None}, "metadata of the LoRA cannot be read"),
+        ({"quantization": "int3"}, "metadata of the LoRA cannot be read"),
         ({"prompt_sha256": None}, "metadata of the LoRA cannot be read"),
         ({"more": 1}, "has the unknown key more; .*; update brewster"),
         ({"task": {"objective": "two"}}, "metadata of the LoRA cannot be read"),
-        ({"task": {"budget_px": "18432"}}, "metadata of the LoRA cannot be read"),
+        ({"task": {"max_composite_pixels": "18432"}}, "metadata of the LoRA cannot be read"),
         ({"task": {"layout": {"panels": ["I", "R"], "direction": "stacked"}}}, "expected a list with T"),
         ({"task": {"layout": {"panels": ["T", "T"], "direction": "stacked"}}}, "each once"),
     ],
@@ -255,10 +263,13 @@ def test_a_damaged_card_is_a_model_error(lora, tmp_path, change, message):
 def test_another_base_has_another_digest(lora, tmp_path):
     for seed in (0, 1):
         tiny("kontext", seed)[0].save(tmp_path / str(seed))
-    digests = [fingerprint(str(lora)), *(fingerprint(str(lora), base=str(tmp_path / name)) for name in "01")]
+    digests = [
+        fingerprint(str(lora)),
+        *(fingerprint(str(lora), base_model=str(tmp_path / name)) for name in "01"),
+    ]
     assert len(set(digests)) == 3
     assert fingerprint(str(tmp_path / "0")) != fingerprint(str(tmp_path / "1"))
-    assert Separator.load(str(lora), base=str(tmp_path / "1")).sha256 == digests[2]
+    assert Separator.load(str(lora), base_model=str(tmp_path / "1")).sha256 == digests[2]
 
 
 @pytest.mark.parametrize("folder", ["compact", "kontext", "models"])
@@ -277,26 +288,28 @@ def test_the_path_of_a_base_that_has_moved_can_be_given(tmp_path):
         tmp_path / "lora",
         backbone,
         prompt,
-        DecompositionTask(budget_px=SMALL_BUDGET_PX),
-        base="/gone/kontext",
+        DecompositionTask(max_composite_pixels=SMALL_COMPOSITE_PIXELS),
+        base_model="/gone/kontext",
     )
-    with pytest.raises(ModelError, match=r"the base of .* was /gone/kontext, which does not exist.*--base"):
+    with pytest.raises(
+        ModelError, match=r"the base model of .* was /gone/kontext, which does not exist.*--base-model"
+    ):
         Separator.load(str(tmp_path / "lora"))
-    assert Separator.load(str(tmp_path / "lora"), base="tiny:kontext").name == "lora"
+    assert Separator.load(str(tmp_path / "lora"), base_model="tiny:kontext").name == "lora"
 
 
 def test_a_one_step_model_refuses_steps_and_averages():
     one_step = FakePipeline()
-    one_step.task = DecompositionTask(PanelLayout(), SMALL_BUDGET_PX, "one_step", 1.0)
+    one_step.task = DecompositionTask(PanelLayout(), SMALL_COMPOSITE_PIXELS, "one_step", 1.0)
     with pytest.raises(ModelError, match="one-step model"):
         DiffusionPredictor(one_step, steps=4)
     with pytest.raises(ModelError, match="one-step model"):
-        DiffusionPredictor(one_step, average=2)
+        DiffusionPredictor(one_step, ensemble_size=2)
 
 
 def test_options_of_diffusion_models_are_refused_for_other_models():
-    with pytest.raises(ModelError, match="steps, plain was set for the model compact"):
-        Separator.load("compact", steps=3, plain=True)
+    with pytest.raises(ModelError, match="steps, no_guided_upsampling was set for the model compact"):
+        Separator.load("compact", steps=3, no_guided_upsampling=True)
 
 
 def test_a_lora_is_opened_by_its_name_on_the_hub_from_the_cache(lora, tmp_path, monkeypatch):

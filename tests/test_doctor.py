@@ -1,4 +1,4 @@
-"""`brewster doctor`: the checks for large models."""
+"""`brewster doctor`: the checks for diffusion models."""
 
 import huggingface_hub
 

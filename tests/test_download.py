@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from brewster.download import Downloader, RemoteFile, file_digest
-from brewster.errors import DownloadError, TargetError
+from brewster.errors import DownloadError, OutputError
 from file_server import loopback_only, served, unused_address
 
 BODY = hashlib.sha256(b"light").digest() * 10_000
@@ -110,14 +110,14 @@ def test_only_http_urls_are_opened(downloader, url, delays):
 
 def test_a_folder_that_cannot_be_created_is_an_error(downloader, remote, tmp_path):
     (tmp_path / "file").write_bytes(b"")
-    with pytest.raises(TargetError, match="a writable folder"):
+    with pytest.raises(OutputError, match="a writable folder"):
         downloader.fetch(remote, tmp_path / "file" / "map")
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="only Linux has /dev/full")
 def test_a_full_disk_is_an_error(downloader, remote, tmp_path):
     (tmp_path / "map.part").symlink_to("/dev/full")
-    with pytest.raises(TargetError, match=r"No space left .* free some space"):
+    with pytest.raises(OutputError, match=r"No space left .* free some space"):
         downloader.fetch(remote, tmp_path / "map")
 
 

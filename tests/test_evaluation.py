@@ -70,7 +70,7 @@ def test_two_runs_and_two_workers_write_the_same_bytes(real20, methods, tmp_path
 
 def test_the_report_shows_the_cases_with_the_worst_scores_of_the_first_model(real20, methods, tmp_path):
     results = evaluate(real20, methods, QUICK, tmp_path / "out", max_report_cases=1)
-    scores = {picture["name"]: picture["scores"]["pane"]["psnr"] for picture in results["pictures"]}
+    scores = {picture["name"]: picture["scores"]["pane"]["psnr"] for picture in results["cases"]}
     page = (tmp_path / "out" / "report.html").read_text()
     assert page.count("<article") == 1
     assert f'data-name="{min(scores, key=scores.get)}"' in page
@@ -104,7 +104,7 @@ def test_a_photo_without_reflection_gives_no_remark_about_copied_ground_truth(tm
 def test_without_a_model_the_report_shows_the_worst_scores_of_the_baseline(real20, tmp_path):
     results = evaluate(real20, [IdentityBaseline()], QUICK, tmp_path / "out", max_report_cases=1)
     scores = {
-        picture["name"]: picture["scores"]["input (unprocessed)"]["psnr"] for picture in results["pictures"]
+        picture["name"]: picture["scores"]["input (unprocessed)"]["psnr"] for picture in results["cases"]
     }
     page = (tmp_path / "out" / "report.html").read_text()
     assert f'data-name="{min(scores, key=scores.get)}"' in page
@@ -134,7 +134,7 @@ def test_a_folder_with_the_ground_truth_gives_a_remark(real20, tmp_path):
 
 
 def test_downscaled_photos_are_written_for_methods_that_run_elsewhere(real20, tmp_path):
-    small = EvaluationConfig(metrics=("psnr",), size=8)
+    small = EvaluationConfig(metrics=("psnr",), short_side_px=8)
     evaluate(real20, [IdentityBaseline()], small, tmp_path / "out")
     inputs = tmp_path / "out" / "inputs"
     results = evaluate(
@@ -156,7 +156,7 @@ def test_equal_benchmark_names_and_benchmarks_without_cases_are_an_error(real20,
 def test_a_missing_prediction_is_reported_in_results_tables_and_report(real20, methods, tmp_path):
     (tmp_path / "theirs" / "2.png").unlink()
     results = evaluate(real20, methods, QUICK, tmp_path / "out")
-    assert "no prediction for real20/2" in results["pictures"][1]["errors"]["theirs"]
+    assert "no prediction for real20/2" in results["cases"][1]["errors"]["theirs"]
     assert "no prediction for real20/2" in (tmp_path / "out" / "tables.md").read_text()
     assert "no prediction for real20/2" in (tmp_path / "out" / "report.html").read_text()
 
@@ -205,7 +205,9 @@ def test_the_report_links_each_file_at_full_size(real20, methods, tmp_path):
 
 
 def test_resized_images_are_written_at_their_size_for_the_report(real20, tmp_path):
-    evaluate(real20, [IdentityBaseline()], EvaluationConfig(metrics=("psnr",), size=8), tmp_path / "out")
+    evaluate(
+        real20, [IdentityBaseline()], EvaluationConfig(metrics=("psnr",), short_side_px=8), tmp_path / "out"
+    )
     page = (tmp_path / "out" / "report.html").read_text()
     assert 'data-full="pictures/real20/1/photo.png"' in page
     assert Photo.open(tmp_path / "out" / "pictures" / "real20" / "1" / "photo.png").size == (12, 8)
@@ -229,7 +231,7 @@ def test_scores_csv_has_a_line_for_each_image_method_and_metric(real20, methods,
     rows = list(csv.DictReader((tmp_path / "out" / "scores.csv").read_text().splitlines()))
     assert len({(row["image"], row["method"], row["metric"]) for row in rows}) == len(rows) == 2 * 3 * 3
     (row,) = (row for row in rows if (row["image"], row["method"], row["metric"]) == ("2", "pane", "psnr"))
-    assert float(row["value"]) == results["pictures"][1]["scores"]["pane"]["psnr"]
+    assert float(row["value"]) == results["cases"][1]["scores"]["pane"]["psnr"]
 
 
 @pytest.fixture

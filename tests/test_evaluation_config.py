@@ -19,7 +19,7 @@ def test_an_unknown_metric_is_an_error_that_suggests_the_nearest():
         {"metrics": ("psnr", "psnr")},
         {"thresholds": ()},
         {"thresholds": (0.1, 1.5)},
-        {"size": 0},
+        {"short_side_px": 0},
     ],
 )
 def test_invalid_settings_are_an_error(settings):
@@ -37,7 +37,9 @@ def test_several_thresholds_give_a_column_each():
 
 def test_every_setting_is_described():
     description = " ".join(
-        EvaluationConfig(size=420, quality="best", thresholds=(0.05, 0.2), paper=True).describe()
+        EvaluationConfig(
+            short_side_px=420, quality="best", thresholds=(0.05, 0.2), paper_subset=True
+        ).describe()
     )
     for word in (
         "420 px",

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from platformdirs import macos, unix
 
 from brewster import files
-from brewster.errors import TargetError
+from brewster.errors import OutputError
 from brewster.files import SeparationPaths, cache_folder, find, write_atomically
 from brewster.image_formats import SUFFIXES
 
@@ -110,7 +110,7 @@ def test_an_image_given_twice_is_listed_once(tmp_path: Path) -> None:
 
 def test_images_of_two_folders_with_one_target_are_refused_before_any_work(tmp_path: Path) -> None:
     touch(tmp_path, "x/a.jpg", "y/a.jpg")
-    with pytest.raises(TargetError, match="would both be written"):
+    with pytest.raises(OutputError, match="would both be written"):
         find([tmp_path / "x/a.jpg", tmp_path / "y/a.jpg"], output_folder=tmp_path / "out")
 
 
@@ -146,7 +146,7 @@ def test_writing_creates_the_folder_and_leaves_only_the_file(tmp_path: Path) -> 
 def test_nothing_is_overwritten_by_default(tmp_path: Path) -> None:
     path = tmp_path / "a.png"
     path.write_bytes(b"old")
-    with pytest.raises(TargetError, match="overwrite"):
+    with pytest.raises(OutputError, match="overwrite"):
         write_atomically(path, b"new")
     assert path.read_bytes() == b"old"
     write_atomically(path, b"new", overwrite=True)
@@ -163,7 +163,7 @@ def test_a_file_that_appears_during_writing_is_not_replaced(
         fsync(descriptor)
 
     monkeypatch.setattr(os, "fsync", write_other_file)
-    with pytest.raises(TargetError, match="exists"):
+    with pytest.raises(OutputError, match="exists"):
         write_atomically(path, b"new")
     assert path.read_bytes() == b"other"
 
@@ -173,7 +173,7 @@ def test_the_source_is_never_the_target(tmp_path: Path) -> None:
     source.write_bytes(b"image")
     link.symlink_to(source)
     for target in (source, link):
-        with pytest.raises(TargetError, match="the input image itself"):
+        with pytest.raises(OutputError, match="the input image itself"):
             write_atomically(target, b"layer", overwrite=True, source=source)
     assert source.read_bytes() == b"image"
 
@@ -189,7 +189,7 @@ def test_a_full_or_failing_disk_is_an_error_and_leaves_nothing(
         raise OSError(code, os.strerror(code))
 
     monkeypatch.setattr(os, "fsync", fail)
-    with pytest.raises(TargetError, match=word):
+    with pytest.raises(OutputError, match=word):
         write_atomically(tmp_path / "a.png", b"layer")
     assert list(tmp_path.iterdir()) == []
 
@@ -210,7 +210,7 @@ def test_ctrl_c_leaves_the_old_file_and_no_partial_one(
 @pytest.mark.skipif(os.geteuid() == 0, reason="root may write anywhere")
 def test_a_read_only_folder_is_an_error(tmp_path: Path) -> None:
     tmp_path.chmod(0o500)
-    with pytest.raises(TargetError, match="writable"):
+    with pytest.raises(OutputError, match="writable"):
         write_atomically(tmp_path / "a.png", b"layer")
     tmp_path.chmod(0o700)
 
@@ -220,7 +220,7 @@ def test_a_read_only_target_is_kept_even_with_overwrite(
 ) -> None:
     (tmp_path / "a.png").write_bytes(b"old")
     monkeypatch.setattr(os, "access", lambda path, mode: False)  # root ignores the permission bits
-    with pytest.raises(TargetError, match="writable"):
+    with pytest.raises(OutputError, match="writable"):
         write_atomically(tmp_path / "a.png", b"new", overwrite=True)
     assert (tmp_path / "a.png").read_bytes() == b"old"
 
@@ -234,7 +234,7 @@ def test_files_are_written_on_file_systems_without_hard_links(
     monkeypatch.setattr(os, "link", refuse)
     write_atomically(tmp_path / "a.png", b"whole")
     assert [path.name for path in tmp_path.iterdir()] == ["a.png"]
-    with pytest.raises(TargetError, match="overwrite"):
+    with pytest.raises(OutputError, match="overwrite"):
         write_atomically(tmp_path / "a.png", b"new")
     assert (tmp_path / "a.png").read_bytes() == b"whole"
 
@@ -245,7 +245,7 @@ def test_files_are_written_on_file_systems_without_hard_links(
 def test_impossible_targets_are_errors(tmp_path: Path, target: str, word: str) -> None:
     (tmp_path / "folder").mkdir()
     (tmp_path / "file").write_bytes(b"")
-    with pytest.raises(TargetError, match=word):
+    with pytest.raises(OutputError, match=word):
         write_atomically(tmp_path / target, b"layer", overwrite=True)
 
 
@@ -292,8 +292,8 @@ def test_a_path_too_long_for_windows_is_named_as_such(
 
     monkeypatch.setattr(files, "_write_synced", refuse)
     monkeypatch.setattr(files, "sys", SimpleNamespace(platform="win32"))
-    with pytest.raises(TargetError, match=r"fewer than 260 characters.* enable long paths"):
+    with pytest.raises(OutputError, match=r"fewer than 260 characters.* enable long paths"):
         write_atomically(tmp_path / ("a" * 240) / "b.jpg", b"layer")
-    with pytest.raises(TargetError, match=r"b\.jpg was not written \(No such file") as raised:
+    with pytest.raises(OutputError, match=r"b\.jpg was not written \(No such file") as raised:
         write_atomically(tmp_path / "b.jpg", b"layer")
     assert "260" not in str(raised.value)

@@ -14,7 +14,7 @@ import pytest
 from pyarrow import parquet
 
 import brewster
-from brewster.errors import DeviceError, TargetError
+from brewster.errors import DeviceError, OutputError
 from brewster.executors import SerialExecutor
 from brewster.rendered import store
 from brewster.rendered.generation import job as job_module
@@ -147,7 +147,7 @@ def test_a_full_disk_ends_the_run_and_finished_samples_remain(four_samples, tmp_
         fsync(file)
 
     monkeypatch.setattr(os, "fsync", fail_after_25_calls)
-    with pytest.raises(TargetError, match=os.strerror(number)):
+    with pytest.raises(OutputError, match=os.strerror(number)):
         render_set(tmp_path / "set")
     finished = list(store.read_set(tmp_path / "set"))
     assert 0 < len(finished) < 4
@@ -171,7 +171,7 @@ def test_a_disk_that_is_full_when_a_shard_or_the_index_is_written_loses_nothing(
     shutil.copytree(four_samples, tmp_path / "set")
     monkeypatch.setattr(Path, "replace", raise_disk_full)
     for shards, name in ((True, "shard-000000.tar"), (False, "index.parquet")):
-        with pytest.raises(TargetError, match=name):
+        with pytest.raises(OutputError, match=name):
             render_set(tmp_path / "set", shards=shards)
     assert hashes(tmp_path / "set") == hashes(four_samples)
 
@@ -188,7 +188,7 @@ def test_another_job_in_the_same_folder_is_refused_and_the_difference_is_reporte
     four_samples, changes, message
 ):
     before = hashes(four_samples)
-    with pytest.raises(TargetError, match=message):
+    with pytest.raises(OutputError, match=message):
         render_set(four_samples, **changes)
     assert hashes(four_samples) == before
 
@@ -196,7 +196,7 @@ def test_another_job_in_the_same_folder_is_refused_and_the_difference_is_reporte
 def test_other_maps_are_another_job(four_samples):
     job = make_job(four_samples)
     smaller = job.catalog.model_copy(update={"maps": job.catalog.maps[1:]})
-    with pytest.raises(TargetError, match="its catalog is"):
+    with pytest.raises(OutputError, match="its catalog is"):
         job_module.build(
             job_module.RenderJob(**{**vars(job), "catalog": smaller}),
             range(4),
@@ -209,36 +209,36 @@ def test_a_set_grows_across_versions_until_its_samples_change(four_samples, tmp_
     monkeypatch.setattr(brewster, "__version__", "99")
     assert statuses(render_set(tmp_path / "set", count=5))[4] == "rendered"
     monkeypatch.setattr(store, "SAMPLE_FORMAT", 99)
-    with pytest.raises(TargetError, match="its format is 3, and 99 was requested"):
+    with pytest.raises(OutputError, match="its format is 3, and 99 was requested"):
         render_set(tmp_path / "set")
 
 
 def test_a_damaged_record_is_reported(four_samples, tmp_path):
     shutil.copytree(four_samples, tmp_path / "set")
     (tmp_path / "set" / "set.toml").write_text("not toml")
-    with pytest.raises(TargetError, match=r"set\.toml cannot be read"):
+    with pytest.raises(OutputError, match=r"set\.toml cannot be read"):
         render_set(tmp_path / "set")
 
 
 def test_a_folder_of_something_else_is_refused(tmp_path):
     (tmp_path / "holiday.jpg").touch()
-    with pytest.raises(TargetError, match=r"holiday\.jpg, but no set"):
+    with pytest.raises(OutputError, match=r"holiday\.jpg, but no set"):
         render_set(tmp_path)
-    with pytest.raises(TargetError, match="cannot be written to"):
+    with pytest.raises(OutputError, match="cannot be written to"):
         render_set(tmp_path / "holiday.jpg")
 
 
 def test_two_runs_in_one_folder_are_refused_until_one_has_ended(four_samples):
     with (
         filelock.FileLock(four_samples / ".lock"),
-        pytest.raises(TargetError, match="another run is writing"),
+        pytest.raises(OutputError, match="another run is writing"),
     ):
         render_set(four_samples)
     render_set(four_samples)
 
 
 def test_a_run_releases_its_lock_even_if_it_fails(four_samples):
-    with pytest.raises(TargetError, match="its seed is"):
+    with pytest.raises(OutputError, match="its seed is"):
         render_set(four_samples, seed=8)
     with filelock.FileLock(four_samples / ".lock", blocking=False):
         pass
@@ -256,7 +256,7 @@ def test_a_file_system_without_locks_is_reported(four_samples, monkeypatch, numb
         raise OSError(number, os.strerror(number))
 
     monkeypatch.setattr(fcntl, "flock", refuse)
-    with pytest.raises(TargetError, match="cannot be locked"):
+    with pytest.raises(OutputError, match="cannot be locked"):
         render_set(four_samples)
 
 

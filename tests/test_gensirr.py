@@ -11,7 +11,7 @@ from torch.nn import functional
 from brewster import Photo, Separator
 from brewster.errors import ModelError
 from brewster.inference.diffusion_predictor import DiffusionPredictor
-from brewster.models.diffusion.backbones import encode_prompt, tiny
+from brewster.models.diffusion.backbones.registry import encode_prompt, tiny
 from brewster.models.diffusion.gensirr import convert
 from brewster.models.diffusion.pipeline import load_pipeline
 from brewster.models.diffusion.task import TASK_FILE
@@ -38,7 +38,7 @@ def checkpoint_values(seed=3, **changes):
 def model(tmp_path_factory):
     folder = tmp_path_factory.mktemp("gensirr")
     torch.save(checkpoint_values(), folder / "GenSIRR.pt")
-    convert(folder / "GenSIRR.pt", folder / "gensirr", base="tiny:kontext", short_side_px=SIDE)
+    convert(folder / "GenSIRR.pt", folder / "gensirr", base_model="tiny:kontext", short_side_px=SIDE)
     return folder / "gensirr"
 
 
@@ -133,7 +133,7 @@ def test_the_name_is_not_opened_without_a_conversion():
 def test_other_checkpoints_are_refused(values, message, tmp_path):
     torch.save(values, tmp_path / "model.pt")
     with pytest.raises(ModelError, match=message):
-        convert(tmp_path / "model.pt", tmp_path / "out", base="tiny:kontext")
+        convert(tmp_path / "model.pt", tmp_path / "out", base_model="tiny:kontext")
     assert not (tmp_path / "out").exists()
 
 
@@ -144,7 +144,7 @@ def test_a_checkpoint_cannot_run_code(tmp_path):
 
     torch.save({"module": Harmful()}, tmp_path / "model.pt")
     with pytest.raises(ModelError, match="tensors only"):
-        convert(tmp_path / "model.pt", tmp_path / "out", base="tiny:kontext")
+        convert(tmp_path / "model.pt", tmp_path / "out", base_model="tiny:kontext")
     assert not (tmp_path / "harm").exists()
 
 

@@ -8,7 +8,7 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 
-from brewster.errors import TargetError
+from brewster.errors import OutputError
 from brewster.evaluate.report.html_report import write_report
 from brewster.evaluate.report.images import (
     COLOUR_MAP,
@@ -16,7 +16,7 @@ from brewster.evaluate.report.images import (
     MAX_SIDE_PX,
     CaseImages,
     error_map,
-    to_tiles,
+    to_thumbnails,
 )
 from brewster.photo import Photo
 
@@ -78,7 +78,7 @@ def results(names=("a", "b"), method="compact", errors=None):
         "input (unprocessed)": {"psnr": estimate(20.0, 19, 21)},
         method: {"psnr": estimate(21.5, 20, 23)},
     }
-    change = {"method": method, "than": "input (unprocessed)", "metric": "psnr", "better": 2}
+    change = {"method": method, "reference": "input (unprocessed)", "metric": "psnr", "improved_count": 2}
     return {
         "brewster": "0.1.0",
         "protocol": {
@@ -89,17 +89,17 @@ def results(names=("a", "b"), method="compact", errors=None):
         },
         "metrics": {"psnr": metric(), "psnr_region": metric("PSNR in the region")},
         "benchmarks": {
-            "nature20": {"title": "Nature20", "pictures": len(names), "expected": [20]}
-            | {"remarks": ["found 2 images, expected 20"], "refused": ["c.png has no partner"]}
+            "nature20": {"title": "Nature20", "cases": len(names), "expected": [20]}
+            | {"remarks": ["found 2 images, expected 20"], "excluded": ["c.png has no partner"]}
         },
         "unavailable": {},
         "unmeasured": [],
         "selections": {
-            "nature20": {"title": "Nature20", "pictures": len(names)},
-            "average": {"title": "Average", "pictures": len(names)},
+            "nature20": {"title": "Nature20", "cases": len(names)},
+            "average": {"title": "Average", "cases": len(names)},
         },
         "methods": {"input (unprocessed)": {"kind": "baseline"}, method: {"kind": "model", "sha256": "7adb"}},
-        "pictures": pictures,
+        "cases": pictures,
         "tables": {"nature20": table, "average": deepcopy(table)},
         "differences": {"nature20": [change | estimate(1.5, 0.5, 2.5)]},
     }
@@ -112,7 +112,7 @@ def make_tiles(name="a", method="compact", size=(40, 60), **changes):
     region[: size[0] // 2] = True
     given = {"photo": photo, "ground_truth": photo // 2, "region": region, "predictions": {method: photo}}
     images = CaseImages("nature20", name, **(given | {"reflections": {method: photo // 4}} | changes))
-    return to_tiles(images)
+    return to_thumbnails(images)
 
 
 @pytest.fixture
@@ -200,7 +200,7 @@ def test_the_same_input_gives_the_same_bytes(tmp_path):
 )
 def test_names_with_markup_are_escaped(page, name):
     given = results([name], method=name, errors={name: name})
-    given["benchmarks"]["nature20"] |= {"title": name, "remarks": [name], "refused": [name]}
+    given["benchmarks"]["nature20"] |= {"title": name, "remarks": [name], "excluded": [name]}
     given["metrics"]["psnr"] |= {"title": name, "about": name}
     made, plain = (
         page(given, [make_tiles(name, name)]),
@@ -246,7 +246,7 @@ def test_differences_between_methods_are_separate_from_those_to_the_baseline(pag
     row = given["differences"]["nature20"][0]
     given["methods"]["RDNet"] = {"kind": "predictions"}
     given["differences"]["nature20"].append(
-        row | {"method": "RDNet", "than": "compact", "low": -3, "high": -1, "mean": -2}
+        row | {"method": "RDNet", "reference": "compact", "low": -3, "high": -1, "mean": -2}
     )
     text = page(given).text
     assert "RDNet minus compact▼ worse: \N{MINUS SIGN}2.00" in text
@@ -258,7 +258,7 @@ def test_a_missing_score_is_a_dash_and_a_metric_without_scores_has_no_column(pag
     given = results()
     assert "PSNR in the region" in page(given).text  # its definition is still listed
     assert "PSNR in the region dB" not in page(given).text
-    given["pictures"][0]["scores"]["compact"] = {"psnr": None, "psnr_region": None}
+    given["cases"][0]["scores"]["compact"] = {"psnr": None, "psnr_region": None}
     given["tables"]["nature20"]["compact"]["psnr"] = None
     assert re.search("compact\\s*\N{EN DASH}", page(given).text)
 
@@ -290,7 +290,7 @@ def test_settings_metrics_remarks_and_excluded_files_are_listed(page):
 
 def test_errors_are_listed_at_the_top_and_at_their_case(page):
     given = results()
-    given["pictures"][0] |= {
+    given["cases"][0] |= {
         "scores": {"input (unprocessed)": {"psnr": 20.0}},
         "errors": {"compact": "no prediction"},
     }
@@ -414,7 +414,7 @@ def test_a_report_replaces_an_older_one_atomically(tmp_path):
 
 def test_a_path_that_cannot_be_written_is_an_error_that_names_it(tmp_path):
     (tmp_path / "report.html").mkdir()
-    with pytest.raises(TargetError, match=r"report\.html was not written \(.*\); .* run again"):
+    with pytest.raises(OutputError, match=r"report\.html was not written \(.*\); .* run again"):
         write_report(results(), [make_tiles("a")], tmp_path / "report.html")
     assert not list(tmp_path.glob(".brewster-*"))
 

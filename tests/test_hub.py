@@ -12,7 +12,7 @@ import fake_hub
 from brewster.errors import DownloadError, ModelError
 from brewster.models.diffusion.adapter.hub import FILES, plan_push, push
 from brewster.models.diffusion.adapter.lora import LORA_FILE, add_lora, load_lora, save_lora
-from brewster.models.diffusion.backbones import BACKBONES, tiny
+from brewster.models.diffusion.backbones.registry import BACKBONES, tiny
 from brewster.models.diffusion.task import DecompositionTask
 from brewster.models.diffusion.tensors import read_metadata, read_tensors
 from brewster.training.lora.model_card import write_card
@@ -42,12 +42,12 @@ def tiny_model():
 def write_lora(tiny_model, tmp_path):
     """A function that writes a LoRA's folder as training does."""
 
-    def write_lora(base="kontext", sets="sets/window"):
+    def write_lora(base_model="kontext", sets="sets/window"):
         folder = tmp_path / "lora"
-        hub_id = BACKBONES["kontext"].hub_id if base == "kontext" else base
-        save_lora(folder, *tiny_model, DecompositionTask(), base=hub_id)
+        hub_id = BACKBONES["kontext"].hub_id if base_model == "kontext" else base_model
+        save_lora(folder, *tiny_model, DecompositionTask(), base_model=hub_id)
         recipe = LoraRecipe.model_validate(
-            VALUES | {"backbone": base, "data": {"rendered": {"sets": [sets]}}}
+            VALUES | {"backbone": base_model, "data": {"rendered": {"datasets": [sets]}}}
         )
         (folder / "recipe.json").write_text(json.dumps(recipe.model_dump(mode="json"), indent=2))
         write_card(folder, recipe, {"loss": 1.0}, BACKBONES["kontext"])
@@ -98,15 +98,15 @@ def test_local_paths_are_replaced_in_uploaded_files_and_the_lora_still_loads(
     sent = contents(plan)
     assert all(str(tmp_path).encode() not in data for data in sent.values())
     recipe = json.loads(sent["recipe.json"])
-    assert recipe["data"]["rendered"]["sets"] == ["window"]
+    assert recipe["data"]["rendered"]["datasets"] == ["window"]
     assert recipe["backbone"] == BACKBONES["kontext"].hub_id
-    assert json.loads(read_metadata(sent[LORA_FILE])["brewster"])["base"] == BACKBONES["kontext"].hub_id
+    assert json.loads(read_metadata(sent[LORA_FILE])["brewster"])["base_model"] == BACKBONES["kontext"].hub_id
     assert f"{sets} is replaced by window in the uploaded files" in plan.remarks
     assert before == {name: (folder / name).read_bytes() for name in FILES}
     for name, data in sent.items():
         (folder / name).write_bytes(data)
     card, _ = load_lora(folder, tiny("kontext")[0])
-    assert card.base == BACKBONES["kontext"].hub_id
+    assert card.base_model == BACKBONES["kontext"].hub_id
     whole, _ = read_tensors(folder / LORA_FILE)
     folder.joinpath(LORA_FILE).write_bytes(before[LORA_FILE])
     assert all((tensor == whole[name]).all() for name, tensor in read_tensors(folder / LORA_FILE)[0].items())

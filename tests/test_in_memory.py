@@ -199,6 +199,6 @@ def test_the_folder_of_a_training_run_is_a_model(tmp_path):
     separator = Separator.load(str(folder))
     assert (separator.name, separator.device) == ("run", "cpu")
     assert zoo.model_name(str(folder)) == "run"
-    assert not zoo.is_large(str(folder))
+    assert not zoo.is_diffusion_model(str(folder))
     (folder / "model.onnx").unlink()
-    assert zoo.is_large(str(folder))  # the folder of a LoRA
+    assert zoo.is_diffusion_model(str(folder))  # the folder of a LoRA

@@ -1,4 +1,4 @@
-"""Training samples of a large backbone: panels, crops, encoding and the choice of samples."""
+"""Training samples of a diffusion backbone: panels, crops, encoding and the choice of samples."""
 
 import numpy as np
 import pytest
@@ -7,14 +7,14 @@ from hypothesis import given, reject
 from hypothesis import strategies as st
 
 from brewster.errors import PhotoError, RecipeError
-from brewster.models.diffusion.backbones import tiny
+from brewster.models.diffusion.backbones.registry import tiny
 from brewster.models.diffusion.panels import PanelLayout, fit_panel, split
 from brewster.photo import Photo
 from brewster.rendered.store import read_set
 from brewster.training.data.mixtures import Pairs
 from brewster.training.data.sample_rng import SampleRng
 from brewster.training.lora.latents import (
-    LatentEncoder,
+    EncodedSampleLoader,
     crop_sample,
     fit_sample,
     layers_from_pair,
@@ -25,7 +25,7 @@ from brewster.training.recipe import LoraRecipe
 from set_folders import render_set
 
 RECIPE = {
-    "backbone": "tiny:kontext", "budget_px": 3 * 32 * 16, "seed": 1, "steps": 6, "batch_size": 1,
+    "backbone": "tiny:kontext", "max_composite_pixels": 3 * 32 * 16, "seed": 1, "steps": 6, "batch_size": 1,
     "learning_rate": 1e-2, "warmup_steps": 2, "weight_decay": 1e-4, "report_every": 6, "checkpoint_every": 2,
 }  # fmt: skip
 
@@ -63,7 +63,7 @@ def recipe(root, monkeypatch):
     return lambda data, **changes: LoraRecipe.model_validate(RECIPE | {"data": data} | changes)
 
 
-RENDERED = {"rendered": {"sets": ["set"], "target": "transmission"}}
+RENDERED = {"rendered": {"datasets": ["set"], "target": "transmission"}}
 LARGE_PAIRS = {"pairs": ["large"], "pairs_share": 1.0}
 """Data with three pairs whose sides are twice those of a panel."""
 
@@ -73,7 +73,7 @@ def test_panels_show_the_whole_sample_in_its_aspect_ratio(recipe, root, backbone
     samples = open_samples(lora_recipe)
     assert len(samples) == 3
     for number, entry in enumerate(read_set(root / "set")):
-        fit = fit_sample(samples[number].layers, lora_recipe, backbone.multiple)
+        fit = fit_sample(samples[number].layers, lora_recipe, backbone.size_divisor)
         panels = make_panels(samples[number].layers, fit)
         assert (fit.content, fit.panel) == ((24, 16), (32, 16))
         for letter, name in zip("ITR", ("photo", "transmission", "reflection"), strict=True):
@@ -84,7 +84,7 @@ def test_panels_show_the_whole_sample_in_its_aspect_ratio(recipe, root, backbone
 
 def test_an_encoded_sample_depends_on_the_rng_alone_and_is_encoded_once(recipe, backbone, monkeypatch):
     lora_recipe = recipe(RENDERED)
-    one, other = (LatentEncoder(open_samples(lora_recipe), backbone, lora_recipe) for _ in range(2))
+    one, other = (EncodedSampleLoader(open_samples(lora_recipe), backbone, lora_recipe) for _ in range(2))
     for slot in range(4):
         other(SampleRng(1, 0, slot))
     assert torch.equal(one(SampleRng(1, 7, 0)).composite, other(SampleRng(1, 7, 0)).composite)
@@ -98,7 +98,7 @@ def test_samples_are_mirrored_at_random_unless_the_recipe_disables_it(recipe, ba
     counts = []
     for flip in (True, False):
         lora_recipe = recipe(RENDERED, flip=flip)
-        latents = LatentEncoder(open_samples(lora_recipe), backbone, lora_recipe)
+        latents = EncodedSampleLoader(open_samples(lora_recipe), backbone, lora_recipe)
         counts.append(len({id(latents(SampleRng(1, step, 0))) for step in range(60)}))
     assert counts == [6, 3]
 
@@ -106,7 +106,7 @@ def test_samples_are_mirrored_at_random_unless_the_recipe_disables_it(recipe, ba
 def test_each_sample_is_used_whole_and_in_the_number_of_crops_of_the_recipe(recipe, backbone):
     for crops, count in ((0, 6), (2, 18)):
         lora_recipe = recipe(LARGE_PAIRS, crops=crops)
-        latents = LatentEncoder(open_samples(lora_recipe), backbone, lora_recipe)
+        latents = EncodedSampleLoader(open_samples(lora_recipe), backbone, lora_recipe)
         encoded = {id(each): each for each in (latents(SampleRng(1, step, 0)) for step in range(200))}
         assert len(encoded) == count
         different = {each.composite.numpy().tobytes() for each in encoded.values()}
@@ -118,7 +118,7 @@ def test_a_crop_depends_on_seed_sample_and_crop_number_alone(recipe, backbone):
     def encode(number, crop, **changes):
         lora_recipe = recipe(LARGE_PAIRS, crops=3, **changes)
         return (
-            LatentEncoder(open_samples(lora_recipe), backbone, lora_recipe)
+            EncodedSampleLoader(open_samples(lora_recipe), backbone, lora_recipe)
             ._encode(number, False, crop)
             .composite
         )
@@ -135,7 +135,7 @@ def test_a_crop_has_the_aspect_ratio_of_the_sample_and_is_never_smaller_than_the
     layout = PanelLayout()
     cells = min(cells, (width // 16) * (height // 16))
     try:
-        fit = fit_panel((width, height), layout, budget_px=3 * 16 * 16 * cells, multiple=16)
+        fit = fit_panel((width, height), layout, max_composite_pixels=3 * 16 * 16 * cells, size_divisor=16)
     except PhotoError:
         reject()
     numbers = torch.arange(height * width).reshape(height, width, 1)
@@ -159,7 +159,7 @@ def test_real_pairs_are_drawn_with_the_probability_pairs_share(recipe, root):
 
 
 def test_data_without_a_share_is_not_read(recipe):
-    gone = {"sets": ["gone"]}
+    gone = {"datasets": ["gone"]}
     assert len(open_samples(recipe({**RENDERED, "pairs": ["gone"], "pairs_share": 0.0}))) == 3
     assert len(open_samples(recipe({"rendered": gone, "pairs": ["triplets"], "pairs_share": 1.0}))) == 1
 
@@ -188,12 +188,12 @@ def test_a_given_reflection_has_weight_one_and_a_missing_one_is_the_difference_i
 
 def test_a_small_sample_gets_the_panels_that_it_gets_at_inference(recipe, backbone):
     """The paper's syn + real: a budget for large rendered samples, and pairs that are smaller than its panels."""
-    mixed = recipe({**RENDERED, "pairs": ["large"], "pairs_share": 0.5}, budget_px=10**6)
+    mixed = recipe({**RENDERED, "pairs": ["large"], "pairs_share": 0.5}, max_composite_pixels=10**6)
     samples = open_samples(mixed)
-    fits = samples.panel_fits(mixed, 16)
+    fits = samples.check_sizes(mixed, 16)
     assert [fit.panel for fit in fits] == [(32, 16), *[(48, 32)] * 3]
     assert fits[-1] == mixed.task.fit((48, 32), 16)
-    latents = LatentEncoder(samples, backbone, mixed)
+    latents = EncodedSampleLoader(samples, backbone, mixed)
     shapes = {latents(SampleRng(1, step, 0)).composite.shape[2:] for step in range(20)}
     assert shapes == {(1, 6), (2, 9)}
     assert samples.description() == "3 rendered samples, 3 real pairs"
@@ -206,16 +206,16 @@ def test_a_sample_with_a_side_of_fewer_than_16_pixels_is_refused(recipe, root):
         Photo.from_array(pixels, encoding="srgb").save(root / "narrow" / role / "a.png")
     narrow = recipe({"pairs": ["narrow"], "pairs_share": 1.0}, reflections="difference")
     with pytest.raises(PhotoError, match="60 x 15 pixels; expected at least 16 pixels a side"):
-        open_samples(narrow).panel_fits(narrow, 16)
+        open_samples(narrow).check_sizes(narrow, 16)
 
 
 def test_too_few_rendered_samples_are_refused(recipe):
     with pytest.raises(RecipeError, match="3 rendered samples; expected at least 9"):
-        open_samples(recipe({"rendered": {"sets": ["set"], "count": 9}}))
+        open_samples(recipe({"rendered": {"datasets": ["set"], "count": 9}}))
 
 
 def test_the_sides_of_crops_are_0_5_to_1_times_those_of_the_sample():
-    fit = fit_panel((300, 200), PanelLayout(), budget_px=3 * 48 * 32, multiple=16)
+    fit = fit_panel((300, 200), PanelLayout(), max_composite_pixels=3 * 48 * 32, size_divisor=16)
     whole = torch.zeros(200, 300, 9, dtype=torch.uint8)
     ratios = [crop_sample(SampleRng(seed, -1, 1), whole, fit).shape[0] / 200 for seed in range(200)]
     assert 0.5 <= min(ratios) < 0.52

@@ -181,7 +181,7 @@ def test_the_throughputs_of_the_orders_sum_to_the_closed_form(panes, cosine):
             total = sum(
                 throughput
                 for throughput, order in zip(throughputs, table, strict=True)
-                if order.behind == behind and is_included(order)
+                if order.is_transmitted == behind and is_included(order)
             )
             assert float((total - expected).abs().max()) < max_error
     assert all((throughput >= -1e-9).all() for throughput in throughputs)
@@ -197,7 +197,7 @@ def test_little_light_is_added_to_the_last_order(count):
         enumerated = sum(
             order.count * 0.04 ** sum(order.reflections) * 0.96 ** sum(order.transmissions)
             for order in table
-            if order.behind == behind
+            if order.is_transmitted == behind
         )
         assert enumerated <= float(total)
         assert enumerated == pytest.approx(float(total), abs=1e-3)
@@ -205,7 +205,7 @@ def test_little_light_is_added_to_the_last_order(count):
 
 def test_one_pane_has_three_reflected_and_two_transmitted_orders():
     table = enumerate_orders((0.04,))
-    assert [order.behind for order in table] == [True, False, False, True, False]
+    assert [order.is_transmitted for order in table] == [True, False, False, True, False]
     assert [order.traversals for order in table] == [(1,), (0,), (2,), (3,), (4,)]
     assert [order.reflections for order in table] == [(0,), (1,), (1,), (2,), (3,)]
     assert [order.transmissions for order in table] == [(2,), (0,), (2,), (2,), (2,)]
@@ -227,8 +227,8 @@ def test_each_order_of_one_pane_is_a_term_of_the_geometric_series():
 
 def test_in_double_glazing_the_papers_reflection_never_enters_the_last_pane():
     table = enumerate_orders((0.04, 0.04))
-    assert sum(order.behind and order.in_truncated_layers for order in table) == 1
-    reflected = [order for order in table if not order.behind]
+    assert sum(order.is_transmitted and order.in_truncated_layers for order in table) == 1
+    reflected = [order for order in table if not order.is_transmitted]
     brightest = [order.traversals for order in reflected[:4]]
     assert brightest == [(0, 0, 0), (2, 0, 0), (2, 2, 0), (2, 2, 2)]
     assert [order.in_truncated_layers for order in reflected[:4]] == [True, True, True, False]
@@ -307,7 +307,7 @@ def test_a_ghost_one_pixel_away_moves_the_lines_centroid_by_its_weight():
     reflected = [
         (float(weight), order.traversals[0] / 2)
         for weight, order in zip(throughputs, table, strict=True)
-        if not order.behind
+        if not order.is_transmitted
     ]
     mean_shift = sum(weight * shift for weight, shift in reflected) / sum(weight for weight, _ in reflected)
     centroid_x = np.average(np.arange(48) + 0.5, weights=columns)

@@ -8,7 +8,7 @@ import pytest
 from huggingface_hub import errors as hub_errors
 
 from brewster.errors import DownloadError, MissingExtra
-from brewster.models.diffusion.backbones import encode_prompt, load_backbone
+from brewster.models.diffusion.backbones.registry import encode_prompt, load_backbone
 from brewster.models.diffusion.lazy_imports import import_library
 
 
@@ -64,7 +64,7 @@ def test_errors_of_the_hub_are_explained(monkeypatch, error, message, load):
 
 def test_a_missing_library_names_the_extra(monkeypatch):
     monkeypatch.setitem(sys.modules, "bitsandbytes", None)
-    with pytest.raises(MissingExtra, match=r"pip install 'brewster\[large\]'"):
+    with pytest.raises(MissingExtra, match=r"pip install 'brewster\[diffusion\]'"):
         import_library("bitsandbytes")
 
 
@@ -74,7 +74,7 @@ import sys
 from pathlib import Path
 from brewster.models.diffusion import sampling
 from brewster.models.diffusion.adapter import lora
-from brewster.models.diffusion.backbones import load_backbone, tiny
+from brewster.models.diffusion.backbones.registry import load_backbone, tiny
 assert not {{'diffusers', 'transformers', 'peft', 'safetensors', 'huggingface_hub'}} & set(sys.modules)
 tiny('kontext')[0].save(Path({str(tmp_path)!r}))
 load_backbone({str(tmp_path)!r})

@@ -231,16 +231,20 @@ def test_a_run_resumes_when_the_checkpoint_that_it_started_from_is_missing(recip
     start = tmp_path / "start.pt"
     initial_checkpoint(recipe).write(start)
     with pytest.raises(Killed):
-        train(recipe.model_copy(update={"start_from": (start,)}), tmp_path / "run", kill_after(5))
+        train(recipe.model_copy(update={"init_checkpoints": (start,)}), tmp_path / "run", kill_after(5))
     start.unlink()
-    train(recipe.model_copy(update={"start_from": (Path("elsewhere.pt"),)}), tmp_path / "run", ignore_step)
+    train(
+        recipe.model_copy(update={"init_checkpoints": (Path("elsewhere.pt"),)}), tmp_path / "run", ignore_step
+    )
     assert logged_steps(tmp_path / "run") == [3, 6]
 
 
 def test_a_missing_checkpoint_in_start_from_is_named_with_its_cure(recipe, tmp_path):
-    with pytest.raises(ModelError, match=r"gone\.pt cannot be read .* correct start_from"):
+    with pytest.raises(ModelError, match=r"gone\.pt cannot be read .* correct init_checkpoints"):
         train(
-            recipe.model_copy(update={"start_from": (tmp_path / "gone.pt",)}), tmp_path / "run", ignore_step
+            recipe.model_copy(update={"init_checkpoints": (tmp_path / "gone.pt",)}),
+            tmp_path / "run",
+            ignore_step,
         )
 
 
@@ -259,8 +263,10 @@ def test_a_checkpoint_of_another_network_is_named(recipe, tmp_path):
     other.write(tmp_path / "checkpoint.pt")
     with pytest.raises(ModelError, match=r"checkpoint\.pt contains another network; .* with -o"):
         train(recipe, tmp_path, ignore_step)
-    started = recipe.model_copy(update={"start_from": (tmp_path / "checkpoint.pt",)})
-    with pytest.raises(ModelError, match=r"checkpoint\.pt contains another network; .* correct start_from"):
+    started = recipe.model_copy(update={"init_checkpoints": (tmp_path / "checkpoint.pt",)})
+    with pytest.raises(
+        ModelError, match=r"checkpoint\.pt contains another network; .* correct init_checkpoints"
+    ):
         train(started, tmp_path / "run", ignore_step)
 
 

@@ -15,12 +15,12 @@ from brewster.models.diffusion.adapter.lora import (
     load_lora,
     load_lora_state,
     lora_parameters,
-    lora_state,
+    lora_state_dict,
     read_lora_metadata,
     remove_lora,
     save_lora,
 )
-from brewster.models.diffusion.backbones import BACKBONES, build, load_backbone, tiny
+from brewster.models.diffusion.backbones.registry import BACKBONES, build, load_backbone, tiny
 from brewster.models.diffusion.panels import PanelLayout
 from brewster.models.diffusion.prompt import load_prompt
 from brewster.models.diffusion.task import DecompositionTask
@@ -63,7 +63,7 @@ def test_all_linear_layers_of_the_blocks_and_no_others_are_adapted(tiny_model):
     assert not any("blocks." in name for name in outside)
     assert "proj_out" in outside
     add_lora(backbone)
-    changed = {name.rsplit(".lora_", 1)[0] for name in lora_state(backbone)}
+    changed = {name.rsplit(".lora_", 1)[0] for name in lora_state_dict(backbone)}
     assert changed == set(targets)
     assert backbone.lora_targets() == targets
 
@@ -73,7 +73,7 @@ def test_a_new_lora_changes_no_prediction_and_only_its_parameters_are_trained(ti
     before = velocity(backbone, prompt)
     parameters = add_lora(backbone, rank=4)
     assert torch.equal(velocity(backbone, prompt), before)
-    assert sum(map(torch.numel, parameters)) == sum(map(torch.numel, lora_state(backbone).values()))
+    assert sum(map(torch.numel, parameters)) == sum(map(torch.numel, lora_state_dict(backbone).values()))
     velocity(backbone, prompt).square().mean().backward()
     without_gradient = {
         name
@@ -93,7 +93,7 @@ def test_the_seed_determines_the_lora_and_the_global_random_state_is_unchanged(k
         rng = torch.get_rng_state()
         add_lora(backbone, rank=4, seed=seed)
         assert torch.equal(torch.get_rng_state(), rng)
-        states.append(lora_state(backbone))
+        states.append(lora_state_dict(backbone))
         remove_lora(backbone)
     name = next(name for name in states[0] if "lora_A" in name)
     assert torch.equal(states[0][name], states[1][name])
@@ -122,27 +122,27 @@ def test_a_lora_is_loaded_in_the_dtype_of_its_base(bf16_kontext, tmp_path):
     save_lora(tmp_path, backbone, prompt, DecompositionTask())
     remove_lora(backbone)
     load_lora(tmp_path, backbone)
-    assert {tensor.dtype for tensor in lora_state(backbone).values()} == {torch.bfloat16}
+    assert {tensor.dtype for tensor in lora_state_dict(backbone).values()} == {torch.bfloat16}
     assert (velocity(backbone, prompt) - expected).std() < 0.2 * (expected - plain).std()
 
 
 def test_targets_select_layers_by_their_names_and_are_stored(kontext, tmp_path):
     backbone, prompt = kontext
     targets = ["*.attn.to_?", "single_transformer_blocks.0.*"]
-    add_lora(backbone, rank=2, targets=targets)
-    adapted = {name.rsplit(".lora_", 1)[0] for name in lora_state(backbone)}
+    add_lora(backbone, rank=2, target_modules=targets)
+    adapted = {name.rsplit(".lora_", 1)[0] for name in lora_state_dict(backbone)}
     assert "transformer_blocks.0.attn.to_q" in adapted
     assert "single_transformer_blocks.0.proj_out" in adapted
     assert not any(name.startswith("transformer_blocks") and ".ff." in name for name in adapted)
     assert "single_transformer_blocks.1.proj_out" not in adapted
     before = velocity(backbone, prompt)
-    save_lora(tmp_path, backbone, prompt, DecompositionTask(), targets=targets)
+    save_lora(tmp_path, backbone, prompt, DecompositionTask(), target_modules=targets)
     fresh, _ = tiny("kontext", seed=1)
-    assert load_lora(tmp_path, fresh)[0].targets == tuple(targets)
+    assert load_lora(tmp_path, fresh)[0].target_modules == tuple(targets)
     torch.testing.assert_close(velocity(fresh, prompt), before, atol=1e-6, rtol=0)
     remove_lora(fresh)
     with pytest.raises(ModelError, match=r"matches the target 'to_q'; expected a name with wildcards"):
-        add_lora(fresh, targets=["to_q"])
+        add_lora(fresh, target_modules=["to_q"])
 
 
 @pytest.mark.parametrize("alpha", [4, 16])
@@ -174,7 +174,7 @@ def test_the_same_lora_gives_the_same_bytes(kontext, tmp_path):
 
 def test_a_state_of_the_weights_alone_can_be_loaded(kontext):
     backbone, prompt = kontext
-    state = {name: tensor.clone() for name, tensor in lora_state(add_trained_lora(backbone)).items()}
+    state = {name: tensor.clone() for name, tensor in lora_state_dict(add_trained_lora(backbone)).items()}
     expected = velocity(backbone, prompt)
     with torch.no_grad():
         for parameter in lora_parameters(backbone):
@@ -188,7 +188,7 @@ def test_removing_a_lora_restores_the_backbone(tiny_model):
     before = velocity(backbone, prompt)
     remove_lora(add_trained_lora(backbone))
     assert not has_lora(backbone)
-    assert lora_state(backbone) == {}
+    assert lora_state_dict(backbone) == {}
     assert torch.equal(velocity(backbone, prompt), before)
 
 
@@ -276,7 +276,7 @@ def test_an_exported_lora_gives_the_same_prediction_merged_and_from_the_file_for
     backbone, prompt = tiny_model
     backbone.save(tmp_path / "base")
     add_trained_lora(backbone, alpha=alpha)
-    save_lora(tmp_path / "lora", backbone, prompt, DecompositionTask(), base=str(tmp_path / "base"))
+    save_lora(tmp_path / "lora", backbone, prompt, DecompositionTask(), base_model=str(tmp_path / "base"))
     expected = velocity(backbone, prompt)
     remove_lora(backbone)
 

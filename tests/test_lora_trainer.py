@@ -1,4 +1,4 @@
-"""Training of LoRAs on toy twins: checkpoints, exported files, and errors."""
+"""Training of LoRAs on tiny versions: checkpoints, exported files, and errors."""
 
 import json
 import os
@@ -13,8 +13,8 @@ import torch
 
 import brewster.training.lora.trainer as trainer_module
 from brewster.errors import DeviceError, ModelError, RecipeError
-from brewster.models.diffusion.adapter.lora import LORA_FILE, load_lora, lora_state, read_lora_metadata
-from brewster.models.diffusion.backbones import tiny
+from brewster.models.diffusion.adapter.lora import LORA_FILE, load_lora, lora_state_dict, read_lora_metadata
+from brewster.models.diffusion.backbones.registry import tiny
 from brewster.models.diffusion.panels import conditioning_image, split
 from brewster.models.diffusion.sampling import GUIDANCE, STEPS, sample
 from brewster.models.diffusion.tensors import read_tensors
@@ -29,7 +29,7 @@ from brewster.training.trainers import open_trainer
 from set_folders import render_set
 
 RECIPE = {
-    "backbone": "tiny:kontext", "rank": 2, "alpha": 2, "budget_px": 3 * 32 * 16,
+    "backbone": "tiny:kontext", "rank": 2, "alpha": 2, "max_composite_pixels": 3 * 32 * 16,
     "seed": 1, "steps": 6, "batch_size": 2, "learning_rate": 1e-2, "warmup_steps": 2, "weight_decay": 1e-4,
     "report_every": 6, "checkpoint_every": 2,
 }  # fmt: skip
@@ -43,9 +43,9 @@ def rendered_set(tmp_path_factory):
 
 @pytest.fixture
 def recipe(rendered_set, monkeypatch):
-    monkeypatch.setattr(trainer_module, "_VALIDATION_SAMPLES", 1)
+    monkeypatch.setattr(trainer_module, "_MAX_VALIDATION_SAMPLES", 1)
     return lambda **changes: LoraRecipe.model_validate(
-        RECIPE | {"data": {"rendered": {"sets": [rendered_set], "target": "transmission"}}} | changes
+        RECIPE | {"data": {"rendered": {"datasets": [rendered_set], "target": "transmission"}}} | changes
     )
 
 
@@ -87,7 +87,7 @@ def test_a_killed_and_resumed_run_ends_with_a_bit_identical_lora(recipe, rendere
         (pairs / role).mkdir(parents=True)
         pixels = np.random.default_rng(len(role)).integers(0, 256, (32, 48, 3), dtype=np.uint8)
         Photo.from_array(pixels, encoding="srgb").save(pairs / role / "a.png")
-    rendered = {"sets": [rendered_set], "target": "transmission"}
+    rendered = {"datasets": [rendered_set], "target": "transmission"}
     paired_recipe = recipe(crops=2, data={"pairs": [pairs], "pairs_share": 0.5, "rendered": rendered})
     uninterrupted = train(paired_recipe, tmp_path / "one").export(tmp_path / "one")
     with pytest.raises(Killed):
@@ -167,7 +167,7 @@ def test_small_validation_photos_get_small_panels(make_trainer, tmp_path, monkey
         )
     trainer = make_trainer()
     data = trainer.recipe.data.model_copy(update={"validate_on": (Path("small"),)})
-    scores, image = make_trainer(data=data, panels=["T", "R"], budget_px=2 * 32 * 16).validate()
+    scores, image = make_trainer(data=data, panels=["T", "R"], max_composite_pixels=2 * 32 * 16).validate()
     assert scores.keys() == {"psnr_gain_db_small"}
     assert image.shape == (20 + 20 + 160, 5 * 240, 3)
 
@@ -228,7 +228,7 @@ def test_data_and_machine_are_checked_before_anything_is_loaded(recipe, tmp_path
     for name in ("load_backbone", "encode_prompt"):
         monkeypatch.setattr(trainer_module, name, refuse)
     with pytest.raises(RecipeError, match="gone"):
-        LoraTrainer(recipe(data={"rendered": {"sets": [tmp_path / "gone"]}}))
+        LoraTrainer(recipe(data={"rendered": {"datasets": [tmp_path / "gone"]}}))
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     with pytest.raises(DeviceError, match=r'optimizer = "adamw8bit" was requested on cpu'):
         LoraTrainer(recipe(optimizer="adamw8bit"))
@@ -264,7 +264,7 @@ def test_a_run_cannot_be_resumed_with_another_optimiser(recipe, tmp_path):
 
 
 def test_validation_is_divided_among_the_processes(make_trainer, monkeypatch):
-    monkeypatch.setattr(trainer_module, "_VALIDATION_SAMPLES", 3)
+    monkeypatch.setattr(trainer_module, "_MAX_VALIDATION_SAMPLES", 3)
     trainer = make_trainer()
     parts = []
     monkeypatch.setattr(
@@ -282,11 +282,13 @@ def test_validation_is_divided_among_the_processes(make_trainer, monkeypatch):
 
 
 def test_values_for_inference_are_stored_with_the_lora(make_trainer, tmp_path):
-    trainer = make_trainer(inference_steps=3, inference_guidance=2.5, white_space=False, targets=["*.attn.*"])
+    trainer = make_trainer(
+        inference_steps=3, inference_guidance=2.5, white_space=False, target_modules=["*.attn.*"]
+    )
     metadata = read_lora_metadata(trainer.export(tmp_path))
     assert (metadata.task.steps, metadata.task.guidance) == (3, 2.5)
     assert not metadata.task.layout.white_space
-    assert metadata.targets == ("*.attn.*",)
+    assert metadata.target_modules == ("*.attn.*",)
     steps = []
     monitor = trainer.backbone.transformer.register_forward_hook(lambda *_: steps.append(1))
     trainer.separate(photo())
@@ -303,14 +305,14 @@ def test_the_learning_rate_falls_to_zero_in_the_last_share_of_the_steps(make_tra
         return rates
 
     assert rates() == [0.5, 1, 1, 1, 1]
-    assert rates(decay_share=0.5) == pytest.approx([0.5, 1, 1, 0.5, 0.1464], abs=1e-3)
+    assert rates(learning_rate_decay_share=0.5) == pytest.approx([0.5, 1, 1, 0.5, 0.1464], abs=1e-3)
 
 
 def test_the_timestep_shift_moves_training_times_towards_noise(make_trainer):
     def sigma(**changes):
         trainer = make_trainer(**changes)
         rng = SampleRng(1, 0, 0)
-        return trainer._start_and_sigma(rng, trainer._latents(rng))[1].item()
+        return trainer._start_and_sigma(rng, trainer._encoded_samples(rng))[1].item()
 
     none, shifted = sigma(timestep_shift=1.0), sigma(timestep_shift=3.0)
     assert shifted == pytest.approx(3 * none / (1 + 2 * none))
@@ -346,17 +348,19 @@ def test_a_nan_loss_stops_the_run_and_keeps_the_last_valid_checkpoint(recipe, tm
         run(trainer, tmp_path, break_after_2)
     saved = Checkpoint.read(tmp_path / "checkpoint.pt")
     assert saved.step == 2
-    for name, tensor in lora_state(trainer.backbone).items():
+    for name, tensor in lora_state_dict(trainer.backbone).items():
         assert torch.equal(tensor, saved.state["lora"][name])
 
 
 def test_an_infinite_gradient_does_not_change_the_lora(make_trainer):
     trainer = make_trainer()
-    before = {name: tensor.clone() for name, tensor in lora_state(trainer.backbone).items()}
+    before = {name: tensor.clone() for name, tensor in lora_state_dict(trainer.backbone).items()}
     trainer._parameters[0].register_hook(lambda gradient: gradient * float("inf"))
     with pytest.raises(ModelError, match=r"the gradient is (inf|nan) at step 0"):
         trainer.training_step(0)
-    assert all(torch.equal(tensor, before[name]) for name, tensor in lora_state(trainer.backbone).items())
+    assert all(
+        torch.equal(tensor, before[name]) for name, tensor in lora_state_dict(trainer.backbone).items()
+    )
 
 
 def test_an_encoded_prompt_is_used_if_it_was_encoded_for_this_backbone(recipe, tmp_path):
@@ -369,28 +373,30 @@ def test_an_encoded_prompt_is_used_if_it_was_encoded_for_this_backbone(recipe, t
         LoraTrainer(recipe(prompt=str(tmp_path / "klein.safetensors"))).initialize()
 
 
-@pytest.mark.parametrize("quantise", [None, "int8"])
-def test_a_backbone_in_a_folder_trains_like_its_twin_quantised_or_not(recipe, tmp_path, quantise):
+@pytest.mark.parametrize("quantization", [None, "int8"])
+def test_a_backbone_in_a_folder_trains_like_its_twin_quantized_or_not(recipe, tmp_path, quantization):
     backbone, prompt = tiny("kontext")
     backbone.save(tmp_path / "base")
     prompt.save(tmp_path / "prompt.safetensors")
     trainer = LoraTrainer(
         recipe(
-            backbone=str(tmp_path / "base"), prompt=str(tmp_path / "prompt.safetensors"), quantise=quantise
+            backbone=str(tmp_path / "base"),
+            prompt=str(tmp_path / "prompt.safetensors"),
+            quantization=quantization,
         )
     )
     trainer.initialize()
     twin = LoraTrainer(recipe())
     twin.initialize()
     assert trainer.training_step(0)["loss"] == pytest.approx(
-        twin.training_step(0)["loss"], rel=0.05 if quantise else 1e-6
+        twin.training_step(0)["loss"], rel=0.05 if quantization else 1e-6
     )
     assert trainer.training_step(1)["loss"] > 0
-    changed = lora_state(trainer.backbone)
+    changed = lora_state_dict(trainer.backbone)
     assert any(tensor.any() for name, tensor in changed.items() if "lora_B" in name)
 
 
 def test_a_twin_of_an_unknown_backbone_is_refused():
-    data = {"data": {"pairs": ["x"], "pairs_share": 0.0, "rendered": {"sets": ["x"], "count": 0}}}
+    data = {"data": {"pairs": ["x"], "pairs_share": 0.0, "rendered": {"datasets": ["x"], "count": 0}}}
     with pytest.raises(ModelError, match="there is no backbone 'contekst'"):
         LoraTrainer(LoraRecipe.model_validate(RECIPE | data | {"backbone": "tiny:contekst"}))

@@ -6,7 +6,7 @@ import torch
 from brewster.training.loop import run
 from brewster.training.recipe import LoraRecipe
 from brewster.training.trainers import open_trainer
-from toy_world import SIDE_PX, STRONG, pretrain, psnr, scenes, write_pairs
+from toy_scenes import SIDE_PX, STRONG, pretrain, psnr, scenes, write_pairs
 
 
 def transmissions(trainer, photos):
@@ -23,7 +23,7 @@ def scores(tmp_path, name, *, vae_steps, pretraining, steps, unseen_count=96):
     write_pairs(tmp_path / "pairs", training)
     recipe = LoraRecipe.model_validate({
         "backbone": str(tmp_path / "base"), "prompt": str(prompt), "objective": "one_step", "seed": 1,
-        "flip": False, "rank": 16, "alpha": 16, "budget_px": 3 * SIDE_PX**2, "steps": steps, "batch_size": 2,
+        "flip": False, "rank": 16, "alpha": 16, "max_composite_pixels": 3 * SIDE_PX**2, "steps": steps, "batch_size": 2,
         "learning_rate": 1e-2, "warmup_steps": 5, "panel_weights": {"I": 0.1, "R": 0.1}, "weight_decay": 1e-4,
         "report_every": steps, "checkpoint_every": steps,
         "data": {"pairs": [tmp_path / "pairs"], "pairs_share": 1.0},

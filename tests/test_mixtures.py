@@ -14,13 +14,13 @@ NO_EFFECTS = MixRecipe(
     crop=(1, 1), temperature=(0, 0), background_map_probability=0, background_level=(0.1, 0.1),
     highlight_boost=(0, 0), shadow_probability=0, background_blur_probability=0, no_glass_probability=0, partial_probability=0, transmittance=(1, 1),
     veil_probability=0, reflection_map_probability=0, reflection_ratio=(0.5, 0.5),
-    reflection_contrast=(1, 1), lamp_probability=0, sign_probability=0, sharp_probability=1,
-    ghost_probability=0, falloff_probability=0, edge_probability=0, softness_probability=0, target_luminance=(1, 1), overexposed_probability=0,
+    reflection_contrast=(1, 1), lamp_probability=0, sign_probability=0, reflection_sharp_probability=1,
+    ghost_probability=0, falloff_probability=0, edge_probability=0, camera_blur_probability=0, target_luminance=(1, 1), overexposed_probability=0,
     gamma=(1, 1), contrast=(0, 0), noise=(0, 0), jpeg_probability=0,
 )  # fmt: skip
 MANY_EFFECTS = MixRecipe(
     background_map_probability=0.5, shadow_probability=0.5, partial_probability=0.5, veil_probability=0.5,
-    reflection_map_probability=0.5, lamp_probability=0.5, sign_probability=0.5, sharp_probability=0.3,
+    reflection_map_probability=0.5, lamp_probability=0.5, sign_probability=0.5, reflection_sharp_probability=0.3,
     ghost_probability=0.5, falloff_probability=0.5, edge_probability=0.5, overexposed_probability=0.5, jpeg_probability=0.5,
 )  # fmt: skip
 
@@ -92,7 +92,7 @@ def test_lamps_are_added_to_the_reflection_alone(photos):
 
 def test_a_reflection_that_is_not_sharp_is_blurred_and_keeps_its_light(photos):
     _, _, mirrored = layers_of(photos)
-    _, _, blurred = layers_of(photos, sharp_probability=0.0, blur_px=(4.0, 4.0))
+    _, _, blurred = layers_of(photos, reflection_sharp_probability=0.0, reflection_blur_sigma_px=(4.0, 4.0))
     edges = [layer.diff(dim=3).square().mean() for layer in (mirrored, blurred)]
     assert edges[1] < edges[0] / 2
     assert to_linear(blurred).mean().item() == pytest.approx(to_linear(mirrored).mean().item(), rel=0.1)
@@ -100,7 +100,7 @@ def test_a_reflection_that_is_not_sharp_is_blurred_and_keeps_its_light(photos):
 
 def test_a_soft_photo_is_blurred_like_its_layers(photos):
     sharp = layers_of(photos)
-    soft = layers_of(photos, softness_probability=1.0, softness_px=(1.5, 1.5))
+    soft = layers_of(photos, camera_blur_probability=1.0, camera_blur_sigma_px=(1.5, 1.5))
     for before, after in zip(sharp, soft, strict=True):
         assert after.diff(dim=3).abs().max() < before.diff(dim=3).abs().max() / 2
     photo, transmission, reflection = map(to_linear, soft)
@@ -110,7 +110,7 @@ def test_a_soft_photo_is_blurred_like_its_layers(photos):
 
 def test_a_background_out_of_focus_is_blurred_and_its_reflection_is_not(photos):
     _, behind, mirrored = layers_of(photos)
-    _, blurred, same = layers_of(photos, background_blur_probability=1.0, background_blur_px=(8.0, 8.0))
+    _, blurred, same = layers_of(photos, background_blur_probability=1.0, background_blur_sigma_px=(8.0, 8.0))
     assert blurred.diff(dim=3).abs().max() < behind.diff(dim=3).abs().max() / 2
     assert same.diff(dim=3).abs().max() > mirrored.diff(dim=3).abs().max() / 2
 

@@ -11,7 +11,7 @@ from PIL import Image
 
 from brewster.errors import ModelError
 from brewster.models.diffusion.adapter.lora import add_lora, lora_parameters, save_lora
-from brewster.models.diffusion.backbones import BACKBONES, tiny
+from brewster.models.diffusion.backbones.registry import BACKBONES, tiny
 from brewster.models.diffusion.panels import PanelLayout, conditioning_image, split
 from brewster.models.diffusion.prompt import PROMPT, PromptEmbedding
 from brewster.models.diffusion.sampling import sample
@@ -27,7 +27,7 @@ def card(name="kontext", scores=None, **changes):
     recipe = read_recipe(RECIPES / f"{name}.toml")
     changed = LoraRecipe.model_validate(recipe.model_dump(exclude_unset=True) | changes)
     family = BACKBONES[name] if name in BACKBONES else BACKBONES["kontext"]
-    return card_text(changed, scores=scores or {}, base=family)
+    return card_text(changed, scores=scores or {}, backbone_class=family)
 
 
 @pytest.mark.parametrize(
@@ -60,10 +60,10 @@ def test_a_finetune_of_a_base_is_named_and_a_folder_is_not():
 
 
 def test_a_toy_is_marked_as_one_and_names_no_base():
-    text = card("large-tiny")
-    assert "**This is a toy.**" in text
+    text = card("lora-tiny")
+    assert "**This model is for software tests.**" in text
     assert "base_model" not in ModelCard(text).data.to_dict()
-    assert "**This is a toy.**" not in card()
+    assert "**This model is for software tests.**" not in card()
 
 
 def test_sets_are_listed_with_their_scenes_and_without_local_paths(tmp_path, monkeypatch):
@@ -71,7 +71,7 @@ def test_sets_are_listed_with_their_scenes_and_without_local_paths(tmp_path, mon
     monkeypatch.setenv("BREWSTER_DATA", str(tmp_path))
     listed = "`sets/paper` (3 samples of the scenes `tiny`, orders all)"
     assert listed in card()
-    elsewhere = {"rendered": {"sets": [str(tmp_path / "sets" / "paper")]}}
+    elsewhere = {"rendered": {"datasets": [str(tmp_path / "sets" / "paper")]}}
     assert "`paper` (3 samples" in card(data=elsewhere)
     assert str(tmp_path) not in card(data=elsewhere)
     monkeypatch.setenv("BREWSTER_DATA", str(tmp_path / "sets"))
@@ -81,7 +81,7 @@ def test_sets_are_listed_with_their_scenes_and_without_local_paths(tmp_path, mon
 def test_pairs_and_their_share_are_listed():
     text = card(
         reflections="difference",
-        data={"pairs": ["real/train"], "pairs_share": 0.25, "rendered": {"sets": ["a"], "count": 7}},
+        data={"pairs": ["real/train"], "pairs_share": 0.25, "rendered": {"datasets": ["a"], "count": 7}},
     )
     assert "75% of the samples: the first 7 samples of `a`." in text
     assert "Real pairs, 25% of the samples: real/train." in text
@@ -134,7 +134,11 @@ def exported(tmp_path):
             for parameter in lora_parameters(backbone):
                 parameter.add_(0.05 * torch.randn(parameter.shape, generator=generator))
         save_lora(tmp_path / "lora", backbone, prompt, DecompositionTask(layout))
-        changes = {"panels": list(layout.panels), "direction": layout.direction, "budget_px": 64 * 64 * 3}
+        changes = {
+            "panels": list(layout.panels),
+            "direction": layout.direction,
+            "max_composite_pixels": 64 * 64 * 3,
+        }
         changes["white_space"] = layout.white_space
         recipe = read_recipe(RECIPES / f"{name}.toml").model_copy(update=changes)
         write_card(tmp_path / "lora", recipe, {}, BACKBONES[name])
@@ -198,6 +202,8 @@ def test_the_card_has_the_prompt_of_the_training(exported, tmp_path):
     text = (tmp_path / "lora" / "README.md").read_text()
     assert "> Take the glass away." in text
     assert PROMPT not in text
-    assert text == card_text(recipe, scores={"loss": 1.0}, base=BACKBONES["klein"], prompt=prompt.text)
+    assert text == card_text(
+        recipe, scores={"loss": 1.0}, backbone_class=BACKBONES["klein"], prompt=prompt.text
+    )
     with pytest.raises(ModelError, match="encoded for klein"):
         write_card(tmp_path / "lora", recipe, {}, BACKBONES["qwen"])

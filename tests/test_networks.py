@@ -71,7 +71,7 @@ def test_a_run_of_one_network_does_not_start_from_a_checkpoint_of_another(recipe
     trainer = CompactTrainer(recipe)
     Checkpoint(0, recipe.model_dump_json(), trainer.state_dict()).write(tmp_path / "start.pt")
     other = with_value(recipe, "network", small_network).model_copy(
-        update={"start_from": (tmp_path / "start.pt",)}
+        update={"init_checkpoints": (tmp_path / "start.pt",)}
     )
     with pytest.raises(
         ModelError,
@@ -97,6 +97,6 @@ def test_a_checkpoint_with_an_older_recipe_contains_the_default_network(recipe, 
         state=trainer.state_dict() | {"average": average},
     )
     checkpoint.write(tmp_path / "start.pt")
-    started = CompactTrainer(recipe.model_copy(update={"start_from": (tmp_path / "start.pt",)}))
+    started = CompactTrainer(recipe.model_copy(update={"init_checkpoints": (tmp_path / "start.pt",)}))
     started.initialize()
     assert all((value == 2).all() for value in started.network.state_dict().values())

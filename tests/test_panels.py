@@ -44,7 +44,10 @@ def test_without_a_generated_photo_the_conditioning_image_is_the_photo():
 
 
 def test_the_papers_composite_is_three_squares_of_512_pixels():
-    assert fit_panel((2000, 2000), PanelLayout(), budget_px=1536 * 512, multiple=16).panel == (512, 512)
+    assert fit_panel((2000, 2000), PanelLayout(), max_composite_pixels=1536 * 512, size_divisor=16).panel == (
+        512,
+        512,
+    )
 
 
 @given(
@@ -54,13 +57,17 @@ def test_the_papers_composite_is_three_squares_of_512_pixels():
     st.integers(1000, 2_000_000),
     st.sampled_from([8, 16, 32]),
 )
-def test_any_photo_fits_without_distortion_or_is_refused(width, height, layout, budget_px, multiple):
+def test_any_photo_fits_without_distortion_or_is_refused(
+    width, height, layout, max_composite_pixels, multiple
+):
     try:
-        fit = fit_panel((width, height), layout, budget_px=budget_px, multiple=multiple)
+        fit = fit_panel(
+            (width, height), layout, max_composite_pixels=max_composite_pixels, size_divisor=multiple
+        )
     except PhotoError:
         assume(False)
     composite = layout.composite_size(fit.panel)
-    assert composite[0] * composite[1] <= budget_px
+    assert composite[0] * composite[1] <= max_composite_pixels
     padding = [panel - content for panel, content in zip(fit.panel, fit.content, strict=True)]
     assert min(padding) == 0
     assert 0 <= max(padding) <= multiple / 2 + 0.5
@@ -81,33 +88,33 @@ def test_any_photo_fits_without_distortion_or_is_refused(width, height, layout, 
 
 
 @given(st.integers(16, 4000), st.integers(16, 4000), layouts, st.integers(10_000, 2_000_000))
-def test_the_next_larger_panel_would_exceed_the_budget(width, height, layout, budget_px):
+def test_the_next_larger_panel_would_exceed_the_budget(width, height, layout, max_composite_pixels):
     try:
-        fit = fit_panel((width, height), layout, budget_px=budget_px, multiple=16)
+        fit = fit_panel((width, height), layout, max_composite_pixels=max_composite_pixels, size_divisor=16)
     except PhotoError:
         assume(False)
     short = min(fit.panel) + 16
     long = round(short * max(width, height) / min(width, height) / 16) * 16
-    assert short * long * len(layout.panels) > budget_px
+    assert short * long * len(layout.panels) > max_composite_pixels
 
 
 @given(st.integers(16, 500), st.integers(16, 500), layouts)
 def test_the_error_for_a_photo_smaller_than_its_panel_names_a_budget_that_works(width, height, layout):
-    with pytest.raises(PhotoError, match="lower budget_px to") as raised:
-        fit_panel((width, height), layout, budget_px=10**7, multiple=16)
-    budget_px = int(str(raised.value).rstrip(".").rsplit(maxsplit=1)[1])
+    with pytest.raises(PhotoError, match="lower max_composite_pixels to") as raised:
+        fit_panel((width, height), layout, max_composite_pixels=10**7, size_divisor=16)
+    max_composite_pixels = int(str(raised.value).rstrip(".").rsplit(maxsplit=1)[1])
     with contextlib.suppress(PhotoError):  # the aspect ratio may be too extreme for this budget
-        fit = fit_panel((width, height), layout, budget_px=budget_px, multiple=16)
+        fit = fit_panel((width, height), layout, max_composite_pixels=max_composite_pixels, size_divisor=16)
         assert max(fit.content) <= max(width, height)
 
 
 def test_an_extreme_aspect_ratio_is_refused():
     with pytest.raises(PhotoError, match=r"no panel with the aspect ratio of 9000 x 2 pixels fits"):
-        fit_panel((9000, 2), PanelLayout(), budget_px=30_000, multiple=16)
+        fit_panel((9000, 2), PanelLayout(), max_composite_pixels=30_000, size_divisor=16)
 
 
 def test_padding_is_a_mirrored_copy_of_the_border():
-    fit = fit_panel((100, 61), PanelLayout(("T",)), budget_px=48 * 80, multiple=16)
+    fit = fit_panel((100, 61), PanelLayout(("T",)), max_composite_pixels=48 * 80, size_divisor=16)
     assert (fit.content, fit.panel) == ((79, 48), (80, 48))
     image = torch.rand(1, 3, 48, 79)
     assert torch.equal(fit.pad(image)[..., 79], image[..., 77])
@@ -133,4 +140,4 @@ def test_missing_panels_and_wrong_sizes_are_refused():
     with pytest.raises(PhotoError, match="is not divisible by 3"):
         split(panel, PanelLayout())
     with pytest.raises(PhotoError, match="resize it first"):
-        fit_panel((64, 64), PanelLayout(("T",)), budget_px=64 * 64, multiple=16).pad(panel)
+        fit_panel((64, 64), PanelLayout(("T",)), max_composite_pixels=64 * 64, size_divisor=16).pad(panel)

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 from PIL import Image, ImageOps
 
-from brewster.errors import MissingExtra, PhotoError, TargetError, UnsupportedPhoto
+from brewster.errors import MissingExtra, OutputError, PhotoError, UnsupportedPhoto
 from brewster.image_formats import FORMATS
 from brewster.photo import FileInfo, Photo
 from picture_files import exif_block, file_of, pil, smooth
@@ -310,7 +310,7 @@ def test_the_suffix_of_a_saved_file_sets_its_format_and_no_file_is_overwritten(t
     ):
         photo.save(tmp_path / f"a{suffix}")
         assert pil((tmp_path / f"a{suffix}").read_bytes()).format == pil_format
-    with pytest.raises(TargetError):
+    with pytest.raises(OutputError):
         photo.save(tmp_path / "a.jpg")
     photo.save(tmp_path / "a.jpg", overwrite=True)
 

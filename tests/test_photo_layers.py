@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
 from brewster.errors import MissingExtra, UnreadablePhoto, UnsupportedPhoto
-from brewster.photo import Photo, read_layers, write_layers
+from brewster.photo import Photo, read_exr_layers, write_exr_layers
 
 NAMES = ("photo", "transmission", "background", "reflection", "mirror")
 HEADER = {"scene": 'seed = 7\nrecipe = "Fenêtre"\n', "software": "brewster 0.1.0"}
@@ -34,24 +34,24 @@ def read_part(data, **options):
     )
 )
 def test_layers_are_kept_in_half_precision(image):
-    again = read_layers(write_layers({"photo": image, "mirror": image * 2**-7}, {}))
+    again = read_exr_layers(write_exr_layers({"photo": image, "mirror": image * 2**-7}, {}))
     assert sorted(again) == ["mirror", "photo"]
     for name, light in (("photo", image), ("mirror", image * 2**-7)):
         assert again[name].dtype == np.float32
         np.testing.assert_allclose(again[name], light, rtol=2**-11, atol=2**-25)
-    halves = read_layers(write_layers(again, {}))
+    halves = read_exr_layers(write_exr_layers(again, {}))
     assert all(np.array_equal(halves[name], again[name]) for name in again)
 
 
 def test_values_beyond_half_precision_are_clipped():
     image = np.full((2, 2, 3), 1e9, np.float32)
     image[0] = np.inf
-    assert (read_layers(write_layers({"photo": image}, {}))["photo"] == 65504).all()
+    assert (read_exr_layers(write_exr_layers({"photo": image}, {}))["photo"] == 65504).all()
 
 
 def test_layers_are_separate_in_any_order(rng):
     layers = random_layers(rng)
-    again = read_layers(write_layers(layers, HEADER))
+    again = read_exr_layers(write_exr_layers(layers, HEADER))
     assert list(again) == sorted(NAMES)
     for name in NAMES:
         np.testing.assert_allclose(again[name], layers[name], rtol=1e-3)
@@ -60,11 +60,13 @@ def test_layers_are_separate_in_any_order(rng):
 def test_the_same_layers_give_the_same_bytes_in_any_order(rng):
     layers = random_layers(rng)
     reversed_layers = {name: layers[name] for name in reversed(NAMES)}
-    assert write_layers(layers, HEADER) == write_layers(reversed_layers, dict(reversed(HEADER.items())))
+    assert write_exr_layers(layers, HEADER) == write_exr_layers(
+        reversed_layers, dict(reversed(HEADER.items()))
+    )
 
 
 def test_other_programs_read_named_compressed_half_layers_and_the_text(rng):
-    data = write_layers(random_layers(rng), HEADER)
+    data = write_exr_layers(random_layers(rng), HEADER)
     exr = pytest.importorskip("OpenEXR")
     part = read_part(data, separate_channels=True)
     assert sorted(part.channels) == sorted(f"{name}.{channel}" for name in NAMES for channel in "RGB")
@@ -81,30 +83,30 @@ def test_a_layer_name_may_have_dots_and_other_channels_are_ignored(rng):
     channels = {f"left.photo.{channel}": half for channel in "RGB"} | {"photo.Z": half, "depth.R": half}
     file = io.BytesIO()
     exr.File({"compression": exr.ZIP_COMPRESSION, "type": exr.scanlineimage}, channels).write(file)
-    assert list(read_layers(file.getvalue())) == ["left.photo"]
+    assert list(read_exr_layers(file.getvalue())) == ["left.photo"]
 
 
 @pytest.mark.parametrize("damage", [b"", b"not an image", None])
 def test_a_damaged_file_is_refused(damage, rng):
-    data = write_layers(random_layers(rng), HEADER)
+    data = write_exr_layers(random_layers(rng), HEADER)
     with pytest.raises(UnreadablePhoto, match="complete"):
-        read_layers(data[: len(data) // 2] if damage is None else damage)
+        read_exr_layers(data[: len(data) // 2] if damage is None else damage)
 
 
 def test_an_exr_without_layers_is_refused(rng):
     photo = Photo.from_array(rng.random((4, 4, 3), np.float32), encoding="linear")
     with pytest.raises(UnreadablePhoto, match=r"the channels B, G, R; .*name\.R"):
-        read_layers(photo.encode("exr"))
+        read_exr_layers(photo.encode("exr"))
 
 
 def test_attributes_that_exr_would_drop_are_refused(rng):
     with pytest.raises(UnsupportedPhoto, match="named version"):
-        write_layers(random_layers(rng), {**HEADER, "version": "0.1.0"})
+        write_exr_layers(random_layers(rng), {**HEADER, "version": "0.1.0"})
 
 
 def test_without_openexr_the_error_names_the_extra(monkeypatch, rng):
-    data = write_layers(random_layers(rng), {})
+    data = write_exr_layers(random_layers(rng), {})
     monkeypatch.setitem(sys.modules, "OpenEXR", None)
-    for call in (lambda: read_layers(data), lambda: write_layers(random_layers(rng), {})):
+    for call in (lambda: read_exr_layers(data), lambda: write_exr_layers(random_layers(rng), {})):
         with pytest.raises(MissingExtra, match="pip install"):
             call()

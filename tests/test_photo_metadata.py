@@ -39,7 +39,7 @@ def test_jpeg_quality_and_chroma_are_no_worse_than_the_source(
     assert all(sum(tables[number]) <= sum(source_tables[number]) for number in source_tables)
 
 
-def test_unusual_quantisation_tables_get_a_quality_that_is_at_least_as_fine() -> None:
+def test_unusual_quantization_tables_get_a_quality_that_is_at_least_as_fine() -> None:
     flat = [[10] * 64, [12] * 64]
     written = Photo.open(file_of(smooth(), "JPEG", qtables=flat)).encode()
     tables = pil(written).quantization

@@ -17,7 +17,7 @@ import pytest
 from brewster.cli import cli
 from brewster.environments import polyhaven
 from brewster.environments.polyhaven import DownloadRequest, maps_folder, pull
-from brewster.errors import DownloadError, TargetError
+from brewster.errors import DownloadError, OutputError
 from cli_helpers import error_lines, json_lines, list_files
 from file_server import loopback_only
 
@@ -390,20 +390,20 @@ def test_redirections_are_followed_to_http_urls_only(haven, fetch):
 def test_a_full_disk_ends_the_call(fetch, maps):
     maps.mkdir()
     (maps / "a_room_4k.hdr.part").symlink_to("/dev/full")
-    with pytest.raises(TargetError, match=r"No space left .* free some space"):
+    with pytest.raises(OutputError, match=r"No space left .* free some space"):
         fetch(indoor=2)
 
 
 def test_a_target_that_is_no_folder_is_an_error(fetch, maps):
     maps.write_bytes(b"")
-    with pytest.raises(TargetError, match="maps"):
+    with pytest.raises(OutputError, match="maps"):
         fetch()
 
 
 def test_a_manifest_of_another_program_is_refused_before_any_download(haven, fetch, maps):
     maps.mkdir()
     (maps / "manifest.csv").write_bytes(b"name,price\n\xff,1\n")
-    with pytest.raises(TargetError, match="was not written by brewster"):
+    with pytest.raises(OutputError, match="was not written by brewster"):
         fetch()
     assert haven.requests == []
 

@@ -64,7 +64,7 @@ def test_what_is_turned_away_from_a_lamp_or_behind_it_is_dark():
 
 
 def test_the_sun_is_half_a_degree_wide():
-    sun = street_environment(Generator(PCG64(7)), night=False).glows[-1]
+    sun = street_environment(Generator(PCG64(7)), night=False).emitters[-1]
     width = 2 * sun.radius / np.linalg.norm(sun.position)
     assert math.degrees(width) == pytest.approx(0.533, abs=0.01)
 

@@ -4,9 +4,9 @@ import pytest
 from brewster.environments.procedural import rooms
 from brewster.environments.procedural.canvas import (
     Canvas,
-    Glow,
     ProceduralEnvironment,
     Quad,
+    SmallEmitter,
     directions,
     fractal,
     render,
@@ -100,7 +100,9 @@ def test_lamps_of_a_room_outshine_its_walls(fine_maps):
 @pytest.mark.parametrize("aim", [(0, 0, -1), (0.6, 0.8, 0), (0.1, 1, 0.1), (0, -1, 0)])
 def test_a_glow_keeps_its_energy_whatever_the_map_resolves(height, aim):
     position = np.array(aim, np.float32) / np.linalg.norm(aim) * 10
-    picture = render(ProceduralEnvironment([], [Glow(position, 0.05, (1000, 0, 0))], dark, 0.5), height)
+    picture = render(
+        ProceduralEnvironment([], [SmallEmitter(position, 0.05, (1000, 0, 0))], dark, 0.5), height
+    )
     energy = (picture[..., 0] * solid_angles(height)).sum()
     assert energy == pytest.approx(1000 * np.pi * 0.005**2, rel=1e-3)
 

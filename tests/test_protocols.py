@@ -27,8 +27,8 @@ def test_the_contest_crops_the_border_and_scores_its_five_metrics():
 
 
 def test_a_changed_setting_is_named():
-    lines = describe_protocol(protocol_config("xreflection", size=None, quality="best"))
-    assert lines[-1] == "This run differs from the protocol xreflection in: size."
+    lines = describe_protocol(protocol_config("xreflection", short_side_px=None, quality="best"))
+    assert lines[-1] == "This run differs from the protocol xreflection in: short_side_px."
 
 
 def test_an_unknown_protocol_is_an_error_with_the_known_names():

@@ -33,28 +33,36 @@ def test_recipes_without_a_mix_table_have_the_default_mixtures():
 
 def test_a_changed_value_leaves_the_rest_of_a_recipe_as_it_was():
     before = read_recipe(BASES[0])
-    after = with_value(before, "data.rendered.mixing", "8-bit")
-    assert after.data.rendered.mixing == "8-bit"
-    assert with_value(after, "data.rendered.mixing", "light") == before
+    after = with_value(before, "data.rendered.blend_space", "srgb")
+    assert after.data.rendered.blend_space == "srgb"
+    assert with_value(after, "data.rendered.blend_space", "linear") == before
     assert with_value(before, "mix.noise", [0, 0.5]).mix == MixRecipe(noise=(0, 0.5))
 
 
 @pytest.mark.parametrize(
     ("key_path", "value", "message"),
     [
-        ("data.rendered.mixng", "light", "no key data.rendered.mixng; .*; did you mean data.rendered.mixing"),
-        ("data.rendered.mixing.more", 1, "no key data.rendered.mixing.more; .*; see docs/recipes.md"),
+        (
+            "data.rendered.blend_spce",
+            "linear",
+            "no key data.rendered.blend_spce; .*; did you mean data.rendered.blend_space",
+        ),
+        (
+            "data.rendered.blend_space.more",
+            1,
+            "no key data.rendered.blend_space.more; .*; see docs/recipes.md",
+        ),
         ("", 1, "no key ; .*; see docs/recipes.md"),
         ("sparkle", 1, "no key sparkle; .*; see docs/recipes.md"),
         (
-            "data.rendered.mixing",
+            "data.rendered.blend_space",
             "dark",
-            "with data.rendered.mixing = 'dark': data.rendered.mixing is \"dark\"; expected a string, one of",
+            "with data.rendered.blend_space = 'dark': data.rendered.blend_space is \"dark\"; expected a string, one of",
         ),
         (
-            "data.rendered.sets",
+            "data.rendered.datasets",
             ["a"],
-            r"sets = \['a'\]: the values of \[data.rendered\] are inconsistent; .* exactly one of the two; compare",
+            r"datasets = \['a'\]: the values of \[data.rendered\] are inconsistent; .* exactly one of the two; compare",
         ),
         ("data.pairs_share", 0.01, "pairs_share = 0.01: the values are inconsistent; .* gives 0 of 8"),
         ("steps", 0, "steps = 0: steps is 0; expected an integer, above 0; compare"),
@@ -90,7 +98,7 @@ def test_the_path_of_a_scene_recipe_is_relative_to_the_recipe(tmp_path):
     ("change", "message"),
     [
         (("seed = 1", "seed ="), "not TOML"),
-        (("# A test of every part", "# Un test complété"), "not TOML .*utf-8"),
+        (("# A short run", "# Un test complété"), "not TOML .*utf-8"),
         (("seed = 1", ""), "seed is missing; expected an integer, at least 0, below 4294967296; add it"),
         (("seed = 1", "seed = -1"), "seed"),
         (("steps = 6", "steps = 0"), "steps"),
@@ -130,15 +138,15 @@ def test_the_path_of_a_scene_recipe_is_relative_to_the_recipe(tmp_path):
             r"\[data\.rendered\] are inconsistent; .* exactly one of the two",
         ),
         (
-            ("[mix]", '[data.rendered]\nrecipe = "tiny"\nsets = ["a"]\n[mix]'),
+            ("[mix]", '[data.rendered]\nrecipe = "tiny"\ndatasets = ["a"]\n[mix]'),
             r"\[data\.rendered\] are inconsistent; .* exactly one of the two",
         ),
         (
-            ("[mix]", '[data.rendered]\nsets = ["a"]\norders = "truncated"\nseed = 0\n[mix]'),
+            ("[mix]", '[data.rendered]\ndatasets = ["a"]\norders = "truncated"\nseed = 0\n[mix]'),
             r"\[data\.rendered\] are inconsistent; expected no orders, seed: ",
         ),
         (
-            ("[mix]", '[data.rendered]\nsets = ["a"]\nmaps = ["hdri"]\nphotos = ["p"]\n[mix]'),
+            ("[mix]", '[data.rendered]\ndatasets = ["a"]\nmaps = ["hdri"]\nphotos = ["p"]\n[mix]'),
             r"\[data\.rendered\] are inconsistent; expected no maps, photos: ",
         ),
         (
@@ -154,7 +162,10 @@ def test_the_path_of_a_scene_recipe_is_relative_to_the_recipe(tmp_path):
             r"\[data\] are inconsistent; expected photos for the rest",
         ),
         (("[mix]", '[data.rendered]\nrecipe = "tiny"\ncount = -1\n[mix]'), r"data\.rendered\.count"),
-        (("[mix]", '[data.rendered]\nrecipe = "tiny"\nmixing = "dark"\n[mix]'), r"data\.rendered\.mixing"),
+        (
+            ("[mix]", '[data.rendered]\nrecipe = "tiny"\nblend_space = "dark"\n[mix]'),
+            r"data\.rendered\.blend_space",
+        ),
         (("[mix]", "[mix]\nsparkle = 1"), r"no key mix\.sparkle"),
         (("[mix]", "[mix]\ncrop = [1, 0.45]"), r"mix\.crop is \[1, 0.45\]; expected low <= high"),
         (
@@ -176,8 +187,8 @@ def test_a_wrong_recipe_is_refused_and_the_key_named(tmp_path, change, message):
 
 
 def test_a_recipe_with_a_backbone_is_a_lora_recipe():
-    large = {path.stem for path in RECIPES if isinstance(read_recipe(path), LoraRecipe)}
-    assert large == {"kontext", "kontext-real", "klein", "qwen", "large-tiny", "large-real-tiny"}
+    lora_recipes = {path.stem for path in RECIPES if isinstance(read_recipe(path), LoraRecipe)}
+    assert lora_recipes == {"kontext", "kontext-real", "klein", "qwen", "lora-tiny", "lora-real-tiny"}
     assert isinstance(read_recipe(TINY), CompactRecipe)
 
 
@@ -185,7 +196,7 @@ def test_the_kontext_recipe_is_the_papers():
     recipe = read_recipe(KONTEXT)
     assert (recipe.backbone, recipe.rank, recipe.steps, recipe.batch_size) == ("kontext", 16, 4000, 1)
     assert recipe.layout.panels == ("I", "T", "R")
-    assert recipe.layout.composite_size((512, 512))[0] * 512 == recipe.budget_px
+    assert recipe.layout.composite_size((512, 512))[0] * 512 == recipe.max_composite_pixels
     assert recipe.data.rendered.target == "transmission"
 
 
@@ -210,8 +221,8 @@ def test_the_path_of_a_prompt_is_relative_to_the_recipe(tmp_path):
         (("rank = 16", "rank = 0"), "rank is 0"),
         (("rank = 16", "rnk = 16"), "no key rnk .*; did you mean rank"),
         (("rank = 16", "image_size_schedule = [[0.0, 64]]"), "no key image_size_schedule"),
-        (('"int8"', '"int3"'), 'quantise is "int3"; .*; did you mean "int8"'),
-        (('"kontext"', '"tiny:kontext"'), "are inconsistent; expected no quantise: a toy backbone"),
+        (('"int8"', '"int3"'), 'quantization is "int3"; .*; did you mean "int8"'),
+        (('"kontext"', '"tiny:kontext"'), "are inconsistent; expected no quantization: a toy backbone"),
         (('["I", "T", "R"]', '["I", "T", "Q"]'), r"panels\.2"),
         (('["I", "T", "R"]', '["I", "R"]'), "inconsistent; expected panels .* T, .*\\['I', 'R'\\]"),
         (('["I", "T", "R"]', '["T", "T"]'), "inconsistent; expected panels .* at most once"),
@@ -221,7 +232,7 @@ def test_the_path_of_a_prompt_is_relative_to_the_recipe(tmp_path):
             "inconsistent; expected a weight above 0",
         ),
         (
-            ('sets = ["sets/paper"]', 'recipe = "window"'),
+            ('datasets = ["sets/paper"]', 'recipe = "window"'),
             "inconsistent; expected rendered sets and pairs only",
         ),
         (

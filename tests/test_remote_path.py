@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from brewster.errors import BrewsterError, MissingExtra, TargetError, UnreadablePhoto
+from brewster.errors import BrewsterError, MissingExtra, OutputError, UnreadablePhoto
 from brewster.files import find, write_atomically
 from brewster.remote_path import RemotePath, location
 
@@ -60,12 +60,12 @@ def test_a_protocol_that_is_unknown_or_not_installed_is_reported_before_any_phot
 def test_a_file_in_a_store_is_written_once():
     path = location("memory://bucket/a.jpg")
     write_atomically(path, b"first")
-    with pytest.raises(TargetError, match=r"memory://bucket/a\.jpg was not written .*exists"):
+    with pytest.raises(OutputError, match=r"memory://bucket/a\.jpg was not written .*exists"):
         write_atomically(path, b"second")
     assert path.read_bytes() == b"first"
     write_atomically(path, b"second", overwrite=True)
     assert path.read_bytes() == b"second"
-    with pytest.raises(TargetError, match="is the input image itself"):
+    with pytest.raises(OutputError, match="is the input image itself"):
         write_atomically(path, b"third", overwrite=True, source=path)
 
 
@@ -101,7 +101,7 @@ def test_errors_of_a_store_name_the_file_and_the_reason(store, monkeypatch):
         UnreadablePhoto, match=r"cannot be read \(503 Slow Down\); expected a store that answers"
     ):
         path.read_bytes()
-    with pytest.raises(TargetError, match=r"was not written \(503 Slow Down\)"):
+    with pytest.raises(OutputError, match=r"was not written \(503 Slow Down\)"):
         write_atomically(path, b"")
     with pytest.raises(UnreadablePhoto, match="memory://bucket cannot be listed"):
         find([path.parent])

@@ -10,8 +10,8 @@ import torch
 from pyarrow import parquet
 
 from brewster import Photo
-from brewster.errors import RecipeError, TargetError
-from brewster.photo import read_layers
+from brewster.errors import OutputError, RecipeError
+from brewster.photo import read_exr_layers
 from brewster.render.sample import LAYERS, LinearSample
 from brewster.rendered import store
 from brewster.rendered.generation import preview
@@ -39,7 +39,7 @@ def test_a_sample_is_five_photographs_their_light_and_their_scene(four_samples, 
     assert {path.name for path in folder.iterdir()} == set(store.SAMPLE_FILES)
     assert all(Photo.open(folder / f"{layer}.jpg").size == (24, 16) for layer in LAYERS)
     assert read_scene(folder / store.SCENE_FILE) == scene
-    light = read_layers((folder / store.LIGHT_FILE).read_bytes())
+    light = read_exr_layers((folder / store.LIGHT_FILE).read_bytes())
     sample = render(scene, None)
     for name, layer in sample.layers().items():
         np.testing.assert_allclose(light[name], layer.permute(1, 2, 0).numpy(), rtol=1e-3)
@@ -123,9 +123,9 @@ def test_a_sample_of_another_process_is_not_replaced(tmp_path):
 
 def test_a_sample_that_cannot_be_written_leaves_nothing(tmp_path):
     (tmp_path / "file").touch()
-    with pytest.raises(TargetError):
+    with pytest.raises(OutputError):
         store.write_folder(tmp_path / "file" / "000000", {"a": b""})
-    with pytest.raises(TargetError):
+    with pytest.raises(OutputError):
         store.write_folder(tmp_path / "000000", {"a": b"", "x" * 300: b""})
     assert [path.name for path in tmp_path.iterdir()] == ["file"]
 

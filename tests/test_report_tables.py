@@ -60,7 +60,7 @@ def test_csv_has_a_line_for_every_mean_and_every_difference(results):
         "psnr",
         "20.0",
     )
-    assert [row["than"] for row in rows if row["set"] == "average"].count("input (unprocessed)") == 2
+    assert [row["reference"] for row in rows if row["set"] == "average"].count("input (unprocessed)") == 2
 
 
 @pytest.mark.parametrize("width", [40, 60, 80, 200])

@@ -29,4 +29,4 @@ def test_a_photo_with_such_sides_is_not_changed():
 
 def test_a_photo_is_first_downscaled_and_then_rounded():
     photo = Photo.from_array(np.zeros((500, 700, 3), np.uint8), encoding="srgb")
-    assert resize(photo, EvaluationConfig(size=420, multiple=32)).size == (576, 416)
+    assert resize(photo, EvaluationConfig(short_side_px=420, size_divisor=32)).size == (576, 416)

@@ -23,7 +23,7 @@ def klein():
 def test_klein_fits_the_papers_card_with_the_known_sizes(klein):
     assert klein.panel == (512, 512)
     assert klein.generated_tokens == klein.condition_tokens == 3 * 32 * 32
-    assert klein.parameters == pytest.approx(3.88e9, rel=0.01)
+    assert klein.parameter_count == pytest.approx(3.88e9, rel=0.01)
     assert klein.memory_gib["base"] == pytest.approx(7.2, abs=0.1)
     klein.check_fits()
     assert klein.total_gib < 16
@@ -44,7 +44,7 @@ def test_the_table_lists_tokens_memory_and_time(klein):
 
 def test_the_estimate_for_kontext_agrees_with_the_counts_for_the_paper():
     estimate = estimate_resources(read_recipe(RECIPES / "kontext.toml"), CARD)
-    assert estimate.parameters == pytest.approx(11.9e9, rel=0.01)
+    assert estimate.parameter_count == pytest.approx(11.9e9, rel=0.01)
     assert estimate.memory_gib["base"] == pytest.approx(11.2, abs=0.2)
     assert estimate.memory_gib["LoRA and AdamW"] == pytest.approx(1.3, abs=0.1)
     assert estimate.memory_gib["activations"] == pytest.approx(3.7, abs=0.2)
@@ -53,7 +53,7 @@ def test_the_estimate_for_kontext_agrees_with_the_counts_for_the_paper():
 
 
 def test_without_panel_i_the_condition_is_the_photo_alone():
-    recipe = with_value(read_recipe(RECIPES / "large-tiny.toml"), "panels", ["T", "R"])
+    recipe = with_value(read_recipe(RECIPES / "lora-tiny.toml"), "panels", ["T", "R"])
     estimate = estimate_resources(recipe, CARD)
     assert estimate.generated_tokens == 2 * estimate.condition_tokens
     both = estimate_resources(with_value(recipe, "panels", ["I", "T", "R"]), CARD)
@@ -61,11 +61,11 @@ def test_without_panel_i_the_condition_is_the_photo_alone():
 
 
 def test_a_recipe_that_does_not_fit_is_refused_with_a_change_that_fits(klein):
-    recipe = with_value(read_recipe(RECIPES / "klein.toml"), "budget_px", 768 * 256)
+    recipe = with_value(read_recipe(RECIPES / "klein.toml"), "max_composite_pixels", 768 * 256)
     for memory, cure in (
-        (7, 'set quantise = "int8", which needs'),
-        (5.5, 'set quantise = "nf4"'),
-        (2, "lower budget_px"),
+        (7, 'set quantization = "int8", which needs'),
+        (5.5, 'set quantization = "nf4"'),
+        (2, "lower max_composite_pixels"),
     ):
         estimate = estimate_resources(recipe, GraphicsCard("toy card", memory, 100))
         with pytest.raises(
@@ -89,7 +89,7 @@ def test_an_unknown_backbone_has_no_estimate():
 
 def test_the_command_prints_the_estimate_and_trains_nothing(run_without_model, tmp_path, monkeypatch):
     monkeypatch.delenv("BREWSTER_DATA", raising=False)
-    code, out, err = run_without_model("train", RECIPES / "large-tiny.toml", "--plan", "--gpu", "A100")
+    code, out, err = run_without_model("train", RECIPES / "lora-tiny.toml", "--plan", "--gpu", "A100")
     assert code == 0
     assert b"A100" in out
     assert "the data was not checked: BREWSTER_DATA is not set" in err
@@ -101,11 +101,11 @@ def test_the_command_prints_the_estimate_and_trains_nothing(run_without_model, t
 
 def test_the_plan_reads_the_data(run_without_model, tmp_path, monkeypatch):
     monkeypatch.setenv("BREWSTER_DATA", str(tmp_path))
-    code, _, err = run_without_model("train", RECIPES / "large-tiny.toml", "--plan")
+    code, _, err = run_without_model("train", RECIPES / "lora-tiny.toml", "--plan")
     assert code == 1
     assert "sets/tiny" in err
     render_set(tmp_path / "sets" / "tiny", count=4)
-    code, out, _ = run_without_model("train", RECIPES / "large-tiny.toml", "--plan")
+    code, out, _ = run_without_model("train", RECIPES / "lora-tiny.toml", "--plan")
     assert code == 0
     assert re.search(rb"^data +4 rendered samples; panels of 32 x 16$", out, re.MULTILINE)
 
@@ -118,7 +118,7 @@ def test_the_plan_lists_download_and_host_memory(klein):
 
 
 def test_white_space_and_the_optimiser_change_the_estimate():
-    recipe = read_recipe(RECIPES / "large-tiny.toml")
+    recipe = read_recipe(RECIPES / "lora-tiny.toml")
     full, plain = (
         estimate_resources(recipe, CARD),
         estimate_resources(with_value(recipe, "white_space", False), CARD),
@@ -127,5 +127,5 @@ def test_white_space_and_the_optimiser_change_the_estimate():
     eight_bit = estimate_resources(with_value(recipe, "optimizer", "adamw8bit"), CARD)
     part = "LoRA and AdamW"
     assert eight_bit.memory_gib[part] == pytest.approx(full.memory_gib[part] * 10 / 16)
-    attention = estimate_resources(with_value(recipe, "targets", ["*.attn.*"]), CARD)
+    attention = estimate_resources(with_value(recipe, "target_modules", ["*.attn.*"]), CARD)
     assert 0 < attention.lora_parameters < full.lora_parameters

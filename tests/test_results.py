@@ -45,7 +45,7 @@ def test_the_average_is_over_all_images(methods):
     )
     assert results["tables"]["a"]["theirs"]["psnr"]["mean"] == 20
     assert results["tables"]["average"]["theirs"]["psnr"]["mean"] == 28
-    assert results["selections"]["average"] == {"title": "Average", "pictures": 100}
+    assert results["selections"]["average"] == {"title": "Average", "cases": 100}
 
 
 def test_a_single_benchmark_has_no_average(methods):
@@ -67,7 +67,7 @@ def test_each_method_is_compared_with_the_methods_before_it(methods):
         parts, methods, lambda case, method: int(case.name) + 0.5 * (method.name == "theirs")
     )
     (row,) = summarise(parts, methods, PSNR, score_rows)["differences"]["a"]
-    assert (row["method"], row["than"], row["mean"], row["better"]) == (
+    assert (row["method"], row["reference"], row["mean"], row["improved_count"]) == (
         "theirs",
         "input (unprocessed)",
         0.5,
@@ -87,8 +87,8 @@ def test_a_failed_case_is_not_counted_and_is_named(methods):
         "high": 0,
         "count": 2,
     }
-    assert results["pictures"][0]["errors"] == {"theirs": "theirs failed"}
-    assert results["benchmarks"]["a"]["refused"] == ["x.png has no partner"]
+    assert results["cases"][0]["errors"] == {"theirs": "theirs failed"}
+    assert results["benchmarks"]["a"]["excluded"] == ["x.png has no partner"]
 
 
 def test_metrics_without_any_score_are_left_out(methods):
@@ -103,7 +103,7 @@ def test_a_benchmark_without_pairs_is_listed_and_has_no_table(methods):
     parts = [make_benchmark("a", 2), make_benchmark("b", 0, excluded=("b.png has no partner",))]
     results = summarise(parts, methods, PSNR, make_rows(parts, methods, lambda *_: 1.0))
     assert list(results["tables"]) == ["a"]
-    assert results["benchmarks"]["b"]["pictures"] == 0
+    assert results["benchmarks"]["b"]["cases"] == 0
 
 
 def test_the_papers_protocol_averages_over_181_images_and_also_reports_whole_benchmarks(tmp_path, methods):
@@ -113,9 +113,9 @@ def test_the_papers_protocol_averages_over_181_images_and_also_reports_whole_ben
     parts = [
         part for name in ("real20", "nature20", "sir2") for part in read_benchmark(name, tmp_path / name)
     ]
-    config = EvaluationConfig(metrics=("psnr",), paper=True)
+    config = EvaluationConfig(metrics=("psnr",), paper_subset=True)
     results = summarise(parts, methods, config, make_rows(parts, methods, lambda *_: 1.0))
-    pictures = {key: selection["pictures"] for key, selection in results["selections"].items()}
+    pictures = {key: selection["cases"] for key, selection in results["selections"].items()}
     assert pictures == {
         "real20": 20,
         "nature20": 20,
@@ -132,9 +132,9 @@ def test_the_papers_protocol_averages_over_181_images_and_also_reports_whole_ben
 
 def test_the_papers_average_uses_only_the_papers_benchmarks_and_reports_missing_images(tmp_path, methods):
     parts = [make_benchmark("real20", 20), make_benchmark("nature20", 10), make_benchmark("mine", 7)]
-    config = EvaluationConfig(metrics=("psnr",), paper=True)
+    config = EvaluationConfig(metrics=("psnr",), paper_subset=True)
     results = summarise(parts, methods, config, make_rows(parts, methods, lambda *_: 1.0))
-    assert results["selections"]["average"]["pictures"] == 30
+    assert results["selections"]["average"]["cases"] == 30
     assert (
         "over 181 images; this one is over 20 of real20, 10 of nature20" in results["protocol"]["choices"][-1]
     )
@@ -154,6 +154,6 @@ def test_the_papers_draw_is_an_error_if_names_do_not_identify_the_scenes(tmp_pat
         summarise(
             parts,
             methods,
-            EvaluationConfig(metrics=("psnr",), paper=True),
+            EvaluationConfig(metrics=("psnr",), paper_subset=True),
             make_rows(parts, methods, lambda *_: 1.0),
         )

@@ -15,7 +15,7 @@ import pytest
 from benchmark_folders import paint, repacked, write
 from brewster import Photo
 from brewster.benchmarks.registry import read_benchmark
-from brewster.errors import BrewsterError, PhotoError, TargetError
+from brewster.errors import BrewsterError, OutputError, PhotoError
 from brewster.evaluate.config import EvaluationConfig
 from brewster.evaluate.methods import IdentityBaseline, MethodOutput, ModelMethod, PredictionFolder
 from brewster.evaluate.runner import score
@@ -304,7 +304,10 @@ def test_photos_are_downscaled_before_any_method_runs(tmp_path):
     sizes = []
     fake.predict = lambda case, photo: sizes.append(photo.size) or MethodOutput(photo)
     (row,) = score(
-        read_benchmark("real20", tmp_path / "real20"), [fake], replace(QUICK, size=20), tmp_path / "out"
+        read_benchmark("real20", tmp_path / "real20"),
+        [fake],
+        replace(QUICK, short_side_px=20),
+        tmp_path / "out",
     )
     assert sizes == [(40, 20)]
     assert (row.width, row.height) == (40, 20)
@@ -312,7 +315,7 @@ def test_photos_are_downscaled_before_any_method_runs(tmp_path):
 
 def test_an_output_folder_that_cannot_be_written_is_an_error(real20, tmp_path):
     write(tmp_path, "out", data=b"a file")
-    with pytest.raises(TargetError, match="was not written"):
+    with pytest.raises(OutputError, match="was not written"):
         score(real20, [FakeMethod()], QUICK, tmp_path / "out")
 
 

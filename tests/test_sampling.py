@@ -6,7 +6,7 @@ from diffusers.pipelines.qwenimage import pipeline_qwenimage_edit
 from PIL import Image
 
 from brewster.errors import DeviceError, ModelError
-from brewster.models.diffusion.backbones import BACKBONES, tiny
+from brewster.models.diffusion.backbones.registry import BACKBONES, tiny
 from brewster.models.diffusion.prompt import PromptEmbedding
 from brewster.models.diffusion.sampling import sample
 

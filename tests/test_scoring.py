@@ -207,7 +207,9 @@ def test_every_metric_gives_the_score_of_its_function(data, monkeypatch):
     names = tuple(
         name for name, metric in METRICS.items() if metric.of == "transmission" and name not in others
     )
-    truth, scorer = open_case(data / "real/dev/nature", EvaluationConfig(metrics=names, size=96), "nature20")
+    truth, scorer = open_case(
+        data / "real/dev/nature", EvaluationConfig(metrics=names, short_side_px=96), "nature20"
+    )
     photo, background = truth.images["photo"], truth.images["transmission"]
     region = truth.region(0.08)
     assert scorer.score(MethodOutput(truth.photo)) == {
@@ -244,7 +246,7 @@ def test_lpips_features_are_computed_once_for_each_image(data, monkeypatch):
     monkeypatch.setenv("BREWSTER_DATA", str(data))
     seen, features = [], Lpips.features
     monkeypatch.setattr(Lpips, "features", lambda self, picture: seen.append(1) or features(self, picture))
-    config = EvaluationConfig(metrics=("lpips", "lpips_region"), thresholds=(0.05, 0.1), size=96)
+    config = EvaluationConfig(metrics=("lpips", "lpips_region"), thresholds=(0.05, 0.1), short_side_px=96)
     truth, scorer = open_case(data / "real/dev/nature", config, "nature20")
     scorer.score(MethodOutput(truth.photo))
     scorer.score(MethodOutput(truth.photo))

@@ -90,22 +90,22 @@ def test_paired_differences_have_narrower_intervals_than_the_means(rng):
     values = np.stack([baseline, baseline + rng.normal(0.5, 0.1, 50)], axis=1)
     series = [("input", "psnr"), ("ours", "psnr")]
     (row,) = differences([make_stratum(values)], series, {"psnr": True})
-    assert (row.method, row.than, row.metric) == ("ours", "input", "psnr")
+    assert (row.method, row.reference, row.metric) == ("ours", "input", "psnr")
     assert row.estimate.mean == pytest.approx(0.5, abs=0.06)
     assert row.estimate.high - row.estimate.low < 0.1
     assert estimate([make_stratum(values)])[0].high - estimate([make_stratum(values)])[0].low > 2
-    assert row.better == 50
+    assert row.improved_count == 50
 
 
 def test_better_uses_the_direction_of_the_metric_and_skips_images_without_both_scores():
     values = np.array([[0.2, 0.1], [0.2, 0.3], [0.2, 0.1], [0.2, np.nan]])
     (row,) = differences([make_stratum(values)], [("a", "lpips"), ("b", "lpips")], {"lpips": False})
-    assert (row.better, row.estimate.count) == (2, 3)
+    assert (row.improved_count, row.estimate.count) == (2, 3)
     assert row.estimate.mean == pytest.approx(-0.1 / 3)
 
 
 def test_every_pair_of_methods_is_compared():
     series = [(method, "psnr") for method in "abc"]
     rows = differences([make_stratum(np.arange(6.0).reshape(2, 3))], series, {"psnr": True})
-    assert [(row.method, row.than) for row in rows] == [("b", "a"), ("c", "a"), ("c", "b")]
+    assert [(row.method, row.reference) for row in rows] == [("b", "a"), ("c", "a"), ("c", "b")]
     assert differences([make_stratum([1.0])], series[:1], {"psnr": True}) == []

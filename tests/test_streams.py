@@ -12,7 +12,7 @@ from brewster.scene.recipe import read_scene_recipe
 from brewster.training.data.data_recipe import DataRecipe
 from brewster.training.data.image_loading import source_weights
 from brewster.training.data.online import OnlineRendered
-from brewster.training.data.rendered import RenderedSets
+from brewster.training.data.rendered import RenderedDatasets
 from brewster.training.recipe import read_recipe, with_value
 from brewster.training.streams import open_stream, validation_pairs
 from cli_helpers import image_bytes
@@ -78,10 +78,10 @@ def test_an_unset_data_folder_is_an_error(recipe, monkeypatch):
 def test_sets_have_a_path_in_the_data_folder_or_an_absolute_path(recipe, root):
     render_set(root / "set", count=3)
     below, absolute = (
-        open_stream(with_data(recipe, rendered={"sets": [folder], "count": 2}))
+        open_stream(with_data(recipe, rendered={"datasets": [folder], "count": 2}))
         for folder in ("set", root / "set")
     )
-    assert isinstance(below, RenderedSets)
+    assert isinstance(below, RenderedDatasets)
     assert len(below) == 2
     assert same(below(3, 2, 32), absolute(3, 2, 32))
 
@@ -105,12 +105,12 @@ def test_orders_and_seed_of_a_recipe_reach_the_scenes(recipe, builtin):
 
 def test_each_batch_is_divided_by_the_shares(recipe, root):
     render_set(root / "set", count=2)
-    data = {"photos": ["photos"], "pairs": ["real"], "rendered": {"sets": ["set"], "share": 0.25}}
+    data = {"photos": ["photos"], "pairs": ["real"], "rendered": {"datasets": ["set"], "share": 0.25}}
     stream = open_stream(with_data(recipe, **data, pairs_share=0.5))
     batch = stream(0, 8, 32)
     assert batch.photo_encoded.shape == (8, 3, 32, 32)
     assert (batch.reflection_weight < 1).tolist() == 4 * [True] + 4 * [False]
-    rendered = open_stream(with_data(recipe, rendered={"sets": ["set"]}))(0, 1, 32)
+    rendered = open_stream(with_data(recipe, rendered={"datasets": ["set"]}))(0, 1, 32)
     assert torch.equal(batch.photo_encoded[4:5], rendered.photo_encoded)
     mixtures = open_stream(with_data(recipe, photos=["photos"]))(0, 3, 32)
     assert torch.equal(batch.photo_encoded[5:], mixtures.photo_encoded)
@@ -122,7 +122,7 @@ def test_pairs_alone_may_fill_a_batch(recipe, root):
 
 
 def test_data_without_a_share_is_not_read(recipe, root):
-    gone = {"pairs": ["gone"], "pairs_share": 0.0, "rendered": {"sets": ["gone"], "share": 0.0}}
+    gone = {"pairs": ["gone"], "pairs_share": 0.0, "rendered": {"datasets": ["gone"], "share": 0.0}}
     only = open_stream(with_data(recipe, photos=["photos"]))
     assert same(
         open_stream(with_data(recipe, photos=["photos"], **gone))(0, 2, 32),

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from brewster import Photo
-from brewster.errors import BrewsterError, TargetError
+from brewster.errors import BrewsterError, OutputError
 from brewster.user_study.create import StudyOptions, create
 from brewster.user_study.degrade import degrade
 from brewster.user_study.study import read_study
@@ -131,7 +131,7 @@ def test_two_files_with_the_same_name_are_refused(tmp_path, folders):
     [
         (StudyOptions(datasets=("wild",)), "no dataset 'wild'"),
         (StudyOptions(pairs=5), "5 pairs .* at most 4"),
-        (StudyOptions(catches=5), "5 catch trials .* at most 4"),
+        (StudyOptions(catch_trials=5), "5 catch trials .* at most 4"),
     ],
 )
 def test_options_beyond_the_available_pictures_are_refused(tmp_path, folders, options, message):
@@ -152,7 +152,7 @@ def test_one_method_and_empty_folders_are_refused(tmp_path, folders):
 
 def test_a_study_is_never_overwritten(tmp_path, folders):
     create(tmp_path / "study", *folders)
-    with pytest.raises(TargetError, match="is not empty"):
+    with pytest.raises(OutputError, match="is not empty"):
         create(tmp_path / "study", *folders)
 
 

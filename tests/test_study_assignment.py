@@ -64,7 +64,7 @@ def test_trials_are_the_same_in_every_version():
     """Participants keep their links, and a study may continue after an update of brewster."""
     first = [
         (trial.comparison, trial.flipped)
-        for trial in draw_trials(make_description(pictures=4, pairs=4, catches=0), 0)
+        for trial in draw_trials(make_description(pictures=4, pairs=4, catch_trials=0), 0)
     ]
     assert first == [(4, False), (1, True), (5, False), (7, True)]
 
@@ -79,18 +79,18 @@ def test_the_pictures_of_a_trial_match_its_comparison_and_sides():
 
 
 def test_catch_trials_have_both_kinds_and_use_photos_of_no_other_trial():
-    study = make_description(catches=4)
+    study = make_description(catch_trials=4)
     for number in range(20):
         trials = draw_trials(study, number)
-        catches = [trial for trial in trials if trial.expected]
-        assert Counter("equal" if trial.left == trial.right else "spoilt" for trial in catches) == {
+        catch_trials = [trial for trial in trials if trial.expected]
+        assert Counter("equal" if trial.left == trial.right else "spoilt" for trial in catch_trials) == {
             "equal": 2,
             "spoilt": 2,
         }
-        assert not {trial.photo for trial in catches} & {
+        assert not {trial.photo for trial in catch_trials} & {
             trial.photo for trial in trials if not trial.expected
         }
-        for trial in catches:
+        for trial in catch_trials:
             chosen = {"left": trial.left, "right": trial.right, "similar": trial.left}[trial.expected]
             assert chosen == "good"
             assert (trial.expected == "similar") == (trial.left == trial.right)

@@ -33,7 +33,7 @@ def _network_off(monkeypatch):
 
 @pytest.fixture(scope="module")
 def study_with_pictures(tmp_path_factory):
-    return make_study(tmp_path_factory.mktemp("study_with_pictures"), size=(240, 180), catches=0)
+    return make_study(tmp_path_factory.mktemp("study_with_pictures"), size=(240, 180), catch_trials=0)
 
 
 @pytest.fixture

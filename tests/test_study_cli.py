@@ -51,7 +51,7 @@ def add_answers(study, participants, rng):
 
 def test_create_prints_a_summary_and_the_next_command(run_without_model, folders):
     code, out, err = run_without_model(
-        "study", "create", "study", *folders, "--seed", 4, "--pairs", 3, "--catch-trials", 2
+        "study", "create", "study", *folders, "--seed", 4, "--comparisons", 3, "--catch-trials", 2
     )
     assert (code, out) == (0, b"")
     assert "4 comparisons of 2 methods; a participant sees 3 of them and 2 catch trials (seed 4)" in err

@@ -222,7 +222,7 @@ def test_the_outcome_of_a_choice_depends_on_the_side_of_the_first_method(flipped
 
 def participant_answers(**fields):
     return ParticipantAnswers(
-        **{"number": 0, "votes": {0: 1}, "catches": 4, "failed": 0, "seconds": 5.0, "is_complete": True}
+        **{"number": 0, "votes": {0: 1}, "catch_trials": 4, "failed": 0, "seconds": 5.0, "is_complete": True}
         | fields
     )
 
@@ -236,15 +236,17 @@ def participant_answers(**fields):
         ({"failed": 3, "seconds": 0.1}, "failed"),
         ({"seconds": 1.49}, "fast"),
         ({"seconds": 1.5}, None),
-        ({"catches": 0}, None),
-        ({"catches": 1, "failed": 1}, "failed"),
+        ({"catch_trials": 0}, None),
+        ({"catch_trials": 1, "failed": 1}, "failed"),
     ],
 )
 def test_the_rule_excludes_participants_who_fail_catch_trials_or_are_too_fast(fields, reason):
     assert ExclusionRule().reason(participant_answers(**fields)) == reason
 
 
-def simulate_participant(description, number, rng, probabilities, *, catches=1.0, seconds=6.0, trials=None):
+def simulate_participant(
+    description, number, rng, probabilities, *, catch_trials=1.0, seconds=6.0, trials=None
+):
     """A participant who chooses outcomes with these probabilities and passes this share of the catch trials."""
     row = draw_trials(description, number)
     answers = {}
@@ -253,7 +255,7 @@ def simulate_participant(description, number, rng, probabilities, *, catches=1.0
             choice = choice_for(trial, rng.choice(3, p=probabilities))
         else:
             wrong = "left" if trial.expected != "left" else "right"
-            choice = trial.expected if rng.random() < catches else wrong
+            choice = trial.expected if rng.random() < catch_trials else wrong
         answers[i] = StoredAnswer(choice, seconds * rng.uniform(0.5, 2))
     return Participant(number, row), answers
 
@@ -261,7 +263,7 @@ def simulate_participant(description, number, rng, probabilities, *, catches=1.0
 @pytest.fixture(scope="module")
 def hundred_participants(tmp_path_factory):
     """100 participants x 40 pairs of three methods; five fail all catch trials, and five are too fast."""
-    description = make_description(pictures=50, methods=("ours", "R&D_Net", "DSIT"), pairs=40, catches=4)
+    description = make_description(pictures=50, methods=("ours", "R&D_Net", "DSIT"), pairs=40, catch_trials=4)
     rng = np.random.default_rng(4)
     records = [
         simulate_participant(
@@ -269,7 +271,7 @@ def hundred_participants(tmp_path_factory):
             number,
             rng,
             RATES if number >= 10 else [0, 0, 1],
-            catches=0.95 if number >= 5 else 0.0,
+            catch_trials=0.95 if number >= 5 else 0.0,
             seconds=0.6 if 5 <= number < 10 else 6.0,
             trials=20 if number == 99 else None,
         )
@@ -317,9 +319,9 @@ def test_the_files_of_a_report_agree_with_each_other(hundred_participants, tmp_p
     assert json.loads((tmp_path / "report.json").read_text()) == results
     assert Photo.open(tmp_path / "plot.png").size[0] > 800
     lines = list(csv.DictReader(io.StringIO((tmp_path / "answers.csv").read_text())))
-    catches = [line for line in lines if line["kind"] == "catch"]
-    assert len(lines) - len(catches) == results["everyone"]["answers"]
-    assert sum(line["choice"] != line["expected"] for line in catches) == results["everyone"]["failed"]
+    catch_trials = [line for line in lines if line["kind"] == "catch"]
+    assert len(lines) - len(catch_trials) == results["everyone"]["answers"]
+    assert sum(line["choice"] != line["expected"] for line in catch_trials) == results["everyone"]["failed"]
     for line in lines:
         if line["kind"] == "comparison" and line["outcome"] != "tie":
             assert line[line["choice"]] == line["first" if line["outcome"] == "win" else "second"]
@@ -390,7 +392,7 @@ def test_a_rule_that_excludes_everyone_still_gives_the_results_of_all(hundred_pa
 
 
 def make_study_with_names(tmp_path, datasets, methods):
-    description = make_description(pictures=3, datasets=datasets, methods=methods, catches=0)
+    description = make_description(pictures=3, datasets=datasets, methods=methods, catch_trials=0)
     rng, study = np.random.default_rng(5), Study(tmp_path, description)
     return study, collect_answers(
         [simulate_participant(description, number, rng, RATES) for number in range(6)]

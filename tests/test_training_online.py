@@ -46,10 +46,10 @@ def test_iterating_gives_the_samples_in_order_at_the_recipes_size(assets):
     assert torch.equal(first.photo_encoded, samples.sample(0).photo_encoded)
 
 
-@pytest.mark.parametrize("mixing", ["light", "8-bit"])
-def test_the_photo_has_jpeg_artefacts_and_the_ground_truth_has_none(assets, mixing):
+@pytest.mark.parametrize("blend_space", ["linear", "srgb"])
+def test_the_photo_has_jpeg_artefacts_and_the_ground_truth_has_none(assets, blend_space):
     """A second JPEG of the same quality changes next to nothing."""
-    sample = stream(assets, mixing=mixing).sample(0)
+    sample = stream(assets, blend_space=blend_space).sample(0)
 
     def change(encoded):
         decoded = Photo.open(encode_jpeg(encoded, sample.scene.camera_response.jpeg_quality)).pixels.copy()
@@ -66,7 +66,7 @@ def test_the_target_is_the_background_or_the_transmission(assets):
 
 
 def test_both_kinds_of_mixing_have_the_same_background(assets):
-    light, mixed = (stream(assets, mixing=mixing).sample(3) for mixing in ("light", "8-bit"))
+    light, mixed = (stream(assets, blend_space=blend_space).sample(3) for blend_space in ("linear", "srgb"))
     assert (light.background_encoded - mixed.transmission_encoded).abs().max() <= 0.5 / 255 + 1e-6
     assert not torch.equal(light.photo_encoded, mixed.photo_encoded)
 

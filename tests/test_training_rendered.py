@@ -10,7 +10,7 @@ from brewster.photo import Photo
 from brewster.render.camera_response import encode_jpeg
 from brewster.rendered.store import read_scene_of, read_set
 from brewster.training.data.alpha_blend import blended_layers
-from brewster.training.data.rendered import CachedRendered, RenderedSets
+from brewster.training.data.rendered import CachedRendered, RenderedDatasets
 from set_folders import render_set
 
 
@@ -41,14 +41,14 @@ class FakeOnline:
 
 def test_a_sample_is_its_photo_its_target_and_its_reflection(folder):
     for target in ("background", "transmission"):
-        stream = RenderedSets([folder], seed=1, target=target)
+        stream = RenderedDatasets([folder], seed=1, target=target)
         for number, entry in enumerate(read_set(folder)):
             pictures = [pixels(entry.read(f"{name}.jpg")) for name in ("photo", target, "reflection")]
             assert torch.equal(stream.sample(number), torch.cat(pictures, dim=2))
 
 
 def test_an_8_bit_sample_is_the_blend_of_its_own_background_and_mirror(folder):
-    stream = RenderedSets([folder], seed=1, mixing="8-bit")
+    stream = RenderedDatasets([folder], seed=1, blend_space="srgb")
     for number, entry in enumerate(read_set(folder)):
         scene = read_scene_of(entry)
         behind, mirror = (
@@ -65,7 +65,7 @@ def test_crops_of_photo_and_ground_truth_are_aligned(folder):
     for sample in folder.glob("0*"):
         for name in ("background", "reflection"):
             shutil.copy(sample / "photo.jpg", sample / f"{name}.jpg")
-    batch = RenderedSets([folder], seed=1)(0, 8, 32)
+    batch = RenderedDatasets([folder], seed=1)(0, 8, 32)
     assert torch.equal(batch.photo_encoded, batch.transmission_encoded)
     assert torch.equal(batch.photo_encoded, batch.reflection_encoded)
     assert (batch.reflection_weight == 1).all()
@@ -73,69 +73,71 @@ def test_crops_of_photo_and_ground_truth_are_aligned(folder):
 
 
 def test_a_batch_from_disk_depends_on_seed_and_step_alone(folder):
-    one, other = RenderedSets([folder], seed=1), RenderedSets([folder], seed=1)
+    one, other = RenderedDatasets([folder], seed=1), RenderedDatasets([folder], seed=1)
     batch = one(7, 4, 32)
     other(0, 2, 64)
     assert same(batch, other(7, 4, 32))
     assert not torch.equal(batch.photo_encoded, one(8, 4, 32).photo_encoded)
-    assert not torch.equal(batch.photo_encoded, RenderedSets([folder], seed=2)(7, 4, 32).photo_encoded)
+    assert not torch.equal(batch.photo_encoded, RenderedDatasets([folder], seed=2)(7, 4, 32).photo_encoded)
 
 
 def test_shards_and_folders_hold_the_same_samples(folder, tmp_path):
     render_set(tmp_path / "shards", count=3, shards=True)
     assert list((tmp_path / "shards").glob("*.tar"))
-    one, other = (RenderedSets([place], seed=1, mixing="8-bit") for place in (folder, tmp_path / "shards"))
+    one, other = (
+        RenderedDatasets([place], seed=1, blend_space="srgb") for place in (folder, tmp_path / "shards")
+    )
     assert same(one(0, 4, 32), other(0, 4, 32))
 
 
 def test_only_the_first_samples_are_used_where_a_count_is_given(folder):
     shutil.rmtree(folder / "000002")
     (folder / "000002").mkdir()
-    stream = RenderedSets([folder], seed=1, count=2)
+    stream = RenderedDatasets([folder], seed=1, count=2)
     assert len(stream) == 2
     stream(0, 20, 32)
 
 
 def test_sets_follow_one_another(folder, tmp_path):
     render_set(tmp_path / "more", count=2, seed=8)
-    both = RenderedSets([folder, tmp_path / "more"], seed=1)
+    both = RenderedDatasets([folder, tmp_path / "more"], seed=1)
     assert len(both) == 5
-    assert torch.equal(both.sample(3), RenderedSets([tmp_path / "more"], seed=1).sample(0))
+    assert torch.equal(both.sample(3), RenderedDatasets([tmp_path / "more"], seed=1).sample(0))
 
 
 def test_a_count_above_the_number_of_samples_is_refused(folder):
     with pytest.raises(RecipeError, match=r"set: 3 rendered samples; expected at least 4, .*; .* lower"):
-        RenderedSets([folder], seed=1, count=4)
+        RenderedDatasets([folder], seed=1, count=4)
 
 
 def test_a_folder_that_is_missing_empty_or_no_set_is_named(tmp_path):
     with pytest.raises(RecipeError, match=r"gone cannot be read \(No such"):
-        RenderedSets([tmp_path / "gone"], seed=1)
+        RenderedDatasets([tmp_path / "gone"], seed=1)
     with pytest.raises(RecipeError, match=r"0 rendered samples; expected at least 1"):
-        RenderedSets([tmp_path], seed=1)
+        RenderedDatasets([tmp_path], seed=1)
     (tmp_path / "shard-000000.tar").write_bytes(b"no tar" * 200)
     with pytest.raises(RecipeError, match="cannot be read"):
-        RenderedSets([tmp_path], seed=1)
+        RenderedDatasets([tmp_path], seed=1)
 
 
 @pytest.mark.parametrize("name", ["mirror.jpg", "scene.toml"])
 def test_a_missing_file_is_named_with_its_sample(folder, name):
     (folder / "000001" / name).unlink()
     with pytest.raises(RecipeError, match=f"{name} of sample 000001 .*; .*; .* again"):
-        RenderedSets([folder], seed=1, mixing="8-bit").sample(1)
+        RenderedDatasets([folder], seed=1, blend_space="srgb").sample(1)
 
 
 def test_a_damaged_picture_is_named_with_its_sample(folder):
     photo = folder / "000001" / "photo.jpg"
     photo.write_bytes(photo.read_bytes()[:200])
     with pytest.raises(PhotoError, match=r"photo\.jpg of sample 000001"):
-        RenderedSets([folder], seed=1).sample(1)
+        RenderedDatasets([folder], seed=1).sample(1)
 
 
 def test_samples_that_were_read_are_cached_within_the_memory_limit(folder, monkeypatch):
-    large = RenderedSets([folder], seed=1)
+    large = RenderedDatasets([folder], seed=1)
     monkeypatch.setattr(rendered_module, "CACHE_BYTES", 16 * 24 * 9)
-    small = RenderedSets([folder], seed=1)
+    small = RenderedDatasets([folder], seed=1)
     first = [stream(0, 20, 32) for stream in (large, small)]
     assert same(*first)
     shutil.rmtree(folder)
@@ -181,4 +183,4 @@ def test_a_full_cache_does_not_change_the_samples():
 
 def test_a_set_can_have_a_relative_path(folder, monkeypatch):
     monkeypatch.chdir(folder.parent)
-    assert len(RenderedSets([Path(folder.name)], seed=1)) == 3
+    assert len(RenderedDatasets([Path(folder.name)], seed=1)) == 3

@@ -15,9 +15,9 @@ from brewster import Photo, Separator
 from brewster.errors import ModelError
 from brewster.inference.diffusion_predictor import DiffusionPredictor
 from brewster.models.diffusion.adapter.windowseat import CONFIG_FILE, INDEX_FILE, PROMPT_FILE, WEIGHTS_FILE
-from brewster.models.diffusion.backbones import load_backbone
+from brewster.models.diffusion.backbones.registry import load_backbone
 from brewster.models.diffusion.pipeline import fingerprint, load_pipeline
-from brewster.models.large_models import LARGE
+from brewster.models.diffusion_models import DIFFUSION_MODELS
 from brewster.srgb import to_encoded, to_linear
 from published_models import SIDE, write_qwen_edit_plus, write_windowseat
 
@@ -103,7 +103,7 @@ def test_a_square_photo_separates_as_published_with_a_derived_reflection(model, 
     image = random_image(SIDE, SIDE)
     encoded = ((image[0].permute(1, 2, 0) + 1) / 2).numpy()
     photo = Photo.from_array(to_linear(encoded).astype(np.float32), encoding="linear")
-    separation = Separator.load(str(model), plain=True)(photo)
+    separation = Separator.load(str(model), no_guided_upsampling=True)(photo)
     expected = ((published_call(model, base, image)[0].permute(1, 2, 0) + 1) / 2).numpy()
     assert np.abs(to_encoded(separation.transmission.linear()) - expected).max() < 1e-3
     assert separation.reflection_is_derived
@@ -150,7 +150,7 @@ def test_steps_and_averages_are_refused(model):
 def test_the_name_is_opened_from_the_hub_and_only_its_subfolders_are_fetched(
     model, base, tmp_path, monkeypatch
 ):
-    repository = tmp_path / f"models--{LARGE['windowseat'].hub_id.replace('/', '--')}"
+    repository = tmp_path / f"models--{DIFFUSION_MODELS['windowseat'].hub_id.replace('/', '--')}"
     shutil.copytree(model, repository / "snapshots" / ("1" * 40))
     (repository / "refs").mkdir()
     (repository / "refs" / "main").write_text("1" * 40)
@@ -231,6 +231,6 @@ def test_damaged_embeddings_are_model_errors(folder, change, message):
 def test_another_base_is_used_and_has_another_digest(model, base, tmp_path):
     copy = shutil.copytree(base, tmp_path / "copy")
     (copy / "note").write_text("another")
-    assert load_pipeline(str(model), base=str(copy)).sha256 != fingerprint(str(model))
-    with pytest.raises(ModelError, match="is a LoRA of qwen; expected a base of qwen, not of kontext"):
-        load_pipeline(str(model), base="tiny:kontext")
+    assert load_pipeline(str(model), base_model=str(copy)).sha256 != fingerprint(str(model))
+    with pytest.raises(ModelError, match="is a LoRA of qwen; expected a base model of qwen, not of kontext"):
+        load_pipeline(str(model), base_model="tiny:kontext")

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from brewster.errors import DeviceError, RecipeError, TargetError
+from brewster.errors import DeviceError, OutputError, RecipeError
 from brewster.executors import ProcessExecutor, SerialExecutor, local
 from brewster.rendered import store
 from brewster.rendered.generation import workers
@@ -119,7 +119,7 @@ def test_a_scene_is_never_rendered_into_a_folder_with_files(tmp_path):
     render_set(tmp_path / "set", count=1)
     scene = tmp_path / "set" / "000000" / store.SCENE_FILE
     for existing in (scene, scene.parent):
-        with pytest.raises(TargetError, match="exists; expected a new or empty folder"):
+        with pytest.raises(OutputError, match="exists; expected a new or empty folder"):
             render_again(scene, existing, renderer="fake_renderer:render")
 
 

@@ -3,8 +3,8 @@ from dataclasses import replace
 import pytest
 
 from brewster.errors import ModelError
-from brewster.models.diffusion.backbones import BACKBONES
-from brewster.models.zoo import LARGE_MODELS, MODELS, find_model
+from brewster.models.diffusion.backbones.registry import BACKBONES
+from brewster.models.zoo import BACKBONE_CLASSES, MODELS, find_model
 
 
 def test_every_shipped_model_is_intact_small_enough_and_has_a_card():
@@ -35,4 +35,4 @@ def test_a_damaged_file_is_refused(tmp_path):
 
 
 def test_the_large_models_of_the_registry_are_the_backbones():
-    assert list(LARGE_MODELS) == list(BACKBONES) == [backbone.name for backbone in BACKBONES.values()]
+    assert list(BACKBONE_CLASSES) == list(BACKBONES) == [backbone.name for backbone in BACKBONES.values()]

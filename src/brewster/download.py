@@ -21,7 +21,7 @@ from typing import Literal, NamedTuple, TypeVar, cast, final
 from urllib import request
 from urllib.error import HTTPError
 
-from brewster.errors import DownloadError, TargetError
+from brewster.errors import DownloadError, OutputError
 
 _RETRYABLE_STATUS = (408, 425, 429, 500, 502, 503, 504)
 _MAX_RETRY_AFTER_S = 120.0
@@ -82,10 +82,10 @@ class Downloader:
 
         Raises:
             DownloadError: all attempts fail, or the digest differs from the expected one.
-            TargetError: the folder cannot be written.
+            OutputError: the folder cannot be written.
         """
         part = target.with_name(f"{target.name}.part")
-        with target_errors(target):
+        with output_errors(target):
             target.parent.mkdir(parents=True, exist_ok=True)
             self._with_retries(remote.url, lambda: self._fetch_rest(remote, part))
             if (digest := file_digest(part, remote.algorithm)) != remote.digest:
@@ -164,14 +164,14 @@ def file_digest(path: Path, algorithm: str) -> str:
 
 
 @contextmanager
-def target_errors(path: Path) -> Iterator[None]:
-    """Converts an OSError in the block to a TargetError about the downloaded file `path`."""
+def output_errors(path: Path) -> Iterator[None]:
+    """Converts an OSError in the block to a OutputError about the downloaded file `path`."""
     try:
         yield
     except OSError as error:
         happened = f"{path} cannot be read or written ({error.strerror or error})"
         cure = "free some space or choose another folder, and run again to resume the download"
-        raise TargetError(happened, "expected a writable folder on a disk with free space", cure) from error
+        raise OutputError(happened, "expected a writable folder on a disk with free space", cure) from error
 
 
 def _read(response: HTTPResponse, max_bytes: int | None = None) -> bytes:

@@ -7,7 +7,7 @@
     |   |-- PhotoTooLarge      the image has more pixels than the limit
     |   `-- MaskError          a mask cannot be read, or does not fit its photo
     |-- ManifestError          a list of photos is not a table of paths
-    |-- TargetError            an output file cannot be written, for example because it exists
+    |-- OutputError            an output file cannot be written, for example because it exists
     |-- ModelError             a model is unknown, damaged, or has the wrong inputs
     |-- DeviceError            the requested device is not available
     |-- RecipeError            a recipe is not TOML, or its values are invalid
@@ -69,7 +69,7 @@ class MaskError(PhotoError):
     """A mask cannot be read, is not grey, or has another size than its photo."""
 
 
-class TargetError(BrewsterError):
+class OutputError(BrewsterError):
     """An output file cannot be written: it exists, is read-only, is the source, or the disk is full."""
 
 

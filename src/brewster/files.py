@@ -19,7 +19,7 @@ from pathlib import Path
 
 import platformdirs
 
-from brewster.errors import TargetError
+from brewster.errors import OutputError
 from brewster.image_formats import FORMATS, VIDEO_SUFFIXES, format_of
 from brewster.remote_path import Location, RemotePath
 
@@ -70,7 +70,7 @@ def find(sources: Iterable[Location], output_folder: Location | None = None) -> 
     always included. If it is not an image, opening it raises the error.
 
     Raises:
-        TargetError: the layers of two images would have the same path.
+        OutputError: the layers of two images would have the same path.
     """
     return name_layers(pair for source in sources for pair in images_in(source, output_folder))
 
@@ -85,7 +85,7 @@ def name_layers(images: Iterable[tuple[Location, Location]]) -> list[SeparationP
     """Returns the paths of images, each with the folder of its layers. Each image is included once. See `find`.
 
     Raises:
-        TargetError: the layers of two images would have the same path.
+        OutputError: the layers of two images would have the same path.
     """
     found: dict[str, SeparationPaths] = {}
     counts: dict[Location, Counter[str]] = {}
@@ -122,7 +122,7 @@ def write_atomically(
     a full disk or Ctrl-C leaves no partial file. In an object store, the file is written with one upload.
 
     Raises:
-        TargetError: the file exists and `overwrite` is False, the file is the `source`, or it cannot be written.
+        OutputError: the file exists and `overwrite` is False, the file is the `source`, or it cannot be written.
     """
     _check_not_source(path, source)
     try:
@@ -135,7 +135,7 @@ def write_atomically(
             _write_synced(part, data)
             _publish(part, path, overwrite)
     except OSError as error:
-        raise _target_error(path, error) from error
+        raise _output_error(path, error) from error
 
 
 @contextlib.contextmanager
@@ -145,7 +145,7 @@ def atomic_path(path: Path) -> Iterator[Path]:
     An existing file is replaced. If another process has created the folder in the meantime, that folder stays.
 
     Raises:
-        TargetError: the file or folder cannot be written, for example because the disk is full.
+        OutputError: the file or folder cannot be written, for example because the disk is full.
     """
     try:
         with _temporary(path) as part:
@@ -155,7 +155,7 @@ def atomic_path(path: Path) -> Iterator[Path]:
             _replace(path, part)
             _sync(path.parent)
     except OSError as error:
-        raise TargetError(
+        raise OutputError(
             f"{path} was not written ({error.strerror or error})",
             "expected a writable folder on a disk with free space",
             "free some space or choose another folder, and run again: finished files are kept",
@@ -293,7 +293,7 @@ def _check_unique_targets(found: Iterable[SeparationPaths]) -> None:
         name = paths.folder / paths.name
         other = first_with_name.setdefault(_absolute(name), paths)
         if other is not paths:
-            raise TargetError(
+            raise OutputError(
                 f"{other.source} and {paths.source} would both be written as {name}.*",
                 "expected a separate output name for each image",
                 "pass their parent folder, whose tree is mirrored, or use different output folders",
@@ -303,7 +303,7 @@ def _check_unique_targets(found: Iterable[SeparationPaths]) -> None:
 def _check_not_source(path: Location, source: Location | None) -> None:
     with contextlib.suppress(OSError):  # a file that does not exist is not the same file
         if source is not None and is_same_file(path, source):
-            raise TargetError(
+            raise OutputError(
                 f"{path} is the input image itself",
                 "expected another path, because input files are never changed",
                 "choose another name",
@@ -378,12 +378,12 @@ _MAX_WINDOWS_PATH = 260
 _DEFAULT_REMEDY = ("expected a writable file", "choose another folder with -o")
 
 
-def _target_error(path: Location, error: OSError) -> TargetError:
+def _output_error(path: Location, error: OSError) -> OutputError:
     expected, cure = _REMEDIES.get(error.errno or 0, _DEFAULT_REMEDY)
     if sys.platform == "win32" and len(_absolute(path)) >= _MAX_WINDOWS_PATH and error.errno == errno.ENOENT:
         expected = f"expected a path of fewer than {_MAX_WINDOWS_PATH} characters, because Windows allows no longer ones by default"
         cure = "choose a shorter folder with -o, or enable long paths in the settings of Windows"
-    return TargetError(f"{path} was not written ({error.strerror or error})", expected, cure)
+    return OutputError(f"{path} was not written ({error.strerror or error})", expected, cure)
 
 
 def cache_folder() -> Path:

@@ -23,10 +23,10 @@ Layer = Literal["transmission", "reflection", "confidence", "layered"]
 Quality = Literal["draft", "standard", "best"]
 Device = Literal["auto", "cuda", "rocm", "directml", "coreml", "cpu"]
 
-Quantisation = Literal["int8", "float8", "nf4"]
+Quantization = Literal["int8", "float8", "nf4"]
 """The number format of the weights of a large base model: int8 and float8 by torchao, nf4 (4 bits) by bitsandbytes."""
 
-DIFFUSION_OPTIONS: Final = ("base", "quantise", "steps", "average", "plain")
+DIFFUSION_OPTIONS: Final = ("base_model", "quantization", "steps", "ensemble_size", "no_guided_upsampling")
 """The options of diffusion models only."""
 
 _CALL_OPTIONS: Final = ("strength", "quality", "mask", "additive", "max_pixels")
@@ -93,13 +93,13 @@ class Options:
         default="auto",
         metadata=_field_metadata("The device that runs the model; auto selects the fastest one available."),
     )
-    base: str | None = field(
+    base_model: str | None = field(
         default=None,
         metadata=_field_metadata(
             "For a LoRA: the folder or hub id of its base model, if it has moved since training."
         ),
     )
-    quantise: Quantisation | None = field(
+    quantization: Quantization | None = field(
         default=None,
         metadata=_field_metadata(
             "For diffusion models: store the weights in 8 or 4 bits; by default, as in training, or as few as the GPU's memory requires."
@@ -112,11 +112,11 @@ class Options:
             ge=1,
         ),
     )
-    average: int = field(
+    ensemble_size: int = field(
         default=1,
         metadata=_field_metadata("For diffusion models: the number of predictions that are averaged.", ge=1),
     )
-    plain: bool = field(
+    no_guided_upsampling: bool = field(
         default=False,
         metadata=_field_metadata(
             "For diffusion models: the transmission as it is generated, enlarged, without the photo's detail."

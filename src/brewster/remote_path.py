@@ -18,7 +18,7 @@ from collections.abc import Iterator
 from pathlib import Path, PurePosixPath
 from typing import Any, TypeAlias, final
 
-from brewster.errors import BrewsterError, MissingExtra, TargetError, UnreadablePhoto
+from brewster.errors import BrewsterError, MissingExtra, OutputError, UnreadablePhoto
 
 _RETRY = "check the network and the credentials, and run the same command again: finished files are kept"
 
@@ -57,7 +57,7 @@ class RemotePath(PurePosixPath):
 
         Raises:
             FileExistsError: the file exists and `overwrite` is False.
-            TargetError: the store fails, or does not allow it.
+            OutputError: the store fails, or does not allow it.
             MissingExtra: the package of the store is not installed.
         """
         store = self._store()
@@ -66,7 +66,7 @@ class RemotePath(PurePosixPath):
         except FileExistsError as error:
             raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST)) from error
         except Exception as error:
-            raise TargetError(
+            raise OutputError(
                 f"{self} was not written ({_reason(error)})",
                 "expected a store that can be written to",
                 _RETRY,

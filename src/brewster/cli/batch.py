@@ -78,7 +78,7 @@ def plan(photos: Sequence[str], output: str | None, options: Options) -> list[Se
 
     Raises:
         click.UsageError: the arguments contradict each other.
-        TargetError: two photos would be written under the same name.
+        OutputError: two photos would be written under the same name.
         PhotoError: the files and folders contain no photo.
     """
     from brewster.inference import plan_files  # noqa: PLC0415  (imports ONNX Runtime and pyvips)
@@ -168,7 +168,7 @@ class _StandardStream:
         """Writes the encoded layer.
 
         Raises:
-            TargetError: standard output cannot be written.
+            OutputError: standard output cannot be written.
         """
         write_out(data)
 
@@ -296,7 +296,7 @@ class BatchCommand:
 def _model_name(model: str) -> str | None:
     """Returns the name of a model as the metadata of its layers record it, or None if it is unknown without loading it."""
     try:
-        return None if zoo.is_large(model) else zoo.find_model(model).name
+        return None if zoo.is_diffusion_model(model) else zoo.find_model(model).name
     except ModelError:
         return None
 

@@ -210,19 +210,19 @@ def _mitsuba() -> Iterator[Check]:
 
 
 def _large() -> Iterator[Check]:
-    """Checks what large image models may need in addition to the extra `large`."""
+    """Checks what diffusion models may need in addition to the extra `diffusion`."""
     if _version("diffusers") is None:
         return
     version = _version("bitsandbytes")
     detail = version or "not installed; needed for nf4 and 8-bit AdamW on NVIDIA GPUs"
     cure = None if version else "pip install bitsandbytes"
-    yield Check("large", "bitsandbytes", "ok" if version else "missing", detail, cure, needed=False)
-    from brewster.models.diffusion.lazy_imports import has_token  # noqa: PLC0415  (imports torch)
+    yield Check("diffusion", "bitsandbytes", "ok" if version else "missing", detail, cure, needed=False)
+    from brewster.models.diffusion.hub_download import has_hub_token  # noqa: PLC0415  (imports torch)
 
-    token_found = has_token()
+    token_found = has_hub_token()
     detail = "found" if token_found else "not found; gated models such as FLUX.1 Kontext need one"
     cure = None if token_found else "hf auth login"
-    yield Check("large", "hub token", "ok" if token_found else "missing", detail, cure, needed=False)
+    yield Check("diffusion", "hub token", "ok" if token_found else "missing", detail, cure, needed=False)
 
 
 def _print(checks: list[Check]) -> None:

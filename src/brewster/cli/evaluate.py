@@ -327,7 +327,7 @@ class _EvaluateCommand:
 
         values: dict[str, Any] = {"quality": self.quality}
         if self.size is not None:
-            values["size"] = None if self.size == _NATIVE else self.size
+            values["short_side_px"] = None if self.size == _NATIVE else self.size
         if self.metrics is not None:
             values["metrics"] = tuple(name.strip() for name in self.metrics.split(","))
         if self.thresholds is not None:
@@ -393,7 +393,7 @@ def print_failures(results: Results, *, quiet: bool) -> bool:
         )
     for error in failures(results):
         print_error(error)
-    count = sum(len(picture["errors"]) for picture in results["pictures"])
+    count = sum(len(picture["errors"]) for picture in results["cases"])
     if count:
         print_error(f"{count} {'prediction' if count == 1 else 'predictions'} could not be scored")
     return not count and not results["unavailable"]

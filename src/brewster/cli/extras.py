@@ -43,7 +43,7 @@ EXTRAS: Final = {
         "torch": "torch",
     },
     "evaluate": {"matplotlib": "matplotlib", "torch": "torch"},
-    "large": {
+    "diffusion": {
         "accelerate": "accelerate",
         "diffusers": "diffusers",
         "huggingface_hub": "huggingface_hub",

@@ -14,7 +14,7 @@ from brewster.cli.terminal import print_error, print_out, print_status
 from brewster.errors import BrewsterError, ModelError
 from brewster.files import write_atomically
 from brewster.models import zoo
-from brewster.models.large_models import LARGE
+from brewster.models.diffusion_models import DIFFUSION_MODELS
 
 if TYPE_CHECKING:
     from brewster.models.diffusion.panels import Panel
@@ -33,19 +33,19 @@ def models() -> None:
 @models.command("list")
 @_JSON
 def list_models(*, as_json: bool) -> None:
-    """List the models that are installed with brewster, and large models that are downloaded at first use.
+    """List the models that are installed with brewster, and diffusion models that are downloaded at first use.
 
-    A line has the name, the size of the file or download, the licence, and for a large model its GPU memory (with the
-    format of the weights), what it gives, and how to get it. Sizes and memory of large models are estimates.
+    A line has the name, the size of the file or download, the licence, and for a diffusion model its GPU memory (with the
+    format of the weights), what it gives, and how to get it. Sizes and memory of diffusion models are estimates.
     """
     rows = [describe(model) for model in zoo.MODELS.values()]
     if as_json:
-        print_out(json.dumps([*rows, *map(asdict, LARGE.values())]))
+        print_out(json.dumps([*rows, *map(asdict, DIFFUSION_MODELS.values())]))
         return
     for row in rows:
         size = f"{row['bytes'] / 1e6:.1f} MB" if row["error"] is None else "damaged"
         print_out(f"{row['name']:20} {size:>10}  {row['licence']}")
-    for model in LARGE.values():
+    for model in DIFFUSION_MODELS.values():
         encoder = f" and {model.text_encoder_gb:g} GB for the prompt" if model.text_encoder_gb else ""
         use = "" if model.is_commercial else " (not for commercial use)"
         print_out(f"{model.name:20} {model.download_gb:>7g} GB  {model.licence}{use}")
@@ -59,7 +59,7 @@ def list_models(*, as_json: bool) -> None:
 @click.argument("source")
 @click.argument("folder", type=click.Path(path_type=Path))
 @click.option(
-    "--base",
+    "--base-model",
     metavar="MODEL",
     default="kontext",
     show_default=True,
@@ -85,25 +85,25 @@ def list_models(*, as_json: bool) -> None:
     help="For a LoRA: the device that encodes the prompt.",
 )
 def import_model(
-    *, source: str, folder: Path, base: str, prompt: str | None, panels: str, device: str
+    *, source: str, folder: Path, base_model: str, prompt: str | None, panels: str, device: str
 ) -> None:
     """Convert a model of another program to a FOLDER that --model opens.
 
     SOURCE is a LoRA for kontext, klein or qwen (a .safetensors file, or a folder or hub id with one) with the keys of
     peft, diffusers, kohya's sd-scripts or ComfyUI; or the checkpoint GenSIRR.pt.
     """
-    require_extra("large", "importing a model")
+    require_extra("diffusion", "importing a model")
     if Path(source).suffix in _CHECKPOINT_SUFFIXES:
         from brewster.models.diffusion import gensirr  # noqa: PLC0415  (imports torch)
 
-        gensirr.convert(Path(source), folder, base=base)
+        gensirr.convert(Path(source), folder, base_model=base_model)
     else:
         if not prompt:
             raise click.UsageError("A LoRA needs --prompt: the prompt with which it was trained.")
         from brewster.models.diffusion.adapter.importer import import_lora  # noqa: PLC0415  (imports torch)
 
         names = cast("tuple[Panel, ...]", tuple(panels.split(",")))
-        import_lora(source, folder, base=base, prompt=prompt, panels=names, device=device)
+        import_lora(source, folder, base_model=base_model, prompt=prompt, panels=names, device=device)
     print_status(f"{source} -> {folder}; use it with: --model {folder}")
 
 
@@ -169,7 +169,7 @@ def push(*, folder: Path, repo_id: str, public: bool, message: str, dry_run: boo
     The weights, the prompt embedding, the recipe and the model card are uploaded. Local paths in them are shortened to
     their last part. The access token is the environment variable HF_TOKEN, or the token that `hf auth login` stored.
     """
-    require_extra("large", "uploading a LoRA")
+    require_extra("diffusion", "uploading a LoRA")
     from brewster.models.diffusion.adapter import hub  # noqa: PLC0415  (imports torch)
 
     plan = hub.plan_push(folder, repo_id, message=message, public=public)
@@ -203,21 +203,23 @@ def push(*, folder: Path, repo_id: str, public: bool, message: str, dry_run: boo
     help="The kind of export. comfyui: one .safetensors file with the LoRA. merged: the base with the LoRA added to its weights, for diffusers.",
 )
 @click.option(
-    "--base",
+    "--base-model",
     metavar="FOLDER|ID",
     help="For merged: the folder or hub id of the base model, if it has moved since training.",
 )
-def export(*, folder: Path, target: Path, target_format: str, base: str | None) -> None:
+def export(*, folder: Path, target: Path, target_format: str, base_model: str | None) -> None:
     """Export the LoRA in FOLDER for other programs."""
-    require_extra("large", "exporting a LoRA")
+    require_extra("diffusion", "exporting a LoRA")
     from brewster.models.diffusion.adapter.export import export_comfyui, export_merged  # noqa: PLC0415
 
     if target_format == "comfyui":
-        if base:
-            raise click.UsageError("--base is for --format merged: a LoRA file for ComfyUI has no base.")
+        if base_model:
+            raise click.UsageError(
+                "--base-model is for --format merged: a LoRA file for ComfyUI has no base."
+            )
         export_comfyui(folder, target)
     else:
-        export_merged(folder, target, base)
+        export_merged(folder, target, base_model)
     print_status(f"{folder} -> {target}")
 
 

@@ -13,8 +13,8 @@ import click
 from click.core import ParameterSource
 from click.shell_completion import CompletionItem
 
-from brewster.cli.archive import ArchiveCommand
 from brewster.cli.batch import BatchCommand, is_single_output, local_path, plan, skipped_videos
+from brewster.cli.parallel_batch import ParallelBatchCommand
 from brewster.cli.terminal import print_status, standard_output
 from brewster.errors import BrewsterError
 from brewster.image_formats import SUFFIXES, FormatName, format_of
@@ -107,7 +107,7 @@ class _ModelName(click.ParamType[str]):
         incomplete: str,
     ) -> list[CompletionItem]:
         """Completes the names of the registered models, and file names."""
-        names = [name for name in (*zoo.MODELS, *zoo.LARGE_NAMES) if name.startswith(incomplete)]
+        names = [name for name in (*zoo.MODELS, *zoo.DIFFUSION_NAMES) if name.startswith(incomplete)]
         return [*map(CompletionItem, names), CompletionItem(incomplete, type="file")]
 
 
@@ -224,7 +224,7 @@ def separate(
         if contact_sheet:
             raise click.UsageError("--contact-sheet cannot be combined with --workers, --cluster or --index.")
         _check_archive_output(single_output, output, needs_folder=bool(cluster or index))
-        archive = ArchiveCommand(
+        archive = ParallelBatchCommand(
             options, output, cluster, workers, index=index, overwrite=overwrite, as_json=as_json, quiet=quiet
         )
         context.exit(0 if archive.run(photos) else 1)

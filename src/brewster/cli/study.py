@@ -92,7 +92,8 @@ def study() -> None:
 )
 @click.option("--all-pairs", is_flag=True, help="Compare each method with every other method.")
 @click.option(
-    "--pairs",
+    "--comparisons",
+    "pairs",
     type=click.IntRange(1),
     metavar="NUMBER",
     help="The number of pairs per participant; by default 40, or all pairs if the study has fewer.",
@@ -152,7 +153,7 @@ def create(
         datasets=datasets,
         names=names,
         pairs=pairs,
-        catches=catch_trials,
+        catch_trials=catch_trials,
         all_pairs=all_pairs,
         seed=seed,
         consent=text,
@@ -165,7 +166,7 @@ def create(
         ).description
     print_status(
         f"{out}: {len(description.comparisons)} comparisons of {len(description.methods)} methods; a participant sees "
-        f"{description.pairs} of them and {description.catches} catch trials (seed {description.seed})"
+        f"{description.pairs} of them and {description.catch_trials} catch trials (seed {description.seed})"
     )
     print_status(f"next: brewster study serve {out}")
 
@@ -328,7 +329,8 @@ def show_progress(folder: Path, *, max_failed: float, min_seconds: float, as_jso
 )
 @click.option("--tie", type=click.FloatRange(0, 1, max_open=True), default=0.25, show_default=True, metavar="FRACTION", help='The expected fraction of the answer "similar".')  # fmt: skip
 @click.option(
-    "--pairs",
+    "--comparisons",
+    "pairs",
     type=click.IntRange(1),
     default=40,
     show_default=True,

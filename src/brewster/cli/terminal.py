@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, redirect_stdout
 from typing import TYPE_CHECKING, Final, TextIO, final
 
-from brewster.errors import TargetError
+from brewster.errors import OutputError
 
 if TYPE_CHECKING:
     from sys import UnraisableHookArgs
@@ -127,7 +127,7 @@ def print_out(text: object) -> None:
     """Prints one line on standard output, and flushes it.
 
     Raises:
-        TargetError: standard output cannot be written, for example because the disk is full.
+        OutputError: standard output cannot be written, for example because the disk is full.
     """
     stream = standard_output.stream
     write_out(f"{text}\n".encode(stream.encoding or "utf-8", stream.errors or "strict"))
@@ -137,7 +137,7 @@ def write_out(data: bytes) -> None:
     """Writes bytes to standard output, and flushes them.
 
     Raises:
-        TargetError: standard output cannot be written, for example because the disk is full.
+        OutputError: standard output cannot be written, for example because the disk is full.
     """
     stream = standard_output.stream
     try:
@@ -146,7 +146,7 @@ def write_out(data: bytes) -> None:
     except OSError as error:
         # Python flushes the buffer again when it exits. With /dev/null as the target, this cannot fail again.
         os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
-        raise TargetError(
+        raise OutputError(
             f"standard output was not written ({error.strerror})",
             "expected a destination that accepts all of the output",
             "write to a file with -o instead",

@@ -13,7 +13,7 @@ import click
 
 from brewster.cli.extras import require_extra
 from brewster.cli.terminal import interrupts, print_out, print_status, progress, standard_output
-from brewster.errors import RecipeError, TargetError
+from brewster.errors import OutputError, RecipeError
 
 if TYPE_CHECKING:
     from brewster.training.recipe import CompactRecipe, LoraRecipe
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 @click.option(
     "--plan",
     is_flag=True,
-    help="Do not train; estimate the memory, download and time that a recipe with a large backbone needs, and check the memory of the GPU and the data.",
+    help="Do not train; estimate the memory, download and time that a recipe with a diffusion backbone needs, and check the memory of the GPU and the data.",
 )
 @click.option(
     "--gpu",
@@ -50,7 +50,7 @@ if TYPE_CHECKING:
     type=click.Choice(["auto", "cpu"]),
     default="auto",
     show_default=True,
-    help="The device to train on. auto is the GPU; without one, a large backbone is refused, because it takes weeks on a CPU.",
+    help="The device to train on. auto is the GPU; without one, a diffusion backbone is refused, because it takes weeks on a CPU.",
 )
 @click.option(
     "--json",
@@ -74,7 +74,7 @@ def train(
 
     The environment variable BREWSTER_DATA is the path of the data folder. To resume an interrupted run from its last
     checkpoint, run the same command again: the final weights are the same. To make a run longer, raise `steps` in the
-    recipe and run the command again. With torchrun, a large backbone is trained on several GPUs (data parallel).
+    recipe and run the command again. With torchrun, a diffusion backbone is trained on several GPUs (data parallel).
     """
     require_extra("train", "training")
     if show_recipe:
@@ -86,7 +86,7 @@ def train(
 
     parsed, out = read_recipe(recipe), out or Path("out") / recipe.stem
     if isinstance(parsed, LoraRecipe):
-        require_extra("large", "training a large backbone")
+        require_extra("diffusion", "training a diffusion backbone")
     if plan or gpu_name:
         _print_plan(parsed, gpu_name)
         return
@@ -189,11 +189,13 @@ def _print_data(recipe: LoraRecipe) -> None:
     if not os.environ.get("BREWSTER_DATA"):
         print_status("the data was not checked: BREWSTER_DATA is not set")
         return
-    from brewster.models.diffusion.backbones import family_of  # noqa: PLC0415
+    from brewster.models.diffusion.backbones.registry import backbone_class_of  # noqa: PLC0415
     from brewster.training.lora.latents import open_samples  # noqa: PLC0415
 
     samples = open_samples(recipe)
-    panels = [fit.panel for fit in samples.panel_fits(recipe, family_of(recipe.backbone).multiple)]
+    panels = [
+        fit.panel for fit in samples.check_sizes(recipe, backbone_class_of(recipe.backbone).size_divisor)
+    ]
     sizes = sorted(set(panels), key=lambda size: size[0] * size[1])
     span = " to ".join(f"{width} x {height}" for width, height in dict.fromkeys((*sizes[:1], *sizes[-1:])))
     print_out(f"{'data':24}{samples.description()}{f'; panels of {span}' if span else ''}")
@@ -203,7 +205,7 @@ def _make_folder(folder: Path) -> None:
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise TargetError(
+        raise OutputError(
             f"{folder} cannot be created ({error.strerror})",
             "expected a writable folder for the run",
             "choose another folder with -o",

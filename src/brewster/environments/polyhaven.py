@@ -18,8 +18,8 @@ from pathlib import Path
 from time import sleep
 from typing import Literal, NamedTuple, final
 
-from brewster.download import Downloader, RemoteFile, file_digest, target_errors
-from brewster.errors import DownloadError, TargetError
+from brewster.download import Downloader, RemoteFile, file_digest, output_errors
+from brewster.errors import DownloadError, OutputError
 from brewster.files import cache_folder, write_atomically
 
 _COLUMNS = ("file", "asset", "category", "resolution", "md5", "authors", "licence")  # of manifest.csv
@@ -80,7 +80,7 @@ def pull(request: DownloadRequest, out: Path) -> Iterator[DownloadResult]:
 
     Raises:
         DownloadError: the list of the server cannot be downloaded, or several assets in a row failed.
-        TargetError: the folder cannot be written to, or contains the manifest.csv of another program.
+        OutputError: the folder cannot be written to, or contains the manifest.csv of another program.
     """
     _read_manifest(out)  # refuses the manifest of another program before any download
     assets = _list_assets(request)
@@ -202,7 +202,7 @@ def _downloader() -> Downloader:
 
 
 def _is_downloaded(target: Path, remote: RemoteFile) -> bool:
-    with target_errors(target):
+    with output_errors(target):
         exists = target.exists()
         if exists and file_digest(target, remote.algorithm) != remote.digest:
             expected, cure = f"expected the MD5 sum {remote.digest}", "move or delete it, and run again"
@@ -213,7 +213,7 @@ def _is_downloaded(target: Path, remote: RemoteFile) -> bool:
 def _read_manifest(out: Path) -> list[dict[str, str]]:
     """Returns the rows of the manifest whose files exist."""
     path = out / "manifest.csv"
-    with target_errors(path):
+    with output_errors(path):
         text = path.read_text("utf-8", errors="replace") if path.exists() else ",".join(_COLUMNS)
         rows = csv.DictReader(io.StringIO(text, newline=""))
         if tuple(rows.fieldnames or ()) != _COLUMNS:
@@ -221,7 +221,7 @@ def _read_manifest(out: Path) -> list[dict[str, str]]:
                 f"expected a table with the columns {','.join(_COLUMNS)}",
                 "choose another folder",
             )
-            raise TargetError(f"{path} was not written by brewster", expected, cure)
+            raise OutputError(f"{path} was not written by brewster", expected, cure)
         return [row for row in rows if (out / row["file"]).is_file()]
 
 

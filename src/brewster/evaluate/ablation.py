@@ -1,7 +1,7 @@
 """Ablation studies: trains a model for each of several values of one key of a training recipe, and compares their scores.
 
-    study = read_study(Path("recipes/ablations/mixing.toml"))
-    ablate(study, study.open_benchmarks(), Path("out/ablations/mixing"))
+    study = read_study(Path("recipes/ablations/blend-space.toml"))
+    ablate(study, study.open_benchmarks(), Path("out/ablations/blend-space"))
 
 A study is a TOML file with a base recipe, the key, its values and the benchmarks. The first value is the reference
 of the comparisons. A stopped study resumes both training and evaluation.
@@ -47,7 +47,7 @@ class AblationStudy(FrozenModel):
     base: Path
     """The training recipe to change, relative to this file."""
     key: str
-    """The key whose value changes, with its tables: "data.rendered.mixing"."""
+    """The key whose value changes, with its tables: "data.rendered.blend_space"."""
     values: Annotated[
         list[Value],
         Field(min_length=2),
@@ -62,10 +62,11 @@ class AblationStudy(FrozenModel):
     ]
     """The benchmarks to score on: a name and a folder relative to BREWSTER_DATA for each."""
     metrics: tuple[str, ...] = DEFAULT_METRICS
-    """The metrics to compute. Those of the reflection region need pairs, the failure metrics need rendered sets."""
+    """The metrics to compute. Metrics of the reflection (`*_reflection`) need benchmarks with a ground-truth reflection, and
+    removed_content, removed_white and kept_reflection need rendered sets."""
 
     def label(self, value: Value) -> str:
-        """The name of a value in tables: "mixing 8-bit"."""
+        """The name of a value in tables: "blend_space srgb"."""
         return f"{self.key.rpartition('.')[2]} {str(value).replace('/', ' ')}"
 
     def open_benchmarks(self) -> list[Benchmark]:

@@ -22,18 +22,18 @@ class EvaluationConfig:
     """The settings of an evaluation run."""
 
     metrics: tuple[str, ...] = DEFAULT_METRICS
-    size: int | None = None
+    short_side_px: int | None = None
     """Larger images are downscaled to this shorter side in px before the methods run. None: the original size."""
     quality: Quality = "standard"
     thresholds: tuple[float, ...] = (DEFAULT_THRESHOLD,)
     """Thresholds of the reflection region, as fractions of full scale, between 0 and 1. Each one has its own columns."""
-    multiple: int = 1
+    size_divisor: int = 1
     """Photo and ground truth are resized so that their sides are multiples of this number of px."""
     border: int = 0
     """The width in px of the border that is not scored."""
     protocol: str = "brewster"
     """The name of a protocol, a key of `brewster.evaluate.protocols.PROTOCOLS`. It selects what reports say about it."""
-    paper: bool = False
+    paper_subset: bool = False
     """Whether to report the paper's subset (one case of each scene) too, and to average over it."""
 
     def __post_init__(self) -> None:
@@ -54,15 +54,15 @@ class EvaluationConfig:
                 "expected numbers between 0 and 1 whose first six digits differ",
                 "choose other numbers",
             )
-        if self.size is not None and self.size < 1:
+        if self.short_side_px is not None and self.short_side_px < 1:
             raise BrewsterError(
-                f"the size is {self.size} px",
+                f"the size is {self.short_side_px} px",
                 "expected a shorter side of 1 px or more",
                 "choose a larger number",
             )
-        if self.multiple < 1 or self.border < 0:
+        if self.size_divisor < 1 or self.border < 0:
             raise BrewsterError(
-                f"the sides are multiples of {self.multiple} px, and the border has {self.border} px",
+                f"the sides are multiples of {self.size_divisor} px, and the border has {self.border} px",
                 "expected multiples of 1 px or more, and a border of 0 px or more",
                 "choose larger numbers",
             )
@@ -70,7 +70,7 @@ class EvaluationConfig:
     @property
     def resizes(self) -> bool:
         """Whether photo and ground truth may be resized."""
-        return self.size is not None or self.multiple > 1
+        return self.short_side_px is not None or self.size_divisor > 1
 
     def columns(self) -> dict[str, Metric]:
         """Returns column -> metric. With several thresholds, a metric of the region has one column per threshold."""
@@ -94,15 +94,15 @@ class EvaluationConfig:
         """Returns one or more sentences for each setting."""
         size = (
             f"Images are compared at the size of the ground truth{'' if self.resizes else '; nothing is resized'}."
-            if self.size is None
-            else f"If the shorter side is longer than {self.size} px, photo and ground truth are downscaled to it before any "
+            if self.short_side_px is None
+            else f"If the shorter side is longer than {self.short_side_px} px, photo and ground truth are downscaled to it before any "
             "method runs, by area means in linear light. Smaller images keep their size."
         )
         region = _REGION.format(" or ".join(f"{threshold:g}" for threshold in self.thresholds))
         quality = f'Models run as in the command "brewster PHOTO", at quality "{self.quality}".'
         return [
             size,
-            *([_ROUNDED.format(self.multiple)] if self.multiple > 1 else []),
+            *([_ROUNDED.format(self.size_divisor)] if self.size_divisor > 1 else []),
             *([_BORDER.format(self.border)] if self.border else []),
             _VALUES,
             _PAIRS,
@@ -111,7 +111,7 @@ class EvaluationConfig:
             _IDENTICAL,
             region,
             _INTERVALS,
-            *([_DRAW] if self.paper else []),
+            *([_DRAW] if self.paper_subset else []),
         ]
 
 

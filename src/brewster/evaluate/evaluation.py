@@ -32,7 +32,13 @@ from brewster.evaluate.methods import (
     check_names,
 )
 from brewster.evaluate.report.html_report import write_report
-from brewster.evaluate.report.images import CaseImages, CaseTiles, method_tiles, photo_tiles, to_tiles
+from brewster.evaluate.report.images import (
+    CaseImages,
+    CaseThumbnails,
+    method_tiles,
+    photo_tiles,
+    to_thumbnails,
+)
 from brewster.evaluate.report.latex import to_latex
 from brewster.evaluate.report.published import read_published
 from brewster.evaluate.report.published import to_markdown as published_to_markdown
@@ -90,13 +96,15 @@ def evaluate(
     Raises:
         BrewsterError: there is no case or no method, names are not unique, an image matches two cases, the file names do
             not identify the scenes for the paper's draw, or an optional dependency is missing.
-        TargetError: `out` cannot be written.
+        OutputError: `out` cannot be written.
     """
     check(benchmarks, methods, config)
     cases = [case for part in benchmarks for case in part.cases]
     with TemporaryDirectory(prefix="brewster-report-") as folder:
         complete = frozenset(part.name for part in benchmarks if len(part.cases) <= max_report_cases)
-        tiles = _TileCache(Path(folder), complete, config, out, {method.name: method for method in methods})
+        tiles = _ThumbnailCache(
+            Path(folder), complete, config, out, {method.name: method for method in methods}
+        )
         unavailable = find_unavailable(benchmarks, methods, config, out)
         rows = score(
             benchmarks,
@@ -142,7 +150,7 @@ def check(benchmarks: Sequence[Benchmark], methods: Sequence[Method], config: Ev
             "expected photos with their ground truth",
             "; ".join(reasons[:5]) or "choose a folder with photos and their ground truth",
         )
-    if config.paper:
+    if config.paper_subset:
         paper_draws(benchmarks)
     cases = [case for part in benchmarks for case in part.cases]
     for method in methods:
@@ -204,7 +212,7 @@ def _write_tables(results: Results, out: Path, *, intervals: bool) -> None:
 
 @final
 @dataclass(frozen=True)
-class _TileCache:
+class _ThumbnailCache:
     """Writes the tiles of the report and the resized photos while a case is decoded.
 
     It stores the tiles of `benchmarks`, of which the report shows all cases. They are stored in files, because worker
@@ -232,7 +240,7 @@ class _TileCache:
             data = json.dumps([width, height, html], ensure_ascii=True).encode()
             self._path(case, method).write_bytes(data)
 
-    def read(self, case: Case, methods: Sequence[str]) -> CaseTiles | None:
+    def read(self, case: Case, methods: Sequence[str]) -> CaseThumbnails | None:
         """Returns the stored tiles of a case and the methods, or None if a file is missing."""
         tiles = {}
         width = height = 0
@@ -241,7 +249,7 @@ class _TileCache:
             if not path.exists():
                 return None
             width, height, tiles[method] = json.loads(path.read_bytes())
-        return CaseTiles(case.benchmark, case.name, (width, height), tiles.pop(BASELINE), tiles)
+        return CaseThumbnails(case.benchmark, case.name, (width, height), tiles.pop(BASELINE), tiles)
 
     def images(self, truth: GroundTruth, predictions: Mapping[str, MethodOutput]) -> CaseImages:
         """Returns the images of a case for the report, with links to files at full size."""
@@ -298,8 +306,8 @@ def _report_cases(
     methods: Sequence[Method],
     rows: Sequence[ScoreRow],
     limit: int,
-    tiles: _TileCache,
-) -> Iterator[CaseTiles]:
+    tiles: _ThumbnailCache,
+) -> Iterator[CaseThumbnails]:
     """Yields the cases of the report. Cases without stored tiles are read and decoded again."""
     scored_rows = {row.id: row for row in rows if not row.error}
     for case in _worst_cases(cases, methods, tiles.config, scored_rows, limit):
@@ -317,7 +325,7 @@ def _report_cases(
         except PhotoError:
             continue  # the row of the case has this error, and the tables show it
         predictions = {method.name: get_prediction(truth, method, row) for method, row in method_rows.items()}
-        yield to_tiles(tiles.images(truth, predictions))
+        yield to_thumbnails(tiles.images(truth, predictions))
 
 
 def _worst_cases(

@@ -24,14 +24,14 @@ from brewster.errors import BrewsterError, PhotoError
 from brewster.files import walk, write_atomically
 from brewster.image_formats import SUFFIXES
 from brewster.inference import Separator
-from brewster.models.zoo import find_model, is_large
+from brewster.models.zoo import find_model, is_diffusion_model
 from brewster.options import Device, Quality
 from brewster.photo import Photo
 
 BASELINE: Final = "input (unprocessed)"
 PREDICTION_FORMAT_VERSION: Final = 1
 """Increase this version when the code changes the predictions of a model. Stored predictions of other versions are not
-reused. test_house_formats checks it."""
+reused. test_conventions_formats checks it."""
 
 _STEM_SUFFIXES: Final = {"transmission": ("_t", "_l"), "reflection": ("_r",)}
 """Ends of the file stems that published code writes: rdnet_t (RDNet), dsrnet_l (DSRNet)."""
@@ -138,7 +138,7 @@ class ModelMethod:
     @property
     def exclusive(self) -> bool:
         """True for diffusion models, because a GPU has memory for only one of them."""
-        return is_large(self.model)
+        return is_diffusion_model(self.model)
 
     def about(self) -> dict[str, str]:
         """Returns the kind of method, the digest of the model file, and the quality."""

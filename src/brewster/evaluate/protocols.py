@@ -2,7 +2,7 @@
 
     config = protocol_config("xreflection", quality="best")
 
-A published row can be compared with a measured one only if both follow one protocol. Reports list the choices.
+A published score can be compared with a measured score only if both use the same protocol. Reports list the choices.
 """
 
 from __future__ import annotations
@@ -22,14 +22,17 @@ class ProtocolPreset:
     title: str
     choices: tuple[tuple[str, str], ...]
     metrics: tuple[str, ...] = DEFAULT_METRICS
-    size: int | None = None
-    multiple: int = 1
+    short_side_px: int | None = None
+    size_divisor: int = 1
     border: int = 0
-    paper: bool = False
+    paper_subset: bool = False
 
     def settings(self) -> dict[str, Any]:
         """The fields of `EvaluationConfig` that the protocol sets."""
-        return {name: getattr(self, name) for name in ("metrics", "size", "multiple", "border", "paper")}
+        return {
+            name: getattr(self, name)
+            for name in ("metrics", "short_side_px", "size_divisor", "border", "paper_subset")
+        }
 
 
 def protocol_config(name: str, **changes: Any) -> EvaluationConfig:  # noqa: ANN401  (the fields of EvaluationConfig)
@@ -72,9 +75,9 @@ PROTOCOLS: Final[dict[str, ProtocolPreset]] = {
         (
             ("Real 20, Nature 20, SIR2 Postcard 20 and SolidObject 20, Wildscene 101; average over 181", _PAPER),
             ("PSNR, SSIM and LPIPS of the transmission; LPIPS in the reflection region", f"{_PAPER}, section 5"),
-            ("Size, SSIM window, LPIPS backbone, threshold and draw are unknown, and are those of brewster", _PAPER),
+            ("The paper does not state image size, SSIM window, LPIPS backbone, threshold and selected images; brewster uses its own", _PAPER),
         ),
-        paper=True,
+        paper_subset=True,
     ),
     "xreflection": ProtocolPreset(
         "the validation of the toolbox XReflection, as for DSRNet, DSIT and RDNet",
@@ -83,12 +86,12 @@ PROTOCOLS: Final[dict[str, ProtocolPreset]] = {
             ("Photo and ground truth are resized to multiples of 32 px, by Pillow's bicubic filter", f"{_DSR_DATASET}.align"),
             ("PSNR is the mean of the PSNR of the three channels", "XReflection, xreflection/metrics/psnr_ssim.py"),
             ("SSIM has the uniform 7x7 window, per channel", "XReflection, xreflection/metrics/psnr_ssim.py"),
-            ("The average has the same weight for each image", "XReflection, xreflection/models/base_model.py"),
-            ("The filter that made the 420-px copy of Real20 is unknown; here area means in linear light", "brewster"),
+            ("Each image has the same weight in the average", "XReflection, xreflection/models/base_model.py"),
+            ("The filter that made the 420-px copy of Real20 is unknown; brewster averages areas in linear light", "brewster"),
         ),
         metrics=("psnr_channels", "ssim"),
-        size=420,
-        multiple=32,
+        short_side_px=420,
+        size_divisor=32,
     ),
     "windowseat": ProtocolPreset(
         "the tables of WindowSeat, as far as they are documented",
@@ -118,10 +121,10 @@ PROTOCOLS: Final[dict[str, ProtocolPreset]] = {
         (
             ("OpenRR-5k, val_300", "repository OpenRR-5k, README"),
             ("4 pixels are removed at each border of prediction and ground truth", _OPENRR),
-            ("PSNR of RGB, SSIM of RGB with the Gaussian 11x11 window, negative local values as 0", f"{_OPENRR}, and pyiqa"),
+            ("PSNR of RGB, SSIM of RGB with the Gaussian 11x11 window, in which negative local values count as 0", f"{_OPENRR}, and pyiqa"),
             ("LPIPS 0.1 with AlexNet, DISTS, and NIQE of the luma of YIQ", f"{_OPENRR}, and pyiqa"),
             ("The script pairs files by sorted position; brewster pairs them by name", _OPENRR),
-            ("32 dB is the threshold for the human evaluation; the best on val was above 36 dB", "repository OpenRR-5k, README"),
+            ("32 dB is the threshold for the human evaluation; the best result on val_300 was above 36 dB", "repository OpenRR-5k, README"),
         ),
         metrics=("psnr", "ssim_clipped", "lpips", "dists", "niqe"),
         border=4,

@@ -13,12 +13,12 @@ _SUPPORT = 2.0
 
 
 def resize(photo: Photo, config: EvaluationConfig) -> Photo:
-    """Downscales a photo to `config.size`, then to sides that are multiples of `config.multiple`.
+    """Downscales a photo to `config.short_side_px`, then to sides that are multiples of `config.size_divisor`.
 
     Returns:
         The resized photo, 8-bit sRGB; the photo itself if both settings leave it as it is.
     """
-    return round_sides(downscale(photo, config.size), config.multiple)
+    return round_sides(downscale(photo, config.short_side_px), config.size_divisor)
 
 
 def downscale(photo: Photo, shorter: int | None) -> Photo:
@@ -34,16 +34,16 @@ def downscale(photo: Photo, shorter: int | None) -> Photo:
     return Photo.from_array(small.srgb_8bit(), encoding="srgb")
 
 
-def round_sides(photo: Photo, multiple: int) -> Photo:
-    """Resizes a photo so that its sides are the next smaller multiples of `multiple` px.
+def round_sides(photo: Photo, size_divisor: int) -> Photo:
+    """Resizes a photo so that its sides are the next smaller multiples of `size_divisor` px.
 
     The 8-bit values are interpolated by cubic convolution (a = -0.5, antialiased), first along the rows, as Pillow's
     `Image.resize` does by default: the test code of DSRNet, RDNet and XReflection uses it.
 
     Returns:
-        The resized photo, 8-bit sRGB. The photo itself if its sides are multiples, or shorter than `multiple`.
+        The resized photo, 8-bit sRGB. The photo itself if its sides are multiples, or shorter than `size_divisor`.
     """
-    width, height = (max(side // multiple * multiple, min(side, multiple)) for side in photo.size)
+    width, height = (max(side // size_divisor * size_divisor, min(side, size_divisor)) for side in photo.size)
     if (width, height) == photo.size:
         return photo
     rows = _resampled(photo.srgb_8bit(), width, axis=1)

@@ -56,10 +56,10 @@ def summarise(
     measured = {column for row in rows for column, score in row.scores.items() if score is not None}
     columns = {name: metric for name, metric in config.columns().items() if name in measured}
     full = [Selection(part.name, part.title, part.cases) for part in benchmarks if part.cases]
-    drawn = paper_draws(benchmarks) if config.paper else []
+    drawn = paper_draws(benchmarks) if config.paper_subset else []
     tables = [[selection] for selection in (*full, *drawn)]
     averaged = _average_selections(
-        [part for part in full if part.key in PAPER_COUNTS] if config.paper else full, drawn
+        [part for part in full if part.key in PAPER_COUNTS] if config.paper_subset else full, drawn
     )
     selections = {group[0].key: group for group in tables} | ({AVERAGE: averaged} if averaged else {})
     series = [(method, column) for method in method_names for column in columns]
@@ -69,7 +69,7 @@ def summarise(
         "brewster": brewster.__version__,
         "protocol": {
             "name": config.protocol,
-            "size": config.size or "native",
+            "size": config.short_side_px or "native",
             "quality": config.quality,
             "region_thresholds": list(config.thresholds),
             "choices": _choices(config, averaged),
@@ -85,7 +85,7 @@ def summarise(
             if name not in (unavailable or {})
         ],
         "draw": {"seed": PAPER_SEED} | {part.key: [case.name for case in part.cases] for part in drawn},
-        "pictures": [
+        "cases": [
             _describe_case(case, method_names, by_id, columns) for part in benchmarks for case in part.cases
         ],
         "tables": {key: _table(strata[key], series) for key in selections},
@@ -129,14 +129,14 @@ def _average_selections(full: Sequence[Selection], drawn: Sequence[Selection]) -
 
 def _describe_selection(key: str, group: Sequence[Selection]) -> dict[str, Any]:
     image_count = sum(len(part.cases) for part in group)
-    return {"title": "Average" if key == AVERAGE else group[0].title, "pictures": image_count}
+    return {"title": "Average" if key == AVERAGE else group[0].title, "cases": image_count}
 
 
 def _choices(config: EvaluationConfig, averaged: Sequence[Selection]) -> list[str]:
     """Returns sentences: the settings, how the average is computed, and how it differs from that of the paper."""
     choices = [*describe_protocol(config), *config.describe(), *([_AVERAGE_NOTE] if averaged else [])]
     counts = {part.key.partition(":")[0]: len(part.cases) for part in averaged}
-    if not config.paper or counts == PAPER_COUNTS:
+    if not config.paper_subset or counts == PAPER_COUNTS:
         return choices
     found = ", ".join(f"{count} of {name}" for name, count in counts.items()) or "too few benchmarks"
     return [
@@ -182,10 +182,10 @@ def _rounded(row: dict[str, Any]) -> dict[str, Any]:
 def _describe_benchmark(part: Benchmark) -> dict[str, Any]:
     return {
         "title": part.title,
-        "pictures": len(part.cases),
+        "cases": len(part.cases),
         "expected": list(part.expected_counts),
         "remarks": list(part.remarks),
-        "refused": list(part.excluded),
+        "excluded": list(part.excluded),
     }
 
 

@@ -78,7 +78,7 @@ def score(
     Raises:
         BrewsterError: two methods have the same name, a name is not valid for a folder, a metric is not available, or
             a worker process died.
-        TargetError: `out` cannot be written.
+        OutputError: `out` cannot be written.
     """
     check_names(methods)
     logged = read_log(out / SCORES_FILE)
@@ -228,7 +228,7 @@ def _empty_row(
     # `paper` selects cases for the tables, and `protocol` is a name: they change no score. `quality` is a part of the keys of
     # models, and does not affect other methods. A row has its own list of columns.
     settings = asdict(config) | dict.fromkeys(("metrics", "paper", "protocol", "quality"))
-    prediction_key = _digest(photo, config.size, config.multiple, method.key(case))
+    prediction_key = _digest(photo, config.short_side_px, config.size_divisor, method.key(case))
     score_key = _digest(prediction_key, ground_truths, settings, case.rendered, SCORE_FORMAT_VERSION)
     row = ScoreRow(case.benchmark, case.name, method.name, prediction_key, score_key)
     logged_row = logged.get(method.name)

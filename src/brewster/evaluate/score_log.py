@@ -7,12 +7,12 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Final, final
 
-from brewster.errors import TargetError
+from brewster.errors import OutputError
 
 SCORES_FILE: Final = "scores.jsonl"
 SCORE_FORMAT_VERSION: Final = 4
 """Increase this version when the scores of a prediction or the fields of `ScoreRow` change. Rows of other versions are
-scored again. test_house_formats checks the scores."""
+scored again. test_conventions_formats checks the scores."""
 
 RowId = tuple[str, str, str]
 
@@ -59,14 +59,14 @@ class ScoreLog:
         """Appends a line.
 
         Raises:
-            TargetError: the file cannot be written.
+            OutputError: the file cannot be written.
         """
         try:
             self._path.parent.mkdir(parents=True, exist_ok=True)
             with self._path.open("ab+") as file:
                 file.write(self._missing_newline(file) + json.dumps(asdict(row)).encode() + b"\n")
         except OSError as error:
-            raise TargetError(
+            raise OutputError(
                 f"{self._path} was not written ({error.strerror or error})",
                 "expected a writable output folder",
                 "free disk space or choose another folder with -o, and run again (the finished scores are saved)",

@@ -101,16 +101,16 @@ def _estimate(
 @final
 @dataclass(frozen=True)
 class Difference:
-    """The mean of score(method) - score(than) in one metric, over the images with both scores, with its interval.
+    """The mean of score(method) - score(reference) in one metric, over the images with both scores, with its interval.
 
-    `better` is the number of images on which `method` has a better score than `than`.
+    `improved_count` is the number of images on which `method` has a better score reference `reference`.
     """
 
     method: str
-    than: str
+    reference: str
     metric: str
     estimate: Estimate
-    better: int
+    improved_count: int
 
 
 def differences(
@@ -129,9 +129,9 @@ def differences(
     column_of = {name: i for i, name in enumerate(series)}
     methods = list(dict.fromkeys(method for method, _ in series))
     comparisons = [
-        (method, than, metric)
+        (method, reference, metric)
         for i, method in enumerate(methods)
-        for than in methods[:i]
+        for reference in methods[:i]
         for metric in directions
     ]
     if not comparisons:

@@ -44,7 +44,7 @@ def export_ntire2026(
     Raises:
         PhotoError: the folder has no photos in the layout of OpenRR-5k, or a photo cannot be read.
         BrewsterError: the method fails.
-        TargetError: a zip file cannot be written.
+        OutputError: a zip file cannot be written.
     """
     splits = {
         name: roles["photo"]

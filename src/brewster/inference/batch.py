@@ -19,7 +19,7 @@ from functools import partial
 from pathlib import Path
 from typing import Final, Literal, Protocol, final
 
-from brewster.errors import BrewsterError, PhotoError, TargetError
+from brewster.errors import BrewsterError, OutputError, PhotoError
 from brewster.files import exists, find_videos, images_in, is_same_file, name_layers, write_atomically
 from brewster.image_formats import SUFFIXES, format_of
 from brewster.inference.assessment import Assessment
@@ -59,7 +59,7 @@ class SeparationTask:
     """One photo, and the target of each of its layers: a path, a URL or a stream."""
 
     source: Location | InputStream
-    targets: Mapping[str, Location | OutputStream]
+    outputs: Mapping[str, Location | OutputStream]
     """The target of each layer, by layer name (`transmission`, `reflection` or `confidence`)."""
 
     @property
@@ -89,7 +89,7 @@ class FileResult:
     outputs: dict[str, str] = field(default_factory=dict)
     """The path of each written layer by layer name, or `-` for a stream. After a failure, only the layers written before."""
     model: str | None = None
-    sha256: str | None = None
+    model_sha256: str | None = None
     """The digest of the model file."""
     photo_sha256: str | None = None
     """The digest of the photo's file."""
@@ -141,7 +141,7 @@ def separate_files(
     Raises:
         PhotoError: the sources contain no photo.
         ManifestError: a manifest is not a table, or a row of it is not a path.
-        TargetError: the layers of two photos would have the same path.
+        OutputError: the layers of two photos would have the same path.
         ModelError: the model does not exist or is damaged (raised during iteration).
         DeviceError: the requested device is not available (raised during iteration).
         Exception: a bug in brewster. The result of the photo has the status `failed`, and the first such exception is
@@ -163,7 +163,7 @@ def plan_files(
     Raises:
         PhotoError: the sources contain no photo.
         ManifestError: a manifest is not a table, or a row of it is not a path.
-        TargetError: the layers of two photos would have the same path.
+        OutputError: the layers of two photos would have the same path.
     """
     given = [sources] if isinstance(sources, str | os.PathLike) else sources
     paths = [location(source) for source in given]
@@ -239,20 +239,20 @@ class BatchRunner:
         """
         result = FileResult(task.name)
         try:
-            targets = self._targets_to_write(task)
+            outputs = self._outputs_to_write(task)
         except BrewsterError as error:
             return _failed(result, error)
-        if not targets or self._dry_run:
-            result.status = "planned" if targets else "skipped"
+        if not outputs or self._dry_run:
+            result.status = "planned" if outputs else "skipped"
             result.outputs = {
-                layer: _display_name(target) for layer, target in (targets or task.targets).items()
+                layer: _display_name(target) for layer, target in (outputs or task.outputs).items()
             }
             return result
         # Not in the try block: without a model no photo can be separated, so a model error ends the batch.
         self._separator = separator = self._separator or Separator.load(**self._options.load_options())
-        result.model, result.sha256, result.device = separator.name, separator.sha256, separator.device
+        result.model, result.model_sha256, result.device = separator.name, separator.sha256, separator.device
         try:
-            self._separate(separator, SeparationTask(task.source, targets), result, on_progress)
+            self._separate(separator, SeparationTask(task.source, outputs), result, on_progress)
         except BrewsterError as error:
             return _failed(result, error)
         except MemoryError:
@@ -268,22 +268,22 @@ class BatchRunner:
             )
         return result
 
-    def _targets_to_write(self, task: SeparationTask) -> dict[str, Location | OutputStream]:
-        """Returns the layers that must be written, with their targets.
+    def _outputs_to_write(self, task: SeparationTask) -> dict[str, Location | OutputStream]:
+        """Returns the layers that must be written, with their outputs.
 
         Raises:
-            TargetError: a layer would replace a photo of the batch.
+            OutputError: a layer would replace a photo of the batch.
         """
-        for target in task.targets.values():
+        for target in task.outputs.values():
             if isinstance(target, Location) and self._is_source(target, task.source):
-                raise TargetError(
+                raise OutputError(
                     f"{target} is itself a photo of the batch",
                     "expected another path, because photos of the batch are never overwritten",
                     "choose another name",
                 )
         return {
             layer: target
-            for layer, target in task.targets.items()
+            for layer, target in task.outputs.items()
             if not isinstance(target, Location) or self._overwrite or not exists(target)
         }
 
@@ -311,7 +311,7 @@ class BatchRunner:
         result.reconstruction_error = separation.reconstruction_error
         result.reflection_is_derived = separation.reflection_is_derived
         started = time.perf_counter()
-        for layer, target in task.targets.items():
+        for layer, target in task.outputs.items():
             target_format = format_of(target) if isinstance(target, Location) else None
             source_format = separation.photo.file_info.container
             container = target_format.name if target_format else self._options.container(layer, source_format)

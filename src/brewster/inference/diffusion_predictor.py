@@ -46,11 +46,11 @@ class DiffusionPredictor(Predictor):
     Args:
         pipeline: the model.
         steps: the number of sampling steps; by default those of the task (20 as in the paper), and at most 4 for "draft".
-        average: the number of samples with different seeds whose mean is the prediction; the mean has less invented detail.
-        plain: whether the transmission is the upsampled generated one, without the detail of the photo.
+        ensemble_size: the number of samples with different seeds whose mean is the prediction; the mean has less invented detail.
+        no_guided_upsampling: whether the transmission is the upsampled generated one, without the detail of the photo.
 
     Raises:
-        ModelError: `steps` or `average` is below 1, or one of them is set for a one-step model.
+        ModelError: `steps` or `ensemble_size` is below 1, or one of them is set for a one-step model.
     """
 
     def __init__(
@@ -58,23 +58,23 @@ class DiffusionPredictor(Predictor):
         pipeline: DecompositionPipeline,
         *,
         steps: int | None = None,
-        average: int = 1,
-        plain: bool = False,
+        ensemble_size: int = 1,
+        no_guided_upsampling: bool = False,
     ) -> None:
-        if (steps is not None and steps < 1) or average < 1:
+        if (steps is not None and steps < 1) or ensemble_size < 1:
             raise ModelError(
-                f"steps = {steps}, average = {average}",
+                f"steps = {steps}, ensemble_size = {ensemble_size}",
                 "expected both to be at least 1",
                 "set them to 1 or more",
             )
-        if pipeline.task.objective != "flow" and (steps not in (None, 1) or average > 1):
+        if pipeline.task.objective != "flow" and (steps not in (None, 1) or ensemble_size > 1):
             raise ModelError(
-                f"steps = {steps}, average = {average} were set for a one-step model",
+                f"steps = {steps}, ensemble_size = {ensemble_size} were set for a one-step model",
                 "expected neither, because it takes one step and is deterministic",
                 "leave them out",
             )
-        self._pipeline, self._plain = pipeline, plain
-        self._steps, self._seeds = steps, range(average)
+        self._pipeline, self._no_guided_upsampling = pipeline, no_guided_upsampling
+        self._steps, self._seeds = steps, range(ensemble_size)
         self._lock = Lock()
 
     def input_sizes(self, size: tuple[int, int], quality: Quality) -> list[tuple[int, int]]:
@@ -85,8 +85,8 @@ class DiffusionPredictor(Predictor):
         Raises:
             PhotoError: a side of the photo has fewer than 16 pixels, or its aspect ratio is too large.
         """
-        task, multiple = self._pipeline.task, self._pipeline.backbone.multiple
-        coarse = task.input_size(size, multiple)
+        task, size_divisor = self._pipeline.task, self._pipeline.backbone.size_divisor
+        coarse = task.input_size(size, size_divisor)
         scale = min(_SECOND_INPUT_SCALE, size[0] / coarse[0])
         if quality != "best" or scale < _MIN_SECOND_INPUT_SCALE:
             return [coarse]
@@ -115,7 +115,7 @@ class DiffusionPredictor(Predictor):
             for maps in zip(*predictions, strict=True)
         )
         override, mean_error = None, None
-        if self._plain:
+        if self._no_guided_upsampling:
             override = GeneratedOverride(generated, np.ones_like(generated[..., :1]))
         elif self._reconstructs_input:
             override = GeneratedOverride.weighted_by_detail(generated, reflection)
@@ -145,14 +145,17 @@ class DiffusionPredictor(Predictor):
 
         The first input is one tile, unless the task has square tiles. Those of other tasks have the area of a panel.
         """
-        task, multiple = self._pipeline.task, self._pipeline.backbone.multiple
+        task, size_divisor = self._pipeline.task, self._pipeline.backbone.size_divisor
         if task.square_tiles:
             side = min(*shape[:2], task.short_side_px or max(shape))
             return {"tile_px": side, "overlap_px": side // _SQUARE_TILE_OVERLAP}
         if is_first:
             side = max(shape)
         else:
-            side = max(1, math.isqrt(task.budget_px // len(task.layout.panels)) // multiple) * multiple
+            side = (
+                max(1, math.isqrt(task.max_composite_pixels // len(task.layout.panels)) // size_divisor)
+                * size_divisor
+            )
         return {"tile_px": side, "overlap_px": side // 4}
 
     def _predict_tile(self, tile: Floats, steps: int, progress: _ProgressCounter) -> tuple[Floats, ...]:
@@ -168,7 +171,9 @@ class DiffusionPredictor(Predictor):
             enlarged = np.clip(_resize(tile, size, "bicubic"), 0, 1)
             maps = self._predict_tile(enlarged, steps, progress)
             return tuple(_resize(map_, (height, width), "bilinear") for map_ in maps)
-        panel_fit = PanelFit((width, height), _round_up((width, height), self._pipeline.backbone.multiple))
+        panel_fit = PanelFit(
+            (width, height), _round_up((width, height), self._pipeline.backbone.size_divisor)
+        )
         panel_input = torch.from_numpy(2 * to_encoded(tile) - 1).permute(2, 0, 1)[None]
         panels = self._pipeline(
             panel_fit.pad(panel_input), steps=steps, seeds=self._seeds, on_progress=progress.within_tile
@@ -217,7 +222,7 @@ def _check_finite(panels: Mapping[str, torch.Tensor]) -> None:
             raise ModelError(
                 f"panel {name} of the model contains NaN or infinity",
                 "expected finite values",
-                "choose another value of quantise, or train the LoRA again: its weights may be damaged",
+                "choose another value of quantization, or train the LoRA again: its weights may be damaged",
             )
 
 
@@ -235,6 +240,6 @@ def _resize(image: Floats, size: tuple[int, ...], mode: str) -> Floats:
     return result
 
 
-def _round_up(size: tuple[int, int], multiple: int) -> tuple[int, int]:
-    width, height = (-(-side // multiple) * multiple for side in size)
+def _round_up(size: tuple[int, int], size_divisor: int) -> tuple[int, int]:
+    width, height = (-(-side // size_divisor) * size_divisor for side in size)
     return width, height

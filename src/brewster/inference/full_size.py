@@ -66,7 +66,7 @@ def _float_template(photo: Photo) -> Photo:
 def _exact_sum_layers(photo: Floats, transmission: Floats) -> list[Floats]:
     """Returns transmission and reflection whose float sum is bit-equal to the photo.
 
-    They are not negative where the photo is not negative.
+    Both layers are at least 0 where the photo is not negative.
 
     At least one of the two differences is exact (Sterbenz 1974), which makes the sum exact.
     """

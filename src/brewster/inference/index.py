@@ -16,7 +16,7 @@ import time
 from collections.abc import Callable
 from typing import Any, Final, Self, final
 
-from brewster.errors import TargetError
+from brewster.errors import OutputError
 from brewster.files import exists, write_atomically
 from brewster.inference.batch import FileResult
 from brewster.inference.manifest import import_parquet
@@ -29,14 +29,14 @@ _PART_INTERVAL_S: Final = 30.0
 
 COLUMNS: Final[dict[str, tuple[str, Callable[[FileResult], object]]]] = {
     "path": ("string", lambda result: result.source),
-    "sha256": ("string", lambda result: result.photo_sha256),
+    "photo_sha256": ("string", lambda result: result.photo_sha256),
     "status": ("string", lambda result: result.status),
     "verdict": ("string", lambda result: result.assessment and result.assessment.verdict),
     "confidence": ("float64", lambda result: result.assessment and result.assessment.confidence),
     "removed_light": ("float64", lambda result: result.assessment and result.assessment.removed_light),
     "residual": ("float64", lambda result: result.residual),
     "seconds": ("float64", lambda result: sum(result.seconds.values()) if result.seconds else None),
-    "model_sha256": ("string", lambda result: result.sha256),
+    "model_sha256": ("string", lambda result: result.model_sha256),
     "outputs": ("strings", lambda result: list(result.outputs.values())),
     "error": ("string", lambda result: result.error),
 }
@@ -48,7 +48,7 @@ class IndexWriter:
     """Writes the index of an output folder. A context manager: on exit, all rows are merged into index.parquet.
 
     Raises:
-        TargetError: the folder cannot be written to, or has another file named index.parquet.
+        OutputError: the folder cannot be written to, or has another file named index.parquet.
         MissingExtra: pyarrow is not installed.
     """
 
@@ -66,20 +66,20 @@ class IndexWriter:
         self._rows.append(result)
         is_due = time.monotonic() > self._written_at + _PART_INTERVAL_S
         if is_due or len(self._rows) % MAX_PART_ROWS == 0:
-            with contextlib.suppress(TargetError):  # `close` raises it, if it remains
+            with contextlib.suppress(OutputError):  # `close` raises it, if it remains
                 self._write_part()
 
     def close(self) -> None:
         """Merges the parts of this run and of killed runs into index.parquet, and deletes them.
 
         Raises:
-            TargetError: the index cannot be written. The parts are kept, and the next run merges them.
+            OutputError: the index cannot be written. The parts are kept, and the next run merges them.
             UnreadablePhoto: the object store of the folder cannot be read.
         """
         self._write_part()
         parts = sorted(path for path in self._parts_folder.iterdir() if path.suffix == ".parquet")
         if not parts:
-            raise TargetError(
+            raise OutputError(
                 f"the folder {self._parts_folder} is empty",
                 "expected the rows of this run",
                 "run the same command again: finished files are kept, and no other program may change this folder",
@@ -126,7 +126,7 @@ class IndexWriter:
                 ["path", "status", *(COLUMNS.keys() & {*table.column_names} - {"path", "status"})]
             )
         except (OSError, ValueError, KeyError) as error:  # the errors of pyarrow are subclasses
-            raise TargetError(
+            raise OutputError(
                 f"{path} is not an index ({str(error).partition(chr(10))[0]})",
                 "expected no such file, or the index of an earlier run",
                 "move it to another folder, or choose another output folder",

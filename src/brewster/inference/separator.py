@@ -37,8 +37,8 @@ from brewster.inference.predictor import (
 )
 from brewster.inference.separation import Separation
 from brewster.inference.tiles import Backend
-from brewster.models.zoo import find_model, is_large
-from brewster.options import Options, Quality, Quantisation, document_options
+from brewster.models.zoo import find_model, is_diffusion_model
+from brewster.options import Options, Quality, Quantization, document_options
 from brewster.photo import Encoding, Mask, Photo, Source
 from brewster.photo.history import with_history
 
@@ -82,11 +82,11 @@ class Separator:
         model: str = Options.model,
         *,
         device: str = Options.device,
-        base: str | None = Options.base,
-        quantise: Quantisation | None = Options.quantise,
+        base_model: str | None = Options.base_model,
+        quantization: Quantization | None = Options.quantization,
         steps: int | None = Options.steps,
-        average: int = Options.average,
-        plain: bool = Options.plain,
+        ensemble_size: int = Options.ensemble_size,
+        no_guided_upsampling: bool = Options.no_guided_upsampling,
     ) -> Separator:
         """Loads a model and returns its separator.
 
@@ -96,12 +96,20 @@ class Separator:
             ModelError: the model is unknown or damaged, or an option of diffusion models is set for another model.
             DeviceError: the device is not available, or the model does not fit into its memory.
             DownloadError: a diffusion model cannot be downloaded, for example because access was not granted.
-            MissingExtra: a diffusion model needs the extra `large`.
+            MissingExtra: a diffusion model needs the extra `diffusion`.
         """
-        if is_large(model):
-            pipeline = _open_pipeline(model, device, base, quantise)
-            return cls._from_pipeline(pipeline, steps=steps, average=average, plain=plain)
-        chosen = {"base": base, "quantise": quantise, "steps": steps, "average": average, "plain": plain}
+        if is_diffusion_model(model):
+            pipeline = _open_pipeline(model, device, base_model, quantization)
+            return cls._from_pipeline(
+                pipeline, steps=steps, ensemble_size=ensemble_size, no_guided_upsampling=no_guided_upsampling
+            )
+        chosen = {
+            "base_model": base_model,
+            "quantization": quantization,
+            "steps": steps,
+            "ensemble_size": ensemble_size,
+            "no_guided_upsampling": no_guided_upsampling,
+        }
         if changed := [name for name, value in chosen.items() if value != getattr(Options, name)]:
             raise ModelError(
                 f"{', '.join(changed)} was set for the model {model}",
@@ -115,11 +123,18 @@ class Separator:
 
     @classmethod
     def _from_pipeline(
-        cls, pipeline: DecompositionPipeline, *, steps: int | None, average: int, plain: bool
+        cls,
+        pipeline: DecompositionPipeline,
+        *,
+        steps: int | None,
+        ensemble_size: int,
+        no_guided_upsampling: bool,
     ) -> Separator:
         from brewster.inference.diffusion_predictor import DiffusionPredictor  # noqa: PLC0415  (imports torch)
 
-        predictor = DiffusionPredictor(pipeline, steps=steps, average=average, plain=plain)
+        predictor = DiffusionPredictor(
+            pipeline, steps=steps, ensemble_size=ensemble_size, no_guided_upsampling=no_guided_upsampling
+        )
         device = str(pipeline.backbone.device)
         return cls(predictor, name=pipeline.name, sha256=pipeline.sha256, device=device)
 
@@ -276,11 +291,11 @@ def separate(
     additive: bool = Options.additive,
     encoding: Encoding | None = None,
     max_pixels: int = Options.max_pixels,
-    base: str | None = Options.base,
-    quantise: Quantisation | None = Options.quantise,
+    base_model: str | None = Options.base_model,
+    quantization: Quantization | None = Options.quantization,
     steps: int | None = Options.steps,
-    average: int = Options.average,
-    plain: bool = Options.plain,
+    ensemble_size: int = Options.ensemble_size,
+    no_guided_upsampling: bool = Options.no_guided_upsampling,
 ) -> Separation:
     """Separates one photo. For several photos, use `Separator.load` once and call the separator for each.
 
@@ -292,7 +307,13 @@ def separate(
         BrewsterError: an error of `Separator.load` or of a call of the `Separator`.
     """
     separator = Separator.load(
-        model, device=device, base=base, quantise=quantise, steps=steps, average=average, plain=plain
+        model,
+        device=device,
+        base_model=base_model,
+        quantization=quantization,
+        steps=steps,
+        ensemble_size=ensemble_size,
+        no_guided_upsampling=no_guided_upsampling,
     )
     return separator(
         source,
@@ -306,7 +327,7 @@ def separate(
 
 
 def _open_pipeline(
-    model: str, device: str, base: str | None, quantise: Quantisation | None
+    model: str, device: str, base_model: str | None, quantization: Quantization | None
 ) -> DecompositionPipeline:
     try:
         from brewster.models.diffusion.pipeline import load_pipeline  # noqa: PLC0415  (imports torch)
@@ -314,9 +335,9 @@ def _open_pipeline(
         raise MissingExtra(
             f"{error.name} is not installed",
             f"expected it to be installed, because {model} needs it",
-            "run: pip install 'brewster[large]'",
+            "run: pip install 'brewster[diffusion]'",
         ) from error
-    return load_pipeline(model, device=device, base=base, quantise=quantise)
+    return load_pipeline(model, device=device, base_model=base_model, quantization=quantization)
 
 
 def history_step(model: str, *, strength: float, quality: str, additive: bool) -> dict[str, str]:

@@ -72,7 +72,7 @@ class Dists:
             MissingExtra: torch is not installed.
             ModelError: the file of VGG16's weights is damaged, or is another file.
             DownloadError: VGG16's weights are not on this machine, and the download fails.
-            TargetError: the download cannot be written to the cache folder.
+            OutputError: the download cannot be written to the cache folder.
         """
         return _load()
 

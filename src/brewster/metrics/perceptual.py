@@ -110,7 +110,7 @@ class Lpips:
             MissingExtra: torch is not installed.
             ModelError: the file of AlexNet's weights is damaged, or holds other weights.
             DownloadError: AlexNet's weights are not on this machine, and the download fails.
-            TargetError: the downloaded weights cannot be written to the cache folder.
+            OutputError: the downloaded weights cannot be written to the cache folder.
         """
         return _load()
 

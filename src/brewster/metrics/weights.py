@@ -1,8 +1,8 @@
-"""The networks of LPIPS and DISTS. The small weights of their channels are part of brewster; networks are downloaded once.
+"""Loads the networks of LPIPS and DISTS. The files with the channel weights are small and are part of brewster. The networks
+are downloaded once.
 
 Both are networks of torchvision (BSD-3-Clause). They are searched for in the folder `brewster/weights` of the user's cache
-folder, then in the folder `weights` of BREWSTER_DATA, and are always checked, because distances with other weights are
-other metrics:
+folder, then in the folder `weights` of BREWSTER_DATA, and are always checked, because other weights define a different metric:
 
     LPIPS   AlexNet: `features.0`, 3, 6, 8 and 10 of alexnet-owt-7be5be79.pth, stored as a state dict of ten tensors,
             `lpips_alexnet_features.pth`. The digest of the values is checked.
@@ -85,7 +85,7 @@ def load_alexnet(
     Raises:
         ModelError: the file is damaged, or contains other weights.
         DownloadError: there is no file, and the download fails.
-        TargetError: the cache folder cannot be written.
+        OutputError: the cache folder cannot be written.
     """
     path = _find(WEIGHTS_FILE)
     if path:
@@ -101,7 +101,7 @@ def load_vgg16(
     Raises:
         ModelError: the file is damaged, or is another file.
         DownloadError: there is no file, and the download fails.
-        TargetError: the cache folder cannot be written.
+        OutputError: the cache folder cannot be written.
     """
     import torch  # noqa: PLC0415 - an extra
 
@@ -171,7 +171,7 @@ def digest_of(tensors: dict[str, Tensor]) -> str:
 
 
 def _fetch(remote: RemoteFile, digest: str, cached: Path, downloader: Downloader) -> dict[str, Tensor]:
-    """Downloads the whole network, stores its ten tensors in `cached`, and deletes the download (the rest is 96 %)."""
+    """Downloads the whole network, stores its ten tensors in `cached`, and deletes the download, because the other 96 % of the file are not needed."""
     import torch  # noqa: PLC0415 - an extra
 
     download = cached.with_name(remote.url.rsplit("/", 1)[-1])

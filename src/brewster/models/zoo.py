@@ -1,4 +1,4 @@
-"""The registry of models: shipped model files with SHA-256 and licence, and names of large models. It needs no torch."""
+"""The registry of models: shipped model files with SHA-256 and licence, and names of diffusion models. It needs no torch."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Final, final
 
 from brewster.errors import ModelError
-from brewster.models.large_models import LARGE
+from brewster.models.diffusion_models import DIFFUSION_MODELS
 
 _WEIGHTS: Final = Path(__file__).parent / "weights"
 
@@ -73,36 +73,36 @@ MODELS: Final = {
 }
 
 
-LARGE_MODELS: Final = {
-    "kontext": "brewster.models.diffusion.families.kontext:Kontext",
-    "klein": "brewster.models.diffusion.families.klein:Klein",
-    "qwen": "brewster.models.diffusion.families.qwen:Qwen",
+BACKBONE_CLASSES: Final = {
+    "kontext": "brewster.models.diffusion.backbones.kontext:Kontext",
+    "klein": "brewster.models.diffusion.backbones.klein:Klein",
+    "qwen": "brewster.models.diffusion.backbones.qwen:Qwen",
 }
-"""Large models: name -> import path of the `Backbone` class. The path is text, because the import needs torch."""
+"""Diffusion models: name -> import path of the `Backbone` class. The path is text, because the import needs torch."""
 
 MODEL_FILE: Final = "model.onnx"
 """The name of the exported model in the folder of a training run."""
-LARGE_NAMES: Final = [name for name, model in LARGE.items() if model.is_opened_by_name]
-"""The large models that `--model` takes by name."""
+DIFFUSION_NAMES: Final = [name for name, model in DIFFUSION_MODELS.items() if model.is_opened_by_name]
+"""The diffusion models that `--model` takes by name."""
 
 TINY_PREFIX: Final = "tiny:"
 """The prefix for the tiny version of a backbone: the same classes with few, random weights, for tests and demos."""
 
 
-def is_large(name: str) -> bool:
-    """Whether `name` is that of a large model or LoRA: a registered name, "tiny:" and a name, a folder, or a hub id."""
+def is_diffusion_model(name: str) -> bool:
+    """Whether `name` is that of a diffusion model or LoRA: a registered name, "tiny:" and a name, a folder, or a hub id."""
     if name in MODELS or Path(name).is_file() or _run_model(name):
         return False
-    return name in LARGE_NAMES or name.startswith(TINY_PREFIX) or Path(name).is_dir() or _is_hub_id(name)
+    return name in DIFFUSION_NAMES or name.startswith(TINY_PREFIX) or Path(name).is_dir() or _is_hub_id(name)
 
 
 def model_name(model: str) -> str:
     """The short name of a model for reports: a registered name, the stem of a file, or the name of a folder.
 
     Raises:
-        ModelError: `model` is neither a large model, a name in the registry, nor a file.
+        ModelError: `model` is neither a diffusion model, a name in the registry, nor a file.
     """
-    if is_large(model):
+    if is_diffusion_model(model):
         return Path(model).resolve().name.replace(":", "-")
     return find_model(model).name
 
@@ -123,13 +123,13 @@ def find_model(name: str) -> ModelFile:
     """The model file with this registered name or path.
 
     Raises:
-        ModelError: there is no such model or file, or it is a large model, which has no single file.
+        ModelError: there is no such model or file, or it is a diffusion model, which has no single file.
     """
     if name in MODELS:
         return MODELS[name]
-    if is_large(name):
+    if is_diffusion_model(name):
         raise ModelError(
-            f"{name} is a large model, which has no model file",
+            f"{name} is a diffusion model, which has no model file",
             f"expected one of {', '.join(MODELS)}, or the path of an .onnx file",
             "to print the model card of a LoRA, run: brewster models card FOLDER",
         )
@@ -144,10 +144,10 @@ def find_model(name: str) -> ModelFile:
         return ModelFile(path.stem, path, None, "unknown")
     if exported := _run_model(name):
         return ModelFile(path.resolve().name, exported, None, "unknown")
-    close = difflib.get_close_matches(name, (*MODELS, *LARGE_NAMES), n=1) if path.name == name else []
+    close = difflib.get_close_matches(name, (*MODELS, *DIFFUSION_NAMES), n=1) if path.name == name else []
     raise ModelError(
         f"there is no model {name!r}",
-        f"expected one of {', '.join((*MODELS, *LARGE_NAMES))}, an .onnx file, the folder of a training run, or the folder or hub id of a LoRA",
+        f"expected one of {', '.join((*MODELS, *DIFFUSION_NAMES))}, an .onnx file, the folder of a training run, or the folder or hub id of a LoRA",
         f"did you mean {close[0]}?"
         if close
         else "check the path, or print all models with: brewster models list",

@@ -9,7 +9,7 @@ Only this package imports pyvips. It imports OpenEXR and pillow-heif when a file
 from brewster.files import DEFAULT_MAX_PIXELS
 from brewster.photo.decode import read_size
 from brewster.photo.file_info import FileInfo
-from brewster.photo.hdr_formats import read_layers, write_layers
+from brewster.photo.hdr_formats import read_exr_layers, write_exr_layers
 from brewster.photo.in_memory import Encoding
 from brewster.photo.mask import Mask
 from brewster.photo.photo import Photo, Source
@@ -21,7 +21,7 @@ __all__ = [
     "Mask",
     "Photo",
     "Source",
-    "read_layers",
+    "read_exr_layers",
     "read_size",
-    "write_layers",
+    "write_exr_layers",
 ]

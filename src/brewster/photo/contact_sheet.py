@@ -33,7 +33,7 @@ def write_contact_sheets(
 
     Raises:
         PhotoError: an image file cannot be read.
-        TargetError: the sheet cannot be written.
+        OutputError: the sheet cannot be written.
     """
     for number, first in enumerate(range(0, len(rows), _MAX_ROWS), 1):
         images = [

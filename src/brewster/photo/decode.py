@@ -256,12 +256,12 @@ def _jpeg_info(data: bytes) -> dict[str, Any]:
 
 
 def _jpeg_quality(data: bytes, bands: int) -> int:
-    """Returns the lowest libvips quality whose quantisation is at least as fine as that of the file, for luma and chroma."""
-    source = metadata.jpeg_quantisation_sums(data)
+    """Returns the lowest libvips quality whose quantization is at least as fine as that of the file, for luma and chroma."""
+    source = metadata.jpeg_quantization_sums(data)
     square = pyvips.Image.black(8, 8, bands=bands)
 
     def is_fine(quality: int) -> bool:
-        candidate = metadata.jpeg_quantisation_sums(square.jpegsave_buffer(Q=quality))
+        candidate = metadata.jpeg_quantization_sums(square.jpegsave_buffer(Q=quality))
         return all(sum_ <= source.get(number, source.get(0, 0)) for number, sum_ in candidate.items())
 
     return min(bisect.bisect_left(range(1, 101), True, key=is_fine) + 1, 100)

@@ -26,7 +26,7 @@ class FileInfo:
     resolution: tuple[float, float] | None = None
     """Pixels per millimetre, horizontal and vertical."""
     jpeg_quality: int | None = None
-    """The lowest libvips quality, 1..100, whose quantisation tables have no larger sums than those of the file."""
+    """The lowest libvips quality, 1..100, whose quantization tables have no larger sums than those of the file."""
     subsampling: str | None = None
     """Chroma subsampling of a JPEG, such as "4:2:0"."""
     compression: str | None = None

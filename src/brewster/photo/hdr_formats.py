@@ -156,7 +156,7 @@ _RESERVED_ATTRIBUTES = {
 """Attributes that OpenEXR defines itself. It silently drops text attributes with some of these names."""
 
 
-def write_layers(layers: Mapping[str, Float32], header: Mapping[str, str]) -> bytes:
+def write_exr_layers(layers: Mapping[str, Float32], header: Mapping[str, str]) -> bytes:
     """Encodes images (H, W, 3) of equal size as the layers of one EXR, in half precision, with text attributes.
 
     The red channel of the layer "photo" has the name "photo.R", as compositing programs expect ("Technical
@@ -188,7 +188,7 @@ def write_layers(layers: Mapping[str, Float32], header: Mapping[str, str]) -> by
     return file.getvalue()
 
 
-def read_layers(data: bytes) -> dict[str, Float32]:
+def read_exr_layers(data: bytes) -> dict[str, Float32]:
     """Returns the layers of an EXR by name, (H, W, 3) float32 each, sorted by name. Other channels are ignored.
 
     Raises:

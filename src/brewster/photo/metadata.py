@@ -41,8 +41,8 @@ def jpeg_exif(data: bytes) -> bytes:
     return next((block[len(_EXIF_NAME) :] for block in blocks if block.startswith(_EXIF_NAME)), b"")
 
 
-def jpeg_quantisation_sums(data: bytes) -> dict[int, int]:
-    """Returns the sum of each quantisation table by its number (0: luma, 1: chroma). A larger sum is coarser."""
+def jpeg_quantization_sums(data: bytes) -> dict[int, int]:
+    """Returns the sum of each quantization table by its number (0: luma, 1: chroma). A larger sum is coarser."""
     sums = {}
     for marker, _, payload in jpeg_segments(data):
         while marker == _DQT and payload:

@@ -293,7 +293,7 @@ class Photo:
             overwrite: replace an existing file.
 
         Raises:
-            TargetError: the file exists and `overwrite` is False, or the file cannot be written.
+            OutputError: the file exists and `overwrite` is False, or the file cannot be written.
             UnsupportedPhoto: the format cannot store this photo, or not at this bit depth.
         """
         if isinstance(target, WritableFile):

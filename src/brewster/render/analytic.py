@@ -3,7 +3,7 @@
     sample = render(scene, Assets([Path("hdri")]), device="cuda")
 
 Smooth parallel panes need no Monte Carlo integration. All orders leave such a glazing in the same direction, so light
-from infinity needs one lookup behind the glass and one in front of it; near content needs one lookup per order, each
+from infinity needs one lookup behind the glass and one in front of it; near content needs one lookup per group of orders, each
 shifted along the glass. Defocus of light from infinity is a convolution, because that light depends on the direction
 alone. Monte Carlo integration is used only for a lens with near content, for wedges and for rough glass
 (`rough_glass`); its random numbers are the same on every device.
@@ -42,7 +42,7 @@ from brewster.scene.scene import Scene
 _MERGE_DISTANCE_PX = 0.1  # orders whose images are closer than this share one lookup
 _MAX_TABLE_REFLECTANCE = 0.08
 """Upper limit of the reflectance for which orders are enumerated. At grazing angles the true value would give too many
-orders. The throughput of each order is exact; the last order of each side also gets the light of the orders left out."""
+orders. The throughput of each order is exact; the last order of each side also gets the light of the omitted orders."""
 _CPU_BATCH_RAYS = 1 << 15  # small enough for the cache of a CPU
 _GPU_BATCH_RAYS = 1 << 20
 
@@ -113,7 +113,8 @@ def _prepare(scene: Scene, assets: Assets, device: Device) -> _PreparedScene:
     origin = to_glass @ (position - torch.tensor(scene.glass.position_mm, device=device))
     right, up, back = (to_glass @ axis for axis in torch.tensor(
         axes(scene.camera.heading_deg, scene.camera.pitch_deg), device=device))  # fmt: skip
-    # A convolution blurs after the lookup, so only Monte Carlo rays filter for the circle of confusion.
+    # Only lookups of Monte Carlo rays are filtered to the circle of confusion. The deterministic renderer applies the blur later,
+    # as a convolution.
     view = CameraView(
         scene.camera_above_glass_mm,
         scene.camera.pixel_rad,
@@ -143,7 +144,7 @@ def _needs_monte_carlo(scene: Scene) -> bool:
 
 
 def _render_deterministic(prepared: _PreparedScene) -> list[Tensor]:
-    """Traces a regular grid of rays in each pixel, then blurs by the lens: I, T, B, R and MR, (3, H, W) each."""
+    """Traces a regular grid of rays in each pixel, then applies the defocus blur of the lens: I, T, B, R and MR, (3, H, W) each."""
     camera = prepared.scene.camera
     margin = margin_px(camera)
     width, height = camera.width + 2 * margin, camera.height + 2 * margin
@@ -158,7 +159,7 @@ def _render_deterministic(prepared: _PreparedScene) -> list[Tensor]:
 
 
 def _grid_size(prepared: _PreparedScene) -> int:
-    """Rays per pixel and axis: ceil(3 * texels per pixel), at most sqrt(samples_per_pixel); textures are filtered to match."""
+    """Rays per pixel and axis: ceil(3 * texels per pixel), at most sqrt(samples_per_pixel); textures are filtered to the distance between rays."""
     finest = max(side.emitters.texels_per_pixel() for side in (prepared.behind, prepared.front))
     return min(max(1, math.ceil(3 * finest)), math.isqrt(prepared.scene.samples_per_pixel))
 
@@ -223,7 +224,8 @@ def _thin_lens_rays(prepared: _PreparedScene, pixels: slice, sobol: SobolPoints)
         x, y = sobol.next_disc() * (camera.aperture_mm / 2)
         lens = _outer(prepared.right, x) + _outer(prepared.up, y)
         origin, direction = origin + lens, direction - lens / camera.focus_mm
-    # Half the mean distance of the samples in a pixel: the average over the samples filters, too.
+    # The footprint is half the mean distance between the samples in a pixel. A full footprint blurs too much, because the
+    # average over the samples is also a filter.
     return Rays(origin, normalize(direction), 1 / (2 * math.sqrt(prepared.scene.samples_per_pixel)))
 
 
@@ -307,7 +309,7 @@ def _group_orders(scene: Scene, emitters: SideEmitters, *, behind: bool) -> list
     pixel_mm = scene.camera.pixel_rad * (scene.camera_above_glass_mm + emitters.distance_mm)
     groups: list[tuple[float, list[ReflectionOrder]]] = []
     for order in table:
-        if order.behind != behind:
+        if order.is_transmitted != behind:
             continue
         shift_px = float(_in_plane_shift(order, shifts) * cosine) / pixel_mm
         for group_px, group in groups:
@@ -331,8 +333,8 @@ def _trace_rough(prepared: _PreparedScene, rays: Rays, sobol: SobolPoints) -> li
     sides = {True: zeros, False: zeros.clone()}
     emitters = prepared.behind.emitters, prepared.front.emitters
     for exiting in trace_orders(prepared.scene.glass, rays, *emitters, sobol):
-        sides[exiting.behind][0] += exiting.light
-        sides[exiting.behind][1] += exiting.light * (
+        sides[exiting.is_transmitted][0] += exiting.light
+        sides[exiting.is_transmitted][1] += exiting.light * (
             prepared.scene.orders == "all" or exiting.in_truncated_layers
         )
     (transmitted, transmission), (reflected, reflection) = sides[True], sides[False]

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 import brewster
 from brewster.errors import RecipeError
 from brewster.files import TEMPORARY_PREFIX, atomic_path, discard, temporary_path, write_atomically
-from brewster.photo import read_layers, write_layers
+from brewster.photo import read_exr_layers, write_exr_layers
 from brewster.render.analytic import ghost_distance_px
 from brewster.render.camera_response import DevelopedSample, develop, encode_jpeg, luminance
 from brewster.render.sample import LAYERS, LinearSample
@@ -69,7 +69,7 @@ def statistics(sample: LinearSample, developed: DevelopedSample) -> dict[str, fl
 
 SAMPLE_FORMAT: Final = 3
 """Version of the files of a sample. Increase it if the same job gives other files, so that no set contains samples of two
-versions (tests/test_house_formats.py). 3: the keys of scene.toml have other names (`refractive_index`, `target_luminance` ...)."""
+versions (tests/test_conventions_formats.py). 3: the keys of scene.toml have other names (`refractive_index`, `target_luminance` ...)."""
 
 
 def encode_sample(sample: LinearSample, renderer: str) -> dict[str, bytes]:
@@ -86,7 +86,7 @@ def encode_sample(sample: LinearSample, renderer: str) -> dict[str, bytes]:
     }
     files = {f"{name}.jpg": encode_jpeg(layer, qualities[name]) for name, layer in developed.layers().items()}
     light = {name: layer.permute(1, 2, 0).float().cpu().numpy() for name, layer in sample.layers().items()}
-    files[LIGHT_FILE] = write_layers(light, {"software": f"brewster {brewster.__version__}"})
+    files[LIGHT_FILE] = write_exr_layers(light, {"software": f"brewster {brewster.__version__}"})
     files[SCENE_FILE] = sample.scene.to_toml(outcome=outcome).encode()
     return files
 
@@ -103,7 +103,7 @@ def write_folder(folder: Path, files: Mapping[str, bytes]) -> None:
     """Writes the folder of a sample, unless it exists: another process may have written it, with the same content.
 
     Raises:
-        TargetError: a file or folder cannot be written, for example because the disk is full.
+        OutputError: a file or folder cannot be written, for example because the disk is full.
     """
     with atomic_path(folder) as part:
         part.mkdir(parents=True)
@@ -132,7 +132,7 @@ def pack(out: Path, block: int) -> None:
     samples only.
 
     Raises:
-        TargetError: a file or folder cannot be written, for example because the disk is full.
+        OutputError: a file or folder cannot be written, for example because the disk is full.
     """
     entries = list(read_block(out, block))
     if any(not entry.spans for entry in entries):
@@ -210,7 +210,7 @@ def open_sample(entry: StoredSample) -> tuple[dict[str, Float32], Scene]:
         PhotoError: the image file is damaged.
         RecipeError: the scene file is damaged.
     """
-    light = read_layers(entry.read(LIGHT_FILE))
+    light = read_exr_layers(entry.read(LIGHT_FILE))
     return {name: light[name] for name in LAYERS}, read_scene_of(entry)
 
 

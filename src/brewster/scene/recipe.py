@@ -54,7 +54,7 @@ class GlassRecipe(FrozenModel):
     absorption_per_m: tuple[tuple[NonNegativeFloat, NonNegativeFloat, NonNegativeFloat], ...] = (
         (4.0, 1.5, 2.5),
     )
-    """Absorption coefficients for red, green and blue, one of which is drawn. They are larger for red
+    """List of triples of absorption coefficients (red, green, blue). One triple is drawn for each scene. They are larger for red
     and blue than for green, because clear float glass is slightly green."""
     tint_strength: LogRange = (0.3, 2.0)
     """Factor on the absorption coefficients."""
@@ -115,7 +115,7 @@ class SideRecipe(FrozenModel):
     map_categories: tuple[str, ...] = ()
     """Categories of the maps, such as indoor, outdoor or night. Empty: all maps."""
     max_px_per_texel: PositiveFloat = 2.5
-    """Largest width of a texel of the map in the image. It limits the choice of maps and the field of view."""
+    """Maximum width of a texel of the map in the image. It limits the choice of maps and the field of view."""
     dome_probability: Share = 0.0
     """Probability that the map is on a sphere (dome) of finite radius around the glass instead of at infinity."""
     radius_mm: LogRange = (3000.0, 10_000.0)
@@ -147,7 +147,7 @@ class CameraResponseRecipe(FrozenModel):
     )
     """Methods of automatic white balance, one of which is drawn."""
     white_balance_strength: Range = (0.3, 1.0)
-    """Strength of the white balance: 0 is none, 1 the full correction. Gains are raised to this power; at most 1."""
+    """Strength of the white balance: 0 is none, 1 the full correction. Exponent on the white balance gains: 0 gives no correction, 1 the full correction."""
     contrast: Range = (-0.1, 0.5)
     """Weight of an S-shaped tone curve: 0 is the sRGB curve, negative values give less contrast."""
     shot_noise: Range = (0.0, 0.02)

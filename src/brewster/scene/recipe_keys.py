@@ -34,7 +34,7 @@ class RecipeKey:
     """One key of a recipe."""
 
     path: str
-    """The names of its tables and its own name, separated by dots: "data.rendered.mixing"."""
+    """The names of its tables and its own name, separated by dots: "data.rendered.blend_space"."""
     kind: str
     """The type in words: "number", "list of paths"."""
     allowed: str

@@ -35,7 +35,7 @@ class Checkpoint:
         """Writes or replaces the file atomically: a killed process leaves either the old or the new checkpoint.
 
         Raises:
-            TargetError: the file cannot be written.
+            OutputError: the file cannot be written.
         """
         stream = io.BytesIO()
         torch.save({"step": self.step, "recipe": self.recipe, "seconds": self.seconds, **self.state}, stream)

@@ -37,7 +37,7 @@ CHECKPOINT_FILE: Final = "checkpoint.pt"
 LOG_FILE: Final = "log.jsonl"
 SAMPLES_FILE: Final = "samples.png"
 CURVES_FILE: Final = "results.png"
-_NOT_COMPARED: Final = ("steps", "report_every", "checkpoint_every", "start_from")
+_NOT_COMPARED: Final = ("steps", "report_every", "checkpoint_every", "init_checkpoints")
 """Recipe values that may change when a run is resumed."""
 
 
@@ -91,7 +91,7 @@ def run(
     Raises:
         RecipeError: `out` contains a run of another recipe, or a run with more steps.
         ModelError: a checkpoint is missing, damaged or of another network, or the loss is NaN or infinite.
-        TargetError: `out` cannot be written to.
+        OutputError: `out` cannot be written to.
     """
     out.mkdir(parents=True, exist_ok=True)
     recipe = trainer.recipe

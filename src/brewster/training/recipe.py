@@ -19,10 +19,10 @@ from brewster.errors import RecipeError
 from brewster.models.diffusion.panels import Direction, Panel, PanelLayout
 from brewster.models.diffusion.prompt import PROMPTS
 from brewster.models.diffusion.sampling import GUIDANCE, STEPS
-from brewster.models.diffusion.task import PAPER_PX, DecompositionTask, Objective
+from brewster.models.diffusion.task import PAPER_COMPOSITE_PIXELS, DecompositionTask, Objective
 from brewster.models.networks import DEFAULT_NETWORK, MAX_STRIDE, NETWORKS
 from brewster.models.zoo import TINY_PREFIX
-from brewster.options import Quantisation
+from brewster.options import Quantization
 from brewster.scene.recipe_file import read_toml, similar_key, validated
 from brewster.scene.values import (
     FrozenModel,
@@ -88,7 +88,7 @@ class TrainingRecipe(FrozenModel):
     """Peak learning rate of AdamW."""
     warmup_steps: PositiveInt
     """Number of steps in which the learning rate rises linearly from 0 to its peak."""
-    decay_share: Share = 1.0
+    learning_rate_decay_share: Share = 1.0
     """Share of the steps, at the end, in which the learning rate falls to zero along a cosine. Before, it is constant."""
     weight_decay: NonNegativeFloat
     """Weight decay of AdamW."""
@@ -101,7 +101,7 @@ class TrainingRecipe(FrozenModel):
     def learning_rate_factor(self, step: int) -> float:
         """Returns the learning rate at this step (from 0) divided by its peak: a linear rise, then a cosine decay."""
         warm = min(1.0, (step + 1) / self.warmup_steps)
-        remaining = (1 - step / self.steps) / max(self.decay_share, 1e-9)
+        remaining = (1 - step / self.steps) / max(self.learning_rate_decay_share, 1e-9)
         return warm * (0.5 - 0.5 * math.cos(math.pi * min(1.0, remaining)))
 
 
@@ -113,16 +113,16 @@ class CompactRecipe(TrainingRecipe):
     ] = DEFAULT_NETWORK
     """Name of the network in the table `NETWORKS` of `brewster.models.networks`."""
     image_size_schedule: ImageSizeSchedule
-    """Side of the training images. Each entry is valid from the given share of the steps: `[0.5, 160]` sets sides of 160 px
-    from half of the steps. Smaller images at the beginning make training faster."""
+    """Side of the training images. Each entry applies from the given share of the steps until the next entry: `[0.5, 160]` sets sides of
+    160 px after half of the steps. Smaller images at the beginning make training faster."""
     encoder_learning_rate: PositiveFloat
     """Peak learning rate of the pretrained encoder."""
     ema_decay: Share
     """Decay per step of the exponential moving average (EMA) of the weights. The exported model has the averaged weights."""
     precision: Literal["float32", "auto"] = "float32"
     """auto: bfloat16 if the processor supports it natively, except for depthwise convolutions and the head."""
-    start_from: tuple[Path, ...] = ()
-    """Checkpoint files, relative to this recipe. The run starts from the mean of their averaged weights."""
+    init_checkpoints: tuple[Path, ...] = ()
+    """Checkpoint files, relative to this recipe. The run starts from the mean of their EMA weights."""
     mix: MixRecipe = MixRecipe()
 
     @model_validator(mode="after")
@@ -137,7 +137,7 @@ class CompactRecipe(TrainingRecipe):
 
 
 class LoraRecipe(TrainingRecipe):
-    """A training run of a LoRA on a large backbone. Defaults are those of the paper, or common values if it states none.
+    """A training run of a LoRA on a diffusion backbone. Defaults are those of the paper, or common values if it states none.
 
     Each sample of a batch is a real pair with probability `data.pairs_share`, else a sample of a rendered set.
     Samples keep their aspect ratio, and are cropped only if `crops` is above 0. Mixtures and scenes that are rendered during training are not supported.
@@ -150,23 +150,23 @@ class LoraRecipe(TrainingRecipe):
     """Rank of the LoRA matrices."""
     alpha: PositiveInt = 16
     """Scale of the LoRA: the product of its matrices is multiplied by alpha / rank."""
-    targets: tuple[str, ...] = ()
+    target_modules: tuple[str, ...] = ()
     """Names of the linear layers that get LoRA matrices, such as "*.attn.*". * and ? are wildcards as in a shell. Empty: all
     linear layers of the blocks."""
     optimizer: Optimizer = "adamw"
     """adamw: float32 moments. adamw8bit: moments in 8 bits, by bitsandbytes on CUDA; 0.5 GB less for the paper's LoRA."""
-    decay_share: Share = 0.0
+    learning_rate_decay_share: Share = 0.0
     """Share of the steps, at the end, in which the learning rate falls to zero along a cosine. Before, it is constant."""
-    quantise: Quantisation | None = None
-    """Quantisation of the frozen backbone. Not set: no quantisation."""
+    quantization: Quantization | None = None
+    """Quantization of the frozen backbone. Not set: no quantization."""
     panels: tuple[Panel, ...] = ("I", "T", "R")
     """The images that the model generates in one composite image: photo I, transmission T, reflection R. T is required."""
     direction: Direction = "side by side"
     """Arrangement of the panels in the composite image."""
     white_space: bool = True
     """Whether the conditioning image has white space for the panels T and R. false: it is the photo alone, with a third of the
-    tokens. The paper calls white space not necessary, but easier to train."""
-    budget_px: PositiveInt = PAPER_PX
+    tokens. According to the paper, white space is not necessary but makes training easier."""
+    max_composite_pixels: PositiveInt = PAPER_COMPOSITE_PIXELS
     """Largest number of pixels of all panels together."""
     panel_weights: Annotated[
         dict[Panel, NonNegativeFloat],
@@ -212,7 +212,7 @@ class LoraRecipe(TrainingRecipe):
         """The task of the trained adapter. Its guidance is that of inference, or that of training if the objective is one_step."""
         guidance = self.inference_guidance if self.objective == "flow" else self.guidance
         return DecompositionTask(
-            self.layout, self.budget_px, self.objective, guidance, steps=self.inference_steps
+            self.layout, self.max_composite_pixels, self.objective, guidance, steps=self.inference_steps
         )
 
     @model_validator(mode="after")
@@ -225,8 +225,8 @@ class LoraRecipe(TrainingRecipe):
             )
         if "T" not in self.panels or len(set(self.panels)) < len(self.panels):
             raise ValueError(f"expected panels with T, each at most once, but panels is {list(self.panels)}")
-        if self.quantise and self.backbone.startswith(TINY_PREFIX):
-            raise ValueError("expected no quantise: a toy backbone (tiny:) cannot be quantised")
+        if self.quantization and self.backbone.startswith(TINY_PREFIX):
+            raise ValueError("expected no quantization: a toy backbone (tiny:) cannot be quantized")
         if self.prompt not in PROMPTS and not self.prompt.endswith(ENCODED_SUFFIX):
             raise ValueError(
                 f"expected one of the prompts {', '.join(PROMPTS)}, or a {ENCODED_SUFFIX} file,"
@@ -267,7 +267,7 @@ def read_recipe(path: Path) -> CompactRecipe | LoraRecipe:
     recipe = _read_unresolved(path)
     changes: dict[str, Any] = {}
     if isinstance(recipe, CompactRecipe):
-        changes["start_from"] = tuple(path.parent / start for start in recipe.start_from)
+        changes["init_checkpoints"] = tuple(path.parent / start for start in recipe.init_checkpoints)
     if isinstance(recipe, LoraRecipe) and recipe.prompt.endswith(ENCODED_SUFFIX):
         changes["prompt"] = str(path.parent / recipe.prompt)
     rendered = recipe.data.rendered
@@ -310,7 +310,7 @@ def with_value(recipe: AnyRecipe, key_path: str, value: object) -> AnyRecipe:
 
     Args:
         recipe: the recipe to change.
-        key_path: the key with its tables, such as "data.rendered.mixing".
+        key_path: the key with its tables, such as "data.rendered.blend_space".
         value: the new value.
 
     Raises:

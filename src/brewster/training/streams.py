@@ -29,7 +29,7 @@ from brewster.training.data.mixtures import (
     TrainingBatch,
 )
 from brewster.training.data.online import OnlineRendered
-from brewster.training.data.rendered import CachedRendered, RenderedSets
+from brewster.training.data.rendered import CachedRendered, RenderedDatasets
 from brewster.training.recipe import CompactRecipe, data_folder
 
 _HELD_OUT_SEED: Final = 1811
@@ -129,14 +129,14 @@ def _open_pairs(recipe: CompactRecipe) -> Stream:
 def _open_rendered(recipe: CompactRecipe, device: torch.device | str) -> Stream:
     rendered, seed = recipe.data.rendered, recipe.seed + 2
     assert rendered
-    if rendered.sets:
-        return RenderedSets(
-            resolve_folders(rendered.sets),
+    if rendered.datasets:
+        return RenderedDatasets(
+            resolve_folders(rendered.datasets),
             seed=seed,
             count=rendered.count,
             crop=recipe.mix.crop,
             target=rendered.target,
-            mixing=rendered.mixing,
+            blend_space=rendered.blend_space,
         )
     online = _open_online(recipe, rendered, device)
     return online if rendered.count is None else CachedRendered(online, rendered.count, seed=seed)
@@ -157,7 +157,7 @@ def _open_online(
         seed=recipe.seed if rendered.seed is None else rendered.seed,
         device=device,
         target=rendered.target,
-        mixing=rendered.mixing,
+        blend_space=rendered.blend_space,
     )
 
 

@@ -11,7 +11,7 @@ from brewster.training.recipe import CompactRecipe, LoraRecipe
 def open_trainer(recipe: CompactRecipe | LoraRecipe, device: str = "auto") -> Trainer:
     """Creates the trainer of a recipe, for `loop.run`. Joins the process group if there are several processes.
 
-    `device` is "auto" or "cpu". A large backbone is trained on a CPU only if "cpu" is chosen explicitly.
+    `device` is "auto" or "cpu". A diffusion backbone is trained on a CPU only if "cpu" is chosen explicitly.
 
     Raises:
         RecipeError, PhotoError: data is missing or damaged, or the batch cannot be divided among the processes.

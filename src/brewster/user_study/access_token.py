@@ -8,7 +8,7 @@ import secrets
 from pathlib import Path
 from typing import Final
 
-from brewster.errors import BrewsterError, TargetError
+from brewster.errors import BrewsterError, OutputError
 
 _PATTERN: Final = re.compile(r"[A-Za-z0-9_-]{16,200}")
 
@@ -21,7 +21,7 @@ def load_or_create_token(folder: Path) -> str:
 
     Raises:
         BrewsterError: the file exists but does not contain a valid token.
-        TargetError: the file cannot be read or written.
+        OutputError: the file cannot be read or written.
     """
     path = folder / "token"
     try:
@@ -29,7 +29,7 @@ def load_or_create_token(folder: Path) -> str:
             _write(path, secrets.token_urlsafe(16))
         token = path.read_text("latin-1").strip()
     except OSError as error:
-        raise TargetError(
+        raise OutputError(
             f"{path} cannot be read or written ({error.strerror or error})",
             "expected a file that can store the token of the study",
             "make the file readable and writable, or pass a token: --token TOKEN",

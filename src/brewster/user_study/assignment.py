@@ -48,7 +48,7 @@ def draw_trials(description: StudyDescription, number: int) -> tuple[Trial, ...]
     rng = Random(f"{description.seed}/participant/{number}")  # noqa: S311  (not a secret: the seed is published)
     trials = [_comparison_trial(description, comparison, flipped) for comparison, flipped in assigned]
     pool = _catch_pool(description, {comparison for comparison, _ in assigned}, rng)
-    trials += [_catch_trial(catch, i, rng) for i, catch in enumerate(pool[: description.catches])]
+    trials += [_catch_trial(catch, i, rng) for i, catch in enumerate(pool[: description.catch_trials])]
     rng.shuffle(trials)
     return tuple(trials)
 

@@ -18,7 +18,7 @@ from random import Random
 from typing import Final, final
 
 import brewster
-from brewster.errors import BrewsterError, PhotoError, TargetError
+from brewster.errors import BrewsterError, OutputError, PhotoError
 from brewster.files import atomic_path, write_atomically
 from brewster.photo import Photo
 from brewster.user_study.degrade import degrade
@@ -56,7 +56,7 @@ class StudyOptions:
         datasets: the datasets to use; all if empty.
         names: the inputs to use, as "dataset/stem", or "stem" if there are no datasets; all if empty.
         pairs: number of comparisons for each participant. None means DEFAULT_PAIRS, or all if there are fewer.
-        catches: number of catch trials for each participant. None means DEFAULT_CATCHES, or all if there are fewer.
+        catch_trials: number of catch trials for each participant. None means DEFAULT_CATCHES, or all if there are fewer.
         all_pairs: whether each method is compared with each other method, instead of the first method only.
         seed: the seed of the assignment; None chooses a random one.
         consent: the text that participants agree to.
@@ -65,7 +65,7 @@ class StudyOptions:
     datasets: Sequence[str] = ()
     names: Sequence[str] = ()
     pairs: int | None = None
-    catches: int | None = None
+    catch_trials: int | None = None
     all_pairs: bool = False
     seed: int | None = None
     consent: str = DEFAULT_CONSENT
@@ -102,7 +102,7 @@ def create(
     Raises:
         BrewsterError: there are fewer than two methods; files are missing, unreadable or of different sizes; or `options`
             requests more pairs or catch trials than exist.
-        TargetError: `out` is not empty or cannot be written.
+        OutputError: `out` is not empty or cannot be written.
     """
     _require_empty(out)
     files = _pair_pictures(inputs, methods, options)
@@ -110,18 +110,18 @@ def create(
     pairs = all_pairs if options.all_pairs else all_pairs[: len(methods) - 1]
     seed = secrets.randbelow(1 << 32) if options.seed is None else options.seed
     pairs_each = _limited(options.pairs, DEFAULT_PAIRS, len(pairs) * len(files.inputs), "pairs")
-    catches = _limited(
-        options.catches, DEFAULT_CATCHES, min(CATCH_POOL_SIZE, len(files.inputs)), "catch trials"
+    catch_trials = _limited(
+        options.catch_trials, DEFAULT_CATCHES, min(CATCH_POOL_SIZE, len(files.inputs)), "catch trials"
     )
     with atomic_path(out) as folder:
         copier = _Copier(folder / PICTURES_FOLDER, Random(f"{seed}/names"), on_progress)  # noqa: S311  (the seed is published)
         comparisons = tuple(_comparisons(files, pairs, copier))
-        pool = tuple(_catch_pool(files, copier, Random(f"{seed}/catches")))  # noqa: S311
+        pool = tuple(_catch_pool(files, copier, Random(f"{seed}/catch_trials")))  # noqa: S311
         description = StudyDescription(
             brewster=brewster.__version__,
             seed=seed,
             pairs=pairs_each,
-            catches=catches,
+            catch_trials=catch_trials,
             consent=options.consent,
             methods=tuple(methods),
             datasets=tuple(dict.fromkeys(dataset for dataset, _ in files.inputs)),
@@ -198,7 +198,7 @@ def _limited(requested: int | None, default: int, maximum: int, what: str) -> in
 
 def _require_empty(out: Path) -> None:
     if out.is_file() or (out.is_dir() and any(out.iterdir())):
-        raise TargetError(f"{out} is not empty", "expected an empty or new folder", "choose another folder")
+        raise OutputError(f"{out} is not empty", "expected an empty or new folder", "choose another folder")
 
 
 # --- copying pictures under random names

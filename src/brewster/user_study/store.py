@@ -6,7 +6,7 @@
 
 For each participant, the database contains a number, the token of the personal link, the date of the consent and the
 trials; it contains no name and no address. The trials are drawn once, at admission, and stored, so a later version of
-brewster cannot change them. A second answer to a trial, for example after a lost acknowledgement, changes nothing. To change
+brewster cannot change them. A second answer to a trial is ignored. A browser sends one, for example, if the response to the first answer was lost. To change
 their last answer, participants withdraw it first; withdrawn answers are kept.
 """
 
@@ -26,7 +26,7 @@ from typing import Annotated, Final, Literal, final
 
 from pydantic import ConfigDict, Field, TypeAdapter
 
-from brewster.errors import BrewsterError, TargetError
+from brewster.errors import BrewsterError, OutputError
 from brewster.user_study.assignment import CHOICES, Choice, Trial, draw_practice, draw_trials
 from brewster.user_study.study import ANSWERS_FILE, Study
 
@@ -64,9 +64,9 @@ class Participant:
 @final
 @dataclass(frozen=True)
 class ViewingConditions:
-    """How the pictures of a trial were shown. Lengths are in CSS px; times `pixel_ratio`, they are in screen pixels.
+    """How the pictures of a trial were shown. Lengths are in CSS px. Multiply them by `pixel_ratio` to get screen pixels.
 
-    `view` is the arrangement at the time of the answer: all three pictures, A and B, or one at a time. `flips` counts how often
+    `view` is the arrangement at the time of the answer: three pictures, the pair A and B, or one picture at a time. `flips` counts how often
     the picture was replaced by another one in place; `zoomed` is true if the pictures were enlarged at any time.
     """
 
@@ -195,7 +195,7 @@ class AnswerStore:
 
         Raises:
             BrewsterError: a later trial has an answer.
-            TargetError: the database cannot be written.
+            OutputError: the database cannot be written.
         """
         key = (participant.number, trial)
         with self._writing() as database:
@@ -236,7 +236,7 @@ class AnswerStore:
 
         Raises:
             BrewsterError: the trial or the choice does not exist.
-            TargetError: the database cannot be written.
+            OutputError: the database cannot be written.
         """
         if not 0 <= trial < len(participant.trials) or choice not in CHOICES:
             raise BrewsterError(
@@ -304,10 +304,10 @@ class AnswerStore:
         try:
             yield
         except sqlite3.Error as error:
-            raise TargetError(
+            raise OutputError(
                 f"{ANSWERS_FILE} cannot be used ({error})",  # without the folder: participants may see this message
                 "expected a database created by brewster, on a local disk with free space",
-                "fix the problem and start again; all acknowledged answers are stored",
+                "free disk space or restore the database file, then start the server again; all acknowledged answers are stored; all acknowledged answers are stored",
             ) from error
 
 

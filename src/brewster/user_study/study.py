@@ -80,14 +80,14 @@ class CatchTrial:
 class StudyDescription:
     """Everything that is fixed before the first answer; the content of study.json.
 
-    `pairs` and `catches` count the comparisons and catch trials of one participant. `consent` is the text that participants
+    `pairs` and `catch_trials` count the comparisons and catch trials of one participant. `consent` is the text that participants
     agree to, with an empty line between paragraphs.
     """
 
     brewster: str
     seed: int
     pairs: int
-    catches: int
+    catch_trials: int
     consent: str
     methods: tuple[str, ...]
     datasets: tuple[str, ...]
@@ -156,7 +156,7 @@ def write_study(folder: Path, description: StudyDescription) -> None:
     """Write the description into a folder.
 
     Raises:
-        TargetError: the file exists already or cannot be written.
+        OutputError: the file exists already or cannot be written.
     """
     text = json.dumps(asdict(description), indent=1, ensure_ascii=False)
     write_atomically(folder / DESCRIPTION_FILE, f"{text}\n".encode())

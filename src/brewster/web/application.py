@@ -28,8 +28,8 @@ from brewster.errors import (
     DownloadError,
     MissingExtra,
     ModelError,
+    OutputError,
     PhotoTooLarge,
-    TargetError,
     UnreadablePhoto,
     UnsupportedPhoto,
 )
@@ -45,7 +45,7 @@ _STATUS_CODES: Final[dict[type[BrewsterError], int]] = {
     MissingExtra: 501,
     DeviceError: 503,
     ModelError: 500,
-    TargetError: 500,
+    OutputError: 500,
     DownloadError: 502,
 }
 """HTTP status by error class; other BrewsterErrors are caused by the request and get 422."""
@@ -84,13 +84,13 @@ def listen(host: str, port: int) -> socket.socket:
     """Open a listening socket; port 0 chooses a free port.
 
     Raises:
-        TargetError: the address or the port cannot be used.
+        OutputError: the address or the port cannot be used.
     """
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     try:
         return socket.create_server((host, port), family=family, backlog=128)
     except OSError as error:
-        raise TargetError(
+        raise OutputError(
             f"{host} port {port} cannot be used ({error.strerror})",
             "expected an address of this machine and a free port",
             "choose others with --host and --port",
@@ -121,7 +121,7 @@ def serve(
 
     Raises:
         KeyboardInterrupt: Ctrl-C or SIGTERM has ended the server.
-        TargetError: the address or the port cannot be used.
+        OutputError: the address or the port cannot be used.
     """
     with _sigterm_as_sigint(), listen(host, port) as listening:
         on_ready(server_url(listening))

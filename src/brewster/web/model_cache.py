@@ -45,7 +45,7 @@ class ModelCache:
         self._loaded: dict[str, Separator] = {}
 
     def _add(self, source: str) -> None:
-        name = Path(source).name if zoo.is_large(source) else zoo.find_model(source).name
+        name = Path(source).name if zoo.is_diffusion_model(source) else zoo.find_model(source).name
         if name in self._sources:
             raise ModelError(
                 f"{source} and {self._sources[name]} have the same name {name}",
@@ -77,7 +77,7 @@ class ModelCache:
 
 
 def _model_row(name: str, source: str) -> ModelRow:
-    if zoo.is_large(source):
+    if zoo.is_diffusion_model(source):
         return ModelRow(name=name, licence="that of its base", sha256=None, card=None)
     model = zoo.find_model(source)
     try:

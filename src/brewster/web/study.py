@@ -142,7 +142,7 @@ class _StudyRoutes:
         description = self.study.description
         is_open = self.max_participants is None or self.store.count_participants() < self.max_participants
         return Invitation(
-            consent=description.consent, trials=description.pairs + description.catches, is_open=is_open
+            consent=description.consent, trials=description.pairs + description.catch_trials, is_open=is_open
         )
 
     def admit(self, _agreement: Annotated[ConsentRequest, Body()]) -> PersonalLink:

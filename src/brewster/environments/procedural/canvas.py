@@ -37,10 +37,10 @@ def unit(values: Floats) -> Floats:
     return directed
 
 
-def tint(random: Generator, value: float, saturation: float) -> Floats:
+def tint(rng: Generator, value: float, saturation: float) -> Floats:
     """A random colour (3,) of about this brightness: half of them warm, a third blue, the others of any hue."""
-    hues = random.normal(0.92, 0.05), random.normal(0.38, 0.05), random.uniform()
-    phase = hues[random.choice(3, p=(0.5, 0.3, 0.2))] + vector(0, 1 / 3, 2 / 3)
+    hues = rng.normal(0.92, 0.05), rng.normal(0.38, 0.05), rng.uniform()
+    phase = hues[rng.choice(3, p=(0.5, 0.3, 0.2))] + vector(0, 1 / 3, 2 / 3)
     return np.clip(value * (1 + saturation * np.cos(2 * np.pi * phase)), 0.01, 1).astype(np.float32)
 
 
@@ -65,13 +65,13 @@ def _stretch(picture: Floats, size: int, axis: int, wrap: bool) -> Floats:
     return second
 
 
-def fractal(random: Generator, height: int, width: int, cells: float = 4, octaves: int = 5) -> Floats:
+def fractal(rng: Generator, height: int, width: int, cells: float = 4, octaves: int = 5) -> Floats:
     """Tileable fractal noise (height, width) of mean 0 and standard deviation 1; `cells` span the height."""
     total = np.zeros((1, 1), np.float32)
     for octave in range(octaves):
         rows = max(1, round(cells * 2**octave))
         size = min(rows, height), min(max(1, round(rows * width / height)), width)
-        total = resize(total, *size, wrap=True) + random.standard_normal(size, np.float32) * 0.65**octave
+        total = resize(total, *size, wrap=True) + rng.standard_normal(size, np.float32) * 0.65**octave
         if size == (height, width):
             break
     total = resize(total, height, width, wrap=True)
@@ -79,24 +79,24 @@ def fractal(random: Generator, height: int, width: int, cells: float = 4, octave
     return noise
 
 
-def lettering(random: Generator, count: int, height: int, width: int) -> Floats:
+def lettering(rng: Generator, count: int, height: int, width: int) -> Floats:
     """The mask (height, width) of a line of `count` random glyphs with gaps between words."""
     glyphs = np.zeros((count, 9, 6), np.float32)
-    bars = random.uniform(size=(count, 3)) < 0.6
-    stems = random.uniform(size=(count, 4)) < 0.6
+    bars = rng.uniform(size=(count, 3)) < 0.6
+    stems = rng.uniform(size=(count, 4)) < 0.6
     glyphs[:, 1:8, 0] = stems[:, :1] | ~stems[:, 1:2]
     glyphs[:, 1:4, 4] = stems[:, 1:2]
     glyphs[:, 4:8, 4] = stems[:, 2:3]
     glyphs[:, 1:8, 2] = np.maximum(glyphs[:, 1:8, 2], (stems[:, 3:] & ~bars[:, :1]).astype(np.float32))
     glyphs[:, [1, 4, 7], :5] = np.maximum(glyphs[:, [1, 4, 7], :5], bars[:, :, None])
-    glyphs *= (random.uniform(size=(count, 1, 1)) > 0.14) | (count < 6)
+    glyphs *= (rng.uniform(size=(count, 1, 1)) > 0.14) | (count < 6)
     line = glyphs.transpose(1, 0, 2).reshape(9, -1)
     return np.clip((resize(line, height, width) - 0.45) * 4 + 0.5, 0, 1)
 
 
 @dataclass
 class Canvas:
-    """A flat surface to paint on. Where it is opaque, its radiance is colour * (light + glow)."""
+    """A flat surface to paint on. Where it is opaque, its radiance is colour * (light + emission)."""
 
     width: float
     height: float
@@ -104,7 +104,7 @@ class Canvas:
     """Texels per metre."""
     colour: Colour = (0.5, 0.5, 0.5)
     pixels: Floats = field(init=False)
-    """(h, w, 5): red, green, blue, opacity, glow."""
+    """(h, w, 5): red, green, blue, opacity, emission."""
 
     def __post_init__(self) -> None:
         size = (max(2, round(self.height * self.density)), max(2, round(self.width * self.density)), 5)
@@ -117,32 +117,32 @@ class Canvas:
         rows = slice(max(0, round(top)), max(0, round(top + height)))
         return self.pixels[rows, max(0, round(left)) : max(0, round(left + width))]
 
-    def rect(self, box: Box, colour: Colour, *, glow: float = 0) -> None:
+    def rect(self, box: Box, colour: Colour, *, emission: float = 0) -> None:
         """Paints a box in one colour."""
-        self.area(box)[:] = (*colour, 1, glow)
+        self.area(box)[:] = (*colour, 1, emission)
 
-    def paste(self, picture: Floats, box: Box, *, glow: float = 0) -> None:
+    def paste(self, picture: Floats, box: Box, *, emission: float = 0) -> None:
         """Paints a picture (h, w, 3), scaled to the box."""
         area = self.area(box)
         area[..., :3] = resize(picture, *area.shape[:2])
-        area[..., 3:] = (1, glow)
+        area[..., 3:] = (1, emission)
 
-    def write(self, random: Generator, box: Box, colour: Colour, *, glow: float = 0) -> None:
+    def write(self, rng: Generator, box: Box, colour: Colour, *, emission: float = 0) -> None:
         """Writes one line of random glyphs that fills the box."""
         area = self.area(box)
         if min(area.shape[:2]) > 2:
             count = max(1, round(box[2] / box[3] * 1.3))
-            mask = lettering(random, count, *area.shape[:2])[..., None]
-            area += (np.array((*colour, 1, glow), np.float32) - area) * mask
+            mask = lettering(rng, count, *area.shape[:2])[..., None]
+            area += (np.array((*colour, 1, emission), np.float32) - area) * mask
 
-    def add_noise(self, random: Generator, amount: float, cells: float = 6, octaves: int = 6) -> None:
+    def add_noise(self, rng: Generator, amount: float, cells: float = 6, octaves: int = 6) -> None:
         """Multiplies the colours by fractal noise of relative standard deviation `amount`."""
         height, width = self.pixels.shape[:2]
-        noise = fractal(random, height, width, cells, octaves)
+        noise = fractal(rng, height, width, cells, octaves)
         self.pixels[..., :3] *= np.clip(1 + amount * noise, 0.2, 2)[..., None]
 
 
-class PaintingTexture:
+class MipmapTexture:
     """A mipmap of a picture (h, w, c)."""
 
     def __init__(self, picture: Floats) -> None:
@@ -184,7 +184,7 @@ class Quad:
         return np.linalg.inv(np.stack([across, down, corner], 1).astype(np.float64)).astype(np.float32)
 
     @cached_property
-    def texture(self) -> PaintingTexture:
+    def texture(self) -> MipmapTexture:
         """Radiance and opacity (h, w, 4)."""
         corner, across, down = self._outline
         pixels = self._canvas.pixels
@@ -195,7 +195,7 @@ class Quad:
         points = corner + rows[:, None, None] * down + columns[:, None] * across
         light = resize(self._light(points, self._normal).astype(np.float32), *pixels.shape[:2])
         radiance = pixels[..., :3] * (light + pixels[..., 4:])
-        return PaintingTexture(np.concatenate([radiance, pixels[..., 3:4]], 2))
+        return MipmapTexture(np.concatenate([radiance, pixels[..., 3:4]], 2))
 
     @cached_property
     def bounds(self) -> tuple[float, float, float, float]:
@@ -213,7 +213,7 @@ class Quad:
 
 
 @dataclass(frozen=True)
-class Glow:
+class SmallEmitter:
     """A small round light, smaller than a texel of the map. Its energy is preserved."""
 
     position: Floats
@@ -227,7 +227,7 @@ class ProceduralEnvironment:
     """Everything around the viewer."""
 
     quads: Sequence[Quad]
-    glows: Sequence[Glow]
+    emitters: Sequence[SmallEmitter]
     sky: Callable[[Floats, float], Floats]
     """(unit directions (h, w, 3), angle of a texel) -> radiance (h, w, 3), where there is no surface."""
     rotation: float
@@ -241,9 +241,9 @@ def render(environment: ProceduralEnvironment, height: int) -> NDArray[np.float3
     """
     strips = [_strip(environment, height, top) for top in range(0, height, _STRIP_ROWS)]
     picture: NDArray[np.float32] = np.concatenate(strips).astype(np.float32)
-    for glow in environment.glows:
-        if not _is_occluded(environment, glow.position):
-            _add_glow(picture, glow, environment.rotation)
+    for emitter in environment.emitters:
+        if not _is_occluded(environment, emitter.position):
+            _add_emitter(picture, emitter, environment.rotation)
     return picture
 
 
@@ -284,7 +284,7 @@ def directions(height: int, rotation: float, top: int, rows: int) -> Floats:
 
 
 def _columns(quad: Quad, rotation: float, width: int) -> list[slice]:
-    """The columns that a quad may cover: one range, or two where it crosses the seam of the map."""
+    """The columns that a quad may cloud_threshold: one range, or two where it crosses the seam of the map."""
     low, high = ((angle + rotation) * width / (2 * np.pi) for angle in quad.bounds[:2])
     first, count = int(np.floor(low)) % width, int(np.ceil(high) - np.floor(low)) + 1
     if count >= width:
@@ -302,38 +302,51 @@ def _rasterise(quad: Quad, rotation: float, polar: Floats, target: tuple[slice, 
     azimuth = (np.arange(columns.start, columns.stop) + 0.5) * (2 * np.pi / width) - rotation
     heading = np.stack([np.sin(azimuth), -np.cos(azimuth)]).astype(np.float32)
     level, rise = np.sin(polar).astype(np.float32)[:, None], np.cos(polar).astype(np.float32)[:, None]
-    across, down, near = (
+    across, down, inverse_distance = (
         level * (row[0] * heading[0] + row[2] * heading[1]) + rise * row[1] for row in quad.projection
     )
-    hit = (near > inverse_depth) & (across >= 0) & (across < near) & (down >= 0) & (down < near)
-    across, down, near = across[hit], down[hit], near[hit]
-    if not near.size:
+    hit = (
+        (inverse_distance > inverse_depth)
+        & (across >= 0)
+        & (across < inverse_distance)
+        & (down >= 0)
+        & (down < inverse_distance)
+    )
+    across, down, inverse_distance = across[hit], down[hit], inverse_distance[hit]
+    if not inverse_distance.size:
         return
     # The footprint of a ray grows with distance, and with the angle to the normal of the surface.
-    footprint = quad.density * 2 * np.pi / width / near * np.maximum(near * quad.distance, 0.01) ** -0.6
-    texels = quad.texture.sample(across / near, down / near, footprint)
+    footprint = (
+        quad.density
+        * 2
+        * np.pi
+        / width
+        / inverse_distance
+        * np.maximum(inverse_distance * quad.distance, 0.01) ** -0.6
+    )
+    texels = quad.texture.sample(across / inverse_distance, down / inverse_distance, footprint)
     opaque = texels[:, 3] > 0.5
     if not opaque.all():
-        hit[hit], texels, near = opaque, texels[opaque], near[opaque]
-    inverse_depth[hit] = near
+        hit[hit], texels, inverse_distance = opaque, texels[opaque], inverse_distance[opaque]
+    inverse_depth[hit] = inverse_distance
     colours[hit] = texels[:, :3]
 
 
 def _is_occluded(environment: ProceduralEnvironment, position: Floats) -> bool:
     for quad in environment.quads:
-        across, down, near = quad.projection @ position
-        if near > 1.05 and 0 <= across < near and 0 <= down < near:
-            coordinates = np.array([[across / near], [down / near]], np.float32)
+        across, down, inverse_distance = quad.projection @ position
+        if inverse_distance > 1.05 and 0 <= across < inverse_distance and 0 <= down < inverse_distance:
+            coordinates = np.array([[across / inverse_distance], [down / inverse_distance]], np.float32)
             if quad.texture.sample(coordinates[0], coordinates[1], np.ones(1, np.float32))[0, 3] > 0.5:
                 return True
     return False
 
 
-def _add_glow(picture: Floats, glow: Glow, rotation: float) -> None:
-    """Adds a disc at least three texels wide with exactly the energy of the glow."""
+def _add_emitter(picture: Floats, emitter: SmallEmitter, rotation: float) -> None:
+    """Adds a disc at least three texels wide with exactly the energy of the emitter."""
     height, texel = picture.shape[0], np.pi / picture.shape[0]
-    distance = float(np.linalg.norm(glow.position))
-    direction, radius = glow.position / distance, glow.radius / distance
+    distance = float(np.linalg.norm(emitter.position))
+    direction, radius = emitter.position / distance, emitter.radius / distance
     disc_radius = max(radius, 1.5 * texel)
     polar = float(np.arccos(np.clip(direction[1], -1, 1)))
     top = max(0, int((polar - disc_radius) / texel) - 2)
@@ -342,4 +355,4 @@ def _add_glow(picture: Floats, glow: Glow, rotation: float) -> None:
     weight = np.clip((disc_radius - chord) / texel + 0.5, 0, 1)
     solid_angle = np.sin((np.arange(top, top + rows) + 0.5) * texel)[:, None] * texel**2
     energy = np.pi * radius**2 / (weight * solid_angle).sum()
-    picture[top : top + rows] += (weight * energy)[..., None] * np.asarray(glow.radiance, np.float32)
+    picture[top : top + rows] += (weight * energy)[..., None] * np.asarray(emitter.radiance, np.float32)

@@ -113,12 +113,12 @@ def box(
     return faces
 
 
-def plain_painter(random: Generator, colour: Colour, density: float = 40, grain: float = 0.12) -> Painter:
+def plain_painter(rng: Generator, colour: Colour, density: float = 40, grain: float = 0.12) -> Painter:
     """A painter that paints every face in one colour with noise."""
 
     def paint(_face: str, width: float, height: float) -> Canvas:
         canvas = Canvas(width, height, density, colour)
-        canvas.add_noise(random, grain, 6, 4)
+        canvas.add_noise(rng, grain, 6, 4)
         return canvas
 
     return paint
@@ -137,7 +137,7 @@ class WindowStyle:
     """The colour of the sky that the glass reflects."""
 
 
-def window(random: Generator, canvas: Canvas, outline: Box, style: WindowStyle) -> None:
+def window(rng: Generator, canvas: Canvas, outline: Box, style: WindowStyle) -> None:
     """Paints a window: glass that reflects the sky or shows a lit room, curtains or a blind, glazing bars."""
     left, top, width, height = outline
     canvas.rect(outline, style.frame)
@@ -146,44 +146,44 @@ def window(random: Generator, canvas: Canvas, outline: Box, style: WindowStyle) 
     glass = canvas.area(inner)
     if not glass.size:
         return
-    fall = np.linspace(1, random.uniform(0.2, 0.7), glass.shape[0], dtype=np.float32)[:, None, None]
-    if random.uniform() < style.lit:
-        glass[..., :3] = vector(1, random.uniform(0.6, 0.85), random.uniform(0.3, 0.7)) * (1.2 - fall)
-        glass[..., 4] = 0.4 * np.exp(random.uniform(0, 3))
+    fall = np.linspace(1, rng.uniform(0.2, 0.7), glass.shape[0], dtype=np.float32)[:, None, None]
+    if rng.uniform() < style.lit:
+        glass[..., :3] = vector(1, rng.uniform(0.6, 0.85), rng.uniform(0.3, 0.7)) * (1.2 - fall)
+        glass[..., 4] = 0.4 * np.exp(rng.uniform(0, 3))
         canvas.rect(
-            (left, top + height * 0.7, width * random.uniform(0.2, 0.6), height * 0.25),
+            (left, top + height * 0.7, width * rng.uniform(0.2, 0.6), height * 0.25),
             vector(0.05, 0.04, 0.03),
         )
     else:
-        slant = np.linspace(0, random.uniform(-0.5, 0.5), glass.shape[1], dtype=np.float32)[:, None]
-        glass[..., :3] = style.sky * random.uniform(0.05, 0.45) * np.clip(fall + slant, 0.1, 1.2) + 0.01
+        slant = np.linspace(0, rng.uniform(-0.5, 0.5), glass.shape[1], dtype=np.float32)[:, None]
+        glass[..., :3] = style.sky * rng.uniform(0.05, 0.45) * np.clip(fall + slant, 0.1, 1.2) + 0.01
         glass[..., 4] = 0 if style.lit else 0.7
-    _add_curtains(random, glass)
+    _add_curtains(rng, glass)
     for index in range(1, style.columns):
         canvas.rect((left + width * index / style.columns - bar / 2, top, bar, height), style.frame)
     for index in range(1, style.rows):
         canvas.rect((left, top + height * index / style.rows - bar / 2, width, bar), style.frame)
 
 
-def _add_curtains(random: Generator, glass: Floats) -> None:
+def _add_curtains(rng: Generator, glass: Floats) -> None:
     """Paints curtains at the sides of a window, or a blind at its top, or nothing."""
     height, width = glass.shape[:2]
-    choice, cloth = random.uniform(), tint(random, 0.5, 0.15)
+    choice, cloth = rng.uniform(), tint(rng, 0.5, 0.15)
     if choice < 0.3:
-        curtain_columns = max(1, round(width * random.uniform(0.1, 0.35)))
+        curtain_columns = max(1, round(width * rng.uniform(0.1, 0.35)))
         folds = 0.7 + 0.3 * np.cos(np.arange(curtain_columns, dtype=np.float32) * 2)[:, None]
         glass[:, :curtain_columns, :3] = cloth * folds
         glass[:, -curtain_columns:, :3] = cloth * folds
     elif choice < 0.55:
-        blind_rows = round(height * random.uniform(0.2, 0.9))
+        blind_rows = round(height * rng.uniform(0.2, 0.9))
         glass[:blind_rows, :, :3] = (
             cloth * (0.7 + 0.3 * (np.arange(blind_rows, dtype=np.float32) % 4 < 2))[:, None, None]
         )
 
 
-def car(random: Generator, foot: Floats, away: bool, light: Lighting, *, night: bool) -> list[Quad]:
+def car(rng: Generator, foot: Floats, away: bool, light: Lighting, *, night: bool) -> list[Quad]:
     """A parked car along z. The viewer sees its tail lights if it points away, else its headlights."""
-    colour = tint(random, random.uniform(0.02, 0.6), random.choice([0.0, 0.1, 0.8]))
+    colour = tint(rng, rng.uniform(0.02, 0.6), rng.choice([0.0, 0.1, 0.8]))
     lamps = vector(0.6, 0.02, 0.02) if away else vector(0.9, 0.9, 0.85)
 
     def body(face: str, width: float, height: float) -> Canvas:
@@ -197,7 +197,7 @@ def car(random: Generator, foot: Floats, away: bool, light: Lighting, *, night: 
                 _wheel(canvas, middle)
         elif face in {"front", "back"}:
             for left in (0.08, width - 0.38):
-                canvas.rect((left, height * 0.3, 0.3, 0.14), lamps, glow=20 if night else 0)
+                canvas.rect((left, height * 0.3, 0.3, 0.14), lamps, emission=20 if night else 0)
             canvas.rect((width * 0.36, height * 0.6, width * 0.28, 0.11), vector(0.8, 0.8, 0.6))
         return canvas
 
@@ -209,11 +209,11 @@ def car(random: Generator, foot: Floats, away: bool, light: Lighting, *, night: 
             canvas.rect((width / 2 - 0.04, 0, 0.08, height * (face in {"left", "right"})), colour)
         return canvas
 
-    length_m, height_m = random.uniform(3.8, 4.8), random.uniform(0.75, 1.0)
-    roof = foot + UP * (height_m + 0.12) + vector(0, 0, random.uniform(-0.3, 0.3))
+    length_m, height_m = rng.uniform(3.8, 4.8), rng.uniform(0.75, 1.0)
+    roof = foot + UP * (height_m + 0.12) + vector(0, 0, rng.uniform(-0.3, 0.3))
     return [
         *box(body, foot + UP * 0.12, (1.8, height_m, length_m), light),
-        *box(cabin, roof, (1.5, random.uniform(0.45, 0.7), length_m * 0.55), light),
+        *box(cabin, roof, (1.5, rng.uniform(0.45, 0.7), length_m * 0.55), light),
     ]
 
 
@@ -226,10 +226,10 @@ def _wheel(canvas: Canvas, middle: float) -> None:
     canvas.pixels[(radius < 0.22) & (radius > 0.04), :3] = 0.3
 
 
-def bookshelf(random: Generator) -> Painter:
+def bookshelf(rng: Generator) -> Painter:
     """A painter of a shelf full of books."""
-    wood = vector(0.35, 0.23, 0.13) * random.uniform(0.2, 1.9)
-    sides = plain_painter(random, wood, 60)
+    wood = vector(0.35, 0.23, 0.13) * rng.uniform(0.2, 1.9)
+    sides = plain_painter(rng, wood, 60)
 
     def paint(face: str, width: float, height: float) -> Canvas:
         if face != "front":
@@ -240,9 +240,9 @@ def bookshelf(random: Generator) -> Painter:
             canvas.rect((0.03, top + 0.03, width - 0.06, step - 0.03), wood * 0.15)
             left = 0.04
             while left < width - 0.08:
-                thickness_m, height_m = random.uniform(0.015, 0.055), step * random.uniform(0.5, 0.85)
-                if random.uniform() < 0.9:
-                    spine = tint(random, random.uniform(0.03, 0.5), 0.8)
+                thickness_m, height_m = rng.uniform(0.015, 0.055), step * rng.uniform(0.5, 0.85)
+                if rng.uniform() < 0.9:
+                    spine = tint(rng, rng.uniform(0.03, 0.5), 0.8)
                     canvas.rect((left, top + step - height_m, thickness_m - 0.004, height_m), spine)
                     canvas.rect((left, top + step - height_m * 0.8, thickness_m - 0.004, 0.02), spine * 2)
                 left += thickness_m
@@ -251,11 +251,11 @@ def bookshelf(random: Generator) -> Painter:
     return paint
 
 
-def cabinet(random: Generator) -> Painter:
+def cabinet(rng: Generator) -> Painter:
     """A painter of a cabinet with drawers or doors."""
-    colour = tint(random, random.uniform(0.1, 0.6), 0.3)
-    sides = plain_painter(random, colour, 60)
-    columns, rows = int(random.integers(1, 4)), int(random.integers(1, 4))
+    colour = tint(rng, rng.uniform(0.1, 0.6), 0.3)
+    sides = plain_painter(rng, colour, 60)
+    columns, rows = int(rng.integers(1, 4)), int(rng.integers(1, 4))
 
     def paint(face: str, width: float, height: float) -> Canvas:
         canvas = sides(face, width, height)
@@ -273,44 +273,44 @@ def cabinet(random: Generator) -> Painter:
 
 
 def facade(
-    random: Generator, width_m: float, floors: int, *, density: float, night: bool, sky: Floats
+    rng: Generator, width_m: float, floors: int, *, density: float, night: bool, sky: Floats
 ) -> Canvas:
     """The front of a house: a grid of windows above a shop or an entrance, below a cornice."""
-    storey, bays = random.uniform(2.8, 3.7), max(2, round(width_m / random.uniform(1.8, 4.2)))
+    storey, bays = rng.uniform(2.8, 3.7), max(2, round(width_m / rng.uniform(1.8, 4.2)))
     bay = width_m / bays
-    wall = tint(random, random.uniform(0.12, 0.6), random.uniform(0.05, 0.3)) * vector(1.1, 1, 0.88)
+    wall = tint(rng, rng.uniform(0.12, 0.6), rng.uniform(0.05, 0.3)) * vector(1.1, 1, 0.88)
     style = WindowStyle(
-        frame=vector(0.7, 0.7, 0.68) if random.uniform() < 0.6 else tint(random, 0.08, 0.5),
-        columns=int(random.integers(1, 4)),
-        rows=int(random.integers(1, 4)),
-        lit=random.uniform(0.15, 0.7) if night else 0,
+        frame=vector(0.7, 0.7, 0.68) if rng.uniform() < 0.6 else tint(rng, 0.08, 0.5),
+        columns=int(rng.integers(1, 4)),
+        rows=int(rng.integers(1, 4)),
+        lit=rng.uniform(0.15, 0.7) if night else 0,
         sky=sky,
     )
-    cells = _cells(random, Canvas(bay, storey, density, wall), style)
-    pattern = random.integers(0, len(cells), (floors, bays))
+    cells = _cells(rng, Canvas(bay, storey, density, wall), style)
+    pattern = rng.integers(0, len(cells), (floors, bays))
     body = cells[pattern].transpose(0, 2, 1, 3, 4).reshape(floors * cells.shape[1], -1, 5)
-    base = _ground_floor(random, Canvas(body.shape[1] / density, storey * 1.15, density, wall), style)
+    base = _ground_floor(rng, Canvas(body.shape[1] / density, storey * 1.15, density, wall), style)
     cornice = Canvas(body.shape[1] / density, 0.7, density, wall * 1.15)
     cornice.area((0, 0.4, width_m, 0.15))[..., :3] *= 0.4
     canvas = Canvas(width_m, 0.7 + storey * (floors + 1.15), density, wall)
     canvas.pixels = np.concatenate([cornice.pixels, body, base.pixels])
-    canvas.add_noise(random, random.uniform(0.06, 0.16), 8)
+    canvas.add_noise(rng, rng.uniform(0.06, 0.16), 8)
     return canvas
 
 
-def _cells(random: Generator, blank: Canvas, style: WindowStyle) -> Floats:
+def _cells(rng: Generator, blank: Canvas, style: WindowStyle) -> Floats:
     """Variants (n, h, w, 5) of one bay of one storey: the same window with different content."""
     width, height = blank.width, blank.height
-    width_fraction, height_fraction = random.uniform(0.4, 0.92), random.uniform(0.45, 0.85)
+    width_fraction, height_fraction = rng.uniform(0.4, 0.92), rng.uniform(0.45, 0.85)
     outline = (
         width * (1 - width_fraction) / 2,
         height * (1 - height_fraction) * 0.45,
         width * width_fraction,
         height * height_fraction,
     )
-    stone = random.uniform(0.25, 0.6)
-    band, sill, balcony = random.uniform(size=3) < (0.4, 0.5, 0.25)
-    rail = tint(random, 0.1, 0.3)
+    stone = rng.uniform(0.25, 0.6)
+    band, sill, balcony = rng.uniform(size=3) < (0.4, 0.5, 0.25)
+    rail = tint(rng, 0.1, 0.3)
     cells = []
     for _ in range(9):
         cell = Canvas(width, height, blank.density, blank.colour)
@@ -323,7 +323,7 @@ def _cells(random: Generator, blank: Canvas, style: WindowStyle) -> Floats:
         cell.area((outline[0] - margin, outline[1] - margin, outline[2] + 2 * margin, outline[3] + margin))[
             ..., :3
         ] *= 1.25
-        window(random, cell, outline, style)
+        window(rng, cell, outline, style)
         if sill:
             cell.area((outline[0] - 0.1, outline[1] + outline[3], outline[2] + 0.2, 0.1))[..., :3] = 0.5
             cell.area((outline[0] - 0.1, outline[1] + outline[3] + 0.1, outline[2] + 0.2, 0.08))[..., :3] *= (
@@ -338,38 +338,44 @@ def _cells(random: Generator, blank: Canvas, style: WindowStyle) -> Floats:
     return np.stack(cells)
 
 
-def _ground_floor(random: Generator, canvas: Canvas, style: WindowStyle) -> Canvas:
+def _ground_floor(rng: Generator, canvas: Canvas, style: WindowStyle) -> Canvas:
     """Paints shop windows below signs, doors between them, and a plinth."""
     bottom, left = canvas.height, 0.3
-    glow = 8 if style.lit else 0
-    shops = random.uniform() < 0.7
+    emission = 8 if style.lit else 0
+    shops = rng.uniform() < 0.7
     canvas.rect((0, bottom - 0.4, canvas.width, 0.4), vector(0.12, 0.12, 0.12))
     while left < canvas.width - 1.5:
-        width_m = min(random.uniform(1.8, 4.5), canvas.width - left - 0.3)
-        sign, ink = tint(random, random.uniform(0.02, 0.4), 1), tint(random, 0.7, 0.5)
+        width_m = min(rng.uniform(1.8, 4.5), canvas.width - left - 0.3)
+        sign, ink = tint(rng, rng.uniform(0.02, 0.4), 1), tint(rng, 0.7, 0.5)
         if shops:
-            window(random, canvas, (left, 1.0, width_m - 0.3, bottom - 1.5), style)
-            _shop_goods(random, canvas, (left + 0.1, bottom - 1.6, width_m - 0.5), glow / 3)
-            canvas.rect((left - 0.1, 0.25, width_m - 0.1, 0.6), sign, glow=glow * (random.uniform() < 0.3))
-            canvas.write(random, (left + 0.1, 0.33, width_m - 0.6, 0.44), ink, glow=glow)
+            window(rng, canvas, (left, 1.0, width_m - 0.3, bottom - 1.5), style)
+            _shop_goods(rng, canvas, (left + 0.1, bottom - 1.6, width_m - 0.5), emission / 3)
+            canvas.rect(
+                (left - 0.1, 0.25, width_m - 0.1, 0.6), sign, emission=emission * (rng.uniform() < 0.3)
+            )
+            canvas.write(rng, (left + 0.1, 0.33, width_m - 0.6, 0.44), ink, emission=emission)
         else:
-            window(random, canvas, (left + 0.3, 0.9, 1.1, 1.5), style)
+            window(rng, canvas, (left + 0.3, 0.9, 1.1, 1.5), style)
         left += width_m
-        if left < canvas.width - 1.2 and random.uniform() < 0.6:
-            door = tint(random, 0.15, 0.8)
+        if left < canvas.width - 1.2 and rng.uniform() < 0.6:
+            door = tint(rng, 0.15, 0.8)
             canvas.rect((left - 0.1, bottom - 2.4, 1.2, 2.4), door * 0.4)
             canvas.rect((left, bottom - 2.25, 1.0, 2.25), door)
-            canvas.rect((left + 0.2, bottom - 2.0, 0.6, 0.8), vector(0.08, 0.09, 0.1), glow=glow)
+            canvas.rect((left + 0.2, bottom - 2.0, 0.6, 0.8), vector(0.08, 0.09, 0.1), emission=emission)
             canvas.rect((left + 0.85, bottom - 1.1, 0.08, 0.08), vector(0.6, 0.5, 0.2))
             left += 1.3
     return canvas
 
 
-def _shop_goods(random: Generator, canvas: Canvas, baseline: tuple[float, float, float], glow: float) -> None:
+def _shop_goods(
+    rng: Generator, canvas: Canvas, baseline: tuple[float, float, float], emission: float
+) -> None:
     """Paints goods in a shop window, from (left, top) over a width, about 1 m tall."""
     left, top, width_m = baseline
     offset = 0.0
     while offset < width_m - 0.4:
-        size, height_m = random.uniform(0.15, 0.5), random.uniform(0.2, 0.9)
-        canvas.rect((left + offset, top + 1 - height_m, size, height_m), tint(random, 0.3, 0.9), glow=glow)
-        offset += size + random.uniform(0, 0.3)
+        size, height_m = rng.uniform(0.15, 0.5), rng.uniform(0.2, 0.9)
+        canvas.rect(
+            (left + offset, top + 1 - height_m, size, height_m), tint(rng, 0.3, 0.9), emission=emission
+        )
+        offset += size + rng.uniform(0, 0.3)

@@ -18,9 +18,9 @@ from numpy.typing import NDArray
 from brewster.environments.procedural.canvas import (
     Canvas,
     Floats,
-    Glow,
     ProceduralEnvironment,
     Quad,
+    SmallEmitter,
     render,
     resize,
     tint,
@@ -83,28 +83,26 @@ ENVIRONMENTS: Final[dict[str, Callable[[int, int], NDArray[np.float32]]]] = {
 class _BoxRoom:
     """A box-shaped room around the viewer: its walls, its lighting, and the furniture placed so far."""
 
-    def __init__(self, random: Generator) -> None:
-        self.random = random
+    def __init__(self, rng: Generator) -> None:
+        self.rng = rng
         ranges = (3.5, 8), (3.5, 9), (2.4, 3.3)
-        width_m, depth_m, self.height_m = (random.uniform(low, high) for low, high in ranges)
-        self.floor = -random.uniform(1.2, 1.7)
-        share = random.uniform(0.3, 0.7, 2)
+        width_m, depth_m, self.height_m = (rng.uniform(low, high) for low, high in ranges)
+        self.floor = -rng.uniform(1.2, 1.7)
+        share = rng.uniform(0.3, 0.7, 2)
         self.low = vector(-width_m * share[0], self.floor, -depth_m * share[1])
         self.high = vector(width_m, self.height_m, depth_m) + self.low
-        self.evening = random.uniform() < 0.25
-        self.daylight = float(np.exp(random.uniform(-3, -1.5) if self.evening else random.uniform(1.8, 3.4)))
-        self.lamps = SceneLighting(vector(0.25, 0.24, 0.22), self.floor)
-        self.sun = unit(vector(*random.uniform(-1, 1, 3)) + UP * 1.2)
-        self.sunlight = vector(1, 0.9, 0.75) * (
-            0 if self.evening else random.choice([0, random.uniform(4, 15)])
-        )
+        self.evening = rng.uniform() < 0.25
+        self.daylight = float(np.exp(rng.uniform(-3, -1.5) if self.evening else rng.uniform(1.8, 3.4)))
+        self.lighting = SceneLighting(vector(0.25, 0.24, 0.22), self.floor)
+        self.sun = unit(vector(*rng.uniform(-1, 1, 3)) + UP * 1.2)
+        self.sunlight = vector(1, 0.9, 0.75) * (0 if self.evening else rng.choice([0, rng.uniform(4, 15)]))
         self.openings: list[tuple[Floats, Floats, float, float]] = []
         self.quads: list[Quad] = []
-        self.glows: list[Glow] = []
+        self.emitters: list[SmallEmitter] = []
 
     def light(self, points: Floats, normal: Floats) -> Floats:
         """Irradiance / pi of lamps and windows, darker in corners, and of sunlight through the windows."""
-        total = self.lamps(points, normal)
+        total = self.lighting(points, normal)
         for end in (self.low, self.high):
             corner = 1 - 0.3 * np.exp(-np.abs(points - end) / 0.3)
             total *= corner[..., :1] * corner[..., 1:2] * corner[..., 2:]
@@ -118,34 +116,34 @@ class _BoxRoom:
                         width_m / 2 - across, height_m / 2 - np.abs(hit[..., 1] - height_m / 2)
                     )
                     inside = np.clip(margin * 8 + 0.5, 0, 1) * (distance[..., 0] > 0.05)
-                    total += inside[..., None] * self.lamps.shade(points, normal) * facing * self.sunlight
+                    total += inside[..., None] * self.lighting.shade(points, normal) * facing * self.sunlight
         return total
 
     def environment(self) -> ProceduralEnvironment:
         """Builds the room. Lights come first; lighting is baked into textures when they are rendered."""
-        random = self.random
-        paint = tint(random, random.uniform(0.3, 0.75), random.uniform(0, 0.2))
+        rng = self.rng
+        paint = tint(rng, rng.uniform(0.3, 0.75), rng.uniform(0, 0.2))
         inward_normals = [vector(0, 0, 1), vector(-1, 0, 0), vector(0, 0, -1), vector(1, 0, 0)]
-        first = int(random.integers(4))
+        first = int(rng.integers(4))
         for index, inward in enumerate(inward_normals):
             role = (
                 "windows"
                 if index == first
-                else str(random.choice(["windows", "pictures", "pictures", "pictures", "bare"]))
+                else str(rng.choice(["windows", "pictures", "pictures", "pictures", "bare"]))
             )
-            accent = random.uniform() < 0.3
-            self._wall(inward, tint(random, random.uniform(0.08, 0.5), 0.7) if accent else paint, role)
+            accent = rng.uniform() < 0.3
+            self._wall(inward, tint(rng, rng.uniform(0.08, 0.5), 0.7) if accent else paint, role)
         self._ceiling()
         self._floor()
         for inward in inward_normals:
             self._furnish_wall(inward)
-        for _ in range(random.integers(3, 9)):
+        for _ in range(rng.integers(3, 9)):
             self._place_free_standing()
         return ProceduralEnvironment(
             self.quads,
-            self.glows,
+            self.emitters,
             lambda directions, _texel: np.zeros_like(directions),
-            random.uniform(0, 2 * np.pi),
+            rng.uniform(0, 2 * np.pi),
         )
 
     def _wall_base(self, inward: Floats) -> tuple[Floats, float]:
@@ -157,39 +155,39 @@ class _BoxRoom:
         return foot.astype(np.float32), float(size[2] if inward[0] else size[0])
 
     def _wall(self, inward: Floats, colour: Floats, role: str) -> None:
-        random = self.random
+        rng = self.rng
         foot, length_m = self._wall_base(inward)
         canvas = Canvas(length_m, self.height_m, _DENSITY, colour)
-        wallpaper(random, canvas)
-        left = random.uniform(0.3, 0.8)
-        sill = random.choice([0.1, 0.9, 0.9])
+        wallpaper(rng, canvas)
+        left = rng.uniform(0.3, 0.8)
+        sill = rng.choice([0.1, 0.9, 0.9])
         while left < length_m - 1.2:
-            width_m = min(random.uniform(0.9, 2.2), length_m - left - 0.3)
-            choice = random.uniform()
+            width_m = min(rng.uniform(0.9, 2.2), length_m - left - 0.3)
+            choice = rng.uniform()
             if role == "windows" and choice < 0.75:
                 self._opening((left, width_m, float(sill)), canvas, foot, inward)
             elif choice < 0.15:
-                door(random, canvas, left)
+                door(rng, canvas, left)
             elif role != "bare":
-                hang_pictures(random, canvas, left, width_m)
-            left += width_m + random.uniform(0.3, 1.2)
+                hang_pictures(rng, canvas, left, width_m)
+            left += width_m + rng.uniform(0.3, 1.2)
         self.quads.append(vertical_quad(canvas, foot, inward, self.light))
 
     def _opening(
         self, opening: tuple[float, float, float], canvas: Canvas, foot: Floats, inward: Floats
     ) -> None:
         """Adds a window at (left, width, sill height) of a wall: blurred view, light, bars and curtains."""
-        random, (left, width_m, sill) = self.random, opening
-        top = random.uniform(0.25, 0.45)
+        rng, (left, width_m, sill) = self.rng, opening
+        top = rng.uniform(0.25, 0.45)
         height_m = self.height_m - sill - top
         canvas.rect((left - 0.08, top - 0.08, width_m + 0.16, height_m + 0.16), vector(0.75, 0.74, 0.7))
-        view = window_view(random)
-        canvas.paste(resize(view, 90, 90), (left, top, width_m, height_m), glow=self.daylight)
-        for part in range(random.integers(1, 4)):
+        view = window_view(rng)
+        canvas.paste(resize(view, 90, 90), (left, top, width_m, height_m), emission=self.daylight)
+        for part in range(rng.integers(1, 4)):
             canvas.rect((left + width_m * part / 3 - 0.03, top, 0.06, height_m), vector(0.7, 0.7, 0.68))
-        canvas.rect((left, top + height_m * random.uniform(0.2, 0.6), width_m, 0.05), vector(0.7, 0.7, 0.68))
-        if random.uniform() < 0.5:
-            cloth = tint(random, 0.5, 0.3)
+        canvas.rect((left, top + height_m * rng.uniform(0.2, 0.6), width_m, 0.05), vector(0.7, 0.7, 0.68))
+        if rng.uniform() < 0.5:
+            cloth = tint(rng, 0.5, 0.3)
             for start in (left - 0.3, left + width_m - 0.15):
                 curtain(
                     canvas.area((start, top - 0.15, 0.45, self.height_m - top)), cloth, self.daylight * 0.04
@@ -199,25 +197,25 @@ class _BoxRoom:
         mean = view.mean((0, 1)) * self.daylight
         for share in (0.25, 0.75):
             source = middle + UP * height_m * share + inward * 0.05
-            self.lamps.lamps.append(Lamp(source, mean * width_m * height_m / 2, inward))
-        self.lamps.ambient = self.lamps.ambient + mean * (width_m * height_m * 0.01)
+            self.lighting.lamps.append(Lamp(source, mean * width_m * height_m / 2, inward))
+        self.lighting.ambient = self.lighting.ambient + mean * (width_m * height_m * 0.01)
         self.openings.append((middle, inward, width_m, height_m))
 
     def _ceiling(self) -> None:
         """Adds a ceiling with lamps of one kind, or none by day. Their radiance follows from the size of the room."""
-        random, size = self.random, self.high - self.low
-        canvas = Canvas(float(size[0]), float(size[2]), 60, vector(0.8, 0.79, 0.76) * random.uniform(0.7, 1))
-        if random.uniform() < 0.3:
+        rng, size = self.rng, self.high - self.low
+        canvas = Canvas(float(size[0]), float(size[2]), 60, vector(0.8, 0.79, 0.76) * rng.uniform(0.7, 1))
+        if rng.uniform() < 0.3:
             canvas.pixels[::36, :, :3] *= 0.7
             canvas.pixels[:, ::36, :3] *= 0.7
-        canvas.add_noise(random, 0.03)
-        colour = vector(1, random.uniform(0.75, 0.98), random.uniform(0.5, 0.95))
+        canvas.add_noise(rng, 0.03)
+        colour = vector(1, rng.uniform(0.75, 0.98), rng.uniform(0.5, 0.95))
         shapes = [(0.6, 0.6, 3.0), (0.12, 1.2, 1.8), (1.2, 0.12, 1.8), (0.11, 0.11, 1.4), (0.2, 0.2, 2.2)]
-        width_m, depth_m, gap = shapes[random.integers(len(shapes))]
+        width_m, depth_m, gap = shapes[rng.integers(len(shapes))]
         rows = [max(1, int(side / gap)) for side in (size[0], size[2])]
-        light = random.uniform(0.6, 1.6)
+        light = rng.uniform(0.6, 1.6)
         radiance = light * size[0] * size[2] / (0.6 * rows[0] * rows[1] * width_m * depth_m)
-        if not self.evening and random.uniform() < 0.35:
+        if not self.evening and rng.uniform() < 0.35:
             rows = [0, 0]
         middle = (self.low + self.high) / 2
         for x in (np.arange(rows[0]) + 0.5) * size[0] / max(1, rows[0]):
@@ -227,35 +225,33 @@ class _BoxRoom:
                     vector(0.4, 0.4, 0.4),
                 )
                 canvas.rect(
-                    (x - width_m / 2, z - depth_m / 2, width_m, depth_m), colour, glow=float(radiance)
+                    (x - width_m / 2, z - depth_m / 2, width_m, depth_m), colour, emission=float(radiance)
                 )
                 position = vector(self.low[0] + x, self.high[1] - 0.05, self.low[2] + z)
-                self.lamps.lamps.append(Lamp(position, colour * float(radiance) * width_m * depth_m, -UP))
-        if random.uniform() < 0.4:
+                self.lighting.lamps.append(Lamp(position, colour * float(radiance) * width_m * depth_m, -UP))
+        if rng.uniform() < 0.4:
             self._pendant(colour)
-        self.lamps.ambient = self.lamps.ambient + colour * (0.35 * light if rows[0] else 0)
+        self.lighting.ambient = self.lighting.ambient + colour * (0.35 * light if rows[0] else 0)
         centre = vector(middle[0], self.high[1], middle[2])
         self.quads.append(horizontal_quad(canvas, centre, self.light))
 
     def _pendant(self, colour: Floats) -> None:
         """Adds a pendant lamp: a bulb below a shade."""
-        share = vector(*self.random.uniform(0.25, 0.75, 3))
+        share = vector(*self.rng.uniform(0.25, 0.75, 3))
         position = self.low + share * (self.high - self.low)
-        position[1] = self.high[1] - self.random.uniform(0.5, 0.9)
-        dark, cloth = (plain_painter(self.random, tint(self.random, value, 0.6)) for value in (0.03, 0.3))
+        position[1] = self.high[1] - self.rng.uniform(0.5, 0.9)
+        dark, cloth = (plain_painter(self.rng, tint(self.rng, value, 0.6)) for value in (0.03, 0.3))
         self.quads += box(dark, position, (0.015, float(self.high[1] - position[1]), 0.015), self.light)
-        self.quads += box(
-            cloth, position + UP * 0.05, (0.34, 0.2, 0.34), self.light, self.random.uniform(0, 1)
-        )
-        self.glows.append(Glow(position, 0.05, colour * 300))
-        self.lamps.lamps.append(Lamp(position, colour * 300 * np.float32(np.pi * 0.05**2)))
+        self.quads += box(cloth, position + UP * 0.05, (0.34, 0.2, 0.34), self.light, self.rng.uniform(0, 1))
+        self.emitters.append(SmallEmitter(position, 0.05, colour * 300))
+        self.lighting.lamps.append(Lamp(position, colour * 300 * np.float32(np.pi * 0.05**2)))
 
     def _floor(self) -> None:
-        random, size = self.random, self.high - self.low
-        canvas = Canvas(float(size[0]), float(size[2]), _DENSITY, tint(random, random.uniform(0.1, 0.4), 0.2))
-        flooring(random, canvas)
-        if random.uniform() < 0.6:
-            rug(random, canvas)
+        rng, size = self.rng, self.high - self.low
+        canvas = Canvas(float(size[0]), float(size[2]), _DENSITY, tint(rng, rng.uniform(0.1, 0.4), 0.2))
+        flooring(rng, canvas)
+        if rng.uniform() < 0.6:
+            rug(rng, canvas)
         middle = (self.low + self.high) / 2
         self.quads.append(horizontal_quad(canvas, vector(middle[0], self.floor, middle[2]), self.light))
 
@@ -264,26 +260,26 @@ class _BoxRoom:
         reach = max(size[0], size[2]) / 2
         if np.hypot(foot[0], foot[2]) < reach + 0.7:
             return False
-        for x, z, half_width, half_depth in self.lamps.contacts:
+        for x, z, half_width, half_depth in self.lighting.contacts:
             if abs(x - foot[0]) < half_width + reach * 0.8 and abs(z - foot[2]) < half_depth + reach * 0.8:
                 return False
         across = abs(np.cos(rotation)) * size[0] + abs(np.sin(rotation)) * size[2]
         depth_m = abs(np.sin(rotation)) * size[0] + abs(np.cos(rotation)) * size[2]
-        self.lamps.contacts.append((float(foot[0]), float(foot[2]), float(across / 2), float(depth_m / 2)))
+        self.lighting.contacts.append((float(foot[0]), float(foot[2]), float(across / 2), float(depth_m / 2)))
         return True
 
     def _furnish_wall(self, inward: Floats) -> None:
         """Adds shelves, cabinets and sofas along a wall."""
-        random = self.random
+        rng = self.rng
         middle, length_m = self._wall_base(inward)
         rotation = float(np.arctan2(-inward[0], inward[2]))
         lit = any(np.array_equal(inward, normal) for _, normal, _, _ in self.openings)
-        for offset in np.arange(-length_m / 2 + 1.1, length_m / 2 - 1, random.uniform(1.2, 2)):
-            kind = random.choice(["shelf", "cabinet", "sofa", "plant", "screen", "nothing"])
-            width_m, depth_m = random.uniform(0.8, 1.8), random.uniform(0.3, 0.5)
-            height_m = random.uniform(0.5, 0.85) if lit or kind != "shelf" else random.uniform(1.2, 2.2)
+        for offset in np.arange(-length_m / 2 + 1.1, length_m / 2 - 1, rng.uniform(1.2, 2)):
+            kind = rng.choice(["shelf", "cabinet", "sofa", "plant", "screen", "nothing"])
+            width_m, depth_m = rng.uniform(0.8, 1.8), rng.uniform(0.3, 0.5)
+            height_m = rng.uniform(0.5, 0.85) if lit or kind != "shelf" else rng.uniform(1.2, 2.2)
             if kind == "sofa":
-                width_m, depth_m = random.uniform(1.5, 2.2), 0.85
+                width_m, depth_m = rng.uniform(1.5, 2.2), 0.85
             foot = middle + np.cross(-inward, UP) * offset + inward * (depth_m / 2 + 0.02)
             if kind == "nothing" or not self._reserve_floor(foot, (width_m, height_m, depth_m), rotation):
                 continue
@@ -292,21 +288,21 @@ class _BoxRoom:
             elif kind == "sofa":
                 self._sofa(foot, (width_m, height_m, depth_m), rotation)
             else:
-                paint = bookshelf(random) if kind == "shelf" else cabinet(random)
+                paint = bookshelf(rng) if kind == "shelf" else cabinet(rng)
                 self.quads += box(paint, foot, (width_m, height_m, depth_m), self.light, rotation)
                 if kind == "screen":
                     self._screen(foot + UP * (height_m + 0.08), inward)
 
     def _screen(self, foot: Floats, inward: Floats) -> None:
-        random = self.random
+        rng = self.rng
         canvas = Canvas(1.1, 0.65, 120, vector(0.015, 0.015, 0.015))
-        picture = painting(int(random.integers(1 << 30)), 126, 72)
-        canvas.paste(picture, (0.03, 0.03, 1.04, 0.56), glow=random.choice([0.05, 2.5]))
+        picture = painting(int(rng.integers(1 << 30)), 126, 72)
+        canvas.paste(picture, (0.03, 0.03, 1.04, 0.56), emission=rng.choice([0.05, 2.5]))
         self.quads.append(vertical_quad(canvas, foot, inward, self.light))
 
     def _sofa(self, foot: Floats, size: tuple[float, float, float], rotation: float) -> None:
         width_m, _, depth_m = size
-        cloth = plain_painter(self.random, tint(self.random, self.random.uniform(0.05, 0.4), 0.6), 60, 0.2)
+        cloth = plain_painter(self.rng, tint(self.rng, self.rng.uniform(0.05, 0.4), 0.6), 60, 0.2)
         forward, sideways = _horizontal_axes(rotation)
         back = foot - forward * (depth_m / 2 - 0.1)
         self.quads += box(cloth, foot, (width_m, 0.42, depth_m), self.light, rotation)
@@ -315,57 +311,55 @@ class _BoxRoom:
             armrest = foot + sideways * side * (width_m / 2 - 0.08)
             self.quads += box(cloth, armrest, (0.16, 0.6, depth_m), self.light, rotation)
         for offset in np.arange(-width_m / 2 + 0.45, width_m / 2 - 0.3, 0.6):
-            cushion = plain_painter(self.random, tint(self.random, 0.35, 0.9), 60, 0.2)
+            cushion = plain_painter(self.rng, tint(self.rng, 0.35, 0.9), 60, 0.2)
             seat = back + sideways * offset + forward * 0.2 + UP * 0.42
             self.quads += box(cushion, seat, (0.4, 0.36, 0.12), self.light, rotation)
 
     def _plant(self, foot: Floats) -> None:
-        height_m = self.random.uniform(0.7, 1.5)
+        height_m = self.rng.uniform(0.7, 1.5)
         self.quads += box(
-            plain_painter(self.random, tint(self.random, 0.3, 0.5)), foot, (0.3, 0.3, 0.3), self.light, 0.4
+            plain_painter(self.rng, tint(self.rng, 0.3, 0.5)), foot, (0.3, 0.3, 0.3), self.light, 0.4
         )
-        self.quads.append(vertical_quad(tree(self.random, height_m, 90), foot + UP * 0.25, None, self.light))
+        self.quads.append(vertical_quad(tree(self.rng, height_m, 90), foot + UP * 0.25, None, self.light))
 
     def _place_free_standing(self) -> None:
         """Adds a table with chairs, a person or a floor lamp."""
-        random = self.random
+        rng = self.rng
         margin = vector(0.8, 0, 0.8)
-        share = vector(random.uniform(), 0, random.uniform())
+        share = vector(rng.uniform(), 0, rng.uniform())
         foot = self.low + margin + share * (self.high - self.low - 2 * margin)
         foot[1] = self.floor
-        kind, rotation = random.choice(["table", "table", "person", "lamp"]), random.uniform(0, 2 * np.pi)
+        kind, rotation = rng.choice(["table", "table", "person", "lamp"]), rng.uniform(0, 2 * np.pi)
         if kind == "table":
-            size = random.uniform(0.8, 1.6), 0.74, random.uniform(0.6, 0.9)
+            size = rng.uniform(0.8, 1.6), 0.74, rng.uniform(0.6, 0.9)
             if self._reserve_floor(foot, size, rotation):
                 self._table(foot, size, rotation)
         elif kind == "person" and self._reserve_floor(foot, (0.5, 1.7, 0.4), 0):
-            self.quads.append(
-                vertical_quad(figure(random, random.uniform(1.55, 1.85), 90), foot, None, self.light)
-            )
+            self.quads.append(vertical_quad(figure(rng, rng.uniform(1.55, 1.85), 90), foot, None, self.light))
         elif kind == "lamp" and self._reserve_floor(foot, (0.4, 1.6, 0.4), 0):
             self._floor_lamp(foot)
 
     def _table(self, foot: Floats, size: tuple[float, float, float], rotation: float) -> None:
-        random, (width_m, height_m, depth_m) = self.random, size
-        wood = plain_painter(random, vector(0.35, 0.22, 0.12) * random.uniform(0.4, 1.6), 60, 0.2)
+        rng, (width_m, height_m, depth_m) = self.rng, size
+        wood = plain_painter(rng, vector(0.35, 0.22, 0.12) * rng.uniform(0.4, 1.6), 60, 0.2)
         forward, sideways = _horizontal_axes(rotation)
         self.quads += box(wood, foot + UP * (height_m - 0.05), (width_m, 0.05, depth_m), self.light, rotation)
         for right in (-0.45, 0.45):
             for front in (-0.42, 0.42):
                 leg = foot + sideways * right * width_m + forward * front * depth_m
                 self.quads += box(wood, leg, (0.06, height_m - 0.05, 0.06), self.light, rotation)
-        for _ in range(random.integers(1, 6)):
+        for _ in range(rng.integers(1, 6)):
             thing = (
                 foot
                 + UP * height_m
-                + sideways * random.uniform(-0.4, 0.4) * width_m
-                + forward * random.uniform(-0.3, 0.3) * depth_m
+                + sideways * rng.uniform(-0.4, 0.4) * width_m
+                + forward * rng.uniform(-0.3, 0.3) * depth_m
             )
-            bulk = random.uniform(0.05, 0.25), random.uniform(0.03, 0.3), random.uniform(0.05, 0.2)
+            bulk = rng.uniform(0.05, 0.25), rng.uniform(0.03, 0.3), rng.uniform(0.05, 0.2)
             self.quads += box(
-                plain_painter(random, tint(random, 0.3, 0.9)), thing, bulk, self.light, random.uniform(0, 3)
+                plain_painter(rng, tint(rng, 0.3, 0.9)), thing, bulk, self.light, rng.uniform(0, 3)
             )
-        seat = plain_painter(random, tint(random, 0.2, 0.6), 60, 0.2)
+        seat = plain_painter(rng, tint(rng, 0.2, 0.6), 60, 0.2)
         for side in (-1, 1):
             chair = foot + forward * side * (depth_m / 2 + 0.3)
             if np.hypot(chair[0], chair[2]) > 1:
@@ -380,17 +374,15 @@ class _BoxRoom:
 
         def shade(_face: str, width: float, height: float) -> Canvas:
             canvas = Canvas(width, height, 80)
-            canvas.rect((0, 0, width, height), colour, glow=5)
+            canvas.rect((0, 0, width, height), colour, emission=5)
             canvas.area((0, 0, width, 0.05))[..., 4] = 15
-            canvas.add_noise(self.random, 0.1)
+            canvas.add_noise(self.rng, 0.1)
             return canvas
 
-        self.quads += box(
-            plain_painter(self.random, vector(0.1, 0.1, 0.1)), foot, (0.03, 1.4, 0.03), self.light
-        )
+        self.quads += box(plain_painter(self.rng, vector(0.1, 0.1, 0.1)), foot, (0.03, 1.4, 0.03), self.light)
         self.quads += box(shade, foot + UP * 1.35, (0.36, 0.26, 0.36), self.light, 0.6)
-        self.lamps.lamps.append(Lamp(foot + UP * 1.5, colour * 1.2))
-        self.glows.append(Glow(foot + UP * 1.66, 0.03, colour * 400))
+        self.lighting.lamps.append(Lamp(foot + UP * 1.5, colour * 1.2))
+        self.emitters.append(SmallEmitter(foot + UP * 1.66, 0.03, colour * 400))
 
 
 def _horizontal_axes(rotation: float) -> tuple[Floats, Floats]:

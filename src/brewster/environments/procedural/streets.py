@@ -11,10 +11,10 @@ from numpy.random import Generator
 from brewster.environments.procedural.canvas import (
     Canvas,
     Floats,
-    Glow,
-    PaintingTexture,
+    MipmapTexture,
     ProceduralEnvironment,
     Quad,
+    SmallEmitter,
     fractal,
     tint,
     unit,
@@ -33,9 +33,9 @@ from brewster.environments.procedural.props import (
     vertical_quad,
 )
 
-_END: Final = 90.0
+_HALF_LENGTH_M: Final = 90.0
 """Half the length of the street in m."""
-_SUN_RADIUS: Final = 0.00465
+_SUN_RADIUS_RAD: Final = 0.00465
 
 
 @dataclass(frozen=True)
@@ -45,13 +45,13 @@ class _Sky:
     zenith: Floats
     horizon: Floats
     cloud: Floats
-    cover: float
+    cloud_threshold: float
     """Threshold of the cloud noise: -2 is overcast, 2 is clear."""
     sun: Floats
     """Unit direction."""
     sunlight: Floats
     """Irradiance / pi (3,) on a surface that faces the sun; 0 when clouds hide it."""
-    noise: PaintingTexture
+    noise: MipmapTexture
 
     def __call__(self, directions: Floats, texel: float) -> Floats:
         """Radiance (h, w, 3) in unit directions."""
@@ -61,10 +61,10 @@ class _Sky:
         halo = 0.03 * nearness**8 + 0.12 * nearness**64 + 0.6 * nearness**800
         radiance = radiance + self.sunlight * halo
         thickness = self._thickness(directions, rise[..., 0], texel)
-        veil = np.clip(thickness * 1.5, 0, 1) * np.clip(rise * 8, 0, 1)
+        cloud_opacity = np.clip(thickness * 1.5, 0, 1) * np.clip(rise * 8, 0, 1)
         dark = np.clip(1.25 - 0.45 * thickness, 0.5, 1.2)
         lit = self.cloud * dark + self.sunlight * halo * np.exp(-3 * thickness)
-        result: Floats = radiance + (lit - radiance) * veil
+        result: Floats = radiance + (lit - radiance) * cloud_opacity
         return result
 
     def _thickness(self, directions: Floats, rise: Floats, texel: float) -> Floats:
@@ -73,69 +73,70 @@ class _Sky:
         coordinates = [(directions[..., axis] / height * 0.35 % 1).ravel() for axis in (0, 2)]
         footprint = (texel * 0.35 * 512 / height**1.5).ravel()
         return np.maximum(
-            self.noise.sample(coordinates[0], coordinates[1], footprint).reshape(*rise.shape, 1) - self.cover,
+            self.noise.sample(coordinates[0], coordinates[1], footprint).reshape(*rise.shape, 1)
+            - self.cloud_threshold,
             0,
         )
 
 
-def _day_sky(random: Generator) -> _Sky:
-    height, azimuth = random.uniform(0.25, 1.2), random.uniform(0, 2 * np.pi)
-    sun = vector(np.cos(height) * np.sin(azimuth), np.sin(height), np.cos(height) * np.cos(azimuth))
-    low = np.exp(-height * 4)
-    hidden = random.uniform() < 0.25
+def _day_sky(rng: Generator) -> _Sky:
+    elevation, azimuth = rng.uniform(0.25, 1.2), rng.uniform(0, 2 * np.pi)
+    sun = vector(np.cos(elevation) * np.sin(azimuth), np.sin(elevation), np.cos(elevation) * np.cos(azimuth))
+    low = np.exp(-elevation * 4)
+    is_overcast = rng.uniform() < 0.25
     warmth = vector(1, 0.93 - 0.3 * low, 0.85 - 0.6 * low)
-    blue = vector(0.3, 0.5, 1) * random.uniform(0.4, 0.8)
-    grey = vector(0.95, 0.97, 1) * random.uniform(0.6, 1.2)
-    haze = vector(0.9, 0.95, 1) * random.uniform(0.7, 1.3) + (warmth - 0.8) * low
+    blue = vector(0.3, 0.5, 1) * rng.uniform(0.4, 0.8)
+    grey = vector(0.95, 0.97, 1) * rng.uniform(0.6, 1.2)
+    haze = vector(0.9, 0.95, 1) * rng.uniform(0.7, 1.3) + (warmth - 0.8) * low
     return _Sky(
-        zenith=grey * 0.9 if hidden else blue,
-        horizon=grey if hidden else haze,
-        cloud=grey if hidden else warmth * random.uniform(1.1, 1.8),
-        cover=random.uniform(-1.2, -0.3) if hidden else random.uniform(-0.1, 1.8),
+        zenith=grey * 0.9 if is_overcast else blue,
+        horizon=grey if is_overcast else haze,
+        cloud=grey if is_overcast else warmth * rng.uniform(1.1, 1.8),
+        cloud_threshold=rng.uniform(-1.2, -0.3) if is_overcast else rng.uniform(-0.1, 1.8),
         sun=sun,
-        sunlight=warmth * (0.0 if hidden else random.uniform(3, 6.5) * (1 - 0.5 * low)),
-        noise=PaintingTexture(fractal(random, 512, 512, 3, 7)[..., None]),
+        sunlight=warmth * (0.0 if is_overcast else rng.uniform(3, 6.5) * (1 - 0.5 * low)),
+        noise=MipmapTexture(fractal(rng, 512, 512, 3, 7)[..., None]),
     )
 
 
-def _night_sky(random: Generator) -> _Sky:
-    town = vector(1, 0.65, 0.4) * random.uniform(0.005, 0.04)
+def _night_sky(rng: Generator) -> _Sky:
+    town = vector(1, 0.65, 0.4) * rng.uniform(0.005, 0.04)
     return _Sky(
-        zenith=vector(0.3, 0.4, 1) * random.uniform(0.002, 0.01),
+        zenith=vector(0.3, 0.4, 1) * rng.uniform(0.002, 0.01),
         horizon=town,
         cloud=town * 0.7,
-        cover=random.uniform(-0.5, 1.8),
+        cloud_threshold=rng.uniform(-0.5, 1.8),
         sun=UP,
         sunlight=vector(0, 0, 0),
-        noise=PaintingTexture(fractal(random, 512, 512, 3, 7)[..., None]),
+        noise=MipmapTexture(fractal(rng, 512, 512, 3, 7)[..., None]),
     )
 
 
 class _Street:
     """The layout of one street, its lighting, and the objects placed so far."""
 
-    def __init__(self, random: Generator, *, night: bool) -> None:
-        self.random, self.night = random, night
-        self.ground = -float(random.choice([1.6, 1.6, random.uniform(3, 8)]))
-        self.half_width = {side: random.uniform(6, 16) for side in (-1, 1)}
-        self.pavement = random.uniform(2.4, 3.6)
-        self.sky = _night_sky(random) if night else _day_sky(random)
+    def __init__(self, rng: Generator, *, night: bool) -> None:
+        self.rng, self.night = rng, night
+        self.ground = -float(rng.choice([1.6, 1.6, rng.uniform(3, 8)]))
+        self.half_width = {side: rng.uniform(6, 16) for side in (-1, 1)}
+        self.pavement = rng.uniform(2.4, 3.6)
+        self.sky = _night_sky(rng) if night else _day_sky(rng)
         ambient = vector(0.04, 0.04, 0.05) if night else 0.5 * (self.sky.zenith + self.sky.horizon)
-        self.lamps = SceneLighting(ambient, self.ground)
+        self.lighting = SceneLighting(ambient, self.ground)
         self.roofs = {side: np.full(256, -99, np.float32) for side in (-1, 1)}
         self.crowns: list[tuple[Floats, float]] = []
         self.quads: list[Quad] = []
-        self.glows: list[Glow] = []
+        self.emitters: list[SmallEmitter] = []
 
     def light(self, points: Floats, normal: Floats) -> Floats:
         """Irradiance / pi of lamps, sky (less of it near the ground), and the sun with shadows of houses and trees."""
-        depth = np.clip((points[..., 1:2] - self.ground) / 12, 0, 1)
-        total = self.lamps(points, normal) * (1 if self.night else 0.65 + 0.35 * depth)
+        height_factor = np.clip((points[..., 1:2] - self.ground) / 12, 0, 1)
+        total = self.lighting(points, normal) * (1 if self.night else 0.65 + 0.35 * height_factor)
         facing = float(normal @ self.sky.sun)
         if facing > 0 and self.sky.sunlight.any():
             total += (
                 self._sunlit(points)[..., None]
-                * self.lamps.shade(points, normal)
+                * self.lighting.shade(points, normal)
                 * facing
                 * self.sky.sunlight
             )
@@ -159,52 +160,52 @@ class _Street:
         return lit
 
 
-def street_environment(random: Generator, *, night: bool) -> ProceduralEnvironment:
+def street_environment(rng: Generator, *, night: bool) -> ProceduralEnvironment:
     """A street with houses, trees, cars, people and lamps."""
-    street = _Street(random, night=night)
+    street = _Street(rng, night=night)
     if night:
         _light_lamps(street)
-    planted = random.uniform() < 0.6
+    planted = rng.uniform() < 0.6
     for side in (-1, 1):
-        park = random.uniform() < 0.15
+        park = rng.uniform() < 0.15
         if not park:
             _row_of_houses(street, side)
         if planted or park:
             _trees(street, side, park=park)
-        _poles(street, side)
+        _signs_and_poles(street, side)
     _cars(street)
-    _people(street)
+    _people_and_posters(street)
     _ends(street)
     _paving(street)
     if not night and street.sky.sunlight.any():
-        radiance = street.sky.sunlight / _SUN_RADIUS**2
-        street.glows.append(Glow(street.sky.sun * 1000, _SUN_RADIUS * 1000, radiance))
-    return ProceduralEnvironment(street.quads, street.glows, street.sky, random.uniform(0, 2 * np.pi))
+        radiance = street.sky.sunlight / _SUN_RADIUS_RAD**2
+        street.emitters.append(SmallEmitter(street.sky.sun * 1000, _SUN_RADIUS_RAD * 1000, radiance))
+    return ProceduralEnvironment(street.quads, street.emitters, street.sky, rng.uniform(0, 2 * np.pi))
 
 
 def _row_of_houses(street: _Street, side: int) -> None:
-    random, z = street.random, -_END
-    typical = random.uniform(2, 7)
-    while z < _END:
-        if random.uniform() < 0.12:
-            z += random.uniform(3, 9)
-        width_m = random.uniform(8, 22)
-        floors = max(1, round(typical * random.uniform(0.6, 1.5)))
-        back = street.half_width[side] + random.choice([0, 0, random.uniform(0.3, 2)])
+    rng, z = street.rng, -_HALF_LENGTH_M
+    typical = rng.uniform(2, 7)
+    while z < _HALF_LENGTH_M:
+        if rng.uniform() < 0.12:
+            z += rng.uniform(3, 9)
+        width_m = rng.uniform(8, 22)
+        floors = max(1, round(typical * rng.uniform(0.6, 1.5)))
+        back = street.half_width[side] + rng.choice([0, 0, rng.uniform(0.3, 2)])
         foot = vector(side * back, street.ground, z + width_m / 2)
         _house(street, foot, width_m, floors)
         z += width_m
 
 
 def _house(street: _Street, foot: Floats, width_m: float, floors: int) -> None:
-    random, side = street.random, 1 if foot[0] > 0 else -1
+    rng, side = street.rng, 1 if foot[0] > 0 else -1
     normal = vector(-side, 0, 0)
-    near = float(np.hypot(foot[0], max(0, abs(foot[2]) - width_m / 2)))
+    distance_m = float(np.hypot(foot[0], max(0, abs(foot[2]) - width_m / 2)))
     front = facade(
-        random,
+        rng,
         width_m,
         floors,
-        density=float(np.clip(170 / near, 4, 26)),
+        density=float(np.clip(170 / distance_m, 4, 26)),
         night=street.night,
         sky=street.sky.horizon,
     )
@@ -213,39 +214,35 @@ def _house(street: _Street, foot: Floats, width_m: float, floors: int) -> None:
     street.roofs[side][start : start + round(width_m)] = foot[1] + front.height
     gable = Canvas(12, front.height, 8, front.colour)
     for index in range(floors):
-        gable.rect(
-            (random.uniform(1, 10), front.height - 2.5 - 3.2 * index, 0.9, 1.3), vector(0.04, 0.05, 0.06)
-        )
-    gable.add_noise(random, 0.15)
+        gable.rect((rng.uniform(1, 10), front.height - 2.5 - 3.2 * index, 0.9, 1.3), vector(0.04, 0.05, 0.06))
+    gable.add_noise(rng, 0.15)
     end = -np.sign(foot[2])  # the end that the viewer sees
     corner = foot + vector(side * 6, 0, end * width_m / 2)
     if abs(foot[2]) > width_m / 2:
         street.quads.append(vertical_quad(gable, corner, vector(0, 0, end), street.light))
-    if random.uniform() < 0.45:
+    if rng.uniform() < 0.45:
         _roof(street, foot + UP * front.height, width_m, side)
 
 
 def _roof(street: _Street, eave: Floats, width_m: float, side: int) -> None:
     """Adds a tiled roof with skylights above the eave."""
-    random = street.random
-    slope = vector(-side * random.uniform(3, 5), -random.uniform(2, 4), 0)
-    canvas = Canvas(
-        width_m, float(np.linalg.norm(slope)), 12, tint(random, 0.12, 0.3) + vector(0.06, 0.01, 0)
-    )
+    rng = street.rng
+    slope = vector(-side * rng.uniform(3, 5), -rng.uniform(2, 4), 0)
+    canvas = Canvas(width_m, float(np.linalg.norm(slope)), 12, tint(rng, 0.12, 0.3) + vector(0.06, 0.01, 0))
     canvas.pixels[::3, :, :3] *= 0.7
-    canvas.add_noise(random, 0.25, 12)
-    for left in np.arange(1.5, width_m - 1.5, random.uniform(2.5, 5)):
-        canvas.rect((left, 1.2, 0.9, 1.3), vector(0.5, 0.55, 0.6), glow=0)
+    canvas.add_noise(rng, 0.25, 12)
+    for left in np.arange(1.5, width_m - 1.5, rng.uniform(2.5, 5)):
+        canvas.rect((left, 1.2, 0.9, 1.3), vector(0.5, 0.55, 0.6), emission=0)
     across = vector(0, 0, side) * width_m
     street.quads.append(Quad(canvas, eave - slope - across / 2, (across, slope), street.light))
 
 
 def _paving(street: _Street) -> None:
     """Adds road, kerbs, pavements and markings: a fine canvas nearby, and a coarse one, slightly lower, far away."""
-    random = street.random
-    asphalt, slabs = random.uniform(0.05, 0.12), tint(random, random.uniform(0.2, 0.4), 0.06)
-    stripes = random.uniform() < 0.4
-    for length_m, density in ((44.0, 20.0), (2 * _END + 40, 5.0)):
+    rng = street.rng
+    asphalt, slabs = rng.uniform(0.05, 0.12), tint(rng, rng.uniform(0.2, 0.4), 0.06)
+    stripes = rng.uniform() < 0.4
+    for length_m, density in ((44.0, 20.0), (2 * _HALF_LENGTH_M + 40, 5.0)):
         width_m = street.half_width[-1] + street.half_width[1] + 30
         canvas = Canvas(width_m, length_m, density, slabs)
         middle = 15 + street.half_width[-1]
@@ -262,8 +259,8 @@ def _paving(street: _Street) -> None:
         if stripes and length_m < 50:
             for start in np.arange(left + 0.4, right - 0.4, 1.0):
                 canvas.rect((start, length_m / 2 - 11, 0.5, 3.5), vector(0.6, 0.6, 0.58))
-        canvas.add_noise(random, 0.06, length_m / 3, 3)
-        canvas.add_noise(random, 0.1, length_m * 6, 2)
+        canvas.add_noise(rng, 0.06, length_m / 3, 3)
+        canvas.add_noise(rng, 0.1, length_m * 6, 2)
         centre = vector(
             (street.half_width[1] - street.half_width[-1]) / 2,
             street.ground - (0.04 if length_m > 50 else 0),
@@ -274,127 +271,125 @@ def _paving(street: _Street) -> None:
 
 def _ends(street: _Street) -> None:
     """Adds a house or hills at both ends of the street."""
-    random = street.random
+    rng = street.rng
     for end in (-1, 1):
-        foot = vector(random.uniform(-10, 10), street.ground, end * (_END + random.uniform(5, 40)))
-        if random.uniform() < 0.6:
+        foot = vector(rng.uniform(-10, 10), street.ground, end * (_HALF_LENGTH_M + rng.uniform(5, 40)))
+        if rng.uniform() < 0.6:
             canvas = facade(
-                random, 60, int(random.integers(3, 9)), density=5, night=street.night, sky=street.sky.horizon
+                rng, 60, int(rng.integers(3, 9)), density=5, night=street.night, sky=street.sky.horizon
             )
         else:
             canvas = Canvas(300, 30, 3, vector(0.1, 0.12, 0.08))
-            canvas.add_noise(random, 0.4, 5)
-            ridge = 30 + 25 * fractal(random, 4, canvas.pixels.shape[1], 1, 6)[0]
+            canvas.add_noise(rng, 0.4, 5)
+            ridge = 30 + 25 * fractal(rng, 4, canvas.pixels.shape[1], 1, 6)[0]
             canvas.pixels[..., 3] = np.arange(canvas.pixels.shape[0])[:, None] > ridge
         street.quads.append(vertical_quad(canvas, foot, vector(0, 0, -end), street.light))
 
 
 def _trees(street: _Street, side: int, *, park: bool) -> None:
-    random = street.random
-    typical = random.uniform(5, 10)
+    rng = street.rng
+    typical = rng.uniform(5, 10)
     first = street.half_width[side] - street.pavement + 0.6
     rows = [first, first + 7, first + 16] if park else [first]
     for row in rows:
-        for z in np.arange(-60, 60, random.uniform(8, 15)):
-            foot = vector(side * (row + random.uniform(-0.3, 0.3)), street.ground, z + random.uniform(-2, 2))
-            near = float(np.hypot(foot[0], foot[2]))
-            if near > 3:
-                canvas = tree(random, typical * random.uniform(0.7, 1.3), float(np.clip(170 / near, 4, 28)))
+        for z in np.arange(-60, 60, rng.uniform(8, 15)):
+            foot = vector(side * (row + rng.uniform(-0.3, 0.3)), street.ground, z + rng.uniform(-2, 2))
+            distance_m = float(np.hypot(foot[0], foot[2]))
+            if distance_m > 3:
+                canvas = tree(rng, typical * rng.uniform(0.7, 1.3), float(np.clip(170 / distance_m, 4, 28)))
                 street.quads.append(vertical_quad(canvas, foot, None, street.light))
                 street.crowns.append((foot + UP * canvas.height * 0.6, canvas.height * 0.3))
 
 
 def _light_lamps(street: _Street) -> None:
     """Adds street lamps along both kerbs. They come first, since lighting is baked into everything else."""
-    random = street.random
-    height_m, gap = random.uniform(5, 8), random.uniform(16, 26)
-    colour = vector(1, random.uniform(0.5, 0.9), random.uniform(0.15, 0.8)) * random.uniform(100, 250)
-    start = random.uniform(0, gap)
+    rng = street.rng
+    height_m, gap = rng.uniform(5, 8), rng.uniform(16, 26)
+    colour = vector(1, rng.uniform(0.5, 0.9), rng.uniform(0.15, 0.8)) * rng.uniform(100, 250)
+    start = rng.uniform(0, gap)
     for index, z in enumerate(np.arange(-60 + start, 60, gap)):
         side = 1 if index % 2 else -1
         position = vector(
             side * (street.half_width[side] - street.pavement - 0.5), street.ground + height_m, z
         )
-        street.lamps.lamps.append(Lamp(position, colour, -UP))
-        street.glows.append(Glow(position - UP * 0.12, 0.16, colour / (np.pi * 0.16**2)))
+        street.lighting.lamps.append(Lamp(position, colour, -UP))
+        street.emitters.append(SmallEmitter(position - UP * 0.12, 0.16, colour / (np.pi * 0.16**2)))
         street.quads += box(
-            plain_painter(random, vector(0.1, 0.1, 0.1)), position, (0.9, 0.12, 0.35), street.light
+            plain_painter(rng, vector(0.1, 0.1, 0.1)), position, (0.9, 0.12, 0.35), street.light
         )
 
 
-def _poles(street: _Street, side: int) -> None:
+def _signs_and_poles(street: _Street, side: int) -> None:
     """Adds posts, road signs on posts, and signs that hang from the houses."""
-    random = street.random
+    rng = street.rng
     kerb = street.half_width[side] - street.pavement + 0.3
-    for z in np.arange(-55 + random.uniform(0, 15), 60, random.uniform(12, 20)):
+    for z in np.arange(-55 + rng.uniform(0, 15), 60, rng.uniform(12, 20)):
         foot = vector(side * kerb, street.ground, z)
-        height_m = random.uniform(2.5, 6)
+        height_m = rng.uniform(2.5, 6)
         street.quads.append(
             vertical_quad(Canvas(0.12, height_m, 30, vector(0.15, 0.16, 0.16)), foot, None, street.light)
         )
-        face = Canvas(0.7, 0.7, 90, tint(random, 0.4, 1))
+        face = Canvas(0.7, 0.7, 90, tint(rng, 0.4, 1))
         face.rect((0.06, 0.06, 0.58, 0.58), vector(0.8, 0.8, 0.8))
-        face.write(random, (0.1, 0.2, 0.5, 0.28), tint(random, 0.05, 1))
+        face.write(rng, (0.1, 0.2, 0.5, 0.28), tint(rng, 0.05, 1))
         normal = vector(0, 0, -np.sign(z))
         street.quads.append(
             vertical_quad(face, foot + UP * (height_m - 0.6) + normal * 0.08, normal, street.light)
         )
-        if random.uniform() < 0.6:
+        if rng.uniform() < 0.6:
             _hanging_sign(
                 street,
-                vector(side * (street.half_width[side] - 0.6), street.ground + random.uniform(3, 5), z + 4),
+                vector(side * (street.half_width[side] - 0.6), street.ground + rng.uniform(3, 5), z + 4),
             )
 
 
 def _hanging_sign(street: _Street, foot: Floats) -> None:
-    random, colour = street.random, tint(street.random, 0.5, 1)
-    glow = random.uniform(5, 40) if street.night else 0
-    height_m = random.uniform(0.6, 2.5)
-    canvas = Canvas(1.1, height_m, 60, colour * (0.1 if glow else 1))
-    ink = colour if glow else vector(0.9, 0.9, 0.85)
-    canvas.rect((0.05, 0.05, 1, 0.05), ink, glow=glow)
-    canvas.rect((0.05, height_m - 0.1, 1, 0.05), ink, glow=glow)
+    rng, colour = street.rng, tint(street.rng, 0.5, 1)
+    emission = rng.uniform(5, 40) if street.night else 0
+    height_m = rng.uniform(0.6, 2.5)
+    canvas = Canvas(1.1, height_m, 60, colour * (0.1 if emission else 1))
+    ink = colour if emission else vector(0.9, 0.9, 0.85)
+    canvas.rect((0.05, 0.05, 1, 0.05), ink, emission=emission)
+    canvas.rect((0.05, height_m - 0.1, 1, 0.05), ink, emission=emission)
     for top in np.arange(0.18, height_m - 0.5, 0.5):
-        canvas.write(random, (0.12, top, 0.86, 0.36), ink, glow=glow)
+        canvas.write(rng, (0.12, top, 0.86, 0.36), ink, emission=emission)
     normal = vector(0, 0, -np.sign(foot[2]))
     street.quads.append(vertical_quad(canvas, foot, normal, street.light))
-    if glow:
-        street.lamps.lamps.append(Lamp(foot + UP * height_m / 2, colour * glow * 0.4))
+    if emission:
+        street.lighting.lamps.append(Lamp(foot + UP * height_m / 2, colour * emission * 0.4))
 
 
 def _cars(street: _Street) -> None:
-    random = street.random
+    rng = street.rng
     for side in (-1, 1):
         if (x := street.half_width[side] - street.pavement - 1.1) < 2.4 and street.ground > -3:
             continue
         for z in np.arange(-45, 45, 6.0):
-            if random.uniform() < 0.45:
-                foot = vector(side * x, street.ground, z + random.uniform(-0.5, 0.5))
+            if rng.uniform() < 0.45:
+                foot = vector(side * x, street.ground, z + rng.uniform(-0.5, 0.5))
                 away = bool((side > 0) == (z < 0))
-                street.lamps.contacts.append((float(foot[0]), float(foot[2]), 0.85, 2))
-                street.quads += car(random, foot, away, street.light, night=street.night)
-                if street.night and not away and random.uniform() < 0.5:
+                street.lighting.contacts.append((float(foot[0]), float(foot[2]), 0.85, 2))
+                street.quads += car(rng, foot, away, street.light, night=street.night)
+                if street.night and not away and rng.uniform() < 0.5:
                     nose = foot - vector(0, 0, np.sign(z) * 2.6) + UP * 0.7
                     for offset in (-0.65, 0.65):
                         position = nose + vector(offset, 0, 0)
-                        street.glows.append(Glow(position, 0.07, vector(1, 0.93, 0.8) * 4000))
+                        street.emitters.append(SmallEmitter(position, 0.07, vector(1, 0.93, 0.8) * 4000))
 
 
-def _people(street: _Street) -> None:
-    random = street.random
-    for _ in range(random.integers(3, 12)):
-        side = random.choice([-1, 1])
-        x = street.half_width[side] - random.uniform(0.5, street.pavement - 0.3)
-        foot = vector(side * x, street.ground, random.uniform(-30, 30))
-        street.quads.append(
-            vertical_quad(figure(random, random.uniform(1.55, 1.9), 60), foot, None, street.light)
-        )
+def _people_and_posters(street: _Street) -> None:
+    rng = street.rng
+    for _ in range(rng.integers(3, 12)):
+        side = rng.choice([-1, 1])
+        x = street.half_width[side] - rng.uniform(0.5, street.pavement - 0.3)
+        foot = vector(side * x, street.ground, rng.uniform(-30, 30))
+        street.quads.append(vertical_quad(figure(rng, rng.uniform(1.55, 1.9), 60), foot, None, street.light))
     for _ in range(4):  # posters on a column
-        side = random.choice([-1, 1])
-        foot = vector(side * (street.half_width[side] - 0.8), street.ground, random.uniform(-20, 20))
-        picture = painting(int(random.integers(1 << 30)), 96, 144)
+        side = rng.choice([-1, 1])
+        foot = vector(side * (street.half_width[side] - 0.8), street.ground, rng.uniform(-20, 20))
+        picture = painting(int(rng.integers(1 << 30)), 96, 144)
         canvas = Canvas(1.2, 2.2, 80, vector(0.1, 0.1, 0.1))
-        canvas.paste(picture, (0.08, 0.08, 1.04, 1.6), glow=6 if street.night else 0)
+        canvas.paste(picture, (0.08, 0.08, 1.04, 1.6), emission=6 if street.night else 0)
         street.quads.append(
             vertical_quad(canvas, foot, unit(vector(-side, 0, -np.sign(foot[2]))), street.light)
         )

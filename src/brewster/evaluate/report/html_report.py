@@ -21,7 +21,7 @@ from brewster.evaluate.report.images import (
     COLOUR_MAP,
     MAX_ERROR,
     MAX_SIDE_PX,
-    CaseTiles,
+    CaseThumbnails,
 )
 from brewster.evaluate.report.tables import is_complete, ranking, remarks
 from brewster.files import atomic_path
@@ -33,7 +33,7 @@ _SCRIPT: Final = Path(__file__).with_name("page.js")
 _DASH: Final = "&ndash;"
 
 
-def write_report(results: Results, cases: Iterable[CaseTiles], path: Path) -> None:
+def write_report(results: Results, cases: Iterable[CaseThumbnails], path: Path) -> None:
     """Writes the page atomically and replaces an older one. Equal arguments give equal bytes.
 
     Args:
@@ -42,7 +42,7 @@ def write_report(results: Results, cases: Iterable[CaseTiles], path: Path) -> No
         path: the HTML file.
 
     Raises:
-        TargetError: the file cannot be written.
+        OutputError: the file cannot be written.
     """
     with (
         atomic_path(path) as part,
@@ -51,7 +51,7 @@ def write_report(results: Results, cases: Iterable[CaseTiles], path: Path) -> No
         file.writelines(_page(results, cases))
 
 
-def _page(results: Results, cases: Iterable[CaseTiles]) -> Iterator[str]:
+def _page(results: Results, cases: Iterable[CaseThumbnails]) -> Iterator[str]:
     """Yields the template with its comments <!--part--> replaced.
 
     "data" follows "cases", because it needs the scores of all cases.
@@ -90,7 +90,7 @@ def _data(results: Results, scores: list[Any]) -> Iterator[str]:
 
 
 def _results(results: Results) -> Iterator[str]:
-    images, methods = results["pictures"], results["methods"]
+    images, methods = results["cases"], results["methods"]
     benchmarks, config = results["benchmarks"], results["protocol"]
     yield (
         f"<p class=lede>{_count(len(methods), 'method')} on {_count(len(images), 'image')} of "
@@ -105,7 +105,7 @@ def _results(results: Results) -> Iterator[str]:
 
 def _problems(results: Results) -> Iterator[str]:
     """Yields the errors of methods, the excluded files and the remarks."""
-    images, benchmarks = results["pictures"], results["benchmarks"].values()
+    images, benchmarks = results["cases"], results["benchmarks"].values()
     errors = [
         (f"{image['benchmark']}/{image['name']}", *error)
         for image in images
@@ -118,7 +118,7 @@ def _problems(results: Results) -> Iterator[str]:
     yield _note(f"Failed: {counted}", [f"{name}, {method}: {error}" for name, method, error in errors])
     excluded, benchmark_remarks = (
         [f"{benchmark['title']}: {text}" for benchmark in benchmarks for text in benchmark[kind]]
-        for kind in ("refused", "remarks")
+        for kind in ("excluded", "remarks")
     )
     all_remarks = benchmark_remarks + remarks(results)
     yield _note(
@@ -182,7 +182,7 @@ def _means(results: Results) -> str:
     bodies = []
     for name, table in results["tables"].items():
         best = {metric: next(iter(ranking(table, metric, about)), None) for metric, about in metrics.items()}
-        image_count = results["selections"][name]["pictures"]
+        image_count = results["selections"][name]["cases"]
         rows = (
             (
                 method,
@@ -247,8 +247,8 @@ def _difference_bodies(results: Results, is_baseline: bool) -> list[str]:
     for name, differences in results["differences"].items():
         rows: dict[str, dict[str, Results]] = {}
         for row in differences:
-            if (row["than"] == BASELINE) == is_baseline:
-                pair = row["method"] if is_baseline else f"{row['method']} minus {row['than']}"
+            if (row["reference"] == BASELINE) == is_baseline:
+                pair = row["method"] if is_baseline else f"{row['method']} minus {row['reference']}"
                 rows.setdefault(pair, {})[row["metric"]] = row
         cells = (
             (pair, [_difference(row.get(metric), metrics[metric]) for metric in metrics])
@@ -273,7 +273,7 @@ def _difference(row: Results | None, about: Results) -> str:
     )
     return (
         f"<td class={verdict}>{mark}<span class=hidden>{verdict}: </span><b>{_number(row['mean'], about, '+')}</b>"
-        f"{_interval(row, about, '+')}<small>{row['better']} of {row['count']}</small></td>"
+        f"{_interval(row, about, '+')}<small>{row['improved_count']} of {row['count']}</small></td>"
     )
 
 
@@ -292,8 +292,8 @@ def _method_notes(results: Results) -> Iterator[str]:
 # --- images
 
 
-def _cases(results: Results, cases: Iterable[CaseTiles], scores: list[Any]) -> Iterator[str]:
-    entries = {(entry["benchmark"], entry["name"]): entry for entry in results["pictures"]}
+def _cases(results: Results, cases: Iterable[CaseThumbnails], scores: list[Any]) -> Iterator[str]:
+    entries = {(entry["benchmark"], entry["name"]): entry for entry in results["cases"]}
     colours = (f"<i style='background:rgb({red},{green},{blue})'></i>" for red, green, blue in COLOUR_MAP)
     yield (
         f"<p class=legend>Colours of error maps, in 8-bit levels: 0 <span>{''.join(colours)}</span> {MAX_ERROR} or more. "
@@ -310,7 +310,7 @@ def _cases(results: Results, cases: Iterable[CaseTiles], scores: list[Any]) -> I
         )
 
 
-def _case(results: Results, case: CaseTiles, entry: Results) -> str:
+def _case(results: Results, case: CaseThumbnails, entry: Results) -> str:
     facts = [
         escape(_title(results, case.benchmark)),
         f"{case.size[0]} &times; {case.size[1]} px",

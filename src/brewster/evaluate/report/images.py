@@ -80,7 +80,7 @@ class CaseImages:
 
 @final
 @dataclass(frozen=True)
-class CaseTiles:
+class CaseThumbnails:
     """The images of a case as HTML with embedded files. `size` is that of the photo, (width, height) in px."""
 
     benchmark: str
@@ -90,12 +90,12 @@ class CaseTiles:
     methods: Mapping[str, str]
 
 
-def to_tiles(case: CaseImages) -> CaseTiles:
+def to_thumbnails(case: CaseImages) -> CaseThumbnails:
     """Downscales and encodes all images of a case."""
     height, width = case.photo.shape[:2]
     names = dict.fromkeys((*case.predictions, *case.reflections))
     methods = {name: method_tiles(case, name) for name in names}
-    return CaseTiles(case.benchmark, case.name, (width, height), photo_tiles(case), methods)
+    return CaseThumbnails(case.benchmark, case.name, (width, height), photo_tiles(case), methods)
 
 
 def photo_tiles(case: CaseImages) -> str:

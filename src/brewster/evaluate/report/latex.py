@@ -84,12 +84,12 @@ def _header_rows(results: Results, keys: Sequence[str], width: int) -> list[str]
     def heading(key: str, rows: int) -> str:
         selection = results["selections"][key]
         name = selection["title"].partition(",")[0].removeprefix("SIR2 ")
-        text = f"{_escape(name)} ({selection['pictures']})"
+        text = f"{_escape(name)} ({selection['cases']})"
         return _multicolumn(width, _multirow(text) if rows > 1 else text, is_last=key == keys[-1])
 
     if len(sir2) < 2:
         return [_line(["Method", *(heading(key, 1) for key in keys)])]
-    image_count = sum(results["selections"][key]["pictures"] for key in sir2)
+    image_count = sum(results["selections"][key]["cases"] for key in sir2)
     above, below = [_multirow("Method")], [""]
     for key in keys:
         if key == sir2[0]:

@@ -45,14 +45,14 @@ def to_terminal(results: Results, width: int = 100, *, intervals: bool = False) 
     95 % interval.
     """
     parts = [
-        f"{selection['title']} ({selection['pictures']} images)\n{_terminal_table(results, key, width, intervals)}"
+        f"{selection['title']} ({selection['cases']} images)\n{_terminal_table(results, key, width, intervals)}"
         for key, selection in results["selections"].items()
     ]
     return "\n\n".join(part for part in parts if part) + "\n"
 
 
 def _terminal_table(results: Results, key: str, width: int, intervals: bool) -> str:
-    table, image_count = results["tables"][key], results["selections"][key]["pictures"]
+    table, image_count = results["tables"][key], results["selections"][key]["cases"]
     names = _shortened(list(results["methods"]), max(12, width // 3))
     columns = []
     for metric in results["metrics"]:
@@ -107,7 +107,7 @@ def _overview(results: Results) -> str:
     if not metrics:
         return ""
     titles = " / ".join(_heading(results, name) for name in metrics)
-    rows = [["", *(f"{part['title']} ({part['pictures']})" for part in results["selections"].values())]]
+    rows = [["", *(f"{part['title']} ({part['cases']})" for part in results["selections"].values())]]
     rows += [
         [method, *(_cell(results, key, method, metrics) for key in results["selections"])]
         for method in results["methods"]
@@ -126,7 +126,7 @@ def _has_unequal_counts(results: Results, metrics: Iterable[str]) -> bool:
 
 
 def _cell(results: Results, key: str, method: str, metrics: Iterable[str]) -> str:
-    row, image_count = results["tables"][key][method], results["selections"][key]["pictures"]
+    row, image_count = results["tables"][key][method], results["selections"][key]["cases"]
     text = " / ".join(_number(results, name, row[name]["mean"]) if name in row else "-" for name in metrics)
     counts = sorted({row[name]["count"] if name in row else 0 for name in metrics})
     if counts == [image_count]:
@@ -138,15 +138,13 @@ def _details(results: Results, key: str) -> str:
     """Returns the table of a selection: one row per metric, with the means of the methods and their differences."""
     selection, table = results["selections"][key], results["tables"][key]
     methods, differences = list(results["methods"]), results["differences"][key]
-    pairs = list(dict.fromkeys((row["method"], row["than"]) for row in differences))
+    pairs = list(dict.fromkeys((row["method"], row["reference"]) for row in differences))
     rows = [["", *methods, *(f"{method} {_MINUS} {than}" for method, than in pairs)]]
     for metric in results["metrics"]:
         if not any(metric in table[method] for method in methods):
             continue
-        by_pair = {(row["method"], row["than"]): row for row in differences if row["metric"] == metric}
-        means = [
-            _mean(results, metric, table[method].get(metric), selection["pictures"]) for method in methods
-        ]
+        by_pair = {(row["method"], row["reference"]): row for row in differences if row["metric"] == metric}
+        means = [_mean(results, metric, table[method].get(metric), selection["cases"]) for method in methods]
         rows.append(
             [
                 _heading(results, metric),
@@ -154,7 +152,7 @@ def _details(results: Results, key: str) -> str:
                 *(_difference_cell(results, metric, by_pair.get(pair)) for pair in pairs),
             ]
         )
-    return f"### {selection['title']} ({selection['pictures']} images)\n\n{_grid(rows)}"
+    return f"### {selection['title']} ({selection['cases']} images)\n\n{_grid(rows)}"
 
 
 def _mean(results: Results, metric: str, entry: Mapping[str, Any] | None, image_count: int) -> str:
@@ -171,7 +169,7 @@ def _difference_cell(results: Results, metric: str, row: Mapping[str, Any] | Non
         _number(results, metric, row["mean"], sign="+"),
         _interval(results, metric, row, sign="+"),
     )
-    return f"{mean}{interval}, better on {row['better']} of {row['count']}"
+    return f"{mean}{interval}, better on {row['improved_count']} of {row['count']}"
 
 
 def _interval(results: Results, metric: str, entry: Mapping[str, Any], *, sign: str = "") -> str:
@@ -186,7 +184,7 @@ def _notes(results: Results) -> str:
     lines = [
         f"- {part['title']}: {text}"
         for part in results["benchmarks"].values()
-        for text in (*part["remarks"], *(f"excluded: {reason}" for reason in part["refused"]))
+        for text in (*part["remarks"], *(f"excluded: {reason}" for reason in part["excluded"]))
     ]
     lines += [f"- {remark}" for remark in remarks(results)]
     lines += [f"- {name} is not computed: {reason}" for name, reason in results["unavailable"].items()]
@@ -205,7 +203,7 @@ def remarks(results: Mapping[str, Any]) -> list[str]:
 
 def failures(results: Results) -> list[str]:
     """Returns the errors of methods, without repetitions."""
-    errors = (error for picture in results["pictures"] for error in picture["errors"].values())
+    errors = (error for picture in results["cases"] for error in picture["errors"].values())
     return list(dict.fromkeys(errors))
 
 
@@ -261,13 +259,15 @@ def to_csv(results: Results) -> str:
     """Returns a CSV table: one line for each mean, and one for each difference of `method` minus `than`."""
     text = io.StringIO()
     table = csv.writer(text, lineterminator="\n")
-    table.writerow(["set", "method", "than", "metric", "unit", "mean", "low", "high", "better", "count"])
+    table.writerow(
+        ["set", "method", "reference", "metric", "unit", "mean", "low", "high", "improved_count", "count"]
+    )
     for key in results["selections"]:
         for method, row in results["tables"][key].items():
             for metric, entry in row.items():
                 table.writerow([key, method, "", *_csv_cells(results, metric, entry)])
         for row in results["differences"][key]:
-            table.writerow([key, row["method"], row["than"], *_csv_cells(results, row["metric"], row)])
+            table.writerow([key, row["method"], row["reference"], *_csv_cells(results, row["metric"], row)])
     return text.getvalue()
 
 
@@ -276,7 +276,7 @@ def scores_to_csv(results: Results) -> str:
     text = io.StringIO()
     table = csv.writer(text, lineterminator="\n")
     table.writerow(["benchmark", "image", "scene", "method", "metric", "value"])
-    for image in results["pictures"]:
+    for image in results["cases"]:
         for method, scores in image["scores"].items():
             for metric, value in scores.items():
                 if value is not None:
@@ -286,4 +286,12 @@ def scores_to_csv(results: Results) -> str:
 
 def _csv_cells(results: Results, metric: str, entry: Mapping[str, Any]) -> list[Any]:
     unit = results["metrics"][metric]["unit"]
-    return [metric, unit, entry["mean"], entry["low"], entry["high"], entry.get("better", ""), entry["count"]]
+    return [
+        metric,
+        unit,
+        entry["mean"],
+        entry["low"],
+        entry["high"],
+        entry.get("improved_count", ""),
+        entry["count"],
+    ]

@@ -1,7 +1,7 @@
 """Large image-editing diffusion models that separate photos by generating I, T and R as panels of one image.
 
     backbones     the table of models: load one from the hub or a folder, or build a tiny version
-    families/     one Backbone class per model family: kontext, klein, qwen
+    families/     one Backbone class per model backbone_class: kontext, klein, qwen
     panels        composes I, T and R into one image, and splits it again
     memory        checks device, memory and disk before a download
     prompt        the paper's prompt, encoded once

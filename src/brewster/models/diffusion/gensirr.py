@@ -18,9 +18,9 @@ import torch
 from torch import Tensor, nn
 
 from brewster.errors import ModelError
-from brewster.models.diffusion.backbones import build
-from brewster.models.diffusion.families.family import Backbone
-from brewster.models.diffusion.families.kontext import Kontext
+from brewster.models.diffusion.backbones.backbone import Backbone
+from brewster.models.diffusion.backbones.kontext import Kontext
+from brewster.models.diffusion.backbones.registry import build
 from brewster.models.diffusion.panels import PanelLayout
 from brewster.models.diffusion.prompt import PROMPT_FILE, PromptEmbedding
 from brewster.models.diffusion.task import TASK_FILE, DecompositionTask, save_task
@@ -34,34 +34,36 @@ _IGNORED: Final = ("text_encoder.",)
 
 
 def convert(
-    checkpoint: Path, folder: Path, *, base: str = "kontext", short_side_px: int = SHORT_SIDE_PX
+    checkpoint: Path, folder: Path, *, base_model: str = "kontext", short_side_px: int = SHORT_SIDE_PX
 ) -> None:
     """Reads the checkpoint and writes the folder. The weights keep their precision.
 
     Args:
         checkpoint: the file GenSIRR.pt.
         folder: the folder to write.
-        base: "kontext", or "tiny:kontext" for tests.
+        base_model: "kontext", or "tiny:kontext" for tests.
         short_side_px: the short side of the input: 768 or 512.
 
     Raises:
-        ModelError: the file is not such a checkpoint, or its weights do not match the architecture of the base.
-        TargetError: the folder cannot be written.
+        ModelError: the file is not such a checkpoint, or its weights do not match the architecture of the base model.
+        OutputError: the folder cannot be written.
     """
-    if base.removeprefix(TINY_PREFIX) != Kontext.name:
+    if base_model.removeprefix(TINY_PREFIX) != Kontext.name:
         raise ModelError(
-            f"the base {base} was given for GenSIRR", f"expected {Kontext.name}", "leave the base out"
+            f"the base model {base_model} was given for GenSIRR",
+            f"expected {Kontext.name}",
+            "leave the base model out",
         )
     state = _read_checkpoint(checkpoint)
     prompt = _prompt(checkpoint, state)
-    architecture = Kontext.tiny if base.startswith(TINY_PREFIX) else Kontext.full_size
+    architecture = Kontext.tiny if base_model.startswith(TINY_PREFIX) else Kontext.full_size
     backbone = build(Kontext.name, architecture, device="meta")
     _load(checkpoint, backbone, state)
     backbone.save(folder)
     prompt.save(folder / PROMPT_FILE)
     task = DecompositionTask(
         PanelLayout(("T",)),
-        budget_px=short_side_px**2,
+        max_composite_pixels=short_side_px**2,
         guidance=3.5,
         steps=28,
         last_sigma=0.001,

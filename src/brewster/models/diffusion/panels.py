@@ -133,7 +133,7 @@ class PanelFit:
     """The sizes for a photo in a panel, (width, height) in pixels: it is reduced to `content`, then padded to `panel`.
 
     The content has the photo's aspect ratio to the nearest pixel. The padding is on the right or at the bottom, and is at
-    most half a `multiple` of `fit_panel`. It is a mirrored copy of the content ("reflect" mode), and is cropped later.
+    most half a `size_divisor` of `fit_panel`. It is a mirrored copy of the content ("reflect" mode), and is cropped later.
     """
 
     content: tuple[int, int]
@@ -162,10 +162,12 @@ class PanelFit:
         return panel[..., :height, :width]
 
 
-def fit_panel(size: tuple[int, int], layout: PanelLayout, *, budget_px: int, multiple: int) -> PanelFit:
-    """The largest panel for a photo of this (width, height) whose composite has at most `budget_px` pixels.
+def fit_panel(
+    size: tuple[int, int], layout: PanelLayout, *, max_composite_pixels: int, size_divisor: int
+) -> PanelFit:
+    """The largest panel for a photo of this (width, height) whose composite has at most `max_composite_pixels` pixels.
 
-    Both sides are multiples of `multiple`. The short side is the largest that fits. The long side is the
+    Both sides are multiples of `size_divisor`. The short side is the largest that fits. The long side is the
     multiple that is nearest to the photo's aspect ratio. The difference of at most half a multiple becomes padding, so
     the photo is not stretched.
 
@@ -180,18 +182,18 @@ def fit_panel(size: tuple[int, int], layout: PanelLayout, *, budget_px: int, mul
             "expected at least one pixel a side",
             "check the file",
         )
-    area = budget_px // len(layout.panels)
-    upper_bound = math.isqrt(area * short // long + 1) + multiple
-    for short_side in range(upper_bound // multiple * multiple, 0, -multiple):
-        long_side = max(multiple, round(short_side * long / short / multiple) * multiple)
+    area = max_composite_pixels // len(layout.panels)
+    upper_bound = math.isqrt(area * short // long + 1) + size_divisor
+    for short_side in range(upper_bound // size_divisor * size_divisor, 0, -size_divisor):
+        long_side = max(size_divisor, round(short_side * long / short / size_divisor) * size_divisor)
         if short_side * long_side <= area:
             fit = _fit(size, (short_side, long_side) if size[0] <= size[1] else (long_side, short_side))
-            _check_not_enlarged(size, fit, layout, multiple)
+            _check_not_enlarged(size, fit, layout, size_divisor)
             return fit
     raise PhotoError(
         f"no panel with the aspect ratio of {size[0]} x {size[1]} pixels fits into {area} pixels",
-        f"expected that both sides of the panel have at least {multiple} pixels",
-        "crop the photo or raise budget_px",
+        f"expected that both sides of the panel have at least {size_divisor} pixels",
+        "crop the photo or raise max_composite_pixels",
     )
 
 
@@ -204,16 +206,16 @@ def _fit(size: tuple[int, int], panel: tuple[int, int]) -> PanelFit:
     return PanelFit((width, height), panel)
 
 
-def _check_not_enlarged(size: tuple[int, int], fit: PanelFit, layout: PanelLayout, multiple: int) -> None:
+def _check_not_enlarged(size: tuple[int, int], fit: PanelFit, layout: PanelLayout, size_divisor: int) -> None:
     if fit.content[0] <= size[0] and fit.content[1] <= size[1]:
         return
-    max_budget_px = math.prod(side // multiple * multiple for side in size) * len(layout.panels)
+    max_allowed_pixels = math.prod(side // size_divisor * size_divisor for side in size) * len(layout.panels)
     raise PhotoError(
         f"the photo has {size[0]} x {size[1]} pixels",
         f"expected at least {fit.content[0]} x {fit.content[1]}, the size of a panel",
-        f"lower budget_px to {max_budget_px}"
-        if max_budget_px
-        else f"use a photo with sides of at least {multiple} pixels",
+        f"lower max_composite_pixels to {max_allowed_pixels}"
+        if max_allowed_pixels
+        else f"use a photo with sides of at least {size_divisor} pixels",
     )
 
 

@@ -21,28 +21,29 @@ from torch import Tensor
 from brewster.errors import DeviceError, ModelError
 from brewster.models.diffusion.adapter.layouts import LAYOUTS, LoraLayout, layout_of
 from brewster.models.diffusion.adapter.lora import LORA_FILE, LoraMetadata
-from brewster.models.diffusion.backbones import (
+from brewster.models.diffusion.backbones.backbone import Backbone
+from brewster.models.diffusion.backbones.registry import (
     BACKBONES,
     INDEX_FILE,
+    backbone_class_of,
     encode_prompt,
-    family_of,
     load_backbone,
 )
-from brewster.models.diffusion.families.family import Backbone
-from brewster.models.diffusion.lazy_imports import explain_out_of_memory, fetch
-from brewster.models.diffusion.memory import check_machine, choose_quantisation
+from brewster.models.diffusion.hub_download import resolve_model_folder
+from brewster.models.diffusion.memory import check_machine, choose_quantization
+from brewster.models.diffusion.out_of_memory import explain_out_of_memory
 from brewster.models.diffusion.panels import PanelLayout, compose, conditioning_image, split
 from brewster.models.diffusion.prompt import PROMPT_FILE, PROMPTS, PromptEmbedding, load_prompt
 from brewster.models.diffusion.sampling import euler, sample
 from brewster.models.diffusion.task import TASK_FILE, DecompositionTask, load_task
-from brewster.models.large_models import LARGE
+from brewster.models.diffusion_models import DIFFUSION_MODELS
 from brewster.models.zoo import TINY_PREFIX, model_name
-from brewster.options import Quantisation
+from brewster.options import Quantization
 
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-_MEMORY_HINT: Final = "use a quantised or a smaller backbone"
+_MEMORY_HINT: Final = "use a quantized or a smaller backbone"
 _FINGERPRINT_BYTES: Final = 1 << 20
 """The number of bytes at the start and at the end of a file that `fingerprint` reads."""
 _DEVICES: Final = {"auto": "", "cuda": "cuda", "rocm": "cuda", "cpu": "cpu"}
@@ -144,17 +145,17 @@ def load_pipeline(
     model: str,
     *,
     device: str = "auto",
-    base: str | None = None,
-    quantise: Quantisation | None = None,
+    base_model: str | None = None,
+    quantization: Quantization | None = None,
     prompt: str = "detailed",
 ) -> DecompositionPipeline:
-    """Loads a LoRA with its base, or a backbone without a LoRA.
+    """Loads a LoRA with its base model, or a backbone without a LoRA.
 
     Args:
         model: a LoRA by its folder or hub id, or a backbone by its name, folder or hub id.
         device: "auto" uses an NVIDIA or AMD GPU if torch finds one, otherwise the CPU.
-        base: the folder or hub id of the LoRA's base; by default the one used in training. Only for a LoRA.
-        quantise: the quantisation of the base; by default the one used in training, or int8 or nf4 if only these fit into
+        base_model: the folder or hub id of the LoRA's base model; by default the one used in training. Only for a LoRA.
+        quantization: the quantization of the base model; by default the one used in training, or int8 or nf4 if only these fit into
             the GPU, and none on the CPU.
         prompt: for a backbone without a LoRA: a name in `PROMPTS`, or the text itself. A finetuned backbone with a
             stored prompt uses that one.
@@ -168,32 +169,34 @@ def load_pipeline(
     device_name = torch_device(device)
     lora = _find_lora(model)
     if lora:
-        return _load_with_lora(model, lora, device, base, quantise)
-    if base:
+        return _load_with_lora(model, lora, device, base_model, quantization)
+    if base_model:
         raise ModelError(
-            f"{model} is a backbone, and the base {base} was given for it",
-            f"expected a base only for a LoRA, which is a folder with {LORA_FILE}",
-            "leave the base out",
+            f"{model} is a backbone, and the base model {base_model} was given for it",
+            f"expected a base model only for a LoRA, which is a folder with {LORA_FILE}",
+            "leave the base model out",
         )
-    digest = fingerprint(model, device=device, quantise=quantise, prompt=prompt)
-    quantise = quantise or choose_quantisation(model, device_name)
-    check_machine(model, requested=device, device=device_name, quantise=quantise, with_text_encoders=True)
+    digest = fingerprint(model, device=device, quantization=quantization, prompt=prompt)
+    quantization = quantization or choose_quantization(model, device_name)
+    check_machine(
+        model, requested=device, device=device_name, quantization=quantization, with_text_encoders=True
+    )
     # The prompt is encoded before the backbone is loaded, because memory may be too small for both.
     embedding, task = _prompt_and_task(model, PROMPTS.get(prompt, prompt), device_name)
-    backbone = load_backbone(model, device=device_name, quantise=quantise)
+    backbone = load_backbone(model, device=device_name, quantization=quantization)
     return DecompositionPipeline(backbone, embedding, task, model_name(model), digest)
 
 
 def _prompt_and_task(model: str, text: str, device: str) -> tuple[PromptEmbedding, DecompositionTask]:
-    """Those stored with a finetuned base, which has no text encoder; otherwise the encoded text, and panel T only."""
+    """Those stored with a finetuned base model, which has no text encoder; otherwise the encoded text, and panel T only."""
     task = DecompositionTask(PanelLayout(("T",)))
     if model in BACKBONES or model.startswith(TINY_PREFIX):
         return encode_prompt(model, text, device=device), task
-    folder = fetch(model, [INDEX_FILE, PROMPT_FILE, TASK_FILE])
+    folder = resolve_model_folder(model, [INDEX_FILE, PROMPT_FILE, TASK_FILE])
     if (folder / TASK_FILE).is_file():
         task = load_task(folder / TASK_FILE)
     if (folder / PROMPT_FILE).is_file():
-        return load_prompt(folder / PROMPT_FILE, family_of(model).name), task
+        return load_prompt(folder / PROMPT_FILE, backbone_class_of(model).name), task
     return encode_prompt(model, text, device=device), task
 
 
@@ -201,30 +204,30 @@ def fingerprint(
     model: str,
     *,
     device: str = "auto",
-    base: str | None = None,
-    quantise: Quantisation | None = None,
+    base_model: str | None = None,
+    quantization: Quantization | None = None,
     prompt: str = "detailed",
 ) -> str:
-    """The SHA-256 of what `load_pipeline` would load: LoRA, prompt, base, and the quantisation of the base.
+    """The SHA-256 of what `load_pipeline` would load: LoRA, prompt, base_model, and the quantization of the base model.
 
-    A base on the hub is identified by its name. A base in a folder is identified by the names, sizes, and first and
+    A base model on the hub is identified by its name. A base model in a folder is identified by the names, sizes, and first and
     last MiB of its files, because reading them completely takes a minute.
 
     Raises:
         ModelError, DownloadError: the LoRA does not exist or is damaged.
-        DeviceError: large models do not run on this device.
+        DeviceError: diffusion models do not run on this device.
     """
     lora = _find_lora(model)
     if lora is None:
-        quantisation = quantise or choose_quantisation(model, torch_device(device))
-        parts = [_source_id(model), str(quantisation), PROMPTS.get(prompt, prompt)]
+        quantization = quantization or choose_quantization(model, torch_device(device))
+        parts = [_source_id(model), str(quantization), PROMPTS.get(prompt, prompt)]
     else:
         layout, folder = lora
         metadata = layout.read_metadata(folder)
         weights = hashlib.sha256((folder / layout.weights).read_bytes()).hexdigest()
-        source = base or metadata.base
-        quantisation = _base_quantisation(metadata, source, torch_device(device), quantise)
-        parts = [weights, metadata.prompt_sha256, _source_id(source), str(quantisation)]
+        source = base_model or metadata.base_model
+        quantization = _base_quantization(metadata, source, torch_device(device), quantization)
+        parts = [weights, metadata.prompt_sha256, _source_id(source), str(quantization)]
     return hashlib.sha256("\0".join(parts).encode()).hexdigest()
 
 
@@ -242,22 +245,22 @@ def _source_id(source: str) -> str:
     return digest.hexdigest()
 
 
-def _base_quantisation(
-    metadata: LoraMetadata, base: str, device: str, quantise: Quantisation | None
-) -> Quantisation | None:
-    """The requested quantisation; by default the one used in training, or a smaller one that fits; none on the CPU."""
-    return quantise or choose_quantisation(base, device, metadata.quantise)
+def _base_quantization(
+    metadata: LoraMetadata, base_model: str, device: str, quantization: Quantization | None
+) -> Quantization | None:
+    """The requested quantization; by default the one used in training, or a smaller one that fits; none on the CPU."""
+    return quantization or choose_quantization(base_model, device, metadata.quantization)
 
 
 def torch_device(device: str) -> str:
     """torch's name, "cuda" or "cpu", for a value of the option --device.
 
     Raises:
-        DeviceError: large models do not run on this device.
+        DeviceError: diffusion models do not run on this device.
     """
     if device not in _DEVICES:
         raise DeviceError(
-            f"large models do not run on {device}",
+            f"diffusion models do not run on {device}",
             f"expected one of {', '.join(_DEVICES)}",
             "use --device auto",
         )
@@ -268,8 +271,8 @@ def _find_lora(model: str) -> tuple[LoraLayout, Path] | None:
     """The layout and the folder of a LoRA, downloaded if it is on the hub; None for a backbone."""
     if model in BACKBONES or model.startswith(TINY_PREFIX):
         return None
-    source = LARGE[model].hub_id if model in LARGE else model
-    folder = fetch(source, [name for layout in LAYOUTS for name in layout.files])
+    source = DIFFUSION_MODELS[model].hub_id if model in DIFFUSION_MODELS else model
+    folder = resolve_model_folder(source, [name for layout in LAYOUTS for name in layout.files])
     if layout := layout_of(folder):
         return layout, folder
     if not (folder / INDEX_FILE).is_file():
@@ -285,30 +288,30 @@ def _load_with_lora(
     model: str,
     lora: tuple[LoraLayout, Path],
     requested: str,
-    base: str | None,
-    quantise: Quantisation | None,
+    base_model: str | None,
+    quantization: Quantization | None,
 ) -> DecompositionPipeline:
     layout, folder = lora
     metadata, device = layout.read_metadata(folder), torch_device(requested)
-    source = base or metadata.base
-    if base is None and _is_local(source) and not Path(source).is_dir():
+    source = base_model or metadata.base_model
+    if base_model is None and _is_local(source) and not Path(source).is_dir():
         raise ModelError(
-            f"the base of {model} was {source}, which does not exist",
+            f"the base model of {model} was {source}, which does not exist",
             f"expected a {metadata.backbone} in diffusers' layout",
-            "pass its folder or hub id with --base",
+            "pass its folder or hub id with --base-model",
         )
-    family = family_of(source)  # checked before the download, which may take an hour
-    if family.name != metadata.backbone:
+    backbone_class = backbone_class_of(source)  # checked before the download, which may take an hour
+    if backbone_class.name != metadata.backbone:
         raise ModelError(
             f"{model} is a LoRA of {metadata.backbone}",
-            f"expected a base of {metadata.backbone}, not of {family.name}",
-            "choose another base",
+            f"expected a base model of {metadata.backbone}, not of {backbone_class.name}",
+            "choose another base model",
         )
-    quantisation = _base_quantisation(metadata, source, device, quantise)
-    check_machine(source, requested=requested, device=device, quantise=quantisation)
-    backbone = load_backbone(source, device=device, quantise=quantisation)
+    quantization = _base_quantization(metadata, source, device, quantization)
+    check_machine(source, requested=requested, device=device, quantization=quantization)
+    backbone = load_backbone(source, device=device, quantization=quantization)
     metadata, prompt = layout.load(folder, backbone)
-    digest = fingerprint(model, device=requested, base=base, quantise=quantise)
+    digest = fingerprint(model, device=requested, base_model=base_model, quantization=quantization)
     return DecompositionPipeline(backbone, prompt, metadata.task, model_name(model), digest)
 
 

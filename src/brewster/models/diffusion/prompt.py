@@ -83,7 +83,7 @@ class PromptEmbedding:
         """Writes a safetensors file. The same embedding always gives the same bytes.
 
         Raises:
-            TargetError: the file cannot be written.
+            OutputError: the file cannot be written.
         """
         metadata = {"kind": _FORMAT, "backbone": self.backbone, "text": self.text, "sha256": self.sha256}
         write_tensors(path, self.tensors, metadata)

@@ -16,8 +16,8 @@ import torch
 from torch import Tensor
 
 from brewster.errors import ModelError
-from brewster.models.diffusion.families.family import Backbone
-from brewster.models.diffusion.lazy_imports import explain_out_of_memory
+from brewster.models.diffusion.backbones.backbone import Backbone
+from brewster.models.diffusion.out_of_memory import explain_out_of_memory
 from brewster.models.diffusion.prompt import PromptEmbedding
 
 if TYPE_CHECKING:
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 STEPS: Final = 20
 GUIDANCE: Final = 4.0
 _MEMORY_HINT: Final = (
-    "store the base in fewer bits (quantise), or use a smaller base or a GPU with more memory"
+    "store the base in fewer bits (quantization), or use a smaller base_model or a GPU with more memory"
 )
 
 

@@ -1,4 +1,4 @@
-"""The task of a large backbone: which panels it generates, their size, and the sampling method."""
+"""The task of a diffusion backbone: which panels it generates, their size, and the sampling method."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from brewster.models.diffusion.sampling import GUIDANCE, STEPS
 Objective = Literal["flow", "one_step"]
 """The objectives that brewster trains."""
 
-PAPER_PX: Final = 1536 * 512
+PAPER_COMPOSITE_PIXELS: Final = 1536 * 512
 """The size of the paper's composite: three panels of 512 x 512 pixels."""
 TASK_FILE: Final = "task.json"
 """The file with the task of a finetuned base, next to model_index.json."""
@@ -29,7 +29,7 @@ TASK_FILE: Final = "task.json"
 @final
 @dataclass(frozen=True)
 class DecompositionTask:
-    """Which panels to generate, and how. All panels together have at most `budget_px` pixels.
+    """Which panels to generate, and how. All panels together have at most `max_composite_pixels` pixels.
 
     `objective` is "flow" (from noise, in many steps), "one_step" (from the photo, in one step) or "direct" (one
     prediction at time `time`, without noise and without a conditioning image: transmission = photo - prediction, both
@@ -41,7 +41,7 @@ class DecompositionTask:
     """
 
     layout: PanelLayout = field(default_factory=PanelLayout)
-    budget_px: int = PAPER_PX
+    max_composite_pixels: int = PAPER_COMPOSITE_PIXELS
     objective: Objective | Literal["direct"] = "flow"
     guidance: float = GUIDANCE
     steps: Annotated[int, Field(ge=1)] = STEPS
@@ -64,32 +64,32 @@ class DecompositionTask:
                 "remove R from the panels",
             )
 
-    def input_size(self, size: tuple[int, int], multiple: int) -> tuple[int, int]:
+    def input_size(self, size: tuple[int, int], size_divisor: int) -> tuple[int, int]:
         """The (width, height) of the copy of a photo that is the input, never larger than the photo.
 
         Raises:
             PhotoError: see `fit`. With `short_side_px` every photo has an input size.
         """
         if self.short_side_px is None:
-            return self.fit(size, multiple).content
+            return self.fit(size, size_divisor).content
         scale = min(1.0, self.short_side_px / min(size))
         return round(scale * size[0]), round(scale * size[1])
 
-    def fit(self, size: tuple[int, int], multiple: int) -> PanelFit:
+    def fit(self, size: tuple[int, int], size_divisor: int) -> PanelFit:
         """The largest panel within the budget for a photo of this (width, height). A photo is never enlarged.
 
         Raises:
-            PhotoError: the photo has fewer than `multiple` pixels on a side, or its aspect ratio is too extreme.
+            PhotoError: the photo has fewer than `size_divisor` pixels on a side, or its aspect ratio is too extreme.
         """
-        max_cells = self.budget_px // (len(self.layout.panels) * multiple**2)
-        cells = min(max_cells, math.prod(-(-side // multiple) for side in size))
+        max_cells = self.max_composite_pixels // (len(self.layout.panels) * size_divisor**2)
+        cells = min(max_cells, math.prod(-(-side // size_divisor) for side in size))
         for cell_count in range(cells, 0, -1):
-            budget = cell_count * len(self.layout.panels) * multiple**2
+            budget = cell_count * len(self.layout.panels) * size_divisor**2
             with suppress(PhotoError):
-                return fit_panel(size, self.layout, budget_px=budget, multiple=multiple)
+                return fit_panel(size, self.layout, max_composite_pixels=budget, size_divisor=size_divisor)
         raise PhotoError(
             f"the photo has {size[0]} x {size[1]} pixels",
-            f"expected at least {multiple} pixels a side, and a less extreme aspect ratio",
+            f"expected at least {size_divisor} pixels a side, and a less extreme aspect ratio",
             "crop it, or use the compact model",
         )
 
@@ -98,7 +98,7 @@ def save_task(task: DecompositionTask, path: Path) -> None:
     """Writes a JSON file, and replaces an existing one.
 
     Raises:
-        TargetError: the file cannot be written.
+        OutputError: the file cannot be written.
     """
     write_atomically(path, f"{json.dumps(asdict(task), indent=2)}\n".encode(), overwrite=True)
 

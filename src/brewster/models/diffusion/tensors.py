@@ -18,7 +18,7 @@ def write_tensors(path: Path, tensors: Mapping[str, Tensor], metadata: Mapping[s
     """Writes the tensors and their metadata atomically, and replaces an existing file.
 
     Raises:
-        TargetError: the file cannot be written.
+        OutputError: the file cannot be written.
         MissingExtra: safetensors is not installed.
     """
     cpu_tensors = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}

@@ -126,10 +126,10 @@ class ReflectionOrder:
     """A set of `count` light paths through a parallel stack, with equal exit side, in-plane shift and throughput.
 
     `reflections` and `transmissions` at surfaces are counted per pane, `traversals` per layer: pane, gap, pane...
-    `behind` is true for light that comes from behind the glass.
+    `is_transmitted` is true for light that comes from behind the glass.
     """
 
-    behind: bool
+    is_transmitted: bool
     reflections: tuple[int, ...]
     transmissions: tuple[int, ...]
     traversals: tuple[int, ...]
@@ -138,7 +138,7 @@ class ReflectionOrder:
     @property
     def in_truncated_layers(self) -> bool:
         """Whether the paper's T or R contains this order."""
-        return sum(self.reflections) == 0 if self.behind else self.traversals[-1] == 0
+        return sum(self.reflections) == 0 if self.is_transmitted else self.traversals[-1] == 0
 
 
 @lru_cache(maxsize=256)
@@ -232,7 +232,7 @@ def order_throughputs(glazing: Glazing, cosine: Tensor, table: Sequence[Reflecti
         throughputs.append(throughput)
     closed_form = total_throughput(glazing, cosine)
     for behind, total in ((True, closed_form.transmittance), (False, closed_form.reflectance)):
-        side = [i for i, order in enumerate(table) if order.behind == behind]
+        side = [i for i, order in enumerate(table) if order.is_transmitted == behind]
         if side:
             throughputs[side[-1]] = throughputs[side[-1]] + (total - sum(throughputs[i] for i in side))
     return throughputs

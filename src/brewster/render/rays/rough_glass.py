@@ -1,8 +1,7 @@
 """Rough or wedged panes: each order is traced from surface to surface, with one microfacet sample per rough surface.
 
 At each surface every path is split into a reflected and a transmitted one, without a random choice between them. A path
-that exits through a rough surface towards a map uses multiple importance sampling (Veach 1997, chapter 9): with
-microfacet samples alone, so few rays would hit a small sun that its light would be noise.
+that exits through a rough surface towards a map uses multiple importance sampling (Veach 1997, chapter 9): with microfacet samples alone, very few rays hit a small sun, and the image is noisy.
 """
 
 from __future__ import annotations
@@ -62,13 +61,13 @@ class _PathState:
 class ExitingLight:
     """The light of one order from one side, (3, N); `in_truncated_layers` says whether the paper's T or R contains it."""
 
-    behind: bool
+    is_transmitted: bool
     in_truncated_layers: bool
     light: Tensor
 
 
 def surfaces(glass: Glazing, like: Tensor) -> list[Surface]:
-    """The surfaces of a glazing in its own frame, from the camera on; tensors have the dtype and device of `like`.
+    """The surfaces of a glazing in the glass frame, starting with the one nearest to the camera; tensors have the dtype and device of `like`.
 
     A wedge rotates the pane's far surface.
     """
@@ -113,7 +112,7 @@ def trace_orders(
 
 
 def _mean_weight(path: _PathState) -> float:
-    """The mean over all rays and polarisations: a single ray is not typical, because microfacets reflect some totally."""
+    """The mean over all rays and polarisations: total reflection at a microfacet gives some rays the weight 0 or 1."""
     return float((path.s + path.p).mean()) / 2
 
 
@@ -207,7 +206,7 @@ def _facet_weights(
 ) -> tuple[Tensor, Tensor]:
     """BSDF times cosine over density, for s- and p-polarised light, (N,) each.
 
-    With visible normals and the separable Smith term G1(wi) G1(wo), all but Fresnel's factor and G1(wo) cancels
+    With visible normals and the separable Smith term G1(wi) G1(wo), everything except the Fresnel factor and G1(wo) cancels
     (Heitz 2018).
     """
     cosine = dot(interaction.wi, facet)

@@ -21,7 +21,7 @@ from typing import Any, Final, Literal, final
 import filelock
 import tomli_w
 
-from brewster.errors import DeviceError, MissingExtra, TargetError
+from brewster.errors import DeviceError, MissingExtra, OutputError
 from brewster.executors import Executor, run_tasks
 from brewster.files import write_atomically
 from brewster.rendered import store
@@ -31,7 +31,7 @@ from brewster.scene.sampler import Catalog
 
 RECORD_FILE: Final = "set.toml"
 _LOCK_FILE: Final = ".lock"
-FATAL_ERRORS: Final = (TargetError, MissingExtra, DeviceError)
+FATAL_ERRORS: Final = (OutputError, MissingExtra, DeviceError)
 """Errors that occur for every sample. They end the run."""
 
 
@@ -74,7 +74,7 @@ class RenderTask:
         return [RenderTask(self.kind, (index,)) for index in self.indices]
 
     def failed_results(self, reason: str) -> list[RenderResult]:
-        """Returns the results if no worker could finish the task."""
+        """Returns a failed result for each index of a task that no worker could finish."""
         message = (
             f"{reason}; expected a sample that fits into memory; use fewer --workers, or a smaller --size."
         )
@@ -123,7 +123,7 @@ def build(
         report: called with the result of every sample.
 
     Raises:
-        TargetError: the folder contains something else, another run writes to it, or the disk is full or read-only.
+        OutputError: the folder contains something else, another run writes to it, or the disk is full or read-only.
         MissingExtra, DeviceError: the renderer cannot run on this machine.
     """
     with _exclusive_lock(job.out):
@@ -141,7 +141,7 @@ def build(
 
 @final
 class _Schedule:
-    """Schedules tasks block by block: missing samples to render, and complete blocks to pack."""
+    """Schedules tasks block by block: missing samples to render, and blocks without missing samples to pack."""
 
     def __init__(
         self, out: Path, indices: range, chunk_size: int, *, shards: bool, report: ResultCallback
@@ -154,7 +154,7 @@ class _Schedule:
         self._render_tasks = self._plan_tasks()
 
     def next(self) -> RenderTask | None:
-        """Returns the next task, or None if there is no task before the next result."""
+        """Returns the next task, or None: no task can start until another result is recorded, or all tasks were returned."""
         return (
             RenderTask("pack", (self._blocks_to_pack.popleft(),))
             if self._blocks_to_pack
@@ -190,7 +190,7 @@ class _Schedule:
                 yield RenderTask("render", tuple(missing[first : first + self._chunk_size]))
 
 
-# --- the lock and the record of a set: one job, one run at a time
+# --- the lock and the record of a set: a set belongs to one job, and one run writes to it at a time
 
 
 @contextmanager
@@ -200,7 +200,7 @@ def _exclusive_lock(out: Path) -> Iterator[None]:
         out.mkdir(parents=True, exist_ok=True)
         (out / _LOCK_FILE).touch()
     except OSError as error:
-        raise TargetError(
+        raise OutputError(
             f"{out} cannot be written to ({error.strerror})",
             "expected a folder for the set",
             "choose another folder",
@@ -217,13 +217,13 @@ def _acquire(lock: filelock.BaseFileLock, out: Path) -> None:
     try:
         lock.acquire()
     except filelock.Timeout as error:
-        raise TargetError(
+        raise OutputError(
             f"another run is writing in {out}",
             "expected no other run, because only one can write at a time",
             "wait until it has ended, or choose another folder",
         ) from error
     except OSError as error:
-        raise TargetError(
+        raise OutputError(
             f"{out} cannot be locked ({error.strerror})",
             "expected a file system with locks, so that only one run writes to a set",
             "choose a folder on another file system",
@@ -241,7 +241,7 @@ def _check_record(job: RenderJob) -> None:
     for name in {**existing, **requested}:
         old, new = existing.get(name, "not set"), requested.get(name, "not set")
         if old != new:
-            raise TargetError(
+            raise OutputError(
                 f"{job.out} contains another set: its {name} is {old}, and {new} was requested",
                 "expected the settings of that set, or a new folder",
                 "choose another folder, or use the same settings",
@@ -252,7 +252,7 @@ def _read_record(path: Path) -> dict[str, Any]:
     try:
         return tomllib.loads(path.read_text("utf-8"))
     except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-        raise TargetError(
+        raise OutputError(
             f"{path} cannot be read ({error})", "expected the record of a set", "choose another folder"
         ) from error
 
@@ -260,7 +260,7 @@ def _read_record(path: Path) -> dict[str, Any]:
 def _check_is_set(out: Path) -> None:
     foreign = next((path for path in out.iterdir() if not path.name.startswith(".")), None)
     if foreign:
-        raise TargetError(
+        raise OutputError(
             f"{out} contains {foreign.name}, but no set",
             "expected an empty folder or a set",
             "choose a new folder",

@@ -66,7 +66,7 @@ def write_index(out: Path) -> None:
     """Writes index.parquet, with a row for each sample in order. Its bytes depend only on the samples and their paths.
 
     Raises:
-        TargetError: the file cannot be written, for example because the disk is full.
+        OutputError: the file cannot be written, for example because the disk is full.
     """
     import pyarrow as pa  # noqa: PLC0415  (not needed to read a set)
     from pyarrow import parquet  # noqa: PLC0415
@@ -107,7 +107,7 @@ def write_preview(out: Path) -> None:
     """Writes preview.png with the first 40 samples. The five photographs of a sample form a row.
 
     Raises:
-        TargetError: the file cannot be written.
+        OutputError: the file cannot be written.
     """
     rows = [_contact_sheet_row(entry) for entry in islice(read_set(out), _SHEET_ROWS * _SHEET_COLUMNS)]
     columns = [

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Final, final
 
 from brewster.environments.assets import Assets
-from brewster.errors import BrewsterError, RecipeError, TargetError
+from brewster.errors import BrewsterError, OutputError, RecipeError
 from brewster.render.sample import LinearSample
 from brewster.rendered import store
 from brewster.rendered.generation.job import FATAL_ERRORS, RenderJob, RenderResult, RenderTask
@@ -42,7 +42,7 @@ class TaskRunner:
         """Runs a task. Returns the results of all samples; for packing, only those of failures.
 
         Raises:
-            TargetError, MissingExtra, DeviceError: an error that occurs for every sample.
+            OutputError, MissingExtra, DeviceError: an error that occurs for every sample.
         """
         with single_torch_thread():
             return self._run(task)
@@ -96,11 +96,11 @@ def render_again(path: Path, folder: Path, folders: Sequence[Path] = (), rendere
 
     Raises:
         RecipeError: the scene cannot be read, or a file of the scene is missing.
-        TargetError: the folder is not empty, or cannot be written.
+        OutputError: the folder is not empty, or cannot be written.
     """
     scene = read_scene(path)
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise TargetError(
+        raise OutputError(
             f"{folder} exists", "expected a new or empty folder", "choose another folder with -o"
         )
     chosen = renderer or _recorded_renderer(path)

@@ -28,7 +28,7 @@ def export_onnx(network: nn.Module, path: Path, stride: int) -> None:
     precision, which halves the size of the file. The network still computes in float32.
 
     Raises:
-        TargetError: the file cannot be written.
+        OutputError: the file cannot be written.
     """
     height, width = (torch.export.Dim(name, min=1, max=256) for name in ("rows", "columns"))
     example = torch.rand(1, 3, 4 * stride, 5 * stride)

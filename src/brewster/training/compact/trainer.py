@@ -46,7 +46,7 @@ _SAMPLE_COLUMNS: Final = (
     "predicted reflection R",
 )
 _MAX_GRADIENT_NORM: Final = 1.0
-_START_FROM_CURE: Final = "train the recipe that writes it first, or correct start_from in this recipe"
+_START_FROM_CURE: Final = "train the recipe that writes it first, or correct init_checkpoints in this recipe"
 
 
 def train(recipe: CompactRecipe, out: Path, on_step: StepCallback) -> nn.Module:
@@ -59,7 +59,7 @@ def train(recipe: CompactRecipe, out: Path, on_step: StepCallback) -> nn.Module:
         RecipeError: data is missing, or `out` contains a run of another recipe.
         PhotoError: an image cannot be read.
         ModelError: a checkpoint is missing, damaged or of another network, or the loss is NaN or infinite.
-        TargetError: `out` cannot be written to.
+        OutputError: `out` cannot be written to.
     """
     trainer = CompactTrainer(recipe)
     # This limits the current thread. The initializer of the trainer's thread pools limits their threads.
@@ -108,7 +108,7 @@ class CompactTrainer:
 
     @torch.no_grad()
     def initialize(self) -> None:
-        """Loads the mean of the EMA weights of all checkpoints in `start_from`.
+        """Loads the mean of the EMA weights of all checkpoints in `init_checkpoints`.
 
         The mean of the weights of several runs with a common start is often better than each of them (model soups,
         Wortsman et al. 2022).
@@ -116,7 +116,7 @@ class CompactTrainer:
         Raises:
             ModelError: a checkpoint is missing, damaged or of another network.
         """
-        for count, path in enumerate(self.recipe.start_from, start=1):
+        for count, path in enumerate(self.recipe.init_checkpoints, start=1):
             loaded, checkpoint = self._entry.build(), Checkpoint.read(path, _START_FROM_CURE)
             with mismatch_as_model_error(path, _START_FROM_CURE):
                 _check_network(path, checkpoint, self.recipe.network)
@@ -194,7 +194,7 @@ class CompactTrainer:
         """Writes the EMA network to model.onnx in `folder`. Returns the path of the file.
 
         Raises:
-            TargetError: the file cannot be written.
+            OutputError: the file cannot be written.
         """
         export_onnx(self.ema_network(), folder / MODEL_FILE, self._entry.stride)
         return folder / MODEL_FILE

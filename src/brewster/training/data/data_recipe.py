@@ -9,22 +9,22 @@ from pydantic import Field, model_validator
 
 from brewster.scene.values import FrozenModel, PositiveInt, Seed, Share
 from brewster.training.data.mixtures import Target
-from brewster.training.data.online import Mixing
+from brewster.training.data.online import BlendSpace
 
 
 class RenderedRecipe(FrozenModel):
-    """Rendered samples: either from `sets` of `brewster render`, or rendered during training from a scene `recipe`."""
+    """Rendered samples: either from `datasets` of `brewster render`, or rendered during training from a scene `recipe`."""
 
-    sets: tuple[Path, ...] = ()
+    datasets: tuple[Path, ...] = ()
     """Folders of rendered sets, relative to BREWSTER_DATA."""
     recipe: str | None = None
     """The name of a packaged scene recipe, or a TOML file, relative to this recipe."""
     count: Annotated[int, Field(ge=0)] | None = None
-    """Number of different samples. Not set: all samples of `sets`, or no limit for `recipe`. 0: no rendered samples."""
+    """Number of different samples. Not set: all samples of `datasets`, or no limit for `recipe`. 0: no rendered samples."""
     share: Share = 1.0
     """Share of rendered samples among the samples of a batch that are not real pairs; the others are mixtures of photos."""
-    mixing: Mixing = "light"
-    """How the photo is composed. light: T + R in linear light. 8-bit: a blend of 8-bit images, for comparison."""
+    blend_space: BlendSpace = "linear"
+    """How the photo is composed. linear: T + R in linear light. srgb: a blend of 8-bit sRGB images, for comparison."""
     target: Target = "background"
     """What the network predicts behind the glass: the background B without glass, or the transmission T."""
     orders: Literal["all", "truncated"] | None = None
@@ -38,14 +38,14 @@ class RenderedRecipe(FrozenModel):
 
     @model_validator(mode="after")
     def _check_source(self) -> Self:
-        if bool(self.sets) == bool(self.recipe):
+        if bool(self.datasets) == bool(self.recipe):
             raise ValueError(
                 "expected either sets (rendered before) or recipe (rendered during training): exactly one of the two"
             )
         unused = [
             name for name in ("orders", "seed", "maps", "photos") if getattr(self, name) not in (None, ())
         ]
-        if self.sets and unused:
+        if self.datasets and unused:
             raise ValueError(
                 f"expected no {', '.join(unused)}: they have no effect on sets, which are already rendered"
             )
@@ -53,10 +53,10 @@ class RenderedRecipe(FrozenModel):
 
 
 class DataRecipe(FrozenModel):
-    """Training data. Folders are relative to BREWSTER_DATA.
+    """Training data. Folders are relative to BREWSTER_DATA. A source with a share of 0 is not read.
 
-    A batch of n samples has n * pairs_share real pairs. Of the other samples, the share `rendered.share` is rendered, and
-    the rest are mixtures of photos and maps. A source with a share of 0 is not read.
+    For the compact network, a batch of n samples has n * pairs_share real pairs. Of the other samples, the share
+    `rendered.share` is rendered, and the rest are mixtures of photos and maps. For a LoRA, see `pairs_share` there.
     """
 
     photos: tuple[Path, ...] = ()
@@ -66,7 +66,7 @@ class DataRecipe(FrozenModel):
     pairs: tuple[Path, ...] = ()
     """Folders of real pairs: a photo through glass and the same view without glass."""
     pairs_share: Share = 0.0
-    """Share of real pairs in each batch. Required if `pairs` is set."""
+    """Share of real pairs in each batch. Must be set explicitly if `pairs` is set."""
     rendered: RenderedRecipe | None = None
     exclude: tuple[str, ...] = ()
     """File names of photos and maps to exclude. * and ? are wildcards as in a shell."""

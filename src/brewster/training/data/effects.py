@@ -115,7 +115,7 @@ def shadow(rng: SampleRng, size: int) -> Mask:
 def jpeg(encoded: Image, quality: int) -> Image:
     """Simulates JPEG compression of an encoded image at a quality of 1..100.
 
-    The steps are a cosine transform of blocks of 8 x 8 px, quantisation (tables K.1 and K.2 of Wallace, "The JPEG still
+    The steps are a cosine transform of blocks of 8 x 8 px, quantization (tables K.1 and K.2 of Wallace, "The JPEG still
     picture compression standard", CACM 34, 1991) and rounding to 8 bits. Colour has full resolution. Without the lossless
     coding, this takes a tenth of the time of a codec. Both sides are multiples of 8.
     """

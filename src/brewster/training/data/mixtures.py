@@ -93,7 +93,7 @@ class MixRecipe(FrozenModel):
     """Probability of a hard shadow on the background."""
     background_blur_probability: Share = 0.08
     """Probability of a background that is out of focus. Without such backgrounds, a network takes all blur for a reflection."""
-    background_blur_px: LogRange = (0.5, 3.0)
+    background_blur_sigma_px: LogRange = (0.5, 3.0)
     """Standard deviation of the defocus blur of these backgrounds."""
 
     no_glass_probability: Share = 0.15
@@ -117,9 +117,9 @@ class MixRecipe(FrozenModel):
     """Probability of small lamps in the reflection."""
     sign_probability: Share = 0.08
     """Probability of a sign with letters in the reflection."""
-    sharp_probability: Share = 0.35
+    reflection_sharp_probability: Share = 0.35
     """Probability of a reflection without defocus blur."""
-    blur_px: LogRange = (0.3, 9.0)
+    reflection_blur_sigma_px: LogRange = (0.3, 9.0)
     """Standard deviation of the defocus blur of the other reflections."""
     ghost_probability: Share = 0.4
     """Probability of a ghost: a displaced copy of the reflection from the second surface of the pane."""
@@ -132,9 +132,9 @@ class MixRecipe(FrozenModel):
     edge_probability: Share = 0.3
     """Probability of a reflection that ends at a straight edge, such as a frame."""
 
-    softness_probability: Share = 0.5
+    camera_blur_probability: Share = 0.5
     """Probability of a soft photo: background and reflection are both blurred by the lens, or enlarged from a smaller photo."""
-    softness_px: LogRange = (0.3, 1.3)
+    camera_blur_sigma_px: LogRange = (0.3, 1.3)
     """Standard deviation of this blur, in pixels of the training image at any size."""
     target_luminance: Range = (0.2, 0.55)
     """Mean luminance of the photo after exposure. A photo with a smaller mean is not brightened."""
@@ -145,7 +145,7 @@ class MixRecipe(FrozenModel):
     gamma: LogRange = (0.8, 1.25)
     """Exponent on the encoded values."""
     contrast: Range = (-0.3, 0.5)
-    """Strength of an S-shaped tone curve on the encoded values: 0 is none, negative values flatten it."""
+    """Strength of an S-shaped tone curve on the encoded values: 0 changes nothing, and negative values reduce the contrast."""
     noise: Range = (0.0, 0.012)
     """Standard deviation of Gaussian noise on the encoded photo."""
     jpeg_probability: Share = 0.3
@@ -195,8 +195,8 @@ class Mixtures:
 
     def _take_photo(self, rng: SampleRng, *layers: Image) -> tuple[Image, Image, Image]:
         """Applies the softness, the exposure and the tone curve of the camera to photo, target and reflection."""
-        if rng.bernoulli(self._recipe.softness_probability):
-            sigma_px = rng.log_uniform(self._recipe.softness_px)
+        if rng.bernoulli(self._recipe.camera_blur_probability):
+            sigma_px = rng.log_uniform(self._recipe.camera_blur_sigma_px)
             layers = tuple(effects.blur(layer, sigma_px, disc=False) for layer in layers)
         return _expose_and_develop(rng, self._recipe, *layers)
 
@@ -204,7 +204,7 @@ class Mixtures:
         recipe, scale = self._recipe, size / _REFERENCE_SIZE
         view = self._view(rng, size, recipe.background_map_probability)
         if rng.bernoulli(recipe.background_blur_probability):
-            sigma_px = rng.log_uniform(recipe.background_blur_px) * scale
+            sigma_px = rng.log_uniform(recipe.background_blur_sigma_px) * scale
             view = effects.blur(view, sigma_px, disc=rng.bernoulli(0.5))
         if rng.bernoulli(recipe.shadow_probability):
             view = view * effects.shadow(rng, size)
@@ -220,8 +220,10 @@ class Mixtures:
         view = view / _mean_without_highlights(view) * _temperature(rng, recipe.temperature)
         if rng.bernoulli(recipe.sign_probability):
             view = effects.sign(rng, view)
-        if not rng.bernoulli(recipe.sharp_probability):
-            view = effects.blur(view, rng.log_uniform(recipe.blur_px) * scale, disc=rng.bernoulli(0.5))
+        if not rng.bernoulli(recipe.reflection_sharp_probability):
+            view = effects.blur(
+                view, rng.log_uniform(recipe.reflection_blur_sigma_px) * scale, disc=rng.bernoulli(0.5)
+            )
         if rng.bernoulli(recipe.lamp_probability):
             view = view + effects.lamps(rng, size)
         if rng.bernoulli(recipe.ghost_probability):

@@ -23,7 +23,7 @@ from brewster.scene.sampler import Catalog, draw
 from brewster.training.data.alpha_blend import blended
 from brewster.training.data.mixtures import Target, TrainingBatch
 
-Mixing = Literal["light", "8-bit"]
+BlendSpace = Literal["linear", "srgb"]
 """How the layers of a photo are added: in linear light, or as a blend of 8-bit images, as in RDNet."""
 
 
@@ -42,10 +42,10 @@ class OnlineRendered:
         seed: int,
         device: torch.device | str = "cpu",
         target: Target = "background",
-        mixing: Mixing = "light",
+        blend_space: BlendSpace = "linear",
     ) -> None:
         self._recipe, self._catalog, self._assets = recipe, catalog, assets
-        self._seed, self._device, self._target, self._mixing = seed, device, target, mixing
+        self._seed, self._device, self._target, self._blend_space = seed, device, target, blend_space
         self._render_lock = Lock()
 
     def __iter__(self) -> Iterator[DevelopedSample]:
@@ -82,4 +82,4 @@ class OnlineRendered:
         with self._render_lock:
             sample = render(scene, self._assets, self._device)
         developed = develop(sample)
-        return with_jpeg(developed if self._mixing == "light" else blended(developed))
+        return with_jpeg(developed if self._blend_space == "linear" else blended(developed))

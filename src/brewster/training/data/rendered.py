@@ -1,6 +1,6 @@
 """Streams of a finite number of rendered samples: crops of sets on disk, or a cache of samples rendered online.
 
-    stream = RenderedSets([Path("out/window")], seed=7, count=300)
+    stream = RenderedDatasets([Path("out/window")], seed=7, count=300)
     stream = CachedRendered(OnlineRendered(...), 300, seed=7)
 
 The sample in a slot, its crop and whether it is mirrored depend on (seed, step, slot) only.
@@ -27,7 +27,7 @@ from brewster.scene.values import Range
 from brewster.srgb import to_encoded
 from brewster.training.data.alpha_blend import blended_layers
 from brewster.training.data.mixtures import Target, TrainingBatch, random_crop
-from brewster.training.data.online import Mixing, OnlineRendered
+from brewster.training.data.online import BlendSpace, OnlineRendered
 from brewster.training.data.sample_rng import SampleRng
 
 CACHE_BYTES: Final = 1 << 30
@@ -35,10 +35,10 @@ CACHE_BYTES: Final = 1 << 30
 the oldest samples are dropped. They are read or rendered again when they are drawn, which is slower, with the same result."""
 
 
-class RenderedSets:
+class RenderedDatasets:
     """A `Stream` of random crops of the first `count` samples of rendered sets, mirrored at random. It is thread-safe.
 
-    With `mixing` "8-bit", the photo is a blend of the sample's background and mirror image. The blend is compressed
+    With `blend_space` "srgb", the photo is a blend of the sample's background and mirror image. The blend is compressed
     as JPEG, with the quality of the sample's photo.
 
     Raises:
@@ -53,10 +53,10 @@ class RenderedSets:
         count: int | None = None,
         crop: Range = (0.45, 1.0),
         target: Target = "background",
-        mixing: Mixing = "light",
+        blend_space: BlendSpace = "linear",
     ) -> None:
         self._entries = _first_entries(folders, count)
-        self._seed, self._crop, self._target, self._mixing = seed, crop, target, mixing
+        self._seed, self._crop, self._target, self._blend_space = seed, crop, target, blend_space
         self._cache = _TensorCache(CACHE_BYTES)
 
     def __len__(self) -> int:
@@ -81,7 +81,7 @@ class RenderedSets:
         return self._cache.get_or_create(number, lambda: self._read(self._entries[number]))
 
     def _read(self, entry: StoredSample) -> Tensor:
-        if self._mixing == "8-bit":
+        if self._blend_space == "srgb":
             return _blended_sample(entry)
         return torch.cat([_read_image(entry, name) for name in ("photo", self._target, "reflection")], dim=2)
 
@@ -113,7 +113,7 @@ class CachedRendered:
         return layers.flip(2) if rng.bernoulli(0.5) else layers
 
     def _render(self, index: int, size: int) -> Tensor:
-        """Renders a sample as (9, size, size) uint8. The first use is quantised too, so that all uses are equal."""
+        """Renders a sample as (9, size, size) uint8. The first use is quantized too, so that all uses are equal."""
         return (self._source.layers(index, size).clamp(0, 1) * 255).round().to(torch.uint8)
 
 
@@ -158,7 +158,7 @@ def _entries(folder: Path) -> list[StoredSample]:
         raise RecipeError(
             f"{folder} cannot be read ({getattr(error, 'strerror', None) or error})",
             "expected a folder that brewster render wrote",
-            "choose another folder in data.rendered.sets, or set BREWSTER_DATA to the folder of the data",
+            "choose another folder in data.rendered.datasets, or set BREWSTER_DATA to the folder of the data",
         ) from error
 
 

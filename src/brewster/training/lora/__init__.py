@@ -1,1 +1,1 @@
-"""Training of a LoRA on a large backbone, its resource estimate and its model card."""
+"""Training of a LoRA on a diffusion backbone, its resource estimate and its model card."""

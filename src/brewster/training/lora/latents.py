@@ -1,7 +1,7 @@
-"""Training samples of a large backbone: panels with the aspect ratio of the sample, encoded by the VAE of the backbone.
+"""Training samples of a diffusion backbone: panels with the aspect ratio of the sample, encoded by the VAE of the backbone.
 
     samples = open_samples(recipe)
-    encoded = LatentEncoder(samples, backbone, recipe)(SampleRng(seed, step, slot))
+    encoded = EncodedSampleLoader(samples, backbone, recipe)(SampleRng(seed, step, slot))
 
 Latents are cached with the key (sample, mirrored, crop). They also depend on the VAE and on the size of the panels. These are
 not in the key, because a run has one frozen VAE, and all crops of a sample have panels of one size.
@@ -22,13 +22,13 @@ from torch.nn import functional
 
 from brewster.benchmarks.pairing import ImageGroup, read_folders
 from brewster.errors import RecipeError
-from brewster.models.diffusion.families.family import Backbone
+from brewster.models.diffusion.backbones.backbone import Backbone
 from brewster.models.diffusion.panels import PanelFit, compose, conditioning_image
 from brewster.models.diffusion.pipeline import one_step_latents
 from brewster.photo import Photo
 from brewster.srgb import to_encoded, to_linear
 from brewster.training.data.image_loading import read_pairs
-from brewster.training.data.rendered import RenderedSets
+from brewster.training.data.rendered import RenderedDatasets
 from brewster.training.data.sample_rng import SampleRng
 from brewster.training.recipe import LoraRecipe
 from brewster.training.streams import resolve_folders
@@ -69,7 +69,7 @@ class SampleSequence:
     """Rendered samples and real pairs as one sequence: first the rendered samples, then the pairs."""
 
     def __init__(
-        self, rendered: RenderedSets | None, pairs: Sequence[TrainingSample], pairs_share: float
+        self, rendered: RenderedDatasets | None, pairs: Sequence[TrainingSample], pairs_share: float
     ) -> None:
         self._rendered, self._pairs, self._pairs_share = rendered, pairs, pairs_share
         self._first_pair = len(rendered) if rendered else 0
@@ -82,14 +82,17 @@ class SampleSequence:
             return TrainingSample(self._rendered.sample(number))
         return self._pairs[number - self._first_pair]
 
-    def panel_fits(self, recipe: LoraRecipe, multiple: int) -> list[PanelFit]:
-        """Returns the panels of the first rendered sample and of every pair, to find unusable samples before training.
+    def check_sizes(self, recipe: LoraRecipe, size_divisor: int) -> list[PanelFit]:
+        """Returns the panel sizes for the first rendered sample and for every pair. An unusable sample raises an error here,
+        before training starts.
 
         Raises:
             RecipeError, PhotoError: a file is damaged or missing, or a sample is too small, see `fit_sample`.
         """
         first = [self._rendered.sample(0)] if self._rendered else []
-        return [fit_sample(layers, recipe, multiple) for layers in (*first, *(p.layers for p in self._pairs))]
+        return [
+            fit_sample(layers, recipe, size_divisor) for layers in (*first, *(p.layers for p in self._pairs))
+        ]
 
     def description(self) -> str:
         """Returns the number of samples of each source in words."""
@@ -103,7 +106,7 @@ class SampleSequence:
         return rng.randint(self._first_pair)
 
 
-class LatentEncoder:
+class EncodedSampleLoader:
     """Draws samples and encodes them. The encoded samples are cached."""
 
     def __init__(self, samples: SampleSequence, backbone: Backbone, recipe: LoraRecipe) -> None:
@@ -123,7 +126,7 @@ class LatentEncoder:
 
     def _encode(self, number: int, mirrored: bool, crop: int) -> EncodedSample:
         sample, layout, encode = self._samples[number], self._recipe.layout, self._backbone.encode
-        fit = fit_sample(sample.layers, self._recipe, self._backbone.multiple)
+        fit = fit_sample(sample.layers, self._recipe, self._backbone.size_divisor)
         layers = sample.layers
         if crop:
             # The step is negative, so that these random numbers differ from those of every training step.
@@ -166,16 +169,16 @@ def make_panels(layers: UInt8[Tensor, "h w 9"], fit: PanelFit) -> dict[str, Floa
     return dict(zip("ITR", padded.chunk(3, dim=1), strict=True))
 
 
-def fit_sample(layers: Tensor, recipe: LoraRecipe, multiple: int) -> PanelFit:
+def fit_sample(layers: Tensor, recipe: LoraRecipe, size_divisor: int) -> PanelFit:
     """Returns the size of the panels of a sample, and the position of the sample in them, as for photos at inference.
 
     A sample is never enlarged: a small one gets small panels.
 
     Raises:
-        PhotoError: a side of the sample is smaller than `multiple`, or its aspect ratio is too extreme.
+        PhotoError: a side of the sample is smaller than `size_divisor`, or its aspect ratio is too extreme.
     """
     height, width, _ = layers.shape
-    return recipe.task.fit((width, height), multiple)
+    return recipe.task.fit((width, height), size_divisor)
 
 
 def open_samples(recipe: LoraRecipe) -> SampleSequence:
@@ -187,12 +190,12 @@ def open_samples(recipe: LoraRecipe) -> SampleSequence:
     """
     data, rendered, sets = recipe.data, recipe.data.rendered, None
     if rendered and data.pairs_share < 1 and data.rendered_share:
-        sets = RenderedSets(
-            resolve_folders(rendered.sets),
+        sets = RenderedDatasets(
+            resolve_folders(rendered.datasets),
             seed=recipe.seed,
             count=rendered.count,
             target=rendered.target,
-            mixing=rendered.mixing,
+            blend_space=rendered.blend_space,
         )
     folders = resolve_folders(data.pairs) if data.pairs_share else []
     pairs = [sample for folder in folders for sample in _read_pairs(folder, recipe)]

@@ -1,4 +1,4 @@
-"""Writes the model card of a LoRA, a README.md for the hub: base, licence, prompt, use, data, settings, scores, limits.
+"""Writes the model card of a LoRA, a README.md for the hub: backbone, licence, prompt, use, data, settings, scores, limits.
 
     write_card(Path("out/kontext/lora"), recipe, {"psnr_gain_db_nature": 1.2}, Kontext)
 
@@ -18,8 +18,8 @@ from typing import Final
 from brewster.errors import BrewsterError, ModelError
 from brewster.files import write_atomically
 from brewster.models.diffusion.adapter.hub import CARD_FILE
-from brewster.models.diffusion.backbones import BACKBONES
-from brewster.models.diffusion.families.family import APACHE_2, Backbone, DiffusersUsage
+from brewster.models.diffusion.backbones.backbone import APACHE_2, Backbone, DiffusersUsage
+from brewster.models.diffusion.backbones.registry import BACKBONES
 from brewster.models.diffusion.panels import fit_panel
 from brewster.models.diffusion.prompt import PROMPT, PROMPT_FILE, load_prompt
 from brewster.models.zoo import TINY_PREFIX
@@ -37,7 +37,7 @@ _PANELS: Final = {
 _SQUARE_PHOTO_PX: Final = (4096, 4096)
 """A large square photo: its panels fill the pixel budget best."""
 _BENCHMARK_HEADING: Final = "## Measured"
-_NO_BENCHMARKS: Final = """No benchmark yet. `brewster evaluate --benchmark NAME=FOLDER --model lora` scores the model, and
+_NO_BENCHMARKS: Final = """This model has no benchmark scores yet. `brewster evaluate --benchmark NAME=FOLDER --model lora` scores the model, and
 `brewster models card lora --scores out/evaluate/results.json` writes the tables here."""
 
 _LIMITS: Final = """## Limits
@@ -51,39 +51,41 @@ _LIMITS: Final = """## Limits
 - **White areas.** The model can take a white area of the scene, such as a sign, for a highlight of a reflection and remove
   it, or keep a white reflection as part of the scene. `brewster evaluate` measures both on rendered sets: removed white,
   kept reflection.
-- It was trained only on the glass of its training data. Rain, dirt, and curved or patterned panes may fail.
+- It was trained only on the glass of its training data. Photos with rain, dirt, or curved or patterned panes may be separated incorrectly.
 - Each seed gives a different result. The mean of several results contains less invented detail."""
 
 
-def write_card(folder: Path, recipe: LoraRecipe, scores: Mapping[str, float], base: type[Backbone]) -> None:
+def write_card(
+    folder: Path, recipe: LoraRecipe, scores: Mapping[str, float], backbone_class: type[Backbone]
+) -> None:
     """Writes or replaces the model card in a folder that contains the LoRA and its prompt.
 
     `scores` is the last line of the run's log.
 
     Raises:
         ModelError: the prompt is missing, damaged, or of another backbone.
-        TargetError: the folder cannot be written.
+        OutputError: the folder cannot be written.
     """
-    prompt = load_prompt(folder / PROMPT_FILE, base.name).text
-    text = card_text(recipe, scores=scores, base=base, prompt=prompt)
+    prompt = load_prompt(folder / PROMPT_FILE, backbone_class.name).text
+    text = card_text(recipe, scores=scores, backbone_class=backbone_class, prompt=prompt)
     write_atomically(folder / CARD_FILE, text.encode(), overwrite=True)
 
 
 def card_text(
-    recipe: LoraRecipe, *, scores: Mapping[str, float], base: type[Backbone], prompt: str = PROMPT
+    recipe: LoraRecipe, *, scores: Mapping[str, float], backbone_class: type[Backbone], prompt: str = PROMPT
 ) -> str:
     """Returns the model card, Markdown, of a LoRA trained with this recipe; `scores` is the last line of the run's log."""
     parts = [
-        _front_matter(recipe, base),
-        _description(recipe, base),
-        f"## Prompt\n\nThe model needs exactly this prompt; `{PROMPT_FILE}` contains it, encoded for the base.\n\n> {prompt}",
-        _usage(recipe, base),
+        _front_matter(recipe, backbone_class),
+        _description(recipe, backbone_class),
+        f"## Prompt\n\nThe model needs exactly this prompt; `{PROMPT_FILE}` contains it, encoded for the backbone.\n\n> {prompt}",
+        _usage(recipe, backbone_class),
         _data(recipe),
         _settings(recipe),
         _scores(scores),
         f"{_BENCHMARK_HEADING}\n\n{_NO_BENCHMARKS}",
         _LIMITS,
-        f"## Licence\n\n{_licence(recipe, base)}",
+        f"## Licence\n\n{_licence(recipe, backbone_class)}",
     ]
     return "\n\n".join(parts) + "\n"
 
@@ -105,23 +107,23 @@ def with_benchmark_tables(card: str, tables: str) -> str:
     return f"{before}{heading}\n{tables.strip()}\n\n{rest[after.start() :]}"
 
 
-def _front_matter(recipe: LoraRecipe, base: type[Backbone]) -> str:
+def _front_matter(recipe: LoraRecipe, backbone_class: type[Backbone]) -> str:
     """The metadata for the hub: YAML, written as JSON strings and lists, which are valid YAML."""
     about: dict[str, object] = {}
     if _is_toy(recipe):
         about |= APACHE_2.hub
     else:
-        about |= {"base_model": _base_id(recipe, base), "base_model_relation": "adapter"}
-        about |= base.licence.hub
+        about |= {"base_model": _base_id(recipe, backbone_class), "base_model_relation": "adapter"}
+        about |= backbone_class.licence.hub
     about |= {"library_name": "diffusers", "pipeline_tag": "image-to-image"}
     about |= {"tags": [*_TAGS, *(["toy"] if _is_toy(recipe) else [])]}
     lines = [f"{name}: {json.dumps(value)}" for name, value in about.items()]
     return "\n".join(["---", *lines, "---"])
 
 
-def _description(recipe: LoraRecipe, base: type[Backbone]) -> str:
+def _description(recipe: LoraRecipe, backbone_class: type[Backbone]) -> str:
     panels = ", ".join(_PANELS[panel] for panel in recipe.panels)
-    text = f"""# Sees through glass: a LoRA for {_base_title(recipe, base)}
+    text = f"""# Reflection removal: a LoRA for {_base_title(recipe, backbone_class)}
 
 From a photograph taken through glass, the base model with this LoRA generates these panels, {recipe.direction}:
 {panels}.
@@ -130,12 +132,12 @@ was trained with brewster, not by the authors of the paper."""
     if _is_toy(recipe):
         text += f"""
 
-**This is a toy.** Its base is a tiny twin of {base.hub_id} with random weights, for software tests.
+**This model is for software tests.** Its base is a tiny version of {backbone_class.hub_id} with random weights, for software tests.
 It does not work with any published model, and it does not separate photos."""
     return text
 
 
-def _usage(recipe: LoraRecipe, base: type[Backbone]) -> str:
+def _usage(recipe: LoraRecipe, backbone_class: type[Backbone]) -> str:
     return f"""## Use
 
 The commands below call this folder `lora`; `hf download OWNER/NAME --local-dir lora` downloads it from the hub.
@@ -151,30 +153,35 @@ separation = Separator.load("lora")("photo.jpg")
 separation.transmission.save("clear.jpg")
 ```
 
-{_diffusers_usage(recipe, base)}"""
+{_diffusers_usage(recipe, backbone_class)}"""
 
 
-def _diffusers_usage(recipe: LoraRecipe, base: type[Backbone]) -> str:
+def _diffusers_usage(recipe: LoraRecipe, backbone_class: type[Backbone]) -> str:
     """Explains how to generate the same image with diffusers alone, if that is possible."""
     if _is_toy(recipe):
-        return "diffusers alone can load the LoRA into the twin that `brewster.models.diffusion.backbones.tiny` builds."
+        return "diffusers alone can load the LoRA into the tiny version that `brewster.models.diffusion.backbones.registry.tiny` builds."
     loads = 'diffusers alone can load it with `pipe.load_lora_weights("lora")`'
     if recipe.objective == "one_step":
         return f"{loads}, but starts from noise; this LoRA starts from the photo and takes one step."
-    usage = base.diffusers_usage
+    usage = backbone_class.diffusers_usage
     if isinstance(usage, str):
         return f"{loads}, {usage}."
     return f"""{loads}.
-With the same input of the same size, it generates the same composite image. It is small, and has no fine detail of the photo and no colour
-processing of brewster. Both sides of a panel are multiples of {base.multiple}. {usage.caution}
+With the same input of the same size, diffusers generates the same composite image. This image is small. It lacks the
+fine detail of the photo and the colour processing of brewster. Both sides of a panel are multiples of {backbone_class.size_divisor}. {usage.caution}
 
 ```python
-{_diffusers_code(recipe, base, usage)}
+{_diffusers_code(recipe, backbone_class, usage)}
 ```"""
 
 
-def _diffusers_code(recipe: LoraRecipe, base: type[Backbone], usage: DiffusersUsage) -> str:
-    fit = fit_panel(_SQUARE_PHOTO_PX, recipe.layout, budget_px=recipe.budget_px, multiple=base.multiple)
+def _diffusers_code(recipe: LoraRecipe, backbone_class: type[Backbone], usage: DiffusersUsage) -> str:
+    fit = fit_panel(
+        _SQUARE_PHOTO_PX,
+        recipe.layout,
+        max_composite_pixels=recipe.max_composite_pixels,
+        size_divisor=backbone_class.size_divisor,
+    )
     (width, height), (full_width, full_height) = fit.panel, recipe.layout.composite_size(fit.panel)
     corners = {
         panel: (index * width, 0) if recipe.layout.axis == -1 else (0, index * height)
@@ -187,12 +194,12 @@ def _diffusers_code(recipe: LoraRecipe, base: type[Backbone], usage: DiffusersUs
         else "condition = photo"
     )
     return f"""import torch
-from diffusers import {base.classes["pipeline"]}
+from diffusers import {backbone_class.classes["pipeline"]}
 from PIL import Image
 from safetensors.torch import load_file
 
-pipe = {base.classes["pipeline"]}.from_pretrained(
-    "{_base_id(recipe, base)}",
+pipe = {backbone_class.classes["pipeline"]}.from_pretrained(
+    "{_base_id(recipe, backbone_class)}",
     dtype=torch.bfloat16, {usage.parts},
 ).to("cuda")
 pipe.load_lora_weights("lora")
@@ -212,11 +219,11 @@ def _data(recipe: LoraRecipe) -> str:
     rendered = data.rendered
     if rendered and data.rendered_share and data.pairs_share < 1:
         first = f"the first {rendered.count} samples of " if rendered.count else ""
-        sets = "; ".join(_set_description(folder) for folder in rendered.sets)
+        sets = "; ".join(_set_description(folder) for folder in rendered.datasets)
         lines.append(
             f"- Rendered by `brewster render`, {1 - data.pairs_share:.0%} of the samples: {first}{sets}."
         )
-        mixed = "added as light" if rendered.mixing == "light" else "blended in 8 bits"
+        mixed = "added as light" if rendered.blend_space == "linear" else "blended in 8 bits"
         lines.append(f"  T is the {rendered.target}; the layers are {mixed}.")
     if data.pairs_share:
         lines.append(
@@ -242,7 +249,7 @@ def _settings(recipe: LoraRecipe) -> str:
         "rank, alpha": f"{recipe.rank}, {recipe.alpha}",
         "steps, batch": f"{recipe.steps}, {recipe.batch_size}",
         "seed": recipe.seed,
-        "panels": f"{' '.join(recipe.panels)}, {recipe.direction}, at most {recipe.budget_px} pixels together",
+        "panels": f"{' '.join(recipe.panels)}, {recipe.direction}, at most {recipe.max_composite_pixels} pixels together",
         "objective": "one step from the photo" if one_step else "flow matching",
         "guidance": f"{recipe.guidance:g} during training",
         "inference": "one step"
@@ -250,15 +257,19 @@ def _settings(recipe: LoraRecipe) -> str:
         else f"{recipe.task.steps} steps at guidance {recipe.task.guidance:g}, by default",
         "learning rate": f"{recipe.learning_rate:g} after {recipe.warmup_steps} steps, {_decay(recipe)}",
         "optimiser": f"{'AdamW' if recipe.optimizer == 'adamw' else '8-bit AdamW'}, weight decay {recipe.weight_decay:g}",
-        "adapted layers": ", ".join(recipe.targets) or "all linear layers of the blocks",
+        "adapted layers": ", ".join(recipe.target_modules) or "all linear layers of the blocks",
         "condition": "the photo and white space" if recipe.layout.has_white_space else "the photo",
-        "quantisation of the base": recipe.quantise or "none",
+        "quantization of the base": recipe.quantization or "none",
     }
     return f"## Settings\n\n{_table(('setting', 'value'), rows)}\n\n`recipe.json` contains all settings."
 
 
 def _decay(recipe: LoraRecipe) -> str:
-    return f"cosine decay in the last {recipe.decay_share:.0%}" if recipe.decay_share else "then constant"
+    return (
+        f"cosine decay in the last {recipe.learning_rate_decay_share:.0%}"
+        if recipe.learning_rate_decay_share
+        else "then constant"
+    )
 
 
 def _scores(scores: Mapping[str, float]) -> str:
@@ -268,7 +279,7 @@ def _scores(scores: Mapping[str, float]) -> str:
         if name not in {"step", "seconds"}
     }
     table = _table(("metric", "value"), rows) if rows else "No scores were logged."
-    return f"## Scores\n\nAt the last training step, on a few validation photos:\n\n{table}"
+    return f"## Scores\n\nThese values are from the last training step; the PSNR gains are measured on the validation pairs.\n\n{table}"
 
 
 def _metric_title(name: str) -> str:
@@ -281,11 +292,11 @@ def _metric_title(name: str) -> str:
     )
 
 
-def _licence(recipe: LoraRecipe, base: type[Backbone]) -> str:
+def _licence(recipe: LoraRecipe, backbone_class: type[Backbone]) -> str:
     if _is_toy(recipe):
-        return f"{APACHE_2.title}. It contains no weights of the base."
-    text = f"{base.licence.title}, the licence of the base."
-    if not base.licence.is_commercial:
+        return f"{APACHE_2.title}. It contains no weights of the backbone."
+    text = f"{backbone_class.licence.title}, the licence of the backbone."
+    if not backbone_class.licence.is_commercial:
         text += " **Not for commercial use.** The base is gated: request access on its page."
     return text
 
@@ -299,17 +310,17 @@ def _is_toy(recipe: LoraRecipe) -> bool:
     return recipe.backbone.startswith(TINY_PREFIX)
 
 
-def _base_id(recipe: LoraRecipe, base: type[Backbone]) -> str:
-    """Returns the hub id of the base. A local folder counts as a copy of its family's model on the hub."""
+def _base_id(recipe: LoraRecipe, backbone_class: type[Backbone]) -> str:
+    """Returns the hub id of the backbone. A local folder counts as a copy of its backbone on the hub."""
     name = recipe.backbone
     is_hub_id = re.fullmatch(r"[\w.-]+/[\w.-]+", name) and not Path(name).exists()
-    return name if is_hub_id and name not in BACKBONES else base.hub_id
+    return name if is_hub_id and name not in BACKBONES else backbone_class.hub_id
 
 
-def _base_title(recipe: LoraRecipe, base: type[Backbone]) -> str:
+def _base_title(recipe: LoraRecipe, backbone_class: type[Backbone]) -> str:
     if _is_toy(recipe):
-        return f"a toy twin of {base.hub_id}"
-    return f"[{_base_id(recipe, base)}](https://huggingface.co/{_base_id(recipe, base)})"
+        return f"a tiny version of {backbone_class.hub_id}"
+    return f"[{_base_id(recipe, backbone_class)}](https://huggingface.co/{_base_id(recipe, backbone_class)})"
 
 
 def _set_description(folder: Path) -> str:

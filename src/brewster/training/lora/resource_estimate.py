@@ -17,14 +17,14 @@ import torch
 from torch.utils.flop_counter import FlopCounterMode
 
 from brewster.errors import DeviceError
-from brewster.models.diffusion.adapter.lora import select_targets
-from brewster.models.diffusion.backbones import build, find_family
-from brewster.models.diffusion.families.family import Backbone
+from brewster.models.diffusion.adapter.lora import select_target_modules
+from brewster.models.diffusion.backbones.backbone import Backbone
+from brewster.models.diffusion.backbones.registry import build, find_backbone_class
 from brewster.models.diffusion.memory import GIB, weights_gib
 from brewster.models.diffusion.panels import fit_panel
 from brewster.models.diffusion.prompt import PromptEmbedding
 from brewster.models.zoo import TINY_PREFIX
-from brewster.options import Quantisation
+from brewster.options import Quantization
 from brewster.training.recipe import ENCODED_SUFFIX, LoraRecipe
 
 _SQUARE_PHOTO_PX: Final = (4096, 4096)
@@ -79,7 +79,7 @@ class ResourceEstimate:
     panel: tuple[int, int]
     generated_tokens: int
     condition_tokens: int
-    parameters: int
+    parameter_count: int
     lora_parameters: int
     memory_gib: dict[str, float]
     tflop: float
@@ -99,9 +99,9 @@ class ResourceEstimate:
         """Returns the estimate as lines of name and value."""
         recipe, (width, height) = self.recipe, self.panel
         encoders = 0 if recipe.prompt.endswith(ENCODED_SUFFIX) else 2 * self.text_encoder_parameters
-        download = 2 * self.parameters + self.memory_gib["VAE"] * GIB + encoders
+        download = 2 * self.parameter_count + self.memory_gib["VAE"] * GIB + encoders
         rows = {
-            "backbone": f"{recipe.backbone}, {self.parameters / 1e9:.2f} billion parameters",
+            "backbone": f"{recipe.backbone}, {self.parameter_count / 1e9:.2f} billion parameters",
             "LoRA": f"rank {recipe.rank}, {self.lora_parameters / 1e6:.1f} million parameters",
             "panels": f"{' '.join(recipe.panels)}, {width} x {height} each, for a square photo",
             "tokens": f"{self.generated_tokens} generated, {self.condition_tokens} condition, {_PROMPT_TOKENS} text",
@@ -129,12 +129,12 @@ class ResourceEstimate:
         )
 
     def _cure(self) -> str:
-        candidates: tuple[Quantisation, ...] = ("int8", "nf4")
-        for quantise in candidates:
-            saved = self.memory_gib["base"] - weights_gib(self.parameters, quantise)
+        candidates: tuple[Quantization, ...] = ("int8", "nf4")
+        for quantization in candidates:
+            saved = self.memory_gib["base"] - weights_gib(self.parameter_count, quantization)
             if saved > 0 and self.total_gib - saved <= self.card.memory_gib:
-                return f'set quantise = "{quantise}", which needs {self.total_gib - saved:.1f} GiB'
-        return "lower budget_px or rank, or choose a smaller backbone (klein) or a larger card"
+                return f'set quantization = "{quantization}", which needs {self.total_gib - saved:.1f} GiB'
+        return "lower max_composite_pixels or rank, or choose a smaller backbone (klein) or a larger card"
 
 
 def find_gpu(name: str | None = None) -> GraphicsCard:
@@ -169,8 +169,13 @@ def estimate_resources(recipe: LoraRecipe, card: GraphicsCard) -> ResourceEstima
         MissingExtra: diffusers is not installed.
     """
     backbone = _meta_backbone(recipe)
-    fit = fit_panel(_SQUARE_PHOTO_PX, recipe.layout, budget_px=recipe.budget_px, multiple=backbone.multiple)
-    tokens_per_panel = (fit.panel[0] // backbone.multiple) * (fit.panel[1] // backbone.multiple)
+    fit = fit_panel(
+        _SQUARE_PHOTO_PX,
+        recipe.layout,
+        max_composite_pixels=recipe.max_composite_pixels,
+        size_divisor=backbone.size_divisor,
+    )
+    tokens_per_panel = (fit.panel[0] // backbone.size_divisor) * (fit.panel[1] // backbone.size_divisor)
     generated_tokens = tokens_per_panel * len(recipe.panels)
     condition_tokens = generated_tokens if recipe.layout.has_white_space else tokens_per_panel
     parameters, vae, lora_parameters = (
@@ -179,7 +184,7 @@ def estimate_resources(recipe: LoraRecipe, card: GraphicsCard) -> ResourceEstima
         _count_lora_parameters(backbone, recipe),
     )
     memory = {
-        "base": weights_gib(parameters, recipe.quantise),
+        "base": weights_gib(parameters, recipe.quantization),
         "VAE": 2 * vae / GIB,
         "LoRA and AdamW": lora_parameters * _BYTES_PER_LORA_WEIGHT[recipe.optimizer] / GIB,
         "activations": _activation_bytes(backbone, generated_tokens + condition_tokens + _PROMPT_TOKENS)
@@ -201,7 +206,7 @@ def estimate_resources(recipe: LoraRecipe, card: GraphicsCard) -> ResourceEstima
         lora_parameters,
         memory,
         tflop,
-        find_family(recipe.backbone.removeprefix(TINY_PREFIX)).text_encoder_parameters,
+        find_backbone_class(recipe.backbone.removeprefix(TINY_PREFIX)).text_encoder_parameters,
     )
 
 
@@ -216,8 +221,8 @@ def _local_gpu() -> GraphicsCard:
 
 def _meta_backbone(recipe: LoraRecipe) -> Backbone:
     name = recipe.backbone.removeprefix(TINY_PREFIX)
-    family = find_family(name)
-    size = family.tiny if recipe.backbone.startswith(TINY_PREFIX) else family.full_size
+    backbone_class = find_backbone_class(name)
+    size = backbone_class.tiny if recipe.backbone.startswith(TINY_PREFIX) else backbone_class.full_size
     return build(name, size, device="meta", dtype=torch.bfloat16)
 
 
@@ -226,7 +231,7 @@ def _count_parameters(backbone: Backbone) -> int:
 
 
 def _count_lora_parameters(backbone: Backbone, recipe: LoraRecipe) -> int:
-    layers = map(backbone.transformer.get_submodule, select_targets(backbone, recipe.targets))
+    layers = map(backbone.transformer.get_submodule, select_target_modules(backbone, recipe.target_modules))
     return sum(recipe.rank * (layer.in_features + layer.out_features) for layer in layers)
 
 

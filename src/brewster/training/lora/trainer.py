@@ -1,4 +1,4 @@
-"""The trainer of a LoRA on a large backbone: flow matching on the latents of panels (paper, Text-to-image Model Fine-tuning).
+"""The trainer of a LoRA on a diffusion backbone: flow matching on the latents of panels (paper, Text-to-image Model Fine-tuning).
 
 trainer = LoraTrainer(read_recipe(Path("recipes/train/kontext.toml")))
 run(trainer, Path("out/kontext"), on_step)
@@ -29,13 +29,13 @@ from brewster.models.diffusion.adapter.lora import (
     add_lora,
     load_lora_state,
     lora_parameters,
-    lora_state,
+    lora_state_dict,
     save_lora,
 )
-from brewster.models.diffusion.backbones import encode_prompt, family_of, load_backbone
-from brewster.models.diffusion.families.family import Backbone
-from brewster.models.diffusion.lazy_imports import explain_out_of_memory
+from brewster.models.diffusion.backbones.backbone import Backbone
+from brewster.models.diffusion.backbones.registry import backbone_class_of, encode_prompt, load_backbone
 from brewster.models.diffusion.memory import check_machine
+from brewster.models.diffusion.out_of_memory import explain_out_of_memory
 from brewster.models.diffusion.panels import PanelFit, split
 from brewster.models.diffusion.pipeline import DecompositionPipeline
 from brewster.models.diffusion.prompt import PROMPTS, PromptEmbedding, load_prompt
@@ -44,7 +44,7 @@ from brewster.training.data.sample_rng import SampleRng
 from brewster.training.loop import read_log
 from brewster.training.lora.latents import (
     EncodedSample,
-    LatentEncoder,
+    EncodedSampleLoader,
     SampleSequence,
     fit_sample,
     layers_from_pair,
@@ -60,10 +60,12 @@ from brewster.training.streams import validation_pairs
 LORA_FOLDER: Final = "lora"
 RECIPE_FILE: Final = "recipe.json"
 _MAX_GRADIENT_NORM: Final = 1.0
-_VALIDATION_SAMPLES: Final = 4
+_MAX_VALIDATION_SAMPLES: Final = 4
 """Validation samples per folder. Their number is small, because generating one takes as long as several training steps."""
-_ROW_PX: Final = (160, 240)
-_MEMORY_CURE: Final = "lower budget_px or rank, quantise the base, or choose a smaller backbone (klein)"
+_THUMBNAIL_SIZE_PX: Final = (160, 240)
+_MEMORY_CURE: Final = (
+    "lower max_composite_pixels or rank, quantize the base, or choose a smaller backbone (klein)"
+)
 
 
 class LoraTrainer:
@@ -85,16 +87,16 @@ class LoraTrainer:
     def __init__(self, recipe: LoraRecipe, device: str = "auto") -> None:
         _check_batch(recipe)
         self.recipe, self._device = recipe, str(distributed.best_device(device))
-        self._family = family_of(recipe.backbone)
+        self._backbone_class = backbone_class_of(recipe.backbone)
         self._samples = open_samples(recipe)
-        self._samples.panel_fits(recipe, self._family.multiple)
-        self._validation_samples = _validation_samples(recipe, self._samples)
+        self._samples.check_sizes(recipe, self._backbone_class.size_divisor)
+        self._validation_samples = _read_validation_samples(recipe, self._samples)
         _check_optimizer(recipe, self._device)
         check_machine(
             recipe.backbone,
             requested=device,
             device=self._device,
-            quantise=recipe.quantise,
+            quantization=recipe.quantization,
             with_text_encoders=not recipe.prompt.endswith(ENCODED_SUFFIX),
         )
         self._prompt: PromptEmbedding | None = None
@@ -107,14 +109,20 @@ class LoraTrainer:
             DownloadError, ModelError, DeviceError, MissingExtra: it cannot be loaded.
         """
         recipe = self.recipe
-        backbone = load_backbone(recipe.backbone, device=self._device, quantise=recipe.quantise)
-        add_lora(backbone, rank=recipe.rank, alpha=recipe.alpha, seed=recipe.seed, targets=recipe.targets)
+        backbone = load_backbone(recipe.backbone, device=self._device, quantization=recipe.quantization)
+        add_lora(
+            backbone,
+            rank=recipe.rank,
+            alpha=recipe.alpha,
+            seed=recipe.seed,
+            target_modules=recipe.target_modules,
+        )
         backbone.transformer.enable_gradient_checkpointing()
         return backbone
 
     @cached_property
-    def _latents(self) -> LatentEncoder:
-        return LatentEncoder(self._samples, self.backbone, self.recipe)
+    def _encoded_samples(self) -> EncodedSampleLoader:
+        return EncodedSampleLoader(self._samples, self.backbone, self.recipe)
 
     @cached_property
     def _parameters(self) -> list[nn.Parameter]:
@@ -139,7 +147,7 @@ class LoraTrainer:
             DownloadError, ModelError, DeviceError, MissingExtra: text encoder, prompt or backbone cannot be loaded.
         """
         self._prompt = distributed.from_main_process(
-            lambda: _load_prompt(self.recipe, self._family, self._device)
+            lambda: _load_prompt(self.recipe, self._backbone_class, self._device)
         )
         _ = self.backbone
 
@@ -147,14 +155,14 @@ class LoraTrainer:
         """Returns the LoRA, the state of the optimiser, and the prompt. The weights of the base are not included."""
         prompt = {"text": self.prompt.text, **self.prompt.tensors}
         return {
-            "lora": lora_state(self.backbone), "optimizer": self._optimizer.state_dict(), "prompt": prompt,
+            "lora": lora_state_dict(self.backbone), "optimizer": self._optimizer.state_dict(), "prompt": prompt,
         }  # fmt: skip
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Restores a state that `state_dict` returned."""
         load_lora_state(self.backbone, state["lora"])
         self._optimizer.load_state_dict(state["optimizer"])
-        self._prompt = PromptEmbedding(self._family.name, **state["prompt"])
+        self._prompt = PromptEmbedding(self._backbone_class.name, **state["prompt"])
 
     def training_step(self, step: int) -> dict[str, float]:
         """Runs one step of AdamW on one batch. Returns `loss` and the term of each panel, `loss_panel_NAME`.
@@ -188,7 +196,9 @@ class LoraTrainer:
         columns = [f"ground truth {panel}" for panel in "ITR"]
         columns += [f"generated {panel}" for panel in self.recipe.panels]
         gains = torch.zeros(len(samples), device=self._device)
-        images = torch.zeros(len(samples), 3, _ROW_PX[0], len(columns) * _ROW_PX[1], device=self._device)
+        images = torch.zeros(
+            len(samples), 3, _THUMBNAIL_SIZE_PX[0], len(columns) * _THUMBNAIL_SIZE_PX[1], device=self._device
+        )
         for index in range(distributed.rank(), len(samples), distributed.world_size()):
             gain, image = self._validate_sample(samples[index])
             gains[index], images[index] = gain, image.clamp(0, 1).to(self._device)
@@ -208,21 +218,21 @@ class LoraTrainer:
         """Writes LoRA, prompt, recipe and model card to `lora` in `folder`. Returns the path. diffusers can load the LoRA.
 
         Raises:
-            TargetError: the folder cannot be written.
+            OutputError: the folder cannot be written.
         """
         target = folder / LORA_FOLDER
-        base, quantise = self.recipe.backbone, self.recipe.quantise
-        if Path(base).is_dir():
-            base = str(Path(base).resolve())
-        targets = self.recipe.targets
+        base_model, quantization = self.recipe.backbone, self.recipe.quantization
+        if Path(base_model).is_dir():
+            base_model = str(Path(base_model).resolve())
+        target_modules = self.recipe.target_modules
         save_lora(
             target,
             self.backbone,
             self.prompt,
             self.recipe.task,
-            base=base,
-            quantise=quantise,
-            targets=targets,
+            base_model=base_model,
+            quantization=quantization,
+            target_modules=target_modules,
         )
         text = json.dumps(self.recipe.model_dump(mode="json"), indent=2)
         write_atomically(target / RECIPE_FILE, f"{text}\n".encode(), overwrite=True)
@@ -253,7 +263,7 @@ class LoraTrainer:
 
         The loss is the sum of these values.
         """
-        encoded, device = self._latents(rng), self.backbone.device
+        encoded, device = self._encoded_samples(rng), self.backbone.device
         start, sigma = self._start_and_sigma(rng, encoded)
         noisy = (1 - sigma) * encoded.composite + sigma * start
         velocity = self.backbone.predict(
@@ -292,7 +302,7 @@ class LoraTrainer:
 
     def _validation_panels(self, layers: Tensor) -> tuple[dict[str, Tensor], PanelFit]:
         """Returns the panels of a validation sample, and their size."""
-        fit = fit_sample(layers, self.recipe, self.backbone.multiple)
+        fit = fit_sample(layers, self.recipe, self.backbone.size_divisor)
         return make_panels(layers, fit), fit
 
     def _validate_sample(self, layers: Tensor) -> tuple[float, Tensor]:
@@ -303,7 +313,7 @@ class LoraTrainer:
             (fit.crop(panel) + 1) / 2 for panel in (ground_truth["I"], ground_truth["T"], predicted["T"])
         )
         panels = [
-            functional.interpolate((panel + 1) / 2, _ROW_PX)
+            functional.interpolate((panel + 1) / 2, _THUMBNAIL_SIZE_PX)
             for panel in (*ground_truth.values(), *predicted.values())
         ]
         return psnr_gain_db(prediction, photo, transmission), torch.cat(panels, dim=3)[0]
@@ -329,9 +339,9 @@ def _check_optimizer(recipe: LoraRecipe, device: str) -> None:
         )
 
 
-def _load_prompt(recipe: LoraRecipe, family: type[Backbone], device: str) -> PromptEmbedding:
+def _load_prompt(recipe: LoraRecipe, backbone_class: type[Backbone], device: str) -> PromptEmbedding:
     if recipe.prompt.endswith(ENCODED_SUFFIX):
-        return load_prompt(Path(recipe.prompt), family.name)
+        return load_prompt(Path(recipe.prompt), backbone_class.name)
     return encode_prompt(recipe.backbone, PROMPTS[recipe.prompt], device=device)
 
 
@@ -345,12 +355,14 @@ def _create_optimizer(parameters: Sequence[nn.Parameter], recipe: LoraRecipe) ->
     return torch.optim.AdamW(parameters, **options)
 
 
-def _validation_samples(recipe: LoraRecipe, samples: SampleSequence) -> dict[str, list[Tensor]]:
+def _read_validation_samples(recipe: LoraRecipe, samples: SampleSequence) -> dict[str, list[Tensor]]:
     """Returns the first validation pairs of each folder, (H, W, 9); the first training samples if there is no such folder."""
     folders = validation_pairs(recipe.data)
     if folders:
         return {
-            name: [layers_from_pair(*pair) for pair in pairs[:_VALIDATION_SAMPLES]]
+            name: [layers_from_pair(*pair) for pair in pairs[:_MAX_VALIDATION_SAMPLES]]
             for name, pairs in folders.items()
         }
-    return {"training": [samples[number].layers for number in range(min(_VALIDATION_SAMPLES, len(samples)))]}
+    return {
+        "training": [samples[number].layers for number in range(min(_MAX_VALIDATION_SAMPLES, len(samples)))]
+    }

@@ -21,14 +21,14 @@ Reason = Literal["failed", "fast"]
 class ParticipantAnswers:
     """The answers of one participant.
 
-    `votes` maps the number of a comparison to an index of OUTCOMES. `catches` is the number of answered catch trials,
+    `votes` maps the number of a comparison to an index of OUTCOMES. `catch_trials` is the number of answered catch trials,
     `failed` is the number of wrong answers to them. `seconds` is the median time for a trial. `trials` has the position of
     each answered trial in the order of presentation, from 0, the trial, and its answer.
     """
 
     number: int
     votes: Mapping[int, int]
-    catches: int
+    catch_trials: int
     failed: int
     seconds: float
     is_complete: bool
@@ -38,7 +38,7 @@ class ParticipantAnswers:
 @final
 @dataclass(frozen=True)
 class ExclusionRule:
-    """Excludes a participant if failed / catches > `max_failed`, or if the median time for a trial is below `min_seconds`."""
+    """Excludes a participant if failed / catch_trials > `max_failed`, or if the median time for a trial is below `min_seconds`."""
 
     max_failed: float = 0.25
     min_seconds: float = 1.5
@@ -51,7 +51,7 @@ class ExclusionRule:
 
     def reason(self, participant: ParticipantAnswers) -> Reason | None:
         """The reason why the participant is excluded, or None if the participant is included."""
-        if participant.failed > self.max_failed * participant.catches:
+        if participant.failed > self.max_failed * participant.catch_trials:
             return "failed"
         return "fast" if participant.seconds < self.min_seconds else None
 

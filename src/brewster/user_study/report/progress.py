@@ -37,7 +37,7 @@ def summarise_progress(
                 "participant": participant.number,
                 "answers": len(answers),
                 "trials": len(participant.trials),
-                "catches": answered.catches if answered else 0,
+                "catch_trials": answered.catch_trials if answered else 0,
                 "failed": answered.failed if answered else 0,
                 "median_seconds": round(answered.seconds, 2) if answered else None,
                 "last_answer": last.answered_at if last else None,
@@ -75,7 +75,7 @@ def progress_text(progress: Mapping[str, Any]) -> str:
         (
             str(row["participant"]),
             f"{row['answers']} of {row['trials']}",
-            f"{row['failed']} of {row['catches']}",
+            f"{row['failed']} of {row['catch_trials']}",
             "" if row["median_seconds"] is None else f"{row['median_seconds']:.1f} s",
             (row["last_answer"] or "")[:16].replace("T", " "),
             row["window"] or "",

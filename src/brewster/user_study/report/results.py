@@ -90,7 +90,7 @@ def summarise(study: Study, participants: Sequence[ParticipantAnswers], rule: Ex
             "datasets": {name: _dataset_title(name) for name in description.datasets},
             "comparisons": len(description.comparisons),
             "pairs": description.pairs,
-            "catches": description.catches,
+            "catch_trials": description.catch_trials,
         },
         "rule": str(rule),
         "excluded": {reason: reasons.count(reason) for reason in ("failed", "fast")},
@@ -117,7 +117,7 @@ def _group(study: Study, participants: Sequence[ParticipantAnswers]) -> dict[str
         "participants": len(participants),
         "complete": sum(participant.is_complete for participant in participants),
         "answers": sum(len(participant.votes) for participant in participants),
-        "catches": sum(participant.catches for participant in participants),
+        "catch_trials": sum(participant.catch_trials for participant in participants),
         "failed": sum(participant.failed for participant in participants),
         "tables": [],
         "strengths": {},
@@ -186,7 +186,7 @@ def _tables(study: Study, counts: Floats, pictures: Floats, weights: Floats) -> 
         {
             "first": first,
             "second": second,
-            "correlation": _round(intraclass_correlation(counts[:, i].sum(axis=1))),
+            "intraclass_correlation": _round(intraclass_correlation(counts[:, i].sum(axis=1))),
             "rows": [
                 {
                     "key": key,
@@ -262,7 +262,7 @@ def write(results: Results, study: Study, participants: Sequence[ParticipantAnsw
     """Write all files of a report into the folder `out`; files of an earlier report are replaced.
 
     Raises:
-        TargetError: a file cannot be written.
+        OutputError: a file cannot be written.
     """
     files = {
         "report.json": f"{json.dumps(results, indent=1, ensure_ascii=False)}\n".encode(),

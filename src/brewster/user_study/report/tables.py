@@ -80,7 +80,7 @@ def _group(results: Results, key: str, heading: str) -> str:
 def _counts_line(group: Mapping[str, Any]) -> str:
     return (
         f"{group['participants']} participants ({group['complete']} complete), {group['answers']} answers; "
-        f"{group['failed']} of {group['catches']} catch trials failed."
+        f"{group['failed']} of {group['catch_trials']} catch trials failed."
     )
 
 
@@ -93,7 +93,11 @@ def _table(table: Mapping[str, Any]) -> str:
         ]
         for row in _filled(table["rows"])
     ]  # fmt: skip
-    correlation = "" if table["correlation"] is None else f"\n\nCorrelation: {table['correlation']:.3f}"
+    correlation = (
+        ""
+        if table["intraclass_correlation"] is None
+        else f"\n\nCorrelation: {table['intraclass_correlation']:.3f}"
+    )
     return f"### {table['first']} and {table['second']}\n\n{_markdown_table(rows)}{correlation}"
 
 

@@ -5,7 +5,8 @@ const STEPS = 1 << 14;
 const LINEAR = Float32Array.from({ length: 256 }, (_, code) => toLinear(code / 255));
 const CODES = Uint8Array.from({ length: STEPS + 1 }, (_, step) => Math.round(255 * toEncoded(step / STEPS)));
 
-// The colours of the confidence: the opacity over the grey photo, red, green and blue, from certain to unknown.
+// The colours of the confidence map. Each row is [opacity over the grey photo, red, green, blue]. The first row is confidence 1,
+// the last row is confidence 0.
 const HEAT_STOPS = [[0, 250, 204, 70], [0.55, 250, 190, 60], [0.75, 226, 84, 48], [0.88, 128, 20, 100]];
 const HEAT = Float32Array.from({ length: 4 * 256 }, (_, i) => {
   const at = ((255 - (i >> 2)) / 255) * (HEAT_STOPS.length - 1);
@@ -62,7 +63,7 @@ export class Layers {
     return new Layers(preview, photo, width, height, { left: 0, top: 0, stepX: full[0] / width, stepY: full[1] / height });
   }
 
-  // The transmission at strength 1 minus the photo, in linear light.
+  // The change at strength 1: transmission - photo, in linear light.
   get change() {
     const { change_slope, change_offset, generated, weight } = this.preview.maps;
     if (!this.#change) {
@@ -92,7 +93,7 @@ export class Layers {
     return layer;
   }
 
-  // Replaces the change by the generated transmission minus the photo, where the weight is 1.
+  // Blends the change with (generated transmission - photo). Weight 0 keeps the change, weight 1 replaces it.
   #override(change, generated, weight) {
     for (let i = 0; i < change.length; i++) {
       change[i] += weight[(i / 3) | 0] * (generated[i] - LINEAR[this.photo[i]] - change[i]);
@@ -137,8 +138,8 @@ function positions(small, count, start, step, full) {
   return { lower, fraction };
 }
 
-// Functions that return the function from the index of a value (three for each pixel) to its code. `weights` is the mask as
-// codes, one for each pixel, or null.
+// One function per view. It returns a second function, which maps the index of a value (three values per pixel) to an 8-bit code.
+// `weights` is the mask in 8-bit codes, one per pixel, or null.
 const VIEWS = {
   photo: ({ photo }) => (i) => photo[i],
   transmission({ photo, change }, strength, weights) {

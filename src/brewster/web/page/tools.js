@@ -7,13 +7,13 @@ const byId = (id) => document.getElementById(id);
 const chosen = (name) => document.querySelector(`input[name=${name}]:checked`).value;
 const DESCRIPTIONS = {
   move: "Mark where the photo is separated, or where it stays as it is.",
-  here: "Only the marked regions are separated, if this is the first region. Hatched parts stay as they are.",
+  here: "The marked regions are separated. If the first region is of this kind, the rest of the photo stays as it is (hatched).",
   protect: "The marked regions stay as they are.",
   erase: "The eraser removes marks.",
 };
 
 // Creates the editor of regions and connects its controls. `onEdit()` is called when the regions of the current photo have changed,
-// `onPaint()` when only the drawing has, `saveMask()` to download the mask.
+// `onPaint()` when only the drawing has, `saveMask()` is called to download the mask, and `announce(text)` to tell screen readers what happened.
 export function createTools({ onEdit, onPaint, saveMask, announce }) {
   const number = (id) => Number(byId(id).value);
   const tool = () => ({
@@ -75,7 +75,7 @@ export function createTools({ onEdit, onPaint, saveMask, announce }) {
 
   return {
     editor,
-    // Shows the regions of a photo with `size`, or none.
+    // Shows the regions of a photo of `size` (width, height). `regions` = null shows none.
     show(regions, size = [1, 1]) {
       editor.cancel();
       Object.assign(editor, { regions, size });

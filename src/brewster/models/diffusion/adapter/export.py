@@ -13,10 +13,10 @@ from typing import Final
 import torch
 from torch import Tensor, nn
 
-from brewster.errors import ModelError, TargetError
+from brewster.errors import ModelError, OutputError
 from brewster.models.diffusion.adapter.lora import read_lora, read_prompt
-from brewster.models.diffusion.backbones import load_backbone
-from brewster.models.diffusion.families.family import Backbone
+from brewster.models.diffusion.backbones.backbone import Backbone
+from brewster.models.diffusion.backbones.registry import load_backbone
 from brewster.models.diffusion.prompt import PROMPT_FILE
 from brewster.models.diffusion.tensors import write_tensors
 
@@ -29,7 +29,7 @@ def export_comfyui(folder: Path, target: Path) -> None:
 
     Raises:
         ModelError: the LoRA is missing or damaged, or was not written by brewster.
-        TargetError: `target` exists or cannot be written.
+        OutputError: `target` exists or cannot be written.
     """
     _check_target(target)
     state, metadata = read_lora(folder)
@@ -45,7 +45,7 @@ def export_comfyui(folder: Path, target: Path) -> None:
     write_tensors(target, tensors | alphas, {})
 
 
-def export_merged(folder: Path, target: Path, base: str | None = None) -> None:
+def export_merged(folder: Path, target: Path, base_model: str | None = None) -> None:
     """Adds the LoRA to the weights of its base, and writes the result as a folder in diffusers' layout, in bfloat16.
 
     The sums are computed in float32 on the CPU. The folder also gets the encoded prompt, but no text encoders. It is for
@@ -59,12 +59,12 @@ def export_merged(folder: Path, target: Path, base: str | None = None) -> None:
     Raises:
         ModelError: the LoRA or its base is missing or damaged, or they do not match.
         DownloadError: the base cannot be downloaded.
-        TargetError: `target` exists or cannot be written.
+        OutputError: `target` exists or cannot be written.
     """
     _check_target(target)
     state, metadata = read_lora(folder)
     prompt = read_prompt(folder, metadata)
-    backbone = load_backbone(base or metadata.base, dtype=torch.bfloat16)
+    backbone = load_backbone(base_model or metadata.base_model, dtype=torch.bfloat16)
     if backbone.name != metadata.backbone:
         raise ModelError(
             f"{folder} is a LoRA of {metadata.backbone}",
@@ -78,7 +78,7 @@ def export_merged(folder: Path, target: Path, base: str | None = None) -> None:
 
 @torch.no_grad()
 def merge(backbone: Backbone, state: Mapping[str, Tensor], scale: float) -> None:
-    """Replaces the weight W of each adapted layer by W + scale B A (Hu et al. 2021). `state` is that of `lora_state`.
+    """Replaces the weight W of each adapted layer by W + scale B A (Hu et al. 2021). `state` is that of `lora_state_dict`.
 
     Raises:
         ModelError: the backbone has no such layer.
@@ -99,6 +99,6 @@ def merge(backbone: Backbone, state: Mapping[str, Tensor], scale: float) -> None
 
 def _check_target(target: Path) -> None:
     if target.exists():
-        raise TargetError(
+        raise OutputError(
             f"{target} exists already", "expected a new file or folder", "choose another target"
         )

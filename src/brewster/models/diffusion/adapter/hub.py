@@ -22,7 +22,7 @@ from typing import Any, Final, final
 
 from brewster.errors import DownloadError, ModelError
 from brewster.models.diffusion.adapter.lora import LORA_FILE, LoraMetadata, read_lora_metadata, read_prompt
-from brewster.models.diffusion.backbones import BACKBONES, find_family
+from brewster.models.diffusion.backbones.registry import BACKBONES, find_backbone_class
 from brewster.models.diffusion.lazy_imports import import_library
 from brewster.models.diffusion.prompt import PROMPT_FILE
 from brewster.models.diffusion.tensors import read_metadata, with_metadata
@@ -104,7 +104,8 @@ def plan_push(folder: Path, repo_id: str, *, message: str = "", public: bool = F
     return UploadPlan(
         repo_id,
         tuple(UploadFile(name, content) for name, content in data.items()),
-        message or f"LoRA of {replacements.get(metadata.base, metadata.base)}, rank {metadata.rank}",
+        message
+        or f"LoRA of {replacements.get(metadata.base_model, metadata.base_model)}, rank {metadata.rank}",
         not public,
         tuple(_remarks(folder, metadata, replacements)),
     )
@@ -228,15 +229,17 @@ def _replace_strings(value: Any, replacements: Mapping[str, str]) -> Any:  # noq
 
 def _base_replacement(metadata: LoraMetadata) -> dict[str, str]:
     """{local folder: hub id} if the base is a local folder; otherwise empty."""
-    is_local = metadata.base not in BACKBONES and (
-        _is_local_path(metadata.base) or Path(metadata.base).is_dir()
+    is_local = metadata.base_model not in BACKBONES and (
+        _is_local_path(metadata.base_model) or Path(metadata.base_model).is_dir()
     )
-    return {metadata.base: find_family(metadata.backbone).hub_id} if is_local else {}
+    return {metadata.base_model: find_backbone_class(metadata.backbone).hub_id} if is_local else {}
 
 
 def _replace_base(data: bytes, metadata: LoraMetadata, replacements: Mapping[str, str]) -> bytes:
     """Replaces the base in the metadata of the LoRA file, and returns the new bytes."""
-    new_text = dataclasses.replace(metadata, base=replacements.get(metadata.base, metadata.base)).to_json()
+    new_text = dataclasses.replace(
+        metadata, base_model=replacements.get(metadata.base_model, metadata.base_model)
+    ).to_json()
     return with_metadata(
         data,
         {
@@ -260,13 +263,13 @@ def _refuse_home_folders(path: Path, data: bytes) -> None:
 
 
 def _is_tiny(metadata: LoraMetadata) -> bool:
-    return metadata.base.startswith(TINY_PREFIX)
+    return metadata.base_model.startswith(TINY_PREFIX)
 
 
 def _remarks(folder: Path, metadata: LoraMetadata, replacements: Mapping[str, str]) -> Iterator[str]:
-    licence = find_family(metadata.backbone).licence
+    licence = find_backbone_class(metadata.backbone).licence
     if _is_tiny(metadata):
-        yield f"its base is {metadata.base}, a tiny test model: it cannot separate photos"
+        yield f"its base is {metadata.base_model}, a tiny test model: it cannot separate photos"
     elif not licence.is_commercial:
         yield f"its base has the licence {licence.title}, which also applies to the LoRA: not for commercial use"
     yield from (f"{path} is replaced by {name} in the uploaded files" for path, name in replacements.items())

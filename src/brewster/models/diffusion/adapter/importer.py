@@ -1,9 +1,9 @@
 """Converts a LoRA of another program to the folder that brewster opens.
 
-    import_lora("someone/glass-lora", Path("glass"), base="kontext", prompt="remove the reflection", panels=("T",))
+    import_lora("someone/glass-lora", Path("glass"), base_model="kontext", prompt="remove the reflection", panels=("T",))
 
-Such a file does not say for which base and prompt it was trained, nor what it generates; the user states them. The prompt is
-encoded here, once. The names and shapes of the layers are compared with the configuration of the base; its weights are not
+Such a file does not say for which base model and prompt it was trained, nor what it generates; the user states them. The prompt is
+encoded here, once. The names and shapes of the layers are compared with the configuration of the base model; its weights are not
 loaded.
 """
 
@@ -18,11 +18,22 @@ import torch
 from torch import nn
 
 from brewster.errors import ModelError
-from brewster.models.diffusion.adapter.key_styles import Scale, alpha_scale, read_layers
 from brewster.models.diffusion.adapter.lora import LoraMetadata, save_layers
-from brewster.models.diffusion.backbones import BACKBONES, INDEX_FILE, build, encode_prompt, family_of
-from brewster.models.diffusion.families.family import Backbone
-from brewster.models.diffusion.lazy_imports import diffusers_class, fetch
+from brewster.models.diffusion.adapter.lora_formats import (
+    ScalingFunction,
+    read_lora_layers,
+    scaling_from_config,
+)
+from brewster.models.diffusion.backbones.backbone import Backbone
+from brewster.models.diffusion.backbones.registry import (
+    BACKBONES,
+    INDEX_FILE,
+    backbone_class_of,
+    build,
+    encode_prompt,
+)
+from brewster.models.diffusion.hub_download import resolve_model_folder
+from brewster.models.diffusion.lazy_imports import diffusers_class
 from brewster.models.diffusion.panels import Panel, PanelLayout
 from brewster.models.diffusion.prompt import PROMPTS
 from brewster.models.diffusion.task import DecompositionTask
@@ -38,7 +49,7 @@ def import_lora(
     source: str,
     folder: Path,
     *,
-    base: str,
+    base_model: str,
     prompt: str,
     panels: tuple[Panel, ...],
     device: str = "cpu",
@@ -48,7 +59,7 @@ def import_lora(
     Args:
         source: a .safetensors file, or a folder or hub id with one.
         folder: the folder to write.
-        base: the base of the LoRA: a name in `BACKBONES`, a folder or a hub id.
+        base_model: the base model of the LoRA: a name in `BACKBONES`, a folder or a hub id.
         prompt: a name in `PROMPTS`, or the text itself.
         panels: what the LoRA generates from the photo.
         device: the device that encodes the prompt.
@@ -57,19 +68,23 @@ def import_lora(
         The metadata of the written LoRA.
 
     Raises:
-        ModelError: there is no LoRA, or a key or shape does not belong to the base; the message names the key style.
+        ModelError: there is no LoRA, or a key or shape does not belong to the base model; the message names the key style.
         RecipeError: the panels do not contain T, or are repeated.
         DownloadError, DeviceError, MissingExtra: see `encode_prompt`.
-        TargetError: the folder cannot be written.
+        OutputError: the folder cannot be written.
     """
     task = DecompositionTask(PanelLayout(panels))
     path = _find_file(source)
     tensors, metadata = read_tensors(path)
-    family = family_of(base)
-    layers = read_layers(tensors, _skeleton(base, family), family.name, _scale(path, metadata))
-    embedding = encode_prompt(base, PROMPTS.get(prompt, prompt), device=device)
+    backbone_class = backbone_class_of(base_model)
+    layers = read_lora_layers(
+        tensors, _skeleton(base_model, backbone_class), backbone_class.name, _scale(path, metadata)
+    )
+    embedding = encode_prompt(base_model, PROMPTS.get(prompt, prompt), device=device)
     rank = max(layer.rank for layer in layers.values())
-    written = LoraMetadata(family.name, base, None, rank, rank, task, embedding.sha256, imported=True)
+    written = LoraMetadata(
+        backbone_class.name, base_model, None, rank, rank, task, embedding.sha256, imported=True
+    )
     save_layers(folder, layers, embedding, written)
     return written
 
@@ -78,7 +93,7 @@ def _find_file(source: str) -> Path:
     """The file with the weights, downloaded if it is on the hub."""
     if Path(source).is_file():
         return Path(source)
-    folder = fetch(source, ["*.safetensors", _PEFT_CONFIG_FILE])
+    folder = resolve_model_folder(source, ["*.safetensors", _PEFT_CONFIG_FILE])
     files = sorted(folder.glob("*.safetensors"))
     if len(files) != 1:
         names = ", ".join(path.name for path in files) or "no such file"
@@ -88,26 +103,30 @@ def _find_file(source: str) -> Path:
     return files[0]
 
 
-def _scale(path: Path, metadata: Mapping[str, str]) -> Scale | None:
+def _scale(path: Path, metadata: Mapping[str, str]) -> ScalingFunction | None:
     """alpha / rank from the settings in the file's metadata (diffusers) or next to it (peft)."""
     config = path.with_name(_PEFT_CONFIG_FILE)
     try:
         if _DIFFUSERS_KEY in metadata:
-            return alpha_scale(dict(json.loads(metadata[_DIFFUSERS_KEY])), _PREFIX)
-        return alpha_scale(dict(json.loads(config.read_text("utf-8")))) if config.is_file() else None
+            return scaling_from_config(dict(json.loads(metadata[_DIFFUSERS_KEY])), _PREFIX)
+        return scaling_from_config(dict(json.loads(config.read_text("utf-8")))) if config.is_file() else None
     except (OSError, ValueError, TypeError) as error:
         raise ModelError(
             f"the settings of {path} cannot be read ({error})", "expected a JSON object", "copy it again"
         ) from error
 
 
-def _skeleton(base: str, family: type[Backbone]) -> nn.Module:
-    """The transformer of the base on the device "meta": names and shapes without weights."""
-    if base in BACKBONES or base.startswith(TINY_PREFIX):
-        architecture = family.tiny if base.startswith(TINY_PREFIX) else family.full_size
-        transformer: nn.Module = build(family.name, architecture, device="meta").transformer
+def _skeleton(base_model: str, backbone_class: type[Backbone]) -> nn.Module:
+    """The transformer of the base model on the device "meta": names and shapes without weights."""
+    if base_model in BACKBONES or base_model.startswith(TINY_PREFIX):
+        architecture = backbone_class.tiny if base_model.startswith(TINY_PREFIX) else backbone_class.full_size
+        transformer: nn.Module = build(backbone_class.name, architecture, device="meta").transformer
         return transformer
-    path = fetch(base, [INDEX_FILE, "transformer/config.json"]) / "transformer" / "config.json"
+    path = (
+        resolve_model_folder(base_model, [INDEX_FILE, "transformer/config.json"])
+        / "transformer"
+        / "config.json"
+    )
     try:
         config: dict[str, Any] = json.loads(path.read_text("utf-8"))
     except (OSError, ValueError) as error:
@@ -117,5 +136,5 @@ def _skeleton(base: str, family: type[Backbone]) -> nn.Module:
             "copy it again",
         ) from error
     with torch.device("meta"):
-        skeleton: nn.Module = diffusers_class(family.classes["transformer"]).from_config(config)
+        skeleton: nn.Module = diffusers_class(backbone_class.classes["transformer"]).from_config(config)
     return skeleton

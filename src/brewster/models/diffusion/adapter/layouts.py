@@ -9,7 +9,7 @@ from typing import Final, final
 
 from brewster.models.diffusion.adapter import lora, windowseat
 from brewster.models.diffusion.adapter.lora import LORA_FILE, LoraMetadata
-from brewster.models.diffusion.families.family import Backbone
+from brewster.models.diffusion.backbones.backbone import Backbone
 from brewster.models.diffusion.prompt import PROMPT_FILE, PromptEmbedding
 
 

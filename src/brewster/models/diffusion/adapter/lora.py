@@ -25,13 +25,14 @@ from pydantic import Field, TypeAdapter, ValidationError
 from torch import Tensor, nn
 
 from brewster.errors import ModelError, RecipeError
-from brewster.models.diffusion.adapter.key_styles import LowRankLayer, check_shape, read_layers, to_state
-from brewster.models.diffusion.families.family import Backbone
+from brewster.models.diffusion.adapter import lora_formats
+from brewster.models.diffusion.adapter.lora_formats import LowRankLayer
+from brewster.models.diffusion.backbones.backbone import Backbone
 from brewster.models.diffusion.lazy_imports import import_library
 from brewster.models.diffusion.prompt import PROMPT_FILE, PromptEmbedding, load_prompt
 from brewster.models.diffusion.task import DecompositionTask
 from brewster.models.diffusion.tensors import read_tensors, write_tensors
-from brewster.options import Quantisation
+from brewster.options import Quantization
 
 LORA_FILE: Final = "pytorch_lora_weights.safetensors"
 """The file name that diffusers expects."""
@@ -44,19 +45,19 @@ _ADAPTER_NAME: Final = "default"
 @final
 @dataclass(frozen=True)
 class LoraMetadata:
-    """The metadata of a LoRA: backbone, base and its quantisation, rank, alpha, task, and the digest of the prompt.
+    """The metadata of a LoRA: backbone, base and its quantization, rank, alpha, task, and the digest of the prompt.
 
-    `base` is a hub id, a folder, or a name in the table of backbones. For `targets`, see `select_targets`.
+    `base_model` is a hub id, a folder, or a name in the table of backbones. For `target_modules`, see `select_target_modules`.
     """
 
     backbone: str
-    base: str
-    quantise: Quantisation | None
+    base_model: str
+    quantization: Quantization | None
     rank: Annotated[int, Field(ge=1)]
     alpha: Annotated[int, Field(ge=1)]
     task: DecompositionTask
     prompt_sha256: str
-    targets: tuple[str, ...] = ()
+    target_modules: tuple[str, ...] = ()
     imported: bool = False
     """Whether another program trained the LoRA. Then it may adapt any layers, each with its own rank up to `rank`."""
 
@@ -100,7 +101,7 @@ def _metadata_validator() -> TypeAdapter[LoraMetadata]:
     return TypeAdapter(LoraMetadata)
 
 
-def select_targets(backbone: Backbone, patterns: Sequence[str] = ()) -> list[str]:
+def select_target_modules(backbone: Backbone, patterns: Sequence[str] = ()) -> list[str]:
     """The full names of the linear layers of the blocks that match a pattern; without patterns, of all of them.
 
     In a pattern, * and ? are wildcards as in a shell: "*.attn.*" selects the layers of the attention.
@@ -114,15 +115,15 @@ def select_targets(backbone: Backbone, patterns: Sequence[str] = ()) -> list[str
             raise ModelError(
                 f"no linear layer of {backbone.name} matches the target {pattern!r}",
                 f"expected a name with wildcards, such as *.attn.*, that matches layers such as {names[0]}",
-                "correct targets, or leave it out to adapt all linear layers of the blocks",
+                "correct target_modules, or leave it out to adapt all linear layers of the blocks",
             )
     return [name for name in names if not patterns or any(fnmatchcase(name, each) for each in patterns)]
 
 
 def add_lora(
-    backbone: Backbone, *, rank: int = 16, alpha: int = 16, seed: int = 0, targets: Sequence[str] = ()
+    backbone: Backbone, *, rank: int = 16, alpha: int = 16, seed: int = 0, target_modules: Sequence[str] = ()
 ) -> list[nn.Parameter]:
-    """Adds a LoRA to the linear layers of the blocks; for `targets` see `select_targets`.
+    """Adds a LoRA to the linear layers of the blocks; for `target_modules` see `select_target_modules`.
 
     Its B matrices are zero, so predictions do not change yet.
 
@@ -137,7 +138,9 @@ def add_lora(
         raise ModelError(f"the rank is {rank}", "expected at least 1", "use 16 as in the paper")
     _check_no_lora(backbone)
     peft = import_library("peft")
-    config = peft.LoraConfig(r=rank, lora_alpha=alpha, target_modules=select_targets(backbone, targets))
+    config = peft.LoraConfig(
+        r=rank, lora_alpha=alpha, target_modules=select_target_modules(backbone, target_modules)
+    )
     with torch.random.fork_rng(devices=_cuda_devices(backbone)):
         torch.manual_seed(seed)
         _add_adapter(backbone, config)
@@ -156,12 +159,14 @@ def attach_layers(backbone: Backbone, layers: Mapping[str, LowRankLayer]) -> Non
     _check_no_lora(backbone)
     modules = dict(backbone.transformer.named_modules())
     for name, layer in layers.items():
-        check_shape(name, layer, modules.get(name))
+        lora_formats.check_shape(name, layer, modules.get(name))
     peft = import_library("peft")
     config = peft.LoraConfig(**_layer_settings(layers))
     _add_adapter(backbone, config)
     _convert_for_inference(backbone)
-    peft.set_peft_model_state_dict(backbone.transformer, to_state(layers), adapter_name=_ADAPTER_NAME)
+    peft.set_peft_model_state_dict(
+        backbone.transformer, lora_formats.to_state_dict(layers), adapter_name=_ADAPTER_NAME
+    )
 
 
 def _check_no_lora(backbone: Backbone) -> None:
@@ -187,7 +192,7 @@ def lora_parameters(backbone: Backbone) -> list[nn.Parameter]:
     return [parameter for parameter in backbone.transformer.parameters() if parameter.requires_grad]
 
 
-def lora_state(backbone: Backbone) -> dict[str, Tensor]:
+def lora_state_dict(backbone: Backbone) -> dict[str, Tensor]:
     """The LoRA's weights by name, such as transformer_blocks.0.attn.to_q.lora_A.weight; empty without a LoRA."""
     if not has_lora(backbone):
         return {}
@@ -196,12 +201,12 @@ def lora_state(backbone: Backbone) -> dict[str, Tensor]:
 
 
 def load_lora_state(backbone: Backbone, state: Mapping[str, Tensor]) -> None:
-    """Loads weights from `lora_state` into a backbone with a LoRA of the same shapes.
+    """Loads weights from `lora_state_dict` into a backbone with a LoRA of the same shapes.
 
     Raises:
         ModelError: the backbone has no LoRA, or the weights are those of another backbone or rank.
     """
-    _check_weights(lora_state(backbone), state)
+    _check_weights(lora_state_dict(backbone), state)
     import_library("peft").set_peft_model_state_dict(
         backbone.transformer, dict(state), adapter_name=_ADAPTER_NAME
     )
@@ -213,20 +218,20 @@ def save_lora(
     prompt: PromptEmbedding,
     task: DecompositionTask,
     *,
-    base: str = "",
-    quantise: Quantisation | None = None,
-    targets: Sequence[str] = (),
+    base_model: str = "",
+    quantization: Quantization | None = None,
+    target_modules: Sequence[str] = (),
 ) -> LoraMetadata:
     """Writes a folder with the LoRA, in a file that diffusers can load, and the prompt. The bytes are reproducible.
 
-    By default `base` is the backbone's hub id. `targets` are those of `add_lora`.
+    By default `base_model` is the backbone's hub id. `target_modules` are those of `add_lora`.
 
     Returns:
         The metadata that is stored in the file.
 
     Raises:
         ModelError: the backbone has no LoRA, or the prompt belongs to another backbone.
-        TargetError: the folder cannot be written.
+        OutputError: the folder cannot be written.
     """
     if not has_lora(backbone):
         raise ModelError("the backbone has no LoRA", "expected a backbone with a LoRA", "call add_lora first")
@@ -237,11 +242,13 @@ def save_lora(
             "encode it for this backbone",
         )
     config = backbone.transformer.peft_config[_ADAPTER_NAME]
-    source, rank, alpha = base or backbone.hub_id, config.r, config.lora_alpha
-    metadata = LoraMetadata(backbone.name, source, quantise, rank, alpha, task, prompt.sha256, tuple(targets))
+    source, rank, alpha = base_model or backbone.hub_id, config.r, config.lora_alpha
+    metadata = LoraMetadata(
+        backbone.name, source, quantization, rank, alpha, task, prompt.sha256, tuple(target_modules)
+    )
     # Without lora_alpha, diffusers assumes that alpha equals the rank.
     settings = {"r": rank, "lora_alpha": alpha, "target_modules": sorted(config.target_modules)}
-    _write(folder, lora_state(backbone), settings, prompt, metadata)
+    _write(folder, lora_state_dict(backbone), settings, prompt, metadata)
     return metadata
 
 
@@ -251,9 +258,9 @@ def save_layers(
     """Writes a LoRA of another program as `save_lora` writes those of brewster.
 
     Raises:
-        TargetError: the folder cannot be written.
+        OutputError: the folder cannot be written.
     """
-    _write(folder, to_state(layers), _layer_settings(layers), prompt, metadata)
+    _write(folder, lora_formats.to_state_dict(layers), _layer_settings(layers), prompt, metadata)
 
 
 def _write(
@@ -317,9 +324,9 @@ def load_lora(folder: Path, backbone: Backbone) -> tuple[LoraMetadata, PromptEmb
         )
     prompt = read_prompt(folder, metadata)
     if metadata.imported:
-        attach_layers(backbone, read_layers(state, backbone.transformer, backbone.name))
+        attach_layers(backbone, lora_formats.read_lora_layers(state, backbone.transformer, backbone.name))
         return metadata, prompt
-    add_lora(backbone, rank=metadata.rank, alpha=metadata.alpha, targets=metadata.targets)
+    add_lora(backbone, rank=metadata.rank, alpha=metadata.alpha, target_modules=metadata.target_modules)
     try:
         load_lora_state(backbone, state)
     except ModelError:
@@ -335,7 +342,7 @@ def _convert_for_inference(backbone: Backbone) -> None:
 
 
 def read_lora(folder: Path) -> tuple[dict[str, Tensor], LoraMetadata]:
-    """The weights of the LoRA in this folder, as `lora_state` names them, and its metadata.
+    """The weights of the LoRA in this folder, as `lora_state_dict` names them, and its metadata.
 
     Raises:
         ModelError: the LoRA is missing or damaged, or was not written by brewster.
@@ -345,7 +352,7 @@ def read_lora(folder: Path) -> tuple[dict[str, Tensor], LoraMetadata]:
         raise ModelError(
             f"{folder / LORA_FILE} was not written by brewster",
             f"expected a LoRA with the entry {_METADATA_KEY} in its metadata",
-            "convert it: brewster models import SOURCE FOLDER --base BASE --prompt TEXT --panels T",
+            "convert it: brewster models import SOURCE FOLDER --base-model BASE --prompt TEXT --panels T",
         )
     metadata = LoraMetadata.from_json(entries[_METADATA_KEY])
     return {name.removeprefix(_PREFIX): tensor for name, tensor in tensors.items()}, metadata

@@ -18,10 +18,10 @@ from typing import Any, Final
 from torch import Tensor
 
 from brewster.errors import ModelError
-from brewster.models.diffusion.adapter.key_styles import alpha_scale, read_layers
 from brewster.models.diffusion.adapter.lora import LoraMetadata, attach_layers
-from brewster.models.diffusion.families.family import Backbone
-from brewster.models.diffusion.families.qwen import Qwen
+from brewster.models.diffusion.adapter.lora_formats import read_lora_layers, scaling_from_config
+from brewster.models.diffusion.backbones.backbone import Backbone
+from brewster.models.diffusion.backbones.qwen import Qwen
 from brewster.models.diffusion.panels import PanelLayout
 from brewster.models.diffusion.prompt import PromptEmbedding
 from brewster.models.diffusion.task import DecompositionTask
@@ -38,7 +38,7 @@ _PROMPT_TEXT: Final = "WindowSeat's trained embedding"
 
 
 def read_metadata(folder: Path) -> LoraMetadata:
-    """The base, rank, task and prompt digest of the model in this folder. The quantisation is that of the published call.
+    """The base, rank, task and prompt digest of the model in this folder. The quantization is that of the published call.
 
     Raises:
         ModelError: a file is missing or damaged, or lacks a value.
@@ -59,16 +59,16 @@ def read_metadata(folder: Path) -> LoraMetadata:
             "expected a hub id",
             "download the model again",
         )
-    if side < Qwen.multiple or side % Qwen.multiple:
+    if side < Qwen.size_divisor or side % Qwen.size_divisor:
         raise ModelError(
             f"processing_resolution in {folder / INDEX_FILE} is {side}",
-            f"expected a multiple of {Qwen.multiple}",
+            f"expected a multiple of {Qwen.size_divisor}",
             "download the model again",
         )
     # Panel I is the encoded photo, decoded again. It separates the errors of the VAE from the change by the model.
     task = DecompositionTask(
         PanelLayout(("I", "T")),
-        budget_px=2 * side**2,
+        max_composite_pixels=2 * side**2,
         objective="direct",
         guidance=1.0,
         time=_TIME,
@@ -90,7 +90,9 @@ def load(folder: Path, backbone: Backbone) -> tuple[LoraMetadata, PromptEmbeddin
     metadata, prompt = read_metadata(folder), _read_prompt(folder)
     tensors, _ = read_tensors(folder / WEIGHTS_FILE)
     config = _read_json(folder / CONFIG_FILE)
-    attach_layers(backbone, read_layers(tensors, backbone.transformer, backbone.name, alpha_scale(config)))
+    attach_layers(
+        backbone, read_lora_layers(tensors, backbone.transformer, backbone.name, scaling_from_config(config))
+    )
     return metadata, prompt
 
 

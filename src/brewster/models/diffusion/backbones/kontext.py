@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from brewster.errors import ModelError
-from brewster.models.diffusion.families.family import (
+from brewster.models.diffusion.backbones.backbone import (
     Backbone,
     DiffusersUsage,
     Licence,
@@ -67,7 +67,7 @@ class Kontext(Backbone):
         "scheduler": _SCHEDULER,
     }  # fmt: skip
     guided_by_embedding = True
-    parameters = 11_901_000_000
+    parameter_count = 11_901_000_000
     text_encoder_parameters = 4_885_000_000  # T5-XXL encoder 4.762, CLIP-L 0.123
 
     def statistics(self) -> tuple[Tensor, Tensor]:

@@ -1,6 +1,6 @@
 """Reads LoRAs of other programs: the key styles of peft, diffusers, kohya's sd-scripts and ComfyUI.
 
-    layers = read_layers(tensors, backbone.transformer, "kontext", alpha_scale(settings))
+    layers = read_lora_layers(tensors, backbone.transformer, "kontext", scaling_from_config(settings))
     attach_layers(backbone, layers)         # in lora.py
 
 Ranks and adapted layers may be any. The scale alpha / rank of a layer is multiplied into its B matrix, so the change of a
@@ -89,7 +89,7 @@ _ORIGINAL_NAMES: Final[dict[str, dict[str, dict[str, tuple[str, ...]]]]] = {
 """Backbone -> prefix -> layer in the original code of the model -> its layers in diffusers. Several layers in diffusers
 have their rows one after the other in the original layer. Qwen has the same names in both."""
 _BLOCKS: Final = {"double_blocks.{}.": "transformer_blocks", "single_blocks.{}.": "single_transformer_blocks"}
-_SWAPPED: Final = "norm_out.linear"
+_SCALE_SHIFT_SWAPPED: Final = "norm_out.linear"
 """The layer whose two halves, scale and shift, have the opposite order in the original code."""
 
 
@@ -107,12 +107,12 @@ class LowRankLayer:
         return len(self.down)
 
 
-Scale = Callable[[str, int], float]
+ScalingFunction = Callable[[str, int], float]
 """The factor alpha / rank for a layer, by its name in the file, and its rank."""
 
 
-def read_layers(
-    tensors: Mapping[str, Tensor], transformer: nn.Module, backbone: str, scale: Scale | None = None
+def read_lora_layers(
+    tensors: Mapping[str, Tensor], transformer: nn.Module, backbone: str, scale: ScalingFunction | None = None
 ) -> dict[str, LowRankLayer]:
     """The LoRA of each layer by the layer's name in the transformer, float32, with the scale multiplied in.
 
@@ -143,15 +143,15 @@ def read_layers(
     return layers
 
 
-def to_state(layers: Mapping[str, LowRankLayer]) -> dict[str, Tensor]:
-    """The weights with the names that `lora_state` uses."""
+def to_state_dict(layers: Mapping[str, LowRankLayer]) -> dict[str, Tensor]:
+    """The weights with the names that `lora_state_dict` uses."""
     state: dict[str, Tensor] = {}
     for name, layer in sorted(layers.items()):
         state |= {f"{name}.lora_A.weight": layer.down, f"{name}.lora_B.weight": layer.up}
     return state
 
 
-def key_style(tensors: Mapping[str, Tensor]) -> str:
+def lora_format(tensors: Mapping[str, Tensor]) -> str:
     """The program whose key style a LoRA file has: peft, diffusers, kohya, ComfyUI, or unknown."""
     styles = {style for key in tensors for prefix, style in _PREFIXES.items() if key.startswith(prefix)}
     if not styles:
@@ -220,7 +220,7 @@ def _split(
             "use the base with which it was trained",
         )
     parts = layer.up.split(sizes)  # type: ignore[no-untyped-call]
-    if targets == (_SWAPPED,) and not name.startswith("norm_out"):
+    if targets == (_SCALE_SHIFT_SWAPPED,) and not name.startswith("norm_out"):
         parts = (layer.up.roll(len(layer.up) // 2, dims=0),)
     layers = {
         target: LowRankLayer(layer.down.clone(), part.clone())  # safetensors refuses shared memory
@@ -231,7 +231,7 @@ def _split(
     return layers
 
 
-def check_shape(name: str, layer: LowRankLayer, module: Any) -> None:  # noqa: ANN401 - quantised layers differ in type
+def check_shape(name: str, layer: LowRankLayer, module: Any) -> None:  # noqa: ANN401 - quantized layers differ in type
     """Checks that the LoRA fits a linear layer.
 
     Raises:
@@ -250,7 +250,7 @@ def check_shape(name: str, layer: LowRankLayer, module: Any) -> None:  # noqa: A
 
 
 def _unknown(key: str, tensors: Mapping[str, Tensor], backbone: str) -> ModelError:
-    style = key_style(tensors)
+    style = lora_format(tensors)
     method = next(
         (method for part, method in _OTHER_METHODS.items() if any(part in name for name in tensors)), ""
     )
@@ -271,7 +271,7 @@ def _unknown(key: str, tensors: Mapping[str, Tensor], backbone: str) -> ModelErr
     )
 
 
-def alpha_scale(settings: Mapping[str, Any], prefix: str = "") -> Scale:
+def scaling_from_config(settings: Mapping[str, Any], prefix: str = "") -> ScalingFunction:
     """alpha / rank from the settings of peft: `lora_alpha`, `alpha_pattern` and `use_rslora` (Kalajdzievski 2023).
 
     `prefix` is that of the keys in the settings, such as "transformer." in the metadata that diffusers writes.

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch.nn import functional
 
-from brewster.models.diffusion.backbones import tiny
+from brewster.models.diffusion.backbones.registry import tiny
 from brewster.models.diffusion.panels import PanelLayout, compose, conditioning_image
 from brewster.photo import Photo
 from brewster.srgb import to_encoded, to_linear

@@ -10,9 +10,9 @@ from brewster import Separator
 from brewster.errors import ModelError, RecipeError
 from brewster.models.diffusion.adapter import importer
 from brewster.models.diffusion.adapter.importer import import_lora
-from brewster.models.diffusion.adapter.key_styles import LowRankLayer, alpha_scale, read_layers
 from brewster.models.diffusion.adapter.lora import LORA_FILE, load_lora, read_lora_metadata
-from brewster.models.diffusion.backbones import tiny
+from brewster.models.diffusion.adapter.lora_formats import LowRankLayer, read_lora_layers, scaling_from_config
+from brewster.models.diffusion.backbones.registry import tiny
 from brewster.models.diffusion.pipeline import load_pipeline
 from brewster.models.diffusion.tensors import read_tensors
 from published_models import linear_layers, random_pair
@@ -100,7 +100,7 @@ STYLES = {
 
 def imported(path, name, folder):
     """The backbone with the imported LoRA, opened as a user opens it."""
-    import_lora(str(path), folder, base=f"tiny:{name}", prompt="remove the reflection", panels=("T",))
+    import_lora(str(path), folder, base_model=f"tiny:{name}", prompt="remove the reflection", panels=("T",))
     backbone, _ = tiny(name, seed=1)
     load_lora(folder, backbone)
     return backbone
@@ -142,7 +142,7 @@ def test_an_imported_lora_is_opened_by_model_and_by_diffusers(tmp_path):
     stock.pipeline().load_lora_weights(folder)
     torch.testing.assert_close(velocity(stock, prompt), velocity(backbone, prompt), atol=1e-5, rtol=0)
     metadata = read_lora_metadata(folder)
-    assert (metadata.backbone, metadata.base, metadata.rank) == ("klein", "tiny:klein", 3)
+    assert (metadata.backbone, metadata.base_model, metadata.rank) == ("klein", "tiny:klein", 3)
     assert metadata.task.layout.panels == ("T",)
     pipeline = load_pipeline(str(folder))
     assert pipeline.prompt.text == "remove the reflection"
@@ -186,7 +186,7 @@ def test_a_layer_of_several_is_split_by_rows_and_the_top_level_layer_is_not_mist
 
 def test_weights_in_bf16_are_read_as_float32(tmp_path):
     tensors = {key: value.bfloat16() for key, value in STYLES["diffusers"]("qwen").items()}
-    layers = read_layers(tensors, tiny("qwen", seed=1)[0].transformer, "qwen")
+    layers = read_lora_layers(tensors, tiny("qwen", seed=1)[0].transformer, "qwen")
     assert {matrix.dtype for layer in layers.values() for matrix in (layer.down, layer.up)} == {torch.float32}
 
 
@@ -208,7 +208,7 @@ def test_alphas_come_from_the_metadata_of_diffusers_and_the_settings_of_peft(tmp
     (tmp_path / "peft" / "adapter_config.json").write_text(json.dumps(settings))
     for index, source in enumerate((tmp_path / "a.safetensors", tmp_path / "peft")):
         folder = tmp_path / f"imported{index}"
-        import_lora(str(source), folder, base="tiny:qwen", prompt="x", panels=("T",))
+        import_lora(str(source), folder, base_model="tiny:qwen", prompt="x", panels=("T",))
         layers.append(read_tensors(folder / LORA_FILE)[0])
     for name, (_, up) in pairs.items():
         alpha = 8 if name.endswith("to_q") else 4
@@ -218,9 +218,9 @@ def test_alphas_come_from_the_metadata_of_diffusers_and_the_settings_of_peft(tmp
 
 
 def test_rank_stabilised_loras_have_their_own_scale():
-    assert alpha_scale({"lora_alpha": 8, "use_rslora": True})("x", 4) == 4
-    assert alpha_scale({"lora_alpha": 8})("x", 4) == 2
-    assert alpha_scale({})("x", 4) == 1
+    assert scaling_from_config({"lora_alpha": 8, "use_rslora": True})("x", 4) == 4
+    assert scaling_from_config({"lora_alpha": 8})("x", 4) == 2
+    assert scaling_from_config({})("x", 4) == 1
     assert LowRankLayer(torch.zeros(3, 2), torch.zeros(5, 3)).rank == 3
 
 
@@ -244,16 +244,20 @@ def test_what_is_not_understood_is_one_clear_sentence(tensors, message, tmp_path
     save_file(tensors, tmp_path / "lora.safetensors")
     with pytest.raises(ModelError, match=message):
         import_lora(
-            str(tmp_path / "lora.safetensors"), tmp_path / "out", base="tiny:qwen", prompt="x", panels=("T",)
+            str(tmp_path / "lora.safetensors"),
+            tmp_path / "out",
+            base_model="tiny:qwen",
+            prompt="x",
+            panels=("T",),
         )
     assert not (tmp_path / "out").exists()
 
 
 def test_a_folder_must_contain_one_file_and_panels_need_t(tmp_path):
     with pytest.raises(ModelError, match=r"contains no such file; expected one \.safetensors file"):
-        import_lora(str(tmp_path), tmp_path / "out", base="tiny:qwen", prompt="x", panels=("T",))
+        import_lora(str(tmp_path), tmp_path / "out", base_model="tiny:qwen", prompt="x", panels=("T",))
     with pytest.raises(RecipeError, match="expected a list with T"):
-        import_lora(str(tmp_path), tmp_path / "out", base="tiny:qwen", prompt="x", panels=("R",))
+        import_lora(str(tmp_path), tmp_path / "out", base_model="tiny:qwen", prompt="x", panels=("R",))
 
 
 def test_the_base_may_be_a_folder(tmp_path, monkeypatch):
@@ -261,11 +265,11 @@ def test_the_base_may_be_a_folder(tmp_path, monkeypatch):
     backbone.save(tmp_path / "base")
     monkeypatch.setattr(importer, "encode_prompt", lambda *_, **__: prompt)
     save_file(STYLES["diffusers"]("qwen"), tmp_path / "lora.safetensors")
-    base = str(tmp_path / "base")
+    base_model = str(tmp_path / "base")
     metadata = import_lora(
-        str(tmp_path / "lora.safetensors"), tmp_path / "out", base=base, prompt="x", panels=("T",)
+        str(tmp_path / "lora.safetensors"), tmp_path / "out", base_model=base_model, prompt="x", panels=("T",)
     )
-    assert (metadata.backbone, metadata.base) == ("qwen", base)
+    assert (metadata.backbone, metadata.base_model) == ("qwen", base_model)
 
 
 def test_a_lora_and_a_checkpoint_are_imported(run_without_model, tmp_path):
@@ -274,7 +278,7 @@ def test_a_lora_and_a_checkpoint_are_imported(run_without_model, tmp_path):
         f"transformer.transformer_blocks.0.attn.to_q.lora_{part}.weight": m for part, m in matrices.items()
     }
     save_file(tensors, tmp_path / "lora.safetensors")
-    arguments = ("models", "import", "lora.safetensors", "imported", "--base", "tiny:kontext")
+    arguments = ("models", "import", "lora.safetensors", "imported", "--base-model", "tiny:kontext")
     code, _, err = run_without_model(*arguments)
     assert (code, "A LoRA needs --prompt" in err) == (2, True)
     code, _, err = run_without_model(*arguments, "--prompt", "remove the reflection", "--panels", "T,R")

@@ -71,7 +71,7 @@ def names(node):
 
 def test_every_extension_point_has_a_section():
     assert list(sections()) == [
-        "A compact network", "A metric", "A glass effect", "A backbone for large models", "A benchmark",
+        "A compact network", "A metric", "A glass effect", "A backbone for diffusion models", "A benchmark",
     ]  # fmt: skip
 
 

@@ -57,7 +57,7 @@ def test_the_tiny_experiment_renders_trains_separates_and_evaluates(tmp_path):
         made = Photo.open(tmp_path / "separated" / f"mixture-coffee-rocket.{layer}.jpg")
         assert made.size == Photo.open(ROOT / "tests/pictures/mixture-coffee-rocket.jpg").size
     card = (tmp_path / "card.md").read_text()
-    assert "**This is a toy.**" in card
+    assert "**This model is for software tests.**" in card
     assert (
         rows_by_first_cell(card.partition("## Measured")[2])["lora"]
         == rows_by_first_cell(tables.partition("###")[0])["lora"]
@@ -72,9 +72,9 @@ def test_the_full_size_check_runs_on_tiny_models(tmp_path, monkeypatch, capsys):
         runpy.run_path(str(RUNS / "full_size_check.py"), run_name="__main__")
     output = rows_by_first_cell(capsys.readouterr().out)
     rows = json.loads((tmp_path / "full_size.json").read_text())["rows"]
-    assert [(row["backbone"], row["quantise"]) for row in rows] == [("kontext", "int8"), ("klein", None)]
+    assert [(row["backbone"], row["quantization"]) for row in rows] == [("kontext", "int8"), ("klein", None)]
     assert all(row["step_s"] > 0 and row["picture_s"] > 0 and row["fits"] for row in rows)
-    assert output["measured or estimated"] == ["toy twin, not full size"] * 2
+    assert output["measured or estimated"] == ["tiny version, not full size"] * 2
     assert rows_by_first_cell((tmp_path / "full_size.md").read_text()) == output
 
 
@@ -107,7 +107,7 @@ def test_every_command_of_the_paper_experiment_is_valid(tmp_path):
     with pytest.raises(click.UsageError):
         parse([*commands[1], "--no-such-option"])
     recipes = {arguments[1] for arguments in commands if arguments[0] in ("train", "ablate")}
-    studies = {f"recipes/ablations/{name}.toml" for name in ("large-mixing", "large-size", "prompt")}
+    studies = {f"recipes/ablations/{name}.toml" for name in ("lora-blend-space", "lora-size", "prompt")}
     assert recipes == {"recipes/train/kontext.toml", "recipes/train/kontext-real.toml"} | studies
     assert all((ROOT / name).is_file() for name in recipes)
 
@@ -121,10 +121,10 @@ def test_the_tiny_paper_experiment_trains_evaluates_and_ablates(tmp_path):
     assert "\\begin{tabular}" in (tmp_path / "table1.tex").read_text()
     results = json.loads((tmp_path / "failures" / "results.json").read_text())
     assert {"removed_white", "kept_reflection"} <= results["metrics"].keys()
-    studies = {"large-mixing": "mixing 8-bit", "large-size": "count 0", "prompt": "prompt none"}
+    studies = {"lora-blend-space": "blend_space srgb", "lora-size": "count 0", "prompt": "prompt none"}
     for name, label in studies.items():
         assert label in (tmp_path / "ablations" / name / "tables.md").read_text()
-    assert (tmp_path / "ablations" / "large-size" / "plot.png").is_file()
+    assert (tmp_path / "ablations" / "lora-size" / "plot.png").is_file()
     loras = [(tmp_path / name / "lora" / FILES[1]).read_bytes() for name in ("syn", "syn+real")]
     assert loras[0] != loras[1]
     assert output.splitlines()[-1] == "nothing was sent"

@@ -7,10 +7,10 @@ import huggingface_hub
 import pytest
 
 from brewster.errors import DownloadError
-from brewster.models.diffusion import download_notice
-from brewster.models.diffusion.backbones import BACKBONES
-from brewster.models.diffusion.lazy_imports import fetch
-from brewster.models.large_models import LARGE, licence_of
+from brewster.models.diffusion import hub_download
+from brewster.models.diffusion.backbones.registry import BACKBONES
+from brewster.models.diffusion.hub_download import resolve_model_folder
+from brewster.models.diffusion_models import DIFFUSION_MODELS, licence_of
 
 
 @pytest.fixture
@@ -35,7 +35,7 @@ def hub(monkeypatch, tmp_path):
 
 def test_size_and_licence_are_printed_before_the_download(hub, capsys):
     hub.free(50_000_000_000)
-    fetch("Qwen/Qwen-Image-Edit-2509", ["*"])
+    resolve_model_folder("Qwen/Qwen-Image-Edit-2509", ["*"])
     assert hub.calls == ["dry run", "download"]
     printed = capsys.readouterr()
     assert printed.out == ""
@@ -46,14 +46,14 @@ def test_size_and_licence_are_printed_before_the_download(hub, capsys):
 def test_a_download_that_does_not_fit_on_the_disk_is_refused(hub):
     hub.free(41_000_000_000)
     with pytest.raises(DownloadError, match=r"has 40\.2 GB to download, and 41\.0 GB are free in .*HF_HOME"):
-        fetch("Qwen/Qwen-Image-Edit-2509", ["*"])
+        resolve_model_folder("Qwen/Qwen-Image-Edit-2509", ["*"])
     assert hub.calls == ["dry run"]
 
 
 def test_small_and_cached_files_are_not_announced(hub, capsys):
     hub.files[:2] = [SimpleNamespace(file_size=None, will_download=True)]
     hub.free(0)
-    fetch("someone/model", ["*"])
+    resolve_model_folder("someone/model", ["*"])
     assert hub.calls == ["dry run", "download"]
     assert capsys.readouterr().err == ""
 
@@ -65,12 +65,12 @@ def test_the_hub_that_cannot_be_asked_does_not_prevent_the_use_of_the_cache(monk
         return str(tmp_path)
 
     monkeypatch.setattr(huggingface_hub, "snapshot_download", snapshot_download)
-    assert fetch("someone/model", ["*"]) == tmp_path
+    assert resolve_model_folder("someone/model", ["*"]) == tmp_path
 
 
 @pytest.mark.parametrize("name", list(BACKBONES))
 def test_the_table_agrees_with_the_backbones(name):
-    model, family = LARGE[name], BACKBONES[name]
+    model, family = DIFFUSION_MODELS[name], BACKBONES[name]
     assert (model.hub_id, model.licence) == (family.hub_id, family.licence.title)
     assert model.is_commercial == family.licence.is_commercial
 
@@ -79,4 +79,4 @@ def test_the_licence_of_a_base_is_that_of_its_owner():
     assert licence_of("black-forest-labs/FLUX.1-Kontext-dev") == "FLUX.1 [dev] Non-Commercial License"
     assert licence_of("Qwen/Qwen-Image-Edit-2509") == "Apache-2.0"
     assert licence_of("someone/model") == "see its page on the hub"
-    assert download_notice.licence_of is licence_of
+    assert hub_download.licence_of is licence_of

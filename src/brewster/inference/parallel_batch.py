@@ -1,9 +1,9 @@
 """Separates an archive: a batch in several processes or on a cluster, with an index of the results.
 
     tasks = plan_files("scans.parquet", "s3://bucket/clear", options)
-    create_runner = partial(ArchiveRunner, options)
+    create_runner = partial(SeparationRunner, options)
     with RayExecutor(create_runner, "10.0.0.1:6379") as executor, IndexWriter(location("s3://bucket/clear")) as index:
-        separate_archive(tasks, executor, report=index.append)
+        separate_in_parallel(tasks, executor, report=index.append)
 
 A worker separates one photo at a time, with the code of a batch in one process (`BatchRunner`). It reads the photo and
 writes the layers itself. A layer that exists is never written again, not even by two workers at the same time. So a lost
@@ -17,7 +17,7 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import final
 
-from brewster.errors import TargetError
+from brewster.errors import OutputError
 from brewster.executors import Executor, run_tasks
 from brewster.files import exists
 from brewster.inference.batch import BatchRunner, FileResult, SeparationTask
@@ -27,7 +27,7 @@ from brewster.remote_path import Location
 ResultCallback = Callable[[FileResult], None]
 
 
-def separate_archive(
+def separate_in_parallel(
     tasks: Sequence[SeparationTask],
     executor: Executor[FileResult],
     *,
@@ -38,12 +38,12 @@ def separate_archive(
 
     Args:
         tasks: the photos and the paths of their layers, from `plan_files`.
-        executor: runs an `ArchiveRunner` in its workers; its context is entered by the caller.
+        executor: runs an `SeparationRunner` in its workers; its context is entered by the caller.
         overwrite: replace layers that exist, instead of skipping them.
         report: called with the result of every photo. An exception raised in it stops the run.
 
     Raises:
-        TargetError: a layer would replace a photo of the archive, or a node cannot reach the output folder.
+        OutputError: a layer would replace a photo of the archive, or a node cannot reach the output folder.
         ModelError: the model does not exist or is damaged.
         DeviceError: the requested device is not available.
     """
@@ -54,7 +54,7 @@ def separate_archive(
 
 
 @final
-class ArchiveRunner:
+class SeparationRunner:
     """Separates photos in a worker. The model is loaded with the first photo.
 
     Args:
@@ -63,14 +63,14 @@ class ArchiveRunner:
         overwrite: replace layers that exist.
 
     Raises:
-        TargetError: the folder does not exist on this node.
+        OutputError: the folder does not exist on this node.
     """
 
     def __init__(
         self, options: Options, shared_folder: Location | None = None, *, overwrite: bool = False
     ) -> None:
         if isinstance(shared_folder, Path) and not shared_folder.is_dir():
-            raise TargetError(
+            raise OutputError(
                 f"the folder {shared_folder} does not exist on the node {socket.gethostname()}",
                 "expected a folder that all nodes share",
                 "mount it on this node, or write to an object store",
@@ -88,17 +88,17 @@ class ArchiveRunner:
             # Another worker has written the layers in the meantime: the node was slow, and its task was tried again.
             result = FileResult(task.name, "skipped")
         if not result.error:
-            result.outputs = {layer: str(target) for layer, target in task.targets.items()}
+            result.outputs = {layer: str(target) for layer, target in task.outputs.items()}
         return [result]
 
 
 def _check_targets(tasks: Sequence[SeparationTask]) -> None:
-    """Raises TargetError if a layer has the path of a photo. Workers cannot check this, because each has one photo only."""
+    """Raises OutputError if a layer has the path of a photo. Workers cannot check this, because each has one photo only."""
     sources = {task.name for task in tasks}
     for task in tasks:
-        for target in task.targets.values():
+        for target in task.outputs.values():
             if str(target) in sources:
-                raise TargetError(
+                raise OutputError(
                     f"{target} is itself a photo of the batch",
                     "expected another path, because photos of the batch are never overwritten",
                     "choose another output folder",
@@ -114,7 +114,7 @@ def _unfinished(
         if not overwrite and _is_finished(task, listing.has):
             report(
                 FileResult(
-                    task.name, "skipped", {layer: str(target) for layer, target in task.targets.items()}
+                    task.name, "skipped", {layer: str(target) for layer, target in task.outputs.items()}
                 )
             )
         else:
@@ -123,7 +123,7 @@ def _unfinished(
 
 def _is_finished(task: SeparationTask, has: Callable[[Location], bool]) -> bool:
     """Whether all layers exist."""
-    return all(isinstance(target, Location) and has(target) for target in task.targets.values())
+    return all(isinstance(target, Location) and has(target) for target in task.outputs.values())
 
 
 @final

@@ -13,12 +13,12 @@ import pyarrow
 import pytest
 from pyarrow import parquet
 
-from brewster.errors import ModelError, TargetError
+from brewster.errors import ModelError, OutputError
 from brewster.executors import ProcessExecutor, SerialExecutor
 from brewster.files import discard
 from brewster.inference import FileResult, plan_files, separate_files
-from brewster.inference.archive import ArchiveRunner, separate_archive
 from brewster.inference.index import COLUMNS, INDEX_FILE, PARTS_FOLDER, IndexWriter
+from brewster.inference.parallel_batch import SeparationRunner, separate_in_parallel
 from brewster.options import Options
 from brewster.remote_path import location
 from cli_helpers import image_bytes, json_lines, layer_files, list_files
@@ -60,8 +60,8 @@ def run_archive(root, options, *, source=None, executor=SerialExecutor, index=Tr
     tasks = plan_files(source or root / "in", out, options)
     writer = IndexWriter(out) if index else None
     try:
-        with executor(partial(ArchiveRunner, options, **settings)) as running:
-            separate_archive(
+        with executor(partial(SeparationRunner, options, **settings)) as running:
+            separate_in_parallel(
                 tasks,
                 running,
                 report=lambda result: (results.append(result), writer and writer.append(result)),
@@ -86,7 +86,7 @@ def test_an_archive_has_the_bytes_of_a_batch_and_a_row_for_each_photo(root, opti
     assert list(rows) == ["a.jpg", "c.jpg", "d.jpg"]
     row, photo = rows["c.jpg"], root / "in/b/c.jpg"
     assert row["path"] == str(photo)
-    assert row["sha256"] == hashlib.sha256(photo.read_bytes()).hexdigest()
+    assert row["photo_sha256"] == hashlib.sha256(photo.read_bytes()).hexdigest()
     assert row["model_sha256"] == hashlib.sha256(Path(options.model).read_bytes()).hexdigest()
     assert row["outputs"] == [str(root / f"out/b/c.{layer}.jpg") for layer in ("transmission", "reflection")]
     assert row["seconds"] > 0
@@ -178,7 +178,7 @@ def test_a_store_that_cannot_be_written_to_ends_the_run_before_the_first_photo(s
         raise PermissionError("Access Denied")
 
     monkeypatch.setattr(type(store), "pipe_file", refuse)
-    with pytest.raises(TargetError, match=r"memory://bucket/out/.* was not written \(Access Denied\)"):
+    with pytest.raises(OutputError, match=r"memory://bucket/out/.* was not written \(Access Denied\)"):
         run_archive(root, Options(model="no-such-model"))
 
 
@@ -186,7 +186,7 @@ def test_a_folder_that_cannot_be_written_to_ends_the_run_before_the_first_photo(
     (tmp_path / "in").mkdir()
     (tmp_path / "in/a.jpg").write_bytes(image_bytes())
     (tmp_path / "out").write_bytes(b"a file")
-    with pytest.raises(TargetError, match="was not written"):
+    with pytest.raises(OutputError, match="was not written"):
         run_archive(tmp_path, Options(model="no-such-model"))
 
 
@@ -218,7 +218,7 @@ def test_a_skipped_photo_replaces_the_row_of_a_failure_only(tmp_path):
         with IndexWriter(tmp_path / "out") as index:
             index.append(FileResult("a.jpg", status, photo_sha256=status))
         seen = read_index(tmp_path)["a.jpg"]
-        assert seen["sha256"] == seen["status"]
+        assert seen["photo_sha256"] == seen["status"]
         assert status == "skipped" or seen["status"] == status
     assert seen["status"] == "separated"
 
@@ -240,7 +240,7 @@ def test_the_documentation_has_every_column_of_the_index():
 
 def test_another_file_with_the_name_of_the_index_is_never_replaced(tmp_path):
     (tmp_path / INDEX_FILE).write_bytes(b"something else")
-    with pytest.raises(TargetError, match=r"index\.parquet is not an index"):
+    with pytest.raises(OutputError, match=r"index\.parquet is not an index"):
         IndexWriter(tmp_path)
     assert list_files(tmp_path) == [INDEX_FILE]
 
@@ -254,7 +254,7 @@ def test_layers_that_another_worker_has_written_in_the_meantime_are_kept(tmp_pat
     for layer in layer_files("a"):
         (tmp_path / "out" / layer).write_bytes(b"written by the other node")
     monkeypatch.setattr("brewster.inference.batch.exists", lambda path: False)
-    (result,) = ArchiveRunner(options, tmp_path / "out")(tasks[0])
+    (result,) = SeparationRunner(options, tmp_path / "out")(tasks[0])
     assert (result.status, result.error) == ("skipped", None)
     assert {(tmp_path / "out" / layer).read_bytes() for layer in layer_files("a")} == {
         b"written by the other node"
@@ -267,13 +267,13 @@ def test_a_photo_of_the_archive_is_never_replaced(tmp_path, options):
         (tmp_path / "out" / name).write_bytes(image_bytes())
     manifest = tmp_path / "out/list.csv"
     manifest.write_text("path\na.jpg\na.transmission.jpg\n")
-    with pytest.raises(TargetError, match="is itself a photo of the batch"):
+    with pytest.raises(OutputError, match="is itself a photo of the batch"):
         run_archive(tmp_path, options, source=manifest, overwrite=True)
 
 
 def test_a_node_without_the_output_folder_ends_the_run(tmp_path, options):
-    with pytest.raises(TargetError, match="does not exist on the node"):
-        ArchiveRunner(options, tmp_path / "not mounted")
+    with pytest.raises(OutputError, match="does not exist on the node"):
+        SeparationRunner(options, tmp_path / "not mounted")
 
 
 def test_two_processes_write_the_files_of_one_and_a_missing_model_ends_the_run(tmp_path, options):
@@ -333,14 +333,14 @@ os.environ["RAY_USAGE_STATS_ENABLED"] = "0"
 from ray.cluster_utils import Cluster
 from brewster.executors.ray_cluster import RayExecutor
 from brewster.inference import plan_files
-from brewster.inference.archive import ArchiveRunner, separate_archive
+from brewster.inference.parallel_batch import SeparationRunner, separate_in_parallel
 from brewster.inference.index import IndexWriter
 from brewster.options import Options
 root, options, done = Path(sys.argv[1]), Options(model=sys.argv[2]), []
 nodes = Cluster(initialize_head=True, head_node_args={"num_cpus": 1, "include_dashboard": False})
 lost_node = nodes.add_node(num_cpus=1)
 nodes.wait_for_nodes()
-with IndexWriter(root / "out") as index, RayExecutor(partial(ArchiveRunner, options, root / "out"), nodes.address) as executor:
+with IndexWriter(root / "out") as index, RayExecutor(partial(SeparationRunner, options, root / "out"), nodes.address) as executor:
 
     def report(result):
         index.append(result)
@@ -348,7 +348,7 @@ with IndexWriter(root / "out") as index, RayExecutor(partial(ArchiveRunner, opti
         if len(done) == 10:
             nodes.remove_node(lost_node, allow_graceful=False)
 
-    separate_archive(plan_files(root / "in", root / "out", options), executor, report=report)
+    separate_in_parallel(plan_files(root / "in", root / "out", options), executor, report=report)
 nodes.shutdown()
 print(len(done), sorted(set(done) - {"skipped"}))
 """

@@ -1,6 +1,6 @@
-"""The table of large backbones: load one from the hub or a folder, or build a tiny version without a network connection.
+"""The table of diffusion backbones: load one from the hub or a folder, or build a tiny version without a network connection.
 
-    backbone = load_backbone("kontext", device="cuda", quantise="int8")
+    backbone = load_backbone("kontext", device="cuda", quantization="int8")
     backbone, prompt = tiny("kontext", seed=0)
 
 diffusers reads the files; its exceptions are converted to brewster's errors.
@@ -24,23 +24,23 @@ import torch
 from torch import Tensor, nn
 
 from brewster.errors import DeviceError, MissingExtra, ModelError
-from brewster.models.diffusion.families.family import Architecture, Backbone
+from brewster.models.diffusion.backbones.backbone import Architecture, Backbone
+from brewster.models.diffusion.hub_download import resolve_model_folder
 from brewster.models.diffusion.lazy_imports import (
     diffusers_class,
     disable_progress_bars_in_pipes,
-    explain_out_of_memory,
-    fetch,
     import_library,
 )
+from brewster.models.diffusion.out_of_memory import explain_out_of_memory
 from brewster.models.diffusion.prompt import PROMPT, PromptEmbedding
 from brewster.models.diffusion.text_encoders import check_text_encoders, text_encoder_device
-from brewster.models.zoo import LARGE_MODELS, TINY_PREFIX
-from brewster.options import Quantisation
+from brewster.models.zoo import BACKBONE_CLASSES, TINY_PREFIX
+from brewster.options import Quantization
 
 BACKBONES: Final[dict[str, type[Backbone]]] = {
-    name: pkgutil.resolve_name(path) for name, path in LARGE_MODELS.items()
+    name: pkgutil.resolve_name(path) for name, path in BACKBONE_CLASSES.items()
 }
-"""name -> Backbone class, for the models in `zoo.LARGE_MODELS`. The class has hub id, licence and architecture."""
+"""name -> Backbone class, for the models in `zoo.BACKBONE_CLASSES`. The class has hub id, licence and architecture."""
 
 INDEX_FILE: Final = "model_index.json"
 _CONFIG_FILES: Final = {
@@ -59,39 +59,43 @@ def load_backbone(
     *,
     device: str = "cpu",
     dtype: torch.dtype | None = None,
-    quantise: Quantisation | None = None,
+    quantization: Quantization | None = None,
 ) -> Backbone:
     """Loads a backbone without its text encoders.
 
     `source` is a name in the table, a hub id, a folder in diffusers' layout, or "tiny:" and a name for a tiny version.
-    By default `dtype` is bfloat16 on an accelerator and float32 on the CPU. `quantise` stores the transformer's weights
+    By default `dtype` is bfloat16 on an accelerator and float32 on the CPU. `quantization` stores the transformer's weights
     in 8 bits (torchao) or 4 bits (bitsandbytes, CUDA only).
 
     Raises:
         DownloadError: no access to a gated model (the message says how to get it), an invalid token, or no network
             connection.
-        ModelError: a file is missing or damaged, the architecture is not supported, or a name or quantisation is unknown.
+        ModelError: a file is missing or damaged, the architecture is not supported, or a name or quantization is unknown.
         DeviceError: there is no such device, or it is out of memory; the message says what to reduce.
         MissingExtra: diffusers, torchao or bitsandbytes is not installed.
     """
     _check_device(device)
     if source.startswith(TINY_PREFIX):
-        return _load_tiny(source, device, quantise)
-    options = _quantisation_options(quantise, device) if quantise else {}
+        return _load_tiny(source, device, quantization)
+    options = _quantization_options(quantization, device) if quantization else {}
     dtype = dtype or (torch.float32 if device == "cpu" else torch.bfloat16)
     disable_progress_bars_in_pipes()
-    folder = _fetch_folder(source, _BACKBONE_PATTERNS)
-    family, index = _family_in(folder)
-    if quantise == "nf4" and family.unquantised:
-        options["quantization_config"].llm_int8_skip_modules = list(family.unquantised)
-    with explain_out_of_memory(_memory_hint(quantise)):
-        vae = _load_part(folder, family, "vae", dtype=dtype, **_device_map(device))
-        transformer = _load_part(folder, family, "transformer", dtype=dtype, **_device_map(device), **options)
-    scheduler = _load_part(folder, family, "scheduler")
-    backbone = family(transformer, vae, scheduler, distilled=bool(index.get("is_distilled")), dtype=dtype)
+    folder = _model_folder(source, _BACKBONE_PATTERNS)
+    backbone_class, index = _read_index(folder)
+    if quantization == "nf4" and backbone_class.unquantized:
+        options["quantization_config"].llm_int8_skip_modules = list(backbone_class.unquantized)
+    with explain_out_of_memory(_memory_hint(quantization)):
+        vae = _load_part(folder, backbone_class, "vae", dtype=dtype, **_device_map(device))
+        transformer = _load_part(
+            folder, backbone_class, "transformer", dtype=dtype, **_device_map(device), **options
+        )
+    scheduler = _load_part(folder, backbone_class, "scheduler")
+    backbone = backbone_class(
+        transformer, vae, scheduler, distilled=bool(index.get("is_distilled")), dtype=dtype
+    )
     _check_channels(backbone, folder)
-    if quantise:
-        _check_quantised(backbone, quantise)
+    if quantization:
+        _check_quantized(backbone, quantization)
     return backbone
 
 
@@ -113,7 +117,8 @@ def encode_prompt(source: str, text: str = PROMPT, *, device: str = "cpu") -> Pr
     if source.startswith(TINY_PREFIX):
         seed = 0 if text == PROMPT else zlib.crc32(text.encode()) or 1  # the sum of "" is 0
         return replace(tiny(source.removeprefix(TINY_PREFIX), seed)[1], text=text)
-    for name in family_of(source).text_encoder_requirements:  # before the download, which may take an hour
+    # Checked before the download, which may take an hour.
+    for name in backbone_class_of(source).text_encoder_requirements:
         if importlib.util.find_spec(name) is None:
             raise MissingExtra(
                 f"{name} is not installed",
@@ -121,8 +126,8 @@ def encode_prompt(source: str, text: str = PROMPT, *, device: str = "cpu") -> Pr
                 f"run: pip install {name} (the version for your torch)",
             )
     disable_progress_bars_in_pipes()
-    folder = _fetch_folder(source, _TEXT_ENCODER_PATTERNS)
-    family, index = _family_in(folder)
+    folder = _model_folder(source, _TEXT_ENCODER_PATTERNS)
+    backbone_class, index = _read_index(folder)
     check_text_encoders(folder, index)
     dtype, device = torch.bfloat16, text_encoder_device(folder, device)
     pipeline_class = diffusers_class(index["_class_name"])
@@ -134,7 +139,7 @@ def encode_prompt(source: str, text: str = PROMPT, *, device: str = "cpu") -> Pr
             folder, transformer=None, vae=None, dtype=dtype, local_files_only=True
         ).to(device)
         with torch.no_grad():
-            embedding = family.embed(pipeline, text).to("cpu", dtype)
+            embedding = backbone_class.embed(pipeline, text).to("cpu", dtype)
     del pipeline
     gc.collect()  # modules refer to each other, so the text encoders would stay in memory while the base is loaded
     if device != "cpu":
@@ -148,9 +153,9 @@ def tiny(name: str, seed: int = 0) -> tuple[Backbone, PromptEmbedding]:
     Raises:
         ModelError: the name is not in the table.
     """
-    family = find_family(name)
-    backbone = build(name, family.tiny, seed=seed)
-    return backbone, family.random_prompt(backbone.transformer, seed)
+    backbone_class = find_backbone_class(name)
+    backbone = build(name, backbone_class.tiny, seed=seed)
+    return backbone, backbone_class.random_prompt(backbone.transformer, seed)
 
 
 def build(
@@ -167,9 +172,9 @@ def build(
         ModelError: the name is not in the table.
         DeviceError: out of memory.
     """
-    family = find_family(name)
-    architecture = architecture or family.full_size
-    part_classes = {part: diffusers_class(family.classes[part]) for part in _CONFIG_FILES}
+    backbone_class = find_backbone_class(name)
+    architecture = architecture or backbone_class.full_size
+    part_classes = {part: diffusers_class(backbone_class.classes[part]) for part in _CONFIG_FILES}
     with (
         torch.random.fork_rng(devices=[]),
         torch.device(device),
@@ -180,10 +185,10 @@ def build(
         transformer = part_classes["transformer"](**architecture["transformer"])
         vae = part_classes["vae"](**architecture["vae"])
         _randomise_batch_norms(vae)
-    return family(transformer, vae, part_classes["scheduler"](**architecture["scheduler"]))
+    return backbone_class(transformer, vae, part_classes["scheduler"](**architecture["scheduler"]))
 
 
-def find_family(name: str) -> type[Backbone]:
+def find_backbone_class(name: str) -> type[Backbone]:
     """The Backbone class of this name.
 
     Raises:
@@ -199,23 +204,23 @@ def find_family(name: str) -> type[Backbone]:
     )
 
 
-def family_of(source: str) -> type[Backbone]:
+def backbone_class_of(source: str) -> type[Backbone]:
     """The Backbone class that `load_backbone` would use for this source. No weights are downloaded.
 
     Raises:
         DownloadError, ModelError, MissingExtra: see `load_backbone`.
     """
     if source in BACKBONES or source.startswith(TINY_PREFIX):
-        return find_family(source.removeprefix(TINY_PREFIX))
-    return _family_in(fetch(source, [INDEX_FILE]))[0]
+        return find_backbone_class(source.removeprefix(TINY_PREFIX))
+    return _read_index(resolve_model_folder(source, [INDEX_FILE]))[0]
 
 
-def _load_tiny(source: str, device: str, quantise: str | None) -> Backbone:
-    if quantise:
+def _load_tiny(source: str, device: str, quantization: str | None) -> Backbone:
+    if quantization:
         raise ModelError(
-            f"{source} was requested with quantise={quantise}",
-            "expected a tiny version without quantisation",
-            "leave quantise out",
+            f"{source} was requested with quantization={quantization}",
+            "expected a tiny version without quantization",
+            "leave quantization out",
         )
     backbone, _ = tiny(source.removeprefix(TINY_PREFIX))
     backbone.transformer.to(device)
@@ -223,30 +228,32 @@ def _load_tiny(source: str, device: str, quantise: str | None) -> Backbone:
     return backbone
 
 
-def _fetch_folder(source: str, patterns: list[str]) -> Path:
-    return fetch(BACKBONES[source].hub_id if source in BACKBONES else source, patterns)
+def _model_folder(source: str, patterns: list[str]) -> Path:
+    return resolve_model_folder(BACKBONES[source].hub_id if source in BACKBONES else source, patterns)
 
 
-def _family_in(folder: Path) -> tuple[type[Backbone], dict[str, Any]]:
+def _read_index(folder: Path) -> tuple[type[Backbone], dict[str, Any]]:
     index = _read_json(folder / INDEX_FILE)
     class_name = index.get("_class_name")
-    for family in BACKBONES.values():
-        if class_name in (family.classes["pipeline"], *family.other_pipelines):
-            return family, index
+    for backbone_class in BACKBONES.values():
+        if class_name in (backbone_class.classes["pipeline"], *backbone_class.other_pipelines):
+            return backbone_class, index
     raise ModelError(
         f"{folder} contains a {class_name}",
-        f"expected one of {', '.join(family.classes['pipeline'] for family in BACKBONES.values())}",
-        f"use {', '.join(family.hub_id for family in BACKBONES.values())} or a finetune of one",
+        f"expected one of {', '.join(backbone_class.classes['pipeline'] for backbone_class in BACKBONES.values())}",
+        f"use {', '.join(backbone_class.hub_id for backbone_class in BACKBONES.values())} or a finetune of one",
     )
 
 
-def _load_part(folder: Path, family: type[Backbone], part: str, **options: Any) -> Any:  # noqa: ANN401 - passed on
+def _load_part(folder: Path, backbone_class: type[Backbone], part: str, **options: Any) -> Any:  # noqa: ANN401 - passed on
     """Loads the transformer, VAE or scheduler of a folder. Checks its class, and that its weights are complete."""
-    part_folder, expected = folder / part, family.classes[part]
+    part_folder, expected = folder / part, backbone_class.classes[part]
     found = _read_json(part_folder / _CONFIG_FILES[part]).get("_class_name")
     if found != expected:
         raise ModelError(
-            f"{part_folder} contains a {found}", f"expected a {expected}", f"use a folder of {family.hub_id}"
+            f"{part_folder} contains a {found}",
+            f"expected a {expected}",
+            f"use a folder of {backbone_class.hub_id}",
         )
     part_class = diffusers_class(expected)
     if part == "scheduler":
@@ -293,7 +300,7 @@ def _translate_load_errors(folder: Path) -> Iterator[None]:
         raise MissingExtra(
             f"{folder} needs a library that is not installed ({' '.join(str(error).split())[:200]})",
             "expected all libraries that its classes use",
-            "install this library in addition to brewster[large]",
+            "install this library in addition to brewster[diffusion]",
         ) from error
     except (OSError, KeyError, ValueError, TypeError, safetensors_error) as error:
         reason = " ".join(str(error).split())[:200]
@@ -304,18 +311,18 @@ def _translate_load_errors(folder: Path) -> Iterator[None]:
         ) from error
 
 
-def _quantisation_options(quantise: str, device: str) -> dict[str, Any]:
-    """The keyword argument of from_pretrained for a quantisation. The quantisation is checked before any download."""
-    if quantise not in get_args(Quantisation):
+def _quantization_options(quantization: str, device: str) -> dict[str, Any]:
+    """The keyword argument of from_pretrained for a quantization. The quantization is checked before any download."""
+    if quantization not in get_args(Quantization):
         raise ModelError(
-            f"there is no quantisation {quantise!r}",
-            f"expected one of {', '.join(get_args(Quantisation))}",
+            f"there is no quantization {quantization!r}",
+            f"expected one of {', '.join(get_args(Quantization))}",
             "choose one of them",
         )
-    if quantise == "nf4":
+    if quantization == "nf4":
         if not device.startswith("cuda"):
             raise DeviceError(
-                f"nf4 does not run on {device}", "expected an NVIDIA GPU", 'use quantise="int8"'
+                f"nf4 does not run on {device}", "expected an NVIDIA GPU", 'use quantization="int8"'
             )
         import_library("bitsandbytes")
         config = diffusers_class("BitsAndBytesConfig")(
@@ -324,7 +331,7 @@ def _quantisation_options(quantise: str, device: str) -> dict[str, Any]:
         return {"quantization_config": config}
     torchao = import_library("torchao.quantization")
     configs = {"int8": torchao.Int8WeightOnlyConfig, "float8": torchao.Float8WeightOnlyConfig}
-    return {"quantization_config": diffusers_class("TorchAoConfig")(configs[quantise]())}
+    return {"quantization_config": diffusers_class("TorchAoConfig")(configs[quantization]())}
 
 
 def _device_map(device: str) -> dict[str, Any]:
@@ -332,9 +339,13 @@ def _device_map(device: str) -> dict[str, Any]:
     return {} if device == "cpu" else {"device_map": {"": device}}
 
 
-def _memory_hint(quantise: str | None) -> str:
-    hints = {None: 'use quantise="int8"', "int8": 'use quantise="nf4"', "float8": 'use quantise="nf4"'}
-    return f"{hints.get(quantise, 'close other programs that use the GPU')}, a smaller backbone (klein) or a GPU with more memory"
+def _memory_hint(quantization: str | None) -> str:
+    hints = {
+        None: 'use quantization="int8"',
+        "int8": 'use quantization="nf4"',
+        "float8": 'use quantization="nf4"',
+    }
+    return f"{hints.get(quantization, 'close other programs that use the GPU')}, a smaller backbone (klein) or a GPU with more memory"
 
 
 def _check_device(device: str) -> None:
@@ -359,13 +370,13 @@ def _check_channels(backbone: Backbone, folder: Path) -> None:
         )
 
 
-def _check_quantised(backbone: Backbone, quantise: str) -> None:
-    """Checks that the weights are quantised: diffusers silently leaves parts on the CPU unquantised."""
+def _check_quantized(backbone: Backbone, quantization: str) -> None:
+    """Checks that the weights are quantized: diffusers silently leaves parts on the CPU unquantized."""
     weight = backbone.transformer.get_submodule(backbone.lora_targets()[0]).weight
     if type(weight) in {Tensor, nn.Parameter}:
         raise ModelError(
             f"the weights were loaded as {weight.dtype}",
-            f"expected weights stored as {quantise}",
+            f"expected weights stored as {quantization}",
             "update diffusers and torchao (constraints.txt lists versions that work)",
         )
 

@@ -1,6 +1,6 @@
 """Separates an archive on two local Ray nodes, also if one of them is killed, and with two processes of the plain command.
 
-    .venv/bin/python bench/archive.py [COUNT [MODEL]]
+    .venv/bin/python bench/parallel_batch.py [COUNT [MODEL]]
 
 Prints the wall time, the photos per second and the CPU-seconds of all processes of each run. On a busy machine, compare the
 CPU-seconds. Checks that all runs wrote the same bytes, and that the index has a row for each photo. The photos have 480x320 pixels.

@@ -1,6 +1,6 @@
 """Runs `brewster separate` in several processes or on a cluster, and prints its output.
 
-The photos are separated by `brewster.inference.archive`.
+The photos are separated by `brewster.inference.parallel_batch`.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 @final
 @dataclass(frozen=True)
-class ArchiveCommand:
+class ParallelBatchCommand:
     """The options of an archive. `run` separates the photos and prints the results."""
 
     options: Options
@@ -46,15 +46,15 @@ class ArchiveCommand:
             Whether no photo failed.
 
         Raises:
-            BrewsterError: see `plan_files` and `separate_archive`.
+            BrewsterError: see `plan_files` and `separate_in_parallel`.
         """
-        from brewster.inference.archive import ArchiveRunner, separate_archive  # noqa: PLC0415
         from brewster.inference.batch import plan_files  # noqa: PLC0415  (imports ONNX Runtime and pyvips)
+        from brewster.inference.parallel_batch import SeparationRunner, separate_in_parallel  # noqa: PLC0415
 
         folder = None if self.output is None else _absolute(self.output)
         tasks = plan_files([_absolute(photo) for photo in photos], folder, self.options)
         shared_folder = folder if self.cluster else None
-        create_runner = partial(ArchiveRunner, self.options, shared_folder, overwrite=self.overwrite)
+        create_runner = partial(SeparationRunner, self.options, shared_folder, overwrite=self.overwrite)
         counts: Counter[str] = Counter()
         printer = BatchCommand(self.options, as_json=self.as_json, quiet=self.quiet)
         shares_terminal = self.as_json and standard_output.stream.isatty()
@@ -74,7 +74,7 @@ class ArchiveCommand:
                 update_progress(counts.total(), result.source)
                 interrupts.raise_pending()
 
-            separate_archive(tasks, executor, overwrite=self.overwrite, report=report)
+            separate_in_parallel(tasks, executor, overwrite=self.overwrite, report=report)
         if not self.quiet:
             print_status(", ".join(f"{count} {status}" for status, count in sorted(counts.items())))
         return not counts["failed"]

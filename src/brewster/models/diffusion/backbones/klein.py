@@ -7,7 +7,7 @@ from typing import Any, ClassVar, Final, final
 import torch
 from torch import Tensor
 
-from brewster.models.diffusion.families.family import (
+from brewster.models.diffusion.backbones.backbone import (
     APACHE_2,
     ClassifierFreeBackbone,
     DiffusersUsage,
@@ -28,7 +28,7 @@ _CONDITION_TIME: Final = 10
 class Klein(ClassifierFreeBackbone):
     """FLUX.2 klein (Black Forest Labs 2026), the base model, with classifier-free guidance.
 
-    The distilled models of the family can be loaded too; they ignore the guidance.
+    The distilled models of the backbone_class can be loaded too; they ignore the guidance.
     """
 
     name = "klein"
@@ -61,7 +61,7 @@ class Klein(ClassifierFreeBackbone):
         "scheduler": _SCHEDULER,
     }  # fmt: skip
 
-    parameters = 3_876_000_000
+    parameter_count = 3_876_000_000
     text_encoder_parameters = 4_022_000_000  # Qwen3-4B
 
     def statistics(self) -> tuple[Tensor, Tensor]:
@@ -71,13 +71,13 @@ class Klein(ClassifierFreeBackbone):
         return norm.running_mean.float().view(1, -1, 1, 1), deviation.view(1, -1, 1, 1)
 
     def noise(self, size: tuple[int, int], seed: int) -> Tensor:
-        """See `Backbone.noise`. For this family, diffusers draws the noise on the packed grid.
+        """See `Backbone.noise`. For this backbone_class, diffusers draws the noise on the packed grid.
 
         Raises:
             ModelError: a side is not a multiple of 16.
         """
         self._check_grid(*size)
-        width, height = (side // self.multiple for side in size)
+        width, height = (side // self.size_divisor for side in size)
         return torch.randn(1, self.channels, height, width, generator=torch.Generator().manual_seed(seed))
 
     def shift(self, tokens: int, steps: int) -> float:

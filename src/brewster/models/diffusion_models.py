@@ -1,4 +1,4 @@
-"""The table of large models: what `brewster models list` says of them before anything is downloaded. It needs no torch."""
+"""The table of diffusion models: what `brewster models list` says of them before anything is downloaded. It needs no torch."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ _GATED: Final = "gated: accept the licence on its page, then run `hf auth login`
 
 @final
 @dataclass(frozen=True)
-class LargeModel:
+class DiffusionModel:
     """A row of the table. Sizes are computed from the numbers of parameters, not measured."""
 
     name: str
@@ -27,38 +27,38 @@ class LargeModel:
     access: str = _OPEN
     text_encoder_gb: float = 0
     """The download of the text encoders, which encode a prompt once. 0 if the prompt is part of the model."""
-    base: str | None = None
+    base_model: str | None = None
     """The hub id of the base of a LoRA or finetuned model."""
     is_opened_by_name: bool = True
     """Whether --model takes the name. Otherwise `brewster models import` converts the model first."""
 
 
-LARGE: Final = {
+DIFFUSION_MODELS: Final = {
     model.name: model
     for model in (
-        LargeModel(
+        DiffusionModel(
             "windowseat", "huawei-bayerlab/windowseat-reflection-removal-v1-0", "Apache-2.0", is_commercial=True,
             download_gb=41, memory_gib=24, memory_format="nf4", gives="transmission; reflection derived",
-            base="Qwen/Qwen-Image-Edit-2509",
+            base_model="Qwen/Qwen-Image-Edit-2509",
         ),
-        LargeModel(
+        DiffusionModel(
             "gensirr", "lime-j/GenSIRR", "none stated; its base: FLUX.1 [dev] Non-Commercial License",
             is_commercial=False, download_gb=24, memory_gib=14, memory_format="int8",
             gives="transmission; reflection derived",
             access="download GenSIRR.pt, then run `brewster models import GenSIRR.pt FOLDER`",
-            base="black-forest-labs/FLUX.1-Kontext-dev", is_opened_by_name=False,
+            base_model="black-forest-labs/FLUX.1-Kontext-dev", is_opened_by_name=False,
         ),
-        LargeModel(
+        DiffusionModel(
             "kontext", "black-forest-labs/FLUX.1-Kontext-dev", "FLUX.1 [dev] Non-Commercial License",
             is_commercial=False, download_gb=24, memory_gib=14, memory_format="int8",
             gives="a base for LoRAs; without one, an edit by prompt", access=_GATED, text_encoder_gb=9.8,
         ),
-        LargeModel(
+        DiffusionModel(
             "klein", "black-forest-labs/FLUX.2-klein-base-4B", "Apache-2.0", is_commercial=True,
             download_gb=7.9, memory_gib=9, memory_format="bf16",
             gives="a base for LoRAs; without one, an edit by prompt", text_encoder_gb=8,
         ),
-        LargeModel(
+        DiffusionModel(
             "qwen", "Qwen/Qwen-Image-Edit", "Apache-2.0", is_commercial=True,
             download_gb=41, memory_gib=14, memory_format="nf4",
             gives="a base for LoRAs; without one, an edit by prompt", text_encoder_gb=16.6,
@@ -70,8 +70,10 @@ LARGE: Final = {
 
 def licence_of(hub_id: str) -> str:
     """The licence of a repository on the hub, for a message before its download."""
-    titles = {model.hub_id: model.licence for model in LARGE.values()}
+    titles = {model.hub_id: model.licence for model in DIFFUSION_MODELS.values()}
     titles |= {
-        model.base: model.licence for model in LARGE.values() if model.base and model.base not in titles
+        model.base_model: model.licence
+        for model in DIFFUSION_MODELS.values()
+        if model.base_model and model.base_model not in titles
     }
     return titles.get(hub_id, "see its page on the hub")

@@ -7,7 +7,7 @@ from typing import Any, ClassVar, Final, final
 import torch
 from torch import Tensor
 
-from brewster.models.diffusion.families.family import (
+from brewster.models.diffusion.backbones.backbone import (
     APACHE_2,
     PATCH,
     ClassifierFreeBackbone,
@@ -36,7 +36,7 @@ class Qwen(ClassifierFreeBackbone):
     licence = APACHE_2
     diffusers_usage = "but resizes the conditioning image to one megapixel, so that its panels differ from those in training"
     other_pipelines = ("QwenImageEditPlusPipeline",)
-    unquantised = ("transformer_blocks.0.img_mod",)
+    unquantized = ("transformer_blocks.0.img_mod",)
     text_encoder_requirements = ("torchvision",)
     classes: ClassVar = {
         "pipeline": "QwenImageEditPipeline", "transformer": "QwenImageTransformer2DModel",
@@ -52,7 +52,7 @@ class Qwen(ClassifierFreeBackbone):
         "scheduler": _SCHEDULER,
     }  # fmt: skip
 
-    parameters = 20_430_000_000
+    parameter_count = 20_430_000_000
     text_encoder_parameters = 8_292_000_000  # Qwen2.5-VL-7B
 
     def statistics(self) -> tuple[Tensor, Tensor]:

@@ -1,4 +1,4 @@
-"""Base classes of the large backbones: encode, decode, predict the velocity, and list the layers for a LoRA.
+"""Base classes of the diffusion backbones: encode, decode, predict the velocity, and list the layers for a LoRA.
 
 Latents are grids (N, C, H/16, W/16): the VAE's latents with each 2 x 2 patch packed into the channels. One grid cell is
 one token of the transformer and 16 x 16 pixels of the image, and a panel is a block of whole cells.
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from jaxtyping import Float
 
 PATCH: Final = 2
-"""The side of a token in VAE cells: all families pack 2 x 2 cells."""
+"""Side of a token in VAE latent pixels: all backbones pack 2 x 2 latent pixels into one token."""
 _BLOCKS: Final = ("transformer_blocks", "single_transformer_blocks")
 _LORA_PARTS: Final = ("lora_A", "lora_B")
 
@@ -57,7 +57,8 @@ class DiffusersUsage:
     parts: str
     """Arguments of `from_pretrained` that leave out the text encoders."""
     options: str
-    """Arguments of the call. {area} is replaced by the number of pixels of the composite; `words` is the encoded prompt."""
+    """Arguments of the call. {area} is replaced by the number of pixels of the composite. `prompt` is a dict with the tensors of
+    the encoded prompt."""
     caution: str
     """One sentence on what the pipeline does without these options."""
 
@@ -81,14 +82,14 @@ class Backbone(ABC):
     """True if the guidance scale is an input of the transformer; False for classifier-free guidance."""
     other_pipelines: ClassVar[tuple[str, ...]] = ()
     """Class names in diffusers of other pipelines for the same transformer, VAE and scheduler."""
-    unquantised: ClassVar[tuple[str, ...]] = ()
+    unquantized: ClassVar[tuple[str, ...]] = ()
     """Layers that stay in full precision with nf4."""
     text_encoder_requirements: ClassVar[tuple[str, ...]] = ()
-    """Libraries that the text encoders need in addition to the extra `large`."""
-    multiple: ClassVar[int] = 16
+    """Libraries that the text encoders need in addition to the extra `diffusion`."""
+    size_divisor: ClassVar[int] = 16
     """The sides of a panel must be multiples of this, in pixels."""
 
-    parameters: ClassVar[int]
+    parameter_count: ClassVar[int]
     """The number of parameters of the full-size transformer."""
     text_encoder_parameters: ClassVar[int]
     """The number of parameters of all text encoders together."""
@@ -102,9 +103,9 @@ class Backbone(ABC):
         distilled: bool = False,
         dtype: torch.dtype | None = None,
     ) -> None:
-        """`dtype` is the one in which the transformer computes, by default that of its parameters.
+        """`dtype` is the data type of the transformer's computations, by default that of its parameters.
 
-        It cannot be read from a quantised transformer: with nf4, only a few float32 layers are floating-point.
+        It cannot be read from a quantized transformer: with nf4, only a few float32 layers are floating-point.
         """
         self.dtype: torch.dtype = dtype or transformer.dtype
         self.transformer = transformer.eval().requires_grad_(False)
@@ -168,7 +169,7 @@ class Backbone(ABC):
         """
 
     @abstractmethod
-    def positions(self, latents: Tensor, condition: Tensor) -> Any:  # noqa: ANN401 - each family has its own kind
+    def positions(self, latents: Tensor, condition: Tensor) -> Any:  # noqa: ANN401 - each backbone_class has its own kind
         """The position ids of the generated tokens, then of the conditioning tokens, as the transformer takes them."""
 
     @classmethod
@@ -194,14 +195,15 @@ class Backbone(ABC):
             ModelError: a side is not a multiple of 16.
         """
         self._check_grid(*size)
-        width, height = (side // self.multiple * PATCH for side in size)
+        width, height = (side // self.size_divisor * PATCH for side in size)
         shape = (1, self.channels // PATCH**2, height, width)
         return functional.pixel_unshuffle(_seeded_noise(shape, seed), PATCH)
 
     def shift(self, tokens: int, steps: int) -> float:  # noqa: ARG002 - the shift of klein depends on the steps
         """The schedule's shift mu for a composite of this many generated tokens, without those of the condition.
 
-        A linear function of the number of tokens through the scheduler's two anchors (Esser et al. 2024; FLUX).
+        A linear function of the number of tokens, through the points (base_image_seq_len, base_shift) and
+        (max_image_seq_len, max_shift) of the scheduler (Esser et al. 2024; FLUX).
         """
         config = self.scheduler.config
         low, high = config.base_image_seq_len, config.max_image_seq_len
@@ -234,7 +236,8 @@ class Backbone(ABC):
         """The sigmas of the scheduler of diffusers: steps + 1 decreasing values from 1 to 0.
 
         Before the shift towards noise, they are evenly spaced from 1 to `last_sigma`, by default 1 / steps, and then 0.
-        The default of `timestep_shift` is the shift of the scheduler, see `shift`; for a value s see `shifted`.
+        If `timestep_shift` is None, the scheduler's own shift is used (see `shift`). A value replaces it (see
+        `shifted`).
         """
         # A shift does not change sigma 1, but stretching to `shift_terminal` would divide 0 by 0.
         if steps == 1:
@@ -253,7 +256,8 @@ class Backbone(ABC):
         return sigmas
 
     def lora_targets(self) -> list[str]:
-        """The full names of all linear layers in the blocks. The suffix proj_out would match layers outside."""
+        """The full names of all linear layers in the blocks. Full names are necessary, because a
+        short name such as proj_out also matches layers outside the blocks."""
         return [
             name.removesuffix(".base_layer")
             for name, module in self.transformer.named_modules()
@@ -286,10 +290,10 @@ class Backbone(ABC):
             pipeline.save_pretrained(folder)
 
     def _check_grid(self, width: int, height: int) -> None:
-        if width % self.multiple or height % self.multiple:
+        if width % self.size_divisor or height % self.size_divisor:
             raise ModelError(
                 f"the image has {width} x {height} pixels",
-                f"expected sides that are multiples of {self.multiple}",
+                f"expected sides that are multiples of {self.size_divisor}",
                 "pad it with PanelFit.pad",
             )
 

@@ -1,0 +1,160 @@
+"""Finds models from the Hugging Face Hub in the cache, or downloads them.
+
+Before a download begins, its size and licence are printed, and the free disk space is checked.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import shutil
+import sys
+from pathlib import Path
+from typing import Any, Final
+
+from brewster.errors import DownloadError, ModelError
+from brewster.models.diffusion.lazy_imports import import_library
+from brewster.models.diffusion_models import licence_of
+
+_MIN_ANNOUNCED_BYTES: Final = 50_000_000
+"""Smaller downloads, such as configuration files, are not announced."""
+_RESERVE_BYTES: Final = 1_000_000_000
+"""Disk space that stays free."""
+
+
+def resolve_model_folder(source: str, patterns: list[str]) -> Path:
+    """Returns the local folder of a model, and downloads its files if necessary.
+
+    If `source` is a folder, it is returned unchanged. Otherwise `source` is a hub id, and the files that match the
+    patterns are found in the cache or downloaded. The token is that of `hf auth login` or HF_TOKEN.
+
+    Raises:
+        DownloadError: the account has no access (the message says how to get it), the hub has no such model, there is
+            no network connection, or the disk is full.
+        ModelError: `source` is neither a folder nor a hub id.
+        MissingExtra: huggingface_hub is not installed.
+    """
+    if Path(source).is_dir():
+        return Path(source)
+    hub, errors = import_library("huggingface_hub"), import_library("huggingface_hub.errors")
+    page = f"https://huggingface.co/{source}"
+    # If the hub cannot be asked, the download itself reports why, or finds the files in the cache.
+    with contextlib.suppress(errors.HfHubHTTPError, errors.HFValidationError, errors.DryRunError, OSError):
+        _announce_download(hub, source, patterns)
+    try:
+        return Path(hub.snapshot_download(source, allow_patterns=patterns))
+    except errors.GatedRepoError as error:
+        raise _gated_error(error, source, page) from error
+    except errors.RepositoryNotFoundError as error:
+        raise DownloadError(
+            f"the hub has no model {source}, or your token has no access to it",
+            "expected a public model, or a private one that your token may read",
+            f"check {page}, then run `hf auth login` or set HF_TOKEN",
+        ) from error
+    except errors.HfHubHTTPError as error:
+        raise _http_error(error, source) from error
+    except errors.HFValidationError as error:
+        raise ModelError(
+            f"there is no folder {source}, and {source} is not a hub id",
+            "expected a model's folder or OWNER/NAME",
+            "check the path",
+        ) from error
+    except (errors.LocalEntryNotFoundError, errors.OfflineModeIsEnabled) as error:
+        # If the cache is empty, huggingface_hub reports a missing file and chains the HTTP error as its cause.
+        if isinstance(error.__cause__, errors.HfHubHTTPError):
+            raise _http_error(error.__cause__, source) from error
+        raise DownloadError(
+            f"{source} is not in the cache and the hub cannot be reached",
+            "expected a network connection, or a folder with the model's files",
+            f"connect, or copy the model from {page} and pass its folder",
+        ) from error
+    except OSError as error:
+        raise DownloadError(
+            f"{source} could not be downloaded: {error}",
+            "expected enough disk space in the cache folder (HF_HOME)",
+            "free disk space and try again",
+        ) from error
+
+
+def is_transformer_cached(hub_id: str) -> bool:
+    """Whether the transformer of a model on the hub is in the cache, so that loading it downloads at most a few files.
+
+    Raises:
+        MissingExtra: huggingface_hub is not installed.
+    """
+    hub = import_library("huggingface_hub")
+    with contextlib.suppress(OSError, ValueError):
+        folder = Path(hub.snapshot_download(hub_id, allow_patterns=["transformer/*"], local_files_only=True))
+        return any(folder.glob("transformer/*.safetensors"))
+    return False
+
+
+def has_hub_token() -> bool:
+    """Whether huggingface_hub finds a token: in HF_TOKEN, or in the file that `hf auth login` writes.
+
+    Raises:
+        MissingExtra: huggingface_hub is not installed.
+    """
+    return import_library("huggingface_hub").get_token() is not None
+
+
+def _gated_error(error: Exception, source: str, page: str) -> DownloadError:
+    """The error for a gated model. The hub returns 401 without a token, and 403 if the account has no access."""
+    is_authenticated = _status(error) == 403
+    return DownloadError(
+        f"{source} is gated and {'your account has no access' if is_authenticated else 'no valid token was sent'}",
+        f"expected that the owner of the token has accepted the licence at {page}",
+        "open that page, agree to the licence, then run `hf auth login` or set HF_TOKEN to a token with read access",
+    )
+
+
+def _http_error(error: Exception, source: str) -> DownloadError:
+    status = _status(error)
+    if status in {401, 403}:
+        return DownloadError(
+            f"the hub refused the token for {source} (HTTP {status})",
+            "expected a valid token with read access",
+            "create one at https://huggingface.co/settings/tokens, then run `hf auth login` or set HF_TOKEN",
+        )
+    return DownloadError(
+        f"the hub returned HTTP {status} for {source}", "expected the model's files", "try again later"
+    )
+
+
+def _status(error: Exception) -> int | None:
+    return getattr(getattr(error, "response", None), "status_code", None)
+
+
+def _announce_download(hub: Any, source: str, patterns: list[str]) -> None:  # noqa: ANN401 - huggingface_hub
+    """Prints the size and the licence on stderr if files that match the patterns are not in the cache yet.
+
+    Args:
+        hub: the library huggingface_hub.
+        source: the hub id of the model.
+        patterns: the names of the files.
+
+    Raises:
+        DownloadError: the files do not fit on the disk of the cache.
+        Exception: those of huggingface_hub, if the hub cannot be asked.
+    """
+    planned = hub.snapshot_download(source, allow_patterns=patterns, dry_run=True)
+    size = sum(file.file_size or 0 for file in planned if file.will_download)
+    if size < _MIN_ANNOUNCED_BYTES:
+        return
+    cache = Path(hub.constants.HF_HUB_CACHE)
+    free = free_disk_bytes(cache)
+    if free < size + _RESERVE_BYTES:
+        raise DownloadError(
+            f"{source} has {size / 1e9:.1f} GB to download, and {free / 1e9:.1f} GB are free in {cache}",
+            f"expected {(size + _RESERVE_BYTES) / 1e9:.1f} GB of free disk space",
+            "free disk space, or set HF_HOME to a folder on a larger disk",
+        )
+    sys.stderr.write(
+        f"downloading {size / 1e9:.1f} GB of {source} to {cache}; licence: {licence_of(source)}\n"
+    )
+    sys.stderr.flush()
+
+
+def free_disk_bytes(folder: Path) -> int:
+    """The free bytes of the disk that has the folder, or will have it: of its nearest existing parent."""
+    existing = next(parent for parent in (folder, *folder.absolute().parents) if parent.exists())
+    return shutil.disk_usage(existing).free
