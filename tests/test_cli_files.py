@@ -10,7 +10,7 @@ import pytest
 from click.shell_completion import ShellComplete
 
 from brewster import Photo
-from brewster.cli import batch, cli
+from brewster.cli import batch_plan, cli
 from brewster.photo import contact_sheet
 from cli_helpers import error_lines, image_bytes, layer_files, list_files
 from picture_files import dng_file, mosaic
@@ -30,8 +30,8 @@ def test_an_address_and_a_quoted_path_name_a_file(run, tmp_path, form):
 def test_an_existing_file_keeps_its_name_even_if_it_has_quotes(tmp_path, monkeypatch):
     (tmp_path / "'a.jpg'").write_bytes(image_bytes())
     monkeypatch.chdir(tmp_path)
-    assert batch.local_path("'a.jpg'") == "'a.jpg'"
-    assert batch.local_path("'b.jpg'") == "b.jpg"
+    assert batch_plan.local_path("'a.jpg'") == "'a.jpg'"
+    assert batch_plan.local_path("'b.jpg'") == "b.jpg"
 
 
 @pytest.mark.parametrize(
@@ -44,7 +44,7 @@ def test_an_existing_file_keeps_its_name_even_if_it_has_quotes(tmp_path, monkeyp
 )
 def test_addresses_of_windows_become_its_paths(address, path, monkeypatch):
     monkeypatch.setattr(urllib.request, "url2pathname", nturl2path.url2pathname)
-    assert batch.local_path(address).removeprefix("\\\\?\\") == path
+    assert batch_plan.local_path(address).removeprefix("\\\\?\\") == path
 
 
 # --- suffixes

@@ -20,6 +20,7 @@ from brewster.inference import FileResult, plan_files, separate_files
 from brewster.inference.index import COLUMNS, INDEX_FILE, PARTS_FOLDER, IndexWriter
 from brewster.inference.parallel_batch import SeparationRunner, separate_in_parallel
 from brewster.options import Options
+from brewster.photo import Photo
 from brewster.remote_path import location
 from cli_helpers import image_bytes, json_lines, layer_files, list_files
 from set_folders import hashes
@@ -64,7 +65,7 @@ def run_archive(root, options, *, source=None, executor=SerialExecutor, index=Tr
             separate_in_parallel(
                 tasks,
                 running,
-                report=lambda result: (results.append(result), writer and writer.append(result)),
+                on_result=lambda result: (results.append(result), writer and writer.append(result)),
                 **settings,
             )
     finally:
@@ -300,7 +301,7 @@ def test_the_command_writes_the_index_and_separates_urls(run, tmp_path, store):
         "memory://bucket/in/b.jpg": "failed",
     }
     assert "error: memory://bucket/in/b.jpg: " in err
-    assert "1 failed, 1 separated" in err
+    assert "1 separated, 1 failed in " in err
     assert {name: row["status"] for name, row in read_index(tmp_path).items()} == {
         "a.jpg": "separated",
         "b.jpg": "failed",
@@ -336,6 +337,7 @@ from brewster.inference import plan_files
 from brewster.inference.parallel_batch import SeparationRunner, separate_in_parallel
 from brewster.inference.index import IndexWriter
 from brewster.options import Options
+from brewster.photo import Photo
 root, options, done = Path(sys.argv[1]), Options(model=sys.argv[2]), []
 nodes = Cluster(initialize_head=True, head_node_args={"num_cpus": 1, "include_dashboard": False})
 lost_node = nodes.add_node(num_cpus=1)
@@ -348,7 +350,7 @@ with IndexWriter(root / "out") as index, RayExecutor(partial(SeparationRunner, o
         if len(done) == 10:
             nodes.remove_node(lost_node, allow_graceful=False)
 
-    separate_in_parallel(plan_files(root / "in", root / "out", options), executor, report=report)
+    separate_in_parallel(plan_files(root / "in", root / "out", options), executor, on_result=report)
 nodes.shutdown()
 print(len(done), sorted(set(done) - {"skipped"}))
 """
@@ -375,3 +377,31 @@ def test_an_archive_is_complete_and_has_the_same_bytes_if_a_node_is_lost(tmp_pat
     (tmp_path / "out" / INDEX_FILE).unlink()
     list(separate_files(tmp_path / "in", tmp_path / "plain", Options(model=str(model))))
     assert hashes(tmp_path / "out") == hashes(tmp_path / "plain")
+
+
+def test_several_processes_have_the_summary_grouped_errors_and_contact_sheet_of_a_batch(run, tmp_path):
+    for name in ("a.jpg", "b.jpg"):
+        (tmp_path / name).write_bytes(image_bytes())
+    (tmp_path / "c.jpg").write_bytes(b"not an image")
+    code, _, err = run(
+        "a.jpg", "b.jpg", "c.jpg", "-o", "out", "--workers", "2", "--contact-sheet", "sheet.png"
+    )
+    assert code == 1
+    assert re.search(r"2 separated, 1 failed in [\d.]+ s; the layers are in .*out", err)
+    assert err.count("error: ") == 1
+    assert Photo.open(tmp_path / "sheet.png").size[1] > 2 * 240
+
+
+def test_a_layer_that_is_another_photo_through_a_link_is_refused(options, tmp_path):
+    """Otherwise --overwrite replaces the photo."""
+    folder = tmp_path / "photos"
+    folder.mkdir()
+    (folder / "a.jpg").write_bytes(image_bytes())
+    (folder / "a.transmission.jpg").write_bytes(image_bytes(seed=1))
+    (tmp_path / "linked").symlink_to(folder)
+    tasks = plan_files([folder / "a.jpg", folder / "a.transmission.jpg"], tmp_path / "linked", options)
+    with (
+        SerialExecutor(partial(SeparationRunner, options, overwrite=True)) as executor,
+        pytest.raises(OutputError, match="is itself a photo of the batch"),
+    ):
+        separate_in_parallel(tasks, executor, overwrite=True)

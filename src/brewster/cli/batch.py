@@ -1,23 +1,22 @@
 """Runs `brewster separate` and prints its output: progress, one line for each photo, a summary.
 
-The photos are separated by `brewster.inference.batch`.
+The photos are separated by `brewster.inference.batch`, or in several processes or on a cluster by
+`brewster.inference.parallel_batch`.
 """
 
 from __future__ import annotations
 
 import json
-import os
-import re
-import sys
 import time
 from collections import Counter, defaultdict
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, final
+from typing import TYPE_CHECKING, final
 
-import click
-
+from brewster.cli.batch_plan import counted
 from brewster.cli.terminal import (
     interrupts,
     one_line,
@@ -28,149 +27,14 @@ from brewster.cli.terminal import (
     write_out,
 )
 from brewster.errors import ModelError
-from brewster.files import LAYER_FORMATS, find_videos
-from brewster.image_formats import WRITABLE, ImageFormat, format_of
 from brewster.models import zoo
 from brewster.options import Options
-from brewster.remote_path import location, path_of_file_url
+from brewster.remote_path import location
 
 if TYPE_CHECKING:
+    from brewster.executors import Executor
     from brewster.inference import FileResult, SeparationTask
-
-
-_MAX_NAMES: Final = 10
-"""In a message about several files, the number of files that are named."""
-
-
-def local_path(text: str) -> str:
-    """Returns the path in an argument that is a file:// address or has quotes around it.
-
-    File managers and some terminals pass a dropped file in this form. The name of an existing file is never changed.
-    """
-    if os.path.lexists(text):
-        return text
-    if len(text) > 2 and text[0] == text[-1] and text[0] in "'\"":
-        text = text[1:-1]
-    return path_of_file_url(text) if text.startswith("file://") else text
-
-
-def skipped_videos(photos: Sequence[str]) -> str | None:
-    """Returns a line about the videos in the folders, or None if there is none."""
-    videos = find_videos(map(location, photos))
-    if not videos:
-        return None
-    return f"{_counted(videos, 'video')} skipped: brewster separates photos; extract single images first, for example with ffmpeg"
-
-
-def _counted(names: Sequence[object], kind: str) -> str:
-    """Returns `2 videos (a.mp4, b.mov)`; the names of a long list are cut."""
-    more = f" and {len(names) - _MAX_NAMES} more" if len(names) > _MAX_NAMES else ""
-    return f"{len(names)} {kind}{'s' * (len(names) != 1)} ({', '.join(map(str, names[:_MAX_NAMES]))}{more})"
-
-
-def is_single_output(photos: Sequence[str], output: str | None) -> bool:
-    """Whether only one layer can be written, because its target is standard output or one image file (-o)."""
-    return "-" in photos or output == "-" or _is_image_file(output)
-
-
-def plan(photos: Sequence[str], output: str | None, options: Options) -> list[SeparationTask]:
-    """Lists the photos in files and folders, each with the targets of its layers.
-
-    Raises:
-        click.UsageError: the arguments contradict each other.
-        OutputError: two photos would be written under the same name.
-        PhotoError: the files and folders contain no photo.
-    """
-    from brewster.inference import plan_files  # noqa: PLC0415  (imports ONNX Runtime and pyvips)
-
-    if is_single_output(photos, output):
-        return [_plan_single_output(photos, output, options)]
-    _check_output_folder(photos, output)
-    return plan_files(photos, output, options)
-
-
-def _plan_single_output(photos: Sequence[str], output: str | None, options: Options) -> SeparationTask:
-    from brewster.inference import SeparationTask  # noqa: PLC0415
-
-    if len(photos) > 1 or Path(photos[0]).is_dir():
-        raise click.UsageError(
-            "With standard input, standard output or an image file as the target (-o), give exactly one photo."
-        )
-    if len(options.layers) > 1:
-        raise click.UsageError(
-            "Standard output and an image file as the target (-o) take one layer: choose it with --layers."
-        )
-    if output not in (None, "-"):
-        _check_format(format_of(Path(output)), options)
-    source = _StandardStream() if photos[0] == "-" else location(photos[0])
-    target = _StandardStream() if output in (None, "-") else location(output)
-    return SeparationTask(source, {options.layers[0]: target})
-
-
-def _check_format(image_format: ImageFormat | None, options: Options) -> None:
-    """Checks that the format of the image file given with -o can be written, and that --format and --additive match it.
-
-    Raises:
-        click.UsageError: the format is unknown or cannot be written, or the options require another format.
-    """
-    if image_format is None:
-        raise click.UsageError(
-            "With standard input, -o takes an image file such as clear.jpg, or is left out."
-        )
-    name = image_format.name
-    layer = options.layers[0]
-    if not image_format.is_writable and LAYER_FORMATS.get(layer) != name:
-        raise click.UsageError(f"brewster cannot write {name.upper()}: choose another suffix for -o.")
-    if layer != "confidence" and options.container(layer, name) != name:
-        raise click.UsageError(
-            f"The target of -o is a {name} file, but --format, --additive or --layers requires another format."
-        )
-
-
-def _check_output_folder(photos: Sequence[str], output: str | None) -> None:
-    """Checks that -o for a single photo is not an image file of an unknown format.
-
-    Raises:
-        click.UsageError: -o ends in an unknown suffix, and is not an existing folder.
-    """
-    if output is None or output.endswith(("/", os.sep)) or len(photos) > 1:
-        return
-    suffix = Path(output).suffix
-    if (
-        re.fullmatch(r"\.[A-Za-z][A-Za-z0-9]{1,4}", suffix)
-        and not os.path.isdir(output)  # noqa: PTH112  (Path.is_dir raises for names that are too long)
-        and not os.path.isdir(photos[0])  # noqa: PTH112
-    ):
-        raise click.UsageError(
-            f"The suffix {suffix} of -o is that of no format that brewster writes. Choose one of "
-            f"{', '.join(row.suffixes[0] for row in WRITABLE.values())}, or end the name of a folder with {os.sep}"
-        )
-
-
-def _is_image_file(output: str | None) -> bool:
-    return (
-        output is not None
-        and not output.endswith(("/", os.sep))
-        and format_of(Path(output)) is not None
-        and not Path(output).is_dir()
-    )
-
-
-@final
-class _StandardStream:
-    """Standard input as the source of a photo, standard output as the target of a layer."""
-
-    def read(self) -> bytes:
-        """The bytes of the photo."""
-        return sys.stdin.buffer.read()
-
-    def write(self, data: bytes) -> None:
-        """Writes the encoded layer.
-
-        Raises:
-            OutputError: standard output cannot be written.
-        """
-        write_out(data)
+    from brewster.inference.index import IndexWriter
 
 
 @final
@@ -185,51 +49,93 @@ class BatchCommand:
     as_json: bool = False
     quiet: bool = False
     contact_sheet: Path | None = None
+    workers: int | None = None
+    cluster: str | None = None
+    index: bool = False
 
     def run(self, tasks: Sequence[SeparationTask]) -> bool:
-        """Separates all photos and prints the results.
+        """Separates all photos and prints the results. Results are not stored, because an archive has millions of photos.
 
         Returns:
             Whether no photo failed.
 
         Raises:
-            ModelError: the model does not exist or is damaged.
-            DeviceError: the requested device is not available.
+            BrewsterError: see `separate_tasks` and `separate_in_parallel`.
         """
-        results: list[FileResult] = []
-        started = time.perf_counter()
+        summary, started = _Summary(), time.perf_counter()
+        shares_terminal = self.as_json and standard_output.stream.isatty()
         try:
-            self._separate(tasks, results)
-            if self.contact_sheet and not self.dry_run:
-                self._write_contact_sheet(self.contact_sheet, results)
-        finally:
-            if len(results) == len(
-                tasks
-            ):  # true also if `separate_tasks` raises an unexpected exception after the last photo
-                self._print_summary(results, time.perf_counter() - started)
-        return all(result.error is None for result in results)
+            with (
+                self._index_writer() as index,
+                progress(len(tasks), shown=not self.quiet and not shares_terminal) as update_progress,
+            ):
 
-    def _separate(self, tasks: Sequence[SeparationTask], results: list[FileResult]) -> None:
-        """Separates the photos in order, appends the result of each to `results`, and prints it."""
+                def on_result(result: FileResult) -> None:
+                    if result.error:
+                        interrupts.raise_pending()  # a Ctrl-C that Python dropped may have caused the error
+                    if index:
+                        index.append(result)
+                    summary.add(result, has_contact_sheet=self.contact_sheet is not None)
+                    self._print_result(result)
+                    update_progress(summary.counts.total(), result.source)
+                    interrupts.raise_pending()
+
+                if self._is_parallel:
+                    self._separate_in_parallel(tasks, on_result)
+                else:
+                    self._separate(tasks, on_result, update_progress)
+            if self.contact_sheet and not self.dry_run:
+                self._write_contact_sheet(self.contact_sheet, summary.contact_sheet_rows)
+        finally:
+            # True also if `separate_tasks` raises an unexpected exception after the last photo.
+            if summary.counts.total() == len(tasks):
+                self._print_summary(summary, time.perf_counter() - started)
+        return not summary.counts["failed"]
+
+    @property
+    def _is_parallel(self) -> bool:
+        return bool(self.workers or self.cluster) and not self.dry_run
+
+    def _separate(
+        self,
+        tasks: Sequence[SeparationTask],
+        on_result: Callable[[FileResult], None],
+        update_progress: Callable[[float, str], None],
+    ) -> None:
         from brewster.inference.batch import separate_tasks  # noqa: PLC0415
 
-        shares_terminal = self.as_json and standard_output.stream.isatty()
-        with progress(len(tasks), shown=not self.quiet and not shares_terminal) as update_progress:
+        def on_progress(done: int, name: str, fraction: float) -> None:
+            interrupts.raise_pending()
+            update_progress(done + fraction, name)
 
-            def on_progress(done: int, name: str, fraction: float) -> None:
-                interrupts.raise_pending()
-                update_progress(done + fraction, name)
+        for result in separate_tasks(
+            tasks, self.options, overwrite=self.overwrite, dry_run=self.dry_run, on_progress=on_progress
+        ):
+            on_result(result)
 
-            for result in separate_tasks(
-                tasks, self.options, overwrite=self.overwrite, dry_run=self.dry_run, on_progress=on_progress
-            ):
-                if result.error:
-                    interrupts.raise_pending()  # a Ctrl-C that Python dropped may have caused the error
-                results.append(result)
-                self.print_result(result)
-                interrupts.raise_pending()
+    def _separate_in_parallel(
+        self, tasks: Sequence[SeparationTask], on_result: Callable[[FileResult], None]
+    ) -> None:
+        from brewster.executors import ProcessExecutor  # noqa: PLC0415
+        from brewster.inference.parallel_batch import SeparationRunner, separate_in_parallel  # noqa: PLC0415
 
-    def print_result(self, result: FileResult) -> None:
+        shared_folder = location(self.output) if self.cluster and self.output else None
+        create_runner = partial(SeparationRunner, self.options, shared_folder, overwrite=self.overwrite)
+        executor: Executor[FileResult] = ProcessExecutor(create_runner, self.workers or 1)
+        if self.cluster:
+            from brewster.executors.ray_cluster import RayExecutor  # noqa: PLC0415
+
+            executor = RayExecutor(create_runner, self.cluster, self.workers)
+        with executor:
+            separate_in_parallel(tasks, executor, overwrite=self.overwrite, on_result=on_result)
+
+    def _index_writer(self) -> AbstractContextManager[IndexWriter | None]:
+        from brewster.inference.index import IndexWriter  # noqa: PLC0415
+
+        is_written = (self.index or self.cluster) and self.output and not self.dry_run
+        return IndexWriter(location(self.output or "")) if is_written else nullcontext()
+
+    def _print_result(self, result: FileResult) -> None:
         """Prints the line of a result: JSON on standard output, or a status line on standard error."""
         outputs = ", ".join(result.outputs.values())
         if self.as_json:
@@ -239,7 +145,8 @@ class BatchCommand:
         if self.quiet or result.error:
             return
         if result.status == "skipped":
-            other = self._other_options(result)
+            # Reading the layers takes time, so the options of an archive are not compared.
+            other = "" if self._is_parallel else self._other_options(result)
             made = f", made with other options ({other})" if other else ""
             print_status(
                 f"{result.source}: skipped, all of its layers exist{made} (--overwrite replaces them)"
@@ -267,30 +174,57 @@ class BatchCommand:
             if value is not None and made.get(name, value) != value
         )
 
-    def _print_summary(self, results: Sequence[FileResult], seconds: float) -> None:
-        counts: Counter[str] = Counter(result.status for result in results)
-        if len(results) > 1 and not self.quiet:
+    def _print_summary(self, summary: _Summary, seconds: float) -> None:
+        if summary.counts.total() > 1 and not self.quiet:
             order = ("separated", "planned", "skipped", "failed")
-            totals = ", ".join(f"{counts[status]} {status}" for status in order if counts[status])
+            totals = ", ".join(
+                f"{summary.counts[status]} {status}" for status in order if summary.counts[status]
+            )
             folder = f"in {self.output}" if self.output else "next to the photos"
             print_status(
                 totals if self.dry_run else f"{totals} in {_duration(seconds)}; the layers are {folder}"
             )
-        for message in _error_messages(results):
+        for message in summary.error_messages():
             print_error(message)
 
-    def _write_contact_sheet(self, path: Path, results: Sequence[FileResult]) -> None:
-        """Writes the contact sheet of the photos whose layers are files."""
+    def _write_contact_sheet(self, path: Path, rows: list[tuple[Path, list[Path]]]) -> None:
+        """Writes the contact sheet of the photos whose layers are files, in the order of their names."""
         from brewster.photo.contact_sheet import write_contact_sheets  # noqa: PLC0415
 
-        rows = [
-            (Path(result.source), [Path(output) for output in result.outputs.values()])
-            for result in results
-            if result.error is None and result.source != "-" and "-" not in result.outputs.values()
-        ]
-        for sheet in write_contact_sheets(path, rows, self.options.max_pixels):
+        for sheet in write_contact_sheets(
+            path, sorted(rows) if self._is_parallel else rows, self.options.max_pixels
+        ):
             if not self.quiet:
                 print_status(f"contact sheet: {sheet}")
+
+
+@final
+class _Summary:
+    """The counts and errors of a batch."""
+
+    def __init__(self) -> None:
+        self.counts: Counter[str] = Counter()
+        self.contact_sheet_rows: list[tuple[Path, list[Path]]] = []
+        self._errors: list[str] = []
+        self._without_extra: defaultdict[str, list[str]] = defaultdict(list)
+
+    def add(self, result: FileResult, *, has_contact_sheet: bool) -> None:
+        """Counts a result."""
+        self.counts[result.status] += 1
+        if result.error and "pip install 'brewster[" in result.error:
+            self._without_extra[result.error].append(result.source)
+        elif result.error:
+            self._errors.append(_error_text(result))
+        elif has_contact_sheet and "-" not in (result.source, *result.outputs.values()):
+            self.contact_sheet_rows.append((Path(result.source), [*map(Path, result.outputs.values())]))
+
+    def error_messages(self) -> list[str]:
+        """Returns a message for each failed photo. Photos that need the same missing extra share a message."""
+        grouped = (
+            f"{sources[0] if len(sources) == 1 else counted(sources, 'photo')}: {error}"
+            for error, sources in self._without_extra.items()
+        )
+        return [*self._errors, *grouped]
 
 
 def _model_name(model: str) -> str | None:
@@ -309,25 +243,10 @@ def _duration(seconds: float) -> str:
     return f"{minutes} min {rest} s" if minutes < 60 else f"{minutes // 60} h {minutes % 60} min"
 
 
-def error_text(result: FileResult) -> str:
+def _error_text(result: FileResult) -> str:
     """Returns the error message of a photo, which begins with its path."""
     has_source = str(result.error).startswith(f"{result.source} ")
     return str(result.error) if has_source else f"{result.source}: {result.error}"
-
-
-def _error_messages(results: Iterable[FileResult]) -> list[str]:
-    """Returns a message for each failed photo. Photos that need the same missing extra share a message."""
-    messages, without_extra = [], defaultdict(list)
-    for result in results:
-        if result.error and "pip install 'brewster[" in result.error:
-            without_extra[result.error].append(result.source)
-        elif result.error:
-            messages.append(error_text(result))
-    grouped = (
-        f"{sources[0] if len(sources) == 1 else _counted(sources, 'photo')}: {error}"
-        for error, sources in without_extra.items()
-    )
-    return [*messages, *grouped]
 
 
 def _json_line(result: FileResult) -> bytes:

@@ -13,8 +13,8 @@ import click
 from click.core import ParameterSource
 from click.shell_completion import CompletionItem
 
-from brewster.cli.batch import BatchCommand, is_single_output, local_path, plan, skipped_videos
-from brewster.cli.parallel_batch import ParallelBatchCommand
+from brewster.cli.batch import BatchCommand
+from brewster.cli.batch_plan import absolute_path, is_single_output, local_path, plan, skipped_videos
 from brewster.cli.terminal import print_status, standard_output
 from brewster.errors import BrewsterError
 from brewster.image_formats import SUFFIXES, FormatName, format_of
@@ -221,16 +221,13 @@ def separate(
     except BrewsterError as error:
         raise click.UsageError(str(error)) from error
     if (workers or cluster or index) and not dry_run:
-        if contact_sheet:
-            raise click.UsageError("--contact-sheet cannot be combined with --workers, --cluster or --index.")
         _check_archive_output(single_output, output, needs_folder=bool(cluster or index))
-        archive = ParallelBatchCommand(
-            options, output, cluster, workers, index=index, overwrite=overwrite, as_json=as_json, quiet=quiet
-        )
-        context.exit(0 if archive.run(photos) else 1)
+        photos, output = tuple(map(absolute_path, photos)), output and absolute_path(output)
     tasks = plan(photos, output, options)
     if single_output and output in (None, "-") and not dry_run:
         _reject_shared_output(as_json=as_json)
+    if contact_sheet and cluster:
+        raise click.UsageError("--contact-sheet cannot be combined with --cluster.")
     if contact_sheet:
         _check_contact_sheet(contact_sheet, photos, output)
     if not quiet and (videos := skipped_videos(photos)):
@@ -243,6 +240,9 @@ def separate(
         as_json=as_json,
         quiet=quiet,
         contact_sheet=contact_sheet,
+        workers=workers,
+        cluster=cluster,
+        index=index,
     )
     context.exit(0 if batch.run(tasks) else 1)
 

@@ -229,7 +229,7 @@ class BatchRunner:
         self.unexpected_error: Exception | None = None
         self._options, self._separator = options, separator
         self._overwrite, self._dry_run = overwrite, dry_run
-        self._sources = {_real_path(task.source) for task in tasks if isinstance(task.source, Location)}
+        self._sources = {real_path(task.source) for task in tasks if isinstance(task.source, Location)}
 
     def run(self, task: SeparationTask, on_progress: Callable[[float], None]) -> FileResult:
         """Separates one photo and returns the result, also for a failure.
@@ -288,7 +288,7 @@ class BatchRunner:
         }
 
     def _is_source(self, target: Location, source: Location | InputStream) -> bool:
-        if _real_path(target) in self._sources:
+        if real_path(target) in self._sources:
             return True
         try:  # unlike realpath, is_same_file finds hard links
             return isinstance(source, Location) and is_same_file(target, source)
@@ -339,7 +339,8 @@ def _sha256(photo: Path | bytes) -> str | None:
         return None
 
 
-def _real_path(path: Location) -> str:
+def real_path(path: Location) -> str:
+    """Returns the absolute path without symbolic links; a URL is returned unchanged."""
     return str(path) if isinstance(path, RemotePath) else os.path.realpath(path)
 
 

@@ -3,7 +3,7 @@
     tasks = plan_files("scans.parquet", "s3://bucket/clear", options)
     create_runner = partial(SeparationRunner, options)
     with RayExecutor(create_runner, "10.0.0.1:6379") as executor, IndexWriter(location("s3://bucket/clear")) as index:
-        separate_in_parallel(tasks, executor, report=index.append)
+        separate_in_parallel(tasks, executor, on_result=index.append)
 
 A worker separates one photo at a time, with the code of a batch in one process (`BatchRunner`). It reads the photo and
 writes the layers itself. A layer that exists is never written again, not even by two workers at the same time. So a lost
@@ -20,11 +20,9 @@ from typing import final
 from brewster.errors import OutputError
 from brewster.executors import Executor, run_tasks
 from brewster.files import exists
-from brewster.inference.batch import BatchRunner, FileResult, SeparationTask
+from brewster.inference.batch import BatchRunner, FileResult, SeparationTask, real_path
 from brewster.options import Options
 from brewster.remote_path import Location
-
-ResultCallback = Callable[[FileResult], None]
 
 
 def separate_in_parallel(
@@ -32,7 +30,7 @@ def separate_in_parallel(
     executor: Executor[FileResult],
     *,
     overwrite: bool = False,
-    report: ResultCallback = lambda _: None,
+    on_result: Callable[[FileResult], None] = lambda _: None,
 ) -> None:
     """Separates the photos of the tasks, in the order in which workers finish them.
 
@@ -40,7 +38,7 @@ def separate_in_parallel(
         tasks: the photos and the paths of their layers, from `plan_files`.
         executor: runs an `SeparationRunner` in its workers; its context is entered by the caller.
         overwrite: replace layers that exist, instead of skipping them.
-        report: called with the result of every photo. An exception raised in it stops the run.
+        on_result: called with the result of every photo. An exception raised in it stops the run.
 
     Raises:
         OutputError: a layer would replace a photo of the archive, or a node cannot reach the output folder.
@@ -48,9 +46,9 @@ def separate_in_parallel(
         DeviceError: the requested device is not available.
     """
     _check_targets(tasks)
-    unfinished = _unfinished(tasks, report, overwrite=overwrite)
+    unfinished = _unfinished(tasks, on_result, overwrite=overwrite)
     for result in run_tasks(lambda: next(unfinished, None), executor):
-        report(result)
+        on_result(result)
 
 
 @final
@@ -94,10 +92,10 @@ class SeparationRunner:
 
 def _check_targets(tasks: Sequence[SeparationTask]) -> None:
     """Raises OutputError if a layer has the path of a photo. Workers cannot check this, because each has one photo only."""
-    sources = {task.name for task in tasks}
+    sources = {real_path(task.source) for task in tasks if isinstance(task.source, Location)}
     for task in tasks:
         for target in task.outputs.values():
-            if str(target) in sources:
+            if isinstance(target, Location) and real_path(target) in sources:
                 raise OutputError(
                     f"{target} is itself a photo of the batch",
                     "expected another path, because photos of the batch are never overwritten",
@@ -106,13 +104,13 @@ def _check_targets(tasks: Sequence[SeparationTask]) -> None:
 
 
 def _unfinished(
-    tasks: Sequence[SeparationTask], report: ResultCallback, *, overwrite: bool
+    tasks: Sequence[SeparationTask], on_result: Callable[[FileResult], None], *, overwrite: bool
 ) -> Iterator[SeparationTask]:
     """Yields the tasks with missing layers. The others are reported as skipped, so that no worker is needed for them."""
     listing = _FolderListing()
     for task in tasks:
         if not overwrite and _is_finished(task, listing.has):
-            report(
+            on_result(
                 FileResult(
                     task.name, "skipped", {layer: str(target) for layer, target in task.outputs.items()}
                 )

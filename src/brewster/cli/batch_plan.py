@@ -1,0 +1,162 @@
+"""Finds the photos of `brewster separate` and the files of their layers, and checks the arguments."""
+
+from __future__ import annotations
+
+import os
+import re
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Final, final
+
+import click
+
+from brewster.cli.terminal import write_out
+from brewster.files import LAYER_FORMATS, find_videos
+from brewster.image_formats import WRITABLE, ImageFormat, format_of
+from brewster.options import Options
+from brewster.remote_path import location, path_of_file_url
+
+if TYPE_CHECKING:
+    from brewster.inference import SeparationTask
+
+
+_MAX_NAMES: Final = 10
+"""In a message about several files, the number of files that are named."""
+
+
+def local_path(text: str) -> str:
+    """Returns the path in an argument that is a file:// address or has quotes around it.
+
+    File managers and some terminals pass a dropped file in this form. The name of an existing file is never changed.
+    """
+    if os.path.lexists(text):
+        return text
+    if len(text) > 2 and text[0] == text[-1] and text[0] in "'\"":
+        text = text[1:-1]
+    return path_of_file_url(text) if text.startswith("file://") else text
+
+
+def absolute_path(path: str) -> str:
+    """Returns the absolute path, or the URL: the workers of a batch may have other working folders."""
+    found = location(path)
+    return os.path.abspath(found) if isinstance(found, Path) else str(found)  # noqa: PTH100  (keeps links)
+
+
+def skipped_videos(photos: Sequence[str]) -> str | None:
+    """Returns a line about the videos in the folders, or None if there is none."""
+    videos = find_videos(map(location, photos))
+    if not videos:
+        return None
+    return f"{counted(videos, 'video')} skipped: brewster separates photos; extract single images first, for example with ffmpeg"
+
+
+def counted(names: Sequence[object], kind: str) -> str:
+    """Returns `2 videos (a.mp4, b.mov)`; the names of a long list are cut."""
+    more = f" and {len(names) - _MAX_NAMES} more" if len(names) > _MAX_NAMES else ""
+    return f"{len(names)} {kind}{'s' * (len(names) != 1)} ({', '.join(map(str, names[:_MAX_NAMES]))}{more})"
+
+
+def is_single_output(photos: Sequence[str], output: str | None) -> bool:
+    """Whether only one layer can be written, because its target is standard output or one image file (-o)."""
+    return "-" in photos or output == "-" or _is_image_file(output)
+
+
+def plan(photos: Sequence[str], output: str | None, options: Options) -> list[SeparationTask]:
+    """Lists the photos in files and folders, each with the targets of its layers.
+
+    Raises:
+        click.UsageError: the arguments contradict each other.
+        OutputError: two photos would be written under the same name.
+        PhotoError: the files and folders contain no photo.
+    """
+    from brewster.inference import plan_files  # noqa: PLC0415  (imports ONNX Runtime and pyvips)
+
+    if is_single_output(photos, output):
+        return [_plan_single_output(photos, output, options)]
+    _check_output_folder(photos, output)
+    return plan_files(photos, output, options)
+
+
+def _plan_single_output(photos: Sequence[str], output: str | None, options: Options) -> SeparationTask:
+    from brewster.inference import SeparationTask  # noqa: PLC0415
+
+    if len(photos) > 1 or Path(photos[0]).is_dir():
+        raise click.UsageError(
+            "With standard input, standard output or an image file as the target (-o), give exactly one photo."
+        )
+    if len(options.layers) > 1:
+        raise click.UsageError(
+            "Standard output and an image file as the target (-o) take one layer: choose it with --layers."
+        )
+    if output not in (None, "-"):
+        _check_format(format_of(Path(output)), options)
+    source = _StandardStream() if photos[0] == "-" else location(photos[0])
+    target = _StandardStream() if output in (None, "-") else location(output)
+    return SeparationTask(source, {options.layers[0]: target})
+
+
+def _check_format(image_format: ImageFormat | None, options: Options) -> None:
+    """Checks that the format of the image file given with -o can be written, and that --format and --additive match it.
+
+    Raises:
+        click.UsageError: the format is unknown or cannot be written, or the options require another format.
+    """
+    if image_format is None:
+        raise click.UsageError(
+            "With standard input, -o takes an image file such as clear.jpg, or is left out."
+        )
+    name = image_format.name
+    layer = options.layers[0]
+    if not image_format.is_writable and LAYER_FORMATS.get(layer) != name:
+        raise click.UsageError(f"brewster cannot write {name.upper()}: choose another suffix for -o.")
+    if layer != "confidence" and options.container(layer, name) != name:
+        raise click.UsageError(
+            f"The target of -o is a {name} file, but --format, --additive or --layers requires another format."
+        )
+
+
+def _check_output_folder(photos: Sequence[str], output: str | None) -> None:
+    """Checks that -o for a single photo is not an image file of an unknown format.
+
+    Raises:
+        click.UsageError: -o ends in an unknown suffix, and is not an existing folder.
+    """
+    if output is None or output.endswith(("/", os.sep)) or "://" in output or len(photos) > 1:
+        return
+    suffix = Path(output).suffix
+    if (
+        re.fullmatch(r"\.[A-Za-z][A-Za-z0-9]{1,4}", suffix)
+        and not os.path.isdir(output)  # noqa: PTH112  (Path.is_dir raises for names that are too long)
+        and not os.path.isdir(photos[0])  # noqa: PTH112
+    ):
+        raise click.UsageError(
+            f"The suffix {suffix} of -o is that of no format that brewster writes. Choose one of "
+            f"{', '.join(row.suffixes[0] for row in WRITABLE.values())}, or end the name of a folder with {os.sep}"
+        )
+
+
+def _is_image_file(output: str | None) -> bool:
+    return (
+        output is not None
+        and not output.endswith(("/", os.sep))
+        and format_of(Path(output)) is not None
+        and not Path(output).is_dir()
+    )
+
+
+@final
+class _StandardStream:
+    """Standard input as the source of a photo, standard output as the target of a layer."""
+
+    def read(self) -> bytes:
+        """The bytes of the photo."""
+        return sys.stdin.buffer.read()
+
+    def write(self, data: bytes) -> None:
+        """Writes the encoded layer.
+
+        Raises:
+            OutputError: standard output cannot be written.
+        """
+        write_out(data)
