@@ -136,7 +136,7 @@ def test_another_file_of_the_same_name_is_refused(folder, rng):
     correct, wrong = hashlib.sha256(data).hexdigest(), hashlib.sha256(b"").hexdigest()
     assets = Assets([folder])
     assets.map_radiance(EnvironmentMap(source=AssetSource(file="sky.hdr", sha256=correct)))
-    with pytest.raises(RecipeError, match="not the file that the scene was drawn with") as error:
+    with pytest.raises(RecipeError, match="not the file with which the scene was drawn") as error:
         assets.map_radiance(
             EnvironmentMap(source=AssetSource(file="sky.hdr", sha256=wrong))
         )  # the cached map of the other file is not used

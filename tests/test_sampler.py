@@ -134,7 +134,7 @@ def test_categories_are_respected_and_a_map_without_one_fits_everywhere():
 
 
 def test_a_recipe_of_pictures_needs_pictures():
-    with pytest.raises(RecipeError, match="there are no pictures to draw from"):
+    with pytest.raises(RecipeError, match="the catalog has no pictures"):
         drawn("vitrine", 0, catalog=Catalog(maps=BUILTIN_CATALOG.maps))
 
 
@@ -234,7 +234,7 @@ def test_the_paper_recipe_has_the_glass_and_the_orders_of_the_paper(paper_scenes
 
 def test_setups_need_a_share_above_zero():
     values = read_scene_recipe(PAPER).model_dump(exclude_unset=True)
-    with pytest.raises(RecipeError, match="a share above 0 for at least one of the setups"):
+    with pytest.raises(RecipeError, match="a weight above 0 for at least one of the setups"):
         validated(SceneRecipe, values | {"setups": {"map|map": 0.0}}, source="x", reference="y")
     with pytest.raises(RecipeError, match="setups"):
         validated(SceneRecipe, values | {"setups": {"plane|plane": 1.0}}, source="x", reference="y")
