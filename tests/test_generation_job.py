@@ -222,7 +222,7 @@ def test_a_damaged_record_is_reported(four_samples, tmp_path):
 
 def test_a_folder_of_something_else_is_refused(tmp_path):
     (tmp_path / "holiday.jpg").touch()
-    with pytest.raises(OutputError, match=r"holiday\.jpg, but no set"):
+    with pytest.raises(OutputError, match=r"holiday\.jpg, but no rendered dataset"):
         render_set(tmp_path)
     with pytest.raises(OutputError, match="cannot be written to"):
         render_set(tmp_path / "holiday.jpg")
