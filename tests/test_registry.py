@@ -347,7 +347,7 @@ def test_an_empty_or_missing_folder_or_a_file_is_an_error_in_three_parts(tmp_pat
 
 def test_a_damaged_shard_is_an_error(tmp_path):
     write(tmp_path, "shard-000000.tar", data=b"no tar" * 200)
-    with pytest.raises(PhotoError, match=r"is not a rendered set \(.*\); .*; "):
+    with pytest.raises(PhotoError, match=r"is not a rendered dataset \(.*\); .*; "):
         read_benchmark("rendered", tmp_path)
 
 
@@ -429,7 +429,7 @@ def test_a_repacked_set_whose_names_identify_the_scenes_can_be_drawn(tmp_path):
 def test_a_repacked_set_whose_names_do_not_identify_the_scenes_cannot_be_drawn(tmp_path, name, stems):
     read = only(name, repacked(tmp_path, stems))
     assert [case.scene for case in read.cases] == names(read.cases)
-    assert "the file names do not identify the scenes, so the paper's draw is not possible" in read.remarks
+    assert "the file names do not identify the scenes, so one case per scene cannot be drawn, as in the paper" in read.remarks
     with pytest.raises(PhotoError, match=r"do not identify the scenes of SIR2 .*; .*; .*"):
         paper_draw(read)
 
