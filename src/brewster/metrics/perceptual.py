@@ -5,7 +5,8 @@
     print([metric.distance(metric.features(prediction), truth) for prediction in predictions])
 
 R. Zhang et al., "The Unreasonable Effectiveness of Deep Features as a Perceptual Metric", CVPR 2018. The
-definition and the weights are those of version 0.1 of the `lpips` package. Only `Lpips.load` imports torch.
+definition and the weights are those of version 0.1 of the `lpips` package. Functions import torch when they are called; the
+import of this module does not.
 """
 
 from __future__ import annotations
@@ -27,18 +28,18 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     Map = Float[Tensor, "_c _h _w"]
-    """The maps of one image differ in all three sizes; the underscores tell jaxtyping not to compare them."""
+    """The five maps of an image differ in all dimensions. The underscores disable jaxtyping's comparison of dimensions."""
 
 MIN_SIDE: Final = 31
-"""The minimum height and width in pixels: with fewer, AlexNet's strides and poolings leave an empty map."""
+"""The minimum height and width in pixels. The last map of a smaller image is empty, because AlexNet reduces the size."""
 
 _SHIFT: Final = np.array([-0.030, -0.088, -0.188])
 _SCALE: Final = np.array([0.458, 0.448, 0.450])
-"""Mean and standard deviation of ImageNet's values in -1..1, rounded as in LPIPS 0.1."""
+"""The mean and the standard deviation of ImageNet's values in -1..1, rounded as in LPIPS 0.1."""
 
 
 class _Layer(NamedTuple):
-    """A convolution of AlexNet. If `pooled_before`, a 3x3 max pooling with stride 2 precedes it."""
+    """A convolution of AlexNet. If `pooled_before` is True, a 3x3 max pooling with stride 2 precedes it."""
 
     stride: int
     padding: int
@@ -78,7 +79,7 @@ class DifferenceMaps:
     size: tuple[int, int]
 
     def mean(self, *, region: Region | None = None) -> float:
-        """The distance, averaged over the whole maps or over a region; see `Lpips.distance`.
+        """Returns the distance, averaged over the whole maps or over a region; see `Lpips.distance`.
 
         Raises:
             ValueError: the region is empty or of another shape.
@@ -108,14 +109,14 @@ class Lpips:
 
         Raises:
             MissingExtra: torch is not installed.
-            ModelError: the file of AlexNet's weights is damaged, or holds other weights.
+            ModelError: the file of AlexNet's weights is damaged, or contains other weights.
             DownloadError: AlexNet's weights are not on this machine, and the download fails.
             OutputError: the downloaded weights cannot be written to the cache folder.
         """
         return _load()
 
     def features(self, image: Image) -> Features:
-        """The features of an image, uint8 (H, W, 3).
+        """Returns the features of an image, uint8 (H, W, 3).
 
         Raises:
             ValueError: the image is not uint8 (H, W, 3), or has fewer than 31 pixels on a side.
@@ -140,12 +141,12 @@ class Lpips:
         return Features(tuple(maps), size)
 
     def distance(self, one: Features, other: Features, *, region: Region | None = None) -> float:
-        """The LPIPS distance between two images, given by their features.
+        """Returns the LPIPS distance between two images, given by their features.
 
         The squared differences of the features are weighted by channel, averaged over each map, and summed over the
         five maps. With a `region`, bool (H, W), each map of differences is first upsampled to the size of the image
-        (bilinear, align_corners=False; `spatial=True` in `lpips`), and their sum is averaged over the region. A region
-        that is the whole image gives a slightly different value than no region, because upsampling changes the
+        (bilinear, align_corners=False; `spatial=True` in `lpips`), and the sum of the maps is averaged over the region.
+        A region that is the whole image gives a slightly different value than no region, because upsampling changes the
         weight of the pixels at the border of a map.
 
         Returns:
@@ -157,7 +158,7 @@ class Lpips:
         return self.difference(one, other).mean(region=region)
 
     def difference(self, one: Features, other: Features) -> DifferenceMaps:
-        """The five maps of `distance` before they are averaged, for several means of one pair.
+        """Returns the five maps of `distance` before they are averaged, so that several means need them only once.
 
         Raises:
             ValueError: the images differ in size.
@@ -175,7 +176,7 @@ class Lpips:
 
 
 def lpips(prediction: Image, truth: Image, *, region: Region | None = None) -> float:
-    """The LPIPS 0.1 (AlexNet) distance between two images, with weights from `Lpips.load`; see `Lpips.distance`.
+    """Returns the LPIPS 0.1 (AlexNet) distance between two images, with weights from `Lpips.load`; see `Lpips.distance`.
 
     Returns:
         The distance, 0 for equal images; lower is better.
@@ -197,7 +198,7 @@ def _load() -> Lpips:
     except ImportError as error:
         raise MissingExtra(
             "torch is not installed",
-            "expected torch, which computes LPIPS",
+            "expected torch, which brewster needs for LPIPS",
             "run: pip install 'brewster[evaluate]'",
         ) from error
     tensors = [*load_alexnet().values()]
@@ -207,9 +208,9 @@ def _load() -> Lpips:
 
 
 def _normalised(image: Image) -> NDArray[np.float32]:
-    """(value / 127.5 - 1 - shift) / scale, (H, W, 3).
+    """Returns (value / 127.5 - 1 - shift) / scale, (H, W, 3).
 
-    The channels stay last in memory, because the convolutions are fastest on a CPU in this layout. The arithmetic runs on
+    The channels stay last in memory, because convolutions on a CPU are fastest in this layout. The arithmetic is done on
     whole rows, because numpy is slow along an axis of length 3.
     """
     height, width, _ = image.shape
@@ -220,7 +221,7 @@ def _normalised(image: Image) -> NDArray[np.float32]:
 
 
 def _mean(values: NDArray[np.float32]) -> float:
-    """The mean, computed by numpy in float64, because the order of torch's sums depends on the number of threads."""
+    """Returns the mean. It is computed by numpy, because the order of torch's sums depends on the number of threads."""
     return float(values.mean(dtype=np.float64))
 
 
