@@ -429,7 +429,10 @@ def test_a_repacked_set_whose_names_identify_the_scenes_can_be_drawn(tmp_path):
 def test_a_repacked_set_whose_names_do_not_identify_the_scenes_cannot_be_drawn(tmp_path, name, stems):
     read = only(name, repacked(tmp_path, stems))
     assert [case.scene for case in read.cases] == names(read.cases)
-    assert "the file names do not identify the scenes, so one case per scene cannot be drawn, as in the paper" in read.remarks
+    assert (
+        "the file names do not identify the scenes, so one case per scene cannot be drawn, as in the paper"
+        in read.remarks
+    )
     with pytest.raises(PhotoError, match=r"do not identify the scenes of SIR2 .*; .*; .*"):
         paper_draw(read)
 
