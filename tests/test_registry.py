@@ -319,7 +319,7 @@ def test_a_dangling_link_is_excluded_and_named(tmp_path):
 # --- remarks
 
 
-def test_an_unexpected_number_of_pictures_is_a_remark(tmp_path):
+def test_an_unexpected_number_of_images_is_a_remark(tmp_path):
     assert only("real20", repacked(tmp_path / "r", ["a"])).remarks == ("found 1 image, expected 20",)
     wild = only("wildscene", wildscene(tmp_path / "w", 56))
     assert wild.remarks == ("found 56 images, expected 101 or 55",)

@@ -27,7 +27,7 @@ def two_workers(create_runner):
 
 
 def start_blocking_run(out, count):
-    """Starts a run in a process of its own, with a worker that never finishes sample 2."""
+    """Starts a run in a separate process, with a worker that never finishes sample 2."""
     code = f"""
 from pathlib import Path
 from brewster.executors import ProcessExecutor
