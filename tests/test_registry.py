@@ -430,7 +430,7 @@ def test_a_repacked_set_whose_names_do_not_identify_the_scenes_cannot_be_drawn(t
     read = only(name, repacked(tmp_path, stems))
     assert [case.scene for case in read.cases] == names(read.cases)
     assert (
-        "the file names do not identify the scenes, so one case per scene cannot be drawn, as in the paper"
+        "the file names do not identify the scenes, so the paper's draw of one case per scene is not possible"
         in read.remarks
     )
     with pytest.raises(PhotoError, match=r"do not identify the scenes of SIR2 .*; .*; .*"):

@@ -85,7 +85,7 @@ class RecipeError(BrewsterError):
     """A recipe is not TOML, or its values are missing, unknown or impossible.
 
     Attributes:
-        others: one error for each further problem of the same recipe. The message has a line for each.
+        others: one error for each further problem of the same recipe. The message has a line for each problem.
     """
 
     def __init__(self, happened: str, expected: str, cure: str, others: tuple[RecipeError, ...] = ()) -> None:

@@ -144,7 +144,9 @@ def read_bytes(path: Path) -> bytes:
         return path.read_bytes()
     except OSError as error:
         raise RecipeError(
-            f"{path} cannot be read ({error.strerror})", "expected an image file", "remove it from the folder"
+            f"{path} cannot be read ({error.strerror})",
+            "expected an image file",
+            "remove the file from the folder",
         ) from error
 
 

@@ -121,5 +121,5 @@ def _read_categories(folder: Path) -> dict[str, str]:
         raise RecipeError(
             f"{folder / 'manifest.csv'} cannot be read ({error})",
             "expected a table with the columns file and category, in UTF-8",
-            "save it in UTF-8, or remove it",
+            "save the table in UTF-8, or remove it",
         ) from error

@@ -74,7 +74,7 @@ class RayExecutor(Generic[ResultT]):
         return []
 
     def __enter__(self) -> Self:
-        """Connects to the cluster, or starts a local one.
+        """Connects to the cluster, or starts a cluster on this machine if the address is "local".
 
         Raises:
             MissingExtra: Ray is not installed.

@@ -166,7 +166,7 @@ def _ssim_formula(
     *,
     sample_covariance: bool,
 ) -> NDArray[np.float64]:
-    """SSIM = (2 mx my + C1) (2 cov + C2) / ((mx^2 + my^2 + C1) (vx + vy + C2)), computed from window sums.
+    """Returns SSIM = (2 mx my + C1) (2 cov + C2) / ((mx^2 + my^2 + C1) (vx + vy + C2)), computed from window sums.
 
     Here m is a mean, v a variance and cov the covariance in the window. Numerator and denominator are multiplied by
     powers of `pixel_count`, the number of pixels in a window sum (1 if `window_sum` returns means). Therefore only one

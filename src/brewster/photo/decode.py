@@ -28,7 +28,7 @@ from brewster.photo.hdr_formats import read_exr, read_hdr, too_large_error
 from brewster.photo.lut_profiles import has_only_tables
 from brewster.photo.raw import is_raw, read_raw, read_raw_size
 
-pyvips.cache_set_max(0)  # each image is read once, so the operation cache of libvips would only use memory
+pyvips.cache_set_max(0)  # each image is read once, so the operation cache of libvips has no use
 logging.getLogger("pyvips").addHandler(logging.NullHandler())  # warnings of libvips become brewster errors
 
 Stored = NDArray[Any]

@@ -60,11 +60,11 @@ class DevelopedSample:
     """The fraction of the pixels of I in which at least one channel clips, 0..1."""
 
     def layers(self) -> dict[str, Tensor]:
-        """The five encoded images by name."""
+        """Returns the five encoded images by name."""
         return {name: getattr(self, f"{name}_encoded") for name in LAYERS}
 
     def camera_settings(self) -> dict[str, Any]:
-        """The exposures, the white balance gains and the overexposed fraction, as TOML values."""
+        """Returns the exposures, the white balance gains and the overexposed fraction, as TOML values."""
         return {
             "exposure_ev": self.exposure_ev,
             "mirror_exposure_ev": self.mirror_exposure_ev,
@@ -190,29 +190,33 @@ def _gains(colour: Tensor, strength: float) -> tuple[float, float, float]:
 
 
 def _grey_world(image: Tensor, valid: Tensor) -> Tensor:
-    """Grey-world: the average of the scene is grey (G. Buchsbaum, J. Franklin Institute 310, 1980)."""
+    """Returns the mean of the valid pixels. Grey-world assumes that the average of a scene is grey.
+
+    Source: G. Buchsbaum, J. Franklin Institute 310, 1980.
+    """
     return image[:, valid].mean(1)
 
 
 def _white_patch(image: Tensor, valid: Tensor) -> Tensor:
-    """White-patch: the brightest surface is white (E. H. Land, Scientific American 237, 1977).
+    """Returns the 99th percentile of each channel. White-patch assumes that the brightest surface is white.
 
-    The 99th percentile of each channel is used instead of the maximum, so that single pixels do not matter.
+    The maximum is not used, so that single pixels do not matter. Source: E. H. Land, Scientific American 237, 1977.
     """
     values = image[:, valid]
     return values.kthvalue(math.ceil(0.99 * values.shape[1]), dim=1).values
 
 
 def _grey_edge(image: Tensor, valid: Tensor) -> Tensor:
-    """Grey-edge: the average edge is grey (J. van de Weijer et al., IEEE Trans. Image Proc. 16, 2007).
+    """Returns the Minkowski norm of the edges. Grey-edge assumes that the average edge is grey.
 
-    Differences are taken along both diagonals of each block of 2 x 2 valid pixels (Roberts cross). The paper smooths
-    first; rendered light has little noise, so that step is left out.
+    Differences are taken along both diagonals of each block of 2 x 2 valid pixels (Roberts cross). The paper smooths the
+    image first. This step is left out, because rendered light has little noise.
+    Source: J. van de Weijer et al., IEEE Trans. Image Proc. 16, 2007.
     """
     first, second = image[:, 1:, 1:] - image[:, :-1, :-1], image[:, 1:, :-1] - image[:, :-1, 1:]
     all_valid = valid[1:, 1:] & valid[:-1, :-1] & valid[1:, :-1] & valid[:-1, 1:]
     edges = torch.hypot(first, second)[:, all_valid]
-    # Scale the maximum to 1 first: sixth powers of small differences would underflow float32.
+    # Scale the maximum to 1 first, because sixth powers of small differences underflow float32.
     max_edge = edges.max().clamp(min=1e-12) if edges.numel() else 1.0
     colour: Tensor = torch.linalg.vector_norm(edges / max_edge, _MINKOWSKI_NORM, dim=1)
     return colour

@@ -30,7 +30,7 @@ class LinearSample:
     mirror: Tensor
 
     def layers(self) -> dict[str, Tensor]:
-        """The five images by name."""
+        """Returns the five images by name."""
         return {name: getattr(self, name) for name in LAYERS}
 
     def map(self, function: Callable[[Tensor], Tensor]) -> LinearSample:

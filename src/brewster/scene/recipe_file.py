@@ -87,7 +87,9 @@ def _problem(
     cure = f"compare with {reference}"
     if kind == "missing":
         missing = [*path, str(location[-1])]
-        return RecipeError(f"{source}: {_dotted(missing)} is missing", _expected(model, missing), "add it")
+        return RecipeError(
+            f"{source}: {_dotted(missing)} is missing", _expected(model, missing), "add this key"
+        )
     if kind == "extra_forbidden" or location[-1:] == ("[key]",):
         return _unknown_key(model, path, value, source)
     message = details["msg"].removeprefix("Value error, ")
@@ -133,7 +135,7 @@ def _unknown_key(
     return RecipeError(
         f"{source}: there is no key {_dotted(path)} (its value is {_shortened(value)})",
         f"expected a key of {owner}{known}",
-        f"did you mean {close}?" if close else "remove it",
+        f"did you mean {close}?" if close else "remove this key",
     )
 
 

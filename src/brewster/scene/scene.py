@@ -110,11 +110,11 @@ class Scene(FrozenModel):
         for side, surface_mm in ((self.behind, self.glass.depth_mm), (self.front, 0.0)):
             if side.map and side.map.radius_mm <= max(camera_distance_mm, self.glass.depth_mm):
                 raise ValueError(
-                    f"expected the camera and the glass inside the dome, but its radius_mm is {side.map.radius_mm:g}: raise it"
+                    f"expected the camera and the glass inside the dome, but its radius_mm is {side.map.radius_mm:g}: increase this radius"
                 )
             if side.plane and side.plane.nearest_mm <= surface_mm:
                 raise ValueError(
-                    f"expected a plane that does not touch the glass, but its distance_mm is {side.plane.distance_mm:g}: raise it"
+                    f"expected a plane that does not touch the glass, but its distance_mm is {side.plane.distance_mm:g}: increase this distance"
                 )
 
     def to_toml(self, **extra_tables: dict[str, Any]) -> str:

@@ -85,7 +85,7 @@ def load() -> ModuleType:
     """
     found = probe()
     for runtime in _runtime_libraries(found.library):
-        # RTLD_GLOBAL is not set: with it, exceptions of other C++ libraries would end the process.
+        # RTLD_GLOBAL is not set, because with it, exceptions of other C++ libraries end the process.
         ctypes.CDLL(runtime)
     if found.library:
         os.environ[LLVM_PATH_VARIABLE] = found.library

@@ -139,7 +139,7 @@ class _SurfaceInteraction:
 def _interact(
     path: _PathState, stack: list[Surface], sobol: SobolPoints
 ) -> Iterator[tuple[_PathState, _SurfaceInteraction]]:
-    """Splits a path at its next surface: yields the reflected path, then the transmitted one."""
+    """Splits a path at its next surface. Yields the reflected path, then the transmitted path."""
     surface = stack[path.surface]
     in_glass = surface.glass_is_below != path.is_downward
     distance = (_plane_offset(surface) - dot(surface.normal, path.origin)) / dot(
