@@ -146,14 +146,14 @@ class ProcessExecutor(Generic[ResultT]):
 
     chunk_size = 1
 
-    def __init__(self, create_runner: Callable[[], Runner[ResultT]], count: int) -> None:
-        self._create_runner, self._count = create_runner, count
+    def __init__(self, create_runner: Callable[[], Runner[ResultT]], worker_count: int) -> None:
+        self._create_runner, self._worker_count = create_runner, worker_count
         self._idle: list[_Worker] = []
         self._busy: dict[Connection, tuple[_Worker, Task[ResultT], int]] = {}
 
     def has_capacity(self) -> bool:
         """Whether a worker is idle or can be started."""
-        return len(self._busy) < self._count
+        return len(self._busy) < self._worker_count
 
     def is_busy(self) -> bool:
         """Whether any worker has a task."""

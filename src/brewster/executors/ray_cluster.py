@@ -29,9 +29,12 @@ class RayExecutor(Generic[ResultT]):
     chunk_size = 4
 
     def __init__(
-        self, create_runner: Callable[[], Runner[ResultT]], address: str = LOCAL, workers: int | None = None
+        self,
+        create_runner: Callable[[], Runner[ResultT]],
+        address: str = LOCAL,
+        worker_count: int | None = None,
     ) -> None:
-        self._create_runner, self._address, self._workers = create_runner, address, workers
+        self._create_runner, self._address, self._worker_count = create_runner, address, worker_count
         self._tasks: dict[Any, Task[ResultT]] = {}
 
     def has_capacity(self) -> bool:
@@ -82,7 +85,7 @@ class RayExecutor(Generic[ResultT]):
         """
         self._ray = _ray()
         local_options = (
-            {"num_cpus": self._workers, "include_dashboard": False} if self._address == LOCAL else {}
+            {"num_cpus": self._worker_count, "include_dashboard": False} if self._address == LOCAL else {}
         )
         try:
             _check_reachable(self._address)

@@ -44,13 +44,13 @@ _STABILISER: Final = 1e-6
 class DistsFeatures:
     """The image in 0..1 and the outputs of VGG16's five stages, (C, h * w) each, with the mean and variance of each channel.
 
-    `size` is the (height, width) of the image.
+    `shape` is the (height, width) of the image.
     """
 
     maps: tuple[Tensor, ...]
     means: tuple[Tensor, ...]
     variances: tuple[Tensor, ...]
-    size: tuple[int, int]
+    shape: tuple[int, int]
 
 
 @final
@@ -85,15 +85,15 @@ class Dists:
         import torch  # noqa: PLC0415 - an extra
 
         check_images(image)
-        size = image.shape[:2]
-        if min(size) < MIN_SIDE:
-            raise ValueError(f"DISTS needs at least {MIN_SIDE}x{MIN_SIDE} pixels, not {size[0]}x{size[1]}")
+        shape = image.shape[:2]
+        if min(shape) < MIN_SIDE:
+            raise ValueError(f"DISTS needs at least {MIN_SIDE}x{MIN_SIDE} pixels, not {shape[0]}x{shape[1]}")
         with torch.inference_mode():
             values = torch.from_numpy(image.transpose(2, 0, 1).astype(np.float32) / 255)
             maps = [values.flatten(1), *(stage.flatten(1) for stage in self._stages(values))]
             means = tuple(map_.mean(dim=1) for map_ in maps)
             variances = tuple(map_.var(dim=1, correction=0) for map_ in maps)
-        return DistsFeatures(tuple(maps), means, variances, size)
+        return DistsFeatures(tuple(maps), means, variances, shape)
 
     def _stages(self, values: Tensor) -> list[Tensor]:
         import torch  # noqa: PLC0415 - an extra
@@ -123,8 +123,8 @@ class Dists:
         """
         import torch  # noqa: PLC0415 - an extra
 
-        if one.size != other.size:
-            raise ValueError(f"the images differ in size: {one.size} and {other.size}")
+        if one.shape != other.shape:
+            raise ValueError(f"the images differ in size: {one.shape} and {other.shape}")
         similarity = 0.0
         with torch.inference_mode():
             for i, (texture, structure) in enumerate(zip(self.texture, self.structure, strict=True)):

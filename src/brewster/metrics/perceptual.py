@@ -60,11 +60,11 @@ _LAYERS: Final = (
 class Features:
     """AlexNet's features of an image: five float32 maps (C, h, w), normalised to unit length over C.
 
-    `size` is the (height, width) of the image.
+    `shape` is the (height, width) of the image.
     """
 
     maps: tuple[Map, ...]
-    size: tuple[int, int]
+    shape: tuple[int, int]
 
 
 @final
@@ -72,11 +72,11 @@ class Features:
 class DifferenceMaps:
     """The weighted squared differences of the features of two images: five float32 maps (h, w).
 
-    `size` is the (height, width) of the images.
+    `shape` is the (height, width) of the images.
     """
 
     maps: tuple[Tensor, ...]
-    size: tuple[int, int]
+    shape: tuple[int, int]
 
     def mean(self, *, region: Region | None = None) -> float:
         """Returns the distance, averaged over the whole maps or over a region; see `Lpips.distance`.
@@ -88,9 +88,9 @@ class DifferenceMaps:
 
         if region is None:
             return float(sum(_mean(map_.numpy()) for map_ in self.maps))
-        check_region(region, self.size)
+        check_region(region, self.shape)
         with torch.inference_mode():
-            return _mean(_upsampled(self.maps, self.size).numpy()[region])
+            return _mean(_upsampled(self.maps, self.shape).numpy()[region])
 
 
 @final
@@ -125,9 +125,9 @@ class Lpips:
         from torch.nn import functional  # noqa: PLC0415
 
         check_images(image)
-        size = image.shape[:2]
-        if min(size) < MIN_SIDE:
-            raise ValueError(f"LPIPS needs at least {MIN_SIDE}x{MIN_SIDE} pixels, not {size[0]}x{size[1]}")
+        shape = image.shape[:2]
+        if min(shape) < MIN_SIDE:
+            raise ValueError(f"LPIPS needs at least {MIN_SIDE}x{MIN_SIDE} pixels, not {shape[0]}x{shape[1]}")
         maps = []
         with torch.inference_mode():
             activations = torch.from_numpy(_normalised(image)).permute(2, 0, 1)[None]
@@ -138,7 +138,7 @@ class Lpips:
                     functional.conv2d(activations, weight, bias, layer.stride, layer.padding)
                 )
                 maps.append(activations[0] / (torch.linalg.vector_norm(activations[0], dim=0) + 1e-10))
-        return Features(tuple(maps), size)
+        return Features(tuple(maps), shape)
 
     def distance(self, one: Features, other: Features, *, region: Region | None = None) -> float:
         """Returns the LPIPS distance between two images, given by their features.
@@ -165,14 +165,14 @@ class Lpips:
         """
         import torch  # noqa: PLC0415 - an extra
 
-        if one.size != other.size:
-            raise ValueError(f"the images differ in size: {one.size} and {other.size}")
+        if one.shape != other.shape:
+            raise ValueError(f"the images differ in size: {one.shape} and {other.shape}")
         with torch.inference_mode():
             maps = [
                 torch.einsum("c,chw->hw", head, (a - b).square_())
                 for head, a, b in zip(self.heads, one.maps, other.maps, strict=True)
             ]
-        return DifferenceMaps(tuple(maps), one.size)
+        return DifferenceMaps(tuple(maps), one.shape)
 
 
 def lpips(prediction: Image, truth: Image, *, region: Region | None = None) -> float:
@@ -225,8 +225,8 @@ def _mean(values: NDArray[np.float32]) -> float:
     return float(values.mean(dtype=np.float64))
 
 
-def _upsampled(maps: Sequence[Tensor], size: tuple[int, int]) -> Tensor:
+def _upsampled(maps: Sequence[Tensor], shape: tuple[int, int]) -> Tensor:
     from torch.nn.functional import interpolate  # noqa: PLC0415 - an extra
 
-    full = [interpolate(map_[None, None], size, mode="bilinear", align_corners=False)[0, 0] for map_ in maps]
+    full = [interpolate(map_[None, None], shape, mode="bilinear", align_corners=False)[0, 0] for map_ in maps]
     return sum(full[1:], start=full[0])

@@ -42,14 +42,14 @@ def check_images(*images: Image) -> None:
             raise ValueError(f"the images differ in shape: {images[0].shape} and {image.shape}")
 
 
-def check_region(region: Region, size: tuple[int, int]) -> None:
+def check_region(region: Region, shape: tuple[int, int]) -> None:
     """Checks that a region is a bool mask of this (height, width) with at least one pixel.
 
     Raises:
         ValueError: the region is not bool (H, W), or is empty.
     """
-    if region.dtype != np.bool_ or region.shape != size:
-        raise ValueError(f"the region must be bool {size}, not {region.dtype} {region.shape}")
+    if region.dtype != np.bool_ or region.shape != shape:
+        raise ValueError(f"the region must be bool {shape}, not {region.dtype} {region.shape}")
     if not region.any():
         raise ValueError("the region is empty; a metric needs at least one pixel")
 

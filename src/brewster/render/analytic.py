@@ -122,19 +122,19 @@ def _prepare(scene: Scene, assets: Assets, device: Device) -> _PreparedScene:
         scene.camera.focus_mm,
     )
     behind, front = (
-        _prepare_side(scene, assets, view, to_glass.T, behind=behind, device=device)
-        for behind in (True, False)
+        _prepare_side(scene, assets, view, to_glass.T, is_behind=is_behind, device=device)
+        for is_behind in (True, False)
     )
     return _PreparedScene(scene, behind, front, origin, right, up, back)
 
 
 def _prepare_side(
-    scene: Scene, assets: Assets, view: CameraView, to_world: Tensor, *, behind: bool, device: Device
+    scene: Scene, assets: Assets, view: CameraView, to_world: Tensor, *, is_behind: bool, device: Device
 ) -> _PreparedSide:
-    side = scene.behind if behind else scene.front
-    emitters = SideEmitters(side, assets, view, behind=behind, to_world=to_world, device=device)
-    groups = _group_orders(scene, emitters, behind=behind)
-    return _PreparedSide(emitters, scene.glass.depth_mm if behind else 0.0, groups)
+    side = scene.behind if is_behind else scene.front
+    emitters = SideEmitters(side, assets, view, is_behind=is_behind, to_world=to_world, device=device)
+    groups = _group_orders(scene, emitters, is_behind=is_behind)
+    return _PreparedSide(emitters, scene.glass.depth_mm if is_behind else 0.0, groups)
 
 
 def _needs_monte_carlo(scene: Scene) -> bool:
@@ -299,7 +299,7 @@ def _in_plane_shift(order: ReflectionOrder, shifts: list[Tensor]) -> Tensor:
     )
 
 
-def _group_orders(scene: Scene, emitters: SideEmitters, *, behind: bool) -> list[list[ReflectionOrder]]:
+def _group_orders(scene: Scene, emitters: SideEmitters, *, is_behind: bool) -> list[list[ReflectionOrder]]:
     """Groups the orders of one side whose images are less than `_MERGE_DISTANCE_PX` apart.
 
     Distances are measured in the corner of the view with the largest angle of incidence, where they are greatest.
@@ -316,7 +316,7 @@ def _group_orders(scene: Scene, emitters: SideEmitters, *, behind: bool) -> list
     pixel_mm = scene.camera.pixel_rad * (scene.camera_above_glass_mm + emitters.distance_mm)
     groups: list[tuple[float, list[ReflectionOrder]]] = []
     for order in table:
-        if order.is_transmitted != behind:
+        if order.is_transmitted != is_behind:
             continue
         shift_px = float(_in_plane_shift(order, shifts) * cosine) / pixel_mm
         for group_px, group in groups:

@@ -1,7 +1,4 @@
-"""A street between two rows of houses, by day or by night, as a `ProceduralEnvironment` for `canvas.render`.
-
-Lengths are in metres.
-"""
+"""A street between two rows of houses, by day or by night, for `canvas.render`. Lengths are in metres."""
 
 from __future__ import annotations
 
@@ -132,10 +129,7 @@ class _Street:
         self.emitters: list[SmallEmitter] = []
 
     def light(self, points: Floats, normal: Floats) -> Floats:
-        """Returns irradiance / pi of lamps, sky and sun.
-
-        Skylight is reduced near the ground. Houses and trees cast shadows in the sunlight.
-        """
+        """Returns irradiance / pi of lamps, sky (reduced near the ground) and sun (with shadows of houses and trees)."""
         height_factor = np.clip((points[..., 1:2] - self.ground) / 12, 0, 1)
         total = self.lighting(points, normal) * (1 if self.night else 0.65 + 0.35 * height_factor)
         facing = float(normal @ self.sky.sun)
@@ -244,10 +238,7 @@ def _roof(street: _Street, eave: Floats, width_m: float, side: int) -> None:
 
 
 def _paving(street: _Street) -> None:
-    """Adds road, kerbs, pavements and markings.
-
-    The surroundings of the viewer have a fine canvas. The whole street has a coarse canvas, slightly lower.
-    """
+    """Adds road, kerbs, pavements and markings: a fine canvas around the viewer, and a coarse, slightly lower canvas."""
     rng = street.rng
     asphalt, slabs = rng.uniform(0.05, 0.12), tint(rng, rng.uniform(0.2, 0.4), 0.06)
     stripes = rng.uniform() < 0.4

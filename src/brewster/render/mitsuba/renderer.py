@@ -113,7 +113,9 @@ def _render_layers(
     scene = builders[0].scene
 
     def estimate(*images: tuple[bool, GlassMode]) -> list[_RunningEstimate]:
-        estimates = [_RunningEstimate(builders, behind, mode, max_samples) for behind, mode in images]
+        estimates = [
+            _RunningEstimate(builders, lit_from_behind, mode, max_samples) for lit_from_behind, mode in images
+        ]
         _converge(estimates, noise_threshold, max_samples)
         return estimates
 
@@ -152,15 +154,19 @@ class _RunningEstimate:
     """An image that is rendered in passes: the mean of the passes so far, and the variance of this mean per pixel."""
 
     def __init__(
-        self, builders: Sequence[MitsubaSceneBuilder], behind: bool, glass_mode: GlassMode, max_samples: int
+        self,
+        builders: Sequence[MitsubaSceneBuilder],
+        lit_from_behind: bool,
+        glass_mode: GlassMode,
+        max_samples: int,
     ) -> None:
         scene = builders[0].scene
         self._mi = builders[0].mi
         self._scenes = [
-            self._mi.load_dict(builder.scene_dict(behind=behind, glass_mode=glass_mode))
+            self._mi.load_dict(builder.scene_dict(lit_from_behind=lit_from_behind, glass_mode=glass_mode))
             for builder in builders
         ]
-        self._seed_key = scene.seed, scene.index, int(behind), get_args(GlassMode).index(glass_mode)
+        self._seed_key = scene.seed, scene.index, int(lit_from_behind), get_args(GlassMode).index(glass_mode)
         self.samples_per_pass = _samples_per_pass(scene.camera.width * scene.camera.height, max_samples)
         self.pass_count = 0
         self._sum = np.zeros((scene.camera.height, scene.camera.width, 3))

@@ -1,10 +1,9 @@
 """Builds Mitsuba scenes: glass, camera and light as the dictionaries that `mitsuba.load_dict` takes.
 
 Coordinates are in the glass frame: x right, y up, z towards the camera, the origin at the position of the glass, in mm.
-In this frame, the surfaces are z = 0, z = -thickness and so on, so that they stay planar and their distances exact in
-float32. A wedge w rotates a far surface about the vertical axis through (0, 0, -thickness), to the normal
-(sin w, 0, cos w). With a positive wedge the pane is thicker on the right. A wedge does not change the positions of the
-panes behind it.
+In this frame, the surfaces are z = 0, z = -thickness and so on, and are exact in float32. A wedge w rotates a far surface
+about the vertical axis through (0, 0, -thickness), to the normal (sin w, 0, cos w). With a positive wedge, the pane is
+thicker on the right. A wedge does not change the positions of the panes behind it.
 """
 
 from __future__ import annotations
@@ -67,7 +66,7 @@ class MitsubaSceneBuilder:
         )
         _check_wedges(scene.glass, self._view_corners[:, 0])
 
-    def scene_dict(self, *, behind: bool, glass_mode: GlassMode) -> Plugin:
+    def scene_dict(self, *, lit_from_behind: bool, glass_mode: GlassMode) -> Plugin:
         """Returns the whole scene, lit from one side of the glass. Objects of the other side are black.
 
         Raises:
@@ -76,7 +75,7 @@ class MitsubaSceneBuilder:
         is_tinted = glass_mode not in {"mirror", "none"} and any(
             any(pane.absorption_per_m) for pane in self._glass.panes
         )
-        parts = [*self._surfaces(glass_mode), *self._wall(), *self._emitters(behind)]
+        parts = [*self._surfaces(glass_mode), *self._wall(), *self._emitters(lit_from_behind)]
         return {
             "type": "scene",
             "integrator": {
@@ -151,10 +150,7 @@ class MitsubaSceneBuilder:
     # The glass
 
     def _surfaces(self, glass_mode: GlassMode) -> Iterator[object]:
-        """Yields all surfaces, from the nearest to the camera to the farthest.
-
-        A frame limits the size of the first surface. The other surfaces are larger than the view.
-        """
+        """Yields all surfaces, the nearest first. A frame limits the first surface; the others are larger than the view."""
         if glass_mode == "none":
             return
         if self._glass.radii_mm:
@@ -207,10 +203,7 @@ class MitsubaSceneBuilder:
         return True, {"bsdf": bsdf, **self._interior_medium(pane)}
 
     def _interior_medium(self, pane: Pane) -> Plugin:
-        """Returns the medium for Beer-Lambert absorption, per mm.
-
-        Mitsuba limits colours to 1, so `scale` holds the largest coefficient.
-        """
+        """Returns the medium for Beer-Lambert absorption. Colours are at most 1, so `scale` is the largest value, per mm."""
         max_absorption = max(pane.absorption_per_m)
         if not max_absorption:
             return {}
@@ -297,19 +290,20 @@ class MitsubaSceneBuilder:
 
     # The light
 
-    def _emitters(self, behind: bool) -> Iterator[Plugin]:
+    def _emitters(self, lit_from_behind: bool) -> Iterator[Plugin]:
         """Yields the map and the plane of the lit side, and the plane of the other side in black, as it hides objects."""
-        envmap = (self.scene.behind if behind else self.scene.front).map
+        envmap = (self.scene.behind if lit_from_behind else self.scene.front).map
         if envmap:
-            yield self._envmap(envmap, behind) if math.isinf(envmap.radius_mm) else self._dome(envmap, behind)
+            emitter = self._envmap if math.isinf(envmap.radius_mm) else self._dome
+            yield emitter(envmap, lit_from_behind)
         for side, is_behind in ((self.scene.behind, True), (self.scene.front, False)):
             if side.plane:
-                yield self._plane(side.plane, is_behind, is_lit=is_behind == behind)
+                yield self._plane(side.plane, is_behind, is_lit=is_behind == lit_from_behind)
 
-    def _plane(self, plane: Plane, behind: bool, *, is_lit: bool) -> Plugin:
+    def _plane(self, plane: Plane, is_behind: bool, *, is_lit: bool) -> Plugin:
         """Returns a plane that faces the glass. Its heading and pitch are as seen by an observer at the glass."""
         picture = self._select_channel(self._assets.plane_radiance(plane))
-        facing = 1 if behind else -1
+        facing = 1 if is_behind else -1
         columns = np.array(axes(plane.heading_deg, plane.pitch_deg)) * (facing, 1, facing)
         half = plane.width_mm / 2, plane.width_mm / 2 * picture.shape[0] / picture.shape[1]
         texture = self._bitmap(picture[::-1], wrap_mode="clamp")  # v increases upwards
@@ -318,30 +312,27 @@ class MitsubaSceneBuilder:
             columns, (*plane.offset_mm, -facing * plane.distance_mm), half, {"bsdf": _BLACK, **emitter}
         )
 
-    def _envmap(self, envmap: EnvironmentMap, behind: bool) -> Plugin:
-        """Returns a map at infinity.
-
-        The columns are at texel centres, as in brewster. Mitsuba expects the first and the last row at the poles.
-        """
+    def _envmap(self, envmap: EnvironmentMap, is_behind: bool) -> Plugin:
+        """Returns a map at infinity. Columns are at texel centres, but Mitsuba expects the first and last row at the poles."""
         height, width = self._map_size(envmap)
         u, v = (np.arange(width) + 0.5) / width, np.arange(2 * height + 1) / (2 * height)
         columns = self._to_glass @ np.array(axes(envmap.heading_deg, 0)).T
-        texels = self._texels(envmap, behind, u, v)
+        texels = self._texels(envmap, is_behind, u, v)
         return {
             "type": "envmap",
             "bitmap": self.mi.Bitmap(texels),
             "to_world": self._transform(columns.T, (0, 0, 0)),
         }
 
-    def _dome(self, envmap: EnvironmentMap, behind: bool) -> Plugin:
+    def _dome(self, envmap: EnvironmentMap, is_behind: bool) -> Plugin:
         """Returns a sphere around the glass that emits inwards.
 
         Mitsuba's longitude increases in the other direction, so the map is mirrored. Mitsuba repeats the texture in both
-        directions. An additional row at each pole prevents interpolation between the poles.
+        directions, so an additional row at each pole prevents interpolation between the poles.
         """
         height, width = self._map_size(envmap)
         u, v = (np.arange(width) + 0.5) / width, (np.arange(height) + 0.5) / height
-        texels = np.pad(self._texels(envmap, behind, u, v)[:, ::-1], ((1, 1), (0, 0), (0, 0)), "edge")
+        texels = np.pad(self._texels(envmap, is_behind, u, v)[:, ::-1], ((1, 1), (0, 0), (0, 0)), "edge")
         to_inner_rows = np.array(((1, 0, 0), (0, height / (height + 2), 1 / (height + 2)), (0, 0, 1)))
         texture = self._bitmap(texels, wrap_mode="repeat", to_uv=self.mi.ScalarTransform3f(to_inner_rows))
         right, up, back = (self._to_glass @ axis for axis in np.array(axes(envmap.heading_deg, 0)))
@@ -368,13 +359,13 @@ class MitsubaSceneBuilder:
         factor = math.ceil(_MIN_MAP_ROWS / height) // 2 * 2 + 1
         return factor * height, factor * width
 
-    def _texels(self, envmap: EnvironmentMap, behind: bool, u: Doubles, v: Doubles) -> Floats:
+    def _texels(self, envmap: EnvironmentMap, is_behind: bool, u: Doubles, v: Doubles) -> Floats:
         """Returns the map's light at u and v, (rows, columns, 3). It is black on the other side of the glass."""
         texels = sample_bilinear(self._select_channel(self._assets.map_radiance(envmap)), u, v)
         azimuth, polar = 2 * math.pi * u + math.radians(envmap.heading_deg), math.pi * v[:, None]
         x, y, z = self._to_glass[2]
         above_glass = np.sin(polar) * (x * np.sin(azimuth) - z * np.cos(azimuth)) + y * np.cos(polar)
-        texels[(above_glass < 0) != behind] = 0
+        texels[(above_glass < 0) != is_behind] = 0
         return texels
 
 

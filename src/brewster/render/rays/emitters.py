@@ -116,7 +116,14 @@ class SideEmitters:
     """The light sources of one side: an environment map or dome, and a plane in front of it; both are optional."""
 
     def __init__(
-        self, side: Side, assets: Assets, view: CameraView, *, behind: bool, to_world: Tensor, device: Device
+        self,
+        side: Side,
+        assets: Assets,
+        view: CameraView,
+        *,
+        is_behind: bool,
+        to_world: Tensor,
+        device: Device,
     ) -> None:
         self._distribution: EnvmapDistribution | None = None
         self.radius_mm = side.map.radius_mm if side.map else math.inf
@@ -127,9 +134,9 @@ class SideEmitters:
         )
         self._view = view
         self._u_offset = -(side.map.heading_deg if side.map else 0.0) / 360
-        self._behind = behind
+        self._is_behind = is_behind
         self._to_world = to_world
-        self.plane = _plane_emitter(side.plane, assets, behind, device) if side.plane else None
+        self.plane = _plane_emitter(side.plane, assets, is_behind, device) if side.plane else None
         self.plane_distance_mm = side.plane.distance_mm if side.plane else math.inf
         self.distance_mm = side.distance_mm
 
@@ -252,7 +259,7 @@ class SideEmitters:
         """Returns the distribution of the map's light on this side of the glass. It is computed at the first call."""
         if self._distribution is None:
             assert self.envmap is not None
-            outward = self._to_world @ self._to_world.new_tensor([0, 0, -1 if self._behind else 1])
+            outward = self._to_world @ self._to_world.new_tensor([0, 0, -1 if self._is_behind else 1])
             self._distribution = EnvmapDistribution(self.envmap.texels, outward, self._u_offset)
         return self._distribution
 
@@ -275,10 +282,10 @@ class SideEmitters:
         return plane.texture(u, v, self._plane_footprint(footprint_px)), coverage
 
 
-def _plane_emitter(plane: Plane, assets: Assets, behind: bool, device: Device) -> _PlaneEmitter:
+def _plane_emitter(plane: Plane, assets: Assets, is_behind: bool, device: Device) -> _PlaneEmitter:
     """Converts a plane to the glass frame. At heading 0 the plane faces the glass; a heading rotates it about the y axis."""
     image = torch.from_numpy(assets.plane_radiance(plane)).to(device)
-    facing = 1.0 if behind else -1.0
+    facing = 1.0 if is_behind else -1.0
     mirrored = torch.tensor([facing, 1.0, facing], device=device)
     right, up, _ = (
         torch.tensor(axis, device=device) * mirrored for axis in axes(plane.heading_deg, plane.pitch_deg)

@@ -238,8 +238,8 @@ def order_throughputs(glazing: Glazing, cosine: Tensor, table: Sequence[Reflecti
             throughput = throughput * power(exponent) if power and exponent else throughput
         throughputs.append(throughput)
     closed_form = total_throughput(glazing, cosine)
-    for behind, total in ((True, closed_form.transmittance), (False, closed_form.reflectance)):
-        side = [i for i, order in enumerate(table) if order.is_transmitted == behind]
+    for is_transmitted, total in ((True, closed_form.transmittance), (False, closed_form.reflectance)):
+        side = [i for i, order in enumerate(table) if order.is_transmitted == is_transmitted]
         if side:
             throughputs[side[-1]] = throughputs[side[-1]] + (total - sum(throughputs[i] for i in side))
     return throughputs
