@@ -195,7 +195,7 @@ def test_an_ordinary_photo_saved_as_a_map_is_refused(folder, rng):
     encoded[:4] = 1
     with pytest.raises(UnsupportedPhoto, match="clipped") as error:
         map_radiance(folder, "photo.hdr", hdr_of(to_linear(encoded)))
-    check_message(error, "photo.hdr", "use it as a picture")
+    check_message(error, "photo.hdr", "use the image as a picture")
 
 
 def test_a_map_with_one_sun_is_not_clipped(folder, rng):

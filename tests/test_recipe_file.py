@@ -153,7 +153,7 @@ def test_an_unknown_recipe_cannot_be_shown(run_without_model):
         1,
         (
             "error: there is no training recipe 'compat'; expected one of the packaged recipes compact, lora;"
-            " choose one of these names, or a .toml file.\n"
+            " choose one of them, or a .toml file.\n"
         ),
     )
     assert run_without_model("train")[0] == 2
