@@ -380,7 +380,10 @@ def test_a_file_that_is_missing_or_too_short_is_an_error_in_three_parts(tmp_path
     for file, why in (
         (ImageFile(tmp_path / "b.png"), "b.png cannot be read .No such file"),
         (ImageFile(tmp_path), "cannot be read .Is a directory"),
-        (ImageFile(tmp_path / "a.png", (len(picture()) - 2, 5)), "cannot be read .the file has only 2 of 5 bytes"),
+        (
+            ImageFile(tmp_path / "a.png", (len(picture()) - 2, 5)),
+            "cannot be read .the file has only 2 of 5 bytes",
+        ),
     ):
         with pytest.raises(UnreadablePhoto, match=f"{why}.*; .*; .*"):
             file.read()
