@@ -2,11 +2,11 @@
 
     python bench/compare_renderers.py [SAMPLES] [NAME]
 
-SAMPLES is the number of Mitsuba's rays per pixel (default 1024); NAME selects the scenes whose names contain it.
+SAMPLES is the number of Mitsuba's rays per pixel (default 1024). NAME selects the scenes whose names contain this text.
 
-Each renderer renders each scene twice, with different random numbers: a1 and a2 by ours, b1 and b2 by Mitsuba. With the
-means a and b, the last column is mse(a - b) / (mse(a1 - a2) / 4 + mse(b1 - b2) / 4). It is 1 if only noise separates
-the renderers.
+Each renderer renders each scene twice, with different random numbers: a1 and a2 with the analytic renderer, b1 and b2 with
+Mitsuba. With the means a and b, the last column is mse(a - b) / (mse(a1 - a2) / 4 + mse(b1 - b2) / 4). The value is 1 if the
+renderers differ only by noise.
 """
 
 from __future__ import annotations
@@ -74,7 +74,7 @@ SCENES = {
 
 @contextmanager
 def averaged_polarisations() -> Iterator[None]:
-    """Averages s- and p-polarised light at every microfacet of our rough glass, as Mitsuba's colour variants do."""
+    """Averages s- and p-polarised light at every microfacet in `rough_glass`, as Mitsuba's colour variants do."""
 
     def averaged(cosine: Tensor, index_in: float, index_out: float) -> tuple[Tensor, Tensor]:
         s, p = polarised(cosine, index_in, index_out)
@@ -92,7 +92,7 @@ def compare(scene: Scene, assets: Assets, samples: int) -> list[str]:
     """Renders a scene with both renderers. Returns a row of the table for each of I, T, B, R and MR."""
     with averaged_polarisations():
         ours = render(scene, assets), render(_reseeded(scene, 1), assets)
-    polarised = scene.camera.heading_deg > 30  # elsewhere, s and p hardly differ
+    polarised = scene.camera.heading_deg > 30  # at smaller angles, s- and p-polarised light hardly differ
     theirs = tuple(
         trace(_reseeded(scene, seed), assets, noise_threshold=0, max_samples=samples, polarised=polarised)
         for seed in (2, 3)
@@ -101,7 +101,7 @@ def compare(scene: Scene, assets: Assets, samples: int) -> list[str]:
 
 
 def _row(name: str, ours: tuple[LinearSample, ...], theirs: tuple[LinearSample, ...]) -> str:
-    """Ratio of the means - 1 with its standard error, PSNR, and squared error over that expected from noise."""
+    """Returns the ratio of the means - 1 with its standard error, the PSNR, and the squared error relative to noise."""
     a1, a2, b1, b2 = (getattr(sample, name).double() for sample in (*ours, *theirs))
     a, b = (a1 + a2) / 2, (b1 + b2) / 2
     error = (a - b).square().mean()
@@ -126,7 +126,7 @@ def main() -> None:
     samples = int(sys.argv[1]) if len(sys.argv) > 1 else 1024
     assets = Assets()
     print(
-        "mean, %: ours / Mitsuba - 1 (standard error) | PSNR, dB | squared error / error expected from noise"
+        "mean, %: analytic / Mitsuba - 1 (standard error) | PSNR, dB | squared error / squared error expected from noise"
     )
     for name, scene in SCENES.items():
         if len(sys.argv) > 2 and sys.argv[2] not in name:

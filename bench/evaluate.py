@@ -63,7 +63,10 @@ def make_pairs(data: Path, count: int) -> None:
 
 
 def measure(out: Path, workers: int) -> tuple[float, list[float]]:
-    """Wall time, and the resident memory of all processes in KiB, every second after the first image is scored."""
+    """Returns the wall time in seconds, and the resident memory of all processes in KiB for every second.
+
+    The memory is measured after the first image is scored.
+    """
     command = [sys.executable, "-m", "brewster", "evaluate", "--quiet", "-o", out, "--workers", str(workers)]
     command += ["--benchmark", f"pairs={OUT / 'pairs'}", "--predictions", f"other={OUT / 'predictions'}"]
     started, memory = time.perf_counter(), []
@@ -86,7 +89,7 @@ def watch(process: subprocess.Popen, out: Path, memory: list[float]) -> None:
 
 
 def process_tree(pid: int) -> list[int]:
-    """The ids of a process and of all its descendants; empty if it has ended."""
+    """Returns the ids of a process and of all its descendants. The list is empty if the process has ended."""
     try:
         children = Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
     except OSError:

@@ -2,9 +2,9 @@
 
     BREWSTER_DATA=../shared/data .venv/bin/python bench/metrics.py
 
-Each uses one thread; they alternate, and the median of 11 rounds is printed. Our LPIPS computes the features of a ground
-truth once for all its predictions, so a further prediction costs less; the package computes both images every time. The
-package itself is not needed: `ReferenceLpips` repeats its operations.
+Both use one thread. The calls alternate, and the median of 11 rounds is printed. Our LPIPS computes the features of a ground
+truth once for all its predictions, so each further prediction takes less time. The package computes the features of both
+images every time. The package is not imported: `ReferenceLpips` repeats its operations.
 """
 
 import os
@@ -65,7 +65,7 @@ def measure_lpips(prediction: np.ndarray, truth: np.ndarray) -> None:
 
 
 class ReferenceLpips:
-    """LPIPS with the operations of the lpips package, in its order."""
+    """LPIPS with the operations of the lpips package, in the same order."""
 
     def __init__(self) -> None:
         tensors = [load_alexnet()[name] for name in TENSOR_NAMES]
@@ -100,19 +100,19 @@ class ReferenceLpips:
 
 
 def unit_length(values: torch.Tensor) -> torch.Tensor:
-    """Features (1, C, H, W) scaled to length 1 over the channels."""
+    """Returns features (1, C, H, W) scaled to length 1 over the channels."""
     return values / (torch.sqrt(torch.sum(values**2, dim=1, keepdim=True)) + 1e-10)
 
 
 def read_pair(data: Path) -> tuple[np.ndarray, np.ndarray]:
-    """A real photo and its ground truth, cropped to 540x400."""
+    """Returns a real photo and its ground truth, cropped to 540x400."""
     photo = min((data / "real/dev/nature/blended").iterdir())
     (truth,) = (data / "real/dev/nature/transmission").glob(f"{photo.stem}.*")
     return tuple(Photo.open(path).pixels[:HEIGHT, :WIDTH] for path in (photo, truth))
 
 
 def median_ms(*runs: Callable[[], object]) -> list[float]:
-    """The median milliseconds of each function. Calls alternate, so that other processes slow all functions alike."""
+    """Returns the median milliseconds of each function. Calls alternate, so that other processes affect all functions equally."""
     times = [[] for _ in runs]
     for _ in range(ROUNDS + 1):
         for run, run_times in zip(runs, times, strict=True):

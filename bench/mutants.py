@@ -1,11 +1,11 @@
 """Mutation testing: applies the faults of mutants.toml one at a time, and runs the tests that should fail.
 
-    make mutants                                  # all of them
-    python bench/mutants.py losses render/rays    # those with one of these texts in `file` or `old`
+    make mutants                                  # all mutants
+    python bench/mutants.py losses render/rays    # the mutants with one of these texts in `file` or `old`
 
-The tests run in a temporary copy of the tree. A mutant is killed if a test fails that passes without it; a test that
-exceeds the time limit fails. The tools mutmut and cosmic-ray are not used, because they generate every possible mutation
-of a file (thousands here) and cannot run a short list with a few test files each.
+The tests run in a temporary copy of the tree. A mutant is killed if a test fails that passes without the mutation. A test
+that exceeds the time limit fails. The tools mutmut and cosmic-ray are not used, because they generate every possible mutation
+of a file (thousands here) and cannot run a short list with a few test files for each mutant.
 """
 
 from __future__ import annotations
@@ -44,12 +44,15 @@ COPIED_PATHS = (
     "constraints.txt",
 )
 TIMEOUT_S = 900
-MIN_KILLED_SHARE = 0.95
+MIN_KILLED_FRACTION = 0.95
 
 
 @dataclass(frozen=True)
 class Mutant:
-    """One fault: `old` in `file` becomes `new`, and one of `tests` should fail. `survives` explains why no test can fail."""
+    """One fault: `old` in `file` is replaced by `new`, and one of `tests` should fail.
+
+    `survives` explains why no test can fail, or is "".
+    """
 
     file: str
     old: str
@@ -61,10 +64,10 @@ class Mutant:
         return f"{self.file}: {_abbreviated(self.old)} -> {_abbreviated(self.new)}"
 
     def applied(self, root: Path = ROOT) -> str:
-        """The mutated source.
+        """Returns the mutated source.
 
         Raises:
-            ValueError: the file is missing, it does not contain `old` exactly once, or the mutation changes nothing.
+            ValueError: the file is missing, does not contain `old` exactly once, or is not changed by the mutation.
         """
         path = root / PACKAGE / self.file
         source = path.read_text("utf-8") if path.is_file() else ""
@@ -81,13 +84,13 @@ class Mutant:
 
 
 def read_list() -> list[Mutant]:
-    """All entries of mutants.toml."""
+    """Returns all entries of mutants.toml."""
     entries = tomllib.loads(LIST_FILE.read_text("utf-8"))["mutant"]
     return [Mutant(**entry | {"tests": tuple(entry["tests"])}) for entry in entries]
 
 
 def main(patterns: Sequence[str]) -> int:
-    """Prints one line per mutant and the share of killed mutants. Returns 0 if it is at least 95 %, else 1."""
+    """Prints a result for each mutant and the percentage of killed mutants. Returns 0 if it is at least 95 %, else 1."""
     mutants = [m for m in read_list() if not patterns or any(p in f"{m.file} {m.old}" for p in patterns)]
     for mutant in mutants:
         mutant.applied()
@@ -99,11 +102,11 @@ def main(patterns: Sequence[str]) -> int:
     print(f"\n{killed} of {len(mutants)} mutants killed, {killed / max(1, len(mutants)):.1%}")
     for mutant, reason in survivors.items():
         print(f"survives: {mutant}\n    {reason}")
-    return int(killed < MIN_KILLED_SHARE * len(mutants))
+    return int(killed < MIN_KILLED_FRACTION * len(mutants))
 
 
 def _survives(copy: Path, mutant: Mutant) -> str:
-    """Runs the tests on a mutant; returns why it survives, or an empty string if a test kills it."""
+    """Runs the tests on a mutant. Returns the reason why it survives, or an empty string if a test kills it."""
     started = time.monotonic()
     path, tests = copy / PACKAGE / mutant.file, [f"tests/{test}" for test in mutant.tests]
     source = path.read_text("utf-8")
@@ -114,7 +117,7 @@ def _survives(copy: Path, mutant: Mutant) -> str:
         path.write_text(source, "utf-8")
     reason = "" if is_killed else mutant.survives or "no reason is known; expected a failing test; write one"
     if is_killed and _run_tests(copy, failed or tests)[0]:
-        reason = f"{' '.join(failed or tests)} fails without the mutation, too; expected it to pass; repair it first"
+        reason = f"{' '.join(failed or tests)} fails without the mutation, too; expected it to pass; repair the test first"
     result = f"SURVIVES  {reason}" if reason else f"killed    {' '.join(failed)[:100] or 'by the time limit'}"
     print(f"{time.monotonic() - started:4.0f} s  {mutant}\n        {result}", flush=True)
     return reason
@@ -139,7 +142,7 @@ def _copy(folder: Path) -> Path:
 
 
 def _run_tests(copy: Path, tests: Sequence[str]) -> tuple[bool, list[str]]:
-    """Runs tests until the first failure or the time limit, at which all their processes are killed.
+    """Runs tests until the first failure or the time limit. Then all processes of the tests are killed.
 
     Returns:
         Whether a test failed or the time limit was exceeded, and the ids of failed tests.
@@ -175,7 +178,7 @@ class _Recorder:
 
 
 def _pytest(copy: Path, tests: Sequence[str], log: Path) -> None:
-    """Runs pytest in the copy, as `python -m pytest` would; the forked process has imported large libraries already."""
+    """Runs pytest in the copy, like `python -m pytest`. The parent process has already imported large libraries."""
     os.setsid()
     for stream in (1, 2):
         os.dup2(os.open(os.devnull, os.O_WRONLY), stream)
@@ -189,7 +192,7 @@ def _pytest(copy: Path, tests: Sequence[str], log: Path) -> None:
 
 
 def _import_heavy() -> None:
-    """Imports libraries that most tests need: every run is forked from this process and saves these seconds."""
+    """Imports libraries that most tests need. Every run is forked from this process, so it does not import them again."""
     os.environ |= {"OMP_NUM_THREADS": "1", "VIPS_CONCURRENCY": "1"}
     for name in (
         "torch",

@@ -1,9 +1,10 @@
-"""Separates an archive on two local Ray nodes, also if one of them is killed, and with two processes of the plain command.
+"""Separates many photos with two processes of the plain command, on two local Ray nodes, and on two nodes of which one is killed.
 
     .venv/bin/python bench/parallel_batch.py [COUNT [MODEL]]
 
-Prints the wall time, the photos per second and the CPU-seconds of all processes of each run. On a busy machine, compare the
-CPU-seconds. Checks that all runs wrote the same bytes, and that the index has a row for each photo. The photos have 480x320 pixels.
+The script prints the wall time, the photos per second and the CPU-seconds of all processes of each run. On a busy machine,
+compare the CPU-seconds. It checks that all runs wrote the same bytes, and that the index has a row for each photo. The photos
+have 480x320 pixels.
 """
 
 from __future__ import annotations
@@ -68,7 +69,10 @@ def start(*arguments: object) -> subprocess.Popen[bytes]:
 
 
 def run_cluster(name: str, options: list[str], kill_after: int | None, meter: Meter) -> int:
-    """Runs the command on two new nodes with one processor each. Kills one after a number of photos. Returns the exit code."""
+    """Runs the command on two new nodes with one processor each. Returns the exit code.
+
+    If `kill_after` is set, one node is killed after this number of photos.
+    """
     from ray.cluster_utils import Cluster  # noqa: PLC0415
 
     nodes = Cluster(initialize_head=True, head_node_args={"num_cpus": 1, "include_dashboard": False})
@@ -95,7 +99,7 @@ class Meter:
         """Waits a moment, and reads the CPU times."""
         time.sleep(0.3)
         for child in psutil.Process().children(recursive=True):
-            with suppress(psutil.Error):  # it has just ended
+            with suppress(psutil.Error):  # the process has just ended
                 times = child.cpu_times()
                 self._cpu_seconds[child.pid] = times.user + times.system
 
@@ -122,7 +126,7 @@ def check(name: str, expected: dict[str, str], count: int) -> None:
 
 
 def hashes(name: str) -> dict[str, str]:
-    """Path of a file -> its sha256."""
+    """Returns the sha256 of each file of a run by its path."""
     return {
         str(path.relative_to(OUT / name)): hashlib.sha256(path.read_bytes()).hexdigest()
         for path in (OUT / name).rglob("*")

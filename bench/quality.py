@@ -3,7 +3,7 @@ fast-reflection-removal 1.1 (Yang et al. 2019), which runs in a separate environ
 
     BREWSTER_DATA=../shared/data .venv/bin/python bench/quality.py
 
-The scores come from the code of `brewster evaluate`; out/bench/quality/report.html shows every image.
+The scores are computed by the code of `brewster evaluate`. out/bench/quality/report.html shows every image.
 """
 
 import os
@@ -35,7 +35,9 @@ def main(data: Path) -> None:
     cases = [case for part in parts for case in part.cases]
     frr_seconds = run_frr(cases)
     models = [ModelMethod(name, name, OUT / "predictions" / name, device="cpu") for name in MODELS]
-    (OUT / SCORES_FILE).unlink(missing_ok=True)  # stored scores would have no new times
+    (OUT / SCORES_FILE).unlink(
+        missing_ok=True
+    )  # stored scores are not computed again, so their times are not measured
     timed = {}
     results = evaluate(
         parts,

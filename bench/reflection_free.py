@@ -1,8 +1,8 @@
-"""Measures the change of ten photos without reflection: PSNR between input and transmission, higher is better.
+"""Measures the change of ten photos without reflection: the PSNR of the transmission, compared with the input.
 
     BREWSTER_DATA=../shared/data .venv/bin/python bench/reflection_free.py
 
-The photos are kodak24 01 to 10, which the training recipes of the compact model exclude.
+Higher is better. The photos are kodak24 01 to 10, which are not training data of the compact model.
 """
 
 import os

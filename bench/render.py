@@ -3,9 +3,10 @@
     python bench/render.py
 
 Costs are CPU-seconds. The error is relMSE = mean((x - reference)^2 / (reference^2 + 0.01 mean(reference)^2)), averaged
-over the five images of a sample. The reference is our image at four times the width and height, averaged down;
-bench/compare_renderers.py shows that the two renderers agree. Mitsuba's rays are doubled until the error is 1e-3 or the
-next run would exceed a minute. In the second case, the cost is extrapolated: the error is proportional to 1 / rays.
+over the five images of a sample. The reference is an image of the analytic renderer at four times the width and height,
+averaged over blocks of 4 x 4 pixels. bench/compare_renderers.py shows that the two renderers agree. The number of Mitsuba's
+rays is doubled until the error is at most 1e-3, or until the next run will take more than a minute. In the second case, the
+cost is extrapolated, because the error is proportional to 1 / rays.
 """
 
 from __future__ import annotations
@@ -50,7 +51,7 @@ SCENES = {
 
 
 def relative_error(sample: LinearSample, reference: LinearSample) -> float:
-    """relMSE, averaged over the five images."""
+    """Returns the relMSE, averaged over the five images."""
     errors = []
     for name in LAYERS:
         x, r = (getattr(which, name).double() for which in (sample, reference))
@@ -70,10 +71,11 @@ def render_reference(scene: Scene, assets: Assets) -> LinearSample:
 def measure_mitsuba(
     scene: Scene, assets: Assets, reference: LinearSample, *, denoise: bool
 ) -> tuple[float, float, int, bool]:
-    """Doubles the rays until the error is at most TARGET_ERROR or the next run would exceed MAX_CPU_S.
+    """Doubles the rays until the error is at most TARGET_ERROR, or until the next run will exceed MAX_CPU_S.
 
     Returns:
-        CPU-seconds at TARGET_ERROR, the last error, the last rays per pixel, and whether the seconds are extrapolated.
+        The CPU-seconds at TARGET_ERROR, the last error, the last number of rays per pixel, and whether the seconds are
+        extrapolated.
     """
     samples = 4
     trace(scene, assets, noise_threshold=0, max_samples=samples, denoise=denoise)  # compiles the kernels
@@ -89,10 +91,11 @@ def measure_mitsuba(
 
 
 def compare_costs() -> None:
-    """Prints one row per scene and variant of Mitsuba."""
+    """Prints one row for each scene, with and without the denoiser of Mitsuba."""
     assets = Assets()
     print(
-        "| scene | ours, relMSE | ours, CPU-s | Mitsuba | relMSE | CPU-s | times |\n|---|---|---|---|---|---|---|"
+        "| scene | analytic: relMSE | analytic: CPU-s | Mitsuba: variant | Mitsuba: relMSE | Mitsuba: CPU-s | ratio of CPU-s |\n"
+        "|---|---|---|---|---|---|---|"
     )
     for name, scene in SCENES.items():
         reference = render_reference(scene, assets)
@@ -113,7 +116,7 @@ def compare_costs() -> None:
 
 
 def cost_per_sample() -> None:
-    """Prints CPU-seconds per sample at 512x384, with all files written, for rising counts: the cost must not rise."""
+    """Prints CPU-seconds per stored sample of 512x384 for several numbers of samples. The cost must not depend on the number."""
     recipe = read_scene_recipe("window")
     print("| samples | CPU-s per sample |\n|---|---|")
     for count in (10, 30, 90):
@@ -131,7 +134,7 @@ def cost_per_sample() -> None:
 
 
 def main(_: Path) -> None:
-    """Both tables, on one thread."""
+    """Prints both tables. Uses one thread."""
     torch.set_num_threads(1)
     compare_costs()
     cost_per_sample()

@@ -1,8 +1,8 @@
-"""Runs all benchmarks, as `make bench` does.
+"""Runs all benchmarks. This is the script of `make bench`.
 
-They measure the quality on the development pairs, compared with the unprocessed input and another method; photos without
-reflection; the cost of a 12-megapixel photo; metrics compared with other packages; a large evaluation; the renderer
-compared with Mitsuba; and both servers under load.
+The benchmarks measure the quality on the development pairs, compared with the unprocessed input and another method; the
+change of photos without reflection; the time and memory for a 12-megapixel photo; the speed of metrics, compared with other
+packages; a large evaluation; the renderer, compared with Mitsuba; and both servers under load.
 
     BREWSTER_DATA=../shared/data .venv/bin/python bench/run.py
 """
@@ -24,7 +24,7 @@ if __name__ == "__main__":
     if not os.environ.get("BREWSTER_DATA"):
         sys.exit(
             "BREWSTER_DATA is not set; expected the folder of test pairs and photos, which brewster does not include;"
-            " set it to that folder"
+            " set the variable to this folder"
         )
     data = Path(os.environ["BREWSTER_DATA"])
     quality.main(data)

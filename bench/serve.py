@@ -2,8 +2,9 @@
 
     BREWSTER_DATA=../shared/data .venv/bin/python bench/serve.py
 
-Each photo is sent twice. Prints the ratio of throughputs, and the memory of the server at the start, halfway and at the
-end. The bytes of every response must be equal to those of the file that the command line writes for the same photo.
+Each photo is sent twice. The script prints the ratio of the throughputs, and the memory of the server at the start, in the
+middle and at the end. The bytes of every response must be equal to those of the file that the command line writes for the
+same photo.
 """
 
 import json
@@ -55,7 +56,7 @@ def check_results(results: dict[str, bytes], expected: dict[str, bytes]) -> None
 
 
 def separate_by_command(photos: list[Path], folder: Path) -> tuple[dict[str, bytes], float]:
-    """The files that one run of the command writes, by photo, and its wall time in seconds."""
+    """Returns the files that one run of the command writes, by photo, and the wall time of the run in seconds."""
     options = [part for name, value in OPTIONS.items() for part in (f"--{name}", value)]
     started = time.perf_counter()
     command = [*BREWSTER, *map(str, photos), "-o", str(folder), *options, "--json", "--device", "cpu"]
@@ -81,7 +82,7 @@ class RunningServer:
 
 
 def separate_by_clients(url: str, photos: list[Path]) -> dict[str, bytes]:
-    """Separates all photos; each client sends its next photo when it has the response to the previous one."""
+    """Separates all photos. Each client sends its next photo when it has received the response to the previous photo."""
     pending, results = queue.SimpleQueue(), {}
     for photo in photos:
         pending.put(photo)

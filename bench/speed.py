@@ -2,8 +2,8 @@
 
     BREWSTER_DATA=../shared/data .venv/bin/python bench/speed.py
 
-Prints wall time and peak memory of the process at quality `standard`, and the share of each stage, as `--json` reports it.
-For comparison, the same file is decoded and encoded twice without separation: a long time means that the machine is busy.
+Prints wall time and peak memory of the process at quality `standard`, and the time of each stage, as `--json` reports it. For
+comparison, the same file is decoded and encoded twice without separation. If this takes long, the machine is busy.
 """
 
 import json
@@ -36,8 +36,8 @@ def main(data: Path) -> None:
         [*brewster, str(photo), "-o", str(OUT), "--json", "--overwrite", "--device", "cpu"]
     )
     seconds = json.loads(line)["seconds"]
-    shares = ", ".join(f"{name} {value:.2f} s ({value / wall:.0%})" for name, value in seconds.items())
-    print(f"12 megapixels: {wall:.2f} s, {peak / 2**20:.2f} GiB; {shares}")
+    stages = ", ".join(f"{name} {value:.2f} s ({value / wall:.0%})" for name, value in seconds.items())
+    print(f"12 megapixels: {wall:.2f} s, {peak / 2**20:.2f} GiB; {stages}")
     print(f"  only decoded and encoded twice: {copy_wall:.2f} s; ratio {wall / copy_wall:.1f}")
     help_times = sorted(measure([*brewster, "--help"])[0] for _ in range(5))
     python_times = sorted(measure([sys.executable, "-c", "pass"])[0] for _ in range(5))
@@ -45,7 +45,7 @@ def main(data: Path) -> None:
 
 
 def make_large_photo(data: Path) -> Path:
-    """Writes a photo enlarged to 4000x3000. Added noise makes it as costly to encode as a photo of a camera."""
+    """Writes a photo enlarged to 4000x3000. With the added noise, encoding takes as long as for a photo of a camera."""
     small = Photo.open(data / "photos/permissive/kodak24__05.jpg").pixels.astype(np.float32)
     rows, columns = (
         np.arange(side) * small.shape[axis] // side for axis, side in ((0, SIZE_PX[1]), (1, SIZE_PX[0]))
@@ -58,7 +58,7 @@ def make_large_photo(data: Path) -> Path:
 
 
 def measure(command: list[str]) -> tuple[float, int, str]:
-    """Runs a command. Returns wall seconds, peak memory in KiB, and its standard output."""
+    """Runs a command. Returns the wall time in seconds, the peak memory in KiB, and the standard output."""
     started = time.perf_counter()
     process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
     output = process.stdout.read()

@@ -3,7 +3,7 @@
     .venv/bin/python bench/study.py
 
 A hundred participants answer concurrently over HTTP, on the loopback interface. The server is `brewster study serve` in a
-separate process; it is killed with SIGKILL ten times. Then the acknowledged answers are compared with the database.
+separate process, which is killed with SIGKILL ten times. Then the acknowledged answers are compared with the database.
 """
 
 import asyncio
@@ -33,7 +33,7 @@ IMAGE_COUNTS = {"real": 20, "nature": 20, "postcard": 20, "solidobject": 20, "wi
 
 
 class Server:
-    """The server process; it can be killed and started again on the same port."""
+    """The server process. It can be killed and started again on the same port."""
 
     def __init__(self, folder):
         self.folder, self.kills = folder, 0
@@ -66,7 +66,7 @@ class Participants:
         )
 
     async def request(self, client, method, path, **options):
-        """Sends a request, again and again while the server is down. Returns the response."""
+        """Sends a request, and repeats it while the server does not respond. Returns the response."""
         while True:
             try:
                 return await client.request(method, f"{self.url}{path}", **options)
@@ -93,7 +93,7 @@ class Participants:
 
 
 def create_study(folder):
-    """Creates a study with 181 images, as in the paper, and three methods; the images are small and random."""
+    """Creates a study with 181 images, as in the paper, and three methods. The images are small and random."""
     rng = np.random.default_rng(1)
     for part in ("inputs", "ours", "RDNet", "DSIT"):
         for name, count in IMAGE_COUNTS.items():

@@ -2,8 +2,8 @@
 
     BREWSTER_DATA=../shared/data .venv/bin/python bench/training_data.py recipes/train/compact-stage1.toml
 
-Prints one row per dataset and per recipe: the 10, 25, 50, 75 and 90 % quantiles over 200 images of 256 px, in linear
-light. The script only measures the real pairs; it trains nothing.
+Prints one row for each dataset and each recipe: the 10, 25, 50, 75 and 90 % quantiles over about 200 images of 256 px, in
+linear light. The script trains nothing: it only computes statistics of the real pairs.
 """
 
 import os

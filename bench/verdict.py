@@ -1,9 +1,9 @@
-"""Measures how reliable the verdicts of `Separation.assessment` are, on photos with ground truth that no model was trained on.
+"""Measures the reliability of the verdicts of `Separation.assessment`, on photos with ground truth that are not training data.
 
     BREWSTER_DATA=../shared/data .venv/bin/python bench/verdict.py [MODEL]
 
-Prints one row per dataset and verdict: the number of photos, the share that is closer to the ground truth after the separation,
-and the mean gain in PSNR.
+Prints one row for each dataset and verdict: the number of photos, the fraction of photos that are closer to the ground truth
+after the separation, and the mean gain in PSNR.
 """
 
 import os
@@ -25,7 +25,7 @@ from brewster.training.streams import held_out_mixtures
 MIXTURES = 200
 SIZE_PX = 320
 EVERY = 7
-"""Of the many similar pairs of real/train, one in so many is measured."""
+"""Every seventh pair of real/train is measured, because many of its pairs are similar."""
 RECIPE = Path(__file__).parents[1] / "recipes/train/compact-stage3.toml"
 
 Pair = tuple[Photo, NDArray[np.uint8]]
@@ -64,7 +64,7 @@ def mixtures() -> Iterator[Pair]:
         batch = stream(step, 8, SIZE_PX)
         for images in zip(batch.photo_encoded, batch.transmission_encoded, strict=True):
             photo, ground_truth = ((255 * image).round().byte().permute(1, 2, 0).numpy() for image in images)
-            yield Photo.from_array(photo), ground_truth
+            yield Photo.from_array(photo, encoding="srgb"), ground_truth
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Writes the figures of docs/rendering.md: samples of every scene recipe, and 8-bit mixtures above rendered photos.
+"""Writes the figures of docs/rendering.md: samples of all scene recipes except tiny, and 8-bit mixtures above rendered photos.
 
     BREWSTER_DATA=../shared/data .venv/bin/python runs/figures.py   # with the CC0 maps in hdri/
 

@@ -1,8 +1,8 @@
 """Measures memory and time of training and inference at the paper's size on the local GPU; estimates them without a GPU.
 
-The architectures are real and the weights random: nothing is downloaded, and only memory and time are meaningful. The base is
-filled and quantized layer by layer, so that the card never holds the whole base in 16 bits. On larger cards, memory is limited
-to that of the paper's 24 GB card. full_size_check.sh runs this script.
+The architectures are real, but the weights are random: nothing is downloaded, and only memory and time are meaningful. The
+base model is filled and quantized layer by layer, so that the GPU never stores the whole model in 16 bits. On larger GPUs,
+memory is limited to that of the paper's 24 GB GPU. full_size_check.sh runs this script.
 """
 
 import argparse
@@ -26,7 +26,7 @@ from brewster.models.diffusion.prompt import PromptEmbedding
 from brewster.models.diffusion.sampling import GUIDANCE, STEPS, sample
 
 GIB = 1 << 30
-CAP_GIB = 23.0  # a 24 GB card, minus the CUDA context
+CAP_GIB = 23.0  # a 24 GB GPU without its CUDA context
 PANEL = (512, 512)
 PROMPT_TOKENS = 512
 RANK = 16
@@ -34,12 +34,12 @@ PAPER_STEPS = 4000
 WARMUP_STEPS, TIMED_STEPS = 2, 5
 CASES = (("kontext", "int8"), ("klein", None))
 TITLES = {
-    "kind": "measured or estimated", "card": "card", "parameters": "parameters, billions",
+    "kind": "measured or estimated", "card": "GPU", "parameters": "parameters, billions",
     "lora": "LoRA, millions", "tokens": "tokens: generated, condition, text", "optimizer": "optimizer",
-    "base_gib": "base and VAE, GiB", "learning_gib": "peak during training, GiB",
+    "base_gib": "base model and VAE, GiB", "training_gib": "peak during training, GiB",
     "reserved_gib": "peak reserved by the allocator, GiB", "step_s": "training step, s",
-    "steps_h": f"{PAPER_STEPS} steps, h", "picture_gib": "peak during inference, GiB",
-    "picture_s": f"a photo in {STEPS} steps, s", "fits": "fits a 24 GB card",
+    "steps_h": f"{PAPER_STEPS} steps, h", "photo_gib": "peak during inference, GiB",
+    "photo_s": f"a photo in {STEPS} steps, s", "fits": "fits into a 24 GB GPU",
 }  # fmt: skip
 
 
@@ -56,12 +56,12 @@ class Row:
     tokens: str | None = None
     optimizer: str | None = None
     base_gib: float | None = None
-    learning_gib: float | None = None
+    training_gib: float | None = None
     reserved_gib: float | None = None
     step_s: float | None = None
     steps_h: float | None = None
-    picture_gib: float | None = None
-    picture_s: float | None = None
+    photo_gib: float | None = None
+    photo_s: float | None = None
     fits: bool | None = None
 
 
@@ -69,7 +69,7 @@ class Row:
 
 
 def measure(name, quantization, device, *, is_tiny):
-    """Trains for a few steps, then separates one photo."""
+    """Trains a backbone for a few steps, then separates one photo. Returns the measured values as a `Row`."""
     panel, prompt_tokens, rank = ((32, 32), 8, 2) if is_tiny else (PANEL, PROMPT_TOKENS, RANK)
     row = Row(name, quantization, "tiny version, not full size" if is_tiny else "measured", gpu_name(device))
     try:
@@ -88,7 +88,7 @@ def measure(name, quantization, device, *, is_tiny):
 
 
 def random_backbone(name, quantization, device, *, is_tiny):
-    """Creates a backbone with random weights on the device. The peak memory is its final size."""
+    """Creates a backbone with random weights on the device. The peak memory is not above its final memory."""
     size = find_backbone_class(name).tiny if is_tiny else None
     dtype = torch.float32 if device == "cpu" else torch.bfloat16
     backbone = build(name, size, device="meta", dtype=dtype)
@@ -120,7 +120,7 @@ def random_prompt(backbone, count):
 
 
 def train(backbone, prompt, photo, rank, row):
-    """Runs training steps as training/lora/trainer.py does, but without its files: encoding, then flow matching on the LoRA."""
+    """Runs the steps of training/lora/trainer.py without writing files: encoding, then flow matching with the LoRA."""
     parameters = add_lora(backbone, rank=rank, alpha=rank)
     backbone.transformer.enable_gradient_checkpointing()
     optimizer = torch.optim.AdamW(parameters, lr=1e-4)
@@ -135,7 +135,7 @@ def train(backbone, prompt, photo, rank, row):
     ]
     row.step_s = statistics.median(times[WARMUP_STEPS:])
     row.steps_h = row.step_s * PAPER_STEPS / 3600
-    row.learning_gib, row.reserved_gib = peak(backbone.device)
+    row.training_gib, row.reserved_gib = peak(backbone.device)
 
 
 def step(backbone, prompt, composite, latents, optimizer):
@@ -156,10 +156,10 @@ def separate(backbone, prompt, photo, row):
     size = PanelLayout().composite_size((photo.shape[3], photo.shape[2]))
     gc.collect()
     reset_peak(backbone.device)
-    row.picture_s = timed(
+    row.photo_s = timed(
         lambda: sample(backbone, image, prompt, size=size, steps=STEPS, guidance=GUIDANCE, seeds=[0])
     )
-    row.picture_gib, _ = peak(backbone.device)
+    row.photo_gib, _ = peak(backbone.device)
 
 
 def timed(function):
@@ -200,31 +200,31 @@ def gpu_name(device):
 
 
 def cap_memory():
-    """Limits the GPU memory to that of the paper's card."""
+    """Limits the GPU memory to that of the paper's GPU."""
     total = torch.cuda.get_device_properties(0).total_memory / GIB
     torch.cuda.set_per_process_memory_fraction(min(1.0, CAP_GIB / total))
 
 
-# --- estimated, where there is no GPU
+# --- estimated, without a GPU
 
 
 def estimate(name, quantization):
-    """Returns the estimate of `brewster train --plan` for the recipe of this name on the paper's card."""
+    """Returns the estimate of `brewster train --plan` for the recipe of this name on the paper's GPU."""
     from brewster.training.lora.resource_estimate import CARDS, estimate_resources  # noqa: PLC0415  (its libraries may be missing)
     from brewster.training.recipe import read_recipe  # noqa: PLC0415
 
     card = CARDS["RTX 4090"]
     recipe = read_recipe(Path(__file__).parents[1] / f"recipes/train/{name}.toml")
     resources = estimate_resources(recipe, card)
-    # A training step costs three passes: forward, recomputation for gradient checkpointing, backward.
+    # A training step has three passes: forward, recomputation for gradient checkpointing, backward.
     forward_s = resources.seconds / 3 / recipe.batch_size
     passes = STEPS * (1 if find_backbone_class(name).guided_by_embedding else 2)
     return Row(
         name, quantization, "ESTIMATED from meta tensors, not measured", card.name,
         parameters=resources.parameters / 1e9, lora=resources.lora_parameters / 1e6,
         tokens=f"{resources.generated_tokens}, {resources.condition_tokens}, {PROMPT_TOKENS}", base_gib=resources.memory_gib["base"] + resources.memory_gib["VAE"],
-        learning_gib=resources.total_gib, step_s=resources.seconds, steps_h=resources.seconds * PAPER_STEPS / 3600,
-        picture_s=passes * forward_s, fits=resources.total_gib <= card.memory_gib,
+        training_gib=resources.total_gib, step_s=resources.seconds, steps_h=resources.seconds * PAPER_STEPS / 3600,
+        photo_s=passes * forward_s, fits=resources.total_gib <= card.memory_gib,
     )  # fmt: skip
 
 
@@ -252,7 +252,9 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--out", type=Path, default=Path("out/full_size"))
     parser.add_argument(
-        "--tiny", action="store_true", help="run the same code on tiny versions; a CPU is sufficient"
+        "--tiny",
+        action="store_true",
+        help="run the same code with tiny versions of the backbones; a CPU is sufficient",
     )
     options = parser.parse_args()
     warnings.filterwarnings("ignore", message=".*get_apply_tensor_subclass.*")
@@ -274,7 +276,7 @@ def main():
 
 
 def save(rows, out):
-    """Writes the results after each backbone, so that an interrupted run keeps the results so far."""
+    """Writes the results. It is called after each backbone, so that an interrupted run keeps the finished results."""
     out.mkdir(parents=True, exist_ok=True)
     versions = {"torch": torch.__version__, "cuda": torch.version.cuda}
     results = {"versions": versions, "cap_gib": CAP_GIB, "rows": [asdict(row) for row in rows]}

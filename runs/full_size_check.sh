@@ -1,12 +1,14 @@
 #!/usr/bin/env bash
-# Memory and time of the paper's method at full size on a 24 GB card, with real architectures, random weights and no download.
+# Measures memory and time of the paper's method at full size for a 24 GB GPU. The architectures are real, the weights are
+# random, and nothing is downloaded.
 #     runs/full_size_check.sh            with a GPU: measures, in a few minutes; without a GPU: prints estimates, marked as such
-#     runs/full_size_check.sh --tiny     a test of this script on tiny versions, on any machine, in half a minute
-# FLUX.1 Kontext (11.9 billion weights, int8 by torchao) and FLUX.2 klein (3.9 billion, bf16): a LoRA of rank 16 on a composite
-# of 1536 x 512 and its condition, gradient checkpointing, seven steps; then a photo in 20 steps. Memory is limited to 23 GiB.
+#     runs/full_size_check.sh --tiny     tests this script with tiny versions of the backbones, on any machine, in half a minute
+# The backbones are FLUX.1 Kontext (11.9 billion weights, int8 by torchao) and FLUX.2 klein (3.9 billion weights, bf16). The script
+# trains a LoRA of rank 16 for seven steps, on a composite of 1536 x 512 and its condition, with gradient checkpointing. Then it
+# separates a photo in 20 steps. Memory is limited to 23 GiB.
 # The script writes full_size.json and full_size.md to $OUT, by default out/full_size. The exit code is 1 if a backbone does not
-# fit. It needs src/, and torch, diffusers, peft, accelerate, safetensors, torchao and huggingface_hub from the extra `diffusion`. On a
-# machine without a network connection, install the missing packages from wheels.
+# fit into memory. The script needs src/, and torch, diffusers, peft, accelerate, safetensors, torchao and huggingface_hub from the
+# extra `diffusion`. On a machine without a network connection, install the missing packages from wheels.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 if [ -x .venv/bin/python ]; then python=.venv/bin/python; else python=python3; fi

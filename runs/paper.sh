@@ -1,17 +1,17 @@
 #!/usr/bin/env bash
-# The paper's method at the paper's size: FLUX.1 Kontext [dev], rank 16, 4,000 steps, one 24 GB card (RTX 4090).
+# The paper's method at the paper's size: FLUX.1 Kontext [dev], rank 16, 4,000 steps, one 24 GB GPU (RTX 4090).
 #     BREWSTER_DATA=/big/disk runs/paper.sh [FOLDER]     writes to FOLDER, by default out/paper
-#     runs/paper.sh --tiny [FOLDER]                      the same experiment on tiny versions: minutes on two CPU cores, offline
+#     runs/paper.sh --tiny [FOLDER]                      the same with a tiny version of the backbone: minutes on two CPU cores, offline
 # Give the same command again to resume an interrupted run. With --tiny, the generated panels are noise, but every step runs.
 #
-# First: pip install -c constraints.txt '.[render,train,large,evaluate]' bitsandbytes; agree to the licence at
+# First run `pip install -c constraints.txt '.[render,train,diffusion,evaluate]' bitsandbytes`, agree to the licence at
 # https://huggingface.co/black-forest-labs/FLUX.1-Kontext-dev (not for commercial use), and run `hf auth login`.
-# In BREWSTER_DATA: photos/ (200 photos of people, animals and artworks), pairs/real and pairs/nature (the 89 + 200 training pairs),
-# real20, nature20 and SIR2 (the benchmarks; docs/evaluation.md describes their layouts), and real/dev/nature (any pairs, on
-# which training is validated).
+# BREWSTER_DATA must contain photos/ (200 photos of people, animals and artworks), pairs/real and pairs/nature (the 89 + 200
+# training pairs), real20, nature20 and SIR2 (the benchmarks; docs/evaluation.md describes their layouts), and real/dev/nature
+# (any pairs, for validation during training).
 #
-# "est." marks estimates that were not measured: from `brewster train recipes/train/kontext.toml --plan`, or arithmetic.
-# runs/full_size_check.sh measures memory and time per step on your card.
+# "est." marks estimates, which come from `brewster train recipes/train/kontext.toml --plan` or are calculated.
+# runs/full_size_check.sh measures memory and time per step on your GPU.
 set -euo pipefail
 root="$(realpath "$(dirname "$0")/..")"
 tiny=false
@@ -43,13 +43,13 @@ cd "$root"
 #    may not be redistributed: put your own copies into the same folder. With --tiny, the built-in environments are used.
 $tiny || brewster assets pull polyhaven "$BREWSTER_DATA/hdri" --indoor 140 --outdoor 30 --resolution 4k
 
-# 2. Render 1,000 samples for training, and others for testing: the paper's three set-ups, rough panes included, with the single
-#    light paths of the paper in T and R. 5 MB per sample. est. 2.5-4 CPU-seconds per sample, more for rough panes.
+# 2. Render 1,000 samples for training, and 40 for testing, with the paper's three set-ups and also rough panes. In the training
+#    samples, T and R contain the paper's single light paths. A sample has 5 MB and needs est. 2.5-4 CPU-seconds, more if rough.
 render() { brewster render "$BREWSTER_DATA/$1" --recipe recipes/render/paper.toml --size "$size" --seed "$2" --count "$3" "${@:4}"; }
 render "$set" 10 "$count" "${assets[@]}" "${workers[@]}"
 render sets/test 11 "$test_count" --orders all "${assets[@]}" "${workers[@]}"  # orders all: I = T + R, for the failure metrics
 
-# With --tiny, two other rendered samples of another size are the stand-ins for the 289 real pairs.
+# With --tiny, two more rendered samples replace the 289 real pairs.
 if $tiny; then
     brewster render "$BREWSTER_DATA/sets/pairs" --recipe tiny --size 64x64 --seed 12 --count 2 --workers 0
     mkdir -p "$BREWSTER_DATA"/pairs/tiny/{blended,transmission}
@@ -59,21 +59,21 @@ if $tiny; then
     done
 fi
 
-# 3. Estimate memory, download and time, and read the data, before anything is downloaded. The script stops here if training does
-#    not fit the card. est. 17.7 GiB: base in int8 11.2, activations 3.5, LoRA and AdamW 1.3, the rest 1.7
+# 3. Estimate memory, download and time, and read the data, before anything is downloaded. The script stops here if the training
+#    does not fit into the GPU's memory: est. 17.7 GiB (base model in int8 11.2, activations 3.5, LoRA and AdamW 1.3, other 1.7).
 brewster train "$syn" --plan
 brewster train "$real" --plan
 
-# 4. Train "syn" and "syn + real". Downloads the base once (est. 34 GB; 10 GB of it are the text encoders, which encode one prompt).
-#    est. 5.3 s per step on an RTX 4090, 5.9 hours for each of both. A checkpoint is est. 1 GB, a LoRA 344 MB.
+# 4. Train "syn" and "syn + real". The base model is downloaded once (est. 34 GB, 10 GB of which are the text encoders).
+#    A step takes est. 5.3 s on an RTX 4090, and each training run 5.9 hours. A checkpoint has est. 1 GB, a LoRA 344 MB.
 brewster train "$syn" -o "$out/syn"
 brewster train "$real" -o "$out/syn+real"
 
-# 5. Separate a photo.   est. 35 s per prediction of 20 steps
+# 5. Separate a photo. A prediction of 20 steps takes est. 35 s.
 brewster tests/pictures/mixture-coffee-rocket.jpg --model "$out/syn/lora" -o "$out/separated" --overwrite "${quality[@]}"
 
-# 6. Evaluate both, the compact model, and the unprocessed input: Table 1 is table.tex. est. 5-6 hours for each model.
-#    The rendered test set measures the paper's failure case: white areas that are removed, and reflections that are kept.
+# 6. Evaluate both LoRAs, the compact model, and the unprocessed input. This takes est. 5-6 hours for each model. The paper's
+#    Table 1 is table.tex. The rendered test set is for the paper's failure cases: removed white areas, and kept reflections.
 evaluate() { brewster evaluate "$@" --model compact --model "syn=$out/syn/lora" --model "syn+real=$out/syn+real/lora"; }
 evaluate --benchmark "rendered=$BREWSTER_DATA/sets/test" "${quality[@]}" \
     --metrics psnr,ssim,removed_content,removed_white,kept_reflection -o "$out/failures"
@@ -81,12 +81,12 @@ $tiny && benchmarks=(--benchmark "rendered=$BREWSTER_DATA/sets/test")
 evaluate "${benchmarks[@]}" "${options[@]}" -o "$out/evaluate"
 cp "$out/evaluate/table.tex" "$out/table1.tex"
 
-# 7. The paper's ablations on the diffusion model: 8-bit blends, number of samples, prompts without training. est. 2-3 days.
+# 7. Run the paper's ablations on the diffusion model: 8-bit blends, number of samples, prompts without training. est. 2-3 days.
 for ablation in lora-blend-space lora-size prompt; do
     brewster ablate "recipes/ablations/$ablation$suffix.toml" -o "$out/ablations/$ablation"
 done
 
-# 8. Write the model card with these scores, and list the files for the hub, 350 MB. Without --dry-run, the command uploads
-#    them as a private repository; with --public the repository is public, under the licence of the base.
+# 8. Write the model card with these scores, and list the files for the hub (350 MB). Without --dry-run, the command uploads
+#    them to a private repository. With --public, the repository is public, under the licence of the base model.
 brewster models card "$out/syn/lora" --scores "$out/evaluate/results.json" > "$out/card.md"
 brewster models push "$out/syn/lora" "${REPO:-somebody/sees-through-glass}" --dry-run

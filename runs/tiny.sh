@@ -1,8 +1,8 @@
 #!/usr/bin/env bash
-# The paper's method from beginning to end on a toy backbone: one or two minutes on two CPU cores, offline.
+# The whole of the paper's method with a tiny version of the backbone: one or two minutes on two CPU cores, offline.
 #     runs/tiny.sh [FOLDER]        writes to FOLDER, by default out/tiny
-# The tiny version has random weights, and its LoRA is trained for six steps. All parts are tested, but the generated panels are noise.
-# runs/paper.sh is the same experiment at the paper's size.
+# The tiny version has random weights, and its LoRA is trained for six steps. All parts are tested, but the generated panels are
+# noise. runs/paper.sh is the same experiment at the paper's size.
 set -euo pipefail
 root="$(realpath "$(dirname "$0")/..")"
 out=$(realpath -m "${1:-$root/out/tiny}")
@@ -10,7 +10,7 @@ cd "$root"
 command -v brewster > /dev/null || export PATH="$PWD/.venv/bin:$PATH"
 export BREWSTER_DATA="$out" OMP_NUM_THREADS=1 HF_HUB_OFFLINE=1
 
-# 1. Render samples with known ground truth: four for training, two others for evaluation.
+# 1. Render samples with known ground truth: four for training, two more for evaluation.
 brewster render "$out/sets/tiny" --recipe tiny --count 4 --workers 0 --quiet
 brewster render "$out/sets/test" --recipe tiny --first 4 --count 2 --workers 0 --quiet
 
@@ -20,7 +20,7 @@ brewster train recipes/train/lora-tiny.toml -o "$out"
 # 3. Separate a photo, with the same tiling, colour handling and guided upsampling as for other models.
 brewster tests/pictures/mixture-coffee-rocket.jpg --model "$out/lora" --quality draft -o "$out/separated" --overwrite
 
-# 4. Evaluate it, the compact model, and the unprocessed input as baseline.
+# 4. Evaluate the LoRA, the compact model, and the unprocessed input as baseline.
 brewster evaluate --benchmark "rendered=$out/sets/test" --model compact --model "lora=$out/lora" \
     --quality draft --metrics psnr,ssim -o "$out/evaluate"
 

@@ -85,7 +85,7 @@ def mitsuba():
     try:
         with warnings.catch_warnings(
             action="ignore", category=RuntimeWarning
-        ):  # about LLVM: see the fixture `requires_llvm`
+        ):  # the warning about LLVM; see the fixture `requires_llvm`
             mitsuba = variant.load()
     except MissingExtra as error:
         pytest.skip(str(error))

@@ -1,4 +1,4 @@
-"""Helpers for tests of rendered sets: jobs with a fake renderer, and the content of folders."""
+"""Helpers for tests of rendered datasets: jobs with a fake renderer, and the content of folders."""
 
 import hashlib
 from functools import partial
@@ -15,7 +15,7 @@ def make_job(out, renderer="render", seed=7, recipe="tiny"):
 
 
 def render_set(out, count=4, first=0, executor=SerialExecutor, shards=False, **job_values):
-    """Renders a set. Returns the results of its samples."""
+    """Renders a dataset. Returns the results of its samples."""
     results = []
     job = make_job(out, **job_values)
     build(
@@ -29,17 +29,17 @@ def render_set(out, count=4, first=0, executor=SerialExecutor, shards=False, **j
 
 
 def statuses(results):
-    """Sample index -> status."""
+    """Returns the status of each sample by its index."""
     return {result.index: result.status for result in results}
 
 
 def names(folder):
-    """The names of the files and folders in a folder."""
+    """Returns the names of the files and folders in a folder."""
     return {path.name for path in folder.iterdir()}
 
 
 def hashes(out):
-    """The sha256 of every file by its path."""
+    """Returns the sha256 of every file by its path."""
     return {
         str(path.relative_to(out)): hashlib.sha256(path.read_bytes()).hexdigest()
         for path in sorted(out.rglob("*"))

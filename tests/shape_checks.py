@@ -1,8 +1,8 @@
 """Checks array shapes against the jaxtyping annotations at run time, in all tests.
 
 brewster imports jaxtyping only for type checkers (`if TYPE_CHECKING`), so that users need not install it. This import hook
-executes those imports, and jaxtyping's loader makes beartype check each call. Only arrays are checked: functions validate
-other values themselves, and tests of their own check that.
+executes those imports, and jaxtyping's loader makes beartype check each call. Only arrays are checked. Functions validate
+other values themselves, and separate tests check this validation.
 """
 
 import sys

@@ -136,7 +136,7 @@ def test_another_file_of_the_same_name_is_refused(folder, rng):
     correct, wrong = hashlib.sha256(data).hexdigest(), hashlib.sha256(b"").hexdigest()
     assets = Assets([folder])
     assets.map_radiance(EnvironmentMap(source=AssetSource(file="sky.hdr", sha256=correct)))
-    with pytest.raises(RecipeError, match="not the file that the scene was drawn with") as error:
+    with pytest.raises(RecipeError, match="not the file with which the scene was drawn") as error:
         assets.map_radiance(
             EnvironmentMap(source=AssetSource(file="sky.hdr", sha256=wrong))
         )  # the cached map of the other file is not used
@@ -195,7 +195,7 @@ def test_an_ordinary_photo_saved_as_a_map_is_refused(folder, rng):
     encoded[:4] = 1
     with pytest.raises(UnsupportedPhoto, match="clipped") as error:
         map_radiance(folder, "photo.hdr", hdr_of(to_linear(encoded)))
-    check_message(error, "photo.hdr", "use it as a picture")
+    check_message(error, "photo.hdr", "use the image as a picture")
 
 
 def test_a_map_with_one_sun_is_not_clipped(folder, rng):

@@ -51,7 +51,7 @@ def random_image(shape=(3, 40, 56), low=0.02, high=0.5):
 
 
 def exposed(light, developed, ev=None):
-    """Light with the recorded exposure and white balance, before clipping."""
+    """Returns light with the recorded exposure and white balance, before clipping."""
     gains = torch.tensor(developed.white_balance_gains).view(3, 1, 1)
     return light * gains * 2 ** (developed.exposure_ev if ev is None else ev)
 

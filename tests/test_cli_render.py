@@ -191,7 +191,7 @@ def test_a_killed_and_restarted_run_gives_the_same_set_as_an_undisturbed_one(
         time.sleep(0.01)
     code, _, err = run_without_model("render", "set", *command, "--workers", 0)
     assert (code, len(error_lines(err))) == (1, 1)
-    assert "another run is writing in" in err
+    assert "another run is writing to" in err
     run.kill()
     run.communicate()
     assert 4 <= len(list(tmp_path.glob("set/0*"))) < 20

@@ -73,7 +73,7 @@ def test_the_full_size_check_runs_on_tiny_models(tmp_path, monkeypatch, capsys):
     output = rows_by_first_cell(capsys.readouterr().out)
     rows = json.loads((tmp_path / "full_size.json").read_text())["rows"]
     assert [(row["backbone"], row["quantization"]) for row in rows] == [("kontext", "int8"), ("klein", None)]
-    assert all(row["step_s"] > 0 and row["picture_s"] > 0 and row["fits"] for row in rows)
+    assert all(row["step_s"] > 0 and row["photo_s"] > 0 and row["fits"] for row in rows)
     assert output["measured or estimated"] == ["tiny version, not full size"] * 2
     assert rows_by_first_cell((tmp_path / "full_size.md").read_text()) == output
 

@@ -1,4 +1,4 @@
-"""Rendering a set: resume, growth, shards, refused folders, and equal bytes in all cases."""
+"""Rendering a dataset: resume, growth, shards, refused folders, and equal bytes in all cases."""
 
 import errno
 import fcntl
@@ -222,7 +222,7 @@ def test_a_damaged_record_is_reported(four_samples, tmp_path):
 
 def test_a_folder_of_something_else_is_refused(tmp_path):
     (tmp_path / "holiday.jpg").touch()
-    with pytest.raises(OutputError, match=r"holiday\.jpg, but no set"):
+    with pytest.raises(OutputError, match=r"holiday\.jpg, but no rendered dataset"):
         render_set(tmp_path)
     with pytest.raises(OutputError, match="cannot be written to"):
         render_set(tmp_path / "holiday.jpg")
@@ -261,7 +261,7 @@ def test_a_file_system_without_locks_is_reported(four_samples, monkeypatch, numb
 
 
 def test_a_schedule_plans_one_block_at_a_time(tmp_path):
-    """So a set of a billion samples needs no more memory than a small one."""
+    """The memory of the schedule does not depend on the number of samples."""
     schedule = job_module._Schedule(tmp_path, range(10**9), 4, shards=True, report=lambda _: None)
     tasks = [schedule.next() for _ in range(3)]
     assert [task.indices for task in tasks] == [(0, 1, 2, 3), (4, 5, 6, 7), (8, 9, 10, 11)]

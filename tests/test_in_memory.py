@@ -1,4 +1,4 @@
-"""The Python API: arrays, PIL images, open files, notebooks, many photos, and models of one's own."""
+"""The Python API: arrays, PIL images, open files, notebooks, many photos, and models of the user."""
 
 import io
 import sys
@@ -162,7 +162,7 @@ def test_many_photos_need_a_thread_and_a_wrong_type_is_raised():
     assert list(SEPARATOR.many([])) == []
 
 
-# --- models of one's own
+# --- models of the user
 
 
 @pytest.mark.parametrize(

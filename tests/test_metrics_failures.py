@@ -97,7 +97,7 @@ def test_a_third_of_the_pixels_at_half_their_light_does_not_change_the_gain(scen
 
 
 def scene_with_share(share):
-    """Background, photo and reflection; in the right half, this share of the photo's light is reflection."""
+    """Returns background, photo and reflection. In the right half, this share of the photo's light is reflection."""
     background_light = np.full((SIDE, SIDE, 3), 0.3)
     reflection_light = np.zeros_like(background_light)
     reflection_light[:, SIDE // 2 :] = 0.3 * share / (1 - share)
@@ -193,7 +193,7 @@ def test_images_of_different_shapes_are_refused(scene, score):
 
 
 @given(images, images, images, images, st.integers(0, 16), st.sampled_from(SCORES))
-def test_scores_are_shares_whatever_the_pictures(
+def test_scores_are_between_zero_and_one_for_any_images(
     prediction, background, photo, reflection, unreflected, score
 ):
     reflection = reflection.copy()

@@ -147,7 +147,7 @@ def test_features_are_of_unit_length(metric):
         (256, 3, 5),
         (256, 3, 5),
     ]
-    assert found.size == (64, 96)
+    assert found.shape == (64, 96)
     for activations in found.maps:
         lengths = activations.norm(dim=0)
         assert ((lengths - 1).abs() < 1e-5).logical_or(lengths == 0).all()

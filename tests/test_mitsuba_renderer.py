@@ -59,7 +59,7 @@ def render_image(scene, side, glass_mode, samples=64):
     mitsuba = variant.load()
     with renderer._active_variant(mitsuba, variant.probe().variant):
         mi_scene = MitsubaSceneBuilder(mitsuba, scene, SyntheticAssets()).scene_dict(
-            behind=side == "behind", glass_mode=glass_mode
+            lit_from_behind=side == "behind", glass_mode=glass_mode
         )
         return np.array(mitsuba.render(mitsuba.load_dict(mi_scene), spp=samples))
 
@@ -125,7 +125,7 @@ def test_s_and_p_light_each_follow_the_closed_form(requires_llvm, mitsuba):
     with renderer._active_variant(mitsuba, renderer._variant(polarised=True)):
         mi_scene = MitsubaSceneBuilder(
             mitsuba, a_scene(camera=camera), SyntheticAssets(), channel=0
-        ).scene_dict(behind=False, glass_mode="full")
+        ).scene_dict(lit_from_behind=False, glass_mode="full")
         mi_scene["integrator"] = {"type": "stokes", "nested": mi_scene["integrator"]}
         stokes = np.array(mitsuba.render(mitsuba.load_dict(mi_scene), spp=4096)).mean((0, 1))
     intensity, difference = stokes[1], abs(stokes[4])
@@ -189,7 +189,7 @@ def test_a_map_emits_the_light_of_its_texels_on_its_own_side_only(
     with renderer._active_variant(mitsuba, variant.COMPILED):
         mi_scene = mitsuba.load_dict(
             MitsubaSceneBuilder(mitsuba, scene, SyntheticAssets()).scene_dict(
-                behind=behind, glass_mode="none"
+                lit_from_behind=behind, glass_mode="none"
             )
         )
         intersection = mi_scene.ray_intersect(

@@ -22,7 +22,7 @@ def opened(data):
 
 
 def composite(data):
-    """The image that an editor shows: the layers of stack.xml from bottom to top, svg:plus adds the stored values."""
+    """Returns the image that an editor shows: the layers of stack.xml from bottom to top. svg:plus adds the stored values."""
     archive = opened(data)
     image = ElementTree.fromstring(archive.read("stack.xml"))
     canvas = 0

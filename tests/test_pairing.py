@@ -162,7 +162,7 @@ def test_a_split_is_the_folder_itself_or_the_only_one_in_it(tmp_path):
     repacked(tmp_path / "test", ["a"])
     with pytest.raises(
         PhotoError,
-        match=r"has pairs in the subfolders test and val; .*; give the path of one, for example .*test",
+        match=r"has pairs in the subfolders test and val; .*; give the path of one subfolder, for example .*test",
     ):
         find_split(tmp_path)
 

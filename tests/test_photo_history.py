@@ -1,4 +1,4 @@
-"""The metadata of a layer say which program made it, and with which options; all other metadata stay."""
+"""The metadata of a layer contain the program that created it, and its options. All other metadata are unchanged."""
 
 import struct
 import xml.etree.ElementTree as ET

@@ -100,7 +100,7 @@ def test_an_exr_without_layers_is_refused(rng):
 
 
 def test_attributes_that_exr_would_drop_are_refused(rng):
-    with pytest.raises(UnsupportedPhoto, match="named version"):
+    with pytest.raises(UnsupportedPhoto, match="have the names version"):
         write_exr_layers(random_layers(rng), {**HEADER, "version": "0.1.0"})
 
 

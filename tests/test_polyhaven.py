@@ -29,13 +29,13 @@ SIZE = 100_000
 
 @pytest.fixture(autouse=True)
 def _network_off(monkeypatch):
-    """Allows connections to this machine only. Other tests may not connect at all."""
+    """Allows connections to this machine only. In other tests, no connection is allowed."""
     loopback_only(monkeypatch)
 
 
 @pytest.fixture(autouse=True)
 def retry_delays(monkeypatch):
-    """The delays in seconds before retries, which are recorded and not slept."""
+    """The delays before retries in seconds. They are recorded, and the test does not wait."""
     delays = []
     monkeypatch.setattr(polyhaven, "sleep", delays.append)
     return delays

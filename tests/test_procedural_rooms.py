@@ -117,9 +117,11 @@ def test_directions_follow_the_convention_of_maps():
 
 
 def test_a_quad_is_at_its_position_and_covers_its_solid_angle():
-    """A unit square, 1 m ahead of the viewer at +x, is 1/6 of a cube that surrounds it when it is 2 m wide."""
+    """A square of 2 m x 2 m at a distance of 1 m is a face of a cube around the viewer: 1/6 of all directions."""
     canvas = Canvas(2, 2, 8, (0.5, 0.5, 0.5))
-    canvas.rect((1, 0, 1, 2), (1.0, 1.0, 1.0))  # its right half: towards +z for who looks at +x
+    canvas.rect(
+        (1, 0, 1, 2), (1.0, 1.0, 1.0)
+    )  # the right half, which is towards +z if the viewer looks at +x
     quad = Quad(
         canvas,
         vector(1, 1, -1),

@@ -1,4 +1,4 @@
-"""Rendering on a Ray cluster, also if a node is lost. It runs in processes of its own, because tests may not connect."""
+"""Rendering on a Ray cluster, also if a node is lost. Ray runs in separate processes, as tests may open no connections."""
 
 import os
 import socket

@@ -99,7 +99,10 @@ def test_the_path_of_a_scene_recipe_is_relative_to_the_recipe(tmp_path):
     [
         (("seed = 1", "seed ="), "not TOML"),
         (("# A short run", "# Un test complété"), "not TOML .*utf-8"),
-        (("seed = 1", ""), "seed is missing; expected an integer, at least 0, below 4294967296; add it"),
+        (
+            ("seed = 1", ""),
+            "seed is missing; expected an integer, at least 0, below 4294967296; add this key",
+        ),
         (("seed = 1", "seed = -1"), "seed"),
         (("steps = 6", "steps = 0"), "steps"),
         (

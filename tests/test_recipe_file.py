@@ -44,7 +44,7 @@ map_probabilty = 0.5
 contrast = [0, 1]
 """
     assert problems(text) == [
-        "mine.toml: about is missing; expected a string; add it.",
+        "mine.toml: about is missing; expected a string; add this key.",
         "mine.toml: samples_per_pixel is 0; expected an integer, above 0; compare with docs/recipes.md.",
         "mine.toml: glass.double_probability is 2; expected a number, from 0 to 1; compare with docs/recipes.md.",
         (

@@ -319,7 +319,7 @@ def test_a_dangling_link_is_excluded_and_named(tmp_path):
 # --- remarks
 
 
-def test_an_unexpected_number_of_pictures_is_a_remark(tmp_path):
+def test_an_unexpected_number_of_images_is_a_remark(tmp_path):
     assert only("real20", repacked(tmp_path / "r", ["a"])).remarks == ("found 1 image, expected 20",)
     wild = only("wildscene", wildscene(tmp_path / "w", 56))
     assert wild.remarks == ("found 56 images, expected 101 or 55",)
@@ -347,7 +347,7 @@ def test_an_empty_or_missing_folder_or_a_file_is_an_error_in_three_parts(tmp_pat
 
 def test_a_damaged_shard_is_an_error(tmp_path):
     write(tmp_path, "shard-000000.tar", data=b"no tar" * 200)
-    with pytest.raises(PhotoError, match=r"is not a rendered set \(.*\); .*; "):
+    with pytest.raises(PhotoError, match=r"is not a rendered dataset \(.*\); .*; "):
         read_benchmark("rendered", tmp_path)
 
 
@@ -380,7 +380,10 @@ def test_a_file_that_is_missing_or_too_short_is_an_error_in_three_parts(tmp_path
     for file, why in (
         (ImageFile(tmp_path / "b.png"), "b.png cannot be read .No such file"),
         (ImageFile(tmp_path), "cannot be read .Is a directory"),
-        (ImageFile(tmp_path / "a.png", (len(picture()) - 2, 5)), "cannot be read .2 of 5 bytes are left"),
+        (
+            ImageFile(tmp_path / "a.png", (len(picture()) - 2, 5)),
+            "cannot be read .the file has only 2 of 5 bytes",
+        ),
     ):
         with pytest.raises(UnreadablePhoto, match=f"{why}.*; .*; .*"):
             file.read()
@@ -429,7 +432,10 @@ def test_a_repacked_set_whose_names_identify_the_scenes_can_be_drawn(tmp_path):
 def test_a_repacked_set_whose_names_do_not_identify_the_scenes_cannot_be_drawn(tmp_path, name, stems):
     read = only(name, repacked(tmp_path, stems))
     assert [case.scene for case in read.cases] == names(read.cases)
-    assert "the file names do not identify the scenes, so the paper's draw is not possible" in read.remarks
+    assert (
+        "the file names do not identify the scenes, so the paper's draw of one case per scene is not possible"
+        in read.remarks
+    )
     with pytest.raises(PhotoError, match=r"do not identify the scenes of SIR2 .*; .*; .*"):
         paper_draw(read)
 

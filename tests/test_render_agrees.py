@@ -26,7 +26,9 @@ def traced_layers():
     seeds = [SCENE.model_copy(update={"seed": seed}) for seed in range(RUNS)]
     with (
         pytest.MonkeyPatch.context() as patch,
-        warnings.catch_warnings(action="ignore", category=RuntimeWarning),  # about LLVM, which is not needed
+        warnings.catch_warnings(
+            action="ignore", category=RuntimeWarning
+        ),  # the warning about LLVM, which this test does not need
     ):
         patch.setattr(renderer, "_variant", lambda polarised: "scalar_rgb")
         try:

@@ -96,7 +96,7 @@ def test_no_texel_of_a_map_spans_more_pixels_than_the_recipe_allows(fifty, recip
 
 
 def test_a_picture_behind_the_glass_fills_the_view():
-    """Whatever its shape, without and through the glass: no pixel is black."""
+    """No pixel is black, for a picture of any shape, with and without the glass."""
     recipe = changed(
         "vitrine",
         camera={"width": 24, "height": 16, "pinhole_probability": 1.0},
@@ -134,7 +134,7 @@ def test_categories_are_respected_and_a_map_without_one_fits_everywhere():
 
 
 def test_a_recipe_of_pictures_needs_pictures():
-    with pytest.raises(RecipeError, match="there are no pictures to draw from"):
+    with pytest.raises(RecipeError, match="the catalog has no pictures"):
         drawn("vitrine", 0, catalog=Catalog(maps=BUILTIN_CATALOG.maps))
 
 
@@ -167,7 +167,7 @@ def test_an_impossible_recipe_names_the_reason(camera, says):
 
 
 @pytest.mark.parametrize("share", [0, 1])
-def test_panes_pinholes_and_focus_come_as_often_as_their_probabilities_say(share):
+def test_panes_pinholes_and_focus_have_the_frequency_of_their_probabilities(share):
     recipe = changed(
         "window",
         glass={"double_probability": share},
@@ -178,14 +178,16 @@ def test_panes_pinholes_and_focus_come_as_often_as_their_probabilities_say(share
     scenes = [drawn(recipe, index) for index in range(12)]
     assert {len(scene.glass.panes) for scene in scenes} == {1 + share}
     assert {scene.camera.aperture_mm == 0 for scene in scenes} == {bool(share)}
-    assert {scene.camera.focus_mm < 1e6 for scene in scenes} == {bool(share)}  # behind, all is far
+    assert {scene.camera.focus_mm < 1e6 for scene in scenes} == {
+        bool(share)
+    }  # content behind the glass is far
 
 
 def test_a_logarithmic_range_has_its_median_at_the_geometric_mean():
     recipe = changed("window", glass={"thickness_mm": (1.0, 100.0), "structural_probability": 0.0})
     thick = sorted(drawn(recipe, index).glass.panes[0].thickness_mm for index in range(101))
     assert 1 <= thick[0] <= thick[-1] <= 100
-    assert 4 < thick[50] < 25  # uniform, it would be 50
+    assert 4 < thick[50] < 25  # a uniform distribution has a median of 50
 
 
 PAPER = str(Path(__file__).parents[1] / "recipes" / "render" / "paper.toml")
@@ -199,8 +201,8 @@ def paper_scenes():
     return [draw(recipe, catalog, 10, index) for index in range(600)]
 
 
-def test_the_paper_recipe_draws_its_three_setups_in_their_shares(paper_scenes):
-    """HDR|HDR, HDR|LDR and LDR|HDR: exactly one kind of content on each side, and never two pictures."""
+def test_the_paper_recipe_draws_its_three_setups_with_their_frequencies(paper_scenes):
+    """The set-ups are HDR|HDR, HDR|LDR and LDR|HDR: one kind of content on each side, and never two pictures."""
 
     def kind(side):
         assert (side.map is None) != (side.plane is None)
@@ -232,9 +234,9 @@ def test_the_paper_recipe_has_the_glass_and_the_orders_of_the_paper(paper_scenes
     assert max(fields) > 85
 
 
-def test_setups_need_a_share_above_zero():
+def test_setups_need_a_weight_above_zero():
     values = read_scene_recipe(PAPER).model_dump(exclude_unset=True)
-    with pytest.raises(RecipeError, match="a share above 0 for at least one of the setups"):
+    with pytest.raises(RecipeError, match="a weight above 0 for at least one of the setups"):
         validated(SceneRecipe, values | {"setups": {"map|map": 0.0}}, source="x", reference="y")
     with pytest.raises(RecipeError, match="setups"):
         validated(SceneRecipe, values | {"setups": {"plane|plane": 1.0}}, source="x", reference="y")

@@ -27,7 +27,7 @@ def two_workers(create_runner):
 
 
 def start_blocking_run(out, count):
-    """Starts a run in a process of its own, with a worker that never finishes sample 2."""
+    """Starts a run in a separate process, with a worker that never finishes sample 2."""
     code = f"""
 from pathlib import Path
 from brewster.executors import ProcessExecutor
@@ -80,7 +80,7 @@ def test_a_sample_that_kills_every_worker_fails_and_the_others_are_rendered(tmp_
     monkeypatch.setattr(local, "MAX_ATTEMPTS", 1)
     results = render_set(tmp_path / "set", renderer="crashing", executor=partial(ProcessExecutor, count=1))
     assert statuses(results) == {0: "rendered", 1: "rendered", 2: "failed", 3: "rendered"}
-    assert "its worker died 1 times (exit code -9)" in next(
+    assert "the worker died 1 times (exit code -9)" in next(
         result.error for result in results if result.error
     )
 

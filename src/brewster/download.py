@@ -32,7 +32,7 @@ _T = TypeVar("_T")
 
 
 class RemoteFile(NamedTuple):
-    """A file to download: its URL, its size in bytes, and its expected digest in lower-case hexadecimal."""
+    """A file to download: its URL, its size in bytes, and its expected digest in lower-case hexadecimal digits."""
 
     url: str
     size: int
@@ -78,10 +78,13 @@ class Downloader:
         return self._with_retries(url, attempt)
 
     def fetch(self, remote: RemoteFile, target: Path) -> None:
-        """Downloads a file and creates its folder. The target is created only after the digest is verified.
+        """Downloads a file to the path `target` and creates its folder.
+
+        The file gets the name `target` only after its digest is verified.
 
         Raises:
-            DownloadError: all attempts fail, or the digest differs from the expected one.
+            DownloadError: the URL is invalid, the server refuses it, all attempts fail, or the digest is not the
+                expected one.
             OutputError: the folder cannot be written.
         """
         part = target.with_name(f"{target.name}.part")
@@ -112,7 +115,7 @@ class Downloader:
                 self.sleep(max(delay, error.wait_s))
 
     def _open(self, url: str, start: int = 0) -> HTTPResponse:
-        """Returns the open response. It begins at byte `start` if the server supports range requests."""
+        """Returns the open response. It starts at byte `start` if the server supports range requests."""
         headers = {"User-Agent": _user_agent()} | ({"Range": f"bytes={start}-"} if start else {})
         try:
             query = request.Request(url, headers=headers)  # noqa: S310  (the opener supports http and https only)
@@ -165,7 +168,7 @@ def file_digest(path: Path, algorithm: str) -> str:
 
 @contextmanager
 def output_errors(path: Path) -> Iterator[None]:
-    """Converts an OSError in the block to a OutputError about the downloaded file `path`."""
+    """Converts an OSError in the block to an OutputError about the downloaded file `path`."""
     try:
         yield
     except OSError as error:
@@ -177,7 +180,7 @@ def output_errors(path: Path) -> Iterator[None]:
 def _read(response: HTTPResponse, max_bytes: int | None = None) -> bytes:
     """Returns the whole body, or at most `max_bytes` bytes of it.
 
-    `read1` returns the bytes that are already received. So no received byte is lost if the connection breaks.
+    `read1` returns the bytes that are already received. Therefore no received byte is lost if the connection breaks.
     """
     try:
         return response.read() if max_bytes is None else response.read1(max_bytes)
@@ -187,7 +190,7 @@ def _read(response: HTTPResponse, max_bytes: int | None = None) -> bytes:
 
 @functools.cache
 def _opener() -> request.OpenerDirector:
-    """Returns an opener for http and https. It follows redirects. For other schemes, its `open` returns None."""
+    """Returns an opener for http and https that follows redirects. For other schemes, its `open` returns None."""
     opener = request.OpenerDirector()
     for handler in (
         request.ProxyHandler,

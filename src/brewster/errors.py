@@ -2,12 +2,12 @@
 
     BrewsterError              exit code 1 on the command line, a message without a traceback
     |-- PhotoError             a photo cannot be read, interpreted or written
-    |   |-- UnreadablePhoto    the file is not an image, is empty or is truncated
+    |   |-- UnreadablePhoto    the file does not exist, is not an image, is empty or is truncated
     |   |-- UnsupportedPhoto   an unsupported kind of image (five channels, animation, NaN)
     |   |-- PhotoTooLarge      the image has more pixels than the limit
     |   `-- MaskError          a mask cannot be read, or does not fit its photo
     |-- ManifestError          a list of photos is not a table of paths
-    |-- OutputError            an output file cannot be written, for example because it exists
+    |-- OutputError            an output file cannot be written, for example because it already exists
     |-- ModelError             a model is unknown, damaged, or has the wrong inputs
     |-- DeviceError            the requested device is not available
     |-- RecipeError            a recipe is not TOML, or its values are invalid
@@ -50,7 +50,7 @@ class PhotoError(BrewsterError):
 
 
 class UnreadablePhoto(PhotoError):
-    """The file is not a complete image: it is empty, truncated, or of another kind."""
+    """The file cannot be read: it does not exist, is not an image, is empty, or is truncated."""
 
 
 class UnsupportedPhoto(PhotoError):
@@ -66,11 +66,11 @@ class ManifestError(BrewsterError):
 
 
 class MaskError(PhotoError):
-    """A mask cannot be read, is not grey, or has another size than its photo."""
+    """A mask cannot be read, is not grey, or does not have the size of its photo."""
 
 
 class OutputError(BrewsterError):
-    """An output file cannot be written: it exists, is read-only, is the source, or the disk is full."""
+    """An output file cannot be written: it already exists, is read-only or is the input file, or the disk is full."""
 
 
 class ModelError(BrewsterError):
@@ -85,7 +85,7 @@ class RecipeError(BrewsterError):
     """A recipe is not TOML, or its values are missing, unknown or impossible.
 
     Attributes:
-        others: one error for each further problem of the same recipe. The message has a line for each.
+        others: one error for each further problem of the same recipe. The message has a line for each problem.
     """
 
     def __init__(self, happened: str, expected: str, cure: str, others: tuple[RecipeError, ...] = ()) -> None:

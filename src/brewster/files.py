@@ -24,7 +24,8 @@ from brewster.image_formats import FORMATS, VIDEO_SUFFIXES, format_of
 from brewster.remote_path import Location, RemotePath
 
 DEFAULT_MAX_PIXELS = 200_000_000
-"""The default limit. Larger images are refused before they are decoded: a small file can expand to a very large image."""
+"""The default for the maximum number of pixels. Larger images are refused before they are decoded, because a small file
+can expand to a very large image."""
 
 TEMPORARY_PREFIX = ".brewster-"
 """File name prefix of unfinished files."""
@@ -82,7 +83,10 @@ def images_in(source: Location, output_folder: Location | None = None) -> Iterat
 
 
 def name_layers(images: Iterable[tuple[Location, Location]]) -> list[SeparationPaths]:
-    """Returns the paths of images, each with the folder of its layers. Each image is included once. See `find`.
+    """Returns the paths of images and of their layers. An image that occurs several times is included once. See `find`.
+
+    Args:
+        images: pairs of an image and the folder of its layers, as `images_in` yields them.
 
     Raises:
         OutputError: the layers of two images would have the same path.
@@ -118,8 +122,8 @@ def write_atomically(
 ) -> None:
     """Writes a file atomically and creates its folder where needed.
 
-    The bytes are written to a hidden file in the same folder and flushed to the disk. Then the file is renamed. So
-    a full disk or Ctrl-C leaves no partial file. In an object store, the file is written with one upload.
+    The bytes are written to a hidden file in the same folder and flushed to the disk. Then the file is renamed.
+    Therefore a full disk or Ctrl-C leaves no partial file. In an object store, the file is written with one upload.
 
     Raises:
         OutputError: the file exists and `overwrite` is False, the file is the `source`, or it cannot be written.
@@ -140,7 +144,7 @@ def write_atomically(
 
 @contextlib.contextmanager
 def atomic_path(path: Path) -> Iterator[Path]:
-    """Yields a hidden path for a new file or folder, and renames it to `path` at the end of the block.
+    """Yields a hidden path for a new file or folder. At the end of the block, the file or folder is renamed to `path`.
 
     An existing file is replaced. If another process has created the folder in the meantime, that folder stays.
 
@@ -164,14 +168,14 @@ def atomic_path(path: Path) -> Iterator[Path]:
 
 @contextlib.contextmanager
 def _temporary(path: Path) -> Iterator[Path]:
-    """Yields a hidden path in the folder of `path` and deletes it afterwards."""
+    """Yields a hidden path in the folder of `path`. A file or folder that still has this path at the end is deleted."""
     part = temporary_path(path)
     try:
         try:
             yield part
         finally:
             discard(part)
-    except KeyboardInterrupt:  # it may have interrupted `discard`
+    except KeyboardInterrupt:  # the interrupt may have stopped `discard`
         discard(part)
         raise
 
@@ -241,7 +245,7 @@ def _walk(folder: Path, is_included: Callable[[Path], bool], visited: set[tuple[
         entries = sorted(folder.iterdir())
         status = folder.stat()
     except OSError:
-        yield folder  # opening it raises the error, and the rest of the batch continues
+        yield folder  # opening this path raises the error for this path only, and the rest of the batch continues
         return
     if (status.st_dev, status.st_ino) in visited:
         return
@@ -311,7 +315,7 @@ def _check_not_source(path: Location, source: Location | None) -> None:
 
 
 def is_same_file(path: Location, other: Location) -> bool:
-    """Whether both are one file. Links and hard links are followed.
+    """Whether both paths lead to the same file, through links or hard links, too.
 
     Raises:
         OSError: one of the files does not exist.
@@ -381,11 +385,13 @@ _DEFAULT_REMEDY = ("expected a writable file", "choose another folder with -o")
 def _output_error(path: Location, error: OSError) -> OutputError:
     expected, cure = _REMEDIES.get(error.errno or 0, _DEFAULT_REMEDY)
     if sys.platform == "win32" and len(_absolute(path)) >= _MAX_WINDOWS_PATH and error.errno == errno.ENOENT:
-        expected = f"expected a path of fewer than {_MAX_WINDOWS_PATH} characters, because Windows allows no longer ones by default"
+        expected = (
+            f"expected a path of fewer than {_MAX_WINDOWS_PATH} characters, the limit of Windows by default"
+        )
         cure = "choose a shorter folder with -o, or enable long paths in the settings of Windows"
     return OutputError(f"{path} was not written ({error.strerror or error})", expected, cure)
 
 
 def cache_folder() -> Path:
-    """Returns the folder for downloads: a folder in the cache folder of the user, as the operating system defines it."""
+    """Returns the folder for downloads. It is in the cache folder that the operating system defines for the user."""
     return platformdirs.user_cache_path("brewster", appauthor=False)

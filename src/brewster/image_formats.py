@@ -23,16 +23,16 @@ class ImageFormat:
     """File name suffixes in lower case. The first one is used for new files."""
     mime_type: str
     signature: bytes
-    """A regular expression for the first bytes of a file. Most RAW files begin like a TIFF, and are told by its tags."""
+    """A regular expression for the first bytes of a file. Most RAW files begin like a TIFF file; their tags identify them."""
     library: Literal["libvips", "OpenEXR", "pillow-heif", "rawpy", "built-in"] = "libvips"
     vips_loader: str | None = None
     vips_saver: str | None = None
     extra: str | None = None
     """The extra of brewster that installs the library, or None if the library is installed without an extra."""
     bit_depths: tuple[int, ...] = ()
-    """The bit depths per channel that can be written. Empty for a format that is only read, or only written with layers."""
+    """The bit depths per channel that can be written. Empty for formats that are only read, and for OpenRaster."""
     replacement: str = "png"
-    """The format of the layers, if this format is only read."""
+    """The format of the layers of a photo, if the format of the photo is only read."""
     has_float32: bool = False
     """Whether 32-bit floats are stored without loss. In HDR files the channels share an exponent, which loses precision."""
     is_linear: bool = False
@@ -177,7 +177,7 @@ SUFFIXES: Final = {suffix: row for row in _ROWS for suffix in row.suffixes}
 VIDEO_SUFFIXES: Final = frozenset(
     (".mp4", ".m4v", ".mov", ".avi", ".mkv", ".webm", ".mts", ".m2ts", ".mpg", ".3gp")
 )
-"""File name suffixes of videos, in lower case. brewster reads no videos, and names those that it skips."""
+"""File name suffixes of videos, in lower case. brewster cannot read videos. It reports those that it skips."""
 
 VIDEO_SIGNATURE: Final = (
     rb"....ftyp(isom|iso[2-9]|mp4[12]|avc1|qt  |M4V |3gp.|MSNV)|RIFF....AVI |\x1aE\xdf\xa3|\0\0\x01\xba"

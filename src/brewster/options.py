@@ -24,7 +24,7 @@ Quality = Literal["draft", "standard", "best"]
 Device = Literal["auto", "cuda", "rocm", "directml", "coreml", "cpu"]
 
 Quantization = Literal["int8", "float8", "nf4"]
-"""The number format of the weights of a large base model: int8 and float8 by torchao, nf4 (4 bits) by bitsandbytes."""
+"""The number format of the weights of a base model: int8 and float8 by torchao, nf4 (4 bits) by bitsandbytes."""
 
 DIFFUSION_OPTIONS: Final = ("base_model", "quantization", "steps", "ensemble_size", "no_guided_upsampling")
 """The options of diffusion models only."""
@@ -80,7 +80,9 @@ class Options:
     )
     format: FormatName | None = field(
         default=None,
-        metadata=_field_metadata("The file format of transmission and reflection, if not that of the photo."),
+        metadata=_field_metadata(
+            "The file format of the transmission and the reflection; by default, the format of the photo."
+        ),
     )
     model: str = field(
         default="compact",
@@ -102,13 +104,14 @@ class Options:
     quantization: Quantization | None = field(
         default=None,
         metadata=_field_metadata(
-            "For diffusion models: store the weights in 8 or 4 bits; by default, as in training, or as few as the GPU's memory requires."
+            "For diffusion models: store the weights in 8 or 4 bits; the default is the setting of the training, "
+            "or fewer bits if the GPU has too little memory for it."
         ),
     )
     steps: int | None = field(
         default=None,
         metadata=_field_metadata(
-            "For diffusion models: sampling steps for each prediction, by default 20, and 4 for a draft.",
+            "For diffusion models: sampling steps for each prediction; by default 20, or 4 if the quality is draft.",
             ge=1,
         ),
     )
@@ -119,7 +122,7 @@ class Options:
     no_guided_upsampling: bool = field(
         default=False,
         metadata=_field_metadata(
-            "For diffusion models: the transmission as it is generated, enlarged, without the photo's detail."
+            "For diffusion models: enlarge the generated transmission without adding fine detail from the photo."
         ),
     )
     max_pixels: int = field(

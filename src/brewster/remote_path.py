@@ -45,11 +45,11 @@ class RemotePath(PurePosixPath):
             return bytes(store.cat_file(str(self)))
         except FileNotFoundError as error:
             raise UnreadablePhoto(
-                f"{self} cannot be read (it does not exist)", "expected an image file", "check its name"
+                f"{self} cannot be read (it does not exist)", "expected an image file", "check the URL"
             ) from error
         except Exception as error:
             raise UnreadablePhoto(
-                f"{self} cannot be read ({_reason(error)})", "expected a store that answers", _RETRY
+                f"{self} cannot be read ({_reason(error)})", "expected a store that responds", _RETRY
             ) from error
 
     def write_bytes(self, data: bytes, *, overwrite: bool = False) -> None:
@@ -57,7 +57,7 @@ class RemotePath(PurePosixPath):
 
         Raises:
             FileExistsError: the file exists and `overwrite` is False.
-            OutputError: the store fails, or does not allow it.
+            OutputError: the store fails, or refuses the upload.
             MissingExtra: the package of the store is not installed.
         """
         store = self._store()
@@ -73,7 +73,7 @@ class RemotePath(PurePosixPath):
             ) from error
 
     def exists(self) -> bool:
-        """Whether the file exists. False if the store fails: then reading or writing the file raises the error."""
+        """Whether the file exists. False if the store fails: reading or writing the file then raises the error."""
         store = self._store()
         try:
             return bool(store.exists(str(self)))
@@ -81,15 +81,15 @@ class RemotePath(PurePosixPath):
             return False
 
     def unlink(self) -> None:
-        """Deletes the file. Ignores errors: this is for temporary files."""
+        """Deletes the file. Ignores errors, because only temporary files are deleted."""
         with contextlib.suppress(Exception):  # each store has its own errors
             self._store().rm_file(str(self))
 
     def rmdir(self) -> None:
-        """Does nothing: a folder in a store exists as long as it has files."""
+        """Does nothing, because a folder in a store exists only as long as it has files."""
 
     def iterdir(self) -> Iterator[RemotePath]:
-        """Yields the files and folders in this folder; none if there are none or the store fails."""
+        """Yields the files and folders in this folder. Yields nothing if the store fails."""
         store = self._store()
         try:
             names = store.ls(str(self), detail=False)
@@ -106,10 +106,10 @@ class RemotePath(PurePosixPath):
         store = self._store()
         try:
             found = store.find(str(self))
-            root = store._strip_protocol(str(self))  # of the names that `find` returns
+            root = store._strip_protocol(str(self))  # the prefix of all names that `find` returns
         except Exception as error:
             raise UnreadablePhoto(
-                f"{self} cannot be listed ({_reason(error)})", "expected a store that answers", _RETRY
+                f"{self} cannot be listed ({_reason(error)})", "expected a store that responds", _RETRY
             ) from error
         return sorted(self / str(name)[len(root) :].lstrip("/") for name in found)
 
@@ -133,7 +133,7 @@ def location(text: str | os.PathLike[str]) -> Location:
     if url.startswith("file:"):
         return Path(path_of_file_url(url))
     path = RemotePath(url)
-    path._store()  # raises the errors now, and not for every photo
+    path._store()  # raises the errors here once, instead of for every photo
     return path
 
 
@@ -153,7 +153,7 @@ def _store(protocol: str) -> Any:  # noqa: ANN401  (fsspec has no types)
         if error.name == "fsspec":
             raise MissingExtra(
                 "the package fsspec is not installed",
-                f"expected it, because {protocol}:// is an object store",
+                f"expected it to be installed, because it reads {protocol}:// URLs",
                 "run: pip install 'brewster[cluster]'",
             ) from error
         raise _missing_package(protocol, error) from error

@@ -16,9 +16,8 @@ REC709_LUMINANCE = (0.2126, 0.7152, 0.0722)
 def to_linear(encoded: Array) -> Array:
     """Converts sRGB-encoded values of any shape to linear light; 1.0 maps to 1.0."""
     dark = encoded <= 0.04045
-    safe = (
-        encoded * ~dark + dark
-    )  # 1 on the linear segment, so that the power gives no NaN and no infinite gradient
+    # `safe` is 1 on the linear segment, so that the power gives no NaN and no infinite gradient.
+    safe = encoded * ~dark + dark
     linear: Array = encoded / 12.92 * dark + ((safe + 0.055) / 1.055) ** 2.4 * ~dark
     return linear
 

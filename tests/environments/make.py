@@ -1,9 +1,9 @@
-"""Writes small reference images of the builtin environments and paintings, for test_environments.
+"""Writes small reference images of the built-in environments and paintings, for test_environments.
 
     .venv/bin/python tests/environments/make.py
 
-A set that was rendered from these environments can be rendered again only while they do not change. If you change
-them on purpose, run this, look at the images, and note in the changelog that such sets cannot be continued.
+A dataset that was rendered from these environments can be rendered again only if they do not change. If you change them on
+purpose, run this script, look at the images, and note in the changelog that such datasets cannot be continued.
 """
 
 from pathlib import Path

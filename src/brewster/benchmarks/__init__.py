@@ -1,1 +1,1 @@
-"""Public benchmarks of reflection removal: a registry of their folder layouts, and the pairing of files by name."""
+"""Public benchmarks of reflection removal: the registry of their folder layouts, and the pairing of files by name."""

@@ -3,9 +3,10 @@
 Files are paired by name only, never by their position in a sorted list. Two layouts are supported:
 
 - Pairs: one folder per role with equal file names: blended/a.png, transmission_layer/a.png.
-- The original folders of SIR2: one folder per shot, one letter in the file name per role: ab/3/ab-3-m-32.png, ab/3/ab-3-g-32.png.
+- The original folders of SIR2: one folder per shot. A letter in the file name denotes the role: ab/3/ab-3-m-32.png,
+  ab/3/ab-3-g-32.png.
 
-A name with one photo, one transmission and at most one reflection becomes a `ImageGroup`. Every other name is excluded,
+A name with one photo, one transmission and at most one reflection becomes an `ImageGroup`. Every other name is excluded,
 with a reason.
 """
 
@@ -27,14 +28,14 @@ ROLES: Final[dict[str, tuple[str, ...]]] = {
     "transmission": ("transmission_layer", "transmission", "gt", "ground_truth", "without_reflection", "t"),
     "reflection": ("reflection_layer", "reflection", "r"),
 }
-"""role -> accepted folder names, in lower case. The transmission is the ground truth of the photo."""
+"""The accepted folder names of each role, in lower case. The transmission is the ground truth of the photo."""
 
 SIR2_TREES: Final[dict[str, tuple[str, ...]]] = {
     "postcard": ("kind", "scene", "variant"),
     "solidobject": ("scene", "kind", "variant"),
     "wildscene": ("scene",),
 }
-"""subset of SIR2 -> the meaning of each folder level, from the folder of the subset to the folder of a shot."""
+"""For each subset of SIR2, the meaning of each folder level, from the folder of the subset to the folder of a shot."""
 
 _SPLIT_PREFIX: Final = re.compile(r"^(?:train|val|test)_\d+_", re.IGNORECASE)
 """The start of the folder names of OpenRR-5k, such as val_300_blended: a split and its number of images."""
@@ -44,7 +45,7 @@ _KINDS: Final = ("focus", "thick")
 
 _ROLE_LETTERS: Final = {"m": "photo", "g": "transmission", "r": "reflection"}
 _ROLE_LETTER: Final = re.compile(r"(?<![^\W_])[mgr](?![^\W_])", re.IGNORECASE)
-"""m, g or r as a separate word; "_" separates words too."""
+"""The letter m, g or r as a separate word. The character "_" also separates words."""
 
 _SYSTEM_FILES: Final = ("thumbs.db", "desktop.ini", "__macosx")
 
@@ -54,7 +55,10 @@ _FilesByRole = Mapping[str, list[Path]]
 @final
 @dataclass(frozen=True)
 class ImageGroup:
-    """The files of one name: photo, transmission (ground truth) and, if there is one, reflection. `scene` is "" if unknown."""
+    """The files with one name: photo, transmission (ground truth) and reflection (None if there is no such file).
+
+    `scene` is "" if the scene is unknown.
+    """
 
     name: str
     scene: str
@@ -68,7 +72,7 @@ class ImageGroup:
 class FolderListing:
     """The content of a folder. The groups are in natural order of their names (2 before 10).
 
-    `remarks` names the ignored files. `excluded` names the images without a unique partner, with the reason.
+    `remarks` lists the ignored files. `excluded` lists the images without a unique partner, with the reason.
     """
 
     groups: tuple[ImageGroup, ...] = ()
@@ -106,7 +110,7 @@ def list_folder(folder: Path) -> tuple[list[Path], list[Path]]:
 
 
 def find_roles(folder: Path) -> dict[str, Path]:
-    """Returns role -> subfolder. A subfolder has a role if its name is in ROLES.
+    """Returns the subfolder of each role. A subfolder has a role if its name is in ROLES.
 
     Raises:
         PhotoError: the folder cannot be read, or has two subfolders for one role.
@@ -116,7 +120,7 @@ def find_roles(folder: Path) -> dict[str, Path]:
 
 
 def find_numbered_splits(folder: Path) -> dict[str, dict[str, Path]]:
-    """Returns split -> role -> subfolder for names such as val_300_blended; the split is then "val_300".
+    """Returns the subfolders by split and role, for names such as val_300_blended. The split of this name is "val_300".
 
     Raises:
         PhotoError: the folder cannot be read.
@@ -153,7 +157,7 @@ def find_split(folder: Path) -> Path:
         raise PhotoError(
             f"{folder} has pairs in the subfolders {join_names([path.name for path in splits])}",
             "expected one subfolder with pairs",
-            f"give the path of one, for example {splits[0]}",
+            f"give the path of one subfolder, for example {splits[0]}",
         )
     return splits[0] if splits else folder
 
@@ -161,7 +165,7 @@ def find_split(folder: Path) -> Path:
 def read_folders(folder: Path, roles: Mapping[str, Path] | None = None) -> FolderListing:
     """Returns the groups of a folder with one subfolder per role. The file stems must be equal; suffixes may differ.
 
-    `roles` is role -> subfolder, as `find_roles` returns it by default.
+    `roles` has the subfolder of each role; by default, it is the result of `find_roles`.
 
     Raises:
         PhotoError: a folder is missing, empty or unreadable, or two folders have the same role.
@@ -202,7 +206,7 @@ def _role_files(folder: Path, role: str, roles: Mapping[str, Path]) -> tuple[lis
 
 
 def find_subsets(folder: Path) -> dict[str, Path]:
-    """Returns subset of SIR2 -> subfolder. Compares only the start of the name: "Postcard Dataset" is "postcard".
+    """Returns the subfolder of each subset of SIR2. Only the start of the name is compared: "Postcard Dataset" is "postcard".
 
     Raises:
         PhotoError: the folder cannot be read, or has two subfolders for one subset.
@@ -213,7 +217,7 @@ def find_subsets(folder: Path) -> dict[str, Path]:
 def read_tree(folder: Path, subset: str) -> FolderListing:
     """Returns the groups of a subset of SIR2. Its folders have one subfolder per shot.
 
-    Files of a shot belong together if their names are equal without the letter of the role.
+    Files of a shot are grouped if their names, without the letter of the role, are equal.
 
     Raises:
         PhotoError: a folder cannot be read, or there is no shot.
@@ -238,7 +242,7 @@ def _read_branches(
 ) -> Iterator[FolderListing]:
     """Yields a listing of each shot below `folder`, and remarks about the other files.
 
-    `levels` are the levels that remain below `folder`, `labels` the folder names of the levels above.
+    `levels` are the folder levels below `folder`. `labels` has the folder name of each level above.
     """
     if not levels:
         yield _read_shot(root, folder, labels)
@@ -271,7 +275,7 @@ def _without_letter(stem: str) -> str:
 
 
 def _exclude_duplicates(root: Path, listing: FolderListing) -> FolderListing:
-    """Excludes all groups whose name is not unique. The folders Focus and focus, for example, give equal names."""
+    """Excludes all groups whose name is not unique. For example, the folders Focus and focus give equal names."""
     counts = Counter(group.name for group in listing.groups)
     duplicates = tuple(
         f"{_relative(root, group.photo)} is ambiguous: another photo has the same name, {group.name}"
@@ -308,14 +312,14 @@ def _exclusion_reason(root: Path, files: _FilesByRole) -> str:
 
 
 def image_files(folder: Path) -> tuple[list[Path], list[Path]]:
-    """Returns the image files in a folder, in natural order, and everything else in it."""
+    """Returns the image files in a folder, in natural order, and all other files and folders in it."""
     folders, files = list_folder(folder)
     images = [path for path in files if path.suffix.lower() in SUFFIXES]
     return images, [*folders, *(path for path in files if path.suffix.lower() not in SUFFIXES)]
 
 
 def _find_subfolders(folder: Path, key_of: Callable[[str], str]) -> dict[str, Path]:
-    """Returns key -> subfolder. `key_of` maps the name of a subfolder to its key, or to "" if it has none."""
+    """Returns the subfolder of each key. `key_of` returns the key of a subfolder's name, or "" if there is no key."""
     found: dict[str, Path] = {}
     for path in list_folder(folder)[0]:
         key = key_of(path.name)
@@ -323,7 +327,7 @@ def _find_subfolders(folder: Path, key_of: Callable[[str], str]) -> dict[str, Pa
             raise PhotoError(
                 f"{folder} has two subfolders for {key}, {found[key].name} and {path.name}",
                 f"expected one subfolder for {key}",
-                "move or rename one of them",
+                "move or rename one of the two",
             )
     return found
 
@@ -352,6 +356,6 @@ def _relative(root: Path, path: Path) -> str:
 
 
 def join_names(names: Sequence[str], last: str = " and ") -> str:
-    """Returns the names as text: "a, b and c". With ten names or more: the first five and the number of the others."""
+    """Returns the names as text: "a, b and c". Of ten names or more, only the first five and the number of the rest."""
     shown = [*names] if len(names) < 10 else [*names[:5], f"{len(names) - 5} more"]
     return last.join(([", ".join(shown[:-1])] if len(shown) > 1 else []) + shown[-1:])

@@ -1,9 +1,9 @@
-"""Reads public benchmarks from the user's own copies. Pairs each photo with its ground truth by file name.
+"""Reads public benchmarks from folders that the user has downloaded. Pairs each photo with its ground truth by file name.
 
-for benchmark in read_benchmark("sir2", Path("SIR2")):
-    print(benchmark.title, len(benchmark.cases), *benchmark.remarks, *benchmark.excluded)
+    for benchmark in read_benchmark("sir2", Path("SIR2")):
+        print(benchmark.title, len(benchmark.cases), *benchmark.remarks, *benchmark.excluded)
 
-The module `pairing` groups the files by name. This module makes a `Case` of each group, compares the image sizes in the
+The module `pairing` groups the files by name. This module creates a `Case` for each group, compares the image sizes in the
 file headers, and checks the number of cases. `excluded` lists the files that cannot be used.
 """
 
@@ -37,13 +37,16 @@ from brewster.photo import read_size
 
 _RENDERED_FILES: Final = ("photo.jpg", "background.jpg", "reflection.jpg")
 _MAX_SCENES: Final = 20
-"""Postcard and SolidObject have 20 scenes each. If a pattern finds more, the names do not identify the scenes."""
+"""Postcard and SolidObject have 20 scenes each. If a pattern finds more scenes, the names do not identify the scenes."""
 
 
 @final
 @dataclass(frozen=True)
 class ImageFile:
-    """The location of an encoded image: a whole file, or `span`, the (offset, length) in bytes within a tar shard."""
+    """The location of an encoded image: a whole file, or a part of a tar shard.
+
+    `span` is the (offset, length) of the part in bytes, or None for a whole file.
+    """
 
     path: Path
     span: tuple[int, int] | None = None
@@ -72,7 +75,7 @@ class ImageFile:
             file.seek(offset)
             data = file.read(length)
         if len(data) < length:
-            raise OSError(f"{len(data)} of {length} bytes are left")
+            raise OSError(f"the file has only {len(data)} of {length} bytes")
         return data
 
 
@@ -81,11 +84,12 @@ class ImageFile:
 class Case:
     """A photo to separate, with its ground truth.
 
-    `name` is unique within the benchmark. Reports and folders of predictions use it. Cases with the same `scene` show the
-    same objects, so they are not statistically independent. `scene` equals `name` if the scene is unknown. `relative_path`
-    is the photo's path relative to the benchmark folder, without the suffix and with forward slashes. `ground_truth` is
-    the ground truth of the transmission, `reflection` that of the reflection. If `rendered` is true, both are exact:
-    `ground_truth` is the background without the glass, and `reflection` is the light that the glass adds.
+    `name` is unique within the benchmark. It is used in reports and in folders of predictions. Cases with the same `scene`
+    show the same objects, so they are not statistically independent. `scene` equals `name` if the scene is unknown.
+    `relative_path` is the photo's path relative to the benchmark folder, without the suffix and with forward slashes.
+    `ground_truth` is the ground truth of the transmission, and `reflection` is the ground truth of the reflection. If
+    `rendered` is True, both are exact: `ground_truth` is the background without the glass, and `reflection` is the light
+    that the glass adds.
     """
 
     benchmark: str
@@ -120,8 +124,8 @@ class Benchmark:
 class BenchmarkLayout:
     """A row of BENCHMARKS: title ("" means the name of the folder), counts that papers report, and reader.
 
-    `scene_pattern` is a regular expression. It matches the start of a file name that identifies the scene. It is set for
-    the benchmarks from which the paper draws one case per scene.
+    `scene_pattern` is a regular expression that matches the part of a file name that identifies the scene. It is set only
+    for the benchmarks from which the paper draws one case per scene.
     """
 
     title: str
@@ -135,11 +139,11 @@ def read_benchmark(name: str, folder: Path) -> list[Benchmark]:
 
     Returns:
         A list with one benchmark. For "sir2", a list with one benchmark for each of the three subsets in the folder.
-        If the copy is incomplete, `remarks` and `excluded` say what is missing.
+        If the copy is incomplete, `remarks` and `excluded` list the missing files.
 
     Raises:
         PhotoError: the name is not in BENCHMARKS, or the folder is missing or empty, or its layout is not supported.
-        MissingExtra: the extra for rendered sets or for the image format is not installed.
+        MissingExtra: the extra for rendered datasets or for the image format is not installed.
     """
     if name not in BENCHMARKS:
         close = difflib.get_close_matches(name.lower(), BENCHMARKS, 1)
@@ -205,7 +209,7 @@ def _read_rendered(name: str, folder: Path) -> list[Benchmark]:
 
 
 def _rendered_samples(folder: Path) -> list[tuple[str, list[ImageFile]]]:
-    """Returns the name and the existing files of each sample of a rendered set."""
+    """Returns the name and the existing files of each sample of a rendered dataset."""
     try:
         from brewster.rendered.store import key, read_set  # noqa: PLC0415  (needs torch, an optional dependency)
 
@@ -213,13 +217,13 @@ def _rendered_samples(folder: Path) -> list[tuple[str, list[ImageFile]]]:
     except ImportError as error:
         raise MissingExtra(
             "torch is not installed",
-            "expected torch, which reads rendered sets",
+            "expected torch, which brewster needs to read rendered datasets",
             "run: pip install 'brewster[render]'",
         ) from error
     except (OSError, tarfile.TarError, ValueError) as error:
-        raise _not_a_rendered_set(folder, str(error)) from error
+        raise _not_a_rendered_dataset(folder, str(error)) from error
     if not entries:
-        raise _not_a_rendered_set(folder, "it has no samples")
+        raise _not_a_rendered_dataset(folder, "it has no samples")
     return [
         (
             key(entry.index),
@@ -234,9 +238,9 @@ def _rendered_samples(folder: Path) -> list[tuple[str, list[ImageFile]]]:
     ]
 
 
-def _not_a_rendered_set(folder: Path, reason: str) -> PhotoError:
+def _not_a_rendered_dataset(folder: Path, reason: str) -> PhotoError:
     return PhotoError(
-        f"{folder} is not a rendered set ({reason})",
+        f"{folder} is not a rendered dataset ({reason})",
         "expected the folders 000000, 000001 ... or files such as shard-000000.tar",
         "give the path of an output folder of `brewster render`",
     )
@@ -270,7 +274,7 @@ def _to_case(benchmark_name: str, scene: str, group: ImageGroup, root: Path) -> 
 def _find_scenes(layout: BenchmarkLayout, groups: Sequence[ImageGroup]) -> tuple[list[str], list[str]]:
     """Returns the scene of each group, and remarks.
 
-    If one name does not identify a scene, all names are used as scenes.
+    If the scene of one name is unknown, the name of each group is used as its scene.
     """
     if not layout.scene_pattern or any(group.scene for group in groups):
         return [group.scene or group.name for group in groups], []
@@ -278,7 +282,7 @@ def _find_scenes(layout: BenchmarkLayout, groups: Sequence[ImageGroup]) -> tuple
     if len(matched) == len(groups) and len(set(matched)) <= _MAX_SCENES:
         return matched, []
     return [group.name for group in groups], [
-        "the file names do not identify the scenes, so the paper's draw is not possible"
+        "the file names do not identify the scenes, so the paper's draw of one case per scene is not possible"
     ]
 
 
@@ -322,7 +326,8 @@ def _missing_reflections(cases: Sequence[Case]) -> list[str]:
 def _benchmark_name(name: str, folder: Path) -> str:
     """Returns the name of the benchmark in results: `name` if its row has a title, else the name of the folder.
 
-    If the name of the folder is "average" or a name with a title, the result is "{name}-{folder}". So it is unique.
+    If the folder has the name "average" or the name of a benchmark with a title, the result is "{name}-{folder}", which
+    is unique.
     """
     if BENCHMARKS[name].title:
         return name
@@ -332,17 +337,17 @@ def _benchmark_name(name: str, folder: Path) -> str:
 
 
 def safe_name(text: str) -> str:
-    """Returns the text with each run of other characters than letters, digits, ".", "_" and "-" as one "-"."""
+    """Returns the text with "-" in place of each sequence of characters other than letters, digits, ".", "_" and "-"."""
     return re.sub(r"[^A-Za-z0-9_.-]+", "-", text).strip("-.")
 
 
 def folder_name(folder: Path) -> str:
-    """Returns the name of a folder, which may be given as "." or with a link, which is not resolved."""
+    """Returns the name of a folder, which may be given as ".". Links are not resolved."""
     return Path(os.path.abspath(folder)).name  # noqa: PTH100  (do not resolve links)
 
 
 def _unusable_reason(case: Case) -> str:
-    """Compares the sizes in the file headers. Returns the reason why the case cannot be scored, or "" if it can."""
+    """Compares the sizes in the file headers. Returns the reason why the case cannot be scored, or "" for a valid case."""
     files = {"photo": case.photo, "ground truth": case.ground_truth, "reflection": case.reflection}
     sizes: dict[str, tuple[int, int]] = {}
     for role, file in files.items():
@@ -378,4 +383,4 @@ BENCHMARKS: Final[dict[str, BenchmarkLayout]] = {
     "pairs": BenchmarkLayout("", (), _read_sets),
     "rendered": BenchmarkLayout("", (), _read_rendered),
 }
-"""name -> layout of the benchmarks that `read_benchmark` supports. docs/evaluation.md describes the folders."""
+"""The layouts of the benchmarks that `read_benchmark` supports, by name. docs/evaluation.md describes the folders."""

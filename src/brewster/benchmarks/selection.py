@@ -1,4 +1,4 @@
-"""The subset of a benchmark that the paper uses, and unique names for the benchmarks of a run."""
+"""The cases of a benchmark that the paper uses, and unique names for the benchmarks of a run."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def paper_draw(benchmark: Benchmark, seed: int = PAPER_SEED) -> tuple[Case, ...]
     therefore does not depend on the other scenes.
 
     Returns:
-        One random case of each scene of Postcard or SolidObject; all cases of any other benchmark.
+        One random case of each scene for Postcard and SolidObject, and all cases for any other benchmark.
 
     Raises:
         PhotoError: the file names do not identify the scenes.
@@ -46,11 +46,11 @@ def paper_draw(benchmark: Benchmark, seed: int = PAPER_SEED) -> tuple[Case, ...]
 
 
 def with_unique_names(benchmarks: Sequence[Benchmark], folders: Sequence[Path]) -> list[Benchmark]:
-    """Puts the name of the parent folder before names that occur twice, such as a/test and b/test.
+    """Adds the name of the parent folder to names that occur twice: the folders a/test and b/test become a-test and b-test.
 
     Args:
         benchmarks: the benchmarks of a run.
-        folders: the folder that each benchmark was read from.
+        folders: the folder of each benchmark.
     """
     counts = Counter(part.name for part in benchmarks)
     return [

@@ -25,12 +25,12 @@ Float32 = NDArray[np.float32]
 
 BUILTIN_HEIGHT = 512
 _MAX_CACHE_BYTES = 300_000_000
-_MAX_CLIPPED_SHARE = 0.002
+_MAX_CLIPPED_FRACTION = 0.002
 _LUMINANCE = np.array(REC709_LUMINANCE, np.float32)
 
 
 class Assets:
-    """Loads sources from the first folder that contains the exact file, with a cache of the most recently used ones."""
+    """Loads sources from the first folder that contains the exact file. The most recently used sources are cached."""
 
     def __init__(self, folders: Sequence[Path] = ()) -> None:
         self._folders = tuple(folders)
@@ -39,8 +39,8 @@ class Assets:
     def map_radiance(self, environment: EnvironmentMap) -> Float32:
         """Returns the radiance of a lat-long map, (H, 2 H, 3).
 
-        It is scaled to the mean luminance in the scene. The mean is computed with values clipped at ten times the mean,
-        so that lamps hardly count.
+        The map is scaled to the mean luminance in the scene. To compute the mean, values are clipped at ten times the mean
+        of the map, so that lamps have little weight.
 
         Raises:
             RecipeError: the file is missing, or has another sha256 than in the scene.
@@ -111,21 +111,21 @@ class Assets:
                 return data
         if paths:
             raise RecipeError(
-                f"{paths[0]} is not the file that the scene was drawn with",
+                f"{paths[0]} is not the file with which the scene was drawn",
                 f"expected the sha256 {source.sha256}",
                 "choose the folder of the original file",
             )
         searched = ", ".join(map(str, self._folders)) or "no folder"
         raise RecipeError(
             f"{source.file} was not found in {searched}",
-            "expected the file that the scene was drawn with",
+            "expected the file with which the scene was drawn",
             "choose its folder with --maps or --photos",
         )
 
 
 @contextmanager
 def naming_file(name: str) -> Iterator[None]:
-    """Adds the name of the file to the errors raised within this block, unless they contain it."""
+    """Adds the name of the file to errors raised within this block, unless the error contains the name."""
     try:
         yield
     except BrewsterError as error:
@@ -144,12 +144,14 @@ def read_bytes(path: Path) -> bytes:
         return path.read_bytes()
     except OSError as error:
         raise RecipeError(
-            f"{path} cannot be read ({error.strerror})", "expected an image file", "remove it from the folder"
+            f"{path} cannot be read ({error.strerror})",
+            "expected an image file",
+            "remove the file from the folder",
         ) from error
 
 
 def check_map(texels: Float32, name: str) -> Float32:
-    """Returns the map if it can light a scene.
+    """Returns the map, if it can light a scene.
 
     Raises:
         UnsupportedPhoto: the map is not 2:1, has values that are not finite, is black, or is clipped like an 8-bit image.
@@ -159,26 +161,26 @@ def check_map(texels: Float32, name: str) -> Float32:
         raise UnsupportedPhoto(
             f"{name} is {width} x {height}",
             "expected a lat-long map, twice as wide as high",
-            "convert it to a lat-long map",
+            "convert the image to a lat-long map",
         )
     brightest = texels.max()
     if not np.isfinite(texels).all() or brightest <= 0:
         raise UnsupportedPhoto(
             f"{name} is black, or has values that are not finite",
-            "expected finite radiance in every texel, above 0 in some",
+            "expected finite radiance in every texel, and radiance above 0 in at least one texel",
             "repair the map, or remove it",
         )
-    if (texels.max(axis=2) >= brightest).mean() > _MAX_CLIPPED_SHARE:
+    if (texels.max(axis=2) >= brightest).mean() > _MAX_CLIPPED_FRACTION:
         raise UnsupportedPhoto(
-            f"{name} is clipped: many texels have its maximum",
+            f"{name} is clipped: many texels have the maximum value",
             "expected the full dynamic range of the light",
-            "use it as a picture, or find its unclipped original",
+            "use the image as a picture, or use the unclipped original",
         )
     return texels
 
 
 def _mean_luminance(texels: Float32) -> np.float32:
-    """Mean luminance over the sphere of values clipped at ten times the mean, so that lamps hardly count."""
+    """Returns the mean luminance over the sphere. Values are clipped at ten times the mean, so lamps have little weight."""
     height = texels.shape[0]
     solid_angle = np.sin((np.arange(height) + 0.5) / height * np.pi)[:, None]
     luminance = np.maximum(texels, 0) @ _LUMINANCE

@@ -1,4 +1,4 @@
-"""Catalogs of environment maps and pictures for random scenes, from folders of files or built in."""
+"""Catalogs of environment maps and pictures for random scenes: from folders of files, or built in."""
 
 from __future__ import annotations
 
@@ -43,9 +43,10 @@ def read_catalog(
 ) -> tuple[Catalog, list[BrewsterError]]:
     """Lists the maps and pictures in folders.
 
-    Maps are decoded and validated. Only the headers of pictures are read: a picture with other damage raises an error
-    when it is used. A `manifest.csv` with the columns file and category contains the categories of maps. If there is no
-    folder for maps or for pictures, the built-in ones are listed. Files that match a pattern in `exclude` are skipped.
+    Maps are decoded and validated. Only the headers of pictures are read, so a picture with damaged pixels raises an error
+    only when it is used. A `manifest.csv` with the columns file and category contains the categories of maps. If no folder
+    of maps is given, the built-in maps are listed, and likewise for pictures. Files that match a pattern in `exclude` are
+    skipped.
 
     Returns: the catalog, and an error for each file that cannot be used.
 
@@ -120,5 +121,5 @@ def _read_categories(folder: Path) -> dict[str, str]:
         raise RecipeError(
             f"{folder / 'manifest.csv'} cannot be read ({error})",
             "expected a table with the columns file and category, in UTF-8",
-            "save it in UTF-8, or remove it",
+            "save the table in UTF-8, or remove it",
         ) from error

@@ -45,7 +45,7 @@ class DownloadRequest:
 @final
 @dataclass(frozen=True)
 class DownloadResult:
-    """The result for one asset. Status "missing": the asset has no file of the requested resolution and format."""
+    """The result for one asset. The status "missing" means that the asset has no file of the resolution and format."""
 
     asset: str
     category: str
@@ -58,7 +58,7 @@ class DownloadResult:
 
 
 class _Asset(NamedTuple):
-    """A map in the list of the server. Its id may be unsafe as a file name."""
+    """A map in the list of the server. The id is not checked: it may be unsafe as a file name."""
 
     id: str
     category: str
@@ -66,14 +66,14 @@ class _Asset(NamedTuple):
 
 
 def maps_folder() -> Path:
-    """The default folder for maps: brewster/maps in the cache folder of the user."""
+    """Returns the default folder for maps: brewster/maps in the cache folder of the user."""
     return cache_folder() / "maps"
 
 
 def pull(request: DownloadRequest, out: Path) -> Iterator[DownloadResult]:
     """Downloads maps into a folder, in the order of their ids, and lists them in its manifest.csv.
 
-    A map that exists already is skipped. An asset without a suitable file is replaced by the next one. A failed
+    A map that exists already is skipped. An asset without a suitable file is replaced by the next asset. A failed
     download is not replaced, so that the next call downloads the same maps.
 
     Yields: a result for each asset.
@@ -97,7 +97,7 @@ def pull(request: DownloadRequest, out: Path) -> Iterator[DownloadResult]:
                 cure = "see their errors, and run again to resume the downloads"
                 raise DownloadError(
                     f"{consecutive_failures} assets in a row failed",
-                    "expected at least one of them to succeed",
+                    "expected at least one successful download",
                     cure,
                 )
 
@@ -137,7 +137,7 @@ def _list_assets(request: DownloadRequest) -> list[_Asset]:
 
 
 def _category(record: object) -> str | None:
-    """Returns "indoor", "outdoor" or None. If a map has both categories, it counts as indoor.
+    """Returns "indoor", "outdoor" or None. For a map with both categories, the result is "indoor".
 
     Both `categories` and `attributes` are read, because the API will replace the first by the second.
     """

@@ -1,4 +1,4 @@
-"""Runs independent tasks in this process, in several processes, or on a Ray cluster. Knows nothing about the tasks."""
+"""Runs independent tasks of any kind in this process, in several processes, or on a Ray cluster."""
 
 from brewster.executors.local import (
     MAX_ATTEMPTS,

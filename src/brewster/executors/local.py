@@ -26,21 +26,21 @@ from brewster.errors import BrewsterError
 ResultT = TypeVar("ResultT")
 
 MAX_ATTEMPTS: Final = 3
-"""Maximum number of workers that may die at the same task. Then the task fails."""
+"""Maximum number of attempts for a task whose worker dies. After the last attempt, the task fails."""
 
 
 class Task(Protocol[ResultT]):
-    """One or more items of work that one worker does. It must be picklable."""
+    """One or more items that one worker processes. A task must be picklable."""
 
     def split(self) -> Sequence[Self]:
         """Returns a task for each item."""
 
     def failed_results(self, reason: str) -> list[ResultT]:
-        """Returns the results if no worker could finish the task."""
+        """Returns the results of a task that no worker could finish."""
 
 
 Runner = Callable[[Any], list[ResultT]]
-"""Runs a task and returns its results. A `BrewsterError` that it raises ends the run."""
+"""A function that runs a task and returns its results. If it raises a `BrewsterError`, the run ends."""
 
 
 class Executor(AbstractContextManager[Any], Protocol[ResultT]):
@@ -59,7 +59,7 @@ class Executor(AbstractContextManager[Any], Protocol[ResultT]):
         """Starts a task."""
 
     def wait(self) -> Sequence[ResultT]:
-        """Waits until a task ends. Returns the results of finished tasks; none if a task is tried again.
+        """Waits until a task ends. Returns the results of finished tasks. The list is empty if a task is tried again.
 
         Raises:
             BrewsterError: raised by the runner.
@@ -126,7 +126,7 @@ class SerialExecutor(Generic[ResultT]):
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Forgets the stored task."""
+        """Discards the stored task."""
         self._task = None
 
 
@@ -142,18 +142,18 @@ class _Worker:
 
 @final
 class ProcessExecutor(Generic[ResultT]):
-    """Runs tasks in several processes, one task in each. If a process dies, another one runs its task again."""
+    """Runs tasks in several processes, one task in each. If a process dies, another process runs its task again."""
 
     chunk_size = 1
 
-    def __init__(self, create_runner: Callable[[], Runner[ResultT]], count: int) -> None:
-        self._create_runner, self._count = create_runner, count
+    def __init__(self, create_runner: Callable[[], Runner[ResultT]], worker_count: int) -> None:
+        self._create_runner, self._worker_count = create_runner, worker_count
         self._idle: list[_Worker] = []
         self._busy: dict[Connection, tuple[_Worker, Task[ResultT], int]] = {}
 
     def has_capacity(self) -> bool:
         """Whether a worker is idle or can be started."""
-        return len(self._busy) < self._count
+        return len(self._busy) < self._worker_count
 
     def is_busy(self) -> bool:
         """Whether any worker has a task."""
@@ -164,7 +164,7 @@ class ProcessExecutor(Generic[ResultT]):
         self._assign(task, 1)
 
     def wait(self) -> list[ResultT]:
-        """Returns the results of the next finished task; none if a worker has died and its task is tried again."""
+        """Returns the results of the next finished task. The list is empty if a worker has died and its task is tried again."""
         pipe = connection.wait(list(self._busy))[0]
         assert isinstance(pipe, Connection)
         worker, task, attempt = self._busy.pop(pipe)
@@ -199,7 +199,7 @@ class ProcessExecutor(Generic[ResultT]):
             self._assign(task, attempt + 1)
             return []
         return task.failed_results(
-            f"its worker died {MAX_ATTEMPTS} times (exit code {worker.process.exitcode})"
+            f"the worker died {MAX_ATTEMPTS} times (exit code {worker.process.exitcode})"
         )
 
     def __enter__(self) -> Self:
@@ -227,7 +227,7 @@ def _interrupts_blocked() -> Iterator[None]:
     if sys.platform == "win32":  # Windows has no signal masks; _worker_main ignores Ctrl-C as soon as it runs
         yield
         return
-    resource_tracker.ensure_running()  # otherwise it starts within this block, and unblocks the signal
+    resource_tracker.ensure_running()  # otherwise the tracker starts within this block, and unblocks the signal
     previous = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield
@@ -236,10 +236,10 @@ def _interrupts_blocked() -> Iterator[None]:
 
 
 def _worker_main(pipe: Connection, create_runner: Callable[[], Runner[Any]]) -> None:
-    """Main function of a worker: runs tasks until the pipe closes."""
+    """The main function of a worker: runs tasks until the pipe closes."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     os.environ.setdefault("OMP_NUM_THREADS", "1")  # one processor for each worker
-    exit_with_parent()  # otherwise it and a resumed run could work on the same task
+    exit_with_parent()  # otherwise this worker and a resumed run could work on the same task
     runner: Runner[Any] | None = None
     with suppress(EOFError):
         while True:

@@ -1,4 +1,4 @@
-"""Runs tasks on a Ray cluster. The nodes exchange only tasks and results: images are read and written by the workers."""
+"""Runs tasks on a Ray cluster. Ray transfers only tasks and results; the workers read and write the images themselves."""
 
 from __future__ import annotations
 
@@ -29,9 +29,12 @@ class RayExecutor(Generic[ResultT]):
     chunk_size = 4
 
     def __init__(
-        self, create_runner: Callable[[], Runner[ResultT]], address: str = LOCAL, workers: int | None = None
+        self,
+        create_runner: Callable[[], Runner[ResultT]],
+        address: str = LOCAL,
+        worker_count: int | None = None,
     ) -> None:
-        self._create_runner, self._address, self._workers = create_runner, address, workers
+        self._create_runner, self._address, self._worker_count = create_runner, address, worker_count
         self._tasks: dict[Any, Task[ResultT]] = {}
 
     def has_capacity(self) -> bool:
@@ -48,7 +51,7 @@ class RayExecutor(Generic[ResultT]):
         self._tasks[self._run_task.remote(self._run_id, self._create_runner_ref, task)] = task
 
     def wait(self) -> list[ResultT]:
-        """Returns the results of the next finished task; none if it was lost and its items are tried again.
+        """Returns the results of the next finished task. The list is empty if the task was lost and is tried again.
 
         Raises:
             BrewsterError: raised by the runner.
@@ -65,16 +68,16 @@ class RayExecutor(Generic[ResultT]):
         return results
 
     def _handle_lost_task(self, task: Task[ResultT], reason: str) -> list[ResultT]:
-        """Submits each item of a lost task as a task of its own, because one item may be the cause."""
+        """Submits each item of a lost task as a separate task, because one item may be the cause."""
         parts = task.split()
         if len(parts) == 1:
-            return task.failed_results(f"its process or node was lost {MAX_ATTEMPTS} times ({reason})")
+            return task.failed_results(f"the process or the node was lost {MAX_ATTEMPTS} times ({reason})")
         for part in parts:
             self.submit(part)
         return []
 
     def __enter__(self) -> Self:
-        """Connects to the cluster, or starts a local one.
+        """Connects to the cluster, or starts a cluster on this machine if the address is "local".
 
         Raises:
             MissingExtra: Ray is not installed.
@@ -82,7 +85,7 @@ class RayExecutor(Generic[ResultT]):
         """
         self._ray = _ray()
         local_options = (
-            {"num_cpus": self._workers, "include_dashboard": False} if self._address == LOCAL else {}
+            {"num_cpus": self._worker_count, "include_dashboard": False} if self._address == LOCAL else {}
         )
         try:
             _check_reachable(self._address)
@@ -91,7 +94,7 @@ class RayExecutor(Generic[ResultT]):
             raise DeviceError(
                 f"there is no cluster at {self._address} ({error})",
                 "expected a running Ray cluster as HOST:PORT, or local",
-                "start one: ray start --head",
+                "start a cluster: ray start --head",
             ) from error
         self._run_task = self._ray.remote(max_retries=MAX_ATTEMPTS - 1, num_cpus=1)(_run_task)
         self._run_id = secrets.token_hex(8)
@@ -107,13 +110,13 @@ class RayExecutor(Generic[ResultT]):
 
 
 def _ray() -> ModuleType:
-    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # Ray reads it on import
+    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # Ray reads the variable on import
     try:
         ray = importlib.import_module("ray")
     except ImportError as error:
         raise MissingExtra(
             "the package ray is not installed",
-            "expected it, because --cluster needs it",
+            "expected the package ray for --cluster",
             "run: pip install 'brewster[cluster]'",
         ) from error
     # Ray prints lost processes on standard output, which is reserved for --json. There is no option to prevent this.
@@ -122,14 +125,14 @@ def _ray() -> ModuleType:
 
 
 def _check_reachable(address: str) -> None:
-    """Raises OSError if no program listens at HOST:PORT. Ray itself would retry for many minutes."""
+    """Raises OSError if no program listens at HOST:PORT. Ray itself retries for many minutes."""
     host, _, port = address.rpartition(":")
     if host and port.isdigit() and "/" not in host:
         socket.create_connection((host, int(port)), timeout=_CONNECT_TIMEOUT_S).close()
 
 
 _runners: dict[str, Runner[Any]] = {}
-"""The runner of this process by run. It is reused for the next tasks, so that a model or a map is read once."""
+"""The runner of this process, by the id of the run. It is reused for the next tasks, so that a model is read once."""
 
 
 def _run_task(run_id: str, create_runner: Callable[[], Runner[Any]], task: Task[Any]) -> list[Any]:

@@ -111,7 +111,7 @@ def _lpips_difference(case: Comparison) -> DifferenceMaps:
 
 
 def _lpips_features(image: Image) -> Features:
-    # The reflection of the baseline is black in every case; its features take as long as those of any image.
+    # The baseline, the unprocessed input, has a black reflection in every case. Its features are cached to save time.
     return Lpips.load().features(image) if image.any() else _lpips_features_of_black(image.shape)
 
 
@@ -146,14 +146,14 @@ def _rendered_score(
 
 
 IDENTICAL_DB: Final = 100.0
-"""The PSNR that METRICS reports for identical images. Their PSNR is infinite, and so would be the mean over a benchmark."""
+"""The PSNR that METRICS reports for identical images. Their true PSNR is infinite, which makes means infinite, too."""
 
 _PSNR: Final = "10 log10(255^2 / MSE) over the three channels of 8-bit sRGB"
 _SSIM: Final = "per RGB channel of 8-bit sRGB, K1 0.01, K2 0.03, range 255"
-_UNIFORM: Final = f"uniform 7x7 window, sample covariance, {_SSIM}, outermost 3 pixels left out"
+_UNIFORM: Final = f"uniform 7x7 window, sample covariance, {_SSIM}, without the outermost 3 pixels"
 _LPIPS: Final = "LPIPS 0.1 of AlexNet, 8-bit sRGB scaled to -1..1, at the size of the ground truth"
 _REGION: Final = (
-    "the reflection region, where |photo - truth| / 255 in its largest channel, averaged over 7x7 pixels,"
+    "the reflection region, where the maximum of |photo - truth| / 255 over the channels, averaged over 7x7 pixels,"
     f" is above {DEFAULT_THRESHOLD} unless the report states another threshold"
 )
 _LINEAR: Final = (
@@ -172,7 +172,7 @@ _ROWS: Final = (
         True,
         3,
         f"Mean local SSIM, Gaussian 11x11 window of sigma 1.5, population covariance, {_SSIM},"
-        " outermost 5 pixels left out.",
+        " without the outermost 5 pixels.",
         "transmission",
         _ssim_gaussian,
     ),
@@ -304,7 +304,7 @@ _ROWS: Final = (
         "",
         False,
         3,
-        "Share of the background's light that the prediction lacks where the reflection is below 2 % of the photo,"
+        "Fraction of the background's light that the prediction lacks where the reflection is below 2 % of the photo,"
         f" {_GAIN}.",
         "rendered",
         _rendered_score(removed_content),
@@ -315,7 +315,7 @@ _ROWS: Final = (
         "",
         False,
         3,
-        "Share of the background's light that the prediction lacks where the reflection is below 2 % of the photo and"
+        "Fraction of the background's light that the prediction lacks where the reflection is below 2 % of the photo and"
         " the background is white (encoded channels above 0.75 and less than 0.12 apart),"
         f" {_GAIN}.",
         "rendered",
@@ -327,7 +327,7 @@ _ROWS: Final = (
         "",
         False,
         3,
-        "Share of the reflection's light that the prediction still has above the background, where the reflection is at"
+        "Fraction of the reflection's light that the prediction still has above the background, where the reflection is at"
         f" least 10 % of the photo and the photo is not clipped, {_GAIN}.",
         "rendered",
         _rendered_score(kept_reflection),
@@ -339,13 +339,13 @@ METRICS: Final = {metric.name: metric for metric in _ROWS}
 
 
 def find_metric(name: str) -> Metric:
-    """The metric of this name.
+    """Returns the metric with this name.
 
     Raises:
-        BrewsterError: there is no metric of this name; the message suggests the closest one.
+        BrewsterError: there is no metric with this name. The message suggests the closest name.
     """
     if name in METRICS:
         return METRICS[name]
     close = difflib.get_close_matches(name.lower(), METRICS, n=1)
-    cure = f"did you mean {close[0]}?" if close else "choose one of them"
+    cure = f"did you mean {close[0]}?" if close else "choose one of these names"
     raise BrewsterError(f"there is no metric {name!r}", f"expected one of {', '.join(METRICS)}", cure)

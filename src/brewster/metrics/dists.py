@@ -1,9 +1,9 @@
-"""DISTS: a distance of structure and texture between two images, which tolerates another sample of the same texture.
+"""DISTS: a distance of structure and texture between two images. It is small for two samples of the same texture.
 
 K. Ding, K. Ma, S. Wang, E. P. Simoncelli, "Image Quality Assessment: Unifying Structure and Texture Similarity", IEEE
 Trans. Pattern Anal. Mach. Intell. 44(5), 2022. The weights of the channels (dists_weights.npz) are those of the package
-dists-pytorch 0.1. VGG16's convolutions are those of torchvision; see `weights.load_vgg16`. Only this module's functions
-import torch.
+dists-pytorch 0.1. VGG16's convolutions are those of torchvision; see `weights.load_vgg16`. Functions import torch when they
+are called; the import of this module does not.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 MIN_SIDE: Final = 16
-"""The minimum height and width in pixels: four poolings halve the image."""
+"""The minimum height and width in pixels, because each of four poolings halves the image."""
 
 STAGES: Final = (2, 2, 3, 3, 3)
 """The number of convolutions in the stages of VGG16. DISTS compares the image and the output of each stage."""
@@ -34,23 +34,23 @@ _WEIGHTS_FILE: Final = Path(__file__).with_name("dists_weights.npz")
 _CHANNELS: Final = (3, 64, 128, 256, 512, 512)
 _MEAN: Final = (0.485, 0.456, 0.406)
 _STD: Final = (0.229, 0.224, 0.225)
-"""Mean and standard deviation of ImageNet's values in 0..1."""
+"""The mean and the standard deviation of ImageNet's values in 0..1."""
 _STABILISER: Final = 1e-6
-"""c1 and c2 of equations 5 and 6."""
+"""The constants c1 and c2 of equations 5 and 6 of the paper."""
 
 
 @final
 @dataclass(frozen=True, eq=False)
 class DistsFeatures:
-    """The image in 0..1 and the outputs of VGG16's five stages, (C, h * w) each, with mean and variance of each channel.
+    """The image in 0..1 and the outputs of VGG16's five stages, (C, h * w) each, with the mean and variance of each channel.
 
-    `size` is the (height, width) of the image.
+    `shape` is the (height, width) of the image.
     """
 
     maps: tuple[Tensor, ...]
     means: tuple[Tensor, ...]
     variances: tuple[Tensor, ...]
-    size: tuple[int, int]
+    shape: tuple[int, int]
 
 
 @final
@@ -77,7 +77,7 @@ class Dists:
         return _load()
 
     def features(self, image: Image) -> DistsFeatures:
-        """The features of an image, uint8 (H, W, 3).
+        """Returns the features of an image, uint8 (H, W, 3).
 
         Raises:
             ValueError: the image is not uint8 (H, W, 3), or has fewer than 16 pixels on a side.
@@ -85,15 +85,15 @@ class Dists:
         import torch  # noqa: PLC0415 - an extra
 
         check_images(image)
-        size = image.shape[:2]
-        if min(size) < MIN_SIDE:
-            raise ValueError(f"DISTS needs at least {MIN_SIDE}x{MIN_SIDE} pixels, not {size[0]}x{size[1]}")
+        shape = image.shape[:2]
+        if min(shape) < MIN_SIDE:
+            raise ValueError(f"DISTS needs at least {MIN_SIDE}x{MIN_SIDE} pixels, not {shape[0]}x{shape[1]}")
         with torch.inference_mode():
             values = torch.from_numpy(image.transpose(2, 0, 1).astype(np.float32) / 255)
             maps = [values.flatten(1), *(stage.flatten(1) for stage in self._stages(values))]
             means = tuple(map_.mean(dim=1) for map_ in maps)
             variances = tuple(map_.var(dim=1, correction=0) for map_ in maps)
-        return DistsFeatures(tuple(maps), means, variances, size)
+        return DistsFeatures(tuple(maps), means, variances, shape)
 
     def _stages(self, values: Tensor) -> list[Tensor]:
         import torch  # noqa: PLC0415 - an extra
@@ -113,7 +113,7 @@ class Dists:
         return outputs
 
     def distance(self, one: DistsFeatures, other: DistsFeatures) -> float:
-        """The DISTS distance of two images, given by their features: equation 7 of the paper.
+        """Returns the DISTS distance of two images, given by their features (equation 7 of the paper).
 
         Returns:
             The distance, 0 for equal images; lower is better.
@@ -123,8 +123,8 @@ class Dists:
         """
         import torch  # noqa: PLC0415 - an extra
 
-        if one.size != other.size:
-            raise ValueError(f"the images differ in size: {one.size} and {other.size}")
+        if one.shape != other.shape:
+            raise ValueError(f"the images differ in size: {one.shape} and {other.shape}")
         similarity = 0.0
         with torch.inference_mode():
             for i, (texture, structure) in enumerate(zip(self.texture, self.structure, strict=True)):
@@ -142,7 +142,7 @@ class Dists:
 
 
 def read_channel_weights() -> tuple[list[NDArray[np.float32]], list[NDArray[np.float32]]]:
-    """The published weights of texture and structure: six arrays (C,) each, all >= 0, which sum to 1."""
+    """Returns the published weights of texture and structure: six arrays (C,) each. All are >= 0, and they sum to 1."""
     with np.load(_WEIGHTS_FILE) as file:
         parts = [file[name] for name in ("texture", "structure")]
     total = sum(float(part.sum(dtype=np.float64)) for part in parts)
@@ -158,7 +158,7 @@ def _load() -> Dists:
     except ImportError as error:
         raise MissingExtra(
             "torch is not installed",
-            "expected torch, which computes DISTS",
+            "expected torch, which brewster needs for DISTS",
             "run: pip install 'brewster[evaluate]'",
         ) from error
     texture, structure = (tuple(map(torch.from_numpy, part)) for part in read_channel_weights())
@@ -173,7 +173,7 @@ def _pairs(tensors: Sequence[Tensor]) -> tuple[tuple[Tensor, Tensor], ...]:
 
 
 def _l2_pool(values: Tensor) -> Tensor:
-    """Root of the Hann-weighted mean of squares over 3x3 pixels, with stride 2 and zeros beyond the border."""
+    """Returns the root of the Hann-weighted mean of squares over 3x3 pixels, with stride 2 and zeros beyond the border."""
     import torch  # noqa: PLC0415 - an extra
     from torch.nn import functional  # noqa: PLC0415
 

@@ -1,14 +1,14 @@
-"""Failure metrics for rendered samples: how much content a prediction removes, and how much reflection it leaves.
+"""Failure metrics for rendered samples: how much content a prediction removes, and how much reflection remains in it.
 
-They need a sample whose photo I, background B and reflection R share one exposure and tone curve. All values are
+They need a sample whose photo I, background B and reflection R have the same exposure and tone curve. All values are
 luminance in linear light, with I = T + R, where the transmission T is the part of B that passes through the glass.
 
-Some methods restore the light that the glass absorbs, and others do not. To score both alike, the prediction is first
-multiplied by one gain: the median of B / prediction over the pixels without reflection that are neither black nor
+Some methods restore the light that the glass absorbs, and others do not. To score both in the same way, the prediction is
+first multiplied by one gain: the median of B / prediction over the pixels without reflection that are neither black nor
 clipped in either image. If B has too few such pixels, the scores are undefined (ValueError). If only the prediction
-has too few, the gain is 1.
+has too few such pixels, the gain is 1.
 
-Each score is a share of light in 0..1; lower is better.
+Each score is a fraction of light in 0..1; lower is better.
 """
 
 from __future__ import annotations
@@ -30,21 +30,21 @@ if TYPE_CHECKING:
 else:
     Light = LightOfPixels = NDArray
 
-NEGLIGIBLE_SHARE: Final = 0.02
-"""A pixel with R below this share of I counts as a pixel without reflection."""
+NEGLIGIBLE_FRACTION: Final = 0.02
+"""A pixel with R below this fraction of I is a pixel without reflection."""
 
-NOTICEABLE_SHARE: Final = 0.1
-"""A pixel with R of at least this share of I counts as a pixel with reflection."""
+NOTICEABLE_FRACTION: Final = 0.1
+"""A pixel with R of at least this fraction of I is a pixel with reflection."""
 
 MIN_WHITE: Final = 0.75
 MAX_WHITE_DIFFERENCE: Final = 0.12
 """A pixel is white if its encoded channels, in 0..1, are above MIN_WHITE and differ by less than MAX_WHITE_DIFFERENCE."""
 
 BLACK_LUMINANCE: Final = 0.01
-"""The gain excludes pixels below this luminance: 8-bit steps are too coarse there for a ratio."""
+"""Pixels below this luminance are excluded from the gain, because 8-bit steps are too coarse for a ratio."""
 
 MIN_CLIPPED: Final = 254
-"""A channel with at least this 8-bit value may be clipped: its true value is unknown."""
+"""A channel with at least this 8-bit value may be clipped, so its true value is unknown."""
 
 MIN_PIXELS: Final = 64
 """A score or gain over fewer pixels is too noisy to report."""
@@ -53,69 +53,69 @@ _LINEAR: Final = to_linear(np.arange(256) / 255)
 
 
 def removed_content(prediction: Image, background: Image, photo: Image, reflection: Image) -> float:
-    """The share of the background's light that the prediction lacks where there is no reflection.
+    """Returns the fraction of the background's light that the prediction lacks where there is no reflection.
 
-    sum max(B - g prediction, 0) / sum B over the pixels with R < 2 % of I and B > 0. The module docstring defines the
-    gain g.
+    The score is sum max(B - g prediction, 0) / sum B over the pixels with R < 2 % of I and B > 0. The module docstring
+    defines the gain g.
 
     Returns:
-        A share in 0..1; lower is better.
+        A fraction in 0..1; lower is better.
 
     Raises:
-        ValueError: the images are not uint8 (H, W, 3) or differ in shape, or fewer than 64 pixels are left for the
-            score or in B for the gain.
+        ValueError: the images are not uint8 (H, W, 3) or differ in shape, or the score or the gain has fewer than 64
+            valid pixels.
     """
     luminance = _Luminances.of(prediction, background, photo, reflection)
-    return luminance.removed_share(luminance.unreflected, f"R < {NEGLIGIBLE_SHARE:.0%} of I")
+    return luminance.removed_fraction(luminance.unreflected, f"R < {NEGLIGIBLE_FRACTION:.0%} of I")
 
 
 def removed_white(prediction: Image, background: Image, photo: Image, reflection: Image) -> float:
-    """The share of the background's light that the prediction lacks in white areas without reflection.
+    """Returns the fraction of the background's light that the prediction lacks in white areas without reflection.
 
     The formula is that of `removed_content`, over the pixels that are also white in B: every encoded channel is above
-    0.75, and the largest is less than 0.12 above the smallest. The score is high if a method removes white objects as
-    if they were highlights.
+    0.75, and the largest is less than 0.12 above the smallest. The score is high if a method removes white objects
+    because it mistakes them for reflections.
 
     Returns:
-        A share in 0..1; lower is better.
+        A fraction in 0..1; lower is better.
 
     Raises:
         ValueError: see `removed_content`.
     """
     luminance = _Luminances.of(prediction, background, photo, reflection)
-    return luminance.removed_share(
-        luminance.unreflected & _is_white(background), f"R < {NEGLIGIBLE_SHARE:.0%} of I and white in B"
+    return luminance.removed_fraction(
+        luminance.unreflected & _is_white(background), f"R < {NEGLIGIBLE_FRACTION:.0%} of I and white in B"
     )
 
 
 def kept_reflection(prediction: Image, background: Image, photo: Image, reflection: Image) -> float:
-    """The share of the reflection's light that the prediction still contains.
+    """Returns the fraction of the reflection's light that the prediction still contains.
 
-    sum min(max(g prediction - B, 0), R) / sum R over the pixels with R >= 10 % of I and I not clipped. The module
-    docstring defines the gain g.
+    The score is sum min(max(g prediction - B, 0), R) / sum R over the pixels with R >= 10 % of I and I not clipped. The
+    module docstring defines the gain g.
 
     Returns:
-        A share in 0..1; lower is better.
+        A fraction in 0..1; lower is better.
 
     Raises:
         ValueError: see `removed_content`.
     """
     luminance = _Luminances.of(prediction, background, photo, reflection)
     reflective = (
-        (luminance.reflection >= NOTICEABLE_SHARE * luminance.photo)
+        (luminance.reflection >= NOTICEABLE_FRACTION * luminance.photo)
         & (luminance.reflection > 0)
         & ~_is_clipped(photo)
     )
     remaining = np.clip(luminance.prediction - luminance.background, 0, luminance.reflection)
-    return _share(
-        remaining, luminance.reflection, reflective, f"R >= {NOTICEABLE_SHARE:.0%} of I and I not clipped"
+    return _fraction(
+        remaining, luminance.reflection, reflective, f"R >= {NOTICEABLE_FRACTION:.0%} of I and I not clipped"
     )
 
 
 @final
 @dataclass(frozen=True, eq=False)
 class _Luminances:
-    """The linear luminances of the four images, (H, W); that of the prediction is multiplied by the gain."""
+    """The linear luminances of the four images, (H, W) each. The luminance of the prediction is multiplied by the gain."""
 
     prediction: Light
     background: Light
@@ -128,25 +128,25 @@ class _Luminances:
     def of(cls, prediction: Image, background: Image, photo: Image, reflection: Image) -> _Luminances:
         check_images(prediction, background, photo, reflection)
         t, b, i, r = map(_luminance, (prediction, background, photo, reflection))
-        unreflected = r < NEGLIGIBLE_SHARE * i
+        unreflected = r < NEGLIGIBLE_FRACTION * i
         comparable_background = unreflected & (b >= BLACK_LUMINANCE) & ~_is_clipped(background)
         _require_pixels(
-            comparable_background, f"R < {NEGLIGIBLE_SHARE:.0%} of I and B neither black nor clipped"
+            comparable_background, f"R < {NEGLIGIBLE_FRACTION:.0%} of I and B neither black nor clipped"
         )
         comparable = comparable_background & (t >= BLACK_LUMINANCE) & ~_is_clipped(prediction)
         return cls(t * _gain(t[comparable], b[comparable]), b, i, r, unreflected)
 
-    def removed_share(self, mask: Region, condition: str) -> float:
+    def removed_fraction(self, mask: Region, condition: str) -> float:
         missing = np.maximum(self.background - self.prediction, 0)
-        return _share(missing, self.background, mask & (self.background > 0), condition)
+        return _fraction(missing, self.background, mask & (self.background > 0), condition)
 
 
 def _gain(prediction: LightOfPixels, background: LightOfPixels) -> float:
-    # The median, because content that is missing in less than half of the pixels must not change the gain.
+    # The median is used, because content that is missing in less than half of the pixels must not change the gain.
     return float(np.median(background / prediction)) if prediction.size >= MIN_PIXELS else 1.0
 
 
-def _share(part: Light, whole: Light, mask: Region, condition: str) -> float:
+def _fraction(part: Light, whole: Light, mask: Region, condition: str) -> float:
     _require_pixels(mask, condition)
     return float(part[mask].sum() / whole[mask].sum())
 

@@ -1,7 +1,7 @@
 """PSNR, SSIM and the linear-light error of 8-bit sRGB images, as papers on reflection removal define them.
 
 SSIM (Z. Wang et al., IEEE Trans. Image Proc. 13, 2004; K1 0.01, K2 0.03, range 255) is computed per RGB channel, and
-its map is averaged over the positions where the whole window is inside the image. Two windows are in use:
+its map is averaged over the positions where the whole window is inside the image. There are two windows:
 
     uniform    7x7, sample covariance, as ERRNet, RAGNet and their successors report it. Equal to scikit-image's
                structural_similarity(a, b, channel_axis=2)
@@ -40,7 +40,7 @@ _WINDOW_SIDES: Final[dict[Window, int]] = {"uniform": BOX_SIDE, "gaussian": 2 * 
 
 
 def psnr(prediction: Image, truth: Image, *, region: Region | None = None) -> float:
-    """Peak signal-to-noise ratio, 10 log10(255^2 / MSE).
+    """Returns the peak signal-to-noise ratio, 10 log10(255^2 / MSE).
 
     The mean squared error is over the three channels of all pixels, or of the pixels in `region`, bool (H, W).
 
@@ -57,9 +57,9 @@ def psnr(prediction: Image, truth: Image, *, region: Region | None = None) -> fl
 
 
 def psnr_of_channels(prediction: Image, truth: Image) -> float:
-    """The mean of the PSNR of red, green and blue, as the code of ERRNet (util/index.py) and XReflection computes it.
+    """Returns the mean of the PSNR of red, green and blue, as the code of ERRNet (util/index.py) and XReflection computes it.
 
-    It is never below `psnr`, which takes one mean squared error over all channels.
+    The value is never below that of `psnr`, which uses one mean squared error over all channels.
 
     Returns:
         The mean in dB; infinity if a channel is equal in both images. Higher is better.
@@ -74,10 +74,10 @@ def psnr_of_channels(prediction: Image, truth: Image) -> float:
 
 
 def linear_error(prediction: Image, truth: Image, *, region: Region | None = None) -> float:
-    """The root mean squared error in linear light, in 0..1: sqrt(mean((L(prediction) - L(truth))^2)).
+    """Returns the root mean squared error in linear light, in 0..1: sqrt(mean((L(prediction) - L(truth))^2)).
 
     L is the inverse of the sRGB curve (IEC 61966-2-1). The mean is over the three channels of all pixels, or of the
-    pixels in `region`, bool (H, W). Unlike errors of encoded values, it is proportional to the wrong amount of light.
+    pixels in `region`, bool (H, W). This error is proportional to the light that is wrong; errors of encoded values are not.
 
     Returns:
         The error, 0 for equal images. Lower is better.
@@ -93,10 +93,10 @@ def linear_error(prediction: Image, truth: Image, *, region: Region | None = Non
 def ssim(
     prediction: Image, truth: Image, *, window: Window = "uniform", region: Region | None = None
 ) -> float:
-    """Mean structural similarity (Wang et al. 2004), with one of the two windows of this module.
+    """Returns the mean structural similarity (Wang et al. 2004), with one of the two windows of this module.
 
     The SSIM map is averaged over all its pixels, or over those in `region`, bool (H, W). The map has no values within
-    3 pixels of the image's border (Gaussian window: 5 pixels).
+    3 pixels of the image's border, or 5 pixels with the Gaussian window.
 
     Returns:
         The mean, at most 1; 1 for equal images. Higher is better.
@@ -109,7 +109,7 @@ def ssim(
 
 
 def mean_ssim(values: NDArray[np.float64], *, region: Region | None = None) -> float:
-    """The mean of a map of `ssim_map`, over all its pixels or over those in `region`, bool (H, W).
+    """Returns the mean of a map of `ssim_map`, over all its pixels or over those in `region`, bool (H, W).
 
     Raises:
         ValueError: the region is empty, of another shape, or has only pixels without a value.
@@ -127,7 +127,7 @@ def mean_ssim(values: NDArray[np.float64], *, region: Region | None = None) -> f
 
 
 def ssim_map(prediction: Image, truth: Image, *, window: Window = "uniform") -> NDArray[np.float64]:
-    """The local SSIM, (H - side + 1, W - side + 1, 3) for a window of `side` pixels.
+    """Returns the local SSIM, (H - side + 1, W - side + 1, 3) for a window with sides of `side` pixels.
 
     Raises:
         ValueError: the images are not uint8 (H, W, 3), differ in shape, or are smaller than the window.
@@ -137,7 +137,7 @@ def ssim_map(prediction: Image, truth: Image, *, window: Window = "uniform") -> 
     height, width = prediction.shape[:2]
     if min(height, width) < side:
         raise ValueError(f"SSIM needs at least {side}x{side} pixels, not {height}x{width}")
-    # Strips of rows fit the processor's cache.
+    # Strips of 32 rows fit into the processor's cache.
     windowed_ssim, strip_height = _WINDOWED_SSIM[window], _STRIP_ROWS + _WINDOW_SIDES[window] - 1
     tops = range(0, len(prediction) - _WINDOW_SIDES[window] + 1, _STRIP_ROWS)
     return np.concatenate(
@@ -146,7 +146,7 @@ def ssim_map(prediction: Image, truth: Image, *, window: Window = "uniform") -> 
 
 
 def _ssim_uniform(prediction: Image, truth: Image) -> NDArray[np.float64]:
-    """The SSIM map with the uniform window. int32 holds the sums of 8-bit values and of their products exactly."""
+    """Returns the SSIM map with the uniform window. int32 holds sums of 8-bit values and of their products exactly."""
     return _ssim_formula(
         prediction.astype(np.int32), truth.astype(np.int32), box_sums, BOX_SIDE**2, sample_covariance=True
     )
@@ -166,11 +166,12 @@ def _ssim_formula(
     *,
     sample_covariance: bool,
 ) -> NDArray[np.float64]:
-    """SSIM = (2 mx my + C1) (2 cov + C2) / ((mx^2 + my^2 + C1) (vx + vy + C2)), computed from window sums.
+    """Returns SSIM = (2 mx my + C1) (2 cov + C2) / ((mx^2 + my^2 + C1) (vx + vy + C2)), computed from window sums.
 
     Here m is a mean, v a variance and cov the covariance in the window. Numerator and denominator are multiplied by
-    powers of `pixel_count`, the number of pixels in a window sum (1 if `window_sum` returns means). So there is only one
-    division, and integer sums stay integers until then. The formula needs only vx + vy, so x^2 + y^2 is summed once.
+    powers of `pixel_count`, the number of pixels in a window sum (1 if `window_sum` returns means). Therefore only one
+    division is needed, and integer sums stay integers until then. The formula needs only vx + vy, so x^2 + y^2 is summed
+    once.
     """
     mean_x, mean_y, squares, products = (
         window_sum(x),

@@ -15,13 +15,13 @@ _Shared = TypeVar("_Shared")
 @final
 @dataclass(frozen=True, eq=False)
 class CachedImage:
-    """An image, uint8 sRGB (H, W, 3), with the features that metrics have computed from it."""
+    """An image, uint8 sRGB (H, W, 3), with the features that metrics have computed from this image."""
 
     pixels: Image
     _features: dict[Callable[[Image], Any], Any] = field(default_factory=dict, repr=False)
 
     def features(self, compute: Callable[[Image], _Features]) -> _Features:
-        """The result of `compute` for this image. It is computed once, and all metrics share it."""
+        """Returns the result of `compute` for this image. It is computed once and reused by all metrics."""
         if compute not in self._features:
             self._features[compute] = compute(self.pixels)
         return cast("_Features", self._features[compute])
@@ -32,7 +32,7 @@ class CachedImage:
 class Comparison:
     """The predicted layer to score, its ground truth, and the photo.
 
-    A metric whose `of` is "rendered" gets the transmission as `prediction` and the background as `truth`, and its
+    For a metric whose `of` is "rendered", `prediction` is the predicted transmission, `truth` is the background, and
     `reflection` is never None.
     """
 
@@ -42,13 +42,13 @@ class Comparison:
     reflection: Image | None = None
     """The ground truth of the reflection; None if the case has none."""
     region: Region | None = None
-    """The pixels to score, for a metric whose `where` is "region"; otherwise None."""
+    """The pixels to score for a metric whose `where` is "region"; otherwise None."""
     _shared: dict[Callable[[Comparison], Any], Any] = field(default_factory=dict, repr=False)
 
     def shared(self, compute: Callable[[Comparison], _Shared]) -> _Shared:
-        """The result of `compute` for this pair of images, which must not depend on the region.
+        """Returns the result of `compute` for this pair of images. The result must not depend on the region.
 
-        It is computed once, and shared by all metrics that score the pair, inside a region or not.
+        It is computed once and reused by all metrics of the pair, with or without a region.
         """
         if compute not in self._shared:
             self._shared[compute] = compute(self)
@@ -63,7 +63,7 @@ class Metric:
     name: str
     title: str
     unit: str
-    """"dB", or "" for a number without unit."""
+    """"dB", or "" for a number without a unit."""
     higher_is_better: bool
     digits: int
     """The number of decimal places in tables."""
@@ -72,13 +72,13 @@ class Metric:
     of: Literal["transmission", "reflection", "rendered"]
     """The ground truth that the metric needs: the transmission, the reflection, or all layers of a rendered sample."""
     score: Callable[[Comparison], float]
-    """Computes the value. Raises ValueError if it is undefined: the region is empty, or the image is too small."""
+    """Computes the value. Raises ValueError if the value is undefined: the region is empty, or the image is too small."""
     where: Literal["picture", "region"] = "picture"
-    """The pixels to average over: the whole image, or the reflection region."""
+    """The pixels over which to average: the whole image ("picture"), or the reflection region ("region")."""
     prepare: Callable[[], object] | None = None
-    """Loads the weights of the metric. It is called before the first score, so that missing weights are reported early."""
+    """A function that loads the weights of the metric, so that missing weights are reported before the first score."""
 
     def to_dict(self) -> dict[str, Any]:
-        """All fields except the name and the functions, for results.json."""
+        """Returns all fields except the name and the functions, for results.json."""
         keys = ("title", "unit", "higher_is_better", "digits", "about", "of", "where")
         return {key: getattr(self, key) for key in keys}

@@ -1,9 +1,9 @@
-"""NIQE: how far the local statistics of an image are from those of undistorted photographs. It needs no ground truth.
+"""NIQE: the distance between the local statistics of an image and those of undistorted photographs, without ground truth.
 
 A. Mittal, R. Soundararajan, A. C. Bovik, "Making a 'Completely Blind' Image Quality Analyzer", IEEE Signal Process.
-Lett. 20(3), 2013. The multivariate Gaussian of undistorted photographs is the one that the authors published; the file
+Lett. 20(3), 2013. The multivariate Gaussian of undistorted photographs was published by the authors; the file
 niqe_pristine.npz has its mean (36,) and covariance (36, 36). Luma is 0.299 R + 0.587 G + 0.114 B of the 8-bit values,
-rounded, as in the package pyiqa, whose values the NTIRE challenges report.
+rounded, as in the package pyiqa. The NTIRE challenges report the values of pyiqa.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ Blocks = NDArray[np.float64]
 
 
 def niqe(image: Image) -> float:
-    """The NIQE of an image, uint8 sRGB (H, W, 3): equation 10 of the paper.
+    """Returns the NIQE of an image, uint8 sRGB (H, W, 3) (equation 10 of the paper).
 
     The image is cropped to whole blocks of 96x96 pixels, from the upper left corner.
 
@@ -75,7 +75,7 @@ def _pristine() -> tuple[NDArray[np.float64], NDArray[np.float64]]:
 
 
 def _features(luma: Float64[NDArray[np.float64], "h w"], rows: int, columns: int) -> NDArray[np.float64]:
-    """The 18 features of each block at one scale, (blocks, 18)."""
+    """Returns the 18 features of each block at one scale, (blocks, 18)."""
     normalised = _normalised(luma)
     height, width = (side // count for side, count in zip(luma.shape, (rows, columns), strict=True))
     blocks = normalised.reshape(rows, height, columns, width).swapaxes(1, 2).reshape(-1, height, width)
@@ -89,17 +89,17 @@ def _features(luma: Float64[NDArray[np.float64], "h w"], rows: int, columns: int
 
 
 def _normalised(luma: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(luma - local mean) / (local standard deviation + 1), equation 1 of the paper."""
+    """Returns (luma - local mean) / (local standard deviation + 1), equation 1 of the paper."""
     mean = _blurred(luma)
     deviation = np.sqrt(np.abs(_blurred(luma * luma) - mean * mean))
     normalised: NDArray[np.float64] = (luma - mean) / (deviation + 1)
-    # In flat areas, such as clipped skies, only rounding errors are left, and their random signs would enter the features.
-    # Other implementations keep them, which changes the distance by up to about 0.01.
+    # In flat areas, such as clipped skies, the result consists of rounding errors. They are set to 0, so that their random
+    # signs do not change the features. Other implementations keep them, which changes the distance by up to about 0.01.
     return np.where(np.abs(normalised) < _ROUNDING_ERROR, 0, normalised)
 
 
 def _blurred(values: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Gaussian 7x7 means; edge pixels are repeated beyond the border."""
+    """Returns Gaussian 7x7 means. Edge pixels are repeated beyond the border."""
     for axis in (0, 1):
         padded = np.pad(values, [(_RADIUS, _RADIUS) if i == axis else (0, 0) for i in range(2)], mode="edge")
         values = _filtered(padded, _TAPS, axis, 1)
@@ -107,7 +107,7 @@ def _blurred(values: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _halved(luma: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The image at half the resolution; it is mirrored beyond the border."""
+    """Returns the image at half the resolution. The image is mirrored beyond the border."""
     for axis in (0, 1):
         padded = np.pad(luma, [(_RADIUS, _RADIUS) if i == axis else (0, 0) for i in range(2)], "symmetric")
         luma = _filtered(padded, _HALVING_TAPS, axis, 2)
@@ -129,8 +129,8 @@ def _fit_asymmetric_gaussian(
     """Fits an asymmetric generalised Gaussian to each block (N. Lasmar et al., ICIP 2009).
 
     Returns:
-        Its shape and the scales of its left and right half, (blocks,) each. NaN for a block without negative or without
-        positive values.
+        The shape, and the scales of the left and the right half, (blocks,) each. The scales are NaN for a block without
+        negative or without positive values.
     """
     flat = blocks.reshape(len(blocks), -1)
     squares = flat * flat
@@ -149,7 +149,7 @@ def _fit_asymmetric_gaussian(
 
 @functools.cache
 def _shape_table() -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Shapes from 0.2 to 10, with Gamma(2/a)^2 / (Gamma(1/a) Gamma(3/a)) and sqrt(Gamma(1/a) / Gamma(3/a)) of each."""
+    """Returns shapes a in 0.2..10, with Gamma(2/a)^2 / (Gamma(1/a) Gamma(3/a)) and sqrt(Gamma(1/a) / Gamma(3/a)) of each."""
     shapes = np.arange(0.2, 10.001, 0.001)
     logs = np.array([[math.lgamma(i / a) for i in (1, 2, 3)] for a in shapes]).T
     return shapes, np.exp(2 * logs[1] - logs[0] - logs[2]), np.exp((logs[0] - logs[2]) / 2)

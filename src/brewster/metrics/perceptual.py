@@ -5,7 +5,8 @@
     print([metric.distance(metric.features(prediction), truth) for prediction in predictions])
 
 R. Zhang et al., "The Unreasonable Effectiveness of Deep Features as a Perceptual Metric", CVPR 2018. The
-definition and the weights are those of version 0.1 of the `lpips` package. Only `Lpips.load` imports torch.
+definition and the weights are those of version 0.1 of the `lpips` package. Functions import torch when they are called; the
+import of this module does not.
 """
 
 from __future__ import annotations
@@ -27,18 +28,18 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     Map = Float[Tensor, "_c _h _w"]
-    """The maps of one image differ in all three sizes; the underscores tell jaxtyping not to compare them."""
+    """The five maps of an image differ in all dimensions. The underscores disable jaxtyping's comparison of dimensions."""
 
 MIN_SIDE: Final = 31
-"""The minimum height and width in pixels: with fewer, AlexNet's strides and poolings leave an empty map."""
+"""The minimum height and width in pixels. The last map of a smaller image is empty, because AlexNet reduces the size."""
 
 _SHIFT: Final = np.array([-0.030, -0.088, -0.188])
 _SCALE: Final = np.array([0.458, 0.448, 0.450])
-"""Mean and standard deviation of ImageNet's values in -1..1, rounded as in LPIPS 0.1."""
+"""The mean and the standard deviation of ImageNet's values in -1..1, rounded as in LPIPS 0.1."""
 
 
 class _Layer(NamedTuple):
-    """A convolution of AlexNet. If `pooled_before`, a 3x3 max pooling with stride 2 precedes it."""
+    """A convolution of AlexNet. If `pooled_before` is True, a 3x3 max pooling with stride 2 precedes it."""
 
     stride: int
     padding: int
@@ -59,11 +60,11 @@ _LAYERS: Final = (
 class Features:
     """AlexNet's features of an image: five float32 maps (C, h, w), normalised to unit length over C.
 
-    `size` is the (height, width) of the image.
+    `shape` is the (height, width) of the image.
     """
 
     maps: tuple[Map, ...]
-    size: tuple[int, int]
+    shape: tuple[int, int]
 
 
 @final
@@ -71,14 +72,14 @@ class Features:
 class DifferenceMaps:
     """The weighted squared differences of the features of two images: five float32 maps (h, w).
 
-    `size` is the (height, width) of the images.
+    `shape` is the (height, width) of the images.
     """
 
     maps: tuple[Tensor, ...]
-    size: tuple[int, int]
+    shape: tuple[int, int]
 
     def mean(self, *, region: Region | None = None) -> float:
-        """The distance, averaged over the whole maps or over a region; see `Lpips.distance`.
+        """Returns the distance, averaged over the whole maps or over a region; see `Lpips.distance`.
 
         Raises:
             ValueError: the region is empty or of another shape.
@@ -87,9 +88,9 @@ class DifferenceMaps:
 
         if region is None:
             return float(sum(_mean(map_.numpy()) for map_ in self.maps))
-        check_region(region, self.size)
+        check_region(region, self.shape)
         with torch.inference_mode():
-            return _mean(_upsampled(self.maps, self.size).numpy()[region])
+            return _mean(_upsampled(self.maps, self.shape).numpy()[region])
 
 
 @final
@@ -108,14 +109,14 @@ class Lpips:
 
         Raises:
             MissingExtra: torch is not installed.
-            ModelError: the file of AlexNet's weights is damaged, or holds other weights.
+            ModelError: the file of AlexNet's weights is damaged, or contains other weights.
             DownloadError: AlexNet's weights are not on this machine, and the download fails.
             OutputError: the downloaded weights cannot be written to the cache folder.
         """
         return _load()
 
     def features(self, image: Image) -> Features:
-        """The features of an image, uint8 (H, W, 3).
+        """Returns the features of an image, uint8 (H, W, 3).
 
         Raises:
             ValueError: the image is not uint8 (H, W, 3), or has fewer than 31 pixels on a side.
@@ -124,9 +125,9 @@ class Lpips:
         from torch.nn import functional  # noqa: PLC0415
 
         check_images(image)
-        size = image.shape[:2]
-        if min(size) < MIN_SIDE:
-            raise ValueError(f"LPIPS needs at least {MIN_SIDE}x{MIN_SIDE} pixels, not {size[0]}x{size[1]}")
+        shape = image.shape[:2]
+        if min(shape) < MIN_SIDE:
+            raise ValueError(f"LPIPS needs at least {MIN_SIDE}x{MIN_SIDE} pixels, not {shape[0]}x{shape[1]}")
         maps = []
         with torch.inference_mode():
             activations = torch.from_numpy(_normalised(image)).permute(2, 0, 1)[None]
@@ -137,15 +138,15 @@ class Lpips:
                     functional.conv2d(activations, weight, bias, layer.stride, layer.padding)
                 )
                 maps.append(activations[0] / (torch.linalg.vector_norm(activations[0], dim=0) + 1e-10))
-        return Features(tuple(maps), size)
+        return Features(tuple(maps), shape)
 
     def distance(self, one: Features, other: Features, *, region: Region | None = None) -> float:
-        """The LPIPS distance between two images, given by their features.
+        """Returns the LPIPS distance between two images, given by their features.
 
         The squared differences of the features are weighted by channel, averaged over each map, and summed over the
         five maps. With a `region`, bool (H, W), each map of differences is first upsampled to the size of the image
-        (bilinear, align_corners=False; `spatial=True` in `lpips`), and their sum is averaged over the region. A region
-        that is the whole image gives a slightly different value than no region, because upsampling changes the
+        (bilinear, align_corners=False; `spatial=True` in `lpips`), and the sum of the maps is averaged over the region.
+        A region that is the whole image gives a slightly different value than no region, because upsampling changes the
         weight of the pixels at the border of a map.
 
         Returns:
@@ -157,25 +158,25 @@ class Lpips:
         return self.difference(one, other).mean(region=region)
 
     def difference(self, one: Features, other: Features) -> DifferenceMaps:
-        """The five maps of `distance` before they are averaged, for several means of one pair.
+        """Returns the five maps of `distance` before they are averaged, so that several means need them only once.
 
         Raises:
             ValueError: the images differ in size.
         """
         import torch  # noqa: PLC0415 - an extra
 
-        if one.size != other.size:
-            raise ValueError(f"the images differ in size: {one.size} and {other.size}")
+        if one.shape != other.shape:
+            raise ValueError(f"the images differ in size: {one.shape} and {other.shape}")
         with torch.inference_mode():
             maps = [
                 torch.einsum("c,chw->hw", head, (a - b).square_())
                 for head, a, b in zip(self.heads, one.maps, other.maps, strict=True)
             ]
-        return DifferenceMaps(tuple(maps), one.size)
+        return DifferenceMaps(tuple(maps), one.shape)
 
 
 def lpips(prediction: Image, truth: Image, *, region: Region | None = None) -> float:
-    """The LPIPS 0.1 (AlexNet) distance between two images, with weights from `Lpips.load`; see `Lpips.distance`.
+    """Returns the LPIPS 0.1 (AlexNet) distance between two images, with weights from `Lpips.load`; see `Lpips.distance`.
 
     Returns:
         The distance, 0 for equal images; lower is better.
@@ -197,7 +198,7 @@ def _load() -> Lpips:
     except ImportError as error:
         raise MissingExtra(
             "torch is not installed",
-            "expected torch, which computes LPIPS",
+            "expected torch, which brewster needs for LPIPS",
             "run: pip install 'brewster[evaluate]'",
         ) from error
     tensors = [*load_alexnet().values()]
@@ -207,9 +208,9 @@ def _load() -> Lpips:
 
 
 def _normalised(image: Image) -> NDArray[np.float32]:
-    """(value / 127.5 - 1 - shift) / scale, (H, W, 3).
+    """Returns (value / 127.5 - 1 - shift) / scale, (H, W, 3).
 
-    The channels stay last in memory, because the convolutions are fastest on a CPU in this layout. The arithmetic runs on
+    The channels stay last in memory, because convolutions on a CPU are fastest in this layout. The arithmetic is done on
     whole rows, because numpy is slow along an axis of length 3.
     """
     height, width, _ = image.shape
@@ -220,12 +221,12 @@ def _normalised(image: Image) -> NDArray[np.float32]:
 
 
 def _mean(values: NDArray[np.float32]) -> float:
-    """The mean, computed by numpy in float64, because the order of torch's sums depends on the number of threads."""
+    """Returns the mean. It is computed by numpy, because the order of torch's sums depends on the number of threads."""
     return float(values.mean(dtype=np.float64))
 
 
-def _upsampled(maps: Sequence[Tensor], size: tuple[int, int]) -> Tensor:
+def _upsampled(maps: Sequence[Tensor], shape: tuple[int, int]) -> Tensor:
     from torch.nn.functional import interpolate  # noqa: PLC0415 - an extra
 
-    full = [interpolate(map_[None, None], size, mode="bilinear", align_corners=False)[0, 0] for map_ in maps]
+    full = [interpolate(map_[None, None], shape, mode="bilinear", align_corners=False)[0, 0] for map_ in maps]
     return sum(full[1:], start=full[0])

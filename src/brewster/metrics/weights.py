@@ -1,11 +1,11 @@
-"""Loads the networks of LPIPS and DISTS. The files with the channel weights are small and are part of brewster. The networks
-are downloaded once.
+"""Loads the networks of LPIPS and DISTS, which are downloaded once. The small files of channel weights are part of brewster.
 
-Both are networks of torchvision (BSD-3-Clause). They are searched for in the folder `brewster/weights` of the user's cache
-folder, then in the folder `weights` of BREWSTER_DATA, and are always checked, because other weights define a different metric:
+Both are networks of torchvision (BSD-3-Clause). Their files are searched for in the folder `brewster/weights` of the user's
+cache folder, then in the folder `weights` of BREWSTER_DATA. Their content is always checked, because other weights define
+a different metric:
 
-    LPIPS   AlexNet: `features.0`, 3, 6, 8 and 10 of alexnet-owt-7be5be79.pth, stored as a state dict of ten tensors,
-            `lpips_alexnet_features.pth`. The digest of the values is checked.
+    LPIPS   AlexNet: the layers `features.0`, 3, 6, 8 and 10 of alexnet-owt-7be5be79.pth, stored as a state dict of ten
+            tensors, `lpips_alexnet_features.pth`. The digest of the values is checked.
     DISTS   VGG16: the whole file, vgg16-397923af.pth (528 MiB). Its SHA-256 is checked.
 """
 
@@ -80,7 +80,7 @@ _LOAD_ERRORS: Final = (
 def load_alexnet(
     remote: RemoteFile = TORCHVISION_ALEXNET, digest: str = DIGEST, *, downloader: Downloader | None = None
 ) -> dict[str, Tensor]:
-    """AlexNet's ten tensors by name, float32: from the cache, from BREWSTER_DATA, or downloaded into the cache.
+    """Returns AlexNet's ten tensors by name, float32: from the cache, from BREWSTER_DATA, or downloaded into the cache.
 
     Raises:
         ModelError: the file is damaged, or contains other weights.
@@ -96,7 +96,7 @@ def load_alexnet(
 def load_vgg16(
     remote: RemoteFile = TORCHVISION_VGG16, *, downloader: Downloader | None = None
 ) -> list[Tensor]:
-    """VGG16's 26 tensors in the order of `VGG16_TENSORS`, float32: from the cache, BREWSTER_DATA, or downloaded.
+    """Returns VGG16's 26 tensors in the order of `VGG16_TENSORS`, float32: from the cache, BREWSTER_DATA, or downloaded.
 
     Raises:
         ModelError: the file is damaged, or is another file.
@@ -131,7 +131,7 @@ def _cached(name: str) -> Path:
 
 
 def _find(name: str) -> Path | None:
-    """The file in the cache, else in BREWSTER_DATA; None if there is none."""
+    """Returns the path of the file in the cache, else in BREWSTER_DATA, or None if it is in neither."""
     data = os.environ.get("BREWSTER_DATA")
     paths = [_cached(name), *([Path(data) / "weights" / name] if data else [])]
     return next((path for path in paths if path.is_file()), None)
@@ -156,13 +156,13 @@ def read_alexnet(path: Path, digest: str = DIGEST) -> dict[str, Tensor]:
 
 
 def read_heads() -> list[NDArray[np.float32]]:
-    """The channel weights of the five layers: (64,), (192,), (384,), (256,), (256,), all >= 0."""
+    """Returns the channel weights of the five layers: (64,), (192,), (384,), (256,), (256,), all >= 0."""
     with np.load(Path(__file__).with_name("lpips_alex_v0.1.npz")) as file:
         return [file[f"layer{i}"] for i in range(5)]
 
 
 def digest_of(tensors: dict[str, Tensor]) -> str:
-    """SHA-256 over name, shape and little-endian float32 values of each tensor, in the order of `TENSOR_NAMES`."""
+    """Returns the SHA-256 of the name, shape and little-endian float32 values of each tensor, in the order of `TENSOR_NAMES`."""
     digest = hashlib.sha256()
     for name in TENSOR_NAMES:
         values: NDArray[Any] = tensors[name].numpy().astype("<f4", order="C")
@@ -171,7 +171,10 @@ def digest_of(tensors: dict[str, Tensor]) -> str:
 
 
 def _fetch(remote: RemoteFile, digest: str, cached: Path, downloader: Downloader) -> dict[str, Tensor]:
-    """Downloads the whole network, stores its ten tensors in `cached`, and deletes the download, because the other 96 % of the file are not needed."""
+    """Downloads the whole network, stores ten of its tensors in `cached`, and deletes the download.
+
+    The other tensors, 96 % of the file, are not needed.
+    """
     import torch  # noqa: PLC0415 - an extra
 
     download = cached.with_name(remote.url.rsplit("/", 1)[-1])

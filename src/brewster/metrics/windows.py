@@ -22,7 +22,7 @@ BOX_SIDE: Final = 7
 
 GAUSSIAN_RADIUS: Final = 5
 GAUSSIAN_SIGMA: Final = 1.5
-"""The Gaussian window of Wang et al. 2004: 11x11 pixels, as scikit-image's truncation at 3.5 sigma gives."""
+"""The Gaussian window of Wang et al. 2004: 11x11 pixels, as in scikit-image, which truncates it at 3.5 sigma."""
 
 # The first half of the symmetric window, up to its centre; the sum of the whole window is 1.
 _HALF_TAPS: Final = np.exp(-0.5 * (np.arange(-GAUSSIAN_RADIUS, 1) / GAUSSIAN_SIGMA) ** 2)
@@ -42,20 +42,20 @@ def check_images(*images: Image) -> None:
             raise ValueError(f"the images differ in shape: {images[0].shape} and {image.shape}")
 
 
-def check_region(region: Region, size: tuple[int, int]) -> None:
+def check_region(region: Region, shape: tuple[int, int]) -> None:
     """Checks that a region is a bool mask of this (height, width) with at least one pixel.
 
     Raises:
         ValueError: the region is not bool (H, W), or is empty.
     """
-    if region.dtype != np.bool_ or region.shape != size:
-        raise ValueError(f"the region must be bool {size}, not {region.dtype} {region.shape}")
+    if region.dtype != np.bool_ or region.shape != shape:
+        raise ValueError(f"the region must be bool {shape}, not {region.dtype} {region.shape}")
     if not region.any():
         raise ValueError("the region is empty; a metric needs at least one pixel")
 
 
 def mean_inside(values: NDArray[Any], region: Region | None = None) -> float:
-    """The mean of values (H, W, 3), or of those in a region, bool (H, W).
+    """Returns the mean of values (H, W, 3), or of the values in a region, bool (H, W).
 
     Raises:
         ValueError: the region is empty or of another shape.
@@ -63,13 +63,13 @@ def mean_inside(values: NDArray[Any], region: Region | None = None) -> float:
     if region is None:
         return float(np.mean(values))
     check_region(region, values.shape[:2])
-    # Sums over the channels first: indexing (H, W, 3) with a mask of pixels takes ten times as long.
+    # Sum over the channels first, because indexing (H, W, 3) with a mask of pixels takes ten times as long.
     sums = values[..., 0] + values[..., 1] + values[..., 2]
     return float(np.sum(sums[region], dtype=np.float64) / (3 * np.count_nonzero(region)))
 
 
 def box_sums(values: _Values) -> _Values:
-    """Sums over all complete 7x7 windows, (H - 6, W - 6, ...). Integer sums are exact if the dtype can hold them."""
+    """Returns sums over all complete 7x7 windows, (H - 6, W - 6, ...). Integer sums are exact if the dtype can hold them."""
     for axis in (0, 1):
         along_axis = np.moveaxis(values, axis, 0)
         sums_of_2 = along_axis[:-1] + along_axis[1:]
@@ -79,7 +79,7 @@ def box_sums(values: _Values) -> _Values:
 
 
 def gaussian_means(values: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Gaussian-weighted means over all complete 11x11 windows, (H - 10, W - 10, ...)."""
+    """Returns Gaussian-weighted means over all complete 11x11 windows, (H - 10, W - 10, ...)."""
     for axis in (0, 1):
         along_axis = np.moveaxis(values, axis, 0)
         count, last = len(along_axis) - 2 * GAUSSIAN_RADIUS, 2 * GAUSSIAN_RADIUS

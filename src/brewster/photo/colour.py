@@ -1,8 +1,8 @@
 """Converts stored pixels to linear Rec.709 light and back.
 
 A `ColourSpace` has a tone curve for each channel, and a matrix from linear RGB to linear Rec.709. It is read from an ICC
-matrix profile (ICC.1:2022) or from the chromaticities of an EXR. Without these it is sRGB for integers and linear
-Rec.709 for floats. Colours outside the Rec.709 gamut have values below 0 or above 1, which are not clipped.
+matrix profile (ICC.1:2022) or from the chromaticities of an EXR file. Without a profile and chromaticities, integers are
+sRGB and floats are linear Rec.709. Colours outside the Rec.709 gamut have values below 0 or above 1, which are not clipped.
 """
 
 from __future__ import annotations
@@ -86,8 +86,8 @@ class ColourSpace:
     def to_stored(self, linear: Float32, original: Stored) -> Stored:
         """Converts linear Rec.709 (H, W, 3) to stored pixels with the dtype and the channels of `original`.
 
-        `original` is the stored pixels before a change. Where the light is unchanged, its values are returned
-        bit-equal. NaN becomes black.
+        `original` has the stored pixels before a change. Pixels with unchanged light keep exactly these stored values.
+        NaN becomes black.
         """
         stored = np.empty_like(original)
         curves = self._curves(original)
@@ -99,7 +99,9 @@ class ColourSpace:
         for i, curve in enumerate(curves):
             stored[..., i] = _encoded(channels[i], curve, original.dtype)
         is_exact = self == LINEAR_REC709 or (self == SRGB and original.dtype.kind == "u")
-        if not is_exact:  # in the exact spaces, decoding and encoding is the identity; tested
+        if (
+            not is_exact
+        ):  # in an exact space, decoding and encoding returns the same values; a test checks this
             same = np.all(linear == self.to_linear(original), axis=2)
             stored[same] = original[same]
         return stored
@@ -107,8 +109,8 @@ class ColourSpace:
     def _curves(self, stored: Stored) -> tuple[ToneCurve, ...]:
         """Returns the curve of each stored channel.
 
-        Grey uses the green curve: grey profiles have the same curve three times, and in RGB profiles red, green and
-        blue of a neutral colour are equal.
+        Grey pixels use the green curve. With a grey profile, the three curves are the same. With an RGB profile, the red,
+        green and blue of a neutral colour are equal.
         """
         return self.curves if stored.shape[-1] == 3 else (self.curves[1],)
 
@@ -124,7 +126,7 @@ def colour_space_of(icc: bytes | None, primaries: tuple[float, ...] | None, is_f
     Without a profile and chromaticities, integers are sRGB and floats are linear Rec.709.
 
     Raises:
-        UnsupportedPhoto: the profile is not a grey profile with a curve, nor an RGB profile with curves and a matrix.
+        UnsupportedPhoto: the profile is neither a grey profile with a curve nor an RGB profile with curves and a matrix.
     """
     if icc is not None:
         return _profile_space(icc)
@@ -158,8 +160,8 @@ def _decode_table(curve: ToneCurve, white: int) -> Float32:
 def _encode_table(curve: ToneCurve, white: int) -> NDArray[Any]:
     """Returns a lookup table from the square root of linear light to stored integers.
 
-    The square root gives dark values more entries, as tone curves do. With 2**16 entries the rounding error is
-    below 0.01 levels of 8 bits, with 2**20 entries below 0.1 levels of 16 bits.
+    With the square root, dark values have more entries, as in tone curves. With 2**16 entries, the rounding error is below
+    0.01 levels of 8 bits; with 2**20 entries, it is below 0.1 levels of 16 bits.
     """
     sqrt_light = np.linspace(0, 1, 2**16 if white < 256 else 2**20)
     levels = np.rint(np.clip(curve.encode(sqrt_light**2), 0, 1) * white)
@@ -169,7 +171,7 @@ def _encode_table(curve: ToneCurve, white: int) -> NDArray[Any]:
 def _apply_matrix(matrix: Matrix, channels: list[Float32]) -> list[Float32]:
     """Multiplies the channels of each pixel by a matrix.
 
-    This does not use BLAS, because its rounding depends on the position of a pixel in the strip.
+    BLAS is not used, because its rounding depends on the position of a pixel in the strip.
     """
     red, green, blue = channels
     rows = np.array(matrix, np.float32)
@@ -177,7 +179,7 @@ def _apply_matrix(matrix: Matrix, channels: list[Float32]) -> list[Float32]:
 
 
 def _grey(linear: Float32) -> Float32:
-    """Returns the luminance (H, W). Where all channels are equal, it is exactly their value."""
+    """Returns the luminance (H, W). For pixels with equal channels, the luminance is exactly the value of the channels."""
     red, green, blue = (linear[..., i] for i in range(3))
     weights = np.array(srgb.REC709_LUMINANCE, np.float32)
     neutral = (red == green) & (green == blue)
@@ -223,13 +225,13 @@ def _profile_space(icc: bytes) -> ColourSpace:
         raise UnsupportedPhoto(
             f"the embedded colour profile ({len(icc)} bytes) does not consist of curves and a matrix",
             "expected an RGB or grey profile such as sRGB, Display P3, Adobe RGB or ProPhoto",
-            "convert the photo to one of these first",
+            "convert the photo to one of these profiles first",
         ) from error
     return space
 
 
 def _snap_to_srgb(space: ColourSpace) -> ColourSpace:
-    """Returns SRGB for a profile that equals sRGB within its rounding errors; otherwise returns `space`."""
+    """Returns SRGB for a profile that equals sRGB except for rounding errors; otherwise returns `space`."""
     levels = np.arange(256) / 255
     curve_errors = [np.abs(curve.decode(levels) - srgb.to_linear(levels)).max() for curve in space.curves]
     matrix_error = np.abs(np.array(space.matrix) - np.eye(3)).max() if space.matrix else 0.0

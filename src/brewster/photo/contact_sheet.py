@@ -17,17 +17,19 @@ from brewster.photo.photo import Photo
 _ROW_PX = 240
 _LABEL_PX = 24
 _GAP_PX = 8
-_MAX_ROWS = 200  # 54,400 pixels; a JPEG has at most 65,535
+_MAX_ROWS = 200  # their height is 54,400 pixels; a JPEG has at most 65,535
 Encoded = NDArray[np.uint8]
 
 
 def write_contact_sheets(
     path: Path, rows: Sequence[tuple[Path, Sequence[Path]]], max_pixels: int
 ) -> Iterator[Path]:
-    """Writes the rows to `path`, or, if there are more than 200, to `sheet.jpg`, `sheet-2.jpg`, ... Yields each path.
+    """Writes the rows to `path`. Yields the path of each sheet.
+
+    A sheet has at most 200 rows. Further sheets have a number: `sheet.jpg`, `sheet-2.jpg` and so on.
 
     Args:
-        path: the image file, which is replaced if it exists.
+        path: the image file. An existing file is replaced.
         rows: the file of each photo, and the files of its layers. The label of a row is the path of the photo.
         max_pixels: files with more pixels are refused.
 
@@ -71,8 +73,7 @@ def _row(photos: Sequence[Photo], label: str) -> Encoded:
     canvas[:_ROW_PX] = images
     printable = "".join(letter if letter.isprintable() else "?" for letter in label)
     escaped = printable.replace("&", "&amp;").replace("<", "&lt;")  # Pango reads markup
-    text = pyvips.Image.text(escaped, dpi=90).numpy()[
-        :_LABEL_PX, -images.shape[1] :
-    ]  # the end of a long path
+    # If the path is too long for the row, only its end is shown.
+    text = pyvips.Image.text(escaped, dpi=90).numpy()[:_LABEL_PX, -images.shape[1] :]
     canvas[_ROW_PX : _ROW_PX + text.shape[0], : text.shape[1]] = 255 - text[..., None]
     return canvas

@@ -28,8 +28,8 @@ from brewster.photo.hdr_formats import read_exr, read_hdr, too_large_error
 from brewster.photo.lut_profiles import has_only_tables
 from brewster.photo.raw import is_raw, read_raw, read_raw_size
 
-pyvips.cache_set_max(0)  # each image is read once, so the operation cache of libvips would only use memory
-logging.getLogger("pyvips").addHandler(logging.NullHandler())  # its warnings become brewster errors
+pyvips.cache_set_max(0)  # each image is read once, so the operation cache of libvips has no use
+logging.getLogger("pyvips").addHandler(logging.NullHandler())  # warnings of libvips become brewster errors
 
 Stored = NDArray[Any]
 
@@ -75,10 +75,11 @@ def decode(data: bytes, max_pixels: int) -> Decoded:
 def read_size(data: bytes) -> tuple[int, int]:
     """Returns (width, height), equal to `Photo.open(data).size`, from the header only.
 
-    Checks the header as `Photo.open` does. Does not find damaged pixel data. EXR and HDR files are read completely.
+    The header is checked as in `Photo.open`. Damaged pixel data are not found. EXR and HDR files are read completely.
 
     Raises:
-        PhotoError: an error of `Photo.open`.
+        PhotoError: the image cannot be read, is not supported, or is too large (see `Photo.open`).
+        MissingExtra: the reader of EXR, HEIC or RAW is not installed.
     """
     container = _detect_container(data)
     if container == "ora":
@@ -109,10 +110,9 @@ _FLOAT_READERS = {"exr": read_exr, "hdr": read_hdr}
 
 def _detect_container(data: bytes) -> str:
     if not data:
-        raise UnreadablePhoto("the file is empty", "expected an image file", "copy it again")
-    if re.match(
-        rb"....ftypmi[fa]", data, re.DOTALL
-    ):  # both formats use these brands; only HEIC files have a decoder configuration hvcC
+        raise UnreadablePhoto("the file is empty", "expected an image file", "copy the file again")
+    # AVIF and HEIC files use these brands. Only HEIC files have a decoder configuration hvcC.
+    if re.match(rb"....ftypmi[fa]", data, re.DOTALL):
         return "heic" if b"hvcC" in data[: 1 << 16] else "avif"
     for image_format in FORMATS.values():
         if re.match(image_format.signature, data, re.DOTALL):
@@ -125,7 +125,7 @@ def _detect_container(data: bytes) -> str:
     raise UnreadablePhoto(
         f"the file starts with {data[:12]!r}, which is no known image format",
         f"expected one of {', '.join(FORMATS)}",
-        "convert it, or check that its content matches its name",
+        "convert the file, or check that its content matches its name",
     )
 
 
@@ -171,7 +171,7 @@ def _unreadable_error(container: str, error: Exception | str) -> PhotoError:
     return UnreadablePhoto(
         f"the {container} cannot be read completely ({message[:200] or error})",
         "expected a complete file in a common variant of the format",
-        "copy it again from its source, or convert it",
+        "copy the file again from its source, or convert it",
     )
 
 
@@ -194,14 +194,14 @@ def _check_supported(image: pyvips.Image, data: bytes, container: str, max_pixel
         raise UnsupportedPhoto(
             f"the {container} has CMYK colours",
             "expected an RGB or grey image",
-            "convert it to sRGB first",
+            "convert the image to sRGB first",
         )
     interpretations = {1: _GREY, 2: _GREY, 3: _RGB, 4: _RGB}.get(image.bands, ())
     if image.interpretation not in interpretations or image.format not in _DTYPES:
         raise UnsupportedPhoto(
             f"the {container} has {image.bands} channels of {image.format} ({image.interpretation})",
             "expected grey or RGB, with or without alpha, of 8 or 16 bits or 32-bit floats",
-            "convert it to one of these",
+            "convert the image to one of these",
         )
     is_tiff = container == "tiff"
     if is_tiff and metadata.pixel_data_end(metadata.read_tags(data)) > len(data):
@@ -245,7 +245,7 @@ def _profile_of(data: bytes, container: str) -> bytes | None:
         raise UnsupportedPhoto(
             f"the {container} has the colours of HDR video (primaries {primaries}, transfer {transfer})",
             "expected sRGB, Display P3, or an ICC profile",
-            "export it with one of these",
+            "export the image with one of these",
         )
     return bytes(pyvips.Image.profile_load("p3")) if primaries == 12 else None
 
@@ -256,7 +256,7 @@ def _jpeg_info(data: bytes) -> dict[str, Any]:
 
 
 def _jpeg_quality(data: bytes, bands: int) -> int:
-    """Returns the lowest libvips quality whose quantization is at least as fine as that of the file, for luma and chroma."""
+    """Returns the lowest libvips quality whose quantization, for luma and chroma, is at least as fine as that of the file."""
     source = metadata.jpeg_quantization_sums(data)
     square = pyvips.Image.black(8, 8, bands=bands)
 
@@ -289,7 +289,7 @@ def _webp_info(data: bytes) -> dict[str, Any]:
 
 
 def _avif_info(data: bytes) -> dict[str, Any]:
-    """Returns whether the AVIF is lossless: only then it stores RGB (matrix code 0, the identity)."""
+    """Returns whether the AVIF is lossless. Only a lossless AVIF stores RGB (matrix code 0, the identity)."""
     codes = metadata.cicp(data)
     return {"lossless": codes is not None and codes[2] == 0}
 
@@ -304,12 +304,13 @@ def _merged_image(data: bytes, max_pixels: int) -> bytes:
     """Returns the PNG of the merged image in an OpenRaster file (baseline 0.0.6).
 
     Raises:
-        PhotoError: the archive is damaged, has no merged image, or one that is larger than any PNG of `max_pixels`.
+        PhotoError: the archive is damaged or has no merged image, or the merged image is larger than any PNG of
+            `max_pixels` pixels.
     """
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
             if archive.getinfo("mergedimage.png").file_size > (1 << 20) + 16 * max_pixels:
-                raise _unreadable_error("ora", "its merged image is too large")
+                raise _unreadable_error("ora", "the merged image is too large")
             return archive.read("mergedimage.png")
     except (zipfile.BadZipFile, KeyError, ValueError, OSError, NotImplementedError, zlib.error) as error:
         raise _unreadable_error("ora", error) from error
@@ -370,7 +371,8 @@ _TRANSPOSED = (5, 6, 7, 8)
 def _full_scale(array: Stored, bits: int) -> Stored:
     """Scales 10- and 12-bit values to 16 bits, so that white is 65535.
 
-    The libraries return such values in the upper bits of 16. The lower bits are filled with a copy of the upper bits.
+    The libraries return such values in the upper bits of 16-bit integers. The lower bits are filled with a copy of the
+    upper bits.
     """
     return array | array >> bits if bits in (10, 12) else array
 

@@ -18,11 +18,10 @@ from brewster.photo.hdr_formats import HdrPixels, write_exr, write_hdr
 Stored = NDArray[Any]
 
 _KEPT_METADATA = 2 | 4 | 8  # libvips flags for XMP, IPTC and ICC; EXIF is inserted unchanged afterwards
-_KEPT_AVIF_METADATA = (
-    _KEPT_METADATA | 1
-)  # also EXIF: libvips must create the item, whose content is replaced afterwards
+# For AVIF, libvips also writes the EXIF item, whose content is replaced afterwards.
+_KEPT_AVIF_METADATA = _KEPT_METADATA | 1
 _DEFAULT_QUALITY = 95  # for lossy files, if the quality of the source is unknown
-_DEFAULT_AVIF_QUALITY = 90  # AV1 has another quality scale
+_DEFAULT_AVIF_QUALITY = 90  # the quality scale of AV1 differs from that of JPEG
 _DEFAULT_RESOLUTION = (72 / 25.4, 72 / 25.4)
 
 
@@ -36,7 +35,7 @@ def encode(pixels: Stored, alpha: Stored | None, file_info: FileInfo) -> bytes:
     if alpha is not None and not FORMATS[file_info.container].has_alpha:
         raise UnsupportedPhoto(
             f"the photo has an alpha channel, which {file_info.container} cannot store",
-            "expected a format with alpha, because no channel is dropped silently",
+            "expected a format with alpha, because brewster drops no channel",
             f"write {', '.join(name for name, row in WRITABLE.items() if row.has_alpha)}",
         )
     if file_info.container == "exr":
@@ -102,7 +101,7 @@ def _save_options(file_info: FileInfo, dtype: np.dtype[Any]) -> dict[str, Any]:
                 "lossless": file_info.lossless,
                 "subsample_mode": "off",
             }
-            # effort 1 takes 1/7 of the time of the default; files are 1/8 larger
+            # Effort 1 takes 1/7 of the time of the default effort. The files are 1/8 larger.
             return {
                 "compression": "av1",
                 "bitdepth": file_info.bits,

@@ -13,7 +13,7 @@ from brewster.image_formats import WRITABLE, format_of
 
 @dataclass(frozen=True)
 class FileInfo:
-    """The metadata of the file of a photo. `exif` begins at its TIFF header, and its orientation is reset to 1."""
+    """The metadata of the file of a photo. `exif` is the block from its TIFF header on; its orientation is reset to 1."""
 
     container: str = "png"
     """The name of the file format, a key of `brewster.image_formats.FORMATS`."""
@@ -34,11 +34,11 @@ class FileInfo:
     lossless: bool = False
     """Whether a WebP or AVIF is compressed without loss."""
     primaries: tuple[float, ...] | None = None
-    """Chromaticities of an EXR or HDR: x and y of red, green, blue and white. None if the file has none."""
+    """Chromaticities of an EXR or HDR: x and y of red, green, blue and white. None if they are unknown."""
     header: Mapping[str, Any] | None = None
     """The other attributes of an EXR or HDR."""
     software: str | None = None
-    """The program that made the pixels, for EXR and HDR, which have neither EXIF nor XMP."""
+    """The program that created the pixels. It is written to EXR and HDR files, which have neither EXIF nor XMP."""
 
 
 def container_of(path: Path) -> str:
@@ -60,11 +60,11 @@ def container_of(path: Path) -> str:
 def depth_for(file_info: FileInfo, container: str, bit_depth: int | None) -> int:
     """Returns the bits per channel to write.
 
-    This is `bit_depth` if it is not None. Otherwise it is the largest depth of the format that is not larger than the
-    depth of the file, or the smallest depth of the format if all are larger.
+    The result is `bit_depth` if it is not None. Otherwise it is the largest depth of the format that is not larger than
+    the depth of the file, or the smallest depth of the format if all its depths are larger.
 
     Raises:
-        UnsupportedPhoto: brewster does not write this format, or not at this bit depth.
+        UnsupportedPhoto: brewster does not write this format, or does not write it at this bit depth.
     """
     depths = WRITABLE[container].bit_depths if container in WRITABLE else ()
     if not depths or (bit_depth is not None and bit_depth not in depths):

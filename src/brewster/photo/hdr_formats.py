@@ -1,6 +1,6 @@
 """Reads and writes floating-point images: OpenEXR with its own package, Radiance HDR with built-in code.
 
-Both formats store linear light. The other header attributes of a file are read, and written again.
+Both formats store linear light. The other header attributes of a file are kept and written to new files.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ Float32 = NDArray[np.float32]
 
 @dataclass(frozen=True)
 class HdrPixels:
-    """Pixels (H, W, 1|3) in linear light, alpha (H, W) or None, both float32, and the metadata of their file."""
+    """Pixels (H, W, 1|3) in linear light and alpha (H, W) or None, both float32, with the metadata of their file."""
 
     pixels: Float32
     alpha: Float32 | None
@@ -42,7 +42,7 @@ def too_large_error(width: int, height: int, max_pixels: int) -> PhotoTooLarge:
 def _valid_chromaticities(chromaticities: Sequence[float | str]) -> tuple[float, ...] | None:
     """Returns chromaticities if red, green and blue form a triangle, otherwise None.
 
-    They may be missing, or all zero, as some programs write them.
+    Some programs write no chromaticities, or zeros.
     """
     try:
         points = np.array(chromaticities, np.float64).reshape(4, 2)
@@ -93,7 +93,9 @@ def _exr_part(data: bytes, *, header_only: bool) -> Any:  # noqa: ANN401  (OpenE
         return exr.File(io.BytesIO(data), separate_channels=True, header_only=header_only).parts[0]
     except (RuntimeError, ValueError, TypeError, IndexError) as error:
         raise UnreadablePhoto(
-            f"the EXR cannot be read completely ({error})", "expected a complete file", "export it again"
+            f"the EXR cannot be read completely ({error})",
+            "expected a complete file",
+            "export the image again",
         ) from error
 
 
@@ -103,7 +105,7 @@ def _exr_pixels(channels: dict[str, NDArray[Any]], header: dict[str, Any]) -> Hd
         raise UnsupportedPhoto(
             f"the EXR has the channels {', '.join(sorted(channels))}",
             "expected the channels R, G, B or Y, and optionally A",
-            "export it with these names",
+            "export the image with these names",
         )
     is_half = all(channels[name].dtype == np.float16 for name in names)
     attributes = {key: value for key, value in header.items() if key not in ("channels", "tiles", "type")}
@@ -153,7 +155,7 @@ _RESERVED_ATTRIBUTES = {
     "type",
     "version",
 }
-"""Attributes that OpenEXR defines itself. It silently drops text attributes with some of these names."""
+"""Attributes that OpenEXR defines. It drops text attributes with some of these names without an error."""
 
 
 def write_exr_layers(layers: Mapping[str, Float32], header: Mapping[str, str]) -> bytes:
@@ -169,8 +171,8 @@ def write_exr_layers(layers: Mapping[str, Float32], header: Mapping[str, str]) -
     exr = _openexr()
     if reserved := _RESERVED_ATTRIBUTES & header.keys():
         raise UnsupportedPhoto(
-            f"attributes are named {', '.join(sorted(reserved))}",
-            "expected other names, because OpenEXR reserves these",
+            f"attributes have the names {', '.join(sorted(reserved))}",
+            "expected other names, because these are reserved by OpenEXR",
             "choose other names",
         )
     max_value = float(np.finfo(np.float16).max)
@@ -207,7 +209,7 @@ def read_exr_layers(data: bytes) -> dict[str, Float32]:
         raise UnreadablePhoto(
             f"the EXR has the channels {', '.join(sorted(channels))}",
             'expected channels with names such as "name.R", "name.G" and "name.B"',
-            "open it with Photo.open, or write it again",
+            "open the file with Photo.open, or write it again",
         )
     return layers
 
@@ -231,12 +233,14 @@ def read_hdr(data: bytes, max_pixels: int) -> HdrPixels:
         raise UnsupportedPhoto(
             f"the header of the HDR image ends in {resolution[:40]!r}",
             "expected an RGBE image with lines from top to bottom, '-Y height +X width'",
-            "export it in this form",
+            "export the image in this form",
         )
     height, width = int(resolution_match[1]), int(resolution_match[2])
     if width * height == 0:
         raise UnreadablePhoto(
-            f"the HDR image has {width} x {height} pixels", "expected at least one pixel", "export it again"
+            f"the HDR image has {width} x {height} pixels",
+            "expected at least one pixel",
+            "export the image again",
         )
     if width * height > max_pixels:
         raise too_large_error(width, height, max_pixels)
@@ -265,7 +269,7 @@ def _scan_lines(body: bytes, width: int, height: int) -> NDArray[np.uint8]:
         raise UnreadablePhoto(
             "the HDR image cannot be read completely (it is truncated)",
             f"expected {height} lines, as its header states",
-            "copy it again from its source",
+            "copy the file again from its source",
         ) from error
 
 
@@ -297,7 +301,7 @@ def _from_rgbe(rgbe: NDArray[np.uint8]) -> Float32:
 
 
 def _to_rgbe(pixels: Float32) -> NDArray[np.uint8]:
-    """Inverts `_from_rgbe`, exactly for its outputs. Negative light becomes black."""
+    """Converts light to RGBE bytes. For light from `_from_rgbe`, this is the exact inverse. Negative light becomes black."""
     light = np.fmax(pixels, 0)
     _, exponent = np.frexp(light.max(axis=2))
     exponent = np.clip(exponent, -127, 127)

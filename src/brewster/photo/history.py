@@ -1,7 +1,7 @@
-"""Records in the metadata of a layer which program made it, and with which options: XMP history, EXIF Software.
+"""Records the program that created a layer, and its options, in the metadata of the layer: XMP history, EXIF Software.
 
-The block that a camera or an editor has written is kept; an entry is added to it. There is no date in the entry, so that the
-same input gives the same bytes. XMP: ISO 16684-1, and part 2 of the XMP specification (xmpMM:History, stEvt:*).
+The XMP block of a camera or an editor is kept, and an entry is added to it. The entry has no date, so that the same input
+gives the same bytes. XMP is defined by ISO 16684-1 and by part 2 of the XMP specification (xmpMM:History, stEvt:*).
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from brewster.photo.file_info import FileInfo
 from brewster.photo.metadata import png_chunks
 
 _EXIF_SOFTWARE = 305
-_MAX_EXIF_BYTES = 65527  # a JPEG segment of 65533 bytes, less the name of the block
+_MAX_EXIF_BYTES = 65527  # a JPEG segment of 65533 bytes without the name of the block
 _SEARCHED_BYTES = 1 << 18
 _PACKET = """<?xpacket begin="\ufeff" id="W5M0MpCehiHzreSzNTczkc9d"?>
 <x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#">
@@ -52,9 +52,9 @@ def with_history(file_info: FileInfo, software: str, parameters: Mapping[str, st
 
 
 def recorded_parameters(path: Path, program: str) -> dict[str, str] | None:
-    """Returns the parameters of the last step of a program in the history of a file, or None if it has none.
+    """Returns the parameters of the last step of a program in the history of a file, or None if there is no such step.
 
-    Only the first and the last 256 KiB are read, where all writers put the metadata.
+    Only the first and the last 256 KiB are read, because all writers put the metadata there.
     """
     try:
         with path.open("rb") as file:
@@ -73,7 +73,7 @@ def recorded_parameters(path: Path, program: str) -> dict[str, str] | None:
 
 
 def _png_xmp(data: bytes) -> bytes:
-    """Returns the XMP block of a PNG, or nothing. libvips writes it as compressed text (PNG 11.3.3.3, zTXt)."""
+    """Returns the XMP block of a PNG, or no bytes. libvips writes the block as compressed text (PNG 11.3.3.3, zTXt)."""
     name, _, text = png_chunks(data).get(b"zTXt", b"").partition(b"\0")
     with contextlib.suppress(zlib.error):
         return zlib.decompress(text[1:]) if name == b"XML:com.adobe.xmp" else b""
@@ -94,10 +94,10 @@ def _with_entry(xmp: bytes, entry: bytes) -> bytes:
 
 
 def _with_exif_software(exif: bytes, software: str) -> bytes:
-    """Sets the tag Software of an EXIF block. All bytes but the offset of the first directory stay where they are.
+    """Sets the tag Software of an EXIF block. All existing bytes keep their positions.
 
-    The directory with the new tag is appended, so that the offsets in maker notes stay valid. A damaged block, and one that
-    would become too large for a JPEG, is returned unchanged.
+    The directory with the new tag is appended, and the offset of the first directory is set to it. Therefore the offsets in
+    maker notes stay valid. A damaged block is returned unchanged, and so is a block that becomes too large for a JPEG.
     """
     byte_order = {b"II*\0": "<", b"MM\0*": ">"}.get(exif[:4])
     if byte_order is None or len(exif) < 10:

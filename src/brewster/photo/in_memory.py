@@ -19,7 +19,7 @@ Encoding = Literal["srgb", "linear"]
 WHITE_LEVELS = {"uint8": 255, "uint16": 65535, "float16": 1, "float32": 1, "float64": 1}
 """The value of white for each supported dtype."""
 _ROUNDING = 1e-3
-"""Floats may be outside 0..1 by this much, less than half a level of 8 bits, because of rounding."""
+"""Floats may be outside 0..1 by this amount because of rounding. It is less than half a level of 8 bits."""
 
 
 @runtime_checkable
@@ -40,7 +40,7 @@ class WritableFile(Protocol):
 
 @runtime_checkable
 class PilImage(Protocol):
-    """An image of the package Pillow, which brewster does not import to read it."""
+    """An image of the package Pillow. brewster does not import Pillow to read such an image."""
 
     width: int
     height: int
@@ -95,13 +95,13 @@ def _check_array(array: Stored, encoding: Encoding) -> None:
         raise UnsupportedPhoto(
             f"the array has the shape {array.shape} and the dtype {array.dtype}",
             "expected (H, W) or (H, W, 1|3|4) of uint8, uint16 or float",
-            "reshape or convert it",
+            "reshape or convert the array",
         )
     if not np.isfinite(array).all():
         raise UnsupportedPhoto(
             "the array contains infinity or NaN",
             "expected finite values",
-            "replace them first",
+            "replace these values first",
         )
     if array.dtype.kind != "f" or array.size == 0:
         return
@@ -112,7 +112,7 @@ def _check_array(array: Stored, encoding: Encoding) -> None:
         raise UnsupportedPhoto(
             f"the {what} of the array are in {low:g}..{high:g}",
             "expected 0..1, because 1.0 is white",
-            "divide values of 8 bits by 255, clip the others, or pass linear light",
+            "divide 8-bit values by 255, clip values outside 0..1, or pass linear light",
         )
 
 
@@ -122,7 +122,7 @@ def decode_pil(image: Any) -> Decoded:  # noqa: ANN401  (Pillow is optional, so 
         raise UnsupportedPhoto(
             f"the PIL image has {image.n_frames} frames",
             "expected a single image",
-            "seek the frame and pass image.copy()",
+            "select a frame with image.seek, and pass image.copy()",
         )
     if image.mode in ("P", "PA", "1"):
         has_alpha = image.mode == "PA" or "transparency" in image.info
@@ -156,7 +156,7 @@ def pil_image(pixels: Stored, alpha: Stored | None, file_info: FileInfo) -> Any:
     except ImportError as error:
         raise MissingExtra(
             "the Pillow package is not installed",
-            "expected it to be installed, because to_pil returns its images",
+            "expected it to be installed, because to_pil returns an image of Pillow",
             "run: pip install pillow",
         ) from error
     array = pixels if alpha is None else np.concatenate([pixels, alpha[..., None]], axis=2)

@@ -1,6 +1,6 @@
 """Converts photos with LUT-based ICC profiles, which scanners and some cameras write, to Display P3.
 
-colour.py converts with profiles of curves and a matrix, in both directions. A photo with another RGB profile is
+colour.py uses profiles with curves and a matrix, and converts in both directions. A photo with another RGB profile is
 converted to Display P3 when it is opened, by littleCMS in libvips. Display P3 is the largest colour space whose profile
 libvips includes. Colours outside Display P3 are clipped.
 """
@@ -57,13 +57,13 @@ def convert_to_display_p3(pixels: NDArray[Any], file_info: FileInfo) -> tuple[ND
     except pyvips.Error as error:
         raise _damaged_profile(icc, str(error).strip()) from error
     if profile_is_ignored:
-        raise _damaged_profile(icc, "libvips ignores it")
+        raise _damaged_profile(icc, "libvips ignores the profile")
     return array, replace(file_info, icc=bytes(pyvips.Image.profile_load("p3")))
 
 
 _PROBE_LEVELS = np.arange(0, 256, 51).astype(np.uint8)
 _PROBE_COLOURS = np.stack(np.meshgrid(_PROBE_LEVELS, _PROBE_LEVELS, _PROBE_LEVELS), axis=-1).reshape(-1, 6, 3)
-"""Test colours. If they convert exactly as with sRGB, libvips cannot use the profile and silently uses sRGB instead."""
+"""Test colours. If a profile converts them exactly as sRGB does, libvips could not use the profile and used sRGB."""
 
 
 def _convert(pixels: NDArray[Any], icc: bytes) -> NDArray[Any]:

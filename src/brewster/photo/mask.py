@@ -3,7 +3,7 @@
     mask = Mask.open("mask.png", photo.size)
     mask.rows(0, 64)  # (64, W, 1) float32: 1 where the mask is white, 0 where it is black
 
-The stored values are weights, not light: they are not converted by a transfer curve or a colour profile.
+The stored values are weights, not light, so they are not converted by a transfer curve or a colour profile.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ class Mask:
     """The weights of the pixels of a photo. Immutable and thread-safe."""
 
     values: Stored
-    """(H, W) uint8, uint16 or float32; white is 255, 65535 or 1."""
+    """The stored values, (H, W) uint8, uint16 or float32; white is 255, 65535 or 1."""
 
     @classmethod
     def open(cls, source: Source, size: tuple[int, int]) -> Mask:
@@ -36,8 +36,8 @@ class Mask:
             size: the (width, height) of the photo, with its EXIF orientation applied.
 
         Raises:
-            MaskError: the source cannot be read, has colours or transparent pixels, values outside 0..1, or another
-                size than the photo.
+            MaskError: the source cannot be read, has colours, transparent pixels or values outside 0..1, or does not
+                have the size of the photo.
         """
         try:
             photo = _open(source)
@@ -57,7 +57,7 @@ class Mask:
         if photo.alpha is not None and (photo.alpha != WHITE_LEVELS[photo.alpha.dtype.name]).any():
             raise MaskError(
                 "the mask has transparent pixels",
-                "expected white where the photo is separated, and black where it is not",
+                "expected white pixels where the photo is to be separated, and black pixels elsewhere",
                 "flatten the layers of the mask",
             )
         values = np.ascontiguousarray(pixels[..., 0])
@@ -81,5 +81,5 @@ def _open(source: Source) -> Photo:
     if not isinstance(source, np.ndarray):
         return Photo.open(source)
     array = np.uint8(255) * source if source.dtype == np.bool_ else source
-    # integers with the encoding srgb and floats with the encoding linear are stored unchanged
+    # Integers with the encoding "srgb" and floats with the encoding "linear" are stored unchanged.
     return Photo.from_array(array, encoding="linear" if array.dtype.kind == "f" else "srgb")

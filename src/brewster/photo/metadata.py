@@ -1,7 +1,7 @@
 """Reads and writes metadata as bytes: JPEG tables, EXIF, PNG and WebP chunks.
 
-libvips writes EXIF with libexif, which drops unknown tags, and ignores EXIF in TIFF. This module copies the EXIF
-block of the source unchanged. A block begins at its TIFF header, without the "Exif\\0\\0" of JPEG.
+libvips writes EXIF with libexif, which drops unknown tags, and libvips ignores EXIF in TIFF files. This module copies the
+EXIF block of the source unchanged. A block begins at its TIFF header, without the "Exif\\0\\0" of JPEG.
 """
 
 from __future__ import annotations
@@ -36,13 +36,13 @@ def jpeg_segments(data: bytes) -> Iterator[tuple[int, int, bytes]]:
 
 
 def jpeg_exif(data: bytes) -> bytes:
-    """Returns the EXIF block of a JPEG, or nothing if it has none."""
+    """Returns the EXIF block of a JPEG, or no bytes if there is no block."""
     blocks = (payload for marker, _, payload in jpeg_segments(data) if marker == _APP1)
     return next((block[len(_EXIF_NAME) :] for block in blocks if block.startswith(_EXIF_NAME)), b"")
 
 
 def jpeg_quantization_sums(data: bytes) -> dict[int, int]:
-    """Returns the sum of each quantization table by its number (0: luma, 1: chroma). A larger sum is coarser."""
+    """Returns the sum of each quantization table by its number (0: luma, 1: chroma). A table with a larger sum is coarser."""
     sums = {}
     for marker, _, payload in jpeg_segments(data):
         while marker == _DQT and payload:
@@ -139,7 +139,7 @@ def with_webp_exif(data: bytes, exif: bytes, size: tuple[int, int], has_alpha: b
 def cicp(data: bytes) -> tuple[int, int, int] | None:
     """Returns the code points (CICP, ITU-T H.273) of primaries, transfer function and matrix of an AVIF, HEIC or PNG.
 
-    Returns None if the file has none.
+    Returns None for a file without code points.
     """
     if data.startswith(b"\x89PNG"):
         chunk = png_chunks(data).get(b"cICP", b"")
@@ -154,7 +154,7 @@ def cicp(data: bytes) -> tuple[int, int, int] | None:
 def with_avif_exif(data: bytes, exif: bytes) -> bytes:
     """Replaces the Exif item of an AVIF that libvips has written.
 
-    The block is appended to the file, and the location of the item is set to it.
+    The new block is appended to the file, and the location of the item is set to this block.
     """
     item = re.search(rb"infe\x02...(..)..Exif", data, re.DOTALL)
     row = _item_location(data, item[1]) if item else None
@@ -169,7 +169,7 @@ def with_avif_exif(data: bytes, exif: bytes) -> bytes:
 def _item_location(data: bytes, item: bytes) -> int | None:
     """Returns the position of the location of an item (base, count, offset, length) in an iloc box.
 
-    Returns None if the box has another layout than the one that libheif writes.
+    Returns None if the box does not have the layout that libheif writes.
     """
     table = data.find(b"iloc")
     version, size_fields, index_fields = data[table + 4], data[table + 8], data[table + 9]
@@ -188,7 +188,7 @@ def _item_location(data: bytes, item: bytes) -> int | None:
 # --- EXIF and TIFF directories (TIFF 6.0 section 2, CIPA DC-008)
 
 Tags = dict[int, "tuple[int, int, bytes] | Tags"]
-"""Tag -> (type, count, little-endian value). For a pointer: tag -> the directory at its target."""
+"""The tags of a directory by number. An entry is (type, count, little-endian value), or the directory for a pointer tag."""
 
 _POINTER_TAGS = (34665, 34853, 40965)  # Exif, GPS, interoperability
 _CAMERA_TAGS = (
@@ -208,7 +208,7 @@ _RATIONAL_TYPES = (5, 10)  # two numbers: numerator and denominator
 
 
 def read_tags(data: bytes) -> Tags:
-    """Returns the first directory of a TIFF or EXIF block with its subdirectories, or an empty one if there is none."""
+    """Returns the first directory of a TIFF or EXIF block with its subdirectories, or an empty dict for other data."""
     byte_order = {b"II*\0": "<", b"MM\0*": ">"}.get(data[:4])
     if byte_order is None:
         return {}
@@ -264,7 +264,7 @@ def numbers(tags: Tags, tag: int) -> list[int]:
 
 
 def orientation_of(exif: bytes) -> int:
-    """Returns the orientation 1..8 of an EXIF block, or 1 if it has none."""
+    """Returns the orientation 1..8 of an EXIF block, or 1 if the block has no orientation."""
     orientation = number_of(read_tags(exif.removeprefix(_EXIF_NAME)), _ORIENTATION, 1)
     return orientation if 1 <= orientation <= 8 else 1
 
@@ -287,7 +287,7 @@ def _serialize_directory(tags: Tags, position: int) -> tuple[bytes, int]:
 
 
 def tiff_exif(tags: Tags) -> bytes | None:
-    """Returns an EXIF block with the camera tags of a TIFF, or None if it has none."""
+    """Returns an EXIF block with the camera tags of a TIFF, or None if there are no such tags."""
     camera: Tags = {tag: entry for tag, entry in tags.items() if tag in _CAMERA_TAGS}
     if not camera:
         return None
@@ -297,7 +297,7 @@ def tiff_exif(tags: Tags) -> bytes | None:
 
 
 def with_tiff_exif(data: bytes, exif: bytes) -> bytes:
-    """Adds the camera tags of an EXIF block to a little-endian TIFF of one page, in a new directory at its end."""
+    """Adds the camera tags of an EXIF block to a little-endian TIFF of one page, in a new directory at the end of the file."""
     tags = read_tags(data)
     tags.update((tag, entry) for tag, entry in read_tags(exif).items() if tag in _CAMERA_TAGS)
     start = len(data) + len(data) % 2
@@ -306,7 +306,7 @@ def with_tiff_exif(data: bytes, exif: bytes) -> bytes:
 
 
 def upright_exif(exif: bytes) -> bytes:
-    """Returns an EXIF block with orientation 1 and without the thumbnail. It begins at the TIFF header.
+    """Returns an EXIF block with orientation 1 and without the thumbnail. The result begins at the TIFF header.
 
     The thumbnail shows the input before rotation and separation, so the pointer to its directory is set to 0. All other
     bytes are unchanged.

@@ -1,11 +1,11 @@
 """Writes transmission and reflection as one layered image for editors.
 
-OpenRaster (baseline 0.0.6, the format of Krita, GIMP and MyPaint): a zip archive with stack.xml and a PNG for each layer. The
-reflection lies above the transmission with the blend mode svg:plus, and the sum of both is the photo.
+OpenRaster (baseline 0.0.6) is a format of Krita, GIMP and MyPaint: a zip archive with stack.xml and a PNG for each layer.
+The reflection is above the transmission, with the blend mode svg:plus. The sum of both layers is the photo.
 
-Editors add the stored values: Krita always, GIMP because it reads svg:plus as its legacy mode. So the reflection layer is the
-difference of the stored values, not of linear light: only then the editor shows the photo. Layers whose light adds up are
-written with the option additive.
+Editors add the stored values, not linear light. Krita always does so, and GIMP does so because it reads svg:plus as its
+legacy mode. Therefore the reflection layer is the difference of the stored values, so that the editor shows the photo. The
+option `additive` writes layers whose linear light sums to the photo.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from brewster.photo.photo import Photo
 
 _FORMAT: Final = "ora"
 _MIME_TYPE: Final = "image/openraster"
-_EPOCH: Final = (1980, 1, 1, 0, 0, 0)  # a fixed date makes the file reproducible
+_EPOCH: Final = (1980, 1, 1, 0, 0, 0)  # with a fixed date, the same input gives the same bytes
 _THUMBNAIL_PX: Final = 256  # the maximum of the specification
 _STACK: Final = """<?xml version="1.0" encoding="UTF-8"?>
 <image version="0.0.6" w="{width}" h="{height}">
@@ -43,10 +43,10 @@ class LayeredImage:
     transmission: Photo
 
     def encode(self, container: str = _FORMAT) -> bytes:
-        """Returns the bytes of an OpenRaster file, with the profile and the bit depth of the photo, 8 or 16.
+        """Returns the bytes of an OpenRaster file with the profile of the photo, in 8 or 16 bits.
 
-        The stored values of both layers sum to those of the photo exactly. The reflection is never negative: where the
-        transmission is brighter than the photo, it is the photo.
+        The stored values of both layers sum to those of the photo exactly. The reflection is never negative, because the
+        transmission is clipped to the photo where it is brighter.
 
         Raises:
             UnsupportedPhoto: `container` is not "ora".
@@ -77,6 +77,6 @@ class LayeredImage:
         return file.getvalue()
 
     def _like_photo(self) -> Photo:
-        """Returns the transmission in the colour space of the photo; an additive one is stored as linear floats."""
+        """Returns the transmission in the colour space of the photo. An additive transmission is stored as linear floats."""
         is_like = self.transmission.pixels.dtype == self.photo.pixels.dtype
         return self.transmission if is_like else self.photo.with_linear(self.transmission.linear())

@@ -41,7 +41,7 @@ Source: TypeAlias = (
 """A path, the bytes of a file, an open binary file, a numpy array, a PIL image, or a `Photo`."""
 _PREVIEW_PX = 1024
 
-_STRIP_PIXELS = 1 << 18  # one strip has a few MB as floats; a whole photo may not fit into memory
+_STRIP_PIXELS = 1 << 18  # a strip of floats needs a few MB; a whole photo may not fit into memory
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,7 +57,7 @@ class Photo:
     file_info: FileInfo = field(default_factory=FileInfo, repr=False)
 
     def __post_init__(self) -> None:
-        """Makes the arrays read-only, so that photos can share them."""
+        """Makes the arrays read-only, so that several photos can use the same arrays."""
         _check_arrays(self.pixels, self.alpha)
         self.pixels.flags.writeable = False
         if self.alpha is not None:
@@ -72,7 +72,7 @@ class Photo:
         Args:
             source: a path, the bytes of a file, a file opened for reading in binary mode, a numpy array, a PIL image, or
                 a `Photo`.
-            encoding: the encoding of an array, "srgb" or "linear"; for arrays only.
+            encoding: the encoding of an array, "srgb" or "linear"; None for all other sources.
             max_pixels: photos with more pixels are refused before they are decoded.
 
         Raises:
@@ -80,8 +80,8 @@ class Photo:
             UnsupportedPhoto: the image has CMYK colours, several frames, five channels, NaN values, or a damaged profile.
             PhotoTooLarge: the image has more pixels than `max_pixels`.
             MissingExtra: the reader of EXR, HEIC or RAW is not installed.
-            PhotoError: the encoding is missing or unknown, or the source is not an array and has an encoding.
-            TypeError: the source has another type, such as None, a list or a file in text mode.
+            PhotoError: the encoding of an array is missing or unknown, or an encoding was passed for another source.
+            TypeError: the source has an unsupported type, such as None, a list or a file in text mode.
         """
         if isinstance(source, np.ndarray):
             height, width = (*source.shape, 1, 1)[:2]
@@ -90,8 +90,8 @@ class Photo:
         if encoding is not None:
             raise PhotoError(
                 f"encoding={encoding!r} was passed with a {type(source).__name__}",
-                "expected no encoding, because only arrays need one",
-                "leave it out",
+                "expected no encoding, because only arrays need an encoding",
+                "leave the argument out",
             )
         if isinstance(source, Photo):
             return source
@@ -106,7 +106,7 @@ class Photo:
         if has_only_tables(file_info.icc):
             pixels, file_info = convert_to_display_p3(pixels, file_info)
         photo = cls(pixels, decoded.alpha, file_info)
-        photo.colour_space()  # raises the error of an invalid profile now, not during a separation
+        photo.colour_space()  # raises the error of an invalid profile now instead of during a separation
         return photo
 
     @classmethod
@@ -133,7 +133,7 @@ class Photo:
         return cls._from_decoded(decode_pil(image))
 
     def __repr__(self) -> str:
-        """A short description: `Photo(4000 x 3000, RGB, uint8, jpeg, ICC profile, EXIF)`."""
+        """Returns a short description: `Photo(4000 x 3000, RGB, uint8, jpeg, ICC profile, EXIF)`."""
         width, height = self.size
         mode = ("grey" if self.pixels.shape[2] == 1 else "RGB") + (
             " with alpha" if self.alpha is not None else ""
@@ -144,9 +144,9 @@ class Photo:
         return f"Photo({', '.join((*parts, *(name for name, block in present.items() if block)))})"
 
     def __array__(self, dtype: np.dtype[Any] | None = None, copy: bool | None = None) -> Stored:
-        """For `np.asarray(photo)`: the stored pixels (H, W, 1|3), without alpha, in the encoding of the file.
+        """Returns the stored pixels (H, W, 1|3) for `np.asarray(photo)`, without alpha, in the encoding of the file.
 
-        For linear light use `linear()`, for sRGB values `srgb_8bit()`.
+        For linear light, use `linear()`. For sRGB values, use `srgb_8bit()`.
         """
         return np.array(self.pixels, dtype=dtype, copy=copy)
 
@@ -163,11 +163,11 @@ class Photo:
         return pil_image(stored.pixels, stored.alpha, stored.file_info)
 
     def _repr_png_(self) -> bytes:
-        """For notebooks: a PNG of at most 1024 pixels a side, 8-bit sRGB."""
+        """Returns a PNG for notebooks: 8-bit sRGB, at most 1024 pixels on each side."""
         return self.thumbnail(_PREVIEW_PX).encode("png", depth=8)
 
     def thumbnail(self, max_side: int) -> Photo:
-        """Returns a copy of at most `max_side` pixels a side, without metadata, clipped to the sRGB gamut."""
+        """Returns a copy with at most `max_side` pixels on each side, without metadata, clipped to the sRGB gamut."""
         scale = min(1, max_side / max(self.size))
         linear = self.resized(*(max(1, round(scale * side)) for side in self.size))
         return Photo.from_array(np.clip(linear, 0, 1), encoding="linear")
@@ -195,9 +195,9 @@ class Photo:
     def stored_rows(self, linear: Float32, top: int) -> Stored:
         """Converts new linear light (n, W, 3) for n rows to stored pixels in the colour space and dtype of this photo.
 
-        `top` is the first of these rows. This is the inverse of `linear_rows`: pixels with unchanged light are
-        bit-equal. The others are clipped to the range of the dtype. To process a photo in strips, write the strips to
-        an array like `pixels`, and call `with_pixels`.
+        `top` is the first of these rows. This is the inverse of `linear_rows`: pixels with unchanged light keep their
+        stored values exactly. Other pixels are clipped to the range of the dtype. To process a photo in strips, write the
+        strips to an array with the shape and dtype of `pixels`, and call `with_pixels`.
         """
         return self.colour_space().to_stored(
             np.asarray(linear, np.float32), self.pixels[top : top + len(linear)]
@@ -206,7 +206,7 @@ class Photo:
     def srgb_8bit(self) -> NDArray[np.uint8]:
         """Returns 8-bit sRGB values (H, W, 3), clipped to the sRGB gamut, without alpha. Benchmarks compare these values.
 
-        For an 8-bit sRGB photo they are the stored values. Grey is repeated in all three channels.
+        For an 8-bit sRGB photo, these are the stored values. Grey values are repeated in all three channels.
         """
         dtype = np.dtype(np.uint8)
         if self.colour_space() == SRGB and self.pixels.dtype.kind == "u":
@@ -218,14 +218,17 @@ class Photo:
         return encoded
 
     def with_linear(self, linear: Float32) -> Photo:
-        """Returns a copy of the photo with other linear light (H, W, 3). Pixels with unchanged light are bit-equal."""
+        """Returns a copy of the photo with other linear light (H, W, 3).
+
+        Pixels with unchanged light keep their stored values exactly.
+        """
         pixels = np.empty_like(self.pixels)
         for rows in self.strips():
             pixels[rows] = self.stored_rows(linear[rows], rows.start)
         return self.with_pixels(pixels)
 
     def with_pixels(self, pixels: Stored) -> Photo:
-        """Returns a copy of the photo with other stored pixels of the same shape and dtype. Makes the array read-only.
+        """Returns a copy of the photo with other stored pixels of the same shape and dtype. The array becomes read-only.
 
         Raises:
             PhotoError: the pixels have another shape or dtype.
@@ -234,7 +237,7 @@ class Photo:
             raise PhotoError(
                 f"the new pixels have the shape {pixels.shape} and the dtype {pixels.dtype}",
                 f"expected {self.pixels.shape} and {self.pixels.dtype}, as in the photo",
-                "use with_linear to convert them",
+                "use with_linear to convert the pixels",
             )
         return replace(self, pixels=pixels)
 
@@ -263,11 +266,12 @@ class Photo:
         A JPEG has the quality and the chroma subsampling of the source.
 
         Args:
-            container: the format, such as "png"; by default that of the source.
-            depth: bits per channel (see `image_formats.FORMATS`); by default those of the photo, or the next smaller depth.
+            container: the format, such as "png"; by default, the format of the photo's file.
+            depth: bits per channel (see `image_formats.FORMATS`); by default, the depth of the photo or, if the format does
+                not have it, the next smaller depth.
 
         Raises:
-            UnsupportedPhoto: the format cannot store this photo, or not at this bit depth.
+            UnsupportedPhoto: the format cannot store this photo, or cannot store it at this bit depth.
             MissingExtra: the writer of EXR or HEIC is not installed.
         """
         container = container or self.file_info.container
@@ -283,18 +287,18 @@ class Photo:
         depth: int | None = None,
         overwrite: bool = False,
     ) -> None:
-        """Writes a file atomically, or to an open binary file such as an `io.BytesIO`.
+        """Writes the photo to a path atomically, or to an open binary file such as an `io.BytesIO`.
 
         Args:
             target: a path, or a file opened for writing in binary mode.
-            format: the format, such as "png"; by default that of the suffix of the path, or, for an open file, that of the
-                photo.
+            format: the format, such as "png"; by default, the format of the path's suffix or, for an open file, the format
+                of the photo's file.
             depth: bits per channel; see `encode`.
-            overwrite: replace an existing file.
+            overwrite: whether to replace an existing file.
 
         Raises:
             OutputError: the file exists and `overwrite` is False, or the file cannot be written.
-            UnsupportedPhoto: the format cannot store this photo, or not at this bit depth.
+            UnsupportedPhoto: the format cannot store this photo, or cannot store it at this bit depth.
         """
         if isinstance(target, WritableFile):
             target.write(self.encode(format, depth=depth))
@@ -303,7 +307,7 @@ class Photo:
         write_atomically(path, self.encode(format or container_of(path), depth=depth), overwrite=overwrite)
 
     def stored_as(self, container: str, bits: int) -> Photo:
-        """Returns the photo with the dtype for a format and bit depth. The light is unchanged."""
+        """Returns the photo with the dtype for a format and bit depth. The light changes only by rounding and clipping."""
         was_linear, is_linear = (FORMATS[name].is_linear for name in (self.file_info.container, container))
         dtype = np.dtype(np.float32 if is_linear or bits == 32 else np.uint8 if bits == 8 else np.uint16)
         changes_light = container != self.file_info.container and (was_linear or is_linear)

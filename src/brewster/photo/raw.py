@@ -1,7 +1,7 @@
 """Develops the RAW files of cameras with LibRaw (package rawpy) to 16-bit Display P3.
 
-Pixels are the linear light that LibRaw computes with the white balance and the colour matrix of the camera, without
-automatic brightening. They are stored with the tone curve of Display P3, so that a TIFF of them looks right in all programs.
+LibRaw computes linear light with the white balance and the colour matrix of the camera, without automatic brightening. The
+pixels are stored with the tone curve of Display P3, so that all programs show a TIFF file of these pixels correctly.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ _EXIF_TAG, _GPS_TAG = 34665, 34853
 def is_raw(tags: metadata.Tags) -> bool:
     """Returns whether the first directory of a TIFF is that of a RAW file.
 
-    A DNG has the tag DNGVersion (50706). Other RAW files begin with a reduced image (NewSubfileType, bit 0), or with the
-    colour filter array itself (PhotometricInterpretation 32803).
+    A DNG has the tag DNGVersion (50706). Other RAW files begin with a reduced image (NewSubfileType, bit 0), or with
+    colour filter array data (PhotometricInterpretation 32803).
     """
     is_reduced = metadata.number_of(tags, 254, 0) & 1 == 1
     return 50706 in tags or is_reduced or metadata.number_of(tags, 262, 0) == 32803
@@ -91,7 +91,7 @@ def _rawpy() -> types.ModuleType:
 
 @contextmanager
 def _opened(data: bytes) -> Iterator[Any]:
-    """Yields the file as a `rawpy.RawPy`. An error of LibRaw in the block becomes an `UnreadablePhoto`."""
+    """Yields the file as a `rawpy.RawPy`. Errors of LibRaw in the block are raised as `UnreadablePhoto`."""
     rawpy = _rawpy()
     try:
         with rawpy.imread(io.BytesIO(data)) as raw:
@@ -101,7 +101,7 @@ def _opened(data: bytes) -> Iterator[Any]:
         raise UnreadablePhoto(
             f"the RAW file cannot be read completely ({reason})",
             f"expected a complete RAW file of a camera that LibRaw {'.'.join(map(str, rawpy.libraw_version))} supports",
-            "copy it again from the camera, or convert it to DNG or TIFF",
+            "copy the file again from the camera, or convert it to DNG or TIFF",
         ) from error
 
 
@@ -115,7 +115,7 @@ def _upright_size(raw: Any) -> tuple[int, int]:  # noqa: ANN401  (rawpy has no t
 
 
 def _exif(data: bytes) -> bytes | None:
-    """Returns the camera tags of a RAW file as an EXIF block, without the maker note, whose offsets would be wrong."""
+    """Returns the camera tags of a RAW file as an EXIF block, without the maker note, because its offsets become invalid."""
     tags = _camera_tags(data)
     exif = tags.get(_EXIF_TAG)
     if isinstance(exif, dict):
@@ -124,7 +124,7 @@ def _exif(data: bytes) -> bytes | None:
 
 
 def _camera_tags(data: bytes) -> metadata.Tags:
-    if data[4:8] == b"ftyp":  # CR3: one TIFF block for each directory, in boxes of their own
+    if data[4:8] == b"ftyp":  # CR3: one TIFF block for each directory, each in a separate box
         blocks = {name: _box(data, name) for name in (b"CMT1", b"CMT2", b"CMT4")}
         tags = metadata.read_tags(blocks[b"CMT1"])
         subdirectories = {_EXIF_TAG: blocks[b"CMT2"], _GPS_TAG: blocks[b"CMT4"]}
@@ -133,10 +133,10 @@ def _camera_tags(data: bytes) -> metadata.Tags:
         start, size = (int.from_bytes(data[at : at + 4], "big") for at in (84, 88))
         return metadata.read_tags(metadata.jpeg_exif(data[start : start + size]))
     byte_order = data[:2] + (b"*\0" if data[:2] == b"II" else b"\0*")
-    return metadata.read_tags(byte_order + data[4:])  # ORF and RW2 have another number in place of 42
+    return metadata.read_tags(byte_order + data[4:])  # ORF and RW2 have another number than 42 at this place
 
 
 def _box(data: bytes, name: bytes) -> bytes:
-    """Returns the content of the first box with this name (ISO/IEC 14496-12 4.2), or nothing."""
+    """Returns the content of the first box with this name (ISO/IEC 14496-12 4.2), or no bytes."""
     found = re.search(rb"(....)" + name, data[: 1 << 20], re.DOTALL)
     return data[found.end() : found.start() + int.from_bytes(found[1], "big")] if found else b""

@@ -3,10 +3,10 @@
     sample = render(scene, Assets([Path("hdri")]), device="cuda")
 
 Smooth parallel panes need no Monte Carlo integration. All orders leave such a glazing in the same direction, so light
-from infinity needs one lookup behind the glass and one in front of it; near content needs one lookup per group of orders, each
-shifted along the glass. Defocus of light from infinity is a convolution, because that light depends on the direction
-alone. Monte Carlo integration is used only for a lens with near content, for wedges and for rough glass
-(`rough_glass`); its random numbers are the same on every device.
+from infinity needs one lookup behind the glass and one in front of it. Near content needs one lookup per group of orders,
+because each order shifts the ray along the glass by its own distance. Defocus of light from infinity is a convolution,
+because that light depends on the direction alone. Monte Carlo integration is used only for defocus of near content, for
+wedges and for rough glass (`rough_glass`). Its random numbers are the same on every device.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ from brewster.scene.scene import Scene
 
 _MERGE_DISTANCE_PX = 0.1  # orders whose images are closer than this share one lookup
 _MAX_TABLE_REFLECTANCE = 0.08
-"""Upper limit of the reflectance for which orders are enumerated. At grazing angles the true value would give too many
+"""Upper limit of the reflectance for which orders are enumerated. At grazing angles, the true reflectance leads to too many
 orders. The throughput of each order is exact; the last order of each side also gets the light of the omitted orders."""
 _CPU_BATCH_RAYS = 1 << 15  # small enough for the cache of a CPU
 _GPU_BATCH_RAYS = 1 << 20
@@ -99,12 +99,12 @@ def render(scene: Scene, assets: Assets, device: Device = "cpu") -> LinearSample
 
 
 def ghost_distance_px(scene: Scene) -> float:
-    """Distance in pixels between the first two reflections of a point at the image centre; 0 if it is at infinity."""
+    """Returns the distance between the first two reflections of a point at the image centre, in px; 0 at infinity."""
     _, _, normal = axes(scene.glass.heading_deg, scene.glass.pitch_deg)
     _, _, back = axes(scene.camera.heading_deg, scene.camera.pitch_deg)
     incidence = math.degrees(math.acos(min(1.0, dot(back, normal))))
-    distance = scene.camera_above_glass_mm + scene.front.distance_mm
-    return ghost_distance_mm(scene.glass.panes[0], incidence) / (scene.camera.pixel_rad * distance)
+    distance_mm = scene.camera_above_glass_mm + scene.front.distance_mm
+    return ghost_distance_mm(scene.glass.panes[0], incidence) / (scene.camera.pixel_rad * distance_mm)
 
 
 def _prepare(scene: Scene, assets: Assets, device: Device) -> _PreparedScene:
@@ -122,44 +122,51 @@ def _prepare(scene: Scene, assets: Assets, device: Device) -> _PreparedScene:
         scene.camera.focus_mm,
     )
     behind, front = (
-        _prepare_side(scene, assets, view, to_glass.T, behind=behind, device=device)
-        for behind in (True, False)
+        _prepare_side(scene, assets, view, to_glass.T, is_behind=is_behind, device=device)
+        for is_behind in (True, False)
     )
     return _PreparedScene(scene, behind, front, origin, right, up, back)
 
 
 def _prepare_side(
-    scene: Scene, assets: Assets, view: CameraView, to_world: Tensor, *, behind: bool, device: Device
+    scene: Scene, assets: Assets, view: CameraView, to_world: Tensor, *, is_behind: bool, device: Device
 ) -> _PreparedSide:
-    side = scene.behind if behind else scene.front
-    emitters = SideEmitters(side, assets, view, behind=behind, to_world=to_world, device=device)
-    groups = _group_orders(scene, emitters, behind=behind)
-    return _PreparedSide(emitters, scene.glass.depth_mm if behind else 0.0, groups)
+    side = scene.behind if is_behind else scene.front
+    emitters = SideEmitters(side, assets, view, is_behind=is_behind, to_world=to_world, device=device)
+    groups = _group_orders(scene, emitters, is_behind=is_behind)
+    return _PreparedSide(emitters, scene.glass.depth_mm if is_behind else 0.0, groups)
 
 
 def _needs_monte_carlo(scene: Scene) -> bool:
-    """Whether the glass is rough or wedged, or a lens sees near content, whose blur varies over the image."""
+    """Whether the glass is rough or wedged, or the defocus blur varies over the image because content is near."""
     is_near = math.isfinite(min(scene.behind.distance_mm, scene.front.distance_mm))
     return scene.glass.is_rough or scene.glass.is_wedged or (scene.camera.aperture_mm > 0 and is_near)
 
 
 def _render_deterministic(prepared: _PreparedScene) -> list[Tensor]:
-    """Traces a regular grid of rays in each pixel, then applies the defocus blur of the lens: I, T, B, R and MR, (3, H, W) each."""
+    """Traces a regular grid of rays in each pixel, then applies the defocus blur of the lens.
+
+    Returns:
+        I, T, B, R and MR, (3, H, W) each.
+    """
     camera = prepared.scene.camera
     margin = margin_px(camera)
     width, height = camera.width + 2 * margin, camera.height + 2 * margin
-    grid = _grid_size(prepared)
+    rays_per_axis = _rays_per_axis(prepared)
     total = torch.zeros(5, 3, width * height, device=prepared.origin.device)
-    for row in range(grid):
-        for column in range(grid):
-            offset = (column + 0.5) / grid, (row + 0.5) / grid
-            for rays, pixels in _pinhole_rays(prepared, offset, margin, 1 / grid):
-                total[:, :, pixels] += torch.stack(_trace_smooth(prepared, rays)) / grid**2
+    for row in range(rays_per_axis):
+        for column in range(rays_per_axis):
+            offset = (column + 0.5) / rays_per_axis, (row + 0.5) / rays_per_axis
+            for rays, pixels in _pinhole_rays(prepared, offset, margin, 1 / rays_per_axis):
+                total[:, :, pixels] += torch.stack(_trace_smooth(prepared, rays)) / rays_per_axis**2
     return [defocus_blur(layer.view(3, height, width), camera, margin) for layer in total]
 
 
-def _grid_size(prepared: _PreparedScene) -> int:
-    """Rays per pixel and axis: ceil(3 * texels per pixel), at most sqrt(samples_per_pixel); textures are filtered to the distance between rays."""
+def _rays_per_axis(prepared: _PreparedScene) -> int:
+    """Returns the number of rays along each side of a pixel: ceil(3 * texels per pixel), at most sqrt(samples_per_pixel).
+
+    Textures are filtered to the distance between the rays.
+    """
     finest = max(side.emitters.texels_per_pixel() for side in (prepared.behind, prepared.front))
     return min(max(1, math.ceil(3 * finest)), math.isqrt(prepared.scene.samples_per_pixel))
 
@@ -167,9 +174,9 @@ def _grid_size(prepared: _PreparedScene) -> int:
 def _pinhole_rays(
     prepared: _PreparedScene, offset: tuple[float, float], margin: int, footprint_px: float
 ) -> Iterator[tuple[Rays, slice]]:
-    """Rays through one point of every pixel, in batches of rows, with their pixel range.
+    """Yields rays through one point of every pixel, in batches of image rows, with the range of their pixels.
 
-    `offset` is the point in the pixel, x and y in 0..1; the image is extended by `margin` pixels on every side.
+    `offset` is the point in the pixel, x and y in 0..1. The image is extended by `margin` pixels on every side.
     """
     camera = prepared.scene.camera
     width, height = camera.width + 2 * margin, camera.height + 2 * margin
@@ -212,7 +219,7 @@ def _render_monte_carlo(prepared: _PreparedScene, device: Device) -> list[Tensor
 
 
 def _thin_lens_rays(prepared: _PreparedScene, pixels: slice, sobol: SobolPoints) -> Rays:
-    """One ray per pixel, from a random point of the lens to a random point of the pixel's image in the focus plane."""
+    """Returns one ray per pixel, from a random point of the lens to a random point of the pixel in the focus plane."""
     camera = prepared.scene.camera
     pixel = torch.arange(pixels.start, pixels.stop, device=prepared.origin.device)
     jitter = sobol.next_2d()
@@ -234,7 +241,7 @@ def _outer(axis: Tensor, values: Tensor) -> Tensor:
 
 
 def _trace_smooth(prepared: _PreparedScene, rays: Rays, _: SobolPoints | None = None) -> list[Tensor]:
-    """I, T, B, R and MR along the rays, (3, N) each, for smooth parallel panes: all orders, no randomness."""
+    """Returns I, T, B, R and MR along the rays, (3, N) each, for smooth parallel panes: all orders, no randomness."""
     glass = prepared.scene.glass
     point, mirrored = _mirror_at_first_surface(rays)
     cosine = mirrored[2]
@@ -260,9 +267,9 @@ def _trace_smooth(prepared: _PreparedScene, rays: Rays, _: SobolPoints | None = 
 def _shifted_orders(
     prepared: _PreparedScene, side: _PreparedSide, exiting: Rays, far: Tensor | None
 ) -> tuple[Tensor, Tensor]:
-    """The light of a side with near content, looked up once per group, at the exit point of its first order.
+    """Looks up the light of a side with near content: once per group, at the exit point of the group's first order.
 
-    `exiting` are the rays after the glass, with their points on the first surface; `far` is their light from infinity.
+    `exiting` holds the rays after the glass, with origins on the first surface; `far` is the light from infinity along them.
 
     Returns:
         The sum of all orders, and the sum of the orders in T or R, (3, N) each.
@@ -292,13 +299,13 @@ def _in_plane_shift(order: ReflectionOrder, shifts: list[Tensor]) -> Tensor:
     )
 
 
-def _group_orders(scene: Scene, emitters: SideEmitters, *, behind: bool) -> list[list[ReflectionOrder]]:
+def _group_orders(scene: Scene, emitters: SideEmitters, *, is_behind: bool) -> list[list[ReflectionOrder]]:
     """Groups the orders of one side whose images are less than `_MERGE_DISTANCE_PX` apart.
 
     Distances are measured in the corner of the view with the largest angle of incidence, where they are greatest.
 
     Returns:
-        The groups; the brightest order of each is first. No group if the side has only light from infinity.
+        The groups, each with its brightest order first. The list is empty if the side has only light from infinity.
     """
     if not emitters.is_near:
         return []
@@ -309,7 +316,7 @@ def _group_orders(scene: Scene, emitters: SideEmitters, *, behind: bool) -> list
     pixel_mm = scene.camera.pixel_rad * (scene.camera_above_glass_mm + emitters.distance_mm)
     groups: list[tuple[float, list[ReflectionOrder]]] = []
     for order in table:
-        if order.is_transmitted != behind:
+        if order.is_transmitted != is_behind:
             continue
         shift_px = float(_in_plane_shift(order, shifts) * cosine) / pixel_mm
         for group_px, group in groups:
@@ -322,13 +329,13 @@ def _group_orders(scene: Scene, emitters: SideEmitters, *, behind: bool) -> list
 
 
 def _min_cosine(scene: Scene) -> Tensor:
-    """Cosine of the largest angle of incidence in the view."""
+    """Returns the cosine of the largest angle of incidence in the view."""
     _, _, normal = axes(scene.glass.heading_deg, scene.glass.pitch_deg)
     return torch.tensor(min(-dot(corner, normal) / math.hypot(*corner) for corner in scene.camera.corners()))
 
 
 def _trace_rough(prepared: _PreparedScene, rays: Rays, sobol: SobolPoints) -> list[Tensor]:
-    """I, T, B, R and MR along the rays, (3, N) each, for panes that are rough or wedged."""
+    """Returns I, T, B, R and MR along the rays, (3, N) each, for panes that are rough or wedged."""
     zeros = torch.zeros(2, *rays.direction.shape, device=rays.direction.device)
     sides = {True: zeros, False: zeros.clone()}
     emitters = prepared.behind.emitters, prepared.front.emitters

@@ -3,8 +3,8 @@
     developed = develop(sample)
     encode_jpeg(developed.photo_encoded, 90)
 
-Exposure and white balance are computed from I and applied, with the same tone curve, to I, T, B and R alike: equal light
-has equal values in all of them. MR is often far brighter and has its own exposure. Only I has noise.
+Exposure and white balance are computed from I. They are applied to I, T, B and R with the same tone curve, so equal light
+has equal values in these four images. MR is often far brighter and has its own exposure. Only I has noise.
 """
 
 from __future__ import annotations
@@ -26,10 +26,11 @@ from brewster.scene.scene import CameraResponse, Scene
 from brewster.srgb import REC709_LUMINANCE, to_encoded
 
 _EV_RANGE: Final = (-64.0, 32.0)
-"""Limits of the exposure in stops: low enough for the brightest lamps; at the upper limit, nearly black images stay dark."""
+"""Limits of the exposure in stops. The lower limit is for the brightest lamps. At the upper limit, nearly black images
+stay dark."""
 
-_MAX_TARGET_SHARE: Final = 0.995
-"""The target is at most this share of the highest possible mean; the last half per cent would need a huge gain."""
+_MAX_TARGET_FRACTION: Final = 0.995
+"""The target is at most this fraction of the highest possible mean, because a higher target needs a huge gain."""
 
 _MAX_GAIN: Final = 3.0
 """White balance multiplies or divides a channel by at most this factor."""
@@ -42,8 +43,8 @@ _MINKOWSKI_NORM: Final = 6
 class DevelopedSample:
     """The five images of a sample as photographs, sRGB-encoded float32 (3, H, W) in 0..1, and the camera settings.
 
-    `white_balance_gains` holds the gains of red, green and blue. Light was multiplied by them and by 2 ** `exposure_ev`
-    (MR by 2 ** `mirror_exposure_ev`), then clipped and encoded.
+    `white_balance_gains` holds the gains of red, green and blue. The light was multiplied by these gains and by
+    2 ** `exposure_ev` (MR by 2 ** `mirror_exposure_ev`), then clipped and encoded.
     """
 
     scene: Scene
@@ -59,11 +60,11 @@ class DevelopedSample:
     """The fraction of the pixels of I in which at least one channel clips, 0..1."""
 
     def layers(self) -> dict[str, Tensor]:
-        """The five encoded images by name."""
+        """Returns the five encoded images by name."""
         return {name: getattr(self, f"{name}_encoded") for name in LAYERS}
 
     def camera_settings(self) -> dict[str, Any]:
-        """Exposures, white balance gains and overexposed fraction, as TOML values."""
+        """Returns the exposures, the white balance gains and the overexposed fraction, as TOML values."""
         return {
             "exposure_ev": self.exposure_ev,
             "mirror_exposure_ev": self.mirror_exposure_ev,
@@ -75,8 +76,8 @@ class DevelopedSample:
 def develop(sample: LinearSample) -> DevelopedSample:
     """Applies exposure, white balance, noise and tone curve, as the scene's `camera_response` describes them.
 
-    Exposure is rounded to a thousandth of a stop before it is applied, and gains to four decimals. So the recorded
-    values are exactly the applied ones, and rounding errors of different devices do not change them.
+    Before they are applied, the exposure is rounded to a thousandth of a stop and the gains to four decimals. Therefore
+    the recorded values are exactly the applied values, and are the same on devices with different rounding errors.
     """
     response = sample.scene.camera_response
     white_balance_gains = _white_balance_gains(sample.photo, response)
@@ -97,13 +98,15 @@ def develop(sample: LinearSample) -> DevelopedSample:
 
 
 def to_uint8(encoded: Tensor) -> NDArray[np.uint8]:
-    """An encoded image (3, H, W) in 0..1 as 8-bit pixels (H, W, 3)."""
+    """Returns an encoded image (3, H, W) in 0..1 as 8-bit pixels (H, W, 3)."""
     levels = (encoded.clamp(0, 1) * 255).round().to(torch.uint8)
     return levels.permute(1, 2, 0).contiguous().cpu().numpy()
 
 
 def encode_jpeg(encoded: Tensor, quality: int) -> bytes:
-    """The bytes of a JPEG file of an encoded image (3, H, W), quality 1..100, without chroma subsampling.
+    """Returns an encoded image (3, H, W) in 0..1 as the bytes of a JPEG file, without chroma subsampling.
+
+    `quality` is in 1..100.
 
     Raises:
         UnsupportedPhoto: a side is longer than 65535 pixels.
@@ -112,7 +115,7 @@ def encode_jpeg(encoded: Tensor, quality: int) -> bytes:
 
 
 def with_jpeg(developed: DevelopedSample) -> DevelopedSample:
-    """The same sample, with I compressed to a JPEG of the scene's `jpeg_quality` and decoded again."""
+    """Returns the sample with I compressed to a JPEG of the scene's `jpeg_quality` and decoded again."""
     photo = developed.photo_encoded
     decoded = Photo.open(encode_jpeg(photo, developed.scene.camera_response.jpeg_quality)).pixels
     levels = torch.from_numpy(decoded.copy()).to(photo.device).permute(2, 0, 1)
@@ -130,7 +133,7 @@ def _tone_curve(linear: Tensor, contrast: float) -> Tensor:
 
 
 def luminance(colour: Tensor) -> float:
-    """The Rec.709 luminance of a linear RGB colour, (3,)."""
+    """Returns the Rec.709 luminance of a linear RGB colour, (3,)."""
     return float(sum(map(operator.mul, REC709_LUMINANCE, colour.tolist())))
 
 
@@ -138,17 +141,17 @@ def luminance(colour: Tensor) -> float:
 
 
 def _exposure_ev(light: Tensor, target: float) -> float:
-    """The exposure in stops at which the mean luminance of light (3, H, W), clipped at white, is `target`.
+    """Returns the exposure in stops at which the mean luminance of light (3, H, W), clipped at white, is `target`.
 
     The mean is a monotonic function of the exposure, so bisection finds the solution. If black pixels make the target
-    unreachable, the result turns nearly all other pixels white. It is 0 for a black image.
+    unreachable, the exposure makes nearly all other pixels white. For a black image, the result is 0.
     """
 
     def mean(ev: float) -> float:
         return luminance((light * math.exp2(ev)).clamp_(0, 1).mean((1, 2)))
 
     low, high = _EV_RANGE
-    target = min(target, _MAX_TARGET_SHARE * mean(high))
+    target = min(target, _MAX_TARGET_FRACTION * mean(high))
     if target <= 0:
         return 0.0
     while high - low > 2e-4:
@@ -161,10 +164,10 @@ def _exposure_ev(light: Tensor, target: float) -> float:
 
 
 def _white_balance_gains(photo: Tensor, response: CameraResponse) -> tuple[float, float, float]:
-    """RGB gains that correct the illuminant's colour by the requested strength and keep its luminance.
+    """Returns RGB gains that correct the illuminant's colour by the requested strength and keep its luminance.
 
-    The colour is estimated on the exposed image, without pixels that clip in any channel, because a camera
-    loses their colour, too. If all pixels clip, all of them are used.
+    The colour is estimated on the exposed image. Pixels that clip in any channel are ignored, because clipping changes
+    their colour. If all pixels clip, all of them are used.
     """
     if response.white_balance == "none":
         return 1.0, 1.0, 1.0
@@ -175,7 +178,7 @@ def _white_balance_gains(photo: Tensor, response: CameraResponse) -> tuple[float
 
 
 def _gains(colour: Tensor, strength: float) -> tuple[float, float, float]:
-    """RGB gains for an illuminant's colour (3,); all 1 if it is nearly black, and so has no colour."""
+    """Returns RGB gains for an illuminant's colour (3,); all gains are 1 if that colour is nearly black."""
     brightness = luminance(colour)
     if brightness < 1e-9:
         return 1.0, 1.0, 1.0
@@ -187,29 +190,33 @@ def _gains(colour: Tensor, strength: float) -> tuple[float, float, float]:
 
 
 def _grey_world(image: Tensor, valid: Tensor) -> Tensor:
-    """Grey-world: the average of the scene is grey (G. Buchsbaum, J. Franklin Institute 310, 1980)."""
+    """Returns the mean of the valid pixels. Grey-world assumes that the average of a scene is grey.
+
+    Source: G. Buchsbaum, J. Franklin Institute 310, 1980.
+    """
     return image[:, valid].mean(1)
 
 
 def _white_patch(image: Tensor, valid: Tensor) -> Tensor:
-    """White-patch: the brightest surface is white (E. H. Land, Scientific American 237, 1977).
+    """Returns the 99th percentile of each channel. White-patch assumes that the brightest surface is white.
 
-    The 99th percentile of each channel stands for the brightest surface, so that single pixels do not matter.
+    The maximum is not used, so that single pixels do not matter. Source: E. H. Land, Scientific American 237, 1977.
     """
     values = image[:, valid]
     return values.kthvalue(math.ceil(0.99 * values.shape[1]), dim=1).values
 
 
 def _grey_edge(image: Tensor, valid: Tensor) -> Tensor:
-    """Grey-edge: the average edge is grey (J. van de Weijer et al., IEEE Trans. Image Proc. 16, 2007).
+    """Returns the Minkowski norm of the edges. Grey-edge assumes that the average edge is grey.
 
-    Differences are taken along both diagonals of each block of 2 x 2 valid pixels (Roberts cross). The paper smooths
-    first; rendered light has little noise, so that step is left out.
+    Differences are taken along both diagonals of each block of 2 x 2 valid pixels (Roberts cross). The paper smooths the
+    image first. This step is left out, because rendered light has little noise.
+    Source: J. van de Weijer et al., IEEE Trans. Image Proc. 16, 2007.
     """
     first, second = image[:, 1:, 1:] - image[:, :-1, :-1], image[:, 1:, :-1] - image[:, :-1, 1:]
     all_valid = valid[1:, 1:] & valid[:-1, :-1] & valid[1:, :-1] & valid[:-1, 1:]
     edges = torch.hypot(first, second)[:, all_valid]
-    # Scale the maximum to 1 first: sixth powers of small differences would underflow float32.
+    # Scale the maximum to 1 first, because sixth powers of small differences underflow float32.
     max_edge = edges.max().clamp(min=1e-12) if edges.numel() else 1.0
     colour: Tensor = torch.linalg.vector_norm(edges / max_edge, _MINKOWSKI_NORM, dim=1)
     return colour
@@ -220,7 +227,8 @@ _ILLUMINANT_ESTIMATORS: Final[dict[str, Callable[[Tensor, Tensor], Tensor]]] = {
     "white-patch": _white_patch,
     "grey-edge": _grey_edge,
 }
-"""Functions from an image (3, H, W) in 0..1 and a mask of valid pixels (H, W) to the illuminant's colour (3,), up to a factor."""
+"""Functions that take an image (3, H, W) in 0..1 and a mask of valid pixels (H, W). Each returns the illuminant's colour
+(3,), up to a factor."""
 
 
 # --- noise

@@ -16,7 +16,7 @@ LAYERS: Final = ("photo", "transmission", "background", "reflection", "mirror")
 
 @dataclass(frozen=True, eq=False)
 class LinearSample:
-    """Five images of linear light, float32 (3, H, W), and the scene they were rendered from.
+    """Five images of linear light, float32 (3, H, W), and the scene from which they were rendered.
 
     `photo` is I, the view with all glass effects; `transmission` T and `reflection` R are its two layers;
     `background` B is the view without glass; `mirror` MR is the reflection in a perfect mirror.
@@ -30,9 +30,9 @@ class LinearSample:
     mirror: Tensor
 
     def layers(self) -> dict[str, Tensor]:
-        """The five images by name."""
+        """Returns the five images by name."""
         return {name: getattr(self, name) for name in LAYERS}
 
     def map(self, function: Callable[[Tensor], Tensor]) -> LinearSample:
-        """A sample with the function applied to each image."""
+        """Returns a sample with the function applied to each image."""
         return LinearSample(self.scene, **{name: function(layer) for name, layer in self.layers().items()})

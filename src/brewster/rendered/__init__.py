@@ -1,1 +1,1 @@
-"""Rendered sets: the store of samples on disk, and their generation with several processes."""
+"""Rendered datasets: the store of samples on disk, and the generation of samples with several processes."""

@@ -35,12 +35,13 @@ from brewster.scene.scene import Scene
 Float32 = NDArray[np.float32]
 
 SHARD_SIZE: Final = 100
+"""Number of samples in a shard."""
 LIGHT_FILE, SCENE_FILE = "layers.exr", "scene.toml"
 SAMPLE_FILES: Final = (*(f"{layer}.jpg" for layer in LAYERS), LIGHT_FILE, SCENE_FILE)
 """The files of a sample: five photographs, their linear light, and the scene."""
 
 _GROUND_TRUTH_QUALITY: Final = 95
-_CURE: Final = "delete this sample, and render the set again"
+_CURE: Final = "delete this sample, and render the dataset again"
 
 
 # --- encoding a sample
@@ -58,8 +59,11 @@ STATISTICS: Final[dict[str, Callable[[LinearSample, DevelopedSample], float]]] =
     "overexposed_fraction": lambda _, developed: developed.overexposed_fraction,
     "ghost_px": lambda sample, _: ghost_distance_px(sample.scene),
 }
-"""Statistics for the selection of samples, in every scene.toml and in the index: mean luminance of R / mean luminance of T;
-share of the pixels of I with a clipped channel; distance in px between the first two mirror images."""
+"""Statistics for the selection of samples. They are stored in every scene.toml and in the index.
+
+`reflection_to_transmission` is the mean luminance of R divided by that of T, `overexposed_fraction` the fraction of the
+pixels of I with a clipped channel, and `ghost_px` the distance between the first two mirror images in px.
+"""
 
 
 def statistics(sample: LinearSample, developed: DevelopedSample) -> dict[str, float]:
@@ -68,12 +72,12 @@ def statistics(sample: LinearSample, developed: DevelopedSample) -> dict[str, fl
 
 
 SAMPLE_FORMAT: Final = 3
-"""Version of the files of a sample. Increase it if the same job gives other files, so that no set contains samples of two
-versions (tests/test_conventions_formats.py). 3: the keys of scene.toml have other names (`refractive_index`, `target_luminance` ...)."""
+"""Version of the files of a sample. Increase it if the same job gives other files, so that no dataset contains samples of
+two versions (tests/test_conventions_formats.py). Version 3 renamed keys of scene.toml (`refractive_index` and others)."""
 
 
 def encode_sample(sample: LinearSample, renderer: str) -> dict[str, bytes]:
-    """Encodes a sample. Returns its files: name -> bytes.
+    """Encodes a sample. Returns the bytes of each of its files by name.
 
     Raises:
         MissingExtra: OpenEXR is not installed.
@@ -95,12 +99,12 @@ def encode_sample(sample: LinearSample, renderer: str) -> dict[str, bytes]:
 
 
 def key(index: int) -> str:
-    """Returns the name of a sample. It is the name of its folder, and the prefix of its files in a shard."""
+    """Returns the name of a sample: the name of its folder, and the prefix of its files in a shard."""
     return f"{index:06d}"
 
 
 def write_folder(folder: Path, files: Mapping[str, bytes]) -> None:
-    """Writes the folder of a sample, unless it exists: another process may have written it, with the same content.
+    """Writes the folder of a sample. An existing folder stays, because another process may have written the same sample.
 
     Raises:
         OutputError: a file or folder cannot be written, for example because the disk is full.
@@ -126,10 +130,10 @@ def shard_name(block: int) -> str:
 
 
 def pack(out: Path, block: int) -> None:
-    """Moves the finished samples of a block from folders into its shard. Samples that are already in the shard remain there.
+    """Moves the finished samples of a block from folders into its shard. Samples that are already in the shard stay there.
 
-    The names of the members follow the convention of WebDataset (000007.photo.jpg). The bytes of the shard depend on the
-    samples only.
+    The names of the members follow the convention of WebDataset (000007.photo.jpg). The bytes of the shard depend only on
+    the samples.
 
     Raises:
         OutputError: a file or folder cannot be written, for example because the disk is full.
@@ -147,7 +151,7 @@ def pack(out: Path, block: int) -> None:
 
 
 def has_folders(out: Path, block: int) -> bool:
-    """Whether there are folders with samples of this block. They may be in the shard as well, if packing was interrupted."""
+    """Whether there are folders with samples of this block. If packing was interrupted, the shard may have them, too."""
     return next(_folders(out, block), None) is not None
 
 
@@ -159,7 +163,7 @@ def _add(tar: tarfile.TarFile, entry: StoredSample) -> None:
 
 
 def _remove(folder: Path) -> None:
-    """Removes the folder of a sample. It is renamed first, so that no reader finds a partial sample."""
+    """Removes the folder of a sample. The folder is renamed first, so that no reader finds a partial sample."""
     hidden = temporary_path(folder)
     with contextlib.suppress(OSError):  # another process has removed it
         folder.replace(hidden)
@@ -171,7 +175,7 @@ def _remove(folder: Path) -> None:
 
 @dataclass(frozen=True)
 class StoredSample:
-    """A finished sample. `path` is its folder, or a shard. In a shard, `spans` has (offset, length) of each of its files."""
+    """A finished sample. `path` is its folder or its shard. For a shard, `spans` has (offset, length) of each file by name."""
 
     index: int
     path: Path
@@ -188,13 +192,16 @@ class StoredSample:
 
 
 def read_set(out: Path) -> Iterator[StoredSample]:
-    """Yields the finished samples of a set from folders and shards, in the order of their indices."""
+    """Yields the finished samples of a dataset from folders and shards, in the order of their indices."""
     for block in _blocks(out):
         yield from read_block(out, block)
 
 
 def read_block(out: Path, block: int) -> Iterator[StoredSample]:
-    """Yields the finished samples of a block of a hundred indices in order. If a sample is in both, the shard is used."""
+    """Yields the finished samples of a block of a hundred indices in order.
+
+    If a sample has a folder and is in the shard, the shard is used.
+    """
     entries = {int(folder.name): StoredSample(int(folder.name), folder) for folder in _folders(out, block)}
     entries |= {entry.index: entry for entry in _members(out / shard_name(block))}
     yield from (entry for _, entry in sorted(entries.items()))
@@ -203,7 +210,7 @@ def read_block(out: Path, block: int) -> Iterator[StoredSample]:
 def open_sample(entry: StoredSample) -> tuple[dict[str, Float32], Scene]:
     """Reads a sample.
 
-    Returns: its five images by name, each (H, W, 3) in linear light, and its scene.
+    Returns: the five images by name, each (H, W, 3) in linear light, and the scene.
 
     Raises:
         MissingExtra: OpenEXR is not installed.

@@ -1,1 +1,1 @@
-"""Scenes and scene recipes: frozen data, read from and written as TOML. No renderer."""
+"""Scenes and scene recipes: frozen data that is read from and written to TOML. This package has no renderer."""

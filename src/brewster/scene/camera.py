@@ -17,8 +17,8 @@ Axes = tuple[Point, Point, Point]
 class Camera(FrozenModel):
     """Position, orientation and thin lens of a camera with square pixels.
 
-    `fov_deg` is the horizontal field of view. `aperture_mm` is the diameter of the lens; 0 is a pinhole. `focus_mm` is the
-    distance from the lens to the plane in focus, along the optical axis.
+    `fov_deg` is the horizontal field of view. `aperture_mm` is the diameter of the lens; with 0, the camera is a pinhole.
+    `focus_mm` is the distance from the lens to the plane in focus, along the optical axis. `width` and `height` are in px.
     """
 
     position_mm: Point = (0.0, 0.0, 1000.0)
@@ -32,7 +32,7 @@ class Camera(FrozenModel):
 
     @property
     def half_width(self) -> float:
-        """Tangent of half the field of view."""
+        """Half the width of the image in the plane at distance 1: the tangent of half the field of view."""
         return math.tan(math.radians(self.fov_deg) / 2)
 
     @property
@@ -41,7 +41,7 @@ class Camera(FrozenModel):
         return 2 * self.half_width / self.width
 
     def corners(self) -> list[Point]:
-        """Directions through the four corners of the image, not normalised."""
+        """Returns the directions through the four corners of the image. They are not normalised."""
         right, up, back = axes(self.heading_deg, self.pitch_deg)
         across, down = self.half_width, self.half_width * self.height / self.width
         return [
@@ -52,9 +52,9 @@ class Camera(FrozenModel):
 
 
 def axes(heading_deg: float, pitch_deg: float) -> Axes:
-    """The axes of an object with a heading (0 is -z, 90 is +x) and a pitch above the horizon.
+    """Returns the axes of an object with a heading (0 is -z, 90 is +x) and a pitch above the horizon.
 
-    Returns: unit vectors (right, up, back) in world coordinates; back is opposite to the viewing direction.
+    Returns: unit vectors (right, up, back) in world coordinates. `back` is opposite to the viewing direction.
     """
     heading, pitch = math.radians(heading_deg), math.radians(pitch_deg)
     forward = (math.sin(heading) * math.cos(pitch), math.sin(pitch), -math.cos(heading) * math.cos(pitch))
@@ -68,7 +68,7 @@ def axes(heading_deg: float, pitch_deg: float) -> Axes:
 
 
 def dot(one: Point, other: Point) -> float:
-    """The inner product."""
+    """Returns the inner product of two vectors."""
     return sum(a * b for a, b in zip(one, other, strict=True))
 
 

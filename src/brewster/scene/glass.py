@@ -1,7 +1,7 @@
 """The glass: one or more panes, their material, and the position of the glazing.
 
-The first pane is the one nearest to the camera. Heading and pitch of a glazing are those of a camera whose axis is
-perpendicular to the glass.
+The first pane is the one nearest to the camera. The heading and the pitch of a glazing are those of a camera whose optical
+axis is perpendicular to the glass.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ class Pane(FrozenModel):
     absorption_per_m: tuple[NonNegativeFloat, NonNegativeFloat, NonNegativeFloat] = (0.0, 0.0, 0.0)
     """Beer-Lambert absorption coefficients for red, green and blue."""
     roughness: Annotated[float, Field(ge=0, le=1)] = 0.0
-    """GGX width (alpha) of both surfaces: 0 is polished, 0.05 satin, 0.2 frosted."""
+    """GGX roughness (alpha) of both surfaces: 0 is polished, 0.05 satin, 0.2 frosted."""
     wedge_deg: Annotated[float, Field(ge=-5, le=5)] = 0.0
 
 

@@ -1,7 +1,8 @@
 """Scene recipes: distributions of the parameters of random scenes, read from TOML into frozen models.
 
-A `Range` is sampled uniformly, a `LogRange` log-uniformly (uniformly in the logarithm). A `_probability` is the share
-of scenes that have the feature. The packaged recipes are the TOML files in the folder `recipes` next to this file.
+A `Range` is sampled uniformly, a `LogRange` log-uniformly (uniformly in the logarithm). A key that ends in `_probability`
+is the probability that a scene has the feature. The packaged recipes are the TOML files in the folder `recipes` next to
+this file.
 """
 
 from __future__ import annotations
@@ -54,14 +55,14 @@ class GlassRecipe(FrozenModel):
     absorption_per_m: tuple[tuple[NonNegativeFloat, NonNegativeFloat, NonNegativeFloat], ...] = (
         (4.0, 1.5, 2.5),
     )
-    """List of triples of absorption coefficients (red, green, blue). One triple is drawn for each scene. They are larger for red
-    and blue than for green, because clear float glass is slightly green."""
+    """List of triples of absorption coefficients (red, green, blue). One triple is drawn for each scene. The default
+    coefficients are larger for red and blue than for green, because clear float glass is slightly green."""
     tint_strength: LogRange = (0.3, 2.0)
     """Factor on the absorption coefficients."""
     rough_probability: Share = 0.0
     """Probability of rough glass."""
     roughness: LogRange = (0.01, 0.1)
-    """GGX width (alpha) of the surfaces of rough glass: 0.05 is satin, 0.2 frosted."""
+    """GGX roughness (alpha) of the surfaces of rough glass: 0.05 is satin, 0.2 frosted."""
     wedge_probability: Share = 0.0
     """Probability of wedged panes, whose two surfaces are not parallel."""
     wedge_deg: LogRange = (0.01, 0.3)
@@ -85,7 +86,7 @@ class GlassRecipe(FrozenModel):
 
 
 class CameraRecipe(FrozenModel):
-    """The camera: its size in pixels, its position in front of the glass, its lens."""
+    """The camera: the size of its image, its position in front of the glass, its lens."""
 
     width: Pixels = 512
     """Width of the image."""
@@ -113,7 +114,7 @@ class SideRecipe(FrozenModel):
     map_probability: Share = 1.0
     """Probability of an environment map. A side without a map has a picture."""
     map_categories: tuple[str, ...] = ()
-    """Categories of the maps, such as indoor, outdoor or night. Empty: all maps."""
+    """Categories of the maps, such as indoor, outdoor or night. An empty list selects all maps."""
     max_px_per_texel: PositiveFloat = 2.5
     """Maximum width of a texel of the map in the image. It limits the choice of maps and the field of view."""
     dome_probability: Share = 0.0
@@ -123,7 +124,7 @@ class SideRecipe(FrozenModel):
     plane_probability: Share = 0.0
     """Probability of a picture on a plane, in front of the map if there is one."""
     distance_mm: LogRange = (1000.0, 8000.0)
-    """Distance of the picture behind the last pane; in [front], behind the camera."""
+    """Distance of the picture behind the last pane; in [front], its distance behind the camera."""
     relative_width: Range = (1.05, 1.5)
     """Width of the picture, divided by the width that exactly covers the view."""
     heading_deg: Range = (0.0, 0.0)
@@ -147,7 +148,7 @@ class CameraResponseRecipe(FrozenModel):
     )
     """Methods of automatic white balance, one of which is drawn."""
     white_balance_strength: Range = (0.3, 1.0)
-    """Strength of the white balance: 0 is none, 1 the full correction. Exponent on the white balance gains: 0 gives no correction, 1 the full correction."""
+    """Exponent on the white balance gains: 0 gives no correction, 1 the full correction."""
     contrast: Range = (-0.1, 0.5)
     """Weight of an S-shaped tone curve: 0 is the sRGB curve, negative values give less contrast."""
     shot_noise: Range = (0.0, 0.02)
@@ -166,8 +167,8 @@ class SceneRecipe(FrozenModel):
     about: str
     """A description of the scenes."""
     orders: Literal["all", "truncated"] = "all"
-    """Light paths in T and R. all: all orders of reflection, so that I = T + R. truncated: T contains only the
-    path without a reflection, R only paths that do not enter the last pane."""
+    """Light paths in T and R. With "all", they contain all orders of reflection, so that I = T + R. With "truncated", T
+    contains only the path without a reflection, and R only the paths that do not enter the last pane."""
     samples_per_pixel: PositiveInt = 8
     """Rays per pixel of scenes that need Monte Carlo sampling (a wedged pane, or a lens and near content), and the maximum
     for other scenes without rough glass."""
@@ -176,13 +177,14 @@ class SceneRecipe(FrozenModel):
     setups: Annotated[
         dict[Setup, Share],
         KeyNote(
-            "table of behind|front = share",
-            'keys "map|map", "map|plane", "plane|map"; shares from 0 to 1',
+            "table of behind|front = weight",
+            'keys "map|map", "map|plane", "plane|map"; weights from 0 to 1',
             replaces_constraints=True,
         ),
     ] = Field(default_factory=dict)
-    """Relative shares of the kinds of content behind|in front of the glass, drawn together: an environment map, or a picture
-    on a plane without a map. They replace map_probability and plane_probability of both sides. Empty: each side is drawn by itself."""
+    """Relative frequencies of the kinds of content behind|in front of the glass: an environment map, or a picture on a plane
+    without a map. They replace map_probability and plane_probability of both sides. With an empty table, each side is
+    drawn independently."""
     glass: GlassRecipe = GlassRecipe()
     camera: CameraRecipe = CameraRecipe()
     behind: SideRecipe = SideRecipe()
@@ -194,7 +196,7 @@ class SceneRecipe(FrozenModel):
     @model_validator(mode="after")
     def _check_setups(self) -> Self:
         if self.setups and not any(self.setups.values()):
-            raise ValueError("expected a share above 0 for at least one of the setups")
+            raise ValueError("expected a weight above 0 for at least one of the setups")
         return self
 
     def with_setup(self, setup: Setup) -> SceneRecipe:
@@ -209,7 +211,7 @@ class SceneRecipe(FrozenModel):
 
 
 def read_scene_recipe(name: str) -> SceneRecipe:
-    """Reads a packaged recipe by its name, or another one from a .toml file.
+    """Reads a packaged recipe by its name, or any recipe from a .toml file.
 
     Raises:
         RecipeError: the name is unknown, the file is missing or not TOML, or keys are missing, unknown or have
@@ -221,6 +223,6 @@ def read_scene_recipe(name: str) -> SceneRecipe:
         raise RecipeError(
             f"there is no recipe {name!r}",
             f"expected one of the packaged recipes {', '.join(RECIPES)}",
-            "choose one of them, or a .toml file",
+            "choose one of these names, or a .toml file",
         )
     return read_toml(SceneRecipe, Path(name), reference=_REFERENCE)

@@ -53,7 +53,7 @@ def read_toml(model: type[Model], path: Path, *, reference: str) -> Model:
         raise RecipeError(f"{path} cannot be read", "expected a TOML file", f"see {reference}") from error
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise RecipeError(
-            f"{path} is not TOML ({error})", "expected a TOML file", "correct the file there"
+            f"{path} is not TOML ({error})", "expected a TOML file", "correct the file at this place"
         ) from error
     return validated(model, values, source=str(path), reference=reference)
 
@@ -62,7 +62,7 @@ def validated(model: type[Model], values: Mapping[str, Any], *, source: str, ref
     """Returns the values as an instance of `model`. Error messages contain `source`, the origin of the values.
 
     Raises:
-        RecipeError: keys are missing, unknown or have impossible values. It has one sentence for each of them.
+        RecipeError: keys are missing, unknown or have impossible values. The error has one message for each problem.
     """
     try:
         return model.model_validate(values)
@@ -80,14 +80,16 @@ def validated(model: type[Model], values: Mapping[str, Any], *, source: str, ref
 def _problem(
     model: type[FrozenModel], values: Mapping[str, Any], details: ErrorDetails, names: tuple[str, str]
 ) -> RecipeError:
-    """Translates an error of pydantic: source, key and value; what is allowed; what to do. `names` are source and reference."""
+    """Translates an error of pydantic into a RecipeError. `names` are the source of the values and the reference."""
     source, reference = names
     location, kind = details["loc"], details["type"]
     path, value = _look_up(values, location)
     cure = f"compare with {reference}"
     if kind == "missing":
         missing = [*path, str(location[-1])]
-        return RecipeError(f"{source}: {_dotted(missing)} is missing", _expected(model, missing), "add it")
+        return RecipeError(
+            f"{source}: {_dotted(missing)} is missing", _expected(model, missing), "add this key"
+        )
     if kind == "extra_forbidden" or location[-1:] == ("[key]",):
         return _unknown_key(model, path, value, source)
     message = details["msg"].removeprefix("Value error, ")
@@ -105,12 +107,12 @@ def _problem(
 
 
 def _look_up(
-    values: Any,  # noqa: ANN401  (what TOML holds)
+    values: Any,  # noqa: ANN401  (any value of TOML)
     location: Sequence[str | int],
 ) -> tuple[list[str | int], Any]:
-    """Returns the part of pydantic's location that exists in the values, and the value there.
+    """Returns the part of pydantic's location that exists in the values, and the value at this location.
 
-    The rest of the location may be a member of a union, or "[key]".
+    The rest of the location may be the name of a member of a union, or "[key]".
     """
     path: list[str | int] = []
     for part in location:
@@ -133,14 +135,14 @@ def _unknown_key(
     return RecipeError(
         f"{source}: there is no key {_dotted(path)} (its value is {_shortened(value)})",
         f"expected a key of {owner}{known}",
-        f"did you mean {close}?" if close else "remove it",
+        f"did you mean {close}?" if close else "remove this key",
     )
 
 
 def similar_key(model: type[FrozenModel], path: Sequence[str | int]) -> str | None:
-    """Returns the known key that is most similar to an unknown one.
+    """Returns the known key that is most similar to an unknown key.
 
-    It is a key of the same table with a similar name, else a key of another table with the same name, else None.
+    The result is a key of the same table with a similar name, else a key of another table with the same name, else None.
     """
     *table, name = path
     close = get_close_matches(str(name), allowed_keys(model, table), n=1)
@@ -167,9 +169,9 @@ def _shortened(value: object) -> str:
 
 
 def commented_toml(recipe: FrozenModel) -> str:
-    """Returns the recipe as TOML with all keys, also those with default values. A comment above each key describes it.
+    """Returns the recipe as TOML with all keys, including those with default values. A comment describes each key.
 
-    An optional key that is not set is commented out. `read_toml` returns an equal recipe from the text.
+    An optional key that is not set is commented out. `read_toml` returns an equal recipe if it reads this text.
     """
     values = recipe.model_dump(mode="json")
     lines: list[str] = []
@@ -192,7 +194,7 @@ def _key_lines(key: RecipeKey, value: object, *, is_set: bool) -> Iterator[str]:
 
 
 def _facts(key: RecipeKey) -> Iterator[str]:
-    """Yields type, allowed values, unit and default of a key in words."""
+    """Yields the type, the allowed values, the unit and the default of a key in words."""
     yield key.kind
     if key.allowed:
         yield key.allowed
@@ -202,7 +204,7 @@ def _facts(key: RecipeKey) -> Iterator[str]:
 
 
 def default_of(key: RecipeKey) -> str:
-    """The default of a key in words."""
+    """Returns the default of a key in words."""
     value = _plain_default(key)
     if key.default is REQUIRED:
         return "required"
@@ -228,7 +230,7 @@ def _value_at(values: Any, path: str) -> Any:  # noqa: ANN401
 
 
 def _toml(value: object) -> str:
-    """A value on one line, as TOML."""
+    """Returns a value as TOML on one line."""
     match value:
         case bool():
             return str(value).lower()

@@ -21,7 +21,7 @@ from pydantic.fields import FieldInfo
 from brewster.scene.values import FrozenModel, KeyNote
 
 REQUIRED: Final = object()
-"""Stands for the default of a key that has no default."""
+"""The default of a key that must be set."""
 
 _UNITS: Final = {"mm": "mm", "deg": "degrees", "px": "px", "per_m": "1/m", "px_per_texel": "px per texel"}
 _SUFFIX: Final = re.compile(rf"(?:^|_)({'|'.join(sorted(_UNITS, key=len, reverse=True))})$")
@@ -34,15 +34,15 @@ class RecipeKey:
     """One key of a recipe."""
 
     path: str
-    """The names of its tables and its own name, separated by dots: "data.rendered.blend_space"."""
+    """The names of the key's tables and of the key, separated by dots: "data.rendered.blend_space"."""
     kind: str
     """The type in words: "number", "list of paths"."""
     allowed: str
     """The allowed values in words, or "" if every value of the type is allowed."""
     unit: str
-    """The unit, or "" for a number without one."""
+    """The unit, or "" for a value without a unit."""
     default: Any
-    """The default value of the model, or REQUIRED."""
+    """The default value in the model, or REQUIRED."""
     meaning: str
     """What the key does."""
 
@@ -59,7 +59,7 @@ class RecipeTable:
 
     @property
     def keys(self) -> list[RecipeKey]:
-        """The keys of the table in the order of the model, without its tables."""
+        """The keys of the table in the order of the model, without the tables inside this table."""
         return [
             _key(_joined(self.path, name), name, field)
             for name, field in self.model.model_fields.items()
@@ -94,7 +94,7 @@ def describe(model: type[FrozenModel], path: Sequence[str | int]) -> str:
 
 
 def literal_values(model: type[FrozenModel], path: Sequence[str | int]) -> tuple[Any, ...]:
-    """Returns the allowed values at a path if they are a fixed list (a Literal), else an empty tuple."""
+    """Returns the allowed values at a path if the type is a Literal, else an empty tuple."""
     annotation, _ = _annotation_at(model, path)
     return get_args(annotation) if get_origin(annotation) is Literal else ()
 
@@ -141,7 +141,7 @@ def _type_and_limits(annotation: Any, metadata: Sequence[Any]) -> tuple[str, str
 
 
 def _kind(annotation: Any) -> tuple[str, str]:  # noqa: ANN401
-    """Returns the type in words, and the allowed values of its parts. Constraints of the type itself are not included."""
+    """Returns the type in words, and the allowed values of its parts. The constraints of the type itself are not included."""
     origin, args = get_origin(annotation), get_args(annotation)
     if origin is Literal:
         return _KINDS[type(args[0])], f"one of {', '.join(_quoted(value) for value in args)}"
@@ -160,7 +160,7 @@ def _kind(annotation: Any) -> tuple[str, str]:  # noqa: ANN401
 
 
 def _limits(metadata: Sequence[Any]) -> Iterator[str]:
-    """Yields limits of numbers and lengths in words."""
+    """Yields the limits of a number, or of the length of a list, in words."""
     low = next((limit for limit in metadata if isinstance(limit, Ge | Gt)), None)
     high = next((limit for limit in metadata if isinstance(limit, Le | Lt)), None)
     if isinstance(low, Ge) and isinstance(high, Le):
@@ -178,7 +178,7 @@ def _limits(metadata: Sequence[Any]) -> Iterator[str]:
 
 
 def _limits_of_parts(*allowed: str) -> str:
-    """Returns the allowed values of the parts of a list or a table in words: only once if they are equal for all parts."""
+    """Returns the allowed values of the parts of a list or a table in words, only once if all parts have the same."""
     if len(set(allowed)) == 1:
         return f"each {allowed[0].removeprefix('each ')}" if allowed[0] else ""
     return "; ".join(allowed)

@@ -1,4 +1,4 @@
-"""Draws random scenes: (recipe, catalog, seed, index) -> Scene, the same on every machine.
+"""Draws random scenes. The same recipe, catalog, seed and index give the same scene on every machine.
 
 scene = draw(read_scene_recipe("window"), catalog, seed=7, index=12)
 """
@@ -35,7 +35,7 @@ class Asset(FrozenModel):
 
 
 class Catalog(FrozenModel):
-    """The environment maps and pictures that scenes are drawn from."""
+    """The environment maps and pictures from which the content of scenes is drawn."""
 
     maps: tuple[Asset, ...] = ()
     pictures: tuple[Asset, ...] = ()
@@ -45,7 +45,7 @@ def draw(recipe: SceneRecipe, catalog: Catalog, seed: int, index: int) -> Scene:
     """Draws the scene with this index. An impossible scene, such as a view at a grazing angle, is drawn again.
 
     Raises:
-        RecipeError: the catalog has no suitable maps or pictures, or no scene was possible in 100 attempts.
+        RecipeError: the catalog has no suitable maps or pictures, or all of 100 attempts gave an impossible scene.
     """
     rng = _SceneRng(f"{recipe.name}/{seed}/{index}")
     reason = ""
@@ -91,8 +91,8 @@ class _PartialScene:
 
 def _draw_once(recipe: SceneRecipe, catalog: Catalog, rng: _SceneRng, seed: int, index: int) -> Scene:
     if recipe.setups:
-        setups, shares = zip(*recipe.setups.items(), strict=True)
-        recipe = recipe.with_setup(rng.choices(setups, shares)[0])
+        setups, weights = zip(*recipe.setups.items(), strict=True)
+        recipe = recipe.with_setup(rng.choices(setups, weights)[0])
     glass = _draw_glazing(recipe.glass, rng)
     behind_map = _choose_map(recipe.behind, recipe.camera, catalog, rng)
     front_map = _choose_map(recipe.front, recipe.camera, catalog, rng)
@@ -143,7 +143,10 @@ def _draw_glazing(recipe: GlassRecipe, rng: _SceneRng) -> Glazing:
 
 
 def _choose_map(recipe: SideRecipe, camera: CameraRecipe, catalog: Catalog, rng: _SceneRng) -> Asset | None:
-    """Draws a map with sufficient resolution for the widest view of the recipe. Returns None for a side without a map."""
+    """Draws a map whose resolution is sufficient for the widest view of the recipe.
+
+    Returns None for a side without a map, and if no map is suitable but the recipe also allows pictures.
+    """
     candidates = [
         asset
         for asset in catalog.maps
@@ -163,7 +166,7 @@ def _choose_map(recipe: SideRecipe, camera: CameraRecipe, catalog: Catalog, rng:
 
 
 def _min_fov_deg(asset: Asset, recipe: SideRecipe, camera: CameraRecipe) -> float:
-    """Smallest horizontal field of view in degrees for which a texel of the map covers at most `max_px_per_texel`."""
+    """Returns the smallest horizontal field of view in degrees at which a texel of the map is at most `max_px_per_texel` wide."""
     return camera.width * 360 / asset.width / recipe.max_px_per_texel
 
 
@@ -206,10 +209,10 @@ def _draw_side(recipe: SideRecipe, asset: Asset | None, partial: _PartialScene, 
 
 
 def _draw_plane(recipe: SideRecipe, partial: _PartialScene, luminance: float, distance_mm: float) -> Plane:
-    """Draws a picture. Its width is `relative_width` times the width that covers the view, which is direct or mirrored."""
+    """Draws a picture. Its width is `relative_width` times the width that covers the direct or mirrored view."""
     if not partial.catalog.pictures:
         raise RecipeError(
-            "there are no pictures to draw from",
+            "the catalog has no pictures",
             "expected pictures, because the recipe uses them",
             "choose a folder with --photos",
         )

@@ -1,4 +1,4 @@
-"""A scene: glass, camera, content on both sides, and camera response. It is read from and written as TOML.
+"""A scene: glass, camera, content on both sides, and camera response. Scenes are read from and written to TOML.
 
 scene = read_scene(Path("scene.toml"))
 print(scene.to_toml())
@@ -19,13 +19,16 @@ from brewster.scene.values import FrozenModel, NonNegativeFloat, PositiveInt, Se
 from brewster.scene.world import Side
 
 MAX_INCIDENCE_DEG = 85.0
-"""The largest angle of incidence of the four corners of the view on flat glass. Scenes above it are refused."""
+"""The largest allowed angle of incidence at the four corners of the view on flat glass."""
 
 WhiteBalance = Literal["none", "grey-world", "white-patch", "grey-edge"]
 
 
 class CameraResponse(FrozenModel):
-    """The camera response: from linear light to a photograph. Exposure and gains are computed on I and applied to all layers."""
+    """The camera response: the conversion of linear light into a photograph.
+
+    Exposure and white balance gains are computed on I and applied to I, T, B and R. MR has its own exposure.
+    """
 
     target_luminance: Annotated[float, Field(gt=0, le=1)] = 0.4
     """Mean luminance of I after exposure and clipping to 0..1."""
@@ -42,10 +45,11 @@ class CameraResponse(FrozenModel):
 
 
 class Scene(FrozenModel):
-    """Everything that a sample depends on: the same scene and version give the same bytes.
+    """All data that determine a sample: the same scene and the same version of brewster give the same bytes.
 
-    `orders` "all": T and R contain all light paths, so that I = T + R. "truncated": T contains only the path without a
-    reflection, and R only the paths that do not enter the last pane (for one pane: the reflection at its first surface).
+    With `orders` "all", T and R contain all light paths, so that I = T + R. With "truncated", T contains only the path
+    without a reflection, and R only the paths that do not enter the last pane (with one pane, R is the reflection at its
+    first surface).
     """
 
     recipe: str = ""
@@ -55,7 +59,7 @@ class Scene(FrozenModel):
     """The version of brewster that drew the scene."""
     orders: Literal["all", "truncated"] = "all"
     samples_per_pixel: PositiveInt = 16
-    """Rays per pixel of scenes with rough or wedged glass, or with a lens and near content; the maximum for others."""
+    """Rays per pixel of scenes with rough or wedged glass, or with a lens and near content; the maximum for other scenes."""
     glass: Glazing = Glazing()
     camera: Camera = Camera()
     behind: Side = Side()
@@ -65,12 +69,14 @@ class Scene(FrozenModel):
     @model_validator(mode="after")
     def _check_geometry(self) -> Scene:
         _, _, normal = axes(self.glass.heading_deg, self.glass.pitch_deg)
-        offset = self.camera_above_glass_mm
-        if offset <= 0:
-            raise ValueError(f"expected the camera in front of the glass, but it is {-offset:g} mm behind it")
+        above_glass_mm = self.camera_above_glass_mm
+        if above_glass_mm <= 0:
+            raise ValueError(
+                f"expected the camera in front of the glass, but it is {-above_glass_mm:g} mm behind it"
+            )
         if self.glass.is_flat:
             self._check_incidence(normal)
-        self._check_focus(normal, offset)
+        self._check_focus(normal, above_glass_mm)
         self._check_distances()
         return self
 
@@ -86,16 +92,16 @@ class Scene(FrozenModel):
             cosine = -dot(corner, normal) / math.sqrt(dot(corner, corner))
             if cosine <= math.cos(math.radians(MAX_INCIDENCE_DEG)):
                 raise ValueError(
-                    f"expected angles of incidence up to {MAX_INCIDENCE_DEG:g} degrees, but a corner of the view exceeds them:"
+                    f"expected angles of incidence up to {MAX_INCIDENCE_DEG:g} degrees, but a corner of the view exceeds this limit:"
                     " turn the camera to the glass, or reduce fov_deg"
                 )
 
-    def _check_focus(self, normal: tuple[float, float, float], offset: float) -> None:
+    def _check_focus(self, normal: tuple[float, float, float], above_glass_mm: float) -> None:
         _, _, back = axes(self.camera.heading_deg, self.camera.pitch_deg)
-        depth = self.camera.focus_mm * dot(back, normal) - offset
-        if self.camera.aperture_mm > 0 and 0 <= depth <= self.glass.depth_mm:
+        focus_depth_mm = self.camera.focus_mm * dot(back, normal) - above_glass_mm
+        if self.camera.aperture_mm > 0 and 0 <= focus_depth_mm <= self.glass.depth_mm:
             raise ValueError(
-                f"expected a focus_mm in front of the glass or behind it, but the focus is {depth:g} mm inside the glass"
+                f"expected a focus_mm in front of the glass or behind it, but the focus is {focus_depth_mm:g} mm inside the glass"
             )
 
     def _check_distances(self) -> None:
@@ -104,15 +110,15 @@ class Scene(FrozenModel):
         for side, surface_mm in ((self.behind, self.glass.depth_mm), (self.front, 0.0)):
             if side.map and side.map.radius_mm <= max(camera_distance_mm, self.glass.depth_mm):
                 raise ValueError(
-                    f"expected the camera and the glass inside the dome, but its radius_mm is {side.map.radius_mm:g}: raise it"
+                    f"expected the camera and the glass inside the dome, but its radius_mm is {side.map.radius_mm:g}: increase this radius"
                 )
             if side.plane and side.plane.nearest_mm <= surface_mm:
                 raise ValueError(
-                    f"expected a plane that does not touch the glass, but its distance_mm is {side.plane.distance_mm:g}: raise it"
+                    f"expected a plane that does not touch the glass, but its distance_mm is {side.plane.distance_mm:g}: increase this distance"
                 )
 
     def to_toml(self, **extra_tables: dict[str, Any]) -> str:
-        """The scene as TOML, followed by extra tables. `read_scene` returns an equal scene from it."""
+        """Returns the scene as TOML, followed by extra tables. `read_scene` returns an equal scene if it reads this text."""
         import tomli_w  # noqa: PLC0415  (not needed to read a scene)
 
         return tomli_w.dumps({**self.model_dump(mode="json", exclude_none=True), **extra_tables})

@@ -1,4 +1,4 @@
-"""The base class of all recipes and scenes, and their common value types."""
+"""The base class of all recipes and scenes, and the types of their values."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ class FrozenModel(BaseModel):
 
 @dataclass(frozen=True)
 class KeyNote:
-    """Additions to the description of a key, for facts that its type and constraints do not contain."""
+    """Additions to the description of a key, which its type and constraints do not contain."""
 
     kind: str = ""
-    """The type in words. It replaces the words for the annotation."""
+    """The type in words. It replaces the description of the annotation."""
     allowed: str = ""
-    """The allowed values in words. They follow the words for the constraints."""
+    """The allowed values in words. They follow the description of the constraints."""
     unit: str = ""
     """The unit, for keys whose name has no suffix such as `_mm`."""
     replaces_constraints: bool = False
-    """Whether `allowed` replaces the words for the constraints."""
+    """Whether `allowed` replaces the description of the constraints."""
 
 
 def _ascending(bounds: tuple[float, float]) -> tuple[float, float]:

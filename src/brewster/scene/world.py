@@ -10,7 +10,7 @@ from pydantic import Field, PlainSerializer, model_validator
 from brewster.scene.values import FrozenModel, NonNegativeFloat, PositiveFloat
 
 BUILTIN = "builtin:"
-"""Prefix of sources that are computed instead of read from a file: `builtin:street:7` is the street with seed 7."""
+"""Prefix of sources that are computed, not read from a file: `builtin:street:7` is the street with seed 7."""
 
 Radius = Annotated[float, Field(gt=0, allow_inf_nan=True), PlainSerializer(float)]
 
@@ -23,26 +23,27 @@ class AssetSource(FrozenModel):
 
 
 class EnvironmentMap(FrozenModel):
-    """A lat-long environment map (u = atan2(x, -z) / 2 pi, v = acos(y) / pi), at infinity or on a dome around the glass."""
+    """A lat-long environment map (u = atan2(x, -z) / (2 pi), v = acos(y) / pi), at infinity or on a dome around the glass."""
 
     source: AssetSource
     heading_deg: float = 0.0
     """Heading of the left edge of the map."""
     luminance: NonNegativeFloat = 1.0
-    """Mean luminance over the sphere, in the arbitrary unit of the scene. Lamps hardly count (see `Assets.map_radiance`)."""
+    """Mean luminance over the sphere, in the arbitrary unit of the scene. Lamps have little weight in this mean (see
+    `Assets.map_radiance`)."""
     radius_mm: Radius = math.inf
 
 
 class Plane(FrozenModel):
-    """A picture on an upright plane. Its height follows from the aspect ratio of the picture.
+    """A picture on a plane. The height of the plane is computed from the aspect ratio of the picture.
 
     A plane in front of the glass is visible in the reflection only. If it is between the glass and the camera, choose a
-    position outside the direct view: the analytic renderer does not show it there.
+    position outside the direct view, because the analytic renderer does not show the plane in that view.
     """
 
     source: AssetSource
     distance_mm: PositiveFloat
-    """Distance from the position of the glazing along the normal of the glass."""
+    """Distance of the plane's centre from the position of the glazing, along the normal of the glass."""
     offset_mm: tuple[float, float] = (0.0, 0.0)
     """Offset of the centre to the right and up, as seen by a camera that looks through the glass."""
     width_mm: PositiveFloat
@@ -55,7 +56,7 @@ class Plane(FrozenModel):
 
     @property
     def nearest_mm(self) -> float:
-        """Lower bound of the distance between the glass and the rotated plane, which is assumed to be square."""
+        """Lower bound of the distance between the glass and the rotated plane, for a square picture."""
         sines = sum(abs(math.sin(math.radians(angle))) for angle in (self.heading_deg, self.pitch_deg))
         return self.distance_mm - sines * self.width_mm / 2
 

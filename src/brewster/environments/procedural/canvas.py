@@ -1,7 +1,7 @@
-"""Textured rectangles around a viewer, and their rendering as a lat-long map. Base of the procedural environments.
+"""Textured rectangles around a viewer, and their rendering as a lat-long map. All procedural environments use this module.
 
-An environment paints each surface on a flat `Canvas` and places it in space as a `Quad` with baked lighting. `render`
-casts rays at all quads. Lengths are in metres, the viewer is at the origin, y is up, light is linear.
+The surfaces of an environment are painted on a flat `Canvas` each and placed in space as a `Quad` with baked lighting.
+`render` casts rays at all quads. Lengths are in metres, the viewer is at the origin, y is up, light is linear.
 """
 
 from __future__ import annotations
@@ -21,44 +21,44 @@ Colour: TypeAlias = Sequence[float] | Floats
 Box: TypeAlias = tuple[float, float, float, float]
 """Left, top, width and height in metres from the upper left corner of a canvas."""
 Lighting: TypeAlias = Callable[[Floats, Floats], Floats]
-"""(points (h, w, 3), unit normal (3,)) -> irradiance / pi at the points, (h, w, 3)."""
+"""A function of points (h, w, 3) and their unit normal (3,). It returns irradiance / pi at the points, (h, w, 3)."""
 
 _STRIP_ROWS: Final = 32
 
 
 def vector(*values: float) -> Floats:
-    """A float32 vector."""
+    """Returns a float32 vector."""
     return np.array(values, np.float32)
 
 
 def unit(values: Floats) -> Floats:
-    """The vectors (..., 3), normalised to length 1."""
-    directed: Floats = values / np.linalg.norm(values, axis=-1, keepdims=True)
-    return directed
+    """Returns the vectors (..., 3), normalised to length 1."""
+    normalised: Floats = values / np.linalg.norm(values, axis=-1, keepdims=True)
+    return normalised
 
 
 def tint(rng: Generator, value: float, saturation: float) -> Floats:
-    """A random colour (3,) of about this brightness: half of them warm, a third blue, the others of any hue."""
+    """Returns a random colour (3,) of about the brightness `value`: warm in 50 % of cases, blue in 30 %, else of any hue."""
     hues = rng.normal(0.92, 0.05), rng.normal(0.38, 0.05), rng.uniform()
     phase = hues[rng.choice(3, p=(0.5, 0.3, 0.2))] + vector(0, 1 / 3, 2 / 3)
     return np.clip(value * (1 + saturation * np.cos(2 * np.pi * phase)), 0.01, 1).astype(np.float32)
 
 
-def resize(picture: Floats, height: int, width: int, *, wrap: bool = False) -> Floats:
-    """Bilinear interpolation of (h, w, ...) between texel centres, without a low-pass filter when it shrinks."""
-    return _stretch(_stretch(picture, height, 0, wrap), width, 1, wrap)
+def resize(image: Floats, height: int, width: int, *, wrap: bool = False) -> Floats:
+    """Resizes an image (h, w, ...) by bilinear interpolation between texel centres, without a low-pass filter."""
+    return _stretch(_stretch(image, height, 0, wrap), width, 1, wrap)
 
 
-def _stretch(picture: Floats, size: int, axis: int, wrap: bool) -> Floats:
-    old = picture.shape[axis]
-    if old == size:
-        return picture
-    coordinates = (np.arange(size, dtype=np.float32) + 0.5) * (old / size) - 0.5
+def _stretch(image: Floats, length: int, axis: int, wrap: bool) -> Floats:
+    old_length = image.shape[axis]
+    if old_length == length:
+        return image
+    coordinates = (np.arange(length, dtype=np.float32) + 0.5) * (old_length / length) - 0.5
     low = np.floor(coordinates).astype(np.int32)
-    fraction = (coordinates - low).reshape([-1 if side == axis else 1 for side in range(picture.ndim)])
+    fraction = (coordinates - low).reshape([-1 if side == axis else 1 for side in range(image.ndim)])
     mode: Literal["wrap", "clip"] = "wrap" if wrap else "clip"
-    first: Floats = picture.take(low, axis, mode=mode)
-    second: Floats = picture.take(low + 1, axis, mode=mode)
+    first: Floats = image.take(low, axis, mode=mode)
+    second: Floats = image.take(low + 1, axis, mode=mode)
     second -= first
     second *= fraction
     second += first
@@ -66,7 +66,10 @@ def _stretch(picture: Floats, size: int, axis: int, wrap: bool) -> Floats:
 
 
 def fractal(rng: Generator, height: int, width: int, cells: float = 4, octaves: int = 5) -> Floats:
-    """Tileable fractal noise (height, width) of mean 0 and standard deviation 1; `cells` span the height."""
+    """Returns tileable fractal noise (height, width) of mean 0 and standard deviation 1.
+
+    `cells` is the number of cells of the coarsest octave along the height.
+    """
     total = np.zeros((1, 1), np.float32)
     for octave in range(octaves):
         rows = max(1, round(cells * 2**octave))
@@ -80,7 +83,7 @@ def fractal(rng: Generator, height: int, width: int, cells: float = 4, octaves: 
 
 
 def lettering(rng: Generator, count: int, height: int, width: int) -> Floats:
-    """The mask (height, width) of a line of `count` random glyphs with gaps between words."""
+    """Returns the mask (height, width) of a line of `count` random glyphs with gaps between words."""
     glyphs = np.zeros((count, 9, 6), np.float32)
     bars = rng.uniform(size=(count, 3)) < 0.6
     stems = rng.uniform(size=(count, 4)) < 0.6
@@ -96,7 +99,7 @@ def lettering(rng: Generator, count: int, height: int, width: int) -> Floats:
 
 @dataclass
 class Canvas:
-    """A flat surface to paint on. Where it is opaque, its radiance is colour * (light + emission)."""
+    """A flat surface that is painted. The radiance of an opaque texel is colour * (light + emission)."""
 
     width: float
     height: float
@@ -104,7 +107,7 @@ class Canvas:
     """Texels per metre."""
     colour: Colour = (0.5, 0.5, 0.5)
     pixels: Floats = field(init=False)
-    """(h, w, 5): red, green, blue, opacity, emission."""
+    """The texels (h, w, 5): red, green, blue, opacity, emission."""
 
     def __post_init__(self) -> None:
         size = (max(2, round(self.height * self.density)), max(2, round(self.width * self.density)), 5)
@@ -112,7 +115,7 @@ class Canvas:
         self.pixels[:] = (*self.colour, 1, 0)
 
     def area(self, box: Box) -> Floats:
-        """A view of the texels (h, w, 5) of a box, cropped to the canvas."""
+        """Returns a view of the texels (h, w, 5) of a box, cropped to the canvas."""
         left, top, width, height = (self.density * side for side in box)
         rows = slice(max(0, round(top)), max(0, round(top + height)))
         return self.pixels[rows, max(0, round(left)) : max(0, round(left + width))]
@@ -121,14 +124,14 @@ class Canvas:
         """Paints a box in one colour."""
         self.area(box)[:] = (*colour, 1, emission)
 
-    def paste(self, picture: Floats, box: Box, *, emission: float = 0) -> None:
-        """Paints a picture (h, w, 3), scaled to the box."""
+    def paste(self, image: Floats, box: Box, *, emission: float = 0) -> None:
+        """Paints an image (h, w, 3), scaled to the box."""
         area = self.area(box)
-        area[..., :3] = resize(picture, *area.shape[:2])
+        area[..., :3] = resize(image, *area.shape[:2])
         area[..., 3:] = (1, emission)
 
     def write(self, rng: Generator, box: Box, colour: Colour, *, emission: float = 0) -> None:
-        """Writes one line of random glyphs that fills the box."""
+        """Paints one line of random glyphs that fills the box."""
         area = self.area(box)
         if min(area.shape[:2]) > 2:
             count = max(1, round(box[2] / box[3] * 1.3))
@@ -143,19 +146,22 @@ class Canvas:
 
 
 class MipmapTexture:
-    """A mipmap of a picture (h, w, c)."""
+    """A mipmap of an image (h, w, c)."""
 
-    def __init__(self, picture: Floats) -> None:
-        levels = [picture]
+    def __init__(self, image: Floats) -> None:
+        levels = [image]
         while min(levels[-1].shape[:2]) > 1:
             last = levels[-1][: levels[-1].shape[0] // 2 * 2, : levels[-1].shape[1] // 2 * 2]
             levels.append((last[::2, ::2] + last[1::2, ::2] + last[::2, 1::2] + last[1::2, 1::2]) * 0.25)
-        self._texels = np.concatenate([level.reshape(-1, picture.shape[2]) for level in levels])
+        self._texels = np.concatenate([level.reshape(-1, image.shape[2]) for level in levels])
         self._rows, self._columns = np.array([level.shape[:2] for level in levels], np.int32).T
         self._starts = np.cumsum([0, *(self._rows * self._columns)[:-1]], dtype=np.int32)
 
     def sample(self, across: Floats, down: Floats, footprint: Floats) -> Floats:
-        """Texels (n, c) at coordinates that repeat with period 1; `footprint` is the size of a sample in finest texels."""
+        """Returns texels (n, c) at coordinates that repeat with period 1.
+
+        `footprint` is the width of a sample in texels of the finest level.
+        """
         level = np.log2(np.maximum(footprint, 1)).astype(np.int32)
         level = np.minimum(level, len(self._starts) - 1)
         rows, columns = self._rows[level], self._columns[level]
@@ -166,7 +172,7 @@ class MipmapTexture:
 
 
 class Quad:
-    """A canvas in space, spanned by `across` and `down` from `corner`, with baked lighting."""
+    """A canvas in space, with baked lighting. `sides` are the vectors from `corner` along its upper and its left edge."""
 
     def __init__(self, canvas: Canvas, corner: Floats, sides: tuple[Floats, Floats], light: Lighting) -> None:
         across, down = sides
@@ -179,7 +185,7 @@ class Quad:
 
     @cached_property
     def projection(self) -> Floats:
-        """The matrix (3, 3) from a direction to its coordinates (across, down, 1) divided by the distance."""
+        """The matrix (3, 3) that maps a direction to its coordinates (across, down, 1), divided by the distance."""
         corner, across, down = self._outline
         return np.linalg.inv(np.stack([across, down, corner], 1).astype(np.float64)).astype(np.float32)
 
@@ -199,7 +205,7 @@ class Quad:
 
     @cached_property
     def bounds(self) -> tuple[float, float, float, float]:
-        """Smallest and largest azimuth, smallest and largest polar angle, in radians."""
+        """The smallest and largest azimuth, and the smallest and largest polar angle, in radians."""
         corner, across, down = self._outline
         step = np.linspace(0, 1, 65)[:, None]
         path = [corner + step * across, corner + across + step * down]
@@ -214,37 +220,38 @@ class Quad:
 
 @dataclass(frozen=True)
 class SmallEmitter:
-    """A small round light, smaller than a texel of the map. Its energy is preserved."""
+    """A round light source that may be smaller than a texel of the map. Its energy is preserved."""
 
     position: Floats
     radius: float
-    """Metres, at the distance of the position."""
+    """The radius in metres, at the distance of the position."""
     radiance: Colour
 
 
 @dataclass(frozen=True)
 class ProceduralEnvironment:
-    """Everything around the viewer."""
+    """All surfaces and light sources around the viewer."""
 
     quads: Sequence[Quad]
     emitters: Sequence[SmallEmitter]
     sky: Callable[[Floats, float], Floats]
-    """(unit directions (h, w, 3), angle of a texel) -> radiance (h, w, 3), where there is no surface."""
+    """A function of unit directions (h, w, 3) and the angle of a texel in radians. It returns the radiance (h, w, 3) in
+    directions without a surface."""
     rotation: float
     """Azimuth of the -z axis of the environment in the map, in radians."""
 
 
 def render(environment: ProceduralEnvironment, height: int) -> NDArray[np.float32]:
-    """The lat-long map (height, 2 height, 3) of an environment, with four rays per texel.
+    """Returns the lat-long map (height, 2 height, 3) of an environment, with four rays per texel.
 
-    It is rendered in strips that fit into the processor cache.
+    The map is rendered in strips that fit into the processor cache.
     """
     strips = [_strip(environment, height, top) for top in range(0, height, _STRIP_ROWS)]
-    picture: NDArray[np.float32] = np.concatenate(strips).astype(np.float32)
+    image: NDArray[np.float32] = np.concatenate(strips).astype(np.float32)
     for emitter in environment.emitters:
         if not _is_occluded(environment, emitter.position):
-            _add_emitter(picture, emitter, environment.rotation)
-    return picture
+            _add_emitter(image, emitter, environment.rotation)
+    return image
 
 
 def _strip(environment: ProceduralEnvironment, height: int, top: int) -> Floats:
@@ -276,7 +283,7 @@ def _strip(environment: ProceduralEnvironment, height: int, top: int) -> Floats:
 
 
 def directions(height: int, rotation: float, top: int, rows: int) -> Floats:
-    """Unit directions (rows, 2 height, 3) of texel centres from row `top`, in an environment rotated by `rotation`."""
+    """Returns unit directions (rows, 2 height, 3) of texel centres from row `top`, in an environment rotated by `rotation`."""
     polar = (np.arange(top, top + rows) + 0.5)[:, None] * (np.pi / height)
     azimuth = (np.arange(2 * height) + 0.5) * (np.pi / height) - rotation
     parts = np.sin(polar) * np.sin(azimuth), np.cos(polar) + 0 * azimuth, -np.sin(polar) * np.cos(azimuth)
@@ -284,7 +291,7 @@ def directions(height: int, rotation: float, top: int, rows: int) -> Floats:
 
 
 def _columns(quad: Quad, rotation: float, width: int) -> list[slice]:
-    """The columns that a quad may cloud_threshold: one range, or two where it crosses the seam of the map."""
+    """Returns the columns that a quad may cover: one range, or two ranges if it crosses the seam of the map."""
     low, high = ((angle + rotation) * width / (2 * np.pi) for angle in quad.bounds[:2])
     first, count = int(np.floor(low)) % width, int(np.ceil(high) - np.floor(low)) + 1
     if count >= width:
@@ -296,7 +303,11 @@ def _columns(quad: Quad, rotation: float, width: int) -> list[slice]:
 
 
 def _rasterise(quad: Quad, rotation: float, polar: Floats, target: tuple[slice, Floats, Floats]) -> None:
-    """Draws a quad on some rows and columns, where it is closer than the surfaces drawn before."""
+    """Draws the part of a quad that is closer than the surfaces drawn before.
+
+    `target` is a range of columns, and the inverse depth and the colours of all columns of some rows. `polar` has the
+    polar angles of these rows.
+    """
     columns, inverse_depth, colours = target[0], target[1][:, target[0]], target[2][:, target[0]]
     width = target[1].shape[1]
     azimuth = (np.arange(columns.start, columns.stop) + 0.5) * (2 * np.pi / width) - rotation
@@ -342,9 +353,9 @@ def _is_occluded(environment: ProceduralEnvironment, position: Floats) -> bool:
     return False
 
 
-def _add_emitter(picture: Floats, emitter: SmallEmitter, rotation: float) -> None:
+def _add_emitter(image: Floats, emitter: SmallEmitter, rotation: float) -> None:
     """Adds a disc at least three texels wide with exactly the energy of the emitter."""
-    height, texel = picture.shape[0], np.pi / picture.shape[0]
+    height, texel = image.shape[0], np.pi / image.shape[0]
     distance = float(np.linalg.norm(emitter.position))
     direction, radius = emitter.position / distance, emitter.radius / distance
     disc_radius = max(radius, 1.5 * texel)
@@ -355,4 +366,4 @@ def _add_emitter(picture: Floats, emitter: SmallEmitter, rotation: float) -> Non
     weight = np.clip((disc_radius - chord) / texel + 0.5, 0, 1)
     solid_angle = np.sin((np.arange(top, top + rows) + 0.5) * texel)[:, None] * texel**2
     energy = np.pi * radius**2 / (weight * solid_angle).sum()
-    picture[top : top + rows] += (weight * energy)[..., None] * np.asarray(emitter.radiance, np.float32)
+    image[top : top + rows] += (weight * energy)[..., None] * np.asarray(emitter.radiance, np.float32)

@@ -2,7 +2,8 @@
 
     picture = painting(seed=7, width=768, height=512)
 
-They are used as pictures on walls and behind glass, with edges and texture at several scales.
+Paintings are placed on walls and behind glass. They have edges and texture at several scales. Lengths on a canvas are in
+metres.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from brewster.environments.procedural.canvas import Canvas, Floats, fractal, let
 
 
 def painting(seed: int, width: int, height: int) -> NDArray[np.float32]:
-    """A picture (height, width, 3) in linear light, 0..1. The seed chooses its kind."""
+    """Returns a picture (height, width, 3) in linear light, 0..1. The seed determines its kind."""
     rng = Generator(PCG64(seed))
     kind = (_abstract, _poster, _landscape, _portrait)[rng.integers(4)]
     picture = kind(rng, height, width)
@@ -25,20 +26,20 @@ def painting(seed: int, width: int, height: int) -> NDArray[np.float32]:
 
 
 def _grid(height: int, width: int) -> tuple[Floats, Floats]:
-    """Coordinates (1, w) and (h, 1) of texel centres relative to the middle, in heights; y points down."""
+    """Returns coordinates (1, w) and (h, 1) of texel centres relative to the middle, in image heights; y points down."""
     x = ((np.arange(width, dtype=np.float32) + 0.5) - width / 2) / height
     y = (np.arange(height, dtype=np.float32) + 0.5) / height - 0.5
     return x[None, :], y[:, None]
 
 
 def _inside(distance: Floats, height: int) -> Floats:
-    """The coverage (h, w, 1) of a signed distance, antialiased over about a texel."""
+    """Returns the mask (h, w, 1) of a shape from its signed distance (h, w), antialiased over about a texel."""
     result: Floats = np.clip(0.5 - distance * (0.7 * height), 0, 1)[..., None]
     return result
 
 
 def _ellipse(grid: tuple[Floats, Floats], centre: tuple[float, float], radii: tuple[float, float]) -> Floats:
-    """The approximate signed distance (h, w) to an ellipse, negative inside."""
+    """Returns the approximate signed distance (h, w) to an ellipse, negative inside."""
     x, y = (grid[0] - centre[0]) / radii[0], (grid[1] - centre[1]) / radii[1]
     result: Floats = (np.sqrt(x * x + y * y) - 1) * min(radii)
     return result
@@ -51,7 +52,7 @@ def _paint_ellipse(
     colour: Floats,
     shade: Floats | None = None,
 ) -> None:
-    """Paints an ellipse in a colour (3,), times a shade (h, w); without one it is translucent and flat."""
+    """Paints an ellipse in a colour (3,), times a shade (h, w). Without a shade, it is translucent and of one colour."""
     height, width = picture.shape[:2]
     x, y = _grid(height, width)
     columns = np.flatnonzero(np.abs(x[0] - centre[0]) < radii[0] + 2 / height)
@@ -71,21 +72,21 @@ def _blend(picture: Floats, mask: Floats, colour: Floats) -> None:
 
 
 def _abstract(rng: Generator, height: int, width: int) -> Floats:
-    """Brush strokes on a mottled background, from coarse to fine."""
+    """Returns brush strokes on a mottled background, from coarse to fine."""
     palette = [tint(rng, rng.uniform(0.05, 0.6), rng.uniform(0.2, 1)) for _ in range(6)]
     mottle = np.clip(0.5 + 0.3 * fractal(rng, height, width, 3), 0, 1)[..., None]
     picture = palette[0] + (palette[1] - palette[0]) * mottle
     bristles = 1 + 0.25 * fractal(rng, 256, 256, 64, 2)
-    for size in np.geomspace(0.9, 0.04, 260 if height > 256 else 90):
-        _stroke(rng, picture, float(size), (palette[rng.integers(6)], bristles))
+    for length in np.geomspace(0.9, 0.04, 260 if height > 256 else 90):
+        _stroke(rng, picture, float(length), (palette[rng.integers(6)], bristles))
     return picture
 
 
-def _stroke(rng: Generator, picture: Floats, size: float, paint: tuple[Floats, Floats]) -> None:
-    """One curved stroke, `size` heights long, with streaks of bristles."""
+def _stroke(rng: Generator, picture: Floats, length: float, paint: tuple[Floats, Floats]) -> None:
+    """Paints one curved stroke with streaks of bristles. `length` is its approximate length in image heights."""
     height, width = picture.shape[:2]
     colour, bristles = paint
-    reach = max(4, round(size * height * rng.uniform(0.6, 1.2)))
+    reach = max(4, round(length * height * rng.uniform(0.6, 1.2)))
     top, left = int(rng.integers(-reach // 2, height)), int(rng.integers(-reach // 2, width))
     part = picture[max(0, top) : max(0, top + reach), max(0, left) : max(0, left + reach)]
     y, x = np.mgrid[: part.shape[0], : part.shape[1]].astype(np.float32) / reach - 0.5
@@ -99,7 +100,7 @@ def _stroke(rng: Generator, picture: Floats, size: float, paint: tuple[Floats, F
 
 
 def _poster(rng: Generator, height: int, width: int) -> Floats:
-    """Bands, discs and stripes below a title and small print."""
+    """Returns a poster: bands, discs and stripes between a title and small print."""
     ground, *inks = (tint(rng, rng.uniform(0.02, 0.8), rng.uniform(0, 1)) for _ in range(5))
     picture = np.ones((height, width, 3), np.float32) * ground
     grid = _grid(height, width)
@@ -124,7 +125,10 @@ def _poster(rng: Generator, height: int, width: int) -> Floats:
 
 
 def _print_line(rng: Generator, picture: Floats, line: tuple[float, float, int], ink: Floats) -> None:
-    """Prints a line at (top, size) in heights, of a number of glyphs, as wide as the margins allow."""
+    """Prints a line of glyphs, at most as wide as the margins allow.
+
+    `line` is the top and the height of the line in image heights, and the number of glyphs.
+    """
     height, width = picture.shape[:2]
     top, rows = round(line[0] * height), max(2, round(line[1] * height))
     columns = min(round(width * 0.9), max(4, round(rows * 0.75 * line[2])))
@@ -134,7 +138,7 @@ def _print_line(rng: Generator, picture: Floats, line: tuple[float, float, int],
 
 
 def _landscape(rng: Generator, height: int, width: int) -> Floats:
-    """Sky, a sun, ranges of hills that fade with distance, and trees in front."""
+    """Returns a landscape: sky, a sun, ranges of hills that fade with distance, and trees in front."""
     x, y = _grid(height, width)
     zenith, haze = (
         tint(rng, 0.3, 0.5) * vector(0.6, 0.9, 1.5),
@@ -147,20 +151,20 @@ def _landscape(rng: Generator, height: int, width: int) -> Floats:
     _blend(picture, _inside(_ellipse((x, y), sun, (0.04, 0.04)), height), vector(1, 0.95, 0.8))
     ground = tint(rng, 0.12, 0.4) * vector(0.9, 1.2, 0.6)
     texture = 1 + 0.35 * fractal(rng, height, width, 50, 4)
-    layers = rng.integers(4, 7)
-    for layer in range(layers):
-        near = layer / (layers - 1)
-        ridge = rng.uniform(-0.05, 0.02) + 0.4 * near - _ridge(rng, width) * rng.uniform(0.03, 0.09)
-        if near > 0.4:  # a fringe of trees
-            ridge = ridge - np.abs(_ridge(rng, width, 60)) * 0.02 * near
-        colour = haze * (1 - near) * 0.6 + ground * (0.4 + 0.6 * near)
+    range_count = rng.integers(4, 7)
+    for number in range(range_count):
+        nearness = number / (range_count - 1)  # 0 for the farthest range of hills, 1 for the nearest
+        ridge = rng.uniform(-0.05, 0.02) + 0.4 * nearness - _ridge(rng, width) * rng.uniform(0.03, 0.09)
+        if nearness > 0.4:  # trees along the ridge
+            ridge = ridge - np.abs(_ridge(rng, width, 60)) * 0.02 * nearness
+        colour = haze * (1 - nearness) * 0.6 + ground * (0.4 + 0.6 * nearness)
         shade = (texture * np.clip(1.2 - (y - ridge) * 1.5, 0.3, 1.2))[..., None]
-        _blend(picture, _inside(ridge - y, height), colour * (1 + (shade - 1) * near))
+        _blend(picture, _inside(ridge - y, height), colour * (1 + (shade - 1) * nearness))
     return picture
 
 
 def _ridge(rng: Generator, width: int, bumps: int = 3) -> Floats:
-    """Fractal noise (width,) with this number of bumps at the coarsest scale."""
+    """Returns fractal noise (width,) with this number of bumps at the coarsest scale."""
     line = np.zeros(width, np.float32)
     for octave in range(6):
         line += resize(rng.standard_normal((1, bumps * 2**octave), np.float32), 1, width)[0] * 0.5**octave
@@ -168,7 +172,7 @@ def _ridge(rng: Generator, width: int, bumps: int = 3) -> Floats:
 
 
 def _portrait(rng: Generator, height: int, width: int) -> Floats:
-    """Head and shoulders of a person, with defocused lights in the background."""
+    """Returns a portrait: head and shoulders of a person, with defocused lights in the background."""
     grid = _grid(height, width)
     ground = tint(rng, rng.uniform(0.05, 0.4), rng.uniform(0.1, 0.6))
     picture = ground * np.clip(1 + 0.35 * fractal(rng, height, width, 2, 4), 0.2, 3)[..., None]
@@ -209,7 +213,7 @@ def _portrait(rng: Generator, height: int, width: int) -> Floats:
 
 
 def tree(rng: Generator, height: float, density: float) -> Canvas:
-    """A cut-out tree, `height` metres tall and wide."""
+    """Returns a cut-out tree on a square canvas, `height` metres tall. `density` is in texels per metre."""
     canvas = Canvas(height, height, density)
     size = canvas.pixels.shape[0]
     x, y = _grid(size, size)
@@ -231,7 +235,7 @@ def tree(rng: Generator, height: float, density: float) -> Canvas:
 
 
 def figure(rng: Generator, height: float, density: float) -> Canvas:
-    """A cut-out standing person, `height` metres tall."""
+    """Returns a cut-out standing person, `height` metres tall. `density` is in texels per metre."""
     canvas = Canvas(height * 0.4, height, density)
     rows, columns = canvas.pixels.shape[:2]
     grid = _grid(rows, columns)
@@ -257,7 +261,7 @@ def figure(rng: Generator, height: float, density: float) -> Canvas:
 
 
 def window_view(rng: Generator) -> Floats:
-    """The defocused view from a window (24, 24, 3): sky, roofs and trees, about 1 at its brightest."""
+    """Returns a defocused view from a window (24, 24, 3): sky, roofs and trees. The maximum is about 1."""
     sky = vector(0.6, 0.8, 1) if rng.uniform() < 0.6 else vector(0.95, 0.97, 1)
     down = np.linspace(0, 1, 24, dtype=np.float32)[:, None, None]
     view = sky + (vector(1, 1, 1) - sky) * down + np.zeros((24, 24, 1), np.float32)
@@ -295,7 +299,7 @@ def wallpaper(rng: Generator, canvas: Canvas) -> None:
 
 
 def door(rng: Generator, canvas: Canvas, left: float) -> None:
-    """Paints a panelled door at `left` of a wall."""
+    """Paints a panelled door on a wall. `left` is the position of its left edge."""
     colour, top = tint(rng, rng.uniform(0.15, 0.7), 0.3), canvas.height - 2.05
     canvas.rect((left - 0.08, top - 0.08, 1.06, 2.2), colour * 0.7)
     canvas.rect((left, top, 0.9, 2.05), colour)
@@ -306,7 +310,7 @@ def door(rng: Generator, canvas: Canvas, left: float) -> None:
 
 
 def hang_pictures(rng: Generator, canvas: Canvas, left: float, width_m: float) -> None:
-    """Paints one large framed picture or several small ones."""
+    """Paints one large framed picture, or two or three small ones."""
     count = int(rng.integers(1, 4))
     each = width_m / count
     for index in range(count):
@@ -324,7 +328,7 @@ def hang_pictures(rng: Generator, canvas: Canvas, left: float, width_m: float) -
 
 
 def curtain(area: Floats, cloth: Floats, emission: float) -> None:
-    """Paints folds of cloth that transmit a little of the light of the window."""
+    """Paints folds of cloth on an area (h, w, 5). `emission` is the light of the window that the cloth transmits."""
     folds = 0.65 + 0.35 * np.cos(np.arange(area.shape[1], dtype=np.float32) * 0.9)
     area[..., :3] = cloth * folds[:, None]
     area[..., 3:] = (1, emission)
@@ -352,7 +356,7 @@ def flooring(rng: Generator, canvas: Canvas) -> None:
 
 
 def rug(rng: Generator, canvas: Canvas) -> None:
-    """Paints a rug of nested borders with a woven middle."""
+    """Paints a rug with nested borders and a woven pattern in the middle."""
     width, height = canvas.width * rng.uniform(0.3, 0.6), canvas.height * rng.uniform(0.3, 0.6)
     left, top = (canvas.width - width) * rng.uniform(), (canvas.height - height) * rng.uniform()
     for inset in (0.0, 0.06, 0.16, 0.22):

@@ -1,4 +1,7 @@
-"""Objects of the procedural environments: surfaces, boxes, windows, cars, facades, and the lighting."""
+"""Objects of the procedural environments (surfaces, boxes, windows, cars, facades), and their lighting.
+
+Lengths are in metres.
+"""
 
 from __future__ import annotations
 
@@ -23,12 +26,15 @@ from brewster.environments.procedural.canvas import (
 
 UP: Final = vector(0, 1, 0)
 Painter: TypeAlias = Callable[[str, float, float], Canvas]
-"""(face, width, height) -> canvas; a face is "front", "back", "left", "right", "top" or "bottom" of a box."""
+"""A function (face, width, height) that returns the painted canvas of a face of a box.
+
+A face is "front", "back", "left", "right", "top" or "bottom".
+"""
 
 
 @dataclass(frozen=True)
 class Lamp:
-    """A point light of intensity (3,) per steradian: to all sides, or to one half-space."""
+    """A point light of intensity (3,) per steradian. It emits in all directions, or only in the half-space of `facing`."""
 
     position: Floats
     intensity: Floats
@@ -37,7 +43,7 @@ class Lamp:
 
 @dataclass
 class SceneLighting:
-    """Lighting: ambient light, lamps, and contact shadows (x, z, half width, half depth) on the floor."""
+    """The lighting: ambient light, lamps, and contact shadows (x, z, half width, half depth) on the floor."""
 
     ambient: Floats
     floor: float
@@ -46,7 +52,7 @@ class SceneLighting:
     contacts: list[tuple[float, float, float, float]] = field(default_factory=list)
 
     def __call__(self, points: Floats, normal: Floats) -> Floats:
-        """Irradiance / pi (h, w, 3) at points of a surface."""
+        """Returns irradiance / pi (h, w, 3) at points (h, w, 3) of a surface with this unit normal (3,)."""
         light: Floats = np.zeros_like(points) + self.ambient * (0.8 + 0.2 * normal[1])
         middle, span = (points[0, 0] + points[-1, -1]) / 2, np.linalg.norm(points[0, 0] - points[-1, -1]) / 2
         for lamp in self.lamps:
@@ -61,7 +67,7 @@ class SceneLighting:
         return light * self.shade(points, normal)
 
     def shade(self, points: Floats, normal: Floats) -> Floats:
-        """The factor (h, w, 1) of the contact shadows on the floor; 1 on other surfaces."""
+        """Returns the factor (h, w, 1) of the contact shadows on the floor; 1 on other surfaces."""
         factor = np.ones((*points.shape[:2], 1), np.float32)
         if normal[1] < 0.9 or points[0, 0, 1] > self.floor + 0.01:
             return factor
@@ -73,7 +79,10 @@ class SceneLighting:
 
 
 def vertical_quad(canvas: Canvas, foot: Floats, normal: Floats | None, light: Lighting) -> Quad:
-    """A vertical canvas with the middle of its lower edge at `foot`, facing a direction or the viewer."""
+    """Places a canvas vertically, with the middle of its lower edge at `foot`.
+
+    The canvas faces the direction `normal`, or the viewer if `normal` is None.
+    """
     facing = unit(-foot * vector(1, 0, 1)) if normal is None else normal
     across = np.cross(-facing, UP) * canvas.width
     rise = UP * canvas.height
@@ -81,7 +90,7 @@ def vertical_quad(canvas: Canvas, foot: Floats, normal: Floats | None, light: Li
 
 
 def horizontal_quad(canvas: Canvas, centre: Floats, light: Lighting, rotation: float = 0) -> Quad:
-    """A horizontal canvas. Its top is towards -z before the rotation about the vertical axis."""
+    """Places a canvas horizontally. Its upper edge is towards -z before the rotation about the vertical axis."""
     across = vector(np.cos(rotation), 0, np.sin(rotation)) * canvas.width
     down = vector(-np.sin(rotation), 0, np.cos(rotation)) * canvas.height
     return Quad(canvas, centre - across / 2 - down / 2, (across, down), light)
@@ -90,7 +99,7 @@ def horizontal_quad(canvas: Canvas, centre: Floats, light: Lighting, rotation: f
 def box(
     paint: Painter, foot: Floats, size: tuple[float, float, float], light: Lighting, rotation: float = 0
 ) -> list[Quad]:
-    """The visible faces of a box (width, height, depth). Its front is towards +z before the rotation."""
+    """Returns the visible faces of a box of `size` (width, height, depth). Its front is towards +z before the rotation."""
     width, height, depth = size
     forward, sideways = (
         vector(-np.sin(rotation), 0, np.cos(rotation)),
@@ -114,7 +123,7 @@ def box(
 
 
 def plain_painter(rng: Generator, colour: Colour, density: float = 40, grain: float = 0.12) -> Painter:
-    """A painter that paints every face in one colour with noise."""
+    """Returns a painter that paints every face in one colour with noise."""
 
     def paint(_face: str, width: float, height: float) -> Canvas:
         canvas = Canvas(width, height, density, colour)
@@ -131,14 +140,14 @@ class WindowStyle:
     frame: Floats
     columns: int
     rows: int
-    lit: float
-    """The share of lit windows; 0 in daylight."""
+    lit_fraction: float
+    """The fraction of lit windows, 0..1; 0 in daylight."""
     sky: Floats
     """The colour of the sky that the glass reflects."""
 
 
 def window(rng: Generator, canvas: Canvas, outline: Box, style: WindowStyle) -> None:
-    """Paints a window: glass that reflects the sky or shows a lit room, curtains or a blind, glazing bars."""
+    """Paints a window: glass that reflects the sky or shows a lit room, curtains or a blind, and glazing bars."""
     left, top, width, height = outline
     canvas.rect(outline, style.frame)
     bar = min(0.07, width / 8)
@@ -147,7 +156,7 @@ def window(rng: Generator, canvas: Canvas, outline: Box, style: WindowStyle) -> 
     if not glass.size:
         return
     fall = np.linspace(1, rng.uniform(0.2, 0.7), glass.shape[0], dtype=np.float32)[:, None, None]
-    if rng.uniform() < style.lit:
+    if rng.uniform() < style.lit_fraction:
         glass[..., :3] = vector(1, rng.uniform(0.6, 0.85), rng.uniform(0.3, 0.7)) * (1.2 - fall)
         glass[..., 4] = 0.4 * np.exp(rng.uniform(0, 3))
         canvas.rect(
@@ -157,7 +166,7 @@ def window(rng: Generator, canvas: Canvas, outline: Box, style: WindowStyle) -> 
     else:
         slant = np.linspace(0, rng.uniform(-0.5, 0.5), glass.shape[1], dtype=np.float32)[:, None]
         glass[..., :3] = style.sky * rng.uniform(0.05, 0.45) * np.clip(fall + slant, 0.1, 1.2) + 0.01
-        glass[..., 4] = 0 if style.lit else 0.7
+        glass[..., 4] = 0 if style.lit_fraction else 0.7
     _add_curtains(rng, glass)
     for index in range(1, style.columns):
         canvas.rect((left + width * index / style.columns - bar / 2, top, bar, height), style.frame)
@@ -181,10 +190,10 @@ def _add_curtains(rng: Generator, glass: Floats) -> None:
         )
 
 
-def car(rng: Generator, foot: Floats, away: bool, light: Lighting, *, night: bool) -> list[Quad]:
-    """A parked car along z. The viewer sees its tail lights if it points away, else its headlights."""
+def car(rng: Generator, foot: Floats, faces_away: bool, light: Lighting, *, night: bool) -> list[Quad]:
+    """Returns a parked car along z. The viewer sees its tail lights if the car faces away, else its headlights."""
     colour = tint(rng, rng.uniform(0.02, 0.6), rng.choice([0.0, 0.1, 0.8]))
-    lamps = vector(0.6, 0.02, 0.02) if away else vector(0.9, 0.9, 0.85)
+    lamps = vector(0.6, 0.02, 0.02) if faces_away else vector(0.9, 0.9, 0.85)
 
     def body(face: str, width: float, height: float) -> Canvas:
         canvas = Canvas(width, height, 40, colour)
@@ -227,7 +236,7 @@ def _wheel(canvas: Canvas, middle: float) -> None:
 
 
 def bookshelf(rng: Generator) -> Painter:
-    """A painter of a shelf full of books."""
+    """Returns a painter of a shelf full of books."""
     wood = vector(0.35, 0.23, 0.13) * rng.uniform(0.2, 1.9)
     sides = plain_painter(rng, wood, 60)
 
@@ -252,7 +261,7 @@ def bookshelf(rng: Generator) -> Painter:
 
 
 def cabinet(rng: Generator) -> Painter:
-    """A painter of a cabinet with drawers or doors."""
+    """Returns a painter of a cabinet with drawers or doors."""
     colour = tint(rng, rng.uniform(0.1, 0.6), 0.3)
     sides = plain_painter(rng, colour, 60)
     columns, rows = int(rng.integers(1, 4)), int(rng.integers(1, 4))
@@ -275,7 +284,7 @@ def cabinet(rng: Generator) -> Painter:
 def facade(
     rng: Generator, width_m: float, floors: int, *, density: float, night: bool, sky: Floats
 ) -> Canvas:
-    """The front of a house: a grid of windows above a shop or an entrance, below a cornice."""
+    """Returns the front of a house: a cornice, a grid of windows, and shops or entrances on the ground floor."""
     storey, bays = rng.uniform(2.8, 3.7), max(2, round(width_m / rng.uniform(1.8, 4.2)))
     bay = width_m / bays
     wall = tint(rng, rng.uniform(0.12, 0.6), rng.uniform(0.05, 0.3)) * vector(1.1, 1, 0.88)
@@ -283,7 +292,7 @@ def facade(
         frame=vector(0.7, 0.7, 0.68) if rng.uniform() < 0.6 else tint(rng, 0.08, 0.5),
         columns=int(rng.integers(1, 4)),
         rows=int(rng.integers(1, 4)),
-        lit=rng.uniform(0.15, 0.7) if night else 0,
+        lit_fraction=rng.uniform(0.15, 0.7) if night else 0,
         sky=sky,
     )
     cells = _cells(rng, Canvas(bay, storey, density, wall), style)
@@ -299,7 +308,7 @@ def facade(
 
 
 def _cells(rng: Generator, blank: Canvas, style: WindowStyle) -> Floats:
-    """Variants (n, h, w, 5) of one bay of one storey: the same window with different content."""
+    """Returns variants (n, h, w, 5) of one bay of one storey: the same window with different content."""
     width, height = blank.width, blank.height
     width_fraction, height_fraction = rng.uniform(0.4, 0.92), rng.uniform(0.45, 0.85)
     outline = (
@@ -341,7 +350,7 @@ def _cells(rng: Generator, blank: Canvas, style: WindowStyle) -> Floats:
 def _ground_floor(rng: Generator, canvas: Canvas, style: WindowStyle) -> Canvas:
     """Paints shop windows below signs, doors between them, and a plinth."""
     bottom, left = canvas.height, 0.3
-    emission = 8 if style.lit else 0
+    emission = 8 if style.lit_fraction else 0
     shops = rng.uniform() < 0.7
     canvas.rect((0, bottom - 0.4, canvas.width, 0.4), vector(0.12, 0.12, 0.12))
     while left < canvas.width - 1.5:
@@ -370,7 +379,7 @@ def _ground_floor(rng: Generator, canvas: Canvas, style: WindowStyle) -> Canvas:
 def _shop_goods(
     rng: Generator, canvas: Canvas, baseline: tuple[float, float, float], emission: float
 ) -> None:
-    """Paints goods in a shop window, from (left, top) over a width, about 1 m tall."""
+    """Paints goods in a shop window, at most 0.9 m tall. `baseline` is (left, top, width)."""
     left, top, width_m = baseline
     offset = 0.0
     while offset < width_m - 0.4:

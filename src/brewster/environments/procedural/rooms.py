@@ -1,9 +1,9 @@
 """Procedural environment maps from a seed, for machines without HDR maps: a street, a street at night, a room.
 
-    picture = ENVIRONMENTS["street"](7, 512)  # (512, 1024, 3), linear radiance around the viewer
-    poster = painting(seed=7, width=768, height=512)  # (512, 768, 3), linear, 0..1
+    environment_map = ENVIRONMENTS["street"](7, 512)  # (512, 1024, 3), linear radiance around the viewer
+    picture = painting(seed=7, width=768, height=512)  # (512, 768, 3), linear, 0..1
 
-The same seed gives the same bytes. Radiance 1 is about that of a white sheet in the shade.
+The same seed gives the same bytes. A white sheet in the shade has a radiance of about 1.
 """
 
 from __future__ import annotations
@@ -58,17 +58,17 @@ _DENSITY: Final = 90.0
 
 
 def street(seed: int, height: int) -> NDArray[np.float32]:
-    """A street by day, radiance (height, 2 height, 3): the sky is about 1, its sun 1e3 to 1e5."""
+    """Returns a street by day, radiance (height, 2 height, 3). The sky has a radiance of about 1, the sun 1e3 to 1e5."""
     return render(street_environment(Generator(PCG64(seed)), night=False), height)
 
 
 def night(seed: int, height: int) -> NDArray[np.float32]:
-    """A street at night, radiance (height, 2 height, 3): the road is about 1, its lamps 1e2 to 1e4."""
+    """Returns a street at night, radiance (height, 2 height, 3). The road has a radiance of about 1, the lamps 1e2 to 1e4."""
     return render(street_environment(Generator(PCG64(seed)), night=True), height)
 
 
 def room(seed: int, height: int) -> NDArray[np.float32]:
-    """A furnished room, radiance (height, 2 height, 3): the walls are below 1, the lamps 15 to 500."""
+    """Returns a furnished room, radiance (height, 2 height, 3). The walls have a radiance below 1, the lamps 15 to 500."""
     return render(_BoxRoom(Generator(PCG64(seed))).environment(), height)
 
 
@@ -77,7 +77,7 @@ ENVIRONMENTS: Final[dict[str, Callable[[int, int], NDArray[np.float32]]]] = {
     "room": room,
     "night": night,
 }
-"""Name -> function (seed, height) that returns a lat-long map (height, 2 height, 3) in linear light."""
+"""Functions (seed, height) by name. Each returns a lat-long map (height, 2 height, 3) in linear light."""
 
 
 class _BoxRoom:
@@ -88,8 +88,8 @@ class _BoxRoom:
         ranges = (3.5, 8), (3.5, 9), (2.4, 3.3)
         width_m, depth_m, self.height_m = (rng.uniform(low, high) for low, high in ranges)
         self.floor = -rng.uniform(1.2, 1.7)
-        share = rng.uniform(0.3, 0.7, 2)
-        self.low = vector(-width_m * share[0], self.floor, -depth_m * share[1])
+        viewer = rng.uniform(0.3, 0.7, 2)  # the position of the viewer, relative to the width and the depth
+        self.low = vector(-width_m * viewer[0], self.floor, -depth_m * viewer[1])
         self.high = vector(width_m, self.height_m, depth_m) + self.low
         self.evening = rng.uniform() < 0.25
         self.daylight = float(np.exp(rng.uniform(-3, -1.5) if self.evening else rng.uniform(1.8, 3.4)))
@@ -101,7 +101,7 @@ class _BoxRoom:
         self.emitters: list[SmallEmitter] = []
 
     def light(self, points: Floats, normal: Floats) -> Floats:
-        """Irradiance / pi of lamps and windows, darker in corners, and of sunlight through the windows."""
+        """Returns irradiance / pi of lamps and windows, reduced in corners, and of sunlight through the windows."""
         total = self.lighting(points, normal)
         for end in (self.low, self.high):
             corner = 1 - 0.3 * np.exp(-np.abs(points - end) / 0.3)
@@ -120,7 +120,7 @@ class _BoxRoom:
         return total
 
     def environment(self) -> ProceduralEnvironment:
-        """Builds the room. Lights come first; lighting is baked into textures when they are rendered."""
+        """Builds the room. The lighting is baked into the textures later, when the room is rendered."""
         rng = self.rng
         paint = tint(rng, rng.uniform(0.3, 0.75), rng.uniform(0, 0.2))
         inward_normals = [vector(0, 0, 1), vector(-1, 0, 0), vector(0, 0, -1), vector(1, 0, 0)]
@@ -147,7 +147,7 @@ class _BoxRoom:
         )
 
     def _wall_base(self, inward: Floats) -> tuple[Floats, float]:
-        """The middle of the lower edge of a wall, and the length of the wall."""
+        """Returns the middle of the lower edge of a wall, and the length of the wall."""
         middle = (self.low + self.high) / 2
         foot = np.where(inward > 0, self.low, np.where(inward < 0, self.high, middle))
         foot[1] = self.floor
@@ -176,7 +176,7 @@ class _BoxRoom:
     def _opening(
         self, opening: tuple[float, float, float], canvas: Canvas, foot: Floats, inward: Floats
     ) -> None:
-        """Adds a window at (left, width, sill height) of a wall: blurred view, light, bars and curtains."""
+        """Adds a window to a wall: a blurred view, light, bars and curtains. `opening` is (left, width, sill height)."""
         rng, (left, width_m, sill) = self.rng, opening
         top = rng.uniform(0.25, 0.45)
         height_m = self.height_m - sill - top
@@ -195,14 +195,17 @@ class _BoxRoom:
         across = np.cross(-inward, UP)
         middle = foot + across * (left + width_m / 2 - canvas.width / 2) + UP * sill
         mean = view.mean((0, 1)) * self.daylight
-        for share in (0.25, 0.75):
-            source = middle + UP * height_m * share + inward * 0.05
+        for relative_height in (0.25, 0.75):
+            source = middle + UP * height_m * relative_height + inward * 0.05
             self.lighting.lamps.append(Lamp(source, mean * width_m * height_m / 2, inward))
         self.lighting.ambient = self.lighting.ambient + mean * (width_m * height_m * 0.01)
         self.openings.append((middle, inward, width_m, height_m))
 
     def _ceiling(self) -> None:
-        """Adds a ceiling with lamps of one kind, or none by day. Their radiance follows from the size of the room."""
+        """Adds a ceiling with lamps of one kind. In some rooms by day, there are no lamps.
+
+        The radiance of the lamps is computed from the area of the room.
+        """
         rng, size = self.rng, self.high - self.low
         canvas = Canvas(float(size[0]), float(size[2]), 60, vector(0.8, 0.79, 0.76) * rng.uniform(0.7, 1))
         if rng.uniform() < 0.3:
@@ -237,8 +240,8 @@ class _BoxRoom:
 
     def _pendant(self, colour: Floats) -> None:
         """Adds a pendant lamp: a bulb below a shade."""
-        share = vector(*self.rng.uniform(0.25, 0.75, 3))
-        position = self.low + share * (self.high - self.low)
+        relative_position = vector(*self.rng.uniform(0.25, 0.75, 3))
+        position = self.low + relative_position * (self.high - self.low)
         position[1] = self.high[1] - self.rng.uniform(0.5, 0.9)
         dark, cloth = (plain_painter(self.rng, tint(self.rng, value, 0.6)) for value in (0.03, 0.3))
         self.quads += box(dark, position, (0.015, float(self.high[1] - position[1]), 0.015), self.light)
@@ -269,7 +272,7 @@ class _BoxRoom:
         return True
 
     def _furnish_wall(self, inward: Floats) -> None:
-        """Adds shelves, cabinets and sofas along a wall."""
+        """Adds shelves, cabinets, sofas, plants and screens along a wall."""
         rng = self.rng
         middle, length_m = self._wall_base(inward)
         rotation = float(np.arctan2(-inward[0], inward[2]))
@@ -326,8 +329,8 @@ class _BoxRoom:
         """Adds a table with chairs, a person or a floor lamp."""
         rng = self.rng
         margin = vector(0.8, 0, 0.8)
-        share = vector(rng.uniform(), 0, rng.uniform())
-        foot = self.low + margin + share * (self.high - self.low - 2 * margin)
+        relative_position = vector(rng.uniform(), 0, rng.uniform())
+        foot = self.low + margin + relative_position * (self.high - self.low - 2 * margin)
         foot[1] = self.floor
         kind, rotation = rng.choice(["table", "table", "person", "lamp"]), rng.uniform(0, 2 * np.pi)
         if kind == "table":
@@ -386,6 +389,6 @@ class _BoxRoom:
 
 
 def _horizontal_axes(rotation: float) -> tuple[Floats, Floats]:
-    """The forward and the sideways direction of a piece of furniture."""
+    """Returns the forward and the sideways direction of a piece of furniture."""
     cos, sin = np.cos(rotation), np.sin(rotation)
     return vector(-sin, 0, cos), vector(cos, 0, sin)

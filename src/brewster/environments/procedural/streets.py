@@ -1,4 +1,4 @@
-"""A street between two rows of houses, by day or by night, as a `ProceduralEnvironment` for `canvas.render`."""
+"""A street between two rows of houses, by day or by night, for `canvas.render`. Lengths are in metres."""
 
 from __future__ import annotations
 
@@ -48,13 +48,13 @@ class _Sky:
     cloud_threshold: float
     """Threshold of the cloud noise: -2 is overcast, 2 is clear."""
     sun: Floats
-    """Unit direction."""
+    """The unit direction of the sun."""
     sunlight: Floats
-    """Irradiance / pi (3,) on a surface that faces the sun; 0 when clouds hide it."""
+    """Irradiance / pi (3,) on a surface that faces the sun; 0 if clouds hide the sun."""
     noise: MipmapTexture
 
     def __call__(self, directions: Floats, texel: float) -> Floats:
-        """Radiance (h, w, 3) in unit directions."""
+        """Returns the radiance (h, w, 3) in unit directions (h, w, 3). `texel` is the angle of a texel in radians."""
         rise = np.maximum(directions[..., 1:2], 0)
         radiance = self.zenith + (self.horizon - self.zenith) * np.exp(-5 * rise)
         nearness = np.maximum(directions @ self.sun, 0)[..., None]
@@ -68,7 +68,7 @@ class _Sky:
         return result
 
     def _thickness(self, directions: Floats, rise: Floats, texel: float) -> Floats:
-        """The thickness (h, w, 1) of clouds in each direction: a flat layer that curves down at the horizon."""
+        """Returns the thickness (h, w, 1) of the clouds, a flat layer that curves down at the horizon."""
         height = rise + 0.1
         coordinates = [(directions[..., axis] / height * 0.35 % 1).ravel() for axis in (0, 2)]
         footprint = (texel * 0.35 * 512 / height**1.5).ravel()
@@ -129,7 +129,7 @@ class _Street:
         self.emitters: list[SmallEmitter] = []
 
     def light(self, points: Floats, normal: Floats) -> Floats:
-        """Irradiance / pi of lamps, sky (less of it near the ground), and the sun with shadows of houses and trees."""
+        """Returns irradiance / pi of lamps, sky (reduced near the ground) and sun (with shadows of houses and trees)."""
         height_factor = np.clip((points[..., 1:2] - self.ground) / 12, 0, 1)
         total = self.lighting(points, normal) * (1 if self.night else 0.65 + 0.35 * height_factor)
         facing = float(normal @ self.sky.sun)
@@ -161,7 +161,7 @@ class _Street:
 
 
 def street_environment(rng: Generator, *, night: bool) -> ProceduralEnvironment:
-    """A street with houses, trees, cars, people and lamps."""
+    """Returns a street with houses, trees, cars and people, and with lamps at night."""
     street = _Street(rng, night=night)
     if night:
         _light_lamps(street)
@@ -238,7 +238,7 @@ def _roof(street: _Street, eave: Floats, width_m: float, side: int) -> None:
 
 
 def _paving(street: _Street) -> None:
-    """Adds road, kerbs, pavements and markings: a fine canvas nearby, and a coarse one, slightly lower, far away."""
+    """Adds road, kerbs, pavements and markings: a fine canvas around the viewer, and a coarse, slightly lower canvas."""
     rng = street.rng
     asphalt, slabs = rng.uniform(0.05, 0.12), tint(rng, rng.uniform(0.2, 0.4), 0.06)
     stripes = rng.uniform() < 0.4
@@ -302,7 +302,7 @@ def _trees(street: _Street, side: int, *, park: bool) -> None:
 
 
 def _light_lamps(street: _Street) -> None:
-    """Adds street lamps along both kerbs. They come first, since lighting is baked into everything else."""
+    """Adds street lamps along both kerbs."""
     rng = street.rng
     height_m, gap = rng.uniform(5, 8), rng.uniform(16, 26)
     colour = vector(1, rng.uniform(0.5, 0.9), rng.uniform(0.15, 0.8)) * rng.uniform(100, 250)
@@ -367,10 +367,10 @@ def _cars(street: _Street) -> None:
         for z in np.arange(-45, 45, 6.0):
             if rng.uniform() < 0.45:
                 foot = vector(side * x, street.ground, z + rng.uniform(-0.5, 0.5))
-                away = bool((side > 0) == (z < 0))
+                faces_away = bool((side > 0) == (z < 0))
                 street.lighting.contacts.append((float(foot[0]), float(foot[2]), 0.85, 2))
-                street.quads += car(rng, foot, away, street.light, night=street.night)
-                if street.night and not away and rng.uniform() < 0.5:
+                street.quads += car(rng, foot, faces_away, street.light, night=street.night)
+                if street.night and not faces_away and rng.uniform() < 0.5:
                     nose = foot - vector(0, 0, np.sign(z) * 2.6) + UP * 0.7
                     for offset in (-0.65, 0.65):
                         position = nose + vector(offset, 0, 0)

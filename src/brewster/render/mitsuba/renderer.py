@@ -2,8 +2,8 @@
 
     sample = trace(scene, Assets([Path("hdri")]), noise_threshold=0.01)
 
-It shares no optics code with the analytic renderer, so that each validates the other. Each image is lit from one side of
-the glass only; objects on the other side are black. Light is additive: I is the sum of the image lit from behind and the
+The two renderers share no code for the optics, so that each validates the other. Each image is lit from one side of the
+glass only; objects on the other side are black. Light is additive, so I is the sum of the image lit from behind and the
 image lit from the front.
 """
 
@@ -31,9 +31,10 @@ _POLARISED: Final = "llvm_ad_mono_polarized"
 _MIN_PASSES: Final = 4
 """Fewer passes give no useful estimate of the variance."""
 _MAX_RAYS_PER_PASS: Final = 1 << 22
-"""As many rays need about 1 GB of memory."""
+"""A pass with this number of rays needs about 1 GB of memory."""
 _RELATIVE_FLOOR: Final = 0.01
-"""Share of the mean light added to each pixel before its relative error is computed, so that black pixels have one."""
+"""This fraction of the mean light is added to each pixel before its relative error is computed, because the relative
+error of a black pixel is not defined."""
 
 
 def trace(
@@ -47,30 +48,31 @@ def trace(
 ) -> LinearSample:
     """Path-traces the five images of a scene in equal passes, until their noise is low enough.
 
-    The error of an image is the mean over its pixels of standard error / (light + 1 % of the mean light); the standard
-    error comes from the variance between passes. An image is finished when its error is below `noise_threshold`, or after
-    `max_samples` rays per pixel. T and R are measured relative to I, their sum: the one that adds more error to I gets
-    the next pass. With truncated orders T and R are rendered separately.
+    The error of an image is the mean over its pixels of standard error / (light + 1 % of the mean light). The standard
+    error is computed from the variance between passes. An image is finished when its error is at most `noise_threshold`,
+    or after `max_samples` rays per pixel. The light from behind and the light from the front are measured together,
+    relative to their sum I: the next pass is for the side that adds more error to I. With truncated orders, T and R are
+    rendered separately.
 
     Mitsuba's colour variants average s- and p-polarised light at every surface, which is wrong for glass with several
-    surfaces. `polarised` traces each colour with the polarised variant, at several times the cost; rough surfaces in
-    Mitsuba depolarise.
+    surfaces. `polarised` traces each colour with the polarised variant, at several times the cost. In Mitsuba, light is
+    unpolarised after a rough surface.
 
     Args:
-        scene: what to render.
-        assets: the source of its maps and pictures.
-        noise_threshold: the relative error below which an image is finished.
-        max_samples: maximum number of rays per pixel and image.
-        denoise: whether Intel Open Image Denoise filters the result.
-        polarised: whether polarisation is traced.
+        scene: the scene to render.
+        assets: the source of the scene's maps and pictures.
+        noise_threshold: the relative error at which an image is finished.
+        max_samples: the maximum number of rays per pixel and image.
+        denoise: whether to filter the result with Intel Open Image Denoise.
+        polarised: whether to trace polarisation.
 
     Returns:
         Linear light, float32 (3, H, W) each.
 
     Raises:
         MissingExtra: mitsuba cannot be imported, or `denoise` is set and mitsuba-oidn is not installed.
-        DeviceError: `polarised` is set, and no LLVM works.
-        RecipeError: a wedge or lens has no thickness somewhere in the view, or a file is missing.
+        DeviceError: `polarised` is set, and Mitsuba works with no LLVM of this machine.
+        RecipeError: a wedge or lens has no thickness somewhere in the view, two surfaces meet, or a file is missing.
         PhotoError: a file cannot be decoded, or is not an environment map.
     """
     mi = load()
@@ -84,7 +86,7 @@ def trace(
 
 @contextmanager
 def _active_variant(mi: ModuleType, name: str) -> Iterator[None]:
-    """Selects a variant of Mitsuba, which is global to the process, and restores the previous one afterwards."""
+    """Selects a variant of Mitsuba for the whole process, and restores the previous variant afterwards."""
     previous = mi.variant()
     mi.set_variant(name)
     try:
@@ -111,7 +113,9 @@ def _render_layers(
     scene = builders[0].scene
 
     def estimate(*images: tuple[bool, GlassMode]) -> list[_RunningEstimate]:
-        estimates = [_RunningEstimate(builders, behind, mode, max_samples) for behind, mode in images]
+        estimates = [
+            _RunningEstimate(builders, lit_from_behind, mode, max_samples) for lit_from_behind, mode in images
+        ]
         _converge(estimates, noise_threshold, max_samples)
         return estimates
 
@@ -141,67 +145,78 @@ def _denoiser() -> ModuleType:
     except ImportError as error:
         raise MissingExtra(
             "mitsuba_oidn is not installed",
-            "expected it for denoising",
+            "expected the package mitsuba-oidn for denoising",
             "run: pip install 'brewster[render]'",
         ) from error
 
 
 class _RunningEstimate:
-    """An image rendered in passes: the mean of the passes so far, and the variance of this mean per pixel."""
+    """An image that is rendered in passes: the mean of the passes so far, and the variance of this mean per pixel."""
 
     def __init__(
-        self, builders: Sequence[MitsubaSceneBuilder], behind: bool, glass_mode: GlassMode, max_samples: int
+        self,
+        builders: Sequence[MitsubaSceneBuilder],
+        lit_from_behind: bool,
+        glass_mode: GlassMode,
+        max_samples: int,
     ) -> None:
         scene = builders[0].scene
         self._mi = builders[0].mi
         self._scenes = [
-            self._mi.load_dict(builder.scene_dict(behind=behind, glass_mode=glass_mode))
+            self._mi.load_dict(builder.scene_dict(lit_from_behind=lit_from_behind, glass_mode=glass_mode))
             for builder in builders
         ]
-        self._seed_key = scene.seed, scene.index, int(behind), get_args(GlassMode).index(glass_mode)
-        self.samples = _samples_per_pass(scene.camera.width * scene.camera.height, max_samples)
-        self.passes = 0
+        self._seed_key = scene.seed, scene.index, int(lit_from_behind), get_args(GlassMode).index(glass_mode)
+        self.samples_per_pass = _samples_per_pass(scene.camera.width * scene.camera.height, max_samples)
+        self.pass_count = 0
         self._sum = np.zeros((scene.camera.height, scene.camera.width, 3))
-        self._squares = np.zeros(self._sum.shape[:2])
+        self._sum_of_squares = np.zeros(self._sum.shape[:2])
 
     def add_pass(self) -> None:
         """Renders one more pass with independent random numbers."""
-        seed = int(np.random.SeedSequence((*self._seed_key, self.passes)).generate_state(1)[0])
-        rendered = [np.array(self._mi.render(scene, spp=self.samples, seed=seed)) for scene in self._scenes]
-        # With polarisation there is one grey image per colour.
+        seed = int(np.random.SeedSequence((*self._seed_key, self.pass_count)).generate_state(1)[0])
+        rendered = [
+            np.array(self._mi.render(scene, spp=self.samples_per_pass, seed=seed)) for scene in self._scenes
+        ]
+        # With polarisation, there is one grey image per colour.
         image = rendered[0] if len(rendered) == 1 else np.stack([one[..., 0] for one in rendered], axis=2)
         self._sum += image
-        self._squares += image.mean(axis=2, dtype=np.float64) ** 2
-        self.passes += 1
+        self._sum_of_squares += image.mean(axis=2, dtype=np.float64) ** 2
+        self.pass_count += 1
 
     @property
     def light(self) -> NDArray[np.float64]:
         """The mean of all passes, (H, W, 3)."""
-        return self._sum / self.passes
+        return self._sum / self.pass_count
 
     @property
     def variance(self) -> NDArray[np.float64]:
-        """The variance of `light` averaged over the colours, (H, W)."""
-        spread = self._squares / self.passes - self.light.mean(axis=2) ** 2
-        variance: NDArray[np.float64] = spread.clip(min=0) / (self.passes - 1)
+        """The variance of the mean of the colours of `light`, (H, W)."""
+        spread = self._sum_of_squares / self.pass_count - self.light.mean(axis=2) ** 2
+        variance: NDArray[np.float64] = spread.clip(min=0) / (self.pass_count - 1)
         return variance
 
 
-def _samples_per_pass(pixels: int, max_samples: int) -> int:
-    """Rays per pixel and pass: 64, 16, 4 or 1, as many as the memory and `_MIN_PASSES` passes allow.
+def _samples_per_pass(pixel_count: int, max_samples: int) -> int:
+    """Returns the number of rays per pixel and pass: 64, 16, 4 or 1, as many as the memory and `_MIN_PASSES` passes allow.
 
     These are square numbers, which the sampler stratifies evenly.
     """
-    limit = min(max_samples // _MIN_PASSES, _MAX_RAYS_PER_PASS // pixels)
+    limit = min(max_samples // _MIN_PASSES, _MAX_RAYS_PER_PASS // pixel_count)
     return next((samples for samples in (64, 16, 4) if samples <= limit), 1)
 
 
 def _converge(estimates: Sequence[_RunningEstimate], noise_threshold: float, max_samples: int) -> None:
-    """Adds passes until the error of the sum is at most `noise_threshold`; each pass is for the image with the largest error."""
+    """Adds passes until the error of the images' sum is at most `noise_threshold`, or all images have `max_samples` rays.
+
+    Each pass is for the image with the largest error.
+    """
     for estimate in estimates:
         for _ in range(_MIN_PASSES):
             estimate.add_pass()
-    while pending := [image for image in estimates if (image.passes + 1) * image.samples <= max_samples]:
+    while pending := [
+        image for image in estimates if (image.pass_count + 1) * image.samples_per_pass <= max_samples
+    ]:
         light = np.sum([image.light.mean(axis=2) for image in estimates], axis=0)
         scale = light + _RELATIVE_FLOOR * light.mean() + np.finfo(np.float32).tiny
         variances = [image.variance for image in estimates]

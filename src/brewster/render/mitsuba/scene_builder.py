@@ -1,9 +1,9 @@
 """Builds Mitsuba scenes: glass, camera and light as the dictionaries that `mitsuba.load_dict` takes.
 
 Coordinates are in the glass frame: x right, y up, z towards the camera, the origin at the position of the glass, in mm.
-Surfaces are then z = 0, z = -thickness and so on, so that float32 keeps them planar and their distances exact. A wedge w
-rotates a far surface about the vertical axis through (0, 0, -thickness): its normal is (sin w, 0, cos w). With a
-positive wedge the pane is thicker on the right; a wedge does not change the positions of the panes behind it.
+In this frame, the surfaces are z = 0, z = -thickness and so on, and are exact in float32. A wedge w rotates a far surface
+about the vertical axis through (0, 0, -thickness), to the normal (sin w, 0, cos w). With a positive wedge, the pane is
+thicker on the right. A wedge does not change the positions of the panes behind it.
 """
 
 from __future__ import annotations
@@ -36,11 +36,13 @@ last pane (the paper's R); `mirror`: the first surface is a perfect mirror (MR);
 """
 
 _BLACK: Final[Plugin] = {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.0}}
-_MIN_EXTINCTION_SHARE: Final = 1e-6  # Mitsuba returns NaN for a medium with an extinction of 0 in one colour
+_MIN_EXTINCTION_FRACTION: Final = (
+    1e-6  # Mitsuba returns NaN for a medium with an extinction of 0 in one colour
+)
 _LENS_GRID: Final = 256  # squares of the mesh along each side of a lens
-_MIN_MAP_ROWS: Final = 512  # a map is cut off at the glass plane to within 180 / 512 degrees
+_MIN_MAP_ROWS: Final = 512  # a map is cut off at the glass plane with an error of at most 180 / 512 degrees
 _RUSSIAN_ROULETTE_DEPTH: Final = 64
-"""Russian roulette ends paths only after this many surfaces, so that faint orders are not noisy."""
+"""Russian roulette ends paths only after this number of surfaces, so that faint orders are not noisy."""
 _WALL_MM: Final = 1e6  # half the width of each part of the wall around a frame
 
 
@@ -48,7 +50,7 @@ class MitsubaSceneBuilder:
     """Builds a scene for Mitsuba: in colour, or in grey from one `channel` 0..2 (for polarised light).
 
     Raises:
-        RecipeError: a wedge has no thickness somewhere in the view.
+        RecipeError: a wedged pane has no thickness somewhere in the view, or meets the next pane there.
     """
 
     def __init__(self, mi: ModuleType, scene: Scene, assets: Assets, channel: int | None = None) -> None:
@@ -64,8 +66,8 @@ class MitsubaSceneBuilder:
         )
         _check_wedges(scene.glass, self._view_corners[:, 0])
 
-    def scene_dict(self, *, behind: bool, glass_mode: GlassMode) -> Plugin:
-        """The whole scene, lit from one side of the glass; objects of the other side are black.
+    def scene_dict(self, *, lit_from_behind: bool, glass_mode: GlassMode) -> Plugin:
+        """Returns the whole scene, lit from one side of the glass. Objects of the other side are black.
 
         Raises:
             RecipeError: a lens has no thickness somewhere in its frame.
@@ -73,7 +75,7 @@ class MitsubaSceneBuilder:
         is_tinted = glass_mode not in {"mirror", "none"} and any(
             any(pane.absorption_per_m) for pane in self._glass.panes
         )
-        parts = [*self._surfaces(glass_mode), *self._wall(), *self._emitters(behind)]
+        parts = [*self._surfaces(glass_mode), *self._wall(), *self._emitters(lit_from_behind)]
         return {
             "type": "scene",
             "integrator": {
@@ -88,7 +90,7 @@ class MitsubaSceneBuilder:
     # Camera and common helpers
 
     def _sensor(self) -> Plugin:
-        """The camera. Mitsuba's cameras look along +z with +x to the left; the pixel filter is a box, not its default."""
+        """Returns the camera. Mitsuba's cameras look along +z with +x to the left. The pixel filter is a box."""
         camera = self.scene.camera
         right, up, back = (
             self._to_glass @ axis for axis in np.array(axes(camera.heading_deg, camera.pitch_deg))
@@ -116,10 +118,10 @@ class MitsubaSceneBuilder:
             "film": {**film, "width": camera.width, "height": camera.height},
         }
 
-    def _transform(self, columns: ArrayLike, origin: ArrayLike, size: ArrayLike = (1, 1, 1)) -> object:
-        """The transform of an object with these axes, scaled by `size`, and its centre at `origin`."""
+    def _transform(self, columns: ArrayLike, origin: ArrayLike, scale: ArrayLike = (1, 1, 1)) -> object:
+        """Returns the transform of an object with these axes, scaled by `scale`, with its centre at `origin`."""
         matrix = np.eye(4)
-        matrix[:3, :3] = np.asarray(columns).T * size
+        matrix[:3, :3] = np.asarray(columns).T * scale
         matrix[:3, 3] = origin
         return self.mi.ScalarTransform4f(matrix)
 
@@ -133,12 +135,12 @@ class MitsubaSceneBuilder:
         }
 
     def _select_channel(self, colours: ArrayLike) -> Floats:
-        """Colours (..., 3) unchanged; with a `channel`, that channel three times."""
+        """Returns the colours (..., 3), or the selected channel repeated three times if the builder has a `channel`."""
         values = np.asarray(colours, np.float32)
         return values if self._channel is None else np.repeat(values[..., self._channel, None], 3, axis=-1)
 
     def _first_surface_corners(self) -> Doubles:
-        """Points (4, 2) on the first surface: the corners of its frame, or of the view."""
+        """Returns points (4, 2) on the first surface: the corners of the frame, or those of the view without a frame."""
         if self._glass.opening_mm:
             return np.array([(-1, -1), (-1, 1), (1, -1), (1, 1)]) * self._glass.opening_mm / 2
         rays = np.array(self.scene.camera.corners()) @ self._to_glass.T
@@ -148,7 +150,7 @@ class MitsubaSceneBuilder:
     # The glass
 
     def _surfaces(self, glass_mode: GlassMode) -> Iterator[object]:
-        """All surfaces, the one nearest to the camera first. A frame limits the first one; the others exceed the view."""
+        """Yields all surfaces, the nearest first. A frame limits the first surface; the others are larger than the view."""
         if glass_mode == "none":
             return
         if self._glass.radii_mm:
@@ -168,7 +170,7 @@ class MitsubaSceneBuilder:
             half_size = max_half_size
 
     def _far_surface(self, pane: Pane, height: float, material: Plugin) -> Plugin:
-        """The pane's far surface; it ends at the edge where the two surfaces of a wedge meet."""
+        """Returns the pane's far surface. It ends at the edge where the two surfaces of a wedge meet."""
         sine, cosine = math.sin(math.radians(pane.wedge_deg)), math.cos(math.radians(pane.wedge_deg))
         edge = -pane.thickness_mm / sine if sine else math.inf
         low, high = (
@@ -182,7 +184,7 @@ class MitsubaSceneBuilder:
         return self._rectangle(columns, middle, ((high - low) / 2, self._half_extent_mm), material)
 
     def _material(self, pane: Pane, glass_mode: GlassMode) -> tuple[bool, Plugin]:
-        """Whether light enters the pane, and the materials of its surfaces and its interior."""
+        """Returns whether light enters the pane, and the materials of its surfaces and its interior."""
         if glass_mode == "mirror":
             return False, {"bsdf": {"type": "conductor", "material": "none"}}
         rough = (
@@ -192,7 +194,7 @@ class MitsubaSceneBuilder:
         )
         kind = "rough" if rough else ""
         if glass_mode == "truncated_reflection" and pane is self._glass.panes[-1]:
-            # A conductor with k = 0 has the reflectance of glass, and no ray is spent on transmission.
+            # A conductor with k = 0 has the reflectance of glass, and Mitsuba traces no transmitted rays.
             index = {"type": "spectrum", "value": pane.refractive_index}
             return False, {"bsdf": {"type": kind + "conductor", "eta": index, "k": 0.0, **rough}}
         bsdf = {"type": kind + "dielectric", "int_ior": pane.refractive_index, "ext_ior": 1.0, **rough}
@@ -201,12 +203,12 @@ class MitsubaSceneBuilder:
         return True, {"bsdf": bsdf, **self._interior_medium(pane)}
 
     def _interior_medium(self, pane: Pane) -> Plugin:
-        """Beer-Lambert absorption, per mm. Mitsuba limits colours to 1, so `scale` holds the largest coefficient."""
+        """Returns the medium for Beer-Lambert absorption. Colours are at most 1, so `scale` is the largest value, per mm."""
         max_absorption = max(pane.absorption_per_m)
         if not max_absorption:
             return {}
-        share = (self._select_channel(pane.absorption_per_m) / max_absorption).clip(min=_MIN_EXTINCTION_SHARE)
-        sigma = {"type": "rgb", "value": share.tolist()}
+        relative = self._select_channel(pane.absorption_per_m) / max_absorption
+        sigma = {"type": "rgb", "value": relative.clip(min=_MIN_EXTINCTION_FRACTION).tolist()}
         return {
             "interior": {
                 "type": "homogeneous",
@@ -217,7 +219,7 @@ class MitsubaSceneBuilder:
         }
 
     def _wall(self) -> Iterator[Plugin]:
-        """A black wall around the frame's opening, in the plane of the first surface: four rectangles."""
+        """Yields a black wall around the frame's opening, in the plane of the first surface, as four rectangles."""
         if not self._glass.opening_mm:
             return
         right, top = self._glass.opening_mm[0] / 2, self._glass.opening_mm[1] / 2
@@ -229,14 +231,14 @@ class MitsubaSceneBuilder:
     # A lens
 
     def _lens(self, near_mm: float, far_mm: float, glass_mode: GlassMode) -> Iterator[object]:
-        """Two spherical surfaces as fine meshes with interpolated normals, inside black frame sides."""
+        """Yields two spherical surfaces as fine meshes with interpolated normals, and the black sides of the frame."""
         pane = self._glass.panes[0]
         is_entered, material = self._material(pane, glass_mode)
         near, far = self._sphere(near_mm, 0.0), self._sphere(far_mm, -pane.thickness_mm)
         depth = near[0][..., 2] - far[0][..., 2]
         if depth.min() <= 0:
             raise RecipeError(
-                f"the lens is {depth.min():.3g} mm thick at its thinnest", "expected a thickness above 0 everywhere in the frame",
+                f"the lens is {depth.min():.3g} mm thick at its thinnest point", "expected a thickness above 0 everywhere in the frame",
                 "increase thickness_mm or radii_mm, or reduce opening_mm",
             )  # fmt: skip
         yield self._mesh(*near, material)
@@ -246,21 +248,21 @@ class MitsubaSceneBuilder:
         yield from self._frame_sides(low, high)
 
     def _sphere(self, radius_mm: float, height: float) -> tuple[Doubles, Doubles]:
-        """Points and normals towards the camera, (rows, columns, 3), of a surface whose centre is at z = `height`."""
+        """Returns points and normals towards the camera, (rows, columns, 3), of a surface whose centre is at z = `height`."""
         half_width, half_height = np.array(self._glass.opening_mm) / 2
         line = np.linspace(-1, 1, _LENS_GRID + 1)
         x, y = np.meshgrid(line * half_width, line * half_height)
         squared = radius_mm**2 - x**2 - y**2
         if squared.min() <= 0:
             raise RecipeError(
-                f"a sphere of {abs(radius_mm):g} mm does not fill the frame", "expected a radius above half the frame's diagonal",
+                f"a sphere with a radius of {abs(radius_mm):g} mm does not fill the frame", "expected a radius above half the frame's diagonal",
                 "increase radii_mm or reduce opening_mm",
             )  # fmt: skip
         rise = np.copysign(np.sqrt(squared), radius_mm)
         return np.stack([x, y, height - radius_mm + rise], axis=2), np.stack([x, y, rise], axis=2) / radius_mm
 
     def _mesh(self, points: Doubles, normals: Doubles, material: Plugin) -> object:
-        """Triangles over a grid of points (rows, columns, 3); Mitsuba interpolates the normals."""
+        """Returns a mesh of triangles over a grid of points (rows, columns, 3). Mitsuba interpolates the normals."""
         corner = np.arange(points[..., 0].size).reshape(points.shape[:2])
         a, b, c, d = (
             part.ravel() for part in (corner[:-1, :-1], corner[:-1, 1:], corner[1:, 1:], corner[1:, :-1])
@@ -278,7 +280,7 @@ class MitsubaSceneBuilder:
         return mesh
 
     def _frame_sides(self, low: float, high: float) -> Iterator[Plugin]:
-        """The frame's black inner sides, so that no light passes between frame and glass."""
+        """Yields the frame's black inner sides, so that no light passes between frame and glass."""
         right, top = np.array(self._glass.opening_mm) / 2
         x, y, z = np.eye(3)
         middle, half = (low + high) / 2, (high - low) / 2
@@ -288,19 +290,20 @@ class MitsubaSceneBuilder:
 
     # The light
 
-    def _emitters(self, behind: bool) -> Iterator[Plugin]:
-        """The map and the plane of the lit side, and the other side's plane in black, because it hides what is behind it."""
-        envmap = (self.scene.behind if behind else self.scene.front).map
+    def _emitters(self, lit_from_behind: bool) -> Iterator[Plugin]:
+        """Yields the map and the plane of the lit side, and the plane of the other side in black, as it hides objects."""
+        envmap = (self.scene.behind if lit_from_behind else self.scene.front).map
         if envmap:
-            yield self._envmap(envmap, behind) if math.isinf(envmap.radius_mm) else self._dome(envmap, behind)
+            emitter = self._envmap if math.isinf(envmap.radius_mm) else self._dome
+            yield emitter(envmap, lit_from_behind)
         for side, is_behind in ((self.scene.behind, True), (self.scene.front, False)):
             if side.plane:
-                yield self._plane(side.plane, is_behind, is_lit=is_behind == behind)
+                yield self._plane(side.plane, is_behind, is_lit=is_behind == lit_from_behind)
 
-    def _plane(self, plane: Plane, behind: bool, *, is_lit: bool) -> Plugin:
-        """A plane faces the glass; heading and pitch are those seen by an observer at the glass."""
+    def _plane(self, plane: Plane, is_behind: bool, *, is_lit: bool) -> Plugin:
+        """Returns a plane that faces the glass. Its heading and pitch are as seen by an observer at the glass."""
         picture = self._select_channel(self._assets.plane_radiance(plane))
-        facing = 1 if behind else -1
+        facing = 1 if is_behind else -1
         columns = np.array(axes(plane.heading_deg, plane.pitch_deg)) * (facing, 1, facing)
         half = plane.width_mm / 2, plane.width_mm / 2 * picture.shape[0] / picture.shape[1]
         texture = self._bitmap(picture[::-1], wrap_mode="clamp")  # v increases upwards
@@ -309,27 +312,27 @@ class MitsubaSceneBuilder:
             columns, (*plane.offset_mm, -facing * plane.distance_mm), half, {"bsdf": _BLACK, **emitter}
         )
 
-    def _envmap(self, envmap: EnvironmentMap, behind: bool) -> Plugin:
-        """A map at infinity. Its columns are at texel centres, as in brewster, but Mitsuba's outer rows are at the poles."""
+    def _envmap(self, envmap: EnvironmentMap, is_behind: bool) -> Plugin:
+        """Returns a map at infinity. Columns are at texel centres, but Mitsuba expects the first and last row at the poles."""
         height, width = self._map_size(envmap)
         u, v = (np.arange(width) + 0.5) / width, np.arange(2 * height + 1) / (2 * height)
         columns = self._to_glass @ np.array(axes(envmap.heading_deg, 0)).T
-        texels = self._texels(envmap, behind, u, v)
+        texels = self._texels(envmap, is_behind, u, v)
         return {
             "type": "envmap",
             "bitmap": self.mi.Bitmap(texels),
             "to_world": self._transform(columns.T, (0, 0, 0)),
         }
 
-    def _dome(self, envmap: EnvironmentMap, behind: bool) -> Plugin:
-        """A sphere around the glass that emits inwards.
+    def _dome(self, envmap: EnvironmentMap, is_behind: bool) -> Plugin:
+        """Returns a sphere around the glass that emits inwards.
 
-        Mitsuba's longitude increases in the other direction, so the map is mirrored. Its texture repeats in both
-        directions: an additional row at each pole prevents interpolation between the poles.
+        Mitsuba's longitude increases in the other direction, so the map is mirrored. Mitsuba repeats the texture in both
+        directions, so an additional row at each pole prevents interpolation between the poles.
         """
         height, width = self._map_size(envmap)
         u, v = (np.arange(width) + 0.5) / width, (np.arange(height) + 0.5) / height
-        texels = np.pad(self._texels(envmap, behind, u, v)[:, ::-1], ((1, 1), (0, 0), (0, 0)), "edge")
+        texels = np.pad(self._texels(envmap, is_behind, u, v)[:, ::-1], ((1, 1), (0, 0), (0, 0)), "edge")
         to_inner_rows = np.array(((1, 0, 0), (0, height / (height + 2), 1 / (height + 2)), (0, 0, 1)))
         texture = self._bitmap(texels, wrap_mode="repeat", to_uv=self.mi.ScalarTransform3f(to_inner_rows))
         right, up, back = (self._to_glass @ axis for axis in np.array(axes(envmap.heading_deg, 0)))
@@ -351,23 +354,23 @@ class MitsubaSceneBuilder:
         }
 
     def _map_size(self, envmap: EnvironmentMap) -> tuple[int, int]:
-        """Height and width of the map. A coarse one is enlarged by an odd factor: texel centres stay texel centres."""
+        """Returns the height and the width of the map. Coarse maps are enlarged by an odd factor, which keeps texel centres."""
         height, width = self._assets.map_radiance(envmap).shape[:2]
         factor = math.ceil(_MIN_MAP_ROWS / height) // 2 * 2 + 1
         return factor * height, factor * width
 
-    def _texels(self, envmap: EnvironmentMap, behind: bool, u: Doubles, v: Doubles) -> Floats:
-        """The map's light at u and v, (rows, columns, 3); black on the other side of the glass."""
+    def _texels(self, envmap: EnvironmentMap, is_behind: bool, u: Doubles, v: Doubles) -> Floats:
+        """Returns the map's light at u and v, (rows, columns, 3). It is black on the other side of the glass."""
         texels = sample_bilinear(self._select_channel(self._assets.map_radiance(envmap)), u, v)
         azimuth, polar = 2 * math.pi * u + math.radians(envmap.heading_deg), math.pi * v[:, None]
         x, y, z = self._to_glass[2]
         above_glass = np.sin(polar) * (x * np.sin(azimuth) - z * np.cos(azimuth)) + y * np.cos(polar)
-        texels[(above_glass < 0) != behind] = 0
+        texels[(above_glass < 0) != is_behind] = 0
         return texels
 
 
 def sample_bilinear(texels: Floats, u: Doubles, v: Doubles) -> Floats:
-    """Bilinear interpolation of a map (H, W, 3) on the grid of columns u (n,) and rows v (m,) in 0..1: (m, n, 3).
+    """Interpolates a map (H, W, 3) bilinearly on the grid of columns u (n,) and rows v (m,) in 0..1: (m, n, 3).
 
     u wraps around; v is clamped to the centres of the first and last row.
     """

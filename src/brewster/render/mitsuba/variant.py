@@ -1,11 +1,11 @@
-"""Loads Mitsuba with a working LLVM if there is one, else prepares the slow scalar variant.
+"""Loads Mitsuba with a working LLVM. Without one, only the slow scalar variant is available.
 
     mitsuba = load()
     mitsuba.set_variant(probe().variant)  # "llvm_ad_rgb" or "scalar_rgb"
 
-Dr.Jit loads an LLVM when it is imported, and an incompatible one (14 to 16) aborts the whole process at the first
-kernel. Therefore each candidate first renders a small image in a separate process. The candidates are the LLVM of the
-pip package `karellen-llvm-core`, then those of the system. If `DRJIT_LIBLLVM_PATH` is set, only that one is tried.
+Dr.Jit loads an LLVM when it is imported. An incompatible LLVM (14 to 16) aborts the whole process at the first kernel.
+Therefore each candidate first renders a small image in a separate process. The candidates are the LLVM of the pip package
+`karellen-llvm-core`, then those of the system. If `DRJIT_LIBLLVM_PATH` is set, only the LLVM at that path is tried.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ INSTALL_LLVM: Final = (
 
 _LLVM_PACKAGE: Final = "karellen-llvm-core"
 _RUNTIME_LIBRARIES: Final = ("libunwind.so.1.0", "libc++abi.so.1.0", "libc++.so.1.0")
-"""The libraries that the package's LLVM needs, in the order in which they depend on each other."""
+"""The libraries that the package's LLVM needs, in the order in which they must be loaded."""
 _KNOWN_GOOD: Final = (19, 20, 18, 17)
 _FOLDERS: Final = ("/usr/lib", "/usr/lib64", "/usr/local/lib", "/opt/homebrew/opt", "/usr/local/opt")
 _PATTERNS: Final = ("libLLVM*.so*", "*/libLLVM*.so*", "*/lib/libLLVM*.so*", "*/lib/libLLVM*.dylib")
@@ -65,7 +65,7 @@ assert 0 < mi.Bitmap(mi.render(scene, spp=1)).channel_count()
 
 @dataclass(frozen=True)
 class VariantProbe:
-    """The variant to use, the path of its LLVM (None: the one that Dr.Jit finds), and the reason if no LLVM works."""
+    """The variant to use, the path of its LLVM (None: the LLVM that Dr.Jit finds), and the reason if no LLVM works."""
 
     variant: str
     library: str | None = None
@@ -73,9 +73,9 @@ class VariantProbe:
 
 
 def load() -> ModuleType:
-    """Imports Mitsuba with a working LLVM, or without any; then only scalar variants can be selected.
+    """Imports Mitsuba with a working LLVM. If no LLVM works, only scalar variants can be selected, and a warning is given.
 
-    The first call takes a second or two, and warns if only the scalar variant works.
+    The first call takes a second or two.
 
     Returns:
         The module `mitsuba`.
@@ -85,22 +85,22 @@ def load() -> ModuleType:
     """
     found = probe()
     for runtime in _runtime_libraries(found.library):
-        # Without RTLD_GLOBAL: otherwise exceptions of other C++ libraries would end the process.
+        # RTLD_GLOBAL is not set, because with it, exceptions of other C++ libraries end the process.
         ctypes.CDLL(runtime)
     if found.library:
         os.environ[LLVM_PATH_VARIABLE] = found.library
     try:
         mitsuba = importlib.import_module("mitsuba")
-    except (ImportError, NameError) as error:  # Dr.Jit hides the ImportError behind a NameError of its own
+    except (ImportError, NameError) as error:  # Dr.Jit raises a NameError while it handles the ImportError
         reason = str(error.__context__ or error)
         raise MissingExtra(
             f"mitsuba cannot be imported ({reason})",
-            "expected it for the renderer mitsuba",
+            "expected a working package mitsuba for this renderer",
             f"run: {install_command(reason)}",
         ) from error
     if found.variant != COMPILED:
         warnings.warn(
-            f"no LLVM works for Mitsuba ({found.reason}), so rendering is several times slower; expected LLVM 17 or newer;"
+            f"no LLVM works with Mitsuba ({found.reason}), so rendering is several times slower; expected LLVM 17 or newer;"
             f" install it ({INSTALL_LLVM}) or set {LLVM_PATH_VARIABLE} to its path",
             RuntimeWarning,
             stacklevel=2,
@@ -109,7 +109,7 @@ def load() -> ModuleType:
 
 
 def install_command(reason: str) -> str:
-    """The command that installs what is missing when the import of Mitsuba fails with this reason."""
+    """Returns the command that installs the missing package when the import of Mitsuba fails for this reason."""
     return (
         "apt install libatomic1" if "libatomic" in reason else "pip install --force-reinstall mitsuba drjit"
     )
@@ -125,7 +125,7 @@ def probe() -> VariantProbe:
     if find_spec("mitsuba") is None:
         raise MissingExtra(
             "mitsuba is not installed",
-            "expected it for the renderer mitsuba",
+            "expected the package mitsuba for this renderer",
             "run: pip install 'brewster[render]'",
         )
     reasons = []
@@ -138,11 +138,11 @@ def probe() -> VariantProbe:
 
 
 def _candidates() -> list[str | None]:
-    """Paths of the LLVMs to try, in order; None stands for Dr.Jit's own search.
+    """Returns the paths of the LLVMs to try, in order. None means the LLVM that Dr.Jit finds.
 
-    If `DRJIT_LIBLLVM_PATH` is set, it is the only one. Otherwise, the LLVM of the pip package is first, then those of
-    the system (versions known to work first), then None. Once Dr.Jit is imported, its LLVM cannot change, so there is
-    only one candidate.
+    If `DRJIT_LIBLLVM_PATH` is set, it is the only candidate. Otherwise, the candidates are the LLVM of the pip package,
+    those of the system (versions known to work first), and None. If Dr.Jit is already imported, its LLVM cannot change,
+    so there is only one candidate.
     """
     configured = os.environ.get(LLVM_PATH_VARIABLE)
     if configured or "drjit" in sys.modules:
@@ -167,16 +167,16 @@ def _packaged_llvm() -> list[str]:
 
 
 def _runtime_libraries(library: str | None) -> list[str]:
-    """The C++ runtime that the package installs next to its LLVM; empty for any other LLVM.
+    """Returns the libraries of the C++ runtime that the package installs next to its LLVM; empty for any other LLVM.
 
-    It must be loaded before the LLVM. The LLVM finds it through links that the package creates only when Python starts.
+    They must be loaded before the LLVM: it finds them through links, which the package creates only when Python starts.
     """
     folder = Path(library or "").parent / "x86_64-unknown-linux-gnu"
     return [str(folder / name) for name in _RUNTIME_LIBRARIES if (folder / name).exists()]
 
 
 def _version(path: Path) -> int:
-    """The major version: 19 for `libLLVM.so.19.1`, `libLLVM-19.so` and `llvm@19/lib/libLLVM.dylib`; 0 if unknown."""
+    """Returns the major version: 19 for `libLLVM.so.19.1`, `libLLVM-19.so` and `llvm@19/lib/libLLVM.dylib`; 0 if unknown."""
     number = re.search(r"LLVM[-.]\D*(\d+)|llvm[@-]?/?(\d+)", str(path))
     return int(number[1] or number[2]) if number else 0
 

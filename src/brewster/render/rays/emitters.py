@@ -3,7 +3,7 @@
 Geometry is in the glass frame, in millimetres: the first surface is z = 0, the camera is at z > 0. Vectors are (3, N).
 Light from a map at infinity depends on the direction alone; light from a dome (a map at a finite radius) or a plane
 depends on the whole ray. The footprint of a ray is the part of a pixel and of its circle of confusion that the ray
-represents: textures are filtered to that size before the lookup.
+represents. Textures are filtered to that size before the lookup.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from brewster.scene.world import Plane, Side
 Device = torch.device | str
 
 _MAX_TEXELS_PER_LOOKUP = 1.2
-"""A lookup with a larger footprint uses a coarser mipmap level; with a higher limit, a sun of one texel would flicker."""
+"""A lookup with a larger footprint uses a coarser mipmap level. With a higher limit, a sun of one texel flickers."""
 
 
 class MipmappedTexture:
@@ -43,7 +43,10 @@ class MipmappedTexture:
         return self._levels[0][0]
 
     def __call__(self, u: Tensor, v: Tensor, footprint: float) -> Tensor:
-        """Values (3, N) at texture coordinates u and v, (N,) in 0..1; `footprint` is in texels of the full image."""
+        """Returns values (3, N) at texture coordinates u and v, (N,) in 0..1.
+
+        `footprint` is in texels of the image at full resolution.
+        """
         level = min(math.ceil(math.log2(max(footprint / _MAX_TEXELS_PER_LOOKUP, 1.0))), len(self._levels) - 1)
         texels = self._level(level)
         if self.wraps:
@@ -55,7 +58,7 @@ class MipmappedTexture:
         )[0, :, 0]
 
     def _level(self, level: int) -> Tensor:
-        """The texels of a level, with a column of the opposite edge on either side if the texture wraps."""
+        """Returns the texels of a level. If the texture wraps, each side has an additional column from the opposite side."""
         if not self.wraps:
             return self._levels[level]
         if level not in self._padded:
@@ -65,19 +68,19 @@ class MipmappedTexture:
 
 @dataclass(frozen=True)
 class _PlaneEmitter:
-    """A textured rectangle in the glass frame: its centre in mm, its unit axes and half its sides in mm."""
+    """A textured rectangle in the glass frame: its centre in mm, its unit axes and half the length of its sides."""
 
     texture: MipmappedTexture
     centre: Tensor
     right: Tensor
     up: Tensor
-    half_width: float
-    half_height: float
+    half_width_mm: float
+    half_height_mm: float
 
 
 @dataclass(frozen=True)
 class Rays:
-    """Rays with origins and unit directions, (3, N) each; `footprint_px` is the width of each in pixels."""
+    """Rays with origins and unit directions, (3, N) each; `footprint_px` is the width of each ray's footprint."""
 
     origin: Tensor
     direction: Tensor
@@ -86,7 +89,7 @@ class Rays:
 
 @dataclass(frozen=True)
 class CameraView:
-    """The values that determine the footprint of a pixel: height above the glass, angle of a pixel, and the thin lens.
+    """The values that determine the footprint of a pixel: height above the glass, angle of a pixel, and thin lens.
 
     An aperture of 0 means that the lens does not widen the footprint.
     """
@@ -97,15 +100,15 @@ class CameraView:
     focus_mm: float
 
     def footprint_mm(self, distance_mm: float) -> float:
-        """Width of a pixel plus its circle of confusion in mm, at a distance from the glass (thin lens).
+        """Returns the width of a pixel plus its circle of confusion in mm, at a distance from the glass (thin lens).
 
-        pixel_rad * d + aperture * |1 - d / focus|, where d is the distance from the camera.
+        The width is pixel_rad * d + aperture * |1 - d / focus|, where d is the distance from the camera.
         """
         from_camera_mm = self.height_mm + distance_mm
         return self.pixel_rad * from_camera_mm + self.aperture_mm * abs(1 - from_camera_mm / self.focus_mm)
 
     def footprint_rad(self) -> float:
-        """Width of a pixel plus its circle of confusion at infinity, in radians."""
+        """Returns the width of a pixel plus its circle of confusion at infinity, in radians."""
         return self.pixel_rad + self.aperture_mm / self.focus_mm
 
 
@@ -113,7 +116,14 @@ class SideEmitters:
     """The light sources of one side: an environment map or dome, and a plane in front of it; both are optional."""
 
     def __init__(
-        self, side: Side, assets: Assets, view: CameraView, *, behind: bool, to_world: Tensor, device: Device
+        self,
+        side: Side,
+        assets: Assets,
+        view: CameraView,
+        *,
+        is_behind: bool,
+        to_world: Tensor,
+        device: Device,
     ) -> None:
         self._distribution: EnvmapDistribution | None = None
         self.radius_mm = side.map.radius_mm if side.map else math.inf
@@ -124,15 +134,15 @@ class SideEmitters:
         )
         self._view = view
         self._u_offset = -(side.map.heading_deg if side.map else 0.0) / 360
-        self._behind = behind
+        self._is_behind = is_behind
         self._to_world = to_world
-        self.plane = _plane_emitter(side.plane, assets, behind, device) if side.plane else None
+        self.plane = _plane_emitter(side.plane, assets, is_behind, device) if side.plane else None
         self.plane_distance_mm = side.plane.distance_mm if side.plane else math.inf
         self.distance_mm = side.distance_mm
 
     @property
     def is_dome(self) -> bool:
-        """Whether the map is at a finite radius, so that it shows parallax."""
+        """Whether the map is at a finite radius, which causes parallax."""
         return self.envmap is not None and math.isfinite(self.radius_mm)
 
     @property
@@ -141,7 +151,7 @@ class SideEmitters:
         return self.is_dome or self.plane is not None
 
     def texels_per_pixel(self) -> float:
-        """The width of a pixel in texels of the map or of the plane, whichever is larger."""
+        """Returns the width of a pixel in texels of the map or of the plane, whichever is larger."""
         return max(self._map_footprint(1.0), self._plane_footprint(1.0))
 
     def _map_footprint(self, footprint_px: float) -> float:
@@ -160,10 +170,10 @@ class SideEmitters:
         if self.plane is None:
             return 0.0
         width_mm = self._view.footprint_mm(self.plane_distance_mm)
-        return footprint_px * width_mm * self.plane.texture.width / (2 * self.plane.half_width)
+        return footprint_px * width_mm * self.plane.texture.width / (2 * self.plane.half_width_mm)
 
     def far_radiance(self, direction: Tensor, footprint_px: float) -> Tensor | None:
-        """Light from infinity along unit directions (3, N): (3, N); None if this side has none."""
+        """Returns light from infinity along unit directions (3, N): (3, N), or None if this side has no such light."""
         if self.envmap is None or self.is_dome:
             return None
         return self.lookup_map(direction, footprint_px)
@@ -171,11 +181,11 @@ class SideEmitters:
     def near_radiance(
         self, origin: Tensor, direction: Tensor, footprint_px: float
     ) -> tuple[Tensor, Tensor | None]:
-        """Light of the dome and the plane along rays, and the visibility of the far light.
+        """Returns the light of the dome and the plane along rays, and the visibility of the far light.
 
         Returns:
-            Radiance (3, N), and the share of the far light that the plane does not hide, (N,) in 0..1; None instead of
-            the share if there is no far light.
+            Radiance (3, N), and the fraction of the far light that the plane does not hide, (N,) in 0..1. The fraction
+            is None if there is no far light.
         """
         radiance, visibility = torch.zeros_like(direction), None
         if self.is_dome:
@@ -190,13 +200,13 @@ class SideEmitters:
         return radiance, visibility
 
     def radiance(self, origin: Tensor, direction: Tensor, footprint_px: float) -> Tensor:
-        """All light along rays from `origin` in unit `direction`, (3, N) each: (3, N)."""
+        """Returns all light along rays from `origin` in unit `direction`, (3, N) each: (3, N)."""
         return self.add_near(self.far_radiance(direction, footprint_px), origin, direction, footprint_px)
 
     def add_near(self, far: Tensor | None, origin: Tensor, direction: Tensor, footprint_px: float) -> Tensor:
-        """Adds the light of the dome and the plane to the far light of rays, as `far_radiance` returns it: (3, N).
+        """Adds the light of the dome and the plane along rays to `far`, the result of `far_radiance`: (3, N).
 
-        Far light does not depend on origins: rays with the same directions need only one call of `far_radiance`.
+        Far light does not depend on origins, so rays with the same directions need only one call of `far_radiance`.
         """
         if not self.is_near:
             return torch.zeros_like(direction) if far is None else far
@@ -204,7 +214,7 @@ class SideEmitters:
         return near if far is None or visibility is None else near + visibility * far
 
     def lookup_map(self, direction: Tensor, footprint_px: float) -> Tensor:
-        """Light of the map in unit directions (3, N) from its centre: (3, N)."""
+        """Returns the light of the map in unit directions (3, N) from its centre: (3, N)."""
         assert self.envmap is not None
         u, v = direction_to_uv(self._to_world @ direction, self._u_offset)
         return self.envmap(u, v, self._map_footprint(footprint_px))
@@ -223,7 +233,7 @@ class SideEmitters:
         return direction, self.pdf(origin, direction)
 
     def pdf(self, origin: Tensor, direction: Tensor) -> Tensor:
-        """The density of `sample` at unit directions (3, N), per steradian at `origin`: (N,)."""
+        """Returns the density of `sample` at unit directions (3, N), per steradian at `origin`: (N,)."""
         if not self.is_dome:
             return self._map_distribution().pdf(self._to_world @ direction, self._u_offset)
         point, distance = self._intersect_dome(origin, direction)
@@ -236,42 +246,46 @@ class SideEmitters:
         )
 
     def _intersect_dome(self, origin: Tensor, direction: Tensor) -> tuple[Tensor, Tensor]:
-        """Intersects rays with the dome: unit directions from its centre, (3, N), and distances in mm, (N,)."""
+        """Intersects rays with the dome.
+
+        Returns:
+            Unit directions from the dome's centre to the intersections, (3, N), and distances along the rays in mm, (N,).
+        """
         along = dot(origin, direction)
         distance = torch.sqrt((along**2 - dot(origin, origin) + self.radius_mm**2).clamp(min=0)) - along
         return (origin + distance * direction) / self.radius_mm, distance
 
     def _map_distribution(self) -> EnvmapDistribution:
-        """The distribution of the map's light on this side of the glass; computed at the first call."""
+        """Returns the distribution of the map's light on this side of the glass. It is computed at the first call."""
         if self._distribution is None:
             assert self.envmap is not None
-            outward = self._to_world @ self._to_world.new_tensor([0, 0, -1 if self._behind else 1])
+            outward = self._to_world @ self._to_world.new_tensor([0, 0, -1 if self._is_behind else 1])
             self._distribution = EnvmapDistribution(self.envmap.texels, outward, self._u_offset)
         return self._distribution
 
     def _plane_radiance(
         self, plane: _PlaneEmitter, origin: Tensor, direction: Tensor, footprint_px: float
     ) -> tuple[Tensor, Tensor]:
-        """The plane's light along rays, (3, N), and the share of each footprint that it covers, (N,) in 0..1."""
+        """Returns the plane's light along rays, (3, N), and the fraction of each footprint that it covers, (N,) in 0..1."""
         normal = torch.linalg.cross(plane.right, plane.up)
         cosine = normal @ direction
         distance = normal @ (plane.centre[:, None] - origin) / torch.where(cosine == 0, 1e-9, cosine)
         point = origin + distance * direction - plane.centre[:, None]
         x, y = plane.right @ point, plane.up @ point
-        u, v = x / (2 * plane.half_width) + 0.5, 0.5 - y / (2 * plane.half_height)
+        u, v = x / (2 * plane.half_width_mm) + 0.5, 0.5 - y / (2 * plane.half_height_mm)
         edge_mm = footprint_px * self._view.footprint_mm(self.plane_distance_mm)
         coverage = (
-            ((plane.half_width - x.abs()) / edge_mm + 0.5).clamp(0, 1)
-            * ((plane.half_height - y.abs()) / edge_mm + 0.5).clamp(0, 1)
+            ((plane.half_width_mm - x.abs()) / edge_mm + 0.5).clamp(0, 1)
+            * ((plane.half_height_mm - y.abs()) / edge_mm + 0.5).clamp(0, 1)
             * (distance > 0)
         )
         return plane.texture(u, v, self._plane_footprint(footprint_px)), coverage
 
 
-def _plane_emitter(plane: Plane, assets: Assets, behind: bool, device: Device) -> _PlaneEmitter:
-    """Converts a plane to the glass frame. At heading 0 it faces the glass; a heading rotates it about the y axis."""
+def _plane_emitter(plane: Plane, assets: Assets, is_behind: bool, device: Device) -> _PlaneEmitter:
+    """Converts a plane to the glass frame. At heading 0 the plane faces the glass; a heading rotates it about the y axis."""
     image = torch.from_numpy(assets.plane_radiance(plane)).to(device)
-    facing = 1.0 if behind else -1.0
+    facing = 1.0 if is_behind else -1.0
     mirrored = torch.tensor([facing, 1.0, facing], device=device)
     right, up, _ = (
         torch.tensor(axis, device=device) * mirrored for axis in axes(plane.heading_deg, plane.pitch_deg)
@@ -283,6 +297,6 @@ def _plane_emitter(plane: Plane, assets: Assets, behind: bool, device: Device) -
         centre=torch.tensor([x, y, -facing * plane.distance_mm], device=device),
         right=right,
         up=up,
-        half_width=plane.width_mm / 2,
-        half_height=plane.width_mm / 2 * height / width,
+        half_width_mm=plane.width_mm / 2,
+        half_height_mm=plane.width_mm / 2 * height / width,
     )

@@ -16,12 +16,12 @@ from brewster.render.rays.vectors import dot, normalize
 
 
 def sample_visible_normal(wi: Tensor, normal: Tensor, alpha: float, uniforms: Tensor) -> Tensor:
-    """Microfacet normals, (3, N), distributed as the facets that are visible from `wi` (Heitz 2018).
+    """Returns random microfacet normals, (3, N), with the distribution of the facets visible from `wi` (Heitz 2018).
 
     `uniforms` are random numbers in [0, 1), (2, N).
     """
     x_axis, y_axis = _tangents(normal)
-    # Stretch wi by alpha: the rough surface becomes a hemisphere.
+    # Stretch wi by alpha, which turns the rough surface into a hemisphere.
     x, y, z = dot(wi, x_axis) * alpha, dot(wi, y_axis) * alpha, dot(wi, normal)
     length = torch.sqrt(x**2 + y**2 + z**2)
     x, y, z = x / length, y / length, z / length
@@ -32,7 +32,7 @@ def sample_visible_normal(wi: Tensor, normal: Tensor, alpha: float, uniforms: Te
     lift = (1 + z) / 2
     t2 = (1 - lift) * (1 - t1**2).clamp(min=0).sqrt() + lift * t2
     t3 = (1 - t1**2 - t2**2).clamp(min=0).sqrt()
-    # Back from the frame of wi to the frame of the surface, and undo the stretch.
+    # Transform from the frame of wi to the frame of the surface, and undo the stretch.
     nx = -y / sine * t1 - x * z / sine * t2 + x * t3
     ny = x / sine * t1 - y * z / sine * t2 + y * t3
     nz = (sine * t2 + z * t3).clamp(min=1e-6)
@@ -40,16 +40,16 @@ def sample_visible_normal(wi: Tensor, normal: Tensor, alpha: float, uniforms: Te
 
 
 def smith_g1(cosine: Tensor, alpha: float) -> Tensor:
-    """Smith's masking function G1: the share of the facets visible from a direction (Walter et al. 2007, eq. 34).
+    """Returns Smith's masking function G1, the fraction of facets visible from a direction (Walter et al. 2007, eq. 34).
 
-    `cosine` is that of the angle between the direction and the surface normal, (N,); the result is (N,), too.
+    `cosine` is the cosine of the angle between the direction and the surface normal, (N,). The result is (N,), too.
     """
     tangent_squared = (1 - cosine**2).clamp(min=0) / cosine.clamp(min=1e-4) ** 2
     return 2 / (1 + torch.sqrt(1 + alpha**2 * tangent_squared))
 
 
 def vndf_over_cosine(wi: Tensor, normal: Tensor, facet: Tensor, alpha: float) -> Tensor:
-    """The density of `sample_visible_normal` at `facet`, divided by dot(wi, facet): D G1 / dot(wi, normal), (N,).
+    """Returns the density of `sample_visible_normal` at `facet`, divided by dot(wi, facet): D G1 / dot(wi, normal), (N,).
 
     D is the GGX distribution (Walter et al. 2007, eq. 33). The factor dot(wi, facet) is left out because the Jacobian
     of a reflection has it in its denominator.
@@ -60,6 +60,6 @@ def vndf_over_cosine(wi: Tensor, normal: Tensor, facet: Tensor, alpha: float) ->
 
 
 def _tangents(normal: Tensor) -> tuple[Tensor, Tensor]:
-    """Two axes perpendicular to the unit normals, (3, 1) or (3, N)."""
+    """Returns two axes perpendicular to the unit normals, (3, 1) or (3, N)."""
     x_axis = normalize(torch.stack([normal[2], torch.zeros_like(normal[0]), -normal[0]]))
     return x_axis, torch.linalg.cross(normal, x_axis, dim=0)

@@ -1,9 +1,9 @@
 """Smooth parallel panes: Fresnel reflectance, Beer-Lambert absorption and the table of reflection orders.
 
 s- and p-polarised light are computed separately, each with its own reflectance at every surface, and averaged at the
-end. For unpolarised light this is exact; an average at each surface is not, because the mean of a product is not the
-product of the means. Intensities add up, not amplitudes: a pane is thousands of wavelengths thick, so interference
-averages out. Angles are given by their cosines, of any shape (...), measured in air.
+end. For unpolarised light this is exact. An average at each surface is not exact, because the mean of a product is not
+the product of the means. Intensities are added, not amplitudes, because a pane is thousands of wavelengths thick and
+interference averages out. Angles are measured in air and given as cosines of any shape (...).
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ MIN_ORDER_WEIGHT = 1e-5
 
 
 def refracted_cosine(cosine: Tensor, index: float) -> Tensor:
-    """Cosine of the angle inside the glass, from the cosine in air (Snell's law)."""
+    """Returns the cosine of the angle inside the glass, from the cosine in air (Snell's law)."""
     return (1 - (1 - cosine**2) / index**2).clamp(min=1e-9).sqrt()
 
 
 def fresnel(cosine: Tensor, index: float) -> tuple[Tensor, Tensor]:
-    """Reflectance of one surface between air and glass for s- and p-polarised light (Fresnel's equations).
+    """Returns the reflectance of one surface between air and glass for s- and p-polarised light (Fresnel's equations).
 
     The reflectance from inside the glass, at the refracted angle, is the same (Stokes' relations).
     """
@@ -40,7 +40,7 @@ def fresnel(cosine: Tensor, index: float) -> tuple[Tensor, Tensor]:
 
 
 def internal_transmittance(pane: Pane, cosine: Tensor) -> Tensor:
-    """Share of the light left after one traversal of the pane, (3, ...) for RGB (Beer-Lambert law)."""
+    """Returns the fraction of the light that remains after one traversal of the pane, (3, ...) for RGB (Beer-Lambert law)."""
     absorption = torch.tensor(pane.absorption_per_m, dtype=cosine.dtype, device=cosine.device)
     path_m = pane.thickness_mm / 1000 / refracted_cosine(cosine, pane.refractive_index)
     return torch.exp(-absorption.view(3, *[1] * cosine.ndim) * path_m)
@@ -55,14 +55,14 @@ class Throughput:
 
 
 def total_throughput(glazing: Glazing, cosine: Tensor) -> Throughput:
-    """The sum of all orders in closed form; panes are combined by the adding method."""
+    """Returns the sum of all orders in closed form. Panes are combined by the adding method."""
     return _average_polarisations(
         [_combine([_slab(r, a) for r, a in panes]) for panes in _by_polarisation(glazing, cosine)]
     )
 
 
 def truncated_throughput(glazing: Glazing, cosine: Tensor) -> Throughput:
-    """The paper's layers: T without any reflection, and R of all light that never enters the last pane."""
+    """Returns the paper's layers: T without any reflection, and R of all light that never enters the last pane."""
     return _average_polarisations([_truncated_layers(panes) for panes in _by_polarisation(glazing, cosine)])
 
 
@@ -72,7 +72,7 @@ _SurfaceAndInterior = tuple[Tensor, Tensor | float]
 
 
 def _by_polarisation(glazing: Glazing, cosine: Tensor) -> list[list[_SurfaceAndInterior]]:
-    """The panes for s-polarised light, then for p-polarised light."""
+    """Returns the panes for s-polarised light, then the panes for p-polarised light."""
     interiors = [
         internal_transmittance(pane, cosine) if any(pane.absorption_per_m) else 1.0 for pane in glazing.panes
     ]
@@ -81,7 +81,7 @@ def _by_polarisation(glazing: Glazing, cosine: Tensor) -> list[list[_SurfaceAndI
 
 
 def _slab(r: Tensor, a: Tensor | float) -> _TransmittanceReflectance:
-    """Transmittance and reflectance of one pane: the paper's two series of light paths, summed.
+    """Returns the transmittance and the reflectance of one pane, the sums of the paper's two series of light paths.
 
     T = (1 - r)^2 a (1 + (r a)^2 + (r a)^4 + ...) and R = r + (1 - r)^2 r a^2 (1 + (r a)^2 + ...) are geometric series.
     """
@@ -90,9 +90,10 @@ def _slab(r: Tensor, a: Tensor | float) -> _TransmittanceReflectance:
 
 
 def _combine(layers: list[_TransmittanceReflectance]) -> _TransmittanceReflectance:
-    """The adding method (Stokes 1862): T = T1 T2 / (1 - R1 R2), R = R1 + T1^2 R2 / (1 - R1 R2).
+    """Combines layers with the adding method (Stokes 1862): T = T1 T2 / (1 - R1 R2), R = R1 + T1^2 R2 / (1 - R1 R2).
 
-    It needs layers that are symmetric front to back, which uniform panes are. The first layer is nearest to the camera.
+    The method requires that each layer has the same properties from both sides, as uniform panes do. The first layer is
+    the one nearest to the camera.
     """
     transmittance, reflectance = layers[-1]
     for t, r in reversed(layers[:-1]):
@@ -105,11 +106,11 @@ def _combine(layers: list[_TransmittanceReflectance]) -> _TransmittanceReflectan
 
 
 def _truncated_layers(panes: list[_SurfaceAndInterior]) -> _TransmittanceReflectance:
-    """Transmittance without any reflection, and reflectance without the light that enters the last pane."""
+    """Returns the transmittance without any reflection, and the reflectance without light that enters the last pane."""
     transmittance: Tensor | float = 1.0
     for r, a in panes:
         transmittance = transmittance * (1 - r) ** 2 * a
-    # No light of R enters the last pane, so the pane's first surface takes the place of the pane.
+    # No light of R enters the last pane, so the first surface of the pane replaces the pane.
     first_surface, _ = panes[-1]
     before = [_slab(*pane) for pane in panes[:-1]]
     assert isinstance(transmittance, Tensor)
@@ -123,10 +124,10 @@ def _average_polarisations(polarised: list[_TransmittanceReflectance]) -> Throug
 
 @dataclass(frozen=True)
 class ReflectionOrder:
-    """A set of `count` light paths through a parallel stack, with equal exit side, in-plane shift and throughput.
+    """A set of `count` light paths through parallel panes, with equal exit side, in-plane shift and throughput.
 
-    `reflections` and `transmissions` at surfaces are counted per pane, `traversals` per layer: pane, gap, pane...
-    `is_transmitted` is true for light that comes from behind the glass.
+    `reflections` and `transmissions` are the counts at the surfaces of each pane. `traversals` are the counts of each
+    layer: pane, gap, pane and so on. `is_transmitted` is True for light that comes from behind the glass.
     """
 
     is_transmitted: bool
@@ -143,10 +144,10 @@ class ReflectionOrder:
 
 @lru_cache(maxsize=256)
 def enumerate_orders(reflectances: tuple[float, ...]) -> tuple[ReflectionOrder, ...]:
-    """The orders of panes whose surfaces have these reflectances, from the brightest to the faintest.
+    """Returns the orders of N panes whose surfaces have these reflectances, from the brightest to the faintest.
 
-    A breadth-first search: at each of the 2 N surfaces a path is reflected or transmitted, and paths in the same state
-    are merged. Without merging, their number would grow exponentially with the number of reflections.
+    The search is breadth-first. At each of the 2 N surfaces, a path is reflected and transmitted. Paths in the same state
+    are merged, because the number of separate paths grows exponentially with the number of reflections.
     """
     surfaces = 2 * len(reflectances)
     zeros = (0,) * len(reflectances), (0,) * len(reflectances), (0,) * (surfaces - 1)
@@ -155,11 +156,11 @@ def enumerate_orders(reflectances: tuple[float, ...]) -> tuple[ReflectionOrder, 
     while frontier:
         next_frontier: defaultdict[_State, int] = defaultdict(int)
         for state, count in frontier.items():
-            for surface, down, *counts in _branches(state):
+            for surface, is_downward, *counts in _branches(state):
                 if surface in (-1, surfaces):
                     exited[surface == surfaces, *counts] += count  # type: ignore[index]
                 elif count * _weight(counts, reflectances) > MIN_ORDER_WEIGHT:
-                    next_frontier[(surface, down, *counts)] += count  # type: ignore[index]
+                    next_frontier[(surface, is_downward, *counts)] += count  # type: ignore[index]
         frontier = next_frontier
     orders = [ReflectionOrder(*key, count) for key, count in exited.items()]
     return tuple(
@@ -169,19 +170,25 @@ def enumerate_orders(reflectances: tuple[float, ...]) -> tuple[ReflectionOrder, 
 
 _Counts = tuple[int, ...]
 _State = tuple[int, bool, _Counts, _Counts, _Counts]
-"""The next surface, whether the path goes down (away from the camera), reflections, transmissions, traversals."""
+"""The next surface, whether the path is downward (away from the camera), reflections, transmissions, traversals."""
 
 
 def _branches(state: _State) -> list[_State]:
-    """The states after transmission and after reflection at the surface of a path."""
-    surface, down, reflections, transmissions, traversals = state
+    """Returns the state after transmission and the state after reflection at the next surface of a path."""
+    surface, is_downward, reflections, transmissions, traversals = state
     pane = surface // 2
-    ahead, back = (surface + 1, surface - 1) if down else (surface - 1, surface + 1)
+    ahead, back = (surface + 1, surface - 1) if is_downward else (surface - 1, surface + 1)
     return [
-        (ahead, down, reflections, _incremented(transmissions, pane), _traversed(traversals, surface, ahead)),
+        (
+            ahead,
+            is_downward,
+            reflections,
+            _incremented(transmissions, pane),
+            _traversed(traversals, surface, ahead),
+        ),
         (
             back,
-            not down,
+            not is_downward,
             _incremented(reflections, pane),
             transmissions,
             _traversed(traversals, surface, back),
@@ -200,7 +207,7 @@ def _traversed(traversals: _Counts, surface: int, next_surface: int) -> _Counts:
 
 
 def _weight(counts: tuple[_Counts, _Counts] | list[_Counts], reflectances: tuple[float, ...]) -> float:
-    """The product of the reflectances and transmittances along one path of an order, without absorption."""
+    """Returns the product of the reflectances and transmittances along one path of an order, without absorption."""
     reflections, transmissions = counts[:2]
     return math.prod(
         r**reflected * (1 - r) ** transmitted
@@ -209,10 +216,10 @@ def _weight(counts: tuple[_Counts, _Counts] | list[_Counts], reflectances: tuple
 
 
 def order_throughputs(glazing: Glazing, cosine: Tensor, table: Sequence[ReflectionOrder]) -> list[Tensor]:
-    """The throughput of each order, (3, ...) or (...).
+    """Returns the throughput of each order, (3, ...) or (...).
 
-    For each side they sum to `total_throughput`: the last order of a side also gets the light of all fainter orders, so
-    that no energy is lost.
+    For each side, the throughputs sum to `total_throughput`. The last order of a side also gets the light of all fainter
+    orders, so that no energy is lost.
     """
     interiors = [
         _powers(internal_transmittance(pane, cosine)) if any(pane.absorption_per_m) else None
@@ -231,15 +238,15 @@ def order_throughputs(glazing: Glazing, cosine: Tensor, table: Sequence[Reflecti
             throughput = throughput * power(exponent) if power and exponent else throughput
         throughputs.append(throughput)
     closed_form = total_throughput(glazing, cosine)
-    for behind, total in ((True, closed_form.transmittance), (False, closed_form.reflectance)):
-        side = [i for i, order in enumerate(table) if order.is_transmitted == behind]
+    for is_transmitted, total in ((True, closed_form.transmittance), (False, closed_form.reflectance)):
+        side = [i for i, order in enumerate(table) if order.is_transmitted == is_transmitted]
         if side:
             throughputs[side[-1]] = throughputs[side[-1]] + (total - sum(throughputs[i] for i in side))
     return throughputs
 
 
 def _powers(base: Tensor) -> Callable[[int], Tensor]:
-    """A function that returns integer powers of the base; each is computed once."""
+    """Returns a function that returns integer powers of the base. Each power is computed once."""
     cached = [torch.ones_like(base), base]
 
     def power(exponent: int) -> Tensor:
@@ -253,7 +260,7 @@ def _powers(base: Tensor) -> Callable[[int], Tensor]:
 def _surface_throughput(
     order: ReflectionOrder, panes: list[tuple[Callable[[int], Tensor], Callable[[int], Tensor]]]
 ) -> Tensor:
-    """The product of all reflectances and transmittances along one path of an order, for one polarisation."""
+    """Returns the product of all reflectances and transmittances along one path of an order, for one polarisation."""
     factors = [
         power(exponent)
         for (reflect, transmit), reflections, transmissions in zip(
@@ -266,7 +273,7 @@ def _surface_throughput(
 
 
 def in_plane_shifts_mm(glazing: Glazing, cosine: Tensor) -> list[Tensor]:
-    """Shift of a ray along the glass per traversal of each layer (pane, gap, pane...), in mm, (...) each."""
+    """Returns the shift of a ray along the glass for one traversal of each layer (pane, gap, pane...), in mm, (...) each."""
     shifts = []
     for pane in glazing.panes:
         inside = refracted_cosine(cosine, pane.refractive_index)
@@ -279,9 +286,10 @@ def _tangent(cosine: Tensor) -> Tensor:
 
 
 def ghost_distance_mm(pane: Pane, incidence_deg: float) -> float:
-    """Distance between the mirror images in a pane's two surfaces, across the view, in mm.
+    """Returns the distance between the mirror images in a pane's two surfaces, perpendicular to the view direction, in mm.
 
-    2 t tan(theta_t) cos(theta_i), with the thickness t, the angle of incidence theta_i and that of refraction theta_t.
+    The distance is 2 t tan(theta_t) cos(theta_i), where t is the thickness, theta_i the angle of incidence and theta_t
+    the angle of refraction.
     """
     cosine = torch.tensor(math.cos(math.radians(incidence_deg)), dtype=torch.float64)
     return float(2 * pane.thickness_mm * _tangent(refracted_cosine(cosine, pane.refractive_index)) * cosine)

@@ -1,7 +1,8 @@
 """Rough or wedged panes: each order is traced from surface to surface, with one microfacet sample per rough surface.
 
-At each surface every path is split into a reflected and a transmitted one, without a random choice between them. A path
-that exits through a rough surface towards a map uses multiple importance sampling (Veach 1997, chapter 9): with microfacet samples alone, very few rays hit a small sun, and the image is noisy.
+At each surface, every path is split into a reflected and a transmitted path, without a random choice between them. A path
+that exits through a rough surface towards a map uses multiple importance sampling (Veach 1997, chapter 9), because with
+microfacet samples alone, very few rays hit a small sun, and the image is noisy.
 """
 
 from __future__ import annotations
@@ -21,8 +22,8 @@ from brewster.render.rays.vectors import dot, normalize
 from brewster.scene.glass import Glazing
 
 MIN_PATH_WEIGHT: Final = 1e-4
-"""Paths with a smaller mean weight are not traced further. It is larger than `layered_glass.MIN_ORDER_WEIGHT`, because
-paths cannot be merged here, so their number grows faster."""
+"""Paths with a smaller mean weight are not traced further. The limit is larger than `layered_glass.MIN_ORDER_WEIGHT`,
+because paths cannot be merged here, so their number grows faster."""
 _MAX_DISTANCE_MM: Final = 1e7
 _MIN_LIGHT_SAMPLING_WEIGHT: Final = 3e-3
 """Orders with a smaller mean weight use microfacet samples only; their noise is too faint to see."""
@@ -30,7 +31,7 @@ _MIN_LIGHT_SAMPLING_WEIGHT: Final = 3e-3
 
 @dataclass(frozen=True)
 class Surface:
-    """One surface of a pane: its height on the z axis, its normal towards the camera, (3, 1), and the medium below it."""
+    """One surface of a pane: its height on the z axis, its normal towards the camera, (3, 1), and its material."""
 
     height_mm: float
     normal: Tensor
@@ -50,8 +51,8 @@ class _PathState:
     s: Tensor
     p: Tensor
     surface: int
-    """The surface that the rays meet next; -1 or the number of surfaces when they have left the glass."""
-    down: bool
+    """The index of the next surface; -1 or the number of surfaces after the rays have left the glass."""
+    is_downward: bool
     """Whether the rays go away from the camera."""
     reflections: int
     entered_last_pane: bool
@@ -59,7 +60,7 @@ class _PathState:
 
 @dataclass(frozen=True)
 class ExitingLight:
-    """The light of one order from one side, (3, N); `in_truncated_layers` says whether the paper's T or R contains it."""
+    """The light of one order from one side, (3, N); `in_truncated_layers` is True if the paper's T or R contains it."""
 
     is_transmitted: bool
     in_truncated_layers: bool
@@ -67,32 +68,31 @@ class ExitingLight:
 
 
 def surfaces(glass: Glazing, like: Tensor) -> list[Surface]:
-    """The surfaces of a glazing in the glass frame, starting with the one nearest to the camera; tensors have the dtype and device of `like`.
+    """Returns the surfaces of a glazing in the glass frame, from the nearest to the camera to the farthest.
 
-    A wedge rotates the pane's far surface.
+    A wedge rotates the far surface of a pane. The tensors have the dtype and the device of `like`.
     """
-    stack, height = [], 0.0
+    stack, height_mm = [], 0.0
     for pane in glass.panes:
         absorption = like.new_tensor(pane.absorption_per_m)[:, None] / 1000
-        for far in (False, True):
-            wedge = torch.tensor(pane.wedge_deg if far else 0.0).deg2rad()
+        for is_far in (False, True):
+            wedge = torch.tensor(pane.wedge_deg if is_far else 0.0).deg2rad()
             normal = like.new_tensor([wedge.sin(), 0, wedge.cos()])[:, None]
-            height -= pane.thickness_mm if far else 0.0
-            alpha = (
-                pane.roughness if pane.refractive_index > 1 else 0.0
-            )  # without refraction there is no scattering
-            stack.append(Surface(height, normal, alpha, pane.refractive_index, not far, absorption))
-        height -= glass.gap_mm
+            height_mm -= pane.thickness_mm if is_far else 0.0
+            # Without refraction there is no scattering.
+            alpha = pane.roughness if pane.refractive_index > 1 else 0.0
+            stack.append(Surface(height_mm, normal, alpha, pane.refractive_index, not is_far, absorption))
+        height_mm -= glass.gap_mm
     return stack
 
 
 def trace_orders(
     glass: Glazing, rays: Rays, behind: SideEmitters, front: SideEmitters, sobol: SobolPoints
 ) -> Iterator[ExitingLight]:
-    """Traces every order of the rays until its weight is too small; yields the light of each order that exits.
+    """Traces every order of the rays until its weight is too small. Yields the light of each order that exits.
 
-    Each refraction scales radiance by the squared ratio of the indices. Every path starts and ends in air, so these
-    factors cancel and are left out.
+    Each refraction scales radiance by the squared ratio of the refractive indices. Every path starts and ends in air, so
+    these factors cancel and are left out.
     """
     stack = surfaces(glass, rays.direction)
     ones = torch.ones_like(rays.direction)
@@ -112,7 +112,10 @@ def trace_orders(
 
 
 def _mean_weight(path: _PathState) -> float:
-    """The mean over all rays and polarisations: total reflection at a microfacet gives some rays the weight 0 or 1."""
+    """Returns the mean weight over all rays and polarisations.
+
+    The weights of single rays are no measure, because total reflection at a microfacet gives some rays the weight 0 or 1.
+    """
     return float((path.s + path.p).mean()) / 2
 
 
@@ -130,19 +133,19 @@ class _SurfaceInteraction:
     index_out: float
     reflects: bool
     before: _PathState
-    """The path as it arrives, with its weights before the surface."""
+    """The path at the surface, with its weights before the interaction."""
 
 
 def _interact(
     path: _PathState, stack: list[Surface], sobol: SobolPoints
 ) -> Iterator[tuple[_PathState, _SurfaceInteraction]]:
-    """Splits a path at its next surface: yields the reflected path, then the transmitted one."""
+    """Splits a path at its next surface. Yields the reflected path, then the transmitted path."""
     surface = stack[path.surface]
-    in_glass = surface.glass_is_below != path.down
+    in_glass = surface.glass_is_below != path.is_downward
     distance = (_plane_offset(surface) - dot(surface.normal, path.origin)) / dot(
         surface.normal, path.direction
     )
-    # Paths of weight 0 may run parallel to the glass: their distance must stay finite, or 0 * inf gives NaN.
+    # Paths of weight 0 may be parallel to the glass. Their distance must stay finite, because 0 * inf gives NaN.
     distance = distance.nan_to_num(0, 0, 0).clamp(0, _MAX_DISTANCE_MM)
     point = path.origin + distance * path.direction
     # Beer-Lambert law over the length of each ray.
@@ -150,7 +153,7 @@ def _interact(
         torch.exp(-surface.absorption * distance) if in_glass else torch.ones_like(surface.absorption)
     )
     before = replace(path, origin=point, s=path.s * transmittance, p=path.p * transmittance)
-    normal = surface.normal if path.down else -surface.normal
+    normal = surface.normal if path.is_downward else -surface.normal
     wi = -path.direction
     facet = sample_visible_normal(wi, normal, surface.alpha, sobol.next_2d()) if surface.alpha else normal
     index_in, index_out = (surface.refractive_index, 1.0) if in_glass else (1.0, surface.refractive_index)
@@ -169,29 +172,30 @@ def _path_after(
     *,
     is_last_pane: bool,
 ) -> _PathState:
-    """The path after a surface; `is_last_pane` marks the first surface of the last pane."""
-    before, down = interaction.before, interaction.before.down != interaction.reflects
+    """Returns the path after a surface. `is_last_pane` is True at the first surface of the last pane."""
+    before = interaction.before
+    is_downward = before.is_downward != interaction.reflects
     return _PathState(
         before.origin,
         direction,
         before.s * weights[0],
         before.p * weights[1],
-        before.surface + (1 if down else -1),
-        down,
+        before.surface + (1 if is_downward else -1),
+        is_downward,
         before.reflections + interaction.reflects,
-        before.entered_last_pane or (is_last_pane and before.down and not interaction.reflects),
+        before.entered_last_pane or (is_last_pane and before.is_downward and not interaction.reflects),
     )
 
 
 def _plane_offset(surface: Surface) -> Tensor:
-    """d of the plane equation dot(normal, x) = d."""
+    """Returns d of the plane equation dot(normal, x) = d, in mm."""
     return surface.normal[2] * surface.height_mm
 
 
 def _scattered_direction(interaction: _SurfaceInteraction, facet: Tensor) -> Tensor:
-    """The direction after reflection or refraction at microfacets (Walter et al. 2007, eq. 39 and 40).
+    """Returns the directions after reflection or refraction at microfacets (Walter et al. 2007, eq. 39 and 40).
 
-    Where total reflection leaves no refracted direction, the result is arbitrary; its weight is 0.
+    Under total reflection there is no refracted direction. The result is then arbitrary and its weight is 0.
     """
     cosine = dot(interaction.wi, facet)
     if interaction.reflects:
@@ -204,7 +208,7 @@ def _scattered_direction(interaction: _SurfaceInteraction, facet: Tensor) -> Ten
 def _facet_weights(
     interaction: _SurfaceInteraction, facet: Tensor, direction: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """BSDF times cosine over density, for s- and p-polarised light, (N,) each.
+    """Returns BSDF times cosine divided by density, for s- and p-polarised light, (N,) each.
 
     With visible normals and the separable Smith term G1(wi) G1(wo), everything except the Fresnel factor and G1(wo) cancels
     (Heitz 2018).
@@ -212,7 +216,7 @@ def _facet_weights(
     cosine = dot(interaction.wi, facet)
     reflected = _reflectances(cosine, interaction.index_in, interaction.index_out)
     cosine_out = dot(direction, interaction.normal) * (1 if interaction.reflects else -1)
-    # Facets that are seen from behind, or that send light to the wrong side of the surface, have weight 0.
+    # Facets seen from behind have weight 0, and so do facets that scatter light to the wrong side of the surface.
     valid = (cosine_out > 0) & (cosine > 0)
     visible = smith_g1(cosine_out, interaction.alpha) * valid if interaction.alpha else valid.float()
     s, p = ((r if interaction.reflects else 1 - r) * visible for r in reflected)
@@ -220,10 +224,10 @@ def _facet_weights(
 
 
 def _reflectances(cosine: Tensor, index_in: float, index_out: float) -> tuple[Tensor, Tensor]:
-    """Fresnel reflectances for s- and p-polarised light from either side; 1 under total reflection."""
+    """Returns Fresnel reflectances for s- and p-polarised light from either side; 1 under total reflection."""
     if index_in <= index_out:
         return fresnel(cosine.clamp(1e-4, 1), index_out)
-    # From inside, evaluate at the refracted angle in air: both directions of a path have the same reflectance.
+    # From inside, evaluate at the refracted angle in air, because both directions of a path have the same reflectance.
     squared = 1 - index_in**2 * (1 - cosine**2)
     s, p = fresnel(squared.clamp(min=1e-8).sqrt(), index_in)
     return torch.where(squared <= 0, 1.0, s), torch.where(squared <= 0, 1.0, p)
@@ -236,9 +240,9 @@ def _exit_radiance(
     footprint_px: float,
     sobol: SobolPoints,
 ) -> Tensor:
-    """The light of an order, (3, N): a microfacet sample and a light sample, joined by the balance heuristic.
+    """Returns the light of an order, (3, N): a microfacet sample and a light sample, combined by the balance heuristic.
 
-    The heuristic weighs a sample by its density over the sum of both densities (Veach 1997, eq. 9.8).
+    The heuristic weights a sample by its density divided by the sum of both densities (Veach 1997, eq. 9.8).
     """
     weight = (path.s + path.p) / 2
     radiance = emitters.radiance(path.origin, path.direction, footprint_px)
@@ -260,7 +264,7 @@ def _exit_radiance(
 
 
 def _half_vector(interaction: _SurfaceInteraction, direction: Tensor) -> Tensor:
-    """Normals of the facets that scatter `wi` into `direction` (Walter et al. 2007, eq. 13 and 16)."""
+    """Returns the normals of the facets that scatter `wi` into `direction` (Walter et al. 2007, eq. 13 and 16)."""
     if interaction.reflects:
         half = interaction.wi + direction
     else:
@@ -270,7 +274,7 @@ def _half_vector(interaction: _SurfaceInteraction, direction: Tensor) -> Tensor:
 
 
 def _scattering_pdf(interaction: _SurfaceInteraction, direction: Tensor) -> Tensor:
-    """The density of microfacet samples at `direction`, per steradian, (N,).
+    """Returns the density of microfacet samples at `direction`, per steradian, (N,).
 
     It is the density of the facet's normal times the Jacobian of the half vector (Walter et al. 2007, eq. 14 and 17).
     """

@@ -15,20 +15,25 @@ from torch.quasirandom import SobolEngine
 
 
 class SobolPoints:
-    """2-D points in [0, 1) for N pixels; each call of `next_2d` for a sample returns the next two dimensions."""
+    """2-D points in [0, 1) for each pixel and sample. Each call of `next_2d` returns the next two dimensions."""
 
-    def __init__(self, seed: int, index: int, pixels: int, samples: int, device: torch.device | str) -> None:
+    def __init__(
+        self, seed: int, index: int, pixel_count: int, sample_count: int, device: torch.device | str
+    ) -> None:
         self._generator = torch.Generator().manual_seed(seed * 1_000_003 + index)
-        self._pixel_count, self._sample_count, self._device = pixels, samples, device
+        self._pixel_count, self._sample_count, self._device = pixel_count, sample_count, device
         self._sequences: list[tuple[Tensor, Tensor]] = []
-        self.start_sample(0, slice(0, pixels))
+        self.start_sample(0, slice(0, pixel_count))
 
     def start_sample(self, number: int, pixels: slice) -> None:
-        """Selects sample `number` (0 to `samples` - 1) of the pixels in the slice, and restarts at the first dimension."""
+        """Selects sample `number` of the pixels in the slice, and restarts at the first dimension.
+
+        `number` is in 0..`sample_count` - 1.
+        """
         self._sample, self._pixels, self._next = number, pixels, 0
 
     def next_2d(self) -> Tensor:
-        """The next point of each selected pixel, (2, n) in [0, 1)."""
+        """Returns the next point of each selected pixel, (2, n) in [0, 1)."""
         if self._next == len(self._sequences):
             self._sequences.append(self._new_sequence())
         points, shift = self._sequences[self._next]
@@ -37,10 +42,10 @@ class SobolPoints:
         return shifted - shifted.floor()
 
     def next_disc(self) -> Tensor:
-        """A point on the unit disc for each selected pixel, (2, n), uniform by area.
+        """Returns a point on the unit disc for each selected pixel, (2, n), uniform by area.
 
-        The concentric map (Shirley and Chiu 1997) keeps points that are close in the square close on the disc, so
-        the low discrepancy of the sequence survives.
+        The concentric map (Shirley and Chiu 1997) maps close points of the square to close points of the disc. This
+        keeps the low discrepancy of the sequence.
         """
         x, y = self.next_2d() * 2 - 1
         x_is_larger = x.abs() > y.abs()
@@ -52,7 +57,7 @@ class SobolPoints:
     def _new_sequence(self) -> tuple[Tensor, Tensor]:
         scramble = int(torch.randint(2**31, (), generator=self._generator))
         points = SobolEngine(2, scramble=True, seed=scramble).draw(self._sample_count)  # type: ignore[no-untyped-call]
-        # Without a random order, sample i would have similar points in all pairs of dimensions: pairs would correlate.
+        # The random order prevents correlations: without it, sample i has similar points in all pairs of dimensions.
         points = points[torch.randperm(self._sample_count, generator=self._generator)]
         shift = torch.rand(2, self._pixel_count, generator=self._generator)
         return points.to(self._device), shift.to(self._device)

@@ -6,10 +6,10 @@ from torch import Tensor
 
 
 def dot(a: Tensor, b: Tensor) -> Tensor:
-    """Inner products, (N,)."""
+    """Returns the inner products of two arrays of vectors, (N,)."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 def normalize(vectors: Tensor) -> Tensor:
-    """The vectors scaled to length 1; zero vectors stay zero."""
+    """Returns the vectors scaled to length 1. Zero vectors stay zero."""
     return vectors * dot(vectors, vectors).clamp(min=1e-30).rsqrt()

@@ -1,1 +1,1 @@
-"""Generation of rendered sets: job, executors (one process, several processes, a Ray cluster), index and preview."""
+"""Generation of rendered datasets: the job, the workers that render its samples, the index and the preview."""

@@ -1,10 +1,11 @@
-"""Renders sets: the job, the schedule of its tasks, and the lock. The executors are in `brewster.executors`.
+"""Renders datasets: the job, the schedule of its tasks, and the lock. The executors are in `brewster.executors`.
 
     job = RenderJob(Path("out/window"), read_scene_recipe("window"), read_catalog([], [])[0], seed=7)
     build(job, range(1000), ProcessExecutor(partial(TaskRunner, job), 8))
 
-A sample depends only on (job, index). The process that renders it writes it atomically. So every existing sample is
-complete, a killed run needs no other state to resume, and memory and time per sample do not depend on the number of samples.
+A sample depends only on the job and its index. The process that renders a sample writes it atomically. Therefore every
+existing sample is complete, and a killed run needs no other state to resume. Memory and time per sample do not depend on
+the number of samples.
 """
 
 from __future__ import annotations
@@ -38,7 +39,7 @@ FATAL_ERRORS: Final = (OutputError, MissingExtra, DeviceError)
 @final
 @dataclass(frozen=True)
 class RenderJob:
-    """What to render, and the folder of the set. All values except `out` and `folders` determine the bytes of the set.
+    """The dataset to render. All values except the folder `out` and `folders` determine the bytes of the dataset.
 
     `renderer` is a name in workers.RENDERERS or "module:function". `folders` contain the files of the catalog.
     """
@@ -51,7 +52,7 @@ class RenderJob:
     folders: tuple[Path, ...] = ()
 
     def record(self) -> dict[str, Any]:
-        """Returns the values that determine the bytes of the set, for set.toml."""
+        """Returns the values that determine the bytes of the dataset, for set.toml."""
         return {
             "format": store.SAMPLE_FORMAT,
             "renderer": self.renderer,
@@ -64,7 +65,10 @@ class RenderJob:
 @final
 @dataclass(frozen=True)
 class RenderTask:
-    """The indices of samples to render ("render"), or of blocks of a hundred samples to pack into shards ("pack")."""
+    """A task for a worker: to render samples ("render"), or to pack blocks of a hundred samples into shards ("pack").
+
+    `indices` are the indices of the samples or of the blocks.
+    """
 
     kind: Literal["render", "pack"]
     indices: tuple[int, ...]
@@ -111,19 +115,19 @@ def build(
     shards: bool = False,
     report: ResultCallback = lambda _: None,
 ) -> None:
-    """Renders the missing samples of a set, packs them into shards on request, and writes the index.
+    """Renders the missing samples of a dataset, packs them into shards if `shards` is True, and writes the index.
 
     A sample that fails is reported and skipped. The next call renders it again.
 
     Args:
-        job: what to render, and the folder of the set.
+        job: the dataset to render.
         indices: the indices of the samples.
-        executor: runs the tasks.
+        executor: the executor that runs the tasks.
         shards: whether to pack every hundred samples into a tar file.
-        report: called with the result of every sample.
+        report: a function that is called with the result of every sample.
 
     Raises:
-        OutputError: the folder contains something else, another run writes to it, or the disk is full or read-only.
+        OutputError: the folder has other content, another run writes to it, or the disk is full or read-only.
         MissingExtra, DeviceError: the renderer cannot run on this machine.
     """
     with _exclusive_lock(job.out):
@@ -150,11 +154,11 @@ class _Schedule:
         self._shards, self._report = shards, report
         self._blocks_to_pack: deque[int] = deque()
         self._remaining: dict[int, int] = {}
-        """Block -> number of samples that must be rendered before the block is packed."""
+        """For each block, the number of samples that must be rendered before the block is packed."""
         self._render_tasks = self._plan_tasks()
 
     def next(self) -> RenderTask | None:
-        """Returns the next task, or None: no task can start until another result is recorded, or all tasks were returned."""
+        """Returns the next task. Returns None after the last task, and if no task can start before the next result."""
         return (
             RenderTask("pack", (self._blocks_to_pack.popleft(),))
             if self._blocks_to_pack
@@ -190,7 +194,7 @@ class _Schedule:
                 yield RenderTask("render", tuple(missing[first : first + self._chunk_size]))
 
 
-# --- the lock and the record of a set: a set belongs to one job, and one run writes to it at a time
+# --- the lock and the record of a dataset: a dataset has one job, and only one run at a time writes to it
 
 
 @contextmanager
@@ -202,7 +206,7 @@ def _exclusive_lock(out: Path) -> Iterator[None]:
     except OSError as error:
         raise OutputError(
             f"{out} cannot be written to ({error.strerror})",
-            "expected a folder for the set",
+            "expected a folder for the dataset",
             "choose another folder",
         ) from error
     lock = filelock.FileLock(out / _LOCK_FILE, blocking=False, fallback_to_soft=False)
@@ -218,20 +222,20 @@ def _acquire(lock: filelock.BaseFileLock, out: Path) -> None:
         lock.acquire()
     except filelock.Timeout as error:
         raise OutputError(
-            f"another run is writing in {out}",
-            "expected no other run, because only one can write at a time",
-            "wait until it has ended, or choose another folder",
+            f"another run is writing to {out}",
+            "expected no other run, because only one run at a time can write to a dataset",
+            "wait until the other run has ended, or choose another folder",
         ) from error
     except OSError as error:
         raise OutputError(
             f"{out} cannot be locked ({error.strerror})",
-            "expected a file system with locks, so that only one run writes to a set",
+            "expected a file system with locks, so that only one run writes to a dataset",
             "choose a folder on another file system",
         ) from error
 
 
 def _check_record(job: RenderJob) -> None:
-    """Writes the record of the job into a new set, or compares it with the record of an existing set."""
+    """Writes the record of the job into a new dataset, or compares it with the record of an existing dataset."""
     path, text = job.out / RECORD_FILE, tomli_w.dumps(job.record())
     if not path.exists():
         _check_is_set(job.out)
@@ -242,8 +246,8 @@ def _check_record(job: RenderJob) -> None:
         old, new = existing.get(name, "not set"), requested.get(name, "not set")
         if old != new:
             raise OutputError(
-                f"{job.out} contains another set: its {name} is {old}, and {new} was requested",
-                "expected the settings of that set, or a new folder",
+                f"{job.out} contains another dataset: its {name} is {old}, and {new} was requested",
+                "expected the settings of that dataset, or a new folder",
                 "choose another folder, or use the same settings",
             )
 
@@ -253,7 +257,7 @@ def _read_record(path: Path) -> dict[str, Any]:
         return tomllib.loads(path.read_text("utf-8"))
     except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
         raise OutputError(
-            f"{path} cannot be read ({error})", "expected the record of a set", "choose another folder"
+            f"{path} cannot be read ({error})", "expected the record of a dataset", "choose another folder"
         ) from error
 
 
@@ -261,14 +265,14 @@ def _check_is_set(out: Path) -> None:
     foreign = next((path for path in out.iterdir() if not path.name.startswith(".")), None)
     if foreign:
         raise OutputError(
-            f"{out} contains {foreign.name}, but no set",
-            "expected an empty folder or a set",
+            f"{out} contains {foreign.name}, but no rendered dataset",
+            "expected an empty folder or a rendered dataset",
             "choose a new folder",
         )
 
 
 def _flatten(table: dict[str, Any], before: str = "") -> Iterator[tuple[str, object]]:
-    """Yields (dotted name, value) for every value of nested tables."""
+    """Yields the dotted name and the value of every value of nested tables."""
     for name, value in table.items():
         if isinstance(value, dict):
             yield from _flatten(value, f"{before}{name}.")

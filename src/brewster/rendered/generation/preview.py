@@ -1,4 +1,4 @@
-"""Writes index.parquet, with a row for each sample of a set, and preview.png, a contact sheet of its first samples."""
+"""Writes index.parquet, with a row for each sample of a dataset, and preview.png, a contact sheet of the first samples."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ COLUMNS: Final = {
     "renderer": ("string", "outcome.renderer"),
     "version": ("string", "outcome.version"),
 }
-"""Column of the index -> its type, and its path in scene.toml. Pane 0 is the one nearest to the camera."""
+"""The type of each column of the index, and its path in scene.toml. Pane 0 is the pane nearest to the camera."""
 
 
 def write_index(out: Path) -> None:
@@ -87,7 +87,7 @@ def _row(entry: StoredSample) -> dict[str, Any]:
     return columns | {name: _lookup(scene, path.split(".")) for name, (_, path) in COLUMNS.items()}
 
 
-def _lookup(table: Any, path: list[str]) -> Any:  # noqa: ANN401  (what TOML holds)
+def _lookup(table: Any, path: list[str]) -> Any:  # noqa: ANN401  (any value of TOML)
     """Returns the value at a path, or None if the scene has no such part."""
     for part in path:
         if isinstance(table, dict) and part not in table:
@@ -104,7 +104,7 @@ _WHITE: Final = 255
 
 
 def write_preview(out: Path) -> None:
-    """Writes preview.png with the first 40 samples. The five photographs of a sample form a row.
+    """Writes preview.png with the first 40 samples. A row shows the five photographs of a sample.
 
     Raises:
         OutputError: the file cannot be written.

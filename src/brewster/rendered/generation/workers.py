@@ -1,7 +1,7 @@
-"""Runs the tasks of a render job. The processes that run it are in `brewster.executors`.
+"""Runs the tasks of a render job. `brewster.executors` starts the processes that use this module.
 
-Every process uses one torch thread. With several threads, the order of sums depends on the number of cores, and so do the
-bytes of a sample.
+Every process uses one torch thread. With several threads, the order of sums depends on the number of cores, and therefore
+the bytes of a sample, too.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ RENDERERS: Final = {
     "analytic": "brewster.render.analytic:render",
     "mitsuba": "brewster.render.mitsuba.renderer:trace",
 }
-"""Name of a renderer -> its module and function."""
+"""The module and the function of each renderer by name."""
 
 
 @final
@@ -39,7 +39,7 @@ class TaskRunner:
         self._job, self._assets = job, Assets(job.folders)
 
     def __call__(self, task: RenderTask) -> list[RenderResult]:
-        """Runs a task. Returns the results of all samples; for packing, only those of failures.
+        """Runs a task. Returns the results of all samples. A task that packs samples returns only failed results.
 
         Raises:
             OutputError, MissingExtra, DeviceError: an error that occurs for every sample.
@@ -58,7 +58,7 @@ class TaskRunner:
 
     def _render(self, index: int) -> None:
         folder = self._job.out / store.key(index)
-        if not folder.is_dir():  # a worker that died may have finished a part of the task
+        if not folder.is_dir():  # a worker that died may have rendered some samples of the task
             scene = draw(self._job.recipe, self._job.catalog, self._job.seed, index)
             sample = find_renderer(self._job.renderer)(scene, self._assets)
             store.write_folder(folder, store.encode_sample(sample, self._job.renderer))
@@ -75,7 +75,7 @@ class TaskRunner:
             return RenderResult(
                 index,
                 "failed",
-                error="the sample does not fit into memory; use fewer --workers",
+                error="the sample does not fit into memory; expected more free memory; use fewer --workers",
                 kind="MemoryError",
             )
         except Exception as bug:  # noqa: BLE001  (a bug in one sample must not end the run)
