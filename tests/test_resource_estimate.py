@@ -76,7 +76,7 @@ def test_a_recipe_that_does_not_fit_is_refused_with_a_change_that_fits(klein):
 
 def test_cards_are_found_by_name_and_the_papers_is_the_default_without_a_gpu(monkeypatch):
     assert find_gpu("rtx 4090") == CARD
-    with pytest.raises(DeviceError, match=r"no card 'rtx 4099' .*; did you mean RTX 4090"):
+    with pytest.raises(DeviceError, match=r"no GPU 'rtx 4099' .*; did you mean RTX 4090"):
         find_gpu("rtx 4099")
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     assert find_gpu() == CARD
@@ -112,9 +112,9 @@ def test_the_plan_reads_the_data(run_without_model, tmp_path, monkeypatch):
 
 def test_the_plan_lists_download_and_host_memory(klein):
     assert re.search(r"host memory +11\.5 GiB, while the text encoders encode the prompt", klein.table())
-    assert re.search(r"download +16 GB, of them 8 GB text encoders", klein.table())
+    assert re.search(r"download +16 GB, of which 8 GB are text encoders", klein.table())
     encoded = estimate_resources(with_value(klein.recipe, "prompt", "prompt.safetensors"), CARD)
-    assert re.search(r"download +8 GB, of them 0 GB text encoders", encoded.table())
+    assert re.search(r"download +8 GB, of which 0 GB are text encoders", encoded.table())
 
 
 def test_white_space_and_the_optimiser_change_the_estimate():

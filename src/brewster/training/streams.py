@@ -1,4 +1,5 @@
-"""Opens the training data of a recipe. Photos, maps and pairs are read into memory at once, rendered samples when needed.
+"""Opens the training data of a recipe. Photos, maps and pairs are read into memory at once; rendered samples are read when
+they are needed.
 
 stream = open_stream(read_recipe(Path("recipes/train/tiny.toml")))
 batch = stream(step=0, count=2, size=64)
@@ -102,7 +103,7 @@ def _open_unpaired(recipe: CompactRecipe, device: torch.device | str) -> Stream:
 
 
 def _interleave(share: float, first: Callable[[], Stream], second: Callable[[], Stream]) -> Stream:
-    """Returns both streams interleaved. A stream with a share of 0 is not opened; the other one is returned."""
+    """Interleaves two streams; `share` is the share of the first. If one stream has a share of 0, only the other is opened."""
     if share in (0, 1):
         return first() if share else second()
     return InterleavedStream(first(), second(), share)
