@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 @final
 @dataclass(frozen=True)
 class ParallelBatchCommand:
-    """The options of an archive. `run` separates the photos and prints the results."""
+    """The options of a batch in several processes or on a cluster. `run` separates the photos and prints the results."""
 
     options: Options
     output: str | None
@@ -40,7 +40,7 @@ class ParallelBatchCommand:
     quiet: bool = False
 
     def run(self, photos: Sequence[str]) -> bool:
-        """Separates all photos and prints the results. They are not stored, so that memory does not grow with them.
+        """Separates all photos and prints the results. Results are not stored, because a batch can have millions of photos.
 
         Returns:
             Whether no photo failed.
@@ -95,6 +95,6 @@ class ParallelBatchCommand:
 
 
 def _absolute(path: str) -> Location:
-    """Returns the absolute path or the URL: the workers may have other working folders."""
+    """Returns the absolute path or the URL, because workers may have other working folders."""
     found = location(path)
     return Path(os.path.abspath(found)) if isinstance(found, Path) else found  # noqa: PTH100  (keeps links)
