@@ -1,4 +1,4 @@
-"""Helpers for tests of rendered sets: jobs with a fake renderer, and the content of folders."""
+"""Helpers for tests of rendered datasets: jobs with a fake renderer, and the content of folders."""
 
 import hashlib
 from functools import partial
@@ -15,7 +15,7 @@ def make_job(out, renderer="render", seed=7, recipe="tiny"):
 
 
 def render_set(out, count=4, first=0, executor=SerialExecutor, shards=False, **job_values):
-    """Renders a set. Returns the results of its samples."""
+    """Renders a dataset. Returns the results of its samples."""
     results = []
     job = make_job(out, **job_values)
     build(

@@ -10,7 +10,7 @@ def check_diffusion(monkeypatch, versions):
     return {check.name: check for check in doctor._diffusion()}
 
 
-def test_optional_parts_for_large_models_are_checked_if_diffusers_is_installed(monkeypatch):
+def test_optional_parts_for_diffusion_models_are_checked_if_diffusers_is_installed(monkeypatch):
     monkeypatch.setattr(huggingface_hub, "get_token", lambda: None)
     assert check_diffusion(monkeypatch, {}) == {}
     missing = check_diffusion(monkeypatch, {"diffusers": "1"})

@@ -1,4 +1,4 @@
-"""Resource estimates, compared with values that were counted and measured elsewhere (facts of the project)."""
+"""Resource estimates, compared with values that were counted and measured independently."""
 
 import re
 from pathlib import Path
@@ -20,7 +20,7 @@ def klein():
     return estimate_resources(read_recipe(RECIPES / "klein.toml"), CARD)
 
 
-def test_klein_fits_the_papers_card_with_the_known_sizes(klein):
+def test_klein_fits_the_papers_gpu_with_the_known_sizes(klein):
     assert klein.panel == (512, 512)
     assert klein.generated_tokens == klein.condition_tokens == 3 * 32 * 32
     assert klein.parameter_count == pytest.approx(3.88e9, rel=0.01)
@@ -74,7 +74,7 @@ def test_a_recipe_that_does_not_fit_is_refused_with_a_change_that_fits(klein):
             estimate.check_fits()
 
 
-def test_cards_are_found_by_name_and_the_papers_is_the_default_without_a_gpu(monkeypatch):
+def test_gpus_are_found_by_name_and_that_of_the_paper_is_the_default_without_a_gpu(monkeypatch):
     assert find_gpu("rtx 4090") == CARD
     with pytest.raises(DeviceError, match=r"no GPU 'rtx 4099' .*; did you mean RTX 4090"):
         find_gpu("rtx 4099")
