@@ -24,7 +24,7 @@ def test_klein_fits_the_papers_gpu_with_the_known_sizes(klein):
     assert klein.panel == (512, 512)
     assert klein.generated_tokens == klein.condition_tokens == 3 * 32 * 32
     assert klein.parameter_count == pytest.approx(3.88e9, rel=0.01)
-    assert klein.memory_gib["base"] == pytest.approx(7.2, abs=0.1)
+    assert klein.memory_gib["backbone"] == pytest.approx(7.2, abs=0.1)
     klein.check_fits()
     assert klein.total_gib < 16
 
@@ -45,7 +45,7 @@ def test_the_table_lists_tokens_memory_and_time(klein):
 def test_the_estimate_for_kontext_agrees_with_the_counts_for_the_paper():
     estimate = estimate_resources(read_recipe(RECIPES / "kontext.toml"), CARD)
     assert estimate.parameter_count == pytest.approx(11.9e9, rel=0.01)
-    assert estimate.memory_gib["base"] == pytest.approx(11.2, abs=0.2)
+    assert estimate.memory_gib["backbone"] == pytest.approx(11.2, abs=0.2)
     assert estimate.memory_gib["LoRA and AdamW"] == pytest.approx(1.3, abs=0.1)
     assert estimate.memory_gib["activations"] == pytest.approx(3.7, abs=0.2)
     assert estimate.tflop == pytest.approx(351, rel=0.01)

@@ -25,7 +25,7 @@ class _DeferredInterrupts:
     """Remembers a KeyboardInterrupt that Python has dropped, and raises it later.
 
     libvips calls Python to write its log. If Ctrl-C is pressed during such a call, the KeyboardInterrupt cannot pass
-    through the C code, so Python drops it. Without this class, the command would continue.
+    through the C code, so that Python drops it. Without this class, the command continues after Ctrl-C.
     """
 
     def __init__(self) -> None:

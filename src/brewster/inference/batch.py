@@ -248,7 +248,7 @@ class BatchRunner:
                 layer: _display_name(target) for layer, target in (outputs or task.outputs).items()
             }
             return result
-        # Not in the try block: without a model no photo can be separated, so a model error ends the batch.
+        # This is not in the try block, because no photo can be separated without a model: a model error ends the batch.
         self._separator = separator = self._separator or Separator.load(**self._options.load_options())
         result.model, result.model_sha256, result.device = separator.name, separator.sha256, separator.device
         try:

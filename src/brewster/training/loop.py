@@ -80,13 +80,13 @@ def run(
     on_step: StepCallback,
     on_start: StartCallback = lambda _completed, _steps, _seconds: None,
 ) -> None:
-    """Trains until the last step of the recipe; resumes from the checkpoint in `out` if there is one.
+    """Trains until the last step of the recipe. If `out` contains a checkpoint, resumes its run.
 
-    Every `checkpoint_every` steps it writes `checkpoint.pt` into `out`. Every `report_every` steps it validates, appends a
-    line to `log.jsonl`, replaces `samples.png` and the curves in `results.png`, and writes metrics and samples as TensorBoard
-    events. The logged `seconds` are those of the whole run: they include the time before an interruption, up to the
-    checkpoint. With several processes, all of them validate, and only rank 0 writes files. If the recipe has no data (a
-    count of 0), `run` takes no step, and the trainer keeps its initial weights.
+    Every `checkpoint_every` steps, this function writes `checkpoint.pt` into `out`. Every `report_every` steps, it validates,
+    appends a line to `log.jsonl`, replaces `samples.png` and the curves in `results.png`, and writes metrics and samples as
+    TensorBoard events. The logged `seconds` include the time before an interruption, up to the checkpoint. If there are several
+    processes, all processes validate, and only rank 0 writes files. If the recipe has no data (a count of 0), there are no
+    training steps, and the trainer keeps its initial weights.
 
     Raises:
         RecipeError: `out` contains a run of another recipe, or a run with more steps.

@@ -149,7 +149,7 @@ def _open_online(
     maps, photos = resolve_folders(rendered.maps), resolve_folders(rendered.photos)
     catalog, refused = read_catalog(maps, photos, recipe.data.excluded_files)
     if refused:
-        # A warning in the log of a long run would be overlooked, and the run would use less data than the recipe lists.
+        # This is an error, because a warning in the log of a long run is easy to overlook.
         raise refused[0]
     return OnlineRendered(
         _scene_recipe(rendered),

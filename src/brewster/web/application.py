@@ -93,7 +93,7 @@ def listen(host: str, port: int) -> socket.socket:
         raise OutputError(
             f"{host} port {port} cannot be used ({error.strerror})",
             "expected an address of this machine and a free port",
-            "choose others with --host and --port",
+            "choose another address with --host, or another port with --port",
         ) from error
 
 
@@ -130,7 +130,7 @@ def serve(
 
 @contextmanager
 def _sigterm_as_sigint() -> Iterator[None]:
-    """Handles SIGTERM like Ctrl-C. uvicorn raises the signal again after its shutdown, which would kill the process."""
+    """Handles SIGTERM like Ctrl-C. uvicorn raises the signal again after its shutdown, which kills the process if SIGTERM is not handled."""
     previous_handler = signal.signal(signal.SIGTERM, lambda *_: signal.raise_signal(signal.SIGINT))
     try:
         yield

@@ -70,7 +70,7 @@ def train(recipe: CompactRecipe, out: Path, on_step: StepCallback) -> nn.Module:
 
 
 class CompactTrainer:
-    """The `Trainer` of a compact network. It holds the network, the EMA of its weights, and the optimiser AdamW.
+    """The `Trainer` of a compact network. It contains the network, the EMA of its weights, and the optimiser AdamW.
 
     A `stream` replaces the training data of the recipe. `device` is "auto" for the GPU if there is one, or "cpu".
 
@@ -150,7 +150,9 @@ class CompactTrainer:
         loss = check_finite(torch.stack(list(parts.values())).sum(), step)
         self._set_learning_rates(step)
         norm = nn.utils.clip_grad_norm_(self.network.parameters(), _MAX_GRADIENT_NORM)
-        if norm.isfinite():  # otherwise skip the batch: one infinite gradient would destroy the weights
+        if (
+            norm.isfinite()
+        ):  # otherwise skip the batch, because one infinite gradient makes all weights invalid
             self.optimizer.step()
             self._update_ema(step + 1)
         return {"loss": loss.item(), **{f"loss_{name}": part.item() for name, part in parts.items()}}

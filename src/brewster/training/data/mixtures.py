@@ -1,4 +1,4 @@
-"""Linear-light mixtures of photographs: an endless stream of training data without a renderer.
+"""Mixtures of photos in linear light: an endless stream of training data without a renderer.
 
     stream = Mixtures(read_photos([Path("photos")]), read_maps([Path("hdri")]), MixRecipe(), seed=7)
     batch = stream(step=0, count=8, size=192)
@@ -364,7 +364,7 @@ def _mean_without_highlights(image: Image) -> Tensor:
 
 
 def _quantile(image: Tensor, fraction: float) -> float:
-    """Returns a quantile of every 29th value. A quantile of all values would take as long as the rest of the sample."""
+    """Returns a quantile of every 29th value. The quantile of all values takes as long as the rest of the sample."""
     values = image.flatten()[::29]
     return values.kthvalue(max(1, round(fraction * len(values)))).values.item()
 

@@ -92,7 +92,7 @@ def card_text(
 
 
 def with_benchmark_tables(card: str, tables: str) -> str:
-    """Returns the card with these Markdown tables under the heading for benchmarks, in place of earlier ones.
+    """Returns the card with these Markdown tables under the heading for benchmarks, in place of earlier tables.
 
     Raises:
         ModelError: the card has no heading for benchmarks.

@@ -133,7 +133,7 @@ class ResourceEstimate:
     def _cure(self) -> str:
         candidates: tuple[Quantization, ...] = ("int8", "nf4")
         for quantization in candidates:
-            saved = self.memory_gib["base"] - weights_gib(self.parameter_count, quantization)
+            saved = self.memory_gib["backbone"] - weights_gib(self.parameter_count, quantization)
             if saved > 0 and self.total_gib - saved <= self.card.memory_gib:
                 return f'set quantization = "{quantization}", which needs {self.total_gib - saved:.1f} GiB'
         return "lower max_composite_pixels or rank, or choose a smaller backbone (klein) or a GPU with more memory"
@@ -186,7 +186,7 @@ def estimate_resources(recipe: LoraRecipe, card: GraphicsCard) -> ResourceEstima
         _count_lora_parameters(backbone, recipe),
     )
     memory = {
-        "base": weights_gib(parameters, recipe.quantization),
+        "backbone": weights_gib(parameters, recipe.quantization),
         "VAE": 2 * vae / GIB,
         "LoRA and AdamW": lora_parameters * _BYTES_PER_LORA_WEIGHT[recipe.optimizer] / GIB,
         "activations": _activation_bytes(backbone, generated_tokens + condition_tokens + _PROMPT_TOKENS)

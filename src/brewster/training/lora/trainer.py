@@ -191,7 +191,7 @@ class LoraTrainer:
     def validate(self) -> tuple[dict[str, float], Tensor]:
         """Returns the mean PSNR gain of the generated T over the photo in dB for each folder, and an image of the panels.
 
-        The samples are divided among the processes, so that none waits for the others. All processes must call this.
+        The samples are divided among the processes. All processes must call this method.
         """
         samples = [layers for folder in self._validation_samples.values() for layers in folder]
         columns = [f"ground truth {panel}" for panel in "ITR"]
