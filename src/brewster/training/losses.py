@@ -35,7 +35,7 @@ def separation_loss(layers: Float[Tensor, "n 6 h w"], batch: TrainingBatch) -> d
     - edges: mean absolute error of the transmission's gradients, so that edges of the reflection are removed
       (Zhang et al. 2018).
     - log_mse: 0.04 times the mean logarithm of each image's mean squared error, so that easy images count as much as hard
-      images. This part is negative, because the mean squared error is usually below 1.
+      images. This part is usually negative, because the mean squared error is usually below 1.
 
     Returns:
         The parts of the loss by name, each a scalar. The loss is their sum.

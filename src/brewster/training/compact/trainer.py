@@ -150,9 +150,8 @@ class CompactTrainer:
         loss = check_finite(torch.stack(list(parts.values())).sum(), step)
         self._set_learning_rates(step)
         norm = nn.utils.clip_grad_norm_(self.network.parameters(), _MAX_GRADIENT_NORM)
-        if (
-            norm.isfinite()
-        ):  # otherwise skip the batch, because one infinite gradient makes all weights invalid
+        # Skip the batch if its gradient is infinite: one such step makes all weights invalid.
+        if norm.isfinite():
             self.optimizer.step()
             self._update_ema(step + 1)
         return {"loss": loss.item(), **{f"loss_{name}": part.item() for name, part in parts.items()}}

@@ -1,6 +1,6 @@
 """8-bit mixtures of the layers of a rendered sample: the baseline of the paper's ablation (Table 4, Figure 7).
 
-RDNet blends two tone-mapped images, I = alpha T + beta R - T o R, where o is the element-wise product. In this module, T is the
+RDNet blends two tone-mapped images, I = alpha T + beta R - T o R, where o is the element-wise product. In this formula, T is the
 background and R the mirror image of a rendered sample, so that the mixture shows the same two scenes as the rendered photo.
 """
 

@@ -120,9 +120,9 @@ def jpeg(encoded: Image, quality: int) -> Image:
     """Simulates JPEG compression of an encoded image at a quality of 1..100.
 
     The steps are a cosine transform of blocks of 8 x 8 px, quantization (tables K.1 and K.2 of Wallace, "The JPEG still
-    picture compression standard", CACM 34, 1991) and rounding to 8 bits. The chroma channels have full resolution. There is no
-    entropy coding, which is lossless; this therefore takes a tenth of the time of a codec. Both sides of the image must be
-    multiples of 8.
+    picture compression standard", CACM 34, 1991) and rounding to 8 bits. The chroma channels have full resolution. Entropy
+    coding is left out, because it is lossless. The simulation therefore takes a tenth of the time of a codec. Both sides of
+    the image must be multiples of 8.
     """
     scale = 50 / quality if quality < 50 else 2 - quality / 50
     luma, chroma = (_JPEG_TABLES * scale + 0.5).floor().clamp(1, 255)
