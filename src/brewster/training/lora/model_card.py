@@ -51,7 +51,7 @@ _LIMITS: Final = """## Limits
   uses it for the confidence, and flags a result with a large error.
 - **White areas.** The model can mistake a white area of the scene, such as a sign, for a reflection and remove it. It can also
   keep a white reflection as part of the scene. `brewster evaluate` measures both errors on rendered datasets, in the columns
-  "removed white" and "kept reflection".
+  "Removed white" and "Kept reflection".
 - It was trained only on the glass of its training data. Photos with rain, dirt, or curved or patterned panes may be separated incorrectly.
 - Each seed gives a different result. The mean of several results contains less invented detail."""
 
