@@ -1,4 +1,4 @@
-"""Shared fixtures. Each test runs offline and with one thread (threads of parallel tests would compete for the cores)."""
+"""Shared fixtures. Each test runs offline and with one thread (otherwise, the threads of parallel tests compete for the cores)."""
 
 import io
 import os
@@ -32,7 +32,7 @@ hypothesis.settings.load_profile("shared machine")
 
 BROWSER_TIMEOUT_MS = 120_000  # long, because the machine may be slow
 SLOW_SECONDS = 1800
-"""The time limit of a test marked as slow; that of the others is in pyproject.toml."""
+"""The time limit of a test marked as slow; the time limit of other tests is in pyproject.toml."""
 
 
 def pytest_collection_modifyitems(items):

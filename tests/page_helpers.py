@@ -9,7 +9,7 @@ from brewster import Photo
 
 
 def upload(page, *files):
-    """Adds files (name, bytes), and waits until all are done and the current one is shown or has failed."""
+    """Adds files (name, bytes), and waits until all photos are done and the current photo is shown or has failed."""
     page.set_input_files("#files", [{"name": name, "mimeType": "", "buffer": data} for name, data in files])
     page.wait_for_selector("#photos:not(:has(.waiting, .working)) li")
     page.wait_for_selector("glass-compare:not([hidden]), #error:not([hidden])")
@@ -21,7 +21,7 @@ def settle(page):
 
 
 def canvas(page, side):
-    """The pixels of one of the two compared pictures."""
+    """Returns the pixels of one of the two compared images."""
     value = page.evaluate("side => document.querySelector('glass-compare')[side].toDataURL()", side)
     return Photo.open(base64.b64decode(value.partition(",")[2])).pixels
 

@@ -17,7 +17,7 @@ _CHECKED = tuple(
     f"brewster.{package}."
     for package in ("evaluate", "inference", "models", "render", "rendered", "training")
 )
-"""Without metrics and user studies: these raise errors of their own for wrong shapes, which their tests check."""
+"""The checked packages. metrics and user_study are left out, because they raise their own errors for wrong shapes."""
 
 _JAXTYPING_IMPORT = b"from jaxtyping import"
 
@@ -40,7 +40,7 @@ class _Loader(_import_hook._JaxtypingLoader):
         return data.replace(b"\nif TYPE_CHECKING:", b"\nif True:") if path == self.path else data
 
     def set_data(self, path, data, **_):
-        """Writes no bytecode cache, because the bytecode differs from that of the file."""
+        """Writes no bytecode cache, because the bytecode is not that of the original file."""
 
 
 class _Finder(MetaPathFinder):

@@ -133,5 +133,7 @@ def test_a_port_in_use_is_an_error():
     with listen("127.0.0.1", 0) as taken:
         port = taken.getsockname()[1]
         assert server_url(taken) == f"http://127.0.0.1:{port}/"
-        with pytest.raises(OutputError, match=f"port {port} cannot be used .*; choose others with --host"):
+        with pytest.raises(
+            OutputError, match=f"port {port} cannot be used .*; choose another address with --host"
+        ):
             listen("127.0.0.1", port)

@@ -25,7 +25,7 @@ def test_an_unchanged_photo_has_nothing_removed_and_full_confidence():
     assert found.verdict == "little found"
 
 
-def test_half_of_the_light_removed_from_a_quarter_of_the_photo():
+def test_half_of_the_light_removed_from_a_quarter_of_the_photo_is_measured():
     transmission = grey(0.4)
     transmission[:12, :16] = 0.2
     confidence = certain(0.9)

@@ -250,7 +250,7 @@ sys.exit(main(sys.argv[1:]))
 
 
 def test_output_of_libraries_does_not_reach_standard_output(model, tmp_path):
-    """C code has its own buffer, which is written when the process exits: after any temporary redirection."""
+    """C code has its own buffer, which is written when the process exits, after any temporary redirection has ended."""
     command = [sys.executable, "-c", PRINTING_CLI, "-", "--model", model]
     process = subprocess.run(command, input=image_bytes(), capture_output=True, check=False)
     expected = run_process("-", "--model", model, input=image_bytes())

@@ -1,4 +1,4 @@
-"""Batches with damaged photos and unusable targets: no partial files, no lost files, and all other photos are separated."""
+"""Batches with damaged photos and unusable outputs: no partial files, no lost files, and all other photos are separated."""
 
 import errno
 import os
@@ -189,11 +189,11 @@ def test_link_loops_end(run, tmp_path):
     assert list_files(tmp_path / "out") == layer_files("a")
 
 
-# --- targets
+# --- outputs
 
 
-def test_a_target_that_cannot_be_written_is_an_error(run, tmp_path):
-    """The target is below a regular file: unlike permission bits, this is an error for root too."""
+def test_an_output_that_cannot_be_written_is_an_error(run, tmp_path):
+    """The output is below a regular file. Unlike permission bits, this is an error also for root."""
     (tmp_path / "a.jpg").write_bytes(image_bytes())
     (tmp_path / "file").write_bytes(b"kept")
     code, _, err = run("a.jpg", "-o", "file/below")
@@ -276,7 +276,7 @@ def test_no_photo_of_the_batch_is_overwritten(run, tmp_path):
     assert (tmp_path / "a.transmission.transmission.jpg").exists()
 
 
-def test_two_photos_with_the_same_target_are_rejected_before_any_is_separated(run, tmp_path):
+def test_two_photos_with_the_same_output_are_rejected_before_any_is_separated(run, tmp_path):
     for folder in ("x", "y"):
         (tmp_path / folder).mkdir()
         (tmp_path / folder / "a.jpg").write_bytes(image_bytes())

@@ -70,7 +70,7 @@ def test_an_output_with_an_unknown_suffix_is_refused(run_without_model, tmp_path
     (tmp_path / "a.jpg").write_bytes(image_bytes())
     code, _, err = run_without_model("a.jpg", "-o", name)
     assert code == 2
-    assert f"The suffix {Path(name).suffix} of -o" in " ".join(err.split())
+    assert f"-o ends in {Path(name).suffix}, but" in " ".join(err.split())
     assert list_files(tmp_path) == ["a.jpg"]
 
 
@@ -184,7 +184,7 @@ def test_an_impossible_contact_sheet_is_refused_before_any_work(run, tmp_path, a
 
 
 def completions(*words):
-    """The types and values that the shell is offered for the last of these words."""
+    """Returns the types and values that the shell offers for the last of these words."""
     *before, last = words
     items = ShellComplete(cli, {}, "brewster", "_BREWSTER_COMPLETE").get_completions(list(before), last)
     return {(item.type, item.value) for item in items}

@@ -33,7 +33,7 @@ def test_ctrl_c_while_a_file_is_written_leaves_no_partial_file(run, tmp_path, mo
 
 
 def raise_interrupt_in_c_callback():
-    """Simulates Ctrl-C while libvips calls Python to log: C code cannot pass the exception on, and Python drops it."""
+    """Simulates Ctrl-C while libvips calls Python to log: C code cannot propagate the exception, and Python drops it."""
 
     def raise_interrupt():
         raise KeyboardInterrupt

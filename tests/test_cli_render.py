@@ -50,10 +50,10 @@ def start_with_fake_renderer(*args, renderer="render", **options):
     return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, env=path, **options)
 
 
-def test_a_set_is_rendered_with_preview_and_each_scene_can_be_rendered_again(
+def test_a_dataset_is_rendered_with_preview_and_each_scene_can_be_rendered_again(
     run_without_model, tmp_path, monkeypatch
 ):
-    """Uses the real renderer and small environments; large ones take seconds each."""
+    """Uses the real renderer and small environments, because each large environment takes seconds."""
     monkeypatch.setattr(assets, "BUILTIN_HEIGHT", 32)
     options = ("--recipe", "tiny", "--count", 2, "--seed", 7, "--size", "48x32", "--orders", "truncated")
     code, out, err = run_without_model("render", "set", *options, "--workers", 0, "--json", "--preview")
@@ -141,7 +141,7 @@ def test_a_damaged_photo_is_excluded_and_reported(run_without_model, fake_render
         (("set", "--size", "8x8"), "from 16 to 16384"),
         (("set", "--count", "-1"), "--count"),
         (("set", "--maps", "nowhere"), "--maps"),
-        (("set", "--scene", "scene.toml", "--count", "3"), "--count belongs to a set"),
+        (("set", "--scene", "scene.toml", "--count", "3"), "--count is an option for datasets"),
     ],
 )
 def test_a_wrong_usage_is_explained(run_without_model, args, message):
@@ -181,7 +181,7 @@ def test_a_full_disk_is_one_error_line(tmp_path):
     assert sorted(path.name for path in (tmp_path / "set").iterdir()) == [".lock", "set.toml"]
 
 
-def test_a_killed_and_restarted_run_gives_the_same_set_as_an_undisturbed_one(
+def test_a_killed_and_restarted_run_gives_the_same_dataset_as_an_uninterrupted_run(
     run_without_model, fake_renderer, tmp_path
 ):
     command = ("--recipe", "tiny", "--count", 20, "--shards")

@@ -53,7 +53,7 @@ def test_a_photo_that_equals_its_ground_truth_has_a_finite_score():
 
 
 def test_pairs_that_became_worse_are_counted():
-    """Of four black predictions, one is worse than its photo, one is equal, and two are better."""
+    """One of four black predictions is worse than its photo, one is equal, and two are better."""
     black, grey = torch.zeros(1, 3, 32, 32), torch.full((1, 3, 32, 32), 0.4)
     pairs = [(grey, grey), (black, grey), (grey, black), (grey, black)]
     numbers = validate(torch.zeros_like, {"four": pairs})

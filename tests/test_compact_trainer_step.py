@@ -151,7 +151,7 @@ def logits(trainer, count=150):
 
 
 def test_training_times_are_logit_normal_with_the_recipes_mean_and_deviation(make_lora_trainer):
-    """The shift for the resolution adds a constant to the logit: it changes the mean alone."""
+    """The shift for the resolution adds a constant to the logit: it changes only the mean."""
     usual = logits(make_lora_trainer())
     assert usual.std().item() == pytest.approx(1, rel=0.15)
     trainer = make_lora_trainer(logit_mean=0.7, logit_std=0.2)

@@ -5,21 +5,21 @@ import huggingface_hub
 from brewster.cli import doctor
 
 
-def check_large(monkeypatch, versions):
+def check_diffusion(monkeypatch, versions):
     monkeypatch.setattr(doctor, "_version", versions.get)
-    return {check.name: check for check in doctor._large()}
+    return {check.name: check for check in doctor._diffusion()}
 
 
-def test_optional_parts_for_large_models_are_checked_if_diffusers_is_installed(monkeypatch):
+def test_optional_parts_for_diffusion_models_are_checked_if_diffusers_is_installed(monkeypatch):
     monkeypatch.setattr(huggingface_hub, "get_token", lambda: None)
-    assert check_large(monkeypatch, {}) == {}
-    missing = check_large(monkeypatch, {"diffusers": "1"})
+    assert check_diffusion(monkeypatch, {}) == {}
+    missing = check_diffusion(monkeypatch, {"diffusers": "1"})
     assert [check.cure for check in missing.values()] == ["pip install bitsandbytes", "hf auth login"]
     assert not any(check.needed for check in missing.values())
 
 
 def test_a_token_is_found_wherever_the_hub_client_finds_it_and_never_shown(monkeypatch):
     monkeypatch.setenv("HF_TOKEN", "hf_secret")
-    found = check_large(monkeypatch, {"diffusers": "1", "bitsandbytes": "2"})
+    found = check_diffusion(monkeypatch, {"diffusers": "1", "bitsandbytes": "2"})
     assert {check.status for check in found.values()} == {"ok"}
     assert "secret" not in found["hub token"].detail

@@ -1,4 +1,4 @@
-"""The Python API: arrays, PIL images, open files, notebooks, many photos, and models of the user."""
+"""The Python API: arrays, PIL images, open files, notebooks, many photos, and custom models."""
 
 import io
 import sys
@@ -37,7 +37,7 @@ def test_a_photo_is_an_array_of_its_stored_pixels():
 
 
 @pytest.mark.parametrize("mode", ["L", "LA", "RGB", "RGBA", "I;16"])
-def test_a_pil_image_survives_the_way_there_and_back(mode):
+def test_a_pil_image_is_unchanged_after_conversion_to_a_photo_and_back(mode):
     wide = Image.fromarray(np.arange(64, dtype=np.uint16).reshape(8, 8) * 1000)
     image = wide if mode == "I;16" else Image.fromarray(smooth()).convert(mode)
     again = Photo.open(image).to_pil()
@@ -162,7 +162,7 @@ def test_many_photos_need_a_thread_and_a_wrong_type_is_raised():
     assert list(SEPARATOR.many([])) == []
 
 
-# --- models of the user
+# --- custom models
 
 
 @pytest.mark.parametrize(

@@ -37,7 +37,7 @@ def backbone():
 
 @pytest.fixture(scope="module")
 def root(tmp_path_factory):
-    """A data folder with a rendered set, pairs without reflection, and pairs with reflection."""
+    """A data folder with a rendered dataset, pairs without reflection, and pairs with reflection."""
     root = tmp_path_factory.mktemp("data")
     render_set(root / "set", count=3)
     for folder, roles in (
@@ -187,7 +187,7 @@ def test_a_given_reflection_has_weight_one_and_a_missing_one_is_the_difference_i
 
 
 def test_a_small_sample_gets_the_panels_that_it_gets_at_inference(recipe, backbone):
-    """The paper's syn + real: a budget for large rendered samples, and pairs that are smaller than its panels."""
+    """The pixel budget is for large rendered samples, and the pairs are smaller than its panels ("syn + real" in the paper)."""
     mixed = recipe({**RENDERED, "pairs": ["large"], "pairs_share": 0.5}, max_composite_pixels=10**6)
     samples = open_samples(mixed)
     fits = samples.check_sizes(mixed, 16)

@@ -175,8 +175,8 @@ def test_a_run_can_be_made_longer_but_not_shorter(recipe, tmp_path):
         run(trainer, tmp_path, ignore_step)
 
 
-def test_a_resumed_run_is_announced_and_its_seconds_go_on(recipe, tmp_path, monkeypatch):
-    """The clock advances by one second at each step; the process is away for an hour."""
+def test_a_resumed_run_is_announced_and_continues_to_count_its_seconds(recipe, tmp_path, monkeypatch):
+    """The clock advances by one second at each step; an hour passes between the two processes."""
     now, starts = [0.0], []
     monkeypatch.setattr("brewster.training.loop.time.monotonic", lambda: now[0])
 
@@ -214,7 +214,7 @@ def test_the_curves_are_drawn_at_each_report(recipe, tmp_path):
 
     run(CountingTrainer(recipe), tmp_path, read)
     assert len(set(pictures)) == 2
-    assert Photo.open(tmp_path / "results.png").size[0] > 800  # two panels: loss and gain
+    assert Photo.open(tmp_path / "results.png").size[0] > 800  # two subplots: loss and gain
 
 
 def test_a_resumed_run_logs_every_step_once(recipe, tmp_path):

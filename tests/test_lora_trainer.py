@@ -100,7 +100,7 @@ def test_a_killed_and_resumed_run_ends_with_a_bit_identical_lora(recipe, rendere
         assert all(torch.equal(value, moments[1][index][name]) for name, value in values.items())
 
 
-def test_a_run_writes_a_log_pictures_and_a_folder_for_diffusers(recipe, tmp_path):
+def test_a_run_writes_a_log_images_and_a_folder_for_diffusers(recipe, tmp_path):
     place = train(recipe(), tmp_path).export(tmp_path)
     assert {path.name for path in place.iterdir()} == {
         LORA_FILE, "prompt.safetensors", "recipe.json", "README.md",
@@ -113,7 +113,7 @@ def test_a_run_writes_a_log_pictures_and_a_folder_for_diffusers(recipe, tmp_path
     assert Photo.open(tmp_path / "samples.png").size == (6 * 240, 20 + 20 + 160)
 
 
-def test_a_checkpoint_contains_the_lora_and_no_weights_of_the_base(make_trainer):
+def test_a_checkpoint_contains_the_lora_and_no_weights_of_the_backbone(make_trainer):
     state = make_trainer().state_dict()
     assert state.keys() == {"lora", "optimizer", "prompt"}
     assert all("lora_" in name and tensor.dtype == torch.float32 for name, tensor in state["lora"].items())
@@ -374,7 +374,7 @@ def test_an_encoded_prompt_is_used_if_it_was_encoded_for_this_backbone(recipe, t
 
 
 @pytest.mark.parametrize("quantization", [None, "int8"])
-def test_a_backbone_in_a_folder_trains_like_its_twin_quantized_or_not(recipe, tmp_path, quantization):
+def test_a_backbone_in_a_folder_trains_like_its_tiny_version_quantized_or_not(recipe, tmp_path, quantization):
     backbone, prompt = tiny("kontext")
     backbone.save(tmp_path / "base")
     prompt.save(tmp_path / "prompt.safetensors")
@@ -396,7 +396,7 @@ def test_a_backbone_in_a_folder_trains_like_its_twin_quantized_or_not(recipe, tm
     assert any(tensor.any() for name, tensor in changed.items() if "lora_B" in name)
 
 
-def test_a_twin_of_an_unknown_backbone_is_refused():
+def test_a_tiny_version_of_an_unknown_backbone_is_refused():
     data = {"data": {"pairs": ["x"], "pairs_share": 0.0, "rendered": {"datasets": ["x"], "count": 0}}}
     with pytest.raises(ModelError, match="there is no backbone 'contekst'"):
         LoraTrainer(LoraRecipe.model_validate(RECIPE | data | {"backbone": "tiny:contekst"}))

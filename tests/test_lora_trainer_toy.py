@@ -15,8 +15,8 @@ def transmissions(trainer, photos):
 
 
 def scores(tmp_path, name, *, vae_steps, pretraining, steps, unseen_count=96):
-    """Returns the mean PSNR of T in dB on unseen toy scenes for four predictions: the photo ("copy"), the mean T of the training
-    scenes ("mean"), the result of the base, and that of the base with the LoRA.
+    """Returns the mean PSNR of T in dB on unseen toy scenes for four predictions: the photo ("copy"), the mean T of the
+    training scenes ("mean"), the result of the backbone ("base"), and the result of the backbone with the LoRA ("LoRA").
     """
     prompt = pretrain(name, tmp_path / "base", vae_steps=vae_steps, steps=pretraining)
     training, unseen = scenes(2, 64, "blob", STRONG), scenes(3, unseen_count, "blob", STRONG)
@@ -45,7 +45,7 @@ def test_a_lora_improves_a_pretrained_toy_backbone_on_unseen_scenes(tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["kontext", "klein", "qwen"])
-def test_longer_training_beats_the_mean_of_the_training_scenes_in_every_family(tmp_path, name, capsys):
+def test_longer_training_beats_the_mean_of_the_training_scenes_for_every_backbone(tmp_path, name, capsys):
     found = scores(tmp_path, name, vae_steps=400, pretraining=400, steps=200)
     with capsys.disabled():
         print(f"\n{name}: " + ", ".join(f"{key} {value:.2f} dB" for key, value in found.items()))

@@ -1,4 +1,4 @@
-"""Manifests: tables of paths, and files that are no such tables."""
+"""Manifests: tables of paths, and files that are not such tables."""
 
 from pathlib import Path
 

@@ -59,14 +59,14 @@ def test_a_finetune_of_a_base_is_named_and_a_folder_is_not():
     assert "somebody" not in text
 
 
-def test_a_toy_is_marked_as_one_and_names_no_base():
+def test_a_lora_of_a_tiny_version_is_marked_and_names_no_base_model():
     text = card("lora-tiny")
     assert "**This model is for software tests.**" in text
     assert "base_model" not in ModelCard(text).data.to_dict()
     assert "**This model is for software tests.**" not in card()
 
 
-def test_sets_are_listed_with_their_scenes_and_without_local_paths(tmp_path, monkeypatch):
+def test_datasets_are_listed_with_their_scenes_and_without_local_paths(tmp_path, monkeypatch):
     render_set(tmp_path / "sets" / "paper", count=3)
     monkeypatch.setenv("BREWSTER_DATA", str(tmp_path))
     listed = "`sets/paper` (3 samples of the scenes `tiny`, orders all)"
@@ -167,7 +167,7 @@ def run_example(folder, monkeypatch, name, **replaced):
 
 @pytest.mark.parametrize("name", ["kontext", "klein"])
 def test_the_python_example_runs_in_bfloat16_with_a_float32_prompt(exported, tmp_path, monkeypatch, name):
-    """As for a LoRA that was really trained: the base is bfloat16, the files of the LoRA are float32."""
+    """The backbone is bfloat16, and the files of the LoRA are float32, as after training."""
     expected = exported(name, PanelLayout())
     picture = run_example(tmp_path, monkeypatch, name)
     assert (picture - expected).abs().mean() < 0.5 * expected.std()
@@ -182,7 +182,7 @@ def test_the_python_example_runs_in_bfloat16_with_a_float32_prompt(exported, tmp
         ("klein", PanelLayout(("T", "R"))),
     ],
 )
-def test_the_python_example_of_the_card_generates_the_same_picture(
+def test_the_python_example_of_the_card_generates_the_same_image(
     exported, tmp_path, monkeypatch, name, layout
 ):
     expected = exported(name, layout)

@@ -44,7 +44,7 @@ def test_the_file_has_two_bytes_for_each_weight(network, model_file):
 
 
 @pytest.mark.parametrize("size", [(1, 1), (33, 31), (5, 200)])
-def test_layers_have_the_size_of_the_tile_if_its_sides_are_no_multiples_of_the_stride(model_file, size):
+def test_layers_have_the_size_of_the_tile_if_its_sides_are_not_multiples_of_the_stride(model_file, size):
     for layer in OnnxBackend(model_file, "cpu")(np.full((*size, 3), 0.5, np.float32)):
         assert layer.shape == (*size, 3)
         assert np.isfinite(layer).all()
@@ -96,7 +96,7 @@ def test_a_device_that_does_not_start_is_an_error_and_auto_skips_it(model_file, 
     assert OnnxBackend(model_file, "auto").device == "cpu"
 
 
-def test_a_file_that_is_no_model_is_an_error(tmp_path):
+def test_a_file_that_is_not_a_model_is_an_error(tmp_path):
     (tmp_path / "text.onnx").write_text("hello")
     with pytest.raises(ModelError, match=r"text\.onnx"):
         OnnxBackend(tmp_path / "text.onnx")

@@ -247,7 +247,7 @@ def test_another_file_with_the_name_of_the_index_is_never_replaced(tmp_path):
 
 
 def test_layers_that_another_worker_has_written_in_the_meantime_are_kept(tmp_path, options, monkeypatch):
-    """A node that is cut off from the others continues, while its task is tried again on another node."""
+    """A node that has lost the connection continues, while another node repeats its task."""
     (tmp_path / "in").mkdir()
     (tmp_path / "in/a.jpg").write_bytes(image_bytes())
     tasks = plan_files(tmp_path / "in", tmp_path / "out", options)

@@ -225,7 +225,7 @@ def test_the_path_of_a_prompt_is_relative_to_the_recipe(tmp_path):
         (("rank = 16", "rnk = 16"), "no key rnk .*; did you mean rank"),
         (("rank = 16", "image_size_schedule = [[0.0, 64]]"), "no key image_size_schedule"),
         (('"int8"', '"int3"'), 'quantization is "int3"; .*; did you mean "int8"'),
-        (('"kontext"', '"tiny:kontext"'), "are inconsistent; expected no quantization: a toy backbone"),
+        (('"kontext"', '"tiny:kontext"'), "are inconsistent; expected no quantization: a tiny backbone"),
         (('["I", "T", "R"]', '["I", "T", "Q"]'), r"panels\.2"),
         (('["I", "T", "R"]', '["I", "R"]'), "inconsistent; expected panels .* T, .*\\['I', 'R'\\]"),
         (('["I", "T", "R"]', '["T", "T"]'), "inconsistent; expected panels .* at most once"),
@@ -236,11 +236,11 @@ def test_the_path_of_a_prompt_is_relative_to_the_recipe(tmp_path):
         ),
         (
             ('datasets = ["sets/paper"]', 'recipe = "window"'),
-            "inconsistent; expected rendered sets and pairs only",
+            "inconsistent; expected only rendered datasets and pairs",
         ),
         (
             ("[data.rendered]", 'photos = ["p"]\n[data.rendered]\nshare = 0.5'),
-            "inconsistent; expected rendered sets and pairs only",
+            "inconsistent; expected only rendered datasets and pairs",
         ),
         (
             ('objective = "flow"', 'objective = "two_step"'),

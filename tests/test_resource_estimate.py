@@ -1,4 +1,4 @@
-"""Resource estimates, compared with values that were counted and measured elsewhere (facts of the project)."""
+"""Resource estimates, compared with values that were counted and measured independently."""
 
 import re
 from pathlib import Path
@@ -20,11 +20,11 @@ def klein():
     return estimate_resources(read_recipe(RECIPES / "klein.toml"), CARD)
 
 
-def test_klein_fits_the_papers_card_with_the_known_sizes(klein):
+def test_klein_fits_the_papers_gpu_with_the_known_sizes(klein):
     assert klein.panel == (512, 512)
     assert klein.generated_tokens == klein.condition_tokens == 3 * 32 * 32
     assert klein.parameter_count == pytest.approx(3.88e9, rel=0.01)
-    assert klein.memory_gib["base"] == pytest.approx(7.2, abs=0.1)
+    assert klein.memory_gib["backbone"] == pytest.approx(7.2, abs=0.1)
     klein.check_fits()
     assert klein.total_gib < 16
 
@@ -45,7 +45,7 @@ def test_the_table_lists_tokens_memory_and_time(klein):
 def test_the_estimate_for_kontext_agrees_with_the_counts_for_the_paper():
     estimate = estimate_resources(read_recipe(RECIPES / "kontext.toml"), CARD)
     assert estimate.parameter_count == pytest.approx(11.9e9, rel=0.01)
-    assert estimate.memory_gib["base"] == pytest.approx(11.2, abs=0.2)
+    assert estimate.memory_gib["backbone"] == pytest.approx(11.2, abs=0.2)
     assert estimate.memory_gib["LoRA and AdamW"] == pytest.approx(1.3, abs=0.1)
     assert estimate.memory_gib["activations"] == pytest.approx(3.7, abs=0.2)
     assert estimate.tflop == pytest.approx(351, rel=0.01)
@@ -74,9 +74,9 @@ def test_a_recipe_that_does_not_fit_is_refused_with_a_change_that_fits(klein):
             estimate.check_fits()
 
 
-def test_cards_are_found_by_name_and_the_papers_is_the_default_without_a_gpu(monkeypatch):
+def test_gpus_are_found_by_name_and_that_of_the_paper_is_the_default_without_a_gpu(monkeypatch):
     assert find_gpu("rtx 4090") == CARD
-    with pytest.raises(DeviceError, match=r"no card 'rtx 4099' .*; did you mean RTX 4090"):
+    with pytest.raises(DeviceError, match=r"no GPU 'rtx 4099' .*; did you mean RTX 4090"):
         find_gpu("rtx 4099")
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     assert find_gpu() == CARD
@@ -112,9 +112,9 @@ def test_the_plan_reads_the_data(run_without_model, tmp_path, monkeypatch):
 
 def test_the_plan_lists_download_and_host_memory(klein):
     assert re.search(r"host memory +11\.5 GiB, while the text encoders encode the prompt", klein.table())
-    assert re.search(r"download +16 GB, of them 8 GB text encoders", klein.table())
+    assert re.search(r"download +16 GB, of which 8 GB are text encoders", klein.table())
     encoded = estimate_resources(with_value(klein.recipe, "prompt", "prompt.safetensors"), CARD)
-    assert re.search(r"download +8 GB, of them 0 GB text encoders", encoded.table())
+    assert re.search(r"download +8 GB, of which 0 GB are text encoders", encoded.table())
 
 
 def test_white_space_and_the_optimiser_change_the_estimate():

@@ -289,7 +289,7 @@ def test_openapi_describes_every_field_and_every_error(app):
     assert api["info"]["version"] == brewster.__version__
 
 
-def test_no_documentation_page_fetches_assets_from_elsewhere(app):
+def test_no_documentation_page_fetches_assets_from_other_servers(app):
     assert request(app, "GET", "/docs").status_code == request(app, "GET", "/redoc").status_code == 404
 
 
@@ -308,6 +308,6 @@ EXCLUDED_CHECKS = [  # the schema cannot express which options contradict each o
 @settings(max_examples=12, suppress_health_check=list(HealthCheck))
 def test_the_server_conforms_to_its_openapi_document(case):
     photo = case.body.get("photo") if isinstance(case.body, dict) else None
-    if isinstance(photo, str | bytes):  # random bytes are not a picture
+    if isinstance(photo, str | bytes):  # random bytes are not an image
         case.body["photo"] = SMALL
     case.call_and_validate(excluded_checks=EXCLUDED_CHECKS)

@@ -194,7 +194,7 @@ def test_every_quality_works_and_higher_quality_uses_larger_inputs():
     assert largest["draft"] < largest["standard"] < largest["best"]
 
 
-def test_a_source_that_is_no_image_is_refused():
+def test_a_source_that_is_not_an_image_is_refused():
     with pytest.raises(PhotoError):
         Separator(identity_backend)(b"hello")
 
@@ -218,7 +218,7 @@ def test_the_shipped_model_beats_the_unprocessed_input_on_the_development_pairs(
 
 
 @pytest.mark.slow
-def test_the_shipped_model_hardly_changes_photographs_without_glass(separator, data):
+def test_the_shipped_model_hardly_changes_photos_without_glass(separator, data):
     photos = [Photo.open(data / "photos/permissive" / f"kodak24__{number:02}.jpg") for number in range(1, 11)]
     scores = [psnr(separator(photo).transmission.pixels, photo.pixels) for photo in photos]
     assert np.mean(scores) >= 32

@@ -170,7 +170,7 @@ def test_the_confidence_is_shown_as_colours_over_the_grey_photo_with_a_legend(op
 
 
 def test_zoom_and_pan_move_both_sides_together(open_page):
-    """At strength 0 both sides show the same ramp, so an offset between the sides would be visible as a step."""
+    """At strength 0, both sides show the same ramp. An offset between the sides is therefore visible as a step."""
     page = open_page()
     ramp = np.repeat(np.linspace(20, 220, 240).astype(np.uint8)[None, :, None], 120, axis=0)
     upload(page, ("a.png", file_of(ramp, "png")))
@@ -184,7 +184,7 @@ def test_zoom_and_pan_move_both_sides_together(open_page):
     page.mouse.up()
     after = row(page)
     for line in (before, after):
-        assert line.all()  # the picture is larger than the view
+        assert line.all()  # the image is larger than the view
         assert set(np.diff(line)) <= {0, 1}
     assert after[0] > before[0]
     page.mouse.wheel(0, -200)

@@ -1,4 +1,4 @@
-"""The page never loses files or results, and says what happens to them; tested in a real browser with a real server."""
+"""The page never loses files or results, and reports what happens to them; tested in a real browser with a real server."""
 
 import io
 import zipfile
@@ -54,8 +54,8 @@ def test_a_folder_can_be_chosen(open_page, folder):
     assert sorted(names_in_list(page)) == ["1.png", "10.png", "9.png"]
 
 
-def test_a_folder_with_more_photos_than_the_list_holds_says_how_many_are_left_out(open_page):
-    """The entries of a folder are simulated: a hundred thousand real files would take minutes."""
+def test_a_folder_with_more_photos_than_the_list_can_contain_reports_how_many_are_left_out(open_page):
+    """The entries of a folder are simulated, because creating a hundred thousand real files takes minutes."""
     page = open_page()
     found = page.evaluate("""async () => {
         const { readTransfer, describeAdded } = await import("/page/drop.js");

@@ -1,4 +1,4 @@
-"""Regions on the page: pointer, touch and keyboard; the mask is that of the command line."""
+"""Regions on the page: pointer, touch and keyboard, and the same mask as on the command line."""
 
 import math
 

@@ -75,7 +75,7 @@ def test_an_unset_data_folder_is_an_error(recipe, monkeypatch):
         open_stream(with_data(recipe, photos=["photos"]))
 
 
-def test_sets_have_a_path_in_the_data_folder_or_an_absolute_path(recipe, root):
+def test_datasets_have_a_path_in_the_data_folder_or_an_absolute_path(recipe, root):
     render_set(root / "set", count=3)
     below, absolute = (
         open_stream(with_data(recipe, rendered={"datasets": [folder], "count": 2}))

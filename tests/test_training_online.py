@@ -32,7 +32,7 @@ def test_a_batch_is_a_function_of_seed_and_step_alone(assets):
     assert not torch.equal(second.photo_encoded, one(0, 2, 32).photo_encoded)
 
 
-def test_a_batch_has_square_encoded_pictures(assets):
+def test_a_batch_has_square_encoded_images(assets):
     batch = stream(assets)(0, 3, 32)
     assert batch.photo_encoded.shape == batch.transmission_encoded.shape == (3, 3, 32, 32)
     assert batch.photo_encoded.min() >= 0
@@ -48,7 +48,7 @@ def test_iterating_gives_the_samples_in_order_at_the_recipes_size(assets):
 
 @pytest.mark.parametrize("blend_space", ["linear", "srgb"])
 def test_the_photo_has_jpeg_artefacts_and_the_ground_truth_has_none(assets, blend_space):
-    """A second JPEG of the same quality changes next to nothing."""
+    """A second JPEG of the same quality changes the image hardly at all."""
     sample = stream(assets, blend_space=blend_space).sample(0)
 
     def change(encoded):

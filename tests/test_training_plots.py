@@ -24,8 +24,8 @@ def test_captions_with_special_characters_are_drawn_literally():
     assert not torch.equal(plain, dollar)
 
 
-def test_metrics_of_one_kind_share_a_panel():
-    """Three panels: the loss, its terms, and the gains of both folders."""
+def test_metrics_of_one_kind_share_a_subplot():
+    """Three subplots: the loss, its terms, and the gains of both folders."""
     lines = [
         {"step": step, "loss": 1 / step, "loss_a": 0.1, "loss_b": -0.1, "psnr_gain_db_x": 1.0, "psnr_gain_db_y": 2.0, "seconds": 5.0}
         for step in (1, 2)
@@ -36,7 +36,7 @@ def test_metrics_of_one_kind_share_a_panel():
     ]
     assert widths[0][0] == 3 * widths[2][0]
     assert widths[0][1] == widths[2][1]
-    assert widths[1] == (widths[0][0], 2 * widths[0][1])  # a fourth panel starts a second row
+    assert widths[1] == (widths[0][0], 2 * widths[0][1])  # a fourth subplot starts a second row
 
 
 def test_a_metric_that_was_added_later_is_plotted_from_its_first_step():

@@ -81,7 +81,7 @@ def test_a_batch_from_disk_depends_on_seed_and_step_alone(folder):
     assert not torch.equal(batch.photo_encoded, RenderedDatasets([folder], seed=2)(7, 4, 32).photo_encoded)
 
 
-def test_shards_and_folders_hold_the_same_samples(folder, tmp_path):
+def test_shards_and_folders_contain_the_same_samples(folder, tmp_path):
     render_set(tmp_path / "shards", count=3, shards=True)
     assert list((tmp_path / "shards").glob("*.tar"))
     one, other = (
@@ -98,7 +98,7 @@ def test_only_the_first_samples_are_used_where_a_count_is_given(folder):
     stream(0, 20, 32)
 
 
-def test_sets_follow_one_another(folder, tmp_path):
+def test_the_samples_of_several_datasets_are_joined_in_order(folder, tmp_path):
     render_set(tmp_path / "more", count=2, seed=8)
     both = RenderedDatasets([folder, tmp_path / "more"], seed=1)
     assert len(both) == 5
@@ -110,7 +110,7 @@ def test_a_count_above_the_number_of_samples_is_refused(folder):
         RenderedDatasets([folder], seed=1, count=4)
 
 
-def test_a_folder_that_is_missing_empty_or_no_set_is_named(tmp_path):
+def test_a_folder_that_is_missing_empty_or_not_a_dataset_is_named(tmp_path):
     with pytest.raises(RecipeError, match=r"gone cannot be read \(No such"):
         RenderedDatasets([tmp_path / "gone"], seed=1)
     with pytest.raises(RecipeError, match=r"0 rendered samples; expected at least 1"):
@@ -127,7 +127,7 @@ def test_a_missing_file_is_named_with_its_sample(folder, name):
         RenderedDatasets([folder], seed=1, blend_space="srgb").sample(1)
 
 
-def test_a_damaged_picture_is_named_with_its_sample(folder):
+def test_a_damaged_image_is_named_with_its_sample(folder):
     photo = folder / "000001" / "photo.jpg"
     photo.write_bytes(photo.read_bytes()[:200])
     with pytest.raises(PhotoError, match=r"photo\.jpg of sample 000001"):
@@ -181,6 +181,6 @@ def test_a_full_cache_does_not_change_the_samples():
     assert len(source.rendered) > 4
 
 
-def test_a_set_can_have_a_relative_path(folder, monkeypatch):
+def test_a_dataset_can_have_a_relative_path(folder, monkeypatch):
     monkeypatch.chdir(folder.parent)
     assert len(RenderedDatasets([Path(folder.name)], seed=1)) == 3

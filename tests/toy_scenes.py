@@ -86,7 +86,7 @@ def pretrain(name, folder, *, vae_steps, steps):
 
     def loss(step):
         batch = torch.randint(len(target), (16,), generator=generator)
-        # Real bases are also trained with an empty prompt and with other guidance: here, every second step is.
+        # Real backbones are also trained with an empty prompt and with other guidance. Here, every second step is.
         is_odd = step % 2
         step_prompt = (
             replace(prompt, embeds=prompt.negative) if prompt.negative is not None and is_odd else prompt

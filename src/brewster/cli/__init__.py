@@ -26,7 +26,7 @@ class _DefaultCommandGroup(click.Group):
     """A click group that treats an unknown command as a photo."""
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
-        """Inserts `separate` in front of the arguments if they begin with no command."""
+        """Inserts `separate` in front of the arguments if the first argument is not a command."""
         if args and args[0] not in self.commands and args[0] not in _GROUP_OPTIONS:
             if not ctx.resilient_parsing:  # shell completion
                 self._reject_misspelled_command(ctx, args[0])
@@ -34,7 +34,7 @@ class _DefaultCommandGroup(click.Group):
         return super().parse_args(ctx, args)
 
     def shell_complete(self, ctx: click.Context, incomplete: str) -> list[CompletionItem]:
-        """Completes commands, and the photos and options of `separate`, whose name may be left out."""
+        """Completes commands, and also the photos and options of `separate`, because its name can be left out."""
         separate_items = self.commands["separate"].shell_complete(ctx, incomplete)
         items = [*super().shell_complete(ctx, incomplete), *separate_items]
         files = [] if incomplete.startswith("-") else [CompletionItem(incomplete, type="file")]
@@ -66,9 +66,9 @@ def _print_version(context: click.Context, _parameter: click.Parameter, requeste
     help="Print the version.",
 )
 def cli() -> None:
-    """Separate a photograph taken through glass into transmission and reflection.
+    """Separate photos taken through glass into transmission and reflection.
 
-    The transmission is the scene behind the glass, the reflection is what the glass mirrors. `brewster PHOTO...` is
+    The transmission is the scene behind the glass. The reflection is the scene that the glass mirrors. `brewster PHOTO...` is
     short for `brewster separate PHOTO...`; `brewster separate --help` shows its options.
     """
 

@@ -80,7 +80,7 @@ def pull(
     quiet: bool,
     **options: Any,  # noqa: ANN401  (the fields of DownloadRequest)
 ) -> None:
-    """Download CC0 environment maps (360-degree HDR photographs) from Poly Haven into the folder OUT.
+    """Download CC0 environment maps (360-degree HDR images) from Poly Haven into the folder OUT.
 
     OUT is brewster/maps in the user's cache folder by default. The maps are chosen in the order of their ids.
     manifest.csv lists the maps, their authors and their MD5 checksums.
@@ -94,14 +94,13 @@ def pull(
     results = _fetch(request, out or maps_folder(), as_json=as_json, quiet=quiet)
     if not quiet:
         _print_missing_counts(request, results)
-        print_status(
-            "powered by Poly Haven, polyhaven.com"
-        )  # the terms of service of Poly Haven require these words
+        # The terms of service of Poly Haven require these words.
+        print_status("powered by Poly Haven, polyhaven.com")
     context.exit(1 if any(result.error for result in results) else 0)
 
 
 def _fetch(request: DownloadRequest, folder: Path, *, as_json: bool, quiet: bool) -> list[DownloadResult]:
-    """Downloads the maps, and prints each result and a summary. The summary is printed after an interruption too."""
+    """Downloads the maps, and prints each result and a summary. After an interruption, the summary is printed too."""
     from brewster.environments.polyhaven import pull as fetch  # noqa: PLC0415
 
     results: list[DownloadResult] = []
@@ -127,9 +126,11 @@ def _print_result(result: DownloadResult, *, as_json: bool, quiet: bool) -> None
     if quiet:
         return
     if result.status == "missing":
-        print_status(f"{result.asset}: left out, the server has no file of it in this resolution and format")
+        print_status(
+            f"{result.asset}: left out, because the server has no file in this resolution and format"
+        )
     elif result.status == "skipped":
-        print_status(f"{result.file}: skipped, it exists")
+        print_status(f"{result.file}: skipped, because it exists")
     elif result.status == "downloaded":
         print_status(f"{result.asset} -> {result.file} ({(result.bytes or 0) / 1e6:.1f} MB)")
 

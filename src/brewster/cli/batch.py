@@ -149,7 +149,7 @@ class BatchCommand:
             other = "" if self._is_parallel else self._other_options(result)
             made = f", made with other options ({other})" if other else ""
             print_status(
-                f"{result.source}: skipped, all of its layers exist{made} (--overwrite replaces them)"
+                f"{result.source}: skipped, because all of its layers exist{made} (--overwrite replaces them)"
             )
         elif result.status == "separated":
             verdict = result.assessment.verdict if result.assessment else ""
@@ -158,7 +158,7 @@ class BatchCommand:
             print_status(f"{result.source} -> {outputs} ({seconds:.1f} s, {verdict}{hint})")
 
     def _other_options(self, result: FileResult) -> str:
-        """Returns the options with which the existing layers were made, where they differ from those of this batch."""
+        """Returns the options in the metadata of the existing layers that differ from the options of this batch."""
         from brewster.inference.separator import PROGRAM, history_step  # noqa: PLC0415
         from brewster.photo.history import recorded_parameters  # noqa: PLC0415
 
@@ -228,7 +228,7 @@ class _Summary:
 
 
 def _model_name(model: str) -> str | None:
-    """Returns the name of a model as the metadata of its layers record it, or None if it is unknown without loading it."""
+    """Returns the model name that the metadata of its layers contain, or None if the model must be loaded to know the name."""
     try:
         return None if zoo.is_diffusion_model(model) else zoo.find_model(model).name
     except ModelError:

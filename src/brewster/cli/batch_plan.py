@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 
 _MAX_NAMES: Final = 10
-"""In a message about several files, the number of files that are named."""
+"""Maximum number of file names in a message."""
 
 
 def local_path(text: str) -> str:
@@ -44,7 +44,7 @@ def absolute_path(path: str) -> str:
 
 
 def skipped_videos(photos: Sequence[str]) -> str | None:
-    """Returns a line about the videos in the folders, or None if there is none."""
+    """Returns a line about the videos in the folders, or None if the folders contain no video."""
     videos = find_videos(map(location, photos))
     if not videos:
         return None
@@ -52,22 +52,22 @@ def skipped_videos(photos: Sequence[str]) -> str | None:
 
 
 def counted(names: Sequence[object], kind: str) -> str:
-    """Returns `2 videos (a.mp4, b.mov)`; the names of a long list are cut."""
+    """Returns `2 videos (a.mp4, b.mov)`, with at most `_MAX_NAMES` names."""
     more = f" and {len(names) - _MAX_NAMES} more" if len(names) > _MAX_NAMES else ""
     return f"{len(names)} {kind}{'s' * (len(names) != 1)} ({', '.join(map(str, names[:_MAX_NAMES]))}{more})"
 
 
 def is_single_output(photos: Sequence[str], output: str | None) -> bool:
-    """Whether only one layer can be written, because its target is standard output or one image file (-o)."""
+    """Whether only one layer can be written, because it is written to standard output or to an image file (-o)."""
     return "-" in photos or output == "-" or _is_image_file(output)
 
 
 def plan(photos: Sequence[str], output: str | None, options: Options) -> list[SeparationTask]:
-    """Lists the photos in files and folders, each with the targets of its layers.
+    """Returns a task for each photo in the files and folders. A task contains the paths of the photo and of its layers.
 
     Raises:
         click.UsageError: the arguments contradict each other.
-        OutputError: two photos would be written under the same name.
+        OutputError: the layers of two photos would have the same path.
         PhotoError: the files and folders contain no photo.
     """
     from brewster.inference import plan_files  # noqa: PLC0415  (imports ONNX Runtime and pyvips)
@@ -83,11 +83,11 @@ def _plan_single_output(photos: Sequence[str], output: str | None, options: Opti
 
     if len(photos) > 1 or Path(photos[0]).is_dir():
         raise click.UsageError(
-            "With standard input, standard output or an image file as the target (-o), give exactly one photo."
+            "Give exactly one photo if it is standard input, or if -o is standard output or an image file."
         )
     if len(options.layers) > 1:
         raise click.UsageError(
-            "Standard output and an image file as the target (-o) take one layer: choose it with --layers."
+            "Only one layer can be written to standard output or to an image file (-o): choose it with --layers."
         )
     if output not in (None, "-"):
         _check_format(format_of(Path(output)), options)
@@ -104,7 +104,7 @@ def _check_format(image_format: ImageFormat | None, options: Options) -> None:
     """
     if image_format is None:
         raise click.UsageError(
-            "With standard input, -o takes an image file such as clear.jpg, or is left out."
+            "If the photo is standard input, -o must be an image file such as clear.jpg, or be left out."
         )
     name = image_format.name
     layer = options.layers[0]
@@ -112,7 +112,7 @@ def _check_format(image_format: ImageFormat | None, options: Options) -> None:
         raise click.UsageError(f"brewster cannot write {name.upper()}: choose another suffix for -o.")
     if layer != "confidence" and options.container(layer, name) != name:
         raise click.UsageError(
-            f"The target of -o is a {name} file, but --format, --additive or --layers requires another format."
+            f"The output file (-o) is a {name} file, but --format, --additive or --layers requires another format."
         )
 
 
@@ -131,8 +131,8 @@ def _check_output_folder(photos: Sequence[str], output: str | None) -> None:
         and not os.path.isdir(photos[0])  # noqa: PTH112
     ):
         raise click.UsageError(
-            f"The suffix {suffix} of -o is that of no format that brewster writes. Choose one of "
-            f"{', '.join(row.suffixes[0] for row in WRITABLE.values())}, or end the name of a folder with {os.sep}"
+            f"-o ends in {suffix}, but brewster writes no format with this suffix. Choose one of "
+            f"{', '.join(row.suffixes[0] for row in WRITABLE.values())}. If -o is a folder, add {os.sep} at its end."
         )
 
 
@@ -147,10 +147,10 @@ def _is_image_file(output: str | None) -> bool:
 
 @final
 class _StandardStream:
-    """Standard input as the source of a photo, standard output as the target of a layer."""
+    """Reads a photo from standard input, or writes a layer to standard output."""
 
     def read(self) -> bytes:
-        """The bytes of the photo."""
+        """Returns the bytes of the photo."""
         return sys.stdin.buffer.read()
 
     def write(self, data: bytes) -> None:

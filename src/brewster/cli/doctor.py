@@ -25,7 +25,7 @@ _MIN_PYTHON: Final = (3, 11)
 _GIF: Final = bytes.fromhex(
     "47494638396101000100800000ffffff00000021f90401000000002c00000000010001000002024401003b"
 )
-"""A GIF of one pixel; brewster reads GIF but cannot write it."""
+"""A GIF of one pixel. It is stored here, because brewster reads GIF but cannot write it."""
 _SYMBOLS: Final = {"ok": "ok", "missing": "--", "broken": "!!"}
 
 
@@ -41,7 +41,7 @@ class Check:
     cure: str | None = None
     """The command or action that repairs the part, if it does not work."""
     needed: bool = True
-    """Whether the part is required. An optional part does not change the exit code."""
+    """Whether the part is required. If an optional part does not work, the exit code is still 0."""
 
 
 @click.command
@@ -78,7 +78,7 @@ def run_checks() -> Iterator[Check]:
     yield from _formats()
     yield from _models()
     yield from _mitsuba()
-    yield from _large()
+    yield from _diffusion()
 
 
 def _packages() -> Iterator[Check]:
@@ -159,7 +159,7 @@ def _encode_sample(container: str) -> bytes:
 
 
 def _try_format(container: str, detail: str, encode_sample: Callable[[], bytes]) -> Check:
-    """Decodes a sample file. `detail` describes the format if this succeeds."""
+    """Decodes a sample file. `detail` is the detail of the check if this succeeds."""
     from brewster.photo import Photo  # noqa: PLC0415  (imports pyvips)
 
     extra = FORMATS[container].extra
@@ -191,9 +191,8 @@ def _mitsuba() -> Iterator[Check]:
     from brewster.render.mitsuba import variant  # noqa: PLC0415  (slow to import)
 
     try:
-        with warnings.catch_warnings(
-            action="ignore", category=RuntimeWarning
-        ):  # about LLVM; the second check reports it
+        # Ignore the warning about LLVM, because the second check reports it.
+        with warnings.catch_warnings(action="ignore", category=RuntimeWarning):
             variant.load()
     except MissingExtra as error:
         yield Check(
@@ -209,7 +208,7 @@ def _mitsuba() -> Iterator[Check]:
         yield Check("tracer", "llvm", "missing", detail, variant.INSTALL_LLVM, needed=False)
 
 
-def _large() -> Iterator[Check]:
+def _diffusion() -> Iterator[Check]:
     """Checks what diffusion models may need in addition to the extra `diffusion`."""
     if _version("diffusers") is None:
         return
@@ -220,7 +219,7 @@ def _large() -> Iterator[Check]:
     from brewster.models.diffusion.hub_download import has_hub_token  # noqa: PLC0415  (imports torch)
 
     token_found = has_hub_token()
-    detail = "found" if token_found else "not found; gated models such as FLUX.1 Kontext need one"
+    detail = "found" if token_found else "not found; gated models such as FLUX.1 Kontext need a token"
     cure = None if token_found else "hf auth login"
     yield Check("diffusion", "hub token", "ok" if token_found else "missing", detail, cure, needed=False)
 

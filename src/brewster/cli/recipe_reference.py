@@ -22,13 +22,13 @@ _BEGINNING: Final = """# Recipe keys
 `make docs` generates this page from the recipe models; a test checks that it is up to date.
 
 Recipes are TOML files. `brewster render --show-recipe window` and `brewster train --show-recipe compact` (or `lora`)
-print a complete recipe with all defaults and a comment for each key; edit this text to write your own recipe. Both
-options also take the path of a recipe file. The error for an invalid recipe has one line for each problem."""
+print a complete recipe with all defaults and a comment for each key. Save and edit this text to write your own recipe. Both
+options also accept the path of a recipe file. The error message for an invalid recipe has one line for each problem."""
 
 RECIPE_KINDS: Final[dict[str, tuple[type[FrozenModel], str]]] = {
     "Scene recipes": (
         SceneRecipe,
-        "For `brewster render --recipe`: the distributions that random scenes are drawn from.",
+        "For `brewster render --recipe`: the distributions from which random scenes are drawn.",
     ),
     "Training recipes of a compact network": (
         CompactRecipe,

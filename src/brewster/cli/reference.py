@@ -16,7 +16,7 @@ _BEGINNING = """# The command line
 
 `make docs` generates this page from the commands; a test checks that it is up to date.
 
-Exit codes: 0 success, 1 error (one line `error: ...` on standard error for each), 2 invalid arguments, 130 interrupted
+Exit codes: 0 success, 1 error (each error is one line `error: ...` on standard error), 2 invalid arguments, 130 interrupted
 by Ctrl-C."""
 
 

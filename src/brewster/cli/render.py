@@ -1,4 +1,4 @@
-"""`brewster render`: render a set of samples from a recipe, or render one sample again from its scene.toml."""
+"""`brewster render`: render a dataset from a recipe, or render one sample again from its scene.toml."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class _Size(click.ParamType[tuple[int, int]]):
     def convert(
         self, value: object, param: click.Parameter | None, ctx: click.Context | None
     ) -> tuple[int, int]:
-        """The width and the height in pixels.
+        """Returns the width and the height in pixels.
 
         Raises:
             click.BadParameter: the value is not two integers from 16 to 16384 with an x between them.
@@ -70,7 +70,7 @@ class _Size(click.ParamType[tuple[int, int]]):
     "--output",
     metavar="FOLDER",
     type=click.Path(path_type=Path),
-    help="The folder of the set, as an alternative to OUT.",
+    help="The folder of the dataset, as an alternative to OUT.",
 )
 @click.option(
     "--recipe",
@@ -95,7 +95,7 @@ class _Size(click.ParamType[tuple[int, int]]):
     type=click.IntRange(0, 2**32 - 1),
     default=0,
     show_default=True,
-    help="The random seed. The same recipe and seed give the same set.",
+    help="The random seed. The same recipe, seed, maps and photos give the same dataset.",
 )
 @click.option(
     "--size",
@@ -105,19 +105,19 @@ class _Size(click.ParamType[tuple[int, int]]):
 @click.option(
     "--orders",
     type=click.Choice(["all", "truncated"]),
-    help="The light paths in T and R: all of them (then I = T + R), or only the one path per layer that the paper uses; by default, the value in the recipe.",
+    help="The light paths in T and R. all: every path, so that I = T + R; truncated: one path for each layer, as in the paper; by default, the value in the recipe.",
 )
 @click.option(
     "--renderer",
     type=click.Choice(["analytic", "mitsuba"]),
-    help="The renderer: analytic (flat glass only) or mitsuba (a path tracer for all kinds of glass); by default analytic, and with --scene the renderer in scene.toml.",
+    help="The renderer: analytic (flat glass only) or mitsuba (a path tracer for all kinds of glass); by default analytic, or with --scene, the renderer in scene.toml.",
 )
 @click.option(
     "--maps",
     metavar="FOLDER",
     type=_FOLDER,
     multiple=True,
-    help="A folder of HDR environment maps; repeatable. By default the built-in environments.",
+    help="A folder of HDR environment maps; repeatable. By default, the built-in environments are used.",
 )
 @click.option(
     "--photos",
@@ -141,7 +141,7 @@ class _Size(click.ParamType[tuple[int, int]]):
 @click.option(
     "--scene",
     type=click.Path(path_type=Path),
-    help="Render only the sample that this scene.toml describes, and write its files directly into OUT.",
+    help="Render only the sample that this scene.toml describes, and write the files of the sample directly into OUT.",
 )
 @click.option(
     "--json", "as_json", is_flag=True, help="Print one line of JSON for each sample on standard output."
@@ -158,15 +158,15 @@ def render(
     show_recipe: str | None,
     **options: Any,  # noqa: ANN401  (the fields of _RenderCommand)
 ) -> None:
-    """Render photographs through glass with their ground truth into the folder OUT.
+    """Render photos through glass with their ground truth into the folder OUT.
 
     Each sample is a folder. It has five images: photo.jpg, its layers transmission.jpg and reflection.jpg,
     background.jpg (without glass) and mirror.jpg (with a mirror in place of the glass). layers.exr has all five in
-    linear light. scene.toml describes the scene; `brewster render --scene` renders the same bytes from it.
+    linear light. scene.toml describes the scene; `brewster render --scene` renders the same files from it.
     index.parquet lists all samples.
 
-    Existing samples are kept: to resume an interrupted run, run the same command again; to add samples, increase
-    --count. If a sample fails, the others are still rendered, the failed sample is listed, and the exit code is 1.
+    Existing samples are kept. To resume an interrupted run, run the same command again. To add samples, increase
+    --count. If a sample fails, the other samples are still rendered, the failed sample is listed, and the exit code is 1.
     """
     if show_recipe:
         _show_recipe(show_recipe)
@@ -176,10 +176,10 @@ def render(
     require_extra("render", "rendering", without=_MITSUBA_PACKAGES)
     command = _RenderCommand(out or output or Path(), **options)
     if scene:
-        _reject_set_options(context)
+        _reject_dataset_options(context)
         command.render_again(scene)
     else:
-        context.exit(0 if command.render_set() else 1)
+        context.exit(0 if command.render_dataset() else 1)
 
 
 @final
@@ -212,8 +212,8 @@ class _RenderCommand:
         if not self.quiet:
             print_status(f"{scene} -> {self.out}")
 
-    def render_set(self) -> bool:
-        """Renders a set and prints each result. Returns whether no sample failed."""
+    def render_dataset(self) -> bool:
+        """Renders a dataset and prints each result. Returns whether no sample failed."""
         from brewster.rendered.generation.job import build  # noqa: PLC0415
         from brewster.rendered.generation.preview import write_preview  # noqa: PLC0415
 
@@ -270,14 +270,14 @@ class _RenderCommand:
 
 @final
 class _RenderPrinter:
-    """Prints each result and counts the results by status. It does not store them, so that memory stays constant."""
+    """Prints each result and counts the results by status. Results are not stored, so that memory stays constant."""
 
     def __init__(self, as_json: bool, quiet: bool) -> None:
         self._as_json, self._quiet = as_json, quiet
         self.counts: Counter[str] = Counter()
 
     def print_result(self, result: RenderResult) -> None:
-        """Prints one line for a sample that was rendered or failed."""
+        """Prints one line for a sample that was rendered or failed, and with `as_json` for every sample."""
         self.counts[result.status] += 1
         if self._as_json:
             write_out(f"{json.dumps(asdict(result))}\n".encode())
@@ -301,8 +301,8 @@ def _show_recipe(name: str) -> None:
     print_out(commented_toml(read_scene_recipe(name)).rstrip())
 
 
-def _reject_set_options(context: click.Context) -> None:
-    """Checks that no option of a set is given together with --scene, which defines the whole sample.
+def _reject_dataset_options(context: click.Context) -> None:
+    """Checks that no option of a dataset is given together with --scene, which defines the whole sample.
 
     Raises:
         click.UsageError: such an option is given on the command line.
@@ -310,5 +310,5 @@ def _reject_set_options(context: click.Context) -> None:
     for name in context.params.keys() - _SCENE_OPTIONS:
         if context.get_parameter_source(name) is ParameterSource.COMMANDLINE:
             raise click.UsageError(
-                f"--scene renders one sample, and --{name} belongs to a set: leave out --{name}."
+                f"--scene renders one sample, but --{name} is an option for datasets: leave out --{name}."
             )

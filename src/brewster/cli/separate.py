@@ -27,10 +27,10 @@ _Command = TypeVar("_Command", bound=Callable[..., Any])
 
 
 class _RangedNumber(click.FloatRange):
-    """A number in a range. NaN is rejected, which `click.FloatRange` accepts."""
+    """A number in a range. Unlike `click.FloatRange`, it rejects NaN."""
 
     def convert(self, value: object, param: click.Parameter | None, ctx: click.Context | None) -> float:
-        """The number.
+        """Returns the number.
 
         Raises:
             click.BadParameter: the value is not a number in the range.
@@ -50,16 +50,16 @@ class _ChoiceList(click.ParamType[tuple[str, ...]]):
         self.choices = choices
 
     def get_metavar(self, param: click.Parameter, ctx: click.Context) -> str:  # noqa: ARG002
-        """The placeholder for the value in the help text."""
+        """Returns the placeholder for the value in the help text."""
         return "LAYER,..."
 
     def convert(
         self, value: object, param: click.Parameter | None, ctx: click.Context | None
     ) -> tuple[str, ...]:
-        """The given choices without duplicates, in the order of the list.
+        """Returns the given choices without duplicates, in the order of `choices`.
 
         Raises:
-            click.BadParameter: a part of the value is not in the list.
+            click.BadParameter: a part of the value is not in `choices`.
         """
         given = str(value).split(",")
         unknown = [choice for choice in given if choice not in self.choices]
@@ -73,7 +73,7 @@ class _ChoiceList(click.ParamType[tuple[str, ...]]):
         param: click.Parameter,  # noqa: ARG002
         incomplete: str,
     ) -> list[CompletionItem]:
-        """Completes the last choice of the list."""
+        """Completes the last choice in the text."""
         *given, last = incomplete.split(",")
         return [
             CompletionItem(",".join((*given, choice)))
@@ -83,10 +83,10 @@ class _ChoiceList(click.ParamType[tuple[str, ...]]):
 
 
 class _FormatChoice(click.Choice[str]):
-    """The name of a file format, or one of its suffixes: jpg is jpeg."""
+    """The name of a file format such as jpeg, or one of its suffixes such as jpg."""
 
     def convert(self, value: object, param: click.Parameter | None, ctx: click.Context | None) -> str:
-        """The name of the format.
+        """Returns the name of the format.
 
         Raises:
             click.BadParameter: brewster does not write this format.
@@ -156,7 +156,7 @@ def _param_type(hint: object, field: dataclasses.Field[Any]) -> click.ParamType[
     "--output",
     metavar="FOLDER|IMAGE|-",
     type=click.Path(),
-    help="The target of the layers: a folder, an image file for a single layer, or - for standard output.",
+    help="Where to write the layers: a folder, an image file for a single layer, or - for standard output.",
 )
 @_with_options
 @click.option(
@@ -169,17 +169,17 @@ def _param_type(hint: object, field: dataclasses.Field[Any]) -> click.ParamType[
     "--contact-sheet",
     metavar="IMAGE",
     type=click.Path(path_type=Path),
-    help="Also write an overview of all photos and their layers as an image file, replacing an existing one.",
+    help="Also write an overview of all photos and their layers to this image file, and replace an existing file.",
 )
 @click.option(
     "--workers",
     type=click.IntRange(min=1),
-    help="Separate in this number of processes, each with one thread; with --cluster local, on this number of processors.",
+    help="The number of processes that separate photos, each with one thread; with --cluster local, the number of processors.",
 )
 @click.option(
     "--cluster",
     metavar="local|ADDRESS",
-    help="Separate on a Ray cluster, and write the index; its nodes must share the folder -o, or -o is a URL.",
+    help="Separate on a Ray cluster, and write the index; -o must be a URL, or a folder that all nodes share.",
 )
 @click.option(
     "--index", is_flag=True, help="Write index.parquet into the folder -o: a table with a row for each photo."
@@ -201,15 +201,15 @@ def separate(
     index: bool,
     **values: object,
 ) -> None:
-    """Separate photographs taken through glass into transmission and reflection.
+    """Separate photos taken through glass into transmission and reflection.
 
     PHOTO is an image file, a folder of image files, a table of paths (.csv or .parquet, with the column path), the URL of one
     of these in an object store (s3://bucket/folder), or - for standard input. The layers of photo.jpg are written next
     to it as photo.transmission.jpg and photo.reflection.jpg, or into the output folder, which mirrors the tree below an
-    input folder. If the target is standard output or an image file, only one layer is written: by default the
-    transmission, else the one that --layers selects.
+    input folder. If -o is an image file or standard output, only one layer is written: the layer that --layers selects,
+    by default the transmission.
 
-    Photos whose layers exist are skipped. If a photo fails, the others are still separated, the failed photo is listed
+    Photos whose layers exist are skipped. If a photo fails, the other photos are still separated, the failed photo is listed
     at the end, and the exit code is 1.
     """
     photos, output = tuple(map(local_path, photos)), output and local_path(output)
@@ -251,11 +251,11 @@ def _check_contact_sheet(path: Path, photos: tuple[str, ...], output: str | None
     """Checks that the contact sheet can be written before any photo is separated.
 
     Raises:
-        click.UsageError: the photos or the layers are no files, or the format of the sheet cannot be written.
+        click.UsageError: the photos or the layers are not files, or the format of the sheet cannot be written.
     """
     row = format_of(path)
     if row is None or not row.is_writable:
-        raise click.UsageError(f"--contact-sheet takes an image file such as sheet.jpg, not {path}.")
+        raise click.UsageError(f"--contact-sheet must be an image file such as sheet.jpg, not {path}.")
     if "-" in (*photos, output):
         raise click.UsageError(
             "--contact-sheet needs photos and layers that are files, not standard input or output."
@@ -263,14 +263,14 @@ def _check_contact_sheet(path: Path, photos: tuple[str, ...], output: str | None
 
 
 def _check_archive_output(single_output: bool, output: str | None, *, needs_folder: bool) -> None:
-    """Checks that the layers are files, in a folder if there is an index.
+    """Checks that the layers are written to files, and to a folder if `needs_folder` is true.
 
     Raises:
-        click.UsageError: there is a single output, or no folder.
+        click.UsageError: -o is standard output or an image file, or -o is missing but needed.
     """
     if single_output or (needs_folder and not output):
         raise click.UsageError(
-            "With --cluster, --workers and --index, layers are files: give a folder with -o."
+            "With --cluster, --workers and --index, layers are written to files: give a folder with -o."
         )
 
 

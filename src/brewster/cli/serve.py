@@ -37,7 +37,7 @@ def address_options(port: int, token_help: str) -> Callable[[Callable[..., Any]]
                 default=port,
                 show_default=True,
                 metavar="NUMBER",
-                help="The port; 0 chooses a free one.",
+                help="The port; 0 chooses a free port.",
             ),
             click.option(
                 "--host",
@@ -63,7 +63,7 @@ def print_link(url: str, token: str | None, *, open_browser: bool = False) -> No
 
 
 def _read_token(_context: click.Context, _parameter: click.Parameter, token: str | None) -> str | None:
-    """Checks that the token is valid in a link and in a cookie, and too long to be guessed.
+    """Checks that the token can be part of a link and of a cookie, and is too long to be guessed.
 
     Raises:
         click.BadParameter: the token has other characters, or fewer than 16, or more than 200.
@@ -78,13 +78,13 @@ def _read_token(_context: click.Context, _parameter: click.Parameter, token: str
 @click.command
 @address_options(
     8417,
-    "The token that each request must contain; auto generates one. By default, no token is required if --host is a loopback address, such as 127.0.0.1; for any other address, the default is auto.",
+    "The token that each request must contain; auto generates a token. By default, no token is required if --host is a loopback address such as 127.0.0.1; for any other address, the default is auto.",
 )
 @click.option(
     "--model",
     "models",
     multiple=True,
-    help="A model to offer in addition to those of `brewster models list`; repeatable. The first one is the default.",
+    help="A model to offer in addition to those of `brewster models list`; repeatable. The first model is the default.",
 )
 @click.option(
     "--device",
@@ -115,7 +115,7 @@ def _read_token(_context: click.Context, _parameter: click.Parameter, token: str
     default=16,
     show_default=True,
     metavar="NUMBER",
-    help="The number of photos that may wait; further requests are rejected with status 503.",
+    help="The maximum number of waiting photos; further requests are rejected with status 503.",
 )
 @click.option(
     "--timeout",
@@ -156,14 +156,13 @@ def serve(
         token = token or AUTO
     token = secrets.token_urlsafe(16) if token == AUTO else token
     model_cache = ModelCache(models, device=device)
-    model_cache.separator(
-        model_cache.names[0]
-    )  # loads the model now, so that a damaged model is reported before the server starts
+    # Load the model now, so that a damaged model is reported before the server starts.
+    model_cache.separator(model_cache.names[0])
     router = separation_router(
         model_cache, JobQueue(max_waiting=queue, timeout_seconds=timeout), max_pixels=max_pixels
     )
     app = web.create_app(router, limits=RequestLimits.for_host(host, token=token, max_bytes=max_bytes))
-    with contextlib.suppress(KeyboardInterrupt):  # the usual way to stop
+    with contextlib.suppress(KeyboardInterrupt):  # Ctrl-C is the usual way to stop the server
         web.serve(
             app, host=host, port=port, on_ready=lambda url: print_link(url, token, open_browser=open_browser)
         )

@@ -25,7 +25,7 @@ class _DeferredInterrupts:
     """Remembers a KeyboardInterrupt that Python has dropped, and raises it later.
 
     libvips calls Python to write its log. If Ctrl-C is pressed during such a call, the KeyboardInterrupt cannot pass
-    through the C code, so Python drops it. Without this class, the command would continue.
+    through the C code, so that Python drops it. Without this class, the command continues after Ctrl-C.
     """
 
     def __init__(self) -> None:
@@ -49,7 +49,7 @@ class _DeferredInterrupts:
             sys.unraisablehook = hook
 
     def raise_pending(self) -> None:
-        """Raises the interrupt that was dropped, if any. Call it before every step that cannot be undone."""
+        """Raises KeyboardInterrupt if Python has dropped one. Call this before every step that cannot be undone."""
         if self._pending:
             self._pending = False
             raise KeyboardInterrupt
@@ -59,7 +59,7 @@ interrupts = _DeferredInterrupts()
 
 
 def one_line(text: object) -> str:
-    """Returns the text with unprintable characters escaped: file names may contain newlines and invalid bytes."""
+    """Returns the text with unprintable characters escaped, because file names may contain newlines and invalid bytes."""
     return "".join(
         letter if letter.isprintable() else letter.encode("unicode_escape").decode() for letter in str(text)
     )
@@ -95,7 +95,7 @@ class _Output:
     def redirect_descriptor(self) -> None:
         """Redirects file descriptor 1 to standard error. `sys.stdout` writes to a copy of the original descriptor.
 
-        The redirection lasts until the process ends, because C code may write its buffered output that late.
+        The redirection lasts until the process ends, because C code may write its buffered output only then.
         """
         try:
             if sys.stdout.fileno() != _STDOUT:  # a test or a notebook has replaced it
@@ -144,7 +144,7 @@ def write_out(data: bytes) -> None:
         stream.buffer.write(data)
         stream.flush()
     except OSError as error:
-        # Python flushes the buffer again when it exits. With /dev/null as the target, this cannot fail again.
+        # Python flushes the buffer again when it exits. This cannot fail if the descriptor is /dev/null.
         os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
         raise OutputError(
             f"standard output was not written ({error.strerror})",
@@ -155,7 +155,7 @@ def write_out(data: bytes) -> None:
 
 @contextmanager
 def progress(total: int, *, shown: bool) -> Iterator[ProgressUpdater]:
-    """Shows a progress bar on standard error if `shown` is set and standard error is a terminal; yields its updater."""
+    """Shows a progress bar if `shown` is true and standard error is a terminal. Yields the function that updates the bar."""
     if not (shown and sys.stderr.isatty()):
         yield lambda _done, _text: None
         return

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 @click.option(
     "--plan",
     is_flag=True,
-    help="Do not train; estimate the memory, download and time that a recipe with a diffusion backbone needs, and check the memory of the GPU and the data.",
+    help="Do not train; estimate the memory, download and time that a recipe with a diffusion backbone needs, and check that the GPU has enough memory and that the data can be read.",
 )
 @click.option(
     "--gpu",
@@ -43,14 +43,14 @@ if TYPE_CHECKING:
 @click.option(
     "--show-recipe",
     metavar="NAME|FILE",
-    help="Do not train; print a recipe as TOML with all defaults and a comment for each key. NAME is compact or lora; FILE is a recipe.",
+    help="Do not train; print a recipe as TOML with all defaults and a comment for each key. NAME is compact or lora; FILE is a recipe file.",
 )
 @click.option(
     "--device",
     type=click.Choice(["auto", "cpu"]),
     default="auto",
     show_default=True,
-    help="The device to train on. auto is the GPU; without one, a diffusion backbone is refused, because it takes weeks on a CPU.",
+    help="The device to train on. auto is the GPU, or the CPU if there is no GPU. A diffusion backbone is trained on a CPU only with --device cpu, because this takes weeks.",
 )
 @click.option(
     "--json",
@@ -73,8 +73,9 @@ def train(
     """Train a model with the settings of RECIPE, a TOML file.
 
     The environment variable BREWSTER_DATA is the path of the data folder. To resume an interrupted run from its last
-    checkpoint, run the same command again: the final weights are the same. To make a run longer, raise `steps` in the
-    recipe and run the command again. With torchrun, a diffusion backbone is trained on several GPUs (data parallel).
+    checkpoint, run the same command again; on a CPU, the final weights are the same as without the interruption. To make a
+    run longer, raise `steps` in the recipe and run the command again. To train a LoRA on several GPUs (data parallel),
+    start the command with torchrun.
     """
     require_extra("train", "training")
     if show_recipe:
@@ -123,7 +124,7 @@ class _TrainingPrinter:
     folder: Path
 
     def start(self, step: int, steps: int, seconds: float) -> None:
-        """Prints how many steps an earlier run completed, if any, and how long they took."""
+        """If the run is resumed, prints the number of completed steps and the time that they took."""
         text = f"step {step} of {steps}, after {seconds / 60:.1f} minutes of training"
         if step == steps:
             text = f"the run in {self.folder} is complete at {text}: to make it longer, raise steps in the recipe"
@@ -185,7 +186,7 @@ def _print_plan(recipe: CompactRecipe | LoraRecipe, gpu_name: str | None) -> Non
 
 
 def _print_data(recipe: LoraRecipe) -> None:
-    """Reads the data of the recipe, as training does, and prints the number of samples and the sizes of their panels."""
+    """Reads the data in the same way as training, and prints the number of samples and the sizes of their panels."""
     if not os.environ.get("BREWSTER_DATA"):
         print_status("the data was not checked: BREWSTER_DATA is not set")
         return

@@ -1,4 +1,4 @@
-"""Inference: separates a photo into transmission and reflection. Imports neither the renderer nor the trainer."""
+"""Inference: separates a photo into transmission and reflection. The package imports neither the renderer nor the trainer."""
 
 from brewster.inference.batch import FileResult, SeparationTask, plan_files, separate_files, separate_tasks
 from brewster.inference.predictor import QUALITIES

@@ -1,6 +1,6 @@
 """Assesses a separation without ground truth: how much light was removed, in which area, and how reliable the result is.
 
-bench/verdict.py measures, on photos with ground truth, how often and by how much the photos of each verdict improve.
+bench/verdict.py measures on photos with ground truth how often, and by how much, photos with each verdict improve.
 """
 
 from __future__ import annotations
@@ -18,15 +18,17 @@ if TYPE_CHECKING:
     from jaxtyping import Float32
 
 Verdict = Literal["clear", "partial", "little found", "doubtful"]
-"""clear: a reflection was found and removed with confidence. partial: a reflection was found, and parts of it probably remain.
-little found: the result is almost the photo. doubtful: the result may be worse than the photo."""
+"""clear: a reflection was found and removed with high confidence. partial: a reflection was found, and parts of it probably
+remain; also if the model does not estimate its confidence. little found: the result differs little from the photo. doubtful: the
+result may be worse than the photo."""
 
 RECONSTRUCTION_ERROR_LIMIT: Final = 0.06
 """A separation with a larger reconstruction error is doubtful. The value is chosen, not measured: about three times the
 error of encoding and decoding with the VAE of a diffusion model."""
 _VISIBLE_CHANGE: Final = 0.03
 """The smallest change of a pixel that counts as visible, sRGB-encoded."""
-_LITTLE_AREA: Final = 0.1
+_MIN_CHANGED_AREA: Final = 0.1
+"""With a smaller changed area, the verdict is "little found"."""
 _MIN_CLEAR_CONFIDENCE: Final = 0.6
 _MIN_PARTIAL_CONFIDENCE: Final = 0.2
 
@@ -40,9 +42,9 @@ class Assessment:
     removed_light: float
     """The removed light divided by the light of the photo, both linear, 0..1."""
     changed_area: float
-    """The fraction of pixels of the photo that changed visibly: by more than 0.03 in sRGB values of 0..1."""
+    """The pixels that changed visibly (by more than 0.03 in sRGB values of 0..1), divided by all pixels."""
     confidence: float
-    """Mean confidence of the changed parts, 0..1, weighted by the change; 1 if nothing changed."""
+    """Mean confidence of all pixels, 0..1, weighted by their change; 1 if nothing changed."""
 
 
 def assess(
@@ -57,7 +59,7 @@ def assess(
         photo: the photo in linear light.
         transmission: the predicted transmission in linear light.
         confidence_map: the confidence of the prediction, 0..1.
-        reconstruction_error: mean of |generated input - input|, sRGB-encoded, of a model that generates the input.
+        reconstruction_error: mean of |generated input - input|, sRGB-encoded, or None if the model does not generate the input.
     """
     light = float(photo.sum(dtype=np.float64))
     removed = float(np.maximum(photo - transmission, 0).sum(dtype=np.float64))
@@ -80,7 +82,7 @@ def _encoded_change(photo: Floats, transmission: Floats) -> Floats:
 def _verdict(changed_area: float, confidence: float, reconstruction_error: float | None) -> Verdict:
     if reconstruction_error is not None and reconstruction_error > RECONSTRUCTION_ERROR_LIMIT:
         return "doubtful"
-    if changed_area < _LITTLE_AREA:
+    if changed_area < _MIN_CHANGED_AREA:
         return "little found"
     if confidence >= _MIN_CLEAR_CONFIDENCE:
         return "clear"

@@ -1,4 +1,4 @@
-"""Separates many files. One bad file does not stop the batch.
+"""Separates many files. A file that cannot be separated does not stop the batch.
 
 The tree of an input folder is mirrored in the output folder, and layers that exist already are skipped.
 
@@ -31,8 +31,8 @@ from brewster.remote_path import Location, RemotePath, location
 BatchProgressCallback = Callable[[int, str, float], None]
 """Called with the number of finished files, the name of the current file, and its completed fraction, 0 to 1.
 
-It is called before each file, several times while a file is separated, and before each layer is written. To stop the
-batch, raise KeyboardInterrupt in it. Any other exception is a failure of the current file.
+It is called before each file, several times while a file is separated, and before each layer is written. To stop the batch,
+raise KeyboardInterrupt in the callback. If it raises another exception while a file is separated, this file fails.
 """
 
 _STREAM_NAME: Final = "-"
@@ -56,11 +56,11 @@ class OutputStream(Protocol):
 @final
 @dataclass(frozen=True)
 class SeparationTask:
-    """One photo, and the target of each of its layers: a path, a URL or a stream."""
+    """One photo, and the output of each of its layers: a path, a URL or a stream."""
 
     source: Location | InputStream
     outputs: Mapping[str, Location | OutputStream]
-    """The target of each layer, by layer name (`transmission`, `reflection` or `confidence`)."""
+    """The output of each layer, by layer name (`transmission`, `reflection` or `confidence`)."""
 
     @property
     def name(self) -> str:
@@ -68,11 +68,11 @@ class SeparationTask:
         return _display_name(self.source)
 
     def split(self) -> list[SeparationTask]:
-        """Returns this task, which has one item. See `brewster.executors.Task`."""
+        """Returns a list with only this task, which cannot be split. See `brewster.executors.Task`."""
         return [self]
 
     def failed_results(self, reason: str) -> list[FileResult]:
-        """Returns the result if no worker could separate the photo."""
+        """Returns the result of a photo that no worker could separate."""
         cure = "use fewer workers for each node, or a smaller photo"
         return [_failed(FileResult(self.name), f"{reason}; expected a photo that fits into memory; {cure}.")]
 
@@ -87,7 +87,7 @@ class FileResult:
     status: Literal["separated", "skipped", "planned", "failed"] = "separated"
     """`skipped`: all layers exist already. `planned`: a dry run would write `outputs`."""
     outputs: dict[str, str] = field(default_factory=dict)
-    """The path of each written layer by layer name, or `-` for a stream. After a failure, only the layers written before."""
+    """The path of each written layer by layer name, or `-` for a stream. If the photo failed, the layers written before."""
     model: str | None = None
     model_sha256: str | None = None
     """The digest of the model file."""
@@ -121,18 +121,18 @@ def separate_files(
     """Separates files and folders of photos, and writes the layers as files.
 
     Layers are named after their photo (`a.transmission.jpg` for `a.jpg`). They never replace a photo of the batch. If
-    all layers of a photo exist, the photo is skipped. If some exist, only the missing ones are written. Each file is
-    written atomically. If a photo fails, its result has the status `failed`, and the batch continues.
+    all layers of a photo exist, the photo is skipped. If some of its layers exist, only the missing layers are written. Each
+    file is written atomically. If a photo fails, its result has the status `failed`, and the batch continues.
 
     Args:
         sources: photos, folders that are searched recursively for photos, and manifests (CSV or Parquet tables with
-            the column `path`). Each may be a URL of an object store, such as s3://bucket/folder.
+            the column `path`). Each source can be a URL of an object store, such as s3://bucket/folder.
         output: the folder for the layers. It mirrors the tree below each source folder. By default, each layer is
             written next to its photo.
         options: layers, strength, quality, format and so on, the same as the options of the command line.
         separator: the model. By default, it is loaded with `options` when the first photo needs it.
-        overwrite: replace layers that exist, instead of skipping them.
-        dry_run: write no file and load no model. The results contain the paths that would be written.
+        overwrite: whether layers that exist are replaced instead of skipped.
+        dry_run: if true, no file is written and no model is loaded. The results contain the paths of the missing layers.
         on_progress: see `BatchProgressCallback`.
 
     Returns:
@@ -144,8 +144,8 @@ def separate_files(
         OutputError: the layers of two photos would have the same path.
         ModelError: the model does not exist or is damaged (raised during iteration).
         DeviceError: the requested device is not available (raised during iteration).
-        Exception: a bug in brewster. The result of the photo has the status `failed`, and the first such exception is
-            raised again after the last photo.
+        Exception: an unexpected exception, which is a bug in brewster. The result of its photo has the status `failed`, and
+            the first such exception is raised again after the last photo.
     """
     tasks = plan_files(sources, output, options)
     return separate_tasks(
@@ -158,7 +158,7 @@ def plan_files(
     output: str | os.PathLike[str] | None = None,
     options: Options = _DEFAULT_OPTIONS,
 ) -> list[SeparationTask]:
-    """Finds the photos, and returns a task for each with the paths of its layers. Arguments as in `separate_files`.
+    """Finds the photos, and returns a task for each photo with the paths of its layers. For arguments, see `separate_files`.
 
     Raises:
         PhotoError: the sources contain no photo.
@@ -199,7 +199,7 @@ def separate_tasks(
     dry_run: bool = False,
     on_progress: BatchProgressCallback = lambda _done, _name, _fraction: None,
 ) -> Iterator[FileResult]:
-    """Separates the photos of the tasks. Arguments, results and errors are those of `separate_files`."""
+    """Separates the photos of the tasks. For the other arguments, results and errors, see `separate_files`."""
     batch = BatchRunner(tasks, options, separator, overwrite=overwrite, dry_run=dry_run)
     for done, task in enumerate(tasks):
         on_progress(done, task.name, 0.0)
@@ -210,11 +210,11 @@ def separate_tasks(
 
 @final
 class BatchRunner:
-    """Separates the photos of a batch one by one: its settings, its lazily loaded model, its first unexpected exception.
+    """Separates the photos of a batch one by one, and stores the first unexpected exception. The model is loaded on first use.
 
     Args:
-        tasks: the batch, whose photos are never overwritten.
-        options, separator, overwrite, dry_run: as in `separate_files`.
+        tasks: the tasks of the batch, whose photos are never overwritten.
+        options, separator, overwrite, dry_run: see `separate_files`.
     """
 
     def __init__(
@@ -232,7 +232,7 @@ class BatchRunner:
         self._sources = {real_path(task.source) for task in tasks if isinstance(task.source, Location)}
 
     def run(self, task: SeparationTask, on_progress: Callable[[float], None]) -> FileResult:
-        """Separates one photo and returns the result, also for a failure.
+        """Separates one photo. Returns its result, also if the photo fails.
 
         Raises:
             ModelError, DeviceError: the model cannot be loaded.
@@ -248,7 +248,7 @@ class BatchRunner:
                 layer: _display_name(target) for layer, target in (outputs or task.outputs).items()
             }
             return result
-        # Not in the try block: without a model no photo can be separated, so a model error ends the batch.
+        # This is not in the try block, because no photo can be separated without a model: a model error ends the batch.
         self._separator = separator = self._separator or Separator.load(**self._options.load_options())
         result.model, result.model_sha256, result.device = separator.name, separator.sha256, separator.device
         try:
@@ -257,7 +257,8 @@ class BatchRunner:
             return _failed(result, error)
         except MemoryError:
             return _failed(
-                result, "the photo does not fit into memory; free some memory, or make the photo smaller"
+                result,
+                "the photo does not fit into memory; expected more free memory; close other programs, or make the photo smaller.",
             )
         except Exception as error:  # noqa: BLE001  (raised again after the last photo)
             self.unexpected_error = (
@@ -335,7 +336,7 @@ def _content(source: Location | InputStream) -> Path | bytes:
 def _sha256(photo: Path | bytes) -> str | None:
     try:
         return hashlib.sha256(photo if isinstance(photo, bytes) else photo.read_bytes()).hexdigest()
-    except OSError:  # opening the photo raises the error
+    except OSError:  # the separator opens the photo later, and reports the error
         return None
 
 

@@ -26,7 +26,7 @@ def upsample_layers(
 ) -> tuple[Photo, Photo, float]:
     """Returns transmission, reflection and the mean residual. The layers are encoded like the photo.
 
-    If `additive` is true, they are 32-bit floats in linear light whose sum is exactly the photo.
+    If `additive` is true, the layers are 32-bit floats in linear light, and their sum is exactly the photo.
     """
     template = _float_template(photo) if additive else photo
     canvases = [np.empty(template.pixels.shape, template.pixels.dtype) for _ in range(2)]
@@ -66,9 +66,8 @@ def _float_template(photo: Photo) -> Photo:
 def _exact_sum_layers(photo: Floats, transmission: Floats) -> list[Floats]:
     """Returns transmission and reflection whose float sum is bit-equal to the photo.
 
-    Both layers are at least 0 where the photo is not negative.
-
-    At least one of the two differences is exact (Sterbenz 1974), which makes the sum exact.
+    Both layers are at least 0 where the photo is not negative. At least one of the two differences is exact (Sterbenz 1974),
+    which makes the sum exact.
     """
     reflection = photo - np.minimum(transmission, photo)
     return [photo - reflection, reflection]

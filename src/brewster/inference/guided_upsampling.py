@@ -1,10 +1,10 @@
 """Upsamples a separation from the resolution of the network to that of the photo, with the detail of the photo.
 
-The transmission is the photo plus a change. In linear light the photo is the sum of its layers, so the change is about
-as smooth as the reflection, and the detail of the background cancels. At low resolution the change is modelled as a
-local linear function of the photo, change = slope * photo + offset. The slopes are those of the guided filter (He et
-al. 2013, eq. 5). Slope and offset are upsampled and applied to the full photo (fast guided filter, He & Sun 2015). The
-offset contains the error of the fit, so at low resolution the result equals the prediction.
+The upsampled quantity is the change, transmission - photo. In linear light, the photo is the sum of its layers. The change
+therefore contains no detail of the background, and is about as smooth as the reflection. At low resolution, the change is modelled
+as a local linear function of the photo, change = slope * photo + offset. The slopes are those of the guided filter (He et al. 2013,
+eq. 5). Slope and offset are upsampled and applied to the full photo (fast guided filter, He & Sun 2015). The offset contains the
+error of the fit, so that at low resolution the result equals the prediction.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ _RADIUS: Final = 2
 _EPSILON: Final = 4e-3
 """The regularisation epsilon of the guided filter (He et al. 2013, eq. 5), in linear light squared."""
 _DETAIL_EPSILON: Final = 1e-6
-"""Added to the denominator of the weight of the generated transmission: without detail, the weight is 0."""
+"""Added to the denominator of the weight of the generated transmission, so that the weight is 0 where there is no detail."""
 
 
 @final
@@ -102,7 +102,7 @@ class GuidedUpsampler:
             photo: the photo.
             change: transmission - photo.
             reflection: the reflection; None if it is photo - transmission.
-            override: where a generated transmission replaces the fitted one.
+            override: a generated transmission, and the weight with which it replaces the fitted transmission.
         """
         mean = _box_mean(photo)
         variance = _box_mean(photo * photo) - mean**2 + _EPSILON
@@ -156,7 +156,10 @@ def upsample_rows(map_: Floats, top: int, rows: int, size: tuple[int, int]) -> F
 
 
 def _positions(small: int, first: int, count: int, large: int) -> tuple[NDArray[np.intp], Floats]:
-    """Returns positions in the small map for `count` pixels of the large map, from `first`: integer and fractional part."""
+    """Returns the positions in a map of length `small` of `count` pixels of a map of length `large`, from the pixel `first`.
+
+    Each position is split into its integer part and its fractional part.
+    """
     centres = (np.arange(first, first + count) + 0.5) * (small / large) - 0.5
     centres = np.clip(centres, 0, small - 1)
     lower = np.minimum(centres.astype(np.intp), max(small - 2, 0))
@@ -175,7 +178,7 @@ def _interpolate(map_: Floats, lower: NDArray[np.intp], fraction: Floats, *, axi
 
 
 def _box_mean(map_: Floats) -> Floats:
-    """Returns the means of a map (h, w, C) over square windows. The edge pixels are repeated beyond the edges."""
+    """Returns the means of a map (h, w, C) over square windows. Pixels outside the map have the value of the nearest pixel."""
     for axis in (0, 1):
         padding = [(0, 0)] * 3
         padding[axis] = (_RADIUS, _RADIUS)

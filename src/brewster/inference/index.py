@@ -3,8 +3,8 @@
     import pandas
     index = pandas.read_parquet("out/index.parquet")
 
-During a run, rows are written to small tables in the folder .brewster-index. At the end of the run they are merged into
-index.parquet, together with the rows of earlier runs. So a killed run loses no more than the rows of its last seconds.
+During a run, rows are written to small tables in the folder .brewster-index, about every 30 seconds. At the end of the run, they
+are merged into index.parquet, together with the rows of earlier runs. A killed run loses only the rows after its last small table.
 """
 
 from __future__ import annotations
@@ -40,12 +40,12 @@ COLUMNS: Final[dict[str, tuple[str, Callable[[FileResult], object]]]] = {
     "outputs": ("strings", lambda result: list(result.outputs.values())),
     "error": ("string", lambda result: result.error),
 }
-"""Name of a column -> its type and its value for a result."""
+"""Name of a column -> its type, and the function that returns its value for a result."""
 
 
 @final
 class IndexWriter:
-    """Writes the index of an output folder. A context manager: on exit, all rows are merged into index.parquet.
+    """Writes the index of an output folder. A context manager: all rows are merged into index.parquet when it exits.
 
     Raises:
         OutputError: the folder cannot be written to, or has another file named index.parquet.
@@ -59,14 +59,14 @@ class IndexWriter:
         self._rows: list[FileResult] = []
         if exists(self._index):
             self._read(self._index)
-        self._write_part()  # an empty part, so that a folder without write access ends the run before the first photo
+        self._write_part()  # an empty part: without write access to the folder, this raises an error before the first photo
 
     def append(self, result: FileResult) -> None:
-        """Adds the row of a result. If a part cannot be written, its rows are kept, and the next part includes them."""
+        """Adds the row of a result, and writes a part if it is time. If this fails, the next part contains the same rows."""
         self._rows.append(result)
         is_due = time.monotonic() > self._written_at + _PART_INTERVAL_S
         if is_due or len(self._rows) % MAX_PART_ROWS == 0:
-            with contextlib.suppress(OutputError):  # `close` raises it, if it remains
+            with contextlib.suppress(OutputError):  # if the error persists, `close` raises it
                 self._write_part()
 
     def close(self) -> None:
@@ -89,7 +89,7 @@ class IndexWriter:
         self._write(self._index, table.take(self._arrow.array(_last_rows(table), "int64")).sort_by("path"))
         for part in parts:
             part.unlink()
-        with contextlib.suppress(OSError):  # another run has parts in it
+        with contextlib.suppress(OSError):  # the folder contains parts of another run
             self._parts_folder.rmdir()
 
     def __enter__(self) -> Self:
@@ -134,7 +134,9 @@ class IndexWriter:
 
 
 def _last_rows(table: Any) -> list[int]:  # noqa: ANN401  (pyarrow has no types)
-    """Returns the number of the last row of each path. A skipped photo keeps the row of the run that separated it."""
+    """Returns the index of the last row of each path. For a photo that was separated and later skipped, this is the row of
+    the run that separated it.
+    """
     last: dict[str, int] = {}
     statuses = table.column("status").to_pylist()
     for row, path in enumerate(table.column("path").to_pylist()):

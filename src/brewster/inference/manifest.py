@@ -4,9 +4,9 @@
     1987/box-04/0017.tif
     s3://scans/1987/box-04/0018.tif
 
-A relative path begins in the folder of the manifest. Below the output folder, layers are written to the same relative
-path. The layers of absolute paths and URLs are written to the whole path, without the root or the protocol:
-`OUT/scans/1987/box-04` for the second row. So the target of a photo does not depend on the other rows.
+A relative path is relative to the folder of the manifest, and its layers are written to the same relative path below the output
+folder. The layers of an absolute path or a URL are written to this path below the output folder, without the root or the protocol:
+to `OUT/scans/1987/box-04` for the second row. The output folder of a photo therefore does not depend on the other rows.
 """
 
 from __future__ import annotations
@@ -38,11 +38,12 @@ def read_manifest(
 
     Args:
         manifest: the path of the table.
-        output_folder: see the module. By default, the layers are written next to their photo.
+        output_folder: the folder below which the layers are written. By default, they are written next to their photo.
 
     Raises:
-        ManifestError: the manifest cannot be read, is not a table, or has a row without a path in its folder.
-        MissingExtra: a Parquet table needs pyarrow; a URL needs the package of its store.
+        ManifestError: the manifest cannot be read, is not a table, or a row has no path or a relative path outside the folder of
+            the manifest.
+        MissingExtra: the package is not installed that a Parquet table (pyarrow) or a URL needs.
     """
     for number, text in enumerate(_paths(manifest), 1):
         photo, mirrored = _photo(manifest, text, number)
@@ -122,6 +123,6 @@ def import_parquet(purpose: str) -> Any:  # noqa: ANN401  (pyarrow has no types)
     except ImportError as error:
         raise MissingExtra(
             "the package pyarrow is not installed",
-            f"expected it, because {purpose} is a Parquet table",
+            f"expected pyarrow, because {purpose} is a Parquet table",
             "run: pip install 'brewster[cluster]'",
         ) from error

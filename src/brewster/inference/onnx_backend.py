@@ -13,7 +13,7 @@ from brewster.errors import DeviceError, ModelError
 from brewster.inference.tiles import Image
 
 _STRIDE_PX: Final = 32
-"""The sides of the input of a network are multiples of this. Tiles are padded by mirroring their edges."""
+"""The sides of the input of a network are multiples of this number. Tiles are padded by mirroring their edges."""
 
 # device name: (execution provider of ONNX Runtime, command that installs it), preferred devices first
 _PROVIDERS: Final = {
@@ -62,7 +62,8 @@ class OnnxBackend:
         )
 
     def __call__(self, tile: Image) -> tuple[Image, Image]:
-        """Returns the transmission and the reflection of a tile. All are (H, W, 3) of any size, linear light in 0..1.
+        """Returns the transmission and the reflection of a tile. All three arrays are (H, W, 3), of any size, in linear light,
+        about 0..1.
 
         Raises:
             ModelError: the model fails on this tile.
@@ -119,7 +120,7 @@ def _create_session(model: Path, data: bytes, device: str) -> ort.InferenceSessi
     """Creates a session on the device. If the libraries of the device do not load, ONNX Runtime uses the CPU."""
     options = ort.SessionOptions()
     options.log_severity_level = 3
-    # The usual variable for a share of the processors: Ray and our workers set it. ONNX Runtime ignores it.
+    # Ray and our workers limit the number of threads with this variable. ONNX Runtime does not read it.
     threads = os.environ.get("OMP_NUM_THREADS", "").partition(",")[0]
     options.intra_op_num_threads = int(threads) if threads.isdigit() else 0  # 0: one thread per core
     providers = dict.fromkeys([_PROVIDERS[device][0], "CPUExecutionProvider"])
@@ -127,8 +128,8 @@ def _create_session(model: Path, data: bytes, device: str) -> ort.InferenceSessi
         return ort.InferenceSession(data, options, list(providers), enable_fallback=0)
     except Exception as error:
         raise ModelError(
-            f"{model} is not a model that ONNX Runtime can load on {device}",
-            f"expected an .onnx file that brewster train has exported ({_first_line(error)})",
+            f"{model} is not a model that ONNX Runtime can load on {device} ({_first_line(error)})",
+            "expected an .onnx file that brewster train has exported",
             "check the file",
         ) from error
 
@@ -146,6 +147,6 @@ def _candidates(device: str) -> list[str]:
         raise DeviceError(
             f"device {device} is not available to the installed ONNX Runtime",
             f"expected one of {', '.join(available)}",
-            f"{_PROVIDERS[device][1]}, or use --device auto",
+            f"run: {_PROVIDERS[device][1]}, or use --device auto",
         )
     return [device]

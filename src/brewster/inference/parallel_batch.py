@@ -5,9 +5,9 @@
     with RayExecutor(create_runner, "10.0.0.1:6379") as executor, IndexWriter(location("s3://bucket/clear")) as index:
         separate_in_parallel(tasks, executor, on_result=index.append)
 
-A worker separates one photo at a time, with the code of a batch in one process (`BatchRunner`). It reads the photo and
-writes the layers itself. A layer that exists is never written again, not even by two workers at the same time. So a lost
-node costs only the photos that it was separating, and a run that has stopped is resumed by the same command.
+A worker separates one photo at a time, with the same code as a batch in one process (`BatchRunner`). The worker itself reads the
+photo and writes the layers. Without `overwrite`, a layer that exists is never written again, even if two workers separate the same
+photo. If a node is lost, only the photos that it was separating are separated again. The same command resumes a stopped run.
 """
 
 from __future__ import annotations
@@ -36,8 +36,8 @@ def separate_in_parallel(
 
     Args:
         tasks: the photos and the paths of their layers, from `plan_files`.
-        executor: runs an `SeparationRunner` in its workers; its context is entered by the caller.
-        overwrite: replace layers that exist, instead of skipping them.
+        executor: runs a `SeparationRunner` in its workers. The caller enters its context.
+        overwrite: whether layers that exist are replaced instead of skipped.
         on_result: called with the result of every photo. An exception raised in it stops the run.
 
     Raises:
@@ -45,7 +45,7 @@ def separate_in_parallel(
         ModelError: the model does not exist or is damaged.
         DeviceError: the requested device is not available.
     """
-    _check_targets(tasks)
+    _check_outputs(tasks)
     unfinished = _unfinished(tasks, on_result, overwrite=overwrite)
     for result in run_tasks(lambda: next(unfinished, None), executor):
         on_result(result)
@@ -53,12 +53,12 @@ def separate_in_parallel(
 
 @final
 class SeparationRunner:
-    """Separates photos in a worker. The model is loaded with the first photo.
+    """Separates photos in a worker. The model is loaded when the first photo is separated.
 
     Args:
         options: the options of the batch.
         shared_folder: the output folder on a cluster. If it is not an object store, all nodes must share it.
-        overwrite: replace layers that exist.
+        overwrite: whether layers that exist are replaced.
 
     Raises:
         OutputError: the folder does not exist on this node.
@@ -76,22 +76,22 @@ class SeparationRunner:
         self._batch, self._overwrite = BatchRunner((), options, overwrite=overwrite), overwrite
 
     def __call__(self, task: SeparationTask) -> list[FileResult]:
-        """Separates one photo. Errors of the photo become a result with the status "failed".
+        """Separates one photo. If the photo fails, its result has the status "failed".
 
         Raises:
             ModelError, DeviceError, MissingExtra: the model cannot be loaded.
         """
         result = self._batch.run(task, lambda _fraction: None)
         if result.error and not self._overwrite and _is_finished(task, exists):
-            # Another worker has written the layers in the meantime: the node was slow, and its task was tried again.
+            # This worker was slow, and another worker got the same task and has already written the layers.
             result = FileResult(task.name, "skipped")
         if not result.error:
             result.outputs = {layer: str(target) for layer, target in task.outputs.items()}
         return [result]
 
 
-def _check_targets(tasks: Sequence[SeparationTask]) -> None:
-    """Raises OutputError if a layer has the path of a photo. Workers cannot check this, because each has one photo only."""
+def _check_outputs(tasks: Sequence[SeparationTask]) -> None:
+    """Raises OutputError if a layer has the path of a photo. A worker cannot check this, because it does not get all paths."""
     sources = {real_path(task.source) for task in tasks if isinstance(task.source, Location)}
     for task in tasks:
         for target in task.outputs.values():
@@ -106,7 +106,7 @@ def _check_targets(tasks: Sequence[SeparationTask]) -> None:
 def _unfinished(
     tasks: Sequence[SeparationTask], on_result: Callable[[FileResult], None], *, overwrite: bool
 ) -> Iterator[SeparationTask]:
-    """Yields the tasks with missing layers. The others are reported as skipped, so that no worker is needed for them."""
+    """Yields the tasks with missing layers, or all tasks with `overwrite`. Reports the other tasks as skipped, without a worker."""
     listing = _FolderListing()
     for task in tasks:
         if not overwrite and _is_finished(task, listing.has):
@@ -120,13 +120,13 @@ def _unfinished(
 
 
 def _is_finished(task: SeparationTask, has: Callable[[Location], bool]) -> bool:
-    """Whether all layers exist."""
+    """Whether all layers of the task exist."""
     return all(isinstance(target, Location) and has(target) for target in task.outputs.values())
 
 
 @final
 class _FolderListing:
-    """The names in the folder that was asked for last. One listing replaces thousands of requests to an object store."""
+    """The file names in the folder of the last request. One listing replaces thousands of requests to an object store."""
 
     def __init__(self) -> None:
         self._folder: Location | None = None

@@ -1,7 +1,7 @@
 """Predicts the layers of a photo from downscaled copies of it.
 
-`MultiScalePredictor` runs a feed-forward network at several input scales with flip augmentation. The mean of the
-outputs is the prediction; their spread gives the confidence. Diffusion models have their own predictor
+`MultiScalePredictor` runs a feed-forward network at several input scales with flip augmentation. The prediction is the mean of
+the outputs. The confidence is computed from the spread of the outputs. Diffusion models have their own predictor
 (diffusion_predictor.py).
 """
 
@@ -36,9 +36,9 @@ QUALITIES: Final[dict[Quality, tuple[int, ...]]] = {
 """The input scales of `MultiScalePredictor`: width times height of each input in pixels, the largest last."""
 
 _MIN_SHORT_SIDE_PX: Final = 160
-"""Inputs are enlarged to this short side, up to the factor below."""
+"""The inputs of photos with a large aspect ratio are enlarged until their short side has this length."""
 _MAX_ELONGATED_SCALE: Final = 3.0
-"""Maximum factor by which the sides of an input are enlarged for photos with a large aspect ratio."""
+"""Maximum factor of this enlargement."""
 _TILE_PX: Final = 1024
 _OVERLAP_PX: Final = 192
 _SPREAD_AT_1_E: Final = 0.05
@@ -64,7 +64,7 @@ class Prediction:
 
 
 _MAX_OUTPUT: Final = 16.0
-"""Larger outputs are refused: they are not linear light in which 1 is white."""
+"""Outputs with larger absolute values are errors: they are not linear light with 1 as white."""
 
 
 class Predictor(ABC):
@@ -89,9 +89,10 @@ class MultiScalePredictor(Predictor):
         self._backend = backend
 
     def input_sizes(self, size: tuple[int, int], quality: Quality) -> list[tuple[int, int]]:
-        """Returns the sizes of the inputs: those of `QUALITIES`, never larger than the photo.
+        """Returns the sizes of the inputs with the numbers of pixels in `QUALITIES`. No input is larger than the photo.
 
-        Inputs for photos with a large aspect ratio are larger, so that their short side has 160 pixels if possible.
+        For photos with a large aspect ratio, the inputs are up to 3 times as wide and high, so that their short side has at least
+        160 pixels if possible.
         """
         width, height = size
         sizes = []
@@ -142,7 +143,7 @@ def checked_layers(outputs: object, tile: Floats) -> tuple[Floats, Floats]:
     """Returns the two outputs of a backend for a tile (H, W, 3) as float32.
 
     Raises:
-        ModelError: the outputs are not two float arrays with the shape of the tile, or are not linear light of about 0..1.
+        ModelError: the outputs are not two float arrays with the shape of the tile, or contain NaN or values outside -16..16.
     """
     if not isinstance(outputs, tuple | list) or len(outputs) != 2:
         count = f" of {len(outputs)}" if isinstance(outputs, tuple | list) else ""
@@ -171,6 +172,6 @@ def checked_layers(outputs: object, tile: Floats) -> tuple[Floats, Floats]:
 
 
 def confidence_from_spread(spread: Float32[Floats, "h w 3"]) -> Float32[Floats, "h w 1"]:
-    """Returns exp(-spread / 0.05), where spread is the largest of the three channels. `spread` is sRGB-encoded."""
+    """Returns exp(-s / 0.05), where s is the largest spread of the three channels. `spread` is sRGB-encoded."""
     confidence: Floats = np.exp(-spread.max(axis=2, keepdims=True) / np.float32(_SPREAD_AT_1_E))
     return confidence

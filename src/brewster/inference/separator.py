@@ -4,9 +4,9 @@
     separation = separator("window.jpg")
     separation.transmission.save("clear.jpg")
 
-The model predicts both layers for small linear copies of the photo (predictor.py, or diffusion_predictor.py for
-diffusion models; tiles.py splits inputs that are too large). guided_upsampling.py applies the prediction to the
-photo at full size.
+The model predicts both layers from downscaled copies of the photo in linear light (predictor.py, or diffusion_predictor.py for
+diffusion models). tiles.py splits copies that are too large for one run of the model. guided_upsampling.py applies the
+prediction to the photo at full size.
 """
 
 from __future__ import annotations
@@ -49,9 +49,9 @@ if TYPE_CHECKING:
 PROGRAM: Final = "brewster"
 """The name under which the metadata of layers record this program."""
 _WHITE_PERCENTILE: Final = 99.0
-"""If this percentile of the photo is above 1, as in an EXR, the input of the network is divided by it."""
+"""If this percentile of the photo is above 1, as in an EXR file, the input of the network is divided by the percentile."""
 _NETWORK_SHARE: Final = 0.6
-"""Estimated fraction of the total time that the network takes, for the progress."""
+"""Estimated time of the network divided by the total time, for the progress."""
 
 
 @final
@@ -148,8 +148,8 @@ class Separator:
     ) -> Iterator[Separation | BrewsterError]:
         """Separates many photos with several threads, and yields the results in the order of the sources.
 
-        A photo that cannot be separated does not stop the others: its result is the error. At most `threads` + 1
-        photos are in memory, so that the sources may be an endless generator.
+        If a photo cannot be separated, its result is the error, and the other photos are still separated. At most
+        `threads` + 1 photos are in memory, so that the sources can be an endless generator.
 
         Args:
             sources: photos, as for a call of the separator.
@@ -209,7 +209,7 @@ class Separator:
             TypeError: the source has another type.
             ModelError: the model returns an invalid output.
             MaskError: the mask cannot be read, is not grey, or has another size than the photo.
-            BrewsterError: strength or quality is out of range.
+            BrewsterError: strength is out of range, or quality is not a key of `QUALITIES`.
         """
         _check_options(strength, quality)
         seconds: dict[str, float] = {}
@@ -254,19 +254,20 @@ class Separator:
         quality: Quality = Options.quality,
         on_progress: ProgressCallback = lambda _fraction: None,
     ) -> tuple[GuidedUpsampler, Prediction, Assessment]:
-        """Predicts the layers of a photo, without computing them at full size.
+        """Predicts the layers of a photo, but does not compute them at full size.
 
         Args:
             photo: the photo.
-            quality: as in a call.
-            on_progress: as in a call.
+            quality: see the call of a separator.
+            on_progress: see the call of a separator.
 
         Returns:
             The upsampler at strength 1, which computes the layers of any rows of the photo; the prediction; and its
             assessment.
 
         Raises:
-            BrewsterError: quality is out of range.
+            BrewsterError: quality is not a key of `QUALITIES`.
+            ModelError: the model returns an invalid output.
         """
         _check_options(Options.strength, quality)
         inputs, white = self._inputs(photo, quality)
@@ -302,7 +303,8 @@ def separate(
     """Separates one photo. For several photos, use `Separator.load` once and call the separator for each.
 
     Args:
-        source: a path, the bytes of a file, a PIL image, a `Photo`, or an array (see `Photo.from_array`).
+        source: a path, the bytes of a file, an open binary file, a PIL image, a `Photo`, or an array (see
+            `Photo.from_array`).
         encoding: the encoding of an array, "srgb" or "linear"; for arrays only.
 
     Raises:
@@ -336,14 +338,14 @@ def _open_pipeline(
     except ImportError as error:
         raise MissingExtra(
             f"{error.name} is not installed",
-            f"expected it to be installed, because {model} needs it",
+            f"expected {error.name}, because the model {model} needs it",
             "run: pip install 'brewster[diffusion]'",
         ) from error
     return load_pipeline(model, device=device, base_model=base_model, quantization=quantization)
 
 
 def history_step(model: str, *, strength: float, quality: str, additive: bool) -> dict[str, str]:
-    """Returns the options of a separation as the metadata of its layers record them."""
+    """Returns the options of a separation as names and values for the metadata of its layers."""
     return {
         "model": model,
         "strength": f"{strength:g}",
@@ -376,7 +378,7 @@ def _assess(largest_input: Floats, prediction: Prediction) -> Assessment:
 def _fit_upsampler(
     largest_input: Floats, prediction: Prediction, strength: float, white: np.float32
 ) -> GuidedUpsampler:
-    """Fits the upsampler to a prediction, scaled by the strength and by the white level `white` of the photo."""
+    """Fits the upsampler to a prediction. The prediction is scaled by the strength and by the white level of the photo, `white`."""
     scale, override = np.float32(strength) * white, prediction.override
     if override:
         override = replace(override, transmission=white * override.transmission, strength=strength)

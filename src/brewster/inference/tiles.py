@@ -1,4 +1,4 @@
-"""Runs a backend on overlapping tiles of an image and blends the outputs, to limit the memory use."""
+"""Runs a backend on overlapping tiles of an image and blends the outputs. The tiles limit the use of memory."""
 
 from __future__ import annotations
 
@@ -54,20 +54,20 @@ def tile_slices(size: tuple[int, int], *, tile_px: int, overlap_px: int) -> list
     return list(product(rows, columns))
 
 
-def _tile_spans(side: int, tile: int, overlap: int) -> list[slice]:
-    """Returns spans of length `tile` that cover 0..side, with equal overlaps of at least `overlap` pixels."""
-    if side <= tile:
-        return [slice(0, side)]
-    count = -(-(side - overlap) // (tile - overlap))
-    starts = np.linspace(0, side - tile, count).round().astype(int)
-    return [slice(int(start), int(start) + tile) for start in starts]
+def _tile_spans(side_px: int, tile_px: int, overlap_px: int) -> list[slice]:
+    """Returns spans of length `tile_px` that cover 0..side_px, with about equal overlaps of at least `overlap_px`."""
+    if side_px <= tile_px:
+        return [slice(0, side_px)]
+    count = -(-(side_px - overlap_px) // (tile_px - overlap_px))
+    starts = np.linspace(0, side_px - tile_px, count).round().astype(int)
+    return [slice(int(start), int(start) + tile_px) for start in starts]
 
 
-def _blend_weights(span: slice, side: int, overlap: int) -> NDArray[np.float32]:
+def _blend_weights(span: slice, side_px: int, overlap_px: int) -> NDArray[np.float32]:
     """Returns weights along a span: 1 in the middle, with a linear ramp at each end that is not an edge of the image."""
     length = span.stop - span.start
-    ramp = (np.arange(length, dtype=np.float32) + 1) / (overlap + 1)
+    ramp = (np.arange(length, dtype=np.float32) + 1) / (overlap_px + 1)
     ones = np.ones(length, np.float32)
     left = ones if span.start == 0 else np.minimum(ramp, 1)
-    right = ones if span.stop == side else np.minimum(ramp[::-1], 1)
+    right = ones if span.stop == side_px else np.minimum(ramp[::-1], 1)
     return np.minimum(left, right)

@@ -3,7 +3,7 @@
 torchrun --standalone --nproc_per_node 2 -m brewster train recipes/train/klein.toml
 accelerate launch --multi_gpu --num_processes 2 -m brewster train recipes/train/klein.toml
 
-Each process computes the gradients of its part of the batch; the sum equals the gradient of one process with the whole
+Each process computes the gradients of its part of the batch. Their sum equals the gradient of one process with the whole
 batch. A run can therefore be resumed with another number of processes. Only rank 0 writes files and logs. The package
 accelerate is needed for several processes.
 """
@@ -25,7 +25,8 @@ from brewster.models.diffusion.lazy_imports import import_library
 _LAUNCHER_VARIABLES: Final = ("RANK", "LOCAL_RANK", "MASTER_ADDR", "MASTER_PORT")
 """The environment variables that a launcher sets for each process, in addition to WORLD_SIZE."""
 _TIMEOUT: Final = timedelta(hours=12)
-"""How long a process waits for the others. NCCL's default of ten minutes is shorter than the download of a base by rank 0."""
+"""Maximum time for which a process waits for the other processes. NCCL's default of ten minutes is shorter than the download of a
+backbone by rank 0."""
 _CURE: Final = "start them with torchrun --nproc_per_node"
 
 

@@ -1,8 +1,8 @@
 """The training loop: `run(trainer, out, on_step)` starts or resumes a run of any `Trainer`.
 
-A step depends on the trainer's state and on (seed, step) only. On a CPU, a run that was killed and resumed therefore ends
-with bit-identical weights to an uninterrupted run (same machine, same number of threads). A run can be resumed with more steps: from then on, its learning rates and image sizes
-are those of the longer run.
+A step depends on the trainer's state and on (seed, step) only. On a CPU, a run that was killed and resumed therefore ends with
+the same weights, bit for bit, as an uninterrupted run on the same machine with the same number of threads. A run can be resumed
+with more steps: from then on, its learning rates and image sizes are those of the longer run.
 """
 
 from __future__ import annotations
@@ -80,13 +80,13 @@ def run(
     on_step: StepCallback,
     on_start: StartCallback = lambda _completed, _steps, _seconds: None,
 ) -> None:
-    """Trains until the last step of the recipe; resumes from the checkpoint in `out` if there is one.
+    """Trains until the last step of the recipe. If `out` contains a checkpoint, resumes its run.
 
-    Every `checkpoint_every` steps it writes `checkpoint.pt` into `out`. Every `report_every` steps it validates, appends a
-    line to `log.jsonl`, replaces `samples.png` and the curves in `results.png`, and writes metrics and samples as TensorBoard
-    events. The logged `seconds` are those of the whole run: they include the time before an interruption, up to the
-    checkpoint. With several processes, all of them validate, and only rank 0 writes files. If the recipe has no data (a
-    count of 0), `run` takes no step, and the trainer keeps its initial weights.
+    Every `checkpoint_every` steps, this function writes `checkpoint.pt` into `out`. Every `report_every` steps, it validates,
+    appends a line to `log.jsonl`, replaces `samples.png` and the curves in `results.png`, and writes metrics and samples as
+    TensorBoard events. The logged `seconds` include the time before an interruption, up to the checkpoint. If there are several
+    processes, all processes validate, and only rank 0 writes files. If the recipe has no data (a count of 0), there are no
+    training steps, and the trainer keeps its initial weights.
 
     Raises:
         RecipeError: `out` contains a run of another recipe, or a run with more steps.
@@ -145,7 +145,7 @@ def _check_recipe(checkpoint: Checkpoint, recipe: TrainingRecipe, path: Path) ->
     before = _compared_values(checkpoint.recipe, recipe)
     now = _compared_values(recipe.model_dump_json(), recipe)
     if before != now:
-        # A run of a recipe with another schema has no values to compare.
+        # `before` is empty if the stored recipe is not valid in the current schema. No change can be listed then.
         names = [name for name in before | now if before and before.get(name) != now.get(name)]
         changes = ", ".join(f"{name} was {before.get(name)}, is {now.get(name)}" for name in names)
         raise RecipeError(
@@ -190,7 +190,7 @@ def _append_log(path: Path, metrics: Mapping[str, float]) -> None:
 
 
 def _truncate_log(step: int, log: Path) -> None:
-    """Removes the lines that a killed run wrote after its last checkpoint. The last line may be incomplete."""
+    """Removes the lines that a killed run wrote after its last checkpoint, also if the last line is incomplete."""
     lines = log.read_text().splitlines() if log.exists() else []
     valid = [line for line in lines if line.endswith("}") and json.loads(line)["step"] <= step]
     if valid != lines:

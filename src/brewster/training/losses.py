@@ -20,22 +20,22 @@ _QUANTIZATION_MSE: Final = 1 / (12 * 255**2)
 _SCALES = (1, 4, 16)
 """Side of the averaging windows of the loss, in pixels."""
 _MAX_ADDED_SHARE = 0.05
-"""A pixel counts as unchanged if the glass added less light than about this fraction of the photo's light."""
+"""A pixel counts as unchanged if the glass added less light than about this share of the photo's light."""
 _MSE_FLOOR = 1e-4
-"""Added to the mean squared error before the logarithm. For an image with a PSNR above 40 dB, the gradient decreases to 0."""
+"""Added to the mean squared error before the logarithm, so that the gradient tends to 0 for an image with a PSNR above 40 dB."""
 
 
 def separation_loss(layers: Float[Tensor, "n 6 h w"], batch: TrainingBatch) -> dict[str, Tensor]:
     """Computes the loss of predicted layers: channels 0-2 are the transmission, 3-5 the reflection.
 
-    It is computed on sRGB-encoded values, as benchmarks do:
+    The loss is computed on sRGB-encoded values, like the metrics of benchmarks. It has these parts:
 
-    - transmission, reflection: mean absolute error at three scales, so that a wrong overall tone counts as much as wrong
-      detail.
+    - transmission: mean absolute error at three scales, so that a wrong overall tone counts as much as wrong detail.
+    - reflection: 0.3 times the same error of the reflection, multiplied by the `reflection_weight` of each image.
     - edges: mean absolute error of the transmission's gradients, so that edges of the reflection are removed
       (Zhang et al. 2018).
-    - log_mse: 0.04 times the logarithm of each image's mean squared error, so that easy images count as much as hard ones. It
-      is negative for small errors.
+    - log_mse: 0.04 times the mean logarithm of each image's mean squared error, so that easy images count as much as hard
+      images. This part is usually negative, because the mean squared error is usually below 1.
 
     Returns:
         The parts of the loss by name, each a scalar. The loss is their sum.
@@ -74,9 +74,9 @@ def tone_ratio(prediction: Tensor, photo: Tensor, ground_truth: Tensor) -> float
     These are the pixels where photo - ground truth < 0.05 photo + 0.0025 in every channel, in linear light. The ratio is 1 if
     prediction and photo have the same exposure, and 1 if there is no such pixel. Images are (..., 3, h, w), encoded in 0..1.
     """
-    before, after, target = (to_linear(image) for image in (photo, prediction, ground_truth))
+    before, after, truth = (to_linear(image) for image in (photo, prediction, ground_truth))
     unchanged = (
-        (before - target < _MAX_ADDED_SHARE * before + _MAX_ADDED_SHARE**2)
+        (before - truth < _MAX_ADDED_SHARE * before + _MAX_ADDED_SHARE**2)
         .all(dim=-3, keepdim=True)
         .expand_as(before)
     )

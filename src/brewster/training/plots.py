@@ -1,4 +1,4 @@
-"""Pictures of a run: results.png with the curves of the log, and the captioned sheet of sample predictions."""
+"""Images of a training run: results.png with the curves of the log, and the sheet of sample predictions with captions."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ if TYPE_CHECKING:
 
 CAPTION_PX: Final = 20
 """Height of a line of text on a sheet of samples."""
-_PANELS: Final = {
+_SUBPLOT_TITLES: Final = {
     "loss": "loss of the batch",
     "loss_": "terms of the loss",
     "psnr_gain_db_": "PSNR gain over the input, dB",
     "worse_": "share of pairs worse than the input",
     "tone_": "tone, prediction / photo",
 }
-"""Metric name, or its prefix -> title of the panel. Metrics with one prefix share a panel. Others have their own panel."""
+"""Name or prefix of metrics -> title of the subplot. Metrics with one prefix share a subplot. All other metrics have their own."""
 _MAX_COLUMNS: Final = 3
 _DPI: Final = 128  # a power of two: sides in inches, and therefore in pixels, are exact
 
@@ -38,15 +38,15 @@ def plot_log(lines: Sequence[Mapping[str, float]]) -> bytes:
     """
     from matplotlib.figure import Figure  # noqa: PLC0415  (slow to import)
 
-    panels: dict[str, dict[str, str]] = {}
+    subplots: dict[str, dict[str, str]] = {}
     for name in dict.fromkeys(name for line in lines for name in line if name not in ("step", "seconds")):
-        title, label = _panel_of(name)
-        panels.setdefault(title, {})[name] = label
-    columns = min(_MAX_COLUMNS, len(panels))
-    rows = -(-len(panels) // columns)
+        title, label = _subplot_of(name)
+        subplots.setdefault(title, {})[name] = label
+    columns = min(_MAX_COLUMNS, len(subplots))
+    rows = -(-len(subplots) // columns)
     figure = Figure(figsize=(4 * columns, 3.25 * rows), layout="constrained")
     axes = figure.subplots(rows, columns, squeeze=False).flat
-    for axis, (title, metrics) in zip(axes, panels.items(), strict=False):
+    for axis, (title, metrics) in zip(axes, subplots.items(), strict=False):
         for name, label in metrics.items():
             points = [(line["step"], line[name]) for line in lines if name in line]
             axis.plot(*zip(*points, strict=True), marker="o", markersize=3, linewidth=1.4, label=label)
@@ -56,7 +56,7 @@ def plot_log(lines: Sequence[Mapping[str, float]]) -> bytes:
         axis.grid(alpha=0.25)
         if any(metrics.values()):
             axis.legend(fontsize=8)
-    for axis in list(axes)[len(panels) :]:
+    for axis in list(axes)[len(subplots) :]:
         axis.set_visible(False)
     data = io.BytesIO()
     figure.savefig(data, format="png", dpi=_DPI, metadata={"Software": None})
@@ -70,7 +70,8 @@ def sample_sheet(
 
     Args:
         columns: the titles of the images of a row. The images have equal widths.
-        rows: caption and images of each row, at least one. All have the same size. Values are sRGB-encoded, in 0..1.
+        rows: the caption of each row, and its images side by side in one array; at least one row. All arrays have the same
+            size. Values are sRGB-encoded, in 0..1.
 
     Returns:
         The sheet, (H, w, 3), sRGB-encoded, with H = CAPTION_PX + len(rows) (CAPTION_PX + h).
@@ -100,11 +101,11 @@ def sample_sheet(
     return sheet
 
 
-def _panel_of(name: str) -> tuple[str, str]:
-    """Returns the title of the panel of a metric, and the label of its curve, which is empty if it is alone."""
-    if name in _PANELS:
-        return _PANELS[name], ""
-    for prefix, title in _PANELS.items():
+def _subplot_of(name: str) -> tuple[str, str]:
+    """Returns the title of a metric's subplot, and the label of its curve, which is empty if the subplot has no other curve."""
+    if name in _SUBPLOT_TITLES:
+        return _SUBPLOT_TITLES[name], ""
+    for prefix, title in _SUBPLOT_TITLES.items():
         if prefix.endswith("_") and name.startswith(prefix):
             return title, name.removeprefix(prefix).replace("_", " ")
     return name.replace("_", " "), ""

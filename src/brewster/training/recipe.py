@@ -68,7 +68,7 @@ ImageSizeSchedule = Annotated[
     AfterValidator(_ascending_from_0),
     KeyNote(
         "list of [share, side]",
-        f"shares from 0 to 1, the first 0, increasing; sides multiples of {MAX_STRIDE}, never decreasing",
+        f"shares increase from 0 and are at most 1; sides are multiples of {MAX_STRIDE} and do not decrease",
         "px",
         replaces_constraints=True,
     ),
@@ -89,13 +89,14 @@ class TrainingRecipe(FrozenModel):
     warmup_steps: PositiveInt
     """Number of steps in which the learning rate rises linearly from 0 to its peak."""
     learning_rate_decay_share: Share = 1.0
-    """Share of the steps, at the end, in which the learning rate falls to zero along a cosine. Before, it is constant."""
+    """Share of the steps, at the end of the run, in which the learning rate falls to zero along a cosine. Between warm-up and
+    decay, it is constant."""
     weight_decay: NonNegativeFloat
     """Weight decay of AdamW."""
     report_every: PositiveInt
     """Number of steps between two reports: log line, validation, example images."""
     checkpoint_every: PositiveInt
-    """Number of steps between two checkpoints. A stopped run resumes from the last one."""
+    """Number of steps between two checkpoints. A stopped run resumes from its last checkpoint."""
     data: DataRecipe
 
     def learning_rate_factor(self, step: int) -> float:
@@ -120,7 +121,7 @@ class CompactRecipe(TrainingRecipe):
     ema_decay: Share
     """Decay per step of the exponential moving average (EMA) of the weights. The exported model has the averaged weights."""
     precision: Literal["float32", "auto"] = "float32"
-    """auto: bfloat16 if the processor supports it natively, except for depthwise convolutions and the head."""
+    """float32: all layers. auto: bfloat16 if the device supports it natively, except for depthwise convolutions and the head."""
     init_checkpoints: tuple[Path, ...] = ()
     """Checkpoint files, relative to this recipe. The run starts from the mean of their EMA weights."""
     mix: MixRecipe = MixRecipe()
@@ -137,14 +138,16 @@ class CompactRecipe(TrainingRecipe):
 
 
 class LoraRecipe(TrainingRecipe):
-    """A training run of a LoRA on a diffusion backbone. Defaults are those of the paper, or common values if it states none.
+    """A training run of a LoRA on a diffusion backbone. The defaults are values of the paper, or common values where the paper
+    states none.
 
-    Each sample of a batch is a real pair with probability `data.pairs_share`, else a sample of a rendered set.
-    Samples keep their aspect ratio, and are cropped only if `crops` is above 0. Mixtures and scenes that are rendered during training are not supported.
+    Each sample of a batch is a real pair with the probability `data.pairs_share`, and otherwise a sample of a rendered dataset.
+    Samples keep their aspect ratio, and are cropped only if `crops` is above 0. Mixtures, and scenes that are rendered during
+    training, are not supported.
     """
 
     backbone: str
-    """A name in the table of backbones, an id on the Hugging Face hub, a folder, or "tiny:NAME" for a toy version with random
+    """A name in the table of backbones, an id on the Hugging Face hub, a folder, or "tiny:NAME" for a tiny version with random
     weights."""
     rank: PositiveInt = 16
     """Rank of the LoRA matrices."""
@@ -154,9 +157,10 @@ class LoraRecipe(TrainingRecipe):
     """Names of the linear layers that get LoRA matrices, such as "*.attn.*". * and ? are wildcards as in a shell. Empty: all
     linear layers of the blocks."""
     optimizer: Optimizer = "adamw"
-    """adamw: float32 moments. adamw8bit: moments in 8 bits, by bitsandbytes on CUDA; 0.5 GB less for the paper's LoRA."""
+    """adamw: float32 moments. adamw8bit: 8-bit moments (bitsandbytes, CUDA only), which saves 0.5 GB for the LoRA of the paper."""
     learning_rate_decay_share: Share = 0.0
-    """Share of the steps, at the end, in which the learning rate falls to zero along a cosine. Before, it is constant."""
+    """Share of the steps, at the end of the run, in which the learning rate falls to zero along a cosine. Between warm-up and
+    decay, it is constant."""
     quantization: Quantization | None = None
     """Quantization of the frozen backbone. Not set: no quantization."""
     panels: tuple[Panel, ...] = ("I", "T", "R")
@@ -164,8 +168,8 @@ class LoraRecipe(TrainingRecipe):
     direction: Direction = "side by side"
     """Arrangement of the panels in the composite image."""
     white_space: bool = True
-    """Whether the conditioning image has white space for the panels T and R. false: it is the photo alone, with a third of the
-    tokens. According to the paper, white space is not necessary but makes training easier."""
+    """Whether the conditioning image has white space for the panels T and R. false: the conditioning image is the photo alone,
+    which has a third of the tokens. According to the paper, white space is not necessary but makes training easier."""
     max_composite_pixels: PositiveInt = PAPER_COMPOSITE_PIXELS
     """Largest number of pixels of all panels together."""
     panel_weights: Annotated[
@@ -191,7 +195,7 @@ class LoraRecipe(TrainingRecipe):
     """Factor by which training times are shifted towards noise; 1 is no shift. Not set: the shift of the sampling schedule,
     which depends on the number of tokens."""
     flip: bool = True
-    """Whether each sample is also used with left and right exchanged."""
+    """Whether samples are mirrored (left and right exchanged) with a probability of 0.5."""
     crops: Annotated[int, Field(ge=0)] = 0
     """Number of different crops of each sample, in addition to the uncropped sample."""
     reflections: Literal["given", "difference"] = "given"
@@ -209,7 +213,7 @@ class LoraRecipe(TrainingRecipe):
 
     @property
     def task(self) -> DecompositionTask:
-        """The task of the trained adapter. Its guidance is that of inference, or that of training if the objective is one_step."""
+        """The task of the trained LoRA. Its guidance is `inference_guidance`, or `guidance` if the objective is one_step."""
         guidance = self.inference_guidance if self.objective == "flow" else self.guidance
         return DecompositionTask(
             self.layout, self.max_composite_pixels, self.objective, guidance, steps=self.inference_steps
@@ -220,13 +224,13 @@ class LoraRecipe(TrainingRecipe):
         rendered = self.data.rendered
         if self.data.photos or self.data.maps or (rendered and rendered.recipe):
             raise ValueError(
-                "expected rendered sets and pairs only, because a LoRA is trained on these:"
+                "expected only rendered datasets and pairs, because LoRA training supports no other data:"
                 " remove photos, maps and rendered.recipe"
             )
         if "T" not in self.panels or len(set(self.panels)) < len(self.panels):
             raise ValueError(f"expected panels with T, each at most once, but panels is {list(self.panels)}")
         if self.quantization and self.backbone.startswith(TINY_PREFIX):
-            raise ValueError("expected no quantization: a toy backbone (tiny:) cannot be quantized")
+            raise ValueError("expected no quantization: a tiny backbone (tiny:) cannot be quantized")
         if self.prompt not in PROMPTS and not self.prompt.endswith(ENCODED_SUFFIX):
             raise ValueError(
                 f"expected one of the prompts {', '.join(PROMPTS)}, or a {ENCODED_SUFFIX} file,"
@@ -306,7 +310,7 @@ def _recipe_class(path: Path) -> type[CompactRecipe] | type[LoraRecipe]:
 
 
 def with_value(recipe: AnyRecipe, key_path: str, value: object) -> AnyRecipe:
-    """Returns a copy of the recipe with one value changed. The copy is validated as a whole.
+    """Returns a copy of the recipe with one changed value. All values of the copy are validated.
 
     Args:
         recipe: the recipe to change.
@@ -323,17 +327,17 @@ def with_value(recipe: AnyRecipe, key_path: str, value: object) -> AnyRecipe:
             "expected a key with its tables, such as data.pairs_share",
             f"did you mean {suggestion}?" if suggestion else f"see {_REFERENCE}",
         )
-    values = target = recipe.model_dump(exclude_unset=True)
+    values = table = recipe.model_dump(exclude_unset=True)
     *tables, last = key_path.split(".")
     for name in tables:
-        target = target.setdefault(name, {})
-    target[last] = value
+        table = table.setdefault(name, {})
+    table[last] = value
     source = f"the recipe with {key_path} = {value!r}"
     return validated(type(recipe), values, source=source, reference=_REFERENCE)
 
 
 def _key_paths(values: FrozenModel, prefix: str = "") -> Iterator[str]:
-    """Yields the paths of all keys and tables of the recipe. Those inside an optional table are included only if it is set."""
+    """Yields the paths of all keys and tables of the recipe. The keys of an optional table are included only if it is set."""
     for name in type(values).model_fields:
         yield prefix + name
         inner = getattr(values, name)

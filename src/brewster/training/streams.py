@@ -1,4 +1,5 @@
-"""Opens the training data of a recipe. Photos, maps and pairs are read into memory at once, rendered samples when needed.
+"""Opens the training data of a recipe. Photos, maps and pairs are read into memory at once; rendered samples are read when
+they are needed.
 
 stream = open_stream(read_recipe(Path("recipes/train/tiny.toml")))
 batch = stream(step=0, count=2, size=64)
@@ -102,7 +103,7 @@ def _open_unpaired(recipe: CompactRecipe, device: torch.device | str) -> Stream:
 
 
 def _interleave(share: float, first: Callable[[], Stream], second: Callable[[], Stream]) -> Stream:
-    """Returns both streams interleaved. A stream with a share of 0 is not opened; the other one is returned."""
+    """Interleaves two streams; `share` is the share of the first. If one stream has a share of 0, only the other is opened."""
     if share in (0, 1):
         return first() if share else second()
     return InterleavedStream(first(), second(), share)
@@ -148,7 +149,7 @@ def _open_online(
     maps, photos = resolve_folders(rendered.maps), resolve_folders(rendered.photos)
     catalog, refused = read_catalog(maps, photos, recipe.data.excluded_files)
     if refused:
-        # A warning in the log of a long run would be overlooked, and the run would use less data than the recipe lists.
+        # This is an error, because a warning in the log of a long run is easy to overlook.
         raise refused[0]
     return OnlineRendered(
         _scene_recipe(rendered),

@@ -39,8 +39,8 @@ class TensorBoardLog:
 
     @cached_property
     def _writer(self) -> SummaryWriter | None:
-        """The event file, or None without tensorboard. It is opened at the first event, so that resuming a completed run
-        creates no empty file.
+        """The writer of the event file, or None without tensorboard. The file is created at the first event, so that a completed
+        run that is resumed gets no empty file.
         """
         if not importlib.util.find_spec("tensorboard"):
             return None

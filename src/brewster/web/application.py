@@ -2,7 +2,7 @@
 
     serve(create_app(router, limits=RequestLimits.for_host("127.0.0.1")), host="127.0.0.1", port=8417)
 
-All assets are files of this package, so the pages work offline.
+All files of the pages are part of this package, so that the pages work offline.
 """
 
 from __future__ import annotations
@@ -48,15 +48,15 @@ _STATUS_CODES: Final[dict[type[BrewsterError], int]] = {
     OutputError: 500,
     DownloadError: 502,
 }
-"""HTTP status by error class; other BrewsterErrors are caused by the request and get 422."""
+"""HTTP status by error class. Other BrewsterErrors are caused by the request and get the status 422."""
 
 
 def create_app(*routers: APIRouter, limits: RequestLimits, index: str = "index.html") -> FastAPI:
-    """Create an application.
+    """Creates an application.
 
     Args:
         routers: the routes of the API.
-        limits: the limits that every request must satisfy.
+        limits: the limits of every request.
         index: the file in web/page/ that is served at `/`.
     """
     app = FastAPI(title="brewster", version=brewster.__version__, docs_url=None, redoc_url=None)
@@ -72,7 +72,7 @@ def create_app(*routers: APIRouter, limits: RequestLimits, index: str = "index.h
 
 
 def page_response(name: str) -> Response:
-    """The response with a file of web/page/; browsers revalidate the file on each use."""
+    """Returns the response with a file of web/page/. Browsers revalidate the file on each use."""
     return FileResponse(PAGE_FOLDER / name, headers={"Cache-Control": "no-cache"})
 
 
@@ -81,7 +81,7 @@ def _add_page(app: FastAPI, path: str, name: str) -> None:
 
 
 def listen(host: str, port: int) -> socket.socket:
-    """Open a listening socket; port 0 chooses a free port.
+    """Opens a listening socket; port 0 chooses a free port.
 
     Raises:
         OutputError: the address or the port cannot be used.
@@ -93,12 +93,12 @@ def listen(host: str, port: int) -> socket.socket:
         raise OutputError(
             f"{host} port {port} cannot be used ({error.strerror})",
             "expected an address of this machine and a free port",
-            "choose others with --host and --port",
+            "choose another address with --host, or another port with --port",
         ) from error
 
 
 def server_url(listening: socket.socket) -> str:
-    """The URL of a listening socket for a browser; a wildcard address becomes a loopback address."""
+    """Returns the URL of a listening socket for a browser; a wildcard address becomes a loopback address."""
     host, port = listening.getsockname()[:2]
     host = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(host, host)  # noqa: S104  (nothing is bound here)
     return f"http://[{host}]:{port}/" if ":" in host else f"http://{host}:{port}/"
@@ -111,7 +111,7 @@ def serve(
     port: int,
     on_ready: Callable[[str], None] = print,
 ) -> None:
-    """Serve the application until it is interrupted. Call this in the main thread, because it handles signals.
+    """Serves the application until it is interrupted. Call this in the main thread, because it handles signals.
 
     Args:
         app: the application.
@@ -130,7 +130,7 @@ def serve(
 
 @contextmanager
 def _sigterm_as_sigint() -> Iterator[None]:
-    """Handle SIGTERM like Ctrl-C. uvicorn raises the signal again after its shutdown, which would kill the process."""
+    """Handles SIGTERM like Ctrl-C. uvicorn raises the signal again after its shutdown, which kills the process if SIGTERM is not handled."""
     previous_handler = signal.signal(signal.SIGTERM, lambda *_: signal.raise_signal(signal.SIGINT))
     try:
         yield
@@ -139,9 +139,9 @@ def _sigterm_as_sigint() -> Iterator[None]:
 
 
 async def _error_response(request: Request, error: Exception) -> Response:
-    """Any error as JSON, `{"error": message}`; `kind` is the class of a BrewsterError."""
+    """Returns an error as JSON, `{"error": message}`. For a BrewsterError, `kind` is the name of its class."""
     if isinstance(error, ClientDisconnect):
-        return Response(status_code=499)  # the client does not read it
+        return Response(status_code=499)  # the client has disconnected and does not read the response
     if isinstance(error, HTTPException):
         return JSONResponse({"error": _http_error_message(request, error)}, error.status_code, error.headers)
     if isinstance(error, RequestValidationError):

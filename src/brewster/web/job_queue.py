@@ -39,7 +39,7 @@ class JobProgress:
 
     state: Literal["waiting", "working"]
     ahead: int
-    """Number of jobs before this one while it waits, running jobs included; 0 while it runs."""
+    """Number of waiting and running jobs before this job; 0 while this job runs."""
     share: float
     """The completed fraction, 0 to 1."""
 
@@ -55,7 +55,7 @@ class SeparationJob:
     cancelled: Event = field(default_factory=Event)
 
     def on_progress(self, share: float) -> None:
-        """Record the completed fraction.
+        """Records the completed fraction.
 
         Raises:
             JobCancelled: the job is cancelled.
@@ -65,7 +65,7 @@ class SeparationJob:
         self.share = share
 
     def run(self, work: Callable[[ProgressCallback], Result]) -> Result:
-        """Run the work function and return its result. This method is called in a worker thread."""
+        """Runs the work function and returns its result. This method is called in a worker thread."""
         self.on_progress(0)
         self.is_working = True
         return work(self.on_progress)
@@ -92,7 +92,7 @@ class JobQueue:
         return len(self._jobs)
 
     def progress(self, name: str) -> JobProgress | None:
-        """The progress of the job with this name, or None if there is no such job."""
+        """Returns the progress of the job with this name, or None if there is no such job."""
         job, names = self._jobs.get(name), list(self._jobs)  # another thread may remove a job at any time
         if job is None or name not in names:
             return None
@@ -101,7 +101,7 @@ class JobQueue:
 
     @contextmanager
     def reserve(self, name: str | None = None) -> Iterator[SeparationJob]:
-        """Reserve a place for a job, before its upload is read.
+        """Reserves a place for a job, before its upload is read.
 
         The place is released at the end of the `with` block, or later, when the thread of the job has finished.
 
@@ -133,7 +133,7 @@ class JobQueue:
     async def run_job(
         self, job: SeparationJob, work: Callable[[ProgressCallback], Result], receive: Receive
     ) -> Result:
-        """Run a work function in a worker thread.
+        """Runs a work function in a worker thread.
 
         Args:
             job: the reserved job.

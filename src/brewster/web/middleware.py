@@ -2,7 +2,7 @@
 
     app.add_middleware(LimitMiddleware, limits=RequestLimits.for_host("127.0.0.1"))
 
-A page of another site must not use a local server through the browser of the user. So the middleware refuses a request with
+A page of another site must not use a local server through the browser of the user. The middleware therefore refuses a request with
 a foreign Host header (DNS rebinding) and a POST request from a foreign origin. It sends no CORS headers.
 """
 
@@ -27,7 +27,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 LOOPBACK: Final = frozenset({"127.0.0.1", "localhost", "::1"})
 _SAFE_METHODS: Final = ("GET", "HEAD", "OPTIONS")
 _DRAIN_SECONDS: Final = 10.0
-_MAX_LENGTH_DIGITS: Final = 18  # of Content-Length; int() refuses very long numbers
+_MAX_LENGTH_DIGITS: Final = 18  # of the header Content-Length, because int() refuses very long numbers
 SECURITY_HEADERS: Final = {
     "Content-Security-Policy": (
         "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' blob: data:; "
@@ -64,12 +64,12 @@ class RequestLimits:
 
     @property
     def cookie_name(self) -> str:
-        """The name of the cookie. It depends on the token, because servers on the same host share cookies, even with other ports."""
+        """The name of the cookie. It depends on the token, because servers with different ports on one host share cookies."""
         return f"brewster-{hashlib.sha256((self.token or '').encode()).hexdigest()[:8]}"
 
     @classmethod
     def for_host(cls, host: str, *, token: str | None = None, max_bytes: int = 100_000_000) -> RequestLimits:
-        """The limits of a server that is bound to an address.
+        """Returns the limits of a server that is bound to an address.
 
         A Host header may contain this address, the host name of the machine, or a loopback address. With a wildcard
         address, it may contain any IP address.
@@ -106,7 +106,7 @@ class LimitMiddleware:
         self.app, self.limits = app, limits
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Handle one request."""
+        """Handles one request."""
         if scope["type"] != "http":
             await self.app(scope, receive, send)
             return
@@ -114,7 +114,7 @@ class LimitMiddleware:
         try:
             response = self._refusal(scope, Headers(scope=scope)) or self.app
             await response(scope, exchange.receive, exchange.send)
-        except HTTPException as error:  # from an application without its own handler
+        except HTTPException as error:  # the application has no handler for this error
             await _error_response(error.status_code, error.detail)(scope, exchange.receive, exchange.send)
         except asyncio.CancelledError:  # only the shutdown of the server cancels a request
             if not exchange.has_started:
@@ -123,7 +123,7 @@ class LimitMiddleware:
                 )(scope, exchange.receive, exchange.forward)
 
     def _refusal(self, scope: Scope, headers: Headers) -> Response | None:
-        """The response that refuses a request, or None if the request is accepted."""
+        """Returns the response that refuses a request, or None if the request is accepted."""
         limits, method = self.limits, scope["method"]
         if not limits.allows_host(headers.get("host", "")):
             return _error_response(
@@ -158,7 +158,7 @@ class _Exchange:
         self._deadline = asyncio.get_running_loop().time() + limits.body_seconds
 
     async def receive(self) -> Message:
-        """Receive the next part of the body, or the message that the client has disconnected after the end of the body.
+        """Receives the next part of the body, or the message that the client has disconnected after the end of the body.
 
         Raises:
             HTTPException: 413 if the body is too large; 408 if it takes too long.
@@ -180,10 +180,9 @@ class _Exchange:
         return message
 
     async def send(self, message: Message) -> None:
-        """Send a message. The last message is delayed until the whole body is received.
+        """Sends a message. The last message is delayed until the whole body is received.
 
-        If the response ended earlier, the connection would be closed during the upload, and the client would not read the
-        response.
+        A response that ends earlier closes the connection during the upload, and the client does not read the response.
         """
         is_end = message["type"] == "http.response.body" and not message.get("more_body", False)
         if not is_end or self._is_complete:
@@ -194,7 +193,7 @@ class _Exchange:
         await self._send({"type": "http.response.body", "body": b""})
 
     async def forward(self, message: Message) -> None:
-        """Send a message without waiting for the rest of the body."""
+        """Sends a message without waiting for the rest of the body."""
         if message["type"] == "http.response.start":
             self.has_started = True
             headers = MutableHeaders(scope=message)
@@ -222,19 +221,19 @@ def _body_too_long(limits: RequestLimits) -> HTTPException:
 
 
 def _redirect_with_cookie(path: str, limits: RequestLimits) -> Response:
-    """The response that sets the cookie and then loads the address without the token.
+    """Returns the response that sets the cookie and then loads the address without the token.
 
     The response is a page with a Refresh header instead of an HTTP redirect: browsers send a SameSite=strict cookie only
     if the navigation starts on a page of this server.
     """
-    target = "/" + quote(path.lstrip("/"))
-    response = HTMLResponse(_REDIRECT_PAGE.format(target), headers={"Refresh": f"0; url={target}"})
+    address = "/" + quote(path.lstrip("/"))
+    response = HTMLResponse(_REDIRECT_PAGE.format(address), headers={"Refresh": f"0; url={address}"})
     response.set_cookie(limits.cookie_name, limits.token or "", httponly=True, samesite="strict")
     return response
 
 
 def _request_token(headers: Headers, cookie_name: str) -> str | None:
-    """The token of the Authorization header or the cookie, or None."""
+    """Returns the token of the Authorization header or the cookie, or None."""
     scheme, _, token = headers.get("authorization", "").partition(" ")
     if scheme.lower() == "bearer":
         return token.strip()

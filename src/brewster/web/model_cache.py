@@ -30,7 +30,7 @@ class ModelCache:
     """Models by name, the default first. Clients choose a model by name, never by path.
 
     Args:
-        models: names or paths of models; they come before the models of the zoo.
+        models: names or paths of models. They come before the models of the zoo.
         device: the device for all models, as in `Separator.load`.
 
     Raises:
@@ -60,11 +60,11 @@ class ModelCache:
         return list(self._sources)
 
     def rows(self) -> list[ModelRow]:
-        """The name, licence, digest and card of each model."""
+        """Returns the name, licence, digest and card of each model."""
         return [_model_row(name, source) for name, source in self._sources.items()]
 
     def separator(self, name: str) -> Separator:
-        """The separator of a model, loaded on first use; safe to call from many threads.
+        """Returns the separator of a model. The model is loaded on first use. This method is thread-safe.
 
         Raises:
             ModelError: the model file is damaged.
@@ -78,7 +78,7 @@ class ModelCache:
 
 def _model_row(name: str, source: str) -> ModelRow:
     if zoo.is_diffusion_model(source):
-        return ModelRow(name=name, licence="that of its base", sha256=None, card=None)
+        return ModelRow(name=name, licence="the licence of its base model", sha256=None, card=None)
     model = zoo.find_model(source)
     try:
         card = model.card()

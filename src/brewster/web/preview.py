@@ -1,4 +1,4 @@
-"""What the page needs to show a separation at any strength, mask and zoom: a reduced photo, and the coefficients of its layers.
+"""Previews, with which the page shows a separation at any strength, mask and zoom: a reduced photo and coefficients of its layers.
 
 The layers are local linear functions of the photo (inference/guided_upsampling.py). page/light.js applies them to the
 reduced photo and to tiles of the full photo, in linear light:
@@ -36,7 +36,7 @@ MAX_LEVEL: Final = 8
 def preview(
     separator: Separator, photo: Photo, options: Options, on_progress: Callable[[float], None]
 ) -> bytes:
-    """Separate a photo for the page.
+    """Separates a photo for the page.
 
     Args:
         separator: the model.
@@ -46,8 +46,8 @@ def preview(
 
     Returns:
         One line of JSON, then the reduced photo (3 bytes for each pixel, sRGB), and then maps of little-endian 16-bit
-        values, row by row. The JSON has `width` and `height` of the reduced photo, `full` (those of the photo),
-        `verdict`, and for each map `name`, `width`, `height`, `channels`, and the `range` of the values 0 to 65535.
+        values, row by row. The JSON has `width` and `height` of the reduced photo, `full` (width and height of the photo),
+        `verdict`, and for each map `name`, `width`, `height`, `channels`, and `range`, the values that 0 and 65535 stand for.
 
     Raises:
         BrewsterError: `Separator` cannot separate the photo.
@@ -82,7 +82,7 @@ def preview(
 
 
 def photo_tile(photo: Photo, level: int, column: int, row: int) -> Photo | None:
-    """The tile of a photo at a level, at most TILE_PX wide and high, in sRGB; None outside the photo.
+    """Returns the tile of a photo at a level, at most TILE_PX wide and high, in sRGB, or None if it is outside the photo.
 
     A pixel of level n is the mean of 2**n x 2**n pixels of the photo, in linear light.
     """
@@ -104,14 +104,14 @@ class PhotoCache:
     """The decoded photos of the last requests by key, for the tiles. Thread-safe.
 
     Args:
-        max_bytes: the maximum size of all photos together; the photos that were not used for the longest time are dropped.
+        max_bytes: the maximum size of all photos together. If it is exceeded, the least recently used photos are dropped.
     """
 
     def __init__(self, max_bytes: int = 400_000_000) -> None:
         self.max_bytes, self._photos, self._lock = max_bytes, OrderedDict[str, Photo](), Lock()
 
     def put(self, key: str, photo: Photo) -> None:
-        """Keep a photo; the photo that was kept last stays, whatever its size."""
+        """Stores a photo. This photo is kept even if it alone exceeds `max_bytes`."""
         with self._lock:
             self._photos[key] = photo
             self._photos.move_to_end(key)
@@ -119,7 +119,7 @@ class PhotoCache:
                 self._photos.popitem(last=False)
 
     def get(self, key: str) -> Photo | None:
-        """The photo with this key, or None if it was dropped."""
+        """Returns the photo with this key, or None if it was dropped."""
         with self._lock:
             if key in self._photos:
                 self._photos.move_to_end(key)
@@ -135,7 +135,7 @@ def _preview_size(size: tuple[int, int]) -> tuple[int, int]:
 
 
 def _block_means(linear: NDArray[np.float32], step: int) -> NDArray[np.float32]:
-    """The means of blocks of step x step pixels. Blocks at the edges have fewer pixels."""
+    """Returns the means of blocks of step x step pixels. Blocks at the edges have fewer pixels."""
     for axis in (0, 1):
         starts = np.arange(0, linear.shape[axis], step)
         counts = np.minimum(starts + step, linear.shape[axis]) - starts
@@ -145,7 +145,7 @@ def _block_means(linear: NDArray[np.float32], step: int) -> NDArray[np.float32]:
 
 
 def _luminance(map_: NDArray[np.float32]) -> NDArray[np.float32]:
-    """The luminance of linear Rec.709 light, which a grey photo stores, or the map itself if it has one channel."""
+    """Returns the luminance of a map in linear Rec.709 light, or the map itself if it has one channel."""
     if map_.shape[2] == 1:
         return map_
     return (map_ @ np.array(REC709_LUMINANCE, np.float32))[..., None]
@@ -157,7 +157,9 @@ def _describe(name: str, map_: NDArray[np.float32]) -> dict[str, Any]:
 
 
 def _range(map_: NDArray[np.float32]) -> tuple[float, float]:
-    """The values of 0 and 65535. They are at least 1 apart: smaller steps are not visible, and compress badly."""
+    """Returns the values that 0 and 65535 stand for. They differ by at least 1, because smaller steps between the stored values
+    are not visible, and increase the size of the compressed map.
+    """
     low = float(map_.min())
     return low, max(float(map_.max()), low + 1)
 

@@ -20,7 +20,7 @@ from brewster.image_formats import SUFFIXES
 from brewster.options import Options
 
 FIELDS: Final = ("layers", "strength", "quality", "format", "additive", "model")
-"""The options that a client may set as text; the server sets the others."""
+"""The options that a client may set as text. The server sets the other options."""
 _FILES: Final = ("photo", "mask")
 _OPTIONS: Final = TypeAdapter(Options)
 _MAX_NAME_BYTES: Final = 120
@@ -43,7 +43,7 @@ class SeparationRequest:
     mask: bytes | None = None
 
     def target(self, layer: str, container: str) -> str:
-        """The file name of a layer, equal to that of the command line; `container` is the format of the photo."""
+        """Returns the file name of a layer, the same as on the command line. `container` is the format of the photo."""
         source = Path(self.name)
         if source.suffix.lower() not in SUFFIXES:
             source = Path(f"{self.name}.{container}")
@@ -55,7 +55,7 @@ class SeparationRequest:
 
 
 async def read_form(request: Request, models: Sequence[str], max_pixels: int) -> SeparationRequest:
-    """Parse and validate the form of a request, in memory.
+    """Parses and validates the form of a request, in memory.
 
     Args:
         request: the request.
@@ -79,7 +79,7 @@ async def read_form(request: Request, models: Sequence[str], max_pixels: int) ->
         raise HTTPException(
             400, f"the form cannot be read ({error.message.rstrip('.')}); send it again"
         ) from error
-    except ValueError as error:  # some charsets known to Python cannot decode text
+    except ValueError as error:  # Python knows the charset, but cannot decode text with it
         raise HTTPException(400, "the charset of the form cannot be decoded; send it in UTF-8") from error
     try:
         return await _build_request(form, _options(form, models, max_pixels))
@@ -90,7 +90,7 @@ async def read_form(request: Request, models: Sequence[str], max_pixels: int) ->
 async def _build_request(form: FormData, options: Options) -> SeparationRequest:
     for name in _FILES:
         if len(form.getlist(name)) > 1:
-            raise HTTPException(400, f"the form contains more than one file {name}; send one")
+            raise HTTPException(400, f"the form contains more than one file {name}; send only one file")
     photo = form.get("photo")
     if not isinstance(photo, UploadFile):
         raise HTTPException(422, "the form contains no photo; send its file in the field photo")
@@ -103,13 +103,13 @@ async def _build_request(form: FormData, options: Options) -> SeparationRequest:
 
 @final
 class _InMemoryParser(MultiPartParser):
-    """Keeps files of any size in memory; LimitMiddleware has limited the size already."""
+    """Stores files of any size in memory. LimitMiddleware limits their size."""
 
     spool_max_size = 0
 
 
 def form_schema(models: Sequence[str]) -> dict[str, Any]:
-    """The JSON schema of the form, for the OpenAPI document."""
+    """Returns the JSON schema of the form, for the OpenAPI document."""
     known = _OPTIONS.json_schema()["properties"]
     mask = {**_PHOTO_SCHEMA, "description": known["mask"]["description"]}
     fields = {"photo": _PHOTO_SCHEMA, "mask": mask, **{name: _as_field(known[name]) for name in FIELDS}}
@@ -123,7 +123,7 @@ def form_schema(models: Sequence[str]) -> dict[str, Any]:
 
 
 def _as_field(schema: dict[str, Any]) -> dict[str, Any]:
-    """The schema without the type null, because a form has no null: an optional field is omitted instead."""
+    """Returns the schema without the type null. A form has no null: an optional field is left out instead."""
     if "anyOf" not in schema:
         return schema
     (not_null,) = (choice for choice in schema["anyOf"] if choice["type"] != "null")
@@ -131,7 +131,7 @@ def _as_field(schema: dict[str, Any]) -> dict[str, Any]:
 
 
 def safe_name(name: str) -> str:
-    """The last component of a file name, with at most _MAX_NAME_BYTES bytes before the suffix.
+    """Returns the last component of a file name, with at most _MAX_NAME_BYTES bytes before the suffix.
 
     Characters that file systems or headers forbid are replaced by underscores.
     """
@@ -144,7 +144,7 @@ def safe_name(name: str) -> str:
 
 
 def validation_message(errors: Iterable[Any]) -> str:
-    """The validation errors of pydantic as one message."""
+    """Returns the validation errors of pydantic as one message."""
     found = (
         f"{'.'.join(map(str, error['loc']))} is {str(error['input'])[:40]!r}; {error['msg']}"
         for error in errors
@@ -173,5 +173,5 @@ def _options(form: FormData, models: Sequence[str], max_pixels: int) -> Options:
 
 
 def _ordered_layers(layers: Sequence[str]) -> list[str]:
-    """Each layer once, in the order of the command line. Unknown names come last, and the validation refuses them."""
+    """Returns each layer once, in the order of the command line. Unknown names come last, and the validation refuses them."""
     return [layer for layer in dict.fromkeys((*LAYERS, *layers)) if layer in layers]

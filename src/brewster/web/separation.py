@@ -45,7 +45,7 @@ class ErrorResponse(BaseModel):
     error: str
     """What happened, what was expected, and what to do."""
     kind: str | None = None
-    """The class of the error in `brewster.errors`, such as UnreadablePhoto, if it has one."""
+    """The class of the error in `brewster.errors`, such as UnreadablePhoto, or None for other errors."""
 
 
 @final
@@ -55,16 +55,16 @@ class HealthResponse(BaseModel):
     status: Literal["ok"] = "ok"
     version: str = brewster.__version__
     jobs: int
-    """Number of photos that wait or are being separated."""
+    """Number of photos that are waiting or being separated."""
     places: int
-    """The maximum of `jobs`."""
+    """Maximum value of `jobs`."""
 
 
 Handler = Callable[[ModelCache, SeparationRequest, ProgressCallback], Response]
 _ERROR: Final[dict[str, Any]] = {"model": ErrorResponse}
 _RESPONSES: Final[dict[int | str, dict[str, Any]]] = {
     200: {
-        "description": "One layer, or a zip of several.",
+        "description": "One layer, or a zip of several layers.",
         "content": {"image/*": {}, "application/zip": {}},
     },
     **dict.fromkeys((400, 401, 403, 408, 409, 413, 415, 421, 422, 500, 501, 503, 504), _ERROR),
@@ -79,7 +79,7 @@ JobName = Annotated[
 
 
 def separation_router(model_cache: ModelCache, job_queue: JobQueue, *, max_pixels: int) -> APIRouter:
-    """The routes of the API, and the previews and tiles for the page.
+    """Returns the routes of the API, and the previews and tiles for the page.
 
     Args:
         model_cache: the models that clients can choose.
@@ -91,14 +91,15 @@ def separation_router(model_cache: ModelCache, job_queue: JobQueue, *, max_pixel
     body = {"requestBody": {"required": True, "content": content}}
 
     async def run(request: Request, job: str | None, handler: Handler) -> Response:
-        """Reserve a place in the queue, read the form, and run the handler."""
+        """Reserves a place in the queue, reads the form, and runs the handler."""
         with job_queue.reserve(job) as reserved_job:
             form = await read_form(request, model_cache.names, max_pixels)
             return await job_queue.run_job(reserved_job, partial(handler, model_cache, form), request.receive)
 
     @router.post("/separate", responses=_RESPONSES, response_class=Response, openapi_extra=body)
     async def separate(request: Request, job: JobName = None) -> Response:
-        """Separate a photo. One layer is returned as an image in the format and colour space of the photo, several as a zip.
+        """Separates a photo. A single layer is returned as an image in the format and colour space of the photo, several layers
+        as a zip.
 
         The names of the files are those of the command line. The separation stops if the client disconnects.
         """
@@ -106,7 +107,7 @@ def separation_router(model_cache: ModelCache, job_queue: JobQueue, *, max_pixel
 
     @router.get("/progress/{job}", responses={404: _ERROR})
     async def progress(job: str) -> JobProgress:
-        """The progress of the job with this name. The status is 404 before the job begins and after its end."""
+        """Returns the progress of the job with this name. The status is 404 before the job begins and after its end."""
         found = job_queue.progress(job)
         if found is None:
             raise HTTPException(
@@ -116,12 +117,12 @@ def separation_router(model_cache: ModelCache, job_queue: JobQueue, *, max_pixel
 
     @router.get("/models")
     def models() -> list[ModelRow]:
-        """The available models, the default first."""
+        """Returns the available models, the default first."""
         return model_cache.rows()
 
     @router.get("/health")
     async def health() -> HealthResponse:
-        """The version of the server and the number of its jobs."""
+        """Returns the version of the server and the number of its jobs."""
         return HealthResponse(jobs=job_queue.jobs, places=job_queue.workers + job_queue.max_waiting)
 
     _add_page_routes(router, run)
@@ -131,7 +132,7 @@ def separation_router(model_cache: ModelCache, job_queue: JobQueue, *, max_pixel
 def _add_page_routes(
     router: APIRouter, run: Callable[[Request, str | None, Handler], Awaitable[Response]]
 ) -> None:
-    """Add the routes that only the page uses: the preview of a photo, and its tiles."""
+    """Adds the routes that only the page uses: the preview of a photo, and its tiles."""
     photos = PhotoCache()
 
     @router.post("/preview", include_in_schema=False)
@@ -148,13 +149,13 @@ def _add_page_routes(
         found = None if photo is None else photo_tile(photo, level, column, row)
         if found is None:
             raise HTTPException(
-                404, "the server has dropped this photo, or it has no such tile; send it again"
+                404, "the server has dropped this photo, or the photo has no such tile; send the photo again"
             )
         return Response(found.encode("png"), media_type="image/png", headers=_TILE_HEADERS)
 
 
 def _separate(model_cache: ModelCache, form: SeparationRequest, on_progress: ProgressCallback) -> Response:
-    """Separate a photo. Returns one layer as an image file, or several layers as a zip."""
+    """Separates a photo. Returns one layer as an image file, or several layers as a zip."""
     started = time.perf_counter()
     options = form.options
     separation = model_cache.separator(options.model)(
@@ -162,7 +163,7 @@ def _separate(model_cache: ModelCache, form: SeparationRequest, on_progress: Pro
     )
     files = {}
     for layer in options.layers:
-        on_progress(1)  # raises JobCancelled; encoding takes time, too
+        on_progress(1)  # raises JobCancelled if the job is cancelled, because encoding also takes time
         name = form.target(layer, separation.photo.file_info.container)
         files[name] = getattr(separation, layer).encode(SUFFIXES[Path(name).suffix.lower()].name)
     name, data = (
@@ -202,7 +203,7 @@ def _keep_photo(
 
 
 def _open_photo(photos: PhotoCache, form: SeparationRequest) -> tuple[Photo, dict[str, str]]:
-    """The decoded photo, which the cache keeps for the tiles, and the headers with its key and its size."""
+    """Returns the decoded photo, and the headers with its key and its size. The photo is stored in the cache for the tiles."""
     key = hashlib.sha256(form.photo).hexdigest()
     photo = photos.get(key) or Photo.open(form.photo, max_pixels=form.options.max_pixels)
     photos.put(key, photo)
@@ -216,7 +217,7 @@ def _media_type(name: str) -> str:
 
 
 def _zip(files: Mapping[str, bytes]) -> bytes:
-    """A zip archive of files by name. It is not compressed, because image files are compressed already."""
+    """Returns a zip archive of files. The archive is not compressed, because image files are already compressed."""
     archive_file = io.BytesIO()
     with zipfile.ZipFile(archive_file, "w", zipfile.ZIP_STORED) as archive:
         for name, data in files.items():
@@ -225,6 +226,6 @@ def _zip(files: Mapping[str, bytes]) -> bytes:
 
 
 def _content_disposition(name: str) -> str:
-    """The Content-Disposition header of a download: an ASCII name for old clients and the full name (RFC 6266)."""
+    """Returns the Content-Disposition header of a download: an ASCII name for old clients and the full name (RFC 6266)."""
     ascii_name = name.encode("ascii", "replace").decode().translate(str.maketrans('"\\?', "___"))
     return f"attachment; filename=\"{ascii_name}\"; filename*=UTF-8''{quote(name, safe='')}"

@@ -2,7 +2,7 @@
 
     create_server(app).run(sockets=[listening])
 
-The idle time limit applies while the server waits for the client: during a request, and while the client receives a response.
+The idle time limit applies while the server waits for the client to send a request or to receive a response.
 """
 
 from __future__ import annotations
@@ -21,11 +21,13 @@ request nor receives a byte between the checks."""
 GRACE_SECONDS: Final = 2.0
 """The time for which running requests may continue after the shutdown begins."""
 _BACKLOG: Final = 128
-_SEND_BUFFER_BYTES: Final = 1 << 17  # a larger kernel buffer would hide whether a slow client still receives
+_SEND_BUFFER_BYTES: Final = (
+    1 << 17
+)  # with a larger kernel buffer, the server cannot see whether a slow client still receives
 
 
 def create_server(app: FastAPI) -> uvicorn.Server:
-    """Create a server for an application. At shutdown it waits GRACE_SECONDS for running requests."""
+    """Creates a server for an application. At shutdown, the server waits up to GRACE_SECONDS for running requests."""
     config = uvicorn.Config(
         app,
         http=TimeoutProtocol,
@@ -48,14 +50,14 @@ class QuietServer(uvicorn.Server):
     """
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
-        """Start serving."""
+        """Starts serving."""
         for listening in sockets or []:  # connections inherit the option
             listening.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _SEND_BUFFER_BYTES)
         asyncio.get_running_loop().set_exception_handler(_handle_loop_error)
         await super().startup(sockets)
 
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
-        """Stop serving; cancel requests that run longer than GRACE_SECONDS."""
+        """Stops serving, and cancels requests that run longer than GRACE_SECONDS."""
         grace_timer = asyncio.get_running_loop().call_later(GRACE_SECONDS, self._cancel)
         try:
             await super().shutdown(sockets)
@@ -83,12 +85,12 @@ class TimeoutProtocol(H11Protocol):
         return self.cycle is not None and not self.cycle.response_started
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
-        """Start the idle check."""
+        """Starts the idle check."""
         super().connection_made(transport)
         self._idle_timer = self.loop.call_later(IDLE_CHECK_SECONDS, self._check_idle)
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """Stop the idle check."""
+        """Stops the idle check."""
         super().connection_lost(exc)
         if self._idle_timer:
             self._idle_timer.cancel()
@@ -105,6 +107,6 @@ class TimeoutProtocol(H11Protocol):
 
 
 def _handle_loop_error(loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
-    """Ignore errors of accept(): with too many connections, asyncio would log an error for each of them every second."""
+    """Ignores errors of accept(). With too many connections, asyncio logs one error per second for each connection."""
     if not any(ignored in context["message"] for ignored in ("socket.accept()", "_start_serving")):
         loop.default_exception_handler(context)

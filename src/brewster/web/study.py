@@ -63,7 +63,7 @@ class TrialResponse(_Strict):
     """The first trial without an answer, and the size of its pictures in px.
 
     `trial` counts from 0 and is None if all trials have answers. `trials` is the number of all trials. `practice` is set as
-    long as there is no answer. `last` is the last trial with an answer, which can be withdrawn.
+    long as there is no answer. `last` is the last trial with an answer. This answer can be withdrawn.
     """
 
     trial: int | None
@@ -75,7 +75,7 @@ class TrialResponse(_Strict):
 
 
 class AnswerRequest(_Strict):
-    """An answer, the seconds for which the pictures were shown, and how they were shown."""
+    """An answer, the seconds for which the pictures were shown, and the viewing conditions."""
 
     trial: Annotated[int, Field(ge=0)]
     choice: Choice
@@ -84,13 +84,13 @@ class AnswerRequest(_Strict):
 
 
 class WithdrawalRequest(_Strict):
-    """The trial whose answer is withdrawn: the last one with an answer."""
+    """The trial whose answer is withdrawn. It must be the last trial with an answer."""
 
     trial: Annotated[int, Field(ge=0)]
 
 
 class AnswerResponse(_Strict):
-    """The stored choice `kept`, which is that of the first answer to the trial, and the next trial."""
+    """The stored choice, which is the choice of the first answer to the trial, and the next trial."""
 
     kept: Choice
     next: TrialResponse
@@ -103,11 +103,11 @@ Side = Literal["photo", "left", "right"]
 def study_router(
     study: Study, store: AnswerStore, *, max_participants: int | None = None, token: str | None = None
 ) -> APIRouter:
-    """The routes of a study.
+    """Returns the routes of a study.
 
     Args:
         study: the study.
-        store: its answers.
+        store: the answers of the study.
         max_participants: maximum number of participants; None means no limit.
         token: the token of the server, which is added to personal links.
     """
@@ -138,7 +138,7 @@ class _StudyRoutes:
     token: str | None
 
     def invitation(self) -> Invitation:
-        """The information that is shown before the consent."""
+        """Returns the information that is shown before the consent."""
         description = self.study.description
         is_open = self.max_participants is None or self.store.count_participants() < self.max_participants
         return Invitation(
@@ -146,7 +146,7 @@ class _StudyRoutes:
         )
 
     def admit(self, _agreement: Annotated[ConsentRequest, Body()]) -> PersonalLink:
-        """Admit a participant who agrees to take part. Returns the personal link."""
+        """Admits a participant who agrees to take part. Returns the personal link."""
         participant_token = self.store.admit(max_participants=self.max_participants)
         if participant_token is None:
             raise HTTPException(
@@ -155,31 +155,31 @@ class _StudyRoutes:
         return self._link(participant_token)
 
     def begin(self, participant_token: Token) -> Response:
-        """The page of a personal link. If the link is unknown, the status is 404, and the page shows the error."""
+        """Returns the page of a personal link. If the link is unknown, the status is 404, and the page shows the error."""
         response = page_response("study.html")
         response.status_code = 404 if self.store.participant(participant_token) is None else 200
         return response
 
     def link(self, participant_token: Token) -> PersonalLink:
-        """The personal link with the token of the server, which the address of the page no longer contains."""
+        """Returns the personal link with the token of the server, which the address of the page no longer contains."""
         self._participant(participant_token)
         return self._link(participant_token)
 
     def next_trial(self, participant_token: Token, response: Response) -> TrialResponse:
-        """The first trial without an answer."""
+        """Returns the first trial without an answer."""
         response.headers.update(_NOT_CACHED)
         return self._next(self._participant(participant_token))
 
     def privacy(self) -> Response:
-        """The page that lists what the study stores about a participant."""
+        """Returns the page that lists what the study stores about a participant."""
         return page_response("privacy.html")
 
     def practice_picture(self, participant_token: Token, side: Side) -> Response:
-        """A picture of the practice trial."""
+        """Returns a picture of the practice trial."""
         return self._picture(_practice(self._participant(participant_token)), side)
 
     def picture(self, participant_token: Token, trial: int, side: Side) -> Response:
-        """A picture of a trial."""
+        """Returns a picture of a trial."""
         return self._picture(_trial(self._participant(participant_token), trial), side)
 
     def _picture(self, shown: assignment.Trial, side: Side) -> Response:
@@ -193,7 +193,7 @@ class _StudyRoutes:
         return Response(data, media_type="image/png", headers=_CACHED)
 
     def answer(self, participant_token: Token, answer: Annotated[AnswerRequest, Body()]) -> AnswerResponse:
-        """Store an answer. A second answer to a trial changes nothing, unless the first one was withdrawn."""
+        """Stores an answer. A second answer to a trial changes nothing, unless the first answer was withdrawn."""
         participant = self._participant(participant_token)
         _trial(participant, answer.trial)
         stored = self.store.record_answer(
@@ -204,7 +204,7 @@ class _StudyRoutes:
     def withdraw(
         self, participant_token: Token, withdrawal: Annotated[WithdrawalRequest, Body()]
     ) -> TrialResponse:
-        """Withdraw the last answer. Returns the trial, which can be answered again."""
+        """Withdraws the last answer. Returns the trial, which can be answered again."""
         participant = self._participant(participant_token)
         _trial(participant, withdrawal.trial)
         self.store.withdraw_answer(participant, withdrawal.trial)

@@ -68,7 +68,7 @@ def with_half_weights(model: ModelProto) -> ModelProto:
 
 @contextmanager
 def _without_warnings() -> Iterator[None]:
-    """Hides warnings of the exporter: torchvision, which is not needed, is missing; the exporter calls deprecated functions."""
+    """Hides two warnings of the exporter: torchvision is missing (it is not needed), and the exporter calls deprecated functions."""
     logger = logging.getLogger("torch.onnx")
     before = logger.level
     logger.setLevel(logging.ERROR)

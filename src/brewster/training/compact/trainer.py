@@ -35,7 +35,8 @@ ValidationPairs = Mapping[str, list[tuple[Tensor, Tensor]]]
 """folder -> pairs of photo and ground truth, each float (1, 3, h, w), sRGB-encoded."""
 
 _VALIDATION_SIDE_PX: Final = 384
-_HELD_OUT_MIXTURES: Final = 320
+_HELD_OUT_COUNT: Final = 320
+"""Number of mixtures of held-out photos for validation."""
 _HELD_OUT_SIDE_PX: Final = 192
 _MIN_VISIBLE_MSE: Final = 1e-4
 """Smallest mean squared difference of encoded photo and transmission with a visible reflection: a PSNR of 40 dB."""
@@ -62,14 +63,14 @@ def train(recipe: CompactRecipe, out: Path, on_step: StepCallback) -> nn.Module:
         OutputError: `out` cannot be written to.
     """
     trainer = CompactTrainer(recipe)
-    # This limits the current thread. The initializer of the trainer's thread pools limits their threads.
+    # This limits torch to one core in the current thread. The thread pools of the trainer do the same in their threads.
     with single_torch_thread():
         run(trainer, out, on_step)
     return trainer.ema_network()
 
 
 class CompactTrainer:
-    """The `Trainer` of a compact network. It holds the network, the EMA of its weights, and the optimiser AdamW.
+    """The `Trainer` of a compact network. It contains the network, the EMA of its weights, and the optimiser AdamW.
 
     A `stream` replaces the training data of the recipe. `device` is "auto" for the GPU if there is one, or "cpu".
 
@@ -149,7 +150,8 @@ class CompactTrainer:
         loss = check_finite(torch.stack(list(parts.values())).sum(), step)
         self._set_learning_rates(step)
         norm = nn.utils.clip_grad_norm_(self.network.parameters(), _MAX_GRADIENT_NORM)
-        if norm.isfinite():  # otherwise skip the batch: one infinite gradient would destroy the weights
+        # Skip the batch if its gradient is infinite: one such step makes all weights invalid.
+        if norm.isfinite():
             self.optimizer.step()
             self._update_ema(step + 1)
         return {"loss": loss.item(), **{f"loss_{name}": part.item() for name, part in parts.items()}}
@@ -157,8 +159,8 @@ class CompactTrainer:
     def _compute_gradients(self, batch: TrainingBatch) -> dict[str, Tensor]:
         """Computes the gradient of the batch's mean loss for each parameter. Returns the parts of the loss.
 
-        On a CPU, the batch is split into one chunk per core, and one thread computes each chunk. Measured on two cores with
-        16 x 128 px, this is 1.2-1.3 times as fast as splitting each operation over all cores.
+        On a CPU, the batch is split into one chunk per core, and one thread computes each chunk. For 16 images of 128 px on two
+        cores, this is 1.2-1.3 times as fast as splitting each operation over all cores.
         """
         count = len(batch.photo_encoded)
         results = list(
@@ -307,11 +309,11 @@ def _has_bfloat16(device: torch.device) -> bool:
 
 
 def _held_out_pairs(recipe: CompactRecipe) -> dict[str, list[tuple[Tensor, Tensor]]]:
-    """Returns fixed mixtures of the held-out photos: "mixtures" have a visible reflection, "plain" have none."""
+    """Returns fixed mixtures of the held-out photos: those in "mixtures" have a visible reflection, those in "plain" do not."""
     stream = held_out_mixtures(recipe)
     if stream is None:
         return {}
-    batch = stream(0, _HELD_OUT_MIXTURES, _HELD_OUT_SIDE_PX)
+    batch = stream(0, _HELD_OUT_COUNT, _HELD_OUT_SIDE_PX)
     pairs = list(zip(batch.photo_encoded[:, None], batch.transmission_encoded[:, None], strict=True))
     visible = [functional.mse_loss(*pair).item() > _MIN_VISIBLE_MSE for pair in pairs]
     return {

@@ -1,7 +1,7 @@
 """8-bit mixtures of the layers of a rendered sample: the baseline of the paper's ablation (Table 4, Figure 7).
 
-RDNet blends two tone-mapped images, I = alpha T + beta R - T o R, where o is the element-wise product. Here T is the
-background and R the mirror image of a rendered sample, so that both kinds of data show the same two scenes.
+RDNet blends two tone-mapped images, I = alpha T + beta R - T o R, where o is the element-wise product. In this formula, T is the
+background and R the mirror image of a rendered sample, so that the mixture shows the same two scenes as the rendered photo.
 """
 
 from __future__ import annotations
@@ -40,7 +40,8 @@ def blended_layers(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Returns I, T and R of an 8-bit mixture, each (3, H, W) in 0..1, from encoded background and mirror image.
 
-    alpha is uniform in 0.8..1, beta is uniform in 0.4..1. Both depend on the seed and the index of the scene only.
+    T is the background. R is the mirror image times beta. alpha is uniform in 0.8..1, beta is uniform in 0.4..1. Both depend on
+    the seed and the index of the scene only.
     """
     rng = Random(f"blend/{scene.seed}/{scene.index}")  # noqa: S311  (not for secrets)
     alpha, beta = rng.uniform(*ALPHA), rng.uniform(*BETA)

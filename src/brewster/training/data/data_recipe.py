@@ -16,19 +16,19 @@ class RenderedRecipe(FrozenModel):
     """Rendered samples: either from `datasets` of `brewster render`, or rendered during training from a scene `recipe`."""
 
     datasets: tuple[Path, ...] = ()
-    """Folders of rendered sets, relative to BREWSTER_DATA."""
+    """Folders of rendered datasets, relative to BREWSTER_DATA."""
     recipe: str | None = None
-    """The name of a packaged scene recipe, or a TOML file, relative to this recipe."""
+    """The name of a packaged scene recipe, or the path of a TOML file, relative to this recipe."""
     count: Annotated[int, Field(ge=0)] | None = None
     """Number of different samples. Not set: all samples of `datasets`, or no limit for `recipe`. 0: no rendered samples."""
     share: Share = 1.0
-    """Share of rendered samples among the samples of a batch that are not real pairs; the others are mixtures of photos."""
+    """Share of rendered samples among the samples of a batch that are not real pairs. The rest are mixtures of photos."""
     blend_space: BlendSpace = "linear"
-    """How the photo is composed. linear: T + R in linear light. srgb: a blend of 8-bit sRGB images, for comparison."""
+    """How the photo is composed. linear: rendered in linear light. srgb: a blend of 8-bit sRGB images, for comparison."""
     target: Target = "background"
-    """What the network predicts behind the glass: the background B without glass, or the transmission T."""
+    """What the network predicts: the background B without glass, or the transmission T, which is B through the glass."""
     orders: Literal["all", "truncated"] | None = None
-    """Replaces the key `orders` of the scene recipe. Not set: that of the scene recipe."""
+    """Replaces the value of `orders` in the scene recipe. Not set: the value in the scene recipe."""
     seed: Seed | None = None
     """Seed of the scenes. Not set: the seed of this recipe."""
     maps: tuple[Path, ...] = ()
@@ -40,14 +40,14 @@ class RenderedRecipe(FrozenModel):
     def _check_source(self) -> Self:
         if bool(self.datasets) == bool(self.recipe):
             raise ValueError(
-                "expected either sets (rendered before) or recipe (rendered during training): exactly one of the two"
+                "expected either datasets (rendered before) or recipe (rendered during training): exactly one of the two"
             )
         unused = [
             name for name in ("orders", "seed", "maps", "photos") if getattr(self, name) not in (None, ())
         ]
         if self.datasets and unused:
             raise ValueError(
-                f"expected no {', '.join(unused)}: they have no effect on sets, which are already rendered"
+                f"expected no {', '.join(unused)}: datasets are already rendered, so that these keys have no effect"
             )
         return self
 
@@ -56,7 +56,8 @@ class DataRecipe(FrozenModel):
     """Training data. Folders are relative to BREWSTER_DATA. A source with a share of 0 is not read.
 
     For the compact network, a batch of n samples has n * pairs_share real pairs. Of the other samples, the share
-    `rendered.share` is rendered, and the rest are mixtures of photos and maps. For a LoRA, see `pairs_share` there.
+    `rendered.share` is rendered, and the rest are mixtures of photos and maps. For a LoRA, `pairs_share` is the probability that
+    a sample is a real pair, and all other samples are rendered.
     """
 
     photos: tuple[Path, ...] = ()
@@ -71,11 +72,11 @@ class DataRecipe(FrozenModel):
     exclude: tuple[str, ...] = ()
     """File names of photos and maps to exclude. * and ? are wildcards as in a shell."""
     held_out: tuple[str, ...] = ()
-    """File names to exclude from training, in addition to `exclude`. The compact model is validated on mixtures of them."""
+    """File names to exclude from training, in addition to `exclude`. A compact network is validated on mixtures of these files."""
     validate_on: tuple[Path, ...] = ()
     """Folders of real pairs to validate on."""
     max_validation_pairs: PositiveInt = 40
-    """Maximum number of pairs from each folder in `validate_on`. They are evenly spaced in the order of their names."""
+    """Maximum number of pairs from each folder in `validate_on`. The pairs are evenly spaced in the order of their names."""
 
     @property
     def excluded_files(self) -> tuple[str, ...]:

@@ -1,6 +1,7 @@
 """Optical effects of mixtures: defocus, ghost images, lamps, signs, shadows, windows, and JPEG.
 
-Images are (3, H, W) in linear light, masks (1, size, size) in 0..1. All random numbers come from the `SampleRng` argument.
+Images are (3, H, W) in linear light, unless their names end in `encoded`. Masks are (1, size, size) in 0..1. All random numbers
+come from the `SampleRng` argument.
 """
 
 from __future__ import annotations
@@ -24,8 +25,8 @@ if TYPE_CHECKING:
 def blur(image: Image, sigma_px: float, *, disc: bool) -> Image:
     """Blurs by defocus: with a Gaussian of this standard deviation, or with a disc, the shape of a lens aperture.
 
-    The disc has the same standard deviation along an axis, half of its radius. A blur with a standard deviation of 6 px or more
-    is computed on a smaller copy of the image, because its cost grows with the standard deviation.
+    The radius of the disc is 2 `sigma_px`, so that its standard deviation along an axis is also `sigma_px`. A blur with a
+    `sigma_px` of 6 or more is computed on a smaller copy of the image, because its cost grows with `sigma_px`.
     """
     reduction = int(sigma_px / 3)
     if reduction > 1:
@@ -41,7 +42,10 @@ def blur(image: Image, sigma_px: float, *, disc: bool) -> Image:
 
 
 def ghost(rng: SampleRng, image: Image, weight: float, reach_px: float) -> Image:
-    """Adds a ghost image, the reflection of the second surface of the pane, displaced by whole pixels. Keeps the mean."""
+    """Adds a ghost image, the reflection of the second surface of the pane, displaced by whole pixels.
+
+    The sum is divided by 1 + `weight`, so that the mean luminance hardly changes.
+    """
     reach = max(1, round(reach_px))
     down, right = rng.randint(2 * reach + 1), rng.randint(2 * reach + 1)
     padded = functional.pad(image[None], (reach,) * 4, mode="replicate")[0]
@@ -50,7 +54,7 @@ def ghost(rng: SampleRng, image: Image, weight: float, reach_px: float) -> Image
 
 
 def lamps(rng: SampleRng, size: int) -> Image:
-    """Returns one to six small lamps on black, (3, size, size). A lamp is a disc with a glow, which the lens scatters."""
+    """Returns one to six small lamps on black, (3, size, size). A lamp is a disc with a glow of light that the lens scatters."""
     count = 1 + rng.randint(6)
     x, y = rng.uniform_tensor(2, count, 1, 1) * size
     rows, columns = _pixels(size)
@@ -64,7 +68,7 @@ def lamps(rng: SampleRng, size: int) -> Image:
 
 
 def sign(rng: SampleRng, image: Image) -> Image:
-    """Adds rows of random glyphs with sharp edges: luminous letters, or dark letters on a luminous panel."""
+    """Adds a sign with rows of random glyphs: luminous letters, or dark letters on a luminous panel. All edges are sharp."""
     size = image.shape[-1]
     rows, columns = 1 + rng.randint(3), 3 + rng.randint(9)
     glyphs = (rng.uniform_tensor(rows, 5, columns, 3) < 0.55).float()
@@ -84,19 +88,19 @@ def sign(rng: SampleRng, image: Image) -> Image:
 
 
 def falloff(rng: SampleRng, size: int) -> Mask:
-    """Returns a smooth mask of the reflection, because some parts of the mirrored scene are dark."""
+    """Returns a smooth mask that dims parts of the reflection, as if parts of the mirrored scene were dark."""
     return torch.sigmoid(
         rng.uniform((1, 6)) * (_noise(rng, size, 2 + rng.randint(4)) + rng.uniform((-0.5, 0.5)))
     )
 
 
 def edge(rng: SampleRng, size: int) -> Mask:
-    """Returns a half-plane as mask of the reflection, which ends at a line such as a frame."""
+    """Returns a mask that is a half-plane, for a reflection that ends at a straight line such as a window frame."""
     return torch.sigmoid(rng.log_uniform((4, 100)) * _line(rng, size))
 
 
 def window(rng: SampleRng, size: int) -> Mask:
-    """Returns the area of the glass: the intersection of one to four half-planes, with edges of about one pixel."""
+    """Returns a mask of the glass: the intersection of one to four half-planes, with edges of about one pixel."""
     inside = torch.stack([_line(rng, size) + 0.3 for _ in range(1 + rng.randint(4))]).amin(dim=0)
     return torch.sigmoid(size * inside)
 
@@ -116,8 +120,9 @@ def jpeg(encoded: Image, quality: int) -> Image:
     """Simulates JPEG compression of an encoded image at a quality of 1..100.
 
     The steps are a cosine transform of blocks of 8 x 8 px, quantization (tables K.1 and K.2 of Wallace, "The JPEG still
-    picture compression standard", CACM 34, 1991) and rounding to 8 bits. Colour has full resolution. Without the lossless
-    coding, this takes a tenth of the time of a codec. Both sides are multiples of 8.
+    picture compression standard", CACM 34, 1991) and rounding to 8 bits. The chroma channels have full resolution. Entropy
+    coding is left out, because it is lossless. The simulation therefore takes a tenth of the time of a codec. Both sides of
+    the image must be multiples of 8.
     """
     scale = 50 / quality if quality < 50 else 2 - quality / 50
     luma, chroma = (_JPEG_TABLES * scale + 0.5).floor().clamp(1, 255)

@@ -100,8 +100,8 @@ def _image_groups(folder: Path) -> list[ImageGroup]:
         ) from error
     if found.excluded:
         raise RecipeError(
-            f"{folder}: {found.excluded[0]} (pictures without a partner: {len(found.excluded)})",
-            "one transmission with the name of each photo, and no other files",
+            f"{folder}: {found.excluded[0]} (images without a partner: {len(found.excluded)})",
+            "expected one transmission with the name of each photo, and no other files",
             "add or remove files until the names match",
         )
     return sorted(found.groups, key=lambda group: group.photo)

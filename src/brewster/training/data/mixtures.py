@@ -1,4 +1,4 @@
-"""Linear-light mixtures of photographs: an endless stream of training data without a renderer.
+"""Mixtures of photos in linear light: an endless stream of training data without a renderer.
 
     stream = Mixtures(read_photos([Path("photos")]), read_maps([Path("hdri")]), MixRecipe(), seed=7)
     batch = stream(step=0, count=8, size=192)
@@ -28,8 +28,8 @@ if TYPE_CHECKING:
 
     Image = Float[Tensor, "3 h w"]
 
-_REFERENCE_SIZE: Final = 256
-"""Side of an image in px. Lengths in a recipe refer to it, and are scaled to the side of the images of the batch."""
+_REFERENCE_SIDE_PX: Final = 256
+"""Side of the image to which lengths in a recipe refer. They are scaled to the side of the images of the batch."""
 
 
 @dataclass(frozen=True)
@@ -66,23 +66,23 @@ class Stream(Protocol):
 
 
 Target = Literal["background", "transmission"]
-"""What a network learns to predict: the background B, photographed without the glass, or the transmission T, the light of B
-that the pane lets through: photo = T + R in linear light."""
+"""What a network learns to predict: the background B, which is the view without glass, or the transmission T, which is the light
+of B that the pane transmits. In linear light, photo = T + R."""
 
 
 class MixRecipe(FrozenModel):
     """Distributions of mixtures of photos: a background behind glass plus a reflection, in linear light.
 
-    `recipes/train/compact-stage4.toml` uses the defaults, except for the crop. Luminances are linear. Lengths in pixels refer to an image of 256 px
-    and scale with the size of the training images.
+    `recipes/train/compact-stage4.toml` uses the defaults, except for `crop`. Luminances are linear. Lengths in pixels refer to an
+    image of 256 px and scale with the size of the training images, unless their description says otherwise.
     """
 
     target: Target = "transmission"
-    """What the network predicts behind the glass: the transmission T, or the background B without glass."""
+    """What the network predicts: the transmission T, or the background B without glass."""
     crop: Range = (0.35, 1.0)
     """Side of the crop divided by the shorter side of the photo."""
     temperature: Range = (-0.35, 0.35)
-    """Colour temperature t of the light: the gains of red and blue are about exp(t) and exp(-t)."""
+    """Warmth of the light. For a value w, the gains of red and blue are about exp(w) and exp(-w)."""
     background_map_probability: Share = 0.2
     """Probability that the background is a view of an environment map instead of a photo."""
     background_level: LogRange = (0.03, 0.5)
@@ -92,7 +92,7 @@ class MixRecipe(FrozenModel):
     shadow_probability: Share = 0.15
     """Probability of a hard shadow on the background."""
     background_blur_probability: Share = 0.08
-    """Probability of a background that is out of focus. Without such backgrounds, a network takes all blur for a reflection."""
+    """Probability of a background that is out of focus. Without such samples, a network predicts that all blur is reflection."""
     background_blur_sigma_px: LogRange = (0.5, 3.0)
     """Standard deviation of the defocus blur of these backgrounds."""
 
@@ -133,9 +133,9 @@ class MixRecipe(FrozenModel):
     """Probability of a reflection that ends at a straight edge, such as a frame."""
 
     camera_blur_probability: Share = 0.5
-    """Probability of a soft photo: background and reflection are both blurred by the lens, or enlarged from a smaller photo."""
+    """Probability of a soft photo: one blur of background and reflection, as from a soft lens or an enlargement."""
     camera_blur_sigma_px: LogRange = (0.3, 1.3)
-    """Standard deviation of this blur, in pixels of the training image at any size."""
+    """Standard deviation of this blur in pixels of the training image. It does not scale with the size of the image."""
     target_luminance: Range = (0.2, 0.55)
     """Mean luminance of the photo after exposure. A photo with a smaller mean is not brightened."""
     overexposed_probability: Share = 0.3
@@ -201,7 +201,7 @@ class Mixtures:
         return _expose_and_develop(rng, self._recipe, *layers)
 
     def _background(self, rng: SampleRng, size: int) -> Image:
-        recipe, scale = self._recipe, size / _REFERENCE_SIZE
+        recipe, scale = self._recipe, size / _REFERENCE_SIDE_PX
         view = self._view(rng, size, recipe.background_map_probability)
         if rng.bernoulli(recipe.background_blur_probability):
             sigma_px = rng.log_uniform(recipe.background_blur_sigma_px) * scale
@@ -212,8 +212,11 @@ class Mixtures:
         return view * _temperature(rng, recipe.temperature) * (level / _mean_without_highlights(view))
 
     def _reflection(self, rng: SampleRng, size: int) -> Image:
-        """Returns a reflection in linear light for a background with mean 1, with random blur, lamps, ghost image and falloff."""
-        recipe, scale = self._recipe, size / _REFERENCE_SIZE
+        """Returns a reflection in linear light, as a multiple of the mean of the background.
+
+        Contrast, colour, sign, blur, lamps, ghost image, falloff and edge are random.
+        """
+        recipe, scale = self._recipe, size / _REFERENCE_SIDE_PX
         view = self._view(rng, size, recipe.reflection_map_probability)
         view = view / _mean_without_highlights(view)
         view = view * (view.mean(dim=0) + 1e-4) ** (rng.log_uniform(recipe.reflection_contrast) - 1)
@@ -334,14 +337,14 @@ _LINEAR_OF_BYTE: Final = to_linear(torch.arange(256) / 255)
 
 
 def _linear_from_bytes(encoded: Tensor) -> Tensor:
-    """Converts sRGB bytes to linear light by a lookup table. Flattened, because torch indexes a vector faster than an image."""
+    """Converts sRGB bytes to linear light with a lookup table. The image is flattened, because torch indexes vectors faster."""
     return _LINEAR_OF_BYTE.index_select(0, encoded.reshape(-1).int()).view(encoded.shape)
 
 
 def _perspective_view(rng: SampleRng, lat_long: Tensor, size: int) -> Image:
     """Returns a random perspective view of a lat-long map (3, H, 2 H).
 
-    The field of view is 50 to 100 degrees, the heading is any, the pitch is -20 to 20 degrees.
+    The field of view is 50 to 100 degrees, the heading is -180 to 180 degrees, and the pitch is -20 to 20 degrees.
     """
     half = math.tan(math.radians(rng.uniform((50, 100))) / 2)
     heading, pitch = rng.uniform((-math.pi, math.pi)), math.radians(rng.uniform((-20, 20)))
@@ -361,7 +364,7 @@ def _mean_without_highlights(image: Image) -> Tensor:
 
 
 def _quantile(image: Tensor, fraction: float) -> float:
-    """Returns a quantile of every 29th value. A quantile of all values would take as long as the rest of the sample."""
+    """Returns a quantile of every 29th value. The quantile of all values takes as long as the rest of the sample."""
     values = image.flatten()[::29]
     return values.kthvalue(max(1, round(fraction * len(values)))).values.item()
 

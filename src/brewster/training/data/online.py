@@ -1,4 +1,4 @@
-"""An endless stream of samples that are rendered during training, on any device. A sample depends on (seed, index) only.
+"""An endless stream of samples that are rendered during training on a CPU or a GPU. A sample depends on (seed, index) only.
 
 stream = OnlineRendered(read_scene_recipe("window"), catalog, Assets(folders), seed=7, device="cuda")
 batch = stream(step=0, count=16, size=256)
@@ -24,13 +24,14 @@ from brewster.training.data.alpha_blend import blended
 from brewster.training.data.mixtures import Target, TrainingBatch
 
 BlendSpace = Literal["linear", "srgb"]
-"""How the layers of a photo are added: in linear light, or as a blend of 8-bit images, as in RDNet."""
+"""How the layers of a photo are composed: in linear light, or as a blend of 8-bit images as in RDNet."""
 
 
 class OnlineRendered:
     """A `Stream` of samples of the analytic renderer, and an iterable of single samples. It is thread-safe.
 
-    Only one thread renders at a time, because `Assets` is not thread-safe. Camera response and JPEG run in parallel.
+    Only one thread renders at a time, because `Assets` is not thread-safe. Several threads can compute camera response and JPEG
+    at the same time.
     """
 
     def __init__(
@@ -52,7 +53,7 @@ class OnlineRendered:
         return (self.sample(index) for index in integers_from(0))
 
     def sample(self, index: int) -> DevelopedSample:
-        """Renders the sample of this index at the recipe's size; the photo has JPEG artefacts.
+        """Renders the sample of this index at the size in the recipe. The photo has JPEG artefacts.
 
         Raises:
             RecipeError: no valid scene can be drawn from the recipe, or a file is missing.
@@ -67,7 +68,8 @@ class OnlineRendered:
         )
 
     def layers(self, index: int, size: int) -> Tensor:
-        """Renders photo, target and reflection of this index as channels, square: (9, size, size), encoded, in 0..1.
+        """Renders the sample of this index as a square. Returns photo, `target` and reflection as channels, (9, size, size),
+        encoded, in 0..1.
 
         Raises:
             RecipeError: no valid scene can be drawn from the recipe, or a file is missing.

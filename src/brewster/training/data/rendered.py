@@ -1,4 +1,4 @@
-"""Streams of a finite number of rendered samples: crops of sets on disk, or a cache of samples rendered online.
+"""Streams of a finite number of rendered samples: crops of datasets on disk, or a cache of samples rendered online.
 
     stream = RenderedDatasets([Path("out/window")], seed=7, count=300)
     stream = CachedRendered(OnlineRendered(...), 300, seed=7)
@@ -32,17 +32,17 @@ from brewster.training.data.sample_rng import SampleRng
 
 CACHE_BYTES: Final = 1 << 30
 """Memory for cached samples, 9 bytes per pixel: 600 samples of 512x384, 1,800 of 256x256 or 7,200 of 128x128. When it is full,
-the oldest samples are dropped. They are read or rendered again when they are drawn, which is slower, with the same result."""
+the oldest samples are dropped. When such a sample is drawn again, it is read or rendered again, with the same result."""
 
 
 class RenderedDatasets:
-    """A `Stream` of random crops of the first `count` samples of rendered sets, mirrored at random. It is thread-safe.
+    """A `Stream` of random crops of the first `count` samples of rendered datasets, mirrored at random. It is thread-safe.
 
     With `blend_space` "srgb", the photo is a blend of the sample's background and mirror image. The blend is compressed
-    as JPEG, with the quality of the sample's photo.
+    as JPEG with the same quality as the photo of the sample.
 
     Raises:
-        RecipeError: a set cannot be read, or all sets together have fewer than `count` samples.
+        RecipeError: a dataset cannot be read, or all datasets together have fewer than `count` samples.
     """
 
     def __init__(
@@ -113,7 +113,7 @@ class CachedRendered:
         return layers.flip(2) if rng.bernoulli(0.5) else layers
 
     def _render(self, index: int, size: int) -> Tensor:
-        """Renders a sample as (9, size, size) uint8. The first use is quantized too, so that all uses are equal."""
+        """Renders a sample as (9, size, size) uint8. The sample has these 8-bit values also when it is first used."""
         return (self._source.layers(index, size).clamp(0, 1) * 255).round().to(torch.uint8)
 
 
@@ -188,5 +188,5 @@ def _file_errors(entry: StoredSample, name: str) -> Iterator[None]:
         raise RecipeError(
             f"{name} of sample {key(entry.index)} in {entry.path} cannot be read",
             "expected a sample with five images and a scene",
-            "delete the sample and render the set again",
+            "delete the sample and render the dataset again",
         ) from error

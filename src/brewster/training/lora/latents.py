@@ -3,8 +3,8 @@
     samples = open_samples(recipe)
     encoded = EncodedSampleLoader(samples, backbone, recipe)(SampleRng(seed, step, slot))
 
-Latents are cached with the key (sample, mirrored, crop). They also depend on the VAE and on the size of the panels. These are
-not in the key, because a run has one frozen VAE, and all crops of a sample have panels of one size.
+Latents are cached with the key (sample, mirrored, crop). They also depend on the VAE and on the size of the panels. The key does
+not contain these two, because a run has one frozen VAE, and all crops of a sample have panels of one size.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 
 CACHE_SIZE: Final = 2048
 """Largest number of cached samples: 3 GiB at the paper's size, enough for 1,000 samples and their mirrored versions without
-crops. The least recently used ones are dropped. They are encoded again when they are drawn, which is slower, with the same
+crops. The least recently used samples are dropped. When such a sample is drawn again, it is encoded again, with the same
 result."""
 _MIN_CROP_SIDE: Final = 0.5
 """Smallest side of a crop divided by the side of the sample."""
@@ -83,8 +83,8 @@ class SampleSequence:
         return self._pairs[number - self._first_pair]
 
     def check_sizes(self, recipe: LoraRecipe, size_divisor: int) -> list[PanelFit]:
-        """Returns the panel sizes for the first rendered sample and for every pair. An unusable sample raises an error here,
-        before training starts.
+        """Returns the panel sizes for the first rendered sample and for every pair. Training calls this first, so that an unusable
+        sample stops it before any step.
 
         Raises:
             RecipeError, PhotoError: a file is damaged or missing, or a sample is too small, see `fit_sample`.
@@ -114,10 +114,10 @@ class EncodedSampleLoader:
         self._encoded = lru_cache(CACHE_SIZE)(self._encode)
 
     def __call__(self, rng: SampleRng) -> EncodedSample:
-        """Draws a sample, whether it is mirrored, and its crop. Returns the encoded sample.
+        """Draws the index of a sample, its crop and whether it is mirrored. Returns the encoded sample.
 
         Raises:
-            RecipeError, PhotoError: a file of the sample is missing or damaged, or the sample has a side of fewer than 16 pixels.
+            RecipeError, PhotoError: a file of the sample is missing or damaged, or the sample is too small, see `fit_sample`.
         """
         number = self._samples.draw_index(rng)
         mirrored = self._recipe.flip and rng.bernoulli(0.5)
@@ -129,7 +129,7 @@ class EncodedSampleLoader:
         fit = fit_sample(sample.layers, self._recipe, self._backbone.size_divisor)
         layers = sample.layers
         if crop:
-            # The step is negative, so that these random numbers differ from those of every training step.
+            # A negative step gives other random numbers than any training step.
             layers = crop_sample(SampleRng(self._recipe.seed, -1 - number, crop), layers, fit)
         panels = make_panels(layers.flip(1) if mirrored else layers, fit)
         return EncodedSample(
@@ -172,7 +172,7 @@ def make_panels(layers: UInt8[Tensor, "h w 9"], fit: PanelFit) -> dict[str, Floa
 def fit_sample(layers: Tensor, recipe: LoraRecipe, size_divisor: int) -> PanelFit:
     """Returns the size of the panels of a sample, and the position of the sample in them, as for photos at inference.
 
-    A sample is never enlarged: a small one gets small panels.
+    A sample is never enlarged: a small sample gets small panels.
 
     Raises:
         PhotoError: a side of the sample is smaller than `size_divisor`, or its aspect ratio is too extreme.
@@ -182,15 +182,15 @@ def fit_sample(layers: Tensor, recipe: LoraRecipe, size_divisor: int) -> PanelFi
 
 
 def open_samples(recipe: LoraRecipe) -> SampleSequence:
-    """Opens the rendered sets and pairs of a recipe. Data with a share of 0 is not read.
+    """Opens the rendered datasets and pairs of a recipe. Data with a share of 0 is not read.
 
     Raises:
         RecipeError: a folder is missing, empty or without reflections, or there are too few rendered samples.
         PhotoError: an image cannot be read.
     """
-    data, rendered, sets = recipe.data, recipe.data.rendered, None
+    data, rendered, datasets = recipe.data, recipe.data.rendered, None
     if rendered and data.pairs_share < 1 and data.rendered_share:
-        sets = RenderedDatasets(
+        datasets = RenderedDatasets(
             resolve_folders(rendered.datasets),
             seed=recipe.seed,
             count=rendered.count,
@@ -199,7 +199,7 @@ def open_samples(recipe: LoraRecipe) -> SampleSequence:
         )
     folders = resolve_folders(data.pairs) if data.pairs_share else []
     pairs = [sample for folder in folders for sample in _read_pairs(folder, recipe)]
-    return SampleSequence(sets, pairs, data.pairs_share)
+    return SampleSequence(datasets, pairs, data.pairs_share)
 
 
 def _read_pairs(folder: Path, recipe: LoraRecipe) -> list[TrainingSample]:

@@ -2,7 +2,8 @@
 
     write_card(Path("out/kontext/lora"), recipe, {"psnr_gain_db_nature": 1.2}, Kontext)
 
-The card depends only on the recipe and the log. It contains no paths of the machine, so that equal runs give equal bytes.
+The card depends only on the recipe, the prompt, the log and the records of the rendered datasets. It contains no absolute paths,
+so that equal runs on different machines write the same card.
 """
 
 from __future__ import annotations
@@ -48,9 +49,9 @@ _LIMITS: Final = """## Limits
   takes fine detail from the photo instead, where the reflection allows it.
 - **Reconstruction error.** Colours and edges of the generated photo can differ from the input. `brewster` measures this error,
   uses it for the confidence, and flags a result with a large error.
-- **White areas.** The model can take a white area of the scene, such as a sign, for a highlight of a reflection and remove
-  it, or keep a white reflection as part of the scene. `brewster evaluate` measures both on rendered sets: removed white,
-  kept reflection.
+- **White areas.** The model can mistake a white area of the scene, such as a sign, for a reflection and remove it. It can also
+  keep a white reflection as part of the scene. `brewster evaluate` measures both errors on rendered datasets, in the columns
+  "Removed white" and "Kept reflection".
 - It was trained only on the glass of its training data. Photos with rain, dirt, or curved or patterned panes may be separated incorrectly.
 - Each seed gives a different result. The mean of several results contains less invented detail."""
 
@@ -91,7 +92,7 @@ def card_text(
 
 
 def with_benchmark_tables(card: str, tables: str) -> str:
-    """Returns the card with these Markdown tables under the heading for benchmarks, in place of earlier ones.
+    """Returns the card with these Markdown tables under the heading for benchmarks, in place of earlier tables.
 
     Raises:
         ModelError: the card has no heading for benchmarks.
@@ -108,7 +109,7 @@ def with_benchmark_tables(card: str, tables: str) -> str:
 
 
 def _front_matter(recipe: LoraRecipe, backbone_class: type[Backbone]) -> str:
-    """The metadata for the hub: YAML, written as JSON strings and lists, which are valid YAML."""
+    """Returns the metadata for the hub in YAML. The values are JSON strings and lists, which are valid YAML."""
     about: dict[str, object] = {}
     if _is_toy(recipe):
         about |= APACHE_2.hub
@@ -125,15 +126,15 @@ def _description(recipe: LoraRecipe, backbone_class: type[Backbone]) -> str:
     panels = ", ".join(_PANELS[panel] for panel in recipe.panels)
     text = f"""# Reflection removal: a LoRA for {_base_title(recipe, backbone_class)}
 
-From a photograph taken through glass, the base model with this LoRA generates these panels, {recipe.direction}:
+From a photo taken through glass, the backbone with this LoRA generates these panels, {recipe.direction}:
 {panels}.
 The in-context method is that of "SIRR-LMM: Single-image Reflection Removal via Large Multimodal Model". This LoRA
 was trained with brewster, not by the authors of the paper."""
     if _is_toy(recipe):
         text += f"""
 
-**This model is for software tests.** Its base is a tiny version of {backbone_class.hub_id} with random weights, for software tests.
-It does not work with any published model, and it does not separate photos."""
+**This model is for software tests.** Its backbone is a tiny version of {backbone_class.hub_id} with random weights.
+The LoRA does not work with any published model, and it does not separate photos."""
     return text
 
 
@@ -162,7 +163,7 @@ def _diffusers_usage(recipe: LoraRecipe, backbone_class: type[Backbone]) -> str:
         return "diffusers alone can load the LoRA into the tiny version that `brewster.models.diffusion.backbones.registry.tiny` builds."
     loads = 'diffusers alone can load it with `pipe.load_lora_weights("lora")`'
     if recipe.objective == "one_step":
-        return f"{loads}, but starts from noise; this LoRA starts from the photo and takes one step."
+        return f"{loads}, but then starts from noise. This LoRA needs to start from the photo and to take one step."
     usage = backbone_class.diffusers_usage
     if isinstance(usage, str):
         return f"{loads}, {usage}."
@@ -259,7 +260,7 @@ def _settings(recipe: LoraRecipe) -> str:
         "optimiser": f"{'AdamW' if recipe.optimizer == 'adamw' else '8-bit AdamW'}, weight decay {recipe.weight_decay:g}",
         "adapted layers": ", ".join(recipe.target_modules) or "all linear layers of the blocks",
         "condition": "the photo and white space" if recipe.layout.has_white_space else "the photo",
-        "quantization of the base": recipe.quantization or "none",
+        "quantization of the backbone": recipe.quantization or "none",
     }
     return f"## Settings\n\n{_table(('setting', 'value'), rows)}\n\n`recipe.json` contains all settings."
 
@@ -297,7 +298,7 @@ def _licence(recipe: LoraRecipe, backbone_class: type[Backbone]) -> str:
         return f"{APACHE_2.title}. It contains no weights of the backbone."
     text = f"{backbone_class.licence.title}, the licence of the backbone."
     if not backbone_class.licence.is_commercial:
-        text += " **Not for commercial use.** The base is gated: request access on its page."
+        text += " **Not for commercial use.** The backbone is gated: request access on its page."
     return text
 
 
@@ -324,7 +325,7 @@ def _base_title(recipe: LoraRecipe, backbone_class: type[Backbone]) -> str:
 
 
 def _set_description(folder: Path) -> str:
-    """Returns the name of a set and, if the set can be read, its number of samples and their scene recipe."""
+    """Returns the name of a dataset and, if the dataset can be read, its number of samples and their scene recipe."""
     with suppress(BrewsterError, OSError, ValueError, KeyError):
         (path,) = resolve_folders([folder])
         recipe = tomllib.loads((path / RECORD_FILE).read_text())["recipe"]

@@ -4,7 +4,8 @@ estimate = estimate_resources(recipe, CARDS["RTX 4090"])
 print(estimate.table())
 estimate.check_fits()
 
-Parameters and operations are counted on a backbone without storage (torch's device "meta"). Memory is computed from them.
+Parameters and operations are counted on a backbone without storage (torch's device "meta"). Memory and time are computed from
+these counts.
 """
 
 from __future__ import annotations
@@ -31,25 +32,25 @@ _SQUARE_PHOTO_PX: Final = (4096, 4096)
 """A large square photo: its panels fill the pixel budget best."""
 _PROMPT_TOKENS: Final = 512
 _BYTES_PER_LORA_WEIGHT: Final = {"adamw": 16, "adamw8bit": 10}
-"""Weight, gradient and two moments of AdamW; the moments are float32 or have 8 bits."""
+"""Bytes of a weight, its gradient, and its two moments in AdamW. The moments are float32 or have 8 bits."""
 _HIDDEN_STATES_PER_BLOCK: Final = 36
-"""Activations of one block, in hidden states, while gradient checkpointing recomputes it. Each block also stores its input,
-one hidden state."""
+"""Size of the activations of one block, divided by the size of a hidden state. Gradient checkpointing recomputes one block at a
+time. In addition, the input of each block is stored, which is one hidden state."""
 _OVERHEAD_GIB: Final = 1.5
-"""The CUDA context, and the activations of the VAE."""
+"""GPU memory of the CUDA context and the activations of the VAE."""
 _HOST_OVERHEAD_GIB: Final = 4.0
-"""Host memory of Python, torch and the data. The base is loaded directly to the GPU."""
+"""Host memory of Python, torch and the data. The backbone is loaded directly to the GPU."""
 _FORWARD_PASSES_PER_STEP: Final = 3
 """Forward pass, recomputation for gradient checkpointing, and backward pass. The backward pass costs as much as one forward
-pass, because the base has no weight gradients."""
+pass, because the frozen backbone has no weight gradients."""
 _EFFICIENCY: Final = 0.4
-"""Assumed speed of training divided by the peak speed of the card."""
+"""Assumed speed of training divided by the peak speed of the GPU."""
 
 
 @final
 @dataclass(frozen=True)
 class GraphicsCard:
-    """A graphics card: memory in GiB, and peak dense bf16 speed in TFLOP/s from its data sheet."""
+    """A GPU: its memory in GiB, and its peak dense bf16 speed in TFLOP/s from the data sheet."""
 
     name: str
     memory_gib: float
@@ -63,15 +64,16 @@ CARDS: Final = {
         GraphicsCard("A100", 80, 312), GraphicsCard("H100", 80, 989), GraphicsCard("H200", 141, 989),
     )
 }  # fmt: skip
-"""name -> card. The paper uses the RTX 4090."""
+"""Name -> GPU. The paper uses the RTX 4090."""
 
 
 @final
 @dataclass(frozen=True)
 class ResourceEstimate:
-    """The estimated resources of a recipe on a card.
+    """The estimated resources of a recipe on a GPU.
 
-    `panel` is (width, height) in px, `memory_gib` contains the memory of each part, `tflop` is for one training step.
+    `panel` is (width, height) in px. `memory_gib` contains the memory of each part. `tflop` is the number of operations of one
+    training step in TFLOP.
     """
 
     recipe: LoraRecipe
@@ -92,7 +94,7 @@ class ResourceEstimate:
 
     @property
     def seconds(self) -> float:
-        """Duration of one training step on the card, in seconds."""
+        """Duration of one training step on the GPU, in seconds."""
         return self.tflop / (_EFFICIENCY * self.card.tflops)
 
     def table(self) -> str:
@@ -108,17 +110,17 @@ class ResourceEstimate:
             **{f"memory, {name}": f"{gib:.1f} GiB" for name, gib in self.memory_gib.items()},
             "memory": f"{self.total_gib:.1f} GiB of {self.card.memory_gib:g} on {self.card.name} (estimate)",
             "host memory": f"{encoders / GIB + _HOST_OVERHEAD_GIB:.1f} GiB, while the text encoders encode the prompt (estimate)",
-            "download": f"{download / 1e9:.0f} GB, of them {encoders / 1e9:.0f} GB text encoders (estimate)",
+            "download": f"{download / 1e9:.0f} GB, of which {encoders / 1e9:.0f} GB are text encoders (estimate)",
             "per step": f"{self.tflop:.0f} TFLOP, {self.seconds:.1f} s (estimate)",
             "total": f"{recipe.steps} steps, {self.seconds * recipe.steps / 3600:.1f} hours (estimate)",
         }
         return "\n".join(f"{name:24}{value}" for name, value in rows.items())
 
     def check_fits(self) -> None:
-        """Checks that the recipe fits into the memory of the card.
+        """Checks that the recipe fits into the memory of the GPU.
 
         Raises:
-            DeviceError: the recipe does not fit. The message contains a change that makes it fit.
+            DeviceError: the recipe does not fit. The message says which values to change.
         """
         if self.total_gib <= self.card.memory_gib:
             return
@@ -131,14 +133,14 @@ class ResourceEstimate:
     def _cure(self) -> str:
         candidates: tuple[Quantization, ...] = ("int8", "nf4")
         for quantization in candidates:
-            saved = self.memory_gib["base"] - weights_gib(self.parameter_count, quantization)
+            saved = self.memory_gib["backbone"] - weights_gib(self.parameter_count, quantization)
             if saved > 0 and self.total_gib - saved <= self.card.memory_gib:
                 return f'set quantization = "{quantization}", which needs {self.total_gib - saved:.1f} GiB'
-        return "lower max_composite_pixels or rank, or choose a smaller backbone (klein) or a larger card"
+        return "lower max_composite_pixels or rank, or choose a smaller backbone (klein) or a GPU with more memory"
 
 
 def find_gpu(name: str | None = None) -> GraphicsCard:
-    """Returns the card of this name; without a name, the local GPU, or the RTX 4090 if there is none.
+    """Returns the GPU of this name. Without a name, returns the local GPU, or the RTX 4090 if there is no local GPU.
 
     Raises:
         DeviceError: the name is not in `CARDS`.
@@ -150,9 +152,9 @@ def find_gpu(name: str | None = None) -> GraphicsCard:
         return known[name.lower()]
     matches = get_close_matches(name.lower(), known, n=1)
     raise DeviceError(
-        f"there is no card {name!r} in the table",
+        f"there is no GPU {name!r} in the table",
         f"expected one of {', '.join(CARDS)}",
-        f"did you mean {known[matches[0]].name}?" if matches else "choose the most similar card",
+        f"did you mean {known[matches[0]].name}?" if matches else "choose the most similar GPU",
     )
 
 
@@ -162,7 +164,7 @@ def is_local_gpu(card: GraphicsCard) -> bool:
 
 
 def estimate_resources(recipe: LoraRecipe, card: GraphicsCard) -> ResourceEstimate:
-    """Estimates the resources of a recipe on a card. This takes a few seconds.
+    """Estimates the resources of a recipe on a GPU. This takes a few seconds.
 
     Raises:
         ModelError: the backbone is not in the table of backbones.
@@ -184,7 +186,7 @@ def estimate_resources(recipe: LoraRecipe, card: GraphicsCard) -> ResourceEstima
         _count_lora_parameters(backbone, recipe),
     )
     memory = {
-        "base": weights_gib(parameters, recipe.quantization),
+        "backbone": weights_gib(parameters, recipe.quantization),
         "VAE": 2 * vae / GIB,
         "LoRA and AdamW": lora_parameters * _BYTES_PER_LORA_WEIGHT[recipe.optimizer] / GIB,
         "activations": _activation_bytes(backbone, generated_tokens + condition_tokens + _PROMPT_TOKENS)
@@ -211,7 +213,7 @@ def estimate_resources(recipe: LoraRecipe, card: GraphicsCard) -> ResourceEstima
 
 
 def _local_gpu() -> GraphicsCard:
-    """Returns the local GPU. Its speed is that of the card in `CARDS` with its name, or of the RTX 4090 if there is none."""
+    """Returns the local GPU. Its speed is that of the GPU in `CARDS` with its name, or of the RTX 4090 if no name matches."""
     found = torch.cuda.get_device_properties(0)
     speed = next(
         (card.tflops for name, card in CARDS.items() if name in found.name), CARDS["RTX 4090"].tflops
@@ -244,7 +246,7 @@ def _activation_bytes(backbone: Backbone, tokens: int) -> int:
 
 
 def _forward_tflop(backbone: Backbone, generated_tokens: int, condition_tokens: int) -> float:
-    """Returns the TFLOP of one prediction. They are counted on the device "meta", which computes nothing."""
+    """Returns the number of operations of one prediction in TFLOP, counted on the device "meta", which computes nothing."""
     prompt = backbone.random_prompt(backbone.transformer, 0)
     prompt_tensors = {
         name: (tensor[:, :1].expand(1, _PROMPT_TOKENS, -1) if tensor.ndim == 3 else tensor).to("meta")

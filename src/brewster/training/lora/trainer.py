@@ -1,4 +1,5 @@
-"""The trainer of a LoRA on a diffusion backbone: flow matching on the latents of panels (paper, Text-to-image Model Fine-tuning).
+"""The trainer of a LoRA on a diffusion backbone: flow matching on the latents of panels (section "Text-to-image Model Fine-tuning"
+of the paper).
 
 trainer = LoraTrainer(read_recipe(Path("recipes/train/kontext.toml")))
 run(trainer, Path("out/kontext"), on_step)
@@ -62,17 +63,17 @@ RECIPE_FILE: Final = "recipe.json"
 _MAX_GRADIENT_NORM: Final = 1.0
 _MAX_VALIDATION_SAMPLES: Final = 4
 """Validation samples per folder. Their number is small, because generating one takes as long as several training steps."""
-_THUMBNAIL_SIZE_PX: Final = (160, 240)
+_THUMBNAIL_SHAPE_PX: Final = (160, 240)  # height, width
 _MEMORY_CURE: Final = (
-    "lower max_composite_pixels or rank, quantize the base, or choose a smaller backbone (klein)"
+    "lower max_composite_pixels or rank, quantize the backbone, or choose a smaller backbone (klein)"
 )
 
 
 class LoraTrainer:
     """The `Trainer` of a LoRA: a frozen backbone, a float32 LoRA on it, and AdamW.
 
-    Everything that can be wrong with data and machine is checked first. The backbone is loaded at its first use, so that
-    `initialize` can release the text encoders before.
+    The constructor checks the data and the machine. The backbone is loaded later, at its first use, so that `initialize` can
+    load and release the text encoders before.
 
     Args:
         recipe: the settings.
@@ -80,7 +81,7 @@ class LoraTrainer:
 
     Raises:
         RecipeError, PhotoError: the data is missing, damaged, too small, or without reflections.
-        DeviceError: there is no GPU and `device` is not "cpu", or memory or optimiser are not sufficient.
+        DeviceError: there is no GPU and `device` is not "cpu", the memory is too small, or the optimiser is not available.
         DownloadError, ModelError, MissingExtra: the backbone is unknown, or the disk is too small for its download.
     """
 
@@ -106,7 +107,7 @@ class LoraTrainer:
         """The frozen backbone with the LoRA. The first use loads it.
 
         Raises:
-            DownloadError, ModelError, DeviceError, MissingExtra: it cannot be loaded.
+            DownloadError, ModelError, DeviceError, MissingExtra: the backbone cannot be loaded.
         """
         recipe = self.recipe
         backbone = load_backbone(recipe.backbone, device=self._device, quantization=recipe.quantization)
@@ -141,10 +142,10 @@ class LoraTrainer:
     def initialize(self) -> None:
         """Loads or encodes the prompt of the recipe, then loads the backbone.
 
-        Only rank 0 loads the text encoders, and releases them before the backbone is loaded.
+        Only rank 0 loads the text encoders. It releases them before the backbone is loaded.
 
         Raises:
-            DownloadError, ModelError, DeviceError, MissingExtra: text encoder, prompt or backbone cannot be loaded.
+            DownloadError, ModelError, DeviceError, MissingExtra: a text encoder, the prompt or the backbone cannot be loaded.
         """
         self._prompt = distributed.from_main_process(
             lambda: _load_prompt(self.recipe, self._backbone_class, self._device)
@@ -152,7 +153,7 @@ class LoraTrainer:
         _ = self.backbone
 
     def state_dict(self) -> dict[str, Any]:
-        """Returns the LoRA, the state of the optimiser, and the prompt. The weights of the base are not included."""
+        """Returns the LoRA, the state of the optimiser, and the prompt. The weights of the backbone are not included."""
         prompt = {"text": self.prompt.text, **self.prompt.tensors}
         return {
             "lora": lora_state_dict(self.backbone), "optimizer": self._optimizer.state_dict(), "prompt": prompt,
@@ -170,7 +171,7 @@ class LoraTrainer:
         Raises:
             ModelError: the loss is NaN or infinite. The last checkpoint is still valid.
             DeviceError: the GPU is out of memory. The message lists the values to lower.
-            RecipeError, PhotoError: a sample is missing, damaged, or smaller than a panel.
+            RecipeError, PhotoError: a sample is missing, damaged or too small.
         """
         self._optimizer.zero_grad()
         with explain_out_of_memory(_MEMORY_CURE):
@@ -188,16 +189,20 @@ class LoraTrainer:
 
     @torch.no_grad()
     def validate(self) -> tuple[dict[str, float], Tensor]:
-        """Returns the mean PSNR gain of the generated T over the photo in dB by folder, and an image of the panels.
+        """Returns the mean PSNR gain of the generated T over the photo in dB for each folder, and an image of the panels.
 
-        The samples are divided among the processes, so that none waits for the others. All processes must call this.
+        The samples are divided among the processes. All processes must call this method.
         """
         samples = [layers for folder in self._validation_samples.values() for layers in folder]
         columns = [f"ground truth {panel}" for panel in "ITR"]
         columns += [f"generated {panel}" for panel in self.recipe.panels]
         gains = torch.zeros(len(samples), device=self._device)
         images = torch.zeros(
-            len(samples), 3, _THUMBNAIL_SIZE_PX[0], len(columns) * _THUMBNAIL_SIZE_PX[1], device=self._device
+            len(samples),
+            3,
+            _THUMBNAIL_SHAPE_PX[0],
+            len(columns) * _THUMBNAIL_SHAPE_PX[1],
+            device=self._device,
         )
         for index in range(distributed.rank(), len(samples), distributed.world_size()):
             gain, image = self._validate_sample(samples[index])
@@ -215,18 +220,19 @@ class LoraTrainer:
         return means, sample_sheet(columns, rows)
 
     def export(self, folder: Path) -> Path:
-        """Writes LoRA, prompt, recipe and model card to `lora` in `folder`. Returns the path. diffusers can load the LoRA.
+        """Writes LoRA, prompt, recipe and model card to the folder `lora` in `folder`, and returns its path. diffusers can load
+        the LoRA.
 
         Raises:
             OutputError: the folder cannot be written.
         """
-        target = folder / LORA_FOLDER
+        lora_folder = folder / LORA_FOLDER
         base_model, quantization = self.recipe.backbone, self.recipe.quantization
         if Path(base_model).is_dir():
             base_model = str(Path(base_model).resolve())
         target_modules = self.recipe.target_modules
         save_lora(
-            target,
+            lora_folder,
             self.backbone,
             self.prompt,
             self.recipe.task,
@@ -235,13 +241,14 @@ class LoraTrainer:
             target_modules=target_modules,
         )
         text = json.dumps(self.recipe.model_dump(mode="json"), indent=2)
-        write_atomically(target / RECIPE_FILE, f"{text}\n".encode(), overwrite=True)
+        write_atomically(lora_folder / RECIPE_FILE, f"{text}\n".encode(), overwrite=True)
         scores = read_log(folder)[-1:]
-        write_card(target, self.recipe, scores[0] if scores else {}, type(self.backbone))
-        return target
+        write_card(lora_folder, self.recipe, scores[0] if scores else {}, type(self.backbone))
+        return lora_folder
 
     def separate(self, photo: Tensor, *, seed: int = 0) -> Mapping[str, Tensor]:
-        """Generates the panels of a photo of the size of a panel, (1, 3, h, w) in [-1, 1], as at inference.
+        """Generates the panels of a photo, (1, 3, h, w) in [-1, 1], in the same way as at inference. The photo has the size of a
+        panel.
 
         Raises:
             DeviceError: the GPU is out of memory. The message lists the values to lower.
@@ -259,9 +266,9 @@ class LoraTrainer:
         return totals
 
     def _losses(self, rng: SampleRng) -> dict[str, Tensor]:
-        """Returns the weighted mean squared error of the velocity for each panel. The velocity is start - composite.
+        """Returns the weighted mean squared error of the predicted velocity for each panel. The loss is the sum of these errors.
 
-        The loss is the sum of these values.
+        The true velocity is start - composite.
         """
         encoded, device = self._encoded_samples(rng), self.backbone.device
         start, sigma = self._start_and_sigma(rng, encoded)
@@ -282,9 +289,9 @@ class LoraTrainer:
         }
 
     def _start_and_sigma(self, rng: SampleRng, encoded: EncodedSample) -> tuple[Tensor, Tensor]:
-        """Returns the start of the sample's path, which is noise or the photo, and its time sigma in 0..1.
+        """Returns the start of the path from noise or photo to the composite, and the time sigma in 0..1 on this path.
 
-        Times are logit-normal (Esser et al. 2024), then shifted for the resolution.
+        The distribution of times is logit-normal (Esser et al. 2024). Times are then shifted for the resolution.
         """
         if encoded.start is not None:
             return encoded.start, torch.ones(1)
@@ -301,7 +308,7 @@ class LoraTrainer:
         return {panel: weight / sum(named.values()) for panel, weight in named.items()}
 
     def _validation_panels(self, layers: Tensor) -> tuple[dict[str, Tensor], PanelFit]:
-        """Returns the panels of a validation sample, and their size."""
+        """Returns the panels of a validation sample, and the position of the sample in them."""
         fit = fit_sample(layers, self.recipe, self.backbone.size_divisor)
         return make_panels(layers, fit), fit
 
@@ -313,7 +320,7 @@ class LoraTrainer:
             (fit.crop(panel) + 1) / 2 for panel in (ground_truth["I"], ground_truth["T"], predicted["T"])
         )
         panels = [
-            functional.interpolate((panel + 1) / 2, _THUMBNAIL_SIZE_PX)
+            functional.interpolate((panel + 1) / 2, _THUMBNAIL_SHAPE_PX)
             for panel in (*ground_truth.values(), *predicted.values())
         ]
         return psnr_gain_db(prediction, photo, transmission), torch.cat(panels, dim=3)[0]
@@ -346,7 +353,7 @@ def _load_prompt(recipe: LoraRecipe, backbone_class: type[Backbone], device: str
 
 
 def _create_optimizer(parameters: Sequence[nn.Parameter], recipe: LoraRecipe) -> torch.optim.Optimizer:
-    """Returns the optimiser of the recipe. The recipe in a checkpoint records it."""
+    """Returns the optimiser of the recipe."""
     options: dict[str, Any] = {"lr": recipe.learning_rate, "weight_decay": recipe.weight_decay}
     if recipe.optimizer == "adamw8bit":
         optimizer = importlib.import_module("bitsandbytes.optim").AdamW8bit(parameters, **options)
@@ -356,7 +363,7 @@ def _create_optimizer(parameters: Sequence[nn.Parameter], recipe: LoraRecipe) ->
 
 
 def _read_validation_samples(recipe: LoraRecipe, samples: SampleSequence) -> dict[str, list[Tensor]]:
-    """Returns the first validation pairs of each folder, (H, W, 9); the first training samples if there is no such folder."""
+    """Returns up to four validation pairs of each folder, (H, W, 9), or training samples if the recipe names no such folder."""
     folders = validation_pairs(recipe.data)
     if folders:
         return {

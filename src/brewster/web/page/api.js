@@ -4,7 +4,7 @@
 const POLL_MS = 300;
 const MAX_RETRIES = 60; // maximum number of repetitions of a request while the queue of the server is full
 
-// What an error of the server means, by its kind; the message of the server is shown below it.
+// The explanation of an error of the server, by its kind. The message of the server is shown below the explanation.
 const MEANINGS = {
   UnreadablePhoto: "This file is not a photo, or it is damaged.",
   UnsupportedPhoto: "This kind of image cannot be separated.",
@@ -12,9 +12,9 @@ const MEANINGS = {
   MissingExtra: "The server cannot read this format, because a part of brewster is not installed.",
 };
 
-// Sends a photo with options to a path. Returns {blob, fileName, header(name)}. Until then, it calls `onProgress` repeatedly with one of
-//   {phase: "upload" | "download", loaded, total} in bytes, {phase: "waiting", ahead}, {phase: "working", share}
-// where `ahead` is the number of photos before this one, and `share` the completed fraction.
+// Sends a photo with options to a path. Returns {blob, fileName, header(name)}. Before it returns, it calls `onProgress` repeatedly
+// with {phase: "upload" | "download", loaded, total} in bytes, {phase: "waiting", ahead} or {phase: "working", share}, where `ahead`
+// is the number of photos before this photo, and `share` is the completed fraction.
 export async function send(path, file, options, { signal, onProgress }) {
   const form = new FormData();
   for (const [name, value] of Object.entries(options)) {
@@ -42,14 +42,14 @@ export async function models() {
   return response.json();
 }
 
-// XMLHttpRequest reports the bytes of an upload, which fetch() does not. Resolves with the request; its status is 0 if there
-// was no response.
+// Sends a form with XMLHttpRequest, because fetch() does not report the progress of an upload. Resolves with the request. The
+// status of the request is 0 if there was no response.
 function post(url, job, form, signal, onProgress) {
   const request = new XMLHttpRequest();
   let watcher = null;
   const stopWatching = () => watcher?.stop();
   return new Promise((resolve, reject) => {
-    const abort = () => (reject(signal.reason), request.abort()); // in this order: abort() fires loadend at once
+    const abort = () => (reject(signal.reason), request.abort()); // reject first, because abort() fires loadend immediately
     if (signal.aborted) return abort();
     signal.addEventListener("abort", abort, { once: true });
     request.open("POST", url);
@@ -71,7 +71,7 @@ function pollProgress(job, onProgress) {
   async function poll() {
     const response = await fetch(`progress/${job}`).catch(() => null);
     const progress = timer && response?.ok ? await response.json() : null;
-    // not after stop(): a late report would overwrite a later phase
+    // Nothing is reported after stop(), because a late report overwrites a later phase.
     if (timer && progress) onProgress({ phase: progress.state, ahead: progress.ahead, share: progress.share });
     if (timer) timer = setTimeout(poll, POLL_MS);
   }
@@ -88,7 +88,7 @@ function fileNameOf(request) {
   return name ? decodeURIComponent(name[1]) : "photo";
 }
 
-// Without a response, either the server does not respond, or the file cannot be read: browsers do not report which.
+// If there is no response, either the server does not respond or the file cannot be read. Browsers do not report which of the two.
 async function connectionError() {
   const response = await fetch("health").catch(() => null);
   if (!response) return new Error("The server does not respond. Start it again if it was stopped, then try again.");

@@ -40,7 +40,7 @@ function applySettings() {
   show();
 }
 
-// The settings of a photo have changed, so its files have to be downloaded again.
+// Changes the settings of a photo. Its files must then be downloaded again.
 function change(photo, values) {
   Object.assign(photo, values, { isSaved: false });
   if (photo === queue.current) byId("strength").value = photo.strength;
@@ -56,7 +56,7 @@ async function saveMask() {
   save(`${file.name.replace(/\.[^.]*$/, "")}.mask.png`, await maskFile(regions.list, ...size));
 }
 
-// Repeats the request until the server responds: nothing can be separated before.
+// Repeats the request until the server responds, because no photo can be separated before.
 async function loadModels() {
   for (;;) {
     try {
@@ -121,7 +121,7 @@ function undoRemove() {
   announce(`${photo.file.name} was added again`);
 }
 
-// A note above the list, with a button while the photo that was removed last can be restored.
+// Shows a note above the list. While the photo that was removed last can be restored, the note has a button for this.
 function showNote(text) {
   byId("removed-text").textContent = text;
   byId("removed").hidden = !text && removed === null;
@@ -195,7 +195,7 @@ async function show() {
   paint();
 }
 
-// The tiles of a photo. If the server has dropped the photo, it is sent again, once for all tiles.
+// Returns the tiles of a photo. If the server has dropped the photo, the photo is sent again, only once for all tiles.
 function tilesOf(photo, preview) {
   let sending = null;
   const context = { signal: new AbortController().signal, onProgress() {} };
@@ -210,7 +210,7 @@ function tilesOf(photo, preview) {
   });
 }
 
-// The mask of the regions at the size of the reduced photo.
+// Returns the mask of the regions at the size of the reduced photo.
 function currentMask() {
   const { list } = queue.current.regions;
   const { width, height } = shown.preview;
@@ -262,7 +262,7 @@ function refresh(photo = null) {
   byId("facts").textContent = isReady ? describePreview(shown.preview) : "";
 }
 
-// Uses aria-disabled: a button with the attribute `disabled` would lose the focus.
+// Uses aria-disabled, because a button with the attribute `disabled` loses the focus.
 function enable(id, isEnabled) {
   byId(id).setAttribute("aria-disabled", !isEnabled);
 }
@@ -308,7 +308,7 @@ function showExportError(problem) {
   byId("export-error").hidden = !problem;
 }
 
-// Shows the progress of a request. `which` names the photo if there are several.
+// Shows the progress of a request. `which` is a prefix with the number of the photo if there are several photos.
 function showExportProgress(progress, which = "") {
   byId("export-status").textContent = which + progressText(progress);
   setBar(byId("export-progress"), fraction(progress));

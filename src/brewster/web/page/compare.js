@@ -4,7 +4,7 @@
 
 const MAX_PIXEL_SIZE = 16; // maximum size of a photo pixel in screen pixels
 const SHARP_PIXEL_SIZE = 2; // photo pixels of at least this size are drawn as squares
-const GRAB_DISTANCE = 28; // in CSS pixels: a pointer at most this far from the line drags the line
+const GRAB_DISTANCE_PX = 28; // in CSS pixels; a pointer that is closer to the line than this drags the line
 
 class GlassCompare extends HTMLElement {
   left = document.createElement("canvas");
@@ -26,7 +26,7 @@ class GlassCompare extends HTMLElement {
     this.tabIndex = 0;
     this.setAttribute("role", "group");
     this.innerHTML = `<canvas aria-hidden="true"></canvas>
-      <div class="line" role="slider" tabindex="0" aria-label="Line between the two"
+      <div class="line" role="slider" tabindex="0" aria-label="Line between photo and layer"
         aria-valuemin="0" aria-valuemax="100"></div>
       <span class="tag left" aria-hidden="true">Photo</span><span class="tag right" aria-hidden="true"></span>
       <div class="zoom" role="group" aria-label="Zoom">
@@ -65,7 +65,7 @@ class GlassCompare extends HTMLElement {
   // Sets the labels of both sides, visible and for screen readers.
   show(photo, layer) {
     this.setAttribute("aria-label", `${photo}: the photo on the left, its ${layer} on the right. `
-      + "Plus and minus zoom, 0 shows all, 1 shows the pixels of the photo, B switches between photo and result, arrow keys move the picture.");
+      + "Plus and minus zoom, 0 shows all, 1 shows the pixels of the photo, B switches between photo and result, arrow keys move the image.");
     this.querySelector(".right").textContent = layer[0].toUpperCase() + layer.slice(1);
     this.paint();
   }
@@ -75,7 +75,7 @@ class GlassCompare extends HTMLElement {
     [this.#split, this.#zoom, this.#centre] = [0.5, 1, { x: 0.5, y: 0.5 }];
   }
 
-  // Zooms by a factor around a point of a pane, by default its middle. A factor of 0 shows the whole image.
+  // Zooms by a factor around a point of a pane, by default the middle of the pane. A factor of 0 shows the whole image.
   zoomBy(factor, point = null) {
     const { width: viewWidth, height: viewHeight } = this.#panes()[0];
     const { x, y } = point ?? { x: viewWidth / 2, y: viewHeight / 2 };
@@ -88,12 +88,12 @@ class GlassCompare extends HTMLElement {
     this.paint();
   }
 
-  // One photo pixel is one screen pixel, around a point of a pane. Photos that are smaller than the view stay as large as they are.
+  // Zooms around a point of a pane until one photo pixel is one screen pixel. The zoom is never less than that of the whole image.
   zoomToFull(point = null) {
     this.zoomBy(Math.max(1, this.#fullZoom()) / this.#zoom, point);
   }
 
-  // The zoom at which one photo pixel is one screen pixel.
+  // Returns the zoom at which one photo pixel is one screen pixel.
   #fullZoom() {
     return this.fullSize[0] / this.#fit().width / this.#density;
   }
@@ -107,8 +107,7 @@ class GlassCompare extends HTMLElement {
     return window.devicePixelRatio || 1;
   }
 
-  // The parts of the view that show an image, all of the same size: {side, x, y, width, height} in CSS pixels, and for the slider the
-  // horizontal limits `from` and `to` of what is shown in it.
+  // Returns the parts of the view that show an image: {side, x, y, width, height} in CSS pixels. All have the same size.
   #panes() {
     const [width, height] = [this.clientWidth, this.clientHeight];
     if (this.#mode === "side") {
@@ -119,15 +118,15 @@ class GlassCompare extends HTMLElement {
     return [{ side: "right", x: 0, y: 0, width, height }];
   }
 
-  // The size of the whole image in a pane, in CSS pixels. Small images are enlarged by a factor of at most 2.
+  // Returns the size of the whole image in a pane, in CSS pixels. Small images are enlarged by a factor of at most 2.
   #fit() {
     const [{ width: viewWidth, height: viewHeight }] = this.#panes();
-    const [width, height] = this.fullSize; // not those of the reduced image, whose aspect ratio is rounded
+    const [width, height] = this.fullSize; // not the size of the reduced image, because its aspect ratio is rounded
     const scale = Math.min(viewWidth / width, viewHeight / height, 2);
     return { width: width * scale, height: height * scale };
   }
 
-  // The position and size of the image in a pane, in CSS pixels. Limits the pan, so that the image covers the pane.
+  // Returns the position and size of the image in a pane, in CSS pixels. Limits the pan, so that a zoomed image covers the pane.
   #placement() {
     const [{ width: viewWidth, height: viewHeight }] = this.#panes();
     const fit = this.#fit();
@@ -140,7 +139,7 @@ class GlassCompare extends HTMLElement {
     return { left, top, width, height };
   }
 
-  // The left and right ends of the visible part of the image, and the position of the line, in CSS pixels.
+  // Returns the left and right ends of the visible part of the image, and the position of the line, in CSS pixels.
   #visible(placement = this.#placement()) {
     const [from, to] = [Math.max(0, placement.left), Math.min(this.clientWidth, placement.left + placement.width)];
     return { from, to, line: from + this.#split * (to - from) };
@@ -148,7 +147,7 @@ class GlassCompare extends HTMLElement {
 
   paint() {
     if (!this.canvas || !this.clientWidth || !this.clientHeight || !this.left.width) return;
-    // a whole number of screen pixels, so that at 1:1 each photo pixel is exactly one screen pixel
+    // Round to whole screen pixels, so that at 1:1 each photo pixel is exactly one screen pixel.
     const round = (length) => Math.round(length * this.#density) / this.#density;
     const { left, top, width, height } = this.#placement();
     const placement = { left: round(left), top: round(top), width, height };
@@ -227,20 +226,20 @@ class GlassCompare extends HTMLElement {
     this.paint();
   }
 
-  // The position of a pointer in the view.
+  // Returns the position of a pointer in the view.
   #point(event) {
     const box = this.getBoundingClientRect();
     return { x: event.clientX - box.left, y: event.clientY - box.top };
   }
 
-  // The same position in the pane that contains a point.
+  // Converts a position in the view to a position in the pane that contains it.
   #inPane({ x, y }) {
     const panes = this.#panes();
     const pane = panes.findLast((one) => x >= one.x && y >= one.y) ?? panes[0];
     return { x: x - pane.x, y: y - pane.y };
   }
 
-  // The position in the photo that is shown at a point, in fractions of its longer side.
+  // Converts a position in the view to a position in the photo, in fractions of the longer side of the photo.
   #inPhoto(point) {
     const placement = this.#placement();
     const { x, y } = this.#inPane(point);
@@ -248,12 +247,12 @@ class GlassCompare extends HTMLElement {
     return [(x - placement.left) / longer, (y - placement.top) / longer];
   }
 
-  // What a pointer drags that goes down at a point. While regions are drawn, the line is dragged by its handle only.
+  // Returns what a pointer drags after it is pressed at a point. While regions are drawn, only the handle of the line drags the line.
   #draggedAt(point, target) {
     const hasLine = this.#mode === "slider" && !this.#isBefore;
-    const isNear = hasLine && Math.abs(point.x - this.#visible().line) < GRAB_DISTANCE;
+    const isNear = hasLine && Math.abs(point.x - this.#visible().line) < GRAB_DISTANCE_PX;
     if (this.editor?.isActive) {
-      return target === this.line && Math.abs(point.y - this.clientHeight / 2) < GRAB_DISTANCE ? "line" : "region";
+      return target === this.line && Math.abs(point.y - this.clientHeight / 2) < GRAB_DISTANCE_PX ? "line" : "region";
     }
     return hasLine && (this.#zoom === 1 || isNear) ? "line" : "image";
   }

@@ -1,18 +1,18 @@
 // The image files of a drop, a paste or a file dialog, including those in dropped folders.
 
-export const MAX_PHOTOS = 1000; // in the list of the page; more files are a task for the command line
+export const MAX_PHOTOS = 1000; // maximum number of photos in the list of the page
 const compareNames = new Intl.Collator(undefined, { numeric: true }).compare;
 
-// Returns {files, others, surplus}: the files to add in the order of their names, the number of files in folders that are no
-// images, and the number of images beyond `room`. Files that are passed directly are always kept: the server names their problem.
-// Must be called in the event handler, because the browser empties the transfer after it.
+// Returns {files, others, surplus}: the files to add in the order of their names, the number of files in folders that are not
+// images, and the number of images beyond `room`. Files that are not in a folder are always kept, because the server explains why it
+// cannot separate them. Call this in the event handler, because the browser empties the transfer after the event.
 export async function readTransfer(transfer, isImage, room) {
   const items = [...transfer.items].filter((item) => item.kind === "file");
   const entries = items.map((item) => item.webkitGetAsEntry?.() ?? item.getAsFile());
   return collect(entries, isImage, room);
 }
 
-// As `readTransfer`, for the files of an <input>. `isFolder`: they are the content of a folder.
+// Does the same as `readTransfer` for the files of an <input>. `isFolder`: whether the files are the content of a folder.
 export function readList(list, isImage, room, isFolder) {
   const files = [...list];
   const images = isFolder ? files.filter((file) => isImage(file.name)) : files;
@@ -34,7 +34,7 @@ async function collect(entries, isImage, room) {
   return { files, others, surplus: Math.max(0, found.length - room) };
 }
 
-// The entries of a folder. `readEntries` returns them in batches, the last of which is empty.
+// Returns the entries of a folder. `readEntries` returns batches of entries; the last batch is empty.
 async function childrenOf(folder) {
   const reader = folder.createReader();
   const children = [];
@@ -47,11 +47,11 @@ async function childrenOf(folder) {
 
 const toFile = (entry) => (entry instanceof File ? entry : new Promise((resolve, reject) => entry.file(resolve, reject)));
 
-// One sentence about what was added and what was left out.
+// Returns one sentence about the files that were added and left out.
 export function describeAdded({ files, others, surplus }) {
   const parts = [files.length === 1 ? `${files[0].name} was added` : `${files.length} photos were added`];
   if (others) parts.push(`${others} other ${others === 1 ? "file was" : "files were"} left out`);
-  if (surplus) parts.push(`${surplus} more photos were left out, because the list holds at most ${MAX_PHOTOS}; use the command line for them`);
+  if (surplus) parts.push(`${surplus} more photos were left out, because the list can contain at most ${MAX_PHOTOS}; use the command line for these photos`);
   return `${parts.join("; ")}.`;
 }
 

@@ -1,29 +1,29 @@
-// Draws regions on <glass-compare> with a pointer or with the keyboard, and hatches what stays as it is.
+// Draws regions on <glass-compare> with a pointer or with the keyboard, and a hatching over the areas that are not separated.
 
 import { maskCodes } from "./regions.js";
 
 const KEY_STEP = 0.01; // of the longer side of the photo; five times as much with Shift
-const HATCH_PX = 8; // width of the dark and light stripes where the photo is not separated: visible on any photo
+const HATCH_PX = 8; // width of the stripes, which are dark and light, so that they are visible on any photo
 const HATCH_OPACITY = 0.45;
 const HATCH_MAX_PX = 800; // longer side of the image of the hatching
-const MIN_STEP = 0.2; // distance of the points of a stroke, as a fraction of the brush radius
+const MIN_STEP = 0.2; // minimum distance of the points of a stroke, as a fraction of the brush radius
 
 export class RegionEditor {
   isActive = false;
   #drawn = null; // the region that is being drawn
   #cursor = null; // position of the pointer or of the keyboard cursor, in fractions of the longer side
   #hatching = document.createElement("canvas");
-  #hatchingOf = null; // the regions and the size of the hatching
+  #hatchingKey = null; // the regions and the size of the hatching, as text
 
-  // `tool()`: {shape, value, radius, feather} of the next region; `onChange(isDrawing)`: called when `list` has changed;
-  // `onAdd(region)`: called with each finished region; `announce(text)`: for screen readers.
+  // `tool()` returns {shape, value, radius, feather} of the next region. `onChange(isDrawing)` is called when `list` or the cursor
+  // has changed, `onAdd(region)` with each finished region, and `announce(text)` to tell screen readers what happened.
   constructor({ tool, onChange, onAdd, announce }) {
     Object.assign(this, { tool, onChange, onAdd, announce });
     this.regions = null; // the Regions of the current photo
     this.size = [1, 1]; // width and height of the photo
   }
 
-  // All regions, with the one that is being drawn.
+  // All regions, including the region that is being drawn.
   get list() {
     const list = this.regions?.list ?? [];
     return this.#drawn ? [...list, this.#drawn] : list;
@@ -64,7 +64,7 @@ export class RegionEditor {
     this.onChange(true);
   }
 
-  // Handles a key: arrows move the cursor, space or Enter starts and ends a region, Escape cancels it. Returns whether it did.
+  // Handles a key: arrows move the cursor, space or Enter starts and ends a region, Escape cancels it. Returns whether the key was handled.
   press(event) {
     const step = KEY_STEP * (event.shiftKey ? 5 : 1);
     const steps = { ArrowLeft: [-step, 0], ArrowRight: [step, 0], ArrowUp: [0, -step], ArrowDown: [0, step] };
@@ -110,8 +110,8 @@ export class RegionEditor {
     const scale = Math.min(1, HATCH_MAX_PX / Math.max(...this.size));
     const [width, height] = this.size.map((side) => Math.max(1, Math.round(side * scale)));
     const key = JSON.stringify([list, width, height]);
-    if (key === this.#hatchingOf) return;
-    this.#hatchingOf = key;
+    if (key === this.#hatchingKey) return;
+    this.#hatchingKey = key;
     Object.assign(this.#hatching, { width, height });
     const codes = maskCodes(list, width, height);
     if (!codes) return;

@@ -1,4 +1,4 @@
-// Downloads at full size, equal to the files of the command line, and the report in the zip of all photos.
+// Downloads at full size, with the same files as on the command line, and the report in the zip of all photos.
 
 import { send } from "./api.js";
 import { maskFile } from "./regions.js";
@@ -7,20 +7,20 @@ import { createZip, crc32, readZip, withUniqueNames } from "./zip.js";
 const ZIP_LAYERS = "transmission,reflection"; // the layers in the zip of all photos
 const REPORT_NAME = "brewster-report.txt";
 
-// Requests layers of a photo at full size. Returns {blob, fileName}, as `send`.
+// Requests layers of a photo at full size. Returns the result of `send`.
 async function requestLayers(photo, layers, settings, context) {
   const mask = await maskFile(photo.regions.list, ...photo.size);
   return send("separate", photo.file, { layers, strength: photo.strength, mask, ...settings }, context);
 }
 
-// Creates one layer of a photo. Returns {name, blob, problem, saved}; `saved` are the photos whose results it contains.
+// Creates one layer of a photo. Returns {name, blob, problem, saved}, where `saved` are the photos whose results the file contains.
 export async function exportLayer(photo, layer, settings, context) {
   const { blob, fileName } = await requestLayers(photo, layer, settings, context);
   return { name: fileName, blob, problem: "", saved: [photo] };
 }
 
 // Creates a zip of the layers of all photos that are done, with a report that also lists the photos that failed. A photo that
-// fails now is left out, and `problem` describes it. `onPhoto(index, count)` is called before each photo.
+// fails during the export is left out, and `problem` describes the error. `onPhoto(index, count)` is called before each photo.
 //
 // Throws an Error if all photos fail.
 export async function exportAll(photos, settings, { onPhoto, ...context }) {
@@ -47,7 +47,7 @@ export async function exportAll(photos, settings, { onPhoto, ...context }) {
 
 const problemOf = ({ error }) => (error ? `${error.message} ${error.details ?? ""}`.trim() : "It was cancelled.");
 
-// The text of the report. `files` are the files of all results in this order, with the names that they have in the zip.
+// Returns the text of the report. `files` are the files of all results in this order, with their names in the zip.
 function describeResults(results, files, { model, quality }) {
   const names = files.map(({ name }) => name);
   const lines = results.map(({ photo, files: own, error }) => {

@@ -51,13 +51,13 @@ export class Layers {
   #reflection = null;
   #confidence = null;
 
-  // `preview`: what `readPreview` returns; `photo`: the 8-bit codes of the part; `area`: the position of its left upper corner and
+  // `preview`: the result of `readPreview`; `photo`: the 8-bit codes of the part; `area`: the position of its upper left corner and
   // the size of its pixels, in pixels of the full photo.
   constructor(preview, photo, width, height, area) {
     Object.assign(this, { preview, photo, width, height, area });
   }
 
-  // The reduced photo as a whole.
+  // Returns the layers of the whole reduced photo.
   static ofPreview(preview) {
     const { photo, width, height, full } = preview;
     return new Layers(preview, photo, width, height, { left: 0, top: 0, stepX: full[0] / width, stepY: full[1] / height });
@@ -85,7 +85,7 @@ export class Layers {
     return (this.#confidence ??= Uint8Array.from(this.#upsample(this.preview.maps.confidence, 1), (value) => Math.round(255 * value)));
   }
 
-  // slope x photo + offset, upsampled.
+  // Returns slope x photo + offset, with slope and offset upsampled to the pixels of this part.
   #apply(slope, offset) {
     const layer = this.#upsample(slope, 3);
     const offsets = this.#upsample(offset, 3);
@@ -100,14 +100,14 @@ export class Layers {
     }
   }
 
-  // A map at the pixels of this part, by bilinear interpolation; one channel is repeated to `channels`.
+  // Upsamples a map to the pixels of this part by bilinear interpolation. A map of one channel is repeated to `channels` channels.
   #upsample({ width, height, channels: stored, values }, channels) {
     const { left, top, stepX, stepY } = this.area;
     const across = positions(width, this.width, left, stepX, this.preview.full[0]);
     const down = positions(height, this.height, top, stepY, this.preview.full[1]);
     const out = new Float32Array(this.width * this.height * channels);
     const source = stored === channels ? values : Float32Array.from({ length: width * height * channels }, (_, i) => values[(i / channels) | 0]);
-    const line = new Float32Array(width * channels); // the map at the height of one row of the result
+    const line = new Float32Array(width * channels); // the map, interpolated at the height of one row of the result
     for (let row = 0, at = 0; row < this.height; row++) {
       const upper = down.lower[row] * line.length;
       const lower = Math.min(down.lower[row] + 1, height - 1) * line.length;
@@ -126,7 +126,7 @@ export class Layers {
   }
 }
 
-// The positions of `count` pixels in a map with `small` pixels: integer and fractional part, as in guided_upsampling.py.
+// Returns the positions of `count` pixels in a map with `small` pixels, as integer and fractional parts (see guided_upsampling.py).
 function positions(small, count, start, step, full) {
   const lower = new Int32Array(count);
   const fraction = new Float32Array(count);
@@ -138,7 +138,7 @@ function positions(small, count, start, step, full) {
   return { lower, fraction };
 }
 
-// One function per view. It returns a second function, which maps the index of a value (three values per pixel) to an 8-bit code.
+// Each view has a function. It returns a second function, which maps the index of a value (three values per pixel) to an 8-bit code.
 // `weights` is the mask in 8-bit codes, one per pixel, or null.
 const VIEWS = {
   photo: ({ photo }) => (i) => photo[i],

@@ -1,5 +1,5 @@
 // Synchronised pan and zoom for several frames that show pictures of the same size.
-// A frame has the aspect ratio of its picture. Offsets are fractions of the frame size, so all frames show the same part.
+// A frame has the aspect ratio of its picture. Offsets are fractions of the frame size, so that all frames show the same part.
 
 const MAX_PIXEL_SIZE = 8; // maximum size of a picture pixel in screen pixels
 const ZOOM_STEP = 1.5; // factor
@@ -10,7 +10,7 @@ export class PanZoom {
   #x = 0; // offsets of the left and upper edge, as fractions of the frame size: 0 or less
   #y = 0;
   #size = [1, 1];
-  #full = false; // whether one picture pixel is kept at one screen pixel, also for other pictures and frame sizes
+  #full = false; // whether one picture pixel stays one screen pixel if the pictures or the frame size change
   #pointers = new Map();
 
   constructor(box, frames) {
@@ -27,7 +27,7 @@ export class PanZoom {
     new ResizeObserver(() => this.#resized()).observe(box);
   }
 
-  // Shows new pictures of this size in px, without zoom, or at full size if the earlier ones were shown at full size.
+  // Shows new pictures of this size in px. They are shown at full size if the earlier pictures were, and otherwise without zoom.
   reset(width, height) {
     this.#size = [width, height];
     this.#scale = 1;
@@ -70,7 +70,7 @@ export class PanZoom {
     return true;
   }
 
-  // The scale at which one picture pixel is one screen pixel in the largest frame.
+  // Returns the scale at which one picture pixel is one screen pixel in the largest frame.
   #fullScale() {
     const fits = this.frames.map(({ clientWidth, clientHeight }) =>
       Math.min(clientWidth / this.#size[0], clientHeight / this.#size[1]));

@@ -1,14 +1,14 @@
-// The photos of the page and their separation: a few at a time, the current one first.
+// The photos of the page and their separation. The current photo is separated first.
 
 import { send } from "./api.js";
 import { Regions } from "./regions.js";
 
-const MAX_CONCURRENT = 2; // one photo is separated while the next one is uploaded
+const MAX_CONCURRENT = 2; // one photo is separated while the next photo is uploaded
 
 export class SeparationQueue {
   photos = [];
   current = null; // the photo that is shown
-  isReady = false; // whether the settings are known; nothing starts before that
+  isReady = false; // whether the settings are known; no separation starts before that
 
   // `settings()` returns the settings of the next request. `onChange(photo)` is called after each change of a photo, and
   // `onEnd(photo)` when its separation has ended.
@@ -41,7 +41,7 @@ export class SeparationQueue {
     return photo.mapSettings === JSON.stringify(this.settings());
   }
 
-  // To be called after a change of the settings. A photo is separated again unless its maps belong to the new settings.
+  // Call this after a change of the settings. A photo is separated again unless its maps were computed with the new settings.
   applySettings() {
     for (const photo of this.photos) {
       this.#supersede(photo);
@@ -90,18 +90,18 @@ export class SeparationQueue {
     try {
       const { blob, header } = await send("preview", photo.file, requestSettings, { signal, onProgress });
       photo.preview = blob;
-      photo.key = header("Brewster-Photo"); // of the photo on the server, for its tiles
+      photo.key = header("Brewster-Photo"); // the key of the photo on the server, for its tiles
       photo.size = header("Brewster-Size").split("x").map(Number);
       Object.assign(photo, { state: "done", mapSettings: JSON.stringify(requestSettings), isSaved: false });
     } catch (error) {
       const isStopped = error.name === "AbortError";
-      const previousState = this.hasCurrentMaps(photo) ? "done" : "waiting"; // the old maps are valid if the settings were reset
+      const previousState = this.hasCurrentMaps(photo) ? "done" : "waiting"; // the old maps are valid if the settings were changed back
       const state = isStopped && photo.isSuperseded ? previousState : "failed";
       Object.assign(photo, { state, error: isStopped ? null : error });
     }
     photo.controller = null;
     if (!this.photos.includes(photo)) return;
-    if (photo.state === "done" && !this.hasCurrentMaps(photo)) photo.state = "waiting"; // the settings have changed since
+    if (photo.state === "done" && !this.hasCurrentMaps(photo)) photo.state = "waiting"; // the settings have changed since the request
     this.onChange(photo);
     this.onEnd(photo);
     this.startNext();

@@ -1,12 +1,13 @@
-// The regions of a photo: brush strokes and rectangles that say where it is separated, and how much. They are drawn into a mask
-// of any size, whose values scale the strength, as `--mask FILE` does on the command line.
+// The regions of a photo: brush strokes and rectangles that define where, and how strongly, it is separated. They are drawn into a
+// mask of any size. The values of the mask scale the strength, like those of `--mask FILE` on the command line.
 //
-// A region is {shape: "brush" | "rectangle", value, points, radius, feather}: `value` is the strength in it, 0 to 1, or null for the
-// eraser; positions and lengths are fractions of the longer side of the photo; a rectangle has two opposite corners.
+// A region is {shape: "brush" | "rectangle", value, points, radius, feather}. `value` is the strength in the region, 0 to 1, or null
+// for the eraser. Positions and lengths are fractions of the longer side of the photo. The points of a rectangle are two opposite
+// corners.
 
 import { crc32 } from "./zip.js";
 
-const BAND_ROWS = 256; // rows of a mask that are computed at once for a file
+const BAND_ROWS = 256; // number of rows of a mask that are computed at once for a file
 const PNG_SIGNATURE = [0x89, 0x50, 0x4e, 0x47, 0x0d, 0x0a, 0x1a, 0x0a];
 
 // The regions of a photo with their history.
@@ -57,7 +58,7 @@ export class Regions {
   }
 }
 
-// The mask outside all regions: 0 if the first region is separated, so that only the regions are; otherwise 1.
+// Returns the mask outside all regions: 0 if the first region has a strength above 0 (only regions are separated), otherwise 1.
 const background = (list) => (list.length && list[0].value > 0 ? 0 : 1);
 
 // Returns the mask of regions as codes, 0 to 255, or null if there are no regions. The mask of the whole photo has `width` x `height`
@@ -74,7 +75,7 @@ export function maskCodes(list, width, height, part = { left: 0, top: 0, columns
 
 function drawRegion(mask, region, value, scale, { left, top, columns, rows }) {
   const points = region.points.map(([x, y]) => [x * scale - left - 0.5, y * scale - top - 0.5]);
-  const feather = Math.max(1, region.feather * scale); // at least one pixel: a smooth edge
+  const feather = Math.max(1, region.feather * scale); // at least one pixel, so that the edge is smooth
   const radius = region.shape === "brush" ? region.radius * scale : 0;
   const reach = radius + feather / 2 + 1;
   const limit = (values, end) => [
@@ -95,7 +96,7 @@ function drawRegion(mask, region, value, scale, { left, top, columns, rows }) {
   }
 }
 
-// Lowers the distances to those to a line segment, within its reach.
+// Replaces distances by those to a line segment where these are smaller. Only pixels within `reach` of the segment are changed.
 function measureSegment(distances, [ax, ay], [bx, by], reach, { x0, y0, x1, y1, width }) {
   const [dx, dy] = [bx - ax, by - ay];
   const squared = dx * dx + dy * dy || 1;
@@ -111,7 +112,7 @@ function measureSegment(distances, [ax, ay], [bx, by], reach, { x0, y0, x1, y1, 
   }
 }
 
-// The signed distances to a rectangle.
+// Computes the signed distances to a rectangle.
 function measureRectangle(distances, [[ax, ay], [bx, by]], { x0, y0, x1, y1 }) {
   const [left, end, top, bottom] = [Math.min(ax, bx), Math.max(ax, bx), Math.min(ay, by), Math.max(ay, by)];
   for (let y = y0, at = 0; y <= y1; y++) {
@@ -124,7 +125,8 @@ function measureRectangle(distances, [[ax, ay], [bx, by]], { x0, y0, x1, y1 }) {
   }
 }
 
-// The mask of regions as a grey 8-bit PNG file of the size of the photo (PNG specification, third edition), or null.
+// Returns the mask of regions as a grey 8-bit PNG file of the size of the photo (PNG specification, third edition), or null if there
+// are no regions.
 export async function maskFile(list, width, height) {
   if (!list.length) return null;
   const compression = new CompressionStream("deflate");

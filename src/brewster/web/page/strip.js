@@ -1,4 +1,4 @@
-// The list of photos below the picture: a row for each photo with its state, the summary, and the buttons that scroll the list.
+// The list of photos below the current photo: a row for each photo with its state, the summary, and the buttons that scroll the list.
 
 const TRANSPARENT_PIXEL = "data:image/gif;base64,R0lGODlhAQABAAAAACH5BAEKAAEALAAAAAABAAEAAAICTAEAOw==";
 const byId = (id) => document.getElementById(id);
@@ -20,7 +20,7 @@ export function createRow(photo, { onSelect, onRemove }, next = null) {
   return row;
 }
 
-// Shows a file as the browser decodes it, or a transparent pixel if it cannot.
+// Shows an image file, or a transparent pixel if the browser cannot decode the file.
 export function showFile(image, file) {
   const url = URL.createObjectURL(file);
   const done = () => URL.revokeObjectURL(url);
@@ -41,9 +41,9 @@ function shortStatus({ state, progress, error }) {
   return progress.phase === "upload" ? "sending" : "receiving";
 }
 
-// The state of a photo that is not done, in words.
+// Returns the state of a photo that is not done, in words.
 export function statusText({ state, progress }) {
-  if (state !== "working") return progress?.ahead ? `Waiting, ${progress.ahead} before this one` : "Waiting";
+  if (state !== "working") return progress?.ahead ? `Waiting, ${progress.ahead} before this photo` : "Waiting";
   return progressText(progress);
 }
 
@@ -54,19 +54,19 @@ export function progressText(progress) {
   return `${verb} ${megabytes(progress.loaded)} of ${megabytes(progress.total)} MB`;
 }
 
-// The completed fraction of a phase, or null if it is unknown.
+// Returns the completed fraction of a phase, or null if it is unknown.
 export function fraction(progress) {
   if (!progress || progress.phase === "waiting") return null;
   return progress.phase === "working" ? progress.share : progress.total ? progress.loaded / progress.total : null;
 }
 
-// Sets the value of a <progress>; null shows that the end is unknown.
+// Sets the value of a <progress>. null shows a bar without a value.
 export function setBar(bar, value) {
   if (value === null) bar.removeAttribute("value");
   else bar.value = value;
 }
 
-// "12 photos: 8 done, 4 failed"
+// Returns a summary such as "12 photos: 8 done, 4 failed".
 export function summarise(queue) {
   const counts = ["done", "working", "waiting", "failed"].map((state) => [queue.count(state), state]);
   const total = queue.photos.length;

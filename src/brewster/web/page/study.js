@@ -19,7 +19,7 @@ let state = null; // the current trial, as returned by the server
 let practising = false; // whether the practice trial is shown
 let flips = 0; // how often another picture was shown in place during the trial
 let zoomed = false; // whether the pictures were enlarged during the trial
-let shownAt = null; // time at which its pictures were shown; null while no answer is accepted
+let shownAt = null; // time at which the pictures of the trial were shown; null while no answer is accepted
 
 function frame(side) {
   return document.querySelector(`figure.${side} .frame`);
@@ -113,7 +113,7 @@ function setView(name) {
   if (name === "single" && !shownSide()) showInPlace("left");
 }
 
-// Shows one picture in the place of all three.
+// Shows one picture instead of all three.
 function showInPlace(side) {
   flips += view() === "single" && shownSide() !== side;
   for (const [name, element] of Object.entries(frames)) element.parentElement.classList.toggle("shown", name === side);
@@ -131,7 +131,7 @@ const VIEW_KEYS = {
   d: () => setView("pair"),
 };
 
-// How the pictures are shown, in CSS px.
+// Returns the viewing conditions, with lengths in CSS px.
 function conditions() {
   return {
     viewport_width: innerWidth,
@@ -186,7 +186,7 @@ async function showTrial(next) {
   preload(next);
 }
 
-// Shows the three pictures of a trial; then answers are accepted. `trial` is its number or "practice".
+// Shows the three pictures of a trial, and then accepts answers. `trial` is its number or "practice".
 async function showPictures(trial, { width, height }, title) {
   byId("position").textContent = title;
   byId("trial").classList.add("waiting");
@@ -214,7 +214,8 @@ function preload(next) {
   preloaded.push(...ahead.map((loading) => loading.catch(() => {}))); // an error is shown when the trial is shown
 }
 
-// Marks the chosen button, and whether choices are accepted. A button with the attribute `disabled` would lose the focus.
+// Marks the chosen button, and shows whether choices are accepted. Uses aria-disabled, because a button with the attribute `disabled`
+// loses the focus.
 function updateChoices(choice, closed) {
   for (const button of byId("choices").children) {
     button.setAttribute("aria-disabled", closed);
@@ -240,7 +241,7 @@ async function choose(choice) {
 // Explains the practice pair, and shows the first trial.
 async function endPractice(choice) {
   const better = state.practice.expected === "left" ? "A" : "B";
-  const text = `${choice === state.practice.expected ? "Yes" : "Look again at such differences"}: ${better} is better, because the other one was blurred. The study begins now.`;
+  const text = `${choice === state.practice.expected ? "Yes" : "Look again at such differences"}: ${better} is better, because the other result was blurred. The study begins now.`;
   await showTrial(state);
   notice(text);
   setTimeout(() => notice(""), 8000);

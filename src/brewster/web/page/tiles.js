@@ -1,19 +1,20 @@
-// Tiles of the full photo, loaded when they are visible. Their layers are computed as those of the reduced photo.
+// Tiles of the full photo, which are loaded when they are visible. Their layers are computed like those of the reduced photo.
 
 import { Layers } from "./light.js";
 
 const TILE_PX = 512;
 const MAX_LEVEL = 8;
-const MAX_TILES = 48; // in memory, about 10 MB each
+const MAX_TILES = 48; // maximum number of tiles in memory, about 10 MB each
 const DRAW_MS = 40; // time for drawing tiles before the page reacts again
 
 export class TileSet {
-  #tiles = new Map(); // by address; the last used is the last
+  #tiles = new Map(); // address -> tile; the most recently used tile is the last
   #isClosed = false;
   #isScheduled = false;
 
-  // `preview`: of `readPreview`; `key`: of the photo on the server; `resend()`: sends the photo again if the server has dropped it;
-  // `drawRight(canvas, layers, part)`: draws the layer that is compared; `onChange()`: called when a tile has arrived.
+  // `preview`: the result of `readPreview`; `key`: the key of the photo on the server; `resend()`: sends the photo again if the server
+  // has dropped it; `drawPhoto(canvas, layers)`: draws the photo; `drawRight(canvas, layers, part)`: draws the layer that is compared;
+  // `onChange()`: called when a tile has arrived.
   constructor(preview, key, { resend, drawPhoto, drawRight, onChange }) {
     Object.assign(this, { preview, key, resend, drawPhoto, drawRight, onChange });
   }
@@ -23,14 +24,14 @@ export class TileSet {
     this.#tiles.clear();
   }
 
-  // The level with at least one pixel for each screen pixel; `scale` is the size of a photo pixel in screen pixels.
+  // Returns the level with at least one pixel for each screen pixel. `scale` is the size of a photo pixel in screen pixels.
   levelFor(scale) {
     return Math.min(MAX_LEVEL, Math.max(0, Math.floor(-Math.log2(scale) + 1e-6)));
   }
 
-  // The loaded tiles in an area of the photo, {left, top, right, bottom} in pixels of the photo, and requests for the others.
-  // Returns {tiles: [{canvas, left, top, right, bottom}], missing}, where `missing` is the number of the others. A tile that is not
-  // drawn with the current `version` within DRAW_MS is missing, too.
+  // Returns the loaded tiles in an area of the photo, and requests the tiles that are not loaded. `area` is {left, top, right, bottom}
+  // in pixels of the photo. The result is {tiles: [{canvas, left, top, right, bottom}], missing}, where `missing` is the number of
+  // tiles that are not loaded, or that could not be drawn with the current `version` within DRAW_MS.
   visible(side, level, area, version) {
     const step = TILE_PX << level;
     const [width, height] = this.preview.full;
@@ -100,14 +101,14 @@ export class TileSet {
       const area = { left: tile.part.left * step, top: tile.part.top * step, stepX: step, stepY: step };
       tile.layers = new Layers(this.preview, codes, width, height, area);
     } catch {
-      setTimeout(() => this.#tiles.delete(address), 3000); // then it is requested again
+      setTimeout(() => this.#tiles.delete(address), 3000); // after this, the tile is requested again
     }
     tile.isLoading = false;
     if (!this.#isClosed) this.onChange();
   }
 }
 
-// The codes of a PNG, three for each pixel.
+// Decodes a PNG file. Returns its 8-bit codes, three for each pixel, and its size.
 async function decode(blob) {
   const bitmap = await createImageBitmap(blob, { colorSpaceConversion: "none", premultiplyAlpha: "none" });
   const { width, height } = bitmap;

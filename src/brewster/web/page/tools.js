@@ -1,4 +1,4 @@
-// The controls for regions: the tool, its size, feather and strength, undo and redo.
+// The controls for regions: the tool, its brush size, feather and strength, and undo and redo.
 
 import { RegionEditor } from "./editor.js";
 import { Regions } from "./regions.js";
@@ -13,7 +13,8 @@ const DESCRIPTIONS = {
 };
 
 // Creates the editor of regions and connects its controls. `onEdit()` is called when the regions of the current photo have changed,
-// `onPaint()` when only the drawing has, `saveMask()` is called to download the mask, and `announce(text)` to tell screen readers what happened.
+// `onPaint()` when the view must be painted again, `saveMask()` to download the mask, and `announce(text)` to tell screen readers what
+// happened.
 export function createTools({ onEdit, onPaint, saveMask, announce }) {
   const number = (id) => Number(byId(id).value);
   const tool = () => ({
@@ -75,7 +76,7 @@ export function createTools({ onEdit, onPaint, saveMask, announce }) {
 
   return {
     editor,
-    // Shows the regions of a photo of `size` (width, height). `regions` = null shows none.
+    // Shows the regions of a photo of `size` (width, height), or no regions if `regions` is null.
     show(regions, size = [1, 1]) {
       editor.cancel();
       Object.assign(editor, { regions, size });

@@ -4,21 +4,21 @@
 const LOCAL = 0x04034b50;
 const CENTRAL = 0x02014b50;
 const END = 0x06054b50;
-const MAX_BYTES = 0xffffffff; // a zip without the ZIP64 extension is not larger
+const MAX_BYTES = 0xffffffff; // maximum size of a zip without the ZIP64 extension
 
 const CRC_TABLE = Uint32Array.from({ length: 256 }, (_, byte) => {
   for (let bit = 0; bit < 8; bit++) byte = byte & 1 ? 0xedb88320 ^ (byte >>> 1) : byte >>> 1;
   return byte;
 });
 
-// The CRC-32 of zip and PNG (ISO 3309). `crc` is the value for the preceding bytes.
+// Returns the CRC-32 of zip and PNG (ISO 3309). `crc` is the value for the preceding bytes.
 export function crc32(bytes, crc = 0) {
   crc = ~crc;
   for (let i = 0; i < bytes.length; i++) crc = CRC_TABLE[(crc ^ bytes[i]) & 0xff] ^ (crc >>> 8);
   return ~crc >>> 0;
 }
 
-// Returns the files with unique names: if a name is already used, a number is put before it.
+// Returns the files with unique names: a number is put before a name that is already used.
 export function withUniqueNames(files) {
   const usedNames = new Set();
   return files.map((file) => ({ ...file, name: uniqueName(file.name, usedNames) }));
