@@ -38,7 +38,7 @@ from brewster.inference.predictor import (
 from brewster.inference.separation import Separation
 from brewster.inference.tiles import Backend
 from brewster.models.zoo import find_model, is_diffusion_model
-from brewster.options import Options, Quality, Quantization, document_options
+from brewster.options import Offload, Options, Quality, Quantization, document_options
 from brewster.photo import Encoding, Mask, Photo, Source
 from brewster.photo.history import with_history
 
@@ -84,6 +84,9 @@ class Separator:
         device: str = Options.device,
         base_model: str | None = Options.base_model,
         quantization: Quantization | None = Options.quantization,
+        offload: Offload = Options.offload,
+        fast_lora: str | None = Options.fast_lora,
+        guidance: float | None = Options.guidance,
         steps: int | None = Options.steps,
         ensemble_size: int = Options.ensemble_size,
         no_guided_upsampling: bool = Options.no_guided_upsampling,
@@ -99,13 +102,30 @@ class Separator:
             MissingExtra: a diffusion model needs the extra `diffusion`.
         """
         if is_diffusion_model(model):
-            pipeline = _open_pipeline(model, device, base_model, quantization)
+            if fast_lora and steps is None:
+                raise ModelError(
+                    f"the LoRA for few steps {fast_lora} was given without the number of steps",
+                    "expected the number for which it was trained",
+                    "set the option steps, for example 4 or 8",
+                )
+            pipeline = _open_pipeline(
+                model,
+                device=device,
+                base_model=base_model,
+                quantization=quantization,
+                offload=offload,
+                fast_lora=fast_lora,
+                guidance=guidance,
+            )
             return cls._from_pipeline(
                 pipeline, steps=steps, ensemble_size=ensemble_size, no_guided_upsampling=no_guided_upsampling
             )
         chosen = {
             "base_model": base_model,
             "quantization": quantization,
+            "offload": offload,
+            "fast_lora": fast_lora,
+            "guidance": guidance,
             "steps": steps,
             "ensemble_size": ensemble_size,
             "no_guided_upsampling": no_guided_upsampling,
@@ -293,6 +313,9 @@ def separate(
     max_pixels: int = Options.max_pixels,
     base_model: str | None = Options.base_model,
     quantization: Quantization | None = Options.quantization,
+    offload: Offload = Options.offload,
+    fast_lora: str | None = Options.fast_lora,
+    guidance: float | None = Options.guidance,
     steps: int | None = Options.steps,
     ensemble_size: int = Options.ensemble_size,
     no_guided_upsampling: bool = Options.no_guided_upsampling,
@@ -311,6 +334,9 @@ def separate(
         device=device,
         base_model=base_model,
         quantization=quantization,
+        offload=offload,
+        fast_lora=fast_lora,
+        guidance=guidance,
         steps=steps,
         ensemble_size=ensemble_size,
         no_guided_upsampling=no_guided_upsampling,
@@ -326,9 +352,7 @@ def separate(
     )
 
 
-def _open_pipeline(
-    model: str, device: str, base_model: str | None, quantization: Quantization | None
-) -> DecompositionPipeline:
+def _open_pipeline(model: str, **options: Any) -> DecompositionPipeline:  # noqa: ANN401  (those of load_pipeline)
     try:
         from brewster.models.diffusion.pipeline import load_pipeline  # noqa: PLC0415  (imports torch)
     except ImportError as error:
@@ -337,7 +361,7 @@ def _open_pipeline(
             f"expected it to be installed, because {model} needs it",
             "run: pip install 'brewster[diffusion]'",
         ) from error
-    return load_pipeline(model, device=device, base_model=base_model, quantization=quantization)
+    return load_pipeline(model, **options)
 
 
 def history_step(model: str, *, strength: float, quality: str, additive: bool) -> dict[str, str]:

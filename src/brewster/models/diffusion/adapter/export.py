@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from brewster.errors import ModelError, OutputError
 from brewster.models.diffusion.adapter.lora import read_lora, read_prompt
 from brewster.models.diffusion.backbones.backbone import Backbone
-from brewster.models.diffusion.backbones.registry import load_backbone
+from brewster.models.diffusion.backbones.loading import load_backbone
 from brewster.models.diffusion.prompt import PROMPT_FILE
 from brewster.models.diffusion.tensors import write_tensors
 
