@@ -101,6 +101,18 @@ class Separator:
             DownloadError: a diffusion model cannot be downloaded, for example because access was not granted.
             MissingExtra: a diffusion model needs the extra `diffusion`.
         """
+        pipeline_options: dict[str, Any] = {
+            "base_model": base_model,
+            "quantization": quantization,
+            "offload": offload,
+            "fast_lora": fast_lora,
+            "guidance": guidance,
+        }
+        predictor_options: dict[str, Any] = {
+            "steps": steps,
+            "ensemble_size": ensemble_size,
+            "no_guided_upsampling": no_guided_upsampling,
+        }
         if is_diffusion_model(model):
             if fast_lora and steps is None:
                 raise ModelError(
@@ -108,28 +120,10 @@ class Separator:
                     "expected the number for which it was trained",
                     "set the option steps, for example 4 or 8",
                 )
-            pipeline = _open_pipeline(
-                model,
-                device=device,
-                base_model=base_model,
-                quantization=quantization,
-                offload=offload,
-                fast_lora=fast_lora,
-                guidance=guidance,
-            )
             return cls._from_pipeline(
-                pipeline, steps=steps, ensemble_size=ensemble_size, no_guided_upsampling=no_guided_upsampling
+                _open_pipeline(model, device=device, **pipeline_options), predictor_options
             )
-        chosen = {
-            "base_model": base_model,
-            "quantization": quantization,
-            "offload": offload,
-            "fast_lora": fast_lora,
-            "guidance": guidance,
-            "steps": steps,
-            "ensemble_size": ensemble_size,
-            "no_guided_upsampling": no_guided_upsampling,
-        }
+        chosen = pipeline_options | predictor_options
         if changed := [name for name, value in chosen.items() if value != getattr(Options, name)]:
             raise ModelError(
                 f"{', '.join(changed)} was set for the model {model}",
@@ -142,19 +136,10 @@ class Separator:
         return cls(backend, name=model_file.name, sha256=digest, device=backend.device)
 
     @classmethod
-    def _from_pipeline(
-        cls,
-        pipeline: DecompositionPipeline,
-        *,
-        steps: int | None,
-        ensemble_size: int,
-        no_guided_upsampling: bool,
-    ) -> Separator:
+    def _from_pipeline(cls, pipeline: DecompositionPipeline, options: dict[str, Any]) -> Separator:
         from brewster.inference.diffusion_predictor import DiffusionPredictor  # noqa: PLC0415  (imports torch)
 
-        predictor = DiffusionPredictor(
-            pipeline, steps=steps, ensemble_size=ensemble_size, no_guided_upsampling=no_guided_upsampling
-        )
+        predictor = DiffusionPredictor(pipeline, **options)
         device = str(pipeline.backbone.device)
         return cls(predictor, name=pipeline.name, sha256=pipeline.sha256, device=device)
 

@@ -37,7 +37,7 @@ def resolve_model_folder(source: str, patterns: list[str]) -> Path:
     if Path(source).is_dir():
         return Path(source)
     hub, errors = import_library("huggingface_hub"), import_library("huggingface_hub.errors")
-    # If the hub cannot be asked, the download itself reports why, or finds the files in the cache.
+    # If this request fails, the download reports the reason, or finds the files in the cache.
     with contextlib.suppress(errors.HfHubHTTPError, errors.HFValidationError, errors.DryRunError, OSError):
         _announce_download(hub, source, patterns)
     with _translate_hub_errors(source):
@@ -74,7 +74,7 @@ def list_root_files(source: str) -> list[str]:
             return sorted(name for name in hub.HfApi().list_repo_files(source) if "/" not in name)
         except (errors.HfHubHTTPError, errors.HFValidationError):
             raise
-        except (OSError, import_library("httpx").TransportError):
+        except (OSError, errors.HTTPError):
             folder = Path(hub.snapshot_download(source, local_files_only=True))
             return sorted(path.name for path in folder.iterdir() if path.is_file())
 
@@ -175,7 +175,7 @@ def _announce_download(hub: Any, source: str, patterns: list[str]) -> None:  # n
 
     Raises:
         DownloadError: the files do not fit on the disk of the cache.
-        Exception: those of huggingface_hub, if the hub cannot be asked.
+        Exception: an exception of huggingface_hub, if the request fails.
     """
     planned = hub.snapshot_download(source, allow_patterns=patterns, dry_run=True)
     size = sum(file.file_size or 0 for file in planned if file.will_download)

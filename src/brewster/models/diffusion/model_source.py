@@ -41,33 +41,25 @@ _FILES: Final = [name for layout in LAYOUTS for name in layout.files] + [INDEX_F
 class ModelSource:
     """A backbone, or a LoRA with its base.
 
-    `base` is the source of the backbone, see `load_backbone`. `folder` has the LoRA or the prompt and the task of a
-    finetuned backbone; it is None for a backbone that is given by its name. `layout` and `metadata` are those of a
-    LoRA.
+    `base` is the source of the backbone, see `load_backbone`. `trained_quantization` is the quantization of the base with which a
+    LoRA was trained, and `has_prompt` is whether the encoded prompt is stored with the model. `folder` has the files of
+    a LoRA or of a finetuned backbone; it is None for a backbone that is given by its name. `layout` and `metadata` are
+    those of a LoRA.
     """
 
     base: str
     backbone_class: type[Backbone]
     task: DecompositionTask
+    trained_quantization: Quantization | None = None
+    has_prompt: bool = False
     folder: Path | None = None
     layout: LoraLayout | None = None
     metadata: LoraMetadata | None = None
 
     @property
-    def trained_quantization(self) -> Quantization | None:
-        """The quantization of the base with which a LoRA was trained."""
-        return self.metadata.quantization if self.metadata else None
-
-    @property
-    def prompt_file(self) -> Path | None:
-        """The file with the stored prompt of a finetuned backbone, if there is one."""
-        path = self.folder / PROMPT_FILE if self.folder and not self.layout else None
-        return path if path and path.is_file() else None
-
-    @property
     def needs_text_encoders(self) -> bool:
         """Whether the prompt must be encoded before the first separation."""
-        return self.layout is None and self.prompt_file is None and not self.base.startswith(TINY_PREFIX)
+        return not self.has_prompt and not self.base.startswith(TINY_PREFIX)
 
     def digest_parts(self) -> list[str]:
         """What identifies LoRA, prompt and base.
@@ -113,7 +105,16 @@ def find_model_source(
     if layout := layout_of(folder):
         metadata = layout.read_metadata(folder)
         base, backbone_class = _find_base(model, metadata, base_model, allow_download=allow_download)
-        return ModelSource(base, backbone_class, metadata.task, folder, layout, metadata)
+        return ModelSource(
+            base,
+            backbone_class,
+            metadata.task,
+            metadata.quantization,
+            has_prompt=True,
+            folder=folder,
+            layout=layout,
+            metadata=metadata,
+        )
     if not (folder / INDEX_FILE).is_file():
         raise ModelError(
             f"{model} contains no model",
@@ -123,7 +124,8 @@ def find_model_source(
     _check_no_base(model, base_model)
     path = folder / TASK_FILE
     task = load_task(path) if path.is_file() else _default_task()
-    return ModelSource(source, read_index(folder)[0], task, folder)
+    has_prompt = (folder / PROMPT_FILE).is_file()
+    return ModelSource(source, read_index(folder)[0], task, has_prompt=has_prompt, folder=folder)
 
 
 def _default_task() -> DecompositionTask:
@@ -139,7 +141,13 @@ def _published_source(model: str, base_model: str | None) -> ModelSource:
             f"expected a folder, a model in the cache, or one of {', '.join(DIFFUSION_MODELS)}",
             "download it first, or plan with its base",
         )
-    return ModelSource(base_model or row.base_model, windowseat.BACKBONE, windowseat.published_task())
+    return ModelSource(
+        base_model or row.base_model,
+        windowseat.BACKBONE,
+        windowseat.published_task(),
+        windowseat.QUANTIZATION,
+        has_prompt=True,
+    )
 
 
 def _find_base(

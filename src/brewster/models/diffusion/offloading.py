@@ -1,7 +1,7 @@
 """Reduces the GPU memory of a prediction: the transformer is offloaded by layers, and large images are decoded in tiles.
 
-Both are methods of diffusers. Offloading does not change the result. Tiling changes it a little, because the VAE
-normalises each tile by its own statistics, so it is used only if the decoding would not fit.
+Both are methods of diffusers. Offloading does not change the result. Tiling changes it, because the VAE of
+FLUX normalises each tile by its own statistics. So tiling is used only if the decoding would not fit.
 """
 
 from __future__ import annotations

@@ -34,7 +34,7 @@ from brewster.models.diffusion.model_source import ModelSource, find_model_sourc
 from brewster.models.diffusion.offloading import offload_layers
 from brewster.models.diffusion.out_of_memory import explain_out_of_memory
 from brewster.models.diffusion.panels import PanelLayout, compose, conditioning_image, split
-from brewster.models.diffusion.prompt import PROMPTS, PromptEmbedding, load_prompt
+from brewster.models.diffusion.prompt import PROMPT_FILE, PROMPTS, PromptEmbedding, load_prompt
 from brewster.models.diffusion.sampling import euler, sample
 from brewster.models.diffusion.task import DecompositionTask
 from brewster.models.zoo import model_name
@@ -160,8 +160,8 @@ def load_pipeline(
         offload: "layers" keeps the weights of the transformer in host memory and copies each block to the GPU while it
             computes; "auto" does this only if they do not fit into the free GPU memory.
         fast_lora: a LoRA for sampling in few steps, which is added to that of the model; see `find_lora_file`.
-        guidance: the guidance of the task by default. With a LoRA for few steps and classifier-free guidance it is 1, that is,
-            there is no second prediction.
+        guidance: the guidance scale, by default that of the task. With a LoRA for few steps and classifier-free guidance, the
+            default is 1, which saves the second prediction.
         prompt: for a backbone without a LoRA: a name in `PROMPTS`, or the text itself. A finetuned backbone with a
             stored prompt uses that one.
 
@@ -198,7 +198,7 @@ def load_pipeline(
         stack_layers(backbone, fast_layers)
     if placement.is_offloaded:
         offload_layers(backbone, placement.device)
-    task = _task_with_guidance(source, guidance, is_fast=bool(fast_lora))
+    task = task_with_guidance(source, guidance, is_fast=bool(fast_lora))
     digest = _digest(source, placement.quantization, text, fast_lora_file, task.guidance)
     return DecompositionPipeline(backbone, embedding, task, model_name(model), digest)
 
@@ -252,8 +252,8 @@ def _choose_placement(
 
 def _embed(source: ModelSource, text: str, device: str) -> PromptEmbedding:
     """The prompt that is stored with a finetuned backbone, which has no text encoder; otherwise the encoded text."""
-    if source.prompt_file:
-        return load_prompt(source.prompt_file, source.backbone_class.name)
+    if source.has_prompt and source.folder:
+        return load_prompt(source.folder / PROMPT_FILE, source.backbone_class.name)
     return encode_prompt(source.base, text, device=device)
 
 
@@ -273,7 +273,8 @@ def _check_takes_steps(model: str, task: DecompositionTask) -> None:
         )
 
 
-def _task_with_guidance(source: ModelSource, guidance: float | None, *, is_fast: bool) -> DecompositionTask:
+def task_with_guidance(source: ModelSource, guidance: float | None, *, is_fast: bool) -> DecompositionTask:
+    """The task of a model with this guidance. By default it is that of the task; see `load_pipeline` for `is_fast`."""
     if guidance is None and is_fast and not source.backbone_class.guided_by_embedding:
         guidance = 1.0
     return source.task if guidance is None else replace(source.task, guidance=guidance)

@@ -2,8 +2,8 @@
 
     import_lora("someone/glass-lora", Path("glass"), base_model="kontext", prompt="remove the reflection", panels=("T",))
 
-Such a file does not say for which base model and prompt it was trained, nor what it generates; the user states them. The prompt is
-encoded here, once. The names and shapes of the layers are compared with the configuration of the base model; its weights are not
+Such a file contains neither its base model nor its prompt nor its panels, so the user states them. The prompt is
+encoded once, during the import. The names and shapes of the layers are compared with the configuration of the base model; its weights are not
 loaded.
 """
 
@@ -53,7 +53,7 @@ def import_lora(
         folder: the folder to write.
         base_model: the base model of the LoRA: a name in `BACKBONES`, a folder or a hub id.
         prompt: a name in `PROMPTS`, or the text itself.
-        panels: what the LoRA generates from the photo.
+        panels: the panels that the LoRA generates from the photo.
         device: the device that encodes the prompt.
 
     Returns:

@@ -25,6 +25,7 @@ from brewster.models.diffusion.panels import PanelLayout
 from brewster.models.diffusion.prompt import PromptEmbedding
 from brewster.models.diffusion.task import DecompositionTask
 from brewster.models.diffusion.tensors import read_json, read_tensors
+from brewster.options import Quantization
 
 INDEX_FILE: Final = "model_index.json"
 CONFIG_FILE: Final = "transformer_lora/adapter_config.json"
@@ -33,6 +34,8 @@ PROMPT_FILE: Final = "text_embeddings/state_dict.safetensors"
 FILES: Final = (INDEX_FILE, CONFIG_FILE, WEIGHTS_FILE, PROMPT_FILE)
 
 BACKBONE: Final = Qwen
+QUANTIZATION: Final[Quantization] = "nf4"
+"""The quantization of the base in the published call."""
 SIDE_PX: Final = 768
 """The processing resolution of the published model."""
 _TIME: Final = 0.499
@@ -68,7 +71,7 @@ def read_metadata(folder: Path) -> LoraMetadata:
             "download the model again",
         )
     return LoraMetadata(
-        BACKBONE.name, base, "nf4", rank, alpha, published_task(side), _read_prompt(folder).sha256
+        BACKBONE.name, base, QUANTIZATION, rank, alpha, published_task(side), _read_prompt(folder).sha256
     )
 
 

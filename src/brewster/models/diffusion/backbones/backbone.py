@@ -172,7 +172,7 @@ class Backbone(ABC):
         """
 
     @abstractmethod
-    def positions(self, latents: Tensor, condition: Tensor) -> Any:  # noqa: ANN401 - each backbone_class has its own kind
+    def positions(self, latents: Tensor, condition: Tensor) -> Any:  # noqa: ANN401 - each backbone has its own type
         """The position ids of the generated tokens, then of the conditioning tokens, as the transformer takes them."""
 
     @classmethod
