@@ -30,7 +30,8 @@ Offload = Literal["auto", "none", "layers"]
 """Whether the weights of a diffusion model are kept in host memory and copied to the GPU layer by layer."""
 
 DIFFUSION_OPTIONS: Final = (
-    "base_model", "quantization", "offload", "fast_lora", "guidance", "steps", "ensemble_size", "no_guided_upsampling",
+    "base_model", "quantization", "offload", "transformer", "fast_lora", "guidance", "steps", "ensemble_size",
+    "no_guided_upsampling",
 )  # fmt: skip
 """The options of diffusion models only."""
 
@@ -115,6 +116,13 @@ class Options:
         metadata=_field_metadata(
             "For diffusion models: layers keeps the weights in host memory and copies each block to the GPU while it computes, "
             "which is slower; auto does this only if the weights do not fit into the free GPU memory."
+        ),
+    )
+    transformer: str | None = field(
+        default=None,
+        metadata=_field_metadata(
+            "For diffusion models: one file with the weights of the transformer, which replaces that of the base: a .gguf or .safetensors "
+            "file, a hub id or OWNER/NAME/FILE."
         ),
     )
     fast_lora: str | None = field(

@@ -33,6 +33,7 @@ from brewster.models.diffusion.memory import (
     GIB,
     OFFLOADED_WEIGHTS_GIB,
     Placement,
+    count_weights,
     place_on_gpu,
     weights_gib,
 )
@@ -144,13 +145,15 @@ def plan_separation(options: Options, size: tuple[int, int], card: GraphicsCard)
         ensemble_size=options.ensemble_size,
     )
     parameters = count_parameters(backbone.transformer)
+    file = _local_file(options.transformer) if options.transformer else None
     placement = place_on_gpu(
-        parameters,
+        count_weights(source.base, source.backbone_class, file) if file else parameters,
         free_gib=card.memory_gib,
         total_gib=card.memory_gib,
         quantization=options.quantization,
         preferred=source.trained_quantization,
         offload=options.offload,
+        is_single_file=file is not None,
     )
     panels = predictor.panel_sizes(size, options.quality)
     steps = predictor.sampling_steps(options.quality) * options.ensemble_size
@@ -177,13 +180,26 @@ def plan_separation(options: Options, size: tuple[int, int], card: GraphicsCard)
         {
             "weights": OFFLOADED_WEIGHTS_GIB
             if placement.is_offloaded
+            else file.stat().st_size / GIB
+            if file
             else weights_gib(parameters, placement.quantization),
             "VAE": 2 * vae / GIB,
             "activations": max(block, pixels * DECODING_BYTES_PER_PIXEL) / GIB,
             "CUDA": _CONTEXT_GIB,
         },
-        0.0 if is_stored else 2e-9 * (parameters + vae) + encoders,
+        0.0 if is_stored else 2e-9 * (vae + (0 if file else parameters)) + encoders,
         0.0 if is_stored else encoders,
+    )
+
+
+def _local_file(transformer: str) -> Path:
+    path = Path(transformer)
+    if path.is_file():
+        return path
+    raise ModelError(
+        f"there is no file {transformer}",
+        "expected a file of this machine, because a plan downloads nothing",
+        "download the file first",
     )
 
 

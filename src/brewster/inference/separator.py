@@ -85,6 +85,7 @@ class Separator:
         base_model: str | None = Options.base_model,
         quantization: Quantization | None = Options.quantization,
         offload: Offload = Options.offload,
+        transformer: str | None = Options.transformer,
         fast_lora: str | None = Options.fast_lora,
         guidance: float | None = Options.guidance,
         steps: int | None = Options.steps,
@@ -102,12 +103,9 @@ class Separator:
             MissingExtra: a diffusion model needs the extra `diffusion`.
         """
         pipeline_options: dict[str, Any] = {
-            "base_model": base_model,
-            "quantization": quantization,
-            "offload": offload,
-            "fast_lora": fast_lora,
-            "guidance": guidance,
-        }
+            "base_model": base_model, "quantization": quantization, "offload": offload, "transformer": transformer,
+            "fast_lora": fast_lora, "guidance": guidance,
+        }  # fmt: skip
         predictor_options: dict[str, Any] = {
             "steps": steps,
             "ensemble_size": ensemble_size,
@@ -299,6 +297,7 @@ def separate(
     base_model: str | None = Options.base_model,
     quantization: Quantization | None = Options.quantization,
     offload: Offload = Options.offload,
+    transformer: str | None = Options.transformer,
     fast_lora: str | None = Options.fast_lora,
     guidance: float | None = Options.guidance,
     steps: int | None = Options.steps,
@@ -320,6 +319,7 @@ def separate(
         base_model=base_model,
         quantization=quantization,
         offload=offload,
+        transformer=transformer,
         fast_lora=fast_lora,
         guidance=guidance,
         steps=steps,

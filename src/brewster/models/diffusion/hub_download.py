@@ -8,7 +8,7 @@ from __future__ import annotations
 import contextlib
 import shutil
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, Final
 
@@ -77,6 +77,35 @@ def list_root_files(source: str) -> list[str]:
         except (OSError, errors.HTTPError):
             folder = Path(hub.snapshot_download(source, local_files_only=True))
             return sorted(path.name for path in folder.iterdir() if path.is_file())
+
+
+def find_weights_file(source: str, suffixes: tuple[str, ...], companions: Sequence[str] = ()) -> Path:
+    """The file with the weights of a LoRA or a transformer, downloaded if it is on the hub.
+
+    Args:
+        source: a file, a folder or hub id with one file that has such a suffix, or OWNER/NAME/FILE on the hub. Subfolders
+            are not searched.
+        suffixes: the possible suffixes.
+        companions: other files that are downloaded with it, if they exist.
+
+    Raises:
+        ModelError: the folder or repository does not have exactly one such file, or `source` is none of these.
+        DownloadError, MissingExtra: see `resolve_model_folder`.
+    """
+    if Path(source).is_file():
+        return Path(source)
+    repository, _, name = source.rpartition("/") if source.endswith(suffixes) else (source, "", "")
+    expected = f"expected one {' or '.join(suffixes)} file"
+    if not repository:
+        raise ModelError(f"there is no file {source}", expected, "check the path")
+    names = [name] if name else [each for each in list_root_files(source) if each.endswith(suffixes)]
+    if len(names) != 1:
+        raise ModelError(
+            f"{source} contains {', '.join(names) or 'no such file'}",
+            expected,
+            "pass the path of the file, or OWNER/NAME/FILE for a file on the hub",
+        )
+    return resolve_model_folder(repository, [*names, *companions]) / names[0]
 
 
 @contextlib.contextmanager

@@ -87,8 +87,13 @@ def torch_device(device: str) -> str:
     return _DEVICES[device] or ("cuda" if torch.cuda.is_available() else "cpu")
 
 
-def count_weights(source: str, backbone_class: type[Backbone]) -> int:
-    """The number of parameters of the transformer: of the files in a folder, otherwise of the backbone; 0 for a tiny version."""
+def count_weights(source: str, backbone_class: type[Backbone], transformer_file: Path | None = None) -> int:
+    """The number of parameters of the transformer: of the files in a folder, otherwise of the backbone; 0 for a tiny version.
+
+    For a `transformer_file` it is the number of bf16 weights that need the same memory.
+    """
+    if transformer_file:
+        return transformer_file.stat().st_size // _FILE_BYTES_PER_WEIGHT
     if source.startswith(TINY_PREFIX):
         return 0
     if not Path(source).is_dir():
@@ -116,6 +121,7 @@ def choose_placement(
     quantization: Quantization | None = None,
     preferred: Quantization | None = None,
     offload: Offload = "auto",
+    is_single_file: bool = False,
 ) -> Placement:
     """The placement of a transformer with this number of weights on this machine.
 
@@ -126,6 +132,7 @@ def choose_placement(
             is none, because int8 is slower there.
         preferred: the quantization with which the model was trained.
         offload: whether to offload the weights.
+        is_single_file: whether the weights are in a file that cannot be quantized again.
 
     Raises:
         DeviceError: diffusion models do not run on this device, or cannot be offloaded in this way.
@@ -148,6 +155,7 @@ def choose_placement(
         quantization=quantization,
         preferred=preferred,
         offload=offload,
+        is_single_file=is_single_file,
     )
 
 
@@ -160,6 +168,7 @@ def place_on_gpu(
     quantization: Quantization | None = None,
     preferred: Quantization | None = None,
     offload: Offload = "auto",
+    is_single_file: bool = False,
 ) -> Placement:
     """The placement on a GPU with this memory.
 
@@ -167,7 +176,7 @@ def place_on_gpu(
     bitsandbytes is installed. The total memory decides, not the free one: the same machine always gives the same
     result. If none fits, or the weights are offloaded on request, it is `preferred`, or int8 instead of nf4.
 
-    With `offload` "auto", the weights are offloaded if they do not fit into the free memory.
+    Weights in a single file stay as they are. With `offload` "auto", the weights are offloaded if they do not fit into the free memory.
 
     Raises:
         DeviceError: offloading was requested with nf4, which cannot be offloaded.
@@ -180,9 +189,9 @@ def place_on_gpu(
         )
     movable: Quantization | None = "int8" if preferred == "nf4" else preferred
     chosen = quantization
-    if quantization is None and offload == "layers":
+    if quantization is None and offload == "layers" and not is_single_file:
         chosen = movable
-    elif quantization is None:
+    elif quantization is None and not is_single_file:
         candidates: list[Quantization | None] = [preferred, "int8"]
         if importlib.util.find_spec("bitsandbytes"):
             candidates.append("nf4")
@@ -202,6 +211,7 @@ def check_machine(
     *,
     requested: str,
     with_text_encoders: bool = False,
+    transformer_file: Path | None = None,
 ) -> None:
     """Checks that a backbone can run on this machine: device, free memory, and free disk for the download.
 
@@ -211,12 +221,13 @@ def check_machine(
         placement: where its weights will be.
         requested: the device that the user chose, or "auto".
         with_text_encoders: whether the prompt must be encoded, so that the text encoders are downloaded too.
+        transformer_file: see `load_backbone`.
 
     Raises:
         DeviceError: there is no GPU and the CPU was not chosen explicitly, or the free memory is too small.
         DownloadError: the free disk is too small.
     """
-    weights = count_weights(source, backbone_class)
+    weights = count_weights(source, backbone_class, transformer_file)
     if weights < _MIN_LARGE:
         return
     if placement.device == "cpu" and requested != "cpu":
@@ -227,7 +238,7 @@ def check_machine(
         )
     _check_memory(source, weights, placement)
     hub_id = hub_id_of(source)
-    if not Path(source).is_dir() and not is_transformer_cached(hub_id):
+    if not transformer_file and not Path(source).is_dir() and not is_transformer_cached(hub_id):
         _check_disk(
             hub_id, weights + VAE_PARAMETERS + with_text_encoders * backbone_class.text_encoder_parameters
         )

@@ -32,7 +32,7 @@ from brewster.models.zoo import TINY_PREFIX
 from brewster.options import Quantization
 
 _FINGERPRINT_BYTES: Final = 1 << 20
-"""The number of bytes at the start and at the end of a file that `ModelSource.digest_parts` reads."""
+"""The number of bytes at the start and at the end of a file that a digest reads."""
 _FILES: Final = [name for layout in LAYOUTS for name in layout.files] + [INDEX_FILE, PROMPT_FILE, TASK_FILE]
 
 
@@ -189,8 +189,17 @@ def _digest_folder(folder: Path) -> str:
     digest = hashlib.sha256()
     for path in sorted(path for path in folder.rglob("*") if path.is_file()):
         digest.update(f"{path.relative_to(folder)} {path.stat().st_size}\0".encode())
-        with path.open("rb") as file:
-            digest.update(file.read(_FINGERPRINT_BYTES))
-            file.seek(max(0, path.stat().st_size - _FINGERPRINT_BYTES))
-            digest.update(file.read())
+        digest.update(_ends(path))
     return digest.hexdigest()
+
+
+def digest_file(path: Path) -> str:
+    """The SHA-256 of the size and the first and last MiB of a large file."""
+    return hashlib.sha256(f"{path.stat().st_size}\0".encode() + _ends(path)).hexdigest()
+
+
+def _ends(path: Path) -> bytes:
+    with path.open("rb") as file:
+        start = file.read(_FINGERPRINT_BYTES)
+        file.seek(max(0, path.stat().st_size - _FINGERPRINT_BYTES))
+        return start + file.read()

@@ -23,6 +23,7 @@ from brewster.models.diffusion.adapter.importer import find_lora_file, read_laye
 from brewster.models.diffusion.adapter.stacking import stack_layers
 from brewster.models.diffusion.backbones.backbone import Backbone
 from brewster.models.diffusion.backbones.loading import encode_prompt, load_backbone
+from brewster.models.diffusion.hub_download import find_weights_file
 from brewster.models.diffusion.memory import (
     Placement,
     check_machine,
@@ -30,7 +31,7 @@ from brewster.models.diffusion.memory import (
     count_weights,
     torch_device,
 )
-from brewster.models.diffusion.model_source import ModelSource, find_model_source
+from brewster.models.diffusion.model_source import ModelSource, digest_file, find_model_source
 from brewster.models.diffusion.offloading import offload_layers
 from brewster.models.diffusion.out_of_memory import explain_out_of_memory
 from brewster.models.diffusion.panels import PanelLayout, compose, conditioning_image, split
@@ -43,6 +44,8 @@ from brewster.options import Offload, Quantization
 if TYPE_CHECKING:
     from jaxtyping import Float
 
+TRANSFORMER_SUFFIXES: Final = (".gguf", ".safetensors")
+"""The suffixes of files with the weights of a transformer."""
 _MEMORY_HINT: Final = "use a quantized or a smaller backbone"
 
 
@@ -145,6 +148,7 @@ def load_pipeline(
     base_model: str | None = None,
     quantization: Quantization | None = None,
     offload: Offload = "auto",
+    transformer: str | None = None,
     fast_lora: str | None = None,
     guidance: float | None = None,
     prompt: str = "detailed",
@@ -159,7 +163,9 @@ def load_pipeline(
             the GPU, and none on the CPU.
         offload: "layers" keeps the weights of the transformer in host memory and copies each block to the GPU while it
             computes; "auto" does this only if they do not fit into the free GPU memory.
-        fast_lora: a LoRA for sampling in few steps, which is added to that of the model; see `find_lora_file`.
+        transformer: a single file (.gguf or .safetensors) whose weights replace those of the base's transformer; see
+            `find_weights_file`.
+        fast_lora: a LoRA for sampling in few steps, which is added to that of the model; see `find_weights_file`.
         guidance: the guidance scale, by default that of the task. With a LoRA for few steps and classifier-free guidance, the
             default is 1, which saves the second prediction.
         prompt: for a backbone without a LoRA: a name in `PROMPTS`, or the text itself. A finetuned backbone with a
@@ -177,19 +183,21 @@ def load_pipeline(
     source = find_model_source(model, base_model)
     if fast_lora:
         _check_takes_steps(model, source.task)
-    placement = _choose_placement(source, device, quantization, offload)
+    transformer_file = find_weights_file(transformer, TRANSFORMER_SUFFIXES) if transformer else None
+    placement = _choose_placement(source, device, quantization, offload, transformer_file)
     check_machine(
         source.base,
         source.backbone_class,
         placement,
         requested=device,
         with_text_encoders=source.needs_text_encoders,
+        transformer_file=transformer_file,
     )
     fast_lora_file = find_lora_file(fast_lora) if fast_lora else None
     text = PROMPTS.get(prompt, prompt)
     # The prompt is encoded before the backbone is loaded, because memory may be too small for both.
     embedding = None if source.layout else _embed(source, text, placement.device)
-    backbone = _load_base(source.base, placement)
+    backbone = _load_base(source.base, placement, transformer_file)
     fast_layers = read_layers(fast_lora_file, backbone) if fast_lora_file else {}
     if source.layout and source.folder:
         _, embedding = source.layout.load(source.folder, backbone)
@@ -199,7 +207,12 @@ def load_pipeline(
     if placement.is_offloaded:
         offload_layers(backbone, placement.device)
     task = task_with_guidance(source, guidance, is_fast=bool(fast_lora))
-    digest = _digest(source, placement.quantization, text, fast_lora_file, task.guidance)
+    changes = {
+        "transformer": digest_file(transformer_file) if transformer_file else None,
+        "fast LoRA": hashlib.sha256(fast_lora_file.read_bytes()).hexdigest() if fast_lora_file else None,
+        "guidance": None if task.guidance == source.task.guidance else task.guidance,
+    }
+    digest = _digest(source, placement.quantization, text, changes)
     return DecompositionPipeline(backbone, embedding, task, model_name(model), digest)
 
 
@@ -220,33 +233,33 @@ def fingerprint(
         DeviceError: diffusion models do not run on this device.
     """
     source = find_model_source(model, base_model)
-    placement = _choose_placement(source, device, quantization, "auto")
-    text = PROMPTS.get(prompt, prompt)
-    return _digest(source, placement.quantization, text, None, source.task.guidance)
+    placement = _choose_placement(source, device, quantization, "auto", None)
+    return _digest(source, placement.quantization, PROMPTS.get(prompt, prompt), {})
 
 
-def _digest(
-    source: ModelSource, quantization: str | None, text: str, fast_lora: Path | None, guidance: float
-) -> str:
+def _digest(source: ModelSource, quantization: str | None, text: str, changes: Mapping[str, object]) -> str:
+    """The digest of a model. `changes` are the options that change its result, by name; None for those that are not set."""
     parts = [*source.digest_parts(), str(quantization)]
     if source.layout is None:
         parts.append(text)
-    if fast_lora:
-        parts.append(hashlib.sha256(fast_lora.read_bytes()).hexdigest())
-    if guidance != source.task.guidance:
-        parts.append(f"guidance {guidance}")
+    parts += [f"{name} {value}" for name, value in changes.items() if value is not None]
     return hashlib.sha256("\0".join(parts).encode()).hexdigest()
 
 
 def _choose_placement(
-    source: ModelSource, device: str, quantization: Quantization | None, offload: Offload
+    source: ModelSource,
+    device: str,
+    quantization: Quantization | None,
+    offload: Offload,
+    transformer_file: Path | None,
 ) -> Placement:
     return choose_placement(
-        count_weights(source.base, source.backbone_class),
+        count_weights(source.base, source.backbone_class, transformer_file),
         requested=device,
         quantization=quantization,
         preferred=source.trained_quantization,
         offload=offload,
+        is_single_file=transformer_file is not None,
     )
 
 
@@ -257,11 +270,17 @@ def _embed(source: ModelSource, text: str, device: str) -> PromptEmbedding:
     return encode_prompt(source.base, text, device=device)
 
 
-def _load_base(base: str, placement: Placement) -> Backbone:
+def _load_base(base: str, placement: Placement, transformer_file: Path | None) -> Backbone:
     """Loads the base to its device, or to host memory in the precision of the device."""
     device = "cpu" if placement.is_offloaded else placement.device
     dtype = torch.float32 if placement.device == "cpu" else torch.bfloat16
-    return load_backbone(base, device=device, dtype=dtype, quantization=placement.quantization)
+    return load_backbone(
+        base,
+        device=device,
+        dtype=dtype,
+        quantization=placement.quantization,
+        transformer_file=transformer_file,
+    )
 
 
 def _check_takes_steps(model: str, task: DecompositionTask) -> None:

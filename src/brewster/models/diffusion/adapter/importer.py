@@ -25,7 +25,7 @@ from brewster.models.diffusion.adapter.lora_formats import (
 from brewster.models.diffusion.backbones.backbone import Backbone
 from brewster.models.diffusion.backbones.loading import encode_prompt
 from brewster.models.diffusion.backbones.registry import skeleton
-from brewster.models.diffusion.hub_download import list_root_files, resolve_model_folder
+from brewster.models.diffusion.hub_download import find_weights_file
 from brewster.models.diffusion.panels import Panel, PanelLayout
 from brewster.models.diffusion.prompt import PROMPTS
 from brewster.models.diffusion.task import DecompositionTask
@@ -34,7 +34,6 @@ from brewster.models.diffusion.tensors import read_json, read_tensors
 _PEFT_CONFIG_FILE: Final = "adapter_config.json"
 _DIFFUSERS_KEY: Final = "lora_adapter_metadata"
 _PREFIX: Final = "transformer."
-_SUFFIX: Final = ".safetensors"
 
 
 def import_lora(
@@ -49,7 +48,7 @@ def import_lora(
     """Reads the LoRA, encodes the prompt, and writes the folder.
 
     Args:
-        source: see `find_lora_file`.
+        source: see `find_weights_file`.
         folder: the folder to write.
         base_model: the base model of the LoRA: a name in `BACKBONES`, a folder or a hub id.
         prompt: a name in `PROMPTS`, or the text itself.
@@ -76,27 +75,8 @@ def import_lora(
 
 
 def find_lora_file(source: str) -> Path:
-    """The file with the weights of a LoRA, downloaded if it is on the hub. Subfolders of a repository are not searched.
-
-    `source` is a .safetensors file, a folder or hub id with one such file, or OWNER/NAME/FILE on the hub.
-
-    Raises:
-        ModelError: the folder or repository does not have exactly one such file, or `source` is none of these.
-        DownloadError, MissingExtra: see `resolve_model_folder`.
-    """
-    if Path(source).is_file():
-        return Path(source)
-    repository, _, name = source.rpartition("/") if source.endswith(_SUFFIX) else (source, "", "")
-    names = [name] if name else [each for each in list_root_files(source) if each.endswith(_SUFFIX)]
-    if len(names) != 1 or not repository:
-        raise ModelError(
-            f"{source} contains {', '.join(names) or 'no such file'}"
-            if repository
-            else f"there is no file {source}",
-            f"expected one {_SUFFIX} file",
-            "pass the path of the file, or OWNER/NAME/FILE for a file on the hub",
-        )
-    return resolve_model_folder(repository, [*names, _PEFT_CONFIG_FILE]) / names[0]
+    """The file with the weights of a LoRA, see `find_weights_file`."""
+    return find_weights_file(source, (".safetensors",), companions=[_PEFT_CONFIG_FILE])
 
 
 def read_layers(path: Path, base: Backbone) -> dict[str, LowRankLayer]:

@@ -45,6 +45,7 @@ from brewster.models.zoo import TINY_PREFIX
 from brewster.options import Quantization
 
 _BACKBONE_PATTERNS: Final = [INDEX_FILE, *(f"{part}/*" for part in CONFIG_FILES)]
+_SINGLE_FILE_PATTERNS: Final = [INDEX_FILE, "transformer/config.json", "vae/*", "scheduler/*"]
 _TEXT_ENCODER_PATTERNS: Final = [INDEX_FILE, "scheduler/*", "text_encoder*/*", "tokenizer*/*", "processor/*"]
 
 
@@ -54,12 +55,14 @@ def load_backbone(
     device: str = "cpu",
     dtype: torch.dtype | None = None,
     quantization: Quantization | None = None,
+    transformer_file: Path | None = None,
 ) -> Backbone:
     """Loads a backbone without its text encoders.
 
     `source` is a name in the table, a hub id, a folder in diffusers' layout, or "tiny:" and a name for a tiny version.
     By default `dtype` is bfloat16 on an accelerator and float32 on the CPU. `quantization` stores the transformer's weights
-    in 8 bits (torchao) or 4 bits (bitsandbytes, CUDA only).
+    in 8 bits (torchao) or 4 bits (bitsandbytes, CUDA only). `transformer_file` is a single file, .gguf or .safetensors, whose
+    weights replace those of the transformer, which are then not downloaded. It cannot be quantized again.
 
     Raises:
         DownloadError: no access to a gated model (the message says how to get it), an invalid token, or no network
@@ -69,20 +72,32 @@ def load_backbone(
         MissingExtra: diffusers, torchao or bitsandbytes is not installed.
     """
     _check_device(device)
+    if transformer_file and (quantization or source.startswith(TINY_PREFIX)):
+        raise ModelError(
+            f"{transformer_file} was given for {source} with quantization={quantization}",
+            "expected a base that is no tiny version, and no quantization, because the file has its own precision",
+            "leave quantization out",
+        )
     if source.startswith(TINY_PREFIX):
         return _load_tiny(source, device, quantization)
     options = _quantization_options(quantization, device) if quantization else {}
     dtype = dtype or (torch.float32 if device == "cpu" else torch.bfloat16)
     disable_progress_bars_in_pipes()
-    folder = resolve_model_folder(hub_id_of(source), _BACKBONE_PATTERNS)
+    patterns = _SINGLE_FILE_PATTERNS if transformer_file else _BACKBONE_PATTERNS
+    folder = resolve_model_folder(hub_id_of(source), patterns)
     backbone_class, index = read_index(folder)
     if quantization == "nf4" and backbone_class.unquantized:
         options["quantization_config"].llm_int8_skip_modules = list(backbone_class.unquantized)
     with explain_out_of_memory(_memory_hint(quantization)):
         vae = _load_part(folder, backbone_class, "vae", dtype=dtype, **_device_map(device))
-        transformer = _load_part(
-            folder, backbone_class, "transformer", dtype=dtype, **_device_map(device), **options
-        )
+        if transformer_file:
+            transformer = _load_single_file(
+                transformer_file, folder, backbone_class, dtype=dtype, device=device
+            )
+        else:
+            transformer = _load_part(
+                folder, backbone_class, "transformer", dtype=dtype, **_device_map(device), **options
+            )
     scheduler = _load_part(folder, backbone_class, "scheduler")
     backbone = backbone_class(
         transformer, vae, scheduler, distilled=bool(index.get("is_distilled")), dtype=dtype
@@ -179,6 +194,38 @@ def _load_part(folder: Path, backbone_class: type[Backbone], part: str, **option
             "copy the model again",
         )
     return model
+
+
+def _load_single_file(
+    path: Path, folder: Path, backbone_class: type[Backbone], *, dtype: torch.dtype, device: str
+) -> Any:  # noqa: ANN401 - a transformer of diffusers
+    """Loads the transformer from one file, with the keys of diffusers or of the original code, and the config of the folder."""
+    expected, options = backbone_class.classes["transformer"], {}
+    if path.suffix == ".gguf":
+        import_library("gguf")
+        options["quantization_config"] = diffusers_class("GGUFQuantizationConfig")(compute_dtype=dtype)
+    with _translate_load_errors(path):
+        try:
+            transformer = diffusers_class(expected).from_single_file(
+                str(path),
+                config=str(folder / "transformer"),
+                dtype=dtype,
+                device=device,
+                local_files_only=True,
+                **options,
+            )
+        except torch.OutOfMemoryError:
+            raise
+        except (IndexError, RuntimeError) as error:  # the file has other layers than diffusers converts
+            raise ValueError(str(error)) from error
+    missing = [name for name, parameter in transformer.named_parameters() if parameter.is_meta]
+    if missing:
+        raise ModelError(
+            f"{path} lacks {len(missing)} weights of {backbone_class.name}, for example {missing[0]}",
+            f"expected all weights of a {expected}",
+            "choose a file for this base, or another base",
+        )
+    return transformer
 
 
 @contextlib.contextmanager
