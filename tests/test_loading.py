@@ -3,6 +3,7 @@
 import shutil
 
 import gguf
+import numpy as np
 import pytest
 import torch
 from safetensors.torch import save_file
@@ -21,14 +22,14 @@ Q8 = gguf.GGMLQuantizationType.Q8_0
 
 
 def write_gguf(path, weights):
-    """Writes a GGUF file with Q8_0 matrices, and returns the values that it holds."""
+    """Writes a GGUF file with Q8_0 matrices, and returns their values in float16, as diffusers reads them."""
     writer, stored = gguf.GGUFWriter(path, "test"), {}
     for name, weight in weights.items():
         array = weight.float().numpy()
         if array.ndim == 2 and array.shape[1] % 32 == 0:
             quantized = gguf.quants.quantize(array, Q8)
             writer.add_tensor(name, quantized, raw_dtype=Q8)
-            array = gguf.quants.dequantize(quantized, Q8)
+            array = gguf.quants.dequantize(quantized, Q8).astype(np.float16).astype(np.float32)
         else:
             writer.add_tensor(name, array)
         stored[name] = torch.from_numpy(array)
