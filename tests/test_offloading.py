@@ -6,6 +6,7 @@ from diffusers.hooks import group_offloading
 
 from brewster.models.diffusion import offloading, pipeline
 from brewster.models.diffusion.adapter.lora import add_lora, lora_parameters, save_lora
+from brewster.models.diffusion.backbones.loading import load_backbone
 from brewster.models.diffusion.backbones.registry import BACKBONES, tiny
 from brewster.models.diffusion.memory import Placement
 from brewster.models.diffusion.offloading import DECODING_BYTES_PER_PIXEL, offload_layers
@@ -49,6 +50,22 @@ def test_an_offloaded_transformer_with_a_lora_predicts_the_same_bits(name, copie
     copied = {id(module) for group in copies for module in group.modules}
     assert {id(block) for block in blocks} <= copied
     assert backbone.device == torch.device("cpu")
+
+
+def test_quantized_weights_are_offloaded_with_their_lora(tmp_path, copies):
+    tiny("kontext", seed=1)[0].save(tmp_path)
+    backbone = load_backbone(str(tmp_path), quantization="int8", dtype=torch.bfloat16)
+    _, prompt = tiny("kontext", seed=1)
+    add_lora(backbone, rank=2)
+    latents, condition = torch.randn(
+        2, 1, backbone.channels, 2, 3, generator=torch.Generator().manual_seed(0)
+    )
+    call = (latents, condition, torch.tensor([0.7]), prompt, 1.0)
+    with torch.no_grad():
+        expected = backbone.predict(*call)
+        offload_layers(backbone, "cpu")
+        assert torch.equal(backbone.predict(*call), expected)
+    assert copies
 
 
 def test_an_offloaded_lora_separates_as_a_resident_one(tmp_path, monkeypatch, copies):

@@ -107,11 +107,11 @@ def weights_gib(parameters: int, quantization: Quantization | None) -> float:
     return parameters * BYTES_PER_WEIGHT[quantization] / GIB
 
 
-def first_fitting(
+def fitting_quantizations(
     parameters: int, budget_gib: float, candidates: Sequence[Quantization | None] = ("int8", "nf4")
 ) -> Sequence[Quantization | None]:
-    """The first quantization of the candidates with which the weights fit into the budget, as a list of one; empty if none fits."""
-    return [each for each in candidates if weights_gib(parameters, each) <= budget_gib][:1]
+    """The candidates with which the weights fit into the budget, in their order."""
+    return [each for each in candidates if weights_gib(parameters, each) <= budget_gib]
 
 
 def choose_placement(
@@ -195,7 +195,7 @@ def place_on_gpu(
         candidates: list[Quantization | None] = [preferred, "int8"]
         if importlib.util.find_spec("bitsandbytes"):
             candidates.append("nf4")
-        fitting = first_fitting(weights, total_gib - INFERENCE_OVERHEAD_GIB, candidates)
+        fitting = fitting_quantizations(weights, total_gib - INFERENCE_OVERHEAD_GIB, candidates)
         fallback = preferred if offload == "none" else movable or "int8"
         chosen = fitting[0] if fitting else fallback
     resident = Placement(device, chosen)
@@ -252,7 +252,7 @@ def _check_memory(source: str, weights: int, placement: Placement) -> None:
     if placement.device == "cpu":
         return
     free = torch.cuda.mem_get_info(placement.device)[0] / GIB
-    fitting = first_fitting(weights, free - INFERENCE_OVERHEAD_GIB)
+    fitting = fitting_quantizations(weights, free - INFERENCE_OVERHEAD_GIB)
     cure = f"choose quantization {fitting[0]}" if fitting else _SMALLER_MODEL
     _check_fits(source, placement.gpu_gib(weights), free, f"on {placement.device}", cure)
 

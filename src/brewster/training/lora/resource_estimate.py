@@ -28,7 +28,7 @@ from brewster.models.diffusion.cost import (
     forward_tflop,
     hidden_state_bytes,
 )
-from brewster.models.diffusion.memory import GIB, first_fitting, weights_gib
+from brewster.models.diffusion.memory import GIB, fitting_quantizations, weights_gib
 from brewster.models.diffusion.panels import fit_panel
 from brewster.models.zoo import TINY_PREFIX
 from brewster.training.recipe import ENCODED_SUFFIX, LoraRecipe
@@ -110,9 +110,9 @@ class ResourceEstimate:
 
     def _cure(self) -> str:
         others = self.total_gib - self.memory_gib["base"]
-        for quantization in first_fitting(self.parameter_count, self.card.memory_gib - others):
-            total = others + weights_gib(self.parameter_count, quantization)
-            return f'set quantization = "{quantization}", which needs {total:.1f} GiB'
+        if fitting := fitting_quantizations(self.parameter_count, self.card.memory_gib - others):
+            total = others + weights_gib(self.parameter_count, fitting[0])
+            return f'set quantization = "{fitting[0]}", which needs {total:.1f} GiB'
         return "lower max_composite_pixels or rank, or choose a smaller backbone (klein) or a larger card"
 
 
