@@ -210,7 +210,8 @@ def cap_memory():
 
 def estimate(name, quantization):
     """Returns the estimate of `brewster train --plan` for the recipe of this name on the paper's GPU."""
-    from brewster.training.lora.resource_estimate import CARDS, estimate_resources  # noqa: PLC0415  (its libraries may be missing)
+    from brewster.models.diffusion.cost import CARDS  # noqa: PLC0415
+    from brewster.training.lora.resource_estimate import estimate_resources  # noqa: PLC0415  (its libraries may be missing)
     from brewster.training.recipe import read_recipe  # noqa: PLC0415
 
     card = CARDS["RTX 4090"]

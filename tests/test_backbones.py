@@ -16,10 +16,19 @@ from tokenizers.pre_tokenizers import ByteLevel
 from brewster.errors import DeviceError, DownloadError, ModelError
 from brewster.models.diffusion import lazy_imports
 from brewster.models.diffusion.adapter.lora import add_lora
-from brewster.models.diffusion.backbones import registry
-from brewster.models.diffusion.backbones.registry import BACKBONES, build, encode_prompt, load_backbone, tiny
-from brewster.models.diffusion.memory import check_machine, choose_quantization
+from brewster.models.diffusion.backbones import loading
+from brewster.models.diffusion.backbones.loading import encode_prompt, load_backbone
+from brewster.models.diffusion.backbones.registry import BACKBONES, build, tiny
+from brewster.models.diffusion.memory import (
+    Placement,
+    check_machine,
+    choose_placement,
+    count_weights,
+    place_on_gpu,
+)
 from brewster.models.diffusion.prompt import PROMPT
+
+KONTEXT = BACKBONES["kontext"]
 
 
 @pytest.fixture(scope="module")
@@ -125,7 +134,7 @@ def test_a_quantized_base_predicts_nearly_the_same_and_trains_a_lora(tiny_folder
 
 
 def test_a_base_that_was_silently_left_unquantized_is_refused(tiny_folders, monkeypatch):
-    monkeypatch.setattr(registry, "_device_map", lambda device: {"device_map": {"": device}})
+    monkeypatch.setattr(loading, "_device_map", lambda device: {"device_map": {"": device}})
     with pytest.raises(ModelError, match=r"loaded as torch\.bfloat16; expected weights stored as int8"):
         load_backbone(str(tiny_folders / "kontext"), quantization="int8", dtype=torch.bfloat16)
 
@@ -253,40 +262,75 @@ def machine(monkeypatch, tmp_path):
 
 def test_a_large_base_needs_a_gpu_unless_the_cpu_is_chosen(machine, tiny_folders):
     with pytest.raises(DeviceError, match=r"finds no GPU, and kontext has 11\.9 billion .*--device cpu"):
-        check_machine("kontext", requested="auto", device="cpu")
-    check_machine("kontext", requested="cpu", device="cpu")
+        check_machine("kontext", KONTEXT, Placement("cpu"), requested="auto")
+    check_machine("kontext", KONTEXT, Placement("cpu"), requested="cpu")
     for small in ("tiny:kontext", str(tiny_folders / "kontext")):
-        check_machine(small, requested="auto", device="cpu")
+        check_machine(small, KONTEXT, Placement("cpu"), requested="auto")
 
 
-def test_the_quantization_is_chosen_by_the_memory_of_the_gpu(machine, monkeypatch):
+def place(name, memory_gib, free_gib=None, **options):
+    weights = count_weights(name, BACKBONES[name])
+    placement = place_on_gpu(weights, free_gib=free_gib or memory_gib, total_gib=memory_gib, **options)
+    return placement.quantization, placement.is_offloaded
+
+
+def test_the_quantization_is_chosen_by_the_memory_of_the_gpu(monkeypatch):
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: object())
-    chosen = {}
-    for machine["memory"] in (40, 24, 16, 12, 8):
-        chosen[machine["memory"]] = choose_quantization("kontext", "cuda")
-    assert chosen == {40: None, 24: "int8", 16: "int8", 12: "nf4", 8: None}
-    machine["memory"] = 24
-    assert choose_quantization("kontext", "cuda", "float8") == "float8"
-    assert choose_quantization("klein", "cuda") is None
-    assert choose_quantization("kontext", "cpu", "int8") is None
+    chosen = {memory: place("kontext", memory) for memory in (40, 24, 16, 12, 8)}
+    assert chosen == {
+        40: (None, False), 24: ("int8", False), 16: ("int8", False), 12: ("nf4", False), 8: ("int8", True)
+    }  # fmt: skip
+    assert place("kontext", 24, preferred="float8") == ("float8", False)
+    assert place("klein", 24) == (None, False)
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    assert place("kontext", 12) == ("int8", True)
+
+
+def test_the_weights_are_offloaded_only_if_they_do_not_fit_or_on_request(monkeypatch):
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: object())
+    assert place("kontext", 24, free_gib=10) == ("int8", True)
+    assert place("kontext", 24, free_gib=10, offload="none") == ("int8", False)
+    assert place("kontext", 80, offload="layers") == (None, True)
+    assert place("kontext", 12, quantization="float8") == ("float8", True)
+    assert place("qwen", 80, preferred="nf4", offload="layers") == ("int8", True)
+    assert place("qwen", 12, free_gib=4, quantization="nf4") == ("nf4", False)
+    with pytest.raises(DeviceError, match=r"with quantization = nf4; .*cannot be moved"):
+        place("qwen", 80, quantization="nf4", offload="layers")
+
+
+def test_on_a_cpu_nothing_is_quantized_by_default_and_nothing_is_offloaded():
+    weights = count_weights("kontext", KONTEXT)
+    assert choose_placement(weights, requested="cpu", preferred="int8") == Placement("cpu")
+    with pytest.raises(DeviceError, match="layers was requested on the CPU; expected a GPU"):
+        choose_placement(weights, requested="cpu", offload="layers")
+
+
+def test_an_offloaded_base_needs_host_memory_instead_of_gpu_memory(machine, monkeypatch):
+    monkeypatch.setattr(torch.cuda, "mem_get_info", lambda device: [5 << 30] * 2)
+    offloaded = Placement("cuda", "int8", is_offloaded=True)
+    check_machine("kontext", KONTEXT, offloaded, requested="auto")
+    with pytest.raises(DeviceError, match=r"about 14\.\d GiB of memory on cuda, and 5\.0"):
+        check_machine("kontext", KONTEXT, Placement("cuda", "int8"), requested="auto")
     machine["memory"] = 12
-    assert choose_quantization("kontext", "cuda") is None
+    with pytest.raises(
+        DeviceError, match=r"about 13\.\d GiB of memory in host memory, because it is offloaded"
+    ):
+        check_machine("kontext", KONTEXT, offloaded, requested="auto")
 
 
 def test_memory_and_disk_are_checked_before_the_download(machine):
     machine["memory"] = 40
     with pytest.raises(DeviceError, match=r"kontext needs about 46\.\d GiB of memory on cpu, and 40\.0"):
-        check_machine("kontext", requested="cpu", device="cpu")
+        check_machine("kontext", KONTEXT, Placement("cpu"), requested="cpu")
     machine["memory"] = 16
     with pytest.raises(DeviceError, match=r"about 25\.\d GiB of memory on cuda.*; choose quantization int8"):
-        check_machine("kontext", requested="auto", device="cuda")
-    check_machine("kontext", requested="auto", device="cuda", quantization="int8")
+        check_machine("kontext", KONTEXT, Placement("cuda"), requested="auto")
+    check_machine("kontext", KONTEXT, Placement("cuda", "int8"), requested="auto")
     machine["disk"] = 30
-    check_machine("kontext", requested="auto", device="cuda", quantization="int8")
+    check_machine("kontext", KONTEXT, Placement("cuda", "int8"), requested="auto")
     with pytest.raises(DownloadError, match=r"Kontext-dev needs about 34 GB on the disk, .* 32 GB free"):
         check_machine(
-            "kontext", requested="auto", device="cuda", quantization="int8", with_text_encoders=True
+            "kontext", KONTEXT, Placement("cuda", "int8"), requested="auto", with_text_encoders=True
         )
 
 
@@ -385,6 +429,6 @@ def test_out_of_memory_while_loading_says_what_to_reduce(folder, monkeypatch):
     def raise_error(*_, **__):
         raise torch.OutOfMemoryError("CUDA out of memory.")
 
-    monkeypatch.setattr(registry, "_load_part", raise_error)
+    monkeypatch.setattr(loading, "_load_part", raise_error)
     with pytest.raises(DeviceError, match='use quantization="int8", a smaller backbone'):
         load_backbone(str(folder))

@@ -11,7 +11,8 @@ from torch.nn import functional
 from brewster import Photo, Separator
 from brewster.errors import ModelError
 from brewster.inference.diffusion_predictor import DiffusionPredictor
-from brewster.models.diffusion.backbones.registry import encode_prompt, tiny
+from brewster.models.diffusion.backbones.loading import encode_prompt
+from brewster.models.diffusion.backbones.registry import tiny
 from brewster.models.diffusion.gensirr import convert
 from brewster.models.diffusion.pipeline import load_pipeline
 from brewster.models.diffusion.task import TASK_FILE

@@ -85,7 +85,9 @@ def test_the_plan_has_the_four_files_unchanged(write_lora):
 
 def test_remarks_name_a_non_commercial_base_and_a_tiny_one(write_lora):
     assert "not for commercial use" in plan_push(write_lora(), REPO).remarks[0]
-    assert "a tiny test model: it cannot separate" in plan_push(write_lora("tiny:kontext"), REPO).remarks[0]
+    assert (
+        "a tiny version: the LoRA cannot separate" in plan_push(write_lora("tiny:kontext"), REPO).remarks[0]
+    )
 
 
 def test_local_paths_are_replaced_in_uploaded_files_and_the_lora_still_loads(

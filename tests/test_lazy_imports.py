@@ -8,7 +8,7 @@ import pytest
 from huggingface_hub import errors as hub_errors
 
 from brewster.errors import DownloadError, MissingExtra
-from brewster.models.diffusion.backbones.registry import encode_prompt, load_backbone
+from brewster.models.diffusion.backbones.loading import encode_prompt, load_backbone
 from brewster.models.diffusion.lazy_imports import import_library
 
 
@@ -74,7 +74,8 @@ import sys
 from pathlib import Path
 from brewster.models.diffusion import sampling
 from brewster.models.diffusion.adapter import lora
-from brewster.models.diffusion.backbones.registry import load_backbone, tiny
+from brewster.models.diffusion.backbones.loading import load_backbone
+from brewster.models.diffusion.backbones.registry import tiny
 assert not {{'diffusers', 'transformers', 'peft', 'safetensors', 'huggingface_hub'}} & set(sys.modules)
 tiny('kontext')[0].save(Path({str(tmp_path)!r}))
 load_backbone({str(tmp_path)!r})

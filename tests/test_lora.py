@@ -20,7 +20,8 @@ from brewster.models.diffusion.adapter.lora import (
     remove_lora,
     save_lora,
 )
-from brewster.models.diffusion.backbones.registry import BACKBONES, build, load_backbone, tiny
+from brewster.models.diffusion.backbones.loading import load_backbone
+from brewster.models.diffusion.backbones.registry import BACKBONES, build, tiny
 from brewster.models.diffusion.panels import PanelLayout
 from brewster.models.diffusion.prompt import load_prompt
 from brewster.models.diffusion.task import DecompositionTask

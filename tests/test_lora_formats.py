@@ -2,6 +2,7 @@
 
 import json
 
+import huggingface_hub
 import pytest
 import torch
 from safetensors.torch import save_file
@@ -258,6 +259,34 @@ def test_a_folder_must_contain_one_file_and_panels_need_t(tmp_path):
         import_lora(str(tmp_path), tmp_path / "out", base_model="tiny:qwen", prompt="x", panels=("T",))
     with pytest.raises(RecipeError, match="expected a list with T"):
         import_lora(str(tmp_path), tmp_path / "out", base_model="tiny:qwen", prompt="x", panels=("R",))
+
+
+def test_only_the_file_in_the_root_of_a_repository_is_downloaded(tmp_path, monkeypatch):
+    save_file(STYLES["diffusers"]("qwen"), tmp_path / "lora.safetensors")
+    requests = []
+
+    def snapshot_download(source, *, allow_patterns, dry_run=False):
+        requests.append((source, allow_patterns))
+        return [] if dry_run else str(tmp_path)
+
+    files = [
+        "README.md",
+        "lora.safetensors",
+        "transformer/diffusion_pytorch_model-00001-of-00041.safetensors",
+    ]
+    monkeypatch.setattr(huggingface_hub, "snapshot_download", snapshot_download)
+    monkeypatch.setattr(huggingface_hub.HfApi, "list_repo_files", lambda self, source: files)
+    assert importer.find_lora_file("someone/glass") == tmp_path / "lora.safetensors"
+    assert importer.find_lora_file("someone/glass/lora.safetensors") == tmp_path / "lora.safetensors"
+    assert {tuple(patterns) for _, patterns in requests} == {("lora.safetensors", "adapter_config.json")}
+    assert {source for source, _ in requests} == {"someone/glass"}
+    files.append("other.safetensors")
+    with pytest.raises(
+        ModelError, match=r"contains lora\.safetensors, other\.safetensors; .*OWNER/NAME/FILE"
+    ):
+        importer.find_lora_file("someone/glass")
+    with pytest.raises(ModelError, match=r"there is no file absent\.safetensors"):
+        importer.find_lora_file("absent.safetensors")
 
 
 def test_the_base_may_be_a_folder(tmp_path, monkeypatch):

@@ -10,8 +10,9 @@ from tokenizers.pre_tokenizers import ByteLevel
 from transformers.models.qwen2_vl.image_processing_pil_qwen2_vl import Qwen2VLImageProcessorPil
 
 from brewster.errors import MissingExtra
+from brewster.models.diffusion.backbones.loading import encode_prompt
 from brewster.models.diffusion.backbones.qwen import Qwen
-from brewster.models.diffusion.backbones.registry import encode_prompt, tiny
+from brewster.models.diffusion.backbones.registry import tiny
 from brewster.models.diffusion.prompt import PROMPT
 
 SPECIAL_TOKENS = ["<|endoftext|>", "<|im_start|>", "<|im_end|>", "<|vision_start|>", "<|vision_end|>"]

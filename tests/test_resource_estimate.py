@@ -7,7 +7,8 @@ import pytest
 import torch
 
 from brewster.errors import DeviceError, ModelError
-from brewster.training.lora.resource_estimate import CARDS, GraphicsCard, estimate_resources, find_gpu
+from brewster.models.diffusion.cost import CARDS, GraphicsCard, find_gpu
+from brewster.training.lora.resource_estimate import estimate_resources
 from brewster.training.recipe import read_recipe, with_value
 from set_folders import render_set
 

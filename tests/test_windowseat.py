@@ -15,7 +15,7 @@ from brewster import Photo, Separator
 from brewster.errors import ModelError
 from brewster.inference.diffusion_predictor import DiffusionPredictor
 from brewster.models.diffusion.adapter.windowseat import CONFIG_FILE, INDEX_FILE, PROMPT_FILE, WEIGHTS_FILE
-from brewster.models.diffusion.backbones.registry import load_backbone
+from brewster.models.diffusion.backbones.loading import load_backbone
 from brewster.models.diffusion.pipeline import fingerprint, load_pipeline
 from brewster.models.diffusion_models import DIFFUSION_MODELS
 from brewster.srgb import to_encoded, to_linear

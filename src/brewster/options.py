@@ -26,7 +26,13 @@ Device = Literal["auto", "cuda", "rocm", "directml", "coreml", "cpu"]
 Quantization = Literal["int8", "float8", "nf4"]
 """The number format of the weights of a base model: int8 and float8 by torchao, nf4 (4 bits) by bitsandbytes."""
 
-DIFFUSION_OPTIONS: Final = ("base_model", "quantization", "steps", "ensemble_size", "no_guided_upsampling")
+Offload = Literal["auto", "none", "layers"]
+"""Whether the weights of a diffusion model are kept in host memory and copied to the GPU layer by layer."""
+
+DIFFUSION_OPTIONS: Final = (
+    "base_model", "quantization", "offload", "transformer", "fast_lora", "guidance", "steps", "ensemble_size",
+    "no_guided_upsampling",
+)  # fmt: skip
 """The options of diffusion models only."""
 
 _CALL_OPTIONS: Final = ("strength", "quality", "mask", "additive", "max_pixels")
@@ -106,6 +112,34 @@ class Options:
         metadata=_field_metadata(
             "For diffusion models: store the weights in 8 or 4 bits; the default is the setting of the training, "
             "or fewer bits if the GPU has too little memory for it."
+        ),
+    )
+    offload: Offload = field(
+        default="auto",
+        metadata=_field_metadata(
+            "For diffusion models: layers keeps the weights in host memory and copies each block to the GPU while it computes, "
+            "which is slower; auto does this only if the weights do not fit into the free GPU memory."
+        ),
+    )
+    transformer: str | None = field(
+        default=None,
+        metadata=_field_metadata(
+            "For diffusion models: one file with the weights of the transformer, which replaces that of the base: a .gguf or .safetensors "
+            "file, a hub id or OWNER/NAME/FILE."
+        ),
+    )
+    fast_lora: str | None = field(
+        default=None,
+        metadata=_field_metadata(
+            "For diffusion models: a LoRA for sampling in few steps (Lightning, turbo), which is added to the model: "
+            "a .safetensors file, a folder, a hub id or OWNER/NAME/FILE. Set the option steps with it."
+        ),
+    )
+    guidance: float | None = field(
+        default=None,
+        metadata=_field_metadata(
+            "For diffusion models: the guidance scale, by default that of the model; with a LoRA for few steps, 1 for klein and qwen.",
+            ge=1,
         ),
     )
     steps: int | None = field(

@@ -27,7 +27,7 @@ _CHECKPOINT_SUFFIXES = (".pt", ".ckpt")
 
 @click.group
 def models() -> None:
-    """List, describe and verify models; upload a LoRA."""
+    """List, import, verify and export models; upload a LoRA."""
 
 
 @models.command("list")
@@ -89,8 +89,9 @@ def import_model(
 ) -> None:
     """Convert a model of another program to a FOLDER that --model opens.
 
-    SOURCE is a LoRA for kontext, klein or qwen (a .safetensors file, or a folder or hub id with one) with the keys of
-    peft, diffusers, kohya's sd-scripts or ComfyUI; or the checkpoint GenSIRR.pt.
+    SOURCE is a LoRA for kontext, klein or qwen (a .safetensors file, a folder or hub id with one such file, or
+    OWNER/NAME/FILE on the hub) with the keys of peft, diffusers, kohya's sd-scripts or ComfyUI; or the checkpoint
+    GenSIRR.pt.
     """
     require_extra("diffusion", "importing a model")
     if Path(source).suffix in _CHECKPOINT_SUFFIXES:

@@ -15,7 +15,8 @@ from click.shell_completion import CompletionItem
 
 from brewster.cli.batch import BatchCommand
 from brewster.cli.batch_plan import absolute_path, is_single_output, local_path, plan, skipped_videos
-from brewster.cli.terminal import print_status, standard_output
+from brewster.cli.extras import require_extra
+from brewster.cli.terminal import print_out, print_status, standard_output
 from brewster.errors import BrewsterError
 from brewster.image_formats import SUFFIXES, FormatName, format_of
 from brewster.models import zoo
@@ -184,6 +185,18 @@ def _param_type(hint: object, field: dataclasses.Field[Any]) -> click.ParamType[
 @click.option(
     "--index", is_flag=True, help="Write index.parquet into the folder -o: a table with a row for each photo."
 )
+@click.option(
+    "--plan",
+    "is_plan",
+    is_flag=True,
+    help="For diffusion models: estimate memory, time and download for the first photo, and stop. Downloads nothing.",
+)
+@click.option(
+    "--gpu",
+    "gpu_name",
+    metavar="NAME",
+    help='Estimate for this GPU, such as "RTX 4060", instead of the GPU of this machine; implies --plan.',
+)
 @click.pass_context
 def separate(
     context: click.Context,
@@ -199,6 +212,8 @@ def separate(
     workers: int | None,
     cluster: str | None,
     index: bool,
+    is_plan: bool,
+    gpu_name: str | None,
     **values: object,
 ) -> None:
     """Separate photos taken through glass into transmission and reflection.
@@ -220,6 +235,9 @@ def separate(
         options = Options(**cast("dict[str, Any]", values))
     except BrewsterError as error:
         raise click.UsageError(str(error)) from error
+    if is_plan or gpu_name:
+        _print_plan(photos, output, options, gpu_name)
+        return
     if (workers or cluster or index) and not dry_run:
         _check_archive_output(single_output, output, needs_folder=bool(cluster or index))
         photos, output = tuple(map(absolute_path, photos)), output and absolute_path(output)
@@ -245,6 +263,27 @@ def separate(
         index=index,
     )
     context.exit(0 if batch.run(tasks) else 1)
+
+
+def _print_plan(photos: tuple[str, ...], output: str | None, options: Options, gpu_name: str | None) -> None:
+    """Prints the estimated resources of the first photo. Raises DeviceError if they exceed the GPU."""
+    require_extra("diffusion", "a plan")
+    from brewster.inference.batch import read_content  # noqa: PLC0415
+    from brewster.inference.separation_plan import plan_separation  # noqa: PLC0415  (imports torch)
+    from brewster.models.diffusion.cost import find_gpu, is_local_gpu  # noqa: PLC0415
+    from brewster.photo import Photo  # noqa: PLC0415
+
+    tasks = plan(photos, output, options)
+    gpu = find_gpu(gpu_name)
+    if gpu_name is None and not is_local_gpu(gpu):
+        print_status(f"no GPU found: the estimate is for the {gpu.name}; choose another GPU with --gpu")
+    photo = Photo.open(read_content(tasks[0].source), max_pixels=options.max_pixels)
+    estimate = plan_separation(options, photo.size, gpu)
+    print_out(estimate.table())
+    if len(tasks) > 1:
+        hours = len(tasks) * estimate.seconds / 3600
+        print_out(f"{'total':24}{len(tasks)} photos, {hours:.1f} hours if all have the size of the first one")
+    estimate.check_fits()
 
 
 def _check_contact_sheet(path: Path, photos: tuple[str, ...], output: str | None) -> None:

@@ -165,7 +165,8 @@ def _show_recipe(name: str) -> None:
 
 
 def _print_plan(recipe: CompactRecipe | LoraRecipe, gpu_name: str | None) -> None:
-    from brewster.training.lora.resource_estimate import estimate_resources, find_gpu, is_local_gpu  # noqa: PLC0415
+    from brewster.models.diffusion.cost import find_gpu, is_local_gpu  # noqa: PLC0415
+    from brewster.training.lora.resource_estimate import estimate_resources  # noqa: PLC0415
     from brewster.training.recipe import LoraRecipe  # noqa: PLC0415
 
     if not isinstance(recipe, LoraRecipe):

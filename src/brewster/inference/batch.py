@@ -304,7 +304,7 @@ class BatchRunner:
         on_progress: Callable[[float], None],
     ) -> None:
         path = task.source if isinstance(task.source, Location) else None
-        photo = _content(task.source)
+        photo = read_content(task.source)
         result.photo_sha256 = _sha256(photo)
         separation = separator(photo, on_progress=on_progress, **self._options.call_options())
         result.seconds, result.residual = dict(separation.seconds), separation.residual
@@ -326,7 +326,7 @@ class BatchRunner:
         result.seconds["encode"] = time.perf_counter() - started
 
 
-def _content(source: Location | InputStream) -> Path | bytes:
+def read_content(source: Location | InputStream) -> Path | bytes:
     """Returns what a `Separator` reads: a local path, or the bytes of a URL or stream."""
     if isinstance(source, Path):
         return source

@@ -47,7 +47,7 @@ class DiffusionPredictor(Predictor):
         pipeline: the model.
         steps: the number of sampling steps; by default those of the task (20 as in the paper), and at most 4 for "draft".
         ensemble_size: the number of samples with different seeds whose mean is the prediction; the mean has less invented detail.
-        no_guided_upsampling: whether the transmission is the upsampled generated one, without the detail of the photo.
+        no_guided_upsampling: whether the transmission is the generated panel, upsampled, without the detail of the photo.
 
     Raises:
         ModelError: `steps` or `ensemble_size` is below 1, or one of them is set for a one-step model.
@@ -96,13 +96,13 @@ class DiffusionPredictor(Predictor):
         self, inputs: Sequence[Floats], quality: Quality, on_progress: ProgressCallback
     ) -> Prediction:
         """Returns the mean prediction over the inputs. The reconstruction error is that of the first input."""
-        size, task_steps = inputs[-1].shape[:2], self._pipeline.task.steps
+        size = inputs[-1].shape[:2]
         tilings = [self._tiling(scaled_input.shape, is_first=i == 0) for i, scaled_input in enumerate(inputs)]
         tiles = [
             len(tile_slices(scaled_input.shape[:2], **tiling))
             for scaled_input, tiling in zip(inputs, tilings, strict=True)
         ]
-        steps = self._steps or (min(_DRAFT_STEPS, task_steps) if quality == "draft" else task_steps)
+        steps = self.sampling_steps(quality)
         progress = _ProgressCounter(on_progress, sum(tiles))
         predictions = []
         with self._lock:  # two predictions at the same time would need twice the GPU memory
@@ -130,6 +130,33 @@ class DiffusionPredictor(Predictor):
             mean_error,
             reflection_is_derived="R" not in self._pipeline.task.layout.panels,
         )
+
+    def sampling_steps(self, quality: Quality) -> int:
+        """Returns the number of sampling steps of each prediction."""
+        task = self._pipeline.task
+        if task.objective != "flow":
+            return 1
+        return self._steps or (min(_DRAFT_STEPS, task.steps) if quality == "draft" else task.steps)
+
+    def panel_sizes(self, size: tuple[int, int], quality: Quality) -> list[tuple[int, int]]:
+        """Returns the (width, height) of the panels for a photo of this (width, height): one for each tile of each input.
+
+        Raises:
+            PhotoError: see `input_sizes`.
+        """
+        sizes = []
+        for i, (width, height) in enumerate(self.input_sizes(size, quality)):
+            for rows, columns in tile_slices(
+                (height, width), **self._tiling((height, width, 3), is_first=i == 0)
+            ):
+                tile = (columns.stop - columns.start, rows.stop - rows.start)
+                sizes.append(_round_up(self._enlarged(tile), self._pipeline.backbone.size_divisor))
+        return sizes
+
+    def _enlarged(self, size: tuple[int, int]) -> tuple[int, int]:
+        """The (width, height) of a tile that the model gets: at least the short side of the task."""
+        scale = max(1.0, (self._pipeline.task.short_side_px or 0) / min(size))
+        return round(scale * size[0]), round(scale * size[1])
 
     @property
     def _reconstructs_input(self) -> bool:
@@ -165,10 +192,9 @@ class DiffusionPredictor(Predictor):
         of the transmission over the samples, and the reconstruction error.
         """
         height, width, _ = tile.shape
-        short_side = self._pipeline.task.short_side_px
-        if short_side and min(height, width) < short_side:
-            size = tuple(round(side * short_side / min(height, width)) for side in (height, width))
-            enlarged = np.clip(_resize(tile, size, "bicubic"), 0, 1)
+        enlarged_size = self._enlarged((width, height))
+        if enlarged_size != (width, height):
+            enlarged = np.clip(_resize(tile, enlarged_size[::-1], "bicubic"), 0, 1)
             maps = self._predict_tile(enlarged, steps, progress)
             return tuple(_resize(map_, (height, width), "bilinear") for map_ in maps)
         panel_fit = PanelFit(

@@ -39,7 +39,7 @@ from brewster.inference.predictor import (
 from brewster.inference.separation import Separation
 from brewster.inference.tiles import Backend
 from brewster.models.zoo import find_model, is_diffusion_model
-from brewster.options import Options, Quality, Quantization, document_options
+from brewster.options import Offload, Options, Quality, Quantization, document_options
 from brewster.photo import Encoding, Mask, Photo, Source
 from brewster.photo.history import with_history
 
@@ -85,6 +85,10 @@ class Separator:
         device: str = Options.device,
         base_model: str | None = Options.base_model,
         quantization: Quantization | None = Options.quantization,
+        offload: Offload = Options.offload,
+        transformer: str | None = Options.transformer,
+        fast_lora: str | None = Options.fast_lora,
+        guidance: float | None = Options.guidance,
         steps: int | None = Options.steps,
         ensemble_size: int = Options.ensemble_size,
         no_guided_upsampling: bool = Options.no_guided_upsampling,
@@ -99,18 +103,26 @@ class Separator:
             DownloadError: a diffusion model cannot be downloaded, for example because access was not granted.
             MissingExtra: a diffusion model needs the extra `diffusion`.
         """
-        if is_diffusion_model(model):
-            pipeline = _open_pipeline(model, device, base_model, quantization)
-            return cls._from_pipeline(
-                pipeline, steps=steps, ensemble_size=ensemble_size, no_guided_upsampling=no_guided_upsampling
-            )
-        chosen = {
-            "base_model": base_model,
-            "quantization": quantization,
+        pipeline_options: dict[str, Any] = {
+            "base_model": base_model, "quantization": quantization, "offload": offload, "transformer": transformer,
+            "fast_lora": fast_lora, "guidance": guidance,
+        }  # fmt: skip
+        predictor_options: dict[str, Any] = {
             "steps": steps,
             "ensemble_size": ensemble_size,
             "no_guided_upsampling": no_guided_upsampling,
         }
+        if is_diffusion_model(model):
+            if fast_lora and steps is None:
+                raise ModelError(
+                    f"the LoRA for few steps {fast_lora} was given without the number of steps",
+                    "expected the number for which it was trained",
+                    "set the option steps, for example 4 or 8",
+                )
+            return cls._from_pipeline(
+                _open_pipeline(model, device=device, **pipeline_options), predictor_options
+            )
+        chosen = pipeline_options | predictor_options
         if changed := [name for name, value in chosen.items() if value != getattr(Options, name)]:
             raise ModelError(
                 f"{', '.join(changed)} was set for the model {model}",
@@ -123,19 +135,10 @@ class Separator:
         return cls(backend, name=model_file.name, sha256=digest, device=backend.device)
 
     @classmethod
-    def _from_pipeline(
-        cls,
-        pipeline: DecompositionPipeline,
-        *,
-        steps: int | None,
-        ensemble_size: int,
-        no_guided_upsampling: bool,
-    ) -> Separator:
+    def _from_pipeline(cls, pipeline: DecompositionPipeline, options: dict[str, Any]) -> Separator:
         from brewster.inference.diffusion_predictor import DiffusionPredictor  # noqa: PLC0415  (imports torch)
 
-        predictor = DiffusionPredictor(
-            pipeline, steps=steps, ensemble_size=ensemble_size, no_guided_upsampling=no_guided_upsampling
-        )
+        predictor = DiffusionPredictor(pipeline, **options)
         device = str(pipeline.backbone.device)
         return cls(predictor, name=pipeline.name, sha256=pipeline.sha256, device=device)
 
@@ -296,6 +299,10 @@ def separate(
     max_pixels: int = Options.max_pixels,
     base_model: str | None = Options.base_model,
     quantization: Quantization | None = Options.quantization,
+    offload: Offload = Options.offload,
+    transformer: str | None = Options.transformer,
+    fast_lora: str | None = Options.fast_lora,
+    guidance: float | None = Options.guidance,
     steps: int | None = Options.steps,
     ensemble_size: int = Options.ensemble_size,
     no_guided_upsampling: bool = Options.no_guided_upsampling,
@@ -315,6 +322,10 @@ def separate(
         device=device,
         base_model=base_model,
         quantization=quantization,
+        offload=offload,
+        transformer=transformer,
+        fast_lora=fast_lora,
+        guidance=guidance,
         steps=steps,
         ensemble_size=ensemble_size,
         no_guided_upsampling=no_guided_upsampling,
@@ -330,9 +341,7 @@ def separate(
     )
 
 
-def _open_pipeline(
-    model: str, device: str, base_model: str | None, quantization: Quantization | None
-) -> DecompositionPipeline:
+def _open_pipeline(model: str, **options: Any) -> DecompositionPipeline:  # noqa: ANN401  (those of load_pipeline)
     try:
         from brewster.models.diffusion.pipeline import load_pipeline  # noqa: PLC0415  (imports torch)
     except ImportError as error:
@@ -341,7 +350,7 @@ def _open_pipeline(
             f"expected {error.name}, because the model {model} needs it",
             "run: pip install 'brewster[diffusion]'",
         ) from error
-    return load_pipeline(model, device=device, base_model=base_model, quantization=quantization)
+    return load_pipeline(model, **options)
 
 
 def history_step(model: str, *, strength: float, quality: str, additive: bool) -> dict[str, str]:

@@ -1,4 +1,4 @@
-"""The table of diffusion models: what `brewster models list` says of them before anything is downloaded. It needs no torch."""
+"""The table of diffusion models, which `brewster models list` prints. This module needs no torch and no download."""
 
 from __future__ import annotations
 

@@ -1,16 +1,21 @@
 """Large image-editing diffusion models that separate photos by generating I, T and R as panels of one image.
 
-    backbones     the table of models: load one from the hub or a folder, or build a tiny version
-    families/     one Backbone class per model backbone_class: kontext, klein, qwen
+    backbones/    one Backbone class for each model (kontext, klein, qwen), their table, and how they are loaded
+    model_source  finds out what a value of --model is: a backbone, or a LoRA with its base
     panels        composes I, T and R into one image, and splits it again
-    memory        checks device, memory and disk before a download
+    memory        chooses where the weights are, and checks device, memory and disk before a download
+    offloading    weights in host memory, and decoding in tiles, for small GPUs
+    cost          counts parameters and operations; the table of graphics cards
     prompt        the paper's prompt, encoded once
     text_encoders where the text encoders are loaded
     task          which panels to generate, their size, and the sampling method
     sampling      generates panels from noise, step by step as the pipelines of diffusers do
     pipeline      a backbone with its LoRA and prompt: photo in, panels out
     adapter/      LoRA files that diffusers can load, and their upload to the hub
-    tensors       safetensors files with metadata
+    gensirr       converts the checkpoint of GenSIRR
+    hub_download  finds files of the hub in the cache, or downloads them
+    tensors       safetensors files with metadata, and JSON files
+    out_of_memory converts out-of-memory errors
     lazy_imports  imports diffusers, transformers and peft at their first use
 
 Importing this package imports torch, but none of the other libraries.

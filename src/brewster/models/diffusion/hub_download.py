@@ -8,6 +8,7 @@ from __future__ import annotations
 import contextlib
 import shutil
 import sys
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, Final
 
@@ -36,12 +37,84 @@ def resolve_model_folder(source: str, patterns: list[str]) -> Path:
     if Path(source).is_dir():
         return Path(source)
     hub, errors = import_library("huggingface_hub"), import_library("huggingface_hub.errors")
-    page = f"https://huggingface.co/{source}"
-    # If the hub cannot be asked, the download itself reports why, or finds the files in the cache.
+    # If this request fails, the download reports the reason, or finds the files in the cache.
     with contextlib.suppress(errors.HfHubHTTPError, errors.HFValidationError, errors.DryRunError, OSError):
         _announce_download(hub, source, patterns)
-    try:
+    with _translate_hub_errors(source):
         return Path(hub.snapshot_download(source, allow_patterns=patterns))
+
+
+def cached_model_folder(source: str, patterns: list[str]) -> Path | None:
+    """Returns the local folder of a model if it is a folder or in the cache, and downloads nothing.
+
+    Raises:
+        MissingExtra: huggingface_hub is not installed.
+    """
+    if Path(source).is_dir():
+        return Path(source)
+    hub = import_library("huggingface_hub")
+    with contextlib.suppress(OSError, ValueError):
+        return Path(hub.snapshot_download(source, allow_patterns=patterns, local_files_only=True))
+    return None
+
+
+def list_root_files(source: str) -> list[str]:
+    """The names of the files of a folder or a repository on the hub, without those in subfolders.
+
+    Without a network connection, these are the files in the cache.
+
+    Raises:
+        DownloadError, ModelError, MissingExtra: see `resolve_model_folder`.
+    """
+    if folder := Path(source) if Path(source).is_dir() else None:
+        return sorted(path.name for path in folder.iterdir() if path.is_file())
+    hub, errors = import_library("huggingface_hub"), import_library("huggingface_hub.errors")
+    with _translate_hub_errors(source):
+        try:
+            return sorted(name for name in hub.HfApi().list_repo_files(source) if "/" not in name)
+        except (errors.HfHubHTTPError, errors.HFValidationError):
+            raise
+        except (OSError, errors.HTTPError):
+            folder = Path(hub.snapshot_download(source, local_files_only=True))
+            return sorted(path.name for path in folder.iterdir() if path.is_file())
+
+
+def find_weights_file(source: str, suffixes: tuple[str, ...], companions: Sequence[str] = ()) -> Path:
+    """The file with the weights of a LoRA or a transformer, downloaded if it is on the hub.
+
+    Args:
+        source: a file, a folder or hub id with one file that has such a suffix, or OWNER/NAME/FILE on the hub. Subfolders
+            are not searched.
+        suffixes: the possible suffixes.
+        companions: other files that are downloaded with it, if they exist.
+
+    Raises:
+        ModelError: the folder or repository does not have exactly one such file, or `source` is none of these.
+        DownloadError, MissingExtra: see `resolve_model_folder`.
+    """
+    if Path(source).is_file():
+        return Path(source)
+    repository, _, name = source.rpartition("/") if source.endswith(suffixes) else (source, "", "")
+    expected = f"expected one {' or '.join(suffixes)} file"
+    if not repository:
+        raise ModelError(f"there is no file {source}", expected, "check the path")
+    names = [name] if name else [each for each in list_root_files(source) if each.endswith(suffixes)]
+    if len(names) != 1:
+        raise ModelError(
+            f"{source} contains {', '.join(names) or 'no such file'}",
+            expected,
+            "pass the path of the file, or OWNER/NAME/FILE for a file on the hub",
+        )
+    return resolve_model_folder(repository, [*names, *companions]) / names[0]
+
+
+@contextlib.contextmanager
+def _translate_hub_errors(source: str) -> Iterator[None]:
+    """Converts the exceptions of huggingface_hub to brewster's errors."""
+    errors = import_library("huggingface_hub.errors")
+    page = f"https://huggingface.co/{source}"
+    try:
+        yield
     except errors.GatedRepoError as error:
         raise _gated_error(error, source, page) from error
     except errors.RepositoryNotFoundError as error:
@@ -81,11 +154,8 @@ def is_transformer_cached(hub_id: str) -> bool:
     Raises:
         MissingExtra: huggingface_hub is not installed.
     """
-    hub = import_library("huggingface_hub")
-    with contextlib.suppress(OSError, ValueError):
-        folder = Path(hub.snapshot_download(hub_id, allow_patterns=["transformer/*"], local_files_only=True))
-        return any(folder.glob("transformer/*.safetensors"))
-    return False
+    folder = cached_model_folder(hub_id, ["transformer/*"])
+    return folder is not None and any(folder.glob("transformer/*.safetensors"))
 
 
 def has_hub_token() -> bool:
@@ -134,7 +204,7 @@ def _announce_download(hub: Any, source: str, patterns: list[str]) -> None:  # n
 
     Raises:
         DownloadError: the files do not fit on the disk of the cache.
-        Exception: those of huggingface_hub, if the hub cannot be asked.
+        Exception: an exception of huggingface_hub, if the request fails.
     """
     planned = hub.snapshot_download(source, allow_patterns=patterns, dry_run=True)
     size = sum(file.file_size or 0 for file in planned if file.will_download)

@@ -8,7 +8,7 @@ Setup" concatenates T and R with I as the control image. Therefore the list of p
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, Literal, final, get_args
 
@@ -175,6 +175,46 @@ def fit_panel(
         PhotoError: the photo is smaller than its panel and would have to be enlarged, or its aspect ratio is so
             extreme that no panel fits the budget.
     """
+    area = max_composite_pixels // len(layout.panels)
+    fit = next(_panel_fits(size, area, size_divisor), None)
+    if fit is None:
+        raise PhotoError(
+            f"no panel with the aspect ratio of {size[0]} x {size[1]} pixels fits into {area} pixels",
+            f"expected that both sides of the panel have at least {size_divisor} pixels",
+            "crop the photo or raise max_composite_pixels",
+        )
+    if not _enlarges(fit, size):
+        return fit
+    max_allowed_pixels = math.prod(side // size_divisor * size_divisor for side in size) * len(layout.panels)
+    raise PhotoError(
+        f"the photo has {size[0]} x {size[1]} pixels",
+        f"expected at least {fit.content[0]} x {fit.content[1]}, the size of a panel",
+        f"lower max_composite_pixels to {max_allowed_pixels}"
+        if max_allowed_pixels
+        else f"use a photo with sides of at least {size_divisor} pixels",
+    )
+
+
+def fit_smaller_panel(
+    size: tuple[int, int], layout: PanelLayout, *, max_composite_pixels: int, size_divisor: int
+) -> PanelFit:
+    """As `fit_panel`, but a photo that is smaller than its panel gets a smaller panel.
+
+    Raises:
+        PhotoError: the photo has fewer than `size_divisor` pixels on a side, or its aspect ratio is too extreme.
+    """
+    fits = _panel_fits(size, max_composite_pixels // len(layout.panels), size_divisor)
+    if fit := next((fit for fit in fits if not _enlarges(fit, size)), None):
+        return fit
+    raise PhotoError(
+        f"the photo has {size[0]} x {size[1]} pixels",
+        f"expected at least {size_divisor} pixels a side, and a less extreme aspect ratio",
+        "crop it, or use the compact model",
+    )
+
+
+def _panel_fits(size: tuple[int, int], area: int, size_divisor: int) -> Iterator[PanelFit]:
+    """The fits of a photo into panels of at most `area` pixels, largest first."""
     short, long = min(size), max(size)
     if short < 1:
         raise PhotoError(
@@ -182,19 +222,11 @@ def fit_panel(
             "expected at least one pixel a side",
             "check the file",
         )
-    area = max_composite_pixels // len(layout.panels)
     upper_bound = math.isqrt(area * short // long + 1) + size_divisor
     for short_side in range(upper_bound // size_divisor * size_divisor, 0, -size_divisor):
         long_side = max(size_divisor, round(short_side * long / short / size_divisor) * size_divisor)
         if short_side * long_side <= area:
-            fit = _fit(size, (short_side, long_side) if size[0] <= size[1] else (long_side, short_side))
-            _check_not_enlarged(size, fit, layout, size_divisor)
-            return fit
-    raise PhotoError(
-        f"no panel with the aspect ratio of {size[0]} x {size[1]} pixels fits into {area} pixels",
-        f"expected that both sides of the panel have at least {size_divisor} pixels",
-        "crop the photo or raise max_composite_pixels",
-    )
+            yield _fit(size, (short_side, long_side) if size[0] <= size[1] else (long_side, short_side))
 
 
 def _fit(size: tuple[int, int], panel: tuple[int, int]) -> PanelFit:
@@ -206,17 +238,8 @@ def _fit(size: tuple[int, int], panel: tuple[int, int]) -> PanelFit:
     return PanelFit((width, height), panel)
 
 
-def _check_not_enlarged(size: tuple[int, int], fit: PanelFit, layout: PanelLayout, size_divisor: int) -> None:
-    if fit.content[0] <= size[0] and fit.content[1] <= size[1]:
-        return
-    max_allowed_pixels = math.prod(side // size_divisor * size_divisor for side in size) * len(layout.panels)
-    raise PhotoError(
-        f"the photo has {size[0]} x {size[1]} pixels",
-        f"expected at least {fit.content[0]} x {fit.content[1]}, the size of a panel",
-        f"lower max_composite_pixels to {max_allowed_pixels}"
-        if max_allowed_pixels
-        else f"use a photo with sides of at least {size_divisor} pixels",
-    )
+def _enlarges(fit: PanelFit, size: tuple[int, int]) -> bool:
+    return fit.content[0] > size[0] or fit.content[1] > size[1]
 
 
 def _check_size(image: Tensor, size: tuple[int, int]) -> None:

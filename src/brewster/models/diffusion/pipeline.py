@@ -11,42 +11,42 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, final
 
 import torch
 from torch import Tensor
 
-from brewster.errors import DeviceError, ModelError
-from brewster.models.diffusion.adapter.layouts import LAYOUTS, LoraLayout, layout_of
-from brewster.models.diffusion.adapter.lora import LORA_FILE, LoraMetadata
+from brewster.errors import ModelError
+from brewster.models.diffusion.adapter.importer import find_lora_file, read_layers
+from brewster.models.diffusion.adapter.stacking import stack_layers
 from brewster.models.diffusion.backbones.backbone import Backbone
-from brewster.models.diffusion.backbones.registry import (
-    BACKBONES,
-    INDEX_FILE,
-    backbone_class_of,
-    encode_prompt,
-    load_backbone,
+from brewster.models.diffusion.backbones.loading import encode_prompt, load_backbone
+from brewster.models.diffusion.hub_download import find_weights_file
+from brewster.models.diffusion.memory import (
+    Placement,
+    check_machine,
+    choose_placement,
+    count_weights,
+    torch_device,
 )
-from brewster.models.diffusion.hub_download import resolve_model_folder
-from brewster.models.diffusion.memory import check_machine, choose_quantization
+from brewster.models.diffusion.model_source import ModelSource, digest_file, find_model_source
+from brewster.models.diffusion.offloading import offload_layers
 from brewster.models.diffusion.out_of_memory import explain_out_of_memory
 from brewster.models.diffusion.panels import PanelLayout, compose, conditioning_image, split
 from brewster.models.diffusion.prompt import PROMPT_FILE, PROMPTS, PromptEmbedding, load_prompt
 from brewster.models.diffusion.sampling import euler, sample
-from brewster.models.diffusion.task import TASK_FILE, DecompositionTask, load_task
-from brewster.models.diffusion_models import DIFFUSION_MODELS
-from brewster.models.zoo import TINY_PREFIX, model_name
-from brewster.options import Quantization
+from brewster.models.diffusion.task import DecompositionTask
+from brewster.models.zoo import model_name
+from brewster.options import Offload, Quantization
 
 if TYPE_CHECKING:
     from jaxtyping import Float
 
+TRANSFORMER_SUFFIXES: Final = (".gguf", ".safetensors")
+"""The suffixes of files with the weights of a transformer."""
 _MEMORY_HINT: Final = "use a quantized or a smaller backbone"
-_FINGERPRINT_BYTES: Final = 1 << 20
-"""The number of bytes at the start and at the end of a file that `fingerprint` reads."""
-_DEVICES: Final = {"auto": "", "cuda": "cuda", "rocm": "cuda", "cpu": "cpu"}
 
 
 @final
@@ -147,6 +147,10 @@ def load_pipeline(
     device: str = "auto",
     base_model: str | None = None,
     quantization: Quantization | None = None,
+    offload: Offload = "auto",
+    transformer: str | None = None,
+    fast_lora: str | None = None,
+    guidance: float | None = None,
     prompt: str = "detailed",
 ) -> DecompositionPipeline:
     """Loads a LoRA with its base model, or a backbone without a LoRA.
@@ -157,47 +161,59 @@ def load_pipeline(
         base_model: the folder or hub id of the LoRA's base model; by default the one used in training. Only for a LoRA.
         quantization: the quantization of the base model; by default the one used in training, or int8 or nf4 if only these fit into
             the GPU, and none on the CPU.
+        offload: "layers" keeps the weights of the transformer in host memory and copies each block to the GPU while it
+            computes; "auto" does this only if they do not fit into the free GPU memory.
+        transformer: a single file (.gguf or .safetensors) whose weights replace those of the base's transformer; see
+            `find_weights_file`.
+        fast_lora: a LoRA for sampling in few steps, which is added to that of the model; see `find_weights_file`.
+        guidance: the guidance scale, by default that of the task. With a LoRA for few steps and classifier-free guidance, the
+            default is 1, which saves the second prediction.
         prompt: for a backbone without a LoRA: a name in `PROMPTS`, or the text itself. A finetuned backbone with a
             stored prompt uses that one.
 
     Raises:
         DownloadError: no access to a gated model, an invalid token, or no network connection.
-        ModelError: a file is missing or damaged, the LoRA belongs to another backbone, or the name is unknown.
-        DeviceError: there is no such device, or it is out of memory; the message says what to reduce.
+        ModelError: a file is missing or damaged, a LoRA belongs to another backbone, the name is unknown, or a LoRA for
+            few steps is given for a model that takes one step.
+        DeviceError: there is no such device, it is out of memory, or the weights cannot be offloaded; the message says
+            what to change.
         MissingExtra: diffusers, torchao or bitsandbytes is not installed.
     """
-    device_name = torch_device(device)
-    lora = _find_lora(model)
-    if lora:
-        return _load_with_lora(model, lora, device, base_model, quantization)
-    if base_model:
-        raise ModelError(
-            f"{model} is a backbone, and the base model {base_model} was given for it",
-            f"expected a base model only for a LoRA, which is a folder with {LORA_FILE}",
-            "leave the base model out",
-        )
-    digest = fingerprint(model, device=device, quantization=quantization, prompt=prompt)
-    quantization = quantization or choose_quantization(model, device_name)
+    torch_device(device)
+    source = find_model_source(model, base_model)
+    if fast_lora:
+        _check_takes_steps(model, source.task)
+    transformer_file = find_weights_file(transformer, TRANSFORMER_SUFFIXES) if transformer else None
+    placement = _choose_placement(source, device, quantization, offload, transformer_file)
     check_machine(
-        model, requested=device, device=device_name, quantization=quantization, with_text_encoders=True
+        source.base,
+        source.backbone_class,
+        placement,
+        requested=device,
+        with_text_encoders=source.needs_text_encoders,
+        transformer_file=transformer_file,
     )
+    fast_lora_file = find_lora_file(fast_lora) if fast_lora else None
+    text = PROMPTS.get(prompt, prompt)
     # The prompt is encoded before the backbone is loaded, because memory may be too small for both.
-    embedding, task = _prompt_and_task(model, PROMPTS.get(prompt, prompt), device_name)
-    backbone = load_backbone(model, device=device_name, quantization=quantization)
+    embedding = None if source.layout else _embed(source, text, placement.device)
+    backbone = _load_base(source.base, placement, transformer_file)
+    fast_layers = read_layers(fast_lora_file, backbone) if fast_lora_file else {}
+    if source.layout and source.folder:
+        _, embedding = source.layout.load(source.folder, backbone)
+    assert embedding is not None
+    if fast_layers:
+        stack_layers(backbone, fast_layers)
+    if placement.is_offloaded:
+        offload_layers(backbone, placement.device)
+    task = task_with_guidance(source, guidance, is_fast=bool(fast_lora))
+    changes = {
+        "transformer": digest_file(transformer_file) if transformer_file else None,
+        "fast LoRA": hashlib.sha256(fast_lora_file.read_bytes()).hexdigest() if fast_lora_file else None,
+        "guidance": None if task.guidance == source.task.guidance else task.guidance,
+    }
+    digest = _digest(source, placement.quantization, text, changes)
     return DecompositionPipeline(backbone, embedding, task, model_name(model), digest)
-
-
-def _prompt_and_task(model: str, text: str, device: str) -> tuple[PromptEmbedding, DecompositionTask]:
-    """Those stored with a finetuned base model, which has no text encoder; otherwise the encoded text, and panel T only."""
-    task = DecompositionTask(PanelLayout(("T",)))
-    if model in BACKBONES or model.startswith(TINY_PREFIX):
-        return encode_prompt(model, text, device=device), task
-    folder = resolve_model_folder(model, [INDEX_FILE, PROMPT_FILE, TASK_FILE])
-    if (folder / TASK_FILE).is_file():
-        task = load_task(folder / TASK_FILE)
-    if (folder / PROMPT_FILE).is_file():
-        return load_prompt(folder / PROMPT_FILE, backbone_class_of(model).name), task
-    return encode_prompt(model, text, device=device), task
 
 
 def fingerprint(
@@ -208,112 +224,76 @@ def fingerprint(
     quantization: Quantization | None = None,
     prompt: str = "detailed",
 ) -> str:
-    """The SHA-256 of what `load_pipeline` would load: LoRA, prompt, base_model, and the quantization of the base model.
+    """The SHA-256 of what `load_pipeline` would load: LoRA, prompt, base model, and the quantization of the base model.
 
-    A base model on the hub is identified by its name. A base model in a folder is identified by the names, sizes, and first and
-    last MiB of its files, because reading them completely takes a minute.
+    See `ModelSource.digest_parts` for how a base model is identified.
 
     Raises:
         ModelError, DownloadError: the LoRA does not exist or is damaged.
         DeviceError: diffusion models do not run on this device.
     """
-    lora = _find_lora(model)
-    if lora is None:
-        quantization = quantization or choose_quantization(model, torch_device(device))
-        parts = [_source_id(model), str(quantization), PROMPTS.get(prompt, prompt)]
-    else:
-        layout, folder = lora
-        metadata = layout.read_metadata(folder)
-        weights = hashlib.sha256((folder / layout.weights).read_bytes()).hexdigest()
-        source = base_model or metadata.base_model
-        quantization = _base_quantization(metadata, source, torch_device(device), quantization)
-        parts = [weights, metadata.prompt_sha256, _source_id(source), str(quantization)]
+    source = find_model_source(model, base_model)
+    placement = _choose_placement(source, device, quantization, "auto", None)
+    return _digest(source, placement.quantization, PROMPTS.get(prompt, prompt), {})
+
+
+def _digest(source: ModelSource, quantization: str | None, text: str, changes: Mapping[str, object]) -> str:
+    """The digest of a model. `changes` are the options that change its result, by name; None for those that are not set."""
+    parts = [*source.digest_parts(), str(quantization)]
+    if source.layout is None:
+        parts.append(text)
+    parts += [f"{name} {value}" for name, value in changes.items() if value is not None]
     return hashlib.sha256("\0".join(parts).encode()).hexdigest()
 
 
-def _source_id(source: str) -> str:
-    """The digest of a folder's files; for any other source its name."""
-    folder, digest = Path(source), hashlib.sha256()
-    if source in BACKBONES or not folder.is_dir():
-        return source
-    for path in sorted(path for path in folder.rglob("*") if path.is_file()):
-        digest.update(f"{path.relative_to(folder)} {path.stat().st_size}\0".encode())
-        with path.open("rb") as file:
-            digest.update(file.read(_FINGERPRINT_BYTES))
-            file.seek(max(0, path.stat().st_size - _FINGERPRINT_BYTES))
-            digest.update(file.read())
-    return digest.hexdigest()
-
-
-def _base_quantization(
-    metadata: LoraMetadata, base_model: str, device: str, quantization: Quantization | None
-) -> Quantization | None:
-    """The requested quantization; by default the one used in training, or a smaller one that fits; none on the CPU."""
-    return quantization or choose_quantization(base_model, device, metadata.quantization)
-
-
-def torch_device(device: str) -> str:
-    """torch's name, "cuda" or "cpu", for a value of the option --device.
-
-    Raises:
-        DeviceError: diffusion models do not run on this device.
-    """
-    if device not in _DEVICES:
-        raise DeviceError(
-            f"diffusion models do not run on {device}",
-            f"expected one of {', '.join(_DEVICES)}",
-            "use --device auto",
-        )
-    return _DEVICES[device] or ("cuda" if torch.cuda.is_available() else "cpu")
-
-
-def _find_lora(model: str) -> tuple[LoraLayout, Path] | None:
-    """The layout and the folder of a LoRA, downloaded if it is on the hub; None for a backbone."""
-    if model in BACKBONES or model.startswith(TINY_PREFIX):
-        return None
-    source = DIFFUSION_MODELS[model].hub_id if model in DIFFUSION_MODELS else model
-    folder = resolve_model_folder(source, [name for layout in LAYOUTS for name in layout.files])
-    if layout := layout_of(folder):
-        return layout, folder
-    if not (folder / INDEX_FILE).is_file():
-        raise ModelError(
-            f"{model} contains no model",
-            f"expected a LoRA ({LORA_FILE}) or a backbone in diffusers' layout ({INDEX_FILE})",
-            "pass the folder lora/ that brewster train wrote, or convert a LoRA with: brewster models import",
-        )
-    return None
-
-
-def _load_with_lora(
-    model: str,
-    lora: tuple[LoraLayout, Path],
-    requested: str,
-    base_model: str | None,
+def _choose_placement(
+    source: ModelSource,
+    device: str,
     quantization: Quantization | None,
-) -> DecompositionPipeline:
-    layout, folder = lora
-    metadata, device = layout.read_metadata(folder), torch_device(requested)
-    source = base_model or metadata.base_model
-    if base_model is None and _is_local(source) and not Path(source).is_dir():
-        raise ModelError(
-            f"the base model of {model} was {source}, which does not exist",
-            f"expected a {metadata.backbone} in diffusers' layout",
-            "pass its folder or hub id with --base-model",
-        )
-    backbone_class = backbone_class_of(source)  # checked before the download, which may take an hour
-    if backbone_class.name != metadata.backbone:
-        raise ModelError(
-            f"{model} is a LoRA of {metadata.backbone}",
-            f"expected a base model of {metadata.backbone}, not of {backbone_class.name}",
-            "choose another base model",
-        )
-    quantization = _base_quantization(metadata, source, device, quantization)
-    check_machine(source, requested=requested, device=device, quantization=quantization)
-    backbone = load_backbone(source, device=device, quantization=quantization)
-    metadata, prompt = layout.load(folder, backbone)
-    digest = fingerprint(model, device=requested, base_model=base_model, quantization=quantization)
-    return DecompositionPipeline(backbone, prompt, metadata.task, model_name(model), digest)
+    offload: Offload,
+    transformer_file: Path | None,
+) -> Placement:
+    return choose_placement(
+        count_weights(source.base, source.backbone_class, transformer_file),
+        requested=device,
+        quantization=quantization,
+        preferred=source.trained_quantization,
+        offload=offload,
+        is_single_file=transformer_file is not None,
+    )
 
 
-def _is_local(source: str) -> bool:
-    return Path(source).is_absolute() or source.startswith((".", "~"))
+def _embed(source: ModelSource, text: str, device: str) -> PromptEmbedding:
+    """The prompt that is stored with a finetuned backbone, which has no text encoder; otherwise the encoded text."""
+    if source.has_prompt and source.folder:
+        return load_prompt(source.folder / PROMPT_FILE, source.backbone_class.name)
+    return encode_prompt(source.base, text, device=device)
+
+
+def _load_base(base: str, placement: Placement, transformer_file: Path | None) -> Backbone:
+    """Loads the base to its device, or to host memory in the precision of the device."""
+    device = "cpu" if placement.is_offloaded else placement.device
+    dtype = torch.float32 if placement.device == "cpu" else torch.bfloat16
+    return load_backbone(
+        base,
+        device=device,
+        dtype=dtype,
+        quantization=placement.quantization,
+        transformer_file=transformer_file,
+    )
+
+
+def _check_takes_steps(model: str, task: DecompositionTask) -> None:
+    if task.objective != "flow":
+        raise ModelError(
+            f"a LoRA for few steps was given for {model}, which takes one step",
+            "expected a model that samples in several steps",
+            "leave the LoRA for few steps out",
+        )
+
+
+def task_with_guidance(source: ModelSource, guidance: float | None, *, is_fast: bool) -> DecompositionTask:
+    """The task of a model with this guidance. By default it is that of the task; see `load_pipeline` for `is_fast`."""
+    if guidance is None and is_fast and not source.backbone_class.guided_by_embedding:
+        guidance = 1.0
+    return source.task if guidance is None else replace(source.task, guidance=guidance)

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
-from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from functools import cache
 from pathlib import Path
@@ -12,9 +10,9 @@ from typing import Annotated, Final, Literal, final
 
 from pydantic import Field, TypeAdapter
 
-from brewster.errors import ModelError, PhotoError, RecipeError
+from brewster.errors import ModelError, RecipeError
 from brewster.files import write_atomically
-from brewster.models.diffusion.panels import PanelFit, PanelLayout, fit_panel
+from brewster.models.diffusion.panels import PanelFit, PanelLayout, fit_smaller_panel
 from brewster.models.diffusion.sampling import GUIDANCE, STEPS
 
 Objective = Literal["flow", "one_step"]
@@ -81,16 +79,11 @@ class DecompositionTask:
         Raises:
             PhotoError: the photo has fewer than `size_divisor` pixels on a side, or its aspect ratio is too extreme.
         """
-        max_cells = self.max_composite_pixels // (len(self.layout.panels) * size_divisor**2)
-        cells = min(max_cells, math.prod(-(-side // size_divisor) for side in size))
-        for cell_count in range(cells, 0, -1):
-            budget = cell_count * len(self.layout.panels) * size_divisor**2
-            with suppress(PhotoError):
-                return fit_panel(size, self.layout, max_composite_pixels=budget, size_divisor=size_divisor)
-        raise PhotoError(
-            f"the photo has {size[0]} x {size[1]} pixels",
-            f"expected at least {size_divisor} pixels a side, and a less extreme aspect ratio",
-            "crop it, or use the compact model",
+        return fit_smaller_panel(
+            size,
+            self.layout,
+            max_composite_pixels=self.max_composite_pixels,
+            size_divisor=size_divisor,
         )
 
 

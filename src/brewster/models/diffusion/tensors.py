@@ -1,4 +1,4 @@
-"""Reading and writing of safetensors files. The same tensors and metadata always give the same bytes."""
+"""Reads and writes the files of models: safetensors and JSON. The same tensors and metadata always give the same bytes."""
 
 from __future__ import annotations
 
@@ -52,6 +52,29 @@ def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
             "expected a complete safetensors file",
             "copy or write it again",
         ) from error
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """The JSON object in a file of a model.
+
+    Raises:
+        ModelError: the file is missing or damaged, or contains no object.
+    """
+    try:
+        value = json.loads(path.read_text("utf-8"))
+    except FileNotFoundError as error:
+        raise ModelError(
+            f"{path} is missing", "expected a complete model", "copy or download it again"
+        ) from error
+    except (OSError, ValueError) as error:
+        raise ModelError(
+            f"{path} is not JSON: {error}", "expected a complete JSON file", "copy or download it again"
+        ) from error
+    if not isinstance(value, dict):
+        raise ModelError(
+            f"{path} contains no settings", "expected a JSON object", "copy or download it again"
+        )
+    return value
 
 
 def _header(data: bytes) -> dict[str, Any]:

@@ -18,7 +18,7 @@ def check_text_encoders(folder: Path, parts: Iterable[str]) -> None:
     """Checks that the folder of a model has all text encoders and tokenizers among the parts in its index.
 
     Raises:
-        ModelError: one is missing; the message says how to do without.
+        ModelError: a text encoder or tokenizer is missing; the message says what to do.
     """
     names = [name for name in parts if name.startswith(("text_encoder", "tokenizer", "processor"))]
     missing = [name for name in names if not (folder / name).is_dir()]

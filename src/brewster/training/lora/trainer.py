@@ -34,8 +34,9 @@ from brewster.models.diffusion.adapter.lora import (
     save_lora,
 )
 from brewster.models.diffusion.backbones.backbone import Backbone
-from brewster.models.diffusion.backbones.registry import backbone_class_of, encode_prompt, load_backbone
-from brewster.models.diffusion.memory import check_machine
+from brewster.models.diffusion.backbones.loading import encode_prompt, load_backbone
+from brewster.models.diffusion.backbones.registry import backbone_class_of
+from brewster.models.diffusion.memory import Placement, check_machine
 from brewster.models.diffusion.out_of_memory import explain_out_of_memory
 from brewster.models.diffusion.panels import PanelFit, split
 from brewster.models.diffusion.pipeline import DecompositionPipeline
@@ -95,9 +96,9 @@ class LoraTrainer:
         _check_optimizer(recipe, self._device)
         check_machine(
             recipe.backbone,
+            self._backbone_class,
+            Placement(self._device, recipe.quantization),
             requested=device,
-            device=self._device,
-            quantization=recipe.quantization,
             with_text_encoders=not recipe.prompt.endswith(ENCODED_SUFFIX),
         )
         self._prompt: PromptEmbedding | None = None

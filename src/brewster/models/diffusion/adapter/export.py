@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from brewster.errors import ModelError, OutputError
 from brewster.models.diffusion.adapter.lora import read_lora, read_prompt
 from brewster.models.diffusion.backbones.backbone import Backbone
-from brewster.models.diffusion.backbones.registry import load_backbone
+from brewster.models.diffusion.backbones.loading import load_backbone
 from brewster.models.diffusion.prompt import PROMPT_FILE
 from brewster.models.diffusion.tensors import write_tensors
 
@@ -48,13 +48,13 @@ def export_comfyui(folder: Path, target: Path) -> None:
 def export_merged(folder: Path, target: Path, base_model: str | None = None) -> None:
     """Adds the LoRA to the weights of its base, and writes the result as a folder in diffusers' layout, in bfloat16.
 
-    The sums are computed in float32 on the CPU. The folder also gets the encoded prompt, but no text encoders. It is for
-    programs that cannot load a LoRA; brewster itself needs the LoRA, which also contains its panels.
+    The sums are computed in float32 on the CPU. The folder also gets the encoded prompt, but no text encoders. The folder is
+    for programs that cannot load a LoRA. For brewster use the LoRA, because its metadata contain the panels.
 
     Args:
         folder: the folder of the LoRA.
         target: the folder to write.
-        base: the folder or hub id of the base, if it has moved since training.
+        base_model: the folder or hub id of the base, if it has moved since training.
 
     Raises:
         ModelError: the LoRA or its base is missing or damaged, or they do not match.

@@ -3,7 +3,7 @@
     layers = read_lora_layers(tensors, backbone.transformer, "kontext", scaling_from_config(settings))
     attach_layers(backbone, layers)         # in lora.py
 
-Ranks and adapted layers may be any. The scale alpha / rank of a layer is multiplied into its B matrix, so the change of a
+Any rank and any selection of layers are accepted. The scale alpha / rank of a layer is multiplied into its B matrix, so the change of a
 layer's weight is B @ A. Keys that are not understood are an error, never ignored.
 """
 
@@ -30,7 +30,7 @@ _PREFIXES: Final = {
     "lora_unet_": "kohya",
     "lora_transformer_": "kohya",
 }
-"""Prefix of a key -> the program that writes it. A key may have several."""
+"""Prefix of a key -> the program that writes it. A key may have several of these prefixes."""
 _KEY: Final = re.compile(
     r"(?P<module>.+?)\.(?:(?P<matrix>lora_A|lora_B|lora_down|lora_up)(?:\.(?!weight$)[^.]+)?\.weight|(?P<alpha>alpha))"
 )
@@ -86,8 +86,8 @@ _ORIGINAL_NAMES: Final[dict[str, dict[str, dict[str, tuple[str, ...]]]]] = {
         },
     },
 }  # fmt: skip
-"""Backbone -> prefix -> layer in the original code of the model -> its layers in diffusers. Several layers in diffusers
-have their rows one after the other in the original layer. Qwen has the same names in both."""
+"""Backbone -> prefix -> layer in the original code of the model -> its layers in diffusers. If an original
+layer has several layers in diffusers, its rows are their rows, one layer after the other. Qwen has the same names in both."""
 _BLOCKS: Final = {"double_blocks.{}.": "transformer_blocks", "single_blocks.{}.": "single_transformer_blocks"}
 _SCALE_SHIFT_SWAPPED: Final = "norm_out.linear"
 """The layer whose two halves, scale and shift, have the opposite order in the original code."""

@@ -11,9 +11,8 @@ The values of the task (time 0.499, latents minus prediction, square tiles, no g
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 from torch import Tensor
 
@@ -25,7 +24,8 @@ from brewster.models.diffusion.backbones.qwen import Qwen
 from brewster.models.diffusion.panels import PanelLayout
 from brewster.models.diffusion.prompt import PromptEmbedding
 from brewster.models.diffusion.task import DecompositionTask
-from brewster.models.diffusion.tensors import read_tensors
+from brewster.models.diffusion.tensors import read_json, read_tensors
+from brewster.options import Quantization
 
 INDEX_FILE: Final = "model_index.json"
 CONFIG_FILE: Final = "transformer_lora/adapter_config.json"
@@ -33,6 +33,11 @@ WEIGHTS_FILE: Final = "transformer_lora/pytorch_lora_weights.safetensors"
 PROMPT_FILE: Final = "text_embeddings/state_dict.safetensors"
 FILES: Final = (INDEX_FILE, CONFIG_FILE, WEIGHTS_FILE, PROMPT_FILE)
 
+BACKBONE: Final = Qwen
+QUANTIZATION: Final[Quantization] = "nf4"
+"""The quantization of the base in the published call."""
+SIDE_PX: Final = 768
+"""The processing resolution of the published model."""
 _TIME: Final = 0.499
 _PROMPT_TEXT: Final = "WindowSeat's trained embedding"
 
@@ -43,7 +48,7 @@ def read_metadata(folder: Path) -> LoraMetadata:
     Raises:
         ModelError: a file is missing or damaged, or lacks a value.
     """
-    index, config = _read_json(folder / INDEX_FILE), _read_json(folder / CONFIG_FILE)
+    index, config = read_json(folder / INDEX_FILE), read_json(folder / CONFIG_FILE)
     try:
         base, side = index["base_model"], int(index["processing_resolution"])
         rank, alpha = int(config["r"]), int(config["lora_alpha"])
@@ -65,17 +70,23 @@ def read_metadata(folder: Path) -> LoraMetadata:
             f"expected a multiple of {Qwen.size_divisor}",
             "download the model again",
         )
+    return LoraMetadata(
+        BACKBONE.name, base, QUANTIZATION, rank, alpha, published_task(side), _read_prompt(folder).sha256
+    )
+
+
+def published_task(side_px: int = SIDE_PX) -> DecompositionTask:
+    """The task of a model with this processing resolution."""
     # Panel I is the encoded photo, decoded again. It separates the errors of the VAE from the change by the model.
-    task = DecompositionTask(
+    return DecompositionTask(
         PanelLayout(("I", "T")),
-        max_composite_pixels=2 * side**2,
+        max_composite_pixels=2 * side_px**2,
         objective="direct",
         guidance=1.0,
         time=_TIME,
-        short_side_px=side,
+        short_side_px=side_px,
         square_tiles=True,
     )
-    return LoraMetadata(Qwen.name, base, "nf4", rank, alpha, task, _read_prompt(folder).sha256)
 
 
 def load(folder: Path, backbone: Backbone) -> tuple[LoraMetadata, PromptEmbedding]:
@@ -89,7 +100,7 @@ def load(folder: Path, backbone: Backbone) -> tuple[LoraMetadata, PromptEmbeddin
     """
     metadata, prompt = read_metadata(folder), _read_prompt(folder)
     tensors, _ = read_tensors(folder / WEIGHTS_FILE)
-    config = _read_json(folder / CONFIG_FILE)
+    config = read_json(folder / CONFIG_FILE)
     attach_layers(
         backbone, read_lora_layers(tensors, backbone.transformer, backbone.name, scaling_from_config(config))
     )
@@ -121,12 +132,3 @@ def _count_tokens(path: Path, mask: Tensor) -> int:
             "download the model again",
         )
     return count
-
-
-def _read_json(path: Path) -> dict[str, Any]:
-    try:
-        return dict(json.loads(path.read_text("utf-8")))
-    except (OSError, ValueError, TypeError) as error:
-        raise ModelError(
-            f"{path} cannot be read ({error})", "expected a JSON object", "download the model again"
-        ) from error

@@ -21,6 +21,7 @@ from torch.nn import functional
 
 from brewster.errors import ModelError
 from brewster.models.diffusion.lazy_imports import diffusers_class, suppress_warnings
+from brewster.models.diffusion.offloading import tiled_if_large
 from brewster.models.diffusion.prompt import PROMPT, PromptEmbedding
 
 if TYPE_CHECKING:
@@ -142,10 +143,12 @@ class Backbone(ABC):
 
     @torch.no_grad()
     def decode(self, latents: Float[Tensor, "n c h w"]) -> Float[Tensor, "n 3 16*h 16*w"]:
-        """Decodes latent grids to images, float32, about [-1, 1], not clamped."""
+        """Decodes latent grids to images, float32, about [-1, 1], not clamped. Large ones are decoded in tiles."""
         mean, deviation = self.statistics()
         grid = latents.to(self.vae.device).float() * deviation + mean
-        return self._vae_decode(functional.pixel_shuffle(grid, PATCH).to(self.vae.dtype)).float()
+        latents = functional.pixel_shuffle(grid, PATCH).to(self.vae.dtype)
+        with tiled_if_large(self.vae, pixels=grid[:, 0].numel() * self.size_divisor**2):
+            return self._vae_decode(latents).float()
 
     @abstractmethod
     def statistics(self) -> tuple[Tensor, Tensor]:
@@ -169,7 +172,7 @@ class Backbone(ABC):
         """
 
     @abstractmethod
-    def positions(self, latents: Tensor, condition: Tensor) -> Any:  # noqa: ANN401 - each backbone_class has its own kind
+    def positions(self, latents: Tensor, condition: Tensor) -> Any:  # noqa: ANN401 - each backbone has its own type
         """The position ids of the generated tokens, then of the conditioning tokens, as the transformer takes them."""
 
     @classmethod

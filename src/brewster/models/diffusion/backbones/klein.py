@@ -28,7 +28,7 @@ _CONDITION_TIME: Final = 10
 class Klein(ClassifierFreeBackbone):
     """FLUX.2 klein (Black Forest Labs 2026), the base model, with classifier-free guidance.
 
-    The distilled models of the backbone_class can be loaded too; they ignore the guidance.
+    The distilled models of FLUX.2 klein can be loaded too; they ignore the guidance.
     """
 
     name = "klein"
@@ -71,7 +71,7 @@ class Klein(ClassifierFreeBackbone):
         return norm.running_mean.float().view(1, -1, 1, 1), deviation.view(1, -1, 1, 1)
 
     def noise(self, size: tuple[int, int], seed: int) -> Tensor:
-        """See `Backbone.noise`. For this backbone_class, diffusers draws the noise on the packed grid.
+        """See `Backbone.noise`. For klein, diffusers draws the noise on the packed grid.
 
         Raises:
             ModelError: a side is not a multiple of 16.

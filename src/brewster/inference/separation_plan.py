@@ -1,0 +1,212 @@
+"""Estimates the memory, the time and the download of a separation with a diffusion model, before anything is downloaded.
+
+plan = plan_separation(Options(model="windowseat"), (4000, 3000), CARDS["RTX 4090"])
+print(plan.table())
+plan.check_fits()
+
+The plan needs no GPU and downloads nothing. It counts on a `skeleton` of the backbone, with the tiles that
+`DiffusionPredictor` would use.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final, final
+
+import torch
+
+from brewster.errors import DeviceError, ModelError
+from brewster.inference.diffusion_predictor import DiffusionPredictor
+from brewster.models.diffusion.backbones.registry import hub_id_of, is_registered, skeleton
+from brewster.models.diffusion.cost import (
+    EFFICIENCY,
+    PROMPT_TOKENS,
+    GraphicsCard,
+    block_bytes,
+    count_parameters,
+    forward_tflop,
+)
+from brewster.models.diffusion.hub_download import is_transformer_cached
+from brewster.models.diffusion.memory import (
+    GIB,
+    OFFLOADED_WEIGHTS_GIB,
+    Placement,
+    count_weights,
+    place_on_gpu,
+    weights_gib,
+)
+from brewster.models.diffusion.model_source import find_model_source
+from brewster.models.diffusion.offloading import DECODING_BYTES_PER_PIXEL
+from brewster.models.diffusion.pipeline import DecompositionPipeline, task_with_guidance
+from brewster.models.diffusion.task import DecompositionTask
+from brewster.models.diffusion_models import licence_of
+from brewster.models.zoo import TINY_PREFIX, is_diffusion_model
+from brewster.options import Options
+
+_CONTEXT_GIB: Final = 0.6
+"""GPU memory of the CUDA context."""
+_COPY_GB_PER_SECOND: Final = 10.0
+"""Assumed speed of copies from host memory to the GPU."""
+
+
+@final
+@dataclass(frozen=True)
+class SeparationPlan:
+    """The estimated resources of the separation of one photo on a graphics card.
+
+    `panels` are the (width, height) of the panels of each tile, in px. `passes` is the number of passes of the transformer, and `tflop` that of
+    their operations. `memory_gib` contains the GPU memory of each part.
+    """
+
+    model: str
+    licence: str
+    card: GraphicsCard
+    parameter_count: int
+    placement: Placement
+    panels: tuple[tuple[int, int], ...]
+    passes: int
+    tflop: float
+    memory_gib: dict[str, float]
+    download_gb: float
+    text_encoder_gb: float
+
+    @property
+    def total_gib(self) -> float:
+        """The peak GPU memory in GiB."""
+        return sum(self.memory_gib.values())
+
+    @property
+    def seconds(self) -> float:
+        """The time for the photo, in seconds, without loading. Offloaded weights are copied in each pass."""
+        copies = self.passes * self.placement.host_gib(self.parameter_count) * GIB / 1e9
+        return self.tflop / (EFFICIENCY * self.card.tflops) + copies / _COPY_GB_PER_SECOND
+
+    def table(self) -> str:
+        """Returns the plan as lines of name and value."""
+        tiles = ", ".join(
+            f"{count} of {width} x {height}" for (width, height), count in Counter(self.panels).items()
+        )
+        host = self.placement.host_gib(self.parameter_count)
+        rows = {
+            "model": f"{self.model}, {self.parameter_count / 1e9:.2f} billion parameters",
+            "licence": self.licence,
+            "weights": f"{self.placement.quantization or 'bf16'}, {'offloaded by layers' if host else 'on the GPU'}",
+            "tiles": f"{tiles} pixels a panel; {self.passes} passes of the transformer",
+            **{f"memory, {name}": f"{gib:.1f} GiB" for name, gib in self.memory_gib.items()},
+            "memory": f"{self.total_gib:.1f} GiB of {self.card.memory_gib:g} on {self.card.name} (estimate)",
+            "host memory": f"{host:.1f} GiB for the weights (estimate)",
+            "download": f"{self.download_gb:.0f} GB, of them {self.text_encoder_gb:.0f} GB text encoders (estimate)",
+            "per photo": f"{self.tflop:.0f} TFLOP, {self.seconds:.1f} s (estimate)",
+        }
+        return "\n".join(f"{name:24}{value}" for name, value in rows.items())
+
+    def check_fits(self) -> None:
+        """Checks that the separation fits into the memory of the card.
+
+        Raises:
+            DeviceError: it does not fit.
+        """
+        if self.total_gib > self.card.memory_gib:
+            raise DeviceError(
+                f"{self.model} needs about {self.total_gib:.1f} GiB",
+                f"expected at most the {self.card.memory_gib:g} GiB of {self.card.name}",
+                "use --offload layers, --quantization int8 or nf4, the model klein, or a larger card",
+            )
+
+
+def plan_separation(options: Options, size: tuple[int, int], card: GraphicsCard) -> SeparationPlan:
+    """Estimates the separation of a photo of this (width, height) on a card. This takes a few seconds.
+
+    A base that is neither a folder nor in the table of backbones is assumed to have the size of its backbone.
+
+    Raises:
+        ModelError: the model is unknown, is no diffusion model, or its files are damaged.
+        DownloadError: the metadata of the model is not in the cache.
+        PhotoError: the photo is too small for the model.
+        DeviceError: the weights cannot be offloaded with the requested quantization.
+        MissingExtra: diffusers is not installed.
+    """
+    if not is_diffusion_model(options.model):
+        raise ModelError(
+            f"a plan was requested for the model {options.model}",
+            "expected a diffusion model, because other models need less than 1 GB",
+            "leave the plan out",
+        )
+    source = find_model_source(options.model, options.base_model, allow_download=False)
+    is_known = is_registered(source.base) or Path(source.base).is_dir()
+    backbone = skeleton(source.base if is_known else source.backbone_class.name, dtype=torch.bfloat16)
+    task = task_with_guidance(source, options.guidance, is_fast=options.fast_lora is not None)
+    prompt = backbone.random_prompt(backbone.transformer, 0)
+    predictor = DiffusionPredictor(
+        DecompositionPipeline(backbone, prompt, task),
+        steps=options.steps,
+        ensemble_size=options.ensemble_size,
+    )
+    parameters = count_parameters(backbone.transformer)
+    file = _local_file(options.transformer) if options.transformer else None
+    placement = place_on_gpu(
+        count_weights(source.base, source.backbone_class, file) if file else parameters,
+        free_gib=card.memory_gib,
+        total_gib=card.memory_gib,
+        quantization=options.quantization,
+        preferred=source.trained_quantization,
+        offload=options.offload,
+        is_single_file=file is not None,
+    )
+    panels = predictor.panel_sizes(size, options.quality)
+    steps = predictor.sampling_steps(options.quality) * options.ensemble_size
+    is_guided_twice = task.guidance > 1 and not backbone.guided_by_embedding and not backbone.distilled
+    passes = steps * (2 if is_guided_twice else 1)
+    tokens = [_tokens(panel, task=task, size_divisor=backbone.size_divisor) for panel in panels]
+    tflop = {pair: forward_tflop(backbone, *pair) for pair in set(tokens)}
+    composites = 1 if task.objective == "direct" else len(task.layout.panels)
+    pixels = composites * max(width * height for width, height in panels)
+    block = max(block_bytes(backbone, sum(pair) + PROMPT_TOKENS) for pair in tokens)
+    is_stored = source.base.startswith(TINY_PREFIX) or Path(source.base).is_dir()
+    is_stored = is_stored or is_transformer_cached(hub_id_of(source.base))
+    encoders = 2e-9 * backbone.text_encoder_parameters if source.needs_text_encoders else 0.0
+    vae = count_parameters(backbone.vae)
+    return SeparationPlan(
+        options.model,
+        licence_of(hub_id_of(source.base)),
+        card,
+        parameters,
+        placement,
+        tuple(panels),
+        passes * len(panels),
+        passes * sum(tflop[pair] for pair in tokens),
+        {
+            "weights": OFFLOADED_WEIGHTS_GIB
+            if placement.is_offloaded
+            else file.stat().st_size / GIB
+            if file
+            else weights_gib(parameters, placement.quantization),
+            "VAE": 2 * vae / GIB,
+            "activations": max(block, pixels * DECODING_BYTES_PER_PIXEL) / GIB,
+            "CUDA": _CONTEXT_GIB,
+        },
+        0.0 if is_stored else 2e-9 * (vae + (0 if file else parameters)) + encoders,
+        0.0 if is_stored else encoders,
+    )
+
+
+def _local_file(transformer: str) -> Path:
+    path = Path(transformer)
+    if path.is_file():
+        return path
+    raise ModelError(
+        f"there is no file {transformer}",
+        "expected a file of this machine, because a plan downloads nothing",
+        "download the file first",
+    )
+
+
+def _tokens(panel: tuple[int, int], *, task: DecompositionTask, size_divisor: int) -> tuple[int, int]:
+    """The numbers of generated tokens and of conditioning tokens for a panel of this (width, height) in px."""
+    tokens = panel[0] * panel[1] // size_divisor**2
+    if task.objective == "direct":
+        return tokens, 0
+    generated = tokens * len(task.layout.panels)
+    return generated, generated if task.layout.has_white_space else tokens

@@ -1,0 +1,319 @@
+"""Loads backbones from the hub or from a folder, and encodes prompts with their text encoders.
+
+    prompt = encode_prompt("kontext", device="cuda")
+    backbone = load_backbone("kontext", device="cuda", quantization="int8")
+
+diffusers reads the files; its exceptions are converted to brewster's errors.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import gc
+import importlib.util
+import zlib
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Final, get_args
+
+import torch
+from torch import Tensor, nn
+
+from brewster.errors import DeviceError, MissingExtra, ModelError
+from brewster.models.diffusion.backbones.backbone import Backbone
+from brewster.models.diffusion.backbones.registry import (
+    CONFIG_FILES,
+    INDEX_FILE,
+    MEMORY_HINT,
+    backbone_class_of,
+    hub_id_of,
+    read_index,
+    tiny,
+)
+from brewster.models.diffusion.hub_download import resolve_model_folder
+from brewster.models.diffusion.lazy_imports import (
+    diffusers_class,
+    disable_progress_bars_in_pipes,
+    import_library,
+)
+from brewster.models.diffusion.out_of_memory import explain_out_of_memory
+from brewster.models.diffusion.prompt import PROMPT, PromptEmbedding
+from brewster.models.diffusion.tensors import read_json
+from brewster.models.diffusion.text_encoders import check_text_encoders, text_encoder_device
+from brewster.models.zoo import TINY_PREFIX
+from brewster.options import Quantization
+
+_BACKBONE_PATTERNS: Final = [INDEX_FILE, *(f"{part}/*" for part in CONFIG_FILES)]
+_SINGLE_FILE_PATTERNS: Final = [INDEX_FILE, "transformer/config.json", "vae/*", "scheduler/*"]
+_TEXT_ENCODER_PATTERNS: Final = [INDEX_FILE, "scheduler/*", "text_encoder*/*", "tokenizer*/*", "processor/*"]
+
+
+def load_backbone(
+    source: str,
+    *,
+    device: str = "cpu",
+    dtype: torch.dtype | None = None,
+    quantization: Quantization | None = None,
+    transformer_file: Path | None = None,
+) -> Backbone:
+    """Loads a backbone without its text encoders.
+
+    `source` is a name in the table, a hub id, a folder in diffusers' layout, or "tiny:" and a name for a tiny version.
+    By default `dtype` is bfloat16 on an accelerator and float32 on the CPU. `quantization` stores the transformer's weights
+    in 8 bits (torchao) or 4 bits (bitsandbytes, CUDA only). `transformer_file` is a single file, .gguf or .safetensors, whose
+    weights replace those of the transformer, which are then not downloaded. It cannot be quantized again.
+
+    Raises:
+        DownloadError: no access to a gated model (the message says how to get it), an invalid token, or no network
+            connection.
+        ModelError: a file is missing or damaged, the architecture is not supported, or a name or quantization is unknown.
+        DeviceError: there is no such device, or it is out of memory; the message says what to reduce.
+        MissingExtra: diffusers, torchao or bitsandbytes is not installed.
+    """
+    _check_device(device)
+    if transformer_file and (quantization or source.startswith(TINY_PREFIX)):
+        raise ModelError(
+            f"{transformer_file} was given for {source} with quantization={quantization}",
+            "expected a base that is no tiny version, and no quantization, because the file has its own precision",
+            "leave quantization out",
+        )
+    if source.startswith(TINY_PREFIX):
+        return _load_tiny(source, device, quantization)
+    options = _quantization_options(quantization, device) if quantization else {}
+    dtype = dtype or (torch.float32 if device == "cpu" else torch.bfloat16)
+    disable_progress_bars_in_pipes()
+    patterns = _SINGLE_FILE_PATTERNS if transformer_file else _BACKBONE_PATTERNS
+    folder = resolve_model_folder(hub_id_of(source), patterns)
+    backbone_class, index = read_index(folder)
+    if quantization == "nf4" and backbone_class.unquantized:
+        options["quantization_config"].llm_int8_skip_modules = list(backbone_class.unquantized)
+    with explain_out_of_memory(_memory_hint(quantization)):
+        vae = _load_part(folder, backbone_class, "vae", dtype=dtype, **_device_map(device))
+        if transformer_file:
+            transformer = _load_single_file(
+                transformer_file, folder, backbone_class, dtype=dtype, device=device
+            )
+        else:
+            transformer = _load_part(
+                folder, backbone_class, "transformer", dtype=dtype, **_device_map(device), **options
+            )
+    scheduler = _load_part(folder, backbone_class, "scheduler")
+    backbone = backbone_class(
+        transformer, vae, scheduler, distilled=bool(index.get("is_distilled")), dtype=dtype
+    )
+    _check_channels(backbone, folder)
+    if quantization:
+        _check_quantized(backbone, quantization)
+    return backbone
+
+
+def encode_prompt(source: str, text: str = PROMPT, *, device: str = "cpu") -> PromptEmbedding:
+    """Encodes a prompt with a backbone's text encoders, which are loaded only for this call.
+
+    For `source`, see `load_backbone`. A tiny version has no text encoder: its embedding is random, seeded by the text.
+
+    They are loaded in bfloat16, on `device` if its free memory suffices, otherwise on the CPU. Call this before
+    `load_backbone`: together with the base, most text encoders fit no consumer GPU.
+
+    Returns:
+        The embedding on the CPU, bfloat16; float32 for a tiny version.
+
+    Raises:
+        DownloadError, ModelError, DeviceError, MissingExtra: see `load_backbone`.
+    """
+    _check_device(device)
+    if source.startswith(TINY_PREFIX):
+        seed = 0 if text == PROMPT else zlib.crc32(text.encode()) or 1  # the sum of "" is 0
+        return replace(tiny(source.removeprefix(TINY_PREFIX), seed)[1], text=text)
+    # Checked before the download, which may take an hour.
+    for name in backbone_class_of(source).text_encoder_requirements:
+        if importlib.util.find_spec(name) is None:
+            raise MissingExtra(
+                f"{name} is not installed",
+                f"expected {name}, which the text encoder of {source} needs",
+                f"run: pip install {name} (the version for your torch)",
+            )
+    disable_progress_bars_in_pipes()
+    folder = resolve_model_folder(hub_id_of(source), _TEXT_ENCODER_PATTERNS)
+    backbone_class, index = read_index(folder)
+    check_text_encoders(folder, index)
+    dtype, device = torch.bfloat16, text_encoder_device(folder, device)
+    pipeline_class = diffusers_class(index["_class_name"])
+    with (
+        explain_out_of_memory("close other programs, or pass an encoded prompt"),
+        _translate_load_errors(folder),
+    ):
+        pipeline = pipeline_class.from_pretrained(
+            folder, transformer=None, vae=None, dtype=dtype, local_files_only=True
+        ).to(device)
+        with torch.no_grad():
+            embedding = backbone_class.embed(pipeline, text).to("cpu", dtype)
+    del pipeline
+    gc.collect()  # modules refer to each other, so the text encoders would stay in memory while the base is loaded
+    if device != "cpu":
+        torch.cuda.empty_cache()
+    return embedding
+
+
+def _load_tiny(source: str, device: str, quantization: str | None) -> Backbone:
+    if quantization:
+        raise ModelError(
+            f"{source} was requested with quantization={quantization}",
+            "expected a tiny version without quantization",
+            "leave quantization out",
+        )
+    backbone, _ = tiny(source.removeprefix(TINY_PREFIX))
+    backbone.transformer.to(device)
+    backbone.vae.to(device)
+    return backbone
+
+
+def _load_part(folder: Path, backbone_class: type[Backbone], part: str, **options: Any) -> Any:  # noqa: ANN401 - passed on
+    """Loads the transformer, VAE or scheduler of a folder. Checks its class, and that its weights are complete."""
+    part_folder, expected = folder / part, backbone_class.classes[part]
+    found = read_json(part_folder / CONFIG_FILES[part]).get("_class_name")
+    if found != expected:
+        raise ModelError(
+            f"{part_folder} contains a {found}",
+            f"expected a {expected}",
+            f"use a folder of {backbone_class.hub_id}",
+        )
+    part_class = diffusers_class(expected)
+    if part == "scheduler":
+        return part_class.from_pretrained(part_folder)
+    with _translate_load_errors(part_folder):
+        model, report = part_class.from_pretrained(
+            part_folder, use_safetensors=True, local_files_only=True, output_loading_info=True, **options
+        )
+    mismatched = [*report["missing_keys"], *report["unexpected_keys"]]
+    if mismatched:
+        raise ModelError(
+            f"{part_folder} has {len(mismatched)} missing or unexpected weights, for example {mismatched[0]}",
+            f"expected the weights of a {expected}",
+            "copy the model again",
+        )
+    return model
+
+
+def _load_single_file(
+    path: Path, folder: Path, backbone_class: type[Backbone], *, dtype: torch.dtype, device: str
+) -> Any:  # noqa: ANN401 - a transformer of diffusers
+    """Loads the transformer from one file, with the keys of diffusers or of the original code, and the config of the folder."""
+    expected, options = backbone_class.classes["transformer"], {}
+    if path.suffix == ".gguf":
+        import_library("gguf")
+        options["quantization_config"] = diffusers_class("GGUFQuantizationConfig")(compute_dtype=dtype)
+    with _translate_load_errors(path):
+        try:
+            transformer = diffusers_class(expected).from_single_file(
+                str(path),
+                config=str(folder / "transformer"),
+                dtype=dtype,
+                device=device,
+                local_files_only=True,
+                **options,
+            )
+        except torch.OutOfMemoryError:
+            raise
+        except (IndexError, RuntimeError) as error:  # the file has other layers than diffusers converts
+            raise ValueError(str(error)) from error
+    missing = [name for name, parameter in transformer.named_parameters() if parameter.is_meta]
+    if missing:
+        raise ModelError(
+            f"{path} lacks {len(missing)} weights of {backbone_class.name}, for example {missing[0]}",
+            f"expected all weights of a {expected}",
+            "choose a file for this base, or another base",
+        )
+    return transformer
+
+
+@contextlib.contextmanager
+def _translate_load_errors(folder: Path) -> Iterator[None]:
+    """Converts the exceptions of diffusers; `explain_out_of_memory` converts those about memory."""
+    safetensors_error = import_library("safetensors").SafetensorError
+    try:
+        yield
+    except ImportError as error:
+        raise MissingExtra(
+            f"{folder} needs a library that is not installed ({' '.join(str(error).split())[:200]})",
+            "expected all libraries that its classes use",
+            "install this library in addition to brewster[diffusion]",
+        ) from error
+    except (OSError, KeyError, ValueError, TypeError, safetensors_error) as error:
+        reason = " ".join(str(error).split())[:200]
+        raise ModelError(
+            f"{folder} cannot be loaded: {reason}",
+            "expected complete weights that match config.json",
+            "copy or download the model again",
+        ) from error
+
+
+def _quantization_options(quantization: str, device: str) -> dict[str, Any]:
+    """The keyword argument of from_pretrained for a quantization. The quantization is checked before any download."""
+    if quantization not in get_args(Quantization):
+        raise ModelError(
+            f"there is no quantization {quantization!r}",
+            f"expected one of {', '.join(get_args(Quantization))}",
+            "choose one of them",
+        )
+    if quantization == "nf4":
+        if not device.startswith("cuda"):
+            raise DeviceError(
+                f"nf4 does not run on {device}", "expected an NVIDIA GPU", 'use quantization="int8"'
+            )
+        import_library("bitsandbytes")
+        config = diffusers_class("BitsAndBytesConfig")(
+            load_in_4bit=True, bnb_4bit_quant_type="nf4", bnb_4bit_compute_dtype=torch.bfloat16
+        )
+        return {"quantization_config": config}
+    torchao = import_library("torchao.quantization")
+    configs = {"int8": torchao.Int8WeightOnlyConfig, "float8": torchao.Float8WeightOnlyConfig}
+    return {"quantization_config": diffusers_class("TorchAoConfig")(configs[quantization]())}
+
+
+def _device_map(device: str) -> dict[str, Any]:
+    """The keyword argument of from_pretrained that loads weights directly to an accelerator, not through host memory."""
+    return {} if device == "cpu" else {"device_map": {"": device}}
+
+
+def _memory_hint(quantization: str | None) -> str:
+    hints = {
+        None: 'use quantization="int8"',
+        "int8": 'use quantization="nf4"',
+        "float8": 'use quantization="nf4"',
+    }
+    return f"{hints.get(quantization, 'close other programs that use the GPU')}, {MEMORY_HINT}"
+
+
+def _check_device(device: str) -> None:
+    device_type = torch.device(device).type
+    if device_type == "cuda" and not torch.cuda.is_available():
+        raise DeviceError(
+            "there is no CUDA device",
+            "expected an NVIDIA or AMD GPU and a torch built for it",
+            "use device cpu",
+        )
+    if device_type == "mps" and not torch.backends.mps.is_available():
+        raise DeviceError("there is no MPS device", "expected an Apple GPU", "use device cpu")
+
+
+def _check_channels(backbone: Backbone, folder: Path) -> None:
+    packed = backbone.statistics()[0].shape[1]
+    if packed not in {1, backbone.channels}:
+        raise ModelError(
+            f"the VAE in {folder} has {packed} values per token",
+            f"expected {backbone.channels}, the input channels of its transformer",
+            "copy both from the same model",
+        )
+
+
+def _check_quantized(backbone: Backbone, quantization: str) -> None:
+    """Checks that the weights are quantized: diffusers silently leaves parts on the CPU unquantized."""
+    weight = backbone.transformer.get_submodule(backbone.lora_targets()[0]).weight
+    if type(weight) in {Tensor, nn.Parameter}:
+        raise ModelError(
+            f"the weights were loaded as {weight.dtype}",
+            f"expected weights stored as {quantization}",
+            "update diffusers and torchao (constraints.txt lists versions that work)",
+        )

@@ -1,0 +1,205 @@
+"""Finds out what a value of --model is: a backbone or a LoRA with its base. Its files are looked up once.
+
+source = find_model_source("windowseat")
+source.base, source.backbone_class.name, source.task     # "Qwen/Qwen-Image-Edit-2509", "qwen", ...
+"""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final, final
+
+from brewster.errors import DownloadError, ModelError
+from brewster.models.diffusion.adapter import windowseat
+from brewster.models.diffusion.adapter.layouts import LAYOUTS, LoraLayout, layout_of
+from brewster.models.diffusion.adapter.lora import LORA_FILE, LoraMetadata
+from brewster.models.diffusion.backbones.backbone import Backbone
+from brewster.models.diffusion.backbones.registry import (
+    INDEX_FILE,
+    backbone_class_of,
+    find_backbone_class,
+    is_registered,
+    read_index,
+)
+from brewster.models.diffusion.hub_download import cached_model_folder, resolve_model_folder
+from brewster.models.diffusion.panels import PanelLayout
+from brewster.models.diffusion.prompt import PROMPT_FILE
+from brewster.models.diffusion.task import TASK_FILE, DecompositionTask, load_task
+from brewster.models.diffusion_models import DIFFUSION_MODELS
+from brewster.models.zoo import TINY_PREFIX
+from brewster.options import Quantization
+
+_FINGERPRINT_BYTES: Final = 1 << 20
+"""The number of bytes at the start and at the end of a file that a digest reads."""
+_FILES: Final = [name for layout in LAYOUTS for name in layout.files] + [INDEX_FILE, PROMPT_FILE, TASK_FILE]
+
+
+@final
+@dataclass(frozen=True)
+class ModelSource:
+    """A backbone, or a LoRA with its base.
+
+    `base` is the source of the backbone, see `load_backbone`. `trained_quantization` is the quantization of the base with which a
+    LoRA was trained, and `has_prompt` is whether the encoded prompt is stored with the model. `folder` has the files of
+    a LoRA or of a finetuned backbone; it is None for a backbone that is given by its name. `layout` and `metadata` are
+    those of a LoRA.
+    """
+
+    base: str
+    backbone_class: type[Backbone]
+    task: DecompositionTask
+    trained_quantization: Quantization | None = None
+    has_prompt: bool = False
+    folder: Path | None = None
+    layout: LoraLayout | None = None
+    metadata: LoraMetadata | None = None
+
+    @property
+    def needs_text_encoders(self) -> bool:
+        """Whether the prompt must be encoded before the first separation."""
+        return not self.has_prompt and not self.base.startswith(TINY_PREFIX)
+
+    def digest_parts(self) -> list[str]:
+        """What identifies LoRA, prompt and base.
+
+        A base on the hub is identified by its name. A base in a folder is identified by the names, sizes, and first and
+        last MiB of its files, because reading them completely takes a minute.
+        """
+        base = _digest_folder(Path(self.base)) if self._is_base_folder else self.base
+        if not (self.layout and self.folder and self.metadata):
+            return [base]
+        weights = hashlib.sha256((self.folder / self.layout.weights).read_bytes()).hexdigest()
+        return [weights, self.metadata.prompt_sha256, base]
+
+    @property
+    def _is_base_folder(self) -> bool:
+        return not is_registered(self.base) and Path(self.base).is_dir()
+
+
+def find_model_source(
+    model: str, base_model: str | None = None, *, allow_download: bool = True
+) -> ModelSource:
+    """Looks up a model. Of a LoRA the files are downloaded, of a backbone only its index.
+
+    Args:
+        model: a LoRA by its folder or hub id, or a backbone by its name, folder or hub id.
+        base_model: the folder or hub id of the LoRA's base; by default the one used in training. Only for a LoRA.
+        allow_download: whether files that are not in the cache are downloaded. Otherwise the class of a base that is not in
+            the cache is that in the metadata of the LoRA, and WindowSeat has its published task.
+
+    Raises:
+        DownloadError: no access to a gated model, an invalid token, no network connection, or a download that is not
+            allowed.
+        ModelError: a file is missing or damaged, the LoRA belongs to another backbone, or the name is unknown.
+    """
+    if is_registered(model):
+        _check_no_base(model, base_model)
+        return ModelSource(model, find_backbone_class(model.removeprefix(TINY_PREFIX)), _default_task())
+    row = DIFFUSION_MODELS.get(model)
+    source = row.hub_id if row else model
+    folder = resolve_model_folder(source, _FILES) if allow_download else cached_model_folder(source, _FILES)
+    if folder is None:
+        return _published_source(model, base_model)
+    if layout := layout_of(folder):
+        metadata = layout.read_metadata(folder)
+        base, backbone_class = _find_base(model, metadata, base_model, allow_download=allow_download)
+        return ModelSource(
+            base,
+            backbone_class,
+            metadata.task,
+            metadata.quantization,
+            has_prompt=True,
+            folder=folder,
+            layout=layout,
+            metadata=metadata,
+        )
+    if not (folder / INDEX_FILE).is_file():
+        raise ModelError(
+            f"{model} contains no model",
+            f"expected a LoRA ({LORA_FILE}) or a backbone in diffusers' layout ({INDEX_FILE})",
+            "pass the folder lora/ that brewster train wrote, or convert a LoRA with: brewster models import",
+        )
+    _check_no_base(model, base_model)
+    path = folder / TASK_FILE
+    task = load_task(path) if path.is_file() else _default_task()
+    has_prompt = (folder / PROMPT_FILE).is_file()
+    return ModelSource(source, read_index(folder)[0], task, has_prompt=has_prompt, folder=folder)
+
+
+def _default_task() -> DecompositionTask:
+    return DecompositionTask(PanelLayout(("T",)))
+
+
+def _published_source(model: str, base_model: str | None) -> ModelSource:
+    """WindowSeat before its download, for a plan."""
+    row = DIFFUSION_MODELS.get(model)
+    if row is None or row.base_model is None or not row.is_opened_by_name:
+        raise DownloadError(
+            f"{model} is not in the cache, and a plan downloads nothing",
+            f"expected a folder, a model in the cache, or one of {', '.join(DIFFUSION_MODELS)}",
+            "download it first, or plan with its base",
+        )
+    return ModelSource(
+        base_model or row.base_model,
+        windowseat.BACKBONE,
+        windowseat.published_task(),
+        windowseat.QUANTIZATION,
+        has_prompt=True,
+    )
+
+
+def _find_base(
+    model: str, metadata: LoraMetadata, base_model: str | None, *, allow_download: bool
+) -> tuple[str, type[Backbone]]:
+    base = base_model or metadata.base_model
+    if base_model is None and _is_path(base) and not Path(base).is_dir():
+        raise ModelError(
+            f"the base model of {model} was {base}, which does not exist",
+            f"expected a {metadata.backbone} in diffusers' layout",
+            "pass its folder or hub id with --base-model",
+        )
+    if not allow_download and not is_registered(base) and not cached_model_folder(base, [INDEX_FILE]):
+        return base, find_backbone_class(metadata.backbone)
+    backbone_class = backbone_class_of(base)  # checked before the download, which may take an hour
+    if backbone_class.name != metadata.backbone:
+        raise ModelError(
+            f"{model} is a LoRA of {metadata.backbone}",
+            f"expected a base model of {metadata.backbone}, not of {backbone_class.name}",
+            "choose another base model",
+        )
+    return base, backbone_class
+
+
+def _check_no_base(model: str, base_model: str | None) -> None:
+    if base_model:
+        raise ModelError(
+            f"{model} is a backbone, and the base model {base_model} was given for it",
+            f"expected a base model only for a LoRA, which is a folder with {LORA_FILE}",
+            "leave the base model out",
+        )
+
+
+def _is_path(source: str) -> bool:
+    return Path(source).is_absolute() or source.startswith((".", "~"))
+
+
+def _digest_folder(folder: Path) -> str:
+    digest = hashlib.sha256()
+    for path in sorted(path for path in folder.rglob("*") if path.is_file()):
+        digest.update(f"{path.relative_to(folder)} {path.stat().st_size}\0".encode())
+        digest.update(_ends(path))
+    return digest.hexdigest()
+
+
+def digest_file(path: Path) -> str:
+    """The SHA-256 of the size and the first and last MiB of a large file."""
+    return hashlib.sha256(f"{path.stat().st_size}\0".encode() + _ends(path)).hexdigest()
+
+
+def _ends(path: Path) -> bytes:
+    with path.open("rb") as file:
+        start = file.read(_FINGERPRINT_BYTES)
+        file.seek(max(0, path.stat().st_size - _FINGERPRINT_BYTES))
+        return start + file.read()

@@ -1,0 +1,58 @@
+"""Reduces the GPU memory of a prediction: the transformer is offloaded by layers, and large images are decoded in tiles.
+
+Both are methods of diffusers. Offloading does not change the result. Tiling changes it, because the VAE of
+FLUX normalises each tile by its own statistics. So tiling is used only if the decoding would not fit.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, Any, Final
+
+import torch
+
+from brewster.models.diffusion.lazy_imports import import_library
+
+if TYPE_CHECKING:
+    from brewster.models.diffusion.backbones.backbone import Backbone
+
+DECODING_BYTES_PER_PIXEL: Final = 3000
+"""Activations of a full-size VAE in bf16 for one pixel of the decoded image: about six maps of 256 channels."""
+
+
+def offload_layers(backbone: Backbone, device: str) -> None:
+    """Keeps the weights of the transformer in host memory, and copies each block to the device while it computes.
+
+    The VAE is moved to the device. A LoRA must be added before this call.
+    """
+    backbone.vae.to(device)
+    import_library("diffusers.hooks").apply_group_offloading(
+        backbone.transformer,
+        onload_device=torch.device(device),
+        offload_device=torch.device("cpu"),
+        offload_type="block_level",
+        num_blocks_per_group=1,
+    )
+
+
+@contextlib.contextmanager
+def tiled_if_large(vae: Any, pixels: int) -> Iterator[None]:  # noqa: ANN401 - a VAE of diffusers
+    """Decodes in tiles within this context if images of this total number of pixels do not fit into the free GPU memory."""
+    free = free_gpu_bytes(vae.device)
+    if free is None or pixels * DECODING_BYTES_PER_PIXEL <= free:
+        yield
+        return
+    vae.enable_tiling()
+    try:
+        yield
+    finally:
+        vae.disable_tiling()
+
+
+def free_gpu_bytes(device: torch.device) -> int | None:
+    """The free memory of a GPU in bytes, with that which torch has reserved and does not use; None for a CPU."""
+    if device.type != "cuda":
+        return None
+    reserved = torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)
+    return torch.cuda.mem_get_info(device)[0] + reserved

@@ -1,0 +1,106 @@
+"""Transformers in one file: GGUF with quantized weights, and safetensors."""
+
+import shutil
+
+import gguf
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import save_file
+
+from brewster.errors import ModelError
+from brewster.models.diffusion.adapter.export import merge
+from brewster.models.diffusion.adapter.lora_formats import LowRankLayer, to_state_dict
+from brewster.models.diffusion.adapter.stacking import stack_layers
+from brewster.models.diffusion.backbones.loading import load_backbone
+from brewster.models.diffusion.backbones.registry import BACKBONES, tiny
+from brewster.models.diffusion.pipeline import load_pipeline
+from brewster.models.diffusion.prompt import PROMPT_FILE
+from published_models import linear_layers, random_pair
+
+Q8 = gguf.GGMLQuantizationType.Q8_0
+
+
+def write_gguf(path, weights):
+    """Writes a GGUF file with Q8_0 matrices, and returns their values in float16, as diffusers reads them."""
+    writer, stored = gguf.GGUFWriter(path, "test"), {}
+    for name, weight in weights.items():
+        array = weight.float().numpy()
+        if array.ndim == 2 and array.shape[1] % 32 == 0:
+            quantized = gguf.quants.quantize(array, Q8)
+            writer.add_tensor(name, quantized, raw_dtype=Q8)
+            array = gguf.quants.dequantize(quantized, Q8).astype(np.float16).astype(np.float32)
+        else:
+            writer.add_tensor(name, array)
+        stored[name] = torch.from_numpy(array)
+    writer.write_header_to_file()
+    writer.write_kv_data_to_file()
+    writer.write_tensors_to_file()
+    writer.close()
+    return stored
+
+
+@pytest.fixture(scope="module")
+def bases(tmp_path_factory):
+    """Folders of tiny versions without the weights of their transformers."""
+    folder = tmp_path_factory.mktemp("bases")
+    for name in BACKBONES:
+        tiny(name)[0].save(folder / name)
+        (folder / name / "transformer" / "diffusion_pytorch_model.safetensors").unlink()
+    return folder
+
+
+def velocity(backbone, prompt):
+    latents, condition = torch.randn(
+        2, 1, backbone.channels, 2, 3, generator=torch.Generator().manual_seed(0)
+    )
+    return backbone.predict(latents, condition, torch.tensor([0.7]), prompt, 1.0)
+
+
+@pytest.mark.parametrize("name", list(BACKBONES))
+def test_a_gguf_file_and_a_lora_predict_as_its_dequantized_weights(name, bases, tmp_path):
+    expected, prompt = tiny(name, seed=1)
+    stored = write_gguf(tmp_path / "model.gguf", expected.transformer.state_dict())
+    original = velocity(expected, prompt)
+    expected.transformer.load_state_dict(stored)
+    found = load_backbone(str(bases / name), transformer_file=tmp_path / "model.gguf")
+    weight = found.transformer.transformer_blocks[0].attn.to_q.weight
+    assert type(weight) is not torch.nn.Parameter
+    torch.testing.assert_close(velocity(found, prompt), velocity(expected, prompt), atol=1e-5, rtol=0)
+    assert 0 < (velocity(found, prompt) - original).std() < 0.05 * original.std()
+    layers, generator = linear_layers(expected.transformer), torch.Generator().manual_seed(5)
+    lora = {
+        target: LowRankLayer(*random_pair(layers[target], 2, generator)) for target in expected.lora_targets()
+    }
+    stack_layers(found, lora)
+    merge(expected, to_state_dict(lora), 1.0)
+    torch.testing.assert_close(velocity(found, prompt), velocity(expected, prompt), atol=1e-4, rtol=0)
+
+
+def test_a_single_safetensors_file_is_the_transformer_of_a_model(bases, tmp_path):
+    folder = shutil.copytree(bases / "klein", tmp_path / "klein")
+    backbone, prompt = tiny("klein", seed=1)
+    prompt.save(folder / PROMPT_FILE)
+    save_file(dict(backbone.transformer.state_dict()), tmp_path / "a.safetensors")
+    save_file(dict(tiny("klein", seed=2)[0].transformer.state_dict()), tmp_path / "b.safetensors")
+    pipeline = load_pipeline(str(folder), transformer=str(tmp_path / "a.safetensors"))
+    assert torch.equal(velocity(pipeline.backbone, prompt), velocity(backbone, prompt))
+    assert pipeline.sha256 != load_pipeline(str(folder), transformer=str(tmp_path / "b.safetensors")).sha256
+    with pytest.raises(ModelError, match=r"expected complete weights|is missing"):
+        load_pipeline(str(folder))
+
+
+@pytest.mark.parametrize("other", ["klein", "qwen"])
+def test_a_file_of_another_architecture_is_refused(other, bases, tmp_path):
+    path = tmp_path / "other.gguf"
+    write_gguf(path, tiny(other)[0].transformer.state_dict())
+    with pytest.raises(ModelError, match=r"other\.gguf (cannot be loaded|lacks \d+ weights of kontext)"):
+        load_backbone(str(bases / "kontext"), transformer_file=path)
+
+
+def test_a_damaged_file_and_a_second_quantization_are_refused(bases, tmp_path):
+    (tmp_path / "damaged.gguf").write_bytes(b"GGUF")
+    with pytest.raises(ModelError, match=r"damaged\.gguf cannot be loaded"):
+        load_backbone(str(bases / "kontext"), transformer_file=tmp_path / "damaged.gguf")
+    with pytest.raises(ModelError, match="the file has its own precision; leave quantization out"):
+        load_backbone(str(bases / "kontext"), transformer_file=tmp_path / "damaged.gguf", quantization="int8")

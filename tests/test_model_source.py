@@ -1,0 +1,57 @@
+"""What a value of --model is, and how often its files are requested."""
+
+import huggingface_hub
+import pytest
+
+from brewster.errors import DownloadError, ModelError
+from brewster.models.diffusion import pipeline
+from brewster.models.diffusion.adapter.windowseat import published_task
+from brewster.models.diffusion.model_source import find_model_source
+from brewster.models.diffusion.pipeline import load_pipeline
+from published_models import write_qwen_edit_plus, write_windowseat
+
+BASE = "Qwen/Qwen-Image-Edit-2509"
+WINDOWSEAT = "huawei-bayerlab/windowseat-reflection-removal-v1-0"
+
+
+@pytest.fixture
+def hub(tmp_path, monkeypatch):
+    """A hub with a tiny WindowSeat and its base, and the list of requests."""
+    folders = {
+        BASE: write_qwen_edit_plus(tmp_path / "base"),
+        WINDOWSEAT: write_windowseat(tmp_path / "windowseat", BASE),
+    }
+    requests = []
+
+    def snapshot_download(source, *, allow_patterns, dry_run=False):
+        if dry_run:
+            return []
+        requests.append(source)
+        return str(folders[source])
+
+    monkeypatch.setattr(huggingface_hub, "snapshot_download", snapshot_download)
+    return requests
+
+
+def test_each_file_of_a_model_is_requested_once(hub, monkeypatch):
+    monkeypatch.setattr(pipeline, "check_machine", lambda *_, **__: None)
+    load_pipeline("windowseat", device="cpu")
+    # The LoRA, the index of the base, and then its weights.
+    assert hub == [WINDOWSEAT, BASE, BASE]
+
+
+def test_a_plan_requests_only_the_cache(tmp_path, monkeypatch):
+    monkeypatch.setattr(huggingface_hub.constants, "HF_HUB_CACHE", str(tmp_path))
+    source = find_model_source("windowseat", allow_download=False)
+    assert (source.base, source.backbone_class.name, source.task) == (BASE, "qwen", published_task())
+    assert (source.trained_quantization, source.needs_text_encoders) == ("nf4", False)
+    with pytest.raises(DownloadError, match="me/glass is not in the cache, and a plan downloads nothing"):
+        find_model_source("me/glass", allow_download=False)
+
+
+def test_a_name_is_a_backbone_without_files():
+    source = find_model_source("kontext")
+    assert (source.base, source.folder, source.task.layout.panels) == ("kontext", None, ("T",))
+    assert source.needs_text_encoders
+    with pytest.raises(ModelError, match="kontext is a backbone, and the base model klein was given"):
+        find_model_source("kontext", "klein")

@@ -1,0 +1,105 @@
+"""Offloading by layers and decoding in tiles, on the CPU: the hooks of diffusers run, and copy from host memory to host memory."""
+
+import pytest
+import torch
+from diffusers.hooks import group_offloading
+
+from brewster.models.diffusion import offloading, pipeline
+from brewster.models.diffusion.adapter.lora import add_lora, lora_parameters, save_lora
+from brewster.models.diffusion.backbones.loading import load_backbone
+from brewster.models.diffusion.backbones.registry import BACKBONES, tiny
+from brewster.models.diffusion.memory import Placement
+from brewster.models.diffusion.offloading import DECODING_BYTES_PER_PIXEL, offload_layers
+from brewster.models.diffusion.pipeline import load_pipeline
+from brewster.models.diffusion.task import DecompositionTask
+
+PHOTO = torch.linspace(-1, 1, 3 * 32 * 48).reshape(1, 3, 32, 48)
+
+
+@pytest.fixture
+def copies(monkeypatch):
+    """The groups of layers that were copied to the device."""
+    copied, onload = [], group_offloading.ModuleGroup.onload_
+    monkeypatch.setattr(
+        group_offloading.ModuleGroup, "onload_", lambda group: (copied.append(group), onload(group))
+    )
+    return copied
+
+
+def with_random_lora(name):
+    backbone, prompt = tiny(name, seed=1)
+    add_lora(backbone, rank=2, alpha=4)
+    with torch.no_grad():
+        for parameter in lora_parameters(backbone):
+            parameter.normal_(0, 0.1, generator=torch.Generator().manual_seed(3))
+    return backbone, prompt
+
+
+@pytest.mark.parametrize("name", list(BACKBONES))
+def test_an_offloaded_transformer_with_a_lora_predicts_the_same_bits(name, copies):
+    backbone, prompt = with_random_lora(name)
+    latents, condition = torch.randn(
+        2, 1, backbone.channels, 2, 3, generator=torch.Generator().manual_seed(0)
+    )
+    call = (latents, condition, torch.tensor([0.7]), prompt, 1.0)
+    expected = backbone.predict(*call)
+    offload_layers(backbone, "cpu")
+    assert torch.equal(backbone.predict(*call), expected)
+    transformer = backbone.transformer
+    blocks = [*transformer.transformer_blocks, *getattr(transformer, "single_transformer_blocks", [])]
+    copied = {id(module) for group in copies for module in group.modules}
+    assert {id(block) for block in blocks} <= copied
+    assert backbone.device == torch.device("cpu")
+
+
+def test_quantized_weights_are_offloaded_with_their_lora(tmp_path, copies):
+    tiny("kontext", seed=1)[0].save(tmp_path)
+    backbone = load_backbone(str(tmp_path), quantization="int8", dtype=torch.bfloat16)
+    _, prompt = tiny("kontext", seed=1)
+    add_lora(backbone, rank=2)
+    latents, condition = torch.randn(
+        2, 1, backbone.channels, 2, 3, generator=torch.Generator().manual_seed(0)
+    )
+    call = (latents, condition, torch.tensor([0.7]), prompt, 1.0)
+    with torch.no_grad():
+        expected = backbone.predict(*call)
+        offload_layers(backbone, "cpu")
+        assert torch.equal(backbone.predict(*call), expected)
+    assert copies
+
+
+def test_an_offloaded_lora_separates_as_a_resident_one(tmp_path, monkeypatch, copies):
+    backbone, prompt = with_random_lora("kontext")
+    save_lora(tmp_path, backbone, prompt, DecompositionTask(steps=2), base_model="tiny:kontext")
+    expected = load_pipeline(str(tmp_path))(PHOTO)
+    assert not copies
+    monkeypatch.setattr(pipeline, "choose_placement", lambda *_, **__: Placement("cpu", is_offloaded=True))
+    panels = load_pipeline(str(tmp_path))(PHOTO)
+    assert copies
+    assert all(torch.equal(panels[name], expected[name]) for name in "ITR")
+
+
+@pytest.mark.parametrize(("name", "tolerance"), [("kontext", 0.7), ("klein", 0.7), ("qwen", 0.2)])
+def test_large_images_are_decoded_in_overlapping_tiles(name, tolerance, monkeypatch):
+    """The tolerance is that of the mean difference, in standard deviations of the image.
+
+    The group norm of FLUX's VAE has the statistics of each tile, which differ most with random weights. Qwen's VAE
+    normalises each pixel separately.
+    """
+    backbone, _ = tiny(name, seed=1)
+    photo = torch.nn.functional.interpolate(PHOTO, (64, 320), mode="bicubic").clamp(-1, 1)
+    for side in ("tile_sample_min_size", "tile_sample_min_height", "tile_sample_min_width"):
+        if hasattr(backbone.vae, side):
+            setattr(backbone.vae, side, 256)
+    if hasattr(backbone.vae, "tile_latent_min_size"):
+        backbone.vae.tile_latent_min_size = 32
+    latents = backbone.encode(photo)
+    whole = backbone.decode(latents)
+    needed = 64 * 320 * DECODING_BYTES_PER_PIXEL
+    monkeypatch.setattr(offloading, "free_gpu_bytes", lambda device: needed)
+    assert torch.equal(backbone.decode(latents), whole)
+    monkeypatch.setattr(offloading, "free_gpu_bytes", lambda device: needed - 1)
+    tiled = backbone.decode(latents)
+    assert tiled.shape == whole.shape
+    assert 0 < (tiled - whole).abs().mean() < tolerance * whole.std()
+    assert not backbone.vae.use_tiling

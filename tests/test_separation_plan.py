@@ -1,0 +1,104 @@
+"""The plan of a separation: the numbers of the estimates for training, and of the pipeline that it plans."""
+
+import huggingface_hub
+import numpy as np
+import pytest
+import torch
+
+from brewster import Photo
+from brewster.errors import DeviceError, ModelError
+from brewster.inference.diffusion_predictor import DiffusionPredictor
+from brewster.inference.separation_plan import plan_separation
+from brewster.models.diffusion.adapter.lora import add_lora, save_lora
+from brewster.models.diffusion.backbones.registry import tiny
+from brewster.models.diffusion.cost import CARDS, GraphicsCard
+from brewster.models.diffusion.memory import weights_gib
+from brewster.models.diffusion.pipeline import load_pipeline
+from brewster.models.diffusion.task import DecompositionTask
+from brewster.options import Options
+
+CARD = CARDS["RTX 4090"]
+
+
+@pytest.fixture(autouse=True)
+def offline(tmp_path, monkeypatch):
+    monkeypatch.setattr(huggingface_hub.constants, "HF_HUB_CACHE", str(tmp_path / "cache"))
+    monkeypatch.setattr(huggingface_hub.constants, "HF_HUB_OFFLINE", True)
+
+
+@pytest.fixture
+def lora(tmp_path):
+    backbone, prompt = tiny("kontext")
+    add_lora(backbone, rank=1)
+    save_lora(
+        tmp_path / "lora", backbone, prompt, DecompositionTask(), base_model="kontext", quantization="int8"
+    )
+    return str(tmp_path / "lora")
+
+
+def test_the_plan_of_the_papers_lora_has_the_known_numbers(lora):
+    plan = plan_separation(Options(model=lora), (4096, 4096), CARD)
+    assert plan.panels == ((512, 512),)
+    assert plan.passes == 20
+    assert plan.tflop == pytest.approx(20 * 351 / 3, rel=0.01)
+    assert plan.seconds == pytest.approx(35, abs=1)
+    assert plan.memory_gib["weights"] == pytest.approx(11.2, abs=0.2)
+    assert 13 < plan.total_gib < 16
+    assert plan.download_gb == pytest.approx(24, abs=0.5)
+    assert plan.text_encoder_gb == 0  # the prompt is stored with the LoRA
+    for text in (
+        "int8, on the GPU",
+        f"{plan.total_gib:.1f} GiB of 24 on RTX 4090",
+        f"{plan.seconds:.1f} s (estimate)",
+    ):
+        assert text in plan.table()
+    small = plan_separation(Options(model=lora, steps=4), (4096, 4096), CARDS["RTX 4060"])
+    assert small.placement.is_offloaded
+    assert small.total_gib < 8
+    copies = 4 * weights_gib(small.parameter_count, "int8") * 1.0737 / 10
+    assert small.seconds == pytest.approx(4 * 117 / (0.4 * 30) + copies, rel=0.01)
+    with pytest.raises(
+        DeviceError, match="GiB; expected at most the 8 GiB of RTX 4060; use --offload layers"
+    ):
+        plan_separation(Options(model=lora, offload="none"), (4096, 4096), CARDS["RTX 4060"]).check_fits()
+
+
+def test_windowseat_is_planned_before_its_download():
+    plan = plan_separation(Options(model="windowseat"), (1600, 800), CARD)
+    assert set(plan.panels) == {(768, 768)}
+    assert plan.passes == len(plan.panels) == 3
+    assert (plan.placement.quantization, plan.text_encoder_gb) == ("nf4", 0)
+    assert plan.download_gb == pytest.approx(41, abs=0.5)
+    assert plan.licence == "Apache-2.0"
+
+
+@pytest.mark.parametrize("quality", ["draft", "standard", "best"])
+@pytest.mark.parametrize("name", ["kontext", "klein"])
+def test_the_planned_passes_are_those_of_the_separation(name, quality, monkeypatch):
+    size = (96, 64)
+    options = Options(model=f"tiny:{name}", steps=2, ensemble_size=2, quality=quality)
+    plan = plan_separation(options, size, CARD)
+    assert plan.download_gb == 0
+    pipeline = load_pipeline(options.model)
+    transformer, calls = pipeline.backbone.transformer, []
+    transformer.register_forward_hook(lambda *_: calls.append(1))
+    photo = Photo.from_array(np.full((*size[::-1], 3), 0.3, np.float32), encoding="linear")
+    predictor = DiffusionPredictor(pipeline, steps=2, ensemble_size=2)
+    inputs = [photo.resized(*each) for each in predictor.input_sizes(size, quality)]
+    with torch.no_grad():
+        predictor(inputs, quality, lambda fraction: None)
+    assert len(calls) == plan.passes
+
+
+def test_a_model_without_diffusion_has_no_plan():
+    with pytest.raises(ModelError, match="for the model compact; expected a diffusion model"):
+        plan_separation(Options(), (64, 64), GraphicsCard("toy", 1, 1))
+
+
+def test_the_command_prints_the_plan_and_separates_nothing(run_without_model, tmp_path):
+    Photo.from_array(np.full((64, 96, 3), 0.3, np.float32), encoding="linear").save(tmp_path / "photo.png")
+    code, out, _ = run_without_model("photo.png", "--model", "tiny:klein", "--gpu", "rtx 4060")
+    assert code == 0
+    table = plan_separation(Options(model="tiny:klein"), (96, 64), CARDS["RTX 4060"]).table()
+    assert out.decode().strip() == table
+    assert [path.name for path in tmp_path.iterdir()] == ["photo.png"]

@@ -1,0 +1,118 @@
+"""A LoRA for few steps beside another LoRA: both changes of the weights are added."""
+
+import pytest
+import torch
+from safetensors.torch import save_file
+
+from brewster import Separator
+from brewster.errors import ModelError
+from brewster.models.diffusion.adapter.export import merge
+from brewster.models.diffusion.adapter.lora import (
+    add_lora,
+    has_lora,
+    lora_parameters,
+    lora_state_dict,
+    save_lora,
+)
+from brewster.models.diffusion.adapter.lora_formats import LowRankLayer, to_state_dict
+from brewster.models.diffusion.adapter.stacking import stack_layers
+from brewster.models.diffusion.backbones.registry import BACKBONES, tiny
+from brewster.models.diffusion.panels import PanelLayout
+from brewster.models.diffusion.pipeline import load_pipeline
+from brewster.models.diffusion.task import DecompositionTask
+from published_models import linear_layers, random_pair
+
+
+def velocity(backbone, prompt):
+    latents, condition = torch.randn(
+        2, 1, backbone.channels, 2, 3, generator=torch.Generator().manual_seed(0)
+    )
+    return backbone.predict(latents, condition, torch.tensor([0.7]), prompt, 1.0)
+
+
+def with_random_lora(name):
+    backbone, prompt = tiny(name)
+    add_lora(backbone, rank=2, alpha=4, target_modules=["*.attn.*"])
+    with torch.no_grad():
+        for parameter in lora_parameters(backbone):
+            parameter.normal_(0, 0.1, generator=torch.Generator().manual_seed(3))
+    return backbone, prompt
+
+
+def fast_layers(name):
+    """Random matrices of rank 3 for all linear layers of the blocks: more than those of `with_random_lora`."""
+    backbone, _ = tiny(name)
+    layers, generator = linear_layers(backbone.transformer), torch.Generator().manual_seed(5)
+    return {
+        target: LowRankLayer(*random_pair(layers[target], 3, generator)) for target in backbone.lora_targets()
+    }
+
+
+@pytest.fixture
+def fast_file(tmp_path):
+    """A LoRA file of a tiny klein with the keys of diffusers."""
+    tensors = {f"transformer.{key}": value for key, value in to_state_dict(fast_layers("klein")).items()}
+    save_file(tensors, tmp_path / "lightning-4steps.safetensors")
+    return tmp_path / "lightning-4steps.safetensors"
+
+
+@pytest.mark.parametrize("name", list(BACKBONES))
+def test_a_stacked_lora_is_the_sum_of_both_changes(name):
+    stacked, prompt = with_random_lora(name)
+    state, layers = lora_state_dict(stacked), fast_layers(name)
+    merged, _ = tiny(name)
+    merge(merged, state, 4 / 2)
+    merge(merged, to_state_dict(layers), 1.0)
+    alone = velocity(stacked, prompt)
+    stack_layers(stacked, layers)
+    torch.testing.assert_close(velocity(stacked, prompt), velocity(merged, prompt), atol=1e-5, rtol=0)
+    assert (velocity(stacked, prompt) - alone).abs().max() > 1e-2
+
+
+def test_without_another_lora_the_layers_are_the_lora():
+    stacked, prompt = tiny("qwen")
+    merged, _ = tiny("qwen")
+    stack_layers(stacked, fast_layers("qwen"))
+    merge(merged, to_state_dict(fast_layers("qwen")), 1.0)
+    assert has_lora(stacked)
+    torch.testing.assert_close(velocity(stacked, prompt), velocity(merged, prompt), atol=1e-5, rtol=0)
+
+
+def test_a_lora_for_few_steps_is_an_option_with_its_steps_and_guidance(fast_file, tmp_path):
+    folder = tmp_path / "lora"
+    backbone, prompt = with_random_lora("klein")
+    task = DecompositionTask(PanelLayout(("T",)), 48 * 32)
+    save_lora(folder, backbone, prompt, task, base_model="tiny:klein", target_modules=["*.attn.*"])
+    pipeline = load_pipeline(str(folder), fast_lora=str(fast_file))
+    stack_layers(backbone, fast_layers("klein"))
+    torch.testing.assert_close(
+        velocity(pipeline.backbone, prompt), velocity(backbone, prompt), atol=1e-6, rtol=0
+    )
+    assert pipeline.task.guidance == 1  # no second prediction
+    plain = load_pipeline(str(folder))
+    other = load_pipeline(str(folder), fast_lora=str(fast_file), guidance=2.5)
+    assert (plain.task.guidance, other.task.guidance) == (4, 2.5)
+    assert len({plain.sha256, pipeline.sha256, other.sha256}) == 3
+    with pytest.raises(ModelError, match=r"without the number of steps; .*; set the option steps"):
+        Separator.load(str(folder), fast_lora=str(fast_file))
+    assert Separator.load(str(folder), fast_lora=str(fast_file), steps=4).sha256 == pipeline.sha256
+
+
+def test_a_guidance_that_is_an_input_of_the_transformer_stays(fast_file, tmp_path):
+    tensors = {f"transformer.{key}": value for key, value in to_state_dict(fast_layers("kontext")).items()}
+    save_file(tensors, tmp_path / "turbo.safetensors")
+    pipeline = load_pipeline("tiny:kontext", fast_lora=str(tmp_path / "turbo.safetensors"))
+    assert pipeline.task.guidance == 4
+    with pytest.raises(ModelError, match="in the style of diffusers, belongs to no layer of kontext"):
+        load_pipeline("tiny:kontext", fast_lora=str(fast_file))
+
+
+def test_a_model_of_one_step_takes_no_lora_for_few_steps(fast_file, tmp_path):
+    backbone, prompt = with_random_lora("klein")
+    save_lora(
+        tmp_path / "lora", backbone, prompt, DecompositionTask(objective="one_step"), base_model="tiny:klein"
+    )
+    with pytest.raises(
+        ModelError, match="which takes one step; expected a model that samples in several steps"
+    ):
+        load_pipeline(str(tmp_path / "lora"), fast_lora=str(fast_file))
