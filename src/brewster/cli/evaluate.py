@@ -178,7 +178,7 @@ class _Size(click.ParamType["int | str"]):
 @click.option(
     "--workers",
     type=click.IntRange(min=1),
-    help="The number of processes that compute scores; by default one for each processor, and fewer for less than 50 images.",
+    help="The number of processes that compute scores; by default one for each processor, or fewer if there are fewer than 50 images.",
 )
 @click.option(
     "--pictures",

@@ -6,8 +6,8 @@
 
 For each participant, the database contains a number, the token of the personal link, the date of the consent and the
 trials; it contains no name and no address. The trials are drawn once, at admission, and stored, so a later version of
-brewster cannot change them. A second answer to a trial is ignored. A browser sends one, for example, if the response to the first answer was lost. To change
-their last answer, participants withdraw it first; withdrawn answers are kept.
+brewster cannot change them. A second answer to a trial is ignored: a browser repeats an answer if the response was lost. To
+change their last answer, participants withdraw it first. Withdrawn answers are kept.
 """
 
 from __future__ import annotations
