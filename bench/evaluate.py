@@ -43,7 +43,7 @@ def main(data: Path, count: int = 500) -> None:
         first, last = (max(part) / 2**20 for part in (memory[:quarter], memory[-quarter:]))
         rate = count / seconds[workers]
         print(
-            f"--workers {workers}: {rate:.2f} images per second, all metrics, for the unprocessed input and one folder"
+            f"--workers {workers}: {rate:.2f} images per second, default metrics, for the unprocessed input and one folder"
         )
         print(
             f"  {cpu_s:.3f} CPU seconds per image, {cpu_s / alexnet_s:.2f} times those of AlexNet on the {ALEXNET_RUNS} images of a case"
