@@ -314,7 +314,7 @@ class AnswerStore:
                 [_row(number, answer) for answer in answer_file.withdrawn],
             )
             return database.executemany(
-                "INSERT INTO answers VALUES (?, ?, ?, ?, ?, ?) ON CONFLICT DO NOTHING",
+                "INSERT OR IGNORE INTO answers VALUES (?, ?, ?, ?, ?, ?)",
                 [_row(number, answer) for answer in answer_file.answers],
             ).rowcount
 
