@@ -1,11 +1,13 @@
-"""Measures `brewster evaluate` with all metrics: images per second with one and two workers, and memory over time.
+"""Measures `brewster evaluate` with the default metrics: images per second with one and two workers, and memory over time.
 
     BREWSTER_DATA=../shared/data .venv/bin/python bench/evaluate.py [COUNT]
 
-COUNT images (default 500) of 540x400 are scored: the unprocessed input and one folder of predictions.
+COUNT images (default 500) of 540x400 are scored: the unprocessed input and one folder of predictions. The processor time per
+image is also given as a multiple of the time of AlexNet on the images of a case, because LPIPS cannot take less than that.
 """
 
 import os
+import resource
 import shutil
 import subprocess
 import sys
@@ -14,27 +16,37 @@ import time
 from pathlib import Path
 
 import numpy as np
+import torch
 
 from brewster import Photo
 from brewster.evaluate.score_log import SCORES_FILE
+from brewster.metrics import Lpips
 from brewster.srgb import to_encoded
 
 OUT = Path("out/bench/evaluate")
 SIZE = (540, 400)
+ALEXNET_RUNS = (
+    5  # photo, both ground truths, and both predicted layers; the black reflection of the baseline is cached
+)
 
 
 def main(data: Path, count: int = 500) -> None:
     make_pairs(data, count)
-    seconds = {}
+    seconds, alexnet_s = {}, measure_alexnet()
     for workers in (1, 2):
         out = OUT / f"workers-{workers}"
         shutil.rmtree(out, ignore_errors=True)
+        cpu_before = cpu_seconds_of_children()
         seconds[workers], memory = measure(out, workers)
+        cpu_s = (cpu_seconds_of_children() - cpu_before) / count
         quarter = len(memory) // 4
         first, last = (max(part) / 2**20 for part in (memory[:quarter], memory[-quarter:]))
         rate = count / seconds[workers]
         print(
-            f"--workers {workers}: {rate:.2f} images per second, all metrics, for the unprocessed input and one folder"
+            f"--workers {workers}: {rate:.2f} images per second, default metrics, for the unprocessed input and one folder"
+        )
+        print(
+            f"  {cpu_s:.3f} CPU seconds per image, {cpu_s / alexnet_s:.2f} times those of AlexNet on the {ALEXNET_RUNS} images of a case"
         )
         print(f"  memory of all processes: {first:.2f} GiB in the first quarter, {last:.2f} GiB in the last")
     print(f"two workers are {seconds[1] / seconds[2]:.2f} times as fast as one")
@@ -60,6 +72,26 @@ def make_pairs(data: Path, count: int) -> None:
         for role, light in layers.items():
             pixels = np.rint(255 * to_encoded(np.clip(light, 0, 1))).astype(np.uint8)
             Photo.from_array(pixels, encoding="srgb").save(OUT / "pairs" / role / f"{i}.png", overwrite=True)
+
+
+def measure_alexnet() -> float:
+    """CPU seconds of the features of the images of one case, with one thread."""
+    torch.set_num_threads(1)
+    metric, images = (
+        Lpips.load(),
+        np.random.default_rng(1).integers(0, 256, (1 + ALEXNET_RUNS, *SIZE[::-1], 3), np.uint8),
+    )
+    metric.features(images[0])  # a warm-up
+    started = time.process_time()
+    for image in images[1:]:
+        metric.features(image)
+    return time.process_time() - started
+
+
+def cpu_seconds_of_children() -> float:
+    """CPU seconds of all child processes that have ended, with their descendants."""
+    usage = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return usage.ru_utime + usage.ru_stime
 
 
 def measure(out: Path, workers: int) -> tuple[float, list[float]]:

@@ -104,6 +104,8 @@ def test_a_method_that_fails_on_a_photo_is_listed_and_the_exit_code_is_one(
         (("--benchmark", "real20=pairs", "--model", "compac"), "did you mean compact"),
         (("--benchmark", "real20=pairs", "--predictions", "theirs=nowhere"), "nowhere"),
         (("--benchmark", "real20=pairs", "--predictions", "theirs=others"), "has the name of a case"),
+        (("--benchmark", "real20=pairs", "--export", "ntire2026"), "needs one benchmark openrr, not 0"),
+        (("--benchmark", "openrr=pairs", "--export", "ntire2026"), "has no method to pack"),
     ],
 )
 def test_invalid_benchmarks_metrics_and_methods_give_a_clear_error(

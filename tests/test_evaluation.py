@@ -209,8 +209,8 @@ def test_resized_images_are_written_at_their_size_for_the_report(real20, tmp_pat
         real20, [IdentityBaseline()], EvaluationConfig(metrics=("psnr",), short_side_px=8), tmp_path / "out"
     )
     page = (tmp_path / "out" / "report.html").read_text()
-    assert 'data-full="pictures/real20/1/photo.png"' in page
-    assert Photo.open(tmp_path / "out" / "pictures" / "real20" / "1" / "photo.png").size == (12, 8)
+    assert 'data-full="inputs/real20/1.png"' in page
+    assert Photo.open(tmp_path / "out" / "inputs" / "real20" / "1.png").size == (12, 8)
 
 
 def test_a_mirrored_prediction_gives_a_remark(tmp_path, rng):

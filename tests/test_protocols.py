@@ -2,6 +2,7 @@
 
 import pytest
 
+from brewster.cli.evaluate import evaluate
 from brewster.errors import BrewsterError
 from brewster.evaluate.config import EvaluationConfig
 from brewster.evaluate.protocols import PROTOCOLS, describe_protocol, protocol_config
@@ -29,6 +30,11 @@ def test_the_contest_crops_the_border_and_scores_its_five_metrics():
 def test_a_changed_setting_is_named():
     lines = describe_protocol(protocol_config("xreflection", short_side_px=None, quality="best"))
     assert lines[-1] == "This run differs from the protocol xreflection in: short_side_px."
+
+
+def test_the_command_offers_all_protocols():
+    (option,) = (option for option in evaluate.params if option.name == "protocol")
+    assert [name.lower() for name in option.type.choices] == [*PROTOCOLS]
 
 
 def test_an_unknown_protocol_is_an_error_with_the_known_names():

@@ -76,7 +76,8 @@ def test_every_method_is_scored_on_every_case_in_order(real20, tmp_path):
 def test_logged_scores_are_reused(real20, tmp_path):
     first = score(real20, [FakeMethod()], QUICK, tmp_path / "out")
     again = FakeMethod()
-    assert comparable(score(real20, [again], QUICK, tmp_path / "out")) == comparable(first)
+    for config in (QUICK, replace(QUICK, protocol="paper", paper_subset=True)):
+        assert comparable(score(real20, [again], config, tmp_path / "out")) == comparable(first)
     assert again.requested == []
 
 

@@ -115,8 +115,7 @@ def find_roles(folder: Path) -> dict[str, Path]:
     Raises:
         PhotoError: the folder cannot be read, or has two subfolders for one role.
     """
-    roles = {name: role for role, names in ROLES.items() for name in names}
-    return _find_subfolders(folder, lambda name: roles.get(re.sub(r"[\s-]+", "_", name.lower()), ""))
+    return _find_subfolders(folder, _role_of)
 
 
 def find_numbered_splits(folder: Path) -> dict[str, dict[str, Path]]:
@@ -125,14 +124,18 @@ def find_numbered_splits(folder: Path) -> dict[str, dict[str, Path]]:
     Raises:
         PhotoError: the folder cannot be read.
     """
-    roles = {name: role for role, names in ROLES.items() for name in names}
     splits: dict[str, dict[str, Path]] = defaultdict(dict)
     for path in list_folder(folder)[0]:
         prefix = _SPLIT_PREFIX.match(path.name)
-        role = roles.get(path.name[prefix.end() :].lower()) if prefix else None
-        if prefix and role:
+        if prefix and (role := _role_of(path.name[prefix.end() :])):
             splits[prefix[0].rstrip("_").lower()][role] = path
     return dict(splits)
+
+
+def _role_of(name: str) -> str:
+    """Returns the role of a folder of this name, or "" if it has none."""
+    normalised = re.sub(r"[\s-]+", "_", name.lower())
+    return next((role for role, names in ROLES.items() if normalised in names), "")
 
 
 def find_sets(folder: Path) -> list[Path]:

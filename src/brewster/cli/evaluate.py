@@ -14,7 +14,6 @@ import click
 
 from brewster.cli.extras import require_extra
 from brewster.cli.terminal import interrupts, print_error, print_status, progress, write_out
-from brewster.errors import BrewsterError
 from brewster.options import Device, Quality
 
 if TYPE_CHECKING:
@@ -179,7 +178,7 @@ class _Size(click.ParamType["int | str"]):
 @click.option(
     "--workers",
     type=click.IntRange(min=1),
-    help="The number of processes that compute scores; by default one for each processor, and fewer for less than 50 images.",
+    help="The number of processes that compute scores; by default one for each processor, or fewer if there are fewer than 50 images.",
 )
 @click.option(
     "--pictures",
@@ -245,6 +244,7 @@ class _EvaluateCommand:
         """Prints the names of images and methods. Returns whether no image was left out of a benchmark."""
         from brewster.evaluate.evaluation import check  # noqa: PLC0415
 
+        self._check_export()
         benchmarks, methods = self._read_benchmarks(), self._methods()
         is_complete = print_remarks(benchmarks, quiet=self.quiet)
         check(benchmarks, methods, self._config())
@@ -264,6 +264,7 @@ class _EvaluateCommand:
         from brewster.evaluate.evaluation import REPORT_FILE  # noqa: PLC0415
         from brewster.evaluate.evaluation import evaluate as measure  # noqa: PLC0415
 
+        export_folder = self._check_export()
         config, benchmarks, methods = self._config(), self._read_benchmarks(), self._methods()
         is_complete = print_remarks(benchmarks, quiet=self.quiet)
         total = len(methods) * sum(len(benchmark.cases) for benchmark in benchmarks)
@@ -290,24 +291,24 @@ class _EvaluateCommand:
             print_status(
                 f"the results are in {self.out}; {self.out / REPORT_FILE} shows the images, and tables.md has intervals and differences"
             )
-        if self.export:
-            self._export(methods)
+        if export_folder:
+            self._export(export_folder, methods)
         return print_failures(results, quiet=self.quiet) and is_complete
 
-    def _export(self, methods: Sequence[Method]) -> None:
+    def _check_export(self) -> Path | None:
+        """Returns the folder that `export` needs; None without `export`."""
+        from brewster.evaluate.submission import openrr_folder  # noqa: PLC0415
+
+        has_method = bool(self.models or self.predictions)
+        return openrr_folder(self.benchmarks, has_method=has_method) if self.export else None
+
+    def _export(self, folder: Path, methods: Sequence[Method]) -> None:
         from brewster.evaluate.submission import export_ntire2026  # noqa: PLC0415
 
-        folders = [Path(folder) for name, folder in self.benchmarks if name == "openrr"]
-        if len(folders) != 1:
-            raise BrewsterError(
-                f"--export {self.export} needs one benchmark openrr, not {len(folders)}",
-                "expected --benchmark openrr=FOLDER with the folders val_300_blended and test_100_blended",
-                "add the benchmark, or leave out --export",
-            )
         for method in methods[1:]:  # the first one is the baseline
             out = self.out / "export" / method.name
             for path in export_ntire2026(
-                folders[0], method, out, on_progress=lambda _: interrupts.raise_pending()
+                folder, method, out, on_progress=lambda _: interrupts.raise_pending()
             ):
                 print_status(f"wrote {path}")
 

@@ -16,6 +16,7 @@ import click
 from brewster.cli.evaluate import NamedValue
 from brewster.cli.extras import require_extra
 from brewster.cli.serve import AUTO, address_options, print_link
+from brewster.cli.study_bundle import export_study, import_answers
 from brewster.cli.terminal import print_out, print_status, progress, write_out
 from brewster.errors import BrewsterError
 
@@ -54,8 +55,13 @@ def study() -> None:
     """Run a user study that asks which of two results people prefer: blind, random pairs with catch trials.
 
     `create` makes a study from folders of outputs, `plan` computes the required number of participants, `serve` serves
-    the page for participants, `progress` shows how far they are, and `report` evaluates their answers. docs/study.md defines all terms.
+    the page for participants, `progress` shows how far they are, and `report` evaluates their answers. `export` and `import` are
+    for participants who cannot reach this machine. docs/study.md defines all terms.
     """
+
+
+study.add_command(export_study)
+study.add_command(import_answers)
 
 
 @study.command

@@ -46,7 +46,7 @@ from brewster.evaluate.report.tables import scores_to_csv, to_csv, to_markdown
 from brewster.evaluate.resizing import resize
 from brewster.evaluate.results import Results, paper_draws, summarise
 from brewster.evaluate.runner import ScoreCallback, find_unavailable, get_prediction, score
-from brewster.evaluate.score_log import RowId, ScoreRow
+from brewster.evaluate.score_log import SCORES_FILE, RowId, ScoreRow, read_log
 from brewster.evaluate.scoring import GroundTruth
 from brewster.files import write_atomically
 from brewster.metrics import IDENTICAL_DB
@@ -105,13 +105,15 @@ def evaluate(
         tiles = _ThumbnailCache(
             Path(folder), complete, config, out, {method.name: method for method in methods}
         )
-        unavailable = find_unavailable(benchmarks, methods, config, out)
+        logged = read_log(out / SCORES_FILE)
+        unavailable = find_unavailable(benchmarks, methods, config, logged)
         rows = score(
             benchmarks,
             methods,
             config,
             out,
             workers=workers,
+            logged=logged,
             unavailable=unavailable,
             on_progress=on_progress,
             on_case_scored=tiles,
@@ -275,6 +277,8 @@ class _ThumbnailCache:
         sources = {"photo": case.photo, "transmission": case.ground_truth, "reflection": case.reflection}
         for layer, image in truth.images.items():
             source = None if self.config.resizes else sources[layer]
+            if self.config.resizes and layer == "photo":
+                source = ImageFile(_input_path(self.out / INPUTS_FOLDER, case))
             yield (layer, ""), self._link(case, source, Photo.from_array(image, encoding="srgb"), layer)
         for name, output in predictions.items():
             method = self.methods[name]

@@ -7,32 +7,21 @@ A published score can be compared with a measured score only if both use the sam
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 from typing import Any, Final, final
 
 from brewster.errors import BrewsterError
-from brewster.evaluate.config import DEFAULT_METRICS, EvaluationConfig
+from brewster.evaluate.config import EvaluationConfig
 
 
 @final
 @dataclass(frozen=True)
 class ProtocolPreset:
-    """A row of PROTOCOLS: the settings of a protocol, and its choices as (choice, source)."""
+    """A row of PROTOCOLS: the choices of a protocol, as (choice, source), and its settings."""
 
     title: str
     choices: tuple[tuple[str, str], ...]
-    metrics: tuple[str, ...] = DEFAULT_METRICS
-    short_side_px: int | None = None
-    size_divisor: int = 1
-    border: int = 0
-    paper_subset: bool = False
-
-    def settings(self) -> dict[str, Any]:
-        """The fields of `EvaluationConfig` that the protocol sets."""
-        return {
-            name: getattr(self, name)
-            for name in ("metrics", "short_side_px", "size_divisor", "border", "paper_subset")
-        }
+    config: EvaluationConfig
 
 
 def protocol_config(name: str, **changes: Any) -> EvaluationConfig:  # noqa: ANN401  (the fields of EvaluationConfig)
@@ -45,20 +34,23 @@ def protocol_config(name: str, **changes: Any) -> EvaluationConfig:  # noqa: ANN
         raise BrewsterError(
             f"there is no protocol {name!r}", f"expected one of {', '.join(PROTOCOLS)}", "choose one of them"
         )
-    settings: dict[str, Any] = {"protocol": name, **PROTOCOLS[name].settings(), **changes}
-    return EvaluationConfig(**settings)
+    return replace(PROTOCOLS[name].config, protocol=name, **changes)
 
 
 def describe_protocol(config: EvaluationConfig) -> list[str]:
     """Returns sentences: the name of the protocol, its choices with their sources, and the settings that differ from it."""
     preset = PROTOCOLS[config.protocol]
-    changed = [name for name, value in preset.settings().items() if getattr(config, name) != value]
+    names = [field.name for field in fields(config) if field.name not in _NOT_IN_PROTOCOLS]
+    changed = [name for name in names if getattr(config, name) != getattr(preset.config, name)]
     lines = [f"Protocol {config.protocol}: {preset.title}."]
     lines += [f"{choice} (source: {source})." for choice, source in preset.choices]
     if changed:
         lines.append(f"This run differs from the protocol {config.protocol} in: {', '.join(changed)}.")
     return lines
 
+
+_NOT_IN_PROTOCOLS: Final = ("protocol", "quality", "thresholds")
+"""The fields of `EvaluationConfig` about which a protocol says nothing."""
 
 _PAPER: Final = "Guo et al., SIRR-LMM, arXiv 2601.07209"
 _DSR_DATASET: Final = "XReflection, xreflection/data/dsrnet_dataset.py, DSRTestDataset"
@@ -69,6 +61,7 @@ PROTOCOLS: Final[dict[str, ProtocolPreset]] = {
     "brewster": ProtocolPreset(
         "all images of each benchmark at the size of the ground truth, with the border",
         (("PSNR over all channels, SSIM with the uniform 7x7 window, LPIPS 0.1 with AlexNet", "brewster"),),
+        EvaluationConfig(),
     ),
     "paper": ProtocolPreset(
         "the tables of SIRR-LMM",
@@ -77,7 +70,7 @@ PROTOCOLS: Final[dict[str, ProtocolPreset]] = {
             ("PSNR, SSIM and LPIPS of the transmission; LPIPS in the reflection region", f"{_PAPER}, section 5"),
             ("The paper does not state image size, SSIM window, LPIPS backbone, threshold and selected images; brewster uses its own", _PAPER),
         ),
-        paper_subset=True,
+        EvaluationConfig(paper_subset=True),
     ),
     "xreflection": ProtocolPreset(
         "the validation of the toolbox XReflection, as for DSRNet, DSIT and RDNet",
@@ -89,9 +82,7 @@ PROTOCOLS: Final[dict[str, ProtocolPreset]] = {
             ("Each image has the same weight in the average", "XReflection, xreflection/models/base_model.py"),
             ("The filter that made the 420-px copy of Real20 is unknown; brewster averages areas in linear light", "brewster"),
         ),
-        metrics=("psnr_channels", "ssim"),
-        short_side_px=420,
-        size_divisor=32,
+        EvaluationConfig(metrics=("psnr_channels", "ssim"), short_side_px=420, size_divisor=32),
     ),
     "windowseat": ProtocolPreset(
         "the tables of WindowSeat, as far as they are documented",
@@ -103,7 +94,7 @@ PROTOCOLS: Final[dict[str, ProtocolPreset]] = {
                 "brewster",
             ),
         ),
-        metrics=("psnr", "ssim", "ssim_gaussian", "lpips"),
+        EvaluationConfig(metrics=("psnr", "ssim", "ssim_gaussian", "lpips")),
     ),
     "errnet": ProtocolPreset(
         "the test code of ERRNet",
@@ -114,7 +105,7 @@ PROTOCOLS: Final[dict[str, ProtocolPreset]] = {
             ("SSIM has the uniform 7x7 window, per channel", f"{_ERRNET}, util/index.py"),
             ("There is no LPIPS; LMSE and NCC are not computed here", f"{_ERRNET}, util/index.py"),
         ),
-        metrics=("psnr_channels", "ssim"),
+        EvaluationConfig(metrics=("psnr_channels", "ssim")),
     ),
     "ntire2026": ProtocolPreset(
         "the NTIRE 2026 challenge on reflection removal in the wild (arXiv 2604.10321)",
@@ -126,8 +117,7 @@ PROTOCOLS: Final[dict[str, ProtocolPreset]] = {
             ("The script pairs files by sorted position; brewster pairs them by name", _OPENRR),
             ("32 dB is the threshold for the human evaluation; the best result on val_300 was above 36 dB", "repository OpenRR-5k, README"),
         ),
-        metrics=("psnr", "ssim_clipped", "lpips", "dists", "niqe"),
-        border=4,
+        EvaluationConfig(metrics=("psnr", "ssim_clipped", "lpips", "dists", "niqe"), border=4),
     ),
 }  # fmt: skip
 """name -> protocol, for `brewster evaluate --protocol`."""

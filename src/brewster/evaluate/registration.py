@@ -63,8 +63,9 @@ def find_misregistration(prediction: Image, photo: Image) -> str:
 def _reduced(image: Image, factor: int) -> _Plane:
     """The sum of the channels, reduced by `factor`, with mean 0, (h, w)."""
     rows, columns = (side // factor * factor for side in image.shape[:2])
-    sums = image[:rows, :columns].sum(axis=2, dtype=np.float64)
-    plane = sums.reshape(rows // factor, factor, columns // factor, factor).mean(axis=(1, 3))
+    inside = image[:rows, :columns].astype(np.uint16)
+    sums = inside[..., 0] + inside[..., 1] + inside[..., 2]  # much faster than sum(axis=2)
+    plane = sums.reshape(rows // factor, factor, columns // factor, factor).sum(axis=1).mean(axis=2) / factor
     centred: _Plane = plane - plane.mean() if plane.size else plane
     return centred
 

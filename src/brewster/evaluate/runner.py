@@ -53,6 +53,7 @@ def score(
     out: Path,
     *,
     workers: int = 1,
+    logged: Mapping[RowId, ScoreRow] | None = None,
     unavailable: Collection[str] = (),
     on_progress: ScoreCallback = lambda _done, _total, _row: None,
     on_case_scored: CaseCallback | None = None,
@@ -67,6 +68,7 @@ def score(
         config: the settings of the evaluation.
         out: the folder of scores.jsonl.
         workers: the number of processes that score in parallel.
+        logged: the rows of an earlier run; by default, those of scores.jsonl.
         unavailable: columns that are not computed now; see `find_unavailable`.
         on_progress: called after each new row.
         on_case_scored: called once for each case with new rows. With several workers, it must be picklable.
@@ -81,7 +83,7 @@ def score(
         OutputError: `out` cannot be written.
     """
     check_names(methods)
-    logged = read_log(out / SCORES_FILE)
+    logged = read_log(out / SCORES_FILE) if logged is None else logged
     cases = {(case.benchmark, case.name): case for benchmark in benchmarks for case in benchmark.cases}
     ids = [(*case, method.name) for case in cases for method in methods]
     for prepare, _ in _missing_metrics(config, ids, logged, unavailable):
@@ -116,13 +118,15 @@ def _tasks(
 
 
 def find_unavailable(
-    benchmarks: Sequence[Benchmark], methods: Sequence[Method], config: EvaluationConfig, out: Path
+    benchmarks: Sequence[Benchmark],
+    methods: Sequence[Method],
+    config: EvaluationConfig,
+    logged: Mapping[RowId, ScoreRow],
 ) -> dict[str, str]:
     """Returns column -> reason, for the columns that cannot be computed on this machine, for example without weights.
 
-    A metric is not tried if the log in `out` has it for all cases and methods.
+    A metric is not tried if `logged`, the rows of an earlier run, has it for all cases and methods.
     """
-    logged = read_log(out / SCORES_FILE)
     cases = [(case.benchmark, case.name) for benchmark in benchmarks for case in benchmark.cases]
     ids = [(*case, method.name) for case in cases for method in methods]
     unavailable: dict[str, str] = {}
@@ -225,9 +229,9 @@ def _empty_row(
     """Returns a row without scores, with the keys that show whether a row of an earlier run can be reused."""
     case = files.case
     photo, *ground_truths = files.digests()
-    # `paper` selects cases for the tables, and `protocol` is a name: they change no score. `quality` is a part of the keys of
-    # models, and does not affect other methods. A row has its own list of columns.
-    settings = asdict(config) | dict.fromkeys(("metrics", "paper", "protocol", "quality"))
+    # `paper_subset` selects cases for the tables, and `protocol` is a name: they change no score. `quality` is a part of the
+    # keys of models, and does not affect other methods. A row has its own list of columns.
+    settings = asdict(config) | dict.fromkeys(("metrics", "paper_subset", "protocol", "quality"))
     prediction_key = _digest(photo, config.short_side_px, config.size_divisor, method.key(case))
     score_key = _digest(prediction_key, ground_truths, settings, case.rendered, SCORE_FORMAT_VERSION)
     row = ScoreRow(case.benchmark, case.name, method.name, prediction_key, score_key)

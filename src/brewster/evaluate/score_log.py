@@ -23,8 +23,9 @@ class ScoreRow:
     """The scores of one method on one case, or the error. These are also the fields of a line of scores.jsonl.
 
     `score_key` is a digest of all inputs of the scores, `prediction_key` of all inputs of the prediction. A score or a
-    prediction is reused if its key is unchanged. `columns` are the columns that were computed; one without a score does not
-    apply to the case. `registration` says how a stored prediction is flipped or shifted. `digest` is the SHA-256 of the files of the prediction, if it has any.
+    prediction is reused if its key is unchanged. `columns` are the columns that were computed. A column that is not in `scores`
+    does not apply to the case. `registration` says how a prediction of a folder is flipped or shifted. `digest` is the SHA-256
+    of the files of the prediction; None if it is not stored in files.
     """
 
     benchmark: str

@@ -7,14 +7,14 @@ from __future__ import annotations
 
 import io
 import zipfile
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
 from brewster.benchmarks.pairing import find_numbered_splits, image_files
 from brewster.benchmarks.registry import Case, ImageFile
-from brewster.errors import PhotoError
+from brewster.errors import BrewsterError, PhotoError
 from brewster.evaluate.methods import Method
 from brewster.files import write_atomically
 from brewster.photo import Photo
@@ -22,6 +22,28 @@ from brewster.photo import Photo
 _JPEG_QUALITY: Final = 100
 """The contest's script reads JPEG files only. At quality 100 without chroma subsampling, they are close to lossless."""
 _BENCHMARK: Final = "openrr"
+
+
+def openrr_folder(benchmarks: Sequence[tuple[str, str]], *, has_method: bool) -> Path:
+    """Returns the folder of OpenRR-5k among the benchmarks, as (name, folder).
+
+    Raises:
+        BrewsterError: there is not exactly one benchmark openrr, or there is no method whose predictions can be packed.
+    """
+    folders = [Path(folder) for name, folder in benchmarks if name == _BENCHMARK]
+    if len(folders) != 1:
+        raise BrewsterError(
+            f"the export needs one benchmark openrr, not {len(folders)}",
+            "expected --benchmark openrr=FOLDER with the folders val_300_blended and test_100_blended",
+            "give the benchmark once, or leave out --export",
+        )
+    if not has_method:
+        raise BrewsterError(
+            "the export has no method to pack",
+            "expected --model or --predictions, because the unprocessed input is not packed",
+            "add a method, or leave out --export",
+        )
+    return folders[0]
 
 
 def export_ntire2026(

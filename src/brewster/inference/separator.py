@@ -22,12 +22,12 @@ from typing import TYPE_CHECKING, Any, Final, final
 
 import numpy as np
 
-import brewster
 from brewster.errors import BrewsterError, MissingExtra, ModelError
 from brewster.inference.assessment import Assessment, assess
 from brewster.inference.clipping import keep_clipped
 from brewster.inference.full_size import upsample_layers
 from brewster.inference.guided_upsampling import Floats, GuidedUpsampler
+from brewster.inference.layer_history import history_step, with_step
 from brewster.inference.onnx_backend import OnnxBackend
 from brewster.inference.predictor import (
     QUALITIES,
@@ -41,13 +41,10 @@ from brewster.inference.tiles import Backend
 from brewster.models.zoo import find_model, is_diffusion_model
 from brewster.options import Offload, Options, Quality, Quantization, document_options
 from brewster.photo import Encoding, Mask, Photo, Source
-from brewster.photo.history import with_history
 
 if TYPE_CHECKING:
     from brewster.models.diffusion.pipeline import DecompositionPipeline
 
-PROGRAM: Final = "brewster"
-"""The name under which the metadata of layers record this program."""
 _WHITE_PERCENTILE: Final = 99.0
 """If this percentile of the photo is above 1, as in an EXR file, the input of the network is divided by the percentile."""
 _NETWORK_SHARE: Final = 0.6
@@ -237,8 +234,8 @@ class Separator:
         step |= {"sha256": self.sha256[:12]} if self.sha256 else {}
         return Separation(
             photo,
-            _with_step(transmission, "transmission", step),
-            _with_step(reflection, "reflection", step),
+            with_step(transmission, "transmission", step),
+            with_step(reflection, "reflection", step),
             prediction.confidence_map,
             residual,
             prediction.reconstruction_error,
@@ -351,21 +348,6 @@ def _open_pipeline(model: str, **options: Any) -> DecompositionPipeline:  # noqa
             "run: pip install 'brewster[diffusion]'",
         ) from error
     return load_pipeline(model, **options)
-
-
-def history_step(model: str, *, strength: float, quality: str, additive: bool) -> dict[str, str]:
-    """Returns the options of a separation as names and values for the metadata of its layers."""
-    return {
-        "model": model,
-        "strength": f"{strength:g}",
-        "quality": quality,
-        "additive": "yes" if additive else "no",
-    }
-
-
-def _with_step(photo: Photo, layer: str, step: dict[str, str]) -> Photo:
-    software = f"{PROGRAM} {brewster.__version__}"
-    return replace(photo, file_info=with_history(photo.file_info, software, {"layer": layer} | step))
 
 
 def _check_options(strength: float, quality: str) -> None:

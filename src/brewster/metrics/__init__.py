@@ -27,11 +27,15 @@ from brewster.errors import BrewsterError
 from brewster.metrics.dists import Dists, DistsFeatures
 from brewster.metrics.failures import kept_reflection, removed_content, removed_white
 from brewster.metrics.fidelity import (
+    PairCounts,
     Window,
+    count_pairs,
     linear_error,
+    linear_error_of_counts,
     mean_ssim,
     psnr,
     psnr_of_channels,
+    psnr_of_counts,
     ssim,
     ssim_map,
 )
@@ -70,6 +74,8 @@ __all__ = [
 
 
 def _psnr(case: Comparison) -> float:
+    if case.region is None:
+        return min(psnr_of_counts(case.shared(_pair_counts)), IDENTICAL_DB)
     return min(psnr(case.prediction.pixels, case.truth.pixels, region=case.region), IDENTICAL_DB)
 
 
@@ -78,7 +84,11 @@ def _psnr_of_channels(case: Comparison) -> float:
 
 
 def _linear_error(case: Comparison) -> float:
-    return linear_error(case.prediction.pixels, case.truth.pixels, region=case.region)
+    return linear_error_of_counts(case.shared(_pair_counts))
+
+
+def _pair_counts(case: Comparison) -> PairCounts:
+    return count_pairs(case.prediction.pixels, case.truth.pixels)
 
 
 def _uniform_map(case: Comparison) -> NDArray[np.float64]:

@@ -11,7 +11,7 @@ its map is averaged over the positions where the whole window is inside the imag
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, Final, Literal
 
 import numpy as np
@@ -31,10 +31,14 @@ from brewster.metrics.windows import (
 from brewster.srgb import to_linear
 
 Window = Literal["uniform", "gaussian"]
+PairCounts = NDArray[np.int64]
 
 _LUMINANCE_CONSTANT: Final = (0.01 * 255) ** 2
 _CONTRAST_CONSTANT: Final = (0.03 * 255) ** 2
 _LINEAR: Final = to_linear(np.arange(256, dtype=np.float32) / 255)
+_SQUARED_ERRORS: Final = np.square(np.subtract.outer(np.arange(256.0), np.arange(256.0))).ravel()
+_LINEAR_SQUARED_ERRORS: Final = np.square(np.subtract.outer(_LINEAR, _LINEAR), dtype=np.float64).ravel()
+"""The squared error of each pair of 8-bit values, (65536,), with the index of `count_pairs`."""
 _STRIP_ROWS: Final = 32
 _WINDOW_SIDES: Final[dict[Window, int]] = {"uniform": BOX_SIDE, "gaussian": 2 * GAUSSIAN_RADIUS + 1}
 
@@ -50,10 +54,38 @@ def psnr(prediction: Image, truth: Image, *, region: Region | None = None) -> fl
     Raises:
         ValueError: the images are not uint8 (H, W, 3) or differ in shape; the region is empty or of another shape.
     """
+    if region is None:
+        return psnr_of_counts(count_pairs(prediction, truth))
     check_images(prediction, truth)
     difference = prediction.astype(np.int32) - truth
-    mse = mean_inside(difference * difference, region)
+    return _to_decibels(mean_inside(difference * difference, region))
+
+
+def psnr_of_counts(counts: PairCounts) -> float:
+    """The PSNR in dB over all pixels, from the counts of `count_pairs`; infinity for equal images."""
+    return _to_decibels(float(_SQUARED_ERRORS @ counts / counts.sum()))
+
+
+def _to_decibels(mse: float) -> float:
     return float(10 * np.log10(255**2 / mse)) if mse else float("inf")
+
+
+def count_pairs(prediction: Image, truth: Image) -> PairCounts:
+    """Counts the pairs of 8-bit values at the same position: the joint histogram of two images, over all channels.
+
+    Every mean over all pixels of a function of two values follows from it, and it is faster than the function of each pixel.
+
+    Returns:
+        The counts, int64 (65536,). The index is 256 times the value of the prediction, plus that of the ground truth.
+
+    Raises:
+        ValueError: the images are not uint8 (H, W, 3) or differ in shape.
+    """
+    check_images(prediction, truth)
+    pairs = prediction.astype(np.intp)
+    pairs *= 256
+    pairs += truth
+    return np.bincount(pairs.ravel(), minlength=256 * 256)
 
 
 def psnr_of_channels(prediction: Image, truth: Image) -> float:
@@ -85,9 +117,16 @@ def linear_error(prediction: Image, truth: Image, *, region: Region | None = Non
     Raises:
         ValueError: the images are not uint8 (H, W, 3) or differ in shape; the region is empty or of another shape.
     """
+    if region is None:
+        return linear_error_of_counts(count_pairs(prediction, truth))
     check_images(prediction, truth)
     difference = _LINEAR[prediction] - _LINEAR[truth]
     return float(mean_inside(difference * difference, region) ** 0.5)
+
+
+def linear_error_of_counts(counts: PairCounts) -> float:
+    """The error of `linear_error` over all pixels, from the counts of `count_pairs`."""
+    return float((_LINEAR_SQUARED_ERRORS @ counts / counts.sum()) ** 0.5)
 
 
 def ssim(
@@ -146,39 +185,33 @@ def ssim_map(prediction: Image, truth: Image, *, window: Window = "uniform") -> 
 
 
 def _ssim_uniform(prediction: Image, truth: Image) -> NDArray[np.float64]:
-    """Returns the SSIM map with the uniform window. int32 holds sums of 8-bit values and of their products exactly."""
-    return _ssim_formula(
-        prediction.astype(np.int32), truth.astype(np.int32), box_sums, BOX_SIDE**2, sample_covariance=True
-    )
+    """Returns the SSIM map with the uniform window.
+
+    int16 holds the sums of 8-bit values exactly, and int32 those of their products.
+    """
+    x, y = prediction.astype(np.int32), truth.astype(np.int32)
+    sums = [box_sums(image.astype(np.int16)).astype(np.int32) for image in (prediction, truth)]
+    sums += [box_sums(x * x + y * y), box_sums(x * y)]
+    return _ssim_formula(sums, BOX_SIDE**2, sample_covariance=True)
 
 
 def _ssim_gaussian(prediction: Image, truth: Image) -> NDArray[np.float64]:
-    return _ssim_formula(
-        prediction.astype(np.float64), truth.astype(np.float64), gaussian_means, 1, sample_covariance=False
-    )
+    x, y = prediction.astype(np.float64), truth.astype(np.float64)
+    means = [gaussian_means(values) for values in (x, y, x * x + y * y, x * y)]
+    return _ssim_formula(means, 1, sample_covariance=False)
 
 
 def _ssim_formula(
-    x: NDArray[Any],
-    y: NDArray[Any],
-    window_sum: Callable[[Any], Any],
-    pixel_count: int,
-    *,
-    sample_covariance: bool,
+    window_sums: Sequence[NDArray[Any]], pixel_count: int, *, sample_covariance: bool
 ) -> NDArray[np.float64]:
     """Returns SSIM = (2 mx my + C1) (2 cov + C2) / ((mx^2 + my^2 + C1) (vx + vy + C2)), computed from window sums.
 
-    Here m is a mean, v a variance and cov the covariance in the window. Numerator and denominator are multiplied by
-    powers of `pixel_count`, the number of pixels in a window sum (1 if `window_sum` returns means). Therefore only one
-    division is needed, and integer sums stay integers until then. The formula needs only vx + vy, so x^2 + y^2 is summed
-    once.
+    `window_sums` has the sums of x, y, x^2 + y^2 and x y. Here m is a mean, v a variance and cov the covariance in the window.
+    Numerator and denominator are multiplied by powers of `pixel_count`, the number of pixels in a window sum (1 if the sums
+    are weighted means). So there is only one division, and integer sums stay integers until then. The formula needs only
+    vx + vy, so x^2 + y^2 is summed once.
     """
-    mean_x, mean_y, squares, products = (
-        window_sum(x),
-        window_sum(y),
-        window_sum(x * x + y * y),
-        window_sum(x * y),
-    )
+    mean_x, mean_y, squares, products = window_sums
     mean_product, mean_squares = mean_x * mean_y, mean_x * mean_x + mean_y * mean_y
     luminance = _LUMINANCE_CONSTANT * pixel_count**2
     contrast = _CONTRAST_CONSTANT * pixel_count * (pixel_count - sample_covariance)

@@ -134,9 +134,9 @@ class Lpips:
             for (weight, bias), layer in zip(self.convolutions, _LAYERS, strict=True):
                 if layer.pooled_before:
                     activations = functional.max_pool2d(activations, 3, 2)
-                activations = functional.relu(
-                    functional.conv2d(activations, weight, bias, layer.stride, layer.padding)
-                )
+                activations = functional.conv2d(
+                    activations, weight, bias, layer.stride, layer.padding
+                ).relu_()
                 maps.append(activations[0] / (torch.linalg.vector_norm(activations[0], dim=0) + 1e-10))
         return Features(tuple(maps), shape)
 

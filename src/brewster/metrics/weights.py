@@ -107,16 +107,9 @@ def load_vgg16(
 
     path = _find(VGG16_FILE)
     if not path:
-        path = _cached(VGG16_FILE)
-        try:
-            (downloader or Downloader()).fetch(remote, path)
-        except DownloadError as error:
-            raise DownloadError(
-                f"VGG16's weights for DISTS (528 MiB) could not be downloaded: {str(error).rstrip('.')}",
-                f"expected a network connection, or {VGG16_FILE} in the folder weights of BREWSTER_DATA",
-                "connect and try again, or leave DISTS out with --metrics",
-            ) from error
-    if (actual := file_digest(path, remote.algorithm)) != remote.digest:
+        path = _cached(VGG16_FILE)  # the download checks the digest
+        _download(remote, path, downloader or Downloader(), ("VGG16", "DISTS", VGG16_FILE))
+    elif (actual := file_digest(path, remote.algorithm)) != remote.digest:
         raise ModelError(
             f"{path} has the {remote.algorithm} {actual:.12}...",
             f"expected {remote.digest:.12}..., the file {VGG16_FILE} of torchvision",
@@ -178,14 +171,7 @@ def _fetch(remote: RemoteFile, digest: str, cached: Path, downloader: Downloader
     import torch  # noqa: PLC0415 - an extra
 
     download = cached.with_name(remote.url.rsplit("/", 1)[-1])
-    try:
-        downloader.fetch(remote, download)
-    except DownloadError as error:
-        raise DownloadError(
-            f"AlexNet's weights for LPIPS (233 MiB) could not be downloaded: {str(error).rstrip('.')}",
-            f"expected a network connection, or {WEIGHTS_FILE} in the folder weights of BREWSTER_DATA",
-            "connect and try again, or leave LPIPS out with --metrics psnr,ssim",
-        ) from error
+    _download(remote, download, downloader, ("AlexNet", "LPIPS", WEIGHTS_FILE))
     try:
         tensors = read_alexnet(download, digest)
         buffer = io.BytesIO()
@@ -194,6 +180,19 @@ def _fetch(remote: RemoteFile, digest: str, cached: Path, downloader: Downloader
     finally:
         download.unlink(missing_ok=True)
     return tensors
+
+
+def _download(remote: RemoteFile, target: Path, downloader: Downloader, names: tuple[str, str, str]) -> None:
+    """Downloads the weights of a network. `names` are the network, its metric, and the file that replaces the download."""
+    network, metric, file_name = names
+    try:
+        downloader.fetch(remote, target)
+    except DownloadError as error:
+        raise DownloadError(
+            f"{network}'s weights for {metric} ({remote.size / 2**20:.0f} MiB) could not be downloaded: {str(error).rstrip('.')}",
+            f"expected a network connection, or {file_name} in the folder weights of BREWSTER_DATA",
+            f"connect and try again, or leave {metric} out with --metrics",
+        ) from error
 
 
 def _not_alexnet(path: Path, reason: str) -> ModelError:

@@ -70,12 +70,13 @@ def mean_inside(values: NDArray[Any], region: Region | None = None) -> float:
 
 def box_sums(values: _Values) -> _Values:
     """Returns sums over all complete 7x7 windows, (H - 6, W - 6, ...). Integer sums are exact if the dtype can hold them."""
-    for axis in (0, 1):
-        along_axis = np.moveaxis(values, axis, 0)
-        sums_of_2 = along_axis[:-1] + along_axis[1:]
-        sums_of_4 = sums_of_2[:-2] + sums_of_2[2:]
-        values = np.moveaxis(sums_of_4[:-3] + sums_of_2[4:-1] + along_axis[6:], 0, axis)
-    return values
+    sums_of_2 = values[:-1] + values[1:]
+    sums_of_4 = sums_of_2[:-2] + sums_of_2[2:]
+    columns = sums_of_4[:-3] + sums_of_2[4:-1] + values[6:]
+    sums_of_2 = columns[:, :-1] + columns[:, 1:]
+    sums_of_4 = sums_of_2[:, :-2] + sums_of_2[:, 2:]
+    sums: _Values = sums_of_4[:, :-3] + sums_of_2[:, 4:-1] + columns[:, 6:]
+    return sums
 
 
 def gaussian_means(values: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -104,7 +104,7 @@ def create(
             requests more pairs or catch trials than exist.
         OutputError: `out` is not empty or cannot be written.
     """
-    _require_empty(out)
+    require_empty(out)
     files = _pair_pictures(inputs, methods, options)
     all_pairs = list(combinations(methods, 2))
     pairs = all_pairs if options.all_pairs else all_pairs[: len(methods) - 1]
@@ -196,7 +196,8 @@ def _limited(requested: int | None, default: int, maximum: int, what: str) -> in
     return min(default, maximum) if requested is None else requested
 
 
-def _require_empty(out: Path) -> None:
+def require_empty(out: Path) -> None:
+    """Raises OutputError if `out` is a file or a folder with content."""
     if out.is_file() or (out.is_dir() and any(out.iterdir())):
         raise OutputError(f"{out} is not empty", "expected an empty or new folder", "choose another folder")
 

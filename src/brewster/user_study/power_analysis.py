@@ -19,7 +19,7 @@ class PowerAnalysis:
     """The required number of participants, and the quantities that it is computed from.
 
     `answers` is the number of participants times the number of pairs. `win` and `lose` are the assumed rates.
-    `design_effect` is the number of real answers that carry as much information as one independent answer. `deviation` is
+    `design_effect` is the number of real answers that have the information of one independent answer. `deviation` is
     the standard deviation, over participants, of the difference between win and lose rate.
     """
 

@@ -6,8 +6,8 @@
 
 For each participant, the database contains a number, the token of the personal link, the date of the consent and the
 trials; it contains no name and no address. The trials are drawn once, at admission, and stored, so a later version of
-brewster cannot change them. A second answer to a trial is ignored. A browser sends one, for example, if the response to the first answer was lost. To change
-their last answer, participants withdraw it first; withdrawn answers are kept.
+brewster cannot change them. A second answer to a trial is ignored: a browser repeats an answer if the response was lost. To
+change their last answer, participants withdraw it first. Withdrawn answers are kept.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from threading import Lock
-from typing import Annotated, Final, Literal, final
+from typing import TYPE_CHECKING, Annotated, Final, Literal, final
 
 from pydantic import ConfigDict, Field, TypeAdapter
 
@@ -30,9 +30,14 @@ from brewster.errors import BrewsterError, OutputError
 from brewster.user_study.assignment import CHOICES, Choice, Trial, draw_practice, draw_trials
 from brewster.user_study.study import ANSWERS_FILE, Study
 
+if TYPE_CHECKING:
+    from brewster.user_study.answer_file import AnswerFile, ExportedAnswer
+
 MAX_SECONDS: Final = 3600.0
 """Longer times are stored as this value."""
 _TIMEOUT_SECONDS: Final = 30.0
+_NO_CONSENT: Final = ""
+"""The value of `consented_on` of a participant of a static bundle, until the answers are imported."""
 _SCHEMA: Final = """
 CREATE TABLE IF NOT EXISTS participants (
     number INTEGER PRIMARY KEY, token TEXT NOT NULL UNIQUE, consented_on TEXT NOT NULL, trials TEXT NOT NULL,
@@ -154,21 +159,35 @@ class AnswerStore:
             (number,) = database.execute("SELECT count(*) FROM participants").fetchone()
             if max_participants is not None and number >= max_participants:
                 return None
-            token = secrets.token_urlsafe(24)
-            drawn = draw_trials(self.study.description, number)
-            trials = json.dumps([asdict(trial) for trial in drawn])
-            practice = json.dumps(asdict(draw_practice(self.study.description, number, drawn)))
             today = datetime.now(UTC).date().isoformat()
-            database.execute(
-                "INSERT INTO participants VALUES (?, ?, ?, ?, ?)", (number, token, today, trials, practice)
-            )
+            return self._insert_participant(database, consented_on=today)
+
+    def admit_exported(self) -> str:
+        """Add a participant of a static bundle, who has not given consent yet. Returns the token."""
+        with self._writing() as database:
+            return self._insert_participant(database, consented_on=_NO_CONSENT)
+
+    def _insert_participant(self, database: sqlite3.Connection, *, consented_on: str) -> str:
+        (number,) = database.execute("SELECT count(*) FROM participants").fetchone()
+        token = secrets.token_urlsafe(24)
+        drawn = draw_trials(self.study.description, number)
+        trials = json.dumps([asdict(trial) for trial in drawn])
+        practice = json.dumps(asdict(draw_practice(self.study.description, number, drawn)))
+        database.execute(
+            "INSERT INTO participants VALUES (?, ?, ?, ?, ?)", (number, token, consented_on, trials, practice)
+        )
         return token
 
-    def participant(self, token: str) -> Participant | None:
-        """The participant with this token, or None if the token is unknown."""
+    def participant(self, token: str, *, exported: bool = False) -> Participant | None:
+        """The participant with this token, or None if the token is unknown.
+
+        A participant of a static bundle whose answers are not imported is returned only with `exported`, because the study does
+        not have the consent yet.
+        """
         with self._reading() as database:
             row = database.execute(
-                "SELECT number, trials, practice FROM participants WHERE token = ?", (token,)
+                "SELECT number, trials, practice FROM participants WHERE token = ? AND (consented_on != ? OR ?)",
+                (token, _NO_CONSENT, exported),
             ).fetchone()
         return (
             None if row is None else Participant(row[0], _parse_trials(row[1]), Trial(**json.loads(row[2])))
@@ -258,6 +277,47 @@ class AnswerStore:
         stored: Choice = row[0]
         return stored
 
+    def import_answers(self, answer_file: AnswerFile) -> int:
+        """Store the answers of a participant of a static bundle, all or none. An answer that is stored already is kept.
+
+        Returns:
+            The number of answers that were not stored before.
+
+        Raises:
+            BrewsterError: the participant or a trial does not exist in this study.
+            OutputError: the database cannot be written.
+        """
+        participant = self.participant(answer_file.participant, exported=True)
+        if participant is None:
+            raise BrewsterError(
+                f"the file of answers is from the participant {answer_file.participant!r}, who is not in this study",
+                "expected a participant of a bundle that `brewster study export` wrote from this study",
+                "choose the study that the bundle belongs to",
+            )
+        count = len(participant.trials)
+        for answer in (*answer_file.answers, *answer_file.withdrawn):
+            if answer.trial >= count:
+                raise BrewsterError(
+                    f"the file of answers has an answer to trial {answer.trial}",
+                    f"expected trials from 0 to {count - 1}",
+                    "ask the participant to download the answers again",
+                )
+        number = participant.number
+        with self._writing() as database:
+            database.execute(
+                "UPDATE participants SET consented_on = ? WHERE number = ? AND consented_on = ?",
+                (answer_file.consented_on.isoformat(), number, _NO_CONSENT),
+            )
+            database.executemany(
+                "INSERT INTO withdrawn SELECT ?1, ?2, ?3, ?4, ?5, ?6 WHERE NOT EXISTS (SELECT 1 FROM withdrawn "
+                "WHERE participant = ?1 AND trial = ?2 AND choice = ?3 AND answered_at = ?5)",
+                [_row(number, answer) for answer in answer_file.withdrawn],
+            )
+            return database.executemany(
+                "INSERT OR IGNORE INTO answers VALUES (?, ?, ?, ?, ?, ?)",
+                [_row(number, answer) for answer in answer_file.answers],
+            ).rowcount
+
     def all_answers(self) -> Iterator[tuple[Participant, dict[int, StoredAnswer]]]:
         """Yield every participant, in order of number, and a dict of the answers by trial, which may be empty."""
         with self._reading() as database:
@@ -307,7 +367,7 @@ class AnswerStore:
             raise OutputError(
                 f"{ANSWERS_FILE} cannot be used ({error})",  # without the folder: participants may see this message
                 "expected a database created by brewster, on a local disk with free space",
-                "free disk space or restore the database file, then start the server again; all acknowledged answers are stored; all acknowledged answers are stored",
+                "free disk space or restore the database file, then start the server again; all acknowledged answers are stored",
             ) from error
 
 
@@ -322,6 +382,14 @@ def _read_only_uri(file: Path) -> str:
     log = file.with_name(f"{file.name}-wal")
     is_immutable = not os.access(file.parent, os.W_OK) and not (log.exists() and log.stat().st_size)
     return f"{file.resolve().as_uri()}?mode=ro{'&immutable=1' if is_immutable else ''}"
+
+
+def _row(participant: int, answer: ExportedAnswer) -> tuple[int, int, str, float, str, str]:
+    """The row of an answer in the tables answers and withdrawn."""
+    seconds = min(answer.seconds, MAX_SECONDS)
+    answered_at = answer.answered_at.astimezone(UTC).isoformat(timespec="seconds")
+    conditions = _CONDITIONS.dump_json(answer.conditions).decode()
+    return participant, answer.trial, answer.choice, seconds, answered_at, conditions
 
 
 def _parse_trials(text: str) -> tuple[Trial, ...]:

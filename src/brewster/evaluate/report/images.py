@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from html import escape
@@ -19,6 +20,8 @@ Float32 = NDArray[np.float32]
 
 MAX_SIDE_PX: Final = 480
 """The maximum of the longer side of an embedded image, in px."""
+
+_JPEG_QUALITY: Final = 90
 
 MAX_ERROR: Final = 96
 """Errors from this value up, of 255, have the last colour of the map."""
@@ -101,9 +104,9 @@ def to_thumbnails(case: CaseImages) -> CaseThumbnails:
 def photo_tiles(case: CaseImages) -> str:
     """Returns HTML with the photo, its error map, the ground truth, the region and, if known, the true reflection."""
     tiles = [
-        _tile(case, "picture", "photo", encode_webp(case.photo), ("photo", "")),
+        _tile(case, "picture", "photo", encode_photo(case.photo), ("photo", "")),
         _tile(case, "error", "error of the photo", encode_lossless(error_map(case.photo, case.ground_truth))),
-        _tile(case, "picture", "ground truth", encode_webp(case.ground_truth), ("transmission", "")),
+        _tile(case, "picture", "ground truth", encode_photo(case.ground_truth), ("transmission", "")),
         _tile(case, "region", "reflection region", overlay(case.region)),
     ]
     if case.reflection_ground_truth is not None:
@@ -112,7 +115,7 @@ def photo_tiles(case: CaseImages) -> str:
                 case,
                 "reflection",
                 "ground truth of the reflection",
-                encode_webp(case.reflection_ground_truth),
+                encode_photo(case.reflection_ground_truth),
                 ("reflection", ""),
             )
         )
@@ -124,7 +127,7 @@ def method_tiles(case: CaseImages, method: str) -> str:
     tiles = []
     if method in case.predictions:
         prediction = case.predictions[method]
-        tiles.append(_tile(case, "picture", method, encode_webp(prediction), ("transmission", method)))
+        tiles.append(_tile(case, "picture", method, encode_photo(prediction), ("transmission", method)))
         tiles.append(
             _tile(
                 case, "error", f"error of {method}", encode_lossless(error_map(prediction, case.ground_truth))
@@ -136,7 +139,7 @@ def method_tiles(case: CaseImages, method: str) -> str:
                 case,
                 "reflection",
                 f"reflection by {method}",
-                encode_webp(case.reflections[method]),
+                encode_photo(case.reflections[method]),
                 ("reflection", method),
             )
         )
@@ -146,11 +149,12 @@ def method_tiles(case: CaseImages, method: str) -> str:
 def _tile(case: CaseImages, kind: str, caption: str, data: bytes, full: tuple[str, str] | None = None) -> str:
     """Returns HTML: an image as a button that opens the viewer, and a link to the file at full size, if there is one."""
     width, height = embedded_size(case.photo)
+    media_type = "image/png" if data.startswith(b"\x89PNG") else "image/jpeg"
     url = escape(case.links.get(full, "") if full else "")
     title = f'<a href="{url}">{escape(caption)}</a>' if url else escape(caption)
     return (
         f'<figure><button type=button data-kind={kind} data-full="{url}"><img width={width} height={height} loading=lazy '
-        f'alt="{escape(caption)}, {escape(case.name)}" src="data:image/webp;base64,{base64.b64encode(data).decode()}">'
+        f'alt="{escape(caption)}, {escape(case.name)}" src="data:{media_type};base64,{base64.b64encode(data).decode()}">'
         f"</button><figcaption>{title}</figcaption></figure>"
     )
 
@@ -162,12 +166,15 @@ def embedded_size(image: NDArray[Any]) -> tuple[int, int]:
     return max(1, round(width * scale)), max(1, round(height * scale))
 
 
-def encode_webp(image: Pixels) -> bytes:
-    """Downscales an sRGB image (H, W, 3) to its embedded size by area means in linear light; returns a WebP file."""
+def encode_photo(image: Pixels) -> bytes:
+    """Downscales an sRGB image (H, W, 3) to its embedded size by area means in linear light; returns a JPEG file.
+
+    WebP files are 1/8 smaller, but their encoder takes seven times as long.
+    """
     if embedded_size(image) != image.shape[1::-1]:
         encoded = srgb.to_encoded(_area_means(_LINEAR[image]))
         image = np.rint(encoded * 255).clip(0, 255).astype(np.uint8)
-    return Photo.from_array(image, encoding="srgb").encode("webp")
+    return Photo(image, None, FileInfo(container="jpeg", jpeg_quality=_JPEG_QUALITY)).encode()
 
 
 def error_map(prediction: Pixels, truth: Pixels) -> Pixels:
@@ -175,19 +182,20 @@ def error_map(prediction: Pixels, truth: Pixels) -> Pixels:
 
     The error is max over channels |prediction - truth|, averaged over the area of each new pixel.
     """
-    errors = np.abs(prediction.astype(np.int16) - truth).max(axis=2)
+    red, green, blue = np.moveaxis(np.abs(prediction.astype(np.int16) - truth), 2, 0)
+    errors = np.maximum(np.maximum(red, green), blue)  # much faster than max(axis=2)
     means = _area_means(errors.astype(np.float32)[..., None])[..., 0]
     colours: Pixels = COLOUR_MAP[(means / MAX_ERROR * _COLOUR_COUNT).astype(int).clip(0, _COLOUR_COUNT - 1)]
     return colours
 
 
 def encode_lossless(image: Pixels, alpha: Pixels | None = None) -> bytes:
-    """Returns an image (H, W, 3) with its `alpha` (H, W) as a lossless WebP file."""
-    return Photo(image, alpha, FileInfo(container="webp", lossless=True)).encode()
+    """Returns an image (H, W, 3) with its `alpha` (H, W) as a PNG file."""
+    return Photo(image, alpha, FileInfo(container="png")).encode()
 
 
 def overlay(region: NDArray[np.bool_]) -> bytes:
-    """Returns a WebP file to draw over the photo: coloured inside the region, transparent outside.
+    """Returns a PNG file to draw over the photo: coloured inside the region, transparent outside.
 
     A new pixel is inside if at least half of its area is in the region.
     """
@@ -203,12 +211,21 @@ def _area_means(values: Float32) -> Float32:
     Photo.resized computes the same row by row to save memory. This function is faster.
     """
     width, height = embedded_size(values)
-    rows = np.tensordot(_area_weights(values.shape[0], height), values, 1)
-    return np.tensordot(_area_weights(values.shape[1], width), rows, (1, 1)).transpose(1, 0, 2)
+    return _area_means_along(_area_means_along(values, height, axis=0), width, axis=1)
 
 
-def _area_weights(old: int, new: int) -> Float32:
-    """Returns the weights of the `old` pixels in each of the `new` pixels along one axis, (new, old). Each row sums to 1."""
-    edges, pixels = np.linspace(0, old, new + 1), np.arange(old)
-    overlap = np.minimum(edges[1:, None], pixels + 1) - np.maximum(edges[:-1, None], pixels)
-    return (overlap.clip(0) * new / old).astype(np.float32)
+def _area_means_along(values: Float32, new: int, *, axis: int) -> Float32:
+    """Downscales one axis to `new` pixels. Each new pixel is a weighted sum of a few neighbouring old pixels."""
+    old = values.shape[axis]
+    if new == old:
+        return values
+    edges = np.arange(new + 1) * old / new
+    first = np.floor(edges[:-1]).astype(int)
+    means = np.zeros((*values.shape[:axis], new, *values.shape[axis + 1 :]), np.float32)
+    for pixel in (first + i for i in range(math.ceil(old / new) + 1)):
+        overlap = np.minimum(edges[1:], pixel + 1) - np.maximum(edges[:-1], pixel)
+        weights = (overlap.clip(0) * new / old).astype(np.float32)
+        shape = [1] * values.ndim
+        shape[axis] = new
+        means += weights.reshape(shape) * values.take(pixel, axis, mode="clip")
+    return means

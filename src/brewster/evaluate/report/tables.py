@@ -84,7 +84,8 @@ def _terminal_cell(
 
 
 def _shortened(names: list[str], width: int) -> list[str]:
-    """Returns the names with at most `width` characters. The middle of a longer one is left out, because ends differ."""
+    """Returns the names with at most `width` characters. In longer names, "…" replaces the middle, because names often
+    differ at the end."""
     left, right = (width - 1) - (width - 1) // 2, (width - 1) // 2
     return [name if len(name) <= width else f"{name[:left]}…{name[-right:]}" for name in names]
 

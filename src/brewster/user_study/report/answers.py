@@ -1,4 +1,4 @@
-"""All answers of a study as CSV, one line for each answer: what was shown, where, how, and what the participant chose."""
+"""All answers of a study as CSV: one line for each answer, with the trial, the choice and the viewing conditions."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def answers_csv(
     Args:
         description: the description of the study.
         participants: the participants with their answers.
-        left_out: the reason why a participant is excluded, by number; participants without a reason are included.
+        left_out: number of a participant -> reason of the exclusion. A participant who is not in it is included.
     """
     text = io.StringIO()
     table = csv.DictWriter(text, COLUMNS, restval="", lineterminator="\n")

@@ -102,7 +102,7 @@ def _table(table: Mapping[str, Any]) -> str:
 
 
 def _filled(rows: Iterable[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
-    """The rows with a rate. A dataset without answers has none, and neither has an average over it."""
+    """The rows that have rates. A dataset without answers has no rates, and an average over it has none either."""
     return [row for row in rows if row["win"]["mean"] is not None]
 
 
@@ -184,7 +184,7 @@ def _latex_row(tables: Iterable[Mapping[str, Any]], key: str) -> str:
 
 
 def to_csv(results: Results) -> str:
-    """One line for each group, pair of methods, row (dataset or average) and rate. Rates are shares, not percentages.
+    """One line for each group, pair of methods, row (dataset or average) and rate. Rates are fractions, not percentages.
 
     The key is the name of the dataset, or begins with a slash for an average.
     """

@@ -2,6 +2,7 @@
 // the next trial, shows its three pictures, sends the answer, and continues after the server has acknowledged it.
 
 import { PanZoom } from "./pan_zoom.js";
+import { bundle } from "./study_bundle.js"; // null if a server runs the study
 
 const PARTICIPANT_TOKEN = location.pathname.match(/^\/s\/([^/]+)/)?.[1];
 // In ms. Earlier answers are ignored, because they may be the second click of a double click in the previous trial.
@@ -35,6 +36,7 @@ function show(section) {
 // Sends a request and returns the data of the response. Repeats the request after a network or server error, and throws after
 // a client error.
 async function send(path, body) {
+  if (bundle) return bundle.respond(path, body);
   for (let wait = 1; ; wait = Math.min(2 * wait, 15)) {
     try {
       const options = body && { method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify(body) };
@@ -148,7 +150,7 @@ function conditions() {
 
 // --- pictures
 
-const pictureUrl = (trial, side) => `/s/${PARTICIPANT_TOKEN}/pictures/${trial}/${side}`;
+const pictureUrl = (trial, side) => bundle ? bundle.pictureUrl(trial, side) : `/s/${PARTICIPANT_TOKEN}/pictures/${trial}/${side}`;
 
 async function loadPicture(source) {
   for (let wait = 1; ; wait = Math.min(2 * wait, 15)) {
@@ -259,7 +261,7 @@ async function undo() {
 }
 
 function finish({ trials }) {
-  byId("done").textContent = `All ${trials} answers are saved.`;
+  byId("done").textContent = bundle ? `You have answered all ${trials} pairs.` : `All ${trials} answers are saved.`;
   show("finish");
   byId("thanks").focus();
 }
@@ -299,10 +301,15 @@ byId("copy").addEventListener("click", async () => {
   }
   setTimeout(() => notice(""), 8000);
 });
+if (bundle) {
+  for (const id of ["hand-in", "download-early"]) byId(id).hidden = false;
+  for (const id of ["copy", "close"]) byId(id).hidden = true;
+  for (const id of ["download", "download-early"]) byId(id).addEventListener("click", () => bundle.download());
+}
 byId("retry").addEventListener("click", () => location.reload());
 
 try {
-  await (PARTICIPANT_TOKEN ? start(await send(`/s/${PARTICIPANT_TOKEN}/trial`)) : showInvitation());
+  await ((bundle ? bundle.hasConsent : PARTICIPANT_TOKEN) ? start(await send(`/s/${PARTICIPANT_TOKEN}/trial`)) : showInvitation());
 } catch (error) {
   showError(error);
 }

@@ -1,0 +1,84 @@
+"""The file of answers that a participant of a static bundle downloads and sends back.
+
+answer_file = read_answer_file(Path("answers-3f9a.json"))
+store.import_answers(answer_file)    # the number of new answers
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from datetime import date
+from pathlib import Path
+from typing import Annotated, Final, Literal, final
+
+from pydantic import AwareDatetime, ConfigDict, Field, TypeAdapter, ValidationError
+
+from brewster.errors import BrewsterError
+from brewster.user_study.assignment import Choice
+from brewster.user_study.store import ViewingConditions
+
+MAX_ANSWER_FILE_BYTES: Final = 2_000_000
+"""A file with 44 answers has about 15,000 bytes."""
+
+
+@final
+@dataclass(frozen=True)
+class ExportedAnswer:
+    """An answer as the browser stored it. `answered_at` is the time of the browser, with its time zone."""
+
+    __pydantic_config__ = ConfigDict(extra="forbid")
+
+    trial: Annotated[int, Field(ge=0)]
+    choice: Choice
+    seconds: Annotated[float, Field(ge=0, allow_inf_nan=False)]
+    answered_at: AwareDatetime
+    conditions: ViewingConditions | None = None
+
+
+@final
+@dataclass(frozen=True)
+class AnswerFile:
+    """The answers of one participant. `participant` is the token of the personal link."""
+
+    __pydantic_config__ = ConfigDict(extra="forbid")
+
+    format: Literal[1]
+    participant: Annotated[str, Field(min_length=1, max_length=64)]
+    consented_on: date
+    answers: tuple[ExportedAnswer, ...]
+    withdrawn: tuple[ExportedAnswer, ...] = ()
+
+
+_ANSWER_FILE: Final = TypeAdapter(AnswerFile)
+
+
+def read_answer_file(path: Path) -> AnswerFile:
+    """Reads a file of answers. Nothing in it is trusted: types, ranges, names and size are checked.
+
+    Raises:
+        BrewsterError: the file cannot be read, is too large, or is not a valid file of answers.
+    """
+    try:
+        with path.open("rb") as file:
+            data = file.read(MAX_ANSWER_FILE_BYTES + 1)
+    except OSError as error:
+        raise BrewsterError(
+            f"{path} cannot be read ({error.strerror or error})",
+            "expected a file of answers from a participant",
+            "check the path",
+        ) from error
+    if len(data) > MAX_ANSWER_FILE_BYTES:
+        raise BrewsterError(
+            f"{path} has more than {MAX_ANSWER_FILE_BYTES:,} bytes",
+            "expected a file of answers from a participant, which is much smaller",
+            "check the path",
+        )
+    try:
+        return _ANSWER_FILE.validate_json(data)
+    except ValidationError as error:
+        first = error.errors()[0]
+        raise BrewsterError(
+            f"{path} is not a valid file of answers ({'.'.join(map(str, first['loc'])) or 'file'}: {first['msg']})",
+            "expected an unchanged file that the page of the study has written",
+            "ask the participant to download the answers again",
+        ) from error

@@ -1,0 +1,100 @@
+"""Writes the page of a study as static files, for participants who cannot reach the machine of the study.
+
+    tokens = export_bundle(study, store, Path("out/bundle"), participants=20)    # one personal link each
+
+Any web server of static files can serve the folder. The browser of a participant stores the answers. The participant downloads
+them as a file, and `brewster study import` adds the file to the study. The folder contains no name of a method, dataset or
+source file, and neither the correct choice of a catch trial nor an answer.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any, Final
+
+from brewster.files import atomic_path
+from brewster.user_study.assignment import Trial
+from brewster.user_study.create import require_empty
+from brewster.user_study.store import AnswerStore, Participant
+from brewster.user_study.study import PICTURES_FOLDER, Study
+
+PARTICIPANTS_FOLDER: Final = "participants"
+_PAGE_FOLDER: Final = Path(__file__).parent / "page"
+_COPIED: Final = ("style.css", "study.css", "study.js", "study_bundle.js", "pan_zoom.js", "icon.svg")
+_HEAD: Final = """<meta http-equiv="Content-Security-Policy" content="default-src 'self'; img-src 'self' data:; base-uri 'none'; form-action 'none'">
+<meta name="study-bundle" content="static">
+"""
+_PRIVACY: Final = """<p>Your browser keeps your answers until you download them as a file and send it to the person who runs the study. They
+      are not sent automatically. The web server that you loaded this page from may store your network address and the time.</p>
+"""
+
+
+def export_bundle(study: Study, store: AnswerStore, out: Path, *, participants: int) -> list[str]:
+    """Writes the page, the pictures and the trials of new participants into the folder `out`.
+
+    The participants take the next places in the assignment of the study, as participants of the server do.
+
+    Returns:
+        The token of each participant. The personal link is the address of the folder, followed by `?p=TOKEN`.
+
+    Raises:
+        OutputError: `out` is not empty or cannot be written, or the answers cannot be written.
+        BrewsterError: a picture of the study is missing or changed.
+    """
+    require_empty(out)
+    study.verify_pictures()
+    with atomic_path(out) as folder:
+        for name in (PICTURES_FOLDER, PARTICIPANTS_FOLDER):
+            (folder / name).mkdir(parents=True)
+            (folder / name / "index.html").touch()  # else many servers list the files, and so the tokens
+        _write_page(folder)
+        tokens = [store.admit_exported() for _ in range(participants)]
+        for token in tokens:
+            participant = store.participant(token, exported=True)
+            assert participant
+            _copy_pictures(study, folder, [*participant.trials, *_practice(participant)])
+            text = json.dumps(_describe(study, participant))
+            (folder / PARTICIPANTS_FOLDER / f"{token}.json").write_text(text, "utf-8")
+    return tokens
+
+
+def _write_page(folder: Path) -> None:
+    for name in _COPIED:
+        shutil.copyfile(_PAGE_FOLDER / name, folder / name)
+    for source, target in (("study.html", "index.html"), ("privacy.html", "privacy.html")):
+        text = (_PAGE_FOLDER / source).read_text("utf-8")
+        text = text.replace('"/page/', '"').replace('"/privacy"', '"privacy.html"')
+        text = text.replace("<title>", f"{_HEAD}<title>").replace("<!-- bundle -->", _PRIVACY)
+        (folder / target).write_text(text, "utf-8")
+
+
+def _copy_pictures(study: Study, folder: Path, trials: Iterable[Trial]) -> None:
+    for name in {name for trial in trials for name in (trial.photo, trial.left, trial.right)}:
+        target = folder / PICTURES_FOLDER / Path(name).name
+        if not target.exists():
+            shutil.copyfile(study.picture_file(name), target)
+
+
+def _describe(study: Study, participant: Participant) -> dict[str, Any]:
+    """Returns what the page needs. The correct choices of catch trials are left out."""
+    practice = [
+        _describe_trial(study, trial) | {"expected": trial.expected} for trial in _practice(participant)
+    ]
+    return {
+        "consent": study.description.consent,
+        "trials": [_describe_trial(study, trial) for trial in participant.trials],
+        "practice": practice[0] if practice else None,
+    }
+
+
+def _describe_trial(study: Study, trial: Trial) -> dict[str, Any]:
+    photo = study.picture(trial.photo)
+    names = {side: Path(getattr(trial, side)).name for side in ("photo", "left", "right")}
+    return names | {"width": photo.width, "height": photo.height}
+
+
+def _practice(participant: Participant) -> list[Trial]:
+    return [participant.practice] if participant.practice else []
