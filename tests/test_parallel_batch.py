@@ -281,7 +281,7 @@ def test_two_processes_write_the_files_of_one_and_a_missing_model_ends_the_run(t
     (tmp_path / "in").mkdir()
     for number in range(4):
         (tmp_path / f"in/{number}.jpg").write_bytes(image_bytes(seed=number))
-    two = partial(ProcessExecutor, count=2)
+    two = partial(ProcessExecutor, worker_count=2)
     assert set(run_archive(tmp_path, options, executor=two, index=False).values()) == {"separated"}
     list(separate_files(tmp_path / "in", tmp_path / "plain", options))
     assert hashes(tmp_path / "out") == hashes(tmp_path / "plain")

@@ -46,6 +46,7 @@ EXTRAS: Final = {
     "diffusion": {
         "accelerate": "accelerate",
         "diffusers": "diffusers",
+        "gguf": "gguf",
         "huggingface_hub": "huggingface_hub",
         "peft": "peft",
         "safetensors": "safetensors",

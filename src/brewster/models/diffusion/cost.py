@@ -20,7 +20,7 @@ from brewster.models.diffusion.prompt import PromptEmbedding
 
 PROMPT_TOKENS: Final = 512
 EFFICIENCY: Final = 0.4
-"""Assumed speed of a transformer divided by the peak speed of the card."""
+"""Assumed speed of a transformer divided by the peak speed of the GPU."""
 _HIDDEN_STATES_PER_BLOCK: Final = 36
 """Activations of one block while it computes, in hidden states."""
 
@@ -28,7 +28,7 @@ _HIDDEN_STATES_PER_BLOCK: Final = 36
 @final
 @dataclass(frozen=True)
 class GraphicsCard:
-    """A graphics card: memory in GiB, and peak dense bf16 speed in TFLOP/s from its data sheet."""
+    """A GPU: memory in GiB, and peak dense bf16 speed in TFLOP/s from its data sheet."""
 
     name: str
     memory_gib: float
@@ -44,11 +44,11 @@ CARDS: Final = {
         GraphicsCard("A100", 80, 312), GraphicsCard("H100", 80, 989), GraphicsCard("H200", 141, 989),
     )
 }  # fmt: skip
-"""name -> card. The paper uses the RTX 4090."""
+"""Name -> GPU. The paper uses the RTX 4090."""
 
 
 def find_gpu(name: str | None = None) -> GraphicsCard:
-    """Returns the card of this name; without a name, the local GPU, or the RTX 4090 if there is none.
+    """Returns the GPU of this name; without a name, the local GPU, or the RTX 4090 if there is none.
 
     Raises:
         DeviceError: the name is not in `CARDS`.
@@ -60,9 +60,9 @@ def find_gpu(name: str | None = None) -> GraphicsCard:
         return known[name.lower()]
     matches = get_close_matches(name.lower(), known, n=1)
     raise DeviceError(
-        f"there is no card {name!r} in the table",
+        f"there is no GPU {name!r} in the table",
         f"expected one of {', '.join(CARDS)}",
-        f"did you mean {known[matches[0]].name}?" if matches else "choose the most similar card",
+        f"did you mean {known[matches[0]].name}?" if matches else "choose the most similar GPU",
     )
 
 
@@ -72,7 +72,7 @@ def is_local_gpu(card: GraphicsCard) -> bool:
 
 
 def _local_gpu() -> GraphicsCard:
-    """Returns the local GPU. Its speed is that of the card in `CARDS` with its name, or of the RTX 4090 if there is none."""
+    """Returns the local GPU. Its speed is that of the GPU in `CARDS` with its name, or of the RTX 4090 if there is none."""
     found = torch.cuda.get_device_properties(0)
     speed = next(
         (card.tflops for name, card in CARDS.items() if name in found.name), CARDS["RTX 4090"].tflops
