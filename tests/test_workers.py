@@ -78,7 +78,9 @@ def test_ctrl_c_stops_all_workers_and_leaves_no_partial_files(tmp_path):
 
 def test_a_sample_that_kills_every_worker_fails_and_the_others_are_rendered(tmp_path, monkeypatch):
     monkeypatch.setattr(local, "MAX_ATTEMPTS", 1)
-    results = render_set(tmp_path / "set", renderer="crashing", executor=partial(ProcessExecutor, worker_count=1))
+    results = render_set(
+        tmp_path / "set", renderer="crashing", executor=partial(ProcessExecutor, worker_count=1)
+    )
     assert statuses(results) == {0: "rendered", 1: "rendered", 2: "failed", 3: "rendered"}
     assert "the worker died 1 times (exit code -9)" in next(
         result.error for result in results if result.error
@@ -89,7 +91,9 @@ def test_a_fatal_error_in_a_worker_ends_the_run(tmp_path):
     with pytest.raises(
         DeviceError, match=r"^there is no GPU; expected a GPU; or a CPU; use another computer\.$"
     ):
-        render_set(tmp_path / "set", renderer="without_device", executor=partial(ProcessExecutor, worker_count=1))
+        render_set(
+            tmp_path / "set", renderer="without_device", executor=partial(ProcessExecutor, worker_count=1)
+        )
 
 
 def test_serial_rendering_restores_the_number_of_torch_threads(tmp_path):
