@@ -67,7 +67,7 @@ class GeneratedOverride:
         var is the local variance: the mean over channels and windows of the squared difference to the window mean.
         """
         reflection_variance, transmission_variance = (
-            _box_mean(np.square(layer - _box_mean(layer)).mean(axis=2, keepdims=True))
+            box_mean(np.square(layer - box_mean(layer)).mean(axis=2, keepdims=True))
             for layer in (reflection, transmission)
         )
         weight: Floats = reflection_variance / (
@@ -104,12 +104,12 @@ class GuidedUpsampler:
             reflection: the reflection; None if it is photo - transmission.
             override: a generated transmission, and the weight with which it replaces the fitted transmission.
         """
-        mean = _box_mean(photo)
-        variance = _box_mean(photo * photo) - mean**2 + _EPSILON
+        mean = box_mean(photo)
+        variance = box_mean(photo * photo) - mean**2 + _EPSILON
 
         def fit_layer(layer: Floats) -> _LocalLinearModel:
             """Fits a slope to each window and averages the slopes. The offset makes the fit exact at low resolution."""
-            slope = _box_mean((_box_mean(photo * layer) - mean * _box_mean(layer)) / variance)
+            slope = box_mean((box_mean(photo * layer) - mean * box_mean(layer)) / variance)
             return _LocalLinearModel(slope, layer - slope * photo)
 
         return cls(fit_layer(change), None if reflection is None else fit_layer(reflection), override)
@@ -177,7 +177,7 @@ def _interpolate(map_: Floats, lower: NDArray[np.intp], fraction: Floats, *, axi
     return high
 
 
-def _box_mean(map_: Floats) -> Floats:
+def box_mean(map_: Floats) -> Floats:
     """Returns the means of a map (h, w, C) over square windows. Pixels outside the map have the value of the nearest pixel."""
     for axis in (0, 1):
         padding = [(0, 0)] * 3
