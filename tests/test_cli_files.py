@@ -12,7 +12,7 @@ from click.shell_completion import ShellComplete
 from brewster import Photo
 from brewster.cli import batch_plan, cli
 from brewster.photo import contact_sheet
-from cli_helpers import error_lines, image_bytes, layer_files, list_files
+from cli_helpers import error_lines, image_bytes, layer_files, list_files, run_process
 from picture_files import dng_file, mosaic
 
 # --- the names of photos
@@ -81,11 +81,12 @@ def test_a_folder_may_have_a_dot_in_its_name(run, tmp_path, name):
     assert list_files(tmp_path / name) == layer_files("a")
 
 
-def test_the_short_option_for_help_works_everywhere(run_without_model):
+def test_the_short_option_for_help_works_everywhere():
+    """In a process of its own: click caches the help option of a command that another test has opened without its group."""
     for arguments in (["-h"], ["separate", "-h"], ["models", "list", "-h"]):
-        code, out, _ = run_without_model(*arguments)
-        assert code == 0
-        assert out.startswith(b"Usage: brewster")
+        result = run_process(*arguments)
+        assert result.returncode == 0
+        assert result.stdout.startswith(b"Usage: brewster")
 
 
 # --- RAW files and videos
