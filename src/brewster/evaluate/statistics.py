@@ -103,7 +103,7 @@ def _estimate(
 class Difference:
     """The mean of score(method) - score(reference) in one metric, over the images with both scores, with its interval.
 
-    `improved_count` is the number of images on which `method` has a better score reference `reference`.
+    `improved_count` is the number of images on which `method` has a better score than `reference`.
     """
 
     method: str

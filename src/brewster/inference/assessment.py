@@ -63,7 +63,7 @@ def assess(
     """
     light = float(photo.sum(dtype=np.float64))
     removed = float(np.maximum(photo - transmission, 0).sum(dtype=np.float64))
-    change = _encoded_change(photo, transmission)
+    change = encoded_change(photo, transmission)
     total = float(change.sum(dtype=np.float64))
     confidence = float((change * confidence_map[..., 0]).sum(dtype=np.float64)) / total if total else 1.0
     removed_light = removed / light if light else 0.0
@@ -72,7 +72,7 @@ def assess(
     return Assessment(verdict, removed_light, changed_area, confidence)
 
 
-def _encoded_change(photo: Floats, transmission: Floats) -> Floats:
+def encoded_change(photo: Floats, transmission: Floats) -> Floats:
     """Returns the largest change of the three channels of each pixel, sRGB-encoded, (h, w)."""
     encoded = (to_encoded(np.clip(image, 0, 1)) for image in (photo, transmission))
     change: Floats = np.abs(np.subtract(*encoded)).max(axis=2)

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
+from brewster.inference.assessment import encoded_change
 from brewster.inference.guided_upsampling import Floats, box_mean
 from brewster.inference.predictor import Prediction
 from brewster.srgb import to_encoded
@@ -36,9 +37,8 @@ def keep_clipped(photo: Float32[Floats, "h w 3"], prediction: Prediction) -> Pre
         prediction: the layers for this input.
     """
     transmission = np.clip(photo + prediction.change, 0, 1)
-    before, after = (to_encoded(image) for image in (photo, transmission))
-    clipped = _smooth_step(before.min(axis=2, keepdims=True), _CLIPPED)
-    certain = _smooth_step(np.abs(before - after).max(axis=2, keepdims=True), _CERTAIN)
+    clipped = _smooth_step(to_encoded(photo.min(axis=2, keepdims=True)), _CLIPPED)
+    certain = _smooth_step(encoded_change(photo, transmission)[..., None], _CERTAIN)
     kept = clipped * (1 - certain)
     for _ in range(_SMOOTHINGS):
         kept = box_mean(kept)

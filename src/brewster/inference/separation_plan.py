@@ -17,7 +17,7 @@ from typing import Final, final
 
 import torch
 
-from brewster.errors import DeviceError, ModelError
+from brewster.errors import ModelError
 from brewster.inference.diffusion_predictor import DiffusionPredictor
 from brewster.models.diffusion.backbones.registry import hub_id_of, is_registered, skeleton
 from brewster.models.diffusion.cost import (
@@ -25,6 +25,7 @@ from brewster.models.diffusion.cost import (
     PROMPT_TOKENS,
     GraphicsCard,
     block_bytes,
+    check_gpu_memory,
     count_parameters,
     forward_tflop,
 )
@@ -39,6 +40,7 @@ from brewster.models.diffusion.memory import (
 )
 from brewster.models.diffusion.model_source import find_model_source
 from brewster.models.diffusion.offloading import DECODING_BYTES_PER_PIXEL
+from brewster.models.diffusion.panels import count_tokens
 from brewster.models.diffusion.pipeline import DecompositionPipeline, task_with_guidance
 from brewster.models.diffusion.task import DecompositionTask
 from brewster.models.diffusion_models import licence_of
@@ -108,12 +110,8 @@ class SeparationPlan:
         Raises:
             DeviceError: it does not fit.
         """
-        if self.total_gib > self.card.memory_gib:
-            raise DeviceError(
-                f"{self.model} needs about {self.total_gib:.1f} GiB",
-                f"expected at most the {self.card.memory_gib:g} GiB of {self.card.name}",
-                "use --offload layers, --quantization int8 or nf4, the model klein, or a larger card",
-            )
+        cure = "use --offload layers, --quantization int8 or nf4, the model klein, or a larger card"
+        check_gpu_memory(self.model, self.total_gib, self.card, cure)
 
 
 def plan_separation(options: Options, size: tuple[int, int], card: GraphicsCard) -> SeparationPlan:
@@ -204,9 +202,7 @@ def _local_file(transformer: str) -> Path:
 
 
 def _tokens(panel: tuple[int, int], *, task: DecompositionTask, size_divisor: int) -> tuple[int, int]:
-    """The numbers of generated tokens and of conditioning tokens for a panel of this (width, height) in px."""
-    tokens = panel[0] * panel[1] // size_divisor**2
+    """The numbers of generated tokens and of conditioning tokens. The objective "direct" generates one panel, without condition."""
     if task.objective == "direct":
-        return tokens, 0
-    generated = tokens * len(task.layout.panels)
-    return generated, generated if task.layout.has_white_space else tokens
+        return panel[0] * panel[1] // size_divisor**2, 0
+    return count_tokens(panel, task.layout, size_divisor)

@@ -66,6 +66,20 @@ def find_gpu(name: str | None = None) -> GraphicsCard:
     )
 
 
+def check_gpu_memory(name: str, needed_gib: float, card: GraphicsCard, cure: str) -> None:
+    """Checks that an estimate for the model `name` fits into the memory of a GPU; `cure` says what to do if it does not.
+
+    Raises:
+        DeviceError: it does not fit.
+    """
+    if needed_gib > card.memory_gib:
+        raise DeviceError(
+            f"{name} needs about {needed_gib:.1f} GiB",
+            f"expected at most the {card.memory_gib:g} GiB of {card.name}",
+            cure,
+        )
+
+
 def is_local_gpu(card: GraphicsCard) -> bool:
     """Whether this is the GPU of this machine."""
     return torch.cuda.is_available() and card == _local_gpu()

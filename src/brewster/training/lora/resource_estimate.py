@@ -15,7 +15,6 @@ from typing import Final, final
 
 import torch
 
-from brewster.errors import DeviceError
 from brewster.models.diffusion.adapter.lora import select_target_modules
 from brewster.models.diffusion.backbones.backbone import Backbone
 from brewster.models.diffusion.backbones.registry import find_backbone_class, skeleton
@@ -24,13 +23,14 @@ from brewster.models.diffusion.cost import (
     PROMPT_TOKENS,
     GraphicsCard,
     block_bytes,
+    check_gpu_memory,
     count_blocks,
     count_parameters,
     forward_tflop,
     hidden_state_bytes,
 )
 from brewster.models.diffusion.memory import GIB, fitting_quantizations, weights_gib
-from brewster.models.diffusion.panels import fit_panel
+from brewster.models.diffusion.panels import count_tokens, fit_panel
 from brewster.models.zoo import TINY_PREFIX
 from brewster.training.recipe import ENCODED_SUFFIX, LoraRecipe
 
@@ -102,13 +102,7 @@ class ResourceEstimate:
         Raises:
             DeviceError: the recipe does not fit. The message says which values to change.
         """
-        if self.total_gib <= self.card.memory_gib:
-            return
-        raise DeviceError(
-            f"{self.recipe.backbone} needs about {self.total_gib:.1f} GiB",
-            f"expected at most the {self.card.memory_gib:g} GiB of {self.card.name}",
-            self._cure(),
-        )
+        check_gpu_memory(self.recipe.backbone, self.total_gib, self.card, self._cure())
 
     def _cure(self) -> str:
         others = self.total_gib - self.memory_gib["backbone"]
@@ -135,9 +129,7 @@ def estimate_resources(recipe: LoraRecipe, card: GraphicsCard) -> ResourceEstima
         max_composite_pixels=recipe.max_composite_pixels,
         size_divisor=backbone.size_divisor,
     )
-    tokens_per_panel = (fit.panel[0] // backbone.size_divisor) * (fit.panel[1] // backbone.size_divisor)
-    generated_tokens = tokens_per_panel * len(recipe.panels)
-    condition_tokens = generated_tokens if recipe.layout.has_white_space else tokens_per_panel
+    generated_tokens, condition_tokens = count_tokens(fit.panel, recipe.layout, backbone.size_divisor)
     parameters, vae, lora_parameters = (
         count_parameters(backbone.transformer),
         count_parameters(backbone.vae),

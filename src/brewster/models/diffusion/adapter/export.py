@@ -15,13 +15,14 @@ from torch import Tensor, nn
 
 from brewster.errors import ModelError, OutputError
 from brewster.models.diffusion.adapter.lora import read_lora, read_prompt
+from brewster.models.diffusion.adapter.lora_formats import DOWN_SUFFIX, UP_SUFFIX, adapted_layers
 from brewster.models.diffusion.backbones.backbone import Backbone
 from brewster.models.diffusion.backbones.loading import load_backbone
 from brewster.models.diffusion.prompt import PROMPT_FILE
 from brewster.models.diffusion.tensors import write_tensors
 
 _PREFIX: Final = "transformer."
-_DOWN, _UP, _ALPHA = ".lora_A.weight", ".lora_B.weight", ".alpha"
+_ALPHA: Final = ".alpha"
 
 
 def export_comfyui(folder: Path, target: Path) -> None:
@@ -34,13 +35,12 @@ def export_comfyui(folder: Path, target: Path) -> None:
     _check_target(target)
     state, metadata = read_lora(folder)
     tensors = {_PREFIX + name: tensor for name, tensor in state.items()}
-    layers = [name.removesuffix(_UP) for name in tensors if name.endswith(_UP)]
     # safetensors refuses tensors that share memory, so each layer gets its own. An imported layer has alpha = rank.
     alphas = {
         layer + _ALPHA: torch.tensor(
-            float(len(tensors[layer + _DOWN]) if metadata.imported else metadata.alpha)
+            float(len(tensors[layer + DOWN_SUFFIX]) if metadata.imported else metadata.alpha)
         )
-        for layer in layers
+        for layer in adapted_layers(tensors)
     }
     write_tensors(target, tensors | alphas, {})
 
@@ -85,7 +85,7 @@ def merge(backbone: Backbone, state: Mapping[str, Tensor], scale: float) -> None
     """
     modules = backbone.transformer.named_modules()
     layers = {name for name, module in modules if isinstance(module, nn.Linear)}
-    for layer in sorted(name.removesuffix(_UP) for name in state if name.endswith(_UP)):
+    for layer in adapted_layers(state):
         if layer not in layers:
             raise ModelError(
                 f"the base has no layer {layer}",
@@ -93,7 +93,7 @@ def merge(backbone: Backbone, state: Mapping[str, Tensor], scale: float) -> None
                 "choose another base",
             )
         weight = backbone.transformer.get_submodule(layer).weight
-        change = scale * state[layer + _UP].float() @ state[layer + _DOWN].float()
+        change = scale * state[layer + UP_SUFFIX].float() @ state[layer + DOWN_SUFFIX].float()
         weight.copy_(weight.float() + change.to(weight.device))
 
 

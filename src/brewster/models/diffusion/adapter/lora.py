@@ -39,7 +39,7 @@ LORA_FILE: Final = "pytorch_lora_weights.safetensors"
 _PREFIX: Final = "transformer."
 _METADATA_KEY: Final = "brewster"
 _PEFT_KEY: Final = "lora_adapter_metadata"
-_ADAPTER_NAME: Final = "default"
+ADAPTER_NAME: Final = "default"
 
 
 @final
@@ -165,7 +165,7 @@ def attach_layers(backbone: Backbone, layers: Mapping[str, LowRankLayer]) -> Non
     _add_adapter(backbone, config)
     _convert_for_inference(backbone)
     peft.set_peft_model_state_dict(
-        backbone.transformer, lora_formats.to_state_dict(layers), adapter_name=_ADAPTER_NAME
+        backbone.transformer, lora_formats.to_state_dict(layers), adapter_name=ADAPTER_NAME
     )
 
 
@@ -196,7 +196,7 @@ def lora_state_dict(backbone: Backbone) -> dict[str, Tensor]:
     """The LoRA's weights by name, such as transformer_blocks.0.attn.to_q.lora_A.weight; empty without a LoRA."""
     if not has_lora(backbone):
         return {}
-    state = import_library("peft").get_peft_model_state_dict(backbone.transformer, adapter_name=_ADAPTER_NAME)
+    state = import_library("peft").get_peft_model_state_dict(backbone.transformer, adapter_name=ADAPTER_NAME)
     return dict(sorted(state.items()))
 
 
@@ -208,7 +208,7 @@ def load_lora_state(backbone: Backbone, state: Mapping[str, Tensor]) -> None:
     """
     _check_weights(lora_state_dict(backbone), state)
     import_library("peft").set_peft_model_state_dict(
-        backbone.transformer, dict(state), adapter_name=_ADAPTER_NAME
+        backbone.transformer, dict(state), adapter_name=ADAPTER_NAME
     )
 
 
@@ -241,7 +241,7 @@ def save_lora(
             f"expected a prompt for {backbone.name}",
             "encode it for this backbone",
         )
-    config = backbone.transformer.peft_config[_ADAPTER_NAME]
+    config = backbone.transformer.peft_config[ADAPTER_NAME]
     source, rank, alpha = base_model or backbone.hub_id, config.r, config.lora_alpha
     metadata = LoraMetadata(
         backbone.name, source, quantization, rank, alpha, task, prompt.sha256, tuple(target_modules)
@@ -377,7 +377,7 @@ def _check_weights(expected: Mapping[str, Tensor], actual: Mapping[str, Tensor])
 
 def _add_adapter(backbone: Backbone, config: Any) -> None:  # noqa: ANN401 - peft's configuration
     """Adds a LoRA with random A matrices, float32. peft creates it in the dtype of the base, which may be bf16."""
-    backbone.transformer.add_adapter(config, adapter_name=_ADAPTER_NAME)
+    backbone.transformer.add_adapter(config, adapter_name=ADAPTER_NAME)
     import_library("diffusers.training_utils").cast_training_params(backbone.transformer, torch.float32)
 
 

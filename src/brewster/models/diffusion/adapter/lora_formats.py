@@ -35,6 +35,9 @@ _KEY: Final = re.compile(
     r"(?P<module>.+?)\.(?:(?P<matrix>lora_A|lora_B|lora_down|lora_up)(?:\.(?!weight$)[^.]+)?\.weight|(?P<alpha>alpha))"
 )
 """A layer, then `lora_A`, `lora_B` (peft) or `lora_down`, `lora_up` (kohya), the name of the adapter, or `alpha`."""
+DOWN_SUFFIX: Final = ".lora_A.weight"
+UP_SUFFIX: Final = ".lora_B.weight"
+"""The suffixes of the keys of a layer's two matrices in a state dict of brewster, peft and diffusers."""
 _DOWN: Final = ("lora_A", "lora_down")
 _TEXT_ENCODERS: Final = ("lora_te", "text_encoder", "te1_", "te2_")
 _OTHER_METHODS: Final = {"dora_scale": "DoRA", "lora_magnitude": "DoRA", "lokr_": "LoKr", "hada_": "LoHa"}
@@ -143,11 +146,16 @@ def read_lora_layers(
     return layers
 
 
+def adapted_layers(state: Mapping[str, Tensor]) -> list[str]:
+    """Returns the names of the layers whose weights are in `state`, which has keys as those of `lora_state_dict`, sorted."""
+    return sorted(key.removesuffix(UP_SUFFIX) for key in state if key.endswith(UP_SUFFIX))
+
+
 def to_state_dict(layers: Mapping[str, LowRankLayer]) -> dict[str, Tensor]:
     """The weights with the names that `lora_state_dict` uses."""
     state: dict[str, Tensor] = {}
     for name, layer in sorted(layers.items()):
-        state |= {f"{name}.lora_A.weight": layer.down, f"{name}.lora_B.weight": layer.up}
+        state |= {name + DOWN_SUFFIX: layer.down, name + UP_SUFFIX: layer.up}
     return state
 
 

@@ -10,12 +10,14 @@ from collections.abc import Mapping
 
 import torch
 
-from brewster.models.diffusion.adapter.lora import attach_layers, lora_state_dict, remove_lora
-from brewster.models.diffusion.adapter.lora_formats import LowRankLayer
+from brewster.models.diffusion.adapter.lora import ADAPTER_NAME, attach_layers, lora_state_dict, remove_lora
+from brewster.models.diffusion.adapter.lora_formats import (
+    DOWN_SUFFIX,
+    UP_SUFFIX,
+    LowRankLayer,
+    adapted_layers,
+)
 from brewster.models.diffusion.backbones.backbone import Backbone
-
-_DOWN, _UP = ".lora_A.weight", ".lora_B.weight"
-_ADAPTER_NAME = "default"
 
 
 def stack_layers(backbone: Backbone, layers: Mapping[str, LowRankLayer]) -> None:
@@ -36,9 +38,9 @@ def _attached_layers(backbone: Backbone) -> dict[str, LowRankLayer]:
     """The layers of the LoRA of a backbone, float32, on the CPU, with the scale alpha / rank multiplied in."""
     state = {name: tensor.float().cpu() for name, tensor in lora_state_dict(backbone).items()}
     layers = {}
-    for name in (key.removesuffix(_UP) for key in state if key.endswith(_UP)):
-        scale: float = backbone.transformer.get_submodule(name).scaling[_ADAPTER_NAME]
-        layers[name] = LowRankLayer(state[name + _DOWN], scale * state[name + _UP])
+    for name in adapted_layers(state):
+        scale: float = backbone.transformer.get_submodule(name).scaling[ADAPTER_NAME]
+        layers[name] = LowRankLayer(state[name + DOWN_SUFFIX], scale * state[name + UP_SUFFIX])
     return layers
 
 
