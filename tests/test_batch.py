@@ -6,8 +6,8 @@ from pathlib import Path
 import pytest
 
 from brewster import Photo, Separator
+from brewster.batch import SeparationTask, plan_files, separate_files, separate_tasks
 from brewster.errors import ModelError, OutputError, PhotoError
-from brewster.inference import SeparationTask, plan_files, separate_files, separate_tasks
 from brewster.options import Options
 from cli_helpers import LAYERS, image_bytes, layer_files, list_files
 

@@ -6,9 +6,9 @@ import pyarrow
 import pytest
 from pyarrow import parquet
 
+from brewster.batch import plan_files
+from brewster.batch.manifest import read_manifest
 from brewster.errors import ManifestError, PhotoError
-from brewster.inference import plan_files
-from brewster.inference.manifest import read_manifest
 from brewster.remote_path import location
 from cli_helpers import image_bytes
 

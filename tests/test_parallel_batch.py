@@ -13,12 +13,12 @@ import pyarrow
 import pytest
 from pyarrow import parquet
 
+from brewster.batch import FileResult, plan_files, separate_files
+from brewster.batch.index import COLUMNS, INDEX_FILE, PARTS_FOLDER, IndexWriter
+from brewster.batch.parallel import SeparationRunner, separate_in_parallel
 from brewster.errors import ModelError, OutputError
 from brewster.executors import ProcessExecutor, SerialExecutor
 from brewster.files import discard
-from brewster.inference import FileResult, plan_files, separate_files
-from brewster.inference.index import COLUMNS, INDEX_FILE, PARTS_FOLDER, IndexWriter
-from brewster.inference.parallel_batch import SeparationRunner, separate_in_parallel
 from brewster.options import Options
 from brewster.photo import Photo
 from brewster.remote_path import location
@@ -194,7 +194,7 @@ def test_a_folder_that_cannot_be_written_to_ends_the_run_before_the_first_photo(
 def test_rows_survive_a_killed_run_and_a_store_that_fails_for_a_while(store, monkeypatch):
     folder = location("memory://bucket/out")
     killed = IndexWriter(folder)
-    monkeypatch.setattr("brewster.inference.index.MAX_PART_ROWS", 2)
+    monkeypatch.setattr("brewster.batch.index.MAX_PART_ROWS", 2)
     for name in "ab":
         killed.append(FileResult(name))
     later = IndexWriter(folder)
@@ -254,7 +254,7 @@ def test_layers_that_another_worker_has_written_in_the_meantime_are_kept(tmp_pat
     (tmp_path / "out").mkdir()
     for layer in layer_files("a"):
         (tmp_path / "out" / layer).write_bytes(b"written by the other node")
-    monkeypatch.setattr("brewster.inference.batch.exists", lambda path: False)
+    monkeypatch.setattr("brewster.batch.runner.exists", lambda path: False)
     (result,) = SeparationRunner(options, tmp_path / "out")(tasks[0])
     assert (result.status, result.error) == ("skipped", None)
     assert {(tmp_path / "out" / layer).read_bytes() for layer in layer_files("a")} == {
@@ -333,9 +333,9 @@ from pathlib import Path
 os.environ["RAY_USAGE_STATS_ENABLED"] = "0"
 from ray.cluster_utils import Cluster
 from brewster.executors.ray_cluster import RayExecutor
-from brewster.inference import plan_files
-from brewster.inference.parallel_batch import SeparationRunner, separate_in_parallel
-from brewster.inference.index import IndexWriter
+from brewster.batch import plan_files
+from brewster.batch.parallel import SeparationRunner, separate_in_parallel
+from brewster.batch.index import IndexWriter
 from brewster.options import Options
 from brewster.photo import Photo
 root, options, done = Path(sys.argv[1]), Options(model=sys.argv[2]), []

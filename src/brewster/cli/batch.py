@@ -1,7 +1,7 @@
 """Runs `brewster separate` and prints its output: progress, one line for each photo, a summary.
 
-The photos are separated by `brewster.inference.batch`, or in several processes or on a cluster by
-`brewster.inference.parallel_batch`.
+The photos are separated by `brewster.batch.runner`, or in several processes or on a cluster by
+`brewster.batch.parallel`.
 """
 
 from __future__ import annotations
@@ -32,9 +32,9 @@ from brewster.options import Options
 from brewster.remote_path import location
 
 if TYPE_CHECKING:
+    from brewster.batch import FileResult, SeparationTask
+    from brewster.batch.index import IndexWriter
     from brewster.executors import Executor
-    from brewster.inference import FileResult, SeparationTask
-    from brewster.inference.index import IndexWriter
 
 
 @final
@@ -102,7 +102,7 @@ class BatchCommand:
         on_result: Callable[[FileResult], None],
         update_progress: Callable[[float, str], None],
     ) -> None:
-        from brewster.inference.batch import separate_tasks  # noqa: PLC0415
+        from brewster.batch.runner import separate_tasks  # noqa: PLC0415
 
         def on_progress(done: int, name: str, fraction: float) -> None:
             interrupts.raise_pending()
@@ -116,8 +116,8 @@ class BatchCommand:
     def _separate_in_parallel(
         self, tasks: Sequence[SeparationTask], on_result: Callable[[FileResult], None]
     ) -> None:
+        from brewster.batch.parallel import SeparationRunner, separate_in_parallel  # noqa: PLC0415
         from brewster.executors import ProcessExecutor  # noqa: PLC0415
-        from brewster.inference.parallel_batch import SeparationRunner, separate_in_parallel  # noqa: PLC0415
 
         shared_folder = location(self.output) if self.cluster and self.output else None
         create_runner = partial(SeparationRunner, self.options, shared_folder, overwrite=self.overwrite)
@@ -130,7 +130,7 @@ class BatchCommand:
             separate_in_parallel(tasks, executor, overwrite=self.overwrite, on_result=on_result)
 
     def _index_writer(self) -> AbstractContextManager[IndexWriter | None]:
-        from brewster.inference.index import IndexWriter  # noqa: PLC0415
+        from brewster.batch.index import IndexWriter  # noqa: PLC0415
 
         is_written = (self.index or self.cluster) and self.output and not self.dry_run
         return IndexWriter(location(self.output or "")) if is_written else nullcontext()

@@ -18,7 +18,7 @@ from brewster.options import Options
 from brewster.remote_path import location, path_of_file_url
 
 if TYPE_CHECKING:
-    from brewster.inference import SeparationTask
+    from brewster.batch import SeparationTask
 
 
 _MAX_NAMES: Final = 10
@@ -70,7 +70,7 @@ def plan(photos: Sequence[str], output: str | None, options: Options) -> list[Se
         OutputError: the layers of two photos would have the same path.
         PhotoError: the files and folders contain no photo.
     """
-    from brewster.inference import plan_files  # noqa: PLC0415  (imports ONNX Runtime and pyvips)
+    from brewster.batch import plan_files  # noqa: PLC0415  (imports ONNX Runtime and pyvips)
 
     if is_single_output(photos, output):
         return [_plan_single_output(photos, output, options)]
@@ -79,7 +79,7 @@ def plan(photos: Sequence[str], output: str | None, options: Options) -> list[Se
 
 
 def _plan_single_output(photos: Sequence[str], output: str | None, options: Options) -> SeparationTask:
-    from brewster.inference import SeparationTask  # noqa: PLC0415
+    from brewster.batch import SeparationTask  # noqa: PLC0415
 
     if len(photos) > 1 or Path(photos[0]).is_dir():
         raise click.UsageError(

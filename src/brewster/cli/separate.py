@@ -268,7 +268,7 @@ def separate(
 def _print_plan(photos: tuple[str, ...], output: str | None, options: Options, gpu_name: str | None) -> None:
     """Prints the estimated resources of the first photo. Raises DeviceError if they exceed the GPU."""
     require_extra("diffusion", "a plan")
-    from brewster.inference.batch import read_content  # noqa: PLC0415
+    from brewster.batch.runner import read_content  # noqa: PLC0415
     from brewster.inference.separation_plan import plan_separation  # noqa: PLC0415  (imports torch)
     from brewster.models.diffusion.cost import find_gpu, is_local_gpu  # noqa: PLC0415
     from brewster.photo import Photo  # noqa: PLC0415

@@ -19,11 +19,11 @@ from functools import partial
 from pathlib import Path
 from typing import Final, Literal, Protocol, final
 
+from brewster.batch.manifest import is_manifest, read_manifest
 from brewster.errors import BrewsterError, OutputError, PhotoError
 from brewster.files import exists, find_videos, images_in, is_same_file, name_layers, write_atomically
 from brewster.image_formats import SUFFIXES, format_of
 from brewster.inference.assessment import Assessment
-from brewster.inference.manifest import is_manifest, read_manifest
 from brewster.inference.separator import Separator
 from brewster.options import Options
 from brewster.remote_path import Location, RemotePath, location

@@ -16,10 +16,10 @@ import time
 from collections.abc import Callable
 from typing import Any, Final, Self, final
 
+from brewster.batch.manifest import import_parquet
+from brewster.batch.runner import FileResult
 from brewster.errors import OutputError
 from brewster.files import exists, write_atomically
-from brewster.inference.batch import FileResult
-from brewster.inference.manifest import import_parquet
 from brewster.remote_path import Location
 
 INDEX_FILE: Final = "index.parquet"

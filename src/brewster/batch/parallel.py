@@ -17,10 +17,10 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import final
 
+from brewster.batch.runner import BatchRunner, FileResult, SeparationTask, real_path
 from brewster.errors import OutputError
 from brewster.executors import Executor, run_tasks
 from brewster.files import exists
-from brewster.inference.batch import BatchRunner, FileResult, SeparationTask, real_path
 from brewster.options import Options
 from brewster.remote_path import Location
 

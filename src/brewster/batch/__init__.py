@@ -1,0 +1,5 @@
+"""Separates many photos: files and folders, in one process, in several processes or on a cluster."""
+
+from brewster.batch.runner import FileResult, SeparationTask, plan_files, separate_files, separate_tasks
+
+__all__ = ["FileResult", "SeparationTask", "plan_files", "separate_files", "separate_tasks"]
