@@ -102,7 +102,7 @@ def test_the_mean_of_one_over_the_density_is_the_solid_angle(radius_mm, behind):
     """A cone of half-angle 60 degrees has a solid angle of pi, from any point inside a dome."""
     emitters = make_emitters(map_side("soft", radius_mm=radius_mm, heading_deg=25), behind)
     origin = torch.tensor([[300.0], [-200.0], [0.0]]).expand(3, 200_000)
-    direction, pdf = emitters.sample(origin, uniforms(200_000))
+    direction, pdf = emitters.towards(emitters.sample_map(uniforms(200_000)), origin)
     outward = -direction[2] if behind else direction[2]
     is_inside = outward > 0.5
     assert float((is_inside / pdf.clamp(min=1e-9)).mean()) == pytest.approx(math.pi, rel=0.01)

@@ -44,6 +44,9 @@ _MAX_TABLE_REFLECTANCE = 0.08
 """Upper limit of the reflectance for which orders are enumerated. At grazing angles, the true reflectance leads to too many
 orders. The throughput of each order is exact; the last order of each side also gets the light of the omitted orders."""
 _CPU_BATCH_RAYS = 1 << 15  # small enough for the cache of a CPU
+_ROUGH_BATCH_RAYS = (
+    1 << 18
+)  # large, because most orders of rough glass contain only a few of the rays of a batch
 _GPU_BATCH_RAYS = 1 << 20
 
 
@@ -207,10 +210,11 @@ def _render_monte_carlo(prepared: _PreparedScene, device: Device) -> list[Tensor
     scene, camera = prepared.scene, prepared.scene.camera
     count = camera.width * camera.height
     sobol = SobolPoints(scene.seed, scene.index, count, scene.samples_per_pixel, device)
-    trace = _trace_rough if scene.glass.is_rough or scene.glass.is_wedged else _trace_smooth
+    is_traced = scene.glass.is_rough or scene.glass.is_wedged
+    trace, batch_rays = (_trace_rough, _ROUGH_BATCH_RAYS) if is_traced else (_trace_smooth, _CPU_BATCH_RAYS)
     total = torch.zeros(5, 3, count, device=prepared.origin.device)
-    for start in range(0, count, _CPU_BATCH_RAYS):
-        pixels = slice(start, min(start + _CPU_BATCH_RAYS, count))
+    for start in range(0, count, batch_rays):
+        pixels = slice(start, min(start + batch_rays, count))
         for sample in range(scene.samples_per_pixel):
             sobol.start_sample(sample, pixels)
             rays = _thin_lens_rays(prepared, pixels, sobol)
@@ -340,10 +344,10 @@ def _trace_rough(prepared: _PreparedScene, rays: Rays, sobol: SobolPoints) -> li
     sides = {True: zeros, False: zeros.clone()}
     emitters = prepared.behind.emitters, prepared.front.emitters
     for exiting in trace_orders(prepared.scene.glass, rays, *emitters, sobol):
-        sides[exiting.is_transmitted][0] += exiting.light
-        sides[exiting.is_transmitted][1] += exiting.light * (
-            prepared.scene.orders == "all" or exiting.in_truncated_layers
-        )
+        complete, in_layer = sides[exiting.is_transmitted]
+        complete.index_add_(1, exiting.rays, exiting.light)
+        if prepared.scene.orders == "all" or exiting.in_truncated_layers:
+            in_layer.index_add_(1, exiting.rays, exiting.light)
     (transmitted, transmission), (reflected, reflection) = sides[True], sides[False]
     point, mirrored = _mirror_at_first_surface(rays)
     background = prepared.behind.emitters.radiance(rays.origin, rays.direction, rays.footprint_px)

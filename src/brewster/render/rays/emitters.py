@@ -219,21 +219,26 @@ class SideEmitters:
         u, v = direction_to_uv(self._to_world @ direction, self._u_offset)
         return self.envmap(u, v, self._map_footprint(footprint_px))
 
-    def sample(self, origin: Tensor, uniforms: Tensor) -> tuple[Tensor, Tensor]:
-        """Draws directions from `origin` with a density proportional to the brightness of the map.
+    def sample_map(self, uniforms: Tensor) -> Tensor:
+        """Draws points of the map with a density proportional to its luminance, for `towards`.
 
         `uniforms` are random numbers in [0, 1), (2, N).
 
         Returns:
-            Unit directions (3, N) and their densities per steradian at `origin`, (N,).
+            Unit directions from the centre of the map, (3, N).
         """
-        point = self._to_world.T @ self._map_distribution().sample(uniforms, self._u_offset)
-        direction = point * self.radius_mm - origin if self.is_dome else point
-        direction = normalize(direction)
+        return self._to_world.T @ self._map_distribution().sample(uniforms, self._u_offset)
+
+    def towards(self, point: Tensor, origin: Tensor) -> tuple[Tensor, Tensor]:
+        """Returns the unit directions from `origin` to points of the map, (3, N), and their densities per steradian, (N,).
+
+        `point` is a result of `sample_map`.
+        """
+        direction = normalize(point * self.radius_mm - origin) if self.is_dome else point
         return direction, self.pdf(origin, direction)
 
     def pdf(self, origin: Tensor, direction: Tensor) -> Tensor:
-        """Returns the density of `sample` at unit directions (3, N), per steradian at `origin`: (N,)."""
+        """Returns the density of `towards` at unit directions (3, N), per steradian at `origin`: (N,)."""
         if not self.is_dome:
             return self._map_distribution().pdf(self._to_world @ direction, self._u_offset)
         point, distance = self._intersect_dome(origin, direction)

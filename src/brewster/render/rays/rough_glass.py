@@ -1,8 +1,9 @@
 """Rough or wedged panes: each order is traced from surface to surface, with one microfacet sample per rough surface.
 
-At each surface, every path is split into a reflected and a transmitted path, without a random choice between them. A path
-that exits through a rough surface towards a map uses multiple importance sampling (Veach 1997, chapter 9), because with
-microfacet samples alone, very few rays hit a small sun, and the image is noisy.
+At each surface, every path is split into a reflected and a transmitted path, without a random choice between them. In rough glass,
+rays whose weight has become small are continued at random (Russian roulette, Arvo and Kirk 1990), because paths cannot be merged here as in
+`layered_glass`, so their number would grow fast. A path that exits through a rough surface towards a map uses multiple importance
+sampling (Veach 1997, chapter 9), because with microfacet samples alone, very few rays hit a small sun, and the image is noisy.
 """
 
 from __future__ import annotations
@@ -21,12 +22,15 @@ from brewster.render.rays.sobol import SobolPoints
 from brewster.render.rays.vectors import dot, normalize
 from brewster.scene.glass import Glazing
 
-MIN_PATH_WEIGHT: Final = 1e-4
-"""Paths with a smaller mean weight are not traced further. The limit is larger than `layered_glass.MIN_ORDER_WEIGHT`,
-because paths cannot be merged here, so their number grows faster."""
+_MIN_PATH_WEIGHT: Final = 1e-4
+"""Paths with a smaller weight, averaged over all rays, are not traced further. Total reflection keeps the weight of a few rays near 1,
+so these rays would be traced for a long time."""
+_ROULETTE_WEIGHT: Final = 0.04
+"""A ray with a smaller weight is continued with the probability weight / _ROULETTE_WEIGHT. Its weight is then _ROULETTE_WEIGHT, so
+that the mean does not change. At normal incidence, a surface of glass reflects about this fraction."""
 _MAX_DISTANCE_MM: Final = 1e7
 _MIN_LIGHT_SAMPLING_WEIGHT: Final = 3e-3
-"""Orders with a smaller mean weight use microfacet samples only; their noise is too faint to see."""
+"""Orders with a smaller weight, averaged over all rays, use microfacet samples only; their noise is too faint to see."""
 
 
 @dataclass(frozen=True)
@@ -56,15 +60,21 @@ class _PathState:
     """Whether the rays go away from the camera."""
     reflections: int
     entered_last_pane: bool
+    rays: Tensor
+    """The indices of these rays among all rays that are traced, (N,)."""
 
 
 @dataclass(frozen=True)
 class ExitingLight:
-    """The light of one order from one side, (3, N); `in_truncated_layers` is True if the paper's T or R contains it."""
+    """The light of one order from one side, (3, N), and the indices of its rays, (N,).
+
+    `in_truncated_layers` is True if the paper's T or R contains it.
+    """
 
     is_transmitted: bool
     in_truncated_layers: bool
     light: Tensor
+    rays: Tensor
 
 
 def surfaces(glass: Glazing, like: Tensor) -> list[Surface]:
@@ -89,34 +99,62 @@ def surfaces(glass: Glazing, like: Tensor) -> list[Surface]:
 def trace_orders(
     glass: Glazing, rays: Rays, behind: SideEmitters, front: SideEmitters, sobol: SobolPoints
 ) -> Iterator[ExitingLight]:
-    """Traces every order of the rays until its weight is too small. Yields the light of each order that exits.
+    """Traces the orders of the rays until no ray is left. Yields the light of each order that exits.
 
     Each refraction scales radiance by the squared ratio of the refractive indices. Every path starts and ends in air, so
     these factors cancel and are left out.
     """
     stack = surfaces(glass, rays.direction)
-    ones = torch.ones_like(rays.direction)
-    pending = [_PathState(rays.origin, rays.direction, ones, ones, 0, True, 0, False)]
+    count = rays.direction.shape[1]
+    ones, indices = torch.ones_like(rays.direction), torch.arange(count, device=rays.direction.device)
+    # All orders of a side share their light samples.
+    light_samples = {
+        emitters: emitters.sample_map(sobol.next_2d())
+        for emitters in (behind, front)
+        if emitters.envmap and glass.is_rough
+    }
+    pending = [_PathState(rays.origin, rays.direction, ones, ones, 0, True, 0, False, indices)]
     while pending:
         path = pending.pop()
+        if glass.is_rough:
+            path = _continue_at_random(path, sobol)
         for branch, interaction in _interact(path, stack, sobol):
             if 0 <= branch.surface < len(stack):
-                if _mean_weight(branch) > MIN_PATH_WEIGHT:
+                if _mean_weight(branch, count) > _MIN_PATH_WEIGHT:
                     pending.append(branch)
                 continue
             is_behind = branch.surface > 0
             emitters = behind if is_behind else front
-            light = _exit_radiance(branch, interaction, emitters, rays.footprint_px, sobol)
+            samples_light = interaction.alpha and _mean_weight(branch, count) > _MIN_LIGHT_SAMPLING_WEIGHT
+            samples = light_samples.get(emitters) if samples_light else None
+            light = _exit_radiance(branch, interaction, emitters, rays.footprint_px, samples)
             in_truncated_layers = branch.reflections == 0 if is_behind else not branch.entered_last_pane
-            yield ExitingLight(is_behind, in_truncated_layers, light)
+            yield ExitingLight(is_behind, in_truncated_layers, light, branch.rays)
 
 
-def _mean_weight(path: _PathState) -> float:
-    """Returns the mean weight over all rays and polarisations.
+def _mean_weight(path: _PathState, count: int) -> float:
+    """Returns the mean weight over both polarisations and all `count` rays. Rays that are not on the path have weight 0.
 
     The weights of single rays are no measure, because total reflection at a microfacet gives some rays the weight 0 or 1.
     """
-    return float((path.s + path.p).mean()) / 2
+    return float((path.s + path.p).sum()) / (6 * count)
+
+
+def _continue_at_random(path: _PathState, sobol: SobolPoints) -> _PathState:
+    """Ends rays of small weight at random, and raises the weights of the others by the inverse of their probability."""
+    weight = (path.s + path.p).mean(dim=0) / 2
+    if not (weight < _ROULETTE_WEIGHT).any():
+        return path
+    kept = (sobol.next_2d(path.rays)[0] * _ROULETTE_WEIGHT < weight).nonzero()[:, 0]
+    scale = (_ROULETTE_WEIGHT / weight[kept]).clamp(min=1)
+    return replace(
+        path,
+        origin=path.origin[:, kept],
+        direction=path.direction[:, kept],
+        s=path.s[:, kept] * scale,
+        p=path.p[:, kept] * scale,
+        rays=path.rays[kept],
+    )
 
 
 @dataclass(frozen=True)
@@ -155,7 +193,11 @@ def _interact(
     before = replace(path, origin=point, s=path.s * transmittance, p=path.p * transmittance)
     normal = surface.normal if path.is_downward else -surface.normal
     wi = -path.direction
-    facet = sample_visible_normal(wi, normal, surface.alpha, sobol.next_2d()) if surface.alpha else normal
+    facet = (
+        sample_visible_normal(wi, normal, surface.alpha, sobol.next_2d(path.rays))
+        if surface.alpha
+        else normal
+    )
     index_in, index_out = (surface.refractive_index, 1.0) if in_glass else (1.0, surface.refractive_index)
     for reflects in (True, False):
         interaction = _SurfaceInteraction(wi, normal, surface.alpha, index_in, index_out, reflects, before)
@@ -184,6 +226,7 @@ def _path_after(
         is_downward,
         before.reflections + interaction.reflects,
         before.entered_last_pane or (is_last_pane and before.is_downward and not interaction.reflects),
+        before.rays,
     )
 
 
@@ -238,19 +281,19 @@ def _exit_radiance(
     interaction: _SurfaceInteraction,
     emitters: SideEmitters,
     footprint_px: float,
-    sobol: SobolPoints,
+    light_samples: Tensor | None,
 ) -> Tensor:
     """Returns the light of an order, (3, N): a microfacet sample and a light sample, combined by the balance heuristic.
 
-    The heuristic weights a sample by its density divided by the sum of both densities (Veach 1997, eq. 9.8).
+    `light_samples` are points of the map for all rays; None if microfacet samples are sufficient. The heuristic weights a sample by its density divided by the sum of both densities (Veach 1997, eq. 9.8).
     """
     weight = (path.s + path.p) / 2
     radiance = emitters.radiance(path.origin, path.direction, footprint_px)
-    if not (interaction.alpha and emitters.envmap and _mean_weight(path) > _MIN_LIGHT_SAMPLING_WEIGHT):
+    if light_samples is None:
         return weight * radiance
     facet_pdf = _scattering_pdf(interaction, path.direction)
     balance = facet_pdf / (facet_pdf + emitters.pdf(path.origin, path.direction)).clamp(min=1e-20)
-    direction, light_pdf = emitters.sample(path.origin, sobol.next_2d())
+    direction, light_pdf = emitters.towards(light_samples[:, path.rays], path.origin)
     facet = _half_vector(interaction, direction)
     s, p = _facet_weights(interaction, facet, direction)
     facet_pdf = _scattering_pdf(interaction, direction)

@@ -32,13 +32,14 @@ class SobolPoints:
         """
         self._sample, self._pixels, self._next = number, pixels, 0
 
-    def next_2d(self) -> Tensor:
-        """Returns the next point of each selected pixel, (2, n) in [0, 1)."""
+    def next_2d(self, subset: Tensor | None = None) -> Tensor:
+        """Returns the next point of each selected pixel, (2, n) in [0, 1), or only of the pixels with the indices `subset`."""
         if self._next == len(self._sequences):
             self._sequences.append(self._new_sequence())
         points, shift = self._sequences[self._next]
         self._next += 1
-        shifted = points[self._sample][:, None] + shift[:, self._pixels]
+        shift = shift[:, self._pixels] if subset is None else shift[:, self._pixels.start + subset]
+        shifted = points[self._sample][:, None] + shift
         return shifted - shifted.floor()
 
     def next_disc(self) -> Tensor:
