@@ -106,7 +106,7 @@ def trace_orders(
                 continue
             is_behind = branch.surface > 0
             emitters = behind if is_behind else front
-            light = _exit_radiance(branch, interaction, emitters, rays.footprint_px, sobol)
+            light = _exit_radiance(branch, interaction, emitters, rays.relative_footprint, sobol)
             in_truncated_layers = branch.reflections == 0 if is_behind else not branch.entered_last_pane
             yield ExitingLight(is_behind, in_truncated_layers, light)
 
@@ -237,7 +237,7 @@ def _exit_radiance(
     path: _PathState,
     interaction: _SurfaceInteraction,
     emitters: SideEmitters,
-    footprint_px: float,
+    relative_footprint: float,
     sobol: SobolPoints,
 ) -> Tensor:
     """Returns the light of an order, (3, N): a microfacet sample and a light sample, combined by the balance heuristic.
@@ -245,7 +245,7 @@ def _exit_radiance(
     The heuristic weights a sample by its density divided by the sum of both densities (Veach 1997, eq. 9.8).
     """
     weight = (path.s + path.p) / 2
-    radiance = emitters.radiance(path.origin, path.direction, footprint_px)
+    radiance = emitters.radiance(path.origin, path.direction, relative_footprint)
     if not (interaction.alpha and emitters.envmap and _mean_weight(path) > _MIN_LIGHT_SAMPLING_WEIGHT):
         return weight * radiance
     facet_pdf = _scattering_pdf(interaction, path.direction)
@@ -259,7 +259,7 @@ def _exit_radiance(
     ratio = facet_pdf / (light_pdf + facet_pdf).clamp(min=1e-20)
     light_weight = (interaction.before.s * s + interaction.before.p * p) / 2 * ratio
     return weight * radiance * balance + light_weight * emitters.radiance(
-        path.origin, direction, footprint_px
+        path.origin, direction, relative_footprint
     )
 
 
