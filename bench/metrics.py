@@ -20,7 +20,7 @@ from torch.nn import functional
 
 from brewster import Photo
 from brewster.metrics import Lpips, psnr, reflection_region, ssim
-from brewster.metrics.weights import TENSOR_NAMES, load_alexnet, read_heads
+from brewster.metrics.weights import ALEXNET_TENSORS, load_alexnet, read_lpips_channel_weights
 
 HEIGHT, WIDTH = 400, 540
 ROUNDS = 11
@@ -68,9 +68,11 @@ class ReferenceLpips:
     """LPIPS with the operations of the lpips package, in the same order."""
 
     def __init__(self) -> None:
-        tensors = [load_alexnet()[name] for name in TENSOR_NAMES]
+        tensors = [load_alexnet()[name] for name in ALEXNET_TENSORS]
         self.convolutions = list(zip(tensors[::2], tensors[1::2], strict=True))
-        self.heads = [torch.from_numpy(head).view(1, -1, 1, 1) for head in read_heads()]
+        self.channel_weights = [
+            torch.from_numpy(weights).view(1, -1, 1, 1) for weights in read_lpips_channel_weights()
+        ]
         self.shift = torch.tensor([-0.030, -0.088, -0.188]).view(1, 3, 1, 1)
         self.scale = torch.tensor([0.458, 0.448, 0.450]).view(1, 3, 1, 1)
 
@@ -78,9 +80,9 @@ class ReferenceLpips:
     def __call__(self, prediction: np.ndarray, truth: np.ndarray) -> float:
         features = [self.features(self.tensor(prediction)), self.features(self.tensor(truth))]
         value = 0
-        for one, other, head in zip(*features, self.heads, strict=True):
+        for one, other, weights in zip(*features, self.channel_weights, strict=True):
             difference = (unit_length(one) - unit_length(other)) ** 2
-            value = value + functional.conv2d(difference, head).mean([2, 3], keepdim=True)
+            value = value + functional.conv2d(difference, weights).mean([2, 3], keepdim=True)
         return value.item()
 
     @staticmethod

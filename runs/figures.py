@@ -1,4 +1,7 @@
-"""Writes the figures of docs/rendering.md: samples of all scene recipes except tiny, and 8-bit mixtures above rendered photos.
+"""Writes the figures of docs/rendering.md.
+
+scenes.jpg: samples of all scene recipes except tiny.
+mixtures.jpg: 8-bit mixtures (top row) and rendered photos of the same scenes (bottom row).
 
     BREWSTER_DATA=../shared/data .venv/bin/python runs/figures.py   # with the CC0 maps in hdri/
 

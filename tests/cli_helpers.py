@@ -31,11 +31,11 @@ def write_pane(path):
     return path
 
 
-def image_bytes(width=60, height=40, container="jpeg", seed=1):
+def image_bytes(width=60, height=40, format_name="jpeg", seed=1):
     """Returns an image of random 10x10 blocks as the bytes of a file."""
     small = np.random.default_rng(seed).integers(0, 256, (height // 10 + 1, width // 10 + 1, 3), np.uint8)
     array = np.kron(small, np.ones((10, 10, 1), np.uint8))[:height, :width]
-    return Photo.from_array(array, encoding="srgb").encode(container)
+    return Photo.from_array(array, encoding="srgb").encode(format_name)
 
 
 def run_process(*args, **kwargs):

@@ -198,7 +198,7 @@ def recipe(tmp_path, monkeypatch, rng):
 
 
 @pytest.fixture
-def rendered(monkeypatch):
+def rendered_recipe(monkeypatch):
     """A training recipe with rendered samples. Its environments are computed once, because that takes most of the time."""
     from brewster.environments.assets import Assets  # noqa: PLC0415
     from brewster.training.recipe import read_recipe  # noqa: PLC0415

@@ -155,7 +155,7 @@ def test_progress_names_the_file_and_grows_and_keyboard_interrupt_stops(photo_fo
 
 def test_photos_and_layers_may_be_streams(separator):
     layer = io.BytesIO()
-    task = SeparationTask(io.BytesIO(image_bytes(container="png")), {"transmission": layer})
+    task = SeparationTask(io.BytesIO(image_bytes(format_name="png")), {"transmission": layer})
     (result,) = separate_tasks([task], separator=separator)
     assert (result.source, result.status, result.outputs) == ("-", "separated", {"transmission": "-"})
-    assert Photo.open(layer.getvalue()).file_info.container == "png"
+    assert Photo.open(layer.getvalue()).file_info.format_name == "png"

@@ -296,7 +296,7 @@ def test_jpegs_are_reproducible_and_grow_with_quality():
 
 def test_a_jpeg_has_its_quality_full_chroma_and_no_metadata():
     photo = Photo.open(encode_jpeg(random_image(), 83))
-    assert (photo.file_info.container, photo.file_info.jpeg_quality) == ("jpeg", 83)
+    assert (photo.file_info.format_name, photo.file_info.jpeg_quality) == ("jpeg", 83)
     assert photo.file_info.subsampling == "4:4:4"
     assert photo.size == (56, 40)
     assert {photo.file_info.icc, photo.file_info.exif, photo.file_info.xmp, photo.file_info.iptc} == {None}

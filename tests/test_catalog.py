@@ -188,9 +188,9 @@ def test_the_size_is_that_of_the_upright_picture(kind, orientation):
         assert read_size(data) == ((48, 64) if orientation > 4 else (64, 48))
 
 
-@pytest.mark.parametrize("container", ["exr", "hdr"])
-def test_the_size_of_a_picture_of_floats(container):
-    assert read_size(Photo.from_array(smooth(), encoding="srgb").encode(container)) == (64, 48)
+@pytest.mark.parametrize("format_name", ["exr", "hdr"])
+def test_the_size_of_a_picture_of_floats(format_name):
+    assert read_size(Photo.from_array(smooth(), encoding="srgb").encode(format_name)) == (64, 48)
 
 
 def test_the_size_of_a_heic():

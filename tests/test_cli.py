@@ -88,7 +88,7 @@ def test_a_web_form_can_be_made_from_the_same_options():
         form.validate_python({"strength": 2})
 
 
-def test_additive_layers_are_rejected_in_containers_without_floats():
+def test_additive_layers_are_rejected_in_formats_without_floats():
     with pytest.raises(BrewsterError, match="tiff or exr"):
         Options(additive=True, format="jpeg")
 
@@ -108,7 +108,7 @@ def test_without_a_command_the_photo_is_separated_and_the_layers_are_next_to_it(
     "arguments", [["separate", "a.png", "-o", "x"], ["a.png", "-o", "x"], ["-o", "x", "a.png"]]
 )
 def test_the_command_name_separate_is_optional_and_options_may_come_first(run, tmp_path, arguments):
-    (tmp_path / "a.png").write_bytes(image_bytes(container="png"))
+    (tmp_path / "a.png").write_bytes(image_bytes(format_name="png"))
     assert run(*arguments)[0] == 0
     assert list_files(tmp_path / "x") == ["a.reflection.png", "a.transmission.png"]
 
@@ -125,7 +125,7 @@ def test_the_layers_are_the_output_of_the_model(run, tmp_path):
 
 
 def test_strength_zero_returns_the_photo_bit_by_bit(run, tmp_path):
-    (tmp_path / "a.png").write_bytes(image_bytes(container="png"))
+    (tmp_path / "a.png").write_bytes(image_bytes(format_name="png"))
     assert run("a.png", "--strength", 0)[0] == 0
     is_equal = Photo.open(tmp_path / "a.transmission.png").pixels == Photo.open(tmp_path / "a.png").pixels
     assert is_equal.all()
@@ -137,14 +137,14 @@ def test_only_the_requested_layers_are_written(run, tmp_path):
     assert list_files(tmp_path / "x") == ["a.confidence.png", "a.reflection.jpg"]
 
 
-def test_another_container_can_be_requested(run, tmp_path):
+def test_another_format_can_be_requested(run, tmp_path):
     (tmp_path / "a.jpg").write_bytes(image_bytes())
     assert run("a.jpg", "--format", "webp", "--layers", "transmission,confidence", "-o", "x")[0] == 0
     assert list_files(tmp_path / "x") == ["a.confidence.png", "a.transmission.webp"]
-    assert Photo.open(tmp_path / "x" / "a.transmission.webp").file_info.container == "webp"
+    assert Photo.open(tmp_path / "x" / "a.transmission.webp").file_info.format_name == "webp"
 
 
-def test_the_suffix_of_the_photo_is_kept_if_its_container_is_requested(run, tmp_path):
+def test_the_suffix_of_the_photo_is_kept_if_its_format_is_requested(run, tmp_path):
     (tmp_path / "A.JPEG").write_bytes(image_bytes())
     assert run("A.JPEG", "--format", "jpeg", "--layers", "transmission", "-o", "x")[0] == 0
     assert list_files(tmp_path / "x") == ["A.transmission.JPEG"]
@@ -163,7 +163,7 @@ def test_an_image_file_as_the_output_gets_the_transmission(run, tmp_path):
     (tmp_path / "a.jpg").write_bytes(image_bytes())
     assert run("a.jpg", "-o", "new/clear.png")[0] == 0
     assert list_files(tmp_path / "new") == ["clear.png"]
-    assert Photo.open(tmp_path / "new" / "clear.png").file_info.container == "png"
+    assert Photo.open(tmp_path / "new" / "clear.png").file_info.format_name == "png"
 
 
 def test_an_output_folder_may_have_an_image_suffix(run, tmp_path):
@@ -177,20 +177,20 @@ def test_an_output_folder_may_have_an_image_suffix(run, tmp_path):
 # --- standard input and output
 
 
-@pytest.mark.parametrize("container", ["jpeg", "png", "tiff", "webp"])
-def test_standard_input_goes_to_standard_output_in_its_container(run, container):
-    code, out, err = run("-", stdin=image_bytes(container=container))
-    assert (code, Photo.open(out).file_info.container) == (0, container)
+@pytest.mark.parametrize("format_name", ["jpeg", "png", "tiff", "webp"])
+def test_standard_input_goes_to_standard_output_in_its_format(run, format_name):
+    code, out, err = run("-", stdin=image_bytes(format_name=format_name))
+    assert (code, Photo.open(out).file_info.format_name) == (0, format_name)
     assert "- -> -" in err
 
 
-def test_standard_output_accepts_another_layer_and_container(run):
+def test_standard_output_accepts_another_layer_and_format(run):
     confidence = run("-", "--layers", "confidence", "--quiet", stdin=image_bytes())
     assert confidence[0] == 0
     assert confidence[2] == ""
     assert Photo.open(confidence[1]).pixels.shape == (40, 60, 1)
     exr = Photo.open(run("-", "--additive", "--format", "exr", stdin=image_bytes())[1])
-    assert exr.file_info.container == "exr"
+    assert exr.file_info.format_name == "exr"
 
 
 def test_a_file_can_go_to_standard_output_and_standard_input_to_a_file(run, tmp_path):

@@ -52,14 +52,14 @@ def test_addresses_of_windows_become_its_paths(address, path, monkeypatch):
 
 @pytest.mark.parametrize("name", ["jpg", "JPG", ".jpeg", "jpeg"])
 def test_a_format_may_be_named_by_its_suffix(run, tmp_path, name):
-    (tmp_path / "a.png").write_bytes(image_bytes(container="png"))
+    (tmp_path / "a.png").write_bytes(image_bytes(format_name="png"))
     assert run("a.png", "--format", name)[0] == 0
     assert list_files(tmp_path) == ["a.png", *layer_files("a")]
 
 
 @pytest.mark.parametrize("name", ["bmp", "gif", "dng", "jpgg"])
 def test_a_format_that_is_not_written_is_refused(run_without_model, tmp_path, name):
-    (tmp_path / "a.png").write_bytes(image_bytes(container="png"))
+    (tmp_path / "a.png").write_bytes(image_bytes(format_name="png"))
     code, _, err = run_without_model("a.png", "--format", name)
     assert code == 2
     assert "'jpeg', 'png'" in err

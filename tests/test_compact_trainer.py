@@ -36,8 +36,8 @@ def initial_checkpoint(recipe):
     return Checkpoint(0, recipe.model_dump_json(), CompactTrainer(recipe).state_dict())
 
 
-def test_without_training_data_the_network_keeps_its_initial_weights(rendered, tmp_path):
-    network = train(with_value(rendered, "data.rendered.count", 0), tmp_path, ignore_step)
+def test_without_training_data_the_network_keeps_its_initial_weights(rendered_recipe, tmp_path):
+    network = train(with_value(rendered_recipe, "data.rendered.count", 0), tmp_path, ignore_step)
     photo = torch.rand(1, 3, 64, 64)
     torch.testing.assert_close(network(photo)[:, :3], photo, atol=1e-5, rtol=0)
 
@@ -45,8 +45,10 @@ def test_without_training_data_the_network_keeps_its_initial_weights(rendered, t
 def test_a_photo_that_equals_its_ground_truth_has_a_finite_score():
     photo = torch.rand(1, 3, 32, 32)
     better, worse = (
-        validate(lambda _, given=given: given, {"plain": [(photo, photo)]})["psnr_gain_db_plain"]
-        for given in (photo, 1 - photo)
+        validate(lambda _, prediction=prediction: prediction, {"plain": [(photo, photo)]})[
+            "psnr_gain_db_plain"
+        ]
+        for prediction in (photo, 1 - photo)
     )
     assert better == 0
     assert -60 < worse < 0
@@ -56,8 +58,8 @@ def test_pairs_that_became_worse_are_counted():
     """One of four black predictions is worse than its photo, one is equal, and two are better."""
     black, grey = torch.zeros(1, 3, 32, 32), torch.full((1, 3, 32, 32), 0.4)
     pairs = [(grey, grey), (black, grey), (grey, black), (grey, black)]
-    numbers = validate(torch.zeros_like, {"four": pairs})
-    assert numbers["worse_four"] == 1 / 4
+    metrics = validate(torch.zeros_like, {"four": pairs})
+    assert metrics["worse_four"] == 1 / 4
 
 
 def test_training_lowers_the_loss_on_a_repeated_batch(recipe):
@@ -76,8 +78,8 @@ def test_chunks_of_a_batch_on_two_cores_give_the_step_of_plain_adamw(recipe):
     reference = copy.deepcopy(trainer.network)
     encoder = list(reference.encoder.parameters())
     rest = list(reference.parameters())[len(encoder) :]
-    warm = 1 / recipe.warmup_steps
-    rates = (recipe.encoder_learning_rate * warm, recipe.learning_rate * warm)
+    warmup_factor = 1 / recipe.warmup_steps
+    rates = (recipe.encoder_learning_rate * warmup_factor, recipe.learning_rate * warmup_factor)
     optimizer = torch.optim.AdamW(
         [{"params": group, "lr": rate} for group, rate in zip((encoder, rest), rates, strict=True)],
         weight_decay=recipe.weight_decay,
@@ -114,10 +116,12 @@ def test_a_batch_whose_gradient_is_infinite_is_skipped(recipe):
 
 
 def test_a_run_starts_from_the_mean_of_the_ema_weights_of_its_checkpoints(recipe, tmp_path):
-    given, starts = initial_checkpoint(recipe), (tmp_path / "one.pt", tmp_path / "three.pt")
+    checkpoint, starts = initial_checkpoint(recipe), (tmp_path / "one.pt", tmp_path / "three.pt")
     for path, value in zip(starts, (1.0, 3.0), strict=True):
-        same = {name: torch.full_like(weights, value) for name, weights in given.state["average"].items()}
-        replace(given, state=given.state | {"average": same}).write(path)
+        same = {
+            name: torch.full_like(weights, value) for name, weights in checkpoint.state["average"].items()
+        }
+        replace(checkpoint, state=checkpoint.state | {"average": same}).write(path)
     for init_checkpoints, mean in ((starts[:1], 1), (starts, 2)):
         trainer = CompactTrainer(recipe.model_copy(update={"init_checkpoints": init_checkpoints}))
         trainer.initialize()
@@ -128,7 +132,7 @@ def test_a_run_starts_from_the_mean_of_the_ema_weights_of_its_checkpoints(recipe
 def test_held_out_mixtures_do_not_depend_on_seed_and_distributions_of_the_recipe(recipe):
     recipe = with_value(recipe, "data.held_out", ["2.png"])
     other = with_value(with_value(recipe, "seed", 99), "mix.reflection_ratio", [1.0, 2.0])
-    one, two = (held_out_mixtures(given)(0, 3, 64) for given in (recipe, other))
+    one, two = (held_out_mixtures(each)(0, 3, 64) for each in (recipe, other))
     assert torch.equal(one.photo_encoded, two.photo_encoded)
     assert torch.equal(one.transmission_encoded, two.transmission_encoded)
 

@@ -16,7 +16,7 @@ from onnx import TensorProto, helper
 from brewster import Photo
 from brewster.benchmarks.registry import Case
 from brewster.environments.catalog import BUILTIN_CATALOG
-from brewster.environments.procedural.rooms import ENVIRONMENTS
+from brewster.environments.procedural.registry import ENVIRONMENTS
 from brewster.evaluate.config import EvaluationConfig
 from brewster.evaluate.methods import PREDICTION_FORMAT_VERSION, MethodOutput, ModelMethod
 from brewster.evaluate.score_log import SCORE_FORMAT_VERSION

@@ -1,4 +1,4 @@
-"""Importance sampling of maps: samples follow the brightness, and the density matches the samples."""
+"""Importance sampling of maps: samples follow the luminance, and the density matches the samples."""
 
 import math
 

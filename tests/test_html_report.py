@@ -134,7 +134,7 @@ def pictures(page):
     for image in page.all("img"):
         media_type, data = image["src"].split(";base64,")
         photo = images[image["alt"]] = Photo.open(base64.b64decode(data))
-        assert media_type == f"data:image/{photo.file_info.container}"
+        assert media_type == f"data:image/{photo.file_info.format_name}"
     return images
 
 

@@ -89,9 +89,9 @@ def test_open_files_are_read_and_written(tmp_path):
     with (tmp_path / "a.jpg").open("rb") as file:
         photo = Photo.open(file)
     assert np.array_equal(photo.pixels, Photo.open(tmp_path / "a.jpg").pixels)
-    for container, kind in ((None, "JPEG"), ("png", "PNG")):
+    for format_name, kind in ((None, "JPEG"), ("png", "PNG")):
         file = io.BytesIO()
-        photo.save(file, format=container)
+        photo.save(file, format=format_name)
         assert pil(file.getvalue()).format == kind
     photo.save(tmp_path / "without-suffix", format="tiff", depth=16)
     assert Photo.open(tmp_path / "without-suffix").file_info.bits == 16

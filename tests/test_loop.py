@@ -106,11 +106,11 @@ def test_a_killed_and_resumed_run_ends_with_bit_identical_weights(recipe, tmp_pa
         assert torch.equal(value, resumed.state_dict()[name]), name
 
 
-def test_a_killed_run_on_rendered_samples_ends_with_bit_identical_weights(rendered, tmp_path):
-    uninterrupted = train(rendered, tmp_path / "one", ignore_step)
+def test_a_killed_run_on_rendered_samples_ends_with_bit_identical_weights(rendered_recipe, tmp_path):
+    uninterrupted = train(rendered_recipe, tmp_path / "one", ignore_step)
     with pytest.raises(Killed):
-        train(rendered, tmp_path / "two", kill_after(3))
-    resumed = train(rendered, tmp_path / "two", ignore_step)
+        train(rendered_recipe, tmp_path / "two", kill_after(3))
+    resumed = train(rendered_recipe, tmp_path / "two", ignore_step)
     for name, value in uninterrupted.state_dict().items():
         assert torch.equal(value, resumed.state_dict()[name]), name
 

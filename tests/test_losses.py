@@ -7,7 +7,7 @@ import torch
 
 from brewster.errors import ModelError
 from brewster.training.data.mixtures import TrainingBatch
-from brewster.training.losses import check_finite, psnr_gain_db, separation_loss, tone_ratio
+from brewster.training.losses import check_finite, exposure_ratio, psnr_gain_db, separation_loss
 
 
 def make_batch(level=0.4, weight=1.0):
@@ -67,15 +67,15 @@ def test_a_tenth_of_the_error_is_a_gain_of_twenty_decibels():
     assert psnr_gain_db(ground_truth + 0.2, ground_truth + 0.02, ground_truth) == pytest.approx(-20, abs=1e-3)
 
 
-def test_tone_is_the_ratio_of_light_where_the_glass_added_none():
+def test_the_exposure_ratio_is_the_ratio_of_light_where_the_glass_added_none():
     """A white spot was added to one corner; elsewhere the prediction has half of the photo's light."""
     ground_truth = torch.full((1, 3, 8, 8), 0.5)
     photo = ground_truth.clone()
     prediction = torch.full_like(ground_truth, 0.3611)  # half the linear light of 0.5
     photo[..., :2, :2] = 1
     prediction[..., :2, :2] = 1
-    assert tone_ratio(prediction, photo, ground_truth) == pytest.approx(0.5, abs=1e-3)
-    assert tone_ratio(prediction, torch.ones_like(ground_truth), ground_truth) == 1
+    assert exposure_ratio(prediction, photo, ground_truth) == pytest.approx(0.5, abs=1e-3)
+    assert exposure_ratio(prediction, torch.ones_like(ground_truth), ground_truth) == 1
 
 
 @pytest.mark.parametrize("value", [math.inf, -math.inf, math.nan])

@@ -17,12 +17,12 @@ from brewster.download import Downloader, RemoteFile
 from brewster.errors import DownloadError, MissingExtra, ModelError
 from brewster.metrics import Lpips, lpips, perceptual
 from brewster.metrics.weights import (
-    TENSOR_NAMES,
-    WEIGHTS_FILE,
-    digest_of,
+    ALEXNET_FILE,
+    ALEXNET_TENSORS,
+    alexnet_digest,
     load_alexnet,
     read_alexnet,
-    read_heads,
+    read_lpips_channel_weights,
 )
 from file_server import loopback_only, served, unused_address
 
@@ -47,13 +47,13 @@ def cache(monkeypatch, tmp_path):
 
 @pytest.fixture(scope="module")
 def metric():
-    """LPIPS with the published heads and random convolutions, for properties that hold for any weights."""
+    """LPIPS with the published channel weights and random convolutions, for properties that hold for any weights."""
     noise = torch.Generator().manual_seed(7)
     convolutions = tuple(
         (torch.randn(out, into, side, side, generator=noise) / (into * side**2) ** 0.5, torch.zeros(out))
         for out, into, side in SHAPES
     )
-    return Lpips(convolutions, tuple(map(torch.from_numpy, read_heads())))
+    return Lpips(convolutions, tuple(map(torch.from_numpy, read_lpips_channel_weights())))
 
 
 @pytest.fixture
@@ -95,7 +95,7 @@ def reference_maps(metric, one, other):
                 (weight.double().flatten(1) @ columns + bias.double()[:, None]).relu().unflatten(2, side)
             )
         unit = [s / (s.pow(2).sum(1, keepdim=True).sqrt() + 1e-10) for s in activations]
-        weighted = (unit[0] - unit[1]).pow(2) * metric.heads[layer].double()[:, None, None]
+        weighted = (unit[0] - unit[1]).pow(2) * metric.channel_weights[layer].double()[:, None, None]
         maps.append(weighted.sum(1, keepdim=True))
     return maps
 
@@ -153,7 +153,7 @@ def test_features_are_of_unit_length(metric):
         assert ((lengths - 1).abs() < 1e-5).logical_or(lengths == 0).all()
 
 
-def test_a_uniform_difference_of_a_single_layer_is_its_head_in_every_region(metric):
+def test_a_uniform_difference_of_a_single_channel_is_its_weight_in_every_region(metric):
     """Upsampling does not change uniform maps, so any region has the mean of the image."""
     one = metric.features(np.full((40, 40, 3), 10, np.uint8))
     maps = [torch.zeros_like(activations) for activations in one.maps]
@@ -161,7 +161,7 @@ def test_a_uniform_difference_of_a_single_layer_is_its_head_in_every_region(metr
         tuple(activations.clone().index_fill_(0, torch.tensor(5), 0.5) for activations in maps), (40, 40)
     )
     none = perceptual.Features(tuple(maps), (40, 40))
-    expected = sum(head[5].item() for head in metric.heads) / 4
+    expected = sum(weights[5].item() for weights in metric.channel_weights) / 4
     assert metric.distance(none, other) == pytest.approx(expected)
     region = np.zeros((40, 40), bool)
     region[3, 37] = True
@@ -187,11 +187,13 @@ def test_images_may_have_any_memory_layout(metric):
     assert metric.distance(metric.features(turned), metric.features(turned.copy())) == 0
 
 
-def test_the_heads_are_the_published_ones():
-    heads = read_heads()
-    assert [head.shape for head in heads] == [(64,), (192,), (384,), (256,), (256,)]
-    assert all(head.dtype == np.float32 and (head >= 0).all() for head in heads)
-    sums = hashlib.sha256(b"".join(head.astype("<f4").tobytes() for head in heads)).hexdigest()
+def test_the_channel_weights_are_the_published_ones():
+    channel_weights = read_lpips_channel_weights()
+    assert [weights.shape for weights in channel_weights] == [(64,), (192,), (384,), (256,), (256,)]
+    assert all(weights.dtype == np.float32 and (weights >= 0).all() for weights in channel_weights)
+    sums = hashlib.sha256(
+        b"".join(weights.astype("<f4").tobytes() for weights in channel_weights)
+    ).hexdigest()
     assert sums == "718a8b40b0d22f96192d34ab93c0db5c7943558ff6c2407f44812dce2f29b5f4"
 
 
@@ -239,7 +241,7 @@ def server():
 @pytest.fixture
 def state():
     noise = torch.Generator().manual_seed(7)
-    return {name: torch.randn(3, 2, generator=noise) for name in (*TENSOR_NAMES, "classifier.6.bias")}
+    return {name: torch.randn(3, 2, generator=noise) for name in (*ALEXNET_TENSORS, "classifier.6.bias")}
 
 
 def serialise(state, path=None):
@@ -257,41 +259,41 @@ def remote_file(server, body):
 
 
 def test_the_file_in_the_shared_data_has_the_pinned_digest(data):
-    tensors = read_alexnet(data / "weights" / WEIGHTS_FILE)
+    tensors = read_alexnet(data / "weights" / ALEXNET_FILE)
     assert [tuple(t.shape[:2]) for t in tensors.values() if t.ndim == 4] == [shape[:2] for shape in SHAPES]
 
 
 def test_the_cache_is_searched_first_then_the_data_folder_then_the_server(
     server, state, cache, monkeypatch, tmp_path
 ):
-    remote, digest = remote_file(server, serialise(state)), digest_of(state)
+    remote, digest = remote_file(server, serialise(state)), alexnet_digest(state)
     monkeypatch.setenv("BREWSTER_DATA", str(tmp_path / "data"))
-    serialise(state, tmp_path / "data" / "weights" / WEIGHTS_FILE)
+    serialise(state, tmp_path / "data" / "weights" / ALEXNET_FILE)
     load_alexnet(remote, digest)
     assert server.requests == []
     assert not cache.exists()
-    serialise({name: values + 1 for name, values in state.items()}, cache / WEIGHTS_FILE)
+    serialise({name: values + 1 for name, values in state.items()}, cache / ALEXNET_FILE)
     with pytest.raises(ModelError, match=str(cache)):
         load_alexnet(remote, digest)
 
 
 def test_a_download_is_stored_without_the_rest_of_the_network(server, state, cache):
-    remote, digest = remote_file(server, serialise(state)), digest_of(state)
+    remote, digest = remote_file(server, serialise(state)), alexnet_digest(state)
     first, second = (load_alexnet(remote, digest) for _ in range(2))
     assert [path for path, _ in server.requests] == ["/alexnet.pth"]
-    assert [path.name for path in cache.iterdir()] == [WEIGHTS_FILE]
+    assert [path.name for path in cache.iterdir()] == [ALEXNET_FILE]
     assert (
         list(first)
         == list(second)
-        == list(torch.load(cache / WEIGHTS_FILE, weights_only=True))
-        == list(TENSOR_NAMES)
+        == list(torch.load(cache / ALEXNET_FILE, weights_only=True))
+        == list(ALEXNET_TENSORS)
     )
-    assert all(torch.equal(first[name], second[name]) for name in TENSOR_NAMES)
+    assert all(torch.equal(first[name], second[name]) for name in ALEXNET_TENSORS)
 
 
 def test_an_interrupted_download_is_resumed_and_not_used_before(server, state, cache):
     body = serialise(state)
-    remote, digest = remote_file(server, body), digest_of(state)
+    remote, digest = remote_file(server, body), alexnet_digest(state)
     server.faults = ["cut"]
     with pytest.raises(DownloadError, match="ended after"):
         load_alexnet(remote, digest, downloader=Downloader(retry_delays_s=()))
@@ -310,7 +312,7 @@ def test_a_wrong_file_from_the_server_is_deleted(server, state, cache):
     remote = remote_file(server, serialise(state))
     server.bodies["/alexnet.pth"] = bytes(remote.size)
     with pytest.raises(DownloadError, match="was deleted"):
-        load_alexnet(remote, digest_of(state))
+        load_alexnet(remote, alexnet_digest(state))
     assert list(cache.iterdir()) == []
 
 
@@ -333,40 +335,43 @@ def test_other_weights_in_the_downloaded_file_are_deleted(server, state, cache):
         lambda body: body.replace(b"features.0.weight", b"features.9.weight"),
         lambda body: serialise([1, 2]),
         lambda body: serialise(torch.zeros(3)),
-        lambda body: serialise(dict.fromkeys(TENSOR_NAMES, "text")),
+        lambda body: serialise(dict.fromkeys(ALEXNET_TENSORS, "text")),
         lambda body: serialise({"model": Path("code")}),
     ],
 )
 def test_a_damaged_file_is_named_and_never_executed(state, cache, damage):
     cache.mkdir(parents=True)
-    (cache / WEIGHTS_FILE).write_bytes(damage(serialise(state)))
+    (cache / ALEXNET_FILE).write_bytes(damage(serialise(state)))
     with pytest.raises(
-        ModelError, match=rf"{cache / WEIGHTS_FILE} does not contain the AlexNet .* delete the file"
+        ModelError, match=rf"{cache / ALEXNET_FILE} does not contain the AlexNet .* delete the file"
     ):
-        load_alexnet(digest=digest_of(state))
+        load_alexnet(digest=alexnet_digest(state))
 
 
 @pytest.mark.filterwarnings("ignore:Detected pickle protocol")
 @settings(max_examples=40)
 @given(st.data())
 def test_every_changed_byte_is_detected_or_harmless(tmp_path_factory, data):
-    state = {name: torch.arange(6.0).view(3, 2) for name in TENSOR_NAMES}
+    state = {name: torch.arange(6.0).view(3, 2) for name in ALEXNET_TENSORS}
     body = bytearray(serialise(state))
     position = data.draw(st.integers(0, len(body) - 1))
     body[position] ^= data.draw(st.integers(1, 255))
-    path = tmp_path_factory.mktemp("weights") / WEIGHTS_FILE
+    path = tmp_path_factory.mktemp("weights") / ALEXNET_FILE
     path.write_bytes(body)
     try:
-        read = read_alexnet(path, digest_of(state))
+        read = read_alexnet(path, alexnet_digest(state))
     except ModelError:
         return
     assert all(
-        torch.equal(read[name], state[name]) for name in TENSOR_NAMES
+        torch.equal(read[name], state[name]) for name in ALEXNET_TENSORS
     )  # the byte is not part of the tensors
 
 
 def test_the_digest_depends_on_names_shapes_and_values(state):
     turned = {name: values.reshape(2, 3) for name, values in state.items()}
-    changed = state | {TENSOR_NAMES[9]: state[TENSOR_NAMES[9]] + 1e-6}
-    swapped = state | {TENSOR_NAMES[0]: state[TENSOR_NAMES[2]], TENSOR_NAMES[2]: state[TENSOR_NAMES[0]]}
-    assert len({digest_of(s) for s in (state, turned, changed, swapped)}) == 4
+    changed = state | {ALEXNET_TENSORS[9]: state[ALEXNET_TENSORS[9]] + 1e-6}
+    swapped = state | {
+        ALEXNET_TENSORS[0]: state[ALEXNET_TENSORS[2]],
+        ALEXNET_TENSORS[2]: state[ALEXNET_TENSORS[0]],
+    }
+    assert len({alexnet_digest(s) for s in (state, turned, changed, swapped)}) == 4

@@ -35,16 +35,15 @@ def composite(data):
 
 @pytest.mark.parametrize("icc", [None, P3], ids=["srgb", "p3"])
 @pytest.mark.parametrize("additive", [False, True])
-def test_an_editor_shows_the_photo_and_without_the_reflection_the_transmission(icc, additive):
+def test_the_layers_add_up_to_the_photo_and_the_lower_layer_is_the_transmission(icc, additive):
     photo = Photo(smooth(), None, FileInfo(icc=icc))
     separation = SEPARATOR(photo, additive=additive)
     data = separation.layered.encode()
     assert np.array_equal(composite(data), photo.pixels)
     layers = [Photo.open(opened(data).read(f"data/{name}.png")) for name in ("transmission", "reflection")]
     assert [layer.file_info.icc for layer in layers] == [icc, icc]
-    in_gamut = (layers[0].pixels > 0).all(
-        axis=2
-    )  # additive layers may have colours outside that of the photo
+    # Additive layers may have colours outside the gamut of the photo.
+    in_gamut = (layers[0].pixels > 0).all(axis=2)
     difference = np.abs(layers[0].linear() - separation.transmission.linear())
     assert difference[in_gamut].max() < 0.01
     assert layers[1].pixels.mean() > 10

@@ -15,8 +15,8 @@ IMAGE = smooth(24, 32)
 IMAGE_16BIT = IMAGE.astype(np.uint16) * 257
 
 
-def encoded_by_brewster(container, array=IMAGE):
-    return Photo.from_array(array, encoding="srgb").encode(container)
+def encoded_by_brewster(format_name, array=IMAGE):
+    return Photo.from_array(array, encoding="srgb").encode(format_name)
 
 
 FILES = {

@@ -31,11 +31,11 @@ def events(xmp):
     return [(event.get(f"{EVENT}softwareAgent"), event.get(f"{EVENT}parameters")) for event in found]
 
 
-@pytest.mark.parametrize("container", [name for name in WRITABLE if name not in ("heic", "exr", "hdr")])
-def test_a_layer_records_the_program_and_the_options(container, tmp_path):
+@pytest.mark.parametrize("format_name", [name for name in WRITABLE if name not in ("heic", "exr", "hdr")])
+def test_a_layer_records_the_program_and_the_options(format_name, tmp_path):
     separation = SEPARATOR(file_of(smooth(), "JPEG", exif=exif_block(1)), strength=0.5, quality="draft")
-    path = tmp_path / f"a.{WRITABLE[container].suffixes[0]}"
-    path.write_bytes(separation.reflection.encode(container))
+    path = tmp_path / f"a.{WRITABLE[format_name].suffixes[0]}"
+    path.write_bytes(separation.reflection.encode(format_name))
     assert recorded_parameters(path, "brewster") == {
         "layer": "reflection",
         "model": "a & <b>",
@@ -50,12 +50,12 @@ def test_a_layer_records_the_program_and_the_options(container, tmp_path):
     assert recorded_parameters(path, "another program") is None
 
 
-@pytest.mark.parametrize("container", ["exr", "hdr"])
-def test_an_image_without_xmp_records_the_program(container):
-    if container == "exr":
+@pytest.mark.parametrize("format_name", ["exr", "hdr"])
+def test_an_image_without_xmp_records_the_program(format_name):
+    if format_name == "exr":
         pytest.importorskip("OpenEXR")
     layer = SEPARATOR(np.full((8, 8, 3), 0.5, np.float32), encoding="linear").transmission
-    header = Photo.open(layer.encode(container)).file_info.header
+    header = Photo.open(layer.encode(format_name)).file_info.header
     assert next(value for key, value in header.items() if key.lower() == "software").startswith("brewster ")
 
 

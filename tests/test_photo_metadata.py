@@ -53,10 +53,10 @@ def test_a_grey_jpeg_keeps_its_quality() -> None:
     assert pil(photo.encode()).mode == "L"
 
 
-@pytest.mark.parametrize("container", ["webp", "avif"])
-def test_lossless_webp_and_avif_stay_lossless(container: str) -> None:
+@pytest.mark.parametrize("format_name", ["webp", "avif"])
+def test_lossless_webp_and_avif_stay_lossless(format_name: str) -> None:
     pixels = np.random.default_rng(0).integers(0, 256, (24, 40, 3), np.uint8)
-    file_info = FileInfo(container=container, lossless=True)
+    file_info = FileInfo(format_name=format_name, lossless=True)
     photo = Photo.open(Photo(pixels, None, file_info).encode())
     assert photo.file_info.lossless
     assert np.array_equal(photo.pixels, pixels)
@@ -64,18 +64,20 @@ def test_lossless_webp_and_avif_stay_lossless(container: str) -> None:
 
 
 def test_lossy_webp_and_avif_stay_lossy_and_close() -> None:
-    for container in ("webp", "avif"):
-        photo = Photo.open(file_of(smooth(), container))
+    for format_name in ("webp", "avif"):
+        photo = Photo.open(file_of(smooth(), format_name))
         assert not photo.file_info.lossless
         assert np.abs(Photo.open(photo.encode()).pixels.astype(int) - photo.pixels).mean() < 2
 
 
-@pytest.mark.parametrize(("container", "bits"), [("avif", 10), ("avif", 12), ("heic", 10)])
-def test_white_is_white_at_every_bit_depth(container: str, bits: int) -> None:
-    if container == "heic":
+@pytest.mark.parametrize(("format_name", "bits"), [("avif", 10), ("avif", 12), ("heic", 10)])
+def test_white_is_white_at_every_bit_depth(format_name: str, bits: int) -> None:
+    if format_name == "heic":
         pytest.importorskip("pillow_heif")
     white = np.full((32, 32, 3), 65535, np.uint16)
-    photo = Photo.open(Photo(white, None, FileInfo(container=container, bits=bits, lossless=True)).encode())
+    photo = Photo.open(
+        Photo(white, None, FileInfo(format_name=format_name, bits=bits, lossless=True)).encode()
+    )
     assert np.array_equal(photo.pixels, white)
     assert photo.file_info.bits == bits
 
@@ -84,7 +86,7 @@ def test_white_is_white_at_every_bit_depth(container: str, bits: int) -> None:
 def test_avif_of_ten_and_twelve_bits_keeps_them_and_its_white(bits: int) -> None:
     levels = np.linspace(0, 2**bits - 1, 2**bits).round().astype(np.uint16)
     shifted = np.repeat((levels << (16 - bits)).reshape(32, -1, 1), 3, axis=2)
-    photo = Photo.open(Photo(shifted, None, FileInfo(container="avif", bits=bits, lossless=True)).encode())
+    photo = Photo.open(Photo(shifted, None, FileInfo(format_name="avif", bits=bits, lossless=True)).encode())
     assert photo.file_info.bits == bits
     assert photo.pixels.max() == 65535
     assert np.array_equal(photo.pixels >> (16 - bits), shifted >> (16 - bits))
@@ -95,27 +97,29 @@ def test_avif_of_ten_and_twelve_bits_keeps_them_and_its_white(bits: int) -> None
 
 
 @pytest.mark.parametrize("orientation", range(1, 9))
-@pytest.mark.parametrize("container", ["jpeg", "png", "tiff", "webp"])
-def test_orientation_is_applied_once_as_pillow_does(container: str, orientation: int) -> None:
-    data = file_of(smooth(24, 40), container, exif=exif_block(orientation), quality=95, lossless=True)
+@pytest.mark.parametrize("format_name", ["jpeg", "png", "tiff", "webp"])
+def test_orientation_is_applied_once_as_pillow_does(format_name: str, orientation: int) -> None:
+    data = file_of(smooth(24, 40), format_name, exif=exif_block(orientation), quality=95, lossless=True)
     expected = ImageOps.exif_transpose(pil(data))
     photo = Photo.open(data)
     assert photo.size == expected.size
-    assert np.abs(photo.pixels.astype(int) - np.asarray(expected)).max() <= (12 if container == "jpeg" else 0)
+    assert np.abs(photo.pixels.astype(int) - np.asarray(expected)).max() <= (
+        12 if format_name == "jpeg" else 0
+    )
     written = pil(photo.encode())
     assert written.size == expected.size
     assert written.getexif()[274] == 1
 
 
-@pytest.mark.parametrize("container", ["jpeg", "png", "webp", "avif"])
-def test_exif_profile_and_xmp_are_kept_byte_for_byte(container: str) -> None:
+@pytest.mark.parametrize("format_name", ["jpeg", "png", "webp", "avif"])
+def test_exif_profile_and_xmp_are_kept_byte_for_byte(format_name: str) -> None:
     exif, upright = exif_block(), exif_block(1)
-    data = file_of(smooth(), container, exif=exif, icc_profile=P3)
+    data = file_of(smooth(), format_name, exif=exif, icc_profile=P3)
     photo = Photo.open(data)
     photo = Photo(photo.pixels, None, FileInfo(**{**vars(photo.file_info), "xmp": UPRIGHT_XMP}))
     written = pil(photo.encode())
     found = written.info["exif"].removeprefix(b"Exif\0\0")
-    if container != "avif":  # Pillow has removed the orientation from it
+    if format_name != "avif":  # Pillow has removed the orientation from it
         assert found == upright.removeprefix(b"Exif\0\0")
     assert found == photo.file_info.exif
     assert written.info["icc_profile"] == P3
@@ -133,17 +137,17 @@ def test_a_tiff_keeps_its_camera_tags() -> None:
     assert Photo.open(Photo.open(data).encode()).file_info.icc == P3
 
 
-@pytest.mark.parametrize("container", ["jpeg", "png", "tiff", "webp", "avif"])
-def test_the_camera_tags_survive_a_change_of_container(container: str) -> None:
+@pytest.mark.parametrize("format_name", ["jpeg", "png", "tiff", "webp", "avif"])
+def test_the_camera_tags_survive_a_change_of_format(format_name: str) -> None:
     source = Photo.open(file_of(smooth(), "JPEG", exif=exif_block()))
-    written = pil(source.encode(container)).getexif()
+    written = pil(source.encode(format_name)).getexif()
     assert written[271] == "Sextant"
     assert written.get_ifd(34665)[36867] == "2020:01:02 03:04:05"
 
 
-@pytest.mark.parametrize("container", ["jpeg", "png", "tiff"])
-def test_resolution_is_kept(container: str) -> None:
-    written = pil(Photo.open(file_of(smooth(), container, dpi=(300, 300))).encode())
+@pytest.mark.parametrize("format_name", ["jpeg", "png", "tiff"])
+def test_resolution_is_kept(format_name: str) -> None:
+    written = pil(Photo.open(file_of(smooth(), format_name, dpi=(300, 300))).encode())
     np.testing.assert_allclose(np.array(written.info["dpi"], float), 300, atol=0.01)
 
 
@@ -165,8 +169,8 @@ def test_damaged_exif_does_not_prevent_reading_and_writing(
 ) -> None:
     exif = byte_order + struct.pack("<I", offset) + garbage
     photo = Photo.open(metadata.with_png_exif(file_of(smooth(4, 4), "PNG"), exif))
-    for container in ("png", "tiff", "jpeg"):
-        assert Photo.open(photo.encode(container)).size == photo.size
+    for format_name in ("png", "tiff", "jpeg"):
+        assert Photo.open(photo.encode(format_name)).size == photo.size
 
 
 def test_code_points_of_display_p3_give_its_profile() -> None:

@@ -52,7 +52,7 @@ def test_what_is_neutral_for_the_camera_is_neutral_in_the_photo():
 def test_a_raw_file_gives_sixteen_bit_tiff_with_the_tags_of_the_camera():
     data = metadata.with_tiff_exif(dng_file(mosaic()), exif_block(1).removeprefix(b"Exif\0\0"))
     photo = Photo.open(data)
-    assert (photo.file_info.container, photo.file_info.bits, photo.pixels.dtype) == ("tiff", 16, np.uint16)
+    assert (photo.file_info.format_name, photo.file_info.bits, photo.pixels.dtype) == ("tiff", 16, np.uint16)
     image = pil(photo.encode())
     assert image.format == "TIFF"
     exif = image.getexif()
@@ -107,7 +107,7 @@ def test_the_missing_extra_names_the_command_that_installs_it(monkeypatch):
 
 
 def test_a_tiff_of_a_photo_is_not_raw():
-    assert Photo.open(file_of(smooth(), "TIFF")).file_info.container == "tiff"
+    assert Photo.open(file_of(smooth(), "TIFF")).file_info.format_name == "tiff"
     assert format_of(Path("a.NEF")) == FORMATS["raw"]
 
 

@@ -69,9 +69,9 @@ def test_a_tiff_with_missing_tiles_is_refused() -> None:
 
 
 @pytest.mark.parametrize("fraction", [0.02, 0.5, 0.99])
-@pytest.mark.parametrize("container", ["exr", "hdr"])
-def test_truncated_floats_are_refused(container: str, fraction: float) -> None:
-    data = Photo.from_array(NOISE, encoding="srgb").encode(container)
+@pytest.mark.parametrize("format_name", ["exr", "hdr"])
+def test_truncated_floats_are_refused(format_name: str, fraction: float) -> None:
+    data = Photo.from_array(NOISE, encoding="srgb").encode(format_name)
     assert_refused(data[: int(len(data) * fraction)], PhotoError, "; ")
 
 
@@ -163,15 +163,15 @@ def test_hdr_video_colours_are_refused(transfer: int) -> None:
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
-@pytest.mark.parametrize("container", ["exr", "tiff"])
-def test_floats_that_are_not_finite_are_refused(container: str, value: float) -> None:
+@pytest.mark.parametrize("format_name", ["exr", "tiff"])
+def test_floats_that_are_not_finite_are_refused(format_name: str, value: float) -> None:
     pixels = np.zeros((4, 4, 3), np.float32)
     whole = Photo.from_array(pixels, encoding="linear")
     broken = pixels.copy()
     broken[2, 1, 0] = value
     bad = Photo(broken, None, whole.file_info)
-    if container == "tiff" or np.isnan(value):
-        assert_refused(bad.encode(container, depth=32), UnsupportedPhoto, "1 pixels")
+    if format_name == "tiff" or np.isnan(value):
+        assert_refused(bad.encode(format_name, depth=32), UnsupportedPhoto, "1 pixels")
     with pytest.raises(UnsupportedPhoto, match="finite"):
         Photo.from_array(broken, encoding="linear")
 
@@ -223,9 +223,9 @@ def test_more_pixels_than_the_limit_are_refused(kind: str) -> None:
     assert Photo.open(data, max_pixels=64 * 40).size == (64, 40)
 
 
-@pytest.mark.parametrize("container", ["exr", "hdr"])
-def test_more_floats_than_the_limit_are_refused(container: str) -> None:
-    data = Photo.from_array(NOISE, encoding="srgb").encode(container)
+@pytest.mark.parametrize("format_name", ["exr", "hdr"])
+def test_more_floats_than_the_limit_are_refused(format_name: str) -> None:
+    data = Photo.from_array(NOISE, encoding="srgb").encode(format_name)
     assert_refused(data, PhotoTooLarge, "64 x 40", max_pixels=64 * 40 - 1)
 
 

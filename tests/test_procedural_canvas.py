@@ -14,7 +14,7 @@ from brewster.environments.procedural.canvas import (
     resize,
     vector,
 )
-from brewster.environments.procedural.props import UP, Lamp, SceneLighting
+from brewster.environments.procedural.props import UP, EnvironmentLighting, Lamp
 from brewster.environments.procedural.streets import street_environment
 
 
@@ -44,7 +44,9 @@ def test_a_near_surface_hides_a_far_one_whichever_is_drawn_first(order):
 
 def lit(distance, normal, facing=None):
     """Light on a point below a lamp of 1 per steradian."""
-    lamps = SceneLighting(vector(0, 0, 0), floor=-2.0, lamps=[Lamp(UP * distance, vector(1, 1, 1), facing)])
+    lamps = EnvironmentLighting(
+        vector(0, 0, 0), floor_y_m=-2.0, lamps=[Lamp(UP * distance, vector(1, 1, 1), facing)]
+    )
     return lamps(np.zeros((1, 1, 3), np.float32), normal)[0, 0, 0]
 
 

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from brewster.environments.procedural import rooms
+from brewster.environments.procedural import registry
 from brewster.environments.procedural.canvas import (
     Canvas,
     ProceduralEnvironment,
@@ -12,7 +12,8 @@ from brewster.environments.procedural.canvas import (
     render,
     vector,
 )
-from brewster.environments.procedural.rooms import ENVIRONMENTS, painting
+from brewster.environments.procedural.paintings import painting
+from brewster.environments.procedural.registry import ENVIRONMENTS
 from brewster.srgb import REC709_LUMINANCE
 
 NAMES = sorted(ENVIRONMENTS)
@@ -36,7 +37,7 @@ def both_maps():
     heights = 64, 128
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(
-            rooms, "render", lambda environment, _height: [render(environment, each) for each in heights]
+            registry, "render", lambda environment, _height: [render(environment, each) for each in heights]
         )
         return {name: ENVIRONMENTS[name](7, 0) for name in NAMES}
 

@@ -101,6 +101,10 @@ def test_a_changed_photo_ground_truth_or_setting_is_scored_again(real20, tmp_pat
     fake = FakeMethod()
     score(real20, [fake], QUICK, tmp_path / "out")
     assert fake.requested == ["2"]
+    paint(tmp_path / "real20" / "blended" / "3.png", 78)
+    fake = FakeMethod()
+    score(real20, [fake], QUICK, tmp_path / "out")
+    assert fake.requested == ["3"]
     fake = FakeMethod()
     score(real20, [fake], replace(QUICK, thresholds=(0.2,)), tmp_path / "out")
     assert fake.requested == NAMES

@@ -318,6 +318,32 @@ def test_arrows_up_and_down_scroll_and_the_focus_stays(open_page, url, store):
     assert [answer.choice for answer in answers.values()] == ["similar"] * 3
 
 
+def test_the_explanation_of_the_practice_pair_stays_while_the_next_pictures_are_loaded(open_page, url):
+    page = open_page(url)
+    begin(page)
+    page.wait_for_load_state("networkidle")
+    page.wait_for_timeout(300)
+    expect(page.locator("#notice")).to_contain_text("The study begins now.")
+
+
+def test_a_notice_is_not_removed_by_the_timer_of_an_earlier_notice(open_page, url):
+    page = open_page(url)
+    begin(page)
+    page.clock.install()
+    notice, copy = page.locator("#notice"), page.get_by_role("button", name="Copy your personal link")
+    page.evaluate("() => { navigator.clipboard.writeText = async () => {} }")
+    copy.click()
+    expect(notice).to_contain_text("Your link is copied.")
+    page.clock.fast_forward(6000)
+    page.evaluate("() => { navigator.clipboard.writeText = async () => { throw new Error() } }")
+    copy.click()
+    expect(notice).to_contain_text("Your link: http")
+    page.clock.fast_forward(6000)
+    expect(notice).to_contain_text("Your link: http")
+    page.clock.fast_forward(6000)
+    expect(notice).to_be_hidden()
+
+
 def test_a_missing_picture_is_reported_when_its_trial_is_shown(open_page, url, store):
     page = open_page(url)
     gone = {"status": 410, "json": {"error": "a picture is missing on the server"}}

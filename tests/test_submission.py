@@ -36,7 +36,7 @@ def test_each_zip_has_a_jpeg_with_the_name_of_each_photo(openrr, tmp_path):
         assert archive.namelist() == ["1.jpg", "2.jpg"]
         packed = Photo.open(archive.read("2.jpg"))
     photo = Photo.open(openrr / "val_2_blended" / "2.jpg")
-    assert packed.file_info.container == "jpeg"
+    assert packed.file_info.format_name == "jpeg"
     assert abs(packed.srgb_8bit().astype(int) - photo.srgb_8bit()).max() <= 3
     again = export_ntire2026(openrr, IdentityBaseline(), tmp_path / "again")
     assert [path.read_bytes() for path in again] == [path.read_bytes() for path in paths]

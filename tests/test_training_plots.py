@@ -32,7 +32,7 @@ def test_metrics_of_one_kind_share_a_subplot():
     ]  # fmt: skip
     widths = [
         Photo.open(plot_log(given)).size
-        for given in (lines, [{**line, "tone_x": 1.0} for line in lines], [{"step": 1, "loss": 0.5}])
+        for given in (lines, [{**line, "exposure_x": 1.0} for line in lines], [{"step": 1, "loss": 0.5}])
     ]
     assert widths[0][0] == 3 * widths[2][0]
     assert widths[0][1] == widths[2][1]

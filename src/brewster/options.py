@@ -182,7 +182,7 @@ class Options:
         """Returns the keywords for calling a `Separator`."""
         return {name: getattr(self, name) for name in _CALL_OPTIONS}
 
-    def container(self, layer: str, source_format: str) -> str:
+    def format_name(self, layer: str, source_format: str) -> str:
         """Returns the file format of a layer. `source_format` is the format of the photo. Confidence is always PNG."""
         if layer in LAYER_FORMATS:
             return LAYER_FORMATS[layer]
@@ -194,8 +194,8 @@ class Options:
         """Returns the suffix of a layer's file, or None if it is the suffix of the source."""
         image_format = format_of(source)
         source_format = image_format.name if image_format else ""
-        container = self.container(layer, source_format)
-        return None if container == source_format else FORMATS[container].suffixes[0]
+        format_name = self.format_name(layer, source_format)
+        return None if format_name == source_format else FORMATS[format_name].suffixes[0]
 
 
 def document_options(function: _Function) -> _Function:

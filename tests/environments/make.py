@@ -10,7 +10,8 @@ from pathlib import Path
 
 import numpy as np
 
-from brewster.environments.procedural.rooms import ENVIRONMENTS, painting
+from brewster.environments.procedural.paintings import painting
+from brewster.environments.procedural.registry import ENVIRONMENTS
 from brewster.photo import Photo
 from brewster.srgb import to_encoded
 

@@ -314,9 +314,11 @@ class BatchRunner:
         started = time.perf_counter()
         for layer, target in task.outputs.items():
             target_format = format_of(target) if isinstance(target, Location) else None
-            source_format = separation.photo.file_info.container
-            container = target_format.name if target_format else self._options.container(layer, source_format)
-            encoded = getattr(separation, layer).encode(container)
+            source_format = separation.photo.file_info.format_name
+            format_name = (
+                target_format.name if target_format else self._options.format_name(layer, source_format)
+            )
+            encoded = getattr(separation, layer).encode(format_name)
             on_progress(1.0)
             if isinstance(target, Location):
                 write_atomically(target, encoded, overwrite=self._overwrite, source=path)

@@ -51,10 +51,12 @@ class BatchCommand:
     contact_sheet: Path | None = None
     workers: int | None = None
     cluster: str | None = None
-    index: bool = False
+    writes_index: bool = False
 
     def run(self, tasks: Sequence[SeparationTask]) -> bool:
-        """Separates all photos and prints the results. Results are not stored, because an archive has millions of photos.
+        """Separates all photos and prints the results.
+
+        The results are not kept in memory, because an archive can have millions of photos.
 
         Returns:
             Whether no photo failed.
@@ -87,7 +89,7 @@ class BatchCommand:
             if self.contact_sheet and not self.dry_run:
                 self._write_contact_sheet(self.contact_sheet, summary.contact_sheet_rows)
         finally:
-            # True also if `separate_tasks` raises an unexpected exception after the last photo.
+            # All photos have a result. `separate_tasks` may still raise, after the last photo.
             if summary.counts.total() == len(tasks):
                 self._print_summary(summary, time.perf_counter() - started)
         return not summary.counts["failed"]
@@ -132,7 +134,7 @@ class BatchCommand:
     def _index_writer(self) -> AbstractContextManager[IndexWriter | None]:
         from brewster.batch.index import IndexWriter  # noqa: PLC0415
 
-        is_written = (self.index or self.cluster) and self.output and not self.dry_run
+        is_written = (self.writes_index or self.cluster) and self.output and not self.dry_run
         return IndexWriter(location(self.output or "")) if is_written else nullcontext()
 
     def _print_result(self, result: FileResult) -> None:
@@ -145,11 +147,12 @@ class BatchCommand:
         if self.quiet or result.error:
             return
         if result.status == "skipped":
-            # Reading the layers takes time, so the options of an archive are not compared.
-            other = "" if self._is_parallel else self._other_options(result)
-            made = f", made with other options ({other})" if other else ""
+            # A parallel batch does not read the existing layers to compare their options with the current ones, because that
+            # takes time.
+            different_options = "" if self._is_parallel else self._different_options(result)
+            note = f", made with other options ({different_options})" if different_options else ""
             print_status(
-                f"{result.source}: skipped, because all of its layers exist{made} (--overwrite replaces them)"
+                f"{result.source}: skipped, because all of its layers exist{note} (--overwrite replaces them)"
             )
         elif result.status == "separated":
             verdict = result.assessment.verdict if result.assessment else ""
@@ -157,7 +160,7 @@ class BatchCommand:
             seconds = sum(result.seconds.values())
             print_status(f"{result.source} -> {outputs} ({seconds:.1f} s, {verdict}{hint})")
 
-    def _other_options(self, result: FileResult) -> str:
+    def _different_options(self, result: FileResult) -> str:
         """Returns the options in the metadata of the existing layers that differ from the options of this batch."""
         from brewster.inference.layer_history import PROGRAM, history_step  # noqa: PLC0415
         from brewster.photo.history import recorded_parameters  # noqa: PLC0415
@@ -166,12 +169,12 @@ class BatchCommand:
         expected = history_step(
             "", strength=options.strength, quality=options.quality, additive=options.additive
         ) | {"model": _model_name(options.model)}
-        recorded = (recorded_parameters(Path(path), PROGRAM) for path in result.outputs.values())
-        made = next((parameters for parameters in recorded if parameters), {})
+        metadata = (recorded_parameters(Path(path), PROGRAM) for path in result.outputs.values())
+        recorded_options = next((parameters for parameters in metadata if parameters), {})
         return ", ".join(
-            f"{name}={made[name]}"
+            f"{name}={recorded_options[name]}"
             for name, value in expected.items()
-            if value is not None and made.get(name, value) != value
+            if value is not None and recorded_options.get(name, value) != value
         )
 
     def _print_summary(self, summary: _Summary, seconds: float) -> None:
@@ -206,13 +209,13 @@ class _Summary:
         self.counts: Counter[str] = Counter()
         self.contact_sheet_rows: list[tuple[Path, list[Path]]] = []
         self._errors: list[str] = []
-        self._without_extra: defaultdict[str, list[str]] = defaultdict(list)
+        self._sources_by_missing_extra: defaultdict[str, list[str]] = defaultdict(list)
 
     def add(self, result: FileResult, *, has_contact_sheet: bool) -> None:
         """Counts a result."""
         self.counts[result.status] += 1
         if result.error and "pip install 'brewster[" in result.error:
-            self._without_extra[result.error].append(result.source)
+            self._sources_by_missing_extra[result.error].append(result.source)
         elif result.error:
             self._errors.append(_error_text(result))
         elif has_contact_sheet and "-" not in (result.source, *result.outputs.values()):
@@ -222,13 +225,16 @@ class _Summary:
         """Returns a message for each failed photo. Photos that need the same missing extra share a message."""
         grouped = (
             f"{sources[0] if len(sources) == 1 else counted(sources, 'photo')}: {error}"
-            for error, sources in self._without_extra.items()
+            for error, sources in self._sources_by_missing_extra.items()
         )
         return [*self._errors, *grouped]
 
 
 def _model_name(model: str) -> str | None:
-    """Returns the model name that the metadata of its layers contain, or None if the model must be loaded to know the name."""
+    """Returns the name under which the metadata of layers record this model.
+
+    Returns None if the model is unknown, or if its name is known only after loading.
+    """
     try:
         return None if zoo.is_diffusion_model(model) else zoo.find_model(model).name
     except ModelError:

@@ -110,7 +110,7 @@ def _check_format(image_format: ImageFormat | None, options: Options) -> None:
     layer = options.layers[0]
     if not image_format.is_writable and LAYER_FORMATS.get(layer) != name:
         raise click.UsageError(f"brewster cannot write {name.upper()}: choose another suffix for -o.")
-    if layer != "confidence" and options.container(layer, name) != name:
+    if layer != "confidence" and options.format_name(layer, name) != name:
         raise click.UsageError(
             f"The output file (-o) is a {name} file, but --format, --additive or --layers requires another format."
         )

@@ -143,35 +143,35 @@ def _formats() -> Iterator[Check]:
     except (ImportError, OSError) as error:
         yield Check("formats", "formats", "broken", str(error), "repair the packages above")
         return
-    for container in WRITABLE:
-        yield _try_format(container, "reads and writes", lambda name=container: _encode_sample(name))  # type: ignore[misc]
+    for format_name in WRITABLE:
+        yield _try_format(format_name, "reads and writes", lambda name=format_name: _encode_sample(name))  # type: ignore[misc]
     yield _try_format("gif", "reads", lambda: _GIF)
 
 
-def _encode_sample(container: str) -> bytes:
+def _encode_sample(format_name: str) -> bytes:
     """Returns a grey image of 64x64 pixels as a file of this format."""
     import numpy as np  # noqa: PLC0415  (slow to import)
 
     from brewster.photo import Photo  # noqa: PLC0415  (imports pyvips)
 
     grey = np.full((64, 64, 3), 128, np.uint8)
-    return Photo.from_array(grey, encoding="srgb").encode(container)
+    return Photo.from_array(grey, encoding="srgb").encode(format_name)
 
 
-def _try_format(container: str, detail: str, encode_sample: Callable[[], bytes]) -> Check:
+def _try_format(format_name: str, detail: str, encode_sample: Callable[[], bytes]) -> Check:
     """Decodes a sample file. `detail` is the detail of the check if this succeeds."""
     from brewster.photo import Photo  # noqa: PLC0415  (imports pyvips)
 
-    extra = FORMATS[container].extra
+    extra = FORMATS[format_name].extra
     try:
         Photo.open(encode_sample())
     except MissingExtra as error:
         cure = f"pip install 'brewster[{extra}]'"
-        return Check("formats", container, "missing", str(error), cure, needed=False)
+        return Check("formats", format_name, "missing", str(error), cure, needed=False)
     except BrewsterError as error:
         cure = "pip install --force-reinstall pyvips-binary"
-        return Check("formats", container, "broken", str(error), cure, needed=extra is None)
-    return Check("formats", container, "ok", detail)
+        return Check("formats", format_name, "broken", str(error), cure, needed=extra is None)
+    return Check("formats", format_name, "ok", detail)
 
 
 def _models() -> Iterator[Check]:

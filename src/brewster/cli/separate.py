@@ -260,7 +260,7 @@ def separate(
         contact_sheet=contact_sheet,
         workers=workers,
         cluster=cluster,
-        index=index,
+        writes_index=index,
     )
     context.exit(0 if batch.run(tasks) else 1)
 

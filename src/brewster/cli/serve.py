@@ -141,8 +141,9 @@ def serve(
 ) -> None:
     """Serve the web page and the HTTP API until Ctrl-C.
 
-    Drop photos on the page to separate them. The server sends nothing to other machines, downloads nothing, and
-    writes nothing to the disk. docs/serving.md describes the API.
+    Drop photos on the page to separate them. Photos are neither sent to other machines nor written to the disk.
+    Nothing is downloaded, except a diffusion model given with --model that is not in the cache. docs/serving.md
+    describes the API.
     """
     require_extra("web", "serving", without=frozenset({"matplotlib"}))
     from brewster.web import application as web  # noqa: PLC0415  (imports FastAPI)

@@ -15,7 +15,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from brewster.environments.procedural.rooms import ENVIRONMENTS, painting
+from brewster.environments.procedural.paintings import painting
+from brewster.environments.procedural.registry import ENVIRONMENTS
 from brewster.errors import BrewsterError, RecipeError, UnsupportedPhoto
 from brewster.photo import Photo
 from brewster.scene.world import BUILTIN, AssetSource, EnvironmentMap, Plane

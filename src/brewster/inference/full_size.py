@@ -54,7 +54,7 @@ def upsample_layers(
 def _float_template(photo: Photo) -> Photo:
     """Returns a black photo of the same size, 32-bit floats in linear light, with the alpha and EXIF of the photo."""
     file_info = replace(
-        photo.file_info, container="tiff", bits=32, compression=None, icc=None, primaries=None, header=None
+        photo.file_info, format_name="tiff", bits=32, compression=None, icc=None, primaries=None, header=None
     )
     alpha = photo.alpha
     if alpha is not None and alpha.dtype.kind == "u":

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brewster.errors import MissingExtra
-from brewster.metrics.weights import load_alexnet, read_heads
+from brewster.metrics.weights import load_alexnet, read_lpips_channel_weights
 from brewster.metrics.windows import Image, Region, check_images, check_region
 
 if TYPE_CHECKING:
@@ -100,7 +100,7 @@ class Lpips:
 
     convolutions: tuple[tuple[Tensor, Tensor], ...]
     """Weights (out, in, k, k) and biases (out,) of AlexNet's five convolutions."""
-    heads: tuple[Tensor, ...]
+    channel_weights: tuple[Tensor, ...]
     """The weight of each channel of the five maps, (C,): the linear layers of LPIPS."""
 
     @classmethod
@@ -169,8 +169,8 @@ class Lpips:
             raise ValueError(f"the images differ in size: {one.shape} and {other.shape}")
         with torch.inference_mode():
             maps = [
-                torch.einsum("c,chw->hw", head, (a - b).square_())
-                for head, a, b in zip(self.heads, one.maps, other.maps, strict=True)
+                torch.einsum("c,chw->hw", weights, (a - b).square_())
+                for weights, a, b in zip(self.channel_weights, one.maps, other.maps, strict=True)
             ]
         return DifferenceMaps(tuple(maps), one.shape)
 
@@ -203,8 +203,8 @@ def _load() -> Lpips:
         ) from error
     tensors = [*load_alexnet().values()]
     weights = [weight.to(memory_format=torch.channels_last) for weight in tensors[::2]]  # faster on the CPU
-    heads = tuple(torch.from_numpy(head) for head in read_heads())
-    return Lpips(tuple(zip(weights, tensors[1::2], strict=True)), heads)
+    channel_weights = tuple(map(torch.from_numpy, read_lpips_channel_weights()))
+    return Lpips(tuple(zip(weights, tensors[1::2], strict=True)), channel_weights)
 
 
 def _normalised(image: Image) -> NDArray[np.float32]:

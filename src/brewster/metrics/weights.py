@@ -30,12 +30,14 @@ from brewster.files import cache_folder, write_atomically
 if TYPE_CHECKING:
     from torch import Tensor
 
-TENSOR_NAMES: Final = tuple(f"features.{i}.{kind}" for i in (0, 3, 6, 8, 10) for kind in ("weight", "bias"))
+ALEXNET_TENSORS: Final = tuple(
+    f"features.{i}.{kind}" for i in (0, 3, 6, 8, 10) for kind in ("weight", "bias")
+)
 
-WEIGHTS_FILE: Final = "lpips_alexnet_features.pth"
+ALEXNET_FILE: Final = "lpips_alexnet_features.pth"
 
-DIGEST: Final = "b58cb12516261361a1ed14f3b70c0abad70c1ca4c1c75e1aa576654d3759aa06"
-"""The expected result of `digest_of`."""
+ALEXNET_DIGEST: Final = "b58cb12516261361a1ed14f3b70c0abad70c1ca4c1c75e1aa576654d3759aa06"
+"""The expected result of `alexnet_digest`."""
 
 TORCHVISION_ALEXNET: Final = RemoteFile(
     "https://download.pytorch.org/models/alexnet-owt-7be5be79.pth",
@@ -78,7 +80,10 @@ _LOAD_ERRORS: Final = (
 
 
 def load_alexnet(
-    remote: RemoteFile = TORCHVISION_ALEXNET, digest: str = DIGEST, *, downloader: Downloader | None = None
+    remote: RemoteFile = TORCHVISION_ALEXNET,
+    digest: str = ALEXNET_DIGEST,
+    *,
+    downloader: Downloader | None = None,
 ) -> dict[str, Tensor]:
     """Returns AlexNet's ten tensors by name, float32: from the cache, from BREWSTER_DATA, or downloaded into the cache.
 
@@ -87,10 +92,10 @@ def load_alexnet(
         DownloadError: there is no file, and the download fails.
         OutputError: the cache folder cannot be written.
     """
-    path = _find(WEIGHTS_FILE)
+    path = _find(ALEXNET_FILE)
     if path:
         return read_alexnet(path, digest)
-    return _fetch(remote, digest, _cached(WEIGHTS_FILE), downloader or Downloader())
+    return _fetch(remote, digest, _cached(ALEXNET_FILE), downloader or Downloader())
 
 
 def load_vgg16(
@@ -130,7 +135,7 @@ def _find(name: str) -> Path | None:
     return next((path for path in paths if path.is_file()), None)
 
 
-def read_alexnet(path: Path, digest: str = DIGEST) -> dict[str, Tensor]:
+def read_alexnet(path: Path, digest: str = ALEXNET_DIGEST) -> dict[str, Tensor]:
     """Reads the ten tensors of a state dict and checks their digest. Other tensors in the file are ignored.
 
     Raises:
@@ -140,24 +145,24 @@ def read_alexnet(path: Path, digest: str = DIGEST) -> dict[str, Tensor]:
 
     try:
         state = torch.load(path, map_location="cpu", weights_only=True)
-        tensors = {name: state[name].float().contiguous() for name in TENSOR_NAMES}
+        tensors = {name: state[name].float().contiguous() for name in ALEXNET_TENSORS}
     except _LOAD_ERRORS as error:
         raise _not_alexnet(path, f"it cannot be read: {type(error).__name__}") from error
-    if (actual := digest_of(tensors)) != digest:
+    if (actual := alexnet_digest(tensors)) != digest:
         raise _not_alexnet(path, f"its digest is {actual:.12}...")
     return tensors
 
 
-def read_heads() -> list[NDArray[np.float32]]:
-    """Returns the channel weights of the five layers: (64,), (192,), (384,), (256,), (256,), all >= 0."""
+def read_lpips_channel_weights() -> list[NDArray[np.float32]]:
+    """Returns the published channel weights of LPIPS for the five layers: (64,), (192,), (384,), (256,), (256,), all >= 0."""
     with np.load(Path(__file__).with_name("lpips_alex_v0.1.npz")) as file:
         return [file[f"layer{i}"] for i in range(5)]
 
 
-def digest_of(tensors: dict[str, Tensor]) -> str:
-    """Returns the SHA-256 of the name, shape and little-endian float32 values of each tensor, in the order of `TENSOR_NAMES`."""
+def alexnet_digest(tensors: dict[str, Tensor]) -> str:
+    """Returns the SHA-256 of the name, shape and little-endian float32 values of each tensor, in the order of `ALEXNET_TENSORS`."""
     digest = hashlib.sha256()
-    for name in TENSOR_NAMES:
+    for name in ALEXNET_TENSORS:
         values: NDArray[Any] = tensors[name].numpy().astype("<f4", order="C")
         digest.update(f"{name} {values.shape}\n".encode() + values.tobytes())
     return digest.hexdigest()
@@ -171,7 +176,7 @@ def _fetch(remote: RemoteFile, digest: str, cached: Path, downloader: Downloader
     import torch  # noqa: PLC0415 - an extra
 
     download = cached.with_name(remote.url.rsplit("/", 1)[-1])
-    _download(remote, download, downloader, ("AlexNet", "LPIPS", WEIGHTS_FILE))
+    _download(remote, download, downloader, ("AlexNet", "LPIPS", ALEXNET_FILE))
     try:
         tensors = read_alexnet(download, digest)
         buffer = io.BytesIO()

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from brewster import srgb
 from brewster.files import write_atomically
-from brewster.photo.file_info import container_of
+from brewster.photo.file_info import format_name_of
 from brewster.photo.photo import Photo
 
 _ROW_PX = 240
@@ -48,7 +48,7 @@ def write_contact_sheets(
             for image in images
         ]
         sheet = path if number == 1 else path.with_stem(f"{path.stem}-{number}")
-        data = Photo(np.concatenate(padded)).encode(container_of(sheet))
+        data = Photo(np.concatenate(padded)).encode(format_name_of(sheet))
         write_atomically(sheet, data, overwrite=True)
         yield sheet
 

@@ -50,18 +50,18 @@ def decode(data: bytes, max_pixels: int) -> Decoded:
         PhotoError: the image cannot be read, is not supported, or is too large (see `Photo.open`).
         MissingExtra: the reader of EXR, HEIC or RAW is not installed.
     """
-    container = _detect_container(data)
-    if container == "ora":
-        data, container = _merged_image(data, max_pixels), "png"
-    if container == "raw":
+    format_name = _detect_format(data)
+    if format_name == "ora":
+        data, format_name = _merged_image(data, max_pixels), "png"
+    if format_name == "raw":
         return split_alpha(*read_raw(data, max_pixels))
-    if container in _FLOAT_READERS:
-        floats = _FLOAT_READERS[container](data, max_pixels)
+    if format_name in _FLOAT_READERS:
+        floats = _FLOAT_READERS[format_name](data, max_pixels)
         decoded = Decoded(floats.pixels, floats.alpha, floats.file_info)
-    elif container == "heic":
+    elif format_name == "heic":
         decoded = _decode_heic(data, max_pixels)
     else:
-        decoded = _decode_vips(data, container, max_pixels)
+        decoded = _decode_vips(data, format_name, max_pixels)
     if decoded.pixels.dtype.kind == "f" and not np.isfinite(decoded.pixels).all():
         count = int((~np.isfinite(decoded.pixels)).any(axis=2).sum())
         raise UnsupportedPhoto(
@@ -81,23 +81,23 @@ def read_size(data: bytes) -> tuple[int, int]:
         PhotoError: the image cannot be read, is not supported, or is too large (see `Photo.open`).
         MissingExtra: the reader of EXR, HEIC or RAW is not installed.
     """
-    container = _detect_container(data)
-    if container == "ora":
-        data, container = _merged_image(data, DEFAULT_MAX_PIXELS), "png"
-    if container == "raw":
+    format_name = _detect_format(data)
+    if format_name == "ora":
+        data, format_name = _merged_image(data, DEFAULT_MAX_PIXELS), "png"
+    if format_name == "raw":
         return read_raw_size(data)
-    if container in _FLOAT_READERS:
+    if format_name in _FLOAT_READERS:
         height, width = decode(data, DEFAULT_MAX_PIXELS).pixels.shape[:2]
         return width, height
-    if container == "heic":
+    if format_name == "heic":
         heif = _open_heic(data, DEFAULT_MAX_PIXELS)
         _check_profile(_heic_profile(heif, data), is_float=False)
         return heif.size[0], heif.size[1]
-    image = _open_vips(data, container, DEFAULT_MAX_PIXELS)
+    image = _open_vips(data, format_name, DEFAULT_MAX_PIXELS)
     icc = image.get("icc-profile-data") if image.get_typeof("icc-profile-data") else None
-    _check_profile(icc or _profile_of(data, container), is_float=image.format == "float")
+    _check_profile(icc or _profile_of(data, format_name), is_float=image.format == "float")
     sides = int(image.width), int(image.height)
-    return sides[::-1] if _orientation(image, container) in _TRANSPOSED else sides
+    return sides[::-1] if _orientation(image, format_name) in _TRANSPOSED else sides
 
 
 def _check_profile(icc: bytes | None, *, is_float: bool) -> None:
@@ -108,7 +108,7 @@ def _check_profile(icc: bytes | None, *, is_float: bool) -> None:
 _FLOAT_READERS = {"exr": read_exr, "hdr": read_hdr}
 
 
-def _detect_container(data: bytes) -> str:
+def _detect_format(data: bytes) -> str:
     if not data:
         raise UnreadablePhoto("the file is empty", "expected an image file", "copy the file again")
     # AVIF and HEIC files use these brands. Only HEIC files have a decoder configuration hvcC.
@@ -137,45 +137,45 @@ _RGB = ("srgb", "rgb", "rgb16", "scrgb")
 _DTYPES = {"uchar": np.uint8, "ushort": np.uint16, "float": np.float32}
 
 
-def _decode_vips(data: bytes, container: str, max_pixels: int) -> Decoded:
-    image = _open_vips(data, container, max_pixels)
+def _decode_vips(data: bytes, format_name: str, max_pixels: int) -> Decoded:
+    image = _open_vips(data, format_name, max_pixels)
     try:
-        file_info = _file_info(image, data, container)
+        file_info = _file_info(image, data, format_name)
         array = np.frombuffer(image.write_to_memory(), _DTYPES[image.format])
     except pyvips.Error as error:
-        raise _unreadable_error(container, error) from error
+        raise _unreadable_error(format_name, error) from error
     array = _full_scale(array.reshape(image.height, image.width, image.bands), file_info.bits)
-    return split_alpha(apply_orientation(array, _orientation(image, container)), file_info)
+    return split_alpha(apply_orientation(array, _orientation(image, format_name)), file_info)
 
 
-def _open_vips(data: bytes, container: str, max_pixels: int) -> pyvips.Image:
+def _open_vips(data: bytes, format_name: str, max_pixels: int) -> pyvips.Image:
     """Opens an image and checks its header. libvips decodes the pixels later."""
-    load = getattr(pyvips.Image, FORMATS[container].vips_loader or "")
+    load = getattr(pyvips.Image, FORMATS[format_name].vips_loader or "")
     try:
-        image = load(data, access="sequential", fail_on=_FAIL_ON.get(container, "truncated"))
-        _check_supported(image, data, container, max_pixels)
+        image = load(data, access="sequential", fail_on=_FAIL_ON.get(format_name, "truncated"))
+        _check_supported(image, data, format_name, max_pixels)
     except pyvips.Error as error:
-        raise _unreadable_error(container, error) from error
+        raise _unreadable_error(format_name, error) from error
     return image
 
 
-def _orientation(image: pyvips.Image, container: str) -> int:
+def _orientation(image: pyvips.Image, format_name: str) -> int:
     """Returns the EXIF orientation that must still be applied; 1 if libvips has applied it."""
-    must_be_applied = FORMATS[container].is_stored_rotated and image.get_typeof("orientation")
+    must_be_applied = FORMATS[format_name].is_stored_rotated and image.get_typeof("orientation")
     return int(image.get("orientation")) if must_be_applied else 1
 
 
-def _unreadable_error(container: str, error: Exception | str) -> PhotoError:
+def _unreadable_error(format_name: str, error: Exception | str) -> PhotoError:
     lines = [line.strip() for line in str(error).splitlines()]
     message = " ".join(line for line in lines if line and not line.startswith(("unable to", "source:")))
     return UnreadablePhoto(
-        f"the {container} cannot be read completely ({message[:200] or error})",
+        f"the {format_name} cannot be read completely ({message[:200] or error})",
         "expected a complete file in a common variant of the format",
         "copy the file again from its source, or convert it",
     )
 
 
-def _check_supported(image: pyvips.Image, data: bytes, container: str, max_pixels: int) -> None:
+def _check_supported(image: pyvips.Image, data: bytes, format_name: str, max_pixels: int) -> None:
     """Checks the header of an image.
 
     Raises:
@@ -184,66 +184,66 @@ def _check_supported(image: pyvips.Image, data: bytes, container: str, max_pixel
     """
     if image.width * image.height > max_pixels:
         raise too_large_error(image.width, image.height, max_pixels)
-    if _has_frames(image, data, container):
+    if _has_frames(image, data, format_name):
         raise UnsupportedPhoto(
-            f"the {container} is an animation or has several pages",
+            f"the {format_name} is an animation or has several pages",
             "expected a single image",
             "extract the frames first, for example with ffmpeg or vips",
         )
     if image.interpretation == "cmyk":
         raise UnsupportedPhoto(
-            f"the {container} has CMYK colours",
+            f"the {format_name} has CMYK colours",
             "expected an RGB or grey image",
             "convert the image to sRGB first",
         )
     interpretations = {1: _GREY, 2: _GREY, 3: _RGB, 4: _RGB}.get(image.bands, ())
     if image.interpretation not in interpretations or image.format not in _DTYPES:
         raise UnsupportedPhoto(
-            f"the {container} has {image.bands} channels of {image.format} ({image.interpretation})",
+            f"the {format_name} has {image.bands} channels of {image.format} ({image.interpretation})",
             "expected grey or RGB, with or without alpha, of 8 or 16 bits or 32-bit floats",
             "convert the image to one of these",
         )
-    is_tiff = container == "tiff"
+    is_tiff = format_name == "tiff"
     if is_tiff and metadata.pixel_data_end(metadata.read_tags(data)) > len(data):
         raise _unreadable_error("tiff", "pixels are missing")  # libvips reads missing tiles as black
 
 
-def _has_frames(image: pyvips.Image, data: bytes, container: str) -> bool:
-    if container == "png":
+def _has_frames(image: pyvips.Image, data: bytes, format_name: str) -> bool:
+    if format_name == "png":
         return b"acTL" in metadata.png_chunks(data)  # libvips reads the first frame without an error
-    if container == "avif":
+    if format_name == "avif":
         return data[8:12] == b"avis"  # libvips counts thumbnails as pages
     return bool(image.get_typeof("n-pages")) and image.get("n-pages") > 1
 
 
-def _file_info(image: pyvips.Image, data: bytes, container: str) -> FileInfo:
+def _file_info(image: pyvips.Image, data: bytes, format_name: str) -> FileInfo:
     names = ("icc-profile-data", "exif-data", "xmp-data", "iptc-data")
     icc, exif, xmp, iptc = (image.get(name) if image.get_typeof(name) else None for name in names)
     bits = {"float": 32, "uchar": 8}.get(image.format, 16)
     has_resolution = (image.xres, image.yres) != (1.0, 1.0)
     file_info = FileInfo(
-        container=FORMATS[container].written_as,
-        bits=image.get("bits-per-sample") if container == "avif" else bits,
-        icc=icc or _profile_of(data, container),
+        format_name=FORMATS[format_name].written_as,
+        bits=image.get("bits-per-sample") if format_name == "avif" else bits,
+        icc=icc or _profile_of(data, format_name),
         exif=metadata.upright_exif(exif) if exif else None,
         xmp=metadata.upright_xmp(xmp) if xmp else None,
         iptc=iptc,
-        resolution=(image.xres, image.yres) if has_resolution else None,
+        resolution_px_per_mm=(image.xres, image.yres) if has_resolution else None,
     )
-    return replace(file_info, **_EXTRA_INFO[container](data)) if container in _EXTRA_INFO else file_info
+    return replace(file_info, **_EXTRA_INFO[format_name](data)) if format_name in _EXTRA_INFO else file_info
 
 
-def _profile_of(data: bytes, container: str) -> bytes | None:
+def _profile_of(data: bytes, format_name: str) -> bytes | None:
     """Returns the ICC profile for the code points (ITU-T H.273) of a file: None for sRGB, or Display P3.
 
     Raises:
         UnsupportedPhoto: the file has other primaries, or the transfer functions PQ (16) or HLG (18) of HDR video.
     """
-    codes = metadata.cicp(data) if FORMATS[container].has_cicp else None
+    codes = metadata.cicp(data) if FORMATS[format_name].has_cicp else None
     primaries, transfer = codes[:2] if codes else (1, 13)
     if transfer in (16, 18) or primaries not in (1, 2, 5, 6, 12):
         raise UnsupportedPhoto(
-            f"the {container} has the colours of HDR video (primaries {primaries}, transfer {transfer})",
+            f"the {format_name} has the colours of HDR video (primaries {primaries}, transfer {transfer})",
             "expected sRGB, Display P3, or an ICC profile",
             "export the image with one of these",
         )
@@ -354,7 +354,7 @@ def _decode_heic(data: bytes, max_pixels: int) -> Decoded:
         raise _unreadable_error("heic", error) from error
     exif, xmp = heif.info.get("exif"), heif.info.get("xmp")
     file_info = FileInfo(
-        container="heic",
+        format_name="heic",
         bits=heif.info.get("bit_depth", 8),
         icc=_heic_profile(heif, data),
         exif=metadata.upright_exif(exif) if exif else None,

@@ -32,44 +32,44 @@ def encode(pixels: Stored, alpha: Stored | None, file_info: FileInfo) -> bytes:
         UnsupportedPhoto: the format cannot store the image.
         MissingExtra: the writer of EXR or HEIC is not installed.
     """
-    if alpha is not None and not FORMATS[file_info.container].has_alpha:
+    if alpha is not None and not FORMATS[file_info.format_name].has_alpha:
         raise UnsupportedPhoto(
-            f"the photo has an alpha channel, which {file_info.container} cannot store",
+            f"the photo has an alpha channel, which {file_info.format_name} cannot store",
             "expected a format with alpha, because brewster drops no channel",
             f"write {', '.join(name for name, row in WRITABLE.items() if row.has_alpha)}",
         )
-    if file_info.container == "exr":
+    if file_info.format_name == "exr":
         return write_exr(HdrPixels(pixels, alpha, file_info))
-    if file_info.container == "hdr":
+    if file_info.format_name == "hdr":
         return write_hdr(HdrPixels(pixels, alpha, file_info))
     array = pixels if alpha is None else np.concatenate([pixels, alpha[..., None]], axis=2)
-    if file_info.container == "heic":
+    if file_info.format_name == "heic":
         return _encode_heic(array, file_info)
     return _with_exif(_encode_vips(array, file_info), array, file_info)
 
 
 def _encode_vips(array: Stored, file_info: FileInfo) -> bytes:
     height, width, channels = array.shape
-    across, down = file_info.resolution or _DEFAULT_RESOLUTION
+    across, down = file_info.resolution_px_per_mm or _DEFAULT_RESOLUTION
     contiguous = np.ascontiguousarray(array)
     band_format = {"uint8": "uchar", "uint16": "ushort", "float32": "float"}[array.dtype.name]
     image = pyvips.Image.new_from_memory(contiguous.data, width, height, channels, band_format)
     image = image.copy(interpretation=_interpretation(array), xres=across, yres=down)
     image.set_type(pyvips.GValue.gstr_type, "resolution-unit", "in")
     blobs = {"icc-profile-data": file_info.icc, "xmp-data": file_info.xmp, "iptc-data": file_info.iptc}
-    if file_info.container == "avif":
+    if file_info.format_name == "avif":
         blobs["exif-data"] = file_info.exif
     for name, blob in blobs.items():
         if blob is not None:
             image.set_type(pyvips.GValue.blob_type, name, blob)
-    keep = _KEPT_AVIF_METADATA if file_info.container == "avif" else _KEPT_METADATA
-    save = getattr(image, FORMATS[file_info.container].vips_saver or "")
+    keep = _KEPT_AVIF_METADATA if file_info.format_name == "avif" else _KEPT_METADATA
+    save = getattr(image, FORMATS[file_info.format_name].vips_saver or "")
     try:
         return bytes(save(keep=keep, **_save_options(file_info, array.dtype)))
     except pyvips.Error as error:
         lines = [line.strip() for line in str(error).splitlines() if line.strip()]
         raise UnsupportedPhoto(
-            f"{width} x {height} pixels cannot be written as {file_info.container} ({lines[-1]})",
+            f"{width} x {height} pixels cannot be written as {file_info.format_name} ({lines[-1]})",
             "expected a size that the format can store",
             "write PNG or TIFF",
         ) from error
@@ -86,7 +86,7 @@ def _interpretation(array: Stored) -> str:
 
 def _save_options(file_info: FileInfo, dtype: np.dtype[Any]) -> dict[str, Any]:
     """Returns the options of the libvips saver for a format. Chroma is subsampled only if the source is subsampled."""
-    match file_info.container:
+    match file_info.format_name:
         case "jpeg":
             mode = "on" if file_info.subsampling == "4:2:0" else "off"
             quality = file_info.jpeg_quality or _DEFAULT_QUALITY
@@ -116,12 +116,13 @@ def _save_options(file_info: FileInfo, dtype: np.dtype[Any]) -> dict[str, Any]:
 
 
 def _with_exif(data: bytes, array: Stored, file_info: FileInfo) -> bytes:
-    if file_info.container == "jpeg":
-        per_inch = file_info.resolution and (25.4 * file_info.resolution[0], 25.4 * file_info.resolution[1])
+    if file_info.format_name == "jpeg":
+        per_mm = file_info.resolution_px_per_mm
+        per_inch = per_mm and (25.4 * per_mm[0], 25.4 * per_mm[1])
         return metadata.with_jpeg_head(data, file_info.exif, per_inch)
     if file_info.exif is None:
         return data
-    match file_info.container:
+    match file_info.format_name:
         case "png":
             return metadata.with_png_exif(data, file_info.exif)
         case "webp":

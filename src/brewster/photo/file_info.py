@@ -13,18 +13,19 @@ from brewster.image_formats import WRITABLE, format_of
 
 @dataclass(frozen=True)
 class FileInfo:
-    """The metadata of the file of a photo. `exif` is the block from its TIFF header on; its orientation is reset to 1."""
+    """The metadata of the file of a photo."""
 
-    container: str = "png"
+    format_name: str = "png"
     """The name of the file format, a key of `brewster.image_formats.FORMATS`."""
     bits: int = 8
     """Bits per channel in the file."""
     icc: bytes | None = None
     exif: bytes | None = None
+    """The EXIF block without the leading `Exif\\0\\0`. Its orientation is set to 1."""
     xmp: bytes | None = None
     iptc: bytes | None = None
-    resolution: tuple[float, float] | None = None
-    """Pixels per millimetre, horizontal and vertical."""
+    resolution_px_per_mm: tuple[float, float] | None = None
+    """Horizontal and vertical resolution."""
     jpeg_quality: int | None = None
     """The lowest libvips quality, 1..100, whose quantization tables have no larger sums than those of the file."""
     subsampling: str | None = None
@@ -41,7 +42,7 @@ class FileInfo:
     """The program that created the pixels. It is written to EXR and HDR files, which have neither EXIF nor XMP."""
 
 
-def container_of(path: Path) -> str:
+def format_name_of(path: Path) -> str:
     """Returns the name of the format for the suffix of a file name.
 
     Raises:
@@ -51,13 +52,13 @@ def container_of(path: Path) -> str:
     if image_format is None or not image_format.is_writable:
         raise UnsupportedPhoto(
             f"the file name {path.name!r} has the suffix {path.suffix!r}",
-            f"expected the suffix of one of the formats {', '.join(WRITABLE)}",
+            f"expected one of the suffixes {' '.join(suffix for row in WRITABLE.values() for suffix in row.suffixes)}",
             "choose one of these suffixes",
         )
     return image_format.name
 
 
-def depth_for(file_info: FileInfo, container: str, bit_depth: int | None) -> int:
+def depth_for(file_info: FileInfo, format_name: str, bit_depth: int | None) -> int:
     """Returns the bits per channel to write.
 
     The result is `bit_depth` if it is not None. Otherwise it is the largest depth of the format that is not larger than
@@ -66,10 +67,10 @@ def depth_for(file_info: FileInfo, container: str, bit_depth: int | None) -> int
     Raises:
         UnsupportedPhoto: brewster does not write this format, or does not write it at this bit depth.
     """
-    depths = WRITABLE[container].bit_depths if container in WRITABLE else ()
+    depths = WRITABLE[format_name].bit_depths if format_name in WRITABLE else ()
     if not depths or (bit_depth is not None and bit_depth not in depths):
         raise UnsupportedPhoto(
-            f"{container} with {bit_depth or 'any'} bits per channel was requested",
+            f"{format_name} with {bit_depth or 'any'} bits per channel was requested",
             f"expected one of {', '.join(f'{name} {row.bit_depths}' for name, row in WRITABLE.items())}",
             "choose one of these formats and depths",
         )

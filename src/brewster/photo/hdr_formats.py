@@ -113,7 +113,7 @@ def _exr_pixels(channels: dict[str, NDArray[Any]], header: dict[str, Any]) -> Hd
         np.stack([channels[name].astype(np.float32) for name in names], axis=2),
         channels["A"].astype(np.float32) if "A" in channels else None,
         FileInfo(
-            container="exr",
+            format_name="exr",
             bits=16 if is_half else 32,
             primaries=_valid_chromaticities(header.get("chromaticities", ())),
             header=attributes,
@@ -250,7 +250,7 @@ def read_hdr(data: bytes, max_pixels: int) -> HdrPixels:
 def _hdr_file_info(lines: list[str]) -> FileInfo:
     header = dict(line.split("=", 1) for line in lines if "=" in line and not line.startswith("FORMAT"))
     return FileInfo(
-        container="hdr",
+        format_name="hdr",
         bits=32,
         header=header,
         primaries=_valid_chromaticities(header.get("PRIMARIES", "").split()),

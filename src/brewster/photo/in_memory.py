@@ -134,10 +134,10 @@ def decode_pil(image: Any) -> Decoded:  # noqa: ANN401  (Pillow is optional, so 
             'use image.convert("RGB")',
         )
     exif, icc = image.info.get("exif"), image.info.get("icc_profile")
-    container = (image.format or "png").lower()
+    format_name = (image.format or "png").lower()
     array = np.asarray(image).reshape(image.height, image.width, -1)
     file_info = FileInfo(
-        container=container if container in WRITABLE else "png",
+        format_name=format_name if format_name in WRITABLE else "png",
         bits=16 if image.mode == "I;16" else 8,
         icc=icc or None,
         exif=metadata.upright_exif(exif) if exif else None,

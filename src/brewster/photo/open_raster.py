@@ -42,25 +42,25 @@ class LayeredImage:
     photo: Photo
     transmission: Photo
 
-    def encode(self, container: str = _FORMAT) -> bytes:
+    def encode(self, format_name: str = _FORMAT) -> bytes:
         """Returns the bytes of an OpenRaster file with the profile of the photo, in 8 or 16 bits.
 
         The stored values of both layers sum to those of the photo exactly. The reflection is never negative, because the
         transmission is clipped to the photo where it is brighter.
 
         Raises:
-            UnsupportedPhoto: `container` is not "ora".
+            UnsupportedPhoto: `format_name` is not "ora".
         """
-        if container != _FORMAT:
+        if format_name != _FORMAT:
             raise UnsupportedPhoto(
-                f"both layers in one file were requested as {container}",
+                f"both layers in one file were requested as {format_name}",
                 f"expected {_FORMAT}, the only format with layers that brewster writes",
                 f"choose the suffix .{_FORMAT}",
             )
         bits = 8 if self.photo.pixels.dtype == np.uint8 else 16
         photo, transmission = (layer.stored_as("png", bits) for layer in (self.photo, self._like_photo()))
         behind = np.minimum(photo.pixels, transmission.pixels)
-        info = replace(photo.file_info, container="png", bits=bits, xmp=self.transmission.file_info.xmp)
+        info = replace(photo.file_info, format_name="png", bits=bits, xmp=self.transmission.file_info.xmp)
         width, height = photo.size
         files = {
             "mimetype": _MIME_TYPE.encode(),  # must be the first file, and not compressed

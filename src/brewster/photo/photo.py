@@ -18,7 +18,7 @@ from brewster.image_formats import FORMATS
 from brewster.photo.colour import SRGB, ColourSpace, colour_space_of
 from brewster.photo.decode import Decoded, decode
 from brewster.photo.encode import encode
-from brewster.photo.file_info import FileInfo, container_of, depth_for
+from brewster.photo.file_info import FileInfo, depth_for, format_name_of
 from brewster.photo.hdr_formats import too_large_error
 from brewster.photo.in_memory import (
     WHITE_LEVELS,
@@ -140,7 +140,7 @@ class Photo:
         )
         info = self.file_info
         present = {"ICC profile": info.icc, "EXIF": info.exif, "XMP": info.xmp}
-        parts = (f"{width} x {height}", mode, self.pixels.dtype.name, info.container)
+        parts = (f"{width} x {height}", mode, self.pixels.dtype.name, info.format_name)
         return f"Photo({', '.join((*parts, *(name for name, block in present.items() if block)))})"
 
     def __array__(self, dtype: np.dtype[Any] | None = None, copy: bool | None = None) -> Stored:
@@ -260,13 +260,13 @@ class Photo:
             out[row] = _area_means(mean_row, width)
         return out
 
-    def encode(self, container: str | None = None, *, depth: int | None = None) -> bytes:
+    def encode(self, format_name: str | None = None, *, depth: int | None = None) -> bytes:
         """Returns the bytes of a file.
 
         A JPEG has the quality and the chroma subsampling of the source.
 
         Args:
-            container: the format, such as "png"; by default, the format of the photo's file.
+            format_name: a key of `image_formats.FORMATS`, such as "png"; by default, the format of the photo's file.
             depth: bits per channel (see `image_formats.FORMATS`); by default, the depth of the photo or, if the format does
                 not have it, the next smaller depth.
 
@@ -274,10 +274,12 @@ class Photo:
             UnsupportedPhoto: the format cannot store this photo, or cannot store it at this bit depth.
             MissingExtra: the writer of EXR or HEIC is not installed.
         """
-        container = container or self.file_info.container
-        bits = depth_for(self.file_info, container, depth)
-        stored = self.stored_as(container, bits)
-        return encode(stored.pixels, stored.alpha, replace(stored.file_info, container=container, bits=bits))
+        format_name = format_name or self.file_info.format_name
+        bits = depth_for(self.file_info, format_name, depth)
+        stored = self.stored_as(format_name, bits)
+        return encode(
+            stored.pixels, stored.alpha, replace(stored.file_info, format_name=format_name, bits=bits)
+        )
 
     def save(
         self,
@@ -304,13 +306,15 @@ class Photo:
             target.write(self.encode(format, depth=depth))
             return
         path = Path(target)
-        write_atomically(path, self.encode(format or container_of(path), depth=depth), overwrite=overwrite)
+        write_atomically(path, self.encode(format or format_name_of(path), depth=depth), overwrite=overwrite)
 
-    def stored_as(self, container: str, bits: int) -> Photo:
+    def stored_as(self, format_name: str, bits: int) -> Photo:
         """Returns the photo with the dtype for a format and bit depth. The light changes only by rounding and clipping."""
-        was_linear, is_linear = (FORMATS[name].is_linear for name in (self.file_info.container, container))
+        was_linear, is_linear = (
+            FORMATS[name].is_linear for name in (self.file_info.format_name, format_name)
+        )
         dtype = np.dtype(np.float32 if is_linear or bits == 32 else np.uint8 if bits == 8 else np.uint16)
-        changes_light = container != self.file_info.container and (was_linear or is_linear)
+        changes_light = format_name != self.file_info.format_name and (was_linear or is_linear)
         if dtype == self.pixels.dtype and not changes_light:
             return self
         alpha = None if self.alpha is None else _rescaled(self.alpha, dtype)

@@ -175,7 +175,7 @@ def _rays_per_axis(prepared: _PreparedScene) -> int:
 
 
 def _pinhole_rays(
-    prepared: _PreparedScene, offset: tuple[float, float], margin: int, footprint_px: float
+    prepared: _PreparedScene, offset: tuple[float, float], margin: int, relative_footprint: float
 ) -> Iterator[tuple[Rays, slice]]:
     """Yields rays through one point of every pixel, in batches of image rows, with the range of their pixels.
 
@@ -196,7 +196,7 @@ def _pinhole_rays(
         direction = direction - prepared.back[:, None]
         origin = prepared.origin[:, None].expand(3, len(across))
         yield (
-            Rays(origin, normalize(direction), footprint_px),
+            Rays(origin, normalize(direction), relative_footprint),
             slice(top * width, top * width + len(across)),
         )
 
@@ -256,10 +256,12 @@ def _trace_smooth(prepared: _PreparedScene, rays: Rays, _: SobolPoints | None = 
         (prepared.behind, rays.origin, rays.direction, complete.transmittance, in_layers.transmittance),
         (prepared.front, point, mirrored, complete.reflectance, in_layers.reflectance),
     ):
-        far = side.emitters.far_radiance(direction, rays.footprint_px)
-        unattenuated = side.emitters.add_near(far, origin, direction, rays.footprint_px)
+        far = side.emitters.far_radiance(direction, rays.relative_footprint)
+        unattenuated = side.emitters.add_near(far, origin, direction, rays.relative_footprint)
         if len(side.groups) > 1:
-            total, layer = _shifted_orders(prepared, side, Rays(point, direction, rays.footprint_px), far)
+            total, layer = _shifted_orders(
+                prepared, side, Rays(point, direction, rays.relative_footprint), far
+            )
         else:
             total = total_ratio * unattenuated
             layer = layer_ratio * unattenuated if in_layers is not complete else total
@@ -288,7 +290,7 @@ def _shifted_orders(
     total, layer = torch.zeros_like(direction), torch.zeros_like(direction)
     for group in side.groups:
         exit_point = surface + in_plane * _in_plane_shift(group[0], shifts)
-        radiance = side.emitters.add_near(far, exit_point, direction, exiting.footprint_px)
+        radiance = side.emitters.add_near(far, exit_point, direction, exiting.relative_footprint)
         weights = list(zip(group, throughputs, strict=False))
         total += sum((weight for _, weight in weights), torch.zeros_like(cosine)) * radiance
         if prepared.scene.orders == "truncated":
@@ -311,7 +313,7 @@ def _group_orders(scene: Scene, emitters: SideEmitters, *, is_behind: bool) -> l
     Returns:
         The groups, each with its brightest order first. The list is empty if the side has only light from infinity.
     """
-    if not emitters.is_near:
+    if not emitters.has_near_light:
         return []
     cosine = _min_cosine(scene)
     reflectances = (float(sum(fresnel(cosine, pane.refractive_index))) / 2 for pane in scene.glass.panes)
@@ -350,8 +352,8 @@ def _trace_rough(prepared: _PreparedScene, rays: Rays, sobol: SobolPoints) -> li
             in_layer.index_add_(1, exiting.rays, exiting.light)
     (transmitted, transmission), (reflected, reflection) = sides[True], sides[False]
     point, mirrored = _mirror_at_first_surface(rays)
-    background = prepared.behind.emitters.radiance(rays.origin, rays.direction, rays.footprint_px)
-    mirror = prepared.front.emitters.radiance(point, mirrored, rays.footprint_px)
+    background = prepared.behind.emitters.radiance(rays.origin, rays.direction, rays.relative_footprint)
+    mirror = prepared.front.emitters.radiance(point, mirrored, rays.relative_footprint)
     return [transmitted + reflected, transmission, background, reflection, mirror]
 
 

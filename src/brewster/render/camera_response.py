@@ -111,7 +111,7 @@ def encode_jpeg(encoded: Tensor, quality: int) -> bytes:
     Raises:
         UnsupportedPhoto: a side is longer than 65535 pixels.
     """
-    return Photo(to_uint8(encoded), file_info=FileInfo(container="jpeg", jpeg_quality=quality)).encode()
+    return Photo(to_uint8(encoded), file_info=FileInfo(format_name="jpeg", jpeg_quality=quality)).encode()
 
 
 def with_jpeg(developed: DevelopedSample) -> DevelopedSample:

@@ -19,8 +19,8 @@ _QUANTIZATION_MSE: Final = 1 / (12 * 255**2)
 """The mean squared error of rounding to 8 bits (58.9 dB). Smaller errors are raised to it, so that no PSNR is infinite."""
 _SCALES = (1, 4, 16)
 """Side of the averaging windows of the loss, in pixels."""
-_MAX_ADDED_SHARE = 0.05
-"""A pixel counts as unchanged if the glass added less light than about this share of the photo's light."""
+_MAX_ADDED_FRACTION = 0.05
+"""A pixel counts as unchanged if the glass added less light than about this fraction of the photo's light."""
 _MSE_FLOOR = 1e-4
 """Added to the mean squared error before the logarithm, so that the gradient tends to 0 for an image with a PSNR above 40 dB."""
 
@@ -30,10 +30,10 @@ def separation_loss(layers: Float[Tensor, "n 6 h w"], batch: TrainingBatch) -> d
 
     The loss is computed on sRGB-encoded values, like the metrics of benchmarks. It has these parts:
 
-    - transmission: mean absolute error at three scales, so that a wrong overall tone counts as much as wrong detail.
+    - transmission: mean absolute error at three scales, so that a wrong exposure counts as much as wrong detail.
     - reflection: 0.3 times the same error of the reflection, multiplied by the `reflection_weight` of each image.
-    - edges: mean absolute error of the transmission's gradients, so that edges of the reflection are removed
-      (Zhang et al. 2018).
+    - edges: mean absolute error of the transmission's horizontal and vertical gradients, so that edges of the reflection
+      are removed (compare the gradient loss of CEILNet, Fan et al. 2017).
     - log_mse: 0.04 times the mean logarithm of each image's mean squared error, so that easy images count as much as hard
       images. This part is usually negative, because the mean squared error is usually below 1.
 
@@ -62,21 +62,25 @@ def _multiscale_error(error: Tensor) -> Float[Tensor, " n"]:
 
 
 def psnr_gain_db(prediction: Tensor, photo: Tensor, ground_truth: Tensor) -> float:
-    """Returns the PSNR of the prediction minus the PSNR of the photo, in dB. Images have one shape and are encoded, in 0..1."""
+    """Returns the PSNR of the prediction minus the PSNR of the photo, in dB.
+
+    All images have the same shape. They are sRGB-encoded, in 0..1.
+    """
     errors = [functional.mse_loss(image, ground_truth).item() for image in (photo, prediction)]
     before, after = (max(error, _QUANTIZATION_MSE) for error in errors)
     return 10 * math.log10(before / after)
 
 
-def tone_ratio(prediction: Tensor, photo: Tensor, ground_truth: Tensor) -> float:
+def exposure_ratio(prediction: Tensor, photo: Tensor, ground_truth: Tensor) -> float:
     """Returns the linear light of the prediction divided by that of the photo, over the pixels that the glass did not change.
 
-    These are the pixels where photo - ground truth < 0.05 photo + 0.0025 in every channel, in linear light. The ratio is 1 if
-    prediction and photo have the same exposure, and 1 if there is no such pixel. Images are (..., 3, h, w), encoded in 0..1.
+    These are the pixels where photo - ground truth < 0.05 photo + 0.0025 in every channel, in linear light. The test is
+    one-sided: a pixel that the glass made darker counts as unchanged. The ratio is 1 if prediction and photo have the same
+    exposure, and 1 if there is no such pixel. Images are (..., 3, h, w), sRGB-encoded in 0..1.
     """
     before, after, truth = (to_linear(image) for image in (photo, prediction, ground_truth))
     unchanged = (
-        (before - truth < _MAX_ADDED_SHARE * before + _MAX_ADDED_SHARE**2)
+        (before - truth < _MAX_ADDED_FRACTION * before + _MAX_ADDED_FRACTION**2)
         .all(dim=-3, keepdim=True)
         .expand_as(before)
     )

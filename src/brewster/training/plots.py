@@ -20,7 +20,7 @@ _SUBPLOT_TITLES: Final = {
     "loss_": "terms of the loss",
     "psnr_gain_db_": "PSNR gain over the input, dB",
     "worse_": "share of pairs worse than the input",
-    "tone_": "tone, prediction / photo",
+    "exposure_": "exposure, prediction / photo",
 }
 """Name or prefix of metrics -> title of the subplot. Metrics with one prefix share a subplot. All other metrics have their own."""
 _MAX_COLUMNS: Final = 3

@@ -169,7 +169,8 @@ class LoraRecipe(TrainingRecipe):
     """Arrangement of the panels in the composite image."""
     white_space: bool = True
     """Whether the conditioning image has white space for the panels T and R. false: the conditioning image is the photo alone,
-    which has a third of the tokens. According to the paper, white space is not necessary but makes training easier."""
+    which has 1/3 of the tokens of a composite of three panels. According to SIRR-LMM (Guo et al., arXiv 2601.07209), white
+    space is not necessary but makes training easier."""
     max_composite_pixels: PositiveInt = PAPER_COMPOSITE_PIXELS
     """Largest number of pixels of all panels together."""
     panel_weights: Annotated[

@@ -1,11 +1,21 @@
-"""Previews, with which the page shows a separation at any strength, mask and zoom: a reduced photo and coefficients of its layers.
+"""Previews of a separation. The page computes the layers from them, at any strength, mask and zoom.
 
-The layers are local linear functions of the photo (inference/guided_upsampling.py). page/light.js applies them to the
-reduced photo and to tiles of the full photo, in linear light:
+A preview contains a reduced photo and maps. page/light.js upsamples the maps to the reduced photo and to tiles of the full
+photo, and computes in linear light (see inference/guided_upsampling.py):
 
-    change       = slope x photo + offset, upsampled to the position of the pixel
+    change       = change_slope x photo + change_offset
+    change       = change + weight x (generated - photo - change), if there are the maps `generated` and `weight`
+    reflection   = reflection_slope x photo + reflection_offset, or -change if there are no such maps
     transmission = max(photo + strength x mask x change, 0)
-    reflection   = min(strength x mask x (slope x photo + offset), photo)
+    reflection   = min(strength x mask x reflection, photo)
+
+The maps:
+
+    change_slope, change_offset           transmission - photo at strength 1, as a local linear function of the photo
+    reflection_slope, reflection_offset   the reflection at strength 1, if the model predicts it
+    generated                             the transmission that a diffusion model generated, without the detail of the photo
+    weight                                the weight of `generated`, 0..1: 0 keeps the change, 1 replaces it
+    confidence                            the confidence, 0..1
 
 `photo_tile` returns the tiles. Level 0 has the pixels of the photo; each further level halves the width and the height.
 """

@@ -42,11 +42,11 @@ class SeparationRequest:
     options: Options
     mask: bytes | None = None
 
-    def target(self, layer: str, container: str) -> str:
-        """Returns the file name of a layer, the same as on the command line. `container` is the format of the photo."""
+    def target(self, layer: str, format_name: str) -> str:
+        """Returns the file name of a layer, the same as on the command line. `format_name` is the format of the photo."""
         source = Path(self.name)
         if source.suffix.lower() not in SUFFIXES:
-            source = Path(f"{self.name}.{container}")
+            source = Path(f"{self.name}.{format_name}")
         return (
             SeparationPaths(source, Path(), source.stem)
             .target(layer, self.options.suffix(layer, source))

@@ -42,12 +42,12 @@ class Lamp:
 
 
 @dataclass
-class SceneLighting:
+class EnvironmentLighting:
     """The lighting: ambient light, lamps, and contact shadows (x, z, half width, half depth) on the floor."""
 
     ambient: Floats
-    floor: float
-    """The height of the floor, below 0."""
+    floor_y_m: float
+    """The height of the floor relative to the viewer, below 0."""
     lamps: list[Lamp] = field(default_factory=list)
     contacts: list[tuple[float, float, float, float]] = field(default_factory=list)
 
@@ -69,7 +69,7 @@ class SceneLighting:
     def shade(self, points: Floats, normal: Floats) -> Floats:
         """Returns the factor (h, w, 1) of the contact shadows on the floor; 1 on other surfaces."""
         factor = np.ones((*points.shape[:2], 1), np.float32)
-        if normal[1] < 0.9 or points[0, 0, 1] > self.floor + 0.01:
+        if normal[1] < 0.9 or points[0, 0, 1] > self.floor_y_m + 0.01:
             return factor
         for x, z, half_width, half_depth in self.contacts:
             x_distance = np.clip(np.abs(points[..., :1] - x) - half_width, 0, None)

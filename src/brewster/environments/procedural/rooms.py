@@ -1,19 +1,12 @@
-"""Procedural environment maps from a seed, for machines without HDR maps: a street, a street at night, a room.
-
-    environment_map = ENVIRONMENTS["street"](7, 512)  # (512, 1024, 3), linear radiance around the viewer
-    picture = painting(seed=7, width=768, height=512)  # (512, 768, 3), linear, 0..1
-
-The same seed gives the same bytes. A white sheet in the shade has a radiance of about 1.
-"""
+"""A furnished room around the viewer, for `canvas.render`. Lengths are in metres."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.random import PCG64, Generator
-from numpy.typing import NDArray
+from numpy.random import Generator
 
 from brewster.environments.procedural.canvas import (
     Canvas,
@@ -21,7 +14,6 @@ from brewster.environments.procedural.canvas import (
     ProceduralEnvironment,
     Quad,
     SmallEmitter,
-    render,
     resize,
     tint,
     unit,
@@ -41,8 +33,8 @@ from brewster.environments.procedural.paintings import (
 )
 from brewster.environments.procedural.props import (
     UP,
+    EnvironmentLighting,
     Lamp,
-    SceneLighting,
     bookshelf,
     box,
     cabinet,
@@ -50,34 +42,25 @@ from brewster.environments.procedural.props import (
     plain_painter,
     vertical_quad,
 )
-from brewster.environments.procedural.streets import street_environment
 
-__all__ = ["ENVIRONMENTS", "night", "painting", "room", "street"]
-
-_DENSITY: Final = 90.0
+_TEXELS_PER_M: Final = 90.0
 
 
-def street(seed: int, height: int) -> NDArray[np.float32]:
-    """Returns a street by day, radiance (height, 2 height, 3). The sky has a radiance of about 1, the sun 1e3 to 1e5."""
-    return render(street_environment(Generator(PCG64(seed)), night=False), height)
+def room_environment(rng: Generator) -> ProceduralEnvironment:
+    """Returns a furnished room with windows, by day or in the evening. Some rooms have no lamps."""
+    return _BoxRoom(rng).environment()
 
 
-def night(seed: int, height: int) -> NDArray[np.float32]:
-    """Returns a street at night, radiance (height, 2 height, 3). The road has a radiance of about 1, the lamps 1e2 to 1e4."""
-    return render(street_environment(Generator(PCG64(seed)), night=True), height)
+@dataclass(frozen=True)
+class _Opening:
+    """A window in a wall, through which sunlight falls."""
 
-
-def room(seed: int, height: int) -> NDArray[np.float32]:
-    """Returns a furnished room, radiance (height, 2 height, 3). The walls have a radiance below 1, the lamps 15 to 500."""
-    return render(_BoxRoom(Generator(PCG64(seed))).environment(), height)
-
-
-ENVIRONMENTS: Final[dict[str, Callable[[int, int], NDArray[np.float32]]]] = {
-    "street": street,
-    "room": room,
-    "night": night,
-}
-"""Functions (seed, height) by name. Each returns a lat-long map (height, 2 height, 3) in linear light."""
+    foot: Floats
+    """The middle of the lower edge."""
+    inward: Floats
+    """The unit normal of the wall, which points into the room."""
+    width_m: float
+    height_m: float
 
 
 class _BoxRoom:
@@ -87,16 +70,18 @@ class _BoxRoom:
         self.rng = rng
         ranges = (3.5, 8), (3.5, 9), (2.4, 3.3)
         width_m, depth_m, self.height_m = (rng.uniform(low, high) for low, high in ranges)
-        self.floor = -rng.uniform(1.2, 1.7)
-        viewer = rng.uniform(0.3, 0.7, 2)  # the position of the viewer, relative to the width and the depth
-        self.low = vector(-width_m * viewer[0], self.floor, -depth_m * viewer[1])
+        self.floor_y_m = -rng.uniform(1.2, 1.7)
+        relative_viewer_position = rng.uniform(0.3, 0.7, 2)  # along the width and the depth
+        self.low = vector(
+            -width_m * relative_viewer_position[0], self.floor_y_m, -depth_m * relative_viewer_position[1]
+        )
         self.high = vector(width_m, self.height_m, depth_m) + self.low
         self.evening = rng.uniform() < 0.25
         self.daylight = float(np.exp(rng.uniform(-3, -1.5) if self.evening else rng.uniform(1.8, 3.4)))
-        self.lighting = SceneLighting(vector(0.25, 0.24, 0.22), self.floor)
+        self.lighting = EnvironmentLighting(vector(0.25, 0.24, 0.22), self.floor_y_m)
         self.sun = unit(vector(*rng.uniform(-1, 1, 3)) + UP * 1.2)
         self.sunlight = vector(1, 0.9, 0.75) * (0 if self.evening else rng.choice([0, rng.uniform(4, 15)]))
-        self.openings: list[tuple[Floats, Floats, float, float]] = []
+        self.openings: list[_Opening] = []
         self.quads: list[Quad] = []
         self.emitters: list[SmallEmitter] = []
 
@@ -107,13 +92,14 @@ class _BoxRoom:
             corner = 1 - 0.3 * np.exp(-np.abs(points - end) / 0.3)
             total *= corner[..., :1] * corner[..., 1:2] * corner[..., 2:]
         if (facing := float(normal @ self.sun)) > 0:
-            for foot, inward, width_m, height_m in self.openings:
-                if (slope := float(inward @ self.sun)) < -0.05:
-                    distance = ((foot - points) @ inward / slope)[..., None]
-                    hit = points + distance * self.sun - foot
-                    across = np.abs(hit @ np.cross(inward, UP))
+            for opening in self.openings:
+                if (slope := float(opening.inward @ self.sun)) < -0.05:
+                    distance = ((opening.foot - points) @ opening.inward / slope)[..., None]
+                    hit = points + distance * self.sun - opening.foot
+                    across = np.abs(hit @ np.cross(opening.inward, UP))
                     margin = np.minimum(
-                        width_m / 2 - across, height_m / 2 - np.abs(hit[..., 1] - height_m / 2)
+                        opening.width_m / 2 - across,
+                        opening.height_m / 2 - np.abs(hit[..., 1] - opening.height_m / 2),
                     )
                     inside = np.clip(margin * 8 + 0.5, 0, 1) * (distance[..., 0] > 0.05)
                     total += inside[..., None] * self.lighting.shade(points, normal) * facing * self.sunlight
@@ -122,19 +108,19 @@ class _BoxRoom:
     def environment(self) -> ProceduralEnvironment:
         """Builds the room. The lighting is baked into the textures later, when the room is rendered."""
         rng = self.rng
-        paint = tint(rng, rng.uniform(0.3, 0.75), rng.uniform(0, 0.2))
+        wall_colour = tint(rng, rng.uniform(0.3, 0.75), rng.uniform(0, 0.2))
         inward_normals = [vector(0, 0, 1), vector(-1, 0, 0), vector(0, 0, -1), vector(1, 0, 0)]
-        first = int(rng.integers(4))
+        window_wall = int(rng.integers(4))
         for index, inward in enumerate(inward_normals):
             role = (
                 "windows"
-                if index == first
+                if index == window_wall
                 else str(rng.choice(["windows", "pictures", "pictures", "pictures", "bare"]))
             )
             accent = rng.uniform() < 0.3
-            self._wall(inward, tint(rng, rng.uniform(0.08, 0.5), 0.7) if accent else paint, role)
+            self._wall(inward, tint(rng, rng.uniform(0.08, 0.5), 0.7) if accent else wall_colour, role)
         self._ceiling()
-        self._floor()
+        self._add_floor()
         for inward in inward_normals:
             self._furnish_wall(inward)
         for _ in range(rng.integers(3, 9)):
@@ -150,14 +136,14 @@ class _BoxRoom:
         """Returns the middle of the lower edge of a wall, and the length of the wall."""
         middle = (self.low + self.high) / 2
         foot = np.where(inward > 0, self.low, np.where(inward < 0, self.high, middle))
-        foot[1] = self.floor
+        foot[1] = self.floor_y_m
         size = self.high - self.low
         return foot.astype(np.float32), float(size[2] if inward[0] else size[0])
 
     def _wall(self, inward: Floats, colour: Floats, role: str) -> None:
         rng = self.rng
         foot, length_m = self._wall_base(inward)
-        canvas = Canvas(length_m, self.height_m, _DENSITY, colour)
+        canvas = Canvas(length_m, self.height_m, _TEXELS_PER_M, colour)
         wallpaper(rng, canvas)
         left = rng.uniform(0.3, 0.8)
         sill = rng.choice([0.1, 0.9, 0.9])
@@ -199,7 +185,7 @@ class _BoxRoom:
             source = middle + UP * height_m * relative_height + inward * 0.05
             self.lighting.lamps.append(Lamp(source, mean * width_m * height_m / 2, inward))
         self.lighting.ambient = self.lighting.ambient + mean * (width_m * height_m * 0.01)
-        self.openings.append((middle, inward, width_m, height_m))
+        self.openings.append(_Opening(middle, inward, width_m, height_m))
 
     def _ceiling(self) -> None:
         """Adds a ceiling with lamps of one kind. In some rooms by day, there are no lamps.
@@ -215,14 +201,14 @@ class _BoxRoom:
         colour = vector(1, rng.uniform(0.75, 0.98), rng.uniform(0.5, 0.95))
         shapes = [(0.6, 0.6, 3.0), (0.12, 1.2, 1.8), (1.2, 0.12, 1.8), (0.11, 0.11, 1.4), (0.2, 0.2, 2.2)]
         width_m, depth_m, gap = shapes[rng.integers(len(shapes))]
-        rows = [max(1, int(side / gap)) for side in (size[0], size[2])]
+        lamp_counts = [max(1, int(side / gap)) for side in (size[0], size[2])]
         light = rng.uniform(0.6, 1.6)
-        radiance = light * size[0] * size[2] / (0.6 * rows[0] * rows[1] * width_m * depth_m)
+        radiance = light * size[0] * size[2] / (0.6 * lamp_counts[0] * lamp_counts[1] * width_m * depth_m)
         if not self.evening and rng.uniform() < 0.35:
-            rows = [0, 0]
+            lamp_counts = [0, 0]
         middle = (self.low + self.high) / 2
-        for x in (np.arange(rows[0]) + 0.5) * size[0] / max(1, rows[0]):
-            for z in (np.arange(rows[1]) + 0.5) * size[2] / max(1, rows[1]):
+        for x in (np.arange(lamp_counts[0]) + 0.5) * size[0] / max(1, lamp_counts[0]):
+            for z in (np.arange(lamp_counts[1]) + 0.5) * size[2] / max(1, lamp_counts[1]):
                 canvas.rect(
                     (x - width_m / 2 - 0.04, z - depth_m / 2 - 0.04, width_m + 0.08, depth_m + 0.08),
                     vector(0.4, 0.4, 0.4),
@@ -234,7 +220,7 @@ class _BoxRoom:
                 self.lighting.lamps.append(Lamp(position, colour * float(radiance) * width_m * depth_m, -UP))
         if rng.uniform() < 0.4:
             self._pendant(colour)
-        self.lighting.ambient = self.lighting.ambient + colour * (0.35 * light if rows[0] else 0)
+        self.lighting.ambient = self.lighting.ambient + colour * (0.35 * light if lamp_counts[0] else 0)
         centre = vector(middle[0], self.high[1], middle[2])
         self.quads.append(horizontal_quad(canvas, centre, self.light))
 
@@ -249,14 +235,14 @@ class _BoxRoom:
         self.emitters.append(SmallEmitter(position, 0.05, colour * 300))
         self.lighting.lamps.append(Lamp(position, colour * 300 * np.float32(np.pi * 0.05**2)))
 
-    def _floor(self) -> None:
+    def _add_floor(self) -> None:
         rng, size = self.rng, self.high - self.low
-        canvas = Canvas(float(size[0]), float(size[2]), _DENSITY, tint(rng, rng.uniform(0.1, 0.4), 0.2))
+        canvas = Canvas(float(size[0]), float(size[2]), _TEXELS_PER_M, tint(rng, rng.uniform(0.1, 0.4), 0.2))
         flooring(rng, canvas)
         if rng.uniform() < 0.6:
             rug(rng, canvas)
         middle = (self.low + self.high) / 2
-        self.quads.append(horizontal_quad(canvas, vector(middle[0], self.floor, middle[2]), self.light))
+        self.quads.append(horizontal_quad(canvas, vector(middle[0], self.floor_y_m, middle[2]), self.light))
 
     def _reserve_floor(self, foot: Floats, size: tuple[float, float, float], rotation: float) -> bool:
         """Reserves floor space for a piece of furniture. Returns False if the viewer or another piece is there."""
@@ -266,9 +252,11 @@ class _BoxRoom:
         for x, z, half_width, half_depth in self.lighting.contacts:
             if abs(x - foot[0]) < half_width + reach * 0.8 and abs(z - foot[2]) < half_depth + reach * 0.8:
                 return False
-        across = abs(np.cos(rotation)) * size[0] + abs(np.sin(rotation)) * size[2]
-        depth_m = abs(np.sin(rotation)) * size[0] + abs(np.cos(rotation)) * size[2]
-        self.lighting.contacts.append((float(foot[0]), float(foot[2]), float(across / 2), float(depth_m / 2)))
+        extent_x_m = abs(np.cos(rotation)) * size[0] + abs(np.sin(rotation)) * size[2]
+        extent_z_m = abs(np.sin(rotation)) * size[0] + abs(np.cos(rotation)) * size[2]
+        self.lighting.contacts.append(
+            (float(foot[0]), float(foot[2]), float(extent_x_m / 2), float(extent_z_m / 2))
+        )
         return True
 
     def _furnish_wall(self, inward: Floats) -> None:
@@ -276,11 +264,11 @@ class _BoxRoom:
         rng = self.rng
         middle, length_m = self._wall_base(inward)
         rotation = float(np.arctan2(-inward[0], inward[2]))
-        lit = any(np.array_equal(inward, normal) for _, normal, _, _ in self.openings)
+        has_window = any(np.array_equal(inward, opening.inward) for opening in self.openings)
         for offset in np.arange(-length_m / 2 + 1.1, length_m / 2 - 1, rng.uniform(1.2, 2)):
             kind = rng.choice(["shelf", "cabinet", "sofa", "plant", "screen", "nothing"])
             width_m, depth_m = rng.uniform(0.8, 1.8), rng.uniform(0.3, 0.5)
-            height_m = rng.uniform(0.5, 0.85) if lit or kind != "shelf" else rng.uniform(1.2, 2.2)
+            height_m = rng.uniform(0.5, 0.85) if has_window or kind != "shelf" else rng.uniform(1.2, 2.2)
             if kind == "sofa":
                 width_m, depth_m = rng.uniform(1.5, 2.2), 0.85
             foot = middle + np.cross(-inward, UP) * offset + inward * (depth_m / 2 + 0.02)
@@ -291,8 +279,8 @@ class _BoxRoom:
             elif kind == "sofa":
                 self._sofa(foot, (width_m, height_m, depth_m), rotation)
             else:
-                paint = bookshelf(rng) if kind == "shelf" else cabinet(rng)
-                self.quads += box(paint, foot, (width_m, height_m, depth_m), self.light, rotation)
+                painter = bookshelf(rng) if kind == "shelf" else cabinet(rng)
+                self.quads += box(painter, foot, (width_m, height_m, depth_m), self.light, rotation)
                 if kind == "screen":
                     self._screen(foot + UP * (height_m + 0.08), inward)
 
@@ -331,7 +319,7 @@ class _BoxRoom:
         margin = vector(0.8, 0, 0.8)
         relative_position = vector(rng.uniform(), 0, rng.uniform())
         foot = self.low + margin + relative_position * (self.high - self.low - 2 * margin)
-        foot[1] = self.floor
+        foot[1] = self.floor_y_m
         kind, rotation = rng.choice(["table", "table", "person", "lamp"]), rng.uniform(0, 2 * np.pi)
         if kind == "table":
             size = rng.uniform(0.8, 1.6), 0.74, rng.uniform(0.6, 0.9)

@@ -23,8 +23,8 @@ from brewster.environments.procedural.canvas import (
 from brewster.environments.procedural.paintings import figure, painting, tree
 from brewster.environments.procedural.props import (
     UP,
+    EnvironmentLighting,
     Lamp,
-    SceneLighting,
     box,
     car,
     facade,
@@ -122,7 +122,7 @@ class _Street:
         self.pavement = rng.uniform(2.4, 3.6)
         self.sky = _night_sky(rng) if night else _day_sky(rng)
         ambient = vector(0.04, 0.04, 0.05) if night else 0.5 * (self.sky.zenith + self.sky.horizon)
-        self.lighting = SceneLighting(ambient, self.ground)
+        self.lighting = EnvironmentLighting(ambient, self.ground)
         self.roofs = {side: np.full(256, -99, np.float32) for side in (-1, 1)}
         self.crowns: list[tuple[Floats, float]] = []
         self.quads: list[Quad] = []

@@ -174,7 +174,7 @@ def encode_photo(image: Pixels) -> bytes:
     if embedded_size(image) != image.shape[1::-1]:
         encoded = srgb.to_encoded(_area_means(_LINEAR[image]))
         image = np.rint(encoded * 255).clip(0, 255).astype(np.uint8)
-    return Photo(image, None, FileInfo(container="jpeg", jpeg_quality=_JPEG_QUALITY)).encode()
+    return Photo(image, None, FileInfo(format_name="jpeg", jpeg_quality=_JPEG_QUALITY)).encode()
 
 
 def error_map(prediction: Pixels, truth: Pixels) -> Pixels:
@@ -191,7 +191,7 @@ def error_map(prediction: Pixels, truth: Pixels) -> Pixels:
 
 def encode_lossless(image: Pixels, alpha: Pixels | None = None) -> bytes:
     """Returns an image (H, W, 3) with its `alpha` (H, W) as a PNG file."""
-    return Photo(image, alpha, FileInfo(container="png")).encode()
+    return Photo(image, alpha, FileInfo(format_name="png")).encode()
 
 
 def overlay(region: NDArray[np.bool_]) -> bytes:

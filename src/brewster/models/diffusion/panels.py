@@ -1,8 +1,9 @@
 """Composes I, T and R as panels of one image, makes the conditioning image, and fits photos into panels.
 
-Images are sRGB-encoded tensors (N, 3, H, W) in [-1, 1], the input range of the VAEs. The paper describes two
-layouts: "Text-to-image Model Fine-tuning" generates [I:T:R] from a condition with white space, and "Experimental
-Setup" concatenates T and R with I as the control image. Therefore the list of panels is a setting.
+Images are sRGB-encoded tensors (N, 3, H, W) in [-1, 1], the input range of the VAEs. The paper SIRR-LMM (Guo et al.,
+arXiv 2601.07209) describes two layouts. In its section "Text-to-image Model Fine-tuning", the model generates [I:T:R] from
+a condition with white space. In its section "Experimental Setup", the model generates T and R, and I is the control image.
+Therefore the list of panels is a setting.
 """
 
 from __future__ import annotations
@@ -123,7 +124,8 @@ def conditioning_image(photo: Float[Tensor, "n 3 h w"], layout: PanelLayout) -> 
 
     White space turns the task into inpainting, which "is not necessary, but it turns out easier to converge" (Text-to-image
     Model Fine-tuning). Without white space, or if I is not among the generated panels, the photo alone is the conditioning
-    image (Experimental Setup: "control image"). It has a third of the tokens.
+    image (Experimental Setup: "control image"). It has 1/3 of the tokens of a composite of
+    three panels.
 
     Returns:
         (N, 3, H, W). Its size is that of the composite if there is white space; otherwise it is the photo itself.

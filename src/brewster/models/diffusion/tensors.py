@@ -44,7 +44,7 @@ def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
         return dict(sorted(tensors.items())), read_metadata(data)
     except FileNotFoundError as error:
         raise ModelError(
-            f"{path} is missing", "expected a safetensors file", "copy the whole folder"
+            f"{path} is missing", "expected a safetensors file", "copy the whole folder of the model"
         ) from error
     except (OSError, ValueError, safetensors.SafetensorError) as error:
         raise ModelError(

@@ -80,11 +80,15 @@ class _PlaneEmitter:
 
 @dataclass(frozen=True)
 class Rays:
-    """Rays with origins and unit directions, (3, N) each; `footprint_px` is the width of each ray's footprint."""
+    """Rays with origins and unit directions, (3, N) each.
+
+    `relative_footprint` is the width of each ray's footprint, relative to the footprint of a whole pixel (the pixel plus
+    its circle of confusion).
+    """
 
     origin: Tensor
     direction: Tensor
-    footprint_px: float
+    relative_footprint: float
 
 
 @dataclass(frozen=True)
@@ -113,7 +117,11 @@ class CameraView:
 
 
 class SideEmitters:
-    """The light sources of one side: an environment map or dome, and a plane in front of it; both are optional."""
+    """The light sources of one side: an environment map or dome, and a plane in front of it; both are optional.
+
+    `to_world` is the rotation matrix (3, 3) from the glass frame to the world. In all methods, `relative_footprint` is the
+    width of a ray's footprint, relative to the footprint of a whole pixel; see `Rays`.
+    """
 
     def __init__(
         self,
@@ -141,45 +149,45 @@ class SideEmitters:
         self.distance_mm = side.distance_mm
 
     @property
-    def is_dome(self) -> bool:
+    def has_dome(self) -> bool:
         """Whether the map is at a finite radius, which causes parallax."""
         return self.envmap is not None and math.isfinite(self.radius_mm)
 
     @property
-    def is_near(self) -> bool:
+    def has_near_light(self) -> bool:
         """Whether any light of this side depends on the origin of a ray."""
-        return self.is_dome or self.plane is not None
+        return self.has_dome or self.plane is not None
 
     def texels_per_pixel(self) -> float:
-        """Returns the width of a pixel in texels of the map or of the plane, whichever is larger."""
+        """Returns the footprint of a whole pixel in texels of the map or of the plane, whichever is larger."""
         return max(self._map_footprint(1.0), self._plane_footprint(1.0))
 
-    def _map_footprint(self, footprint_px: float) -> float:
-        """Converts a footprint from pixels to texels of the map."""
+    def _map_footprint(self, relative_footprint: float) -> float:
+        """Converts a footprint that is relative to a whole pixel's to texels of the map."""
         if self.envmap is None:
             return 0.0
         angle = (
             self._view.footprint_mm(self.radius_mm) / self.radius_mm
-            if self.is_dome
+            if self.has_dome
             else self._view.footprint_rad()
         )
-        return footprint_px * angle * self.envmap.width / (2 * math.pi)
+        return relative_footprint * angle * self.envmap.width / (2 * math.pi)
 
-    def _plane_footprint(self, footprint_px: float) -> float:
-        """Converts a footprint from pixels to texels of the plane's image."""
+    def _plane_footprint(self, relative_footprint: float) -> float:
+        """Converts a footprint that is relative to a whole pixel's to texels of the plane's image."""
         if self.plane is None:
             return 0.0
         width_mm = self._view.footprint_mm(self.plane_distance_mm)
-        return footprint_px * width_mm * self.plane.texture.width / (2 * self.plane.half_width_mm)
+        return relative_footprint * width_mm * self.plane.texture.width / (2 * self.plane.half_width_mm)
 
-    def far_radiance(self, direction: Tensor, footprint_px: float) -> Tensor | None:
+    def far_radiance(self, direction: Tensor, relative_footprint: float) -> Tensor | None:
         """Returns light from infinity along unit directions (3, N): (3, N), or None if this side has no such light."""
-        if self.envmap is None or self.is_dome:
+        if self.envmap is None or self.has_dome:
             return None
-        return self.lookup_map(direction, footprint_px)
+        return self.lookup_map(direction, relative_footprint)
 
     def near_radiance(
-        self, origin: Tensor, direction: Tensor, footprint_px: float
+        self, origin: Tensor, direction: Tensor, relative_footprint: float
     ) -> tuple[Tensor, Tensor | None]:
         """Returns the light of the dome and the plane along rays, and the visibility of the far light.
 
@@ -188,36 +196,40 @@ class SideEmitters:
             is None if there is no far light.
         """
         radiance, visibility = torch.zeros_like(direction), None
-        if self.is_dome:
+        if self.has_dome:
             point, _ = self._intersect_dome(origin, direction)
-            radiance = self.lookup_map(point, footprint_px)
+            radiance = self.lookup_map(point, relative_footprint)
         elif self.envmap is not None:
             visibility = torch.ones_like(direction[0])
         if self.plane is not None:
-            image, coverage = self._plane_radiance(self.plane, origin, direction, footprint_px)
+            image, coverage = self._plane_radiance(self.plane, origin, direction, relative_footprint)
             radiance = radiance + coverage * (image - radiance)
             visibility = None if visibility is None else visibility * (1 - coverage)
         return radiance, visibility
 
-    def radiance(self, origin: Tensor, direction: Tensor, footprint_px: float) -> Tensor:
+    def radiance(self, origin: Tensor, direction: Tensor, relative_footprint: float) -> Tensor:
         """Returns all light along rays from `origin` in unit `direction`, (3, N) each: (3, N)."""
-        return self.add_near(self.far_radiance(direction, footprint_px), origin, direction, footprint_px)
+        return self.add_near(
+            self.far_radiance(direction, relative_footprint), origin, direction, relative_footprint
+        )
 
-    def add_near(self, far: Tensor | None, origin: Tensor, direction: Tensor, footprint_px: float) -> Tensor:
+    def add_near(
+        self, far: Tensor | None, origin: Tensor, direction: Tensor, relative_footprint: float
+    ) -> Tensor:
         """Adds the light of the dome and the plane along rays to `far`, the result of `far_radiance`: (3, N).
 
         Far light does not depend on origins, so rays with the same directions need only one call of `far_radiance`.
         """
-        if not self.is_near:
+        if not self.has_near_light:
             return torch.zeros_like(direction) if far is None else far
-        near, visibility = self.near_radiance(origin, direction, footprint_px)
+        near, visibility = self.near_radiance(origin, direction, relative_footprint)
         return near if far is None or visibility is None else near + visibility * far
 
-    def lookup_map(self, direction: Tensor, footprint_px: float) -> Tensor:
+    def lookup_map(self, direction: Tensor, relative_footprint: float) -> Tensor:
         """Returns the light of the map in unit directions (3, N) from its centre: (3, N)."""
         assert self.envmap is not None
         u, v = direction_to_uv(self._to_world @ direction, self._u_offset)
-        return self.envmap(u, v, self._map_footprint(footprint_px))
+        return self.envmap(u, v, self._map_footprint(relative_footprint))
 
     def sample_map(self, uniforms: Tensor) -> Tensor:
         """Draws points of the map with a density proportional to its luminance, for `towards`.
@@ -234,12 +246,12 @@ class SideEmitters:
 
         `point` is a result of `sample_map`.
         """
-        direction = normalize(point * self.radius_mm - origin) if self.is_dome else point
+        direction = normalize(point * self.radius_mm - origin) if self.has_dome else point
         return direction, self.pdf(origin, direction)
 
     def pdf(self, origin: Tensor, direction: Tensor) -> Tensor:
         """Returns the density of `towards` at unit directions (3, N), per steradian at `origin`: (N,)."""
-        if not self.is_dome:
+        if not self.has_dome:
             return self._map_distribution().pdf(self._to_world @ direction, self._u_offset)
         point, distance = self._intersect_dome(origin, direction)
         # The same area of the dome has the solid angle A / r^2 at the centre and A cos / distance^2 at `origin`.
@@ -269,7 +281,7 @@ class SideEmitters:
         return self._distribution
 
     def _plane_radiance(
-        self, plane: _PlaneEmitter, origin: Tensor, direction: Tensor, footprint_px: float
+        self, plane: _PlaneEmitter, origin: Tensor, direction: Tensor, relative_footprint: float
     ) -> tuple[Tensor, Tensor]:
         """Returns the plane's light along rays, (3, N), and the fraction of each footprint that it covers, (N,) in 0..1."""
         normal = torch.linalg.cross(plane.right, plane.up)
@@ -278,17 +290,21 @@ class SideEmitters:
         point = origin + distance * direction - plane.centre[:, None]
         x, y = plane.right @ point, plane.up @ point
         u, v = x / (2 * plane.half_width_mm) + 0.5, 0.5 - y / (2 * plane.half_height_mm)
-        edge_mm = footprint_px * self._view.footprint_mm(self.plane_distance_mm)
+        edge_mm = relative_footprint * self._view.footprint_mm(self.plane_distance_mm)
         coverage = (
             ((plane.half_width_mm - x.abs()) / edge_mm + 0.5).clamp(0, 1)
             * ((plane.half_height_mm - y.abs()) / edge_mm + 0.5).clamp(0, 1)
             * (distance > 0)
         )
-        return plane.texture(u, v, self._plane_footprint(footprint_px)), coverage
+        return plane.texture(u, v, self._plane_footprint(relative_footprint)), coverage
 
 
 def _plane_emitter(plane: Plane, assets: Assets, is_behind: bool, device: Device) -> _PlaneEmitter:
-    """Converts a plane to the glass frame. At heading 0 the plane faces the glass; a heading rotates it about the y axis."""
+    """Converts a plane to the glass frame.
+
+    At heading 0 and pitch 0, the plane faces the glass. The heading rotates it about the y axis, and the pitch about its
+    horizontal axis.
+    """
     image = torch.from_numpy(assets.plane_radiance(plane)).to(device)
     facing = 1.0 if is_behind else -1.0
     mirrored = torch.tensor([facing, 1.0, facing], device=device)

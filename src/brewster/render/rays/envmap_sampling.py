@@ -1,4 +1,4 @@
-"""Importance sampling of an environment map: directions are drawn with a density proportional to brightness.
+"""Importance sampling of an environment map: directions are drawn with a density proportional to luminance.
 
 Source: Pharr, Jakob and Humphreys, "Physically Based Rendering", section on image infinite lights. The probability of a
 texel is proportional to its luminance times its solid angle, so most samples hit the sun even if it is small. Samples are
@@ -33,7 +33,7 @@ def direction_to_uv(direction: Tensor, u_offset: float) -> tuple[Tensor, Tensor]
 
 
 class EnvmapDistribution:
-    """A distribution of directions on one side of the glass, in proportion to the brightness of a map.
+    """A distribution of directions on one side of the glass, in proportion to the luminance of a map.
 
     `texels` is the map, (3, H, W). `outward` is the normal of the glass on that side, (3,). `u_offset` rotates the map.
     """

@@ -127,7 +127,7 @@ def trace_orders(
             emitters = behind if is_behind else front
             samples_light = interaction.alpha and _mean_weight(branch, count) > _MIN_LIGHT_SAMPLING_WEIGHT
             samples = light_samples.get(emitters) if samples_light else None
-            light = _exit_radiance(branch, interaction, emitters, rays.footprint_px, samples)
+            light = _exit_radiance(branch, interaction, emitters, rays.relative_footprint, samples)
             in_truncated_layers = branch.reflections == 0 if is_behind else not branch.entered_last_pane
             yield ExitingLight(is_behind, in_truncated_layers, light, branch.rays)
 
@@ -280,15 +280,16 @@ def _exit_radiance(
     path: _PathState,
     interaction: _SurfaceInteraction,
     emitters: SideEmitters,
-    footprint_px: float,
+    relative_footprint: float,
     light_samples: Tensor | None,
 ) -> Tensor:
     """Returns the light of an order, (3, N): a microfacet sample and a light sample, combined by the balance heuristic.
 
-    `light_samples` are points of the map for all rays; None if microfacet samples are sufficient. The heuristic weights a sample by its density divided by the sum of both densities (Veach 1997, eq. 9.8).
+    `light_samples` are points of the map for all rays; None if microfacet samples are sufficient. The
+    heuristic weights a sample by its density divided by the sum of both densities (Veach 1997, eq. 9.8).
     """
     weight = (path.s + path.p) / 2
-    radiance = emitters.radiance(path.origin, path.direction, footprint_px)
+    radiance = emitters.radiance(path.origin, path.direction, relative_footprint)
     if light_samples is None:
         return weight * radiance
     facet_pdf = _scattering_pdf(interaction, path.direction)
@@ -302,7 +303,7 @@ def _exit_radiance(
     ratio = facet_pdf / (light_pdf + facet_pdf).clamp(min=1e-20)
     light_weight = (interaction.before.s * s + interaction.before.p * p) / 2 * ratio
     return weight * radiance * balance + light_weight * emitters.radiance(
-        path.origin, direction, footprint_px
+        path.origin, direction, relative_footprint
     )
 
 

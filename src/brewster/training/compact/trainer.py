@@ -1,6 +1,6 @@
 """Trains the compact network with AdamW and an exponential moving average (EMA) of the weights, on a GPU if there is one.
 
-network = train(read_recipe(Path("recipes/train/compact.toml")), Path("out/compact"), on_step)
+network = train(read_recipe(Path("recipes/train/compact-stage1.toml")), Path("out/compact-stage1"), on_step)
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from brewster.training.compact.export import export_onnx
 from brewster.training.data.mixtures import Stream, TrainingBatch
 from brewster.training.distributed import best_device
 from brewster.training.loop import StepCallback, run
-from brewster.training.losses import check_finite, psnr_gain_db, separation_loss, tone_ratio
+from brewster.training.losses import check_finite, exposure_ratio, psnr_gain_db, separation_loss
 from brewster.training.plots import sample_sheet
 from brewster.training.recipe import CompactRecipe
 from brewster.training.streams import held_out_mixtures, open_stream, validation_pairs
@@ -243,21 +243,21 @@ def validate(
 
     Returns:
         For each folder: psnr_gain_db_NAME, the mean PSNR gain over the input in dB; worse_NAME, the fraction of pairs whose
-        prediction is worse than the input; tone_NAME, the mean `tone_ratio`, which is 1 if prediction and photo have the same
-        exposure.
+        prediction is worse than the input; exposure_NAME, the mean `exposure_ratio`, which is 1 if prediction and photo
+        have the same exposure.
     """
 
     @torch.no_grad()
     def measure(pair: tuple[Tensor, Tensor]) -> tuple[float, float]:
         prediction = network(pair[0])[:, :3].clamp(0, 1)
-        return psnr_gain_db(prediction, *pair), tone_ratio(prediction, *pair)
+        return psnr_gain_db(prediction, *pair), exposure_ratio(prediction, *pair)
 
     metrics = {}
     for name, folder in filter(itemgetter(1), pairs.items()):
-        gains, tones = zip(*map_(measure, folder), strict=True)
+        gains, exposures = zip(*map_(measure, folder), strict=True)
         metrics[f"psnr_gain_db_{name}"] = sum(gains) / len(gains)
         metrics[f"worse_{name}"] = sum(gain < 0 for gain in gains) / len(gains)
-        metrics[f"tone_{name}"] = sum(tones) / len(tones)
+        metrics[f"exposure_{name}"] = sum(exposures) / len(exposures)
     return metrics
 
 

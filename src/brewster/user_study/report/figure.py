@@ -1,4 +1,4 @@
-"""Plot the results: one stacked bar of win, tie and lose rates for each pair of methods and dataset."""
+"""Plots the results: one stacked bar of win, tie and lose rates for each pair of methods and dataset."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _EVERYONE_TITLE: Final = "All participants: the rule excludes everyone"
 
 
 def plot(results: Mapping[str, Any]) -> bytes:
-    """Plot the results after the exclusion rule, or those of all participants if the rule excludes everyone.
+    """Plots the results after the exclusion rule, or those of all participants if the rule excludes everyone.
 
     Returns:
         The plot as the bytes of a PNG file.
@@ -31,8 +31,8 @@ def plot(results: Mapping[str, Any]) -> bytes:
     height = 0.36 * sum(heights) + (0.3 if included else 0.7)
     figure = Figure(figsize=(7.2, height), layout="constrained")
     axes = figure.subplots(len(tables), 1, squeeze=False, gridspec_kw={"height_ratios": heights})[:, 0]
-    for table, rows, axis in zip(tables, rows_of_tables, axes, strict=True):
-        _bars(axis, table, rows)
+    for table, rows, ax in zip(tables, rows_of_tables, axes, strict=True):
+        _bars(ax, table, rows)
     if not included:
         figure.suptitle(_EVERYONE_TITLE, fontsize=9, color="#a8561b")
     data = io.BytesIO()
@@ -43,21 +43,21 @@ def plot(results: Mapping[str, Any]) -> bytes:
 
 
 def _plotted_rows(results: Mapping[str, Any], table: Mapping[str, Any]) -> list[Mapping[str, Any]]:
-    """The rows to plot: the datasets, if there are several, and the average. Rows without answers are left out."""
+    """Returns the rows to plot: the datasets, if there are several, and the average. Rows without answers are left out."""
     datasets = results["study"]["datasets"]
     keys = [*(datasets if len(datasets) > 1 else ()), *_AVERAGE_KEYS]
     return [row for row in table["rows"] if row["key"] in keys and row["win"]["mean"] is not None]
 
 
-def _bars(axis: Any, table: Mapping[str, Any], rows: Sequence[Mapping[str, Any]]) -> None:  # noqa: ANN401  (matplotlib)
+def _bars(ax: Any, table: Mapping[str, Any], rows: Sequence[Mapping[str, Any]]) -> None:  # noqa: ANN401  (matplotlib)
     positions = range(len(rows))  # matplotlib merges bars with equal titles
     starts = [0.0] * len(rows)
     for name, colour in _BAR_COLOURS.items():
         widths = [row[name]["mean"] for row in rows]
-        axis.barh(positions, widths, left=starts, color=colour, height=0.72, edgecolor="white", linewidth=0.8)
+        ax.barh(positions, widths, left=starts, color=colour, height=0.72, edgecolor="white", linewidth=0.8)
         for i, (start, width) in enumerate(zip(starts, widths, strict=True)):
             if width >= _MIN_LABELLED_RATE:
-                axis.text(
+                ax.text(
                     start + width / 2,
                     i,
                     f"{100 * width:.0f} %",
@@ -67,22 +67,22 @@ def _bars(axis: Any, table: Mapping[str, Any], rows: Sequence[Mapping[str, Any]]
                     fontsize=8,
                 )
         starts = [start + width for start, width in zip(starts, widths, strict=True)]
-    axis.invert_yaxis()
-    axis.set(xlim=(0, 1), xticks=[])
-    axis.set_yticks(positions, [row["title"] for row in rows], parse_math=False)
-    axis.tick_params(left=False, labelsize=9)
-    axis.spines[:].set_visible(False)
+    ax.invert_yaxis()
+    ax.set(xlim=(0, 1), xticks=[])
+    ax.set_yticks(positions, [row["title"] for row in rows], parse_math=False)
+    ax.tick_params(left=False, labelsize=9)
+    ax.spines[:].set_visible(False)
     headings = (
         (0.0, "left", f"{table['first']} better", _HEADING_COLOURS["win"]),
         (0.5, "center", "similar", _HEADING_COLOURS["tie"]),
         (1.0, "right", f"{table['second']} better", _HEADING_COLOURS["lose"]),
     )
     for x, alignment, text, colour in headings:
-        axis.text(
+        ax.text(
             x,
             1.02,
             text,
-            transform=axis.transAxes,
+            transform=ax.transAxes,
             ha=alignment,
             color=colour,
             fontsize=9,

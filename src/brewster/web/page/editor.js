@@ -15,7 +15,7 @@ export class RegionEditor {
   #hatching = document.createElement("canvas");
   #hatchingKey = null; // the regions and the size of the hatching, as text
 
-  // `tool()` returns {shape, value, radius, feather} of the next region. `onChange(isDrawing)` is called when `list` or the cursor
+  // `tool()` returns {shape, value, radius, feather} of the next region. `onChange()` is called when `list` or the cursor
   // has changed, `onAdd(region)` with each finished region, and `announce(text)` to tell screen readers what happened.
   constructor({ tool, onChange, onAdd, announce }) {
     Object.assign(this, { tool, onChange, onAdd, announce });
@@ -33,7 +33,7 @@ export class RegionEditor {
     const { shape, ...rest } = this.tool();
     this.#cursor = point;
     this.#drawn = { shape, ...rest, points: shape === "rectangle" ? [point, point] : [point] };
-    this.onChange(true);
+    this.onChange();
   }
 
   move(point) {
@@ -43,25 +43,25 @@ export class RegionEditor {
     const [x, y] = points.at(-1);
     if (shape === "brush" && Math.hypot(point[0] - x, point[1] - y) < MIN_STEP * radius) return;
     this.#drawn = { ...this.#drawn, points: shape === "rectangle" ? [points[0], point] : [...points, point] };
-    this.onChange(true);
+    this.onChange();
   }
 
   end() {
     const region = this.#drawn;
     this.#drawn = null;
     if (region && isVisible(region)) this.onAdd(region);
-    else this.onChange(false);
+    else this.onChange();
   }
 
   cancel() {
     if (!this.#drawn) return;
     this.#drawn = null;
-    this.onChange(false);
+    this.onChange();
   }
 
   hover(point) {
     this.#cursor = point;
-    this.onChange(true);
+    this.onChange();
   }
 
   // Handles a key: arrows move the cursor, space or Enter starts and ends a region, Escape cancels it. Returns whether the key was handled.
@@ -73,7 +73,7 @@ export class RegionEditor {
     this.#cursor ??= ends.map((end) => end / 2);
     if (event.key in steps) {
       this.move(this.#cursor.map((at, i) => Math.min(ends[i], Math.max(0, at + steps[event.key][i]))));
-      this.onChange(true);
+      this.onChange();
     } else if (event.key === " " || event.key === "Enter") {
       const isEnd = this.#drawn !== null;
       isEnd ? this.end() : this.start(this.#cursor);

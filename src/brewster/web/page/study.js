@@ -8,7 +8,8 @@ const PARTICIPANT_TOKEN = location.pathname.match(/^\/s\/([^/]+)/)?.[1];
 // In ms. Earlier answers are ignored, because they may be the second click of a double click in the previous trial.
 const MIN_ANSWER_DELAY = 300;
 const MIN_WIDTH = 900; // in CSS px; in a narrower window, pictures side by side are too small to compare
-const KEYS = { 1: "left", 2: "similar", 3: "right", ArrowLeft: "left", ArrowRight: "right" }; // the up and down arrows scroll
+const NOTICE_SECONDS = 8; // how long a notice is shown that needs no action
+const CHOICE_KEYS = { 1: "left", 2: "similar", 3: "right", ArrowLeft: "left", ArrowRight: "right" }; // the up and down arrows scroll
 
 const byId = (id) => document.getElementById(id);
 const sections = ["invitation", "trial", "finish", "error"];
@@ -16,10 +17,11 @@ const frames = { left: frame("left"), photo: frame("photo"), right: frame("right
 const panZoom = new PanZoom(byId("pictures"), Object.values(frames));
 const captions = { left: "Result A", photo: "Photo", right: "Result B" };
 const preloaded = []; // the pictures of the next trial, held in memory
-let state = null; // the current trial, as returned by the server
+let currentTrial = null; // the current trial, as returned by the server
 let practising = false; // whether the practice trial is shown
 let flips = 0; // how often another picture was shown in place during the trial
 let zoomed = false; // whether the pictures were enlarged during the trial
+let noticeTimer; // the timer that removes the notice
 let shownAt = null; // time at which the pictures of the trial were shown; null while no answer is accepted
 
 function frame(side) {
@@ -45,7 +47,7 @@ async function send(path, body) {
     } catch (error) {
       if (error instanceof RequestError) throw error;
     }
-    notice(body?.choice ? "Not saved yet: the server does not respond. Trying again…" : "The server does not respond. Trying again…");
+    showNotice(body?.choice ? "Not saved yet: the server does not respond. Trying again…" : "The server does not respond. Trying again…");
     await new Promise((resolve) => setTimeout(resolve, 1000 * wait));
   }
 }
@@ -55,15 +57,18 @@ class RequestError extends Error {}
 const isClientError = (response) => response.status >= 400 && response.status < 500 && response.status !== 408;
 
 async function parse(response) {
-  notice("");
+  showNotice("");
   const data = await response.json();
   if (!response.ok) throw new RequestError(data.error);
   return data;
 }
 
-function notice(text) {
+// Shows a notice until the next one, or for `seconds`. An empty text removes the notice.
+function showNotice(text, seconds) {
+  clearTimeout(noticeTimer); // otherwise the timer of the previous notice would remove this one
   byId("notice").textContent = text;
   byId("notice").hidden = !text;
+  if (seconds) noticeTimer = setTimeout(() => showNotice(""), 1000 * seconds);
 }
 
 function showError(error) {
@@ -94,8 +99,6 @@ byId("agreement").addEventListener("submit", async (event) => {
     showError(error);
   }
 });
-
-// --- a trial
 
 // --- window and arrangement
 
@@ -134,7 +137,7 @@ const VIEW_KEYS = {
 };
 
 // Returns the viewing conditions, with lengths in CSS px.
-function conditions() {
+function viewingConditions() {
   return {
     viewport_width: innerWidth,
     viewport_height: innerHeight,
@@ -158,29 +161,31 @@ async function loadPicture(source) {
     picture.src = source;
     try {
       await picture.decode();
-      notice("");
+      if (wait > 1) showNotice(""); // removes the notice of the failed attempts, but no other notice
       return picture;
     } catch {
       const response = await fetch(source).catch(() => null); // an image element does not report the reason of a failure
       if (response && isClientError(response)) await parse(response);
-      notice("A picture could not be loaded. Trying again…");
+      showNotice("A picture could not be loaded. Trying again…");
       await new Promise((resolve) => setTimeout(resolve, 1000 * wait));
     }
   }
 }
 
+// --- a trial
+
 // Shows the practice trial before the first trial, then the trials.
 async function start(next) {
   practising = Boolean(next.practice);
   if (!practising) return showTrial(next);
-  state = next;
+  currentTrial = next;
   byId("bar").value = 0;
   await showPictures("practice", next.practice, "Practice: not counted");
 }
 
 async function showTrial(next) {
   practising = false;
-  state = next;
+  currentTrial = next;
   byId("undo").hidden = next.last === null;
   if (next.trial === null) return finish(next);
   byId("bar").value = next.trial / next.trials;
@@ -225,6 +230,8 @@ function updateChoices(choice, closed) {
   }
 }
 
+// --- answers
+
 async function choose(choice) {
   if (shownAt === null || performance.now() - shownAt < MIN_ANSWER_DELAY) return;
   const seconds = (performance.now() - shownAt) / 1000;
@@ -232,7 +239,7 @@ async function choose(choice) {
   updateChoices(choice, true);
   try {
     if (practising) return await endPractice(choice);
-    const body = { trial: state.trial, choice, seconds, conditions: conditions() };
+    const body = { trial: currentTrial.trial, choice, seconds, conditions: viewingConditions() };
     const answer = await send(`/s/${PARTICIPANT_TOKEN}/answers`, body);
     await showTrial(answer.next);
   } catch (error) {
@@ -242,18 +249,17 @@ async function choose(choice) {
 
 // Explains the practice pair, and shows the first trial.
 async function endPractice(choice) {
-  const better = state.practice.expected === "left" ? "A" : "B";
-  const text = `${choice === state.practice.expected ? "Yes" : "Look again at such differences"}: ${better} is better, because the other result was blurred. The study begins now.`;
-  await showTrial(state);
-  notice(text);
-  setTimeout(() => notice(""), 8000);
+  const better = currentTrial.practice.expected === "left" ? "A" : "B";
+  const text = `${choice === currentTrial.practice.expected ? "Yes" : "Look again at such differences"}: ${better} is better, because the other result was blurred. The study begins now.`;
+  await showTrial(currentTrial);
+  showNotice(text, NOTICE_SECONDS);
 }
 
 async function undo() {
-  if (state.last === null || (state.trial !== null && shownAt === null)) return; // an answer is being sent
+  if (currentTrial.last === null || (currentTrial.trial !== null && shownAt === null)) return; // an answer is being sent
   shownAt = null;
   try {
-    await showTrial(await send(`/s/${PARTICIPANT_TOKEN}/withdrawals`, { trial: state.last }));
+    await showTrial(await send(`/s/${PARTICIPANT_TOKEN}/withdrawals`, { trial: currentTrial.last }));
     byId("undo").hidden = true; // only one answer can be undone in a row
   } catch (error) {
     showError(error);
@@ -266,16 +272,18 @@ function finish({ trials }) {
   byId("thanks").focus();
 }
 
+// --- controls
+
 for (const button of byId("choices").children) button.addEventListener("click", () => choose(button.dataset.choice));
 
 addEventListener("keydown", (event) => {
   if (byId("trial").hidden || event.ctrlKey || event.metaKey || event.altKey) return;
-  const answers = event.key in KEYS ? !event.shiftKey : event.key === "Enter" && byId("choices").contains(event.target);
-  if (event.repeat && answers) return event.preventDefault(); // a held key counts as one answer
+  const isAnswerKey = event.key in CHOICE_KEYS ? !event.shiftKey : event.key === "Enter" && byId("choices").contains(event.target);
+  if (event.repeat && isAnswerKey) return event.preventDefault(); // a held key counts as one answer
   if (event.shiftKey ? panZoom.press(`Shift+${event.key}`) || panZoom.press(event.key) : panZoom.press(event.key)) event.preventDefault();
-  else if (event.key in KEYS && !event.shiftKey) {
+  else if (event.key in CHOICE_KEYS && !event.shiftKey) {
     event.preventDefault();
-    choose(KEYS[event.key]);
+    choose(CHOICE_KEYS[event.key]);
   } else if (event.key.toLowerCase() in VIEW_KEYS && !event.repeat) VIEW_KEYS[event.key.toLowerCase()]();
 });
 
@@ -295,11 +303,10 @@ byId("copy").addEventListener("click", async () => {
   const link = new URL((await send(`/s/${PARTICIPANT_TOKEN}/link`)).link, location.href).href;
   try {
     await navigator.clipboard.writeText(link);
-    notice("Your link is copied. Do not share it.");
+    showNotice("Your link is copied. Do not share it.", NOTICE_SECONDS);
   } catch {
-    notice(`Your link: ${link}`);
+    showNotice(`Your link: ${link}`, NOTICE_SECONDS);
   }
-  setTimeout(() => notice(""), 8000);
 });
 if (bundle) {
   for (const id of ["hand-in", "download-early"]) byId(id).hidden = false;
