@@ -43,9 +43,9 @@ from brewster.environments.procedural.props import (
     UP,
     Lamp,
     SceneLighting,
-    bookshelf,
+    bookshelf_painter,
     box,
-    cabinet,
+    cabinet_painter,
     horizontal_quad,
     plain_painter,
     vertical_quad,
@@ -116,7 +116,7 @@ class _BoxRoom:
                         width_m / 2 - across, height_m / 2 - np.abs(hit[..., 1] - height_m / 2)
                     )
                     inside = np.clip(margin * 8 + 0.5, 0, 1) * (distance[..., 0] > 0.05)
-                    total += inside[..., None] * self.lighting.shade(points, normal) * facing * self.sunlight
+                    total += inside[..., None] * self.lighting.contact_shadow_factor(points, normal) * facing * self.sunlight
         return total
 
     def environment(self) -> ProceduralEnvironment:
@@ -263,12 +263,12 @@ class _BoxRoom:
         reach = max(size[0], size[2]) / 2
         if np.hypot(foot[0], foot[2]) < reach + 0.7:
             return False
-        for x, z, half_width, half_depth in self.lighting.contacts:
+        for x, z, half_width, half_depth in self.lighting.contact_shadows:
             if abs(x - foot[0]) < half_width + reach * 0.8 and abs(z - foot[2]) < half_depth + reach * 0.8:
                 return False
         across = abs(np.cos(rotation)) * size[0] + abs(np.sin(rotation)) * size[2]
         depth_m = abs(np.sin(rotation)) * size[0] + abs(np.cos(rotation)) * size[2]
-        self.lighting.contacts.append((float(foot[0]), float(foot[2]), float(across / 2), float(depth_m / 2)))
+        self.lighting.contact_shadows.append((float(foot[0]), float(foot[2]), float(across / 2), float(depth_m / 2)))
         return True
 
     def _furnish_wall(self, inward: Floats) -> None:
@@ -291,7 +291,7 @@ class _BoxRoom:
             elif kind == "sofa":
                 self._sofa(foot, (width_m, height_m, depth_m), rotation)
             else:
-                paint = bookshelf(rng) if kind == "shelf" else cabinet(rng)
+                paint = bookshelf_painter(rng) if kind == "shelf" else cabinet_painter(rng)
                 self.quads += box(paint, foot, (width_m, height_m, depth_m), self.light, rotation)
                 if kind == "screen":
                     self._screen(foot + UP * (height_m + 0.08), inward)
