@@ -282,7 +282,7 @@ def _find_scenes(layout: BenchmarkLayout, groups: Sequence[ImageGroup]) -> tuple
     if len(matched) == len(groups) and len(set(matched)) <= _MAX_SCENES:
         return matched, []
     return [group.name for group in groups], [
-        "the file names do not identify the scenes, so the paper's draw of one case per scene is not possible"
+        "the file names do not identify the scenes, so the subset of the paper (one case of each scene) cannot be drawn"
     ]
 
 

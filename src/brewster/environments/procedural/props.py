@@ -13,12 +13,12 @@ import numpy as np
 from numpy.random import Generator
 
 from brewster.environments.procedural.canvas import (
-    Rect,
     Canvas,
     Colour,
     Floats,
     Lighting,
     Quad,
+    Rect,
     tint,
     unit,
     vector,
@@ -167,7 +167,9 @@ def paint_window(rng: Generator, canvas: Canvas, outline: Rect, style: WindowSty
         )
     else:
         slant = np.linspace(0, rng.uniform(-0.5, 0.5), glass.shape[1], dtype=np.float32)[:, None]
-        glass[..., :3] = style.sky * rng.uniform(0.05, 0.45) * np.clip(vertical_gradient + slant, 0.1, 1.2) + 0.01
+        glass[..., :3] = (
+            style.sky * rng.uniform(0.05, 0.45) * np.clip(vertical_gradient + slant, 0.1, 1.2) + 0.01
+        )
         glass[..., 4] = 0 if style.lit_fraction else 0.7
     _add_curtains(rng, glass)
     for index in range(1, style.columns):
@@ -360,7 +362,7 @@ def _ground_floor(rng: Generator, canvas: Canvas, style: WindowStyle) -> Canvas:
         sign, ink = tint(rng, rng.uniform(0.02, 0.4), 1), tint(rng, 0.7, 0.5)
         if shops:
             paint_window(rng, canvas, (left, 1.0, width_m - 0.3, bottom - 1.5), style)
-            _shop_goods(rng, canvas, left + 0.1, bottom - 0.6, width_m - 0.5, emission / 3)
+            _shop_goods(rng, canvas, left + 0.1, bottom - 0.6, width_m - 0.5, emission=emission / 3)
             canvas.rect(
                 (left - 0.1, 0.25, width_m - 0.1, 0.6), sign, emission=emission * (rng.uniform() < 0.3)
             )
@@ -379,7 +381,7 @@ def _ground_floor(rng: Generator, canvas: Canvas, style: WindowStyle) -> Canvas:
 
 
 def _shop_goods(
-    rng: Generator, canvas: Canvas, left: float, bottom: float, width_m: float, emission: float
+    rng: Generator, canvas: Canvas, left: float, bottom: float, width_m: float, *, emission: float
 ) -> None:
     """Paints a row of goods, at most 0.9 m tall, in a shop window. `left` and `bottom` are in metres on the canvas."""
     offset = 0.0

@@ -116,7 +116,12 @@ class _BoxRoom:
                         width_m / 2 - across, height_m / 2 - np.abs(hit[..., 1] - height_m / 2)
                     )
                     inside = np.clip(margin * 8 + 0.5, 0, 1) * (distance[..., 0] > 0.05)
-                    total += inside[..., None] * self.lighting.contact_shadow_factor(points, normal) * facing * self.sunlight
+                    total += (
+                        inside[..., None]
+                        * self.lighting.contact_shadow_factor(points, normal)
+                        * facing
+                        * self.sunlight
+                    )
         return total
 
     def environment(self) -> ProceduralEnvironment:
@@ -268,7 +273,9 @@ class _BoxRoom:
                 return False
         across = abs(np.cos(rotation)) * size[0] + abs(np.sin(rotation)) * size[2]
         depth_m = abs(np.sin(rotation)) * size[0] + abs(np.cos(rotation)) * size[2]
-        self.lighting.contact_shadows.append((float(foot[0]), float(foot[2]), float(across / 2), float(depth_m / 2)))
+        self.lighting.contact_shadows.append(
+            (float(foot[0]), float(foot[2]), float(across / 2), float(depth_m / 2))
+        )
         return True
 
     def _furnish_wall(self, inward: Floats) -> None:
