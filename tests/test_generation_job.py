@@ -100,7 +100,7 @@ def test_shards_are_packed_as_they_become_complete_and_grow_with_the_set(tmp_pat
     render_set(out, count=8, shards=True)
     render_set(tmp_path / "undisturbed", count=8, shards=True)
     assert hashes(out) == hashes(tmp_path / "undisturbed")
-    assert parquet.read_table(out / "index.parquet")["place"].to_pylist()[-2:] == ["shard-000002.tar"] * 2
+    assert parquet.read_table(out / "index.parquet")["path"].to_pylist()[-2:] == ["shard-000002.tar"] * 2
 
 
 def test_folders_of_an_earlier_run_are_packed_when_shards_are_requested(tmp_path, small_shards):
