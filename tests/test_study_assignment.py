@@ -44,7 +44,7 @@ def test_no_participant_sees_one_method_much_more_often_on_one_side(sizes, seed,
 
 
 def test_a_study_with_the_size_of_the_paper_is_balanced():
-    """100 participants with 40 of 2 x 181 pairs each."""
+    """100 participants; each answers 40 of the 362 comparisons (181 photos, 2 comparisons each)."""
     participants = assigned_items(362, 40, 1, 100)
     rights = [sum(flipped for _, flipped in items) for items in participants]
     assert min(rights) >= 18
