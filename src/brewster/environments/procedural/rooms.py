@@ -116,12 +116,8 @@ class _BoxRoom:
                         width_m / 2 - across, height_m / 2 - np.abs(hit[..., 1] - height_m / 2)
                     )
                     inside = np.clip(margin * 8 + 0.5, 0, 1) * (distance[..., 0] > 0.05)
-                    total += (
-                        inside[..., None]
-                        * self.lighting.contact_shadow_factor(points, normal)
-                        * facing
-                        * self.sunlight
-                    )
+                    shadow_factor = self.lighting.contact_shadow_factor(points, normal)
+                    total += inside[..., None] * shadow_factor * facing * self.sunlight
         return total
 
     def environment(self) -> ProceduralEnvironment:
