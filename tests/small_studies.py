@@ -30,7 +30,7 @@ def make_description(
         for dataset, name in photos
         for other in methods[1:]
     ]
-    catch_pool = [CatchTrial(*photo, "-".join(photo), "good", "spoilt") for photo in photos]
+    catch_pool = [CatchTrial(*photo, "-".join(photo), "good", "degraded") for photo in photos]
     names = {name for row in comparisons for name in (row.photo, *row.outputs)}
     return StudyDescription(
         brewster="0",

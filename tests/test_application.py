@@ -79,7 +79,7 @@ def test_an_interrupted_upload_releases_its_place():
         while status(response := raw_exchange(port, *post_request())) == 503:
             assert b"Retry-After" in response or b"retry-after" in response
         assert status(response) == 200
-    assert job_queue.jobs == 0
+    assert job_queue.job_count == 0
 
 
 def test_a_broken_connection_stops_the_work():

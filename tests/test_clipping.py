@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from brewster import Separator
-from brewster.inference.clipping import keep_clipped
+from brewster.inference.clipping import keep_clipped_white
 from brewster.inference.predictor import Prediction
 from brewster.photo import Photo
 from brewster.srgb import to_linear
@@ -27,7 +27,7 @@ def predict(photo_level, transmission_level):
 )
 def test_only_small_changes_of_clipped_pixels_are_removed(photo_level, transmission_level, is_kept):
     photo, prediction = predict(photo_level, transmission_level)
-    kept = keep_clipped(photo, prediction)
+    kept = keep_clipped_white(photo, prediction)
     for layer in ("change", "reflection"):
         expected = np.zeros_like(photo) if is_kept else getattr(prediction, layer)
         np.testing.assert_allclose(getattr(kept, layer), expected, atol=1e-6)
@@ -36,13 +36,13 @@ def test_only_small_changes_of_clipped_pixels_are_removed(photo_level, transmiss
 def test_a_coloured_pixel_with_one_clipped_channel_is_not_white():
     photo, prediction = predict(1.0, 0.9)
     photo[..., 2] = 0.2
-    np.testing.assert_array_equal(keep_clipped(photo, prediction).change, prediction.change)
+    np.testing.assert_array_equal(keep_clipped_white(photo, prediction).change, prediction.change)
 
 
 @given(st.floats(0, 1), st.floats(0, 1))
 def test_a_change_is_never_enlarged_or_inverted(photo_level, transmission_level):
     photo, prediction = predict(photo_level, transmission_level)
-    kept = keep_clipped(photo, prediction)
+    kept = keep_clipped_white(photo, prediction)
     assert (np.abs(kept.change) <= np.abs(prediction.change) + 1e-7).all()
     assert (kept.change * prediction.change >= 0).all()
     np.testing.assert_allclose(kept.change + kept.reflection, 0, atol=1e-6)

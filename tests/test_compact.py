@@ -19,17 +19,21 @@ def test_an_untrained_network_returns_the_photo_and_no_reflection():
 
 
 def test_the_head_subtracts_light_then_applies_the_gain_then_corrects():
-    """With a constant head: T = encoded((I - added) gain) + repair, R = encoded(added + other); I, added, other linear."""
-    added, gain, repair, other = 0.1, 1.5, 0.02, 0.05
+    """With a constant head: T = encoded((I - added) gain) + transmission_correction, R = encoded(added + reflection_correction).
+
+    I, `added` and `reflection_correction` are linear.
+    """
+    added, gain, transmission_correction, reflection_correction = 0.1, 1.5, 0.02, 0.05
     network = CompactNetwork()
     with torch.no_grad():
         # The inverse of the limit in the network: log gain = 1.5 tanh(unlimited / 1.5).
         unlimited = 1.5 * math.atanh(math.log(gain) / 1.5)
-        network.head.bias.copy_(torch.tensor([added, unlimited, repair, other]).repeat_interleave(3))
+        head = torch.tensor([added, unlimited, transmission_correction, reflection_correction])
+        network.head.bias.copy_(head.repeat_interleave(3))
     layers = network(to_encoded(torch.full((1, 3, 32, 32), 0.4)))
     expected = (
-        to_encoded(torch.tensor((0.4 - added) * gain)) + repair,
-        to_encoded(torch.tensor(added + other)),
+        to_encoded(torch.tensor((0.4 - added) * gain)) + transmission_correction,
+        to_encoded(torch.tensor(added + reflection_correction)),
     )
     for layer, value in zip(layers.chunk(2, dim=1), expected, strict=True):
         torch.testing.assert_close(layer, value.expand_as(layer), atol=1e-5, rtol=0)

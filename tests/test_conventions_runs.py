@@ -59,7 +59,7 @@ def test_the_tiny_experiment_renders_trains_separates_and_evaluates(tmp_path):
     card = (tmp_path / "card.md").read_text()
     assert "**This model is for software tests.**" in card
     assert (
-        rows_by_first_cell(card.partition("## Measured")[2])["lora"]
+        rows_by_first_cell(card.partition("## Benchmark scores")[2])["lora"]
         == rows_by_first_cell(tables.partition("###")[0])["lora"]
     )
     assert {path.name for path in (tmp_path / "lora").iterdir()} == set(FILES)

@@ -276,10 +276,10 @@ def test_a_resumed_run_decodes_only_the_images_of_the_report(tmp_path, methods, 
     assert (tmp_path / "out" / "report.html").read_bytes() == page
 
 
-def test_the_report_is_the_same_for_stored_tiles_and_for_images_that_are_read_again(
+def test_the_report_is_the_same_for_stored_thumbnails_and_for_images_that_are_read_again(
     tmp_path, methods, real20
 ):
-    """The whole benchmark is shown from stored tiles, and a part of it from files that are read again."""
+    """The whole benchmark is shown from stored thumbnails, and a part of it from files that are read again."""
     evaluate(real20, methods, QUICK, tmp_path / "whole")
     evaluate(real20, methods, QUICK, tmp_path / "part", max_report_cases=1)
     pages = [(tmp_path / name / "report.html").read_text() for name in ("whole", "part")]

@@ -66,7 +66,7 @@ def test_an_interrupted_set_equals_an_uninterrupted_one(tmp_path, small_shards, 
     with pytest.raises(KeyboardInterrupt):
         render_set(tmp_path / "set", count=8, executor=InterruptedExecutor, shards=shards)
     assert not list((tmp_path / "set").glob(".brewster-*"))
-    assert 3 > len(list(store.read_set(tmp_path / "set"))) - 1 >= 1
+    assert 3 > len(list(store.read_dataset(tmp_path / "set"))) - 1 >= 1
     render_set(tmp_path / "set", count=8, shards=shards)
     assert hashes(tmp_path / "set") == hashes(tmp_path / "undisturbed")
 
@@ -100,7 +100,7 @@ def test_shards_are_packed_as_they_become_complete_and_grow_with_the_set(tmp_pat
     render_set(out, count=8, shards=True)
     render_set(tmp_path / "undisturbed", count=8, shards=True)
     assert hashes(out) == hashes(tmp_path / "undisturbed")
-    assert parquet.read_table(out / "index.parquet")["place"].to_pylist()[-2:] == ["shard-000002.tar"] * 2
+    assert parquet.read_table(out / "index.parquet")["path"].to_pylist()[-2:] == ["shard-000002.tar"] * 2
 
 
 def test_folders_of_an_earlier_run_are_packed_when_shards_are_requested(tmp_path, small_shards):
@@ -120,7 +120,7 @@ def test_a_sample_that_fails_is_reported_and_the_others_are_rendered(
     results = render_set(tmp_path / "set", count=5, renderer=renderer, shards=True)
     assert statuses(results) == {0: "rendered", 1: "failed", 2: "rendered", 3: "rendered", 4: "rendered"}
     assert message in next(result.error for result in results if result.error)
-    assert [entry.path.name for entry in store.read_set(tmp_path / "set")] == [
+    assert [entry.path.name for entry in store.read_dataset(tmp_path / "set")] == [
         "000000",
         "000002",
         "shard-000001.tar",
@@ -149,7 +149,7 @@ def test_a_full_disk_ends_the_run_and_finished_samples_remain(four_samples, tmp_
     monkeypatch.setattr(os, "fsync", fail_after_25_calls)
     with pytest.raises(OutputError, match=os.strerror(number)):
         render_set(tmp_path / "set")
-    finished = list(store.read_set(tmp_path / "set"))
+    finished = list(store.read_dataset(tmp_path / "set"))
     assert 0 < len(finished) < 4
     assert all(names(entry.path) == set(store.SAMPLE_FILES) for entry in finished)
     assert not list((tmp_path / "set").glob(".brewster-*"))

@@ -106,7 +106,7 @@ def results(names=("a", "b"), method="compact", errors=None):
     }
 
 
-def make_tiles(name="a", method="compact", size=(40, 60), **changes):
+def make_thumbnails(name="a", method="compact", size=(40, 60), **changes):
     photo = np.full((*size, 3), 90, np.uint8)
     photo[: size[0] // 2] = 200  # bright at the top, dark at the bottom, so that the orientation is visible
     region = np.zeros(size, bool)
@@ -122,7 +122,7 @@ def page(tmp_path):
 
     def page(given=None, cases=None):
         path = tmp_path / "report.html"
-        write_report(given or results(), cases or [make_tiles("a"), make_tiles("b")], path)
+        write_report(given or results(), cases or [make_thumbnails("a"), make_thumbnails("b")], path)
         return Page(path.read_text("utf-8"))
 
     return page
@@ -163,13 +163,14 @@ def test_every_case_and_method_appears_with_scores_and_differences(page):
         "reflection region 25%",
         "60 \N{MULTIPLICATION SIGN} 40 px",
         "Nature20",
+        "on 2 images of 1 benchmark: original size, quality",
     ):
         assert text in made.text
     assert made.data()["scores"][1]["compact"] == {"psnr": 21.5, "psnr_region": None}
 
 
 def test_every_image_has_a_button_and_an_alternative_text(page):
-    made = page(cases=[make_tiles("a", reflection_ground_truth=np.zeros((40, 60, 3), np.uint8))])
+    made = page(cases=[make_thumbnails("a", reflection_ground_truth=np.zeros((40, 60, 3), np.uint8))])
     kinds = [has["data-kind"] for has in made.all("button", type="button") if "data-kind" in has]
     assert len(kinds) == len(made.all("img")) == 8
     assert [has["alt"] for has in made.all("img")] == [
@@ -193,7 +194,7 @@ def test_controls_have_labels_and_scrolling_areas_can_have_the_keyboard_focus(pa
 
 def test_the_same_input_gives_the_same_bytes(tmp_path):
     for name in ("one", "two"):
-        write_report(results(), iter([make_tiles("a"), make_tiles("b")]), tmp_path / name)
+        write_report(results(), iter([make_thumbnails("a"), make_thumbnails("b")]), tmp_path / name)
     assert (tmp_path / "one").read_bytes() == (tmp_path / "two").read_bytes()
 
 
@@ -206,8 +207,8 @@ def test_names_with_markup_are_escaped(page, name):
     given["benchmarks"]["nature20"] |= {"title": name, "remarks": [name], "excluded": [name]}
     given["metrics"]["psnr"] |= {"title": name, "about": name}
     made, plain = (
-        page(given, [make_tiles(name, name)]),
-        page(results(["a"], errors={"compact": "a"}), [make_tiles("a")]),
+        page(given, [make_thumbnails(name, name)]),
+        page(results(["a"], errors={"compact": "a"}), [make_thumbnails("a")]),
     )
     assert [tag for tag, _ in made.elements] == [tag for tag, _ in plain.elements]
     assert [set(has) for _, has in made.elements] == [set(has) for _, has in plain.elements]
@@ -297,7 +298,7 @@ def test_errors_are_listed_at_the_top_and_at_their_case(page):
         "scores": {"input (unprocessed)": {"psnr": 20.0}},
         "errors": {"compact": "no prediction"},
     }
-    made = page(given, [make_tiles("a", predictions={}, reflections={}), make_tiles("b")])
+    made = page(given, [make_thumbnails("a", predictions={}, reflections={}), make_thumbnails("b")])
     assert "Failed: compact on 1 of 2 images" in made.text
     assert "nature20/a, compact: no prediction" in made.text
     assert "Failed: no prediction" in made.text
@@ -306,7 +307,7 @@ def test_errors_are_listed_at_the_top_and_at_their_case(page):
 
 def test_a_long_list_of_errors_is_collapsed(page):
     given = results([f"{number}" for number in range(9)], errors={"compact": "no prediction"})
-    made = page(given, [make_tiles("0")])
+    made = page(given, [make_thumbnails("0")])
     assert "Failed: compact on 9 of 9 images" in made.text
     assert [has for has in made.all("details") if has.get("class") == "note" and "open" not in has]
     assert (
@@ -323,14 +324,14 @@ def test_a_long_list_of_errors_is_collapsed(page):
     [((40, 60), (60, 40)), ((600, 1200), (480, 240)), ((960, 320), (160, 480)), ((1, 2000), (480, 1))],
 )
 def test_images_are_downscaled_to_480_px_and_never_enlarged(page, size, embedded):
-    made = page(cases=[make_tiles("a", size=size)])
+    made = page(cases=[make_thumbnails("a", size=size)])
     assert {photo.size for photo in pictures(made).values()} == {embedded}
     assert {(has["width"], has["height"]) for has in made.all("img")} == {tuple(map(str, embedded))}
     assert max(embedded) <= MAX_SIDE_PX
 
 
 def test_images_keep_their_orientation_and_their_values(page):
-    photo = pictures(page(cases=[make_tiles("a", size=(700, 500))]))["photo, a"].pixels
+    photo = pictures(page(cases=[make_thumbnails("a", size=(700, 500))]))["photo, a"].pixels
     assert abs(photo[:200].astype(int) - 200).max() <= 6
     assert abs(photo[-200:].astype(int) - 90).max() <= 6
 
@@ -338,7 +339,7 @@ def test_images_keep_their_orientation_and_their_values(page):
 def test_images_are_downscaled_like_photo_resized(page, rng):
     photo = rng.integers(0, 255, (501, 733, 3)).astype(np.uint8)
     expected = Photo.from_array(Photo.from_array(photo, encoding="srgb").resized(480, 328), encoding="linear")
-    made = pictures(page(cases=[make_tiles("a", size=(501, 733), photo=photo)]))["photo, a"]
+    made = pictures(page(cases=[make_thumbnails("a", size=(501, 733), photo=photo)]))["photo, a"]
     expected = Photo.from_array(expected.srgb_8bit(), encoding="srgb")
     info = replace(expected.file_info, jpeg_quality=90)
     difference = abs(
@@ -348,7 +349,7 @@ def test_images_are_downscaled_like_photo_resized(page, rng):
 
 
 def test_the_overlay_is_coloured_inside_the_region_and_transparent_outside(page):
-    tint = pictures(page(cases=[make_tiles("a", size=(800, 600))]))["reflection region, a"]
+    tint = pictures(page(cases=[make_thumbnails("a", size=(800, 600))]))["reflection region, a"]
     assert tint.alpha[:239].min() > 50
     assert tint.alpha[241:].max() == 0
 
@@ -374,7 +375,7 @@ def test_a_downscaled_error_map_averages_the_errors():
 
 def test_error_maps_are_embedded_losslessly(page, rng):
     truth, photo = rng.integers(0, 255, (2, 40, 60, 3)).astype(np.uint8)
-    made = pictures(page(cases=[make_tiles("a", photo=photo, ground_truth=truth)]))
+    made = pictures(page(cases=[make_thumbnails("a", photo=photo, ground_truth=truth)]))
     assert (made["error of the photo, a"].pixels == error_map(photo, truth)).all()
 
 
@@ -392,7 +393,7 @@ def test_cases_are_read_and_freed_one_at_a_time(tmp_path):
     def cases():
         for number in range(6):
             assert sum(case() is not None for case in alive) <= 1  # the case that was just written
-            case = make_tiles(f"{number}")
+            case = make_thumbnails(f"{number}")
             alive.append(weakref.ref(case))
             yield case
             del case
@@ -403,16 +404,16 @@ def test_cases_are_read_and_freed_one_at_a_time(tmp_path):
 
 def test_a_report_replaces_an_older_one_atomically(tmp_path):
     def broken():
-        yield make_tiles("a")
+        yield make_thumbnails("a")
         raise ValueError
 
     path = tmp_path / "new" / "report.html"
-    write_report(results(), [make_tiles("a")], path)
+    write_report(results(), [make_thumbnails("a")], path)
     before = path.read_bytes()
     with pytest.raises(ValueError):  # noqa: PT011
         write_report(results(), broken(), path)
     assert path.read_bytes() == before
-    write_report(results(), [make_tiles("b")], path)
+    write_report(results(), [make_thumbnails("b")], path)
     assert path.read_bytes() != before
     assert [file.name for file in path.parent.iterdir()] == ["report.html"]
 
@@ -420,9 +421,9 @@ def test_a_report_replaces_an_older_one_atomically(tmp_path):
 def test_a_path_that_cannot_be_written_is_an_error_that_names_it(tmp_path):
     (tmp_path / "report.html").mkdir()
     with pytest.raises(OutputError, match=r"report\.html was not written \(.*\); .* run again"):
-        write_report(results(), [make_tiles("a")], tmp_path / "report.html")
+        write_report(results(), [make_thumbnails("a")], tmp_path / "report.html")
     assert not list(tmp_path.glob(".brewster-*"))
 
 
 def test_a_case_that_is_not_in_the_results_is_shown_without_scores(page):
-    assert page(cases=[make_tiles("unknown")]).data()["scores"] == [{}]
+    assert page(cases=[make_thumbnails("unknown")]).data()["scores"] == [{}]

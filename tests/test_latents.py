@@ -10,7 +10,7 @@ from brewster.errors import PhotoError, RecipeError
 from brewster.models.diffusion.backbones.registry import tiny
 from brewster.models.diffusion.panels import PanelLayout, fit_panel, split
 from brewster.photo import Photo
-from brewster.rendered.store import read_set
+from brewster.rendered.store import read_dataset
 from brewster.training.data.mixtures import Pairs
 from brewster.training.data.sample_rng import SampleRng
 from brewster.training.lora.latents import (
@@ -72,7 +72,7 @@ def test_panels_show_the_whole_sample_in_its_aspect_ratio(recipe, root, backbone
     lora_recipe = recipe(RENDERED)
     samples = open_samples(lora_recipe)
     assert len(samples) == 3
-    for number, entry in enumerate(read_set(root / "set")):
+    for number, entry in enumerate(read_dataset(root / "set")):
         fit = fit_sample(samples[number].layers, lora_recipe, backbone.size_divisor)
         panels = make_panels(samples[number].layers, fit)
         assert (fit.content, fit.panel) == ((24, 16), (32, 16))

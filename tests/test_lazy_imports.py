@@ -9,7 +9,7 @@ from huggingface_hub import errors as hub_errors
 
 from brewster.errors import DownloadError, MissingExtra
 from brewster.models.diffusion.backbones.loading import encode_prompt, load_backbone
-from brewster.models.diffusion.lazy_imports import import_library
+from brewster.models.diffusion.lazy_imports import diffusers_class, import_library
 
 
 def hub_error(error_class, status, **headers):
@@ -66,6 +66,15 @@ def test_a_missing_library_names_the_extra(monkeypatch):
     monkeypatch.setitem(sys.modules, "bitsandbytes", None)
     with pytest.raises(MissingExtra, match=r"pip install 'brewster\[diffusion\]'"):
         import_library("bitsandbytes")
+
+
+def test_a_class_that_diffusers_does_not_have_or_cannot_import_is_an_error(monkeypatch):
+    with pytest.raises(MissingExtra, match=r"NoSuchPipeline cannot .*no attribute NoSuchPipeline.*--upgrade"):
+        diffusers_class("NoSuchPipeline")
+    module = "diffusers.pipelines.ddim.pipeline_ddim"
+    monkeypatch.setitem(sys.modules, module, None)
+    with pytest.raises(MissingExtra, match=f"DDIMPipeline cannot be imported .*import of {module} halted"):
+        diffusers_class("DDIMPipeline")
 
 
 def test_libraries_are_imported_when_a_model_is_built_and_print_nothing(tmp_path):

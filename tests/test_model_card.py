@@ -63,13 +63,14 @@ def test_a_lora_of_a_tiny_version_is_marked_and_names_no_base_model():
     text = card("lora-tiny")
     assert "**This model is for software tests.**" in text
     assert "base_model" not in ModelCard(text).data.to_dict()
+    assert "tiny" in ModelCard(text).data.tags
     assert "**This model is for software tests.**" not in card()
 
 
 def test_datasets_are_listed_with_their_scenes_and_without_local_paths(tmp_path, monkeypatch):
     render_set(tmp_path / "sets" / "paper", count=3)
     monkeypatch.setenv("BREWSTER_DATA", str(tmp_path))
-    listed = "`sets/paper` (3 samples of the scenes `tiny`, orders all)"
+    listed = "`sets/paper` (3 samples of the scene recipe `tiny`, orders all)"
     assert listed in card()
     elsewhere = {"rendered": {"datasets": [str(tmp_path / "sets" / "paper")]}}
     assert "`paper` (3 samples" in card(data=elsewhere)
@@ -85,6 +86,8 @@ def test_pairs_and_their_share_are_listed():
     )
     assert "75% of the samples: the first 7 samples of `a`." in text
     assert "Real pairs, 25% of the samples: real/train." in text
+    two = card(data={"rendered": {"datasets": ["a", "b"], "count": 7}})
+    assert "the first 7 samples of these datasets together, in this order: `a`; `b`." in two
     assert "photo minus transmission, in linear light" in text
 
 
@@ -107,10 +110,12 @@ def test_settings_and_scores_are_listed():
 def test_benchmark_tables_replace_earlier_ones():
     once = with_benchmark_tables(card(), "| a | 1 |\n")
     twice = with_benchmark_tables(once, "### Real20\n\n| b | 2 |")
-    assert "\n## Measured\n\n| a | 1 |\n\n## Limits\n" in once
-    assert "\n## Measured\n\n### Real20\n\n| b | 2 |\n\n## Limits\n" in twice
-    assert twice.partition("## Measured")[0] == card().partition("## Measured")[0]
-    with pytest.raises(ModelError, match="has no section for benchmarks; expected the heading '## Measured'"):
+    assert "\n## Benchmark scores\n\n| a | 1 |\n\n## Limits\n" in once
+    assert "\n## Benchmark scores\n\n### Real20\n\n| b | 2 |\n\n## Limits\n" in twice
+    assert twice.partition("## Benchmark scores")[0] == card().partition("## Benchmark scores")[0]
+    with pytest.raises(
+        ModelError, match="has no section for benchmarks; expected the heading '## Benchmark scores'"
+    ):
         with_benchmark_tables("# somebody else's", "| a | 1 |")
 
 

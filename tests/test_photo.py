@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 from PIL import Image, ImageOps
 
-from brewster.errors import MissingExtra, OutputError, PhotoError, UnsupportedPhoto
+from brewster.errors import MissingExtra, OutputError, PhotoError, UnreadablePhoto, UnsupportedPhoto
 from brewster.image_formats import FORMATS
 from brewster.photo import FileInfo, Photo
 from picture_files import exif_block, file_of, pil, smooth
@@ -150,6 +150,26 @@ def test_radiance_images_round_trip_bit_equal_and_run_lengths_are_decoded() -> N
         again = Photo.open(photo.encode())
         assert np.array_equal(again.pixels, photo.pixels)
         assert again.file_info.header == {"EXPOSURE": "2"}
+
+
+def test_run_lengths_of_old_radiance_images_are_decoded() -> None:
+    """The pixel (1, 1, 1, n) repeats the pixel before it n times; the next such pixel counts 256 times as much."""
+    first, second, third = (bytes((128, 2, level, 129)) for level in (3, 4, 5))
+    body = first + bytes((1, 1, 1, 43, 1, 1, 1, 1)) + second + third + bytes((1, 1, 1, 42, 1, 1, 1, 1))
+    head = b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 2 +X 300\n"
+    flat = first * 300 + second + third * 299
+    np.testing.assert_array_equal(Photo.open(head + body).linear(), Photo.open(head + flat).linear())
+    for damaged in (body[:-4], body + first, body[4:]):
+        with pytest.raises(UnreadablePhoto, match="is truncated or damaged"):
+            Photo.open(head + damaged)
+
+
+def test_repeated_factors_of_a_radiance_header_are_multiplied() -> None:
+    """The exposure of an image is the product of all EXPOSURE lines."""
+    head = b"#?RADIANCE\nEXPOSURE=2\nVIEW=a\nEXPOSURE= 0.25\nCOLORCORR=1 2 3\nCOLORCORR=2 2 0.5\nVIEW=b\n"
+    photo = Photo.open(head + b"\n-Y 1 +X 1\n" + bytes((128, 64, 32, 129)))
+    header = {"EXPOSURE": "0.5", "VIEW": "b", "COLORCORR": "2 4 1.5"}
+    assert photo.file_info.header == Photo.open(photo.encode()).file_info.header == header
 
 
 @pytest.mark.parametrize("width", [1 << 15, 1 << 16])

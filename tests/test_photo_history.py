@@ -2,6 +2,7 @@
 
 import struct
 import xml.etree.ElementTree as ET
+import zlib
 
 import numpy as np
 import pytest
@@ -103,6 +104,34 @@ def test_damaged_metadata_never_stop_a_separation(garbage, byte_order, offset, x
     exif = byte_order + struct.pack("<I", offset) + garbage
     info = with_history(FileInfo(exif=exif, xmp=xmp), SOFTWARE, {})
     assert metadata.orientation_of(info.exif) in range(1, 9)
+
+
+def test_the_xmp_of_a_png_is_found_next_to_other_texts_and_where_other_programs_write_it(tmp_path):
+    path = tmp_path / "a.png"
+    data = SEPARATOR(file_of(smooth(), "PNG")).transmission.encode("png")
+    chunks = dict(metadata.png_chunks(data))
+    xmp = zlib.decompress(chunks[b"zTXt"].removeprefix(b"XML:com.adobe.xmp\0\0"))
+
+    def write(*before_pixels, after_pixels=b""):
+        start, end = data.index(b"IDAT") - 4, len(data) - 12
+        header = data[: 8 + 12 + 13]
+        path.write_bytes(b"".join((header, *before_pixels, data[start:end], after_pixels, data[end:])))
+        Photo.open(path)  # the file is a valid PNG
+        return recorded_parameters(path, "brewster")
+
+    def chunk(name, content):
+        body = name + content
+        return struct.pack(">I", len(content)) + body + struct.pack(">I", zlib.crc32(body))
+
+    comment = chunk(b"zTXt", b"Comment\0\0" + zlib.compress(b"a comment"))
+    compressed = chunk(b"zTXt", chunks[b"zTXt"])
+    uncompressed = chunk(b"iTXt", b"XML:com.adobe.xmp" + bytes(5) + xmp)
+    path.write_bytes(data)
+    expected = recorded_parameters(path, "brewster")
+    assert expected["model"] == "a & <b>"
+    assert write(comment) is None
+    assert write(comment, compressed) == write(compressed, comment) == expected
+    assert write(uncompressed) == write(comment, after_pixels=uncompressed) == expected
 
 
 def test_a_file_without_history_or_without_a_name_has_no_parameters(tmp_path):

@@ -83,7 +83,7 @@ def test_white_is_white_at_every_bit_depth(format_name: str, bits: int) -> None:
 
 
 @pytest.mark.parametrize("bits", [10, 12])
-def test_avif_of_ten_and_twelve_bits_keeps_them_and_its_white(bits: int) -> None:
+def test_avif_keeps_10_and_12_bits_and_white(bits: int) -> None:
     levels = np.linspace(0, 2**bits - 1, 2**bits).round().astype(np.uint16)
     shifted = np.repeat((levels << (16 - bits)).reshape(32, -1, 1), 3, axis=2)
     photo = Photo.open(Photo(shifted, None, FileInfo(format_name="avif", bits=bits, lossless=True)).encode())
@@ -173,7 +173,7 @@ def test_damaged_exif_does_not_prevent_reading_and_writing(
         assert Photo.open(photo.encode(format_name)).size == photo.size
 
 
-def test_code_points_of_display_p3_give_its_profile() -> None:
+def test_a_png_with_the_cicp_chunk_of_display_p3_gets_its_profile() -> None:
     chunk = b"cICP" + bytes((12, 13, 0, 1))
     data = file_of(smooth(), "PNG")
     sized = struct.pack(">I", 4) + chunk + struct.pack(">I", zlib.crc32(chunk))
@@ -183,7 +183,7 @@ def test_code_points_of_display_p3_give_its_profile() -> None:
 
 
 @pytest.mark.parametrize("order", ["<", ">"])
-def test_the_thumbnail_of_the_input_is_unlinked_and_nothing_else_changes(order):
+def test_upright_exif_resets_the_orientation_unlinks_the_thumbnail_and_keeps_all_other_bytes(order):
     mark = b"II*\0" if order == "<" else b"MM\0*"
     entry = struct.pack(f"{order}HHIHH", 274, 3, 1, 8, 0)
     block = (

@@ -182,11 +182,25 @@ def test_an_exr_without_colour_channels_is_refused() -> None:
     header = {"compression": exr.ZIP_COMPRESSION, "type": exr.scanlineimage}
     exr.File(header, {"Z": np.zeros((4, 4), np.float32)}).write(file)
     assert_refused(file.getvalue(), UnsupportedPhoto, "channels Z")
+    file = io.BytesIO()
+    exr.File(header, {name: np.zeros((4, 4), np.float32) for name in ("Y", "RY", "BY")}).write(file)
+    assert_refused(
+        file.getvalue(), UnsupportedPhoto, "channels BY, RY, Y; expected the channels R, G and B, or Y alone"
+    )
 
 
 def test_a_radiance_image_with_xyz_or_rotated_lines_is_refused() -> None:
-    for head in (b"FORMAT=32-bit_rle_xyze\n\n-Y 1 +X 1\n", b"FORMAT=32-bit_rle_rgbe\n\n+Y 1 +X 1\n"):
-        assert_refused(b"#?RADIANCE\n" + head + bytes(4), UnsupportedPhoto, "RGBE")
+    for head, message in (
+        (
+            b"FORMAT=32-bit_rle_xyze\n\n-Y 1 +X 1\n",
+            "XYZ colours .*; expected RGBE colours; export the image as RGBE",
+        ),
+        (
+            b"FORMAT=32-bit_rle_rgbe\n\n+Y 1 +X 1\n",
+            "ends in .*; expected an RGBE image with scan lines from top",
+        ),
+    ):
+        assert_refused(b"#?RADIANCE\n" + head + bytes(4), UnsupportedPhoto, message)
 
 
 @pytest.mark.parametrize(("height", "width"), [(0, 8), (8, 0), (0, 0)])

@@ -62,7 +62,7 @@ contrast = [0, 1]
     ]
 
 
-def test_a_key_in_the_wrong_table_is_named_with_its_own(problems):
+def test_a_key_in_the_wrong_table_suggests_the_right_table(problems):
     [line] = problems('name = "mine"\nabout = ""\nfov_deg = [30, 40]')
     assert line.endswith("did you mean camera.fov_deg?")
 
@@ -79,7 +79,7 @@ def test_a_misspelt_choice_is_corrected_and_an_unknown_key_lists_the_known_ones(
     assert any("expected a key of [glass], one of double_probability, gap_mm" in line for line in lines)
 
 
-def test_problems_of_a_training_recipe_are_reported_alike(problems):
+def test_problems_of_a_training_recipe_are_reported_in_the_same_way(problems):
     text = 'backbone = "kontext"\nrnk = 4\nseed = 1.5\npanel_weights = { X = 1 }\n[data]\npairs = ["a"]\npairs_share = 3'
     found = "\n".join(problems(text, read_recipe))
     assert "seed is 1.5; expected an integer" in found
@@ -92,7 +92,7 @@ def test_problems_of_a_training_recipe_are_reported_alike(problems):
     assert "there is no key rnk (its value is 4); expected a key of the recipe; did you mean rank?" in found
 
 
-def test_an_error_with_several_problems_survives_another_process(problems, tmp_path):
+def test_an_error_with_several_problems_can_be_pickled(problems, tmp_path):
     (tmp_path / "mine.toml").write_text("")
     with pytest.raises(RecipeError) as caught:
         read_toml(SceneRecipe, tmp_path / "mine.toml", reference="docs/recipes.md")
@@ -123,7 +123,7 @@ def test_a_scene_recipe_that_is_printed_and_read_is_the_same(name):
 @pytest.mark.parametrize("name", [*TEMPLATES, *map(str, TRAINING)])
 def test_a_training_recipe_that_is_printed_and_read_is_the_same(name):
     if "ablations" in name and "benchmarks" in Path(name).read_text():
-        pytest.skip("an ablation")
+        pytest.skip("an ablation file is not a training recipe")
     recipe = read_template(name)
     assert type(recipe).model_validate(tomllib.loads(commented_toml(recipe))) == recipe
 

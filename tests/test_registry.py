@@ -18,7 +18,7 @@ from benchmark_folders import (
 from brewster.benchmarks import registry
 from brewster.benchmarks.pairing import natural_key
 from brewster.benchmarks.registry import BENCHMARKS, Benchmark, Case, ImageFile, read_benchmark
-from brewster.benchmarks.selection import PAPER_SEED, paper_draw, with_unique_names
+from brewster.benchmarks.selection import PAPER_SEED, paper_subset, with_unique_names
 from brewster.errors import PhotoError, UnreadablePhoto
 from brewster.photo import Photo
 from picture_files import exif_block, file_of, smooth
@@ -389,58 +389,58 @@ def test_a_file_that_is_missing_or_too_short_is_an_error_in_three_parts(tmp_path
             file.read()
 
 
-# --- the paper's draw
+# --- the subsets of the paper
 
 
-def test_the_draw_takes_one_shot_of_each_scene(subsets):
+def test_the_subset_of_the_paper_has_one_shot_of_each_scene(subsets):
     for name in ("postcard", "solidobject"):
-        drawn = paper_draw(subsets[name])
+        drawn = paper_subset(subsets[name])
         assert len(drawn) == len({case.scene for case in drawn}) == 20
         assert set(drawn) <= set(subsets[name].cases)
         assert [case.scene for case in drawn] == sorted((case.scene for case in drawn), key=natural_key)
-        assert drawn != paper_draw(subsets[name], seed=PAPER_SEED + 1)
-    assert paper_draw(subsets["wildscene"]) == subsets["wildscene"].cases
+        assert drawn != paper_subset(subsets[name], seed=PAPER_SEED + 1)
+    assert paper_subset(subsets["wildscene"]) == subsets["wildscene"].cases
 
 
-def test_the_published_draw_never_changes(subsets):
-    solid = {case.scene: case.name for case in paper_draw(subsets["solidobject"])}
+def test_the_published_subset_never_changes(subsets):
+    solid = {case.scene: case.name for case in paper_subset(subsets["solidobject"])}
     assert " ".join(solid[str(scene)].split("-", 1)[1] for scene in range(1, 11)) == (
         "Focus-16 Focus-19 Focus-11 Focus-11 Thick-10 Thick-10 Focus-22 Focus-11 Focus-32 Thick-3"
     )
 
 
-def test_the_draw_of_a_scene_depends_on_no_other_scene(subsets, tmp_path):
-    full = {case.scene: case.name for case in paper_draw(subsets["postcard"])}
-    few = paper_draw(only("postcard", postcard(tmp_path, POSTCARD_SCENES[3:6])))
+def test_the_drawn_case_of_a_scene_depends_on_no_other_scene(subsets, tmp_path):
+    full = {case.scene: case.name for case in paper_subset(subsets["postcard"])}
+    few = paper_subset(only("postcard", postcard(tmp_path, POSTCARD_SCENES[3:6])))
     assert {case.scene: case.name for case in few} == {scene: full[scene] for scene in POSTCARD_SCENES[3:6]}
 
 
-def test_the_draw_does_not_depend_on_the_order_of_cases(subsets, original, monkeypatch):
+def test_the_subset_does_not_depend_on_the_order_of_cases(subsets, original, monkeypatch):
     listing = registry.Path.iterdir
     monkeypatch.setattr(registry.Path, "iterdir", lambda path: iter(sorted(listing(path), reverse=True)))
-    assert paper_draw(only("solidobject", original)) == paper_draw(subsets["solidobject"])
+    assert paper_subset(only("solidobject", original)) == paper_subset(subsets["solidobject"])
 
 
-def test_a_repacked_set_whose_names_identify_the_scenes_can_be_drawn(tmp_path):
+def test_a_repacked_set_whose_names_identify_the_scenes_has_a_subset(tmp_path):
     read = only("solidobject", repacked(tmp_path, ["1-Focus-11", "1-Focus-13", "12_Thick_3", "2-x"]))
     assert [case.scene for case in read.cases] == ["1", "1", "2", "12"]
-    assert [case.scene for case in paper_draw(read)] == ["1", "2", "12"]
+    assert [case.scene for case in paper_subset(read)] == ["1", "2", "12"]
 
 
 @pytest.mark.parametrize("stems", [["ab-1", "7"], ["1", "2"], [f"{number}-m" for number in range(21)]])
 @pytest.mark.parametrize("name", ["postcard", "solidobject"])
-def test_a_repacked_set_whose_names_do_not_identify_the_scenes_cannot_be_drawn(tmp_path, name, stems):
+def test_a_repacked_set_whose_names_do_not_identify_the_scenes_has_no_subset(tmp_path, name, stems):
     read = only(name, repacked(tmp_path, stems))
     assert [case.scene for case in read.cases] == names(read.cases)
     assert (
-        "the file names do not identify the scenes, so the paper's draw of one case per scene is not possible"
+        "the file names do not identify the scenes, so the subset of the paper (one case of each scene) cannot be drawn"
         in read.remarks
     )
     with pytest.raises(PhotoError, match=r"do not identify the scenes of SIR2 .*; .*; .*"):
-        paper_draw(read)
+        paper_subset(read)
 
 
-def test_the_draw_from_other_benchmarks_is_the_whole_benchmark(tmp_path):
+def test_the_subset_of_other_benchmarks_is_the_whole_benchmark(tmp_path):
     for name, folder in (("real20", "r"), ("pairs", "mine"), ("pairs", "postcard")):
         read = only(name, repacked(tmp_path / folder, ["a", "b"]))
-        assert paper_draw(read) == read.cases
+        assert paper_subset(read) == read.cases

@@ -67,7 +67,7 @@ def test_folders_and_shards_read_alike(four_samples, tmp_path):
     shutil.copytree(four_samples, packed)
     store.pack(packed, 0)
     assert not list(packed.glob("0000*"))
-    folders, members = list(store.read_set(four_samples)), list(store.read_set(packed))
+    folders, members = list(store.read_dataset(four_samples)), list(store.read_dataset(packed))
     assert [entry.index for entry in folders] == [entry.index for entry in members] == [0, 1, 2, 3]
     for one, other in zip(folders, members, strict=True):
         assert all(one.read(name) == other.read(name) for name in store.SAMPLE_FILES)
@@ -106,7 +106,7 @@ def test_packing_removes_folders_of_samples_in_the_shard(four_samples, tmp_path)
     store.pack(tmp_path / "set", 0)
     shard = (tmp_path / "set" / "shard-000000.tar").read_bytes()
     shutil.copytree(four_samples / "000002", tmp_path / "set" / "000002")
-    entries = list(store.read_set(tmp_path / "set"))
+    entries = list(store.read_dataset(tmp_path / "set"))
     assert [entry.index for entry in entries] == [0, 1, 2, 3]
     assert {entry.path.name for entry in entries} == {"shard-000000.tar"}
     store.pack(tmp_path / "set", 0)
@@ -135,19 +135,19 @@ def test_a_damaged_scene_is_reported(four_samples, tmp_path):
     for text in ("no toml", "seed = 'seven'"):
         (tmp_path / "set" / "000000" / store.SCENE_FILE).write_text(text)
         with pytest.raises(RecipeError, match="000000"):
-            store.open_sample(next(store.read_set(tmp_path / "set")))
+            store.open_sample(next(store.read_dataset(tmp_path / "set")))
 
 
 def test_samples_beyond_a_million_keep_their_order(tmp_path):
     for index in (1_000_000, 999_999, 5):
         store.write_folder(tmp_path / store.key(index), {"a": b""})
-    assert [entry.index for entry in store.read_set(tmp_path)] == [5, 999_999, 1_000_000]
+    assert [entry.index for entry in store.read_dataset(tmp_path)] == [5, 999_999, 1_000_000]
 
 
 def test_the_index_has_a_row_with_the_parameters_of_each_sample(four_samples, monkeypatch):
     table = parquet.read_table(four_samples / preview.INDEX_FILE).to_pylist()
     assert [row["index"] for row in table] == [0, 1, 2, 3]
-    for row, entry in zip(table, store.read_set(four_samples), strict=True):
+    for row, entry in zip(table, store.read_dataset(four_samples), strict=True):
         _, scene = store.open_sample(entry)
         pane = scene.glass.panes[0]
         assert (row["thickness_mm"], row["refractive_index"]) == (pane.thickness_mm, pane.refractive_index)
@@ -156,7 +156,7 @@ def test_the_index_has_a_row_with_the_parameters_of_each_sample(four_samples, mo
         assert row["front_map_file"] == (scene.front.map and scene.front.map.source.file)
         assert row["behind_plane_distance_mm"] == (scene.behind.plane and scene.behind.plane.distance_mm)
         assert (row["seed"], row["recipe"], row["renderer"]) == (7, "tiny", "fake_renderer:render")
-        assert row["place"] == entry.path.name
+        assert row["path"] == entry.path.name
         assert row["reflection_to_transmission"] == pytest.approx(1, abs=0.2)
 
 

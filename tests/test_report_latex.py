@@ -79,7 +79,7 @@ def test_a_mean_over_fewer_images_has_a_dagger_and_no_mark(results):
 def test_the_papers_draw_replaces_the_whole_benchmark(results):
     for part in ("selections", "tables", "differences"):
         results[part]["postcard:paper"] = results[part]["postcard"]
-    results["selections"]["postcard:paper"] = {"title": "Postcard, the paper's draw", "cases": 7}
+    results["selections"]["postcard:paper"] = {"title": "Postcard, subset of the paper", "cases": 7}
     text = to_latex(results)
     assert "Postcard (7)" in text
     assert "Postcard (20)" not in text

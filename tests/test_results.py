@@ -136,7 +136,8 @@ def test_the_papers_average_uses_only_the_papers_benchmarks_and_reports_missing_
     results = summarise(parts, methods, config, make_rows(parts, methods, lambda *_: 1.0))
     assert results["selections"]["average"]["cases"] == 30
     assert (
-        "over 181 images; this one is over 20 of real20, 10 of nature20" in results["protocol"]["choices"][-1]
+        "over 181 images. The average of this evaluation is over 20 of real20, 10 of nature20."
+        in results["protocol"]["choices"][-1]
     )
 
 
@@ -147,7 +148,7 @@ def test_a_requested_metric_without_a_score_is_listed(methods):
     assert results["unmeasured"] == ["kept_reflection"]
 
 
-def test_the_papers_draw_is_an_error_if_names_do_not_identify_the_scenes(tmp_path, methods):
+def test_the_subset_of_the_paper_is_an_error_if_names_do_not_identify_the_scenes(tmp_path, methods):
     repacked(tmp_path / "postcard", ["001", "002"])
     parts = read_benchmark("postcard", tmp_path / "postcard")
     with pytest.raises(BrewsterError, match="scene"):

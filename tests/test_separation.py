@@ -204,7 +204,7 @@ def test_a_client_that_disconnects_stops_the_work():
             task.cancel()
             await asyncio.wait([task])
         backend.proceed.set()
-        while job_queue.jobs:
+        while job_queue.job_count:
             await asyncio.sleep(0.001)
 
     asyncio.run(leave())
@@ -222,7 +222,7 @@ def test_a_full_server_returns_retry_after_and_continues():
         async with client(make_app(backend, job_queue=job_queue)) as http:
             first = [asyncio.create_task(http.post("/separate", **form(SMALL))) for _ in range(2)]
             await asyncio.to_thread(backend.started.wait)
-            while job_queue.jobs < 2:
+            while job_queue.job_count < 2:
                 await asyncio.sleep(0.001)
             health = (await http.get("/health")).json()
             late = await http.post("/separate", **form(SMALL))

@@ -71,7 +71,10 @@ def test_a_folder_that_is_missing_or_without_images_is_named(recipe, root, kind)
 
 def test_an_unset_data_folder_is_an_error(recipe, monkeypatch):
     monkeypatch.delenv("BREWSTER_DATA", raising=False)
-    with pytest.raises(RecipeError, match="BREWSTER_DATA"):
+    with pytest.raises(RecipeError, match="BREWSTER_DATA is not set; expected an existing folder"):
+        open_stream(with_data(recipe, photos=["photos"]))
+    monkeypatch.setenv("BREWSTER_DATA", "/no/such/folder")
+    with pytest.raises(RecipeError, match="BREWSTER_DATA is '/no/such/folder'; expected an existing folder"):
         open_stream(with_data(recipe, photos=["photos"]))
 
 

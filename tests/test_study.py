@@ -181,23 +181,23 @@ def test_an_invalid_description_is_refused_with_the_key_of_the_error(tmp_path):
 def test_catch_pictures_are_clearly_degraded_outputs(tmp_path):
     study = make_study(tmp_path, size=(96, 72))
     for catch in study.description.catch_pool:
-        good, spoilt = (
-            Photo.open(study.picture_file(name)).pixels.astype(float) for name in (catch.good, catch.spoilt)
+        good, degraded = (
+            Photo.open(study.picture_file(name)).pixels.astype(float) for name in (catch.good, catch.degraded)
         )
-        assert good.shape == spoilt.shape
-        assert 10 * np.log10(255**2 / np.mean((good - spoilt) ** 2)) < 22
+        assert good.shape == degraded.shape
+        assert 10 * np.log10(255**2 / np.mean((good - degraded) ** 2)) < 22
         outputs = {name for row in study.description.comparisons for name in row.outputs}
         assert catch.good in outputs
-        assert catch.spoilt not in outputs
+        assert catch.degraded not in outputs
 
 
 def test_degrading_preserves_the_mean_of_dark_and_light_pictures(rng):
     for level in (20, 128, 235):
         flat = np.full((60, 80, 3), level, np.uint8)
-        spoilt = degrade(flat, 1)
-        assert spoilt.astype(float).std() > 10
-        assert abs(spoilt.mean() - level) < 12
-    assert np.array_equal(degrade(flat, 1), spoilt)
+        degraded = degrade(flat, 1)
+        assert degraded.astype(float).std() > 10
+        assert abs(degraded.mean() - level) < 12
+    assert np.array_equal(degrade(flat, 1), degraded)
 
 
 def test_a_moved_study_stays_valid(tmp_path):

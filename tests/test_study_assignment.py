@@ -44,7 +44,7 @@ def test_no_participant_sees_one_method_much_more_often_on_one_side(sizes, seed,
 
 
 def test_a_study_with_the_size_of_the_paper_is_balanced():
-    """100 participants with 40 of 2 x 181 pairs each."""
+    """100 participants; each answers 40 of the 362 comparisons (181 photos, 2 comparisons each)."""
     participants = assigned_items(362, 40, 1, 100)
     rights = [sum(flipped for _, flipped in items) for items in participants]
     assert min(rights) >= 18
@@ -83,9 +83,9 @@ def test_catch_trials_have_both_kinds_and_use_photos_of_no_other_trial():
     for number in range(20):
         trials = draw_trials(study, number)
         catch_trials = [trial for trial in trials if trial.expected]
-        assert Counter("equal" if trial.left == trial.right else "spoilt" for trial in catch_trials) == {
+        assert Counter("equal" if trial.left == trial.right else "degraded" for trial in catch_trials) == {
             "equal": 2,
-            "spoilt": 2,
+            "degraded": 2,
         }
         assert not {trial.photo for trial in catch_trials} & {
             trial.photo for trial in trials if not trial.expected

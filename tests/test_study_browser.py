@@ -102,7 +102,7 @@ def test_the_whole_study_works_with_the_keyboard_only(open_page, url, store):
     assert all(0.3 < answer.seconds < 60 for answer in answers.values())
     shown = answers[0].conditions
     assert (shown.viewport_width, shown.viewport_height, shown.pixel_ratio) == (1280, 720, 1)
-    assert (shown.theme, shown.pointer, shown.view, shown.flips) == ("light", "fine", "all", 0)
+    assert (shown.theme, shown.pointer, shown.view, shown.switches) == ("light", "fine", "all", 0)
 
 
 def test_a_participant_continues_on_another_device_with_the_personal_link_only(open_page, url):
@@ -210,7 +210,7 @@ def test_results_can_be_swapped_in_place_at_a_larger_size(open_page, url, store)
     press(page, "3")
     expect(page.get_by_text("Pair 2 of 4").first).to_be_visible()
     ((_, answers),) = store.all_answers()
-    assert (answers[0].conditions.view, answers[0].conditions.flips) == ("single", 4)
+    assert (answers[0].conditions.view, answers[0].conditions.switches) == ("single", 4)
 
 
 def test_the_last_answer_can_be_undone_also_after_the_last_trial(open_page, url, store):

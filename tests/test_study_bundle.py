@@ -24,7 +24,7 @@ CONDITIONS = {
     "theme": "dark",
     "pointer": "fine",
     "view": "all",
-    "flips": 2,
+    "switches": 2,
     "zoomed": False,
 }
 

@@ -199,3 +199,24 @@ def test_a_reader_creates_no_database_and_sees_new_answers(store):
     empty = make_empty_study(store.study.folder / "empty")
     assert answers_by_participant(AnswerStore(empty, read_only=True)) == {}
     assert not empty.answers_file.exists()
+
+
+def test_all_answers_are_read_from_one_state_of_the_database(store):
+    """Another process withdraws an answer and admits a participant while the answers are being read."""
+    participant = store.participant(store.admit())
+    store.record_answer(participant, 0, "left", seconds=2)
+    other = AnswerStore(store.study)
+
+    def change(statement):
+        if "FROM withdrawn" in statement:
+            other.withdraw_answer(participant, 0)
+            other.admit()
+
+    store._database.set_trace_callback(change)
+    read = answers_by_participant(store)
+    store._database.set_trace_callback(None)
+    assert {
+        number: {trial: a.withdrawn for trial, a in answers.items()} for number, answers in read.items()
+    } == {0: {0: ()}}
+    assert answers_by_participant(store) == {0: {}, 1: {}}
+    other.close()

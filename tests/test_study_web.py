@@ -118,7 +118,7 @@ def test_the_practice_pair_has_a_known_answer_and_its_pictures(app, store, study
     assert practice == {"width": 24, "height": 18, "expected": trial.expected}
     better = getattr(trial, practice["expected"])
     assert better in {catch.good for catch in study.description.catch_pool}
-    assert {trial.left, trial.right} - {better} <= {catch.spoilt for catch in study.description.catch_pool}
+    assert {trial.left, trial.right} - {better} <= {catch.degraded for catch in study.description.catch_pool}
     for side in ("photo", "left", "right"):
         shown = request(app, "GET", f"{link}/pictures/practice/{side}").content
         assert shown == study.picture_file(getattr(trial, side)).read_bytes()
@@ -144,7 +144,7 @@ def test_only_the_last_answer_can_be_withdrawn_and_a_second_withdrawal_changes_n
 def test_viewing_conditions_are_stored_and_others_are_refused(app, store):
     conditions = {
         "viewport_width": 1280, "viewport_height": 800, "pixel_ratio": 1.5, "picture_width": 417, "theme": "dark",
-        "pointer": "fine", "view": "single", "flips": 3, "zoomed": False,
+        "pointer": "fine", "view": "single", "switches": 3, "zoomed": False,
     }  # fmt: skip
     link = admit_participant(app)
     given = {"trial": 0, "choice": "left", "seconds": 2}

@@ -8,7 +8,7 @@ import brewster.training.data.rendered as rendered_module
 from brewster.errors import PhotoError, RecipeError
 from brewster.photo import Photo
 from brewster.render.camera_response import encode_jpeg
-from brewster.rendered.store import read_scene_of, read_set
+from brewster.rendered.store import read_dataset, read_scene_of
 from brewster.training.data.alpha_blend import blended_layers
 from brewster.training.data.rendered import CachedRendered, RenderedDatasets
 from set_folders import render_set
@@ -42,14 +42,14 @@ class FakeOnline:
 def test_a_sample_is_its_photo_its_target_and_its_reflection(folder):
     for target in ("background", "transmission"):
         stream = RenderedDatasets([folder], seed=1, target=target)
-        for number, entry in enumerate(read_set(folder)):
+        for number, entry in enumerate(read_dataset(folder)):
             pictures = [pixels(entry.read(f"{name}.jpg")) for name in ("photo", target, "reflection")]
             assert torch.equal(stream.sample(number), torch.cat(pictures, dim=2))
 
 
 def test_an_8_bit_sample_is_the_blend_of_its_own_background_and_mirror(folder):
     stream = RenderedDatasets([folder], seed=1, blend_space="srgb")
-    for number, entry in enumerate(read_set(folder)):
+    for number, entry in enumerate(read_dataset(folder)):
         scene = read_scene_of(entry)
         behind, mirror = (
             pixels(entry.read(f"{name}.jpg")).permute(2, 0, 1) / 255 for name in ("background", "mirror")

@@ -211,9 +211,9 @@ def _read_rendered(name: str, folder: Path) -> list[Benchmark]:
 def _rendered_samples(folder: Path) -> list[tuple[str, list[ImageFile]]]:
     """Returns the name and the existing files of each sample of a rendered dataset."""
     try:
-        from brewster.rendered.store import key, read_set  # noqa: PLC0415  (needs torch, an optional dependency)
+        from brewster.rendered.store import key, read_dataset  # noqa: PLC0415  (needs torch, an optional dependency)
 
-        entries = list(read_set(folder))
+        entries = list(read_dataset(folder))
     except ImportError as error:
         raise MissingExtra(
             "torch is not installed",
@@ -282,7 +282,7 @@ def _find_scenes(layout: BenchmarkLayout, groups: Sequence[ImageGroup]) -> tuple
     if len(matched) == len(groups) and len(set(matched)) <= _MAX_SCENES:
         return matched, []
     return [group.name for group in groups], [
-        "the file names do not identify the scenes, so the paper's draw of one case per scene is not possible"
+        "the file names do not identify the scenes, so the subset of the paper (one case of each scene) cannot be drawn"
     ]
 
 

@@ -14,14 +14,14 @@ from brewster.benchmarks.registry import BENCHMARKS, Benchmark, Case, folder_nam
 from brewster.errors import PhotoError
 
 PAPER_SEED: Final = 181
-"""The seed of `paper_draw`. The value is arbitrary; 181 is also the number of images in the paper's average."""
+"""The seed of `paper_subset`. The value is arbitrary; 181 is also the number of images in the paper's average."""
 
 
-def paper_draw(benchmark: Benchmark, seed: int = PAPER_SEED) -> tuple[Case, ...]:
+def paper_subset(benchmark: Benchmark, seed: int = PAPER_SEED) -> tuple[Case, ...]:
     """Draws the cases of the paper's protocol.
 
-    The paper does not publish its draw. This function draws one case of each scene with
-    `Random(f"{seed}/{benchmark}/{scene}").choice(...)` from the cases in natural order of their names. The draw of a scene
+    The paper does not say which cases it uses. This function draws one case of each scene with
+    `Random(f"{seed}/{benchmark}/{scene}").choice(...)` from the cases in natural order of their names. The case of a scene
     therefore does not depend on the other scenes.
 
     Returns:
@@ -52,15 +52,15 @@ def with_unique_names(benchmarks: Sequence[Benchmark], folders: Sequence[Path]) 
         benchmarks: the benchmarks of a run.
         folders: the folder of each benchmark.
     """
-    counts = Counter(part.name for part in benchmarks)
+    counts = Counter(benchmark.name for benchmark in benchmarks)
     return [
-        _renamed(part, f"{safe_name(folder_name(folder.parent))}-{part.name}")
-        if counts[part.name] > 1
-        else part
-        for part, folder in zip(benchmarks, folders, strict=True)
+        _renamed(benchmark, f"{safe_name(folder_name(folder.parent))}-{benchmark.name}")
+        if counts[benchmark.name] > 1
+        else benchmark
+        for benchmark, folder in zip(benchmarks, folders, strict=True)
     ]
 
 
-def _renamed(part: Benchmark, name: str) -> Benchmark:
-    cases = tuple(replace(case, benchmark=name) for case in part.cases)
-    return replace(part, name=name, title=f"{part.title} ({name})", cases=cases)
+def _renamed(benchmark: Benchmark, name: str) -> Benchmark:
+    cases = tuple(replace(case, benchmark=name) for case in benchmark.cases)
+    return replace(benchmark, name=name, title=f"{benchmark.title} ({name})", cases=cases)

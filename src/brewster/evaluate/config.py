@@ -111,7 +111,7 @@ class EvaluationConfig:
             _IDENTICAL,
             region,
             _INTERVALS,
-            *([_DRAW] if self.paper_subset else []),
+            *([_SUBSET] if self.paper_subset else []),
         ]
 
 
@@ -134,7 +134,7 @@ _INTERVALS: Final = (
     f"Confidence intervals are 95 %, from {RESAMPLES:,} bootstrap resamples of whole scenes within each benchmark. Differences "
     "are paired by image. The mean of a method is over the images on which it did not fail. The tables show their number."
 )
-_DRAW: Final = (
-    "The paper draws one image of each scene of Postcard and SolidObject, and does not publish its draw. This draw uses the "
-    f"seed {PAPER_SEED} and is listed in results.json. The average is over the paper's five benchmarks, with the drawn images."
+_SUBSET: Final = (
+    "The paper uses one image of each scene of Postcard and SolidObject, and does not say which. These subsets are drawn with the "
+    f"seed {PAPER_SEED} and listed in results.json. The average is over the paper's five benchmarks, with these subsets."
 )

@@ -35,8 +35,8 @@ from brewster.evaluate.report.html_report import write_report
 from brewster.evaluate.report.images import (
     CaseImages,
     CaseThumbnails,
-    method_tiles,
-    photo_tiles,
+    method_thumbnails,
+    photo_thumbnails,
     to_thumbnails,
 )
 from brewster.evaluate.report.latex import to_latex
@@ -44,7 +44,7 @@ from brewster.evaluate.report.published import read_published
 from brewster.evaluate.report.published import to_markdown as published_to_markdown
 from brewster.evaluate.report.tables import scores_to_csv, to_csv, to_markdown
 from brewster.evaluate.resizing import resize
-from brewster.evaluate.results import Results, paper_draws, summarise
+from brewster.evaluate.results import Results, paper_subsets, summarise
 from brewster.evaluate.runner import ScoreCallback, find_unavailable, get_prediction, score
 from brewster.evaluate.score_log import SCORES_FILE, RowId, ScoreRow, read_log
 from brewster.evaluate.scoring import GroundTruth
@@ -95,14 +95,16 @@ def evaluate(
 
     Raises:
         BrewsterError: there is no case or no method, names are not unique, an image matches two cases, the file names do
-            not identify the scenes for the paper's draw, or an optional dependency is missing.
+            not identify the scenes, which the subsets of the paper need, or an optional dependency is missing.
         OutputError: `out` cannot be written.
     """
     check(benchmarks, methods, config)
-    cases = [case for part in benchmarks for case in part.cases]
+    cases = [case for benchmark in benchmarks for case in benchmark.cases]
     with TemporaryDirectory(prefix="brewster-report-") as folder:
-        complete = frozenset(part.name for part in benchmarks if len(part.cases) <= max_report_cases)
-        tiles = _ThumbnailCache(
+        complete = frozenset(
+            benchmark.name for benchmark in benchmarks if len(benchmark.cases) <= max_report_cases
+        )
+        thumbnails = _ThumbnailCache(
             Path(folder), complete, config, out, {method.name: method for method in methods}
         )
         logged = read_log(out / SCORES_FILE)
@@ -116,7 +118,7 @@ def evaluate(
             logged=logged,
             unavailable=unavailable,
             on_progress=on_progress,
-            on_case_scored=tiles,
+            on_case_scored=thumbnails,
         )
         if config.resizes:
             _write_missing_inputs(cases, config, out / INPUTS_FOLDER)
@@ -125,7 +127,9 @@ def evaluate(
             if remarks := list(_method_remarks(method, cases, rows)):
                 results["methods"][method.name]["remark"] = "; ".join(remarks)
         _write_tables(results, out, intervals=intervals)
-        write_report(results, _report_cases(cases, methods, rows, max_report_cases, tiles), out / REPORT_FILE)
+        write_report(
+            results, _report_cases(cases, methods, rows, max_report_cases, thumbnails), out / REPORT_FILE
+        )
     return results
 
 
@@ -134,10 +138,10 @@ def check(benchmarks: Sequence[Benchmark], methods: Sequence[Method], config: Ev
 
     Raises:
         BrewsterError: there is no case or no method, names are not unique, an image matches two cases, or the file names
-            do not identify the scenes for the paper's draw.
+            do not identify the scenes, which the subsets of the paper need.
     """
     check_names(methods)
-    names = [part.name for part in benchmarks]
+    names = [benchmark.name for benchmark in benchmarks]
     for name in names:
         if names.count(name) > 1:
             raise BrewsterError(
@@ -145,16 +149,16 @@ def check(benchmarks: Sequence[Benchmark], methods: Sequence[Method], config: Ev
                 "expected unique names",
                 "rename one of the folders",
             )
-    if not any(part.cases for part in benchmarks):
-        reasons = [reason for part in benchmarks for reason in part.excluded]
+    if not any(benchmark.cases for benchmark in benchmarks):
+        reasons = [reason for benchmark in benchmarks for reason in benchmark.excluded]
         raise PhotoError(
             f"there is no case in {', '.join(names) or 'no benchmark'}",
             "expected photos with their ground truth",
             "; ".join(reasons[:5]) or "choose a folder with photos and their ground truth",
         )
     if config.paper_subset:
-        paper_draws(benchmarks)
-    cases = [case for part in benchmarks for case in part.cases]
+        paper_subsets(benchmarks)
+    cases = [case for benchmark in benchmarks for case in benchmark.cases]
     for method in methods:
         if isinstance(method, PredictionFolder):
             method.check_pairing(cases)
@@ -215,9 +219,9 @@ def _write_tables(results: Results, out: Path, *, intervals: bool) -> None:
 @final
 @dataclass(frozen=True)
 class _ThumbnailCache:
-    """Writes the tiles of the report and the resized photos while a case is decoded.
+    """Writes the thumbnails of the report and the resized photos while a case is decoded.
 
-    It stores the tiles of `benchmarks`, of which the report shows all cases. They are stored in files, because worker
+    It stores the thumbnails of `benchmarks`, of which the report shows all cases. They are stored in files, because worker
     processes create them, and because memory must not grow with the number of cases.
     """
 
@@ -228,7 +232,7 @@ class _ThumbnailCache:
     methods: Mapping[str, Method]
 
     def __call__(self, truth: GroundTruth, predictions: Mapping[str, MethodOutput]) -> None:
-        """Stores the tiles and the resized photo of a case. `score` calls this after it has scored the case."""
+        """Stores the thumbnails and the resized photo of a case. `score` calls this after it has scored the case."""
         case = truth.case
         if self.config.resizes:
             truth.photo.save(_input_path(self.out / INPUTS_FOLDER, case), overwrite=True)
@@ -236,22 +240,24 @@ class _ThumbnailCache:
             return
         images = self.images(truth, predictions)
         width, height = truth.photo.size
-        tiles = {BASELINE: photo_tiles(images)}
-        tiles |= {name: method_tiles(images, name) for name in predictions if name != BASELINE}
-        for method, html in tiles.items():
+        thumbnails = {BASELINE: photo_thumbnails(images)}
+        thumbnails |= {name: method_thumbnails(images, name) for name in predictions if name != BASELINE}
+        for method, html in thumbnails.items():
             data = json.dumps([width, height, html], ensure_ascii=True).encode()
             self._path(case, method).write_bytes(data)
 
     def read(self, case: Case, methods: Sequence[str]) -> CaseThumbnails | None:
-        """Returns the stored tiles of a case and the methods, or None if a file is missing."""
-        tiles = {}
+        """Returns the stored thumbnails of a case and the methods, or None if a file is missing."""
+        thumbnails = {}
         width = height = 0
         for method in (BASELINE, *methods):
             path = self._path(case, method)
             if not path.exists():
                 return None
-            width, height, tiles[method] = json.loads(path.read_bytes())
-        return CaseThumbnails(case.benchmark, case.name, (width, height), tiles.pop(BASELINE), tiles)
+            width, height, thumbnails[method] = json.loads(path.read_bytes())
+        return CaseThumbnails(
+            case.benchmark, case.name, (width, height), thumbnails.pop(BASELINE), thumbnails
+        )
 
     def images(self, truth: GroundTruth, predictions: Mapping[str, MethodOutput]) -> CaseImages:
         """Returns the images of a case for the report, with links to files at full size."""
@@ -310,26 +316,26 @@ def _report_cases(
     methods: Sequence[Method],
     rows: Sequence[ScoreRow],
     limit: int,
-    tiles: _ThumbnailCache,
+    thumbnails: _ThumbnailCache,
 ) -> Iterator[CaseThumbnails]:
-    """Yields the cases of the report. Cases without stored tiles are read and decoded again."""
+    """Yields the cases of the report. Cases without stored thumbnails are read and decoded again."""
     scored_rows = {row.id: row for row in rows if not row.error}
-    for case in _worst_cases(cases, methods, tiles.config, scored_rows, limit):
+    for case in _worst_cases(cases, methods, thumbnails.config, scored_rows, limit):
         method_rows = {
             method: row
             for method in methods
             if method.name != BASELINE and (row := scored_rows.get((case.benchmark, case.name, method.name)))
         }
-        cached = tiles.read(case, [method.name for method in method_rows])
+        cached = thumbnails.read(case, [method.name for method in method_rows])
         if cached:
             yield cached
             continue
         try:
-            truth = GroundTruth.open(case, tiles.config)
+            truth = GroundTruth.open(case, thumbnails.config)
         except PhotoError:
             continue  # the row of the case has this error, and the tables show it
         predictions = {method.name: get_prediction(truth, method, row) for method, row in method_rows.items()}
-        yield to_thumbnails(tiles.images(truth, predictions))
+        yield to_thumbnails(thumbnails.images(truth, predictions))
 
 
 def _worst_cases(

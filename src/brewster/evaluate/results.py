@@ -10,7 +10,7 @@ import numpy as np
 
 import brewster
 from brewster.benchmarks.registry import Benchmark, Case
-from brewster.benchmarks.selection import PAPER_SEED, paper_draw
+from brewster.benchmarks.selection import PAPER_SEED, paper_subset
 from brewster.evaluate.config import DEFAULT_METRICS, EvaluationConfig
 from brewster.evaluate.methods import Method
 from brewster.evaluate.protocols import describe_protocol
@@ -30,7 +30,7 @@ Results = dict[str, Any]
 @final
 @dataclass(frozen=True)
 class Selection:
-    """The cases of a table: a whole benchmark, or the paper's draw from it."""
+    """The cases of a table: a whole benchmark, or the subset of it that the paper uses."""
 
     key: str
     title: str
@@ -49,22 +49,29 @@ def summarise(
     `unavailable` is column -> reason, for the columns that could not be computed.
 
     Raises:
-        BrewsterError: the paper's draw is requested, but the file names of a benchmark do not identify its scenes.
+        BrewsterError: the subsets of the paper are requested, but the file names of a benchmark do not identify its scenes.
     """
     by_id = {row.id: row for row in rows}
     method_names = [method.name for method in methods]
     measured = {column for row in rows for column, score in row.scores.items() if score is not None}
     columns = {name: metric for name, metric in config.columns().items() if name in measured}
-    full = [Selection(part.name, part.title, part.cases) for part in benchmarks if part.cases]
-    drawn = paper_draws(benchmarks) if config.paper_subset else []
-    tables = [[selection] for selection in (*full, *drawn)]
+    full = [
+        Selection(benchmark.name, benchmark.title, benchmark.cases)
+        for benchmark in benchmarks
+        if benchmark.cases
+    ]
+    subsets = paper_subsets(benchmarks) if config.paper_subset else []
+    tables = [[selection] for selection in (*full, *subsets)]
     averaged = _average_selections(
-        [part for part in full if part.key in PAPER_COUNTS] if config.paper_subset else full, drawn
+        [selection for selection in full if selection.key in PAPER_COUNTS] if config.paper_subset else full,
+        subsets,
     )
     selections = {group[0].key: group for group in tables} | ({AVERAGE: averaged} if averaged else {})
     series = [(method, column) for method in method_names for column in columns]
     directions = {name: metric.higher_is_better for name, metric in columns.items()}
-    strata = {key: [_stratum(part, series, by_id) for part in group] for key, group in selections.items()}
+    strata = {
+        key: [_stratum(selection, series, by_id) for selection in group] for key, group in selections.items()
+    }
     return {
         "brewster": brewster.__version__,
         "protocol": {
@@ -75,7 +82,7 @@ def summarise(
             "choices": _choices(config, averaged),
         },
         "metrics": {name: metric.to_dict() for name, metric in columns.items()},
-        "benchmarks": {part.name: _describe_benchmark(part) for part in benchmarks},
+        "benchmarks": {benchmark.name: _describe_benchmark(benchmark) for benchmark in benchmarks},
         "selections": {key: _describe_selection(key, group) for key, group in selections.items()},
         "methods": {method.name: method.about() for method in methods},
         "unavailable": dict(unavailable or {}),
@@ -84,9 +91,12 @@ def summarise(
             for name in ([] if config.metrics == DEFAULT_METRICS else _unmeasured(config, measured))
             if name not in (unavailable or {})
         ],
-        "draw": {"seed": PAPER_SEED} | {part.key: [case.name for case in part.cases] for part in drawn},
+        "draw": {"seed": PAPER_SEED}
+        | {subset.key: [case.name for case in subset.cases] for subset in subsets},
         "cases": [
-            _describe_case(case, method_names, by_id, columns) for part in benchmarks for case in part.cases
+            _describe_case(case, method_names, by_id, columns)
+            for benchmark in benchmarks
+            for case in benchmark.cases
         ],
         "tables": {key: _table(strata[key], series) for key in selections},
         "differences": {
@@ -104,45 +114,47 @@ def _unmeasured(config: EvaluationConfig, measured: set[str]) -> list[str]:
     return [name for name in config.columns() if name not in measured]
 
 
-def paper_draws(benchmarks: Sequence[Benchmark]) -> list[Selection]:
-    """Returns the paper's draw from each benchmark of which it uses only a part.
+def paper_subsets(benchmarks: Sequence[Benchmark]) -> list[Selection]:
+    """Returns the subset that the paper uses of each benchmark, without the benchmarks that it uses as a whole.
 
     Raises:
         BrewsterError: the file names of a benchmark do not identify its scenes.
     """
-    draws = [(part, paper_draw(part)) for part in benchmarks if part.cases]
+    subsets = [(benchmark, paper_subset(benchmark)) for benchmark in benchmarks if benchmark.cases]
     return [
-        Selection(f"{part.name}:paper", f"{part.title}, the paper's draw", cases)
-        for part, cases in draws
-        if len(cases) < len(part.cases)
+        Selection(f"{benchmark.name}:paper", f"{benchmark.title}, subset of the paper", cases)
+        for benchmark, cases in subsets
+        if len(cases) < len(benchmark.cases)
     ]
 
 
-def _average_selections(full: Sequence[Selection], drawn: Sequence[Selection]) -> list[Selection]:
-    """Returns the selections of the average: the draw from each benchmark, or the benchmark if there is no draw.
+def _average_selections(full: Sequence[Selection], subsets: Sequence[Selection]) -> list[Selection]:
+    """Returns the selections of the average: the subset of each benchmark, or the whole benchmark if it has no subset.
 
     The list is empty if there is only one benchmark.
     """
-    draws = {part.key.partition(":")[0]: part for part in drawn}
-    return [draws.get(part.key, part) for part in full] if len(full) > 1 else []
+    subset_of = {subset.key.partition(":")[0]: subset for subset in subsets}
+    return [subset_of.get(whole.key, whole) for whole in full] if len(full) > 1 else []
 
 
 def _describe_selection(key: str, group: Sequence[Selection]) -> dict[str, Any]:
-    image_count = sum(len(part.cases) for part in group)
+    image_count = sum(len(selection.cases) for selection in group)
     return {"title": "Average" if key == AVERAGE else group[0].title, "cases": image_count}
 
 
 def _choices(config: EvaluationConfig, averaged: Sequence[Selection]) -> list[str]:
     """Returns sentences: the settings, how the average is computed, and how it differs from that of the paper."""
     choices = [*describe_protocol(config), *config.describe(), *([_AVERAGE_NOTE] if averaged else [])]
-    counts = {part.key.partition(":")[0]: len(part.cases) for part in averaged}
+    counts = {selection.key.partition(":")[0]: len(selection.cases) for selection in averaged}
     if not config.paper_subset or counts == PAPER_COUNTS:
         return choices
-    found = ", ".join(f"{count} of {name}" for name, count in counts.items()) or "too few benchmarks"
-    return [
-        *choices,
-        f"The paper's average is over {sum(PAPER_COUNTS.values())} images; this one is over {found}.",
-    ]
+    found = ", ".join(f"{count} of {name}" for name, count in counts.items())
+    difference = (
+        f"The average of this evaluation is over {found}."
+        if found
+        else "This evaluation has no average, because it has fewer than two of the paper's benchmarks."
+    )
+    return [*choices, f"The paper's average is over {sum(PAPER_COUNTS.values())} images. {difference}"]
 
 
 def _stratum(
@@ -179,13 +191,13 @@ def _rounded(row: dict[str, Any]) -> dict[str, Any]:
     return {name: round(value, _DIGITS) if isinstance(value, float) else value for name, value in row.items()}
 
 
-def _describe_benchmark(part: Benchmark) -> dict[str, Any]:
+def _describe_benchmark(benchmark: Benchmark) -> dict[str, Any]:
     return {
-        "title": part.title,
-        "cases": len(part.cases),
-        "expected": list(part.expected_counts),
-        "remarks": list(part.remarks),
-        "excluded": list(part.excluded),
+        "title": benchmark.title,
+        "cases": len(benchmark.cases),
+        "expected": list(benchmark.expected_counts),
+        "remarks": list(benchmark.remarks),
+        "excluded": list(benchmark.excluded),
     }
 
 

@@ -145,11 +145,12 @@ class CompactNetwork(nn.Module):
     values outside 0..1 still have a gradient in training. The head predicts four maps, and the layers follow from the
     image formation, with the photo I and `added` in linear light:
 
-        T = encoded((I - added) exp(gain)) + repair
-        R = encoded(added + other)
+        T = encoded((I - added) exp(gain)) + transmission_correction
+        R = encoded(added + reflection_correction)
 
     `added` is the light that the pane adds, and exp(gain) compensates for the light that it absorbs. Both vary more
-    slowly than the photo. `repair` corrects overexposed pixels; `other` corrects R where added light is not reflection.
+    slowly than the photo. `transmission_correction` corrects overexposed pixels. `reflection_correction` corrects R where the
+    added light is not reflection.
     """
 
     def __init__(self) -> None:
@@ -173,10 +174,10 @@ class CompactNetwork(nn.Module):
             x = decoder(x, skip)
         x = functional.interpolate(self.squeeze(x), scale_factor=2.0, mode="bilinear")
         x = _in_float32(self.head, _leaky(_in_float32(self.join, torch.cat([x, normal], dim=1))))
-        added, gain, repair, other = x.chunk(4, dim=1)
+        added, gain, transmission_correction, reflection_correction = x.chunk(4, dim=1)
         gain = (_LARGEST_GAIN * torch.tanh(gain / _LARGEST_GAIN)).exp()
-        transmission = to_encoded((to_linear(photo_encoded) - added) * gain) + repair
-        return torch.cat([transmission, to_encoded(added + other)], dim=1)
+        transmission = to_encoded((to_linear(photo_encoded) - added) * gain) + transmission_correction
+        return torch.cat([transmission, to_encoded(added + reflection_correction)], dim=1)
 
 
 @final

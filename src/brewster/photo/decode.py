@@ -210,7 +210,7 @@ def _check_supported(image: pyvips.Image, data: bytes, format_name: str, max_pix
 
 def _has_frames(image: pyvips.Image, data: bytes, format_name: str) -> bool:
     if format_name == "png":
-        return b"acTL" in metadata.png_chunks(data)  # libvips reads the first frame without an error
+        return b"acTL" in dict(metadata.png_chunks(data))  # libvips reads the first frame without an error
     if format_name == "avif":
         return data[8:12] == b"avis"  # libvips counts thumbnails as pages
     return bool(image.get_typeof("n-pages")) and image.get("n-pages") > 1

@@ -1,6 +1,6 @@
 """Reads and writes floating-point images: OpenEXR with its own package, Radiance HDR with built-in code.
 
-Both formats store linear light. The other header attributes of a file are kept and written to new files.
+Both formats store linear light. Header attributes are kept and written to new files.
 """
 
 from __future__ import annotations
@@ -70,13 +70,16 @@ def _openexr() -> types.ModuleType:
 
 
 def read_exr(data: bytes, max_pixels: int) -> HdrPixels:
-    """Reads the channels R, G and B or Y, and A, of the first part of an EXR. Other channels, such as Z, are ignored.
+    """Reads the first part of an EXR: the channels R, G and B, or Y alone, and the channel A if there is one.
+
+    Other channels, such as Z, are ignored.
 
     Raises:
         MissingExtra: OpenEXR is not installed.
         PhotoTooLarge: the image has more pixels than `max_pixels`.
         UnreadablePhoto: the file is damaged or truncated.
-        UnsupportedPhoto: the file has neither the channels R, G and B nor the channel Y.
+        UnsupportedPhoto: the file has neither the channels R, G and B nor the channel Y, or its colours are stored as luminance
+            and chroma (Y, RY, BY).
     """
     header = _exr_part(data, header_only=True).header
     low, high = header["dataWindow"]
@@ -104,8 +107,8 @@ def _exr_pixels(channels: dict[str, NDArray[Any]], header: dict[str, Any]) -> Hd
     if not set(names) <= channels.keys() or "RY" in channels:
         raise UnsupportedPhoto(
             f"the EXR has the channels {', '.join(sorted(channels))}",
-            "expected the channels R, G, B or Y, and optionally A",
-            "export the image with these names",
+            "expected the channels R, G and B, or Y alone, and optionally A",
+            "export the image as RGB",
         )
     is_half = all(channels[name].dtype == np.float16 for name in names)
     attributes = {key: value for key, value in header.items() if key not in ("channels", "tiles", "type")}
@@ -216,6 +219,9 @@ def read_exr_layers(data: bytes) -> dict[str, Float32]:
 
 # --- Radiance HDR (G. Ward, "Real Pixels", Graphics Gems II; the RADIANCE reference manual)
 
+_FACTORS = ("EXPOSURE", "COLORCORR", "PIXASPECT")
+"""Attributes that are factors. If a header has one of them several times, its value is the product ("Radiance File Formats")."""
+
 
 def read_hdr(data: bytes, max_pixels: int) -> HdrPixels:
     """Reads a Radiance HDR image: red, green and blue with a shared exponent (RGBE).
@@ -223,16 +229,22 @@ def read_hdr(data: bytes, max_pixels: int) -> HdrPixels:
     Raises:
         PhotoTooLarge: the image has more pixels than `max_pixels`.
         UnreadablePhoto: the image is empty or truncated.
-        UnsupportedPhoto: the image has XYZ colours, or its scan lines are not ordered from top to bottom.
+        UnsupportedPhoto: the image has XYZ colours, its scan lines are not ordered from top to bottom, or its header has no size.
     """
     header_text, separator, rest = data.partition(b"\n\n")
     resolution, _, body = rest.partition(b"\n")
     resolution_match = re.fullmatch(rb"-Y (\d{1,9}) \+X (\d{1,9})\s*", resolution)
     lines = header_text.decode("latin-1").splitlines()[1:]
-    if not separator or resolution_match is None or any("xyze" in line for line in lines):
+    if any(line.startswith("FORMAT=") and "xyze" in line for line in lines):
+        raise UnsupportedPhoto(
+            "the HDR image has XYZ colours (FORMAT=32-bit_rle_xyze)",
+            "expected RGBE colours",
+            "export the image as RGBE",
+        )
+    if not separator or resolution_match is None:
         raise UnsupportedPhoto(
             f"the header of the HDR image ends in {resolution[:40]!r}",
-            "expected an RGBE image with lines from top to bottom, '-Y height +X width'",
+            "expected an RGBE image with scan lines from top to bottom, '-Y height +X width'",
             "export the image in this form",
         )
     height, width = int(resolution_match[1]), int(resolution_match[2])
@@ -248,7 +260,11 @@ def read_hdr(data: bytes, max_pixels: int) -> HdrPixels:
 
 
 def _hdr_file_info(lines: list[str]) -> FileInfo:
-    header = dict(line.split("=", 1) for line in lines if "=" in line and not line.startswith("FORMAT"))
+    header: dict[str, str] = {}
+    for line in lines:
+        key, separator, value = line.partition("=")
+        if separator and not line.startswith("FORMAT"):
+            header[key] = _product(header[key], value) if key in _FACTORS and key in header else value
     return FileInfo(
         format_name="hdr",
         bits=32,
@@ -257,17 +273,29 @@ def _hdr_file_info(lines: list[str]) -> FileInfo:
     )
 
 
+def _product(first: str, second: str) -> str:
+    """Returns the products of the numbers of two attributes, or the second attribute if they are not numbers."""
+    try:
+        products = [float(a) * float(b) for a, b in zip(first.split(), second.split(), strict=True)]
+    except ValueError:
+        return second
+    return " ".join(f"{product:.9g}" for product in products)
+
+
 def _scan_lines(body: bytes, width: int, height: int) -> NDArray[np.uint8]:
-    """Reads RGBE bytes (H, W, 4) from run-length encoded or flat scan lines. Lines of 2**15 or more pixels are flat."""
+    """Reads RGBE bytes (H, W, 4) from scan lines in one of three forms: run-length encoded, run-length encoded in the form of
+    Radiance 1.4 and earlier, or flat. Lines of 2**15 or more pixels have one of the last two forms."""
     is_run_length_encoded = width < 1 << 15 and body.startswith(b"\2\2" + width.to_bytes(2, "big"))
     try:
         if is_run_length_encoded:
             planes = np.frombuffer(_decode_runs(body, width, height), np.uint8)
             return planes.reshape(height, 4, width).swapaxes(1, 2)
+        if len(body) < height * width * 4:
+            body = _decode_old_runs(body, height * width)
         return np.frombuffer(body, np.uint8, height * width * 4).reshape(height, width, 4)
     except (IndexError, ValueError) as error:
         raise UnreadablePhoto(
-            "the HDR image cannot be read completely (it is truncated)",
+            "the HDR image cannot be read completely (it is truncated or damaged)",
             f"expected {height} lines, as its header states",
             "copy the file again from its source",
         ) from error
@@ -291,6 +319,27 @@ def _decode_runs(body: bytes, width: int, height: int) -> bytes:
             )
             position += 2 if run > 128 else 1 + run
     return bytes(planes)
+
+
+def _decode_old_runs(body: bytes, count: int) -> bytes:
+    """Decodes the run-length encoding of Radiance 1.4 and earlier to `count` pixels.
+
+    The pixel (1, 1, 1, n) repeats the pixel before it n times. If k such pixels follow each other, the last one has the weight
+    256**(k-1).
+
+    Raises:
+        ValueError: the runs do not have `count` pixels together.
+    """
+    pixels = np.frombuffer(body, np.uint8, len(body) // 4 * 4).reshape(-1, 4)
+    is_run = (pixels[:, :3] == 1).all(axis=1)
+    positions = np.arange(len(pixels))
+    last_literal = np.maximum.accumulate(np.where(is_run, -1, positions))
+    repeats = np.where(
+        is_run, pixels[:, 3].astype(np.int64) << np.minimum(8 * (positions - last_literal - 1), 24), 1
+    )
+    if last_literal[:1].tolist() != [0] or repeats.sum() != count:
+        raise ValueError
+    return np.repeat(pixels[last_literal], repeats, axis=0).tobytes()
 
 
 def _from_rgbe(rgbe: NDArray[np.uint8]) -> Float32:

@@ -63,7 +63,8 @@ def recorded_parameters(path: Path, program: str) -> dict[str, str] | None:
             data = head + file.read()
     except OSError:
         return None
-    data = _png_xmp(data) if data.startswith(b"\x89PNG") else data
+    if data.startswith(b"\x89PNG"):
+        data += _compressed_png_xmp(data)
     agent = re.escape(program.encode())
     found = re.findall(rb'stEvt:softwareAgent="' + agent + rb' [^"]*" stEvt:parameters="([^"]*)"', data)
     if not found:
@@ -72,11 +73,17 @@ def recorded_parameters(path: Path, program: str) -> dict[str, str] | None:
     return dict(part.split("=", 1) for part in text.split("; ") if "=" in part)
 
 
-def _png_xmp(data: bytes) -> bytes:
-    """Returns the XMP block of a PNG, or no bytes. libvips writes the block as compressed text (PNG 11.3.3.3, zTXt)."""
-    name, _, text = png_chunks(data).get(b"zTXt", b"").partition(b"\0")
-    with contextlib.suppress(zlib.error):
-        return zlib.decompress(text[1:]) if name == b"XML:com.adobe.xmp" else b""
+def _compressed_png_xmp(data: bytes) -> bytes:
+    """Returns the XMP block of a PNG if it is compressed, or no bytes.
+
+    libvips writes the block as compressed text (PNG 11.3.3.3, zTXt). Other programs write it uncompressed (iTXt), as the XMP
+    specification, part 3, requires.
+    """
+    for kind, chunk in png_chunks(data):
+        keyword, _, text = chunk.partition(b"\0")
+        if kind == b"zTXt" and keyword == b"XML:com.adobe.xmp":
+            with contextlib.suppress(zlib.error):
+                return zlib.decompress(text[1:])
     return b""
 
 

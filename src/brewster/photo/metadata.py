@@ -92,14 +92,13 @@ def _segment(marker: int, payload: bytes) -> bytes:
 # --- PNG and WebP chunks
 
 
-def png_chunks(data: bytes) -> dict[bytes, bytes]:
-    """Returns the chunks of a PNG before its pixel data, by name."""
-    found, position = {}, 8
+def png_chunks(data: bytes) -> Iterator[tuple[bytes, bytes]]:
+    """Yields the name and the content of each chunk of a PNG before its pixel data."""
+    position = 8
     while position + 8 <= len(data) and data[position + 4 : position + 8] != b"IDAT":
         size = int.from_bytes(data[position : position + 4], "big")
-        found[data[position + 4 : position + 8]] = data[position + 8 : position + 8 + size]
+        yield data[position + 4 : position + 8], data[position + 8 : position + 8 + size]
         position += 12 + size
-    return found
 
 
 def with_png_exif(data: bytes, exif: bytes) -> bytes:
@@ -142,7 +141,7 @@ def cicp(data: bytes) -> tuple[int, int, int] | None:
     Returns None for a file without code points.
     """
     if data.startswith(b"\x89PNG"):
-        chunk = png_chunks(data).get(b"cICP", b"")
+        chunk = dict(png_chunks(data)).get(b"cICP", b"")
         return (chunk[0], chunk[1], chunk[2]) if len(chunk) >= 3 else None
     found = re.search(rb"colrnclx(.{6})", data[: 1 << 16], re.DOTALL)
     return struct.unpack(">3H", found[1]) if found else None

@@ -1,6 +1,6 @@
 """Stores rendered samples: one folder per sample, or shards (tar files) of a hundred samples, and an index.
 
-    for entry in read_set(Path("out/window")):
+    for entry in read_dataset(Path("out/window")):
         layers, scene = open_sample(entry)
 
 Writing is atomic: a file or folder is written with a hidden name, flushed to disk, and then renamed.
@@ -191,7 +191,7 @@ class StoredSample:
             return shard.read(length)
 
 
-def read_set(out: Path) -> Iterator[StoredSample]:
+def read_dataset(out: Path) -> Iterator[StoredSample]:
     """Yields the finished samples of a dataset from folders and shards, in the order of their indices."""
     for block in _blocks(out):
         yield from read_block(out, block)

@@ -79,7 +79,7 @@ class TrainingRecipe(FrozenModel):
     """The settings of every training run."""
 
     seed: Seed
-    """Seed of all random numbers. The same recipe and data give the same weights."""
+    """Seed of all random numbers. On the same machine, the same recipe and data give bit-identical weights on a CPU."""
     steps: PositiveInt
     """Number of training steps."""
     batch_size: PositiveInt
@@ -100,7 +100,7 @@ class TrainingRecipe(FrozenModel):
     data: DataRecipe
 
     def learning_rate_factor(self, step: int) -> float:
-        """Returns the learning rate at this step (from 0) divided by its peak: a linear rise, then a cosine decay."""
+        """Returns the learning rate at this step (from 0) divided by its peak: a linear rise, a constant part, then a cosine decay."""
         warm = min(1.0, (step + 1) / self.warmup_steps)
         remaining = (1 - step / self.steps) / max(self.learning_rate_decay_share, 1e-9)
         return warm * (0.5 - 0.5 * math.cos(math.pi * min(1.0, remaining)))
@@ -128,8 +128,8 @@ class CompactRecipe(TrainingRecipe):
 
     @model_validator(mode="after")
     def _check_shares(self) -> Self:
-        real = _share_of(self.batch_size, "pairs_share", self.data.pairs_share)
-        _share_of(self.batch_size - real, "rendered.share", self.data.rendered_share)
+        pair_count = _sample_count(self.batch_size, "pairs_share", self.data.pairs_share)
+        _sample_count(self.batch_size - pair_count, "rendered.share", self.data.rendered_share)
         return self
 
     def size_at(self, step: int) -> int:
@@ -200,7 +200,8 @@ class LoraRecipe(TrainingRecipe):
     crops: Annotated[int, Field(ge=0)] = 0
     """Number of different crops of each sample, in addition to the uncropped sample."""
     reflections: Literal["given", "difference"] = "given"
-    """R of real pairs. given: from the reflection image, which every pair must have. difference: R = I - T in linear light."""
+    """R of real pairs. given: from the reflection image of the pair; every pair must have one if R is a panel. difference: pairs
+    without one get R = I - T in linear light."""
     derived_reflection_weight: NonNegativeFloat = Pairs.reflection_weight
     """Weight of panel R in the loss of pairs whose reflection is the difference I - T; 1 is the weight of a given reflection."""
     prompt: str = "paper"
@@ -245,19 +246,19 @@ class LoraRecipe(TrainingRecipe):
 AnyRecipe = TypeVar("AnyRecipe", bound=TrainingRecipe)
 
 
-def _share_of(samples: int, name: str, share: float) -> int:
-    """Returns round(samples * share).
+def _sample_count(batch_size: int, name: str, share: float) -> int:
+    """Returns the number of samples of a source in a batch: round(batch_size * share).
 
     Raises:
         ValueError: a share between 0 and 1 gives no sample or all samples.
     """
-    part = round(samples * share)
-    if samples and 0 < share < 1 and part in (0, samples):
+    count = round(batch_size * share)
+    if batch_size and 0 < share < 1 and count in (0, batch_size):
         raise ValueError(
-            f"expected at least one sample of each source, but {name} = {share:g} gives {part} of {samples} samples:"
+            f"expected at least one sample of each source, but {name} = {share:g} gives {count} of {batch_size} samples:"
             " raise batch_size, or change the share"
         )
-    return part
+    return count
 
 
 def read_recipe(path: Path) -> CompactRecipe | LoraRecipe:
@@ -355,7 +356,7 @@ def data_folder() -> Path:
     folder = os.environ.get("BREWSTER_DATA", "")
     if not Path(folder or "/nowhere").is_dir():
         raise RecipeError(
-            f"BREWSTER_DATA is {folder!r}",
+            f"BREWSTER_DATA is {folder!r}" if folder else "BREWSTER_DATA is not set",
             "expected an existing folder: the paths in a recipe are relative to it",
             "export BREWSTER_DATA=/path/to/data",
         )

@@ -134,5 +134,5 @@ def _catch_trial(catch: CatchTrial, i: int, rng: Random) -> Trial:
     if i % 2 == 0:
         return Trial(catch.photo, catch.good, catch.good, expected="similar")
     if rng.random() < 0.5:
-        return Trial(catch.photo, catch.good, catch.spoilt, expected="left")
-    return Trial(catch.photo, catch.spoilt, catch.good, expected="right")
+        return Trial(catch.photo, catch.good, catch.degraded, expected="left")
+    return Trial(catch.photo, catch.degraded, catch.good, expected="right")

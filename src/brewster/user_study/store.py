@@ -71,7 +71,7 @@ class Participant:
 class ViewingConditions:
     """How the pictures of a trial were shown. Lengths are in CSS px. Multiply them by `pixel_ratio` to get screen pixels.
 
-    `view` is the arrangement at the time of the answer: three pictures, the pair A and B, or one picture at a time. `flips` counts how often
+    `view` is the arrangement at the time of the answer: three pictures, the pair A and B, or one picture at a time. `switches` counts how often
     the picture was replaced by another one in place; `zoomed` is true if the pictures were enlarged at any time.
     """
 
@@ -84,7 +84,7 @@ class ViewingConditions:
     theme: Literal["light", "dark"]
     pointer: Literal["fine", "coarse"]
     view: Literal["all", "pair", "single"]
-    flips: Annotated[int, Field(ge=0, le=100_000)]
+    switches: Annotated[int, Field(ge=0, le=100_000)]
     zoomed: bool
 
 
@@ -155,7 +155,7 @@ class AnswerStore:
         Returns:
             The token of the participant's link, or None if `max_participants` are admitted already.
         """
-        with self._writing() as database:
+        with self._transaction("IMMEDIATE") as database:
             (number,) = database.execute("SELECT count(*) FROM participants").fetchone()
             if max_participants is not None and number >= max_participants:
                 return None
@@ -164,7 +164,7 @@ class AnswerStore:
 
     def admit_exported(self) -> str:
         """Add a participant of a static bundle, who has not given consent yet. Returns the token."""
-        with self._writing() as database:
+        with self._transaction("IMMEDIATE") as database:
             return self._insert_participant(database, consented_on=_NO_CONSENT)
 
     def _insert_participant(self, database: sqlite3.Connection, *, consented_on: str) -> str:
@@ -217,7 +217,7 @@ class AnswerStore:
             OutputError: the database cannot be written.
         """
         key = (participant.number, trial)
-        with self._writing() as database:
+        with self._transaction("IMMEDIATE") as database:
             (last,) = database.execute(
                 "SELECT max(trial) FROM answers WHERE participant = ?", key[:1]
             ).fetchone()
@@ -265,11 +265,11 @@ class AnswerStore:
             )
         seconds_shown = min(max(seconds, 0.0), MAX_SECONDS)
         now = datetime.now(UTC).isoformat(timespec="seconds")
-        shown = _CONDITIONS.dump_json(conditions).decode()
-        with self._writing() as database:
+        conditions_json = _CONDITIONS.dump_json(conditions).decode()
+        with self._transaction("IMMEDIATE") as database:
             database.execute(
                 "INSERT INTO answers VALUES (?, ?, ?, ?, ?, ?) ON CONFLICT DO NOTHING",
-                (participant.number, trial, choice, seconds_shown, now, shown),
+                (participant.number, trial, choice, seconds_shown, now, conditions_json),
             )
             row = database.execute(
                 "SELECT choice FROM answers WHERE participant = ? AND trial = ?", (participant.number, trial)
@@ -278,7 +278,7 @@ class AnswerStore:
         return stored
 
     def import_answers(self, answer_file: AnswerFile) -> int:
-        """Store the answers of a participant of a static bundle, all or none. An answer that is stored already is kept.
+        """Store the answers of a participant of a static bundle in one transaction. An answer that is stored already is kept.
 
         Returns:
             The number of answers that were not stored before.
@@ -303,7 +303,7 @@ class AnswerStore:
                     "ask the participant to download the answers again",
                 )
         number = participant.number
-        with self._writing() as database:
+        with self._transaction("IMMEDIATE") as database:
             database.execute(
                 "UPDATE participants SET consented_on = ? WHERE number = ? AND consented_on = ?",
                 (answer_file.consented_on.isoformat(), number, _NO_CONSENT),
@@ -320,21 +320,20 @@ class AnswerStore:
 
     def all_answers(self) -> Iterator[tuple[Participant, dict[int, StoredAnswer]]]:
         """Yield every participant, in order of number, and a dict of the answers by trial, which may be empty."""
-        with self._reading() as database:
-            rows = database.execute("SELECT * FROM answers").fetchall()
-            earlier = database.execute(
+        with self._transaction("DEFERRED") as database:
+            answer_rows = database.execute("SELECT * FROM answers").fetchall()
+            withdrawn_rows = database.execute(
                 "SELECT participant, trial, choice FROM withdrawn ORDER BY rowid"
             ).fetchall()
-            # read participants after answers: another process may admit participants in between
             participants = database.execute(
                 "SELECT number, trials FROM participants ORDER BY number"
             ).fetchall()
         answers: dict[int, dict[int, StoredAnswer]] = {number: {} for number, _ in participants}
         withdrawn: dict[tuple[int, int], tuple[Choice, ...]] = {}
-        for number, trial, choice in earlier:
+        for number, trial, choice in withdrawn_rows:
             withdrawn[number, trial] = (*withdrawn.get((number, trial), ()), choice)
-        for number, trial, choice, seconds, answered_at, shown in rows:
-            conditions = _CONDITIONS.validate_json(shown)
+        for number, trial, choice, seconds, answered_at, conditions_json in answer_rows:
+            conditions = _CONDITIONS.validate_json(conditions_json)
             before = withdrawn.get((number, trial), ())
             answers[number][trial] = StoredAnswer(choice, seconds, answered_at, conditions, before)
         for number, trials in participants:
@@ -346,10 +345,14 @@ class AnswerStore:
             yield self._database
 
     @contextmanager
-    def _writing(self) -> Iterator[sqlite3.Connection]:
-        """An exclusive write transaction; its changes are synced to the disk at the end of the block."""
+    def _transaction(self, kind: Literal["DEFERRED", "IMMEDIATE"]) -> Iterator[sqlite3.Connection]:
+        """A transaction. All statements of the block read the same state of the database.
+
+        DEFERRED is for a block that only reads. IMMEDIATE is for a block that writes: it waits for other writers, and the changes
+        are synced to the disk at the end of the block.
+        """
         with self._reading() as database:
-            database.execute("BEGIN IMMEDIATE")
+            database.execute(f"BEGIN {kind}")
             try:
                 yield database
                 database.execute("COMMIT")

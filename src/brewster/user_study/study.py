@@ -24,7 +24,7 @@ from brewster.files import write_atomically
 DESCRIPTION_FILE: Final = "study.json"
 PICTURES_FOLDER: Final = "pictures"
 ANSWERS_FILE: Final = "answers.sqlite"
-FORMAT_VERSION: Final = 2
+FORMAT_VERSION: Final = 3
 UNNAMED_DATASET: Final = ""
 """The name of the only dataset if the source folders have no subfolders."""
 
@@ -65,14 +65,14 @@ class PairedComparison:
 class CatchTrial:
     """Pictures for a catch trial, which tests attention: an output is compared with itself or with a degraded copy.
 
-    `photo`, `good` and `spoilt` are names of pictures: the photo, the output, and the degraded copy of the output.
+    `photo`, `good` and `degraded` are names of pictures: the photo, the output, and the degraded copy of the output.
     """
 
     dataset: str
     name: str
     photo: str
     good: str
-    spoilt: str
+    degraded: str
 
 
 @final

@@ -87,7 +87,7 @@ class JobQueue:
         self._jobs: dict[object, SeparationJob] = {}
 
     @property
-    def jobs(self) -> int:
+    def job_count(self) -> int:
         """Number of waiting and running jobs."""
         return len(self._jobs)
 
@@ -108,10 +108,10 @@ class JobQueue:
         Raises:
             HTTPException: 503 if the queue is full; 409 if a job with this name exists.
         """
-        if self.jobs >= self.workers + self.max_waiting:
+        if self.job_count >= self.workers + self.max_waiting:
             raise HTTPException(
                 503,
-                f"the queue is full with {self.jobs} photos; try again in a few seconds",
+                f"the queue is full with {self.job_count} photos; try again in a few seconds",
                 {"Retry-After": "5"},
             )
         if name in self._jobs:
@@ -160,7 +160,8 @@ class JobQueue:
                 raise ClientDisconnect
             raise HTTPException(
                 504,
-                f"the separation took longer than {self.timeout_seconds:g} seconds; try a smaller photo or quality draft",
+                f"the separation did not finish within {self.timeout_seconds:g} seconds, including the waiting time; "
+                "try a smaller photo or quality draft",
             )
         finally:
             job.cancelled.set()

@@ -123,7 +123,7 @@ def separation_router(model_cache: ModelCache, job_queue: JobQueue, *, max_pixel
     @router.get("/health")
     async def health() -> HealthResponse:
         """Returns the version of the server and the number of its jobs."""
-        return HealthResponse(jobs=job_queue.jobs, places=job_queue.workers + job_queue.max_waiting)
+        return HealthResponse(jobs=job_queue.job_count, places=job_queue.workers + job_queue.max_waiting)
 
     _add_page_routes(router, run)
     return router

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 Floats: TypeAlias = NDArray[Any]
 """float32 of any shape."""
 Colour: TypeAlias = Sequence[float] | Floats
-Box: TypeAlias = tuple[float, float, float, float]
+Rect: TypeAlias = tuple[float, float, float, float]
 """Left, top, width and height in metres from the upper left corner of a canvas."""
 Lighting: TypeAlias = Callable[[Floats, Floats], Floats]
 """A function of points (h, w, 3) and their unit normal (3,). It returns irradiance / pi at the points, (h, w, 3)."""
@@ -114,27 +114,27 @@ class Canvas:
         self.pixels = np.empty(size, np.float32)
         self.pixels[:] = (*self.colour, 1, 0)
 
-    def area(self, box: Box) -> Floats:
-        """Returns a view of the texels (h, w, 5) of a box, cropped to the canvas."""
-        left, top, width, height = (self.density * side for side in box)
+    def area(self, rect: Rect) -> Floats:
+        """Returns a view of the texels (h, w, 5) of a rectangle, cropped to the canvas."""
+        left, top, width, height = (self.density * side for side in rect)
         rows = slice(max(0, round(top)), max(0, round(top + height)))
         return self.pixels[rows, max(0, round(left)) : max(0, round(left + width))]
 
-    def rect(self, box: Box, colour: Colour, *, emission: float = 0) -> None:
-        """Paints a box in one colour."""
-        self.area(box)[:] = (*colour, 1, emission)
+    def rect(self, rect: Rect, colour: Colour, *, emission: float = 0) -> None:
+        """Paints a rectangle in one colour."""
+        self.area(rect)[:] = (*colour, 1, emission)
 
-    def paste(self, image: Floats, box: Box, *, emission: float = 0) -> None:
-        """Paints an image (h, w, 3), scaled to the box."""
-        area = self.area(box)
+    def paste(self, image: Floats, rect: Rect, *, emission: float = 0) -> None:
+        """Paints an image (h, w, 3), scaled to the rectangle."""
+        area = self.area(rect)
         area[..., :3] = resize(image, *area.shape[:2])
         area[..., 3:] = (1, emission)
 
-    def write(self, rng: Generator, box: Box, colour: Colour, *, emission: float = 0) -> None:
-        """Paints one line of random glyphs that fills the box."""
-        area = self.area(box)
+    def write(self, rng: Generator, rect: Rect, colour: Colour, *, emission: float = 0) -> None:
+        """Paints one line of random glyphs that fills the rectangle."""
+        area = self.area(rect)
         if min(area.shape[:2]) > 2:
-            count = max(1, round(box[2] / box[3] * 1.3))
+            count = max(1, round(rect[2] / rect[3] * 1.3))
             mask = lettering(rng, count, *area.shape[:2])[..., None]
             area += (np.array((*colour, 1, emission), np.float32) - area) * mask
 

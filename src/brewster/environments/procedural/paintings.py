@@ -284,9 +284,9 @@ def wallpaper(rng: Generator, canvas: Canvas) -> None:
             0.7, 0.95
         )
     elif choice < 0.35:
-        for course, top in enumerate(np.arange(0, canvas.height, 0.09)):
+        for brick_row, top in enumerate(np.arange(0, canvas.height, 0.09)):
             canvas.area((0, top, canvas.width, 0.02))[..., :3] *= 1.35
-            for left in np.arange((course % 2) * 0.13, canvas.width, 0.26):
+            for left in np.arange((brick_row % 2) * 0.13, canvas.width, 0.26):
                 canvas.area((left, top, 0.245, 0.07))[..., :3] *= rng.uniform(0.75, 1.15)
     elif choice < 0.5:
         for left in np.arange(0.1, canvas.width, 0.7):

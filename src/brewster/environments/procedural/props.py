@@ -13,12 +13,12 @@ import numpy as np
 from numpy.random import Generator
 
 from brewster.environments.procedural.canvas import (
-    Box,
     Canvas,
     Colour,
     Floats,
     Lighting,
     Quad,
+    Rect,
     tint,
     unit,
     vector,
@@ -34,7 +34,9 @@ A face is "front", "back", "left", "right", "top" or "bottom".
 
 @dataclass(frozen=True)
 class Lamp:
-    """A point light of intensity (3,) per steradian. It emits in all directions, or only in the half-space of `facing`."""
+    """A point light of intensity (3,) per steradian. If `facing` is None, it emits equally in all directions.
+    Otherwise it emits only in the half-space of `facing`, with intensity proportional to the cosine of the angle to `facing`.
+    """
 
     position: Floats
     intensity: Floats
@@ -49,7 +51,7 @@ class EnvironmentLighting:
     floor_y_m: float
     """The height of the floor relative to the viewer, below 0."""
     lamps: list[Lamp] = field(default_factory=list)
-    contacts: list[tuple[float, float, float, float]] = field(default_factory=list)
+    contact_shadows: list[tuple[float, float, float, float]] = field(default_factory=list)
 
     def __call__(self, points: Floats, normal: Floats) -> Floats:
         """Returns irradiance / pi (h, w, 3) at points (h, w, 3) of a surface with this unit normal (3,)."""
@@ -64,14 +66,14 @@ class EnvironmentLighting:
             if lamp.facing is not None:
                 weight *= np.clip(-(to_lamp @ lamp.facing), 0, None) / np.sqrt(squared)
             light += weight[..., None] * lamp.intensity
-        return light * self.shade(points, normal)
+        return light * self.contact_shadow_factor(points, normal)
 
-    def shade(self, points: Floats, normal: Floats) -> Floats:
+    def contact_shadow_factor(self, points: Floats, normal: Floats) -> Floats:
         """Returns the factor (h, w, 1) of the contact shadows on the floor; 1 on other surfaces."""
         factor = np.ones((*points.shape[:2], 1), np.float32)
         if normal[1] < 0.9 or points[0, 0, 1] > self.floor_y_m + 0.01:
             return factor
-        for x, z, half_width, half_depth in self.contacts:
+        for x, z, half_width, half_depth in self.contact_shadows:
             x_distance = np.clip(np.abs(points[..., :1] - x) - half_width, 0, None)
             z_distance = np.clip(np.abs(points[..., 2:] - z) - half_depth, 0, None)
             factor *= 1 - 0.75 * np.exp(-(x_distance**2 + z_distance**2) / 0.12)
@@ -146,7 +148,7 @@ class WindowStyle:
     """The colour of the sky that the glass reflects."""
 
 
-def window(rng: Generator, canvas: Canvas, outline: Box, style: WindowStyle) -> None:
+def paint_window(rng: Generator, canvas: Canvas, outline: Rect, style: WindowStyle) -> None:
     """Paints a window: glass that reflects the sky or shows a lit room, curtains or a blind, and glazing bars."""
     left, top, width, height = outline
     canvas.rect(outline, style.frame)
@@ -155,9 +157,9 @@ def window(rng: Generator, canvas: Canvas, outline: Box, style: WindowStyle) -> 
     glass = canvas.area(inner)
     if not glass.size:
         return
-    fall = np.linspace(1, rng.uniform(0.2, 0.7), glass.shape[0], dtype=np.float32)[:, None, None]
+    vertical_gradient = np.linspace(1, rng.uniform(0.2, 0.7), glass.shape[0], dtype=np.float32)[:, None, None]
     if rng.uniform() < style.lit_fraction:
-        glass[..., :3] = vector(1, rng.uniform(0.6, 0.85), rng.uniform(0.3, 0.7)) * (1.2 - fall)
+        glass[..., :3] = vector(1, rng.uniform(0.6, 0.85), rng.uniform(0.3, 0.7)) * (1.2 - vertical_gradient)
         glass[..., 4] = 0.4 * np.exp(rng.uniform(0, 3))
         canvas.rect(
             (left, top + height * 0.7, width * rng.uniform(0.2, 0.6), height * 0.25),
@@ -165,7 +167,9 @@ def window(rng: Generator, canvas: Canvas, outline: Box, style: WindowStyle) -> 
         )
     else:
         slant = np.linspace(0, rng.uniform(-0.5, 0.5), glass.shape[1], dtype=np.float32)[:, None]
-        glass[..., :3] = style.sky * rng.uniform(0.05, 0.45) * np.clip(fall + slant, 0.1, 1.2) + 0.01
+        glass[..., :3] = (
+            style.sky * rng.uniform(0.05, 0.45) * np.clip(vertical_gradient + slant, 0.1, 1.2) + 0.01
+        )
         glass[..., 4] = 0 if style.lit_fraction else 0.7
     _add_curtains(rng, glass)
     for index in range(1, style.columns):
@@ -190,7 +194,7 @@ def _add_curtains(rng: Generator, glass: Floats) -> None:
         )
 
 
-def car(rng: Generator, foot: Floats, faces_away: bool, light: Lighting, *, night: bool) -> list[Quad]:
+def car_quads(rng: Generator, foot: Floats, faces_away: bool, light: Lighting, *, night: bool) -> list[Quad]:
     """Returns a parked car along z. The viewer sees its tail lights if the car faces away, else its headlights."""
     colour = tint(rng, rng.uniform(0.02, 0.6), rng.choice([0.0, 0.1, 0.8]))
     lamps = vector(0.6, 0.02, 0.02) if faces_away else vector(0.9, 0.9, 0.85)
@@ -219,10 +223,10 @@ def car(rng: Generator, foot: Floats, faces_away: bool, light: Lighting, *, nigh
         return canvas
 
     length_m, height_m = rng.uniform(3.8, 4.8), rng.uniform(0.75, 1.0)
-    roof = foot + UP * (height_m + 0.12) + vector(0, 0, rng.uniform(-0.3, 0.3))
+    cabin_foot = foot + UP * (height_m + 0.12) + vector(0, 0, rng.uniform(-0.3, 0.3))
     return [
         *box(body, foot + UP * 0.12, (1.8, height_m, length_m), light),
-        *box(cabin, roof, (1.5, rng.uniform(0.45, 0.7), length_m * 0.55), light),
+        *box(cabin, cabin_foot, (1.5, rng.uniform(0.45, 0.7), length_m * 0.55), light),
     ]
 
 
@@ -235,7 +239,7 @@ def _wheel(canvas: Canvas, middle: float) -> None:
     canvas.pixels[(radius < 0.22) & (radius > 0.04), :3] = 0.3
 
 
-def bookshelf(rng: Generator) -> Painter:
+def bookshelf_painter(rng: Generator) -> Painter:
     """Returns a painter of a shelf full of books."""
     wood = vector(0.35, 0.23, 0.13) * rng.uniform(0.2, 1.9)
     sides = plain_painter(rng, wood, 60)
@@ -260,7 +264,7 @@ def bookshelf(rng: Generator) -> Painter:
     return paint
 
 
-def cabinet(rng: Generator) -> Painter:
+def cabinet_painter(rng: Generator) -> Painter:
     """Returns a painter of a cabinet with drawers or doors."""
     colour = tint(rng, rng.uniform(0.1, 0.6), 0.3)
     sides = plain_painter(rng, colour, 60)
@@ -323,8 +327,8 @@ def _cells(rng: Generator, blank: Canvas, style: WindowStyle) -> Floats:
     cells = []
     for _ in range(9):
         cell = Canvas(width, height, blank.density, blank.colour)
-        for course in np.arange(0, height, stone):
-            cell.area((0, course, width, 0.03))[..., :3] *= 0.8
+        for stone_row in np.arange(0, height, stone):
+            cell.area((0, stone_row, width, 0.03))[..., :3] *= 0.8
         if band:
             cell.area((0, height - 0.2, width, 0.2))[..., :3] *= 1.3
             cell.area((0, height - 0.04, width, 0.04))[..., :3] *= 0.4
@@ -332,7 +336,7 @@ def _cells(rng: Generator, blank: Canvas, style: WindowStyle) -> Floats:
         cell.area((outline[0] - margin, outline[1] - margin, outline[2] + 2 * margin, outline[3] + margin))[
             ..., :3
         ] *= 1.25
-        window(rng, cell, outline, style)
+        paint_window(rng, cell, outline, style)
         if sill:
             cell.area((outline[0] - 0.1, outline[1] + outline[3], outline[2] + 0.2, 0.1))[..., :3] = 0.5
             cell.area((outline[0] - 0.1, outline[1] + outline[3] + 0.1, outline[2] + 0.2, 0.08))[..., :3] *= (
@@ -348,7 +352,7 @@ def _cells(rng: Generator, blank: Canvas, style: WindowStyle) -> Floats:
 
 
 def _ground_floor(rng: Generator, canvas: Canvas, style: WindowStyle) -> Canvas:
-    """Paints shop windows below signs, doors between them, and a plinth."""
+    """Paints shop windows below signs, or plain windows; doors; and a plinth."""
     bottom, left = canvas.height, 0.3
     emission = 8 if style.lit_fraction else 0
     shops = rng.uniform() < 0.7
@@ -357,14 +361,14 @@ def _ground_floor(rng: Generator, canvas: Canvas, style: WindowStyle) -> Canvas:
         width_m = min(rng.uniform(1.8, 4.5), canvas.width - left - 0.3)
         sign, ink = tint(rng, rng.uniform(0.02, 0.4), 1), tint(rng, 0.7, 0.5)
         if shops:
-            window(rng, canvas, (left, 1.0, width_m - 0.3, bottom - 1.5), style)
-            _shop_goods(rng, canvas, (left + 0.1, bottom - 1.6, width_m - 0.5), emission / 3)
+            paint_window(rng, canvas, (left, 1.0, width_m - 0.3, bottom - 1.5), style)
+            _shop_goods(rng, canvas, left + 0.1, bottom - 0.6, width_m - 0.5, emission=emission / 3)
             canvas.rect(
                 (left - 0.1, 0.25, width_m - 0.1, 0.6), sign, emission=emission * (rng.uniform() < 0.3)
             )
             canvas.write(rng, (left + 0.1, 0.33, width_m - 0.6, 0.44), ink, emission=emission)
         else:
-            window(rng, canvas, (left + 0.3, 0.9, 1.1, 1.5), style)
+            paint_window(rng, canvas, (left + 0.3, 0.9, 1.1, 1.5), style)
         left += width_m
         if left < canvas.width - 1.2 and rng.uniform() < 0.6:
             door = tint(rng, 0.15, 0.8)
@@ -377,14 +381,13 @@ def _ground_floor(rng: Generator, canvas: Canvas, style: WindowStyle) -> Canvas:
 
 
 def _shop_goods(
-    rng: Generator, canvas: Canvas, baseline: tuple[float, float, float], emission: float
+    rng: Generator, canvas: Canvas, left: float, bottom: float, width_m: float, *, emission: float
 ) -> None:
-    """Paints goods in a shop window, at most 0.9 m tall. `baseline` is (left, top, width)."""
-    left, top, width_m = baseline
+    """Paints a row of goods, at most 0.9 m tall, in a shop window. `left` and `bottom` are in metres on the canvas."""
     offset = 0.0
     while offset < width_m - 0.4:
         size, height_m = rng.uniform(0.15, 0.5), rng.uniform(0.2, 0.9)
         canvas.rect(
-            (left + offset, top + 1 - height_m, size, height_m), tint(rng, 0.3, 0.9), emission=emission
+            (left + offset, bottom - height_m, size, height_m), tint(rng, 0.3, 0.9), emission=emission
         )
         offset += size + rng.uniform(0, 0.3)

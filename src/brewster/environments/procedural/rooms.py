@@ -35,9 +35,9 @@ from brewster.environments.procedural.props import (
     UP,
     EnvironmentLighting,
     Lamp,
-    bookshelf,
+    bookshelf_painter,
     box,
-    cabinet,
+    cabinet_painter,
     horizontal_quad,
     plain_painter,
     vertical_quad,
@@ -102,7 +102,8 @@ class _BoxRoom:
                         opening.height_m / 2 - np.abs(hit[..., 1] - opening.height_m / 2),
                     )
                     inside = np.clip(margin * 8 + 0.5, 0, 1) * (distance[..., 0] > 0.05)
-                    total += inside[..., None] * self.lighting.shade(points, normal) * facing * self.sunlight
+                    shadow_factor = self.lighting.contact_shadow_factor(points, normal)
+                    total += inside[..., None] * shadow_factor * facing * self.sunlight
         return total
 
     def environment(self) -> ProceduralEnvironment:
@@ -249,12 +250,12 @@ class _BoxRoom:
         reach = max(size[0], size[2]) / 2
         if np.hypot(foot[0], foot[2]) < reach + 0.7:
             return False
-        for x, z, half_width, half_depth in self.lighting.contacts:
+        for x, z, half_width, half_depth in self.lighting.contact_shadows:
             if abs(x - foot[0]) < half_width + reach * 0.8 and abs(z - foot[2]) < half_depth + reach * 0.8:
                 return False
         extent_x_m = abs(np.cos(rotation)) * size[0] + abs(np.sin(rotation)) * size[2]
         extent_z_m = abs(np.sin(rotation)) * size[0] + abs(np.cos(rotation)) * size[2]
-        self.lighting.contacts.append(
+        self.lighting.contact_shadows.append(
             (float(foot[0]), float(foot[2]), float(extent_x_m / 2), float(extent_z_m / 2))
         )
         return True
@@ -279,7 +280,7 @@ class _BoxRoom:
             elif kind == "sofa":
                 self._sofa(foot, (width_m, height_m, depth_m), rotation)
             else:
-                painter = bookshelf(rng) if kind == "shelf" else cabinet(rng)
+                painter = bookshelf_painter(rng) if kind == "shelf" else cabinet_painter(rng)
                 self.quads += box(painter, foot, (width_m, height_m, depth_m), self.light, rotation)
                 if kind == "screen":
                     self._screen(foot + UP * (height_m + 0.08), inward)

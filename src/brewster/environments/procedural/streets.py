@@ -26,7 +26,7 @@ from brewster.environments.procedural.props import (
     EnvironmentLighting,
     Lamp,
     box,
-    car,
+    car_quads,
     facade,
     horizontal_quad,
     plain_painter,
@@ -136,7 +136,7 @@ class _Street:
         if facing > 0 and self.sky.sunlight.any():
             total += (
                 self._sunlit(points)[..., None]
-                * self.lighting.shade(points, normal)
+                * self.lighting.contact_shadow_factor(points, normal)
                 * facing
                 * self.sky.sunlight
             )
@@ -368,8 +368,8 @@ def _cars(street: _Street) -> None:
             if rng.uniform() < 0.45:
                 foot = vector(side * x, street.ground, z + rng.uniform(-0.5, 0.5))
                 faces_away = bool((side > 0) == (z < 0))
-                street.lighting.contacts.append((float(foot[0]), float(foot[2]), 0.85, 2))
-                street.quads += car(rng, foot, faces_away, street.light, night=street.night)
+                street.lighting.contact_shadows.append((float(foot[0]), float(foot[2]), 0.85, 2))
+                street.quads += car_quads(rng, foot, faces_away, street.light, night=street.night)
                 if street.night and not faces_away and rng.uniform() < 0.5:
                     nose = foot - vector(0, 0, np.sign(z) * 2.6) + UP * 0.7
                     for offset in (-0.65, 0.65):

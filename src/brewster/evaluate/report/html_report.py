@@ -92,9 +92,10 @@ def _data(results: Results, scores: list[Any]) -> Iterator[str]:
 def _results(results: Results) -> Iterator[str]:
     images, methods = results["cases"], results["methods"]
     benchmarks, config = results["benchmarks"], results["protocol"]
+    size = "original size" if config["size"] == "native" else f"shorter side of at most {config['size']} px"
     yield (
         f"<p class=lede>{_count(len(methods), 'method')} on {_count(len(images), 'image')} of "
-        f"{_count(len(benchmarks), 'benchmark')}: size {escape(str(config['size']))}, quality "
+        f"{_count(len(benchmarks), 'benchmark')}: {escape(size)}, quality "
         f"{escape(str(config['quality']))}, brewster {escape(results['brewster'])}.</p>\n"
     )
     yield from _problems(results)
@@ -122,7 +123,7 @@ def _problems(results: Results) -> Iterator[str]:
     )
     all_remarks = benchmark_remarks + remarks(results)
     yield _note(
-        "Not computed, run again to add them",
+        "Metrics that were not computed. Correct the cause, then run the evaluation again to add them.",
         [f"{name}: {reason}" for name, reason in results["unavailable"].items()],
     )
     yield _note(_count(len(excluded), "file excluded"), excluded)
@@ -159,7 +160,7 @@ def _title(results: Results, name: str) -> str:
     return str(results["selections"][name]["title"])
 
 
-def _table(caption: str, metrics: Results, bodies: Iterable[str]) -> str:
+def _table(caption: str, metrics: Mapping[str, Any], bodies: Iterable[str]) -> str:
     columns = "".join(
         f"<th scope=col>{escape(metric['title'])} <small>{escape(metric['unit'] or '')} "
         f"{'&uarr;' if metric['higher_is_better'] else '&darr;'}</small></th>"
@@ -171,7 +172,7 @@ def _table(caption: str, metrics: Results, bodies: Iterable[str]) -> str:
     )
 
 
-def _body(title: str, metrics: Results, rows: Iterable[tuple[str, Iterable[str]]]) -> str:
+def _body(title: str, metrics: Mapping[str, Any], rows: Iterable[tuple[str, Iterable[str]]]) -> str:
     rows_html = (f"<tr><th scope=row>{escape(name)}</th>{''.join(cells)}</tr>\n" for name, cells in rows)
     span = len(metrics) + 1
     return f"<tbody><tr><th scope=rowgroup colspan={span}><span>{title}</span></th></tr>\n{''.join(rows_html)}</tbody>\n"
@@ -181,49 +182,55 @@ def _means(results: Results) -> str:
     metrics = _scored_metrics(results)
     bodies = []
     for name, table in results["tables"].items():
-        best = {metric: next(iter(ranking(table, metric, about)), None) for metric, about in metrics.items()}
+        best = {key: next(iter(ranking(table, key, metric)), None) for key, metric in metrics.items()}
         image_count = results["selections"][name]["cases"]
         rows = (
             (
                 method,
                 [
                     _mean(
-                        row.get(metric),
-                        metrics[metric],
-                        best[metric] if is_complete(table, method, metric) else None,
+                        row.get(key),
+                        metric,
+                        best[key] if is_complete(table, method, key) else None,
                         image_count,
                     )
-                    for metric in metrics
+                    for key, metric in metrics.items()
                 ],
             )
             for method, row in table.items()
         )
         count = f" <small>{_count(image_count, 'image')}</small>"
         bodies.append(_body(escape(_title(results, name)) + count, metrics, rows))
-    return _table("Means and their 95 % intervals. A star marks the best mean of a column", metrics, bodies)
+    return _table(
+        "Means and their 95 % intervals. A star marks the best mean of each metric on each benchmark",
+        metrics,
+        bodies,
+    )
 
 
-def _mean(estimate: Results | None, about: Results, best: str | None, image_count: int) -> str:
+def _mean(
+    estimate: Mapping[str, Any] | None, metric: Mapping[str, Any], best: str | None, image_count: int
+) -> str:
     if not estimate:
         return f"<td>{_DASH}</td>"
-    mean, is_best = _number(estimate["mean"], about), f"{estimate['mean']:.{about['digits']}f}" == best
+    mean, is_best = _number(estimate["mean"], metric), f"{estimate['mean']:.{metric['digits']}f}" == best
     style = " class=best" if is_best else ""
     star = "<span class=star>&starf;<span class=hidden> best </span></span>" if is_best else ""
     count = f"<small>{estimate['count']} of {image_count}</small>" if estimate["count"] != image_count else ""
-    return f"<td{style}>{star}<b>{mean}</b>{_interval(estimate, about)}{count}</td>"
+    return f"<td{style}>{star}<b>{mean}</b>{_interval(estimate, metric)}{count}</td>"
 
 
-def _interval(estimate: Results, about: Results, sign: str = "") -> str:
+def _interval(estimate: Mapping[str, Any], metric: Mapping[str, Any], sign: str = "") -> str:
     if estimate["low"] is None or estimate["high"] is None:
         return ""
-    ends = [_number(estimate[end], about, sign) for end in ("low", "high")]
+    ends = [_number(estimate[end], metric, sign) for end in ("low", "high")]
     return f"<small>{ends[0]} to {ends[1]}</small>"
 
 
-def _number(value: float | None, about: Results, sign: str = "") -> str:
+def _number(value: float | None, metric: Mapping[str, Any], sign: str = "") -> str:
     if value is None:
         return _DASH
-    return f"{value:{sign}.{about['digits']}f}".replace("-", "&minus;")
+    return f"{value:{sign}.{metric['digits']}f}".replace("-", "&minus;")
 
 
 def _differences(results: Results) -> str:
@@ -245,13 +252,13 @@ def _difference_bodies(results: Results, is_baseline: bool) -> list[str]:
     """Returns the table bodies: differences from the baseline if `is_baseline`, else those between other methods."""
     metrics, bodies = _scored_metrics(results), []
     for name, differences in results["differences"].items():
-        rows: dict[str, dict[str, Results]] = {}
+        rows: dict[str, dict[str, Mapping[str, Any]]] = {}
         for row in differences:
             if (row["reference"] == BASELINE) == is_baseline:
                 pair = row["method"] if is_baseline else f"{row['method']} minus {row['reference']}"
                 rows.setdefault(pair, {})[row["metric"]] = row
         cells = (
-            (pair, [_difference(row.get(metric), metrics[metric]) for metric in metrics])
+            (pair, [_difference(row.get(key), metric) for key, metric in metrics.items()])
             for pair, row in rows.items()
         )
         if rows:
@@ -259,11 +266,11 @@ def _difference_bodies(results: Results, is_baseline: bool) -> list[str]:
     return bodies
 
 
-def _difference(row: Results | None, about: Results) -> str:
+def _difference(row: Mapping[str, Any] | None, metric: Mapping[str, Any]) -> str:
     if not row:
         return f"<td>{_DASH}</td>"
     is_inconclusive = row["low"] is None or row["low"] <= 0 <= row["high"]
-    is_better = (row["mean"] > 0) == about["higher_is_better"]
+    is_better = (row["mean"] > 0) == metric["higher_is_better"]
     verdict, mark = (
         ("inconclusive", "")
         if is_inconclusive
@@ -272,8 +279,8 @@ def _difference(row: Results | None, about: Results) -> str:
         else ("worse", "&#9660; ")
     )
     return (
-        f"<td class={verdict}>{mark}<span class=hidden>{verdict}: </span><b>{_number(row['mean'], about, '+')}</b>"
-        f"{_interval(row, about, '+')}<small>{row['improved_count']} of {row['count']}</small></td>"
+        f"<td class={verdict}>{mark}<span class=hidden>{verdict}: </span><b>{_number(row['mean'], metric, '+')}</b>"
+        f"{_interval(row, metric, '+')}<small>{row['improved_count']} of {row['count']}</small></td>"
     )
 
 
@@ -306,11 +313,11 @@ def _cases(results: Results, cases: Iterable[CaseThumbnails], scores: list[Any])
     if len(scores) < len(entries):
         yield (
             f"<p>This page shows {len(scores):,} of {_count(len(entries), 'image')}: for each benchmark, first the images on "
-            "which the first method after the baseline failed, then its worst scores in the first metric.</p>\n"
+            "which the first method after the baseline failed, then the images on which this method has its worst scores in the first metric.</p>\n"
         )
 
 
-def _case(results: Results, case: CaseThumbnails, entry: Results) -> str:
+def _case(results: Results, case: CaseThumbnails, entry: Mapping[str, Any]) -> str:
     facts = [
         escape(_title(results, case.benchmark)),
         f"{case.size[0]} &times; {case.size[1]} px",
@@ -327,33 +334,33 @@ def _case(results: Results, case: CaseThumbnails, entry: Results) -> str:
     )
 
 
-def _row(results: Results, entry: Results, method: str, tiles: str) -> str:
+def _row(results: Results, entry: Mapping[str, Any], method: str, thumbnails: str) -> str:
     error = entry["errors"].get(method)
     failure = f"<p class=failure>Failed: {escape(error)}</p>" if error else ""
     title = "photo, input (unprocessed)" if method == BASELINE else method
     return (
         f"<section><div><h4>{escape(title)}</h4>{failure}{_scores(results, entry['scores'], method)}</div>"
-        f"<div class=tiles>{tiles}</div></section>\n"
+        f"<div class=thumbnails>{thumbnails}</div></section>\n"
     )
 
 
-def _scores(results: Results, scores: Results, method: str) -> str:
+def _scores(results: Results, scores: Mapping[str, Any], method: str) -> str:
     """Returns a table with the scores of a method on one image, and their differences from the unprocessed input."""
     method_scores, baseline_scores = scores.get(method, {}), scores.get(BASELINE, {})
     lines = []
-    for name, about in results["metrics"].items():
+    for name, metric in results["metrics"].items():
         if all(row.get(name) is None for row in scores.values()) or method not in scores:
             continue
         value, baseline = method_scores.get(name), baseline_scores.get(name)
         has_change = method != BASELINE and value is not None and baseline is not None and value != baseline
-        change = _gain(value - baseline, about) if has_change else ""
+        change = _gain(value - baseline, metric) if has_change else ""
         lines.append(
-            f"<tr><th scope=row>{escape(about['title'])}</th><td>{_number(value, about)}</td><td>{change}</td></tr>"
+            f"<tr><th scope=row>{escape(metric['title'])}</th><td>{_number(value, metric)}</td><td>{change}</td></tr>"
         )
     return f"<table>{''.join(lines)}</table>" if lines else ""
 
 
-def _gain(change: float, about: Results) -> str:
-    is_better = (change > 0) == about["higher_is_better"]
+def _gain(change: float, metric: Mapping[str, Any]) -> str:
+    is_better = (change > 0) == metric["higher_is_better"]
     verdict, mark = ("better", "&#9650;") if is_better else ("worse", "&#9660;")
-    return f"<span class={verdict}>{_number(change, about, '+')} {mark}<span class=hidden>{verdict}</span></span>"
+    return f"<span class={verdict}>{_number(change, metric, '+')} {mark}<span class=hidden>{verdict}</span></span>"

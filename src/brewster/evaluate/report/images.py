@@ -97,21 +97,23 @@ def to_thumbnails(case: CaseImages) -> CaseThumbnails:
     """Downscales and encodes all images of a case."""
     height, width = case.photo.shape[:2]
     names = dict.fromkeys((*case.predictions, *case.reflections))
-    methods = {name: method_tiles(case, name) for name in names}
-    return CaseThumbnails(case.benchmark, case.name, (width, height), photo_tiles(case), methods)
+    methods = {name: method_thumbnails(case, name) for name in names}
+    return CaseThumbnails(case.benchmark, case.name, (width, height), photo_thumbnails(case), methods)
 
 
-def photo_tiles(case: CaseImages) -> str:
+def photo_thumbnails(case: CaseImages) -> str:
     """Returns HTML with the photo, its error map, the ground truth, the region and, if known, the true reflection."""
-    tiles = [
-        _tile(case, "picture", "photo", encode_photo(case.photo), ("photo", "")),
-        _tile(case, "error", "error of the photo", encode_lossless(error_map(case.photo, case.ground_truth))),
-        _tile(case, "picture", "ground truth", encode_photo(case.ground_truth), ("transmission", "")),
-        _tile(case, "region", "reflection region", overlay(case.region)),
+    thumbnails = [
+        _thumbnail(case, "picture", "photo", encode_photo(case.photo), ("photo", "")),
+        _thumbnail(
+            case, "error", "error of the photo", encode_lossless(error_map(case.photo, case.ground_truth))
+        ),
+        _thumbnail(case, "picture", "ground truth", encode_photo(case.ground_truth), ("transmission", "")),
+        _thumbnail(case, "region", "reflection region", overlay(case.region)),
     ]
     if case.reflection_ground_truth is not None:
-        tiles.append(
-            _tile(
+        thumbnails.append(
+            _thumbnail(
                 case,
                 "reflection",
                 "ground truth of the reflection",
@@ -119,23 +121,25 @@ def photo_tiles(case: CaseImages) -> str:
                 ("reflection", ""),
             )
         )
-    return "".join(tiles)
+    return "".join(thumbnails)
 
 
-def method_tiles(case: CaseImages, method: str) -> str:
+def method_thumbnails(case: CaseImages, method: str) -> str:
     """Returns HTML with the transmission of a method, its error map and its reflection; "" if the method failed."""
-    tiles = []
+    thumbnails = []
     if method in case.predictions:
         prediction = case.predictions[method]
-        tiles.append(_tile(case, "picture", method, encode_photo(prediction), ("transmission", method)))
-        tiles.append(
-            _tile(
+        thumbnails.append(
+            _thumbnail(case, "picture", method, encode_photo(prediction), ("transmission", method))
+        )
+        thumbnails.append(
+            _thumbnail(
                 case, "error", f"error of {method}", encode_lossless(error_map(prediction, case.ground_truth))
             )
         )
     if method in case.reflections:
-        tiles.append(
-            _tile(
+        thumbnails.append(
+            _thumbnail(
                 case,
                 "reflection",
                 f"reflection by {method}",
@@ -143,10 +147,12 @@ def method_tiles(case: CaseImages, method: str) -> str:
                 ("reflection", method),
             )
         )
-    return "".join(tiles)
+    return "".join(thumbnails)
 
 
-def _tile(case: CaseImages, kind: str, caption: str, data: bytes, full: tuple[str, str] | None = None) -> str:
+def _thumbnail(
+    case: CaseImages, kind: str, caption: str, data: bytes, full: tuple[str, str] | None = None
+) -> str:
     """Returns HTML: an image as a button that opens the viewer, and a link to the file at full size, if there is one."""
     width, height = embedded_size(case.photo)
     media_type = "image/png" if data.startswith(b"\x89PNG") else "image/jpeg"

@@ -8,7 +8,7 @@
   const rank = button => ["picture", "error", "reflection", "region"].indexOf(button.dataset.kind);
   const cases = [...list.querySelectorAll("article")].map((element, i) => ({
     element, scores: data.scores[i], benchmark: element.dataset.benchmark, name: element.dataset.name,
-    buttons: [...element.querySelectorAll(".tiles button")].sort((a, b) => rank(a) - rank(b)),
+    buttons: [...element.querySelectorAll(".thumbnails button")].sort((a, b) => rank(a) - rank(b)),
   }));
 
   // --- sort and filter; the URL fragment stores the settings that differ from the defaults, so that a view can be shared

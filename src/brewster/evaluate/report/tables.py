@@ -108,7 +108,12 @@ def _overview(results: Results) -> str:
     if not metrics:
         return ""
     titles = " / ".join(_heading(results, name) for name in metrics)
-    rows = [["", *(f"{part['title']} ({part['cases']})" for part in results["selections"].values())]]
+    rows = [
+        [
+            "",
+            *(f"{selection['title']} ({selection['cases']})" for selection in results["selections"].values()),
+        ]
+    ]
     rows += [
         [method, *(_cell(results, key, method, metrics) for key in results["selections"])]
         for method in results["methods"]
@@ -183,9 +188,9 @@ def _interval(results: Results, metric: str, entry: Mapping[str, Any], *, sign: 
 def _notes(results: Results) -> str:
     """Returns the notes: remarks, excluded files, metrics without a score, and errors."""
     lines = [
-        f"- {part['title']}: {text}"
-        for part in results["benchmarks"].values()
-        for text in (*part["remarks"], *(f"excluded: {reason}" for reason in part["excluded"]))
+        f"- {benchmark['title']}: {text}"
+        for benchmark in results["benchmarks"].values()
+        for text in (*benchmark["remarks"], *(f"excluded: {reason}" for reason in benchmark["excluded"]))
     ]
     lines += [f"- {remark}" for remark in remarks(results)]
     lines += [f"- {name} is not computed: {reason}" for name, reason in results["unavailable"].items()]

@@ -19,12 +19,12 @@ def import_library(name: str) -> Any:  # noqa: ANN401 - a module of a library th
         MissingExtra: the library is not installed.
     """
     try:
-        with suppress_warnings():
+        with suppress_log_messages():
             return importlib.import_module(name)
     except ImportError as error:
         raise MissingExtra(
             f"{error.name or name} cannot be imported ({error})",
-            "expected a library that the diffusion models need",
+            "expected it to be installed, because the diffusion models need it",
             "run: pip install 'brewster[diffusion]'",
         ) from error
 
@@ -33,15 +33,23 @@ def diffusers_class(name: str) -> Any:  # noqa: ANN401 - diffusers has no types 
     """A class of diffusers by its name; diffusers imports the module of the class at this first access.
 
     Raises:
-        MissingExtra: diffusers, or a library that this class needs, is not installed.
+        MissingExtra: diffusers, or a library that this class needs, is not installed; or this version of diffusers does not have
+            the class.
     """
     diffusers = import_library("diffusers")
-    with suppress_warnings():
-        return getattr(diffusers, name)
+    try:
+        with suppress_log_messages():
+            return getattr(diffusers, name)
+    except (AttributeError, RuntimeError) as error:  # diffusers converts errors of the import to RuntimeError
+        raise MissingExtra(
+            f"the class {name} cannot be imported from diffusers ({error.__cause__ or error})",
+            "expected a version of diffusers that has the class, and the libraries that the class needs",
+            "run: pip install --upgrade 'brewster[diffusion]'",
+        ) from error
 
 
 @contextlib.contextmanager
-def suppress_warnings() -> Iterator[None]:
+def suppress_log_messages() -> Iterator[None]:
     """Disables log messages up to WARNING: on import, diffusers and transformers warn about optional packages."""
     previous_level = logging.root.manager.disable
     logging.disable(logging.WARNING)

@@ -15,7 +15,7 @@ from torch.nn import functional
 from brewster.files import atomic_path, write_atomically
 from brewster.photo import Photo
 from brewster.render.sample import LAYERS
-from brewster.rendered.store import SCENE_FILE, STATISTICS, StoredSample, read_set
+from brewster.rendered.store import SCENE_FILE, STATISTICS, StoredSample, read_dataset
 
 INDEX_FILE, PREVIEW_FILE = "index.parquet", "preview.png"
 _BATCH_ROWS: Final = 1000
@@ -43,13 +43,13 @@ COLUMNS: Final = {
     "aperture_mm": ("float64", "camera.aperture_mm"),
     "focus_mm": ("float64", "camera.focus_mm"),
     **{
-        f"{side}_{light}_{name}": (kind, f"{side}.{light}.{path}")
+        f"{side}_{source}_{name}": (kind, f"{side}.{source}.{path}")
         for side in ("behind", "front")
-        for light, more in (("map", "radius_mm"), ("plane", "distance_mm"))
+        for source, distance_key in (("map", "radius_mm"), ("plane", "distance_mm"))
         for name, kind, path in (
             ("file", "string", "source.file"),
             ("luminance", "float64", "luminance"),
-            (more, "float64", more),
+            (distance_key, "float64", distance_key),
         )
     },
     "jpeg_quality": ("int64", "camera_response.jpeg_quality"),
@@ -65,17 +65,19 @@ COLUMNS: Final = {
 def write_index(out: Path) -> None:
     """Writes index.parquet, with a row for each sample in order. Its bytes depend only on the samples and their paths.
 
+    The column `path` is the folder or the shard of the sample, relative to `out`.
+
     Raises:
         OutputError: the file cannot be written, for example because the disk is full.
     """
-    import pyarrow as pa  # noqa: PLC0415  (not needed to read a set)
+    import pyarrow as pa  # noqa: PLC0415  (not needed to read a dataset)
     from pyarrow import parquet  # noqa: PLC0415
 
-    kinds = {"index": "int64", "place": "string", "panes": "int64"} | {
+    kinds = {"index": "int64", "path": "string", "panes": "int64"} | {
         name: kind for name, (kind, _) in COLUMNS.items()
     }
     schema = pa.schema([(name, pa.type_for_alias(kind)) for name, kind in kinds.items()])
-    rows = map(_row, read_set(out))
+    rows = map(_row, read_dataset(out))
     with atomic_path(out / INDEX_FILE) as part, parquet.ParquetWriter(part, schema) as writer:
         while batch := list(islice(rows, _BATCH_ROWS)):
             writer.write_batch(pa.RecordBatch.from_pylist(batch, schema=schema))
@@ -83,7 +85,7 @@ def write_index(out: Path) -> None:
 
 def _row(entry: StoredSample) -> dict[str, Any]:
     scene = tomllib.loads(entry.read(SCENE_FILE).decode())
-    columns = {"index": entry.index, "place": entry.path.name, "panes": len(scene["glass"]["panes"])}
+    columns = {"index": entry.index, "path": entry.path.name, "panes": len(scene["glass"]["panes"])}
     return columns | {name: _lookup(scene, path.split(".")) for name, (_, path) in COLUMNS.items()}
 
 
@@ -104,12 +106,12 @@ _WHITE: Final = 255
 
 
 def write_preview(out: Path) -> None:
-    """Writes preview.png with the first 40 samples. A row shows the five photographs of a sample.
+    """Writes preview.png with the first 40 samples, in two columns. Each sample is a row of five images.
 
     Raises:
         OutputError: the file cannot be written.
     """
-    rows = [_contact_sheet_row(entry) for entry in islice(read_set(out), _SHEET_ROWS * _SHEET_COLUMNS)]
+    rows = [_contact_sheet_row(entry) for entry in islice(read_dataset(out), _SHEET_ROWS * _SHEET_COLUMNS)]
     columns = [
         np.concatenate(rows[first : first + _SHEET_ROWS]) for first in range(0, len(rows), _SHEET_ROWS)
     ]
@@ -128,7 +130,7 @@ def _contact_sheet_row(entry: StoredSample) -> NDArray[np.uint8]:
 
 
 def _cell(data: bytes) -> NDArray[np.uint8]:
-    """Scales a photograph down, and centres it in a white cell (120, 160, 3)."""
+    """Scales an image down, and centres it in a white cell (120, 160, 3)."""
     pixels = torch.from_numpy(Photo.open(data).pixels.copy()).permute(2, 0, 1)[None].float()
     scale = min((cell - 4) / side for cell, side in zip(_CELL, pixels.shape[2:], strict=True))
     height, width = (max(1, round(side * scale)) for side in pixels.shape[2:])

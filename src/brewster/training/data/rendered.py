@@ -22,7 +22,7 @@ from brewster.environments.assets import naming_file
 from brewster.errors import RecipeError
 from brewster.photo import Photo
 from brewster.render.camera_response import encode_jpeg, to_uint8
-from brewster.rendered.store import SCENE_FILE, StoredSample, key, read_scene_of, read_set
+from brewster.rendered.store import SCENE_FILE, StoredSample, key, read_dataset, read_scene_of
 from brewster.scene.values import Range
 from brewster.srgb import to_encoded
 from brewster.training.data.alpha_blend import blended_layers
@@ -153,7 +153,7 @@ def _first_entries(folders: Sequence[Path], count: int | None) -> list[StoredSam
 
 def _entries(folder: Path) -> list[StoredSample]:
     try:
-        return list(read_set(folder))
+        return list(read_dataset(folder))
     except (OSError, ValueError, tarfile.TarError) as error:
         raise RecipeError(
             f"{folder} cannot be read ({getattr(error, 'strerror', None) or error})",

@@ -25,7 +25,7 @@ from brewster.models.diffusion.panels import fit_panel
 from brewster.models.diffusion.prompt import PROMPT, PROMPT_FILE, load_prompt
 from brewster.models.zoo import TINY_PREFIX
 from brewster.rendered.generation.job import RECORD_FILE
-from brewster.rendered.store import read_set
+from brewster.rendered.store import read_dataset
 from brewster.training.recipe import LoraRecipe
 from brewster.training.streams import resolve_folders
 
@@ -37,7 +37,7 @@ _PANELS: Final = {
 }
 _SQUARE_PHOTO_PX: Final = (4096, 4096)
 """A large square photo: its panels fill the pixel budget best."""
-_BENCHMARK_HEADING: Final = "## Measured"
+_BENCHMARK_HEADING: Final = "## Benchmark scores"
 _NO_BENCHMARKS: Final = """This model has no benchmark scores yet. `brewster evaluate --benchmark NAME=FOLDER --model lora` scores the model, and
 `brewster models card lora --scores out/evaluate/results.json` writes the tables here."""
 
@@ -52,7 +52,7 @@ _LIMITS: Final = """## Limits
 - **White areas.** The model can mistake a white area of the scene, such as a sign, for a reflection and remove it. It can also
   keep a white reflection as part of the scene. `brewster evaluate` measures both errors on rendered datasets, in the columns
   "Removed white" and "Kept reflection".
-- It was trained only on the glass of its training data. Photos with rain, dirt, or curved or patterned panes may be separated incorrectly.
+- The model works only for kinds of glass that are in its training data. Photos with rain, dirt, or curved or patterned panes may be separated incorrectly.
 - Each seed gives a different result. The mean of several results contains less invented detail."""
 
 
@@ -111,13 +111,13 @@ def with_benchmark_tables(card: str, tables: str) -> str:
 def _front_matter(recipe: LoraRecipe, backbone_class: type[Backbone]) -> str:
     """Returns the metadata for the hub in YAML. The values are JSON strings and lists, which are valid YAML."""
     about: dict[str, object] = {}
-    if _is_toy(recipe):
+    if _is_tiny(recipe):
         about |= APACHE_2.hub
     else:
         about |= {"base_model": _base_id(recipe, backbone_class), "base_model_relation": "adapter"}
         about |= backbone_class.licence.hub
     about |= {"library_name": "diffusers", "pipeline_tag": "image-to-image"}
-    about |= {"tags": [*_TAGS, *(["toy"] if _is_toy(recipe) else [])]}
+    about |= {"tags": [*_TAGS, *(["tiny"] if _is_tiny(recipe) else [])]}
     lines = [f"{name}: {json.dumps(value)}" for name, value in about.items()]
     return "\n".join(["---", *lines, "---"])
 
@@ -128,9 +128,9 @@ def _description(recipe: LoraRecipe, backbone_class: type[Backbone]) -> str:
 
 From a photo taken through glass, the backbone with this LoRA generates these panels, {recipe.direction}:
 {panels}.
-The in-context method is that of "SIRR-LMM: Single-image Reflection Removal via Large Multimodal Model". This LoRA
-was trained with brewster, not by the authors of the paper."""
-    if _is_toy(recipe):
+The method is that of the paper "SIRR-LMM: Single-image Reflection Removal via Large Multimodal Model" (Guo et al.,
+arXiv 2601.07209). This LoRA was trained with brewster, not by the authors of the paper."""
+    if _is_tiny(recipe):
         text += f"""
 
 **This model is for software tests.** Its backbone is a tiny version of {backbone_class.hub_id} with random weights.
@@ -141,7 +141,7 @@ The LoRA does not work with any published model, and it does not separate photos
 def _usage(recipe: LoraRecipe, backbone_class: type[Backbone]) -> str:
     return f"""## Use
 
-The commands below call this folder `lora`; `hf download OWNER/NAME --local-dir lora` downloads it from the hub.
+In the examples, `lora` is this folder. The command `hf download OWNER/NAME --local-dir lora` downloads it from the hub.
 
 ```sh
 brewster photo.jpg --model lora
@@ -159,9 +159,9 @@ separation.transmission.save("clear.jpg")
 
 def _diffusers_usage(recipe: LoraRecipe, backbone_class: type[Backbone]) -> str:
     """Explains how to generate the same image with diffusers alone, if that is possible."""
-    if _is_toy(recipe):
+    if _is_tiny(recipe):
         return "diffusers alone can load the LoRA into the tiny version that `brewster.models.diffusion.backbones.registry.tiny` builds."
-    loads = 'diffusers alone can load it with `pipe.load_lora_weights("lora")`'
+    loads = 'diffusers alone can load the LoRA with `pipe.load_lora_weights("lora")`'
     if recipe.objective == "one_step":
         return f"{loads}, but then starts from noise. This LoRA needs to start from the photo and to take one step."
     usage = backbone_class.diffusers_usage
@@ -220,11 +220,15 @@ def _data(recipe: LoraRecipe) -> str:
     rendered = data.rendered
     if rendered and data.rendered_share and data.pairs_share < 1:
         first = f"the first {rendered.count} samples of " if rendered.count else ""
-        sets = "; ".join(_set_description(folder) for folder in rendered.datasets)
+        if first and len(rendered.datasets) > 1:
+            first += "these datasets together, in this order: "
+        datasets = "; ".join(_dataset_description(folder) for folder in rendered.datasets)
         lines.append(
-            f"- Rendered by `brewster render`, {1 - data.pairs_share:.0%} of the samples: {first}{sets}."
+            f"- Rendered by `brewster render`, {1 - data.pairs_share:.0%} of the samples: {first}{datasets}."
         )
-        mixed = "added as light" if rendered.blend_space == "linear" else "blended in 8 bits"
+        mixed = (
+            "added in linear light" if rendered.blend_space == "linear" else "blended as 8-bit sRGB images"
+        )
         lines.append(f"  T is the {rendered.target}; the layers are {mixed}.")
     if data.pairs_share:
         lines.append(
@@ -232,10 +236,10 @@ def _data(recipe: LoraRecipe) -> str:
         )
         if recipe.reflections == "difference":
             lines.append(
-                "  The reflection of a pair without one is photo minus transmission, in linear light."
+                "  If a pair has no reflection image, its reflection is photo minus transmission, in linear light."
             )
     lines.append(
-        f"- {'Mirrored at random' if recipe.flip else 'Never mirrored'}; each sample has its own aspect ratio."
+        f"- {'Flipped left to right at random' if recipe.flip else 'Never flipped'}; each sample has its own aspect ratio."
     )
     if data.validate_on:
         lines.append(
@@ -280,7 +284,7 @@ def _scores(scores: Mapping[str, float]) -> str:
         if name not in {"step", "seconds"}
     }
     table = _table(("metric", "value"), rows) if rows else "No scores were logged."
-    return f"## Scores\n\nThese values are from the last training step; the PSNR gains are measured on the validation pairs.\n\n{table}"
+    return f"## Validation during training\n\nThese values are from the last training step; the PSNR gains are measured on the validation pairs.\n\n{table}"
 
 
 def _metric_title(name: str) -> str:
@@ -294,7 +298,7 @@ def _metric_title(name: str) -> str:
 
 
 def _licence(recipe: LoraRecipe, backbone_class: type[Backbone]) -> str:
-    if _is_toy(recipe):
+    if _is_tiny(recipe):
         return f"{APACHE_2.title}. It contains no weights of the backbone."
     text = f"{backbone_class.licence.title}, the licence of the backbone."
     if not backbone_class.licence.is_commercial:
@@ -307,7 +311,7 @@ def _table(head: tuple[str, str], rows: Mapping[str, object]) -> str:
     return "\n".join(f"| {name} | {value} |" for name, value in lines)
 
 
-def _is_toy(recipe: LoraRecipe) -> bool:
+def _is_tiny(recipe: LoraRecipe) -> bool:
     return recipe.backbone.startswith(TINY_PREFIX)
 
 
@@ -319,18 +323,18 @@ def _base_id(recipe: LoraRecipe, backbone_class: type[Backbone]) -> str:
 
 
 def _base_title(recipe: LoraRecipe, backbone_class: type[Backbone]) -> str:
-    if _is_toy(recipe):
+    if _is_tiny(recipe):
         return f"a tiny version of {backbone_class.hub_id}"
     return f"[{_base_id(recipe, backbone_class)}](https://huggingface.co/{_base_id(recipe, backbone_class)})"
 
 
-def _set_description(folder: Path) -> str:
+def _dataset_description(folder: Path) -> str:
     """Returns the name of a dataset and, if the dataset can be read, its number of samples and their scene recipe."""
     with suppress(BrewsterError, OSError, ValueError, KeyError):
         (path,) = resolve_folders([folder])
         recipe = tomllib.loads((path / RECORD_FILE).read_text())["recipe"]
-        count = sum(1 for _ in read_set(path))
-        return f"`{_folder_name(folder)}` ({count} samples of the scenes `{recipe['name']}`, orders {recipe['orders']})"
+        count = sum(1 for _ in read_dataset(path))
+        return f"`{_folder_name(folder)}` ({count} samples of the scene recipe `{recipe['name']}`, orders {recipe['orders']})"
     return f"`{_folder_name(folder)}`"
 
 

@@ -78,7 +78,9 @@ def _comparison(description: StudyDescription, trial: Trial) -> dict[str, object
 def _catch(description: StudyDescription, trial: Trial) -> dict[str, object]:
     """A catch trial: the sides have an unchanged output or its degraded copy, and no methods are compared."""
     catch = next(catch for catch in description.catch_pool if catch.photo == trial.photo)
-    left, right = ("degraded" if side == catch.spoilt else "unchanged" for side in (trial.left, trial.right))
+    left, right = (
+        "degraded" if side == catch.degraded else "unchanged" for side in (trial.left, trial.right)
+    )
     return {
         "kind": "catch", "dataset": catch.dataset, "name": catch.name,
         "left": left, "right": right, "expected": trial.expected,

@@ -19,7 +19,7 @@ const captions = { left: "Result A", photo: "Photo", right: "Result B" };
 const preloaded = []; // the pictures of the next trial, held in memory
 let currentTrial = null; // the current trial, as returned by the server
 let practising = false; // whether the practice trial is shown
-let flips = 0; // how often another picture was shown in place during the trial
+let switches = 0; // how often another picture was shown in place during the trial
 let zoomed = false; // whether the pictures were enlarged during the trial
 let noticeTimer; // the timer that removes the notice
 let shownAt = null; // time at which the pictures of the trial were shown; null while no answer is accepted
@@ -120,7 +120,7 @@ function setView(name) {
 
 // Shows one picture instead of all three.
 function showInPlace(side) {
-  flips += view() === "single" && shownSide() !== side;
+  switches += view() === "single" && shownSide() !== side;
   for (const [name, element] of Object.entries(frames)) element.parentElement.classList.toggle("shown", name === side);
   for (const button of byId("flip").children) button.setAttribute("aria-pressed", button.dataset.side === side);
   if (view() !== "single") setView("single");
@@ -146,7 +146,7 @@ function viewingConditions() {
     theme: matchMedia("(prefers-color-scheme: dark)").matches ? "dark" : "light",
     pointer: matchMedia("(pointer: coarse)").matches ? "coarse" : "fine",
     view: view(),
-    flips,
+    switches,
     zoomed: zoomed || panZoom.isZoomed,
   };
 }
@@ -206,7 +206,7 @@ async function showPictures(trial, { width, height }, title) {
   await Promise.all(sides.map((side) => frames[side].firstElementChild.decode()));
   panZoom.reset(width, height);
   if (view() === "single") showInPlace("left");
-  [flips, zoomed] = [0, panZoom.isZoomed];
+  [switches, zoomed] = [0, panZoom.isZoomed];
   byId("trial").classList.remove("waiting");
   updateChoices(null, false);
   byId("announcement").textContent = title;

@@ -37,7 +37,7 @@ _HOME_FOLDERS: Final = re.compile(r"(?:(?<![\w.])/home/|/Users/|/root/|[A-Za-z]:
 _LOGIN_HINT: Final = (
     "create one at https://huggingface.co/settings/tokens, then run `hf auth login` or set HF_TOKEN"
 )
-_RETRAIN_HINT: Final = "correct the model card, or train again to write a new one"
+_CARD_HINT: Final = "correct the model card, or train again to write a new one"
 
 
 @final
@@ -86,7 +86,7 @@ def plan_push(folder: Path, repo_id: str, *, message: str = "", public: bool = F
 
     Raises:
         ModelError: a file is missing or damaged, the prompt does not belong to the LoRA, the model card has no front
-            matter, a file contains the path of a home folder, or `repo_id` is not OWNER/NAME.
+            matter, a file or the message contains the path of a home folder, or `repo_id` is not OWNER/NAME.
         MissingExtra: huggingface_hub is not installed.
     """
     _check_repo_id(repo_id)
@@ -99,8 +99,9 @@ def plan_push(folder: Path, repo_id: str, *, message: str = "", public: bool = F
     if replacements:
         data[RECIPE_FILE] = f"{json.dumps(_replace_strings(recipe, replacements), indent=2)}\n".encode()
         data[LORA_FILE] = _replace_base(data[LORA_FILE], metadata, replacements)
-    for name, content in [*data.items(), ("the message", message.encode())]:
-        _refuse_home_folders(folder / name, content)
+    for name, content in data.items():
+        _refuse_home_folders(str(folder / name), _readable_text(name, content))
+    _refuse_home_folders("the commit message", message)
     return UploadPlan(
         repo_id,
         tuple(UploadFile(name, content) for name, content in data.items()),
@@ -167,7 +168,7 @@ def _read_bytes(path: Path) -> bytes:
         raise ModelError(
             f"{path} cannot be read ({error.strerror})",
             f"expected a LoRA's folder, with {', '.join(FILES)}",
-            "pass the folder lora that brewster train wrote, or train again to write it",
+            "pass the folder named `lora` in the output folder of brewster train, or train again to write it",
         ) from error
 
 
@@ -195,14 +196,14 @@ def _check_front_matter(folder: Path, card: bytes, *, is_tiny: bool) -> None:
         raise ModelError(
             f"the front matter of {folder / CARD_FILE} is not YAML: {error}",
             "expected YAML that the hub can read",
-            _RETRAIN_HINT,
+            _CARD_HINT,
         ) from error
     missing = sorted(required - {name for name, value in fields.items() if value})
     if missing:
         raise ModelError(
             f"the front matter of {folder / CARD_FILE} has no {', '.join(missing)}",
             "expected these fields as YAML between two lines ---",
-            _RETRAIN_HINT,
+            _CARD_HINT,
         )
 
 
@@ -249,16 +250,23 @@ def _replace_base(data: bytes, metadata: LoraMetadata, replacements: Mapping[str
     )
 
 
-def _refuse_home_folders(path: Path, data: bytes) -> None:
-    """Refuses text and metadata with the path of a home folder, because the path can contain the user's name."""
-    text = json.dumps(read_metadata(data)) if path.suffix == ".safetensors" else data.decode(errors="replace")
+def _readable_text(name: str, data: bytes) -> str:
+    """Returns the text of a file, or the metadata of a .safetensors file."""
+    return json.dumps(read_metadata(data)) if name.endswith(".safetensors") else data.decode(errors="replace")
+
+
+def _refuse_home_folders(source: str, text: str) -> None:
+    """Refuses a text with the path of a home folder, because the path can contain the user's name.
+
+    `source` is the path of the file, or "the commit message".
+    """
     home = str(Path.home())
     match = _HOME_FOLDERS.search(text)
     if match or (len(home) > 1 and home in text):
         raise ModelError(
-            f"{path} contains the path {match[0] if match else home}",
-            "expected no path of a home folder in uploaded files",
-            "remove it from the file",
+            f"{source} contains the path {match[0] if match else home}",
+            "expected no path of a home folder, because it is published",
+            f"remove it from {source}",
         )
 
 
@@ -290,7 +298,7 @@ def _translate_hub_errors(repo_id: str) -> Iterator[None]:
         raise DownloadError(
             f"the hub cannot be reached ({error})",
             "expected a network connection",
-            "connect and push again (nothing was sent)",
+            "connect and push again (no commit was made)",
         ) from error
     except json.JSONDecodeError as error:
         raise DownloadError(
@@ -300,7 +308,7 @@ def _translate_hub_errors(repo_id: str) -> Iterator[None]:
         ) from error
     except ValueError as error:  # huggingface_hub raises it if the hub rejects the front matter
         raise DownloadError(
-            f"the hub refused {CARD_FILE}: {error}", "expected valid front matter", _RETRAIN_HINT
+            f"the hub refused {CARD_FILE}: {error}", "expected valid front matter", _CARD_HINT
         ) from error
 
 
@@ -319,5 +327,7 @@ def _http_error(status: int, repo_id: str) -> DownloadError:
             _LOGIN_HINT,
         )
     return DownloadError(
-        f"the hub returned HTTP {status} for {repo_id}", "expected a commit", "try again later"
+        f"the hub returned HTTP {status} for {repo_id}",
+        "expected the hub to accept the commit (HTTP 200)",
+        "try again later",
     )

@@ -2,7 +2,7 @@
 
     import_lora("someone/glass-lora", Path("glass"), base_model="kontext", prompt="remove the reflection", panels=("T",))
 
-Such a file contains neither its base model nor its prompt nor its panels, so the user states them. The prompt is
+The file of a LoRA contains neither its base model nor its prompt nor its panels, so the user states them. The prompt is
 encoded once, during the import. The names and shapes of the layers are compared with the configuration of the base model; its weights are not
 loaded.
 """
@@ -90,7 +90,10 @@ def read_layers(path: Path, base: Backbone) -> dict[str, LowRankLayer]:
 
 
 def _scale(path: Path, metadata: Mapping[str, str]) -> ScalingFunction | None:
-    """alpha / rank from the settings in the file's metadata (diffusers) or next to it (peft)."""
+    """Returns the function that gives alpha / rank of a layer, from the settings in the file (diffusers) or next to it (peft).
+
+    Returns None if there are no settings.
+    """
     config = path.with_name(_PEFT_CONFIG_FILE)
     if _DIFFUSERS_KEY not in metadata:
         return scaling_from_config(read_json(config)) if config.is_file() else None

@@ -20,7 +20,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from brewster.errors import ModelError
-from brewster.models.diffusion.lazy_imports import diffusers_class, suppress_warnings
+from brewster.models.diffusion.lazy_imports import diffusers_class, suppress_log_messages
 from brewster.models.diffusion.offloading import tiled_if_large
 from brewster.models.diffusion.prompt import PROMPT, PromptEmbedding
 
@@ -289,7 +289,7 @@ class Backbone(ABC):
     def save(self, folder: Path) -> None:
         """Writes a folder that `load_backbone` and diffusers can load."""
         pipeline = self.pipeline()
-        with suppress_warnings():  # diffusers warns about missing text encoders
+        with suppress_log_messages():  # diffusers warns about missing text encoders
             pipeline.save_pretrained(folder)
 
     def _check_grid(self, width: int, height: int) -> None:
