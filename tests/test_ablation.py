@@ -99,14 +99,18 @@ def test_a_study_with_missing_or_invalid_keys_is_an_error(text, message, tmp_pat
 
 @pytest.fixture
 def without_training(monkeypatch, model):
-    """Replaces training: every trained model is a copy of the model of the fixture."""
+    """Replaces training: every trained model is a copy of the model of the fixture. Returns the recipes that are trained."""
+
+    recipes = []
 
     def train(recipe, folder, on_step):
+        recipes.append(recipe)
         on_step(1, 1, {"loss": 0.5}, True)
         folder.mkdir(parents=True, exist_ok=True)
         return Path(shutil.copy(model, folder / "model.onnx"))
 
     monkeypatch.setattr(module, "_train", train)
+    return recipes
 
 
 @pytest.fixture
@@ -131,6 +135,7 @@ def test_values_are_compared_with_the_first_and_numbers_are_plotted(
     labels = [f"count {count}" for count in (0, 10, 50, 100, 300, 1000)]
     assert list(results["methods"]) == ["input (unprocessed)", *labels]
     assert [values[0] for values in calls] == labels
+    assert [recipe.data.rendered.count for recipe in without_training] == [0, 10, 50, 100, 300, 1000]
     compared = {(row["method"], row["reference"]) for row in results["differences"]["real20"]}
     assert ("count 300", "count 0") in compared
     plot = np.asarray(Image.open(io.BytesIO((tmp_path / "out" / "plot.png").read_bytes())).convert("L"))

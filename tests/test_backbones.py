@@ -142,11 +142,12 @@ def test_a_base_that_was_silently_left_unquantized_is_refused(tiny_folders, monk
 @pytest.mark.parametrize("name", list(BACKBONES))
 def test_a_base_computes_in_the_dtype_in_which_it_was_loaded(tiny_folders, name):
     """bitsandbytes stores weights as integers, and diffusers may keep the first floating-point layer in float32."""
-    backbone = load_backbone(str(tiny_folders / name), dtype=torch.bfloat16)
-    first = next(backbone.transformer.parameters())
+    loaded = load_backbone(str(tiny_folders / name), dtype=torch.bfloat16)
+    first = next(loaded.transformer.parameters())
     first.data = first.data.float()
-    assert backbone.transformer.dtype == torch.float32
-    assert backbone.dtype == torch.bfloat16
+    assert loaded.transformer.dtype == torch.float32
+    backbone = type(loaded)(loaded.transformer, loaded.vae, loaded.scheduler, dtype=torch.bfloat16)
+    assert loaded.dtype == backbone.dtype == torch.bfloat16
 
 
 def test_nf4_needs_an_nvidia_gpu():

@@ -34,8 +34,8 @@ def test_only_small_changes_of_clipped_pixels_are_removed(photo_level, transmiss
 
 
 def test_a_coloured_pixel_with_one_clipped_channel_is_not_white():
-    photo, prediction = predict(1.0, 0.9)
-    photo[..., 2] = 0.2
+    photo, prediction = predict(1.0, 0.95)
+    photo[..., 2] = 0.5
     np.testing.assert_array_equal(keep_clipped_white(photo, prediction).change, prediction.change)
 
 

@@ -84,12 +84,12 @@ def test_additive_layers_with_a_mask_still_sum_to_the_photo(photo):
 
 def test_strips_use_their_own_rows_of_the_mask():
     values = np.zeros((3000, 200), np.uint8)
-    values[::2] = 255
+    values[1000:] = 255
     grey = Photo(np.full((3000, 200, 3), 128, np.uint8))
     assert len(list(grey.strips())) > 1
     transmission = Separator(glass_backend)(grey, mask=values).transmission.pixels
-    assert (transmission[1::2] == 128).all()
-    assert (transmission[::2] < 128).all()
+    assert (transmission[:1000] == 128).all()
+    assert (transmission[1000:] < 128).all()
 
 
 def test_the_mask_belongs_to_the_upright_photo():

@@ -38,3 +38,8 @@ def test_images_without_two_blocks_of_texture_have_no_niqe(photo, rng):
     with pytest.raises(ValueError, match="uint8"):
         niqe(photo.astype(float))
     assert niqe(rng.integers(0, 256, (96, 192, 3)).astype(np.uint8)) > 10
+
+
+def test_a_negative_is_as_natural_as_the_photo(photo):
+    """The negative swaps the left and the right half of each distribution."""
+    assert niqe(255 - photo) == pytest.approx(niqe(photo), abs=1e-6)

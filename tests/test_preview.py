@@ -167,6 +167,8 @@ def test_the_tiles_of_level_zero_are_the_pixels_of_the_photo_and_others_are_mean
     expected = 255 * to_encoded(photo.resized(550, 350))
     assert np.abs(half - expected).max() <= 1
     assert tiles_of(photo, 3).shape == (88, 138, 3)
+    grey = Photo(np.full((1001, 603, 3), 128, np.uint8))
+    assert (tiles_of(grey, 3) == 128).all()
 
 
 @pytest.mark.parametrize("address", [(0, 3, 0), (0, 0, 2), (0, -1, 0), (-1, 0, 0), (9, 0, 0), (60, 0, 0)])

@@ -258,6 +258,17 @@ def test_a_crash_is_reported_with_its_case_and_the_next_run_tries_again(real20, 
     assert working.requested == ["2"]
 
 
+def test_a_later_error_does_not_delete_scores(real20, tmp_path):
+    first = score(real20, [FakeMethod()], QUICK, tmp_path / "out")
+    more = EvaluationConfig(metrics=("psnr", "ssim", "psnr_region"))
+    failed = score(real20, [FakeMethod(predictions={"2": RuntimeError("boom")})], more, tmp_path / "out")
+    assert failed[1].error
+    again = FakeMethod()
+    rows = score(real20, [again], QUICK, tmp_path / "out")
+    assert [row.scores["psnr"] for row in rows] == [row.scores["psnr"] for row in first]
+    assert again.requested == []
+
+
 def test_a_prediction_of_another_size_is_an_error_and_is_not_resized(real20, tmp_path):
     small = Photo.from_array(np.zeros((8, 8, 3), np.uint8), encoding="srgb")
     rows = score(real20, [FakeMethod(predictions={"1": MethodOutput(small)})], QUICK, tmp_path / "out")

@@ -206,7 +206,7 @@ def _load_single_file(
         options["quantization_config"] = diffusers_class("GGUFQuantizationConfig")(compute_dtype=dtype)
     with _translate_load_errors(path):
         try:
-            transformer = diffusers_class(expected).from_single_file(
+            return diffusers_class(expected).from_single_file(
                 str(path),
                 config=str(folder / "transformer"),
                 dtype=dtype,
@@ -216,16 +216,13 @@ def _load_single_file(
             )
         except torch.OutOfMemoryError:
             raise
-        except (IndexError, RuntimeError) as error:  # the file has other layers than diffusers converts
-            raise ValueError(str(error)) from error
-    missing = [name for name, parameter in transformer.named_parameters() if parameter.is_meta]
-    if missing:
-        raise ModelError(
-            f"{path} lacks {len(missing)} weights of {backbone_class.name}, for example {missing[0]}",
-            f"expected all weights of a {expected}",
-            "choose a file for this base, or another base",
-        )
-    return transformer
+        except (IndexError, RuntimeError) as error:
+            # diffusers does not find a weight that it converts or copies.
+            raise ModelError(
+                f"{path} lacks weights of {backbone_class.name} ({error})",
+                f"expected all weights of a {expected}",
+                "choose a file for this base, or another base",
+            ) from error
 
 
 @contextlib.contextmanager
