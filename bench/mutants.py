@@ -187,7 +187,18 @@ def _pytest(copy: Path, tests: Sequence[str], log: Path) -> None:
     os.environ |= {"PYTHONPATH": str(copy / "src"), "BREWSTER_DATA": data}
     sys.path[0] = str(copy / "src")
     plugins_are_imported = "ignore::pytest.PytestAssertRewriteWarning"
-    options = ["-x", "-q", "-p", "no:cacheprovider", "--tb=no", "-W", plugins_are_imported]
+    rawpy_is_forked = "ignore:rawpy is being used:RuntimeWarning"
+    options = [
+        "-x",
+        "-q",
+        "-p",
+        "no:cacheprovider",
+        "--tb=no",
+        "-W",
+        plugins_are_imported,
+        "-W",
+        rawpy_is_forked,
+    ]
     sys.exit(pytest.main([*options, *tests], plugins=[_Recorder(log)]))
 
 

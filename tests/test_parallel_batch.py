@@ -388,7 +388,7 @@ def test_several_processes_have_the_summary_grouped_errors_and_contact_sheet_of_
     )
     assert code == 1
     assert re.search(r"2 separated, 1 failed in [\d.]+ s; the layers are in .*out", err)
-    assert err.count("error: ") == 1
+    assert err.count("error: ") == 1, err
     assert Photo.open(tmp_path / "sheet.png").size[1] > 2 * 240
 
 

@@ -121,7 +121,7 @@ def load_vgg16(
             "delete the file, so that brewster downloads it again (528 MiB), or replace it with the correct one",
         )
     state = torch.load(path, map_location="cpu", weights_only=True)
-    return [state[name].float().contiguous() for name in VGG16_TENSORS]
+    return [state[name].detach().float().contiguous() for name in VGG16_TENSORS]
 
 
 def _cached(name: str) -> Path:
@@ -145,7 +145,7 @@ def read_alexnet(path: Path, digest: str = ALEXNET_DIGEST) -> dict[str, Tensor]:
 
     try:
         state = torch.load(path, map_location="cpu", weights_only=True)
-        tensors = {name: state[name].float().contiguous() for name in ALEXNET_TENSORS}
+        tensors = {name: state[name].detach().float().contiguous() for name in ALEXNET_TENSORS}
     except _LOAD_ERRORS as error:
         raise _not_alexnet(path, f"it cannot be read: {type(error).__name__}") from error
     if (actual := alexnet_digest(tensors)) != digest:
