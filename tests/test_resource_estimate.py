@@ -109,6 +109,8 @@ def test_the_plan_reads_the_data(run_without_model, tmp_path, monkeypatch):
     code, out, _ = run_without_model("train", RECIPES / "lora-tiny.toml", "--plan")
     assert code == 0
     assert re.search(rb"^data +4 rendered samples; panels of 32 x 16$", out, re.MULTILINE)
+    assert re.search(rb"^download +0 GB, of which 0 GB", out, re.MULTILINE)
+    assert re.search(rb"^host memory +4\.0 GiB \(estimate\)$", out, re.MULTILINE)
 
 
 def test_the_plan_lists_download_and_host_memory(klein):

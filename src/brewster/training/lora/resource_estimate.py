@@ -80,8 +80,12 @@ class ResourceEstimate:
     def table(self) -> str:
         """Returns the estimate as lines of name and value."""
         recipe, (width, height) = self.recipe, self.panel
-        encoders = 0 if recipe.prompt.endswith(ENCODED_SUFFIX) else 2 * self.text_encoder_parameters
-        download = 2 * self.parameter_count + self.memory_gib["VAE"] * GIB + encoders
+        is_tiny = recipe.backbone.startswith(
+            TINY_PREFIX
+        )  # a tiny version has random weights and no text encoders
+        is_encoded = is_tiny or recipe.prompt.endswith(ENCODED_SUFFIX)
+        encoders = 0 if is_encoded else 2 * self.text_encoder_parameters
+        download = 0 if is_tiny else 2 * self.parameter_count + self.memory_gib["VAE"] * GIB + encoders
         rows = {
             "backbone": f"{recipe.backbone}, {self.parameter_count / 1e9:.2f} billion parameters",
             "LoRA": f"rank {recipe.rank}, {self.lora_parameters / 1e6:.1f} million parameters",
@@ -89,7 +93,7 @@ class ResourceEstimate:
             "tokens": f"{self.generated_tokens} generated, {self.condition_tokens} condition, {PROMPT_TOKENS} text",
             **{f"memory, {name}": f"{gib:.1f} GiB" for name, gib in self.memory_gib.items()},
             "memory": f"{self.total_gib:.1f} GiB of {self.card.memory_gib:g} on {self.card.name} (estimate)",
-            "host memory": f"{encoders / GIB + _HOST_OVERHEAD_GIB:.1f} GiB, while the text encoders encode the prompt (estimate)",
+            "host memory": f"{encoders / GIB + _HOST_OVERHEAD_GIB:.1f} GiB{'' if is_encoded else ', while the text encoders encode the prompt'} (estimate)",
             "download": f"{download / 1e9:.0f} GB, of which {encoders / 1e9:.0f} GB are text encoders (estimate)",
             "per step": f"{self.tflop:.0f} TFLOP, {self.seconds:.1f} s (estimate)",
             "total": f"{recipe.steps} steps, {self.seconds * recipe.steps / 3600:.1f} hours (estimate)",
