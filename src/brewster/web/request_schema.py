@@ -15,7 +15,7 @@ from starlette.exceptions import HTTPException
 from starlette.formparsers import MultiPartException, MultiPartParser
 from starlette.requests import Request
 
-from brewster.files import LAYERS, SeparationPaths
+from brewster.files import OUTPUT_LAYERS, SeparationPaths
 from brewster.image_formats import SUFFIXES
 from brewster.options import Options
 
@@ -186,4 +186,4 @@ def _options(form: FormData, models: Sequence[str], max_pixels: int) -> Options:
 
 def _ordered_layers(layers: Sequence[str]) -> list[str]:
     """Returns each layer once, in the order of the command line. Unknown names come last, and the validation refuses them."""
-    return [layer for layer in dict.fromkeys((*LAYERS, *layers)) if layer in layers]
+    return [layer for layer in dict.fromkeys((*OUTPUT_LAYERS, *layers)) if layer in layers]
