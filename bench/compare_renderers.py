@@ -23,7 +23,7 @@ from brewster.environments.assets import Assets
 from brewster.render.analytic import render
 from brewster.render.mitsuba.renderer import trace
 from brewster.render.rays import rough_glass
-from brewster.render.sample import LAYERS, LinearSample
+from brewster.render.sample import SAMPLE_IMAGES, LinearSample
 from brewster.scene.camera import Camera
 from brewster.scene.glass import Glazing, Pane
 from brewster.scene.scene import Scene
@@ -97,7 +97,7 @@ def compare(scene: Scene, assets: Assets, samples: int) -> list[str]:
         trace(_reseeded(scene, seed), assets, noise_threshold=0, max_samples=samples, polarised=polarised)
         for seed in (2, 3)
     )
-    return [_row(name, ours, theirs) for name in LAYERS]
+    return [_row(name, ours, theirs) for name in SAMPLE_IMAGES]
 
 
 def _row(name: str, ours: tuple[LinearSample, ...], theirs: tuple[LinearSample, ...]) -> str:
@@ -132,7 +132,7 @@ def main() -> None:
         if len(sys.argv) > 2 and sys.argv[2] not in name:
             continue
         print(f"| {name} |", flush=True)
-        for layer, line in zip(LAYERS, compare(scene, assets, samples), strict=True):
+        for layer, line in zip(SAMPLE_IMAGES, compare(scene, assets, samples), strict=True):
             print(f"|   {layer} | {line} |", flush=True)
 
 

@@ -19,7 +19,7 @@ from brewster.benchmarks.registry import Case, read_benchmark
 from brewster.evaluate.config import EvaluationConfig
 from brewster.evaluate.evaluation import evaluate
 from brewster.evaluate.methods import IdentityBaseline, ModelMethod, PredictionFolder
-from brewster.evaluate.report.tables import overview
+from brewster.evaluate.report.tables import tables_to_markdown
 from brewster.evaluate.score_log import SCORES_FILE
 from brewster.models.zoo import MODELS
 
@@ -46,7 +46,7 @@ def main(data: Path) -> None:
         OUT,
         on_progress=lambda _done, _total, row: timed.setdefault(row.method, []).append(row),
     )
-    print(overview(results))
+    print(tables_to_markdown(results))
     for model in models:
         megapixels = sum(row.width * row.height for row in timed[model.name]) / 1e6
         model_seconds = sum(row.seconds for row in timed[model.name])

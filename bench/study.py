@@ -22,7 +22,7 @@ import httpx
 import numpy as np
 
 from brewster import Photo
-from brewster.user_study.create import StudyOptions, create
+from brewster.user_study.create import StudyOptions, create_study
 from brewster.user_study.report.participants import ExclusionRule, collect_answers
 from brewster.user_study.report.results import summarise
 from brewster.user_study.store import AnswerStore
@@ -92,7 +92,7 @@ class Participants:
                 state = answer["next"]
 
 
-def create_study(folder):
+def create_large_study(folder):
     """Creates a study with 181 images, as in the paper, and three methods. The images are small and random."""
     rng = np.random.default_rng(1)
     for part in ("inputs", "ours", "RDNet", "DSIT"):
@@ -102,7 +102,7 @@ def create_study(folder):
                 blocks = np.kron(rng.integers(0, 256, (6, 8, 3)), np.ones((20, 20, 1))).astype(np.uint8)
                 Photo.from_array(blocks, encoding="srgb").save(folder / part / name / f"{i}.png")
     methods = {name: folder / name for name in ("ours", "RDNet", "DSIT")}
-    return create(folder / "study", folder / "inputs", methods, StudyOptions(seed=1))
+    return create_study(folder / "study", folder / "inputs", methods, StudyOptions(seed=1))
 
 
 async def run(study):
@@ -126,7 +126,7 @@ async def run(study):
 
 def main():
     shutil.rmtree(OUT, ignore_errors=True)
-    study = create_study(OUT)
+    study = create_large_study(OUT)
     participants, kills, seconds = asyncio.run(run(study))
     with sqlite3.connect(study.answers_file) as database:
         integrity = database.execute("PRAGMA integrity_check").fetchone()[0]

@@ -143,6 +143,27 @@ def test_values_are_compared_with_the_first_and_numbers_are_plotted(
     assert 0.005 < (plot < 128).mean() < 0.5
 
 
+def test_metrics_without_scores_are_left_out_of_the_plot():
+    study = read_study(RECIPES / "size.toml")
+    estimate = {"mean": 0.5, "low": None, "high": None}
+    scored = {study.label(value): {"niqe": estimate} for value in study.values}
+    results = {
+        "metrics": {"niqe": {"title": "NIQE", "unit": ""}},
+        "selections": {
+            "real20": {"title": "Real20"},
+            "nature20": {"title": "Nature20"},
+            "postcard": {"title": "P"},
+        },
+        "tables": {
+            "real20": scored,
+            "nature20": scored | {"count 50": {}},  # a model that failed on every image of a benchmark
+            "postcard": {label: {} for label in scored},
+        },
+    }
+    plot = Image.open(io.BytesIO(module._plot(study, study.values, results)))
+    assert min(plot.size) > 300
+
+
 def test_missing_weights_of_a_metric_are_reported_before_training(pairs, data, tmp_path, monkeypatch):
     def refuse():
         raise DownloadError("LPIPS has no weights", "expected a network connection", "connect")

@@ -49,7 +49,7 @@ def closed_form(scene, throughput_of=total_throughput):
 @given(random_scenes(orders="all"))
 def test_the_photo_is_the_sum_of_its_two_layers(scene):
     sample = render(scene, ASSETS)
-    layers = sample.layers().values()
+    layers = sample.images().values()
     assert all(layer.shape == (3, 16, 16) and layer.dtype == torch.float32 for layer in layers)
     assert all(torch.isfinite(layer).all() and (layer >= 0).all() for layer in layers)
     torch.testing.assert_close(
@@ -197,7 +197,7 @@ def test_a_very_small_wedge_renders_like_parallel_glass():
         for wedge_deg in (0.0, 1e-6)
     )
     parallel, wedged = (render(scene, ASSETS) for scene in scenes_)
-    for layer in parallel.layers():
+    for layer in parallel.images():
         torch.testing.assert_close(getattr(wedged, layer), getattr(parallel, layer), rtol=1e-3, atol=0)
 
 
@@ -337,7 +337,7 @@ def test_a_sun_of_one_texel_does_not_flicker(texels):
     assert max(energies) / min(energies) < 1.01
 
 
-GLASS_KINDS = {
+SCENE_KINDS = {
     "far": {"front": map_side("soft")},
     "near": {"front": map_side("soft", radius_mm=3000.0), "behind": plane_side("mottled")},
     "lens": {"front": map_side("soft", radius_mm=3000.0), "camera": {"aperture_mm": 10}},
@@ -346,20 +346,22 @@ GLASS_KINDS = {
 }
 
 
-@pytest.mark.parametrize("kind", sorted(GLASS_KINDS))
+@pytest.mark.parametrize("kind", sorted(SCENE_KINDS))
 def test_the_same_scene_gives_the_same_bytes(kind):
-    one, other = (render(make_scene(**GLASS_KINDS[kind], samples_per_pixel=4), ASSETS) for _ in range(2))
-    for first, second in zip(one.layers().values(), other.layers().values(), strict=True):
+    one, other = (render(make_scene(**SCENE_KINDS[kind], samples_per_pixel=4), ASSETS) for _ in range(2))
+    for first, second in zip(one.images().values(), other.images().values(), strict=True):
         assert first.numpy().tobytes() == second.numpy().tobytes()
 
 
-@pytest.mark.parametrize("kind", sorted(GLASS_KINDS))
+@pytest.mark.parametrize("kind", sorted(SCENE_KINDS))
 def test_the_result_does_not_depend_on_the_batch_size(kind, monkeypatch):
-    one_batch = render(make_scene(**GLASS_KINDS[kind], samples_per_pixel=4), ASSETS)
+    one_batch = render(make_scene(**SCENE_KINDS[kind], samples_per_pixel=4), ASSETS)
     monkeypatch.setattr(analytic, "_CPU_BATCH_RAYS", 100)
-    many_batches = render(make_scene(**GLASS_KINDS[kind], samples_per_pixel=4), ASSETS)
-    for first, second in zip(one_batch.layers().values(), many_batches.layers().values(), strict=True):
-        if kind == "rough":  # orders end by their mean weight over a batch
+    many_batches = render(make_scene(**SCENE_KINDS[kind], samples_per_pixel=4), ASSETS)
+    for first, second in zip(one_batch.images().values(), many_batches.images().values(), strict=True):
+        # The rays of a batch decide where the tracing of rough glass ends: orders of small mean weight end, and rays of
+        # small weight are continued at random. So the batch size changes the result.
+        if kind == "rough":
             assert float(first.mean()) == pytest.approx(float(second.mean()), rel=2e-3)
         else:
             torch.testing.assert_close(first, second, rtol=1e-5, atol=1e-6)

@@ -10,7 +10,7 @@ import pytest
 from brewster.errors import OutputError
 from brewster.web.application import listen, server_url
 from brewster.web.job_queue import JobQueue
-from brewster.web.middleware import RequestLimits
+from brewster.web.middleware import AccessPolicy
 from cli_helpers import image_bytes
 from file_server import loopback_only
 from other_processes import started
@@ -52,7 +52,7 @@ def test_a_photo_is_separated_over_a_socket():
 
 def test_an_upload_that_is_too_large_gets_a_complete_response():
     """A client that sends everything before it reads must receive the response, not a broken connection."""
-    with served_port(make_app(limits=RequestLimits(max_bytes=10_000))) as port:
+    with served_port(make_app(policy=AccessPolicy(max_bytes=10_000))) as port:
         body = bytes(3_000_000)
         assert status(raw_exchange(port, head(f"Content-Length: {len(body)}"), body)) == 413
         chunked = [chunk(bytes(100_000)) for _ in range(30)]
@@ -61,7 +61,7 @@ def test_an_upload_that_is_too_large_gets_a_complete_response():
 
 
 def test_a_slow_upload_is_refused():
-    with served_port(make_app(limits=RequestLimits(body_seconds=0.1))) as port:
+    with served_port(make_app(policy=AccessPolicy(body_seconds=0.1))) as port:
         response = raw_exchange(port, head(f"Content-Length: {len(FORM)}"), FORM[:50])
         assert status(response) == 408
         assert b"send it again" in response
@@ -106,9 +106,9 @@ def test_a_request_that_is_not_http_is_refused(invalid_bytes):
 SERVING = """
 from fastapi import APIRouter
 from brewster.web.application import create_app, serve
-from brewster.web.middleware import RequestLimits
+from brewster.web.middleware import AccessPolicy
 try:
-    serve(create_app(APIRouter(), limits=RequestLimits()), host="127.0.0.1", port=0, on_ready=lambda url: print(url, flush=True))
+    serve(create_app(APIRouter(), policy=AccessPolicy()), host="127.0.0.1", port=0, on_ready=lambda url: print(url, flush=True))
 except KeyboardInterrupt:
     print("interrupted")
 finally:

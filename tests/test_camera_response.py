@@ -13,7 +13,7 @@ from hypothesis.extra import numpy as arrays
 from brewster.errors import UnsupportedPhoto
 from brewster.photo import Photo
 from brewster.render.camera_response import develop, encode_jpeg, to_uint8, with_jpeg
-from brewster.render.sample import LAYERS, LinearSample
+from brewster.render.sample import SAMPLE_IMAGES, LinearSample
 from brewster.scene.scene import CameraResponse, Scene
 from brewster.srgb import REC709_LUMINANCE, to_encoded, to_linear
 
@@ -80,7 +80,7 @@ def test_a_black_image_stays_black_and_is_not_exposed():
         developed = develop(sample_of(torch.zeros(3, 4, 5), white_balance=balance))
         assert developed.exposure_ev == developed.mirror_exposure_ev == developed.overexposed_fraction == 0
         assert developed.white_balance_gains == (1, 1, 1)
-        assert not any(layer.any() for layer in developed.layers().values())
+        assert not any(layer.any() for layer in developed.images().values())
 
 
 def test_lamps_do_not_change_the_exposure():
@@ -113,8 +113,8 @@ def test_the_overexposed_fraction_counts_pixels_that_clip_in_any_channel():
 def test_the_same_light_has_the_same_value_in_every_layer(picture, response):
     sample = sample_of(picture, **response.model_dump())
     alike = LinearSample(sample.scene, *[sample.photo] * 5)
-    layers = develop(alike).layers()
-    assert list(layers) == list(LAYERS)
+    layers = develop(alike).images()
+    assert list(layers) == list(SAMPLE_IMAGES)
     for layer in layers.values():
         assert layer.dtype == torch.float32
         assert layer.shape == picture.shape
@@ -130,12 +130,12 @@ def test_the_recorded_settings_reproduce_the_pictures(picture, response):
     developed = develop(sample)
     recorded = tomllib.loads(tomli_w.dumps(developed.camera_settings()))
     assert recorded["white_balance_gains"] == list(developed.white_balance_gains)
-    for name in LAYERS:
+    for name in SAMPLE_IMAGES:
         ev = recorded["mirror_exposure_ev" if name == "mirror" else "exposure_ev"]
         encoded = to_encoded(exposed(getattr(sample, name), developed, ev).clamp(0, 1))
         smooth = encoded**2 * (3 - 2 * encoded)
         expected = encoded + response.contrast * (smooth - encoded)
-        torch.testing.assert_close(developed.layers()[name], expected, atol=2e-6, rtol=0)
+        torch.testing.assert_close(developed.images()[name], expected, atol=2e-6, rtol=0)
     assert recorded["overexposed_fraction"] == pytest.approx(
         (exposed(sample.photo, developed) >= 1).any(0).float().mean().item(), abs=1e-6
     )
@@ -254,8 +254,8 @@ def test_noise_has_the_requested_deviation_and_is_in_the_photo_only(level):
     quiet = develop(flat(level))
     deviation = (to_linear(developed.photo_encoded) - level).std().item()
     assert deviation == pytest.approx((0.03**2 * level + 0.01**2) ** 0.5, rel=0.02)
-    for name in LAYERS[1:]:
-        assert torch.equal(developed.layers()[name], quiet.layers()[name])
+    for name in SAMPLE_IMAGES[1:]:
+        assert torch.equal(developed.images()[name], quiet.images()[name])
 
 
 def test_noise_depends_on_seed_and_index():
@@ -275,7 +275,7 @@ def test_developing_twice_gives_the_same_bits():
             for _ in range(2)
         )
         assert one.camera_settings() == two.camera_settings()
-        assert all(torch.equal(one.layers()[name], two.layers()[name]) for name in LAYERS)
+        assert all(torch.equal(one.images()[name], two.images()[name]) for name in SAMPLE_IMAGES)
 
 
 # --- bytes
@@ -315,5 +315,5 @@ def test_with_jpeg_changes_the_photo_only():
     assert np.array_equal(to_uint8(compressed.photo_encoded), decoded)
     assert compressed.photo_encoded.dtype == torch.float32
     assert 0.001 < (compressed.photo_encoded - developed.photo_encoded).abs().mean() < 0.05
-    for name in LAYERS[1:]:
-        assert torch.equal(compressed.layers()[name], developed.layers()[name])
+    for name in SAMPLE_IMAGES[1:]:
+        assert torch.equal(compressed.images()[name], developed.images()[name])

@@ -69,7 +69,7 @@ def test_the_options_offer_the_values_that_the_library_accepts():
     hints = get_type_hints(Options)
     assert get_args(hints["quality"]) == tuple(QUALITIES)
     assert set(get_args(hints["device"])) == set(DEVICES)
-    assert get_args(get_args(hints["layers"])[0]) == files.LAYERS
+    assert get_args(get_args(hints["layers"])[0]) == files.OUTPUT_LAYERS
     assert set(get_args(get_args(hints["format"])[0])) == set(WRITABLE)
 
 

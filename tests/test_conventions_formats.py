@@ -125,8 +125,8 @@ SCORES = {
         "removed_content": 0.435374,
         "removed_white": 0.580899,
         "kept_reflection": 0.609849,
-        "linear_error": 0.131727,
-        "linear_error_reflection": 0.04864,
+        "linear_rmse": 0.131727,
+        "linear_rmse_reflection": 0.04864,
         "psnr_channels": 20.658735,
         "ssim_clipped": 0.876616,
     },
@@ -278,9 +278,9 @@ def test_a_changed_rendering_needs_a_new_sample_format():
         seed=5,
     )
     sample = render(scene, ASSETS)
-    output = {f"{name}, light": layer[:, 5, 17].tolist() for name, layer in sample.layers().items()}
+    output = {f"{name}, light": layer[:, 5, 17].tolist() for name, layer in sample.images().items()}
     output |= {
-        name: layer[1, 3::9, 4::9].ravel().tolist() for name, layer in develop(sample).layers().items()
+        name: layer[1, 3::9, 4::9].ravel().tolist() for name, layer in develop(sample).images().items()
     }
     rounded = {name: [round(value, 4) for value in values] for name, values in output.items()}
     check_output("rendered.store.SAMPLE_FORMAT", SAMPLE_FORMAT, SAMPLES, rounded, 2e-3)

@@ -32,7 +32,7 @@ def test_the_simulated_jpeg_has_the_loss_of_a_codec(scene, quality):
     assert (simulated - decoded).abs().mean() < 0.5 * codec_error
 
 
-@given(st.integers(0, 10**6), st.sampled_from(["falloff", "edge", "window", "shadow"]))
+@given(st.integers(0, 10**6), st.sampled_from(["smooth_attenuation_mask", "edge", "window", "shadow"]))
 def test_every_mask_is_between_zero_and_one(slot, name):
     mask = getattr(effects, name)(SampleRng(1, 2, slot), 48)
     assert mask.shape == (1, 48, 48)

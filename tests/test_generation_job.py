@@ -53,7 +53,7 @@ def test_existing_samples_are_skipped_and_nothing_changes(four_samples):
     assert before == {path: path.stat().st_mtime_ns for path in four_samples.rglob("*.jpg")}
 
 
-def test_a_set_can_grow_in_both_directions(four_samples, tmp_path):
+def test_a_dataset_can_grow_in_both_directions(four_samples, tmp_path):
     render_set(tmp_path / "set", count=1, first=2)
     render_set(tmp_path / "set", count=2)
     assert statuses(render_set(tmp_path / "set")) == {0: "skipped", 1: "skipped", 2: "skipped", 3: "rendered"}
@@ -61,7 +61,7 @@ def test_a_set_can_grow_in_both_directions(four_samples, tmp_path):
 
 
 @pytest.mark.parametrize("shards", [False, True])
-def test_an_interrupted_set_equals_an_uninterrupted_one(tmp_path, small_shards, shards):
+def test_an_interrupted_dataset_equals_an_uninterrupted_one(tmp_path, small_shards, shards):
     render_set(tmp_path / "undisturbed", count=8, shards=shards)
     with pytest.raises(KeyboardInterrupt):
         render_set(tmp_path / "set", count=8, executor=InterruptedExecutor, shards=shards)
@@ -79,7 +79,7 @@ def test_partial_files_of_a_killed_run_are_removed(four_samples, tmp_path):
     assert hashes(tmp_path / "set") == hashes(four_samples)
 
 
-def test_shards_are_packed_as_they_become_complete_and_grow_with_the_set(tmp_path, small_shards):
+def test_shards_are_packed_as_they_become_complete_and_grow_with_the_dataset(tmp_path, small_shards):
     folders_at_submit = {}
 
     class RecordingExecutor(SerialExecutor):
@@ -204,7 +204,7 @@ def test_other_maps_are_another_job(four_samples):
         )
 
 
-def test_a_set_grows_across_versions_until_its_samples_change(four_samples, tmp_path, monkeypatch):
+def test_a_dataset_grows_across_versions_until_its_samples_change(four_samples, tmp_path, monkeypatch):
     shutil.copytree(four_samples, tmp_path / "set")
     monkeypatch.setattr(brewster, "__version__", "99")
     assert statuses(render_set(tmp_path / "set", count=5))[4] == "rendered"

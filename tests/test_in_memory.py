@@ -45,6 +45,28 @@ def test_a_pil_image_is_unchanged_after_conversion_to_a_photo_and_back(mode):
     assert np.array_equal(np.asarray(again), np.asarray(image))
 
 
+@pytest.mark.parametrize(
+    ("mode", "transparency"), [("1", 0), ("L", 77), ("RGB", (10, 20, 30)), ("P", 3), ("I;16", 500)]
+)
+def test_a_transparent_colour_becomes_the_same_alpha_as_in_the_png(mode, transparency):
+    levels = np.zeros((8, 8), np.uint16 if mode == "I;16" else np.uint8)
+    levels[:4] = 500 if mode == "I;16" else 77
+    image = Image.fromarray(levels) if mode == "I;16" else Image.fromarray(levels).convert(mode)
+    if mode == "RGB":
+        image.putpixel((5, 6), transparency)
+    elif mode == "P":
+        image.putpixel((5, 6), 3)
+    file = io.BytesIO()
+    image.save(file, "PNG", transparency=transparency)
+    expected = Photo.open(file.getvalue())
+    assert expected.alpha is not None
+    assert expected.alpha.min() == 0 < expected.alpha.max()
+    photo = Photo.from_pil(Image.open(file))
+    assert np.array_equal(photo.alpha, expected.alpha)
+    assert np.array_equal(photo.linear(), expected.linear())
+    assert photo.pixels.dtype == expected.pixels.dtype
+
+
 def test_a_pil_image_has_profile_and_exif_and_is_upright():
     photo = Photo.open(file_of(smooth(), "JPEG", exif=exif_block(6)))
     photo = Photo(photo.pixels, None, FileInfo(**{**vars(photo.file_info), "icc": None}))

@@ -10,30 +10,30 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from brewster.web.application import create_app
-from brewster.web.middleware import RequestLimits, is_loopback
+from brewster.web.middleware import AccessPolicy, is_loopback
 from web_servers import client, request
 
 TOKEN = "a-token-for-the-tests"
 
 
-def app_with(limits):
+def app_with(policy):
     router = APIRouter()
 
     @router.post("/length")
     async def length(request: Request) -> int:
         return len(await request.body())
 
-    return create_app(router, limits=limits)
+    return create_app(router, policy=policy)
 
 
 @pytest.fixture
 def app():
-    return app_with(RequestLimits(max_bytes=100))
+    return app_with(AccessPolicy(max_bytes=100))
 
 
 @pytest.fixture
 def app_with_token():
-    return app_with(RequestLimits(token=TOKEN))
+    return app_with(AccessPolicy(token=TOKEN))
 
 
 def post(app, **what):
@@ -78,14 +78,14 @@ def test_a_foreign_host_is_refused(app, host):
 
 @given(name=st.text(string.ascii_lowercase + string.digits + ".-", min_size=1))
 def test_only_the_listed_host_names_are_allowed(name):
-    assert RequestLimits().allows_host(name) == (name in {"localhost", "127.0.0.1"})
+    assert AccessPolicy().allows_host(name) == (name in {"localhost", "127.0.0.1"})
 
 
 def test_a_network_server_accepts_its_address_and_no_foreign_name():
-    limits = RequestLimits.for_host("192.168.1.5")
-    assert limits.allows_host("192.168.1.5:8417")
-    assert not limits.allows_host("192.168.1.6:8417")
-    everywhere = RequestLimits.for_host("0.0.0.0")
+    policy = AccessPolicy.for_host("192.168.1.5")
+    assert policy.allows_host("192.168.1.5:8417")
+    assert not policy.allows_host("192.168.1.6:8417")
+    everywhere = AccessPolicy.for_host("0.0.0.0")
     assert everywhere.allows_host("192.168.1.6:8417")
     assert not everywhere.allows_host("evil.com")
 
@@ -105,7 +105,7 @@ def test_a_network_server_accepts_its_address_and_no_foreign_name():
 )
 def test_only_loopback_counts_as_this_machine(host, is_local):
     assert is_loopback(host) is is_local
-    assert RequestLimits.for_host(host).any_address is (host in {"0.0.0.0", "::"})
+    assert AccessPolicy.for_host(host).any_address is (host in {"0.0.0.0", "::"})
 
 
 # --- origin
@@ -152,7 +152,7 @@ def test_the_response_to_a_bug_has_security_headers():
         raise ZeroDivisionError
 
     async def once():
-        app = create_app(router, limits=RequestLimits())
+        app = create_app(router, policy=AccessPolicy())
         transport = httpx.ASGITransport(app, raise_app_exceptions=False)
         async with httpx.AsyncClient(transport=transport, base_url="http://localhost") as http:
             return await http.get("/bug")
@@ -185,7 +185,7 @@ def test_every_response_has_security_headers(app):
         {},
         {"authorization": "Bearer wrong"},
         {"authorization": TOKEN},
-        {"cookie": f"{RequestLimits(token=TOKEN).cookie_name}=wrong"},
+        {"cookie": f"{AccessPolicy(token=TOKEN).cookie_name}=wrong"},
         {"authorization": "Bearer \xe9"},
     ],
 )
@@ -208,7 +208,7 @@ def test_a_bearer_token_is_accepted(app_with_token):
 
 def test_a_link_with_the_token_sets_a_cookie_and_redirects():
     async def visit():
-        async with client(app_with(RequestLimits(token=TOKEN))) as browser:
+        async with client(app_with(AccessPolicy(token=TOKEN))) as browser:
             redirect = await browser.get(f"/page/index.html?token={TOKEN}")
             return redirect, await browser.get("/"), await browser.post("/length", content=b"abc")
 
@@ -254,7 +254,9 @@ def test_a_body_up_to_the_limit_is_accepted(app):
 def test_a_larger_body_is_refused_with_and_without_content_length(app, content):
     response = post(app, content=content())
     assert response.status_code == 413
-    assert response.json()["error"] == "the upload is larger than 0.0001 MB; send a smaller file"
+    assert (
+        response.json()["error"] == "the upload is too large; expected at most 0.0001 MB; send a smaller file"
+    )
 
 
 @pytest.mark.parametrize("length", ["-1", "1e3", "\u00b2", "9" * 20, "9" * 5000])
@@ -270,6 +272,6 @@ def test_a_body_that_takes_too_long_is_refused():
         yield b"x"
         await never_set().wait()
 
-    response = post(app_with(RequestLimits(body_seconds=0.01)), content=slow())
+    response = post(app_with(AccessPolicy(body_seconds=0.01)), content=slow())
     assert response.status_code == 408
     assert "longer than 0.01 seconds" in response.json()["error"]

@@ -284,7 +284,7 @@ def test_the_same_seed_gives_the_same_bytes_and_another_seed_gives_other_bytes()
         traced(s, max_samples=16) for s in (scene, scene, scene.model_copy(update={"seed": 1}))
     )
     samples = (first, repeated, reseeded)
-    for a, b, c in zip(*(sample.layers().values() for sample in samples), strict=True):
+    for a, b, c in zip(*(sample.images().values() for sample in samples), strict=True):
         assert a.numpy().tobytes() == b.numpy().tobytes()
         assert a.numpy().tobytes() != c.numpy().tobytes()
 

@@ -213,6 +213,16 @@ def test_heic_keeps_profile_exif_and_pixels() -> None:
         assert np.abs(again.linear() - photo.linear()).mean() < 0.01
 
 
+@pytest.mark.parametrize("brand", [b"mif1", b"miaf"])
+@pytest.mark.parametrize("format_name", ["avif", "heic"])
+def test_a_file_with_a_general_brand_is_recognised_by_its_content(format_name: str, brand: bytes) -> None:
+    pytest.importorskip("pillow_heif")
+    data = Photo(smooth(), None, FileInfo()).encode(format_name)
+    again = Photo.open(data[:8] + brand + data[12:])
+    assert again.file_info.format_name == format_name
+    assert np.array_equal(again.pixels, Photo.open(data).pixels)
+
+
 @pytest.mark.parametrize(("format_name", "module"), [("heic", "pillow_heif"), ("exr", "OpenEXR")])
 def test_a_missing_extra_names_the_command_that_installs_it(
     format_name: str, module: str, monkeypatch: pytest.MonkeyPatch

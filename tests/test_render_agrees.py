@@ -33,7 +33,7 @@ def traced_layers():
         patch.setattr(renderer, "_variant", lambda polarised: "scalar_rgb")
         try:
             samples = [
-                renderer.trace(scene, ASSETS, noise_threshold=0.02, max_samples=512).layers()
+                renderer.trace(scene, ASSETS, noise_threshold=0.02, max_samples=512).images()
                 for scene in seeds
             ]
         except MissingExtra as error:
@@ -44,7 +44,7 @@ def traced_layers():
 @pytest.mark.parametrize("layer", ["photo", "transmission", "background", "reflection", "mirror"])
 def test_the_analytic_renderer_and_mitsuba_render_the_same_image(traced_layers, layer):
     """The mean error is at most 1.3 times the noise plus 1 % of the mean light; the means differ by at most 1.5 %."""
-    analytic = render(SCENE, ASSETS).layers()[layer].double()
+    analytic = render(SCENE, ASSETS).images()[layer].double()
     mitsuba, noise = traced_layers[layer].mean(0), traced_layers[layer].std(0) / RUNS**0.5
     light = float(mitsuba.mean())
     assert float((analytic - mitsuba).abs().mean()) < 1.3 * float(noise.mean()) + 0.01 * light

@@ -12,7 +12,7 @@ from pyarrow import parquet
 from brewster import Photo
 from brewster.errors import OutputError, RecipeError
 from brewster.photo import read_exr_layers
-from brewster.render.sample import LAYERS, LinearSample
+from brewster.render.sample import SAMPLE_IMAGES, LinearSample
 from brewster.rendered import store
 from brewster.rendered.generation import preview
 from brewster.scene.recipe import read_scene_recipe
@@ -37,11 +37,11 @@ def scene():
 def test_a_sample_is_five_photographs_their_light_and_their_scene(four_samples, scene):
     folder = four_samples / "000003"
     assert {path.name for path in folder.iterdir()} == set(store.SAMPLE_FILES)
-    assert all(Photo.open(folder / f"{layer}.jpg").size == (24, 16) for layer in LAYERS)
+    assert all(Photo.open(folder / f"{layer}.jpg").size == (24, 16) for layer in SAMPLE_IMAGES)
     assert read_scene(folder / store.SCENE_FILE) == scene
     light = read_exr_layers((folder / store.LIGHT_FILE).read_bytes())
     sample = render(scene, None)
-    for name, layer in sample.layers().items():
+    for name, layer in sample.images().items():
         np.testing.assert_allclose(light[name], layer.permute(1, 2, 0).numpy(), rtol=1e-3)
 
 
@@ -73,8 +73,8 @@ def test_folders_and_shards_read_alike(four_samples, tmp_path):
         assert all(one.read(name) == other.read(name) for name in store.SAMPLE_FILES)
         (light, scene), (same_light, same_scene) = store.open_sample(one), store.open_sample(other)
         assert scene == same_scene
-        assert list(light) == list(LAYERS)
-        assert all(np.array_equal(light[name], same_light[name]) for name in LAYERS)
+        assert list(light) == list(SAMPLE_IMAGES)
+        assert all(np.array_equal(light[name], same_light[name]) for name in SAMPLE_IMAGES)
         assert light["photo"].shape == (16, 24, 3)
         assert light["photo"].dtype == np.float32
 

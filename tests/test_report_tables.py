@@ -6,7 +6,7 @@ import re
 
 import pytest
 
-from brewster.evaluate.report.tables import overview, ranking, to_csv, to_markdown, to_terminal
+from brewster.evaluate.report.tables import ranking, tables_to_markdown, to_csv, to_markdown, to_terminal
 from known_results import METRICS, entry, known_results
 
 
@@ -37,7 +37,7 @@ def test_markdown_lists_excluded_files_errors_and_every_setting(results):
 
 
 def test_all_lines_of_a_table_have_the_same_number_of_cells_with_any_names(results):
-    for block in re.findall(r"(?:^\|.*\n)+", overview(results), re.M):
+    for block in re.findall(r"(?:^\|.*\n)+", tables_to_markdown(results), re.M):
         assert len({len(re.findall(r"(?<!\\)\|", line)) for line in block.splitlines()}) == 1
 
 
@@ -92,16 +92,16 @@ def test_a_method_with_errors_is_not_in_the_ranking(results):
 
 def test_a_note_warns_of_means_over_fewer_images(results):
     note = "Do not compare a mean over fewer images"
-    assert note not in overview(results)
+    assert note not in tables_to_markdown(results)
     results["tables"]["real20"] = {
         "input (unprocessed)": {"psnr": entry(20.0)},
         "A_b|c": {"psnr": entry(21.5, count=19)},
     }
-    assert note in overview(results)
+    assert note in tables_to_markdown(results)
 
 
 def test_a_cell_with_several_counts_shows_the_smallest_and_the_largest(results):
     results["metrics"]["ssim"] = METRICS["psnr"]
     counts = {"psnr": entry(20.0, count=5), "ssim": entry(0.9, count=3), "lpips": entry(0.2, count=1)}
     results["tables"]["real20"] = {"input (unprocessed)": counts, "A_b|c": counts}
-    assert "(1 to 5 of 20)" in overview(results)
+    assert "(1 to 5 of 20)" in tables_to_markdown(results)

@@ -141,7 +141,7 @@ def test_files_that_are_missing_or_no_text_are_refused(tmp_path):
         read_scene_recipe("windw")
 
 
-def test_framed_glass_may_be_seen_at_any_angle_and_a_pinhole_has_no_focus_to_hit_glass(written):
+def test_framed_glass_is_accepted_at_any_angle_and_a_pinhole_camera_with_any_focus(written):
     read_scene(written("glass.opening_mm = [500, 400]\ncamera.heading_deg = 80"))
     read_scene(written("camera.focus_mm = 1002"))
 

@@ -18,7 +18,7 @@ from brewster.metrics import (
     Lpips,
     Metric,
     kept_reflection,
-    linear_error,
+    linear_rmse,
     lpips,
     psnr,
     psnr_of_channels,
@@ -220,7 +220,7 @@ def test_every_metric_gives_the_score_of_its_function(data, monkeypatch):
         "psnr_region": pytest.approx(psnr(photo, background, region=region), abs=1e-6),
         "ssim_region": pytest.approx(ssim(photo, background, region=region), abs=1e-6),
         "lpips_region": pytest.approx(lpips(photo, background, region=region), abs=1e-6),
-        "linear_error": pytest.approx(linear_error(photo, background), abs=1e-6),
+        "linear_rmse": pytest.approx(linear_rmse(photo, background), abs=1e-6),
         "psnr_channels": pytest.approx(psnr_of_channels(photo, background), abs=1e-6),
         "ssim_clipped": pytest.approx(ssim(photo, background, window="gaussian"), abs=1e-3),
     }

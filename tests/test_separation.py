@@ -18,7 +18,7 @@ from brewster import Photo
 from brewster.inference import Separator
 from brewster.web.application import create_app
 from brewster.web.job_queue import JobQueue
-from brewster.web.middleware import RequestLimits
+from brewster.web.middleware import AccessPolicy
 from brewster.web.model_cache import ModelCache
 from brewster.web.separation import separation_router
 from cli_helpers import image_bytes
@@ -48,7 +48,7 @@ def error_of(response):
 
 def test_the_server_returns_the_bytes_of_the_command_line(run_without_model, tmp_path):
     app = create_app(
-        separation_router(ModelCache(device="cpu"), JobQueue(), max_pixels=10**8), limits=RequestLimits()
+        separation_router(ModelCache(device="cpu"), JobQueue(), max_pixels=10**8), policy=AccessPolicy()
     )
     response = separate(app, MIXTURE.read_bytes(), MIXTURE.name, quality="draft", strength="0.7")
     run_without_model(MIXTURE, "-o", tmp_path, "--quality", "draft", "--strength", "0.7", "--device", "cpu")
@@ -293,7 +293,7 @@ def test_no_documentation_page_fetches_assets_from_other_servers(app):
     assert request(app, "GET", "/docs").status_code == request(app, "GET", "/redoc").status_code == 404
 
 
-SCHEMA_APP = make_app(limits=RequestLimits(hosts=frozenset({"testserver"})))
+SCHEMA_APP = make_app(policy=AccessPolicy(hosts=frozenset({"testserver"})))
 """An application with the host name that schemathesis uses."""
 SCHEMA = schemathesis.openapi.from_asgi("/openapi.json", SCHEMA_APP)
 

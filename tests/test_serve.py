@@ -43,30 +43,30 @@ def test_the_command_serves_requests_until_it_is_interrupted(reachable, model):
 
 @pytest.fixture
 def served_apps(monkeypatch, model):
-    """Records the limits and arguments of `serve` instead of serving."""
+    """Records the policy and arguments of `serve` instead of serving."""
     import brewster.web.application as web  # noqa: PLC0415
 
     calls = []
     monkeypatch.setattr(
-        web, "serve", lambda app, **kwargs: calls.append((app.user_middleware[0].kwargs["limits"], kwargs))
+        web, "serve", lambda app, **kwargs: calls.append((app.user_middleware[0].kwargs["policy"], kwargs))
     )
     return calls
 
 
 def test_another_address_prints_a_warning_and_gets_a_token(run_without_model, served_apps):
     code, _, err = run_without_model("serve", "--host", "0.0.0.0")
-    ((limits, kwargs),) = served_apps
+    ((policy, kwargs),) = served_apps
     assert code == 0
     assert "warning: everybody who can reach 0.0.0.0" in err
-    assert limits.any_address
-    assert len(limits.token) >= 16
+    assert policy.any_address
+    assert len(policy.token) >= 16
     assert kwargs["host"] == "0.0.0.0"
 
 
 def test_a_loopback_address_needs_no_token(run_without_model, served_apps):
     code, _, err = run_without_model("serve", "--max-bytes", "1000")
-    ((limits, kwargs),) = served_apps
-    assert (code, limits.token, limits.max_bytes, kwargs["host"], kwargs["port"]) == (
+    ((policy, kwargs),) = served_apps
+    assert (code, policy.token, policy.max_bytes, kwargs["host"], kwargs["port"]) == (
         0,
         None,
         1000,

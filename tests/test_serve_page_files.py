@@ -146,7 +146,7 @@ def test_the_bytes_of_the_upload_and_of_the_download_are_shown(open_page):
         assert ends, phase
         assert ends[-1]["loaded"] == ends[-1]["total"] > 500
     texts = page.evaluate("""async () => {
-        const { progressText } = await import("/page/strip.js");
+        const { progressText } = await import("/page/filmstrip.js");
         return [{ phase: "upload", loaded: 1_200_000, total: 5_000_000 }, { phase: "working", share: 0.351 },
                 { phase: "download", loaded: 12_000_000, total: 36_500_000 }].map(progressText);
     }""")

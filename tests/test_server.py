@@ -11,7 +11,7 @@ from fastapi import APIRouter, Response
 
 from brewster.web import server
 from brewster.web.application import create_app
-from brewster.web.middleware import RequestLimits
+from brewster.web.middleware import AccessPolicy
 from cli_helpers import image_bytes
 from file_server import loopback_only
 from web_servers import BlockingBackend, make_app, raw_exchange, running_server, served_port
@@ -42,7 +42,7 @@ def app_with_long_response():
     """An application with a long response."""
     router = APIRouter()
     router.get("/long")(lambda: Response(bytes(LONG_BYTES)))
-    return create_app(router, limits=RequestLimits())
+    return create_app(router, policy=AccessPolicy())
 
 
 def slow_client(port, buffer_bytes=1 << 12):

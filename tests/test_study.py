@@ -10,7 +10,7 @@ import pytest
 
 from brewster import Photo
 from brewster.errors import BrewsterError, OutputError
-from brewster.user_study.create import StudyOptions, create
+from brewster.user_study.create import StudyOptions, create_study
 from brewster.user_study.degrade import degrade
 from brewster.user_study.study import read_study
 from small_studies import make_study, write_pictures
@@ -59,14 +59,14 @@ def test_outputs_named_by_brewster_are_found(tmp_path, folders):
         Photo.from_array(np.zeros((2, 2, 3), np.uint8), encoding="srgb").save(
             path.with_suffix(".reflection.png")
         )
-    assert len(create(tmp_path / "study", inputs, methods).description.comparisons) == 4
+    assert len(create_study(tmp_path / "study", inputs, methods).description.comparisons) == 4
 
 
 def test_a_picture_is_copied_without_loss_from_any_format(tmp_path, folders):
     inputs, methods = folders
     (inputs / "real/1.png").unlink()
     write_pictures(inputs, ["real/1"], suffix=".tif", seed=5)
-    study = create(tmp_path / "study", inputs, methods)
+    study = create_study(tmp_path / "study", inputs, methods)
     row = next(row for row in study.description.comparisons if (row.dataset, row.name) == ("real", "1"))
     copied = Photo.open(study.picture_file(row.photo))
     assert np.array_equal(copied.pixels, Photo.open(inputs / "real/1.tif").pixels)
@@ -87,7 +87,7 @@ def test_file_names_and_bytes_reveal_neither_method_nor_picture(tmp_path):
 def test_equal_seeds_make_equal_studies_and_different_seeds_do_not(tmp_path, folders):
     inputs, methods = folders
     first, second, third = (
-        create(tmp_path / name, inputs, methods, StudyOptions(seed=seed)).description
+        create_study(tmp_path / name, inputs, methods, StudyOptions(seed=seed)).description
         for name, seed in (("a", 5), ("b", 5), ("c", 6))
     )
     assert first == second
@@ -95,7 +95,7 @@ def test_equal_seeds_make_equal_studies_and_different_seeds_do_not(tmp_path, fol
 
 
 def test_a_study_without_a_given_seed_gets_a_random_one(tmp_path, folders):
-    seeds = {create(tmp_path / name, *folders).description.seed for name in "ab"}
+    seeds = {create_study(tmp_path / name, *folders).description.seed for name in "ab"}
     assert len(seeds) == 2
 
 
@@ -107,7 +107,7 @@ def test_all_problems_of_the_files_are_listed_at_once_and_nothing_is_written(tmp
     write_pictures(methods["RDNet"], ["real/1.png"], size=(12, 18), suffix="")
     (methods["RDNet"] / "real/10.png").write_bytes(b"\x89PNG\r\n\x1a\n")
     with pytest.raises(BrewsterError) as caught:
-        create(tmp_path / "study", inputs, methods)
+        create_study(tmp_path / "study", inputs, methods)
     for message in (
         f"ours has no {methods['ours'] / 'real/2'}.*",
         f"{methods['ours'] / 'nature/1.png'} has no input",
@@ -123,7 +123,7 @@ def test_two_files_with_the_same_name_are_refused(tmp_path, folders):
     inputs, methods = folders
     write_pictures(methods["ours"], ["real/2"], suffix=".jpg")
     with pytest.raises(BrewsterError, match=r"2\.jpg and .*2\.png have the same name"):
-        create(tmp_path / "study", inputs, methods)
+        create_study(tmp_path / "study", inputs, methods)
 
 
 @pytest.mark.parametrize(
@@ -136,24 +136,24 @@ def test_two_files_with_the_same_name_are_refused(tmp_path, folders):
 )
 def test_options_beyond_the_available_pictures_are_refused(tmp_path, folders, options, message):
     with pytest.raises(BrewsterError, match=message):
-        create(tmp_path / "study", *folders, options)
+        create_study(tmp_path / "study", *folders, options)
 
 
 def test_one_method_and_empty_folders_are_refused(tmp_path, folders):
     inputs, methods = folders
     with pytest.raises(BrewsterError, match="two or more"):
-        create(tmp_path / "study", inputs, {"ours": methods["ours"]})
+        create_study(tmp_path / "study", inputs, {"ours": methods["ours"]})
     (tmp_path / "empty").mkdir()
     with pytest.raises(BrewsterError, match="contains no picture"):
-        create(tmp_path / "study", tmp_path / "empty", methods)
+        create_study(tmp_path / "study", tmp_path / "empty", methods)
     with pytest.raises(BrewsterError, match="is not a folder"):
-        create(tmp_path / "study", tmp_path / "nowhere", methods)
+        create_study(tmp_path / "study", tmp_path / "nowhere", methods)
 
 
 def test_a_study_is_never_overwritten(tmp_path, folders):
-    create(tmp_path / "study", *folders)
+    create_study(tmp_path / "study", *folders)
     with pytest.raises(OutputError, match="is not empty"):
-        create(tmp_path / "study", *folders)
+        create_study(tmp_path / "study", *folders)
 
 
 def test_a_changed_picture_is_detected(tmp_path):
@@ -211,8 +211,8 @@ def test_pictures_next_to_subfolders_with_pictures_are_refused_unless_datasets_a
     inputs, methods = folders
     write_pictures(inputs, ["stray"])
     with pytest.raises(BrewsterError, match=r"stray\.png\) and subfolders with pictures \(nature, real\)"):
-        create(tmp_path / "study", inputs, methods)
-    study = create(tmp_path / "study", inputs, methods, StudyOptions(datasets=("nature", "real")))
+        create_study(tmp_path / "study", inputs, methods)
+    study = create_study(tmp_path / "study", inputs, methods, StudyOptions(datasets=("nature", "real")))
     assert len(study.description.comparisons) == 4
 
 

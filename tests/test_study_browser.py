@@ -9,7 +9,7 @@ from playwright.sync_api import expect
 from brewster import Photo
 from brewster.user_study.store import AnswerStore
 from brewster.web.application import create_app
-from brewster.web.middleware import RequestLimits
+from brewster.web.middleware import AccessPolicy
 from brewster.web.study import study_router
 from file_server import loopback_only
 from small_studies import copy_without_answers, make_study
@@ -44,7 +44,7 @@ def store(study_with_pictures, tmp_path):
 
 @pytest.fixture
 def url(store):
-    app = create_app(study_router(store.study, store), limits=RequestLimits(), index="study.html")
+    app = create_app(study_router(store.study, store), policy=AccessPolicy(), index="study.html")
     with served_port(app) as port:
         yield f"http://127.0.0.1:{port}/"
 

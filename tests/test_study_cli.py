@@ -1,5 +1,6 @@
 """The commands `brewster study create, plan, serve, report`."""
 
+import contextlib
 import json
 import os
 import re
@@ -56,6 +57,22 @@ def test_create_prints_a_summary_and_the_next_command(run_without_model, folders
     assert (code, out) == (0, b"")
     assert "4 comparisons of 2 methods; a participant sees 3 of them and 2 catch trials (seed 4)" in err
     assert "next: brewster study serve study" in err
+
+
+@pytest.mark.parametrize("names", [("inputs", "ours", "rdnet"), ("inputs", "ours", "inputs")])
+def test_the_progress_of_create_ends_at_its_total(run_without_model, folders, names, monkeypatch):
+    totals, counts = [], []
+
+    @contextlib.contextmanager
+    def progress(total, *, shown):
+        totals.append(total)
+        yield lambda done, _text: counts.append(done)
+
+    monkeypatch.setattr("brewster.cli.study.progress", progress)
+    inputs, first, second = names
+    options = ["--inputs", inputs, "--method", f"a={first}", "--method", f"b={second}"]
+    assert run_without_model("study", "create", "study", *options)[0] == 0
+    assert counts == list(range(1, totals[0] + 1))
 
 
 def test_create_accepts_a_consent_text(run_without_model, folders, tmp_path):

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from brewster import Photo
-from brewster.user_study.create import create
+from brewster.user_study.create import create_study
 from brewster.user_study.store import AnswerStore
 from brewster.web.application import create_app
-from brewster.web.middleware import RequestLimits
+from brewster.web.middleware import AccessPolicy
 from brewster.web.study import study_router
 from small_studies import copy_without_answers, make_study
 from web_servers import request
@@ -37,7 +37,7 @@ def store(study):
 
 @pytest.fixture
 def app(study, store):
-    return create_app(study_router(study, store), limits=RequestLimits(), index="study.html")
+    return create_app(study_router(study, store), policy=AccessPolicy(), index="study.html")
 
 
 def admit_participant(app):
@@ -200,7 +200,7 @@ def test_trials_beyond_the_last_are_an_error(app):
 
 def test_a_full_study_admits_no_one_else_and_its_participants_can_continue(study, store):
     app = create_app(
-        study_router(study, store, max_participants=1), limits=RequestLimits(), index="study.html"
+        study_router(study, store, max_participants=1), policy=AccessPolicy(), index="study.html"
     )
     link = admit_participant(app)
     assert not request(app, "GET", "/invitation").json()["is_open"]
@@ -211,8 +211,8 @@ def test_a_full_study_admits_no_one_else_and_its_participants_can_continue(study
 
 
 def test_a_personal_link_contains_the_token_of_the_server(study, store):
-    limits = RequestLimits(token=TOKEN)
-    app = create_app(study_router(study, store, token=TOKEN), limits=limits, index="study.html")
+    policy = AccessPolicy(token=TOKEN)
+    app = create_app(study_router(study, store, token=TOKEN), policy=policy, index="study.html")
     assert request(app, "POST", "/participants", json={"agreed": True}).status_code == 401
     bearer = {"Authorization": f"Bearer {TOKEN}"}
     link = request(app, "POST", "/participants", json={"agreed": True}, headers=bearer).json()["link"]
@@ -230,9 +230,9 @@ def test_a_16_bit_picture_is_shown_as_8_bit_srgb(tmp_path):
     for folder in ("inputs", "Secretlus", "Rivalino"):
         deep.save(tmp_path / folder / "a.png", overwrite=True)
     methods = {name: tmp_path / name for name in ("Secretlus", "Rivalino")}
-    study = create(tmp_path / "again", tmp_path / "inputs", methods)
+    study = create_study(tmp_path / "again", tmp_path / "inputs", methods)
     with closing(AnswerStore(study)) as store:
-        app = create_app(study_router(study, store), limits=RequestLimits(), index="study.html")
+        app = create_app(study_router(study, store), policy=AccessPolicy(), index="study.html")
         shown = Photo.open(request(app, "GET", f"{admit_participant(app)}/pictures/0/photo").content)
     assert shown.pixels.dtype == np.uint8
     assert np.array_equal(shown.pixels, deep.srgb_8bit())
@@ -261,7 +261,7 @@ def test_an_answer_that_cannot_be_written_is_not_acknowledged_and_can_be_sent_ag
 def test_a_missing_picture_is_a_permanent_error(tmp_path):
     study = make_study(tmp_path)
     with closing(AnswerStore(study)) as store:
-        app = create_app(study_router(study, store), limits=RequestLimits(), index="study.html")
+        app = create_app(study_router(study, store), policy=AccessPolicy(), index="study.html")
         link = admit_participant(app)
         trial = store.participant(link.removeprefix("/s/")).trials[0]
         study.picture_file(trial.left).unlink()

@@ -14,7 +14,7 @@ import httpx
 from brewster.inference import Separator
 from brewster.web.application import create_app, listen
 from brewster.web.job_queue import JobQueue
-from brewster.web.middleware import RequestLimits
+from brewster.web.middleware import AccessPolicy
 from brewster.web.model_cache import ModelRow
 from brewster.web.separation import separation_router
 from brewster.web.server import create_server
@@ -54,10 +54,10 @@ class BlockingBackend:
         return pane(tile)
 
 
-def make_app(backend=pane, *, job_queue=None, max_pixels=10**8, limits=None):
+def make_app(backend=pane, *, job_queue=None, max_pixels=10**8, policy=None):
     return create_app(
         separation_router(FakeModelCache(backend), job_queue or JobQueue(), max_pixels=max_pixels),
-        limits=limits or RequestLimits(),
+        policy=policy or AccessPolicy(),
     )
 
 

@@ -30,7 +30,7 @@ can expand to a very large image."""
 TEMPORARY_PREFIX = ".brewster-"
 """File name prefix of unfinished files."""
 
-LAYERS = ("transmission", "reflection", "confidence", "layered")
+OUTPUT_LAYERS = ("transmission", "reflection", "confidence", "layered")
 LAYER_FORMATS = {"confidence": "png", "layered": "ora"}
 """The formats of the layers whose format does not depend on that of the photo."""
 
@@ -283,7 +283,7 @@ def _layer_name(image: Location, counts: Counter[str]) -> str:
 
 def _is_input(path: Location) -> bool:
     """Returns whether a file has an image suffix, is not hidden, and is not a layer that brewster has written."""
-    is_result = Path(path.stem).suffix.lstrip(".") in LAYERS
+    is_result = Path(path.stem).suffix.lstrip(".") in OUTPUT_LAYERS
     return format_of(path) is not None and not path.name.startswith(".") and not is_result
 
 

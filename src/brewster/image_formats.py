@@ -10,7 +10,7 @@ from pathlib import PurePath
 from typing import Final, Literal, final
 
 FormatName = Literal["jpeg", "png", "tiff", "webp", "avif", "heic", "exr", "hdr"]
-"""The names of the formats that brewster writes."""
+"""The names of the formats in which a single layer can be written."""
 
 
 @final
@@ -46,7 +46,7 @@ class ImageFormat:
 
     @property
     def is_writable(self) -> bool:
-        """Whether brewster writes this format."""
+        """Whether a single layer can be written in this format."""
         return bool(self.bit_depths)
 
     @property
@@ -169,7 +169,7 @@ FORMATS: Final = {row.name: row for row in _ROWS}
 """All formats by name, in the order in which their signatures are tried."""
 
 WRITABLE: Final = {name: row for name, row in FORMATS.items() if row.is_writable}
-"""The formats that brewster writes, by name."""
+"""The formats in which a single layer can be written, by name."""
 
 SUFFIXES: Final = {suffix: row for row in _ROWS for suffix in row.suffixes}
 """All formats by file name suffix, in lower case."""

@@ -12,7 +12,7 @@ import click
 
 from brewster.evaluate.ablation import AblationStudy
 from brewster.scene.recipe import SceneRecipe
-from brewster.scene.recipe_file import default_of
+from brewster.scene.recipe_file import describe_default
 from brewster.scene.recipe_keys import RecipeKey, RecipeTable, recipe_tables
 from brewster.scene.values import FrozenModel
 from brewster.training.recipe import CompactRecipe, LoraRecipe
@@ -69,7 +69,7 @@ def _row(key: RecipeKey) -> str:
 
 
 def _default(key: RecipeKey) -> str:
-    text = default_of(key)
+    text = describe_default(key)
     value = text.removeprefix("default ")
     return text if value == text else f"`{value}`"
 

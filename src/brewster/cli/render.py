@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 from collections import Counter
 from dataclasses import asdict, dataclass
 from functools import partial
@@ -32,6 +33,7 @@ if TYPE_CHECKING:
 _MITSUBA_PACKAGES: Final = frozenset({"mitsuba", "mitsuba-oidn"})
 _SCENE_OPTIONS: Final = {"out", "output", "scene", "renderer", "maps", "photos", "quiet"}
 _MAX_WORKERS: Final = 8
+_SIZE: Final = re.compile(r"0*([0-9]{1,5})[xX]0*([0-9]{1,5})")
 _FOLDER: Final = click.Path(path_type=Path, file_okay=False, exists=True)
 
 
@@ -51,16 +53,15 @@ class _Size(click.ParamType[tuple[int, int]]):
         """
         if isinstance(value, tuple):
             return value
-        width, _, height = str(value).lower().partition("x")
-        if not all(
-            side.isascii() and side.isdigit() and 16 <= int(side) <= 16384 for side in (width, height)
-        ):
+        match = _SIZE.fullmatch(str(value))
+        size = (int(match[1]), int(match[2])) if match else (0, 0)
+        if not all(16 <= side <= 16384 for side in size):
             self.fail(
                 f"{value!r} is not a size. Give width and height in pixels, from 16 to 16384, such as 512x384.",
                 param,
                 ctx,
             )
-        return int(width), int(height)
+        return size
 
 
 @click.command
@@ -307,8 +308,10 @@ def _reject_dataset_options(context: click.Context) -> None:
     Raises:
         click.UsageError: such an option is given on the command line.
     """
-    for name in context.params.keys() - _SCENE_OPTIONS:
-        if context.get_parameter_source(name) is ParameterSource.COMMANDLINE:
+    for parameter in context.command.params:
+        name = parameter.name or ""
+        if name not in _SCENE_OPTIONS and context.get_parameter_source(name) is ParameterSource.COMMANDLINE:
+            option = parameter.opts[0]
             raise click.UsageError(
-                f"--scene renders one sample, but --{name} is an option for datasets: leave out --{name}."
+                f"--scene renders one sample, but {option} is an option for datasets: leave out {option}."
             )

@@ -148,7 +148,7 @@ def serve(
     require_extra("web", "serving", without=frozenset({"matplotlib"}))
     from brewster.web import application as web  # noqa: PLC0415  (imports FastAPI)
     from brewster.web.job_queue import JobQueue  # noqa: PLC0415
-    from brewster.web.middleware import RequestLimits, is_loopback  # noqa: PLC0415
+    from brewster.web.middleware import AccessPolicy, is_loopback  # noqa: PLC0415
     from brewster.web.model_cache import ModelCache  # noqa: PLC0415
     from brewster.web.separation import separation_router  # noqa: PLC0415
 
@@ -162,7 +162,7 @@ def serve(
     router = separation_router(
         model_cache, JobQueue(max_waiting=queue, timeout_seconds=timeout), max_pixels=max_pixels
     )
-    app = web.create_app(router, limits=RequestLimits.for_host(host, token=token, max_bytes=max_bytes))
+    app = web.create_app(router, policy=AccessPolicy.for_host(host, token=token, max_bytes=max_bytes))
     with contextlib.suppress(KeyboardInterrupt):  # Ctrl-C is the usual way to stop the server
         web.serve(
             app, host=host, port=port, on_ready=lambda url: print_link(url, token, open_browser=open_browser)

@@ -24,7 +24,7 @@ _HOST_NAME: Final = re.compile(r"[a-z0-9_-]+(\.[a-z0-9_-]+)*", re.IGNORECASE)
 _MAX_BYTES: Final = 10_000  # an answer has about 80 bytes
 _FOLDER: Final = click.Path(path_type=Path, file_okay=False)
 _WARNING: Final = (
-    "warning: everybody who can reach {host} can take part, and the connection is not encrypted; "
+    "warning: {visitors} can take part, and the connection is not encrypted; "
     "for an encrypted connection, keep --host 127.0.0.1, run an HTTPS proxy in front, and give its name with --host-name"
 )
 
@@ -99,7 +99,7 @@ study.add_command(import_answers)
 @click.option("--all-pairs", is_flag=True, help="Compare each method with every other method.")
 @click.option(
     "--comparisons",
-    "pairs",
+    "comparisons_per_participant",
     type=click.IntRange(1),
     metavar="NUMBER",
     help="The number of pairs per participant; by default 40, or all pairs if the study has fewer.",
@@ -130,7 +130,7 @@ def create(
     datasets: tuple[str, ...],
     list_file: Path | None,
     all_pairs: bool,
-    pairs: int | None,
+    comparisons_per_participant: int | None,
     catch_trials: int | None,
     seed: int | None,
     consent: Path | None,
@@ -142,8 +142,7 @@ def create(
     dataset without a name. If an image is missing, duplicate, unreadable or of another size, the error lists it, and
     nothing is written. The study folder contains copies of all images and can be moved.
     """
-    from brewster.user_study.create import CATCH_POOL_SIZE, DEFAULT_CONSENT, StudyOptions  # noqa: PLC0415  (imports pyvips)
-    from brewster.user_study.create import create as freeze  # noqa: PLC0415
+    from brewster.user_study.create import CATCH_POOL_SIZE, DEFAULT_CONSENT, StudyOptions, create_study  # noqa: PLC0415  (imports pyvips)
     from brewster.user_study.folders import find_pictures, select_pictures  # noqa: PLC0415
 
     folders = {name: Path(folder) for name, folder in methods}
@@ -158,16 +157,17 @@ def create(
     options = StudyOptions(
         datasets=datasets,
         names=names,
-        pairs=pairs,
+        pairs=comparisons_per_participant,
         catch_trials=catch_trials,
         all_pairs=all_pairs,
         seed=seed,
         consent=text,
     )
     pictures = select_pictures(find_pictures(inputs, datasets), options.names, inputs)
-    total = len(pictures) * (1 + len(folders)) + CATCH_POOL_SIZE
+    sources = {inputs, *folders.values()}  # a picture that is both input and output is copied once
+    total = len(pictures) * len(sources) + min(CATCH_POOL_SIZE, len(pictures))
     with progress(total, shown=True) as update_progress:
-        description = freeze(
+        description = create_study(
             out, inputs, folders, options, lambda done: update_progress(done, "copying")
         ).description
     print_status(
@@ -251,20 +251,21 @@ def serve(
     from brewster.user_study.store import AnswerStore  # noqa: PLC0415
     from brewster.user_study.study import read_study  # noqa: PLC0415
     from brewster.web import application as web  # noqa: PLC0415  (imports FastAPI)
-    from brewster.web.middleware import RequestLimits, is_loopback  # noqa: PLC0415
+    from brewster.web.middleware import AccessPolicy, is_loopback  # noqa: PLC0415
     from brewster.web.study import study_router  # noqa: PLC0415
 
-    frozen_study = read_study(folder)
-    frozen_study.verify_pictures()
+    opened_study = read_study(folder)
+    opened_study.verify_pictures()
     if not is_loopback(host):
-        print_status(_WARNING.format(host=host))
+        visitors = "only visitors with the printed link" if token else f"everybody who can reach {host}"
+        print_status(_WARNING.format(visitors=visitors))
     token = load_or_create_token(folder) if token == AUTO else token
-    limits = RequestLimits.for_host(host, token=token, max_bytes=_MAX_BYTES)
-    limits = replace(limits, hosts=limits.hosts | {*host_names})
-    store = AnswerStore(frozen_study)
+    policy = AccessPolicy.for_host(host, token=token, max_bytes=_MAX_BYTES)
+    policy = replace(policy, hosts=policy.hosts | {*host_names})
+    store = AnswerStore(opened_study)
     app = web.create_app(
-        study_router(frozen_study, store, max_participants=max_participants, token=token),
-        limits=limits,
+        study_router(opened_study, store, max_participants=max_participants, token=token),
+        policy=policy,
         index="study.html",
     )
     with contextlib.closing(store), contextlib.suppress(KeyboardInterrupt):  # the usual way to stop
@@ -297,12 +298,12 @@ def report(folder: Path, *, out: Path | None, max_failed: float, min_seconds: fl
     from brewster.user_study.store import AnswerStore  # noqa: PLC0415
     from brewster.user_study.study import read_study  # noqa: PLC0415
 
-    frozen_study = read_study(folder)
-    with contextlib.closing(AnswerStore(frozen_study, read_only=True)) as store:
+    opened_study = read_study(folder)
+    with contextlib.closing(AnswerStore(opened_study, read_only=True)) as store:
         answers = collect_answers(store.all_answers())
-    results = summarise(frozen_study, answers, ExclusionRule(max_failed, min_seconds))
+    results = summarise(opened_study, answers, ExclusionRule(max_failed, min_seconds))
     out = folder / "report" if out is None else out
-    write(results, frozen_study, answers, out)
+    write(results, opened_study, answers, out)
     write_out((json.dumps(results) + "\n" if as_json else overview(results)).encode())
     print_status(f"the report is in {out}")
 
@@ -318,10 +319,10 @@ def show_progress(folder: Path, *, max_failed: float, min_seconds: float, as_jso
     from brewster.user_study.store import AnswerStore  # noqa: PLC0415
     from brewster.user_study.study import read_study  # noqa: PLC0415
 
-    frozen_study = read_study(folder)
-    with contextlib.closing(AnswerStore(frozen_study, read_only=True)) as store:
+    opened_study = read_study(folder)
+    with contextlib.closing(AnswerStore(opened_study, read_only=True)) as store:
         records = list(store.all_answers())
-    found = summarise_progress(frozen_study.description, records, ExclusionRule(max_failed, min_seconds))
+    found = summarise_progress(opened_study.description, records, ExclusionRule(max_failed, min_seconds))
     write_out((json.dumps(found) + "\n" if as_json else progress_text(found)).encode())
 
 
@@ -336,7 +337,7 @@ def show_progress(folder: Path, *, max_failed: float, min_seconds: float, as_jso
 @click.option("--tie", type=click.FloatRange(0, 1, max_open=True), default=0.25, show_default=True, metavar="FRACTION", help='The expected fraction of the answer "similar".')  # fmt: skip
 @click.option(
     "--comparisons",
-    "pairs",
+    "comparisons_per_participant",
     type=click.IntRange(1),
     default=40,
     show_default=True,
@@ -354,13 +355,23 @@ def show_progress(folder: Path, *, max_failed: float, min_seconds: float, as_jso
 @click.option("--power", type=click.FloatRange(0.5, 1, max_open=True), default=0.8, show_default=True, metavar="FRACTION", help="The probability of detecting the difference if it exists.")  # fmt: skip
 @click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 def plan(
-    *, difference: float, tie: float, pairs: int, correlation: float, power: float, as_json: bool
+    *,
+    difference: float,
+    tie: float,
+    comparisons_per_participant: int,
+    correlation: float,
+    power: float,
+    as_json: bool,
 ) -> None:
     """Compute the number of participants needed to detect a difference at the 5 % significance level."""
     from brewster.user_study.power_analysis import required_participants  # noqa: PLC0415
 
     estimate = required_participants(
-        difference=difference, tie=tie, pairs=pairs, correlation=correlation, power=power
+        difference=difference,
+        tie=tie,
+        pairs=comparisons_per_participant,
+        correlation=correlation,
+        power=power,
     )
     if as_json:
         print_out(json.dumps(asdict(estimate)))
@@ -370,7 +381,7 @@ def plan(
         f"{estimate.lose:.1%} losses with {power:.0%} power at the 5 % significance level."
     )
     print_out(
-        f"With {pairs} pairs each and correlation {correlation:g}, the design effect is {estimate.design_effect:.2f}: this number of "
-        f"answers carries as much information as one independent answer. Between participants, the difference of wins and "
-        f"losses has a standard deviation of {estimate.deviation:.0%}."
+        f"With {comparisons_per_participant} pairs each and correlation {correlation:g}, the design effect is {estimate.design_effect:.2f}: this number of "
+        f"answers carries as much information as one independent answer. The difference between win rate and loss rate varies "
+        f"between participants, with a standard deviation of {estimate.deviation:.0%}."
     )

@@ -102,7 +102,7 @@ def ablate(
 ) -> Results:
     """Trains and evaluates a model for every value. `out` gets one folder per value and the files that `evaluate` writes.
 
-    If all values are numbers, plot.png shows the metrics against them.
+    If all values are numbers and any metric has a score, plot.png shows the metrics against the values.
 
     Args:
         study: the definition of the study.
@@ -140,7 +140,7 @@ def ablate(
     numbers = [
         value for value in study.values if isinstance(value, int | float) and not isinstance(value, bool)
     ]
-    if len(numbers) == len(study.values):
+    if len(numbers) == len(study.values) and results["metrics"]:
         write_atomically(out / PLOT_FILE, _plot(study, numbers, results), overwrite=True)
     return results
 
@@ -153,26 +153,32 @@ def _train(recipe: CompactRecipe | LoraRecipe, folder: Path, on_step: loop.StepC
 
 
 def _plot(study: AblationStudy, numbers: Sequence[float], results: Results) -> bytes:
-    """Returns a PNG plot: PSNR, SSIM and LPIPS as functions of the value.
+    """Returns a PNG plot: PSNR, SSIM and LPIPS as functions of the value, or all metrics if these three have no scores.
 
-    There is one line for each benchmark and one for the average. The bands are the 95 % intervals.
+    There is one line for each benchmark and one for the average. The bands are the 95 % intervals. A line has no point
+    for a model without a score.
     """
     import io  # noqa: PLC0415
 
     from matplotlib.figure import Figure  # noqa: PLC0415  (only needed for plots)
 
-    metrics = [name for name in ("psnr", "ssim", "lpips") if name in results["metrics"]]
+    measured = list(results["metrics"])
+    metrics = [name for name in ("psnr", "ssim", "lpips") if name in measured] or measured
     figure = Figure(figsize=(4 * len(metrics), 3.4), layout="constrained")
     for panel, metric in zip(figure.subplots(1, len(metrics), squeeze=False)[0], metrics, strict=True):
         for key, selection in results["selections"].items():
-            rows = [results["tables"][key][study.label(number)][metric] for number in numbers]
+            means = {number: results["tables"][key][study.label(number)].get(metric) for number in numbers}
+            scored = [number for number in numbers if means[number]]
+            rows = [means[number] for number in scored]
+            if not rows:
+                continue
             style = {"linewidth": 2.4, "color": "black"} if key == AVERAGE else {"linewidth": 1.2}
             (line,) = panel.plot(
-                numbers, [row["mean"] for row in rows], marker="o", label=selection["title"], **style
+                scored, [row["mean"] for row in rows], marker="o", label=selection["title"], **style
             )
             if all(row["low"] is not None for row in rows):
                 ends = ([row[end] for row in rows] for end in ("low", "high"))
-                panel.fill_between(numbers, *ends, color=line.get_color(), alpha=0.12, linewidth=0)
+                panel.fill_between(scored, *ends, color=line.get_color(), alpha=0.12, linewidth=0)
         entry = results["metrics"][metric]
         panel.set_title(f"{entry['title']}{', ' + entry['unit'] if entry['unit'] else ''}")
         panel.set_xlabel(study.key)

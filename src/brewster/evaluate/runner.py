@@ -2,7 +2,7 @@
 
     rows = score(read_benchmark("nature20", folder), [IdentityBaseline(), model], EvaluationConfig(), Path("out/evaluate"))
 
-The file `scores.jsonl` in the output folder has one line for each scored prediction. A later run reuses a line if its inputs
+The file `scores.jsonl` in the output folder has one line for each new result, scored or failed. A later run reuses a line if its inputs
 have not changed, and adds the columns that it does not have, such as LPIPS after its weights were missing. Each file of a
 case is read once: its bytes are hashed and, if a score is missing, decoded.
 """
@@ -30,7 +30,7 @@ from brewster.executors import exit_with_parent
 from brewster.worker_setup import single_torch_thread
 
 ScoreCallback = Callable[[int, int, "ScoreRow"], None]
-"""Called with (done, total, row) after each prediction that was scored."""
+"""Called with (done, total, row) after each new result, scored or failed."""
 
 CaseCallback = Callable[[GroundTruth, Mapping[str, MethodOutput]], None]
 """Called with (case, method -> new prediction) after a case is scored, in the process that scored it."""
@@ -144,10 +144,10 @@ def _missing_metrics(
     logged: Mapping[RowId, ScoreRow],
     unavailable: Collection[str] = (),
 ) -> list[tuple[Callable[[], object], list[str]]]:
-    """Returns each `Metric.prepare`, which loads the weights of LPIPS, for example, and its columns.
+    """Returns (prepare, columns) for the metrics with missing scores.
 
-    It must be called before the workers start, so that it runs once. Metrics are left out if they are unavailable, or have a
-    score in every row of an earlier run.
+    `prepare` loads weights, for example of LPIPS. Call each `prepare` once, before the workers start. Metrics are left out
+    if they are unavailable, or have a score in every row of an earlier run.
     """
     columns: dict[Callable[[], object], list[str]] = {}
     for column, metric in config.columns().items():
@@ -230,7 +230,7 @@ def _empty_row(
     case = files.case
     photo, *ground_truths = files.digests()
     # `paper_subset` selects cases for the tables, and `protocol` is a name: they change no score. `quality` is a part of the
-    # keys of models, and does not affect other methods. A row has its own list of columns.
+    # keys of models, and does not affect other methods. `metrics` is left out because each row lists its own columns.
     settings = asdict(config) | dict.fromkeys(("metrics", "paper_subset", "protocol", "quality"))
     prediction_key = _digest(photo, config.short_side_px, config.size_divisor, method.key(case))
     score_key = _digest(prediction_key, ground_truths, settings, case.rendered, SCORE_FORMAT_VERSION)

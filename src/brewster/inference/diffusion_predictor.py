@@ -33,7 +33,7 @@ _SECOND_INPUT_SCALE: Final = 2
 """Side of the second input for quality "best" relative to the first. The second input is processed in tiles."""
 _MIN_SECOND_INPUT_SCALE: Final = 1.25
 """A second input with a smaller relative side adds almost no detail, so it is not used."""
-_SQUARE_TILE_OVERLAP: Final = 12
+_SQUARE_TILE_OVERLAP_DIVISOR: Final = 12
 """Square tiles overlap by at least their side divided by this: 64 of 768 pixels, as in WindowSeat."""
 
 
@@ -110,15 +110,17 @@ class DiffusionPredictor(Predictor):
                 predictions.append(
                     run_tiled(lambda tile: self._predict_tile(tile, steps, progress), scaled_input, **tiling)
                 )
-        change, reflection, generated, spread, reconstruction_error = (
+        change, reflection, generated_transmission, spread, reconstruction_error = (
             np.mean([upsample_rows(map_, 0, size[0], size) for map_ in maps], axis=0)
             for maps in zip(*predictions, strict=True)
         )
         override, mean_error = None, None
         if self._no_guided_upsampling:
-            override = GeneratedOverride(generated, np.ones_like(generated[..., :1]))
+            override = GeneratedOverride(
+                generated_transmission, np.ones_like(generated_transmission[..., :1])
+            )
         elif self._reconstructs_input:
-            override = GeneratedOverride.weighted_by_detail(generated, reflection)
+            override = GeneratedOverride.weighted_by_detail(generated_transmission, reflection)
         if self._reconstructs_input:
             mean_error = float(predictions[0][-1].mean())
         confidence = confidence_from_spread(spread + reconstruction_error)
@@ -175,7 +177,7 @@ class DiffusionPredictor(Predictor):
         task, size_divisor = self._pipeline.task, self._pipeline.backbone.size_divisor
         if task.square_tiles:
             side = min(*shape[:2], task.short_side_px or max(shape))
-            return {"tile_px": side, "overlap_px": side // _SQUARE_TILE_OVERLAP}
+            return {"tile_px": side, "overlap_px": side // _SQUARE_TILE_OVERLAP_DIVISOR}
         if is_first:
             side = max(shape)
         else:
@@ -210,13 +212,13 @@ class DiffusionPredictor(Predictor):
         photo = linear_panels.get("I", tile)
         change = linear_panels["T"] - photo
         reflection = linear_panels.get("R", np.maximum(-change, 0))
-        generated = to_encoded(_reconstruction(linear_panels, tile))
+        reconstruction_encoded = to_encoded(_reconstruction(linear_panels, tile))
         return (
             change.mean(axis=0),
             reflection.mean(axis=0),
             linear_panels["T"].mean(axis=0),
             np.ptp(to_encoded(linear_panels["T"]), axis=0),
-            np.abs(generated - to_encoded(tile)).mean(axis=0),
+            np.abs(reconstruction_encoded - to_encoded(tile)).mean(axis=0),
         )
 
 

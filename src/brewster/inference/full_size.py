@@ -33,8 +33,8 @@ def upsample_layers(
 
     def fill(rows: slice) -> float:
         linear = photo.linear_rows(rows.start, rows.stop)
-        weights = None if mask is None else mask.rows(rows.start, rows.stop)
-        layers = upsampler.apply(linear, rows.start, photo.size[1], weights)
+        strength_mask = None if mask is None else mask.rows(rows.start, rows.stop)
+        layers = upsampler.apply(linear, rows.start, photo.size[1], strength_mask)
         stored = [template.stored_rows(layer, rows.start) for layer in layers]
         if additive:
             stored = _exact_sum_layers(template.stored_rows(linear, rows.start), stored[0])

@@ -115,7 +115,7 @@ class GuidedUpsampler:
         return cls(fit_layer(change), None if reflection is None else fit_layer(reflection), override)
 
     def apply(
-        self, photo: Floats, top: int, height: int, weights: Floats | None = None
+        self, photo: Floats, top: int, height: int, strength_mask: Floats | None = None
     ) -> tuple[Floats, Floats]:
         """Returns transmission and reflection, each (n, W, 3), for n rows of the full photo.
 
@@ -126,7 +126,7 @@ class GuidedUpsampler:
             photo: the n rows of the photo, (n, W, 3) linear light.
             top: the index of the first of these rows.
             height: the number of rows of the full photo.
-            weights: a factor of the strength for each pixel, (n, W, 1) in 0..1; where it is 0, the transmission is the photo.
+            strength_mask: a factor of the strength for each pixel, (n, W, 1) in 0..1; where it is 0, the transmission is the photo.
         """
         transmission = self.change.apply(photo, top, height)
         if self.override:
@@ -136,16 +136,16 @@ class GuidedUpsampler:
                 for map_ in (self.override.transmission, self.override.weight)
             )
             transmission += weight * (np.float32(self.override.strength) * (generated - photo) - transmission)
-        if weights is not None:
-            transmission *= weights
+        if strength_mask is not None:
+            transmission *= strength_mask
         transmission += photo
         np.maximum(transmission, np.minimum(photo, 0), out=transmission)
         if self.reflection is None:
             reflection = photo - transmission
         else:
             reflection = self.reflection.apply(photo, top, height)
-            if weights is not None:
-                reflection *= weights
+            if strength_mask is not None:
+                reflection *= strength_mask
         return transmission, np.clip(reflection, 0, np.maximum(photo, 0), out=reflection)
 
 
@@ -156,7 +156,7 @@ def upsample_rows(map_: Floats, top: int, rows: int, size: tuple[int, int]) -> F
 
 
 def _positions(small: int, first: int, count: int, large: int) -> tuple[NDArray[np.intp], Floats]:
-    """Returns the positions in a map of length `small` of `count` pixels of a map of length `large`, from the pixel `first`.
+    """Returns the positions, on an axis of length `small`, of `count` pixels of an axis of length `large`, starting at `first`.
 
     Each position is split into its integer part and its fractional part.
     """

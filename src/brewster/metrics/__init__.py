@@ -30,8 +30,8 @@ from brewster.metrics.fidelity import (
     PairCounts,
     Window,
     count_pairs,
-    linear_error,
-    linear_error_of_counts,
+    linear_rmse,
+    linear_rmse_of_counts,
     mean_ssim,
     psnr,
     psnr_of_channels,
@@ -61,7 +61,7 @@ __all__ = [
     "Window",
     "find_metric",
     "kept_reflection",
-    "linear_error",
+    "linear_rmse",
     "lpips",
     "niqe",
     "psnr",
@@ -83,8 +83,8 @@ def _psnr_of_channels(case: Comparison) -> float:
     return min(psnr_of_channels(case.prediction.pixels, case.truth.pixels), IDENTICAL_DB)
 
 
-def _linear_error(case: Comparison) -> float:
-    return linear_error_of_counts(case.shared(_pair_counts))
+def _linear_rmse(case: Comparison) -> float:
+    return linear_rmse_of_counts(case.shared(_pair_counts))
 
 
 def _pair_counts(case: Comparison) -> PairCounts:
@@ -170,7 +170,10 @@ _LINEAR: Final = (
     "Root mean squared error of linear light (the inverse sRGB curve of the 8-bit values, in 0..1) over the three"
     " channels of all pixels"
 )
-_GAIN: Final = "after one gain, the median of background over prediction where there is no reflection, in linear luminance"
+_GAIN: Final = (
+    "The prediction is first multiplied by one gain: the median of background / prediction in linear luminance where there"
+    " is no reflection."
+)
 
 _ROWS: Final = (
     Metric("psnr", "PSNR", "dB", True, 2, f"{_PSNR} of all pixels.", "transmission", _psnr),
@@ -232,14 +235,14 @@ _ROWS: Final = (
         prepare=Lpips.load,
     ),
     Metric(
-        "linear_error",
-        "Linear error",
+        "linear_rmse",
+        "RMSE (linear light)",
         "",
         False,
         4,
         f"{_LINEAR}.",
         "transmission",
-        _linear_error,
+        _linear_rmse,
     ),
     Metric(
         "dists",
@@ -299,14 +302,14 @@ _ROWS: Final = (
         prepare=Lpips.load,
     ),
     Metric(
-        "linear_error_reflection",
-        "Linear error of R",
+        "linear_rmse_reflection",
+        "RMSE of R (linear light)",
         "",
         False,
         4,
         f"{_LINEAR}.",
         "reflection",
-        _linear_error,
+        _linear_rmse,
     ),
     Metric(
         "removed_content",
@@ -314,8 +317,8 @@ _ROWS: Final = (
         "",
         False,
         3,
-        "Fraction of the background's light that the prediction lacks where the reflection is below 2 % of the photo,"
-        f" {_GAIN}.",
+        "Fraction of the background's light that the prediction lacks where the reflection is below 2 % of the photo."
+        f" {_GAIN}",
         "rendered",
         _rendered_score(removed_content),
     ),
@@ -326,8 +329,8 @@ _ROWS: Final = (
         False,
         3,
         "Fraction of the background's light that the prediction lacks where the reflection is below 2 % of the photo and"
-        " the background is white (encoded channels above 0.75 and less than 0.12 apart),"
-        f" {_GAIN}.",
+        " the background is white (encoded channels above 0.75 and less than 0.12 apart)."
+        f" {_GAIN}",
         "rendered",
         _rendered_score(removed_white),
     ),
@@ -338,7 +341,7 @@ _ROWS: Final = (
         False,
         3,
         "Fraction of the reflection's light that the prediction still has above the background, where the reflection is at"
-        f" least 10 % of the photo and the photo is not clipped, {_GAIN}.",
+        f" least 10 % of the photo and the photo is not clipped. {_GAIN}",
         "rendered",
         _rendered_score(kept_reflection),
     ),

@@ -105,7 +105,7 @@ def psnr_of_channels(prediction: Image, truth: Image) -> float:
     return float(np.mean(10 * np.log10(255**2 / mse))) if mse.all() else float("inf")
 
 
-def linear_error(prediction: Image, truth: Image, *, region: Region | None = None) -> float:
+def linear_rmse(prediction: Image, truth: Image, *, region: Region | None = None) -> float:
     """Returns the root mean squared error in linear light, in 0..1: sqrt(mean((L(prediction) - L(truth))^2)).
 
     L is the inverse of the sRGB curve (IEC 61966-2-1). The mean is over the three channels of all pixels, or of the
@@ -118,14 +118,14 @@ def linear_error(prediction: Image, truth: Image, *, region: Region | None = Non
         ValueError: the images are not uint8 (H, W, 3) or differ in shape; the region is empty or of another shape.
     """
     if region is None:
-        return linear_error_of_counts(count_pairs(prediction, truth))
+        return linear_rmse_of_counts(count_pairs(prediction, truth))
     check_images(prediction, truth)
     difference = _LINEAR[prediction] - _LINEAR[truth]
     return float(mean_inside(difference * difference, region) ** 0.5)
 
 
-def linear_error_of_counts(counts: PairCounts) -> float:
-    """The error of `linear_error` over all pixels, from the counts of `count_pairs`."""
+def linear_rmse_of_counts(counts: PairCounts) -> float:
+    """The error of `linear_rmse` over all pixels, from the counts of `count_pairs`."""
     return float((_LINEAR_SQUARED_ERRORS @ counts / counts.sum()) ** 0.5)
 
 

@@ -68,7 +68,7 @@ class Metric:
     digits: int
     """The number of decimal places in tables."""
     about: str
-    """The definition with all parameters, in one sentence."""
+    """The definition with all parameters, in one or two sentences."""
     of: Literal["transmission", "reflection", "rendered"]
     """The ground truth that the metric needs: the transmission, the reflection, or all layers of a rendered sample."""
     score: Callable[[Comparison], float]

@@ -85,7 +85,9 @@ def _interpretation(array: Stored) -> str:
 
 
 def _save_options(file_info: FileInfo, dtype: np.dtype[Any]) -> dict[str, Any]:
-    """Returns the options of the libvips saver for a format. Chroma is subsampled only if the source is subsampled."""
+    """Returns the options of the libvips saver for a format. The chroma of a JPEG is subsampled only if
+    that of the source is; that of an AVIF never is. Lossy WebP has no format without chroma subsampling (RFC 6386).
+    """
     match file_info.format_name:
         case "jpeg":
             mode = "on" if file_info.subsampling == "4:2:0" else "off"

@@ -18,6 +18,14 @@ Stored = NDArray[Any]
 Encoding = Literal["srgb", "linear"]
 WHITE_LEVELS = {"uint8": 255, "uint16": 65535, "float16": 1, "float32": 1, "float64": 1}
 """The value of white for each supported dtype."""
+_PIL_CONVERSIONS = {
+    "1": ("L", "LA"),
+    "L": ("L", "LA"),
+    "P": ("RGB", "RGBA"),
+    "PA": ("RGBA", "RGBA"),
+    "RGB": ("RGB", "RGBA"),
+}
+"""The modes of Pillow to which a mode is converted: without and with a transparent colour in `info`."""
 _ROUNDING = 1e-3
 """Floats may be outside 0..1 by this amount because of rounding. It is less than half a level of 8 bits."""
 
@@ -124,9 +132,13 @@ def decode_pil(image: Any) -> Decoded:  # noqa: ANN401  (Pillow is optional, so 
             "expected a single image",
             "select a frame with image.seek, and pass image.copy()",
         )
-    if image.mode in ("P", "PA", "1"):
-        has_alpha = image.mode == "PA" or "transparency" in image.info
-        image = image.convert("L" if image.mode == "1" else "RGBA" if has_alpha else "RGB")
+    transparency = image.info.get(
+        "transparency"
+    )  # of a PNG or GIF: one transparent colour, or alpha per entry
+    opaque_mode, alpha_mode = _PIL_CONVERSIONS.get(image.mode, (image.mode, image.mode))
+    mode = opaque_mode if transparency is None else alpha_mode
+    if mode != image.mode:
+        image = image.convert(mode)
     if image.mode not in ("L", "LA", "RGB", "RGBA", "I;16"):
         raise UnsupportedPhoto(
             f"the PIL image has mode {image.mode}",
@@ -136,6 +148,8 @@ def decode_pil(image: Any) -> Decoded:  # noqa: ANN401  (Pillow is optional, so 
     exif, icc = image.info.get("exif"), image.info.get("icc_profile")
     format_name = (image.format or "png").lower()
     array = np.asarray(image).reshape(image.height, image.width, -1)
+    if image.mode == "I;16" and transparency is not None:  # Pillow has no mode for 16-bit grey with alpha
+        array = np.concatenate([array, np.where(array == transparency, 0, 65535).astype(array.dtype)], axis=2)
     file_info = FileInfo(
         format_name=format_name if format_name in WRITABLE else "png",
         bits=16 if image.mode == "I;16" else 8,

@@ -125,7 +125,8 @@ class Photo:
 
     @classmethod
     def from_pil(cls, image: PilImage) -> Photo:
-        """Creates a photo from a PIL image with its profile and EXIF. A palette image becomes RGB.
+        """Creates a photo from a PIL image with its profile and EXIF. A palette image becomes RGB, and a transparent
+        colour becomes alpha.
 
         Raises:
             UnsupportedPhoto: the image has several frames, or another mode than RGB or grey, such as CMYK, LAB or floats.

@@ -35,7 +35,7 @@ from brewster.render.rays.layered_glass import (
 from brewster.render.rays.rough_glass import trace_orders
 from brewster.render.rays.sobol import SobolPoints
 from brewster.render.rays.vectors import normalize
-from brewster.render.sample import LAYERS, LinearSample
+from brewster.render.sample import SAMPLE_IMAGES, LinearSample
 from brewster.scene.camera import axes, dot
 from brewster.scene.scene import Scene
 
@@ -98,7 +98,7 @@ def render(scene: Scene, assets: Assets, device: Device = "cpu") -> LinearSample
             if _needs_monte_carlo(scene)
             else _render_deterministic(prepared)
         )
-    return LinearSample(scene, **dict(zip(LAYERS, layers, strict=True)))
+    return LinearSample(scene, **dict(zip(SAMPLE_IMAGES, layers, strict=True)))
 
 
 def ghost_distance_px(scene: Scene) -> float:

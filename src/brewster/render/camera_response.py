@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from torch import Generator, Tensor
 
 from brewster.photo import FileInfo, Photo
-from brewster.render.sample import LAYERS, LinearSample
+from brewster.render.sample import SAMPLE_IMAGES, LinearSample
 from brewster.scene.scene import CameraResponse, Scene
 from brewster.srgb import REC709_LUMINANCE, to_encoded
 
@@ -59,9 +59,9 @@ class DevelopedSample:
     overexposed_fraction: float
     """The fraction of the pixels of I in which at least one channel clips, 0..1."""
 
-    def layers(self) -> dict[str, Tensor]:
+    def images(self) -> dict[str, Tensor]:
         """Returns the five encoded images by name."""
-        return {name: getattr(self, f"{name}_encoded") for name in LAYERS}
+        return {name: getattr(self, f"{name}_encoded") for name in SAMPLE_IMAGES}
 
     def camera_settings(self) -> dict[str, Any]:
         """Returns the exposures, the white balance gains and the overexposed fraction, as TOML values."""
@@ -84,7 +84,7 @@ def develop(sample: LinearSample) -> DevelopedSample:
     gains = sample.photo.new_tensor(white_balance_gains).view(3, 1, 1)
     ev = _exposure_ev(sample.photo * gains, response.target_luminance)
     mirror_ev = _exposure_ev(sample.mirror * gains, response.target_luminance)
-    exposed = sample.map(lambda light: light * (gains * math.exp2(ev))).layers()
+    exposed = sample.map(lambda light: light * (gains * math.exp2(ev))).images()
     exposed["photo"] = _add_noise(exposed["photo"], sample.scene)
     exposed["mirror"] = sample.mirror * (gains * math.exp2(mirror_ev))
     return DevelopedSample(

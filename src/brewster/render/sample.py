@@ -10,7 +10,7 @@ from torch import Tensor
 
 from brewster.scene.scene import Scene
 
-LAYERS: Final = ("photo", "transmission", "background", "reflection", "mirror")
+SAMPLE_IMAGES: Final = ("photo", "transmission", "background", "reflection", "mirror")
 """The names of I, T, B, R and MR in files and fields."""
 
 
@@ -29,10 +29,10 @@ class LinearSample:
     reflection: Tensor
     mirror: Tensor
 
-    def layers(self) -> dict[str, Tensor]:
+    def images(self) -> dict[str, Tensor]:
         """Returns the five images by name."""
-        return {name: getattr(self, name) for name in LAYERS}
+        return {name: getattr(self, name) for name in SAMPLE_IMAGES}
 
     def map(self, function: Callable[[Tensor], Tensor]) -> LinearSample:
         """Returns a sample with the function applied to each image."""
-        return LinearSample(self.scene, **{name: function(layer) for name, layer in self.layers().items()})
+        return LinearSample(self.scene, **{name: function(layer) for name, layer in self.images().items()})

@@ -28,7 +28,7 @@ from brewster.files import TEMPORARY_PREFIX, atomic_path, discard, temporary_pat
 from brewster.photo import read_exr_layers, write_exr_layers
 from brewster.render.analytic import ghost_distance_px
 from brewster.render.camera_response import DevelopedSample, develop, encode_jpeg, luminance
-from brewster.render.sample import LAYERS, LinearSample
+from brewster.render.sample import SAMPLE_IMAGES, LinearSample
 from brewster.scene.recipe_file import validated
 from brewster.scene.scene import Scene
 
@@ -37,7 +37,7 @@ Float32 = NDArray[np.float32]
 SHARD_SIZE: Final = 100
 """Number of samples in a shard."""
 LIGHT_FILE, SCENE_FILE = "layers.exr", "scene.toml"
-SAMPLE_FILES: Final = (*(f"{layer}.jpg" for layer in LAYERS), LIGHT_FILE, SCENE_FILE)
+SAMPLE_FILES: Final = (*(f"{layer}.jpg" for layer in SAMPLE_IMAGES), LIGHT_FILE, SCENE_FILE)
 """The files of a sample: five photographs, their linear light, and the scene."""
 
 _GROUND_TRUTH_QUALITY: Final = 95
@@ -85,11 +85,11 @@ def encode_sample(sample: LinearSample, renderer: str) -> dict[str, bytes]:
     developed = develop(sample)
     origin = {"version": brewster.__version__, "renderer": renderer}
     outcome = {**origin, **developed.camera_settings(), **statistics(sample, developed)}
-    qualities = dict.fromkeys(LAYERS, _GROUND_TRUTH_QUALITY) | {
+    qualities = dict.fromkeys(SAMPLE_IMAGES, _GROUND_TRUTH_QUALITY) | {
         "photo": sample.scene.camera_response.jpeg_quality
     }
-    files = {f"{name}.jpg": encode_jpeg(layer, qualities[name]) for name, layer in developed.layers().items()}
-    light = {name: layer.permute(1, 2, 0).float().cpu().numpy() for name, layer in sample.layers().items()}
+    files = {f"{name}.jpg": encode_jpeg(layer, qualities[name]) for name, layer in developed.images().items()}
+    light = {name: layer.permute(1, 2, 0).float().cpu().numpy() for name, layer in sample.images().items()}
     files[LIGHT_FILE] = write_exr_layers(light, {"software": f"brewster {brewster.__version__}"})
     files[SCENE_FILE] = sample.scene.to_toml(outcome=outcome).encode()
     return files
@@ -218,7 +218,7 @@ def open_sample(entry: StoredSample) -> tuple[dict[str, Float32], Scene]:
         RecipeError: the scene file is damaged.
     """
     light = read_exr_layers(entry.read(LIGHT_FILE))
-    return {name: light[name] for name in LAYERS}, read_scene_of(entry)
+    return {name: light[name] for name in SAMPLE_IMAGES}, read_scene_of(entry)
 
 
 def read_scene_of(entry: StoredSample) -> Scene:

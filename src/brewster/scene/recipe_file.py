@@ -200,10 +200,10 @@ def _facts(key: RecipeKey) -> Iterator[str]:
         yield key.allowed
     if key.unit:
         yield f"in {key.unit}"
-    yield default_of(key)
+    yield describe_default(key)
 
 
-def default_of(key: RecipeKey) -> str:
+def describe_default(key: RecipeKey) -> str:
     """Returns the default of a key in words."""
     value = _plain_default(key)
     if key.default is REQUIRED:

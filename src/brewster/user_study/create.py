@@ -1,6 +1,6 @@
 """Create a study from folders of outputs: pair pictures by name and copy them under random names.
 
-    create(Path("out/study"), Path("inputs"), {"ours": Path("out/ours"), "RDNet": Path("out/rdnet")})
+    create_study(Path("out/study"), Path("inputs"), {"ours": Path("out/ours"), "RDNet": Path("out/rdnet")})
 
 All files are checked before anything is written, and one error lists all problems. Pictures are stored as upright 8-bit
 sRGB PNG without metadata, so every browser shows the same pixels, and neither format nor EXIF reveals the method.
@@ -80,7 +80,7 @@ class _StudyFiles:
     outputs: Mapping[str, Mapping[Key, Path]]
 
 
-def create(
+def create_study(
     out: Path,
     inputs: Path,
     methods: Mapping[str, Path],
@@ -94,7 +94,7 @@ def create(
         inputs: the folder of photos with reflections.
         methods: the folder of outputs by method name. The first method is compared with each of the others.
         options: sizes, seed and consent text.
-        on_progress: called after each copied picture with the number of pictures copied so far.
+        on_progress: called after each written picture with the number of pictures written so far, including degraded copies.
 
     Returns:
         The study in the folder `out`.
@@ -231,6 +231,7 @@ class _Copier:
             degrade(Photo.open(data).srgb_8bit(), self.rng.getrandbits(32)), encoding="srgb"
         )
         self.pictures[key] = self.write(degraded, hashlib.sha256(data).hexdigest())
+        self.on_progress(len(self.pictures))
         return self.pictures[key].name
 
     def write(self, photo: Photo, source_sha256: str) -> StudyPicture:

@@ -1,6 +1,6 @@
-"""The FastAPI application of both pages: routers, request limits, page files, and errors as JSON.
+"""The FastAPI application of both pages: routers, access policy, page files, and errors as JSON.
 
-    serve(create_app(router, limits=RequestLimits.for_host("127.0.0.1")), host="127.0.0.1", port=8417)
+    serve(create_app(router, policy=AccessPolicy.for_host("127.0.0.1")), host="127.0.0.1", port=8417)
 
 All files of the pages are part of this package, so that the pages work offline.
 """
@@ -33,7 +33,7 @@ from brewster.errors import (
     UnreadablePhoto,
     UnsupportedPhoto,
 )
-from brewster.web.middleware import SECURITY_HEADERS, LimitMiddleware, RequestLimits
+from brewster.web.middleware import SECURITY_HEADERS, AccessMiddleware, AccessPolicy
 from brewster.web.request_schema import validation_message
 from brewster.web.server import create_server
 
@@ -51,16 +51,16 @@ _STATUS_CODES: Final[dict[type[BrewsterError], int]] = {
 """HTTP status by error class. Other BrewsterErrors are caused by the request and get the status 422."""
 
 
-def create_app(*routers: APIRouter, limits: RequestLimits, index: str = "index.html") -> FastAPI:
+def create_app(*routers: APIRouter, policy: AccessPolicy, index: str = "index.html") -> FastAPI:
     """Creates an application.
 
     Args:
         routers: the routes of the API.
-        limits: the limits of every request.
+        policy: the access policy for every request.
         index: the file in web/page/ that is served at `/`.
     """
     app = FastAPI(title="brewster", version=brewster.__version__, docs_url=None, redoc_url=None)
-    app.add_middleware(LimitMiddleware, limits=limits)
+    app.add_middleware(AccessMiddleware, policy=policy)
     for error_class in (ClientDisconnect, HTTPException, RequestValidationError, BrewsterError, Exception):
         app.add_exception_handler(error_class, _error_response)
     for router in routers:
@@ -149,11 +149,13 @@ async def _error_response(request: Request, error: Exception) -> Response:
     if isinstance(error, BrewsterError):
         body = {"error": str(error), "kind": type(error).__name__}
         return JSONResponse(body, _STATUS_CODES.get(type(error), 422))
-    body = {"error": f"brewster has an internal error ({type(error).__name__}); please report it"}
-    return JSONResponse(body, 500, SECURITY_HEADERS)  # Starlette sends this response outside LimitMiddleware
+    body = {
+        "error": f"brewster has an internal error ({type(error).__name__}); expected no such error; please report it"
+    }
+    return JSONResponse(body, 500, SECURITY_HEADERS)  # Starlette sends this response outside AccessMiddleware
 
 
 def _http_error_message(request: Request, error: HTTPException) -> str:
     if error.detail != HTTPStatus(error.status_code).phrase:
         return error.detail
-    return f"{request.method} {request.url.path} does not exist; GET /openapi.json lists the routes"
+    return f"{request.method} {request.url.path} does not exist; expected an existing route; choose one from GET /openapi.json"

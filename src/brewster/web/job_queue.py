@@ -111,11 +111,13 @@ class JobQueue:
         if self.job_count >= self.workers + self.max_waiting:
             raise HTTPException(
                 503,
-                f"the queue is full with {self.job_count} photos; try again in a few seconds",
+                f"the queue is full with {self.job_count} photos; expected a free place; try again in a few seconds",
                 {"Retry-After": "5"},
             )
         if name in self._jobs:
-            raise HTTPException(409, f"a job with the name {name} exists already; choose another name")
+            raise HTTPException(
+                409, f"a job with the name {name} exists already; expected a new name; choose another name"
+            )
         job, key = SeparationJob(), name or object()
         self._jobs[key] = job
         try:
@@ -161,7 +163,7 @@ class JobQueue:
             raise HTTPException(
                 504,
                 f"the separation did not finish within {self.timeout_seconds:g} seconds, including the waiting time; "
-                "try a smaller photo or quality draft",
+                "expected it to finish in this time; try a smaller photo or quality draft",
             )
         finally:
             job.cancelled.set()

@@ -1,6 +1,6 @@
-"""ASGI middleware that checks host, origin, token and body size of every request.
+"""ASGI middleware that checks host, origin, token, body size and upload time of every request.
 
-    app.add_middleware(LimitMiddleware, limits=RequestLimits.for_host("127.0.0.1"))
+    app.add_middleware(AccessMiddleware, policy=AccessPolicy.for_host("127.0.0.1"))
 
 A page of another site must not use a local server through the browser of the user. The middleware therefore refuses a request with
 a foreign Host header (DNS rebinding) and a POST request from a foreign origin. It sends no CORS headers.
@@ -48,8 +48,8 @@ _REDIRECT_PAGE: Final = (
 
 @final
 @dataclass(frozen=True)
-class RequestLimits:
-    """Limits for the requests to a server."""
+class AccessPolicy:
+    """Which requests a server accepts: their hosts, their token, and the size and duration of their bodies."""
 
     hosts: frozenset[str] = LOOPBACK
     """Host names and addresses that a Host header may contain."""
@@ -68,8 +68,8 @@ class RequestLimits:
         return f"brewster-{hashlib.sha256((self.token or '').encode()).hexdigest()[:8]}"
 
     @classmethod
-    def for_host(cls, host: str, *, token: str | None = None, max_bytes: int = 100_000_000) -> RequestLimits:
-        """Returns the limits of a server that is bound to an address.
+    def for_host(cls, host: str, *, token: str | None = None, max_bytes: int = 100_000_000) -> AccessPolicy:
+        """Returns the policy of a server that is bound to an address.
 
         A Host header may contain this address, the host name of the machine, or a loopback address. With a wildcard
         address, it may contain any IP address.
@@ -99,18 +99,18 @@ def is_loopback(host: str) -> bool:
 
 
 @final
-class LimitMiddleware:
+class AccessMiddleware:
     """Pure ASGI middleware: passes a request to `app`, or refuses it with a status and `{"error": message}`."""
 
-    def __init__(self, app: ASGIApp, *, limits: RequestLimits) -> None:
-        self.app, self.limits = app, limits
+    def __init__(self, app: ASGIApp, *, policy: AccessPolicy) -> None:
+        self.app, self.policy = app, policy
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Handles one request."""
         if scope["type"] != "http":
             await self.app(scope, receive, send)
             return
-        exchange = _Exchange(self.limits, receive, send)
+        exchange = _Exchange(self.policy, receive, send)
         try:
             response = self._refusal(scope, Headers(scope=scope)) or self.app
             await response(scope, exchange.receive, exchange.send)
@@ -119,31 +119,37 @@ class LimitMiddleware:
         except asyncio.CancelledError:  # only the shutdown of the server cancels a request
             if not exchange.has_started:
                 await _error_response(
-                    503, "the server is being stopped; start it again and repeat the request"
+                    503,
+                    "the server is being stopped; expected a running server; start it again and repeat the request",
                 )(scope, exchange.receive, exchange.forward)
 
     def _refusal(self, scope: Scope, headers: Headers) -> Response | None:
         """Returns the response that refuses a request, or None if the request is accepted."""
-        limits, method = self.limits, scope["method"]
-        if not limits.allows_host(headers.get("host", "")):
+        policy, method = self.policy, scope["method"]
+        if not policy.allows_host(headers.get("host", "")):
             return _error_response(
-                421, "the Host header does not name this server; use the address that the server printed"
+                421,
+                "the Host header does not name this server; expected its name or address; "
+                "use the address that the server printed",
             )
         if method not in _SAFE_METHODS and not _is_same_origin(headers):
             return _error_response(
-                403, "the request comes from another site; only the page of this server may send it"
+                403,
+                "the request comes from another site; expected a request of the page of this server; "
+                "open the address that the server printed and repeat the request there",
             )
         query_token = parse_qs(scope["query_string"].decode("latin-1")).get("token", [None])[0]
-        if limits.token and query_token and method == "GET" and limits.accepts_token(query_token):
-            return _redirect_with_cookie(scope["path"], limits)
-        if not limits.accepts_token(_request_token(headers, limits.cookie_name)):
+        if policy.token and query_token and method == "GET" and policy.accepts_token(query_token):
+            return _redirect_with_cookie(scope["path"], policy)
+        if not policy.accepts_token(_request_token(headers, policy.cookie_name)):
             return _error_response(
                 401,
-                "a token is needed; open the link that the server printed, or send the token as a Bearer token",
+                "the token is missing or wrong; expected the token of this server; "
+                "open the link that the server printed, or send the token as a Bearer token",
             )
         length = headers.get("content-length", "0")
-        if not length.isdecimal() or len(length) > _MAX_LENGTH_DIGITS or int(length) > limits.max_bytes:
-            raise _body_too_long(limits)
+        if not length.isdecimal() or len(length) > _MAX_LENGTH_DIGITS or int(length) > policy.max_bytes:
+            raise _body_too_long(policy)
         return None
 
 
@@ -151,11 +157,11 @@ class LimitMiddleware:
 class _Exchange:
     """One request and its response. Limits the size and the time of the body, and adds SECURITY_HEADERS to the response."""
 
-    def __init__(self, limits: RequestLimits, receive: Receive, send: Send) -> None:
-        self._limits, self._receive, self._send = limits, receive, send
+    def __init__(self, policy: AccessPolicy, receive: Receive, send: Send) -> None:
+        self._policy, self._receive, self._send = policy, receive, send
         self._bytes, self._is_complete, self._is_draining = 0, False, False
         self.has_started = False
-        self._deadline = asyncio.get_running_loop().time() + limits.body_seconds
+        self._deadline = asyncio.get_running_loop().time() + policy.body_seconds
 
     async def receive(self) -> Message:
         """Receives the next part of the body, or the message that the client has disconnected after the end of the body.
@@ -171,12 +177,14 @@ class _Exchange:
         except TimeoutError as error:
             self._is_complete = True  # do not wait for the rest
             raise HTTPException(
-                408, f"the upload took longer than {self._limits.body_seconds:g} seconds; send it again"
+                408,
+                f"the upload took longer than {self._policy.body_seconds:g} seconds; expected all of it within this time; "
+                "send it again, or send a smaller file",
             ) from error
         self._bytes += len(message.get("body", b""))
         self._is_complete = not message.get("more_body", False)
-        if self._bytes > self._limits.max_bytes and not self._is_draining:
-            raise _body_too_long(self._limits)
+        if self._bytes > self._policy.max_bytes and not self._is_draining:
+            raise _body_too_long(self._policy)
         return message
 
     async def send(self, message: Message) -> None:
@@ -215,12 +223,12 @@ def _error_response(status: int, message: str) -> Response:
     return JSONResponse({"error": message}, status)
 
 
-def _body_too_long(limits: RequestLimits) -> HTTPException:
-    limit = f"{limits.max_bytes / 1e6:g} MB"
-    return HTTPException(413, f"the upload is larger than {limit}; send a smaller file")
+def _body_too_long(policy: AccessPolicy) -> HTTPException:
+    limit = f"{policy.max_bytes / 1e6:g} MB"
+    return HTTPException(413, f"the upload is too large; expected at most {limit}; send a smaller file")
 
 
-def _redirect_with_cookie(path: str, limits: RequestLimits) -> Response:
+def _redirect_with_cookie(path: str, policy: AccessPolicy) -> Response:
     """Returns the response that sets the cookie and then loads the address without the token.
 
     The response is a page with a Refresh header instead of an HTTP redirect: browsers send a SameSite=strict cookie only
@@ -228,7 +236,7 @@ def _redirect_with_cookie(path: str, limits: RequestLimits) -> Response:
     """
     address = "/" + quote(path.lstrip("/"))
     response = HTMLResponse(_REDIRECT_PAGE.format(address), headers={"Refresh": f"0; url={address}"})
-    response.set_cookie(limits.cookie_name, limits.token or "", httponly=True, samesite="strict")
+    response.set_cookie(policy.cookie_name, policy.token or "", httponly=True, samesite="strict")
     return response
 
 

@@ -15,7 +15,7 @@ from starlette.exceptions import HTTPException
 from starlette.formparsers import MultiPartException, MultiPartParser
 from starlette.requests import Request
 
-from brewster.files import LAYERS, SeparationPaths
+from brewster.files import OUTPUT_LAYERS, SeparationPaths
 from brewster.image_formats import SUFFIXES
 from brewster.options import Options
 
@@ -69,7 +69,8 @@ async def read_form(request: Request, models: Sequence[str], max_pixels: int) ->
     """
     if not request.headers.get("content-type", "").lower().startswith("multipart/form-data"):
         raise HTTPException(
-            415, "the body is not a form; send multipart/form-data with the photo in the field photo"
+            415,
+            "the body is not a form; expected multipart/form-data; send the photo in the field photo of such a form",
         )
     try:
         form = await _InMemoryParser(
@@ -77,10 +78,13 @@ async def read_form(request: Request, models: Sequence[str], max_pixels: int) ->
         ).parse()
     except MultiPartException as error:
         raise HTTPException(
-            400, f"the form cannot be read ({error.message.rstrip('.')}); send it again"
+            400,
+            f"the form cannot be read ({error.message.rstrip('.')}); expected a complete form; send it again",
         ) from error
     except ValueError as error:  # Python knows the charset, but cannot decode text with it
-        raise HTTPException(400, "the charset of the form cannot be decoded; send it in UTF-8") from error
+        raise HTTPException(
+            400, "the charset of the form cannot be decoded; expected UTF-8; send the form in UTF-8"
+        ) from error
     try:
         return await _build_request(form, _options(form, models, max_pixels))
     finally:
@@ -90,20 +94,26 @@ async def read_form(request: Request, models: Sequence[str], max_pixels: int) ->
 async def _build_request(form: FormData, options: Options) -> SeparationRequest:
     for name in _FILES:
         if len(form.getlist(name)) > 1:
-            raise HTTPException(400, f"the form contains more than one file {name}; send only one file")
+            raise HTTPException(
+                400, f"the form contains several files {name}; expected one; send only one file"
+            )
     photo = form.get("photo")
     if not isinstance(photo, UploadFile):
-        raise HTTPException(422, "the form contains no photo; send its file in the field photo")
+        raise HTTPException(
+            422, "the form contains no photo; expected an image file; send it in the field photo"
+        )
     mask = form.get("mask")
     if mask is not None and not isinstance(mask, UploadFile):
-        raise HTTPException(422, "the field mask contains no file; send the mask as an image file")
+        raise HTTPException(
+            422, "the field mask contains no file; expected an image file; send the mask as a file"
+        )
     values = await mask.read() if mask else None
     return SeparationRequest(await photo.read(), safe_name(photo.filename or ""), options, values)
 
 
 @final
 class _InMemoryParser(MultiPartParser):
-    """Stores files of any size in memory. LimitMiddleware limits their size."""
+    """Stores files of any size in memory. AccessMiddleware limits their size."""
 
     spool_max_size = 0
 
@@ -157,14 +167,16 @@ def _options(form: FormData, models: Sequence[str], max_pixels: int) -> Options:
     unknown = [name for name in texts if name not in FIELDS]
     if unknown:
         raise HTTPException(
-            422, f"there is no field {unknown[0][:40]!r}; use {', '.join((*_FILES, *FIELDS))}"
+            422,
+            f"there is no field {unknown[0][:40]!r}; expected {', '.join((*_FILES, *FIELDS))}; correct the name",
         )
     values_by_name: dict[str, Any] = {name: values[-1] for name, values in texts.items() if values[-1]}
     if "layers" in texts:
         values_by_name["layers"] = _ordered_layers(",".join(texts["layers"]).split(","))
     if values_by_name.setdefault("model", models[0]) not in models:
         raise HTTPException(
-            422, f"there is no model {values_by_name['model'][:40]!r}; choose {' or '.join(models)}"
+            422,
+            f"there is no model {values_by_name['model'][:40]!r}; expected a model of this server; choose {' or '.join(models)}",
         )
     try:
         return _OPTIONS.validate_python(values_by_name | {"max_pixels": max_pixels})
@@ -174,4 +186,4 @@ def _options(form: FormData, models: Sequence[str], max_pixels: int) -> Options:
 
 def _ordered_layers(layers: Sequence[str]) -> list[str]:
     """Returns each layer once, in the order of the command line. Unknown names come last, and the validation refuses them."""
-    return [layer for layer in dict.fromkeys((*LAYERS, *layers)) if layer in layers]
+    return [layer for layer in dict.fromkeys((*OUTPUT_LAYERS, *layers)) if layer in layers]

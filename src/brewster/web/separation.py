@@ -111,7 +111,9 @@ def separation_router(model_cache: ModelCache, job_queue: JobQueue, *, max_pixel
         found = job_queue.progress(job)
         if found is None:
             raise HTTPException(
-                404, "there is no job with this name; it has ended, or its request has not arrived yet"
+                404,
+                "there is no job with this name; expected a job that is waiting or running; "
+                "it may have ended, or not have arrived yet: try again later",
             )
         return found
 
@@ -149,7 +151,9 @@ def _add_page_routes(
         found = None if photo is None else photo_tile(photo, level, column, row)
         if found is None:
             raise HTTPException(
-                404, "the server has dropped this photo, or the photo has no such tile; send the photo again"
+                404,
+                "the server has dropped this photo, or the photo has no such tile; expected a tile of a kept photo; "
+                "send the photo again",
             )
         return Response(found.encode("png"), media_type="image/png", headers=_TILE_HEADERS)
 

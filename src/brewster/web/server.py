@@ -46,7 +46,7 @@ def create_server(app: FastAPI) -> uvicorn.Server:
 class QuietServer(uvicorn.Server):
     """A uvicorn server that logs nothing at shutdown.
 
-    It cancels requests that run longer than GRACE_SECONDS; LimitMiddleware then sends an error message for each of them.
+    It cancels requests that run longer than GRACE_SECONDS; AccessMiddleware then sends an error message for each of them.
     """
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:

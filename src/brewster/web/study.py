@@ -1,6 +1,6 @@
 """The HTTP API of the user study: consent, the pictures of a trial, answers.
 
-    create_app(study_router(study, AnswerStore(study)), limits=limits, index="study.html")
+    create_app(study_router(study, AnswerStore(study)), policy=policy, index="study.html")
 
 No response contains the name of a method, file or dataset. A picture is requested by its trial and its side (`photo`, `left`
 or `right`), and only with the personal link of the participant.

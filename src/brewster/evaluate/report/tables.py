@@ -31,7 +31,7 @@ def to_markdown(results: Results) -> str:
     return "\n\n".join(part for part in parts if part) + "\n"
 
 
-def overview(results: Results) -> str:
+def tables_to_markdown(results: Results) -> str:
     """Returns the tables as Markdown without notes and settings, for model cards."""
     return (
         "\n\n".join([_overview(results), *(_details(results, key) for key in results["selections"])]) + "\n"
@@ -262,7 +262,7 @@ def is_complete(table: Mapping[str, Any], method: str, metric: str) -> bool:
 
 
 def to_csv(results: Results) -> str:
-    """Returns a CSV table: one line for each mean, and one for each difference of `method` minus `than`."""
+    """Returns a CSV table: one line for each mean, and one for each difference of `method` minus `reference`."""
     text = io.StringIO()
     table = csv.writer(text, lineterminator="\n")
     table.writerow(

@@ -31,7 +31,7 @@ _POLARISED: Final = "llvm_ad_mono_polarized"
 _MIN_PASSES: Final = 4
 """Fewer passes give no useful estimate of the variance."""
 _MAX_RAYS_PER_PASS: Final = 1 << 22
-"""A pass with this number of rays needs about 1 GB of memory."""
+"""A pass with this number of rays (pixels x samples per pixel) needs about 1 GB of memory."""
 _RELATIVE_FLOOR: Final = 0.01
 """This fraction of the mean light is added to each pixel before its relative error is computed, because the relative
 error of a black pixel is not defined."""
@@ -50,7 +50,7 @@ def trace(
 
     The error of an image is the mean over its pixels of standard error / (light + 1 % of the mean light). The standard
     error is computed from the variance between passes. An image is finished when its error is at most `noise_threshold`,
-    or after `max_samples` rays per pixel. The light from behind and the light from the front are measured together,
+    or after `max_samples` samples per pixel (spp). The light from behind and the light from the front are measured together,
     relative to their sum I: the next pass is for the side that adds more error to I. With truncated orders, T and R are
     rendered separately.
 
@@ -62,7 +62,7 @@ def trace(
         scene: the scene to render.
         assets: the source of the scene's maps and pictures.
         noise_threshold: the relative error at which an image is finished.
-        max_samples: the maximum number of rays per pixel and image.
+        max_samples: the maximum number of samples per pixel of an image.
         denoise: whether to filter the result with Intel Open Image Denoise.
         polarised: whether to trace polarisation.
 
@@ -198,7 +198,7 @@ class _RunningEstimate:
 
 
 def _samples_per_pass(pixel_count: int, max_samples: int) -> int:
-    """Returns the number of rays per pixel and pass: 64, 16, 4 or 1, as many as the memory and `_MIN_PASSES` passes allow.
+    """Returns the number of samples per pixel in a pass: 64, 16, 4 or 1, as many as the memory and `_MIN_PASSES` passes allow.
 
     These are square numbers, which the sampler stratifies evenly.
     """
@@ -207,7 +207,7 @@ def _samples_per_pass(pixel_count: int, max_samples: int) -> int:
 
 
 def _converge(estimates: Sequence[_RunningEstimate], noise_threshold: float, max_samples: int) -> None:
-    """Adds passes until the error of the images' sum is at most `noise_threshold`, or all images have `max_samples` rays.
+    """Adds passes until the error of the images' sum is at most `noise_threshold`, or all images have `max_samples` samples per pixel.
 
     Each pass is for the image with the largest error.
     """

@@ -14,7 +14,7 @@ from torch.nn import functional
 
 from brewster.files import atomic_path, write_atomically
 from brewster.photo import Photo
-from brewster.render.sample import LAYERS
+from brewster.render.sample import SAMPLE_IMAGES
 from brewster.rendered.store import SCENE_FILE, STATISTICS, StoredSample, read_dataset
 
 INDEX_FILE, PREVIEW_FILE = "index.parquet", "preview.png"
@@ -126,7 +126,7 @@ def write_preview(out: Path) -> None:
 
 
 def _contact_sheet_row(entry: StoredSample) -> NDArray[np.uint8]:
-    return np.concatenate([_cell(entry.read(f"{layer}.jpg")) for layer in LAYERS], axis=1)
+    return np.concatenate([_cell(entry.read(f"{layer}.jpg")) for layer in SAMPLE_IMAGES], axis=1)
 
 
 def _cell(data: bytes) -> NDArray[np.uint8]:

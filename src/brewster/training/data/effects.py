@@ -87,7 +87,7 @@ def sign(rng: SampleRng, image: Image) -> Image:
     return image * (1 - 0.7 * panel) + rng.log_uniform((0.8, 6.0)) * colour * lit
 
 
-def falloff(rng: SampleRng, size: int) -> Mask:
+def smooth_attenuation_mask(rng: SampleRng, size: int) -> Mask:
     """Returns a smooth mask that dims parts of the reflection, as if parts of the mirrored scene were dark."""
     return torch.sigmoid(
         rng.uniform((1, 6)) * (_noise(rng, size, 2 + rng.randint(4)) + rng.uniform((-0.5, 0.5)))
@@ -119,7 +119,7 @@ def shadow(rng: SampleRng, size: int) -> Mask:
 def jpeg(encoded: Image, quality: int) -> Image:
     """Simulates JPEG compression of an encoded image at a quality of 1..100.
 
-    The steps are a cosine transform of blocks of 8 x 8 px, quantization (tables K.1 and K.2 of Wallace, "The JPEG still
+    The steps are a cosine transform of blocks of 8 x 8 px, quantization (tables K.1 and K.2 of ITU-T T.81; Wallace, "The JPEG still
     picture compression standard", CACM 34, 1991) and rounding to 8 bits. The chroma channels have full resolution. Entropy
     coding is left out, because it is lossless. The simulation therefore takes a tenth of the time of a codec. Both sides of
     the image must be multiples of 8.

@@ -232,7 +232,7 @@ class Mixtures:
         if rng.bernoulli(recipe.ghost_probability):
             view = effects.ghost(rng, view, rng.uniform(recipe.ghost_weight), recipe.ghost_px * scale)
         if rng.bernoulli(recipe.falloff_probability):
-            view = view * effects.falloff(rng, size)
+            view = view * effects.smooth_attenuation_mask(rng, size)
         if rng.bernoulli(recipe.edge_probability):
             view = view * effects.edge(rng, size)
         return view * rng.log_uniform(recipe.reflection_ratio)

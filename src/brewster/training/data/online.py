@@ -76,7 +76,7 @@ class OnlineRendered:
             PhotoError: a file cannot be decoded.
         """
         camera = self._recipe.camera.model_copy(update={"width": size, "height": size})
-        developed = self._developed(self._recipe.model_copy(update={"camera": camera}), index).layers()
+        developed = self._developed(self._recipe.model_copy(update={"camera": camera}), index).images()
         return torch.cat([developed[name] for name in ("photo", self._target, "reflection")])
 
     def _developed(self, recipe: SceneRecipe, index: int) -> DevelopedSample:

@@ -290,7 +290,7 @@ class LoraTrainer:
         }
 
     def _start_and_sigma(self, rng: SampleRng, encoded: EncodedSample) -> tuple[Tensor, Tensor]:
-        """Returns the start of the path from noise or photo to the composite, and the time sigma in 0..1 on this path.
+        """Returns the start of the path (noise, or the photo for one_step) and the time sigma: 1 at the start, 0 at the composite.
 
         The distribution of times is logit-normal (Esser et al. 2024). Times are then shifted for the resolution.
         """
@@ -342,7 +342,7 @@ def _check_optimizer(recipe: LoraRecipe, device: str) -> None:
     ):
         raise DeviceError(
             f'optimizer = "adamw8bit" was requested on {device}',
-            "expected an NVIDIA GPU and bitsandbytes, which computes it",
+            "expected an NVIDIA GPU and the package bitsandbytes, which contains this optimizer",
             'set optimizer = "adamw", or run: pip install bitsandbytes',
         )
 

@@ -108,7 +108,7 @@ def sign_flip_test(
     The test exchanges wins and losses of whole participants at random, because their answers are correlated. It assumes that,
     without a difference of the methods, each participant is as likely to prefer one as the other. (A randomisation test, Good
     2005, "Permutation, Parametric and Bootstrap Tests of Hypotheses", 3.2; one is added to both counts as in Phipson and Smyth
-    2010.) With few participants, the p-values vary by chance about those of all 2^n exchanges.
+    2010.) The p-values are random estimates of the exact ones over all 2^n exchanges of n participants.
     """
     rng = np.random.default_rng([SEED, len(counts), 1])
     signs = rng.choice([-1.0, 1.0], (resamples, len(counts)))
@@ -125,7 +125,7 @@ def sign_flip_test(
 def agreement_bounds(
     counts: Float64[Floats, "p ... d 3"], pictures: Float64[Floats, "... d"]
 ) -> Float64[Floats, "... d+3"]:
-    """The lower 95 % bound of a rate of 1, for each row of `rates`; NaN without answers.
+    """The lower end of the 95 % interval for an observed rate of 1, for each row of `rates`; NaN without answers.
 
     If all answers agree, the bootstrap has no spread. The bound is then that of Clopper and Pearson (1934) for n successes of
     n trials, 0.025^(1 / n). Here n is the number of participants, not of answers, since answers of one participant are not

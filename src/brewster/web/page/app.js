@@ -7,7 +7,7 @@ import { exportAll, exportLayer, save } from "./export.js";
 import { Layers, draw, readPreview } from "./light.js";
 import { SeparationQueue } from "./queue.js";
 import { maskCodes, maskFile } from "./regions.js";
-import { createRow, fraction, progressText, setBar, showFile, statusText, summarise, updateRow, watchScrolling } from "./strip.js";
+import { createThumbnail, fraction, progressText, setBar, showFile, statusText, summarise, updateThumbnail, watchScrolling } from "./filmstrip.js";
 import { TileSet } from "./tiles.js";
 import { createTools } from "./tools.js";
 
@@ -87,25 +87,25 @@ function add(found) {
   if (!found.files.length) return refresh();
   if (queue.current === null) {
     select(queue.photos[0]);
-    queue.current.row.querySelector("button").focus();
+    queue.current.thumbnail.querySelector("button").focus();
   }
   refresh();
   queue.startNext();
 }
 
 function insert(photo, next = null) {
-  photo.row = createRow(photo, { onSelect: () => select(photo), onRemove: () => remove(photo) }, next);
+  photo.thumbnail = createThumbnail(photo, { onSelect: () => select(photo), onRemove: () => remove(photo) }, next);
 }
 
 function remove(photo) {
-  const hadFocus = photo.row.contains(document.activeElement) || byId("stage").contains(document.activeElement);
+  const hadFocus = photo.thumbnail.contains(document.activeElement) || byId("stage").contains(document.activeElement);
   const index = queue.remove(photo);
   removed = { photo, index };
-  photo.row.remove();
+  photo.thumbnail.remove();
   if (photo === queue.current) select(queue.photos[Math.min(index, queue.photos.length - 1)] ?? null);
   showNote(`${photo.file.name} was removed.`);
   refresh();
-  if (hadFocus) (queue.current ? queue.current.row.querySelector("button") : byId("undo-remove")).focus();
+  if (hadFocus) (queue.current ? queue.current.thumbnail.querySelector("button") : byId("undo-remove")).focus();
   announce(`${photo.file.name} was removed`);
   queue.startNext();
 }
@@ -114,10 +114,10 @@ function undoRemove() {
   const { photo, index } = removed;
   removed = null;
   queue.restore(photo, index);
-  insert(photo, queue.photos[index + 1]?.row ?? null);
+  insert(photo, queue.photos[index + 1]?.thumbnail ?? null);
   showNote("");
   select(photo);
-  photo.row.querySelector("button").focus();
+  photo.thumbnail.querySelector("button").focus();
   announce(`${photo.file.name} was added again`);
 }
 
@@ -156,10 +156,10 @@ function announceResult(message) {
 function select(photo) {
   queue.current = photo;
   close();
-  for (const other of queue.photos) other.row.querySelector(".pick").removeAttribute("aria-current");
+  for (const other of queue.photos) other.thumbnail.querySelector(".pick").removeAttribute("aria-current");
   if (photo) {
-    photo.row.querySelector(".pick").setAttribute("aria-current", "true");
-    photo.row.scrollIntoView({ block: "nearest", inline: "nearest" });
+    photo.thumbnail.querySelector(".pick").setAttribute("aria-current", "true");
+    photo.thumbnail.scrollIntoView({ block: "nearest", inline: "nearest" });
     byId("strength").value = photo.strength;
     showFile(byId("thumbnail"), photo.file);
     compare.reset();
@@ -235,7 +235,7 @@ function paint() {
 }
 
 function refresh(photo = null) {
-  for (const one of photo ? [photo] : queue.photos) if (one.row) updateRow(one);
+  for (const one of photo ? [photo] : queue.photos) if (one.thumbnail) updateThumbnail(one);
   const { current } = queue;
   enable("all", exporting === null && queue.count("done") > 0);
   byId("summary").textContent = queue.photos.length ? summarise(queue) : "";

@@ -58,14 +58,14 @@ export class Regions {
   }
 }
 
-// Returns the mask outside all regions: 0 if the first region has a strength above 0 (only regions are separated), otherwise 1.
-const background = (list) => (list.length && list[0].value > 0 ? 0 : 1);
+// Returns the value of the mask outside all regions: 0 if the first region has a strength above 0 (only regions are separated), otherwise 1.
+const outsideValue = (list) => (list.length && list[0].value > 0 ? 0 : 1);
 
 // Returns the mask of regions as codes, 0 to 255, or null if there are no regions. The mask of the whole photo has `width` x `height`
 // pixels; `part` selects a part of it: {left, top, columns, rows}.
 export function maskCodes(list, width, height, part = { left: 0, top: 0, columns: width, rows: height }) {
   if (!list.length) return null;
-  const outside = background(list);
+  const outside = outsideValue(list);
   const mask = new Float32Array(part.columns * part.rows).fill(outside);
   for (const region of list) drawRegion(mask, region, region.value ?? outside, Math.max(width, height), part);
   const codes = new Uint8Array(mask.length);
@@ -114,13 +114,13 @@ function measureSegment(distances, [ax, ay], [bx, by], reach, { x0, y0, x1, y1, 
 
 // Computes the signed distances to a rectangle.
 function measureRectangle(distances, [[ax, ay], [bx, by]], { x0, y0, x1, y1 }) {
-  const [left, end, top, bottom] = [Math.min(ax, bx), Math.max(ax, bx), Math.min(ay, by), Math.max(ay, by)];
+  const [left, right, top, bottom] = [Math.min(ax, bx), Math.max(ax, bx), Math.min(ay, by), Math.max(ay, by)];
   for (let y = y0, at = 0; y <= y1; y++) {
     const down = Math.max(top - y, y - bottom);
     for (let x = x0; x <= x1; x++, at++) {
-      const across = Math.max(left - x, x - end);
-      const [right, below] = [Math.max(across, 0), Math.max(down, 0)];
-      distances[at] = Math.sqrt(right * right + below * below) + Math.min(Math.max(across, down), 0);
+      const across = Math.max(left - x, x - right);
+      const [outsideX, outsideY] = [Math.max(across, 0), Math.max(down, 0)];
+      distances[at] = Math.sqrt(outsideX * outsideX + outsideY * outsideY) + Math.min(Math.max(across, down), 0);
     }
   }
 }

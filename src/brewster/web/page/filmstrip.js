@@ -1,23 +1,23 @@
-// The list of photos below the current photo: a row for each photo with its state, the summary, and the buttons that scroll the list.
+// The list of photos below the current photo: a thumbnail for each photo with its state, the summary, and the buttons that scroll the list.
 
 const TRANSPARENT_PIXEL = "data:image/gif;base64,R0lGODlhAQABAAAAACH5BAEKAAEALAAAAAABAAEAAAICTAEAOw==";
 const byId = (id) => document.getElementById(id);
 
 export const megabytes = (bytes) => (bytes / 1e6).toFixed(bytes < 9.95e6 ? 1 : 0);
 
-// Creates the row of a photo and inserts it before `next`, or at the end.
-export function createRow(photo, { onSelect, onRemove }, next = null) {
-  const row = document.createElement("li");
-  row.innerHTML = `<button type="button" class="pick"><img alt="" width="56" height="56"><span class="name"></span>
+// Creates the thumbnail of a photo with its name and state, and inserts it before `next`, or at the end.
+export function createThumbnail(photo, { onSelect, onRemove }, next = null) {
+  const thumbnail = document.createElement("li");
+  thumbnail.innerHTML = `<button type="button" class="pick"><img alt="" width="56" height="56"><span class="name"></span>
     <span class="state"></span></button><button type="button" class="remove"><span aria-hidden="true">×</span></button>`;
-  row.querySelector(".name").textContent = photo.file.name;
-  row.querySelector(".pick").title = photo.file.name;
-  row.querySelector(".remove").setAttribute("aria-label", `Remove ${photo.file.name}`);
-  row.querySelector(".pick").addEventListener("click", onSelect);
-  row.querySelector(".remove").addEventListener("click", onRemove);
-  showFile(row.querySelector("img"), photo.file);
-  byId("photos").insertBefore(row, next);
-  return row;
+  thumbnail.querySelector(".name").textContent = photo.file.name;
+  thumbnail.querySelector(".pick").title = photo.file.name;
+  thumbnail.querySelector(".remove").setAttribute("aria-label", `Remove ${photo.file.name}`);
+  thumbnail.querySelector(".pick").addEventListener("click", onSelect);
+  thumbnail.querySelector(".remove").addEventListener("click", onRemove);
+  showFile(thumbnail.querySelector("img"), photo.file);
+  byId("photos").insertBefore(thumbnail, next);
+  return thumbnail;
 }
 
 // Shows an image file, or a transparent pixel if the browser cannot decode the file.
@@ -29,9 +29,9 @@ export function showFile(image, file) {
   image.src = url;
 }
 
-export function updateRow(photo) {
-  photo.row.className = photo.state;
-  photo.row.querySelector(".state").textContent = shortStatus(photo);
+export function updateThumbnail(photo) {
+  photo.thumbnail.className = photo.state;
+  photo.thumbnail.querySelector(".state").textContent = shortStatus(photo);
 }
 
 function shortStatus({ state, progress, error }) {
