@@ -1,6 +1,8 @@
 """Files of the command line: names in other forms, suffixes, RAW, videos, hints, contact sheets, and completion."""
 
 import nturl2path
+import os
+import subprocess
 import sys
 import urllib.request
 from pathlib import Path
@@ -208,3 +210,23 @@ def test_completion_offers_models_layers_and_formats():
     assert completions("a.jpg", "--layers", "transmission,c") == {("plain", "transmission,confidence")}
     assert ("plain", "reflection") in completions("a.jpg", "--layers", "")
     assert ("plain", "tiff") in completions("a.jpg", "--format", "t")
+
+
+def test_on_a_system_without_fonts_the_captions_of_a_contact_sheet_have_letters():
+    """Without a font, all letters are boxes of one width. fontconfig is configured once in a process, so this needs a new one."""
+    script = """
+import pyvips
+from pathlib import Path
+from brewster import Photo
+from brewster.photo import contact_sheet
+import numpy as np
+contact_sheet._SYSTEM_FONTS = Path("/nonexistent")
+contact_sheet._row([Photo(np.zeros((8, 8, 3), np.uint8))], "label")
+print(pyvips.Image.text("mmmm").width > 2 * pyvips.Image.text("iiii").width)
+"""
+    environment = {name: value for name, value in os.environ.items() if name != "FONTCONFIG_FILE"}
+    done = subprocess.run(
+        [sys.executable, "-c", script], env=environment, capture_output=True, text=True, check=True
+    )
+    assert done.stdout == "True\n"
+    assert "Fontconfig" not in done.stderr

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import Final
 
 import numpy as np
 import pyvips
@@ -19,6 +21,10 @@ _LABEL_PX = 24
 _GAP_PX = 8
 _MAX_ROWS = 200  # their height is 54,400 pixels; a JPEG has at most 65,535
 Encoded = NDArray[np.uint8]
+
+_SYSTEM_FONTS: Final = Path("/etc/fonts/fonts.conf")
+_PACKAGED_FONTS: Final = Path(__file__).with_name("fonts") / "fonts.conf"
+"""DejaVu Sans, for systems without fonts. Without it, a caption there consists of boxes, and fontconfig prints an error."""
 
 
 def write_contact_sheets(
@@ -73,6 +79,8 @@ def _row(photos: Sequence[Photo], label: str) -> Encoded:
     canvas[:_ROW_PX] = images
     printable = "".join(letter if letter.isprintable() else "?" for letter in label)
     escaped = printable.replace("&", "&amp;").replace("<", "&lt;")  # Pango reads markup
+    if not _SYSTEM_FONTS.exists():
+        os.environ.setdefault("FONTCONFIG_FILE", str(_PACKAGED_FONTS))  # ignored on Windows and macOS
     # If the path is too long for the row, only its end is shown.
     text = pyvips.Image.text(escaped, dpi=90).numpy()[:_LABEL_PX, -images.shape[1] :]
     canvas[_ROW_PX : _ROW_PX + text.shape[0], : text.shape[1]] = 255 - text[..., None]
