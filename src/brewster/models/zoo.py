@@ -131,7 +131,7 @@ def find_model(name: str) -> ModelFile:
         raise ModelError(
             f"{name} is a diffusion model, which has no model file",
             f"expected one of {', '.join(MODELS)}, or the path of an .onnx file",
-            "to print the model card of a LoRA, run: brewster models card FOLDER",
+            "for the source of this model, run: brewster models list; for the card of a LoRA: brewster models card FOLDER",
         )
     path = Path(name)
     if path.suffix == ".safetensors":
