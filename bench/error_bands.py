@@ -10,14 +10,14 @@ import os
 import sys
 from collections import defaultdict
 from collections.abc import Sequence
-from itertools import islice, pairwise
+from itertools import pairwise
 from pathlib import Path
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
-from verdict import mixtures, read_pairs
+from verdict import read_datasets
 
 from brewster import Separator
 
@@ -25,22 +25,14 @@ Errors = NDArray[np.float64]
 
 SIGMAS_PX: Final = (1.5, 4, 12, 40)
 MIXTURES: Final = 120
-EVERY: Final = 7
-"""Of the many similar pairs of real/train, one in so many is measured."""
 SMOOTH: Final = 0.1
 """Below this ratio of fine (1.5 to 4 px) to coarse (4 to 40 px) energy, a reflection is called smooth."""
 
 
 def main(data: Path, model: str) -> None:
     separator = Separator.load(model)
-    datasets = {
-        "dev Nature": read_pairs(data / "real/dev/nature"),
-        "dev Real": read_pairs(data / "real/dev/real"),
-        "real/train": read_pairs(data / "real/train", EVERY),
-        "held-out mixtures": islice(mixtures(), MIXTURES),
-    }
     reductions: defaultdict[tuple[str, str], list[Sequence[float]]] = defaultdict(list)
-    for name, pairs in datasets.items():
+    for name, pairs in read_datasets(data, MIXTURES).items():
         for photo, ground_truth in pairs:
             transmission = separator(photo).transmission
             before, after = (image.pixels / 255.0 - ground_truth / 255.0 for image in (photo, transmission))

@@ -10,6 +10,7 @@ import os
 import sys
 from collections import defaultdict
 from collections.abc import Iterator
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -33,14 +34,8 @@ Pair = tuple[Photo, NDArray[np.uint8]]
 
 def main(data: Path, model: str) -> None:
     separator = Separator.load(model)
-    datasets = {
-        "dev Nature": read_pairs(data / "real/dev/nature"),
-        "dev Real": read_pairs(data / "real/dev/real"),
-        "real/train": read_pairs(data / "real/train", EVERY),
-        "held-out mixtures": mixtures(),
-    }
     gains: defaultdict[tuple[str, str], list[float]] = defaultdict(list)
-    for name, pairs in datasets.items():
+    for name, pairs in read_datasets(data).items():
         for photo, ground_truth in pairs:
             separation = separator(photo)
             before, after = (psnr(layer.pixels, ground_truth) for layer in (photo, separation.transmission))
@@ -50,6 +45,16 @@ def main(data: Path, model: str) -> None:
     for (verdict, name), values in sorted(gains.items()):
         better = np.mean(np.array(values) > 0)
         print(f"| {verdict} | {name} | {len(values)} | {better:.0%} | {np.mean(values):+.2f} |")
+
+
+def read_datasets(data: Path, mixture_count: int = MIXTURES) -> dict[str, Iterator[Pair]]:
+    """Returns pairs of photo and ground truth, 8-bit (H, W, 3), of the four datasets."""
+    return {
+        "dev Nature": read_pairs(data / "real/dev/nature"),
+        "dev Real": read_pairs(data / "real/dev/real"),
+        "real/train": read_pairs(data / "real/train", EVERY),
+        "held-out mixtures": islice(mixtures(), mixture_count),
+    }
 
 
 def read_pairs(folder: Path, every: int = 1) -> Iterator[Pair]:

@@ -80,9 +80,8 @@ class ResourceEstimate:
     def table(self) -> str:
         """Returns the estimate as lines of name and value."""
         recipe, (width, height) = self.recipe, self.panel
-        is_tiny = recipe.backbone.startswith(
-            TINY_PREFIX
-        )  # a tiny version has random weights and no text encoders
+        # A tiny version has random weights and no text encoders.
+        is_tiny = recipe.backbone.startswith(TINY_PREFIX)
         is_encoded = is_tiny or recipe.prompt.endswith(ENCODED_SUFFIX)
         encoders = 0 if is_encoded else 2 * self.text_encoder_parameters
         download = 0 if is_tiny else 2 * self.parameter_count + self.memory_gib["VAE"] * GIB + encoders
