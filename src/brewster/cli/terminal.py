@@ -155,16 +155,26 @@ def write_out(data: bytes) -> None:
 
 @contextmanager
 def progress(total: int, *, shown: bool) -> Iterator[ProgressUpdater]:
-    """Shows a progress bar if `shown` is true and standard error is a terminal. Yields the function that updates the bar."""
+    """Shows a progress bar if `shown` is true and standard error is a terminal. Yields the function that updates the bar.
+
+    A single item has a percentage instead of the number of finished items.
+    """
     if not (shown and sys.stderr.isatty()):
         yield lambda _done, _text: None
         return
     from rich.console import Console  # noqa: PLC0415  (slow to import; only used on a terminal)
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn  # noqa: PLC0415
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        TaskProgressColumn,
+        TextColumn,
+        TimeRemainingColumn,
+    )
 
     columns = (
         BarColumn(),
-        MofNCompleteColumn(),
+        TaskProgressColumn() if total == 1 else MofNCompleteColumn(),
         TextColumn("time left"),
         TimeRemainingColumn(),
         TextColumn("{task.description}", markup=False),
