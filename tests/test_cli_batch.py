@@ -291,13 +291,32 @@ def test_two_photos_with_the_same_output_are_rejected_before_any_is_separated(ru
 
 def test_finished_photos_are_skipped_without_loading_the_model(run, tmp_path):
     (tmp_path / "a.jpg").write_bytes(image_bytes())
+    (tmp_path / "broken.onnx").write_bytes(b"")
     assert run("a.jpg")[0] == 0
     times = {path: path.stat().st_mtime_ns for path in tmp_path.iterdir()}
-    code, out, err = run("a.jpg", "--json", "--model", "no-such-model", with_model=False)
+    code, out, err = run("a.jpg", "--json", "--model", "broken.onnx", with_model=False)
     assert code == 0
     assert "a.jpg: skipped" in err
     assert json_lines(out)[0]["status"] == "skipped"
     assert times == {path: path.stat().st_mtime_ns for path in tmp_path.iterdir()}
+
+
+@pytest.mark.parametrize("options", [[], ["--dry-run"], ["--workers", 1, "-o", "."]])
+def test_a_model_that_does_not_exist_is_an_error_even_if_all_layers_exist(run, tmp_path, options):
+    (tmp_path / "a.jpg").write_bytes(image_bytes())
+    assert run("a.jpg")[0] == 0
+    code, out, err = run("a.jpg", "--model", "nonsuch", *options, with_model=False)
+    assert (code, out) == (1, b"")
+    assert err.startswith("error: there is no model 'nonsuch'; expected one of compact, ")
+    for model in (
+        "compact",
+        "owner/name",
+        "tiny:klein",
+        "windowseat",
+        "folder",
+    ):  # valid names; the models are not loaded
+        (tmp_path / "folder").mkdir(exist_ok=True)
+        assert run("a.jpg", "--model", model, *options, with_model=False)[0] == 0
 
 
 def test_a_missing_layer_is_added_and_the_existing_one_is_kept(run, tmp_path):
@@ -337,8 +356,9 @@ def test_a_dry_run_prints_the_planned_files_and_writes_nothing(run, tmp_path):
     (tmp_path / "a.jpg").write_bytes(image_bytes())
     (tmp_path / "b.jpg").write_bytes(image_bytes())
     (tmp_path / "a.reflection.jpg").write_bytes(b"")
+    (tmp_path / "broken.onnx").write_bytes(b"")
     before = list_files(tmp_path)
-    code, out, _ = run(".", "--dry-run", "--model", "no-such-model", with_model=False)
+    code, out, _ = run(".", "--dry-run", "--model", "broken.onnx", with_model=False)
     assert (code, out) == (
         0,
         b"a.jpg -> a.transmission.jpg\nb.jpg -> b.transmission.jpg, b.reflection.jpg\n",
