@@ -141,7 +141,7 @@ def test_two_images_that_differ_only_in_suffix_get_separate_layers(run, tmp_path
     (tmp_path / "a.jpg").write_bytes(image_bytes())
     (tmp_path / "a.png").write_bytes(image_bytes(format_name="png"))
     assert run(".", "-o", "out")[0] == 0
-    assert list_files(tmp_path / "out") == sorted(layer_files("a.jpg") + layer_files("a.png", suffix="png"))
+    assert list_files(tmp_path / "out") == sorted(layer_files("a") + layer_files("a", suffix="png"))
 
 
 def test_the_tree_below_a_folder_is_mirrored(run, tmp_path):

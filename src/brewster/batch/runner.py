@@ -19,9 +19,10 @@ from functools import partial
 from pathlib import Path
 from typing import Final, Literal, Protocol, final
 
+from brewster.batch.layer_names import name_layers
 from brewster.batch.manifest import is_manifest, read_manifest
 from brewster.errors import BrewsterError, OutputError, PhotoError
-from brewster.files import exists, find_videos, images_in, is_same_file, name_layers, write_atomically
+from brewster.files import exists, find_videos, images_in, is_same_file, write_atomically
 from brewster.image_formats import SUFFIXES, format_of
 from brewster.inference.assessment import Assessment
 from brewster.inference.separator import Separator
@@ -174,11 +175,8 @@ def plan_files(
         for pair in (read_manifest(source, folder) if is_manifest(source) else images_in(source, folder))
     )
     tasks = [
-        SeparationTask(
-            found.source,
-            {layer: found.target(layer, options.suffix(layer, found.source)) for layer in options.layers},
-        )
-        for found in name_layers(images)
+        SeparationTask(image, outputs)
+        for image, outputs in name_layers(images, options.layers, options.suffix)
     ]
     if not tasks:
         videos = f" ({len(names)} videos)" if (names := find_videos(paths)) else ""
