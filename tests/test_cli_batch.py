@@ -319,6 +319,46 @@ def test_a_model_that_does_not_exist_is_an_error_even_if_all_layers_exist(run, t
         assert run("a.jpg", "--model", model, *options, with_model=False)[0] == 0
 
 
+@pytest.mark.parametrize("options", [[], ["--workers", 1], ["--dry-run"]])
+def test_the_layers_of_another_photo_are_an_error(run, tmp_path, options):
+    for seed, name in enumerate(("a/1.jpg", "b/1.jpg", "b/2.jpg")):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_bytes(image_bytes(seed=seed))
+    assert run("a/1.jpg", "-o", "col")[0] == 0
+    layers = {path.name: path.read_bytes() for path in (tmp_path / "col").iterdir()}
+    code, out, err = run("b", "-o", "col", "--json", *options)
+    assert code == 1
+    assert [line["status"] for line in json_lines(out)].count("failed") == 1
+    assert (
+        "col/1.transmission.jpg was made from another photo, or from another version of "
+        in error_lines(err)[0]
+    )
+    assert "b/1.jpg; expected layers of this photo" in error_lines(err)[0]
+    assert {name: (tmp_path / "col" / name).read_bytes() for name in layers} == layers
+    assert run("a", "-o", "col", *options)[0] == 0  # its own layers
+    assert run("b", "-o", "col", "--overwrite", *options)[0] == 0
+
+
+def test_layers_of_two_photos_are_not_mixed(run, tmp_path):
+    for seed, name in enumerate(("a", "b")):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "1.jpg").write_bytes(image_bytes(seed=seed))
+    run("a/1.jpg", "-o", "col", "--layers", "transmission")
+    assert run("b/1.jpg", "-o", "col")[0] == 1
+    assert list_files(tmp_path / "col") == ["1.transmission.jpg"]
+    assert run("b/1.jpg", "-o", "col/1.transmission.jpg")[0] == 1
+
+
+def test_a_photo_that_has_changed_since_its_separation_is_an_error(run, tmp_path):
+    (tmp_path / "a.jpg").write_bytes(image_bytes())
+    run("a.jpg")
+    (tmp_path / "a.jpg").write_bytes(image_bytes(seed=2))
+    assert "another version of a.jpg" in run("a.jpg")[2]
+    (tmp_path / "a.transmission.jpg").write_bytes(image_bytes())  # layers without a record are accepted
+    (tmp_path / "a.reflection.jpg").write_bytes(image_bytes())
+    assert "a.jpg: skipped" in run("a.jpg")[2]
+
+
 def test_a_missing_layer_is_added_and_the_existing_one_is_kept(run, tmp_path):
     (tmp_path / "a.jpg").write_bytes(image_bytes())
     (tmp_path / "a.transmission.jpg").write_bytes(b"mine")

@@ -145,8 +145,8 @@ class BatchCommand:
         if self.quiet or result.error:
             return
         if result.status == "skipped":
-            # A parallel batch does not read the existing layers to compare their options with the current ones, because that
-            # takes time.
+            # A parallel batch does not read an existing layer a second time to compare its options with the current ones,
+            # because that takes time.
             different_options = "" if self._is_parallel else self._different_options(result)
             note = f", made with other options ({different_options})" if different_options else ""
             print_status(

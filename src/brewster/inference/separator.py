@@ -27,7 +27,7 @@ from brewster.inference.assessment import Assessment, assess
 from brewster.inference.clipping import keep_clipped_white
 from brewster.inference.full_size import upsample_layers
 from brewster.inference.guided_upsampling import Floats, GuidedUpsampler
-from brewster.inference.layer_history import history_step, with_step
+from brewster.inference.layer_history import PHOTO, history_step, with_step
 from brewster.inference.onnx_backend import OnnxBackend
 from brewster.inference.predictor import (
     QUALITIES,
@@ -232,6 +232,7 @@ class Separator:
             )
         step = history_step(self.name, strength=strength, quality=quality, additive=additive)
         step |= {"sha256": self.sha256[:12]} if self.sha256 else {}
+        step |= {PHOTO: photo.file_info.digest} if photo.file_info.digest else {}
         return Separation(
             photo,
             with_step(transmission, "transmission", step),
