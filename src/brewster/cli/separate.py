@@ -236,9 +236,8 @@ def separate(
         options = Options(**cast("dict[str, Any]", values))
     except BrewsterError as error:
         raise click.UsageError(str(error)) from error
-    zoo.model_name(
-        options.model
-    )  # an unknown name is an error, even if no photo needs the model; loads nothing
+    # An unknown name is an error, even if no photo needs the model. Nothing is loaded.
+    zoo.model_name(options.model)
     if is_plan or gpu_name:
         _print_plan(photos, output, options, gpu_name)
         return
