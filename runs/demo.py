@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 
 from brewster import Photo, Separation, Separator
+from brewster.batch import SeparationTask, plan_files
 from brewster.errors import BrewsterError
-from brewster.files import SeparationPaths, find
 
 OUT = Path("out/demo")
 ROW_PX = 240
@@ -21,12 +21,12 @@ def main(source: Path) -> int:
     separator = Separator.load("compact")
     OUT.mkdir(parents=True, exist_ok=True)
     rows, failures = [], 0
-    for paths in find([source], output_folder=OUT):
+    for task in plan_files(source, OUT):
         try:
-            rows.append(separate(separator, paths))
+            rows.append(separate(separator, task))
         except BrewsterError as error:
             failures += 1
-            print(f"error: {paths.source}: {error}", file=sys.stderr)
+            print(f"error: {task.name}: {error}", file=sys.stderr)
     if rows:
         width = max(row.shape[1] for row in rows)
         padded = [np.pad(row, [(0, 8), (0, width - row.shape[1]), (0, 0)], constant_values=1) for row in rows]
@@ -36,15 +36,14 @@ def main(source: Path) -> int:
     return 1 if failures or not rows else 0
 
 
-def separate(separator: Separator, paths: SeparationPaths) -> np.ndarray:
+def separate(separator: Separator, task: SeparationTask) -> np.ndarray:
     """Separates one photo and saves its layers. Returns its row of the sheet."""
     started = time.perf_counter()
-    result = separator(paths.source)
-    targets = [paths.target(layer) for layer in ("transmission", "reflection")]
-    for layer, target in zip((result.transmission, result.reflection), targets, strict=True):
-        layer.save(target, overwrite=True)
-    print(f"{paths.source}: {time.perf_counter() - started:.2f} s")
-    print(*(f"  {target}" for target in targets), sep="\n")
+    result = separator(task.source)
+    for layer, target in task.outputs.items():
+        getattr(result, layer).save(target, overwrite=True)
+    print(f"{task.name}: {time.perf_counter() - started:.2f} s")
+    print(*(f"  {target}" for target in task.outputs.values()), sep="\n")
     return side_by_side(result)
 
 

@@ -76,3 +76,9 @@ def test_a_separation_has_the_assessment_of_the_full_prediction_at_any_strength(
     assert assessments[0] == assessments[1]
     assert assessments[0].removed_light == pytest.approx(0.5, abs=0.01)
     assert assessments[0].changed_area == 1
+
+
+def test_a_separation_of_strength_0_removes_nothing_and_its_verdict_says_so():
+    photo = Photo.from_array(np.full((40, 60, 3), 0.5, np.float32), encoding="linear")
+    found = Separator(lambda tile: (0.5 * tile, 0.5 * tile))(photo, strength=0).assessment
+    assert (found.verdict, found.removed_light, found.changed_area) == ("little found", 0, 0)

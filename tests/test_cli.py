@@ -1,7 +1,9 @@
 """The command line: commands, options, help, standard input and output, errors and progress."""
 
+import contextlib
 import os
 import pty
+import re
 import subprocess
 import sys
 from dataclasses import fields
@@ -350,26 +352,46 @@ def test_an_error_is_one_line_with_exit_code_1(run, run_without_model, tmp_path,
 # --- progress
 
 
-def test_a_terminal_shows_progress_and_standard_output_stays_clean(model, tmp_path):
-    """Standard error is a pseudo terminal, where the bar is drawn; standard output is a pipe, and stays empty."""
-    for index in range(3):
-        (tmp_path / f"{index}.jpg").write_bytes(image_bytes())
+def run_on_terminal(*args, folder):
+    """Runs the command in its own process. Standard error is a pseudo terminal. Returns standard output and the text on the terminal."""
     controller, terminal = pty.openpty()
-    command = [sys.executable, "-m", "brewster", tmp_path, "--model", model]
-    process = subprocess.run(
-        command,
+    with subprocess.Popen(
+        [sys.executable, "-m", "brewster", *map(str, args)],
+        cwd=folder,
         stdout=subprocess.PIPE,
         stderr=terminal,
-        check=False,
         env=os.environ | {"TERM": "xterm", "COLUMNS": "200"},
-    )
-    os.close(terminal)
-    output = os.read(controller, 1 << 16).decode(errors="replace")  # a read may end within a character
-    os.close(controller)
-    assert (process.returncode, process.stdout) == (0, b"")
-    assert "\x1b[" in output
-    assert "/3" in output
-    assert "0.transmission.jpg" in output
+    ) as process:
+        os.close(terminal)
+        output = b""
+        with contextlib.suppress(OSError):  # Linux reports an error when the process has closed the terminal
+            while part := os.read(controller, 1 << 16):
+                output += part
+        os.close(controller)
+        out = process.stdout.read()
+    assert process.returncode == 0
+    return out, output.decode()
+
+
+def test_a_terminal_shows_progress_and_standard_output_stays_clean(model, tmp_path):
+    for index in range(3):
+        (tmp_path / f"{index}.jpg").write_bytes(image_bytes())
+    out, shown = run_on_terminal(".", "--model", model, folder=tmp_path)
+    assert out == b""
+    assert "\x1b[" in shown
+    assert "/3" in shown
+    assert "0.transmission.jpg" in shown
+
+
+def test_a_single_photo_has_a_percentage_but_not_with_json(model, tmp_path):
+    (tmp_path / "a.jpg").write_bytes(image_bytes())
+    out, shown = run_on_terminal("a.jpg", "--model", model, folder=tmp_path)
+    assert out == b""
+    assert re.search(r"\d%", shown)
+    assert "/1" not in shown
+    for option in ("--json", "--quiet"):
+        out, shown = run_on_terminal("a.jpg", "--model", model, "--overwrite", option, folder=tmp_path)
+        assert (bool(out), "%" in shown) == (option == "--json", False)
 
 
 # --- Python

@@ -141,7 +141,7 @@ def test_two_images_that_differ_only_in_suffix_get_separate_layers(run, tmp_path
     (tmp_path / "a.jpg").write_bytes(image_bytes())
     (tmp_path / "a.png").write_bytes(image_bytes(format_name="png"))
     assert run(".", "-o", "out")[0] == 0
-    assert list_files(tmp_path / "out") == sorted(layer_files("a.jpg") + layer_files("a.png", suffix="png"))
+    assert list_files(tmp_path / "out") == sorted(layer_files("a") + layer_files("a", suffix="png"))
 
 
 def test_the_tree_below_a_folder_is_mirrored(run, tmp_path):
@@ -291,13 +291,72 @@ def test_two_photos_with_the_same_output_are_rejected_before_any_is_separated(ru
 
 def test_finished_photos_are_skipped_without_loading_the_model(run, tmp_path):
     (tmp_path / "a.jpg").write_bytes(image_bytes())
+    (tmp_path / "broken.onnx").write_bytes(b"")
     assert run("a.jpg")[0] == 0
     times = {path: path.stat().st_mtime_ns for path in tmp_path.iterdir()}
-    code, out, err = run("a.jpg", "--json", "--model", "no-such-model", with_model=False)
+    code, out, err = run("a.jpg", "--json", "--model", "broken.onnx", with_model=False)
     assert code == 0
     assert "a.jpg: skipped" in err
     assert json_lines(out)[0]["status"] == "skipped"
     assert times == {path: path.stat().st_mtime_ns for path in tmp_path.iterdir()}
+
+
+@pytest.mark.parametrize("options", [[], ["--dry-run"], ["--workers", 1, "-o", "."]])
+def test_a_model_that_does_not_exist_is_an_error_even_if_all_layers_exist(run, tmp_path, options):
+    (tmp_path / "a.jpg").write_bytes(image_bytes())
+    assert run("a.jpg")[0] == 0
+    code, out, err = run("a.jpg", "--model", "nonsuch", *options, with_model=False)
+    assert (code, out) == (1, b"")
+    assert err.startswith("error: there is no model 'nonsuch'; expected one of compact, ")
+    for model in (
+        "compact",
+        "owner/name",
+        "tiny:klein",
+        "windowseat",
+        "folder",
+    ):  # valid names; the models are not loaded
+        (tmp_path / "folder").mkdir(exist_ok=True)
+        assert run("a.jpg", "--model", model, *options, with_model=False)[0] == 0
+
+
+@pytest.mark.parametrize("options", [[], ["--workers", 1], ["--dry-run"]])
+def test_the_layers_of_another_photo_are_an_error(run, tmp_path, options):
+    for seed, name in enumerate(("a/1.jpg", "b/1.jpg", "b/2.jpg")):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_bytes(image_bytes(seed=seed))
+    assert run("a/1.jpg", "-o", "col")[0] == 0
+    layers = {path.name: path.read_bytes() for path in (tmp_path / "col").iterdir()}
+    code, out, err = run("b", "-o", "col", "--json", *options)
+    assert code == 1
+    assert [line["status"] for line in json_lines(out)].count("failed") == 1
+    assert (
+        "col/1.transmission.jpg was made from another photo, or from another version of "
+        in error_lines(err)[0]
+    )
+    assert "b/1.jpg; expected layers of this photo" in error_lines(err)[0]
+    assert {name: (tmp_path / "col" / name).read_bytes() for name in layers} == layers
+    assert run("a", "-o", "col", *options)[0] == 0  # its own layers
+    assert run("b", "-o", "col", "--overwrite", *options)[0] == 0
+
+
+def test_layers_of_two_photos_are_not_mixed(run, tmp_path):
+    for seed, name in enumerate(("a", "b")):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "1.jpg").write_bytes(image_bytes(seed=seed))
+    run("a/1.jpg", "-o", "col", "--layers", "transmission")
+    assert run("b/1.jpg", "-o", "col")[0] == 1
+    assert list_files(tmp_path / "col") == ["1.transmission.jpg"]
+    assert run("b/1.jpg", "-o", "col/1.transmission.jpg")[0] == 1
+
+
+def test_a_photo_that_has_changed_since_its_separation_is_an_error(run, tmp_path):
+    (tmp_path / "a.jpg").write_bytes(image_bytes())
+    run("a.jpg")
+    (tmp_path / "a.jpg").write_bytes(image_bytes(seed=2))
+    assert "another version of a.jpg" in run("a.jpg")[2]
+    (tmp_path / "a.transmission.jpg").write_bytes(image_bytes())  # layers without a record are accepted
+    (tmp_path / "a.reflection.jpg").write_bytes(image_bytes())
+    assert "a.jpg: skipped" in run("a.jpg")[2]
 
 
 def test_a_missing_layer_is_added_and_the_existing_one_is_kept(run, tmp_path):
@@ -337,8 +396,9 @@ def test_a_dry_run_prints_the_planned_files_and_writes_nothing(run, tmp_path):
     (tmp_path / "a.jpg").write_bytes(image_bytes())
     (tmp_path / "b.jpg").write_bytes(image_bytes())
     (tmp_path / "a.reflection.jpg").write_bytes(b"")
+    (tmp_path / "broken.onnx").write_bytes(b"")
     before = list_files(tmp_path)
-    code, out, _ = run(".", "--dry-run", "--model", "no-such-model", with_model=False)
+    code, out, _ = run(".", "--dry-run", "--model", "broken.onnx", with_model=False)
     assert (code, out) == (
         0,
         b"a.jpg -> a.transmission.jpg\nb.jpg -> b.transmission.jpg, b.reflection.jpg\n",

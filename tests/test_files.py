@@ -14,8 +14,9 @@ from hypothesis import strategies as st
 from platformdirs import macos, unix
 
 from brewster import files
+from brewster.batch.layer_names import name_layers
 from brewster.errors import OutputError
-from brewster.files import SeparationPaths, cache_folder, find, write_atomically
+from brewster.files import cache_folder, images_in, write_atomically
 from brewster.image_formats import SUFFIXES
 
 
@@ -27,53 +28,116 @@ def touch(folder: Path, *names: str) -> Path:
     return folder
 
 
-def layer_names(found: list[SeparationPaths]) -> dict[str, str]:
-    return {paths.source.name: paths.name for paths in found}
+LAYERS = ("transmission", "reflection", "confidence")
+
+
+def find(*sources: Path, output: Path | None = None, suffix: str | None = None) -> dict[str, dict[str, str]]:
+    """Returns the names of the images, in their order, with the paths of their layers, relative to the first source or output."""
+    images = (pair for source in sources for pair in images_in(source, output))
+    return {
+        image.name: {
+            layer: os.path.relpath(target, output or image.parent) for layer, target in targets.items()
+        }
+        for image, targets in name_layers(
+            images, LAYERS, lambda layer, _: suffix if layer != "confidence" else None
+        )
+    }
+
+
+def transmissions(*sources: Path, suffix: str | None = None) -> dict[str, str]:
+    return {name: targets["transmission"] for name, targets in find(*sources, suffix=suffix).items()}
 
 
 def test_layers_are_next_to_their_image_and_keep_its_suffix(tmp_path: Path) -> None:
-    (paths,) = find([touch(tmp_path, "view.jpg") / "view.jpg"])
-    assert paths.target("transmission") == tmp_path / "view.transmission.jpg"
-    assert paths.target("reflection") == tmp_path / "view.reflection.jpg"
-    assert paths.target("confidence") == tmp_path / "view.confidence.png"
-    assert paths.target("reflection", ".tif") == tmp_path / "view.reflection.tif"
+    path = touch(tmp_path, "view.jpg") / "view.jpg"
+    assert find(path)["view.jpg"] == {
+        "transmission": "view.transmission.jpg",
+        "reflection": "view.reflection.jpg",
+        "confidence": "view.confidence.png",
+    }
+    assert find(path, suffix=".tif")["view.jpg"]["reflection"] == "view.reflection.tif"
 
 
 @pytest.mark.parametrize("name", ["view.gif", "view.unknown", "view"])
 def test_images_whose_format_is_not_written_get_png_layers(tmp_path: Path, name: str) -> None:
-    (paths,) = find([touch(tmp_path, name) / name])
-    assert paths.target("transmission") == tmp_path / "view.transmission.png"
+    assert transmissions(touch(tmp_path, name) / name) == {name: "view.transmission.png"}
 
 
 def test_a_folder_is_searched_in_order_and_its_tree_is_mirrored(tmp_path: Path) -> None:
     touch(tmp_path / "in", "b.jpg", "a.PNG", "deep/er/c.webp", "notes.txt")
-    found = find([tmp_path / "in"], output_folder=tmp_path / "out")
-    assert [paths.source.name for paths in found] == ["a.PNG", "b.jpg", "c.webp"]
-    assert found[2].target("transmission") == tmp_path / "out/deep/er/c.transmission.webp"
+    found = find(tmp_path / "in", output=tmp_path / "out")
+    assert list(found) == ["a.PNG", "b.jpg", "c.webp"]
+    assert found["c.webp"]["transmission"] == "deep/er/c.transmission.webp"
 
 
 def test_hidden_files_and_results_are_skipped(tmp_path: Path) -> None:
-    results = [f"a.{layer}.png" for layer in ("transmission", "reflection", "confidence")]
+    results = [f"a.{layer}.png" for layer in LAYERS]
     touch(tmp_path, "a.jpg", ".hidden.jpg", ".thumbnails/b.jpg", *results)
-    assert layer_names(find([tmp_path])) == {"a.jpg": "a"}
+    assert list(find(tmp_path)) == ["a.jpg"]
+
+
+def test_masks_are_skipped_if_their_photo_is_in_the_same_folder(tmp_path: Path) -> None:
+    touch(
+        tmp_path, "a.jpg", "a.mask.png", "b.mask.png", "x/a.mask.png", "x/c.mask.png", "x/c.tif", "mask.png"
+    )
+    touch(tmp_path, "d.mask.png", "d.transmission.jpg")  # the photo itself is in another folder
+    found = [image.relative_to(tmp_path).as_posix() for image, _ in images_in(tmp_path)]
+    assert found == ["a.jpg", "b.mask.png", "d.mask.png", "mask.png", "x/a.mask.png", "x/c.tif"]
+    assert list(find(tmp_path / "a.mask.png")) == ["a.mask.png"]
 
 
 def test_a_file_given_by_name_is_always_listed(tmp_path: Path) -> None:
     file_names = ["a.transmission.jpg", ".hidden.jpg", "missing.jpg"]
     touch(tmp_path, *file_names[:2])
-    assert list(layer_names(find([tmp_path / name for name in file_names]))) == file_names
+    assert list(find(*(tmp_path / name for name in file_names))) == file_names
 
 
-def test_two_images_of_one_stem_keep_their_suffix(tmp_path: Path) -> None:
-    touch(tmp_path, "a.jpg", "a.png", "b.jpg")
-    assert layer_names(find([tmp_path])) == {"a.jpg": "a.jpg", "a.png": "a.png", "b.jpg": "b"}
+@pytest.mark.parametrize("suffix", [None, ".tiff", ".png", ".jpg"])
+def test_an_image_that_is_added_to_a_folder_does_not_change_the_layers_of_the_others(
+    tmp_path: Path, suffix: str | None
+) -> None:
+    before = find(touch(tmp_path, "a.jpg"), suffix=suffix)["a.jpg"]
+    touch(
+        tmp_path,
+        "a.CR2",
+        "a.dng",
+        "a.jpg.png",
+        "a.tif",
+        "a.tiff",
+        "a.png",
+        "a.avif",
+        "a.jpg.transmission.jpg",
+    )
+    assert (
+        find(tmp_path / "a.jpg", suffix=suffix)["a.jpg"] == find(tmp_path, suffix=suffix)["a.jpg"] == before
+    )
+    assert before["confidence"] == "a.confidence.png"
 
 
-def test_names_do_not_depend_on_the_selection_or_on_existing_results(tmp_path: Path) -> None:
-    touch(tmp_path, "a.jpg", "a.png")
-    before = layer_names(find([tmp_path / "a.jpg"]))
-    touch(tmp_path, "a.jpg.transmission.jpg", "a.jpg.confidence.png")
-    assert before == layer_names(find([tmp_path / "a.jpg"])) == {"a.jpg": "a.jpg"}
+def test_images_of_one_stem_use_their_full_name_only_if_they_would_write_the_same_file(
+    tmp_path: Path,
+) -> None:
+    touch(tmp_path, "a.gif", "a.jpg", "a.png")
+    assert find(tmp_path) == {
+        "a.gif": dict(zip(LAYERS, [f"a.gif.{layer}.png" for layer in LAYERS], strict=True)),
+        "a.jpg": {
+            "transmission": "a.transmission.jpg",
+            "reflection": "a.reflection.jpg",
+            "confidence": "a.confidence.png",
+        },
+        "a.png": {
+            "transmission": "a.transmission.png",
+            "reflection": "a.reflection.png",
+            "confidence": "a.png.confidence.png",
+        },
+    }
+    assert transmissions(tmp_path / "a.gif") == {"a.gif": "a.transmission.png"}
+
+
+def test_the_case_of_a_suffix_does_not_separate_two_files(tmp_path: Path) -> None:
+    touch(tmp_path, "a.JPG", "a.dng")
+    assert transmissions(tmp_path, suffix=".jpg")["a.dng"] == "a.dng.transmission.jpg"
+    assert transmissions(tmp_path / "a.JPG") == {"a.JPG": "a.transmission.JPG"}
 
 
 @settings(max_examples=50, deadline=None, database=None)
@@ -84,34 +148,35 @@ def test_names_do_not_depend_on_the_selection_or_on_existing_results(tmp_path: P
             st.sampled_from(sorted(SUFFIXES)),
         ).map(lambda parts: ".".join(parts[0]) + parts[1]),
         max_size=8,
-    )
+    ),
+    st.sampled_from([None, ".png"]),
 )
 def test_no_two_images_of_a_folder_share_a_target(
-    tmp_path_factory: pytest.TempPathFactory, files: set[str]
+    tmp_path_factory: pytest.TempPathFactory, files: set[str], suffix: str | None
 ) -> None:
-    found = find([touch(tmp_path_factory.mktemp("images"), *files)])
-    targets = {paths.target(layer) for paths in found for layer in ("transmission", "confidence")}
+    found = find(touch(tmp_path_factory.mktemp("images"), *files), suffix=suffix)
+    targets = {target for row in found.values() for target in row.values()}
     assert len(found) == len(files)
-    assert len(targets) == 2 * len(files)
+    assert len(targets) == len(LAYERS) * len(files)
 
 
 def test_link_loops_end_and_linked_folders_are_searched_once(tmp_path: Path) -> None:
     touch(tmp_path, "deep/a.jpg")
     (tmp_path / "deep" / "loop").symlink_to(tmp_path)
     (tmp_path / "self.jpg").symlink_to(tmp_path / "self.jpg")
-    found = find([tmp_path])
-    assert [paths.source.name for paths in found] == ["a.jpg", "self.jpg"]
+    assert list(find(tmp_path)) == ["a.jpg", "self.jpg"]
 
 
 def test_an_image_given_twice_is_listed_once(tmp_path: Path) -> None:
     touch(tmp_path, "a.jpg")
-    assert len(find([tmp_path, tmp_path / "a.jpg", tmp_path / "." / "a.jpg"])) == 1
+    images = (pair for name in (".", "a.jpg", "./a.jpg") for pair in images_in(tmp_path / name))
+    assert len(name_layers(images, LAYERS)) == 1
 
 
 def test_images_of_two_folders_with_one_target_are_refused_before_any_work(tmp_path: Path) -> None:
     touch(tmp_path, "x/a.jpg", "y/a.jpg")
     with pytest.raises(OutputError, match="would both be written"):
-        find([tmp_path / "x/a.jpg", tmp_path / "y/a.jpg"], output_folder=tmp_path / "out")
+        find(tmp_path / "x/a.jpg", tmp_path / "y/a.jpg", output=tmp_path / "out")
 
 
 def test_an_unreadable_folder_is_listed_so_that_opening_it_reports_the_error(
@@ -126,15 +191,15 @@ def test_an_unreadable_folder_is_listed_so_that_opening_it_reports_the_error(
         return listing(path)
 
     monkeypatch.setattr(Path, "iterdir", iterdir)
-    assert [paths.source.name for paths in find([tmp_path])] == ["locked", "z.jpg"]
+    assert list(find(tmp_path)) == ["locked", "z.jpg"]
 
 
 @pytest.mark.parametrize("name", ["two words.jpg", "Kühlhaus été 窓.jpg", "line\nbreak.jpg", "-dash.jpg"])
 def test_names_with_spaces_accents_and_newlines_work(tmp_path: Path, name: str) -> None:
-    (paths,) = find([touch(tmp_path, name)])
-    write_atomically(paths.target("transmission"), b"layer")
-    assert paths.target("transmission").read_bytes() == b"layer"
-    assert paths.target("transmission").name == name.replace(".jpg", ".transmission.jpg")
+    target = tmp_path / transmissions(touch(tmp_path, name))[name]
+    write_atomically(target, b"layer")
+    assert target.read_bytes() == b"layer"
+    assert target.name == name.replace(".jpg", ".transmission.jpg")
 
 
 def test_writing_creates_the_folder_and_leaves_only_the_file(tmp_path: Path) -> None:

@@ -51,7 +51,7 @@ def test_a_batch_accepts_manifests_and_missing_photos_are_tasks_too(tmp_path):
     manifest = write_manifest(tmp_path / "list.parquet", "in/missing.jpg", "in/a.png", "in/a.png")
     tasks = plan_files(manifest, tmp_path / "out")
     assert [Path(task.name).name for task in tasks] == ["missing.jpg", "a.png"]
-    assert tasks[1].outputs["transmission"] == tmp_path / "out/in/a.png.transmission.png"
+    assert tasks[1].outputs["transmission"] == tmp_path / "out/in/a.transmission.png"
     with pytest.raises(PhotoError, match="there is no photo in"):
         plan_files(write_manifest(tmp_path / "empty.csv"))
 

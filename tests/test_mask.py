@@ -154,7 +154,7 @@ def test_a_photo_whose_size_differs_from_the_mask_fails_and_the_others_are_separ
     (tmp_path / "m/mask.png").write_bytes(file_of(left_half(), "png"))
     code, _, err = run("a.png", "b.png", "--mask", "m/mask.png")
     assert code == 1
-    assert "b.png: the mask has 60 x 40 pixels; expected 50 x 50" in err
+    assert "b.png: the mask m/mask.png has 60 x 40 pixels; expected 50 x 50" in err
     assert (tmp_path / "a.transmission.png").exists()
     assert not (tmp_path / "b.transmission.png").exists()
     assert run("a.png", "--mask", "missing.png")[0] == 2

@@ -1,5 +1,6 @@
 """The metadata of a layer contain the program that created it, and its options. All other metadata are unchanged."""
 
+import io
 import struct
 import xml.etree.ElementTree as ET
 import zlib
@@ -12,7 +13,7 @@ from hypothesis import strategies as st
 from brewster import Photo, Separator
 from brewster.image_formats import WRITABLE
 from brewster.photo import FileInfo, metadata
-from brewster.photo.history import recorded_parameters, with_history
+from brewster.photo.history import recorded_parameters, sampled_digest, with_history
 from picture_files import exif_block, file_of, pil, smooth
 
 SEPARATOR = Separator(lambda tile: (0.8 * tile, 0.2 * tile), name="a & <b>", sha256="f" * 64)
@@ -34,7 +35,8 @@ def events(xmp):
 
 @pytest.mark.parametrize("format_name", [name for name in WRITABLE if name not in ("heic", "exr", "hdr")])
 def test_a_layer_records_the_program_and_the_options(format_name, tmp_path):
-    separation = SEPARATOR(file_of(smooth(), "JPEG", exif=exif_block(1)), strength=0.5, quality="draft")
+    photo = file_of(smooth(), "JPEG", exif=exif_block(1))
+    separation = SEPARATOR(photo, strength=0.5, quality="draft")
     path = tmp_path / f"a.{WRITABLE[format_name].suffixes[0]}"
     path.write_bytes(separation.reflection.encode(format_name))
     assert recorded_parameters(path, "brewster") == {
@@ -44,6 +46,7 @@ def test_a_layer_records_the_program_and_the_options(format_name, tmp_path):
         "quality": "draft",
         "additive": "no",
         "sha256": "f" * 12,
+        "photo": sampled_digest(io.BytesIO(photo)),
     }
     exif = pil(path.read_bytes()).getexif()
     assert exif[305].startswith("brewster ")
@@ -138,3 +141,20 @@ def test_a_file_without_history_or_without_a_name_has_no_parameters(tmp_path):
     (tmp_path / "a.jpg").write_bytes(file_of(smooth(), "JPEG"))
     assert recorded_parameters(tmp_path / "a.jpg", "brewster") is None
     assert recorded_parameters(tmp_path / "missing.jpg", "brewster") is None
+
+
+def test_the_digest_of_a_photo_changes_with_its_pixels_but_not_with_the_metadata_of_a_large_jpeg(rng):
+    def digest(data):
+        return sampled_digest(io.BytesIO(data))
+
+    large = bytearray(rng.bytes(5_000_000))
+    original = digest(large)
+    assert digest(large[:2] + b"a caption" + large[2:]) == original
+    for position in (len(large) - 1, len(large) - (1 << 21), len(large) - (1 << 22)):
+        changed = bytearray(large)
+        changed[position] ^= 1
+        assert digest(changed) != original
+    small = [digest(rng.bytes(size)) for size in (0, 1, 2, 100, 100, 1 << 16)]
+    assert len(set(small)) == len(small)
+    assert len(original) == 16
+    assert digest(b"ab") != digest(b"b")

@@ -6,8 +6,10 @@ from pathlib import Path
 
 import pytest
 
+from brewster.batch import plan_files
 from brewster.errors import BrewsterError, MissingExtra, OutputError, UnreadablePhoto
-from brewster.files import find, write_atomically
+from brewster.files import write_atomically
+from brewster.options import Options
 from brewster.remote_path import RemotePath, location
 
 fsspec = pytest.importorskip("fsspec")
@@ -70,25 +72,23 @@ def test_a_file_in_a_store_is_written_once():
 
 
 def test_photos_in_a_store_are_found_like_those_in_a_folder(tmp_path):
-    names = ("b/c.png", "a.jpg", "b/c.jpg", ".hidden/d.jpg", "a.transmission.jpg", "notes.txt")
+    names = ("b/c.png", "a.jpg", "a.mask.png", "b/c.jpg", ".hidden/d.jpg", "a.transmission.jpg", "notes.txt")
     root = location("memory://bucket/in")
     for name in names:
         (root / name).write_bytes(b"")
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).write_bytes(b"")
     output = location("memory://out")
-    remote = [
-        (str(found.source.relative_to(root)), str(found.target("reflection")))
-        for found in find([root], output)
-    ]
-    local = [
-        (found.source.relative_to(tmp_path).as_posix(), str(found.target("reflection")))
-        for found in find([tmp_path], output)
-    ]
-    assert remote == local
-    assert dict(remote)["b/c.png"] == "memory://out/b/c.png.reflection.png"
-    (single,) = find([root / "a.jpg"], tmp_path)
-    assert single.target("transmission") == tmp_path / "a.transmission.jpg"
+
+    def found(folder):
+        tasks = plan_files(folder, output, Options(layers=("reflection",)))
+        return {task.source.relative_to(folder).as_posix(): str(task.outputs["reflection"]) for task in tasks}
+
+    assert found(root) == found(tmp_path)
+    assert found(root)["b/c.png"] == "memory://out/b/c.reflection.png"
+    assert sorted(found(root)) == ["a.jpg", "b/c.jpg", "b/c.png"]
+    (single,) = plan_files(root / "a.jpg", tmp_path)
+    assert single.outputs["transmission"] == tmp_path / "a.transmission.jpg"
 
 
 def test_errors_of_a_store_name_the_file_and_the_reason(store, monkeypatch):
@@ -104,6 +104,6 @@ def test_errors_of_a_store_name_the_file_and_the_reason(store, monkeypatch):
     with pytest.raises(OutputError, match=r"was not written \(503 Slow Down\)"):
         write_atomically(path, b"")
     with pytest.raises(UnreadablePhoto, match="memory://bucket cannot be listed"):
-        find([path.parent])
+        plan_files(path.parent)
     assert not path.exists()
     assert list(path.parent.iterdir()) == []

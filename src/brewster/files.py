@@ -1,7 +1,7 @@
 """Finds input images and writes results atomically, without overwriting other files.
 
-for paths in find([Path("holiday")], output_folder=Path("clear")):
-    write_atomically(paths.target("transmission"), data, source=paths.source)
+for image, folder in images_in(Path("holiday"), output_folder=Path("clear")):
+    write_atomically(SeparationPaths(image, folder).target("transmission"), data, source=image)
 """
 
 from __future__ import annotations
@@ -12,7 +12,6 @@ import os
 import secrets
 import shutil
 import sys
-from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -33,18 +32,19 @@ TEMPORARY_PREFIX = ".brewster-"
 OUTPUT_LAYERS = ("transmission", "reflection", "confidence", "layered")
 LAYER_FORMATS = {"confidence": "png", "layered": "ora"}
 """The formats of the layers whose format does not depend on that of the photo."""
+MASK_SUFFIX = ".mask"
+"""The end of the stem of a mask: the page saves the mask of `a.jpg` as `a.mask.png`."""
 
 
 @dataclass(frozen=True)
 class SeparationPaths:
-    """An image to separate and the paths of its layers: `folder/name.layer.suffix`."""
+    """An image to separate, and the folder of its layers."""
 
     source: Location
     folder: Location
-    name: str
 
-    def target(self, layer: str, suffix: str | None = None) -> Location:
-        """Returns the path of a layer.
+    def target(self, layer: str, suffix: str | None = None, *, has_full_name: bool = False) -> Location:
+        """Returns the path of a layer: `a.transmission.jpg` for `a.jpg`, or `a.jpg.transmission.jpg` with the full name.
 
         The default suffix is that of the source. If brewster does not write the format of the source, it is the suffix
         of the format that replaces it: .tiff for RAW files, .png for the others.
@@ -55,55 +55,25 @@ class SeparationPaths:
         else:
             name = fixed or (image_format.written_as if image_format else "png")
             default = FORMATS[name].suffixes[0]
-        return self.folder / f"{self.name}.{layer}{suffix or default}"
-
-
-def find(sources: Iterable[Location], output_folder: Location | None = None) -> list[SeparationPaths]:
-    """Returns the images in files and folders, each once, in a stable order.
-
-    Layers are written next to their image, or below `output_folder`, which mirrors the tree of each input folder.
-    Their name begins with the stem of the image, or with its full name if another image in the folder has the same
-    stem: `a.jpg` gives `a`; `a.jpg` and `a.png` in one folder give `a.jpg` and `a.png`. The name depends only on the
-    images in the folder. It does not depend on which images are selected or already separated.
-
-    In folders, hidden files, files without an image suffix, and layers that brewster has written are skipped. A
-    folder that is reached through several links is visited once, so that link loops end. A file given by name is
-    always included. If it is not an image, opening it raises the error.
-
-    Raises:
-        OutputError: the layers of two images would have the same path.
-    """
-    return name_layers(pair for source in sources for pair in images_in(source, output_folder))
+        name = self.source.name if has_full_name else self.source.stem
+        return self.folder / f"{name}.{layer}{suffix or default}"
 
 
 def images_in(source: Location, output_folder: Location | None = None) -> Iterator[tuple[Location, Location]]:
-    """Yields the images in a file or folder, each with the folder of its layers. See `find`."""
+    """Yields the images in a file or folder in a stable order, each with the folder of its layers.
+
+    Layers are written next to their image, or below `output_folder`, which mirrors the tree of an input folder.
+
+    In folders, hidden files, files without an image suffix, layers that brewster has written, and masks next to their
+    image (`a.mask.png` next to `a.jpg`) are skipped. A folder that is reached through several links is visited once, so
+    that link loops end. A file given by name is always included. If it is not an image, opening it raises the error.
+    """
     for image in _image_files(source):
         yield image, _output_folder(image, source, output_folder)
 
 
-def name_layers(images: Iterable[tuple[Location, Location]]) -> list[SeparationPaths]:
-    """Returns the paths of images and of their layers. An image that occurs several times is included once. See `find`.
-
-    Args:
-        images: pairs of an image and the folder of its layers, as `images_in` yields them.
-
-    Raises:
-        OutputError: the layers of two images would have the same path.
-    """
-    found: dict[str, SeparationPaths] = {}
-    counts: dict[Location, Counter[str]] = {}
-    for image, folder in images:
-        parent = image.parent
-        if parent not in counts:
-            counts[parent] = _name_counts(parent)
-        found.setdefault(_absolute(image), SeparationPaths(image, folder, _layer_name(image, counts[parent])))
-    _check_unique_targets(found.values())
-    return list(found.values())
-
-
 def find_videos(sources: Iterable[Location]) -> list[Path]:
-    """Returns the videos in local folders, which `find` skips, in a stable order."""
+    """Returns the videos in local folders, which `images_in` skips, in a stable order."""
     folders = (source for source in sources if isinstance(source, Path) and _is_folder(source))
     return [path for folder in folders for path in walk(folder, _is_video) if _is_video(path)]
 
@@ -217,9 +187,9 @@ def _sync(path: Path) -> None:
 
 def _image_files(source: Location) -> Iterator[Location]:
     if isinstance(source, RemotePath):
-        yield from [source] if format_of(source) else _remote_images(source)
+        yield from [source] if format_of(source) else _without_masks(_remote_images(source))
     elif _is_folder(source):
-        yield from walk(source, _is_input)
+        yield from _without_masks(walk(source, _is_input))
     else:
         yield source
 
@@ -258,7 +228,7 @@ def _walk(folder: Path, is_included: Callable[[Path], bool], visited: set[tuple[
             yield entry
 
 
-def _absolute(path: Location) -> str:
+def absolute(path: Location) -> str:
     """Returns the absolute path or the URL. Links are not resolved: two links to one file are two images."""
     return str(path) if isinstance(path, RemotePath) else os.path.abspath(path)  # noqa: PTH100
 
@@ -267,18 +237,17 @@ def _is_folder(path: Path) -> bool:
     return os.path.isdir(path)  # noqa: PTH112  (Path.is_dir raises without permission)
 
 
-def _name_counts(folder: Location) -> Counter[str]:
-    """Counts the stems and the full names of the images in a folder."""
-    try:
-        images = [path for path in folder.iterdir() if _is_input(path)]
-    except OSError:
-        return Counter()
-    return Counter(name for path in images for name in (path.stem, path.name))
-
-
-def _layer_name(image: Location, counts: Counter[str]) -> str:
-    others = counts[image.stem] - _is_input(image)
-    return image.name if others > 0 else image.stem
+def _without_masks(images: Iterable[Location]) -> Iterator[Location]:
+    """Yields the images of folders, but not the mask `a.mask.png` if the folder has an image with the stem `a`."""
+    stems: dict[Location, set[str]] = {}
+    for image in images:
+        photo_stem, folder = image.stem.removesuffix(MASK_SUFFIX), image.parent
+        if photo_stem != image.stem:
+            if folder not in stems:
+                stems[folder] = {path.stem for path in folder.iterdir() if _is_input(path)}
+            if photo_stem in stems[folder]:
+                continue
+        yield image
 
 
 def _is_input(path: Location) -> bool:
@@ -289,19 +258,6 @@ def _is_input(path: Location) -> bool:
 
 def _is_video(path: Path) -> bool:
     return path.suffix.lower() in VIDEO_SUFFIXES and not path.name.startswith(".")
-
-
-def _check_unique_targets(found: Iterable[SeparationPaths]) -> None:
-    first_with_name: dict[str, SeparationPaths] = {}
-    for paths in found:
-        name = paths.folder / paths.name
-        other = first_with_name.setdefault(_absolute(name), paths)
-        if other is not paths:
-            raise OutputError(
-                f"{other.source} and {paths.source} would both be written as {name}.*",
-                "expected a separate output name for each image",
-                "pass their parent folder, whose tree is mirrored, or use different output folders",
-            )
 
 
 def _check_not_source(path: Location, source: Location | None) -> None:
@@ -384,7 +340,7 @@ _DEFAULT_REMEDY = ("expected a writable file", "choose another folder with -o")
 
 def _output_error(path: Location, error: OSError) -> OutputError:
     expected, cure = _REMEDIES.get(error.errno or 0, _DEFAULT_REMEDY)
-    if sys.platform == "win32" and len(_absolute(path)) >= _MAX_WINDOWS_PATH and error.errno == errno.ENOENT:
+    if sys.platform == "win32" and len(absolute(path)) >= _MAX_WINDOWS_PATH and error.errno == errno.ENOENT:
         expected = (
             f"expected a path of fewer than {_MAX_WINDOWS_PATH} characters, the limit of Windows by default"
         )

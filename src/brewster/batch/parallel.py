@@ -17,7 +17,7 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import final
 
-from brewster.batch.runner import BatchRunner, FileResult, SeparationTask, real_path
+from brewster.batch.runner import BatchRunner, FileResult, SeparationTask, real_path, skipped_result
 from brewster.errors import OutputError
 from brewster.executors import Executor, run_tasks
 from brewster.files import exists
@@ -84,7 +84,7 @@ class SeparationRunner:
         result = self._batch.run(task, lambda _fraction: None)
         if result.error and not self._overwrite and _is_finished(task, exists):
             # This worker was slow, and another worker got the same task and has already written the layers.
-            result = FileResult(task.name, "skipped")
+            result = skipped_result(task)
         if not result.error:
             result.outputs = {layer: str(target) for layer, target in task.outputs.items()}
         return [result]
@@ -110,11 +110,7 @@ def _unfinished(
     listing = _FolderListing()
     for task in tasks:
         if not overwrite and _is_finished(task, listing.has):
-            on_result(
-                FileResult(
-                    task.name, "skipped", {layer: str(target) for layer, target in task.outputs.items()}
-                )
-            )
+            on_result(skipped_result(task))
         else:
             yield task
 

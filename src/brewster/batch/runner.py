@@ -19,11 +19,13 @@ from functools import partial
 from pathlib import Path
 from typing import Final, Literal, Protocol, final
 
+from brewster.batch.layer_names import name_layers
 from brewster.batch.manifest import is_manifest, read_manifest
 from brewster.errors import BrewsterError, OutputError, PhotoError
-from brewster.files import exists, find_videos, images_in, is_same_file, name_layers, write_atomically
+from brewster.files import exists, find_videos, images_in, is_same_file, write_atomically
 from brewster.image_formats import SUFFIXES, format_of
 from brewster.inference.assessment import Assessment
+from brewster.inference.layer_history import find_layer_of_another_photo
 from brewster.inference.separator import Separator
 from brewster.options import Options
 from brewster.remote_path import Location, RemotePath, location
@@ -121,8 +123,8 @@ def separate_files(
     """Separates files and folders of photos, and writes the layers as files.
 
     Layers are named after their photo (`a.transmission.jpg` for `a.jpg`). They never replace a photo of the batch. If
-    all layers of a photo exist, the photo is skipped. If some of its layers exist, only the missing layers are written. Each
-    file is written atomically. If a photo fails, its result has the status `failed`, and the batch continues.
+    all layers of a photo exist, the photo is skipped. If some of its layers exist, only the missing layers are written. If an
+    existing layer was made from another photo, the photo fails. Each file is written atomically. If a photo fails, its result has the status `failed`, and the batch continues.
 
     Args:
         sources: photos, folders that are searched recursively for photos, and manifests (CSV or Parquet tables with
@@ -174,11 +176,8 @@ def plan_files(
         for pair in (read_manifest(source, folder) if is_manifest(source) else images_in(source, folder))
     )
     tasks = [
-        SeparationTask(
-            found.source,
-            {layer: found.target(layer, options.suffix(layer, found.source)) for layer in options.layers},
-        )
-        for found in name_layers(images)
+        SeparationTask(image, outputs)
+        for image, outputs in name_layers(images, options.layers, options.suffix)
     ]
     if not tasks:
         videos = f" ({len(names)} videos)" if (names := find_videos(paths)) else ""
@@ -273,7 +272,7 @@ class BatchRunner:
         """Returns the layers that must be written, with their outputs.
 
         Raises:
-            OutputError: a layer would replace a photo of the batch.
+            OutputError: a layer would replace a photo of the batch, or an existing layer was made from another photo.
         """
         for target in task.outputs.values():
             if isinstance(target, Location) and self._is_source(target, task.source):
@@ -282,11 +281,13 @@ class BatchRunner:
                     "expected another path, because photos of the batch are never overwritten",
                     "choose another name",
                 )
-        return {
+        missing = {
             layer: target
             for layer, target in task.outputs.items()
             if not isinstance(target, Location) or self._overwrite or not exists(target)
         }
+        check_layers(task.source, [target for layer, target in task.outputs.items() if layer not in missing])
+        return missing
 
     def _is_source(self, target: Location, source: Location | InputStream) -> bool:
         if real_path(target) in self._sources:
@@ -326,6 +327,36 @@ class BatchRunner:
                 target.write(encoded)
             result.outputs[layer] = _display_name(target)
         result.seconds["encode"] = time.perf_counter() - started
+
+
+def skipped_result(task: SeparationTask) -> FileResult:
+    """Returns the result of a photo whose layers all exist: skipped, or failed if they were made from another photo."""
+    try:
+        check_layers(task.source, task.outputs.values())
+    except OutputError as error:
+        return _failed(FileResult(task.name), error)
+    outputs = {layer: _display_name(target) for layer, target in task.outputs.items()}
+    return FileResult(task.name, "skipped", outputs)
+
+
+def check_layers(source: Location | InputStream, layers: Iterable[Location | OutputStream]) -> None:
+    """Checks that existing layers were made from this photo. See `find_layer_of_another_photo`.
+
+    Streams are not checked, because they can be read only once. Files in an object store are not checked either: two more
+    requests for each photo of an archive would take hours.
+
+    Raises:
+        OutputError: a layer was made from another photo, or from another version of this photo.
+    """
+    if not isinstance(source, Path):
+        return
+    layer = find_layer_of_another_photo(source, (path for path in layers if isinstance(path, Path)))
+    if layer:
+        raise OutputError(
+            f"{layer} was made from another photo, or from another version of {source}",
+            "expected layers of this photo, or no files with their names",
+            "choose another folder with -o, or replace the layers with --overwrite (in Python overwrite=True)",
+        )
 
 
 def read_content(source: Location | InputStream) -> Path | bytes:

@@ -23,7 +23,6 @@ from brewster.cli.terminal import (
     print_error,
     print_status,
     progress,
-    standard_output,
     write_out,
 )
 from brewster.errors import ModelError
@@ -65,11 +64,10 @@ class BatchCommand:
             BrewsterError: see `separate_tasks` and `separate_in_parallel`.
         """
         summary, started = _Summary(), time.perf_counter()
-        shares_terminal = self.as_json and standard_output.stream.isatty()
         try:
             with (
                 self._index_writer() as index,
-                progress(len(tasks), shown=not self.quiet and not shares_terminal) as update_progress,
+                progress(len(tasks), shown=not (self.quiet or self.as_json)) as update_progress,
             ):
 
                 def on_result(result: FileResult) -> None:
@@ -147,8 +145,8 @@ class BatchCommand:
         if self.quiet or result.error:
             return
         if result.status == "skipped":
-            # A parallel batch does not read the existing layers to compare their options with the current ones, because that
-            # takes time.
+            # A parallel batch does not read an existing layer a second time to compare its options with the current ones,
+            # because that takes time.
             different_options = "" if self._is_parallel else self._different_options(result)
             note = f", made with other options ({different_options})" if different_options else ""
             print_status(

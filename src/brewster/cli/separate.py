@@ -224,8 +224,9 @@ def separate(
     input folder. If -o is an image file or standard output, only one layer is written: the layer that --layers selects,
     by default the transmission.
 
-    Photos whose layers exist are skipped. If a photo fails, the other photos are still separated, the failed photo is listed
-    at the end, and the exit code is 1.
+    Photos whose layers exist are skipped. A photo fails if these layers were made from another photo, for example one with the
+    same name in another folder. If a photo fails, the other photos are still separated, the failed photo is listed at the
+    end, and the exit code is 1.
     """
     photos, output = tuple(map(local_path, photos)), output and local_path(output)
     single_output = is_single_output(photos, output)
@@ -235,6 +236,8 @@ def separate(
         options = Options(**cast("dict[str, Any]", values))
     except BrewsterError as error:
         raise click.UsageError(str(error)) from error
+    # An unknown name is an error, even if no photo needs the model. Nothing is loaded.
+    zoo.model_name(options.model)
     if is_plan or gpu_name:
         _print_plan(photos, output, options, gpu_name)
         return

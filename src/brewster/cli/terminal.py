@@ -155,20 +155,24 @@ def write_out(data: bytes) -> None:
 
 @contextmanager
 def progress(total: int, *, shown: bool) -> Iterator[ProgressUpdater]:
-    """Shows a progress bar if `shown` is true and standard error is a terminal. Yields the function that updates the bar."""
+    """Shows a progress bar if `shown` is true and standard error is a terminal. Yields the function that updates the bar.
+
+    A single item has a percentage instead of the number of finished items.
+    """
     if not (shown and sys.stderr.isatty()):
         yield lambda _done, _text: None
         return
+    from rich import progress as rich_progress  # noqa: PLC0415
     from rich.console import Console  # noqa: PLC0415  (slow to import; only used on a terminal)
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn  # noqa: PLC0415
 
     columns = (
-        BarColumn(),
-        MofNCompleteColumn(),
-        TextColumn("time left"),
-        TimeRemainingColumn(),
-        TextColumn("{task.description}", markup=False),
+        rich_progress.BarColumn(),
+        rich_progress.TaskProgressColumn() if total == 1 else rich_progress.MofNCompleteColumn(),
+        rich_progress.TextColumn("time left"),
+        rich_progress.TimeRemainingColumn(),
+        rich_progress.TextColumn("{task.description}", markup=False),
     )
-    with Progress(*columns, console=Console(stderr=True), redirect_stdout=False, transient=True) as bar:
+    console = Console(stderr=True)
+    with rich_progress.Progress(*columns, console=console, redirect_stdout=False, transient=True) as bar:
         task = bar.add_task("", total=total)
         yield lambda done, text: bar.update(task, completed=done, description=one_line(text))

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import replace
+from pathlib import Path
 from typing import Final
 
 import brewster
 from brewster.photo import Photo
-from brewster.photo.history import with_history
+from brewster.photo.history import recorded_parameters, sampled_digest, with_history
 
 PROGRAM: Final = "brewster"
 """The name under which the metadata of layers record this program."""
+PHOTO: Final = "photo"
+"""The name of the parameter that identifies the photo of a layer: its `sampled_digest`."""
 
 
 def history_step(model: str, *, strength: float, quality: str, additive: bool) -> dict[str, str]:
@@ -27,3 +31,20 @@ def with_step(photo: Photo, layer: str, step: dict[str, str]) -> Photo:
     """Returns a layer whose metadata record the program, its version, the name of the layer and the options in `step`."""
     software = f"{PROGRAM} {brewster.__version__}"
     return replace(photo, file_info=with_history(photo.file_info, software, {"layer": layer} | step))
+
+
+def find_layer_of_another_photo(photo: Path, layers: Iterable[Path]) -> Path | None:
+    """Returns a layer that was made from another photo, or from another version of this photo. Otherwise returns None.
+
+    The first layer that records its photo decides, and the other layers are not read. A layer without this record is
+    accepted: it is from an earlier version of brewster, or its format has no XMP. None is returned if the photo cannot be read.
+    """
+    for layer in layers:
+        recorded = (recorded_parameters(layer, PROGRAM) or {}).get(PHOTO)
+        if recorded:
+            try:
+                with photo.open("rb") as file:
+                    return None if sampled_digest(file) == recorded else layer
+            except OSError:
+                return None
+    return None

@@ -27,7 +27,7 @@ from brewster.inference.assessment import Assessment, assess
 from brewster.inference.clipping import keep_clipped_white
 from brewster.inference.full_size import upsample_layers
 from brewster.inference.guided_upsampling import Floats, GuidedUpsampler
-from brewster.inference.layer_history import history_step, with_step
+from brewster.inference.layer_history import PHOTO, history_step, with_step
 from brewster.inference.onnx_backend import OnnxBackend
 from brewster.inference.predictor import (
     QUALITIES,
@@ -232,6 +232,7 @@ class Separator:
             )
         step = history_step(self.name, strength=strength, quality=quality, additive=additive)
         step |= {"sha256": self.sha256[:12]} if self.sha256 else {}
+        step |= {PHOTO: photo.file_info.digest} if photo.file_info.digest else {}
         return Separation(
             photo,
             with_step(transmission, "transmission", step),
@@ -239,7 +240,7 @@ class Separator:
             prediction.confidence_map,
             residual,
             prediction.reconstruction_error,
-            _assess(inputs[-1], prediction),
+            _assess(inputs[-1], prediction, strength),
             self.name,
             self.sha256,
             self.device,
@@ -273,7 +274,7 @@ class Separator:
         inputs, white = self._inputs(photo, quality)
         prediction = keep_clipped_white(inputs[-1], self._predictor(inputs, quality, on_progress))
         upsampler = _fit_upsampler(inputs[-1], prediction, Options.strength, white)
-        return upsampler, prediction, _assess(inputs[-1], prediction)
+        return upsampler, prediction, _assess(inputs[-1], prediction, Options.strength)
 
     def _inputs(self, photo: Photo, quality: Quality) -> tuple[list[Floats], np.float32]:
         """Returns the inputs of the model in 0..1, smallest first, and the white level by which they are divided."""
@@ -361,7 +362,10 @@ def _check_options(strength: float, quality: str) -> None:
         )
 
 
-def _assess(largest_input: Floats, prediction: Prediction) -> Assessment:
+def _assess(largest_input: Floats, prediction: Prediction, strength: float) -> Assessment:
+    """Assesses the prediction at strength 1; at strength 0, assesses the unchanged photo."""
+    if strength == 0:
+        return assess(largest_input, largest_input, prediction.confidence_map)
     transmission = np.clip(largest_input + prediction.change, 0, 1)
     return assess(largest_input, transmission, prediction.confidence_map, prediction.reconstruction_error)
 

@@ -40,6 +40,8 @@ class FileInfo:
     """The other attributes of an EXR or HDR."""
     software: str | None = None
     """The program that created the pixels. It is written to EXR and HDR files, which have neither EXIF nor XMP."""
+    digest: str | None = None
+    """See `brewster.photo.history.sampled_digest`; None if the photo was not read from a file."""
 
 
 def format_name_of(path: Path) -> str:

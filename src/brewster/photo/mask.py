@@ -8,6 +8,7 @@ The stored values are weights, not light, so they are not converted by a transfe
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass
 from typing import Any, final
 
@@ -39,6 +40,7 @@ class Mask:
             MaskError: the source cannot be read, has colours, transparent pixels or values outside 0..1, or does not
                 have the size of the photo.
         """
+        mask = f"the mask {source}" if isinstance(source, str | os.PathLike) else "the mask"
         try:
             photo = _open(source)
         except PhotoError as error:
@@ -48,22 +50,22 @@ class Mask:
         pixels = photo.pixels
         if photo.size != size:
             raise MaskError(
-                f"the mask has {' x '.join(map(str, photo.size))} pixels",
+                f"{mask} has {' x '.join(map(str, photo.size))} pixels",
                 f"expected {' x '.join(map(str, size))}, the size of the photo",
                 "resize the mask, or leave it out for this photo",
             )
         if (pixels != pixels[..., :1]).any():
-            raise MaskError("the mask has colours", "expected grey values", "convert the mask to grey")
+            raise MaskError(f"{mask} has colours", "expected grey values", "convert the mask to grey")
         if photo.alpha is not None and (photo.alpha != WHITE_LEVELS[photo.alpha.dtype.name]).any():
             raise MaskError(
-                "the mask has transparent pixels",
+                f"{mask} has transparent pixels",
                 "expected white pixels where the photo is to be separated, and black pixels elsewhere",
                 "flatten the layers of the mask",
             )
         values = np.ascontiguousarray(pixels[..., 0])
         if values.dtype.kind == "f" and not (values.min() >= 0 and values.max() <= 1):
             raise MaskError(
-                f"the mask has values from {values.min():g} to {values.max():g}",
+                f"{mask} has values from {values.min():g} to {values.max():g}",
                 "expected values from 0 to 1",
                 "scale the mask",
             )

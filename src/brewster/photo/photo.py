@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import math
 import os
 from collections.abc import Iterator
@@ -20,6 +21,7 @@ from brewster.photo.decode import Decoded, decode
 from brewster.photo.encode import encode
 from brewster.photo.file_info import FileInfo, depth_for, format_name_of
 from brewster.photo.hdr_formats import too_large_error
+from brewster.photo.history import sampled_digest
 from brewster.photo.in_memory import (
     WHITE_LEVELS,
     BinaryFile,
@@ -98,7 +100,10 @@ class Photo:
         if isinstance(source, PilImage):
             _check_pixel_count(source.width, source.height, max_pixels)
             return cls.from_pil(source)
-        return cls._from_decoded(decode(_read_source(source), max_pixels))
+        data = _read_source(source)
+        decoded = decode(data, max_pixels)
+        file_info = replace(decoded.file_info, digest=sampled_digest(io.BytesIO(data)))
+        return cls._from_decoded(replace(decoded, file_info=file_info))
 
     @classmethod
     def _from_decoded(cls, decoded: Decoded) -> Photo:

@@ -47,11 +47,7 @@ class SeparationRequest:
         source = Path(self.name)
         if source.suffix.lower() not in SUFFIXES:
             source = Path(f"{self.name}.{format_name}")
-        return (
-            SeparationPaths(source, Path(), source.stem)
-            .target(layer, self.options.suffix(layer, source))
-            .name
-        )
+        return SeparationPaths(source, Path()).target(layer, self.options.suffix(layer, source)).name
 
 
 async def read_form(request: Request, models: Sequence[str], max_pixels: int) -> SeparationRequest:
