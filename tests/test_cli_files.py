@@ -112,7 +112,7 @@ def test_raw_files_without_the_extra_are_counted_and_named_once(run, tmp_path, m
     assert code == 1
     (line,) = error_lines(err)
     assert "3 photos (a.dng, b.dng, c.dng): the rawpy package is not installed" in line
-    assert "pip install 'brewster[raw]'" in line
+    assert "pip install -c constraints.txt -e '.[raw]'" in line
     assert "1 separated, 3 failed" in err
 
 

@@ -225,7 +225,7 @@ def test_shapes_are_compared_before_weights_are_loaded():
 
 def test_without_torch_the_extra_is_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "torch", None)
-    with pytest.raises(MissingExtra, match=r"brewster\[evaluate\]"):
+    with pytest.raises(MissingExtra, match=r"-e '\.\[evaluate\]'"):
         Lpips.load()
 
 

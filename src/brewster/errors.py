@@ -148,8 +148,22 @@ class DownloadError(BrewsterError):
     """A server cannot be reached, refuses a request, or sends a file with another digest than expected."""
 
 
+INSTALL_COMMAND: Final = "pip install -c constraints.txt -e"
+"""Installs brewster from its repository, because it is on no package index. The next argument is the path "." or ".[EXTRA]"."""
+
+
+def install_command(extra: str) -> str:
+    """Returns the command that installs an extra of brewster. It must be run in the root of the repository."""
+    return f"{INSTALL_COMMAND} '.[{extra}]'"
+
+
 class MissingExtra(BrewsterError):
     """An optional dependency is needed, but not installed."""
+
+    @classmethod
+    def for_extra(cls, extra: str, happened: str, expected: str) -> MissingExtra:
+        """Returns the error for a package that an extra of brewster installs. Its third part is the command that installs it."""
+        return cls(happened, expected, f"run in the repository of brewster: {install_command(extra)}")
 
 
 def invalid_value(details: Mapping[str, Any]) -> BrewsterError:
