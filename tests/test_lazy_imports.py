@@ -97,7 +97,7 @@ load_backbone({str(tmp_path)!r})
 
 def run_without_torch(*arguments):
     """Runs the command line in a process in which torch cannot be imported."""
-    code = f"import sys; sys.modules['torch'] = None; sys.argv = {['brewster', *arguments]!r}; from brewster.cli import main; main()"
+    code = f"import sys; sys.modules['torch'] = None; sys.argv = {['brewster', *arguments]!r}; from brewster.cli import main; sys.exit(main())"
     return subprocess.run([sys.executable, "-c", code], check=False, capture_output=True, text=True)
 
 

@@ -187,6 +187,15 @@ def test_an_invalid_answer_is_refused_with_a_message(app, store, wrong, message)
     assert [len(answers) for _, answers in store.all_answers()] == [0]
 
 
+def test_a_body_that_is_not_json_is_refused_with_a_message(app):
+    header = {"Content-Type": "application/json"}
+    response = request(app, "POST", "/participants", content=b'{"agreed": ', headers=header)
+    assert response.status_code == 422
+    assert re.fullmatch(
+        r"body is not JSON \([^;]+\); expected JSON; correct body\.", response.json()["error"]
+    )
+
+
 def test_without_agreement_there_is_no_link(app, store):
     for body in ({}, {"agreed": False}, {"agreed": True, "name": "Jo"}):
         assert request(app, "POST", "/participants", json=body).status_code == 422

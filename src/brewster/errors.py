@@ -53,7 +53,6 @@ _EXPECTED_KINDS: Final = {
     "timezone": "a time with its time zone",
     "list": "a list",
     "tuple": "a list",
-    "json": "valid JSON",
     "model": "an object with named values",
     "dataclass": "an object with named values",
 }
@@ -176,6 +175,11 @@ def invalid_value(details: Mapping[str, Any]) -> BrewsterError:
     kind, value = details["type"], details["input"]
     if kind.startswith("missing"):
         return BrewsterError(f"{name} is missing", "expected a value", f"add {name}")
+    if kind == "json_invalid":  # FastAPI adds the position in the text to the location
+        name = str(details["loc"][0]) if details["loc"] else "the text"
+        return BrewsterError(
+            f"{name} is not JSON ({details['ctx']['error']})", "expected JSON", f"correct {name}"
+        )
     text = repr(value[:_MAX_VALUE_LENGTH]) if isinstance(value, str) else repr(value)[:_MAX_VALUE_LENGTH]
     if kind in {"extra_forbidden", "unexpected_keyword_argument"}:
         return BrewsterError(
