@@ -25,7 +25,7 @@ from torch.nn.functional import avg_pool2d
 from brewster.environments.assets import Assets
 from brewster.environments.catalog import BUILTIN_CATALOG
 from brewster.executors import SerialExecutor
-from brewster.render.analytic import render
+from brewster.render.analytic import needs_monte_carlo, render
 from brewster.render.mitsuba.renderer import trace
 from brewster.render.sample import SAMPLE_IMAGES, LinearSample
 from brewster.rendered.generation.job import RenderJob, build
@@ -147,7 +147,12 @@ def cost_by_method(count: int = 60) -> None:
         scene = draw(recipe, BUILTIN_CATALOG, 7, index)
         start = time.process_time()
         encode_sample(render(scene, assets), "analytic")
-        method = "rough glass" if scene.glass.is_rough else "lens" if scene.camera.aperture_mm else "pinhole"
+        if scene.glass.is_rough:
+            method = "rough glass"
+        elif needs_monte_carlo(scene):
+            method = "lens and near content"
+        else:
+            method = "pinhole or blur of content at infinity"
         seconds[method].append(time.process_time() - start)
     print("| method | samples | CPU-s per sample |\n|---|---|---|")
     for method, spent in [*seconds.items(), ("all", [s for values in seconds.values() for s in values])]:

@@ -4,7 +4,7 @@
 # Give the same command again to resume an interrupted run. It takes about 4 hours on two CPU cores with AVX512_BF16.
 #
 # BREWSTER_DATA contains photos/permissive (with manifest.csv), hdri/, and real/ (pairs for validation; they are not trained on).
-# First install the extras: pip install -c constraints.txt '.[render,train]'
+# First install the extras: pip install -c constraints.txt -e '.[render,train]'
 set -euo pipefail
 cd "$(dirname "$0")/.."
 command -v brewster > /dev/null || export PATH="$PWD/.venv/bin:$PATH"

@@ -23,7 +23,8 @@ from brewster.models.diffusion.backbones.registry import build, find_backbone_cl
 from brewster.models.diffusion.lazy_imports import import_library
 from brewster.models.diffusion.panels import PanelLayout, conditioning_image
 from brewster.models.diffusion.prompt import PromptEmbedding
-from brewster.models.diffusion.sampling import GUIDANCE, STEPS, sample
+from brewster.models.diffusion.sampling import sample
+from brewster.models.diffusion.task import GUIDANCE, STEPS
 
 GIB = 1 << 30
 CAP_GIB = 23.0  # a 24 GB GPU without its CUDA context

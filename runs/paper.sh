@@ -4,7 +4,7 @@
 #     runs/paper.sh --tiny [FOLDER]                      the same with a tiny version of the backbone: minutes on two CPU cores, offline
 # Give the same command again to resume an interrupted run. With --tiny, the generated panels are noise, but every step runs.
 #
-# First run `pip install -c constraints.txt '.[render,train,diffusion,evaluate]' bitsandbytes`, agree to the licence at
+# First run `pip install -c constraints.txt -e '.[render,train,diffusion,evaluate]' bitsandbytes`, agree to the licence at
 # https://huggingface.co/black-forest-labs/FLUX.1-Kontext-dev (not for commercial use), and run `hf auth login`.
 # BREWSTER_DATA must contain photos/ (200 photos of people, animals and artworks), pairs/real and pairs/nature (the 89 + 200
 # training pairs), real20, nature20 and SIR2 (the benchmarks; docs/evaluation.md describes their layouts), and real/dev/nature

@@ -124,7 +124,7 @@ def test_an_extra_with_a_missing_package_is_reported_without_an_error_code(
     exr = next(check for check in output["checks"] if (check["area"], check["name"]) == ("extras", "exr"))
     assert (code, output["ok"]) == (0, True)
     assert (exr["status"], exr["detail"]) == ("missing", "without no-such-package")
-    assert exr["cure"] == "pip install 'brewster[exr]'"
+    assert exr["cure"] == "pip install -c constraints.txt -e '.[exr]'"
 
 
 def test_a_package_that_does_not_load_is_broken(run_without_model, model_zoo, monkeypatch):
@@ -142,7 +142,7 @@ def test_training_without_its_extra_names_the_command_that_installs_it(run_witho
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None if name == "torch" else find_spec(name))
     code, _, err = run_without_model("train", "recipe.toml", "-o", "run")
     assert code == 1
-    assert "pip install 'brewster[train]'" in err
+    assert "pip install -c constraints.txt -e '.[train]'" in err
 
 
 def test_a_missing_recipe_is_an_error_and_creates_no_folder(run_without_model, tmp_path):

@@ -161,7 +161,7 @@ def test_the_error_for_a_missing_package_has_the_command_that_installs_it(run_wi
     code, _, err = run_without_model("render", "set")
     assert code == 1
     assert "rendering needs packages that are not installed: torch" in err
-    assert "pip install 'brewster[render]'" in err
+    assert "pip install -c constraints.txt -e '.[render]'" in err
 
 
 def test_help_imports_no_heavy_library():

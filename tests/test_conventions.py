@@ -180,6 +180,21 @@ def test_the_tree_in_the_readme_equals_the_tree_on_disk():
     assert listed == on_disk
 
 
+def test_install_lines_need_no_package_index():
+    texts = [
+        README,
+        *(
+            path.read_text()
+            for path in (*FILES, *(ROOT / "docs").glob("*.md"), *(ROOT / "runs").glob("*.sh"))
+        ),
+    ]
+    for text in texts:
+        assert "OWNER/brewster" not in text
+        assert "brewster[" not in text
+        for line in re.findall(r"pip install [^`\n]*\.\[.*", text):
+            assert "pip install -c constraints.txt -e '.[" in line
+
+
 def test_the_python_examples_in_the_readme_run(tmp_path, monkeypatch):
     blocks = re.findall(r"```python\n(.*?)```", README, re.S)
     assert blocks

@@ -1,11 +1,15 @@
 """Errors have three parts and can be sent between processes."""
 
 import inspect
+import math
 import pickle
 from concurrent.futures import ProcessPoolExecutor
+from datetime import date
 from multiprocessing import get_context
+from typing import Annotated
 
 import pytest
+from pydantic import AfterValidator, AwareDatetime, BaseModel, ConfigDict, Field, ValidationError
 
 from brewster import errors
 from brewster.errors import PhotoError
@@ -32,3 +36,54 @@ def test_an_error_that_is_raised_in_a_worker_arrives_unchanged():
         pool.submit(raise_photo_error).result()
     assert str(raised.value) == "the width is 7; expected an even width; crop the image."
     assert raised.value.cure == "crop the image"
+
+
+class Described(BaseModel):
+    """A model with one field for each kind of limit."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    above: Annotated[float, Field(gt=0, lt=5, allow_inf_nan=False)] = 1
+    whole: Annotated[int, Field(ge=1)] = 1
+    name: Annotated[str, Field(min_length=2, max_length=4, pattern="^[a-z]+$")] = "abc"
+    day: date = date(2026, 1, 31)
+    time: AwareDatetime | None = None
+    sizes: Annotated[tuple[int, ...], Field(min_length=1)] = (1,)
+    ours: Annotated[int, AfterValidator(lambda _: fail("expected an even number"))] = 2
+
+
+def fail(message):
+    raise ValueError(message)
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "expected"),
+    [
+        ("above", 0, "a number above 0"),
+        ("above", 5, "a number below 5"),
+        ("above", math.nan, "a finite number"),
+        ("above", "much", "a number"),
+        ("whole", 0, "a number of at least 1"),
+        ("whole", 1.5, "an integer"),
+        ("name", "a", "at least 2 characters"),
+        ("name", "abcde", "at most 4 characters"),
+        ("name", "A1", "a text that matches ^[a-z]+$"),
+        ("name", 1, "a text"),
+        ("day", "yesterday", "a date such as 2026-01-31"),
+        ("time", "2026-01-31T12:00:00", "a time with its time zone"),
+        ("sizes", 1, "a list"),
+        ("sizes", [], "at least 1 entries"),
+        ("ours", 3, "an even number"),
+    ],
+)
+def test_an_invalid_value_gives_three_parts_without_the_words_of_pydantic(name, value, expected):
+    with pytest.raises(ValidationError) as raised:
+        Described.model_validate({name: value})
+    error = errors.invalid_value(raised.value.errors()[0])
+    assert str(error) == f"{name} is {value!r}; expected {expected}; correct {name}."
+
+
+def test_an_unknown_type_of_error_is_named_and_a_long_value_is_shortened():
+    error = errors.invalid_value({"type": "url_scheme", "loc": ("a", 0), "input": ["x" * 500]})
+    assert error.happened == f"a.0 is ['{'x' * 38}"
+    assert error.expected == "expected a valid value (url_scheme)"

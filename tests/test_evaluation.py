@@ -181,7 +181,7 @@ def test_a_metric_without_weights_does_not_stop_the_run_and_is_added_later(
     assert "the weights are missing" in first["unavailable"]["late"]
     assert set(first["tables"]["real20"]["theirs"]) == {"psnr"}
     assert not calls
-    assert "late is not computed: the weights are missing" in (tmp_path / "out" / "tables.md").read_text()
+    assert "- not computed: late: the weights are missing" in (tmp_path / "out" / "tables.md").read_text()
     weights.append("found")
     monkeypatch.setitem(
         METRICS, "psnr", replace(METRICS["psnr"], score=lambda _: pytest.fail("scored again"))

@@ -64,12 +64,14 @@ def test_errors_of_the_hub_are_explained(monkeypatch, error, message, load):
 
 def test_a_missing_library_names_the_extra(monkeypatch):
     monkeypatch.setitem(sys.modules, "bitsandbytes", None)
-    with pytest.raises(MissingExtra, match=r"pip install 'brewster\[diffusion\]'"):
+    with pytest.raises(MissingExtra, match=r"pip install -c constraints.txt -e '\.\[diffusion\]'"):
         import_library("bitsandbytes")
 
 
 def test_a_class_that_diffusers_does_not_have_or_cannot_import_is_an_error(monkeypatch):
-    with pytest.raises(MissingExtra, match=r"NoSuchPipeline cannot .*no attribute NoSuchPipeline.*--upgrade"):
+    with pytest.raises(
+        MissingExtra, match=r"NoSuchPipeline cannot .*no attribute NoSuchPipeline.*-c constraints.txt"
+    ):
         diffusers_class("NoSuchPipeline")
     module = "diffusers.pipelines.ddim.pipeline_ddim"
     monkeypatch.setitem(sys.modules, module, None)
@@ -91,3 +93,30 @@ load_backbone({str(tmp_path)!r})
 """
     done = subprocess.run([sys.executable, "-c", code], check=False, capture_output=True, text=True)
     assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
+
+
+def run_without_torch(*arguments):
+    """Runs the command line in a process in which torch cannot be imported."""
+    code = f"import sys; sys.modules['torch'] = None; sys.argv = {['brewster', *arguments]!r}; from brewster.cli import main; sys.exit(main())"
+    return subprocess.run([sys.executable, "-c", code], check=False, capture_output=True, text=True)
+
+
+@pytest.mark.parametrize(
+    ("command", "name", "line"),
+    [
+        ("train", "compact", 'network = "lite2-unet"'),
+        ("train", "lora", 'panels = ["I", "T", "R"]'),
+        ("render", "window", "samples_per_pixel ="),
+    ],
+)
+def test_a_recipe_is_printed_without_torch(command, name, line):
+    done = run_without_torch(command, "--show-recipe", name)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert f"\n{line}" in done.stdout
+
+
+def test_a_plan_for_a_model_without_diffusion_is_refused_without_torch():
+    done = run_without_torch("photo.jpg", "--plan")
+    assert done.returncode == 1
+    assert "a plan was requested for the model compact; expected a diffusion model" in done.stderr
+    assert "pip install" not in done.stderr

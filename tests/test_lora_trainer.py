@@ -16,7 +16,8 @@ from brewster.errors import DeviceError, ModelError, RecipeError
 from brewster.models.diffusion.adapter.lora import LORA_FILE, load_lora, lora_state_dict, read_lora_metadata
 from brewster.models.diffusion.backbones.registry import tiny
 from brewster.models.diffusion.panels import conditioning_image, split
-from brewster.models.diffusion.sampling import GUIDANCE, STEPS, sample
+from brewster.models.diffusion.sampling import sample
+from brewster.models.diffusion.task import GUIDANCE, STEPS
 from brewster.models.diffusion.tensors import read_tensors
 from brewster.photo import Photo
 from brewster.training import distributed

@@ -127,7 +127,7 @@ def test_no_other_llvm_is_tried_once_drjit_is_imported(monkeypatch):
 def test_a_missing_mitsuba_is_reported_with_its_install_command(monkeypatch):
     variant.probe.cache_clear()
     monkeypatch.setitem(sys.modules, "mitsuba", None)
-    with pytest.raises(MissingExtra, match=r"brewster\[render\]"):
+    with pytest.raises(MissingExtra, match=r"-e '\.\[render\]'"):
         variant.load()
 
 

@@ -7,7 +7,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from brewster.srgb import to_linear
-from brewster.training.data.mixtures import InterleavedStream, MixRecipe, Mixtures, Pairs, TrainingBatch
+from brewster.training.data.data_recipe import MixRecipe
+from brewster.training.data.mixtures import InterleavedStream, Mixtures, Pairs, TrainingBatch
 from brewster.training.data.sample_rng import SampleRng
 
 NO_EFFECTS = MixRecipe(

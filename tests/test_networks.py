@@ -8,6 +8,7 @@ from torch import nn
 
 from brewster.errors import ModelError, RecipeError
 from brewster.inference.onnx_backend import OnnxBackend
+from brewster.models.compact import CompactNetwork
 from brewster.models.networks import DEFAULT_NETWORK, MAX_STRIDE, NETWORKS, NetworkEntry
 from brewster.training.checkpoint import Checkpoint
 from brewster.training.compact.trainer import CompactTrainer, train
@@ -53,7 +54,7 @@ def test_every_network_has_the_stride_and_channels_of_its_row(name):
 
 def test_a_recipe_without_a_network_trains_the_default_one(recipe):
     assert recipe.network == DEFAULT_NETWORK
-    assert type(CompactTrainer(recipe).network) is NETWORKS[DEFAULT_NETWORK].build
+    assert type(CompactTrainer(recipe).network) is CompactNetwork
 
 
 def test_a_recipe_trains_and_exports_the_network_that_it_names(recipe, small_network, tmp_path):

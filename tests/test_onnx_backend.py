@@ -7,7 +7,8 @@ import torch
 from brewster.errors import DeviceError, ModelError
 from brewster.inference import onnx_backend
 from brewster.inference.onnx_backend import OnnxBackend, available_devices
-from brewster.models.compact import STRIDE, LinearSeparator, with_imagenet_features
+from brewster.models.compact import LinearSeparator, with_imagenet_features
+from brewster.models.networks import MAX_STRIDE
 from brewster.training.compact.export import export_onnx
 
 
@@ -25,7 +26,7 @@ def network():
 @pytest.fixture(scope="module")
 def model_file(network, tmp_path_factory):
     path = tmp_path_factory.mktemp("model") / "model.onnx"
-    export_onnx(network, path, STRIDE)
+    export_onnx(network, path, MAX_STRIDE)
     return path
 
 

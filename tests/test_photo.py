@@ -228,7 +228,7 @@ def test_a_missing_extra_names_the_command_that_installs_it(
     format_name: str, module: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, module, None)
-    with pytest.raises(MissingExtra, match=rf"pip install 'brewster\[{format_name}\]'"):
+    with pytest.raises(MissingExtra, match=rf"pip install -c constraints.txt -e '\.\[{format_name}\]'"):
         Photo.from_array(smooth(), encoding="srgb").encode(format_name)
 
 

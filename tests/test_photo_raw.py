@@ -102,7 +102,9 @@ def test_the_pixel_limit_is_that_of_the_image():
 def test_the_missing_extra_names_the_command_that_installs_it(monkeypatch):
     monkeypatch.setitem(sys.modules, "rawpy", None)
     for read in (Photo.open, read_size):
-        with pytest.raises(MissingExtra, match=r"RAW files need it; run: pip install 'brewster\[raw\]'"):
+        with pytest.raises(
+            MissingExtra, match=r"RAW files need it; run in .*: pip install -c constraints.txt -e '\.\[raw\]'"
+        ):
             read(dng_file(mosaic()))
 
 

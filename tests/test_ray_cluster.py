@@ -68,7 +68,7 @@ def run_in_process(code, *args):
 
 def test_without_ray_the_error_has_the_command_that_installs_it(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "ray", None)
-    with pytest.raises(MissingExtra, match=r"pip install 'brewster\[cluster\]'"):
+    with pytest.raises(MissingExtra, match=r"pip install -c constraints.txt -e '\.\[cluster\]'"):
         render_set(tmp_path / "set", executor=ray_cluster.RayExecutor)
 
 

@@ -3,7 +3,7 @@ from pathlib import Path
 import pytest
 
 from brewster.errors import RecipeError
-from brewster.training.data.mixtures import MixRecipe
+from brewster.training.data.data_recipe import MixRecipe
 from brewster.training.recipe import CompactRecipe, LoraRecipe, read_recipe, with_value
 
 FOLDER = Path(__file__).parents[1] / "recipes"

@@ -55,7 +55,7 @@ def test_a_protocol_that_is_unknown_or_not_installed_is_reported_before_any_phot
     with pytest.raises(MissingExtra, match=r"s3:// needs a package that is not installed .*s3fs"):
         location("s3://bucket/a.jpg")
     monkeypatch.setitem(sys.modules, "fsspec", None)
-    with pytest.raises(MissingExtra, match=r"pip install 'brewster\[cluster\]'"):
+    with pytest.raises(MissingExtra, match=r"pip install -c constraints.txt -e '\.\[cluster\]'"):
         location("memory://bucket/a.jpg")
 
 

@@ -1,6 +1,7 @@
 """The form of a request: its fields, errors, schema and file names."""
 
 import asyncio
+import re
 import string
 from pathlib import Path, PurePosixPath, PureWindowsPath
 
@@ -119,6 +120,21 @@ def test_a_wrong_value_is_named_in_the_message(fields, part):
     assert status == 422
     assert part in message
     assert len(message) < 300
+    assert re.fullmatch(r"[^;]+; (expected|choose) [^;]+; [^;]+", message), message
+    assert "Input should" not in message
+
+
+def test_every_wrong_value_is_in_the_message():
+    data = body(
+        ("photo", b"bytes", "a.jpg"), ("strength", b"1.5"), ("quality", b"fine"), ("additive", b"perhaps")
+    )
+    status, message = refused(data)
+    assert status == 422
+    assert message == (
+        "strength is '1.5'; expected a number of at most 1; correct strength. "
+        "quality is 'fine'; expected 'draft', 'standard' or 'best'; correct quality. "
+        "additive is 'perhaps'; expected true or false; correct additive."
+    )
 
 
 def test_contradicting_options_raise_the_error_of_options():

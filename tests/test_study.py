@@ -169,8 +169,8 @@ def test_an_invalid_description_is_refused_with_the_key_of_the_error(tmp_path):
     study = make_study(tmp_path)
     text = json.loads((study.folder / "study.json").read_text())
     for change, message in (
-        ({"pairs": "many"}, "pairs: "),
-        ({"unknown": 1}, "unknown: "),
+        ({"pairs": "many"}, "pairs is 'many'; expected an integer"),
+        ({"unknown": 1}, "there is no field unknown"),
         ({"format": 1}, "format 1"),
     ):
         (study.folder / "study.json").write_text(json.dumps(text | change))

@@ -124,7 +124,7 @@ def test_imported_answers_are_stored_once(study, store, answers, tmp_path):
     ("changes", "message"),
     [
         ({"participant": "../../x"}, "who is not in this study"),
-        ({"participant": "x" * 65}, "participant: String should have at most 64"),
+        ({"participant": "x" * 65}, "participant is 'x{40}'; expected at most 64 char"),
         ({"format": 2}, "format"),
         ({"extra": 1}, "extra"),
         ({"consented_on": "never"}, "consented_on"),

@@ -158,20 +158,42 @@ def test_viewing_conditions_are_stored_and_others_are_refused(app, store):
 
 
 @pytest.mark.parametrize(
-    "wrong",
+    ("wrong", "message"),
     [
-        {"trial": -1, "choice": "left", "seconds": 1},
-        {"trial": 0, "choice": "both", "seconds": 1},
-        {"trial": 0, "choice": "left", "seconds": -1},
-        {"trial": 0, "choice": "left", "seconds": 1, "more": 1},
-        {"trial": 0, "choice": "left"},
+        (
+            {"trial": -1, "choice": "left", "seconds": 1},
+            "body.trial is -1; expected a number of at least 0; correct body.trial.",
+        ),
+        (
+            {"trial": 0, "choice": "both", "seconds": 1},
+            "body.choice is 'both'; expected 'left', 'similar' or 'right'; correct body.choice.",
+        ),
+        (
+            {"trial": 0, "choice": "left", "seconds": "long"},
+            "body.seconds is 'long'; expected a number; correct body.seconds.",
+        ),
+        (
+            {"trial": 0, "choice": "left", "seconds": 1, "more": 1},
+            "there is no field body.more (its value is 1); expected known fields only; remove body.more.",
+        ),
+        ({"trial": 0, "choice": "left"}, "body.seconds is missing; expected a value; add body.seconds."),
+        ([], "body is []; expected an object with named values; correct body."),
     ],
 )
-def test_an_invalid_answer_is_refused_with_a_message(app, store, wrong):
+def test_an_invalid_answer_is_refused_with_a_message(app, store, wrong, message):
     response = request(app, "POST", f"{admit_participant(app)}/answers", json=wrong)
     assert response.status_code == 422
-    assert response.json()["error"]
+    assert response.json()["error"] == message
     assert [len(answers) for _, answers in store.all_answers()] == [0]
+
+
+def test_a_body_that_is_not_json_is_refused_with_a_message(app):
+    header = {"Content-Type": "application/json"}
+    response = request(app, "POST", "/participants", content=b'{"agreed": ', headers=header)
+    assert response.status_code == 422
+    assert re.fullmatch(
+        r"body is not JSON \([^;]+\); expected JSON; correct body\.", response.json()["error"]
+    )
 
 
 def test_without_agreement_there_is_no_link(app, store):

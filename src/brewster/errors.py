@@ -14,10 +14,49 @@
     |-- DownloadError          a server cannot be reached, or its file has an unexpected digest
     `-- MissingExtra           an optional dependency is not installed
 
-Messages have three parts: what happened (with the value), what was expected, what to do.
+Messages have three parts: what happened (with the value), what was expected, what to do. `invalid_value` translates an error
+of pydantic into such a message.
 """
 
 from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+    from typing import Any
+
+_MAX_VALUE_LENGTH: Final = 40
+
+_EXPECTED: Final = {
+    "greater_than": "a number above {gt:g}",
+    "greater_than_equal": "a number of at least {ge:g}",
+    "less_than": "a number below {lt:g}",
+    "less_than_equal": "a number of at most {le:g}",
+    "finite_number": "a finite number",
+    "literal_error": "{expected}",
+    "string_pattern_mismatch": "a text that matches {pattern}",
+    "string_too_long": "at most {max_length} characters",
+    "string_too_short": "at least {min_length} characters",
+    "too_long": "at most {max_length} entries",
+    "too_short": "at least {min_length} entries",
+}
+"""What is expected, by the type of pydantic's error. The names in braces are keys of its context."""
+
+_EXPECTED_KINDS: Final = {
+    "bool": "true or false",
+    "int": "an integer",
+    "float": "a number",
+    "string": "a text",
+    "date": "a date such as 2026-01-31",
+    "datetime": "a time such as 2026-01-31T12:00:00Z",
+    "timezone": "a time with its time zone",
+    "list": "a list",
+    "tuple": "a list",
+    "model": "an object with named values",
+    "dataclass": "an object with named values",
+}
+"""What is expected, by the first word of the type of pydantic's error, for the types that are not in `_EXPECTED`."""
 
 
 class BrewsterError(Exception):
@@ -108,5 +147,56 @@ class DownloadError(BrewsterError):
     """A server cannot be reached, refuses a request, or sends a file with another digest than expected."""
 
 
+INSTALL_COMMAND: Final = "pip install -c constraints.txt -e"
+"""Installs brewster from its repository, because it is on no package index. The next argument is the path "." or ".[EXTRA]"."""
+
+
+def install_command(extra: str) -> str:
+    """Returns the command that installs an extra of brewster. It must be run in the root of the repository."""
+    return f"{INSTALL_COMMAND} '.[{extra}]'"
+
+
 class MissingExtra(BrewsterError):
     """An optional dependency is needed, but not installed."""
+
+    @classmethod
+    def for_extra(cls, extra: str, happened: str, expected: str) -> MissingExtra:
+        """Returns the error for a package that an extra of brewster installs. Its third part is the command that installs it."""
+        return cls(happened, expected, f"run in the repository of brewster: {install_command(extra)}")
+
+
+def invalid_value(details: Mapping[str, Any]) -> BrewsterError:
+    """Returns an error about one invalid value.
+
+    Args:
+        details: an item of `errors()` of pydantic's ValidationError: the type of the error, its location `loc`, and the value.
+    """
+    name = ".".join(map(str, details["loc"])) or "the whole value"
+    kind, value = details["type"], details["input"]
+    if kind.startswith("missing"):
+        return BrewsterError(f"{name} is missing", "expected a value", f"add {name}")
+    if kind == "json_invalid":  # FastAPI adds the position in the text to the location
+        name = str(details["loc"][0]) if details["loc"] else "the text"
+        return BrewsterError(
+            f"{name} is not JSON ({details['ctx']['error']})", "expected JSON", f"correct {name}"
+        )
+    text = repr(value[:_MAX_VALUE_LENGTH]) if isinstance(value, str) else repr(value)[:_MAX_VALUE_LENGTH]
+    if kind in {"extra_forbidden", "unexpected_keyword_argument"}:
+        return BrewsterError(
+            f"there is no field {name} (its value is {text})", "expected known fields only", f"remove {name}"
+        )
+    return BrewsterError(f"{name} is {text}", expected_value(details), f"correct {name}")
+
+
+def expected_value(details: Mapping[str, Any]) -> str:
+    """Returns the second part of a message, such as "expected a finite number", for an item of `errors()` of a ValidationError.
+
+    The text of a validator of our own has this form already and is returned unchanged.
+    """
+    kind: str = details["type"]
+    if kind == "value_error":
+        return str(details["ctx"]["error"])
+    known = _EXPECTED.get(kind) or _EXPECTED_KINDS.get(kind.partition("_")[0])
+    return (
+        f"expected {known.format(**details.get('ctx', {}))}" if known else f"expected a valid value ({kind})"
+    )

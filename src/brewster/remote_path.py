@@ -151,10 +151,10 @@ def _store(protocol: str) -> Any:  # noqa: ANN401  (fsspec has no types)
         return importlib.import_module("fsspec").filesystem(protocol, use_listings_cache=False)
     except ModuleNotFoundError as error:
         if error.name == "fsspec":
-            raise MissingExtra(
+            raise MissingExtra.for_extra(
+                "cluster",
                 "the package fsspec is not installed",
                 f"expected it to be installed, because it reads {protocol}:// URLs",
-                "run: pip install 'brewster[cluster]'",
             ) from error
         raise _missing_package(protocol, error) from error
     except ImportError as error:

@@ -121,8 +121,8 @@ def import_parquet(purpose: str) -> Any:  # noqa: ANN401  (pyarrow has no types)
     try:
         return importlib.import_module("pyarrow.parquet")
     except ImportError as error:
-        raise MissingExtra(
+        raise MissingExtra.for_extra(
+            "cluster",
             "the package pyarrow is not installed",
             f"expected pyarrow, because {purpose} is a Parquet table",
-            "run: pip install 'brewster[cluster]'",
         ) from error

@@ -215,10 +215,10 @@ def _rendered_samples(folder: Path) -> list[tuple[str, list[ImageFile]]]:
 
         entries = list(read_dataset(folder))
     except ImportError as error:
-        raise MissingExtra(
+        raise MissingExtra.for_extra(
+            "render",
             "torch is not installed",
             "expected torch, which brewster needs to read rendered datasets",
-            "run: pip install 'brewster[render]'",
         ) from error
     except (OSError, tarfile.TarError, ValueError) as error:
         raise _not_a_rendered_dataset(folder, str(error)) from error

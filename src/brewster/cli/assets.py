@@ -55,7 +55,7 @@ def assets() -> None:
     type=click.Choice(["hdr", "exr"]),
     default="hdr",
     show_default=True,
-    help="The file format of the maps; exr files need the extra brewster[exr].",
+    help="The file format of the maps; exr files need the extra exr.",
 )
 @click.option(
     "--server",

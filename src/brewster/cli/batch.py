@@ -25,7 +25,7 @@ from brewster.cli.terminal import (
     progress,
     write_out,
 )
-from brewster.errors import ModelError
+from brewster.errors import INSTALL_COMMAND, ModelError
 from brewster.models import zoo
 from brewster.options import Options
 from brewster.remote_path import location
@@ -212,7 +212,7 @@ class _Summary:
     def add(self, result: FileResult, *, has_contact_sheet: bool) -> None:
         """Counts a result."""
         self.counts[result.status] += 1
-        if result.error and "pip install 'brewster[" in result.error:
+        if result.error and INSTALL_COMMAND in result.error:
             self._sources_by_missing_extra[result.error].append(result.source)
         elif result.error:
             self._errors.append(_error_text(result))

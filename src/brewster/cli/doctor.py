@@ -17,7 +17,7 @@ import click
 from brewster.cli.extras import CORE, EXTRAS
 from brewster.cli.models import describe
 from brewster.cli.terminal import print_out
-from brewster.errors import BrewsterError, MissingExtra
+from brewster.errors import INSTALL_COMMAND, BrewsterError, MissingExtra, install_command
 from brewster.image_formats import FORMATS, WRITABLE
 from brewster.models import zoo
 
@@ -50,7 +50,8 @@ class Check:
 def doctor(context: click.Context, *, as_json: bool) -> None:
     """Check what works on this machine and what is missing.
 
-    The command that installs a missing part is printed below it. The exit code is 1 if a required part does not work.
+    The command that installs a missing part is printed below it. Commands with constraints.txt must be run in the root of the
+    repository of brewster. The exit code is 1 if a required part does not work.
     """
     checks = list(run_checks())
     is_healthy = all(check.status == "ok" for check in checks if check.needed)
@@ -89,7 +90,7 @@ def _packages() -> Iterator[Check]:
         missing = [package for package, version in versions.items() if version is None]
         found = ", ".join(f"{package} {version}" for package, version in versions.items() if version)
         detail = f"{'without ' + ', '.join(missing) if missing else found}"
-        cure = f"pip install 'brewster[{extra}]'" if missing else None
+        cure = install_command(extra) if missing else None
         yield Check("extras", extra, "missing" if missing else "ok", detail, cure, needed=False)
 
 
@@ -166,7 +167,7 @@ def _try_format(format_name: str, detail: str, encode_sample: Callable[[], bytes
     try:
         Photo.open(encode_sample())
     except MissingExtra as error:
-        cure = f"pip install 'brewster[{extra}]'"
+        cure = install_command(extra) if extra else None
         return Check("formats", format_name, "missing", str(error), cure, needed=False)
     except BrewsterError as error:
         cure = "pip install --force-reinstall pyvips-binary"
@@ -177,7 +178,7 @@ def _try_format(format_name: str, detail: str, encode_sample: Callable[[], bytes
 def _models() -> Iterator[Check]:
     for row in map(describe, zoo.MODELS.values()):
         if row["error"]:
-            cure = "pip install --force-reinstall brewster"
+            cure = f"git restore src/brewster/models/weights; {INSTALL_COMMAND} ."
             yield Check("models", row["name"], "broken", row["error"], cure)
         else:
             yield Check("models", row["name"], "ok", f"sha256 {row['sha256']}")

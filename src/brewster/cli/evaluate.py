@@ -380,14 +380,14 @@ def _default_workers(case_count: int) -> int:
 
 def print_failures(results: Results, *, quiet: bool) -> bool:
     """Prints remarks about methods, metrics without scores, and errors. Returns whether all predictions were scored."""
-    from brewster.evaluate.report.tables import failures, remarks  # noqa: PLC0415
+    from brewster.evaluate.report.tables import failures, remarks, unavailable_metrics  # noqa: PLC0415
 
     for remark in () if quiet else remarks(results):
         print_status(remark)
     for name in results["unmeasured"]:
         print_status(f"{name} was not computed: no image has the ground truth that it needs")
-    for name, reason in results["unavailable"].items():
-        print_error(f"{name} was not computed: {reason}")
+    for metrics in unavailable_metrics(results):
+        print_error(f"not computed: {metrics}")
     if results["unavailable"]:
         print_status(
             "run the same command again to add the missing metrics; all other scores are kept in scores.jsonl"

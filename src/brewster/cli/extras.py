@@ -81,8 +81,8 @@ def require_extra(name: str, purpose: str, *, without: frozenset[str] = frozense
         if package not in without and importlib.util.find_spec(module) is None
     ]
     if missing:
-        raise MissingExtra(
+        raise MissingExtra.for_extra(
+            name,
             f"{purpose} needs packages that are not installed: {', '.join(missing)}",
-            f"expected the extra brewster[{name}]",
-            f"run: pip install 'brewster[{name}]'",
+            f"expected the extra {name}",
         )

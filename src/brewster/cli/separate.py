@@ -270,6 +270,9 @@ def separate(
 
 def _print_plan(photos: tuple[str, ...], output: str | None, options: Options, gpu_name: str | None) -> None:
     """Prints the estimated resources of the first photo. Raises DeviceError if they exceed the GPU."""
+    from brewster.models.zoo import check_diffusion_model  # noqa: PLC0415
+
+    check_diffusion_model(options.model)
     require_extra("diffusion", "a plan")
     from brewster.batch.runner import read_content  # noqa: PLC0415
     from brewster.inference.separation_plan import plan_separation  # noqa: PLC0415  (imports torch)

@@ -77,13 +77,13 @@ def train(
     run longer, raise `steps` in the recipe and run the command again. To train a LoRA on several GPUs (data parallel),
     start the command with torchrun.
     """
-    require_extra("train", "training")
     if show_recipe:
         _show_recipe(show_recipe)
         return
+    require_extra("train", "training")
     if recipe is None:
         raise click.UsageError("The recipe is missing. Usage: brewster train RECIPE.")
-    from brewster.training.recipe import LoraRecipe, read_recipe  # noqa: PLC0415  (imports torch, two seconds)
+    from brewster.training.recipe import LoraRecipe, read_recipe  # noqa: PLC0415
 
     parsed, out = read_recipe(recipe), out or Path("out") / recipe.stem
     if isinstance(parsed, LoraRecipe):

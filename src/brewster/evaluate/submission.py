@@ -5,9 +5,7 @@ export_ntire2026(Path("OpenRR-5k"), method, Path("out/ntire2026"))  # [.../val_3
 
 from __future__ import annotations
 
-import io
-import zipfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Final
@@ -18,6 +16,7 @@ from brewster.errors import BrewsterError, PhotoError
 from brewster.evaluate.methods import Method
 from brewster.files import write_atomically
 from brewster.photo import Photo
+from brewster.photo.open_raster import zip_images
 
 _JPEG_QUALITY: Final = 100
 """The contest's script reads JPEG files only. At quality 100 without chroma subsampling, they are close to lossless."""
@@ -88,14 +87,12 @@ def export_ntire2026(
 
 
 def _packed(split: str, photos: Path, method: Method, on_progress: Callable[[str], None]) -> bytes:
-    buffer = io.BytesIO()
-    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_STORED) as archive:
+    def predictions() -> Iterator[tuple[str, bytes]]:
         for path in image_files(photos)[0]:
             on_progress(path.stem)
-            # A fixed date, so that equal predictions give equal bytes.
-            entry = zipfile.ZipInfo(f"{path.stem}.jpg", (1980, 1, 1, 0, 0, 0))
-            archive.writestr(entry, _prediction(split, photos, path, method))
-    return buffer.getvalue()
+            yield f"{path.stem}.jpg", _prediction(split, photos, path, method)
+
+    return zip_images(predictions())
 
 
 def _prediction(split: str, photos: Path, path: Path, method: Method) -> bytes:

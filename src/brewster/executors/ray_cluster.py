@@ -114,10 +114,10 @@ def _ray() -> ModuleType:
     try:
         ray = importlib.import_module("ray")
     except ImportError as error:
-        raise MissingExtra(
+        raise MissingExtra.for_extra(
+            "cluster",
             "the package ray is not installed",
             "expected the package ray for --cluster",
-            "run: pip install 'brewster[cluster]'",
         ) from error
     # Ray prints lost processes on standard output, which is reserved for --json. There is no option to prevent this.
     importlib.import_module("ray._private.worker")._worker_logs_enabled = False  # type: ignore[attr-defined]

@@ -26,6 +26,7 @@ from brewster.models.diffusion.cost import (
     GraphicsCard,
     block_bytes,
     check_gpu_memory,
+    cost_table,
     count_parameters,
     forward_tflop,
 )
@@ -44,7 +45,7 @@ from brewster.models.diffusion.panels import count_tokens
 from brewster.models.diffusion.pipeline import DecompositionPipeline, task_with_guidance
 from brewster.models.diffusion.task import DecompositionTask
 from brewster.models.diffusion_models import licence_of
-from brewster.models.zoo import TINY_PREFIX, is_diffusion_model
+from brewster.models.zoo import TINY_PREFIX, check_diffusion_model
 from brewster.options import Options
 
 _CONTEXT_GIB: Final = 0.6
@@ -91,18 +92,21 @@ class SeparationPlan:
             f"{count} of {width} x {height}" for (width, height), count in Counter(self.panels).items()
         )
         host = self.placement.host_gib(self.parameter_count)
-        rows = {
+        model = {
             "model": f"{self.model}, {self.parameter_count / 1e9:.2f} billion parameters",
             "licence": self.licence,
             "weights": f"{self.placement.quantization or 'bf16'}, {'offloaded by layers' if host else 'on the GPU'}",
             "tiles": f"{tiles} pixels a panel; {self.passes} passes of the transformer",
-            **{f"memory, {name}": f"{gib:.1f} GiB" for name, gib in self.memory_gib.items()},
-            "memory": f"{self.total_gib:.1f} GiB of {self.card.memory_gib:g} on {self.card.name} (estimate)",
-            "host memory": f"{host:.1f} GiB for the weights (estimate)",
-            "download": f"{self.download_gb:.0f} GB, of them {self.text_encoder_gb:.0f} GB text encoders (estimate)",
-            "per photo": f"{self.tflop:.0f} TFLOP, {self.seconds:.1f} s (estimate)",
         }
-        return "\n".join(f"{name:24}{value}" for name, value in rows.items())
+        return cost_table(
+            model,
+            {"per photo": f"{self.tflop:.0f} TFLOP, {self.seconds:.1f} s (estimate)"},
+            memory_gib=self.memory_gib,
+            card=self.card,
+            host_memory=f"{host:.1f} GiB for the weights",
+            download_gb=self.download_gb,
+            text_encoder_gb=self.text_encoder_gb,
+        )
 
     def check_fits(self) -> None:
         """Checks that the separation fits into the memory of the card.
@@ -126,12 +130,7 @@ def plan_separation(options: Options, size: tuple[int, int], card: GraphicsCard)
         DeviceError: the weights cannot be offloaded with the requested quantization.
         MissingExtra: diffusers is not installed.
     """
-    if not is_diffusion_model(options.model):
-        raise ModelError(
-            f"a plan was requested for the model {options.model}",
-            "expected a diffusion model, because other models need less than 1 GB",
-            "leave the plan out",
-        )
+    check_diffusion_model(options.model)
     source = find_model_source(options.model, options.base_model, allow_download=False)
     is_known = is_registered(source.base) or Path(source.base).is_dir()
     backbone = skeleton(source.base if is_known else source.backbone_class.name, dtype=torch.bfloat16)

@@ -343,10 +343,10 @@ def _open_pipeline(model: str, **options: Any) -> DecompositionPipeline:  # noqa
     try:
         from brewster.models.diffusion.pipeline import load_pipeline  # noqa: PLC0415  (imports torch)
     except ImportError as error:
-        raise MissingExtra(
+        raise MissingExtra.for_extra(
+            "diffusion",
             f"{error.name} is not installed",
             f"expected {error.name}, because the model {model} needs it",
-            "run: pip install 'brewster[diffusion]'",
         ) from error
     return load_pipeline(model, **options)
 

@@ -156,10 +156,10 @@ def _load() -> Dists:
     try:
         import torch  # noqa: PLC0415 - an extra
     except ImportError as error:
-        raise MissingExtra(
+        raise MissingExtra.for_extra(
+            "evaluate",
             "torch is not installed",
             "expected torch, which brewster needs for DISTS",
-            "run: pip install 'brewster[evaluate]'",
         ) from error
     texture, structure = (tuple(map(torch.from_numpy, part)) for part in read_channel_weights())
     return Dists(_pairs(load_vgg16()), texture, structure)

@@ -196,10 +196,10 @@ def _load() -> Lpips:
     try:
         import torch  # noqa: PLC0415 - an extra
     except ImportError as error:
-        raise MissingExtra(
+        raise MissingExtra.for_extra(
+            "evaluate",
             "torch is not installed",
             "expected torch, which brewster needs for LPIPS",
-            "run: pip install 'brewster[evaluate]'",
         ) from error
     tensors = [*load_alexnet().values()]
     weights = [weight.to(memory_format=torch.channels_last) for weight in tensors[::2]]  # faster on the CPU

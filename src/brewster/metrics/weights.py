@@ -16,6 +16,7 @@ import io
 import os
 import pickle
 import struct
+import sys
 import zipfile
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -188,13 +189,22 @@ def _fetch(remote: RemoteFile, digest: str, cached: Path, downloader: Downloader
 
 
 def _download(remote: RemoteFile, target: Path, downloader: Downloader, names: tuple[str, str, str]) -> None:
-    """Downloads the weights of a network. `names` are the network, its metric, and the file that replaces the download."""
+    """Downloads the weights of a network. `names` are the network, its metric, and the file that replaces the download.
+
+    Before the download, its size and licence are printed on standard error, and how to avoid it.
+    """
     network, metric, file_name = names
+    size = f"{remote.size / 2**20:.0f} MiB"
+    sys.stderr.write(
+        f"downloading {size}, {network}'s weights for {metric}, to {target.parent}; licence: BSD-3-Clause; to avoid the download, "
+        f"put {file_name} into the folder weights of BREWSTER_DATA, or leave {metric} out with --metrics\n"
+    )
+    sys.stderr.flush()
     try:
         downloader.fetch(remote, target)
     except DownloadError as error:
         raise DownloadError(
-            f"{network}'s weights for {metric} ({remote.size / 2**20:.0f} MiB) could not be downloaded: {str(error).rstrip('.')}",
+            f"{network}'s weights for {metric} ({size}) could not be downloaded: {error.happened}",
             f"expected a network connection, or {file_name} in the folder weights of BREWSTER_DATA",
             f"connect and try again, or leave {metric} out with --metrics",
         ) from error

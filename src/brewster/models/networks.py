@@ -7,13 +7,13 @@ A training recipe selects a row with `network = "..."`. Checkpoints and the expo
 
 from __future__ import annotations
 
+import pkgutil
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Final, final
+from typing import TYPE_CHECKING, Final, final
 
-from torch import nn
-
-from brewster.models import compact
+if TYPE_CHECKING:
+    from torch import nn
 
 
 @final
@@ -38,9 +38,22 @@ MAX_STRIDE: Final = 32
 
 DEFAULT_NETWORK: Final = "lite2-unet"
 
+
+def _imported(path: str) -> Callable[[], nn.Module]:
+    """Returns the function at an import path. It is imported when it is called, because the names of networks need no torch."""
+
+    def build() -> nn.Module:
+        network: nn.Module = pkgutil.resolve_name(path)()
+        return network
+
+    return build
+
+
 NETWORKS: Final[dict[str, NetworkEntry]] = {
     DEFAULT_NETWORK: NetworkEntry(
-        compact.CompactNetwork, compact.with_imagenet_features, stride=compact.STRIDE
+        _imported("brewster.models.compact:CompactNetwork"),
+        _imported("brewster.models.compact:with_imagenet_features"),
+        stride=32,
     ),
 }
 """The networks by name. The key `network` of a training recipe is such a name."""

@@ -96,6 +96,20 @@ def is_diffusion_model(name: str) -> bool:
     return name in DIFFUSION_NAMES or name.startswith(TINY_PREFIX) or Path(name).is_dir() or _is_hub_id(name)
 
 
+def check_diffusion_model(name: str) -> None:
+    """Checks that `name` is that of a diffusion model, because only these need a plan. Needs no torch.
+
+    Raises:
+        ModelError: it is not.
+    """
+    if not is_diffusion_model(name):
+        raise ModelError(
+            f"a plan was requested for the model {name}",
+            "expected a diffusion model, because other models need no GPU and no download",
+            "leave the plan out",
+        )
+
+
 def model_name(model: str) -> str:
     """The short name of a model for reports: a registered name, the stem of a file, or the name of a folder.
 

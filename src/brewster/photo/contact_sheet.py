@@ -43,6 +43,8 @@ def write_contact_sheets(
         PhotoError: an image file cannot be read.
         OutputError: the sheet cannot be written.
     """
+    if not _SYSTEM_FONTS.exists():
+        os.environ.setdefault("FONTCONFIG_FILE", str(_PACKAGED_FONTS))  # ignored on Windows and macOS
     for number, first in enumerate(range(0, len(rows), _MAX_ROWS), 1):
         images = [
             _row([Photo.open(file, max_pixels=max_pixels) for file in (source, *layers)], str(source))
@@ -79,8 +81,6 @@ def _row(photos: Sequence[Photo], label: str) -> Encoded:
     canvas[:_ROW_PX] = images
     printable = "".join(letter if letter.isprintable() else "?" for letter in label)
     escaped = printable.replace("&", "&amp;").replace("<", "&lt;")  # Pango reads markup
-    if not _SYSTEM_FONTS.exists():
-        os.environ.setdefault("FONTCONFIG_FILE", str(_PACKAGED_FONTS))  # ignored on Windows and macOS
     # If the path is too long for the row, only its end is shown.
     text = pyvips.Image.text(escaped, dpi=90).numpy()[:_LABEL_PX, -images.shape[1] :]
     canvas[_ROW_PX : _ROW_PX + text.shape[0], : text.shape[1]] = 255 - text[..., None]

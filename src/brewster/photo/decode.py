@@ -326,10 +326,10 @@ def _open_heic(data: bytes, max_pixels: int) -> Any:  # noqa: ANN401  (pillow-he
     try:
         import pillow_heif  # noqa: PLC0415  (an extra, because of the patents on HEVC)
     except ImportError as error:
-        raise MissingExtra(
+        raise MissingExtra.for_extra(
+            "heic",
             "the pillow-heif package is not installed",
             "expected it to be installed, because HEIC files need it",
-            "run: pip install 'brewster[heic]'",
         ) from error
     try:
         heif = pillow_heif.open_heif(data, convert_hdr_to_8bit=False)

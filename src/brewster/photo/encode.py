@@ -139,10 +139,10 @@ def _encode_heic(array: Stored, file_info: FileInfo) -> bytes:
     try:
         import pillow_heif  # noqa: PLC0415  (an extra, because of the patents on HEVC)
     except ImportError as error:
-        raise MissingExtra(
+        raise MissingExtra.for_extra(
+            "heic",
             "the pillow-heif package is not installed",
             "expected it to be installed, because HEIC files need it",
-            "run: pip install 'brewster[heic]'",
         ) from error
     height, width, channels = array.shape
     mode = {1: "L", 2: "LA", 3: "RGB", 4: "RGBA"}[channels] + (";16" if file_info.bits > 8 else "")

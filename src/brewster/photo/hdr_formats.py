@@ -61,10 +61,10 @@ def _openexr() -> types.ModuleType:
     try:
         import OpenEXR  # noqa: PLC0415  (an extra: only EXR files need it)
     except ImportError as error:
-        raise MissingExtra(
+        raise MissingExtra.for_extra(
+            "exr",
             "the OpenEXR package is not installed",
             "expected it to be installed, because EXR files need it",
-            "run: pip install 'brewster[exr]'",
         ) from error
     return OpenEXR  # type: ignore[no-any-return]
 

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import io
 import zipfile
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import Final, final
 
@@ -22,7 +23,8 @@ from brewster.photo.photo import Photo
 
 _FORMAT: Final = "ora"
 _MIME_TYPE: Final = "image/openraster"
-_EPOCH: Final = (1980, 1, 1, 0, 0, 0)  # with a fixed date, the same input gives the same bytes
+_EPOCH: Final = (1980, 1, 1, 0, 0, 0)
+"""The date of all files in a zip archive: the earliest possible one."""
 _THUMBNAIL_PX: Final = 256  # the maximum of the specification
 _STACK: Final = """<?xml version="1.0" encoding="UTF-8"?>
 <image version="0.0.6" w="{width}" h="{height}">
@@ -32,6 +34,18 @@ _STACK: Final = """<?xml version="1.0" encoding="UTF-8"?>
  </stack>
 </image>
 """
+
+
+def zip_images(files: Iterable[tuple[str, bytes]]) -> bytes:
+    """Returns a zip archive of (name, content) in this order. The same files always give the same bytes.
+
+    The archive is not compressed, because image files are already compressed.
+    """
+    archive_file = io.BytesIO()
+    with zipfile.ZipFile(archive_file, "w", zipfile.ZIP_STORED) as archive:
+        for name, data in files:
+            archive.writestr(zipfile.ZipInfo(name, _EPOCH), data)
+    return archive_file.getvalue()
 
 
 @final
@@ -70,11 +84,7 @@ class LayeredImage:
             "mergedimage.png": Photo(photo.pixels, photo.alpha, info).encode(),
             "Thumbnails/thumbnail.png": photo.thumbnail(_THUMBNAIL_PX).encode("png", depth=8),
         }
-        file = io.BytesIO()
-        with zipfile.ZipFile(file, "w", zipfile.ZIP_STORED) as archive:
-            for name, data in files.items():
-                archive.writestr(zipfile.ZipInfo(name, _EPOCH), data)
-        return file.getvalue()
+        return zip_images(files.items())
 
     def _like_photo(self) -> Photo:
         """Returns the transmission in the colour space of the photo. An additive transmission is stored as linear floats."""

@@ -80,10 +80,10 @@ def _rawpy() -> types.ModuleType:
     try:
         import rawpy  # noqa: PLC0415  (an extra: only RAW files need it)
     except ImportError as error:
-        raise MissingExtra(
+        raise MissingExtra.for_extra(
+            "raw",
             "the rawpy package is not installed",
             "expected it to be installed, because RAW files need it",
-            "run: pip install 'brewster[raw]'",
         ) from error
     module: types.ModuleType = rawpy
     return module

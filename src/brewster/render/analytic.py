@@ -95,7 +95,7 @@ def render(scene: Scene, assets: Assets, device: Device = "cpu") -> LinearSample
     with torch.no_grad():
         layers = (
             _render_monte_carlo(prepared, device)
-            if _needs_monte_carlo(scene)
+            if needs_monte_carlo(scene)
             else _render_deterministic(prepared)
         )
     return LinearSample(scene, **dict(zip(SAMPLE_IMAGES, layers, strict=True)))
@@ -121,7 +121,7 @@ def _prepare(scene: Scene, assets: Assets, device: Device) -> _PreparedScene:
     view = CameraView(
         scene.camera_above_glass_mm,
         scene.camera.pixel_rad,
-        scene.camera.aperture_mm if _needs_monte_carlo(scene) else 0.0,
+        scene.camera.aperture_mm if needs_monte_carlo(scene) else 0.0,
         scene.camera.focus_mm,
     )
     behind, front = (
@@ -140,7 +140,7 @@ def _prepare_side(
     return _PreparedSide(emitters, scene.glass.depth_mm if is_behind else 0.0, groups)
 
 
-def _needs_monte_carlo(scene: Scene) -> bool:
+def needs_monte_carlo(scene: Scene) -> bool:
     """Whether the glass is rough or wedged, or the defocus blur varies over the image because content is near."""
     is_near = math.isfinite(min(scene.behind.distance_mm, scene.front.distance_mm))
     return scene.glass.is_rough or scene.glass.is_wedged or (scene.camera.aperture_mm > 0 and is_near)

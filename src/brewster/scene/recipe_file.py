@@ -17,7 +17,7 @@ from typing import Any, Final, TypeVar
 from pydantic import ValidationError
 from pydantic_core import ErrorDetails, to_jsonable_python
 
-from brewster.errors import RecipeError
+from brewster.errors import RecipeError, expected_value
 from brewster.scene.recipe_keys import (
     REQUIRED,
     RecipeKey,
@@ -92,15 +92,12 @@ def _problem(
         )
     if kind == "extra_forbidden" or location[-1:] == ("[key]",):
         return _unknown_key(model, path, value, source)
-    message = details["msg"].removeprefix("Value error, ")
     if isinstance(value, Mapping):
         table = f" of [{_dotted(path)}]" if path else ""
-        return RecipeError(f"{source}: the values{table} are inconsistent", message, cure)
+        return RecipeError(f"{source}: the values{table} are inconsistent", expected_value(details), cure)
     happened = f"{source}: {_dotted(path)} is {_shortened(value)}"
-    if kind == "value_error":
-        return RecipeError(happened, message, cure)
-    if kind == "finite_number":
-        return RecipeError(happened, "expected a finite number", cure)
+    if kind in {"value_error", "finite_number"}:
+        return RecipeError(happened, expected_value(details), cure)
     allowed = [name for name in literal_values(model, path) if isinstance(name, str)]
     close = get_close_matches(str(value), allowed, n=1)
     return RecipeError(happened, _expected(model, path), f'did you mean "{close[0]}"?' if close else cure)

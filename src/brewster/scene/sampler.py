@@ -13,7 +13,7 @@ from typing import Final
 from pydantic import ValidationError
 
 from brewster import __version__
-from brewster.errors import RecipeError
+from brewster.errors import RecipeError, expected_value
 from brewster.scene.camera import Camera, axes, dot
 from brewster.scene.glass import Glazing, Pane, Point
 from brewster.scene.recipe import CameraRecipe, CameraResponseRecipe, GlassRecipe, SceneRecipe, SideRecipe
@@ -53,7 +53,7 @@ def draw(recipe: SceneRecipe, catalog: Catalog, seed: int, index: int) -> Scene:
         try:
             return _draw_once(recipe, catalog, rng, seed, index)
         except ValidationError as error:
-            reason = error.errors()[0]["msg"].removeprefix("Value error, ")
+            reason = expected_value(error.errors()[0])
     raise RecipeError(
         f"the recipe {recipe.name!r} gave no possible scene in {_MAX_ATTEMPTS} attempts",
         reason,

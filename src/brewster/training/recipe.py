@@ -1,6 +1,7 @@
 """Training recipes: the settings of one training run, read from TOML into frozen models.
 
-Data paths in a recipe are relative to the folder in the environment variable BREWSTER_DATA.
+Data paths in a recipe are relative to the folder in the environment variable BREWSTER_DATA. This module imports no torch, so that
+`brewster train --show-recipe` does not need it.
 """
 
 from __future__ import annotations
@@ -18,8 +19,13 @@ from pydantic import AfterValidator, Field, model_validator
 from brewster.errors import RecipeError
 from brewster.models.diffusion.panels import Direction, Panel, PanelLayout
 from brewster.models.diffusion.prompt import PROMPTS
-from brewster.models.diffusion.sampling import GUIDANCE, STEPS
-from brewster.models.diffusion.task import PAPER_COMPOSITE_PIXELS, DecompositionTask, Objective
+from brewster.models.diffusion.task import (
+    GUIDANCE,
+    PAPER_COMPOSITE_PIXELS,
+    STEPS,
+    DecompositionTask,
+    Objective,
+)
 from brewster.models.networks import DEFAULT_NETWORK, MAX_STRIDE, NETWORKS
 from brewster.models.zoo import TINY_PREFIX
 from brewster.options import Quantization
@@ -33,8 +39,7 @@ from brewster.scene.values import (
     Seed,
     Share,
 )
-from brewster.training.data.data_recipe import DataRecipe
-from brewster.training.data.mixtures import MixRecipe, Pairs
+from brewster.training.data.data_recipe import PAIR_REFLECTION_WEIGHT, DataRecipe, MixRecipe
 
 _REFERENCE: Final = "docs/recipes.md"
 
@@ -202,7 +207,7 @@ class LoraRecipe(TrainingRecipe):
     reflections: Literal["given", "difference"] = "given"
     """R of real pairs. given: from the reflection image of the pair; every pair must have one if R is a panel. difference: pairs
     without one get R = I - T in linear light."""
-    derived_reflection_weight: NonNegativeFloat = Pairs.reflection_weight
+    derived_reflection_weight: NonNegativeFloat = PAIR_REFLECTION_WEIGHT
     """Weight of panel R in the loss of pairs whose reflection is the difference I - T; 1 is the weight of a given reflection."""
     prompt: str = "paper"
     """The name of a prompt, which the text encoder of the backbone encodes, or a .safetensors file with an encoded prompt,

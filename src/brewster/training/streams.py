@@ -19,11 +19,10 @@ from brewster.environments.assets import Assets
 from brewster.environments.catalog import read_catalog
 from brewster.errors import RecipeError
 from brewster.scene.recipe import SceneRecipe, read_scene_recipe
-from brewster.training.data.data_recipe import DataRecipe, RenderedRecipe
+from brewster.training.data.data_recipe import DataRecipe, MixRecipe, RenderedRecipe
 from brewster.training.data.image_loading import read_maps, read_pairs, read_photos, source_weights
 from brewster.training.data.mixtures import (
     InterleavedStream,
-    MixRecipe,
     Mixtures,
     Pairs,
     Stream,

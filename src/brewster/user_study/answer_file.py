@@ -13,7 +13,7 @@ from typing import Annotated, Final, Literal, final
 
 from pydantic import AwareDatetime, ConfigDict, Field, TypeAdapter, ValidationError
 
-from brewster.errors import BrewsterError
+from brewster.errors import BrewsterError, invalid_value
 from brewster.user_study.assignment import Choice
 from brewster.user_study.store import ViewingConditions
 
@@ -76,9 +76,9 @@ def read_answer_file(path: Path) -> AnswerFile:
     try:
         return _ANSWER_FILE.validate_json(data)
     except ValidationError as error:
-        first = error.errors()[0]
+        problem = invalid_value(error.errors()[0])
         raise BrewsterError(
-            f"{path} is not a valid file of answers ({'.'.join(map(str, first['loc'])) or 'file'}: {first['msg']})",
-            "expected an unchanged file that the page of the study has written",
+            f"{path} is not a valid file of answers: {problem.happened}",
+            f"{problem.expected}, as in the file that the page of the study has written",
             "ask the participant to download the answers again",
         ) from error

@@ -18,7 +18,7 @@ from typing import Final, final
 
 from pydantic import TypeAdapter, ValidationError
 
-from brewster.errors import BrewsterError
+from brewster.errors import BrewsterError, invalid_value
 from brewster.files import write_atomically
 
 DESCRIPTION_FILE: Final = "study.json"
@@ -178,10 +178,10 @@ def read_study(folder: Path) -> Study:
             "check the path",
         ) from error
     except ValidationError as error:
-        first = error.errors()[0]
+        problem = invalid_value(error.errors()[0])
         raise BrewsterError(
-            f"{path} is not a valid description of a study ({'.'.join(map(str, first['loc']))}: {first['msg']})",
-            "expected an unchanged file written by `brewster study create`",
+            f"{path} is not a valid description of a study: {problem.happened}",
+            f"{problem.expected}, as in the file that `brewster study create` has written",
             "restore the original file, or create the study again",
         ) from error
     if description.format != FORMAT_VERSION:

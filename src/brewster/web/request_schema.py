@@ -15,6 +15,7 @@ from starlette.exceptions import HTTPException
 from starlette.formparsers import MultiPartException, MultiPartParser
 from starlette.requests import Request
 
+from brewster.errors import invalid_value
 from brewster.files import OUTPUT_LAYERS, SeparationPaths
 from brewster.image_formats import SUFFIXES
 from brewster.options import Options
@@ -150,12 +151,8 @@ def safe_name(name: str) -> str:
 
 
 def validation_message(errors: Iterable[Any]) -> str:
-    """Returns the validation errors of pydantic as one message."""
-    found = (
-        f"{'.'.join(map(str, error['loc']))} is {str(error['input'])[:40]!r}; {error['msg']}"
-        for error in errors
-    )
-    return "; ".join(found)
+    """Returns the validation errors of pydantic as one message, with three parts for each error."""
+    return " ".join(str(invalid_value(error)) for error in errors)
 
 
 def _options(form: FormData, models: Sequence[str], max_pixels: int) -> Options:

@@ -10,10 +10,8 @@ from __future__ import annotations
 
 import gzip
 import hashlib
-import io
 import time
-import zipfile
-from collections.abc import Awaitable, Callable, Mapping
+from collections.abc import Awaitable, Callable
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal, final
@@ -28,6 +26,7 @@ import brewster
 from brewster.image_formats import SUFFIXES
 from brewster.inference.predictor import ProgressCallback
 from brewster.photo import Photo
+from brewster.photo.open_raster import zip_images
 from brewster.web.job_queue import JobProgress, JobQueue
 from brewster.web.model_cache import ModelCache, ModelRow
 from brewster.web.preview import PhotoCache, photo_tile, preview
@@ -35,7 +34,6 @@ from brewster.web.request_schema import SeparationRequest, form_schema, read_for
 
 _GZIP_LEVEL: Final = 1  # higher levels save little more and take several times longer
 _TILE_HEADERS: Final = {"Cache-Control": "private, max-age=3600"}
-_EPOCH: Final = (1980, 1, 1, 0, 0, 0)  # the earliest date of zip; a fixed date makes the archive reproducible
 
 
 @final
@@ -171,7 +169,9 @@ def _separate(model_cache: ModelCache, form: SeparationRequest, on_progress: Pro
         name = form.target(layer, separation.photo.file_info.format_name)
         files[name] = getattr(separation, layer).encode(SUFFIXES[Path(name).suffix.lower()].name)
     name, data = (
-        next(iter(files.items())) if len(files) == 1 else (f"{Path(form.name).stem}.zip", _zip(files))
+        next(iter(files.items()))
+        if len(files) == 1
+        else (f"{Path(form.name).stem}.zip", zip_images(files.items()))
     )
     headers = {
         "Content-Disposition": _content_disposition(name),
@@ -218,15 +218,6 @@ def _media_type(name: str) -> str:
     if name.endswith(".zip"):
         return "application/zip"
     return SUFFIXES[Path(name).suffix.lower()].mime_type
-
-
-def _zip(files: Mapping[str, bytes]) -> bytes:
-    """Returns a zip archive of files. The archive is not compressed, because image files are already compressed."""
-    archive_file = io.BytesIO()
-    with zipfile.ZipFile(archive_file, "w", zipfile.ZIP_STORED) as archive:
-        for name, data in files.items():
-            archive.writestr(zipfile.ZipInfo(name, _EPOCH), data)
-    return archive_file.getvalue()
 
 
 def _content_disposition(name: str) -> str:

@@ -150,7 +150,9 @@ class _StudyRoutes:
         participant_token = self.store.admit(max_participants=self.max_participants)
         if participant_token is None:
             raise HTTPException(
-                403, "the study has all the participants that it needs; thank you for your interest"
+                403,
+                "the study has all the participants that it needs; expected a study that needs more; "
+                "thank you for your interest",
             )
         return self._link(participant_token)
 
@@ -188,7 +190,8 @@ class _StudyRoutes:
         except FileNotFoundError as error:
             raise HTTPException(
                 410,  # not 500: the page repeats requests that fail with 500 or more
-                "a picture is missing on the server; please inform the person who runs the study",
+                "a picture is missing on the server; expected all pictures of the study; "
+                "please inform the person who runs the study",
             ) from error
         return Response(data, media_type="image/png", headers=_CACHED)
 
@@ -217,7 +220,9 @@ class _StudyRoutes:
         participant = self.store.participant(participant_token)
         if participant is None:
             raise HTTPException(
-                404, "this link is unknown; check that it is complete, or begin at the start page"
+                404,
+                "this link is unknown; expected the personal link of a participant; "
+                "check that it is complete, or begin at the start page",
             )
         return participant
 
@@ -250,5 +255,8 @@ def _practice(participant: Participant) -> assignment.Trial:
 
 def _trial(participant: Participant, trial: int) -> assignment.Trial:
     if not 0 <= trial < len(participant.trials):
-        raise HTTPException(404, f"there is no trial {trial}; load the page again")
+        raise HTTPException(
+            404,
+            f"there is no trial {trial}; expected a trial from 0 to {len(participant.trials) - 1}; load the page again",
+        )
     return participant.trials[trial]

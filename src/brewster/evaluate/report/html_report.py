@@ -23,7 +23,7 @@ from brewster.evaluate.report.images import (
     MAX_SIDE_PX,
     CaseThumbnails,
 )
-from brewster.evaluate.report.tables import is_complete, ranking, remarks
+from brewster.evaluate.report.tables import is_complete, ranking, remarks, unavailable_metrics
 from brewster.files import atomic_path
 
 Results = Mapping[str, Any]
@@ -124,7 +124,7 @@ def _problems(results: Results) -> Iterator[str]:
     all_remarks = benchmark_remarks + remarks(results)
     yield _note(
         "Metrics that were not computed. Correct the cause, then run the evaluation again to add them.",
-        [f"{name}: {reason}" for name, reason in results["unavailable"].items()],
+        unavailable_metrics(results),
     )
     yield _note(_count(len(excluded), "file excluded"), excluded)
     yield _note(_count(len(all_remarks), "remark"), all_remarks)

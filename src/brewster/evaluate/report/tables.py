@@ -193,7 +193,7 @@ def _notes(results: Results) -> str:
         for text in (*benchmark["remarks"], *(f"excluded: {reason}" for reason in benchmark["excluded"]))
     ]
     lines += [f"- {remark}" for remark in remarks(results)]
-    lines += [f"- {name} is not computed: {reason}" for name, reason in results["unavailable"].items()]
+    lines += [f"- not computed: {metrics}" for metrics in unavailable_metrics(results)]
     lines += [
         f"- {name} is not scored: no image has the ground truth that it needs"
         for name in results["unmeasured"]
@@ -205,6 +205,14 @@ def _notes(results: Results) -> str:
 def remarks(results: Mapping[str, Any]) -> list[str]:
     """Returns the remarks on methods."""
     return [f"{name}: {about['remark']}" for name, about in results["methods"].items() if "remark" in about]
+
+
+def unavailable_metrics(results: Mapping[str, Any]) -> list[str]:
+    """Returns each reason why metrics were not computed, once, after the names of these metrics."""
+    names: dict[str, list[str]] = {}
+    for name, reason in results["unavailable"].items():
+        names.setdefault(reason, []).append(name)
+    return [f"{', '.join(metrics)}: {reason}" for reason, metrics in names.items()]
 
 
 def failures(results: Results) -> list[str]:

@@ -5,6 +5,7 @@ Parameters and operations are counted on a `skeleton`, which has no storage.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from difflib import get_close_matches
 from typing import Final, final
@@ -78,6 +79,39 @@ def check_gpu_memory(name: str, needed_gib: float, card: GraphicsCard, cure: str
             f"expected at most the {card.memory_gib:g} GiB of {card.name}",
             cure,
         )
+
+
+def cost_table(
+    model: Mapping[str, str],
+    time: Mapping[str, str],
+    *,
+    memory_gib: Mapping[str, float],
+    card: GraphicsCard,
+    host_memory: str,
+    download_gb: float,
+    text_encoder_gb: float,
+) -> str:
+    """Returns an estimate as lines of name and value: the rows of the model, memory, host memory and download, and the rows of the time.
+
+    Args:
+        model: rows about the model.
+        time: rows about the operations and the time.
+        memory_gib: the GPU memory of each part. Their sum is a row of its own.
+        card: the GPU.
+        host_memory: the host memory, in GiB, with a remark if necessary.
+        download_gb: the size of all downloads.
+        text_encoder_gb: the size of the text encoders in it.
+    """
+    total = sum(memory_gib.values())
+    rows = {
+        **model,
+        **{f"memory, {name}": f"{gib:.1f} GiB" for name, gib in memory_gib.items()},
+        "memory": f"{total:.1f} GiB of {card.memory_gib:g} on {card.name} (estimate)",
+        "host memory": f"{host_memory} (estimate)",
+        "download": f"{download_gb:.0f} GB, of which {text_encoder_gb:.0f} GB are text encoders (estimate)",
+        **time,
+    }
+    return "\n".join(f"{name:24}{value}" for name, value in rows.items())
 
 
 def is_local_gpu(card: GraphicsCard) -> bool:

@@ -22,10 +22,10 @@ def import_library(name: str) -> Any:  # noqa: ANN401 - a module of a library th
         with suppress_log_messages():
             return importlib.import_module(name)
     except ImportError as error:
-        raise MissingExtra(
+        raise MissingExtra.for_extra(
+            "diffusion",
             f"{error.name or name} cannot be imported ({error})",
             "expected it to be installed, because the diffusion models need it",
-            "run: pip install 'brewster[diffusion]'",
         ) from error
 
 
@@ -41,10 +41,10 @@ def diffusers_class(name: str) -> Any:  # noqa: ANN401 - diffusers has no types 
         with suppress_log_messages():
             return getattr(diffusers, name)
     except (AttributeError, RuntimeError) as error:  # diffusers converts errors of the import to RuntimeError
-        raise MissingExtra(
+        raise MissingExtra.for_extra(
+            "diffusion",
             f"the class {name} cannot be imported from diffusers ({error.__cause__ or error})",
             "expected a version of diffusers that has the class, and the libraries that the class needs",
-            "run: pip install --upgrade 'brewster[diffusion]'",
         ) from error
 
 

@@ -13,14 +13,11 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, Literal, final, get_args
 
-import torch
-from torch import Tensor
-from torch.nn import functional
-
 from brewster.errors import PhotoError, RecipeError
 
 if TYPE_CHECKING:
     from jaxtyping import Float
+    from torch import Tensor
 
 Panel = Literal["I", "T", "R"]
 Direction = Literal["side by side", "stacked"]
@@ -93,6 +90,8 @@ def compose(panels: Mapping[str, Tensor], layout: PanelLayout) -> Float[Tensor, 
     shapes = {name: tuple(panels[name].shape) for name in layout.panels}
     if len(set(shapes.values())) > 1:
         raise PhotoError(f"the panels have the shapes {shapes}", "expected equal shapes", "resize them first")
+    import torch  # noqa: PLC0415 - recipes are read without torch
+
     return torch.cat([panels[name] for name in layout.panels], dim=layout.axis)
 
 
@@ -132,7 +131,7 @@ def conditioning_image(photo: Float[Tensor, "n 3 h w"], layout: PanelLayout) -> 
     """
     if not layout.has_white_space:
         return photo
-    white = torch.full_like(photo, WHITE)
+    white = photo.new_full(photo.shape, WHITE)
     return compose({name: photo if name == "I" else white for name in layout.panels}, layout)
 
 
@@ -158,6 +157,8 @@ class PanelFit:
         right, below = (panel - content for panel, content in zip(self.panel, self.content, strict=True))
         if not right and not below:
             return content
+        from torch.nn import functional  # noqa: PLC0415 - recipes are read without torch
+
         return functional.pad(content, (0, right, 0, below), mode="reflect")
 
     def crop(self, panel: Float[Tensor, "n c H W"]) -> Float[Tensor, "n c h w"]:

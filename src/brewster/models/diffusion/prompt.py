@@ -12,14 +12,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, final
 
-import torch
-from torch import Tensor
-
 from brewster.errors import ModelError
 from brewster.models.diffusion.tensors import read_tensors, write_tensors
 
 if TYPE_CHECKING:
+    import torch
     from jaxtyping import Float
+    from torch import Tensor
 
 PROMPT: Final = (
     "This set of three images showcases an image decomposition task; "
@@ -117,6 +116,8 @@ def load_prompt(path: Path, backbone: str) -> PromptEmbedding:
 
 
 def _digest(backbone: str, text: str, tensors: Mapping[str, Tensor]) -> str:
+    import torch  # noqa: PLC0415 - recipes are read without torch
+
     digest = hashlib.sha256(f"{backbone}\0{text}".encode())
     for name, tensor in sorted(tensors.items()):
         digest.update(f"\0{name} {tensor.dtype} {tuple(tensor.shape)}\0".encode())

@@ -19,12 +19,11 @@ from brewster.errors import ModelError
 from brewster.models.diffusion.backbones.backbone import Backbone
 from brewster.models.diffusion.out_of_memory import explain_out_of_memory
 from brewster.models.diffusion.prompt import PromptEmbedding
+from brewster.models.diffusion.task import GUIDANCE, STEPS
 
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-STEPS: Final = 20
-GUIDANCE: Final = 4.0
 _MEMORY_HINT: Final = (
     "store the base in fewer bits (quantization), or use a smaller base_model or a GPU with more memory"
 )

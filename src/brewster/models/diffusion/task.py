@@ -13,11 +13,12 @@ from pydantic import Field, TypeAdapter
 from brewster.errors import ModelError, RecipeError
 from brewster.files import write_atomically
 from brewster.models.diffusion.panels import PanelFit, PanelLayout, fit_smaller_panel
-from brewster.models.diffusion.sampling import GUIDANCE, STEPS
 
 Objective = Literal["flow", "one_step"]
 """The objectives that brewster trains."""
 
+STEPS: Final = 20
+GUIDANCE: Final = 4.0
 PAPER_COMPOSITE_PIXELS: Final = 1536 * 512
 """The size of the paper's composite: three panels of 512 x 512 pixels."""
 TASK_FILE: Final = "task.json"

@@ -143,10 +143,10 @@ def _denoiser() -> ModuleType:
     try:
         return importlib.import_module("mitsuba_oidn")
     except ImportError as error:
-        raise MissingExtra(
+        raise MissingExtra.for_extra(
+            "render",
             "mitsuba_oidn is not installed",
             "expected the package mitsuba-oidn for denoising",
-            "run: pip install 'brewster[render]'",
         ) from error
 
 

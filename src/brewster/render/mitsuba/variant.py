@@ -123,10 +123,10 @@ def probe() -> VariantProbe:
         MissingExtra: mitsuba is not installed.
     """
     if find_spec("mitsuba") is None:
-        raise MissingExtra(
+        raise MissingExtra.for_extra(
+            "render",
             "mitsuba is not installed",
             "expected the package mitsuba for this renderer",
-            "run: pip install 'brewster[render]'",
         )
     reasons = []
     for library in _candidates():

@@ -1,15 +1,26 @@
-"""The table [data] of a training recipe: photos, real pairs and rendered samples."""
+"""The tables [data] and [mix] of a training recipe: photos, real pairs, rendered samples, and mixtures of photos.
+
+This module imports no torch, so that a recipe can be read and printed without it.
+"""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Literal, Self
+from typing import Annotated, Final, Literal, Self
 
 from pydantic import Field, model_validator
 
-from brewster.scene.values import FrozenModel, PositiveInt, Seed, Share
-from brewster.training.data.mixtures import Target
-from brewster.training.data.online import BlendSpace
+from brewster.scene.values import FrozenModel, JpegQualityRange, LogRange, PositiveInt, Range, Seed, Share
+
+Target = Literal["background", "transmission"]
+"""What a network learns to predict: the background B, which is the view without glass, or the transmission T, which is the light
+of B that the pane transmits. In linear light, photo = T + R."""
+
+BlendSpace = Literal["linear", "srgb"]
+"""How the layers of a photo are composed: in linear light, or as a blend of 8-bit images as in RDNet."""
+
+PAIR_REFLECTION_WEIGHT: Final = 0.3
+"""Weight of the reflection of a real pair in the loss. It is below 1, because photo - transmission only approximates the reflection."""
 
 
 class RenderedRecipe(FrozenModel):
@@ -113,3 +124,87 @@ class DataRecipe(FrozenModel):
                 "expected photos for the rest of each batch: pairs and rendered samples are only a part of it"
             )
         return self
+
+
+class MixRecipe(FrozenModel):
+    """Distributions of mixtures of photos: a background behind glass plus a reflection, in linear light.
+
+    `recipes/train/compact-stage4.toml` uses the defaults, except for `crop`. Luminances are linear. Lengths in pixels refer to an
+    image of 256 px and scale with the size of the training images, unless their description says otherwise.
+    """
+
+    target: Target = "transmission"
+    """What the network predicts: the transmission T, or the background B without glass."""
+    crop: Range = (0.35, 1.0)
+    """Side of the crop divided by the shorter side of the photo."""
+    temperature: Range = (-0.35, 0.35)
+    """Warmth of the light. For a value w, the gains of red and blue are about exp(w) and exp(-w)."""
+    background_map_probability: Share = 0.2
+    """Probability that the background is a view of an environment map instead of a photo."""
+    background_level: LogRange = (0.03, 0.5)
+    """Mean luminance of the background before the camera's exposure."""
+    highlight_boost: Range = (0.0, 6.0)
+    """White parts of a photo are multiplied by up to 1 + this value, because their true luminance was clipped."""
+    shadow_probability: Share = 0.15
+    """Probability of a hard shadow on the background."""
+    background_blur_probability: Share = 0.08
+    """Probability of a background that is out of focus. Without such samples, a network predicts that all blur is reflection."""
+    background_blur_sigma_px: LogRange = (0.5, 3.0)
+    """Standard deviation of the defocus blur of these backgrounds."""
+
+    no_glass_probability: Share = 0.15
+    """Probability of a sample without glass, so that the network leaves plain photos unchanged."""
+    partial_probability: Share = 0.12
+    """Probability of glass that covers only a part of the image."""
+    transmittance: Range = (0.85, 1.0)
+    """Transmittance t of the pane: T = t B."""
+    veil_probability: Share = 0.1
+    """Probability of a veil: uniform light that the pane scatters."""
+    veil: Range = (0.0, 0.1)
+    """Luminance of the veil divided by the mean luminance of the photo."""
+
+    reflection_map_probability: Share = 0.4
+    """Probability that the reflection is a view of an environment map instead of a photo."""
+    reflection_ratio: LogRange = (0.04, 2.0)
+    """Mean luminance of the reflection without its lamps, divided by that of the background."""
+    reflection_contrast: LogRange = (0.8, 1.8)
+    """Exponent on the luminance of the reflected scene. Values above 1 increase the contrast of its light sources."""
+    lamp_probability: Share = 0.15
+    """Probability of small lamps in the reflection."""
+    sign_probability: Share = 0.08
+    """Probability of a sign with letters in the reflection."""
+    reflection_sharp_probability: Share = 0.35
+    """Probability of a reflection without defocus blur."""
+    reflection_blur_sigma_px: LogRange = (0.3, 9.0)
+    """Standard deviation of the defocus blur of the other reflections."""
+    ghost_probability: Share = 0.4
+    """Probability of a ghost: a displaced copy of the reflection from the second surface of the pane."""
+    ghost_weight: Range = (0.4, 0.95)
+    """Weight of the ghost."""
+    ghost_px: float = 6.0
+    """Largest displacement of the ghost in each direction."""
+    falloff_probability: Share = 0.5
+    """Probability of a reflection that fades smoothly across the image."""
+    edge_probability: Share = 0.3
+    """Probability of a reflection that ends at a straight edge, such as a frame."""
+
+    camera_blur_probability: Share = 0.5
+    """Probability of a soft photo: one blur of background and reflection, as from a soft lens or an enlargement."""
+    camera_blur_sigma_px: LogRange = (0.3, 1.3)
+    """Standard deviation of this blur in pixels of the training image. It does not scale with the size of the image."""
+    target_luminance: Range = (0.2, 0.55)
+    """Mean luminance of the photo after exposure. A photo with a smaller mean is not brightened."""
+    overexposed_probability: Share = 0.3
+    """Probability of an overexposed photo, in which a part of the background is white."""
+    overexposed_share: Range = (0.005, 0.3)
+    """Share of white pixels in an overexposed photo."""
+    gamma: LogRange = (0.8, 1.25)
+    """Exponent on the encoded values."""
+    contrast: Range = (-0.3, 0.5)
+    """Strength of an S-shaped tone curve on the encoded values: 0 changes nothing, and negative values reduce the contrast."""
+    noise: Range = (0.0, 0.012)
+    """Standard deviation of Gaussian noise on the encoded photo."""
+    jpeg_probability: Share = 0.3
+    """Probability of JPEG compression of the photo."""
+    jpeg_quality: JpegQualityRange = (60, 97)
+    """Quality of the JPEG compression."""

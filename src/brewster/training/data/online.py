@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 from itertools import count as integers_from
 from threading import Lock
-from typing import Literal
 
 import torch
 from torch import Tensor
@@ -21,10 +20,8 @@ from brewster.render.camera_response import DevelopedSample, develop, with_jpeg
 from brewster.scene.recipe import SceneRecipe
 from brewster.scene.sampler import Catalog, draw
 from brewster.training.data.alpha_blend import blended
-from brewster.training.data.mixtures import Target, TrainingBatch
-
-BlendSpace = Literal["linear", "srgb"]
-"""How the layers of a photo are composed: in linear light, or as a blend of 8-bit images as in RDNet."""
+from brewster.training.data.data_recipe import BlendSpace, Target
+from brewster.training.data.mixtures import TrainingBatch
 
 
 class OnlineRendered:

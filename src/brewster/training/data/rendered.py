@@ -26,8 +26,9 @@ from brewster.rendered.store import SCENE_FILE, StoredSample, key, read_dataset,
 from brewster.scene.values import Range
 from brewster.srgb import to_encoded
 from brewster.training.data.alpha_blend import blended_layers
-from brewster.training.data.mixtures import Target, TrainingBatch, random_crop
-from brewster.training.data.online import BlendSpace, OnlineRendered
+from brewster.training.data.data_recipe import BlendSpace, Target
+from brewster.training.data.mixtures import TrainingBatch, random_crop
+from brewster.training.data.online import OnlineRendered
 from brewster.training.data.sample_rng import SampleRng
 
 CACHE_BYTES: Final = 1 << 30

@@ -24,6 +24,7 @@ from brewster.models.diffusion.cost import (
     GraphicsCard,
     block_bytes,
     check_gpu_memory,
+    cost_table,
     count_blocks,
     count_parameters,
     forward_tflop,
@@ -85,19 +86,25 @@ class ResourceEstimate:
         is_encoded = is_tiny or recipe.prompt.endswith(ENCODED_SUFFIX)
         encoders = 0 if is_encoded else 2 * self.text_encoder_parameters
         download = 0 if is_tiny else 2 * self.parameter_count + self.memory_gib["VAE"] * GIB + encoders
-        rows = {
+        model = {
             "backbone": f"{recipe.backbone}, {self.parameter_count / 1e9:.2f} billion parameters",
             "LoRA": f"rank {recipe.rank}, {self.lora_parameters / 1e6:.1f} million parameters",
             "panels": f"{' '.join(recipe.panels)}, {width} x {height} each, for a square photo",
             "tokens": f"{self.generated_tokens} generated, {self.condition_tokens} condition, {PROMPT_TOKENS} text",
-            **{f"memory, {name}": f"{gib:.1f} GiB" for name, gib in self.memory_gib.items()},
-            "memory": f"{self.total_gib:.1f} GiB of {self.card.memory_gib:g} on {self.card.name} (estimate)",
-            "host memory": f"{encoders / GIB + _HOST_OVERHEAD_GIB:.1f} GiB{'' if is_encoded else ', while the text encoders encode the prompt'} (estimate)",
-            "download": f"{download / 1e9:.0f} GB, of which {encoders / 1e9:.0f} GB are text encoders (estimate)",
+        }
+        time = {
             "per step": f"{self.tflop:.0f} TFLOP, {self.seconds:.1f} s (estimate)",
             "total": f"{recipe.steps} steps, {self.seconds * recipe.steps / 3600:.1f} hours (estimate)",
         }
-        return "\n".join(f"{name:24}{value}" for name, value in rows.items())
+        return cost_table(
+            model,
+            time,
+            memory_gib=self.memory_gib,
+            card=self.card,
+            host_memory=f"{encoders / GIB + _HOST_OVERHEAD_GIB:.1f} GiB{'' if is_encoded else ', while the text encoders encode the prompt'}",
+            download_gb=download / 1e9,
+            text_encoder_gb=encoders / 1e9,
+        )
 
     def check_fits(self) -> None:
         """Checks that the recipe fits into the memory of the GPU.

@@ -24,7 +24,7 @@ import torch
 from pydantic import Field, TypeAdapter, ValidationError
 from torch import Tensor, nn
 
-from brewster.errors import ModelError, RecipeError
+from brewster.errors import ModelError, RecipeError, invalid_value
 from brewster.models.diffusion.adapter import lora_formats
 from brewster.models.diffusion.adapter.lora_formats import LowRankLayer
 from brewster.models.diffusion.backbones.backbone import Backbone
@@ -75,17 +75,17 @@ class LoraMetadata:
         try:
             return _metadata_validator().validate_json(text, strict=True, extra="forbid")
         except ValidationError as error:
-            problem = error.errors()[0]
-            key = ".".join(map(str, problem["loc"]))
-            if problem["type"] in {"extra_forbidden", "unexpected_keyword_argument"}:
+            details = error.errors()[0]
+            problem = invalid_value(details)
+            if details["type"] in {"extra_forbidden", "unexpected_keyword_argument"}:
                 raise ModelError(
-                    f"the metadata of the LoRA has the unknown key {key}",
+                    f"the metadata of the LoRA has the unknown key {'.'.join(map(str, details['loc']))}",
                     "expected the keys that this version of brewster knows",
                     "update brewster: a newer version wrote the LoRA",
                 ) from error
             raise ModelError(
-                f"the metadata of the LoRA cannot be read: {f'{key}: ' if key else ''}{problem['msg']}",
-                "expected metadata that brewster wrote",
+                f"the metadata of the LoRA cannot be read: {problem.happened}",
+                f"{problem.expected}, as in the metadata that brewster writes",
                 "copy the folder again, or save the LoRA again",
             ) from error
         except RecipeError as error:

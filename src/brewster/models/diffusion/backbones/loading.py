@@ -235,7 +235,7 @@ def _translate_load_errors(folder: Path) -> Iterator[None]:
         raise MissingExtra(
             f"{folder} needs a library that is not installed ({' '.join(str(error).split())[:200]})",
             "expected all libraries that its classes use",
-            "install this library in addition to brewster[diffusion]",
+            "install this library in addition to the extra diffusion",
         ) from error
     except (OSError, KeyError, ValueError, TypeError, safetensors_error) as error:
         reason = " ".join(str(error).split())[:200]
