@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Sequence
 from typing import Any, Final
 
-from brewster.evaluate.report.tables import MAIN_METRICS, is_complete, ranking
+from brewster.evaluate.report.tables import is_complete, main_metrics, ranking
 from brewster.evaluate.results import AVERAGE, Results
 
 _SIR2: Final = ("postcard", "solidobject", "wildscene")
@@ -23,13 +23,13 @@ _ESCAPES: Final = str.maketrans(
 
 
 def to_latex(results: Results, *, intervals: bool = False) -> str:
-    """Returns a table with one row per method and three metrics per benchmark. The average is the last column group.
+    """Returns a table with one row per method and up to three metrics per benchmark. The average is the last column group.
 
     The best three values of a column are marked as in the paper, but the worst value has no mark. A dagger marks a mean
     over fewer images than those of other methods. With `intervals`, each mean has its 95 % interval. The first line names
     the LaTeX packages that the table needs.
     """
-    metrics = [name for name in MAIN_METRICS if name in results["metrics"]] or list(results["metrics"])[:3]
+    metrics = main_metrics(results)
     keys = _table_selections(results)
     if not metrics or not keys:
         return "% there are no scores\n"

@@ -9,12 +9,17 @@ from typing import Any, Final
 
 from brewster.evaluate.results import Results
 
-MAIN_METRICS: Final = ("psnr", "ssim", "lpips")
-"""The metrics of the overview table."""
+_MAIN_METRICS: Final = ("psnr", "ssim", "lpips")
 
 _ARROWS: Final = {True: "↑", False: "↓"}
 _UNEQUAL_COUNTS_NOTE: Final = "\n\nDo not compare a mean over fewer images with the other means. Differences use the images that both methods have."
 _MINUS: Final = "\N{MINUS SIGN}"
+
+
+def main_metrics(results: Results) -> list[str]:
+    """Returns the metrics of the overview: PSNR, SSIM and LPIPS if the results have all three, else the first three metrics."""
+    names = list(results["metrics"])
+    return list(_MAIN_METRICS) if set(_MAIN_METRICS) <= set(names) else names[:3]
 
 
 # --- Markdown
@@ -104,7 +109,7 @@ def _aligned(columns: list[list[str]]) -> str:
 
 def _overview(results: Results) -> str:
     """Returns a table with one row per method and one column per selection. Each cell has the main metrics."""
-    metrics = [name for name in MAIN_METRICS if name in results["metrics"]]
+    metrics = main_metrics(results)
     if not metrics:
         return ""
     titles = " / ".join(_heading(results, name) for name in metrics)
