@@ -1,4 +1,4 @@
-"""The cases of a benchmark that the paper uses, and unique names for the benchmarks of a run."""
+"""Draws a random subset like the paper's, whose cases are unknown. Gives the benchmarks of a run unique names."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ PAPER_SEED: Final = 181
 
 
 def paper_subset(benchmark: Benchmark, seed: int = PAPER_SEED) -> tuple[Case, ...]:
-    """Draws the cases of the paper's protocol.
+    """Draws a random subset like that of the paper, which does not say which cases it uses.
 
-    The paper does not say which cases it uses. This function draws one case of each scene with
+    This function draws one case of each scene with
     `Random(f"{seed}/{benchmark}/{scene}").choice(...)` from the cases in natural order of their names. The case of a scene
     therefore does not depend on the other scenes.
 

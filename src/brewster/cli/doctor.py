@@ -199,16 +199,16 @@ def _mitsuba() -> Iterator[Check]:
             variant.load()
     except MissingExtra as error:
         yield Check(
-            "tracer", "mitsuba", "broken", str(error), variant.install_command(str(error)), needed=False
+            "renderer", "mitsuba", "broken", str(error), variant.install_command(str(error)), needed=False
         )
         return
-    yield Check("tracer", "mitsuba", "ok", version)
+    yield Check("renderer", "mitsuba", "ok", version)
     probed = variant.probe()
     if probed.variant == variant.COMPILED:
-        yield Check("tracer", "llvm", "ok", probed.library or "found by Dr.Jit")
+        yield Check("renderer", "llvm", "ok", probed.library or "found by Dr.Jit")
     else:
         detail = f"not usable, so rendering is several times slower ({probed.reason})"
-        yield Check("tracer", "llvm", "missing", detail, variant.INSTALL_LLVM, needed=False)
+        yield Check("renderer", "llvm", "missing", detail, variant.INSTALL_LLVM, needed=False)
 
 
 def _diffusion() -> Iterator[Check]:

@@ -46,7 +46,7 @@ from brewster.evaluate.report.tables import scores_to_csv, to_csv, to_markdown
 from brewster.evaluate.resizing import resize
 from brewster.evaluate.results import Results, paper_subsets, summarise
 from brewster.evaluate.runner import ScoreCallback, find_unavailable, get_prediction, score
-from brewster.evaluate.score_log import SCORES_FILE, RowId, ScoreRow, read_log
+from brewster.evaluate.score_log import SCORES_FILE, RowId, ScoreRow, read_score_rows
 from brewster.evaluate.scoring import GroundTruth
 from brewster.files import write_atomically
 from brewster.metrics import IDENTICAL_DB
@@ -107,7 +107,7 @@ def evaluate(
         thumbnails = _ThumbnailCache(
             Path(folder), complete, config, out, {method.name: method for method in methods}
         )
-        logged = read_log(out / SCORES_FILE)
+        logged = read_score_rows(out / SCORES_FILE)
         unavailable = find_unavailable(benchmarks, methods, config, logged)
         rows = score(
             benchmarks,

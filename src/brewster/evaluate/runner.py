@@ -24,7 +24,14 @@ from brewster.benchmarks.registry import Benchmark, Case
 from brewster.errors import BrewsterError
 from brewster.evaluate.config import EvaluationConfig
 from brewster.evaluate.methods import Method, MethodOutput, PredictionFolder, check_names
-from brewster.evaluate.score_log import SCORE_FORMAT_VERSION, SCORES_FILE, RowId, ScoreLog, ScoreRow, read_log
+from brewster.evaluate.score_log import (
+    SCORE_FORMAT_VERSION,
+    SCORES_FILE,
+    RowId,
+    ScoreLog,
+    ScoreRow,
+    read_score_rows,
+)
 from brewster.evaluate.scoring import CaseFiles, GroundTruth, Scorer
 from brewster.executors import exit_with_parent
 from brewster.worker_setup import single_torch_thread
@@ -84,7 +91,7 @@ def score(
         OutputError: `out` cannot be written.
     """
     check_names(methods)
-    logged = read_log(out / SCORES_FILE) if logged is None else logged
+    logged = read_score_rows(out / SCORES_FILE) if logged is None else logged
     cases = {(case.benchmark, case.name): case for benchmark in benchmarks for case in benchmark.cases}
     ids = [(*case, method.name) for case in cases for method in methods]
     if unavailable is None:

@@ -219,7 +219,7 @@ def failures(results: Results) -> list[str]:
 
 
 def _settings(results: Results) -> str:
-    metrics = (f"{entry['title']}: {entry['about']}" for entry in results["metrics"].values())
+    metrics = (f"{entry['title']}: {entry['definition']}" for entry in results["metrics"].values())
     lines = [*results["protocol"]["choices"], *metrics]
     return "\n".join(["### Settings and definitions", "", *(f"- {line}" for line in lines)])
 
@@ -244,7 +244,7 @@ def _number(results: Results, metric: str, value: float, *, sign: str = "") -> s
     return f"{value:{sign}.{results['metrics'][metric]['digits']}f}"
 
 
-def ranking(table: Mapping[str, Any], metric: str, about: Mapping[str, Any]) -> list[str]:
+def ranking(table: Mapping[str, Any], metric: str, metric_info: Mapping[str, Any]) -> list[str]:
     """Returns the distinct means in descending order of quality, as they are printed.
 
     The list has no means of methods with scores on fewer images than other methods. It is empty if fewer than two methods
@@ -253,8 +253,8 @@ def ranking(table: Mapping[str, Any], metric: str, about: Mapping[str, Any]) -> 
     means = [row[metric]["mean"] for method, row in table.items() if is_complete(table, method, metric)]
     if len(means) < 2:
         return []
-    means.sort(reverse=about["higher_is_better"])
-    return list(dict.fromkeys(f"{mean:.{about['digits']}f}" for mean in means))
+    means.sort(reverse=metric_info["higher_is_better"])
+    return list(dict.fromkeys(f"{mean:.{metric_info['digits']}f}" for mean in means))
 
 
 def is_complete(table: Mapping[str, Any], method: str, metric: str) -> bool:
