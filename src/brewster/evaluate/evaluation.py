@@ -75,9 +75,9 @@ def evaluate(
     """Scores the methods. Writes results.json, scores.csv, tables.md, table.tex, table.csv and report.html into `out`.
 
     A metric whose weights are missing is left out, and "unavailable" in the results says why; the next run adds it. If photos
-    are resized, it also writes them into `out`/inputs. Each image is read and decoded once, with
-    three exceptions. Exclusive methods read the cases again. The report reads the images of a case again if the benchmark
-    has more than `max_report_cases` cases, or if an earlier run scored the case.
+    are resized, it also writes them into `out`/inputs. Each image is read and decoded once, with four exceptions. The files are
+    read twice if an earlier run has all scores. Exclusive methods read the cases again. The report reads the images of a case
+    again if the benchmark has more than `max_report_cases` cases, or if an earlier run scored the case.
 
     Args:
         benchmarks: the benchmarks, as `read_benchmark` returns them.

@@ -4,7 +4,8 @@
 
 The file `scores.jsonl` in the output folder has one line for each new result, scored or failed. A later run reuses a line if its inputs
 have not changed, and adds the columns that it does not have, such as LPIPS after its weights were missing. Each file of a
-case is read once: its bytes are hashed and, if a score is missing, decoded.
+case is read once: its bytes are hashed and, if a score is missing, decoded. If an earlier run has all scores of a metric that needs
+weights, the files are read twice: first to find out whether these weights are needed.
 """
 
 from __future__ import annotations
