@@ -2,8 +2,9 @@
 
     BREWSTER_DATA=../shared/data .venv/bin/python bench/training_data.py recipes/train/compact-stage1.toml
 
-Prints one row for each dataset and each recipe: the 10, 25, 50, 75 and 90 % quantiles over about 200 images of 256 px, in
-linear light. The script trains nothing: it only computes statistics of the real pairs.
+Prints one row for each dataset and each recipe: the 10, 25, 50, 75 and 90 % quantiles over at most about 200 images (10 for
+dev), 256 px on the longer side. The statistics are computed in linear light, the PSNR on encoded values. The script trains
+nothing: it only computes statistics of the real pairs.
 """
 
 import os
@@ -30,7 +31,7 @@ def main(data: Path, recipes: list[Path]) -> None:
     print("| stream | " + " | ".join(statistics(torch.rand(3, 32, 32), torch.rand(3, 32, 32))) + " |")
     for name in ("dev/nature", "dev/real", "train"):
         pairs = read_pairs([data / "real" / name])
-        print_row(f"real/{name}", (fit(pair) for pair in pairs[:: max(1, len(pairs) // COUNT)]))
+        print_row(f"real/{name}", (resize_pair(pair) for pair in pairs[:: max(1, len(pairs) // COUNT)]))
     for path in recipes:
         stream = open_stream(read_recipe(path))
         batches = (stream(10**6 + step, 8, SIZE_PX) for step in range(COUNT // 8))
@@ -48,7 +49,7 @@ def print_row(name: str, pairs: Iterable[tuple[Tensor, Tensor]]) -> None:
     print(f"| {name} ({len(rows)}) | " + " | ".join(cells) + " |", flush=True)
 
 
-def fit(pair: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
+def resize_pair(pair: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
     """Converts uint8 images (H, W, 3) to encoded tensors (3, h, w) whose longer side is 256 px."""
     scale = SIZE_PX / max(pair[0].shape[:2])
     size = [round(side * scale) for side in pair[0].shape[:2]]
@@ -63,13 +64,11 @@ def statistics(photo: Tensor, truth: Tensor) -> dict[str, float]:
     """Returns the statistics of one pair in linear light, (3, h, w) each. docs/training.md defines them."""
     ratio = (truth / (photo + 1e-3)).flatten()[::3]
     change = photo - truth
-    gain = (photo * truth).sum((1, 2)) / (photo * photo).sum((1, 2)).clamp(min=1e-9)
     coarse = functional.avg_pool2d(change[None], 16)
     coarse = functional.interpolate(coarse, photo.shape[1:], mode="bilinear")[0]
     energy = change.square().mean()
     return {
         "input PSNR, dB": psnr(photo, truth),
-        "best gain adds, dB": psnr(photo * gain[:, None, None], truth) - psnr(photo, truth),
         "median T/I": ratio.median().item(),
         "90th pct T/I": ratio.quantile(0.9).item(),
         "added light": (change.clamp(min=0).mean() / truth.mean().clamp(min=1e-6)).item(),

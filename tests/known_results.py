@@ -6,14 +6,14 @@ METRICS = {
         "unit": "dB",
         "higher_is_better": True,
         "digits": 2,
-        "about": "Definition of PSNR.",
+        "definition": "Definition of PSNR.",
     },
     "lpips": {
         "title": "LPIPS",
         "unit": "",
         "higher_is_better": False,
         "digits": 3,
-        "about": "Definition of LPIPS.",
+        "definition": "Definition of LPIPS.",
     },
 }
 SETS = ["real20", "nature20", "postcard", "solidobject", "wildscene"]

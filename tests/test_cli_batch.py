@@ -436,7 +436,7 @@ def test_json_has_the_result_of_each_photo(run, tmp_path, model):
     )
     assert len(separated["model_sha256"]) == 64
     assert separated["device"]
-    assert set(separated["seconds"]) == {"decode", "network", "detail", "encode"}
+    assert set(separated["seconds"]) == {"decode", "network", "upsampling", "encode"}
     assert separated["residual"] == pytest.approx(0, abs=0.01)
     assert (failed["source"], failed["status"], failed["outputs"]) == ("b.jpg", "failed", {})
     assert failed["error"]

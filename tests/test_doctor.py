@@ -1,4 +1,4 @@
-"""`brewster doctor`: the checks for diffusion models."""
+"""`brewster doctor`: the checks of packages and for diffusion models."""
 
 import huggingface_hub
 
@@ -16,6 +16,13 @@ def test_optional_parts_for_diffusion_models_are_checked_if_diffusers_is_install
     missing = check_diffusion(monkeypatch, {"diffusers": "1"})
     assert [check.cure for check in missing.values()] == ["pip install bitsandbytes", "hf auth login"]
     assert not any(check.needed for check in missing.values())
+
+
+def test_another_build_of_onnx_runtime_is_accepted(monkeypatch):
+    monkeypatch.setattr(doctor, "_version", {"onnxruntime-gpu": "1.31"}.get)
+    checks = {check.name: check for check in doctor._packages()}
+    assert (checks["onnxruntime"].status, checks["onnxruntime"].detail) == ("ok", "1.31 (onnxruntime-gpu)")
+    assert checks["numpy"].status == "missing"
 
 
 def test_a_token_is_found_wherever_the_hub_client_finds_it_and_never_shown(monkeypatch):

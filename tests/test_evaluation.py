@@ -6,6 +6,7 @@ import json
 import re
 from collections import Counter
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +15,7 @@ import pytest
 from benchmark_folders import paint
 from brewster import Photo
 from brewster.benchmarks.registry import Benchmark, read_benchmark
-from brewster.errors import BrewsterError, DownloadError, PhotoError
+from brewster.errors import BrewsterError, DownloadError, MissingExtra, PhotoError
 from brewster.evaluate.config import EvaluationConfig
 from brewster.evaluate.evaluation import evaluate
 from brewster.evaluate.methods import IdentityBaseline, ModelMethod, PredictionFolder
@@ -193,6 +194,32 @@ def test_a_metric_without_weights_does_not_stop_the_run_and_is_added_later(
     assert len(calls) == 4
     evaluate(real20, [IdentityBaseline(), methods[2]], config, tmp_path / "out")
     assert len(calls) == 4
+
+
+def test_an_outdated_score_does_not_count_as_computed_if_the_weights_are_missing_now(
+    real20, methods, tmp_path, monkeypatch
+):
+    def load():
+        if not weights:
+            raise MissingExtra("torch is not installed", "expected torch", "install torch")
+
+    def measure(case):
+        load()
+        return 0.5
+
+    weights = ["found"]
+    late = replace(METRICS["lpips"], name="late", title="Late", score=measure, prepare=load)
+    monkeypatch.setitem(METRICS, "late", late)
+    config = EvaluationConfig(metrics=("psnr", "late"))
+    run = partial(evaluate, real20, [IdentityBaseline(), methods[2]], out=tmp_path / "out")
+    run(config=config)
+    weights.clear()
+    unchanged = run(config=config)
+    assert not unchanged["unavailable"]
+    assert unchanged["tables"]["real20"]["theirs"]["late"]["mean"] == 0.5
+    changed = run(config=replace(config, border=1))
+    assert "torch is not installed" in changed["unavailable"]["late"]
+    assert set(changed["tables"]["real20"]["theirs"]) == {"psnr"}
 
 
 def test_the_report_links_each_file_at_full_size(real20, methods, tmp_path):

@@ -58,7 +58,7 @@ class Page(HTMLParser):
 
 def metric(title="PSNR", *, unit="dB", higher=True, digits=2):
     about = f"Definition of {title}."
-    return {"title": title, "unit": unit, "higher_is_better": higher, "digits": digits, "about": about}
+    return {"title": title, "unit": unit, "higher_is_better": higher, "digits": digits, "definition": about}
 
 
 def estimate(mean, low=None, high=None, count=2):
@@ -205,7 +205,7 @@ def test_the_same_input_gives_the_same_bytes(tmp_path):
 def test_names_with_markup_are_escaped(page, name):
     given = results([name], method=name, errors={name: name})
     given["benchmarks"]["nature20"] |= {"title": name, "remarks": [name], "excluded": [name]}
-    given["metrics"]["psnr"] |= {"title": name, "about": name}
+    given["metrics"]["psnr"] |= {"title": name, "definition": name}
     made, plain = (
         page(given, [make_thumbnails(name, name)]),
         page(results(["a"], errors={"compact": "a"}), [make_thumbnails("a")]),

@@ -184,11 +184,11 @@ def test_the_table_has_each_metric_once_with_a_definition():
     assert [metric.name for metric in METRICS.values()] == list(METRICS)
     assert len({metric.title for metric in METRICS.values()}) == len(METRICS)
     for metric in METRICS.values():
-        assert metric.about.endswith(".")
-        assert metric.about.count(". ") <= 1  # the definition, and what is done before it
+        assert metric.definition.endswith(".")
+        assert metric.definition.count(". ") <= 1  # the definition, and what is done before it
         assert metric.unit == ("dB" if metric.name.startswith("psnr") else "")
         assert metric.higher_is_better == metric.name.startswith(("psnr", "ssim"))
-        assert (metric.where == "region") == metric.name.endswith("_region")
+        assert (metric.area == "region") == metric.name.endswith("_region")
 
 
 def test_a_metric_is_found_by_name_and_a_typing_error_gets_a_suggestion():

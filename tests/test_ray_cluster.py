@@ -4,13 +4,16 @@ import os
 import socket
 import subprocess
 import sys
+import threading
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
 from brewster.errors import DeviceError, MissingExtra
 from brewster.executors import ray_cluster
+from brewster.rendered.generation.job import RenderTask
 from brewster.rendered.generation.workers import TaskRunner
 from set_folders import hashes, make_job, render_set, statuses
 
@@ -76,6 +79,58 @@ def test_an_executor_does_not_import_ray_before_it_is_used(tmp_path):
     code = "import sys, brewster.executors.ray_cluster; assert 'ray' not in sys.modules"
     subprocess.run([sys.executable, "-c", code], check=True)
     assert not ray_cluster.RayExecutor(partial(TaskRunner, make_job(tmp_path))).is_busy()
+
+
+class UnpicklableError(Exception):
+    def __init__(self):
+        super().__init__()
+        self.cannot_be_pickled = threading.Lock()
+
+
+def executor_whose_task_raises(error):
+    """Returns an executor with a task of two items, whose result raises the error."""
+
+    def get(_task_id):
+        raise error
+
+    executor = ray_cluster.RayExecutor(partial(TaskRunner, None))
+    executor._ray = SimpleNamespace(
+        wait=lambda ids, num_returns: (ids, []), get=get, exceptions=pytest.importorskip("ray").exceptions
+    )
+    executor._run_id = executor._create_runner_ref = None
+    executor._run_task = SimpleNamespace(remote=lambda *_: object())
+    executor._tasks = {"lost": RenderTask("render", (1, 2))}
+    return executor
+
+
+@pytest.mark.parametrize(
+    "raised", [ZeroDivisionError("a bug"), DeviceError("no GPU", "expected a GPU", "add a GPU")]
+)
+def test_an_exception_of_the_runner_is_raised_with_the_traceback_of_the_worker(raised):
+    errors = pytest.importorskip("ray").exceptions
+    in_worker = errors.RayTaskError("run", "traceback of the worker", raised).as_instanceof_cause()
+    with pytest.raises(type(raised)) as caught:
+        executor_whose_task_raises(in_worker).wait()
+    assert caught.value is raised
+    assert "traceback of the worker" in str(caught.value.__cause__)
+
+
+def test_an_exception_of_the_runner_that_cannot_be_pickled_is_raised():
+    errors = pytest.importorskip("ray").exceptions
+    in_worker = errors.RayTaskError("run", "traceback of the worker", UnpicklableError())
+    with pytest.raises(errors.RayError, match="UnpicklableError"):
+        executor_whose_task_raises(in_worker).wait()
+
+
+@pytest.mark.parametrize("are_arguments_lost", [False, True])
+def test_the_items_of_a_lost_task_are_tried_again_one_by_one(are_arguments_lost):
+    errors = pytest.importorskip("ray").exceptions
+    lost = errors.ObjectLostError("00", None, "") if are_arguments_lost else errors.WorkerCrashedError()
+    executor = executor_whose_task_raises(
+        errors.RayTaskError("run", "", lost) if are_arguments_lost else lost
+    )
+    assert executor.wait() == []
+    assert [task.indices for task in executor._tasks.values()] == [(1,), (2,)]
 
 
 @pytest.mark.slow

@@ -23,7 +23,7 @@ def photo(rng):
     ("flip", "found"),
     [
         (np.s_[:, ::-1], "mirrored left to right"),
-        (np.s_[::-1], "upside down"),
+        (np.s_[::-1], "mirrored top to bottom"),
         (np.s_[::-1, ::-1], "rotated by 180 degrees"),
     ],
 )

@@ -162,6 +162,19 @@ def test_equal_names_get_the_name_of_the_parent_folder(tmp_path):
     assert [part.cases[0].benchmark for part in unique] == ["one-test", "two-test", "mine"]
 
 
+def test_as_many_parent_folders_are_added_as_are_needed(tmp_path, monkeypatch):
+    folders = [repacked(tmp_path / parent / "a" / "test", ["1"]) for parent in ("x", "y")]
+    read = [only("pairs", folder) for folder in folders]
+    assert [part.name for part in with_unique_names(read, folders)] == ["x-a-test", "y-a-test"]
+    monkeypatch.chdir(folders[0])
+    assert [part.name for part in with_unique_names(read, [registry.Path(), folders[1]])] == [
+        "x-a-test",
+        "y-a-test",
+    ]
+    equal = {part.name for part in with_unique_names([read[0], read[0]], [folders[0], folders[0]])}
+    assert len(equal) == 1
+
+
 def test_a_folder_has_its_name_also_as_the_current_folder(tmp_path, monkeypatch):
     monkeypatch.chdir(repacked(tmp_path / "mine", ["a"]))
     assert only("pairs", registry.Path()).name == "mine"

@@ -5,6 +5,7 @@ import re
 import pytest
 
 from brewster.evaluate.report.latex import to_latex
+from brewster.evaluate.report.tables import to_markdown
 from known_results import entry, known_results
 
 
@@ -83,6 +84,20 @@ def test_the_papers_draw_replaces_the_whole_benchmark(results):
     text = to_latex(results)
     assert "Postcard (7)" in text
     assert "Postcard (20)" not in text
+
+
+@pytest.mark.parametrize("names", [["psnr_channels", "ssim"], ["psnr", "ssim_clipped", "lpips", "dists"]])
+def test_requested_metrics_are_in_the_table_and_in_the_overview(results, names):
+    results["metrics"] = {name: results["metrics"]["psnr"] | {"title": name.upper()} for name in names}
+    titles = [name.upper() for name in names[:3]]
+    assert " & ".join(f"{title}$\\uparrow$" for title in titles) in to_latex(results)
+    assert to_markdown(results).startswith(" / ".join(f"{title}, dB ↑" for title in titles) + "\n")
+
+
+def test_psnr_ssim_and_lpips_come_first_if_the_results_have_all_of_them(results):
+    psnr = results["metrics"]["psnr"]
+    results["metrics"] = {name: psnr | {"title": name} for name in ("psnr", "ssim", "psnr_region", "lpips")}
+    assert "psnr_region" not in to_latex(results)
 
 
 def test_without_sir2_the_header_has_one_row(results):

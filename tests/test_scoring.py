@@ -158,7 +158,7 @@ def test_a_new_metric_is_one_row_with_its_function(triplet, tmp_path, monkeypatc
 
 
 def test_a_metric_of_the_region_receives_the_region_of_its_column(triplet, monkeypatch):
-    row = make_metric("share", lambda case: float(case.region.mean()), where="region")
+    row = make_metric("share", lambda case: float(case.region.mean()), area="region")
     monkeypatch.setitem(METRICS, "share", row)
     truth, scorer = open_case(triplet, EvaluationConfig(metrics=("share",), thresholds=(0.01, 0.1)))
     assert scorer.score(MethodOutput(truth.photo)) == {
@@ -205,7 +205,9 @@ def test_every_metric_gives_the_score_of_its_function(data, monkeypatch):
         "niqe",
     )  # test_metrics_dists.py and test_metrics_naturalness.py: weights, and larger images
     names = tuple(
-        name for name, metric in METRICS.items() if metric.of == "transmission" and name not in others
+        name
+        for name, metric in METRICS.items()
+        if metric.ground_truth == "transmission" and name not in others
     )
     truth, scorer = open_case(
         data / "real/dev/nature", EvaluationConfig(metrics=names, short_side_px=96), "nature20"

@@ -5,6 +5,7 @@ import signal
 import subprocess
 import sys
 from functools import partial
+from multiprocessing import connection
 from pathlib import Path
 
 import pytest
@@ -15,7 +16,7 @@ from brewster.executors import ProcessExecutor, SerialExecutor, local
 from brewster.rendered import store
 from brewster.rendered.generation import workers
 from brewster.rendered.generation.job import RenderTask
-from brewster.rendered.generation.workers import render_again
+from brewster.rendered.generation.workers import TaskRunner, render_again
 from other_processes import children, is_alive, started, wait_for
 from set_folders import hashes, make_job, names, render_set, statuses
 
@@ -94,6 +95,17 @@ def test_a_fatal_error_in_a_worker_ends_the_run(tmp_path):
         render_set(
             tmp_path / "set", renderer="without_device", executor=partial(ProcessExecutor, worker_count=1)
         )
+
+
+@pytest.mark.parametrize("is_finished", [False, True])
+def test_leaving_the_context_before_a_result_is_read_prints_no_traceback(tmp_path, capfd, is_finished):
+    job = make_job(tmp_path, "slow")
+    with ProcessExecutor(partial(TaskRunner, job), 1) as executor:
+        executor.submit(RenderTask("render", (0,)))
+        if is_finished:
+            connection.wait(list(executor._busy))
+    assert (tmp_path / "000000").is_dir()
+    assert capfd.readouterr().err == ""
 
 
 def test_serial_rendering_restores_the_number_of_torch_threads(tmp_path):

@@ -37,7 +37,7 @@ def separate_in_parallel(
     Args:
         tasks: the photos and the paths of their layers, from `plan_files`.
         executor: runs a `SeparationRunner` in its workers. The caller enters its context.
-        overwrite: whether layers that exist are replaced instead of skipped.
+        overwrite: whether tasks whose layers exist are given to a worker. The runner needs the same value.
         on_result: called with the result of every photo. An exception raised in it stops the run.
 
     Raises:
@@ -107,9 +107,9 @@ def _unfinished(
     tasks: Sequence[SeparationTask], on_result: Callable[[FileResult], None], *, overwrite: bool
 ) -> Iterator[SeparationTask]:
     """Yields the tasks with missing layers, or all tasks with `overwrite`. Reports the other tasks as skipped, without a worker."""
-    listing = _FolderListing()
+    cache = _FileNameCache()
     for task in tasks:
-        if not overwrite and _is_finished(task, listing.has):
+        if not overwrite and _is_finished(task, cache.has):
             on_result(skipped_result(task))
         else:
             yield task
@@ -121,7 +121,7 @@ def _is_finished(task: SeparationTask, has: Callable[[Location], bool]) -> bool:
 
 
 @final
-class _FolderListing:
+class _FileNameCache:
     """The file names in the folder of the last request. One listing replaces thousands of requests to an object store."""
 
     def __init__(self) -> None:

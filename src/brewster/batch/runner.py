@@ -97,7 +97,7 @@ class FileResult:
     """The digest of the photo's file."""
     device: str | None = None
     seconds: dict[str, float] = field(default_factory=dict)
-    """Wall time of the steps `decode`, `network`, `detail` and `encode`."""
+    """Wall time of the steps `decode`, `network`, `upsampling` and `encode`."""
     residual: float | None = None
     """See `Separation.residual`."""
     reconstruction_error: float | None = None

@@ -1,7 +1,8 @@
-"""The cases of a benchmark that the paper uses, and unique names for the benchmarks of a run."""
+"""Draws a random subset like the paper's, whose cases are unknown. Gives the benchmarks of a run unique names."""
 
 from __future__ import annotations
 
+import os
 from collections import Counter, defaultdict
 from collections.abc import Sequence
 from dataclasses import replace
@@ -10,7 +11,7 @@ from random import Random
 from typing import Final
 
 from brewster.benchmarks.pairing import natural_key
-from brewster.benchmarks.registry import BENCHMARKS, Benchmark, Case, folder_name, safe_name
+from brewster.benchmarks.registry import BENCHMARKS, Benchmark, Case, safe_name
 from brewster.errors import PhotoError
 
 PAPER_SEED: Final = 181
@@ -18,9 +19,9 @@ PAPER_SEED: Final = 181
 
 
 def paper_subset(benchmark: Benchmark, seed: int = PAPER_SEED) -> tuple[Case, ...]:
-    """Draws the cases of the paper's protocol.
+    """Draws a random subset like that of the paper, which does not say which cases it uses.
 
-    The paper does not say which cases it uses. This function draws one case of each scene with
+    This function draws one case of each scene with
     `Random(f"{seed}/{benchmark}/{scene}").choice(...)` from the cases in natural order of their names. The case of a scene
     therefore does not depend on the other scenes.
 
@@ -46,19 +47,35 @@ def paper_subset(benchmark: Benchmark, seed: int = PAPER_SEED) -> tuple[Case, ..
 
 
 def with_unique_names(benchmarks: Sequence[Benchmark], folders: Sequence[Path]) -> list[Benchmark]:
-    """Adds the name of the parent folder to names that occur twice: the folders a/test and b/test become a-test and b-test.
+    """Adds names of parent folders to names that occur twice: the folders a/test and b/test become a-test and b-test.
+
+    As many parent folders are added as are needed: x/a/test and y/a/test become x-a-test and y-a-test. Only equal folders
+    keep equal names.
 
     Args:
         benchmarks: the benchmarks of a run.
         folders: the folder of each benchmark.
     """
-    counts = Counter(benchmark.name for benchmark in benchmarks)
+    names = [benchmark.name for benchmark in benchmarks]
+    unique_names = list(names)
+    parents = [_parent_names(folder) for folder in folders]
+    for name, count in Counter(names).items():
+        group = [i for i in range(len(names)) if names[i] == name]
+        depth = 0
+        while len({unique_names[i] for i in group}) < count and depth < max(len(parents[i]) for i in group):
+            depth += 1
+            for i in group:
+                unique_names[i] = "-".join([*parents[i][-depth:], name])
     return [
-        _renamed(benchmark, f"{safe_name(folder_name(folder.parent))}-{benchmark.name}")
-        if counts[benchmark.name] > 1
-        else benchmark
-        for benchmark, folder in zip(benchmarks, folders, strict=True)
+        benchmark if name == benchmark.name else _renamed(benchmark, name)
+        for benchmark, name in zip(benchmarks, unique_names, strict=True)
     ]
+
+
+def _parent_names(folder: Path) -> list[str]:
+    """Returns the names of all folders above a folder. Links are not resolved."""
+    parts = Path(os.path.abspath(folder)).parts[1:-1]  # noqa: PTH100  (do not resolve links)
+    return [name for part in parts if (name := safe_name(part))]
 
 
 def _renamed(benchmark: Benchmark, name: str) -> Benchmark:

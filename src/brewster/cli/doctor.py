@@ -26,6 +26,8 @@ _GIF: Final = bytes.fromhex(
     "47494638396101000100800000ffffff00000021f90401000000002c00000000010001000002024401003b"
 )
 """A GIF of one pixel. It is stored here, because brewster reads GIF but cannot write it."""
+_ALTERNATIVES: Final = {"onnxruntime": ("onnxruntime-gpu", "onnxruntime-rocm", "onnxruntime-directml")}
+"""Required package -> packages that install the same module."""
 _SYMBOLS: Final = {"ok": "ok", "missing": "--", "broken": "!!"}
 
 
@@ -95,14 +97,15 @@ def _packages() -> Iterator[Check]:
 
 
 def _package(package: str, module: str) -> Check:
-    cure = f"pip install {package}"
-    version = _version(package)
-    if version is None:
-        return Check("packages", package, "missing", "not installed", cure)
+    installed = [name for name in (*_ALTERNATIVES.get(package, ()), package) if _version(name)]
+    if not installed:
+        return Check("packages", package, "missing", "not installed", f"pip install {package}")
+    version = f"{_version(installed[0])}" + ("" if installed[0] == package else f" ({installed[0]})")
     try:
         importlib.import_module(module)
     except (ImportError, OSError) as error:  # a shared library is missing, or was built for another machine
-        return Check("packages", package, "broken", f"{version}: {error}", f"{cure} --force-reinstall")
+        cure = f"pip install {installed[0]} --force-reinstall"
+        return Check("packages", package, "broken", f"{version}: {error}", cure)
     return Check("packages", package, "ok", version)
 
 
@@ -197,16 +200,16 @@ def _mitsuba() -> Iterator[Check]:
             variant.load()
     except MissingExtra as error:
         yield Check(
-            "tracer", "mitsuba", "broken", str(error), variant.install_command(str(error)), needed=False
+            "renderer", "mitsuba", "broken", str(error), variant.install_command(str(error)), needed=False
         )
         return
-    yield Check("tracer", "mitsuba", "ok", version)
+    yield Check("renderer", "mitsuba", "ok", version)
     probed = variant.probe()
     if probed.variant == variant.COMPILED:
-        yield Check("tracer", "llvm", "ok", probed.library or "found by Dr.Jit")
+        yield Check("renderer", "llvm", "ok", probed.library or "found by Dr.Jit")
     else:
         detail = f"not usable, so rendering is several times slower ({probed.reason})"
-        yield Check("tracer", "llvm", "missing", detail, variant.INSTALL_LLVM, needed=False)
+        yield Check("renderer", "llvm", "missing", detail, variant.INSTALL_LLVM, needed=False)
 
 
 def _diffusion() -> Iterator[Check]:

@@ -33,10 +33,11 @@ def models() -> None:
 @models.command("list")
 @_JSON
 def list_models(*, as_json: bool) -> None:
-    """List the models that are installed with brewster, and diffusion models that are downloaded at first use.
+    """List the models that are installed with brewster, and diffusion models that are downloaded at first use or imported.
 
-    A line has the name, the size of the file or download, the licence, and for a diffusion model its GPU memory (with the
-    format of the weights), what it gives, and how to get it. Sizes and memory of diffusion models are estimates.
+    An entry has the name, the size of the file or download, and the licence. A diffusion model has two more lines: the layers
+    that it predicts, its GPU memory (with the format of the weights), the download of its text encoder, and how to get it.
+    Sizes and memory of diffusion models are estimates.
     """
     rows = [describe(model) for model in zoo.MODELS.values()]
     if as_json:
@@ -46,7 +47,9 @@ def list_models(*, as_json: bool) -> None:
         size = f"{row['bytes'] / 1e6:.1f} MB" if row["error"] is None else "damaged"
         print_out(f"{row['name']:20} {size:>10}  {row['licence']}")
     for model in DIFFUSION_MODELS.values():
-        encoder = f" and {model.text_encoder_gb:g} GB for the prompt" if model.text_encoder_gb else ""
+        encoder = (
+            f"; text encoder: {model.text_encoder_gb:g} GB more to download" if model.text_encoder_gb else ""
+        )
         use = "" if model.is_commercial else " (not for commercial use)"
         print_out(f"{model.name:20} {model.download_gb:>7g} GB  {model.licence}{use}")
         print_out(
@@ -63,7 +66,7 @@ def list_models(*, as_json: bool) -> None:
     metavar="MODEL",
     default="kontext",
     show_default=True,
-    help="The base for which the model was trained: a name from `brewster models list`, a folder or a hub id.",
+    help=f"The base for which the model was trained: {', '.join(zoo.BACKBONE_CLASSES)}, a folder or a hub id.",
 )
 @click.option(
     "--prompt",

@@ -77,7 +77,7 @@ class EvaluationConfig:
         columns = {}
         for name in self.metrics:
             metric = METRICS[name]
-            if metric.where == "picture" or len(self.thresholds) == 1:
+            if metric.area == "image" or len(self.thresholds) == 1:
                 columns[name] = metric
                 continue
             for threshold in self.thresholds:

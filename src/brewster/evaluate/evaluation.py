@@ -46,7 +46,7 @@ from brewster.evaluate.report.tables import scores_to_csv, to_csv, to_markdown
 from brewster.evaluate.resizing import resize
 from brewster.evaluate.results import Results, paper_subsets, summarise
 from brewster.evaluate.runner import ScoreCallback, find_unavailable, get_prediction, score
-from brewster.evaluate.score_log import SCORES_FILE, RowId, ScoreRow, read_log
+from brewster.evaluate.score_log import SCORES_FILE, RowId, ScoreRow, read_score_rows
 from brewster.evaluate.scoring import GroundTruth
 from brewster.files import write_atomically
 from brewster.metrics import IDENTICAL_DB
@@ -75,9 +75,9 @@ def evaluate(
     """Scores the methods. Writes results.json, scores.csv, tables.md, table.tex, table.csv and report.html into `out`.
 
     A metric whose weights are missing is left out, and "unavailable" in the results says why; the next run adds it. If photos
-    are resized, it also writes them into `out`/inputs. Each image is read and decoded once, with
-    three exceptions. Exclusive methods read the cases again. The report reads the images of a case again if the benchmark
-    has more than `max_report_cases` cases, or if an earlier run scored the case.
+    are resized, it also writes them into `out`/inputs. Each image is read and decoded once, with four exceptions. The files are
+    read twice if an earlier run has all scores. Exclusive methods read the cases again. The report reads the images of a case
+    again if the benchmark has more than `max_report_cases` cases, or if an earlier run scored the case.
 
     Args:
         benchmarks: the benchmarks, as `read_benchmark` returns them.
@@ -107,7 +107,7 @@ def evaluate(
         thumbnails = _ThumbnailCache(
             Path(folder), complete, config, out, {method.name: method for method in methods}
         )
-        logged = read_log(out / SCORES_FILE)
+        logged = read_score_rows(out / SCORES_FILE)
         unavailable = find_unavailable(benchmarks, methods, config, logged)
         rows = score(
             benchmarks,

@@ -88,7 +88,7 @@ PROTOCOLS: Final[dict[str, ProtocolPreset]] = {
         "the tables of WindowSeat, as far as they are documented",
         (
             ("Nature, Real and SIR2 500 (199 + 200 + 101)", "windowseat-reflection-removal, README, Reproducibility"),
-            ("A prediction is resized to the size of its photo before it is scored", "windowseat_inference.py"),
+            ("WindowSeat resizes a prediction to the size of its photo; brewster does not resize predictions", "windowseat_inference.py"),
             (
                 "SSIM window and LPIPS backbone are not confirmed, because windowseat_reproducibility.py was not available",
                 "brewster",
@@ -99,7 +99,7 @@ PROTOCOLS: Final[dict[str, ProtocolPreset]] = {
     "errnet": ProtocolPreset(
         "the test code of ERRNet",
         (
-            ("Real 20, SIR2 Objects 200, Postcard 199, and Wild in the subset of 55", f"{_ERRNET}, section 5"),
+            ("Real 20, SIR2 Objects 200, Postcard 199, and Wild in the subset of 55; brewster scores the images that are given", f"{_ERRNET}, section 5"),
             ("Images keep their size", f"{_ERRNET}, data/reflect_dataset.py, CEILTestDataset"),
             ("PSNR is the mean of the PSNR of the three channels", f"{_ERRNET}, util/index.py"),
             ("SSIM has the uniform 7x7 window, per channel", f"{_ERRNET}, util/index.py"),

@@ -1,6 +1,6 @@
 """Finds predictions that are mirrored or shifted against their photo, which ruins all scores of a good method.
 
-    find_misregistration(prediction, photo)  # "", "mirrored left to right" or "shifted by 8 px to the right"
+    find_misregistration(prediction, photo)  # "", "mirrored left to right" or "shifted by about 9 px to the right"
 
 The comparison is with the photo, not with the ground truth: refraction can shift the ground truth by some pixels.
 """
@@ -22,7 +22,7 @@ MIN_SHIFT_PX: Final = 2.0
 
 _FLIPS: Final = {
     "mirrored left to right": np.s_[:, ::-1],
-    "upside down": np.s_[::-1, :],
+    "mirrored top to bottom": np.s_[::-1, :],
     "rotated by 180 degrees": np.s_[::-1, ::-1],
 }
 _MIN_FLIP_GAIN: Final = 0.1

@@ -4,7 +4,8 @@
 
 The file `scores.jsonl` in the output folder has one line for each new result, scored or failed. A later run reuses a line if its inputs
 have not changed, and adds the columns that it does not have, such as LPIPS after its weights were missing. Each file of a
-case is read once: its bytes are hashed and, if a score is missing, decoded.
+case is read once: its bytes are hashed and, if a score is missing, decoded. If an earlier run has all scores of a metric that needs
+weights, the files are read twice: first to find out whether these weights are needed.
 """
 
 from __future__ import annotations
@@ -24,7 +25,14 @@ from brewster.benchmarks.registry import Benchmark, Case
 from brewster.errors import BrewsterError
 from brewster.evaluate.config import EvaluationConfig
 from brewster.evaluate.methods import Method, MethodOutput, PredictionFolder, check_names
-from brewster.evaluate.score_log import SCORE_FORMAT_VERSION, SCORES_FILE, RowId, ScoreLog, ScoreRow, read_log
+from brewster.evaluate.score_log import (
+    SCORE_FORMAT_VERSION,
+    SCORES_FILE,
+    RowId,
+    ScoreLog,
+    ScoreRow,
+    read_score_rows,
+)
 from brewster.evaluate.scoring import CaseFiles, GroundTruth, Scorer
 from brewster.executors import exit_with_parent
 from brewster.worker_setup import single_torch_thread
@@ -54,7 +62,7 @@ def score(
     *,
     workers: int = 1,
     logged: Mapping[RowId, ScoreRow] | None = None,
-    unavailable: Collection[str] = (),
+    unavailable: Collection[str] | None = None,
     on_progress: ScoreCallback = lambda _done, _total, _row: None,
     on_case_scored: CaseCallback | None = None,
 ) -> list[ScoreRow]:
@@ -69,7 +77,8 @@ def score(
         out: the folder of scores.jsonl.
         workers: the number of processes that score in parallel.
         logged: the rows of an earlier run; by default, those of scores.jsonl.
-        unavailable: columns that are not computed now; see `find_unavailable`.
+        unavailable: columns that are not computed now, from `find_unavailable`. By default, a metric whose weights are missing
+            is an error.
         on_progress: called after each new row.
         on_case_scored: called once for each case with new rows. With several workers, it must be picklable.
 
@@ -83,11 +92,13 @@ def score(
         OutputError: `out` cannot be written.
     """
     check_names(methods)
-    logged = read_log(out / SCORES_FILE) if logged is None else logged
+    logged = read_score_rows(out / SCORES_FILE) if logged is None else logged
     cases = {(case.benchmark, case.name): case for benchmark in benchmarks for case in benchmark.cases}
     ids = [(*case, method.name) for case in cases for method in methods]
-    for prepare, _ in _missing_metrics(config, ids, logged, unavailable):
-        prepare()
+    if unavailable is None:
+        unavailable = ()
+        for prepare, _ in _missing_metrics(cases.values(), methods, config, logged):
+            prepare()
     log, rows = ScoreLog(out / SCORES_FILE), dict[RowId, ScoreRow]()
 
     def log_rows(case_rows: Sequence[ScoreRow]) -> None:
@@ -125,12 +136,12 @@ def find_unavailable(
 ) -> dict[str, str]:
     """Returns column -> reason, for the columns that cannot be computed on this machine, for example without weights.
 
-    A metric is not tried if `logged`, the rows of an earlier run, has it for all cases and methods.
+    The weights of all other metrics are loaded. A metric is not tried if `logged`, the rows of an earlier run, has it for all
+    cases and methods, and their inputs have not changed.
     """
-    cases = [(case.benchmark, case.name) for benchmark in benchmarks for case in benchmark.cases]
-    ids = [(*case, method.name) for case in cases for method in methods]
+    cases = [case for benchmark in benchmarks for case in benchmark.cases]
     unavailable: dict[str, str] = {}
-    for prepare, columns in _missing_metrics(config, ids, logged):
+    for prepare, columns in _missing_metrics(cases, methods, config, logged):
         try:
             prepare()
         except BrewsterError as error:
@@ -139,25 +150,41 @@ def find_unavailable(
 
 
 def _missing_metrics(
+    cases: Collection[Case],
+    methods: Sequence[Method],
     config: EvaluationConfig,
-    ids: Sequence[RowId],
     logged: Mapping[RowId, ScoreRow],
-    unavailable: Collection[str] = (),
 ) -> list[tuple[Callable[[], object], list[str]]]:
     """Returns (prepare, columns) for the metrics with missing scores.
 
-    `prepare` loads weights, for example of LPIPS. Call each `prepare` once, before the workers start. Metrics are left out
-    if they are unavailable, or have a score in every row of an earlier run.
+    `prepare` loads weights, for example of LPIPS. Call each `prepare` once, before the workers start. A metric is left out if
+    every row of an earlier run has it and no row is outdated. The files of the cases are read only if every row has it.
     """
     columns: dict[Callable[[], object], list[str]] = {}
     for column, metric in config.columns().items():
-        if metric.prepare and column not in unavailable:
+        if metric.prepare:
             columns.setdefault(metric.prepare, []).append(column)
-    return [
-        (prepare, names)
+    ids = [(case.benchmark, case.name, method.name) for case in cases for method in methods]
+    complete = {
+        prepare
         for prepare, names in columns.items()
-        if any(row_id not in logged or not set(names) <= {*logged[row_id].columns} for row_id in ids)
-    ]
+        if all(row_id in logged and set(names) <= {*logged[row_id].columns} for row_id in ids)
+    }
+    if complete and any(_has_outdated_row(case, methods, config, logged) for case in cases):
+        complete = set()
+    return [(prepare, names) for prepare, names in columns.items() if prepare not in complete]
+
+
+def _has_outdated_row(
+    case: Case, methods: Sequence[Method], config: EvaluationConfig, logged: Mapping[RowId, ScoreRow]
+) -> bool:
+    """Whether a row of an earlier run for this case cannot be reused, because its inputs have changed."""
+    try:
+        files = CaseFiles.read(case)
+    except BrewsterError:  # the case fails without a score
+        return False
+    rows = (_empty_row(files, method, config, {}) for method in methods)
+    return any(logged[row.id].score_key != row.score_key for row in rows)
 
 
 # --- one case

@@ -81,8 +81,10 @@ class ScoreLog:
         return b"" if file.read(1) == b"\n" else b"\n"
 
 
-def read_log(path: Path) -> dict[RowId, ScoreRow]:
-    """Returns the last row for each id. Skips rows with errors, incomplete lines and lines of other versions."""
+def read_score_rows(path: Path) -> dict[RowId, ScoreRow]:
+    """Returns the last row for each id. Skips rows with errors, incomplete lines and lines with other fields.
+
+    A row may be outdated: the caller compares its `score_key`."""
     rows = {}
     for line in path.read_text(errors="replace").splitlines() if path.is_file() else ():
         try:

@@ -162,11 +162,15 @@ class Scorer:
         }
 
     def _applies(self, metric: Metric, comparisons: Mapping[str, Comparison]) -> bool:
-        return self._truth.case.rendered if metric.of == "rendered" else metric.of in comparisons
+        return (
+            self._truth.case.rendered
+            if metric.ground_truth == "rendered"
+            else metric.ground_truth in comparisons
+        )
 
     def _compute(self, column: str, metric: Metric, comparisons: Mapping[str, Comparison]) -> float:
-        comparison = comparisons["transmission" if metric.of == "rendered" else metric.of]
-        if metric.where == "region":
+        comparison = comparisons["transmission" if metric.ground_truth == "rendered" else metric.ground_truth]
+        if metric.area == "region":
             comparison = replace(comparison, region=self._region(self._config.threshold(column)))
         return metric.score(comparison)
 

@@ -59,14 +59,14 @@ def estimate(strata: Sequence[Stratum]) -> list[Estimate | None]:
     resampled = [_resample(stratum) for stratum in strata]
     sums, counts = (np.sum([part[i] for part in resampled], axis=0) for i in range(2))
     values = np.concatenate([stratum.values for stratum in strata])
-    has_interval = np.any([_scenes(stratum) > 1 for stratum in strata], axis=0)
+    has_interval = np.any([_scene_counts(stratum) > 1 for stratum in strata], axis=0)
     return [
         _estimate(values[:, i], sums[:, i], counts[:, i], has_interval=bool(has_interval[i]))
         for i in range(values.shape[1])
     ]
 
 
-def _scenes(stratum: Stratum) -> NDArray[np.int64]:
+def _scene_counts(stratum: Stratum) -> NDArray[np.int64]:
     """Returns the number of scenes with a value, for each series, (s,)."""
     names = np.array(stratum.scenes)
     return np.array([len(set(names[is_valid])) for is_valid in np.isfinite(stratum.values).T])

@@ -1,7 +1,8 @@
 """Runs tasks on one machine: in this process, or in several processes.
 
-    for result in run_tasks(tasks.pop_next, ProcessExecutor(partial(TaskRunner, job), 8)):
-        print(result)
+    with ProcessExecutor(partial(TaskRunner, job), 8) as executor:
+        for result in run_tasks(tasks.pop_next, executor):
+            print(result)
 
 Each process creates a runner once, and calls it with one task at a time.
 """
@@ -44,7 +45,11 @@ Runner = Callable[[Any], list[ResultT]]
 
 
 class Executor(AbstractContextManager[Any], Protocol[ResultT]):
-    """Runs a limited number of tasks at a time. On exit from the context, the running tasks are stopped."""
+    """Runs a limited number of tasks at a time.
+
+    If the context is left with an error, the running tasks are stopped. Otherwise, the exit may wait for them, and their
+    results are lost.
+    """
 
     chunk_size: int
     """Number of items per task."""
@@ -208,7 +213,10 @@ class ProcessExecutor(Generic[ResultT]):
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Closes all pipes. Idle workers exit when their pipe closes. After an error, all workers are killed."""
+        """Closes all pipes, and waits until the workers exit: at once if they are idle, otherwise after their task.
+
+        After an error, all workers are killed.
+        """
         for worker in [*self._idle, *(worker for worker, _, _ in self._busy.values())]:
             worker.pipe.close()
             if error:
@@ -238,18 +246,25 @@ def _interrupts_blocked() -> Iterator[None]:
 def _worker_main(pipe: Connection, create_runner: Callable[[], Runner[Any]]) -> None:
     """The main function of a worker: runs tasks until the pipe closes."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    os.environ.setdefault("OMP_NUM_THREADS", "1")  # one processor for each worker
+    # One processor for each worker. The ONNX backend reads this variable. If torch is already imported, the variable has no
+    # effect on torch, and the runner limits its threads (see worker_setup.py).
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
     exit_with_parent()  # otherwise this worker and a resumed run could work on the same task
     runner: Runner[Any] | None = None
-    with suppress(EOFError):
-        while True:
+    while True:
+        try:
             task = pipe.recv()
-            try:
-                runner = runner or create_runner()
-                results: list[Any] | BrewsterError = runner(task)
-            except BrewsterError as error:
-                results = error
+        except (EOFError, ConnectionError):  # the parent process has closed the pipe
+            return
+        try:
+            runner = runner or create_runner()
+            results: list[Any] | BrewsterError = runner(task)
+        except BrewsterError as error:
+            results = error
+        try:
             pipe.send(results)
+        except ConnectionError:  # the parent process has closed the pipe during the task
+            return
 
 
 def exit_with_parent() -> None:

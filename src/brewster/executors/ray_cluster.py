@@ -10,7 +10,7 @@ from collections.abc import Callable
 from types import ModuleType, TracebackType
 from typing import Any, Final, Generic, Self, final
 
-from brewster.errors import BrewsterError, DeviceError, MissingExtra
+from brewster.errors import DeviceError, MissingExtra
 from brewster.executors.local import MAX_ATTEMPTS, ResultT, Runner, Task
 
 LOCAL: Final = "local"
@@ -54,17 +54,19 @@ class RayExecutor(Generic[ResultT]):
         """Returns the results of the next finished task. The list is empty if the task was lost and is tried again.
 
         Raises:
-            BrewsterError: raised by the runner.
+            Exception: raised by the runner; its cause is Ray's error with the traceback of the worker.
         """
         (done, *_), _ = self._ray.wait(list(self._tasks), num_returns=1)
-        task = self._tasks.pop(done)
+        task, ray_error = self._tasks.pop(done), self._ray.exceptions.RayError
         try:
             results: list[ResultT] = self._ray.get(done)
-        except self._ray.exceptions.RayError as error:
-            cause = getattr(error, "cause", None)
-            if isinstance(cause, BrewsterError):
-                raise cause from error
-            return self._handle_lost_task(task, type(error).__name__)
+        except ray_error as error:
+            cause = getattr(error, "cause", None)  # the exception that a task has raised
+            # A subclass of RayError is not from the runner: the arguments of the task were lost with a node, for example.
+            # RayError itself replaces an exception of the runner that cannot be pickled.
+            if cause is None or (isinstance(cause, ray_error) and type(cause) is not ray_error):
+                return self._handle_lost_task(task, type(error).__name__)
+            raise cause from error
         return results
 
     def _handle_lost_task(self, task: Task[ResultT], reason: str) -> list[ResultT]:

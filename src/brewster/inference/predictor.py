@@ -36,8 +36,8 @@ QUALITIES: Final[dict[Quality, tuple[int, ...]]] = {
 """The input scales of `MultiScalePredictor`: width times height of each input in pixels, the largest last."""
 
 _MIN_SHORT_SIDE_PX: Final = 160
-"""The inputs of photos with a large aspect ratio are enlarged until their short side has this length."""
-_MAX_ELONGATED_SCALE: Final = 3.0
+"""Inputs whose short side would be below this length are enlarged."""
+_MAX_ENLARGEMENT: Final = 3.0
 """Maximum factor of this enlargement."""
 _TILE_PX: Final = 1024
 _OVERLAP_PX: Final = 192
@@ -91,14 +91,13 @@ class MultiScalePredictor(Predictor):
     def input_sizes(self, size: tuple[int, int], quality: Quality) -> list[tuple[int, int]]:
         """Returns the sizes of the inputs with the numbers of pixels in `QUALITIES`. No input is larger than the photo.
 
-        For photos with a large aspect ratio, the inputs are up to 3 times as wide and high, so that their short side has at least
-        160 pixels if possible.
+        Inputs whose short side would be below 160 px are enlarged to 160 px, by a factor of at most 3.
         """
         width, height = size
         sizes = []
         for pixels in QUALITIES[quality]:
             scale = math.sqrt(pixels / (width * height))
-            scale = min(1.0, max(scale, min(_MAX_ELONGATED_SCALE * scale, _MIN_SHORT_SIDE_PX / min(size))))
+            scale = min(1.0, max(scale, min(_MAX_ENLARGEMENT * scale, _MIN_SHORT_SIDE_PX / min(size))))
             sizes.append((max(1, round(width * scale)), max(1, round(height * scale))))
         return list(dict.fromkeys(sizes))
 

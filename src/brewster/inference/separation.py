@@ -36,7 +36,7 @@ class Separation:
     sha256: str | None
     device: str
     seconds: dict[str, float] = field(compare=False)
-    """Wall time of the steps `decode`, `network` and `detail`."""
+    """Wall time of the steps `decode`, `network` and `upsampling`."""
     reflection_is_derived: bool = False
     """Whether the reflection is photo - transmission in linear light, because the model predicts no reflection."""
 

@@ -221,7 +221,7 @@ class Separator:
         with _timed(seconds, "network"):
             prediction = self._predictor(inputs, quality, lambda done: on_progress(_NETWORK_SHARE * done))
             prediction = keep_clipped_white(inputs[-1], prediction)
-        with _timed(seconds, "detail"):
+        with _timed(seconds, "upsampling"):
             upsampler = _fit_upsampler(inputs[-1], prediction, strength, white)
             transmission, reflection, residual = upsample_layers(
                 photo,

@@ -73,50 +73,54 @@ __all__ = [
 ]
 
 
-def _psnr(case: Comparison) -> float:
-    if case.region is None:
-        return min(psnr_of_counts(case.shared(_pair_counts)), IDENTICAL_DB)
-    return min(psnr(case.prediction.pixels, case.truth.pixels, region=case.region), IDENTICAL_DB)
+def _psnr(comparison: Comparison) -> float:
+    if comparison.region is None:
+        return min(psnr_of_counts(comparison.shared(_pair_counts)), IDENTICAL_DB)
+    return min(
+        psnr(comparison.prediction.pixels, comparison.truth.pixels, region=comparison.region), IDENTICAL_DB
+    )
 
 
-def _psnr_of_channels(case: Comparison) -> float:
-    return min(psnr_of_channels(case.prediction.pixels, case.truth.pixels), IDENTICAL_DB)
+def _psnr_of_channels(comparison: Comparison) -> float:
+    return min(psnr_of_channels(comparison.prediction.pixels, comparison.truth.pixels), IDENTICAL_DB)
 
 
-def _linear_rmse(case: Comparison) -> float:
-    return linear_rmse_of_counts(case.shared(_pair_counts))
+def _linear_rmse(comparison: Comparison) -> float:
+    return linear_rmse_of_counts(comparison.shared(_pair_counts))
 
 
-def _pair_counts(case: Comparison) -> PairCounts:
-    return count_pairs(case.prediction.pixels, case.truth.pixels)
+def _pair_counts(comparison: Comparison) -> PairCounts:
+    return count_pairs(comparison.prediction.pixels, comparison.truth.pixels)
 
 
-def _uniform_map(case: Comparison) -> NDArray[np.float64]:
-    return ssim_map(case.prediction.pixels, case.truth.pixels)
+def _uniform_map(comparison: Comparison) -> NDArray[np.float64]:
+    return ssim_map(comparison.prediction.pixels, comparison.truth.pixels)
 
 
-def _gaussian_map(case: Comparison) -> NDArray[np.float64]:
-    return ssim_map(case.prediction.pixels, case.truth.pixels, window="gaussian")
+def _gaussian_map(comparison: Comparison) -> NDArray[np.float64]:
+    return ssim_map(comparison.prediction.pixels, comparison.truth.pixels, window="gaussian")
 
 
-def _ssim(case: Comparison) -> float:
-    return mean_ssim(case.shared(_uniform_map), region=case.region)
+def _ssim(comparison: Comparison) -> float:
+    return mean_ssim(comparison.shared(_uniform_map), region=comparison.region)
 
 
-def _ssim_gaussian(case: Comparison) -> float:
-    return mean_ssim(case.shared(_gaussian_map), region=case.region)
+def _ssim_gaussian(comparison: Comparison) -> float:
+    return mean_ssim(comparison.shared(_gaussian_map), region=comparison.region)
 
 
-def _ssim_clipped(case: Comparison) -> float:
-    return mean_ssim(np.maximum(case.shared(_gaussian_map), 0), region=case.region)
+def _ssim_clipped(comparison: Comparison) -> float:
+    return mean_ssim(np.maximum(comparison.shared(_gaussian_map), 0), region=comparison.region)
 
 
-def _lpips(case: Comparison) -> float:
-    return case.shared(_lpips_difference).mean(region=case.region)
+def _lpips(comparison: Comparison) -> float:
+    return comparison.shared(_lpips_difference).mean(region=comparison.region)
 
 
-def _lpips_difference(case: Comparison) -> DifferenceMaps:
-    prediction, truth = (image.features(_lpips_features) for image in (case.prediction, case.truth))
+def _lpips_difference(comparison: Comparison) -> DifferenceMaps:
+    prediction, truth = (
+        image.features(_lpips_features) for image in (comparison.prediction, comparison.truth)
+    )
     return Lpips.load().difference(prediction, truth)
 
 
@@ -130,8 +134,10 @@ def _lpips_features_of_black(shape: tuple[int, ...]) -> Features:
     return Lpips.load().features(np.zeros(shape, np.uint8))
 
 
-def _dists(case: Comparison) -> float:
-    prediction, truth = (image.features(_dists_features) for image in (case.prediction, case.truth))
+def _dists(comparison: Comparison) -> float:
+    prediction, truth = (
+        image.features(_dists_features) for image in (comparison.prediction, comparison.truth)
+    )
     return Dists.load().distance(prediction, truth)
 
 
@@ -139,8 +145,8 @@ def _dists_features(image: Image) -> DistsFeatures:
     return Dists.load().features(image)
 
 
-def _niqe(case: Comparison) -> float:
-    return niqe(case.prediction.pixels)
+def _niqe(comparison: Comparison) -> float:
+    return niqe(comparison.prediction.pixels)
 
 
 def _rendered_score(
@@ -148,11 +154,13 @@ def _rendered_score(
 ) -> Callable[[Comparison], float]:
     """Converts a function of prediction, background, photo and reflection to the `score` function of a metric."""
 
-    def score_case(case: Comparison) -> float:
-        assert case.reflection is not None
-        return score(case.prediction.pixels, case.truth.pixels, case.photo, case.reflection)
+    def score_comparison(comparison: Comparison) -> float:
+        assert comparison.reflection is not None
+        return score(
+            comparison.prediction.pixels, comparison.truth.pixels, comparison.photo, comparison.reflection
+        )
 
-    return score_case
+    return score_comparison
 
 
 IDENTICAL_DB: Final = 100.0

@@ -62,8 +62,8 @@ def removed_content(prediction: Image, background: Image, photo: Image, reflecti
         A fraction in 0..1; lower is better.
 
     Raises:
-        ValueError: the images are not uint8 (H, W, 3) or differ in shape, or the score or the gain has fewer than 64
-            valid pixels.
+        ValueError: the images are not uint8 (H, W, 3) or differ in shape, or the score or the background has fewer
+            than 64 valid pixels.
     """
     luminance = _Luminances.of(prediction, background, photo, reflection)
     return luminance.removed_fraction(luminance.unreflected, f"R < {NEGLIGIBLE_FRACTION:.0%} of I")
@@ -127,14 +127,14 @@ class _Luminances:
     @classmethod
     def of(cls, prediction: Image, background: Image, photo: Image, reflection: Image) -> _Luminances:
         check_images(prediction, background, photo, reflection)
-        t, b, i, r = map(_luminance, (prediction, background, photo, reflection))
+        p, b, i, r = map(_luminance, (prediction, background, photo, reflection))
         unreflected = r < NEGLIGIBLE_FRACTION * i
         comparable_background = unreflected & (b >= BLACK_LUMINANCE) & ~_is_clipped(background)
         _require_pixels(
             comparable_background, f"R < {NEGLIGIBLE_FRACTION:.0%} of I and B neither black nor clipped"
         )
-        comparable = comparable_background & (t >= BLACK_LUMINANCE) & ~_is_clipped(prediction)
-        return cls(t * _gain(t[comparable], b[comparable]), b, i, r, unreflected)
+        comparable = comparable_background & (p >= BLACK_LUMINANCE) & ~_is_clipped(prediction)
+        return cls(p * _gain(p[comparable], b[comparable]), b, i, r, unreflected)
 
     def removed_fraction(self, mask: Region, condition: str) -> float:
         missing = np.maximum(self.background - self.prediction, 0)

@@ -32,7 +32,7 @@ class CachedImage:
 class Comparison:
     """The predicted layer to score, its ground truth, and the photo.
 
-    For a metric whose `of` is "rendered", `prediction` is the predicted transmission, `truth` is the background, and
+    For a metric whose `ground_truth` is "rendered", `prediction` is the predicted transmission, `truth` is the background, and
     `reflection` is never None.
     """
 
@@ -42,7 +42,7 @@ class Comparison:
     reflection: Image | None = None
     """The ground truth of the reflection; None if the case has none."""
     region: Region | None = None
-    """The pixels to score for a metric whose `where` is "region"; otherwise None."""
+    """The pixels to score for a metric whose `area` is "region"; otherwise None."""
     _shared: dict[Callable[[Comparison], Any], Any] = field(default_factory=dict, repr=False)
 
     def shared(self, compute: Callable[[Comparison], _Shared]) -> _Shared:
@@ -67,18 +67,18 @@ class Metric:
     higher_is_better: bool
     digits: int
     """The number of decimal places in tables."""
-    about: str
+    definition: str
     """The definition with all parameters, in one or two sentences."""
-    of: Literal["transmission", "reflection", "rendered"]
+    ground_truth: Literal["transmission", "reflection", "rendered"]
     """The ground truth that the metric needs: the transmission, the reflection, or all layers of a rendered sample."""
     score: Callable[[Comparison], float]
     """Computes the value. Raises ValueError if the value is undefined: the region is empty, or the image is too small."""
-    where: Literal["picture", "region"] = "picture"
-    """The pixels over which to average: the whole image ("picture"), or the reflection region ("region")."""
+    area: Literal["image", "region"] = "image"
+    """The pixels over which to average: the whole image ("image"), or the reflection region ("region")."""
     prepare: Callable[[], object] | None = None
     """A function that loads the weights of the metric, so that missing weights are reported before the first score."""
 
     def to_dict(self) -> dict[str, Any]:
         """Returns all fields except the name and the functions, for results.json."""
-        keys = ("title", "unit", "higher_is_better", "digits", "about", "of", "where")
+        keys = ("title", "unit", "higher_is_better", "digits", "definition", "ground_truth", "area")
         return {key: getattr(self, key) for key in keys}

@@ -288,7 +288,7 @@ def _method_notes(results: Results) -> Iterator[str]:
     yield f"<details><summary>Settings and definitions</summary>{_list(results['protocol']['choices'])}<dl>"
     for name, metric in results["metrics"].items():
         better = "higher is better" if metric["higher_is_better"] else "lower is better"
-        yield f"<dt>{escape(metric['title'])} <code>{escape(name)}</code></dt><dd>{escape(metric['about'])} ({better})</dd>\n"
+        yield f"<dt>{escape(metric['title'])} <code>{escape(name)}</code></dt><dd>{escape(metric['definition'])} ({better})</dd>\n"
     yield "</dl></details>\n<details><summary>Methods</summary><dl>"
     for name, method in results["methods"].items():
         facts = (f"{key} {value}" for key, value in method.items())

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Sequence
 from typing import Any, Final
 
-from brewster.evaluate.report.tables import MAIN_METRICS, is_complete, ranking
+from brewster.evaluate.report.tables import is_complete, main_metrics, ranking
 from brewster.evaluate.results import AVERAGE, Results
 
 _SIR2: Final = ("postcard", "solidobject", "wildscene")
@@ -23,13 +23,13 @@ _ESCAPES: Final = str.maketrans(
 
 
 def to_latex(results: Results, *, intervals: bool = False) -> str:
-    """Returns a table with one row per method and three metrics per benchmark. The average is the last column group.
+    """Returns a table with one row per method and up to three metrics per benchmark. The average is the last column group.
 
     The best three values of a column are marked as in the paper, but the worst value has no mark. A dagger marks a mean
     over fewer images than those of other methods. With `intervals`, each mean has its 95 % interval. The first line names
     the LaTeX packages that the table needs.
     """
-    metrics = [name for name in MAIN_METRICS if name in results["metrics"]] or list(results["metrics"])[:3]
+    metrics = main_metrics(results)
     keys = _table_selections(results)
     if not metrics or not keys:
         return "% there are no scores\n"
@@ -68,7 +68,7 @@ def to_latex(results: Results, *, intervals: bool = False) -> str:
 def _table_selections(results: Results) -> list[str]:
     """Returns the selections of the table. The subsets of SIR2 are adjacent, and the average is last.
 
-    If there is a draw from a benchmark, it replaces the whole benchmark.
+    If a benchmark has a paper subset, the subset replaces the whole benchmark.
     """
     keys = [
         key for key in results["selections"] if f"{key}:paper" not in results["selections"] and key != AVERAGE
@@ -118,27 +118,27 @@ def _multicolumn(columns: int, text: str, *, is_last: bool) -> str:
 
 
 def _title(results: Results, metric: str) -> str:
-    about = results["metrics"][metric]
-    return f"{about['title']}$\\{'uparrow' if about['higher_is_better'] else 'downarrow'}$"
+    metric_info = results["metrics"][metric]
+    return f"{metric_info['title']}$\\{'uparrow' if metric_info['higher_is_better'] else 'downarrow'}$"
 
 
 def _cells(results: Results, key: str, method: str, metrics: Iterable[str], intervals: bool) -> Iterator[str]:
     """Yields the means with their marks and, on request, their intervals."""
     table = results["tables"][key]
     for metric in metrics:
-        about: dict[str, Any] = results["metrics"][metric]
+        metric_info: dict[str, Any] = results["metrics"][metric]
         entry = table[method].get(metric)
         if entry is None:
             yield "--"
             continue
-        text = f"{entry['mean']:.{about['digits']}f}"
+        text = f"{entry['mean']:.{metric_info['digits']}f}"
         has_interval = intervals and entry["low"] is not None
-        ends = (f"{entry[end]:.{about['digits']}f}" for end in ("low", "high"))
+        ends = (f"{entry[end]:.{metric_info['digits']}f}" for end in ("low", "high"))
         interval = f" {{\\scriptsize [{', '.join(ends)}]}}" if has_interval else ""
         if not is_complete(table, method, metric):
             yield f"{text}{_DAGGER}{interval}"
             continue
-        marks = dict(zip(ranking(table, metric, about)[:-1], _MARKS, strict=False))
+        marks = dict(zip(ranking(table, metric, metric_info)[:-1], _MARKS, strict=False))
         yield (f"{marks[text]}{{{text}}}" if text in marks else text) + interval
 
 

@@ -32,16 +32,16 @@
 
   function value(item) {
     const score = item.scores[state.of]?.[state.sort];
-    const baseline = state.by === "gain" ? item.scores[data.baseline]?.[state.sort] : 0;
+    const baseline = state.by === "difference" ? item.scores[data.baseline]?.[state.sort] : 0;
     return score == null || baseline == null ? null : score - baseline;
   }
 
   function scoreText(number) {
     const metric = data.metrics[state.sort];
     if (!metric) return "";
-    const title = `· ${metric.title} of ${state.of}${state.by === "gain" ? ", difference" : ""}: `;
+    const title = `· ${metric.title} of ${state.of}${state.by === "difference" ? ", difference" : ""}: `;
     if (number === null) return title + "none";
-    const sign = state.by === "gain" && number > 0 ? "+" : "";
+    const sign = state.by === "difference" && number > 0 ? "+" : "";
     return title + sign + number.toFixed(metric.digits).replace("-", "\u2212") + (metric.unit ? "\u00a0" + metric.unit : "");
   }
 
@@ -96,7 +96,7 @@
   let current = null, at = 0;
   const view = {zoom: 1, x: 0, y: 0, fits: true};  // CSS pixels per image pixel, and the image point in the centre of a pane
   const stage = dialog.querySelector(".stage");
-  const [one, other, gain] = ["one", "other", "gain"].map(name => dialog.querySelector(`[name=${name}]`));
+  const [one, other, amplification] = ["one", "other", "amplification"].map(name => dialog.querySelector(`[name=${name}]`));
   const toggle = name => dialog.querySelector(`button[value=${name}]`);
   const isOn = name => toggle(name).getAttribute("aria-pressed") === "true";
   const id = item => `${item.benchmark}/${item.name}`;
@@ -178,14 +178,14 @@
   // The browser blends the two images, so that no script has to read the pixels of a file.
   function showDifference() {
     stage.querySelector(".difference")?.remove();
-    for (const select of [one, other, gain]) select.parentElement.hidden = !isOn("difference");
+    for (const select of [one, other, amplification]) select.parentElement.hidden = !isOn("difference");
     const names = isOn("difference") ? [one.value, other.value] : [];
-    const text = names.length ? `${names.join(" \u2212 ")}, absolute difference \u00d7 ${gain.value}` : caption(current.buttons[at]);
+    const text = names.length ? `${names.join(" \u2212 ")}, absolute difference \u00d7 ${amplification.value}` : caption(current.buttons[at]);
     heading.textContent = `${current.name}: ${text}`;
     if (!names.length) return;
     const layer = document.createElement("div");
     layer.className = "layer on difference";
-    layer.style.setProperty("--gain", gain.value);
+    layer.style.setProperty("--amplification", amplification.value);
     layer.append(...names.map(name => planeOf(current.buttons.find(button => caption(button) === name))));
     layer.querySelectorAll(".tint").forEach(tint => tint.remove());
     stage.append(layer);
@@ -319,7 +319,7 @@
     action();
   });
   dialog.querySelector("header").addEventListener("click", event => actions[event.target.closest("button")?.value]?.());
-  for (const select of [one, other, gain]) select.addEventListener("input", showDifference);
+  for (const select of [one, other, amplification]) select.addEventListener("input", showDifference);
   dialog.addEventListener("close", () => {
     Object.assign(state, {open: "", layer: ""});
     writeFragment();

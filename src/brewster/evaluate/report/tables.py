@@ -9,12 +9,17 @@ from typing import Any, Final
 
 from brewster.evaluate.results import Results
 
-MAIN_METRICS: Final = ("psnr", "ssim", "lpips")
-"""The metrics of the overview table."""
+_MAIN_METRICS: Final = ("psnr", "ssim", "lpips")
 
 _ARROWS: Final = {True: "↑", False: "↓"}
 _UNEQUAL_COUNTS_NOTE: Final = "\n\nDo not compare a mean over fewer images with the other means. Differences use the images that both methods have."
 _MINUS: Final = "\N{MINUS SIGN}"
+
+
+def main_metrics(results: Results) -> list[str]:
+    """Returns the metrics of the overview: PSNR, SSIM and LPIPS if the results have all three, else the first three metrics."""
+    names = list(results["metrics"])
+    return list(_MAIN_METRICS) if set(_MAIN_METRICS) <= set(names) else names[:3]
 
 
 # --- Markdown
@@ -104,7 +109,7 @@ def _aligned(columns: list[list[str]]) -> str:
 
 def _overview(results: Results) -> str:
     """Returns a table with one row per method and one column per selection. Each cell has the main metrics."""
-    metrics = [name for name in MAIN_METRICS if name in results["metrics"]]
+    metrics = main_metrics(results)
     if not metrics:
         return ""
     titles = " / ".join(_heading(results, name) for name in metrics)
@@ -222,7 +227,7 @@ def failures(results: Results) -> list[str]:
 
 
 def _settings(results: Results) -> str:
-    metrics = (f"{entry['title']}: {entry['about']}" for entry in results["metrics"].values())
+    metrics = (f"{entry['title']}: {entry['definition']}" for entry in results["metrics"].values())
     lines = [*results["protocol"]["choices"], *metrics]
     return "\n".join(["### Settings and definitions", "", *(f"- {line}" for line in lines)])
 
@@ -247,7 +252,7 @@ def _number(results: Results, metric: str, value: float, *, sign: str = "") -> s
     return f"{value:{sign}.{results['metrics'][metric]['digits']}f}"
 
 
-def ranking(table: Mapping[str, Any], metric: str, about: Mapping[str, Any]) -> list[str]:
+def ranking(table: Mapping[str, Any], metric: str, metric_info: Mapping[str, Any]) -> list[str]:
     """Returns the distinct means in descending order of quality, as they are printed.
 
     The list has no means of methods with scores on fewer images than other methods. It is empty if fewer than two methods
@@ -256,8 +261,8 @@ def ranking(table: Mapping[str, Any], metric: str, about: Mapping[str, Any]) -> 
     means = [row[metric]["mean"] for method, row in table.items() if is_complete(table, method, metric)]
     if len(means) < 2:
         return []
-    means.sort(reverse=about["higher_is_better"])
-    return list(dict.fromkeys(f"{mean:.{about['digits']}f}" for mean in means))
+    means.sort(reverse=metric_info["higher_is_better"])
+    return list(dict.fromkeys(f"{mean:.{metric_info['digits']}f}" for mean in means))
 
 
 def is_complete(table: Mapping[str, Any], method: str, metric: str) -> bool:

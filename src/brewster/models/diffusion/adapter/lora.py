@@ -5,8 +5,8 @@
     metadata, prompt = load_lora(folder, backbone)
 
 The paper uses rank 16 (Experimental Setup). It does not state alpha or the adapted layers; alpha 16 and all linear
-layers of the blocks are usual settings. The LoRA is float32 for a base of any precision, because most of Adam's updates are
-smaller than the rounding error of bf16.
+layers of the blocks are usual settings. During training, the LoRA is float32 for a base of any precision, because most of
+Adam's updates are smaller than the rounding error of bf16.
 """
 
 from __future__ import annotations
@@ -80,7 +80,7 @@ class LoraMetadata:
             if details["type"] in {"extra_forbidden", "unexpected_keyword_argument"}:
                 raise ModelError(
                     f"the metadata of the LoRA has the unknown key {'.'.join(map(str, details['loc']))}",
-                    "expected the keys that this version of brewster knows",
+                    "expected only keys of the metadata format of this version",
                     "update brewster: a newer version wrote the LoRA",
                 ) from error
             raise ModelError(
@@ -304,9 +304,10 @@ def read_prompt(folder: Path, metadata: LoraMetadata) -> PromptEmbedding:
 
 
 def load_lora(folder: Path, backbone: Backbone) -> tuple[LoraMetadata, PromptEmbedding]:
-    """Adds the LoRA of a folder to its backbone for inference, in the dtype in which the backbone computes.
+    """Adds the LoRA of a folder to its backbone for inference.
 
-    A float32 LoRA on a bf16 base converts the activations of every layer twice.
+    The LoRA has the dtype in which the backbone computes, because a float32 LoRA would convert the activations of every layer
+    of a bf16 base twice.
 
     Returns:
         The metadata of the LoRA, and its prompt.
@@ -363,7 +364,7 @@ def _check_weights(expected: Mapping[str, Tensor], actual: Mapping[str, Tensor])
     if mismatched:
         raise ModelError(
             f"{len(mismatched)} weights of the LoRA are missing or unexpected, for example {mismatched[0]}",
-            "expected one pair of matrices for each linear layer of the blocks",
+            "expected one pair of matrices for each adapted layer",
             "use the backbone with which it was trained",
         )
     for name, tensor in sorted(actual.items()):
