@@ -116,7 +116,9 @@ def test_a_participant_continues_on_another_device_with_the_personal_link_only(o
     again = open_page(link)
     expect(again.get_by_text("Pair 3 of 4").first).to_be_visible()
     again.goto(link[:-1])
-    expect(again.get_by_role("alert")).to_contain_text("this link is unknown; check that it is complete")
+    expect(again.get_by_role("alert")).to_contain_text(
+        "is unknown. Expected a complete link of this study. Check the link"
+    )
 
 
 def test_the_pictures_of_the_trial_are_shown_on_their_sides_and_have_names(open_page, url, store):
@@ -262,7 +264,7 @@ def test_an_answer_without_acknowledgement_is_sent_again(open_page, url, store):
 
     page.route("**/answers", fail)
     press(page, "1")
-    expect(page.get_by_text("Not saved yet")).to_be_visible()
+    expect(page.get_by_text("not saved yet")).to_be_visible()
     page.keyboard.press("3")  # ignored while the first answer is sent
     expect(page.get_by_text("Pair 2 of 4").first).to_be_visible(timeout=15_000)
     ((_, answers),) = store.all_answers()
@@ -346,9 +348,11 @@ def test_a_notice_is_not_removed_by_the_timer_of_an_earlier_notice(open_page, ur
 
 def test_a_missing_picture_is_reported_when_its_trial_is_shown(open_page, url, store):
     page = open_page(url)
-    gone = {"status": 410, "json": {"error": "a picture is missing on the server"}}
+    gone = {"status": 410, "json": {"error": "result A of pair 2 is missing; expected three; tell it"}}
     page.route("**/pictures/1/left", lambda route: route.fulfill(**gone))
     begin(page)
     press(page, "1")
-    expect(page.get_by_role("alert")).to_contain_text("a picture is missing on the server")
+    expect(page.get_by_role("alert")).to_contain_text(
+        "Result A of pair 2 is missing. Expected three. Tell it."
+    )
     expect(page.locator("#notice")).to_be_hidden()
