@@ -76,9 +76,11 @@ def find(sources: Iterable[Location], output_folder: Location | None = None) -> 
     return name_layers(pair for source in sources for pair in images_in(source, output_folder))
 
 
-def images_in(source: Location, output_folder: Location | None = None) -> Iterator[tuple[Location, Location]]:
-    """Yields the images in a file or folder, each with the folder of its layers. See `find`."""
-    for image in _image_files(source):
+def images_in(
+    source: Location, output_folder: Location | None = None, *, videos: list[Path] | None = None
+) -> Iterator[tuple[Location, Location]]:
+    """Yields the images in a file or folder, each with the folder of its layers. See `find`. Appends videos in folders to `videos`."""
+    for image in _image_files(source, [] if videos is None else videos):
         yield image, _output_folder(image, source, output_folder)
 
 
@@ -100,12 +102,6 @@ def name_layers(images: Iterable[tuple[Location, Location]]) -> list[SeparationP
         found.setdefault(_absolute(image), SeparationPaths(image, folder, _layer_name(image, counts[parent])))
     _check_unique_targets(found.values())
     return list(found.values())
-
-
-def find_videos(sources: Iterable[Location]) -> list[Path]:
-    """Returns the videos in local folders, which `find` skips, in a stable order."""
-    folders = (source for source in sources if isinstance(source, Path) and _is_folder(source))
-    return [path for folder in folders for path in walk(folder, _is_video) if _is_video(path)]
 
 
 def _output_folder(image: Location, source: Location, output_folder: Location | None) -> Location:
@@ -215,11 +211,15 @@ def _sync(path: Path) -> None:
         os.close(file)
 
 
-def _image_files(source: Location) -> Iterator[Location]:
+def _image_files(source: Location, videos: list[Path]) -> Iterator[Location]:
     if isinstance(source, RemotePath):
         yield from [source] if format_of(source) else _remote_images(source)
     elif _is_folder(source):
-        yield from walk(source, _is_input)
+        for path in walk(source, lambda path: _is_input(path) or _is_video(path)):
+            if _is_video(path):
+                videos.append(path)
+            else:
+                yield path
     else:
         yield source
 
