@@ -174,7 +174,7 @@ def test_zoom_and_pan_apply_to_all_three_pictures_and_are_reset_for_new_ones(ope
     assert transforms() == whole
 
 
-def test_full_size_is_kept_for_the_next_pair(open_page, url):
+def test_full_size_shows_the_pixels_of_the_picture_and_is_kept_for_the_next_pair(open_page, url, store):
     page = open_page(url, viewport={"width": 500, "height": 500})  # the pictures have 240 px
     begin(page)
     full = page.locator("[data-zoom=full]")
@@ -183,11 +183,19 @@ def test_full_size_is_kept_for_the_next_pair(open_page, url):
         return page.locator(".left img").bounding_box()["width"]
 
     page.keyboard.press("f")
-    assert picture_width() == pytest.approx(240, abs=1)
+    assert picture_width() == 240
+    ((participant, _),) = store.all_answers()
+    expected = Photo.open(store.study.picture_file(participant.trials[0].left)).pixels
+    screen = Photo.open(page.screenshot()).pixels
+    picture, frame = (page.locator(f".left {part}").bounding_box() for part in ("img", ".frame"))
+    left, top, x, y = (round(value) for value in (frame["x"] + 2, frame["y"] + 2, picture["x"], picture["y"]))
+    rows, columns = int(frame["height"]) - 4, int(frame["width"]) - 4
+    shown = screen[top : top + rows, left : left + columns].astype(int)
+    assert np.abs(shown - expected[top - y :, left - x :][:rows, :columns]).max() <= 1
     press(page, "2")
     expect(page.get_by_text("Pair 2 of 4").first).to_be_visible()
     page.wait_for_selector(READY)
-    assert picture_width() == pytest.approx(240, abs=1)
+    assert picture_width() == 240
     expect(full).to_have_attribute("aria-pressed", "true")
     page.keyboard.press("+")
     expect(full).to_have_attribute("aria-pressed", "false")
