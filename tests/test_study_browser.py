@@ -116,7 +116,9 @@ def test_a_participant_continues_on_another_device_with_the_personal_link_only(o
     again = open_page(link)
     expect(again.get_by_text("Pair 3 of 4").first).to_be_visible()
     again.goto(link[:-1])
-    expect(again.get_by_role("alert")).to_contain_text("this link is unknown; check that it is complete")
+    expect(again.get_by_role("alert")).to_contain_text(
+        "is unknown. Expected a complete link of this study. Check the link"
+    )
 
 
 def test_the_pictures_of_the_trial_are_shown_on_their_sides_and_have_names(open_page, url, store):
@@ -172,7 +174,7 @@ def test_zoom_and_pan_apply_to_all_three_pictures_and_are_reset_for_new_ones(ope
     assert transforms() == whole
 
 
-def test_full_size_is_kept_for_the_next_pair(open_page, url):
+def test_full_size_shows_the_pixels_of_the_picture_and_is_kept_for_the_next_pair(open_page, url, store):
     page = open_page(url, viewport={"width": 500, "height": 500})  # the pictures have 240 px
     begin(page)
     full = page.locator("[data-zoom=full]")
@@ -181,11 +183,19 @@ def test_full_size_is_kept_for_the_next_pair(open_page, url):
         return page.locator(".left img").bounding_box()["width"]
 
     page.keyboard.press("f")
-    assert picture_width() == pytest.approx(240, abs=1)
+    assert picture_width() == 240
+    ((participant, _),) = store.all_answers()
+    expected = Photo.open(store.study.picture_file(participant.trials[0].left)).pixels
+    screen = Photo.open(page.screenshot()).pixels
+    picture, frame = (page.locator(f".left {part}").bounding_box() for part in ("img", ".frame"))
+    left, top, x, y = (round(value) for value in (frame["x"] + 2, frame["y"] + 2, picture["x"], picture["y"]))
+    rows, columns = int(frame["height"]) - 4, int(frame["width"]) - 4
+    shown = screen[top : top + rows, left : left + columns].astype(int)
+    assert np.abs(shown - expected[top - y :, left - x :][:rows, :columns]).max() <= 1
     press(page, "2")
     expect(page.get_by_text("Pair 2 of 4").first).to_be_visible()
     page.wait_for_selector(READY)
-    assert picture_width() == pytest.approx(240, abs=1)
+    assert picture_width() == 240
     expect(full).to_have_attribute("aria-pressed", "true")
     page.keyboard.press("+")
     expect(full).to_have_attribute("aria-pressed", "false")
@@ -262,7 +272,7 @@ def test_an_answer_without_acknowledgement_is_sent_again(open_page, url, store):
 
     page.route("**/answers", fail)
     press(page, "1")
-    expect(page.get_by_text("Not saved yet")).to_be_visible()
+    expect(page.get_by_text("not saved yet")).to_be_visible()
     page.keyboard.press("3")  # ignored while the first answer is sent
     expect(page.get_by_text("Pair 2 of 4").first).to_be_visible(timeout=15_000)
     ((_, answers),) = store.all_answers()
@@ -346,9 +356,11 @@ def test_a_notice_is_not_removed_by_the_timer_of_an_earlier_notice(open_page, ur
 
 def test_a_missing_picture_is_reported_when_its_trial_is_shown(open_page, url, store):
     page = open_page(url)
-    gone = {"status": 410, "json": {"error": "a picture is missing on the server"}}
+    gone = {"status": 410, "json": {"error": "result A of pair 2 is missing; expected three; tell it"}}
     page.route("**/pictures/1/left", lambda route: route.fulfill(**gone))
     begin(page)
     press(page, "1")
-    expect(page.get_by_role("alert")).to_contain_text("a picture is missing on the server")
+    expect(page.get_by_role("alert")).to_contain_text(
+        "Result A of pair 2 is missing. Expected three. Tell it."
+    )
     expect(page.locator("#notice")).to_be_hidden()

@@ -179,7 +179,13 @@ def test_a_participant_answers_in_a_browser_and_the_file_is_imported(study, stor
         page = context.new_page()
         page.on("pageerror", lambda error: errors.append(error))  # noqa: PLW0108  (playwright marks its handlers)
         page.goto(f"{url}?p=0000000000000000")
-        page.get_by_text("This link is unknown").wait_for()
+        page.get_by_text(
+            "The link with ?p=0000000000000000 is unknown. Expected the complete link"
+        ).wait_for()
+        page.route("**/participants/*", lambda route: route.abort())
+        page.goto(f"{url}?p={token}")
+        page.get_by_text("Your list of pairs could not be loaded. Expected a connection").wait_for()
+        page.unroute("**/participants/*")
         page.goto(f"{url}?p={token}")
         page.get_by_role("checkbox").check()
         page.get_by_role("button", name="Begin").click()

@@ -54,7 +54,7 @@ def post_answer(app, link, trial, choice="left", seconds=2.5):
 
 def test_a_participant_who_agrees_gets_a_link_and_all_trials(app, store):
     invitation = request(app, "GET", "/invitation").json()
-    assert invitation == {"consent": "First.\n\n<b>Second</b>.", "trials": 8, "is_open": True}
+    assert invitation == {"consent": "First.\n\n<b>Second</b>.", "trials": 8}
     link = admit_participant(app)
     state = request(app, "GET", f"{link}/trial").json()
     for trial in range(8):
@@ -206,7 +206,7 @@ def test_an_unknown_link_is_an_error(app):
     for path in ("/s/nobody/trial", "/s/nobody/link", "/s/nobody/pictures/0/left"):
         response = request(app, "GET", path)
         assert response.status_code == 404
-        assert "this link is unknown" in response.json()["error"]
+        assert "/s/nobody is unknown; expected" in response.json()["error"]
     assert post_answer(app, "/s/nobody", 0).status_code == 404
     whole = request(app, "GET", "/s/nobody")
     assert (whole.status_code, "<title>Compare pictures" in whole.text) == (404, True)
@@ -215,7 +215,11 @@ def test_an_unknown_link_is_an_error(app):
 def test_trials_beyond_the_last_are_an_error(app):
     link = admit_participant(app)
     for trial in (-1, 8):
-        assert request(app, "GET", f"{link}/pictures/{trial}/left").status_code == 404
+        response = request(app, "GET", f"{link}/pictures/{trial}/left")
+        assert response.status_code == 404
+        assert response.json()["error"].startswith(
+            f"there is no pair {trial + 1}; expected a pair from 1 to 8; "
+        )
     assert request(app, "GET", f"{link}/pictures/0/middle").status_code == 422
     assert post_answer(app, link, 8).status_code == 404
 
@@ -225,10 +229,11 @@ def test_a_full_study_admits_no_one_else_and_its_participants_can_continue(study
         study_router(study, store, max_participants=1), policy=AccessPolicy(), index="study.html"
     )
     link = admit_participant(app)
-    assert not request(app, "GET", "/invitation").json()["is_open"]
+    invited = request(app, "GET", "/invitation")
     refused = request(app, "POST", "/participants", json={"agreed": True})
-    assert refused.status_code == 403
-    assert "all the participants" in refused.json()["error"]
+    assert invited.status_code == refused.status_code == 403
+    assert invited.json()["error"] == refused.json()["error"]
+    assert "has all the participants that it needs (1);" in refused.json()["error"]
     assert post_answer(app, link, 0).status_code == 200
 
 
@@ -289,5 +294,5 @@ def test_a_missing_picture_is_a_permanent_error(tmp_path):
         study.picture_file(trial.left).unlink()
         response = request(app, "GET", f"{link}/pictures/0/left")
     assert response.status_code == 410  # the page repeats requests that fail with 500 or more
-    assert response.json()["error"].startswith("a picture is missing on the server")
+    assert response.json()["error"].startswith("result A of pair 1 is missing on the server")
     assert trial.left.removesuffix(".png") not in response.text

@@ -59,7 +59,9 @@ class SeparationPaths:
         return self.folder / f"{name}.{layer}{suffix or default}"
 
 
-def images_in(source: Location, output_folder: Location | None = None) -> Iterator[tuple[Location, Location]]:
+def images_in(
+    source: Location, output_folder: Location | None = None, *, videos: list[Path] | None = None
+) -> Iterator[tuple[Location, Location]]:
     """Yields the images in a file or folder in a stable order, each with the folder of its layers.
 
     Layers are written next to their image, or below `output_folder`, which mirrors the tree of an input folder.
@@ -67,15 +69,10 @@ def images_in(source: Location, output_folder: Location | None = None) -> Iterat
     In folders, hidden files, files without an image suffix, layers that brewster has written, and masks next to their
     image (`a.mask.png` next to `a.jpg`) are skipped. A folder that is reached through several links is visited once, so
     that link loops end. A file given by name is always included. If it is not an image, opening it raises the error.
+    The videos in local folders are appended to `videos`.
     """
-    for image in _image_files(source):
+    for image in _image_files(source, [] if videos is None else videos):
         yield image, _output_folder(image, source, output_folder)
-
-
-def find_videos(sources: Iterable[Location]) -> list[Path]:
-    """Returns the videos in local folders, which `images_in` skips, in a stable order."""
-    folders = (source for source in sources if isinstance(source, Path) and _is_folder(source))
-    return [path for folder in folders for path in walk(folder, _is_video) if _is_video(path)]
 
 
 def _output_folder(image: Location, source: Location, output_folder: Location | None) -> Location:
@@ -185,13 +182,22 @@ def _sync(path: Path) -> None:
         os.close(file)
 
 
-def _image_files(source: Location) -> Iterator[Location]:
+def _image_files(source: Location, videos: list[Path]) -> Iterator[Location]:
     if isinstance(source, RemotePath):
         yield from [source] if format_of(source) else _without_masks(_remote_images(source))
     elif _is_folder(source):
-        yield from _without_masks(walk(source, _is_input))
+        yield from _without_masks(_images_and_videos(source, videos))
     else:
         yield source
+
+
+def _images_and_videos(folder: Path, videos: list[Path]) -> Iterator[Path]:
+    """Yields the images below a local folder, and appends the videos to `videos`."""
+    for path in walk(folder, lambda path: _is_input(path) or _is_video(path)):
+        if _is_video(path):
+            videos.append(path)
+        else:
+            yield path
 
 
 def _remote_images(folder: RemotePath) -> Iterator[RemotePath]:

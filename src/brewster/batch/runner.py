@@ -22,7 +22,7 @@ from typing import Final, Literal, Protocol, final
 from brewster.batch.layer_names import name_layers
 from brewster.batch.manifest import is_manifest, read_manifest
 from brewster.errors import BrewsterError, OutputError, PhotoError
-from brewster.files import exists, find_videos, images_in, is_same_file, write_atomically
+from brewster.files import exists, images_in, is_same_file, write_atomically
 from brewster.image_formats import SUFFIXES, format_of
 from brewster.inference.assessment import Assessment
 from brewster.inference.layer_history import find_layer_of_another_photo
@@ -159,8 +159,14 @@ def plan_files(
     sources: str | os.PathLike[str] | Iterable[str | os.PathLike[str]],
     output: str | os.PathLike[str] | None = None,
     options: Options = _DEFAULT_OPTIONS,
+    *,
+    videos: list[Path] | None = None,
 ) -> list[SeparationTask]:
-    """Finds the photos, and returns a task for each photo with the paths of its layers. For arguments, see `separate_files`.
+    """Finds the photos, and returns a task for each photo with the paths of its layers.
+
+    Args:
+        sources, output, options: see `separate_files`.
+        videos: the list to which videos in the folders are appended. They get no task.
 
     Raises:
         PhotoError: the sources contain no photo.
@@ -170,19 +176,22 @@ def plan_files(
     given = [sources] if isinstance(sources, str | os.PathLike) else sources
     paths = [location(source) for source in given]
     folder = None if output is None else location(output)
+    videos = [] if videos is None else videos
     images = (
         pair
         for source in paths
-        for pair in (read_manifest(source, folder) if is_manifest(source) else images_in(source, folder))
+        for pair in (
+            read_manifest(source, folder) if is_manifest(source) else images_in(source, folder, videos=videos)
+        )
     )
     tasks = [
         SeparationTask(image, outputs)
         for image, outputs in name_layers(images, options.layers, options.suffix)
     ]
     if not tasks:
-        videos = f" ({len(names)} videos)" if (names := find_videos(paths)) else ""
+        found_videos = f" ({len(videos)} videos)" if videos else ""
         raise PhotoError(
-            f"there is no photo in {', '.join(map(str, paths))}{videos}",
+            f"there is no photo in {', '.join(map(str, paths))}{found_videos}",
             f"expected files with one of the suffixes {' '.join(SUFFIXES)}",
             "pass the path of the file itself, or choose another folder",
         )

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Final, final
 import click
 
 from brewster.cli.terminal import write_out
-from brewster.files import LAYER_FORMATS, find_videos
+from brewster.files import LAYER_FORMATS
 from brewster.image_formats import WRITABLE, ImageFormat, format_of
 from brewster.options import Options
 from brewster.remote_path import location, path_of_file_url
@@ -43,11 +43,8 @@ def absolute_path(path: str) -> str:
     return os.path.abspath(found) if isinstance(found, Path) else str(found)  # noqa: PTH100  (keeps links)
 
 
-def skipped_videos(photos: Sequence[str]) -> str | None:
-    """Returns a line about the videos in the folders, or None if the folders contain no video."""
-    videos = find_videos(map(location, photos))
-    if not videos:
-        return None
+def skipped_videos(videos: Sequence[Path]) -> str:
+    """Returns a line about the videos in the folders, at least one."""
     return f"{counted(videos, 'video')} skipped: brewster separates photos; extract single images first, for example with ffmpeg"
 
 
@@ -62,8 +59,12 @@ def is_single_output(photos: Sequence[str], output: str | None) -> bool:
     return "-" in photos or output == "-" or _is_image_file(output)
 
 
-def plan(photos: Sequence[str], output: str | None, options: Options) -> list[SeparationTask]:
+def plan(
+    photos: Sequence[str], output: str | None, options: Options, videos: list[Path] | None = None
+) -> list[SeparationTask]:
     """Returns a task for each photo in the files and folders. A task contains the paths of the photo and of its layers.
+
+    Videos in the folders are appended to the list `videos`.
 
     Raises:
         click.UsageError: the arguments contradict each other.
@@ -75,7 +76,7 @@ def plan(photos: Sequence[str], output: str | None, options: Options) -> list[Se
     if is_single_output(photos, output):
         return [_plan_single_output(photos, output, options)]
     _check_output_folder(photos, output)
-    return plan_files(photos, output, options)
+    return plan_files(photos, output, options, videos=videos)
 
 
 def _plan_single_output(photos: Sequence[str], output: str | None, options: Options) -> SeparationTask:

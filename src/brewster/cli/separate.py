@@ -244,15 +244,16 @@ def separate(
     if (workers or cluster or index) and not dry_run:
         _check_archive_output(single_output, output, needs_folder=bool(cluster or index))
         photos, output = tuple(map(absolute_path, photos)), output and absolute_path(output)
-    tasks = plan(photos, output, options)
+    videos: list[Path] = []
+    tasks = plan(photos, output, options, videos)
     if single_output and output in (None, "-") and not dry_run:
         _reject_shared_output(as_json=as_json)
     if contact_sheet and cluster:
         raise click.UsageError("--contact-sheet cannot be combined with --cluster.")
     if contact_sheet:
         _check_contact_sheet(contact_sheet, photos, output)
-    if not quiet and (videos := skipped_videos(photos)):
-        print_status(videos)
+    if videos and not quiet:
+        print_status(skipped_videos(videos))
     batch = BatchCommand(
         options,
         output=output,

@@ -223,8 +223,8 @@ class AnswerStore:
             ).fetchone()
             if last is not None and last > trial:
                 raise BrewsterError(
-                    f"trial {trial} is not the last one with an answer",
-                    f"expected trial {last}: only the last answer can be withdrawn",
+                    f"the answer to pair {trial + 1} cannot be withdrawn",
+                    f"expected pair {last + 1}, because only the last answer can be withdrawn",
                     "load the page again",
                 )
             database.execute(

@@ -32,11 +32,10 @@ class _Strict(BaseModel):
 
 
 class Invitation(_Strict):
-    """The information before the consent: the consent text, the number of trials, and whether more participants are admitted."""
+    """The information before the consent: the consent text and the number of trials."""
 
     consent: str
     trials: int
-    is_open: bool
 
 
 class ConsentRequest(_Strict):
@@ -98,6 +97,8 @@ class AnswerResponse(_Strict):
 
 Token = Annotated[str, FromPath(max_length=64)]
 Side = Literal["photo", "left", "right"]
+_CAPTIONS: Final = {"photo": "the photo", "left": "result A", "right": "result B"}
+"""The pictures of a trial as the page names them."""
 
 
 def study_router(
@@ -138,23 +139,25 @@ class _StudyRoutes:
     token: str | None
 
     def invitation(self) -> Invitation:
-        """Returns the information that is shown before the consent."""
+        """Returns the information that is shown before the consent. If the study is full, the status is 403."""
+        if self.max_participants is not None and self.store.count_participants() >= self.max_participants:
+            raise self._full()
         description = self.study.description
-        is_open = self.max_participants is None or self.store.count_participants() < self.max_participants
-        return Invitation(
-            consent=description.consent, trials=description.pairs + description.catch_trials, is_open=is_open
-        )
+        return Invitation(consent=description.consent, trials=description.pairs + description.catch_trials)
 
     def admit(self, _agreement: Annotated[ConsentRequest, Body()]) -> PersonalLink:
         """Admits a participant who agrees to take part. Returns the personal link."""
         participant_token = self.store.admit(max_participants=self.max_participants)
         if participant_token is None:
-            raise HTTPException(
-                403,
-                "the study has all the participants that it needs; expected a study that needs more; "
-                "thank you for your interest",
-            )
+            raise self._full()
         return self._link(participant_token)
+
+    def _full(self) -> HTTPException:
+        return HTTPException(
+            403,
+            f"this study has all the participants that it needs ({self.max_participants}); expected a study with free places; "
+            "close this page, and thank you for your interest",
+        )
 
     def begin(self, participant_token: Token) -> Response:
         """Returns the page of a personal link. If the link is unknown, the status is 404, and the page shows the error."""
@@ -178,20 +181,21 @@ class _StudyRoutes:
 
     def practice_picture(self, participant_token: Token, side: Side) -> Response:
         """Returns a picture of the practice trial."""
-        return self._picture(_practice(self._participant(participant_token)), side)
+        return self._picture(_practice(self._participant(participant_token)), side, "the practice pair")
 
     def picture(self, participant_token: Token, trial: int, side: Side) -> Response:
         """Returns a picture of a trial."""
-        return self._picture(_trial(self._participant(participant_token), trial), side)
+        shown = _trial(self._participant(participant_token), trial)
+        return self._picture(shown, side, f"pair {trial + 1}")
 
-    def _picture(self, shown: assignment.Trial, side: Side) -> Response:
+    def _picture(self, shown: assignment.Trial, side: Side, pair: str) -> Response:
         try:
             data = self.study.picture_file(getattr(shown, side)).read_bytes()
         except FileNotFoundError as error:
             raise HTTPException(
                 410,  # not 500: the page repeats requests that fail with 500 or more
-                "a picture is missing on the server; expected all pictures of the study; "
-                "please inform the person who runs the study",
+                f"{_CAPTIONS[side]} of {pair} is missing on the server; expected three pictures for each pair; "
+                "tell this to the person who runs the study",
             ) from error
         return Response(data, media_type="image/png", headers=_CACHED)
 
@@ -221,8 +225,8 @@ class _StudyRoutes:
         if participant is None:
             raise HTTPException(
                 404,
-                "this link is unknown; expected the personal link of a participant; "
-                "check that it is complete, or begin at the start page",
+                f"the personal link /s/{participant_token} is unknown; expected a complete link of this study; "
+                "check the link, or begin at the start page",
             )
         return participant
 
@@ -257,6 +261,6 @@ def _trial(participant: Participant, trial: int) -> assignment.Trial:
     if not 0 <= trial < len(participant.trials):
         raise HTTPException(
             404,
-            f"there is no trial {trial}; expected a trial from 0 to {len(participant.trials) - 1}; load the page again",
+            f"there is no pair {trial + 1}; expected a pair from 1 to {len(participant.trials)}; load the page again",
         )
     return participant.trials[trial]

@@ -95,11 +95,21 @@ export class PanZoom {
   #paint() {
     const clamp = (at) => Math.min(0, Math.max(1 - this.#scale, at));
     [this.#x, this.#y] = [clamp(this.#x), clamp(this.#y)];
-    const transform = `translate(${100 * this.#x}%, ${100 * this.#y}%) scale(${this.#scale})`;
-    for (const frame of this.frames) frame.firstElementChild.style.transform = transform;
+    for (const frame of this.frames) Object.assign(frame.firstElementChild.style, this.#style(frame));
     this.box.classList.toggle("zoomed", this.#scale > 1);
     this.box.classList.toggle("pixelated", this.#scale > 3 * this.#fullScale());
     this.box.dispatchEvent(new Event("zoomed"));
+  }
+
+  // Returns the size and position of a picture. At full size they are whole screen pixels without a scale, because the browser would
+  // resample a scaled picture, and so blur its pixels.
+  #style({ clientWidth, clientHeight }) {
+    if (!this.#full || this.#scale === 1) {
+      return { width: "", height: "", transform: `translate(${100 * this.#x}%, ${100 * this.#y}%) scale(${this.#scale})` };
+    }
+    const [width, height] = this.#size.map((side) => `${side / devicePixelRatio}px`);
+    const [left, top] = [this.#x * clientWidth, this.#y * clientHeight].map((at) => Math.round(at * devicePixelRatio) / devicePixelRatio);
+    return { width, height, transform: `translate(${left}px, ${top}px)` };
   }
 
   #point(event, frame) {

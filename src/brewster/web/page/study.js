@@ -47,7 +47,8 @@ async function send(path, body) {
     } catch (error) {
       if (error instanceof RequestError) throw error;
     }
-    showNotice(body?.choice ? "Not saved yet: the server does not respond. Trying again…" : "The server does not respond. Trying again…");
+    const happened = body?.choice ? "Your answer is not saved yet, because the server does not respond." : "The server does not respond.";
+    showNotice(`${happened} Expected a connection to the server. Keep this page open: it tries again.`);
     await new Promise((resolve) => setTimeout(resolve, 1000 * wait));
   }
 }
@@ -58,9 +59,14 @@ const isClientError = (response) => response.status >= 400 && response.status < 
 
 async function parse(response) {
   showNotice("");
-  const data = await response.json();
-  if (!response.ok) throw new RequestError(data.error);
-  return data;
+  if (response.ok) return response.json();
+  const { error } = await response.json().catch(() => ({})); // a proxy may answer with a page instead of JSON
+  throw new RequestError(error ? sentences(error) : `The server refused the request (status ${response.status}). Expected a response of the study. Load the page again. If this does not help, tell it to the person who runs the study.`);
+}
+
+// Returns the three parts of a message of the server, which are separated by semicolons, as sentences.
+function sentences(message) {
+  return message.split("; ").map((part) => part[0].toUpperCase() + part.slice(1).replace(/\.?$/, ".")).join(" ");
 }
 
 // Shows a notice until the next one, or for `seconds`. An empty text removes the notice.
@@ -80,7 +86,6 @@ function showError(error) {
 
 async function showInvitation() {
   const invitation = await send("/invitation");
-  if (!invitation.is_open) throw new RequestError("The study has all the participants that it needs. Thank you for your interest.");
   for (const text of [...invitation.consent.split(/\n\s*\n/), `There are ${invitation.trials} comparisons.`]) {
     const paragraph = document.createElement("p");
     paragraph.textContent = text;
@@ -166,7 +171,7 @@ async function loadPicture(source) {
     } catch {
       const response = await fetch(source).catch(() => null); // an image element does not report the reason of a failure
       if (response && isClientError(response)) await parse(response);
-      showNotice("A picture could not be loaded. Trying again…");
+      showNotice("A picture could not be loaded. Expected a connection to the server. Keep this page open: it tries again.");
       await new Promise((resolve) => setTimeout(resolve, 1000 * wait));
     }
   }
@@ -300,7 +305,9 @@ byId("pictures").addEventListener("zoomed", () => {
 });
 
 byId("copy").addEventListener("click", async () => {
-  const link = new URL((await send(`/s/${PARTICIPANT_TOKEN}/link`)).link, location.href).href;
+  const { link: path } = await send(`/s/${PARTICIPANT_TOKEN}/link`).catch((error) => (showError(error), {}));
+  if (!path) return;
+  const link = new URL(path, location.href).href;
   try {
     await navigator.clipboard.writeText(link);
     showNotice("Your link is copied. Do not share it.", NOTICE_SECONDS);

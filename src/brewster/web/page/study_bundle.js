@@ -21,7 +21,7 @@ class Bundle {
     const stored = this.#read();
     switch (path.split("/").at(-1)) {
       case "invitation":
-        return { consent: this.#loaded.consent, trials: this.#loaded.trials.length, is_open: true };
+        return { consent: this.#loaded.consent, trials: this.#loaded.trials.length };
       case "participants":
         this.#write({ ...stored, consented_on: new Date().toISOString().slice(0, 10) });
         return { link: location.href };
@@ -59,11 +59,13 @@ class Bundle {
   }
 
   async #load() {
-    const unknown = "This link is unknown. Check that it is complete, or ask the person who invited you.";
-    if (!/^[\w-]{16,64}$/.test(this.#token)) throw new Error(unknown);
-    const response = await fetch(`participants/${this.#token}.json`);
-    if (!response.ok) throw new Error(unknown);
-    return response.json();
+    const isToken = /^[\w-]{16,64}$/.test(this.#token);
+    const response = isToken ? await fetch(`participants/${this.#token}.json`).catch(() => null) : { status: 404 };
+    if (response?.ok) return response.json();
+    if (response?.status === 404) {
+      throw new Error(`The link with ?p=${this.#token} is unknown. Expected the complete link that you received. Check the link, or ask the person who invited you.`);
+    }
+    throw new Error(`Your list of pairs could not be loaded${response ? ` (status ${response.status})` : ""}. Expected a connection to the web server. Check your connection, and try again.`);
   }
 
   #read() {
@@ -77,8 +79,8 @@ class Bundle {
   #write(stored) {
     try {
       localStorage.setItem(this.#key, JSON.stringify(stored));
-    } catch {
-      throw new Error("This browser cannot store your answers. Allow this page to store data, and load it again.");
+    } catch (error) {
+      throw new Error(`This browser could not store your answer (${error.name}). Expected a browser that stores the data of this page. Allow it in the settings of the browser, and load the page again.`);
     }
   }
 
