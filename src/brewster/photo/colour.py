@@ -87,7 +87,7 @@ class ColourSpace:
         """Converts linear Rec.709 (H, W, 3) to stored pixels with the dtype and the channels of `original`.
 
         `original` has the stored pixels before a change. Pixels with unchanged light keep exactly these stored values.
-        NaN becomes black.
+        In integers, NaN becomes black; floats keep NaN.
         """
         stored = np.empty_like(original)
         curves = self._curves(original)
@@ -109,8 +109,7 @@ class ColourSpace:
     def _curves(self, stored: Stored) -> tuple[ToneCurve, ...]:
         """Returns the curve of each stored channel.
 
-        Grey pixels use the green curve. With a grey profile, the three curves are the same. With an RGB profile, the red,
-        green and blue of a neutral colour are equal.
+        Grey pixels use the green curve. In a grey profile all three curves are the same. In an RGB profile they usually are.
         """
         return self.curves if stored.shape[-1] == 3 else (self.curves[1],)
 
@@ -268,6 +267,8 @@ def _parse_curve(tag: bytes) -> ToneCurve:
         return ToneCurve()
     numbers = struct.unpack_from(f">{count}H", tag, 12)
     if count == 1:
+        if numbers[0] == 0:  # the exponent 0 has no inverse
+            raise ValueError(numbers)
         return ToneCurve(parameters=(numbers[0] / 256, 1, 0, 0, 0, 0, 0))
     return ToneCurve(samples=tuple(number / 65535 for number in numbers))
 
@@ -276,8 +277,8 @@ def _parse_parametric(function: int, tag: bytes) -> ToneCurve:
     names = _PARAMETRIC_NAMES[function] if function < len(_PARAMETRIC_NAMES) else ""
     values = dict(zip(names, struct.unpack_from(f">{len(names)}i", tag, 12), strict=True))
     g, a, b, c, d, e, f = (values.get(name, 65536 * (name == "a")) / 65536 for name in "gabcdef")
-    if function in (1, 2):  # types 1 and 2 are constant for x < -b/a
-        c, d, e, f = 0.0, -b / a, c, c
     if g <= 0 or a <= 0:
         raise ValueError(names)
+    if function in (1, 2):  # types 1 and 2 are constant for x < -b/a
+        c, d, e, f = 0.0, -b / a, c, c
     return ToneCurve(parameters=(g, a, b, c, d, e, f))

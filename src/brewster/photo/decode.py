@@ -8,6 +8,7 @@ from __future__ import annotations
 import bisect
 import io
 import logging
+import lzma
 import re
 import zipfile
 import zlib
@@ -85,7 +86,7 @@ def read_size(data: bytes) -> tuple[int, int]:
     if format_name == "ora":
         data, format_name = _merged_image(data, DEFAULT_MAX_PIXELS), "png"
     if format_name == "raw":
-        return read_raw_size(data)
+        return read_raw_size(data, DEFAULT_MAX_PIXELS)
     if format_name in _FLOAT_READERS:
         height, width = decode(data, DEFAULT_MAX_PIXELS).pixels.shape[:2]
         return width, height
@@ -233,18 +234,24 @@ def _file_info(image: pyvips.Image, data: bytes, format_name: str) -> FileInfo:
     return replace(file_info, **_EXTRA_INFO[format_name](data)) if format_name in _EXTRA_INFO else file_info
 
 
+_SRGB_TRANSFERS = (1, 2, 6, 13, 14, 15)  # BT.709, unspecified, BT.601, sRGB, BT.2020 of 10 and 12 bits
+
+
 def _profile_of(data: bytes, format_name: str) -> bytes | None:
-    """Returns the ICC profile for the code points (ITU-T H.273) of a file: None for sRGB, or Display P3.
+    """Returns the ICC profile for the code points (ITU-T H.273) of a file.
+
+    Returns Display P3 if the primaries are those of Display P3; otherwise None, which means sRGB.
 
     Raises:
-        UnsupportedPhoto: the file has other primaries, or the transfer functions PQ (16) or HLG (18) of HDR video.
+        UnsupportedPhoto: the file has other primaries, or a transfer function that is neither unspecified, sRGB nor a similar
+            one of video (BT.709, BT.601, BT.2020): for example linear (8), or PQ (16) or HLG (18) of HDR video.
     """
     codes = metadata.cicp(data) if FORMATS[format_name].has_cicp else None
     primaries, transfer = codes[:2] if codes else (1, 13)
-    if transfer in (16, 18) or primaries not in (1, 2, 5, 6, 12):
+    if transfer not in _SRGB_TRANSFERS or primaries not in (1, 2, 5, 6, 12):
         raise UnsupportedPhoto(
-            f"the {format_name} has the colours of HDR video (primaries {primaries}, transfer {transfer})",
-            "expected sRGB, Display P3, or an ICC profile",
+            f"the {format_name} has the primaries {primaries} and the transfer function {transfer} of ITU-T H.273",
+            "expected those of sRGB or Display P3, or an ICC profile",
             "export the image with one of these",
         )
     return bytes(pyvips.Image.profile_load("p3")) if primaries == 12 else None
@@ -299,6 +306,17 @@ _EXTRA_INFO = {"jpeg": _jpeg_info, "tiff": _tiff_info, "webp": _webp_info, "avif
 
 # --- OpenRaster
 
+_ZIP_ERRORS = (
+    zipfile.BadZipFile,
+    KeyError,
+    ValueError,
+    OSError,
+    EOFError,
+    RuntimeError,  # an encrypted file, or an unknown compression (NotImplementedError)
+    zlib.error,
+    lzma.LZMAError,
+)
+
 
 def _merged_image(data: bytes, max_pixels: int) -> bytes:
     """Returns the PNG of the merged image in an OpenRaster file (baseline 0.0.6).
@@ -312,7 +330,7 @@ def _merged_image(data: bytes, max_pixels: int) -> bytes:
             if archive.getinfo("mergedimage.png").file_size > (1 << 20) + 16 * max_pixels:
                 raise _unreadable_error("ora", "the merged image is too large")
             return archive.read("mergedimage.png")
-    except (zipfile.BadZipFile, KeyError, ValueError, OSError, NotImplementedError, zlib.error) as error:
+    except _ZIP_ERRORS as error:
         raise _unreadable_error("ora", error) from error
 
 
