@@ -3,8 +3,8 @@ Removal") to a folder in diffusers' layout with its prompt and task.
 
     convert(Path("GenSIRR.pt"), Path("gensirr"))        # then: brewster window.jpg --model gensirr
 
-GenSIRR is FLUX.1 Kontext with other weights of transformer and VAE, and a stored prompt embedding. Its published call takes 28
-steps with guidance 3.5 from sigma 1 to 0.001, and an input with a short side of 768 (or 512) pixels.
+GenSIRR is FLUX.1 Kontext with other weights of transformer and VAE, and a stored prompt embedding. Its published inference
+code takes 28 steps with guidance 3.5 from sigma 1 to 0.001, and an input with a short side of 768 (or 512) pixels.
 """
 
 from __future__ import annotations

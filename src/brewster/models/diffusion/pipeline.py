@@ -3,7 +3,7 @@
     pipeline = load_pipeline("out/kontext/lora", device="cuda")
     panels = pipeline(photo, steps=20, seeds=[0, 1])     # {"I": ..., "T": ..., "R": ...}
 
-A backbone without a LoRA generates panel T only, with the photo as its control image. This is the baseline of the paper
+A backbone without a LoRA generates panel T only, with the photo as its conditioning image. This is the baseline of the paper
 ("Comparing to original Flux model").
 """
 
@@ -159,8 +159,8 @@ def load_pipeline(
         model: a LoRA by its folder or hub id, or a backbone by its name, folder or hub id.
         device: "auto" uses an NVIDIA or AMD GPU if torch finds one, otherwise the CPU.
         base_model: the folder or hub id of the LoRA's base model; by default the one used in training. Only for a LoRA.
-        quantization: the quantization of the base model; by default the one used in training, or int8 or nf4 if only these fit into
-            the GPU, and none on the CPU.
+        quantization: the quantization of the base model. On a GPU, the default is that of the training; if it does not fit, int8,
+            then nf4. On a CPU, the default is none.
         offload: "layers" keeps the weights of the transformer in host memory and copies each block to the GPU while it
             computes; "auto" does this only if they do not fit into the free GPU memory.
         transformer: a single file (.gguf or .safetensors) whose weights replace those of the base's transformer; see
