@@ -56,7 +56,7 @@ class Assets:
     def plane_radiance(self, plane: Plane) -> Float32:
         """Returns the radiance of a picture, (H, W, 3), with brighter highlights (see `Plane.highlight_boost`).
 
-        The file is decoded with its colour profile, or as sRGB.
+        The file is decoded with its colour profile; without a profile as sRGB (integers) or linear Rec.709 (floats).
 
         Raises:
             RecipeError: the file is missing, or has another sha256 than in the scene.
@@ -112,14 +112,14 @@ class Assets:
                 return data
         if paths:
             raise RecipeError(
-                f"{paths[0]} is not the file with which the scene was drawn",
+                f"{paths[0]} is not the file that was chosen when the scene was sampled",
                 f"expected the sha256 {source.sha256}",
                 "choose the folder of the original file",
             )
         searched = ", ".join(map(str, self._folders)) or "no folder"
         raise RecipeError(
             f"{source.file} was not found in {searched}",
-            "expected the file with which the scene was drawn",
+            "expected the file that was chosen when the scene was sampled",
             "choose its folder with --maps or --photos",
         )
 
@@ -191,8 +191,9 @@ def _mean_luminance(texels: Float32) -> np.float32:
 
 
 def _parse_builtin(source: AssetSource, known: Iterable[str]) -> tuple[str, int]:
-    _, name, seed = (*source.file.split(":"), "", "")[:3]
-    if name not in known or not seed.isdigit():
+    parts = source.file.split(":")
+    name, seed = parts[1:] if len(parts) == 3 else ("", "")
+    if name not in known or not seed.isdecimal():
         raise RecipeError(
             f"{source.file!r} is not built in",
             f"expected builtin:NAME:SEED with one of the names {', '.join(known)}",
