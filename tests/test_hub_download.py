@@ -95,7 +95,7 @@ def test_a_file_that_does_not_exist_is_refused(tmp_path, monkeypatch):
 def test_the_table_agrees_with_the_backbones(name):
     model, family = DIFFUSION_MODELS[name], BACKBONES[name]
     assert (model.hub_id, model.licence) == (family.hub_id, family.licence.title)
-    assert model.is_commercial == family.licence.is_commercial
+    assert model.allows_commercial_use == family.licence.allows_commercial_use
 
 
 def test_the_licence_of_a_base_is_that_of_its_owner():

@@ -101,7 +101,7 @@ class Assets:
         return self._open(source).linear().clip(0, 1)
 
     def _open(self, source: AssetSource) -> Photo:
-        with naming_file(source.file):
+        with add_file_name_to_errors(source.file):
             return Photo.open(self._bytes(source))
 
     def _bytes(self, source: AssetSource) -> bytes:
@@ -125,7 +125,7 @@ class Assets:
 
 
 @contextmanager
-def naming_file(name: str) -> Iterator[None]:
+def add_file_name_to_errors(name: str) -> Iterator[None]:
     """Adds the name of the file to errors raised within this block, unless the error contains the name."""
     try:
         yield

@@ -23,7 +23,7 @@ Float64 = NDArray[np.float64]
 Stored = NDArray[Any]
 Matrix = tuple[tuple[float, float, float], ...]
 
-REC709 = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290)
+REC709_CHROMATICITIES = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290)
 _D50 = np.array([0.9642, 1.0, 0.8249])
 _BRADFORD = np.array([[0.8951, 0.2664, -0.1614], [-0.7502, 1.7135, 0.0367], [0.0389, -0.0685, 1.0296]])
 
@@ -129,7 +129,7 @@ def colour_space_of(icc: bytes | None, primaries: tuple[float, ...] | None, is_f
     """
     if icc is not None:
         return _profile_space(icc)
-    if primaries is not None and not np.allclose(primaries, REC709, atol=1e-4):
+    if primaries is not None and not np.allclose(primaries, REC709_CHROMATICITIES, atol=1e-4):
         return ColourSpace((ToneCurve(),) * 3, _to_rec709(_to_d50(primaries)))
     return LINEAR_REC709 if is_float else SRGB
 
@@ -208,7 +208,7 @@ def _to_d50(primaries: tuple[float, ...]) -> Float64:
 
 
 def _to_rec709(to_d50: Float64) -> Matrix:
-    return _as_matrix(np.linalg.inv(_to_d50(REC709)) @ to_d50)
+    return _as_matrix(np.linalg.inv(_to_d50(REC709_CHROMATICITIES)) @ to_d50)
 
 
 def _profile_space(icc: bytes) -> ColourSpace:

@@ -20,7 +20,7 @@ from torch import Tensor, nn
 from brewster.errors import ModelError
 from brewster.models.diffusion.backbones.backbone import Backbone
 from brewster.models.diffusion.backbones.kontext import Kontext
-from brewster.models.diffusion.backbones.registry import skeleton
+from brewster.models.diffusion.backbones.registry import build_on_meta
 from brewster.models.diffusion.panels import PanelLayout
 from brewster.models.diffusion.prompt import PROMPT_FILE, PromptEmbedding
 from brewster.models.diffusion.task import TASK_FILE, DecompositionTask, save_task
@@ -56,7 +56,7 @@ def convert(
         )
     state = _read_checkpoint(checkpoint)
     prompt = _prompt(checkpoint, state)
-    backbone = skeleton(base_model)
+    backbone = build_on_meta(base_model)
     _load(checkpoint, backbone, state)
     backbone.save(folder)
     prompt.save(folder / PROMPT_FILE)

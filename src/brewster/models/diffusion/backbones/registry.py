@@ -1,7 +1,7 @@
-"""The table of diffusion backbones, and backbones without their real weights: tiny versions and skeletons.
+"""The table of diffusion backbones, and backbones without their real weights: tiny versions, and on the device "meta".
 
     backbone, prompt = tiny("kontext", seed=0)         # random weights
-    backbone = skeleton("someone/finetuned-kontext")   # names and shapes of the weights only; downloads no weights
+    backbone = build_on_meta("someone/finetuned-kontext")   # names and shapes of the weights only; downloads no weights
 
 `loading.py` loads backbones with their weights.
 """
@@ -86,7 +86,7 @@ def build(
     return backbone_class(transformer, vae, part_classes["scheduler"](**architecture["scheduler"]))
 
 
-def skeleton(source: str, *, dtype: torch.dtype = torch.float32) -> Backbone:
+def build_on_meta(source: str, *, dtype: torch.dtype = torch.float32) -> Backbone:
     """The backbone on the device "meta": the names and shapes of its weights, which need no memory.
 
     For `source`, see `load_backbone`. For a hub id, only configuration files are downloaded.
