@@ -204,8 +204,7 @@ def _check_supported(image: pyvips.Image, data: bytes, format_name: str, max_pix
             "expected grey or RGB, with or without alpha, of 8 or 16 bits or 32-bit floats",
             "convert the image to one of these",
         )
-    is_tiff = format_name == "tiff"
-    if is_tiff and metadata.pixel_data_end(metadata.read_tags(data)) > len(data):
+    if format_name == "tiff" and metadata.pixel_data_end(metadata.read_tags(data)) > len(data):
         raise _unreadable_error("tiff", "pixels are missing")  # libvips reads missing tiles as black
 
 
@@ -243,8 +242,8 @@ def _profile_of(data: bytes, format_name: str) -> bytes | None:
     Returns Display P3 if the primaries are those of Display P3; otherwise None, which means sRGB.
 
     Raises:
-        UnsupportedPhoto: the file has other primaries, or a transfer function that is neither unspecified, sRGB nor a similar
-            one of video (BT.709, BT.601, BT.2020): for example linear (8), or PQ (16) or HLG (18) of HDR video.
+        UnsupportedPhoto: the file has other primaries, or a transfer function unlike that of sRGB: for example linear (8), or
+            PQ (16) or HLG (18) of HDR video.
     """
     codes = metadata.cicp(data) if FORMATS[format_name].has_cicp else None
     primaries, transfer = codes[:2] if codes else (1, 13)
@@ -275,14 +274,8 @@ def _jpeg_quality(data: bytes, bands: int) -> int:
 
 
 _COMPRESSIONS = {
-    1: "none",
-    5: "lzw",
-    7: "jpeg",
-    8: "deflate",
-    32946: "deflate",
-    32773: "packbits",
-    50000: "zstd",
-}
+    1: "none", 5: "lzw", 7: "jpeg", 8: "deflate", 32946: "deflate", 32773: "packbits", 50000: "zstd",
+}  # fmt: skip
 
 
 def _tiff_info(data: bytes) -> dict[str, Any]:
@@ -307,15 +300,8 @@ _EXTRA_INFO = {"jpeg": _jpeg_info, "tiff": _tiff_info, "webp": _webp_info, "avif
 # --- OpenRaster
 
 _ZIP_ERRORS = (
-    zipfile.BadZipFile,
-    KeyError,
-    ValueError,
-    OSError,
-    EOFError,
-    RuntimeError,  # an encrypted file, or an unknown compression (NotImplementedError)
-    zlib.error,
-    lzma.LZMAError,
-)
+    zipfile.BadZipFile, KeyError, ValueError, OSError, EOFError, RuntimeError, zlib.error, lzma.LZMAError,
+)  # fmt: skip
 
 
 def _merged_image(data: bytes, max_pixels: int) -> bytes:
@@ -330,7 +316,7 @@ def _merged_image(data: bytes, max_pixels: int) -> bytes:
             if archive.getinfo("mergedimage.png").file_size > (1 << 20) + 16 * max_pixels:
                 raise _unreadable_error("ora", "the merged image is too large")
             return archive.read("mergedimage.png")
-    except _ZIP_ERRORS as error:
+    except _ZIP_ERRORS as error:  # RuntimeError: the file is encrypted
         raise _unreadable_error("ora", error) from error
 
 
