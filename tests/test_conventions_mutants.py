@@ -51,7 +51,7 @@ def test_a_pattern_without_a_mutant_is_an_error():
 
 
 @pytest.mark.parametrize("exit_code", [pytest.ExitCode.USAGE_ERROR, pytest.ExitCode.NO_TESTS_COLLECTED])
-def test_a_mutant_without_which_pytest_finds_tests_is_killed(tmp_path, monkeypatch, exit_code):
+def test_a_mutant_with_which_pytest_finds_no_test_is_killed(tmp_path, monkeypatch, exit_code):
     """pytest finds no test if the mutation prevents the import of conftest.py."""
     monkeypatch.setattr(mutants, "_pytest", lambda *_: sys.exit(exit_code))
     assert mutants._run_tests(tmp_path / "copy", ["test_a.py"]) == (True, [])
