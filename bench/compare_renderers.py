@@ -77,15 +77,15 @@ def averaged_polarisations() -> Iterator[None]:
     """Averages s- and p-polarised light at every microfacet in `rough_glass`, as Mitsuba's colour variants do."""
 
     def averaged(cosine: Tensor, index_in: float, index_out: float) -> tuple[Tensor, Tensor]:
-        s, p = polarised(cosine, index_in, index_out)
+        s, p = original_reflectances(cosine, index_in, index_out)
         return (s + p) / 2, (s + p) / 2
 
-    polarised = rough_glass._reflectances
+    original_reflectances = rough_glass._reflectances
     rough_glass._reflectances = averaged
     try:
         yield
     finally:
-        rough_glass._reflectances = polarised
+        rough_glass._reflectances = original_reflectances
 
 
 def compare(scene: Scene, assets: Assets, samples: int) -> list[str]:
@@ -125,15 +125,14 @@ def main() -> None:
     torch.set_num_threads(2)
     samples = int(sys.argv[1]) if len(sys.argv) > 1 else 1024
     assets = Assets()
-    print(
-        "mean, %: analytic / Mitsuba - 1 (standard error) | PSNR, dB | squared error / squared error expected from noise"
-    )
+    print("| scene, image | analytic / Mitsuba - 1, % (standard error) | PSNR, dB | squared error / noise |")
+    print("|---|---|---|---|")
     for name, scene in SCENES.items():
         if len(sys.argv) > 2 and sys.argv[2] not in name:
             continue
-        print(f"| {name} |", flush=True)
+        print(f"| **{name}** | | | |", flush=True)
         for layer, line in zip(SAMPLE_IMAGES, compare(scene, assets, samples), strict=True):
-            print(f"|   {layer} | {line} |", flush=True)
+            print(f"| {layer} | {line} |", flush=True)
 
 
 if __name__ == "__main__":

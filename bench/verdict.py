@@ -24,6 +24,7 @@ from brewster.training.recipe import read_recipe
 from brewster.training.streams import held_out_mixtures
 
 MIXTURES = 200
+BATCH_SIZE = 8
 SIZE_PX = 320
 EVERY = 7
 """Every seventh pair of real/train is measured, because many of its pairs are similar."""
@@ -53,7 +54,7 @@ def read_datasets(data: Path, mixture_count: int = MIXTURES) -> dict[str, Iterat
         "dev Nature": read_pairs(data / "real/dev/nature"),
         "dev Real": read_pairs(data / "real/dev/real"),
         "real/train": read_pairs(data / "real/train", EVERY),
-        "held-out mixtures": islice(mixtures(), mixture_count),
+        "held-out mixtures": mixtures(mixture_count),
     }
 
 
@@ -63,11 +64,12 @@ def read_pairs(folder: Path, every: int = 1) -> Iterator[Pair]:
         yield Photo.open(case.photo.path), Photo.open(case.ground_truth.path).pixels
 
 
-def mixtures() -> Iterator[Pair]:
+def mixtures(count: int) -> Iterator[Pair]:
     stream = held_out_mixtures(read_recipe(RECIPE))
-    for step in range(MIXTURES // 8):
-        batch = stream(step, 8, SIZE_PX)
-        for images in zip(batch.photo_encoded, batch.transmission_encoded, strict=True):
+    for step, start in enumerate(range(0, count, BATCH_SIZE)):
+        batch = stream(step, BATCH_SIZE, SIZE_PX)
+        pairs = zip(batch.photo_encoded, batch.transmission_encoded, strict=True)
+        for images in islice(pairs, count - start):
             photo, ground_truth = ((255 * image).round().byte().permute(1, 2, 0).numpy() for image in images)
             yield Photo.from_array(photo, encoding="srgb"), ground_truth
 

@@ -111,7 +111,15 @@ def test_builtin_maps_need_no_folder(monkeypatch, rng):
 
 
 @pytest.mark.parametrize(
-    "name", ["builtin:beach:1", "builtin:street", "builtin:street:-1", "builtin:painting:1"]
+    "name",
+    [
+        "builtin:beach:1",
+        "builtin:street",
+        "builtin:street:-1",
+        "builtin:street:\u00b2",
+        "builtin:street:7:more",
+        "builtin:painting:1",
+    ],
 )
 def test_maps_that_are_not_built_in_are_refused(name):
     with pytest.raises(RecipeError, match="is not built in") as error:
@@ -136,7 +144,7 @@ def test_another_file_of_the_same_name_is_refused(folder, rng):
     correct, wrong = hashlib.sha256(data).hexdigest(), hashlib.sha256(b"").hexdigest()
     assets = Assets([folder])
     assets.map_radiance(EnvironmentMap(source=AssetSource(file="sky.hdr", sha256=correct)))
-    with pytest.raises(RecipeError, match="not the file with which the scene was drawn") as error:
+    with pytest.raises(RecipeError, match="not the file that was chosen when the scene was sampled") as error:
         assets.map_radiance(
             EnvironmentMap(source=AssetSource(file="sky.hdr", sha256=wrong))
         )  # the cached map of the other file is not used

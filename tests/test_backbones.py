@@ -397,6 +397,9 @@ def test_a_folder_of_another_pipeline_is_refused(folder):
         ModelError, match="contains a StableDiffusionPipeline; expected one of FluxKontextPipeline"
     ):
         load_backbone(str(folder))
+    (folder / "model_index.json").write_text("{}")
+    with pytest.raises(ModelError, match=r"model_index.json has no _class_name; .*QwenImageEditPlusPipeline"):
+        load_backbone(str(folder))
 
 
 def test_a_transformer_of_another_architecture_is_refused(folder, tiny_folders):

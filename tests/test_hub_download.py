@@ -6,10 +6,10 @@ from types import SimpleNamespace
 import huggingface_hub
 import pytest
 
-from brewster.errors import DownloadError
+from brewster.errors import DownloadError, ModelError
 from brewster.models.diffusion import hub_download
 from brewster.models.diffusion.backbones.registry import BACKBONES
-from brewster.models.diffusion.hub_download import resolve_model_folder
+from brewster.models.diffusion.hub_download import find_weights_file, resolve_model_folder
 from brewster.models.diffusion_models import DIFFUSION_MODELS, licence_of
 
 
@@ -68,11 +68,34 @@ def test_the_hub_that_cannot_be_asked_does_not_prevent_the_use_of_the_cache(monk
     assert resolve_model_folder("someone/model", ["*"]) == tmp_path
 
 
+def test_a_connection_that_fails_during_the_download_is_an_error(monkeypatch):
+    def snapshot_download(source, *, allow_patterns, dry_run=False):
+        raise huggingface_hub.errors.HTTPError("the server closed the connection")
+
+    monkeypatch.setattr(huggingface_hub, "snapshot_download", snapshot_download)
+    with pytest.raises(DownloadError, match=r"because the connection failed .*the server closed the connec"):
+        resolve_model_folder("someone/model", ["*"])
+
+
+def test_a_file_that_does_not_exist_is_refused(tmp_path, monkeypatch):
+    with pytest.raises(ModelError, match=r"contains no file missing\.gguf; expected one \.gguf file"):
+        find_weights_file(str(tmp_path / "missing.gguf"), (".gguf",))
+
+    def snapshot_download(source, *, allow_patterns, dry_run=False):
+        return [] if dry_run else str(tmp_path)
+
+    monkeypatch.setattr(huggingface_hub, "snapshot_download", snapshot_download)
+    with pytest.raises(ModelError, match=r"someone/model contains no file missing\.gguf"):
+        find_weights_file("someone/model/missing.gguf", (".gguf",))
+    (tmp_path / "missing.gguf").write_bytes(b"")
+    assert find_weights_file(str(tmp_path / "missing.gguf"), (".gguf",)).is_file()
+
+
 @pytest.mark.parametrize("name", list(BACKBONES))
 def test_the_table_agrees_with_the_backbones(name):
     model, family = DIFFUSION_MODELS[name], BACKBONES[name]
     assert (model.hub_id, model.licence) == (family.hub_id, family.licence.title)
-    assert model.is_commercial == family.licence.is_commercial
+    assert model.allows_commercial_use == family.licence.allows_commercial_use
 
 
 def test_the_licence_of_a_base_is_that_of_its_owner():

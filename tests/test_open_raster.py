@@ -21,16 +21,38 @@ def opened(data):
     return zipfile.ZipFile(io.BytesIO(data))
 
 
-def composite(data):
-    """Returns the image that an editor shows: the layers of stack.xml from bottom to top. svg:plus adds the stored values."""
-    archive = opened(data)
-    image = ElementTree.fromstring(archive.read("stack.xml"))
-    canvas = 0
-    for layer in reversed(image.findall("stack/layer")):
-        pixels = Photo.open(archive.read(layer.get("src"))).pixels.astype(int)
-        assert pixels.shape[:2] == (int(image.get("h")), int(image.get("w")))
-        canvas = {"svg:plus": canvas + pixels, "svg:src-over": pixels}[layer.get("composite-op")]
+def blend(operator, upper, lower):
+    """Composites premultiplied colour and alpha in 0..1 (W3C Compositing and Blending, section 9.1)."""
+    (colour, alpha), (below, alpha_below) = upper, lower
+    if operator == "svg:plus":
+        return np.minimum(1, colour + below), np.minimum(1, alpha + alpha_below)
+    if operator == "svg:src-atop":
+        return colour * alpha_below + below * (1 - alpha), alpha_below
+    assert operator == "svg:src-over"
+    return colour + below * (1 - alpha), alpha + alpha_below * (1 - alpha)
+
+
+def composite_stack(archive, stack):
+    """Returns the premultiplied colour and the alpha (H, W, 1) of the layers and groups of a stack, from bottom to top."""
+    canvas = 0.0, 0.0
+    for item in reversed(stack):
+        if item.tag == "stack":
+            upper = composite_stack(archive, item)
+        else:
+            layer = Photo.open(archive.read(item.get("src")))
+            white = np.iinfo(layer.pixels.dtype).max
+            alpha = np.ones(layer.pixels.shape[:2]) if layer.alpha is None else layer.alpha / white
+            upper = layer.pixels / white * alpha[..., None], alpha[..., None]
+        canvas = blend(item.get("composite-op"), upper, canvas)
     return canvas
+
+
+def composite(data):
+    """Returns the image that an editor shows, (H, W, 1|3) in stored values. Where alpha is 0, it is black."""
+    archive = opened(data)
+    colour, alpha = composite_stack(archive, ElementTree.fromstring(archive.read("stack.xml")).find("stack"))
+    white = np.iinfo(Photo.open(data).pixels.dtype).max
+    return np.rint(white * np.divide(colour, alpha, where=alpha > 0, out=np.zeros_like(colour))).astype(int)
 
 
 @pytest.mark.parametrize("icc", [None, P3], ids=["srgb", "p3"])
@@ -57,6 +79,26 @@ def test_a_transmission_brighter_than_the_photo_is_the_photo():
     ).layered.encode()
     assert np.array_equal(composite(data), smooth())
     assert Photo.open(opened(data).read("data/reflection.png")).pixels.max() == 0
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+@pytest.mark.parametrize("is_binary", [True, False])
+def test_the_composite_of_a_transparent_photo_has_its_colours_and_its_alpha(dtype, is_binary):
+    white = np.iinfo(dtype).max
+    alpha = np.linspace(0, white, 48 * 64).reshape(48, 64, 1)
+    alpha = (alpha > white / 2) * white if is_binary else alpha
+    pixels = smooth().astype(float) / 255 * white
+    data = SEPARATOR(np.dstack([pixels, alpha]).astype(dtype), encoding="srgb").layered.encode()
+    photo, archive = Photo.open(data), opened(data)
+    stack = ElementTree.fromstring(archive.read("stack.xml")).find("stack")
+    colour, composite_alpha = composite_stack(archive, stack)
+    expected_alpha = photo.alpha[..., None] / white
+    np.testing.assert_allclose(composite_alpha, expected_alpha, atol=1e-12)
+    np.testing.assert_allclose(colour, photo.pixels / white * expected_alpha, atol=1e-12)
+    layers = [Photo.open(archive.read(f"data/{name}.png")) for name in ("transmission", "reflection")]
+    assert all(np.array_equal(layer.alpha > 0, photo.alpha > 0) for layer in layers)
+    assert np.array_equal(layers[0].pixels + layers[1].pixels, photo.pixels)
+    assert layers[1].pixels.mean() > 0.04 * white
 
 
 def test_the_archive_begins_with_its_mime_type_and_has_a_thumbnail():
@@ -106,6 +148,27 @@ def test_a_damaged_archive_is_refused():
         Photo.open(bomb.getvalue(), max_pixels=1000)
     with pytest.raises(UnsupportedPhoto, match="requested as png"):
         SEPARATOR(image_bytes()).layered.encode("png")
+
+
+def test_an_encrypted_or_damaged_merged_image_is_refused():
+    file = io.BytesIO()
+    with zipfile.ZipFile(file, "w", zipfile.ZIP_LZMA) as archive:
+        archive.writestr(zipfile.ZipInfo("mimetype"), b"image/openraster", zipfile.ZIP_STORED)
+        archive.writestr("mergedimage.png", image_bytes())
+    compressed = bytearray(file.getvalue())
+    start = compressed.index(b"mergedimage.png") + len("mergedimage.png")
+    compressed[start + 20 : start + 60] = b"\xff" * 40
+    encrypted = bytearray(SEPARATOR(image_bytes()).layered.encode())
+    for signature, flags in ((b"PK\3\4", 6), (b"PK\1\2", 8)):
+        entry = encrypted.rindex(
+            signature,
+            0,
+            encrypted.rindex(b"mergedimage.png") if flags == 8 else encrypted.index(b"mergedimage.png"),
+        )
+        encrypted[entry + flags] |= 1
+    for data in (bytes(compressed), bytes(encrypted)):
+        with pytest.raises(UnreadablePhoto, match="the ora cannot be read completely"):
+            Photo.open(data)
 
 
 def test_other_zip_archives_are_no_photos():

@@ -356,3 +356,28 @@ def test_a_lut_profile_is_refused_for_grey_and_for_floats(dtype: type, channels:
 def test_profiles_without_curves_and_matrix_are_refused(icc: bytes) -> None:
     with pytest.raises(UnsupportedPhoto, match="curves and a matrix"):
         colour_space_of(icc, None, is_float=False)
+
+
+def parametric(function: int, *parameters: float) -> bytes:
+    """Returns a tone curve as a tag of parametricCurveType."""
+    numbers = [round(65536 * value) for value in parameters]
+    return struct.pack(f">4s4xHH{len(numbers)}i", b"para", function, 0, *numbers)
+
+
+@pytest.mark.parametrize(
+    "curve",
+    [
+        struct.pack(">4s4xIH", b"curv", 1, 0),
+        parametric(0, 0),
+        parametric(1, 2.2, 0, 0.1),
+        parametric(2, 2.2, 0, 0.1, 0.05),
+        parametric(3, 2.2, 0, 0.1, 0.5, 0.04),
+    ],
+    ids=["curve, g = 0", "g = 0", "type 1, a = 0", "type 2, a = 0", "type 3, a = 0"],
+)
+@pytest.mark.parametrize("colourants", [None, ADOBE], ids=["grey", "rgb"])
+def test_curves_without_an_inverse_are_refused(
+    curve: bytes, colourants: tuple[tuple[float, ...], ...] | None
+) -> None:
+    with pytest.raises(UnsupportedPhoto, match="curves and a matrix"):
+        colour_space_of(profile(curve, colourants), None, is_float=False)

@@ -173,6 +173,14 @@ def test_damaged_exif_does_not_prevent_reading_and_writing(
         assert Photo.open(photo.encode(format_name)).size == photo.size
 
 
+@pytest.mark.parametrize("size", [4, 7])
+def test_an_exif_block_shorter_than_its_header_does_not_prevent_writing(size: int) -> None:
+    segment = b"Exif\0\0" + b"II*\0\x08\0\0"[:size]
+    data = file_of(smooth(), "JPEG")
+    data = data[:2] + struct.pack(">HH", 0xFFE1, len(segment) + 2) + segment + data[2:]
+    assert Photo.open(Photo.open(data).encode("tiff")).size == (64, 48)
+
+
 def test_a_png_with_the_cicp_chunk_of_display_p3_gets_its_profile() -> None:
     chunk = b"cICP" + bytes((12, 13, 0, 1))
     data = file_of(smooth(), "PNG")

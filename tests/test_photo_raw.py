@@ -11,7 +11,7 @@ from PIL import Image
 
 from brewster.errors import MissingExtra, PhotoTooLarge, UnreadablePhoto
 from brewster.image_formats import FORMATS, format_of
-from brewster.photo import Photo, metadata, raw, read_size
+from brewster.photo import Photo, decode, metadata, raw, read_size
 from brewster.photo.colour import colour_space_of
 from picture_files import CAMERA_NEUTRAL, dng_file, exif_block, file_of, mosaic, pil, smooth
 
@@ -97,6 +97,12 @@ def test_the_pixel_limit_is_that_of_the_image():
     assert Photo.open(data, max_pixels=96 * 128).size == (128, 96)
     with pytest.raises(PhotoTooLarge):
         Photo.open(data, max_pixels=96 * 128 - 1)
+
+
+def test_the_size_of_a_raw_file_above_the_limit_is_refused(monkeypatch):
+    monkeypatch.setattr(decode, "DEFAULT_MAX_PIXELS", 96 * 128 - 1)
+    with pytest.raises(PhotoTooLarge):
+        read_size(dng_file(mosaic(96, 128)))
 
 
 def test_the_missing_extra_names_the_command_that_installs_it(monkeypatch):

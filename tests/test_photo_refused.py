@@ -60,6 +60,11 @@ def test_a_truncated_image_is_refused(kind: str, options: dict[str, object], fra
     assert_refused(data[: int(len(data) * fraction)], UnreadablePhoto, "read completely")
 
 
+@pytest.mark.parametrize("size", [4, 7])
+def test_a_tiff_shorter_than_its_header_is_refused(size: int) -> None:
+    assert_refused(b"II*\0\x08\0\0"[:size], UnreadablePhoto, "read completely")
+
+
 def test_a_tiff_with_missing_tiles_is_refused() -> None:
     data = tiff_of(NOISE, tile=True, tile_width=16, tile_height=16)
     assert np.array_equal(Photo.open(data).pixels, NOISE)
@@ -154,12 +159,26 @@ def test_a_raw_file_is_never_read_as_its_preview() -> None:
         assert_refused(file.getvalue(), UnreadablePhoto, "the RAW file")  # LibRaw finds only the preview
 
 
-@pytest.mark.parametrize("transfer", [16, 18])
-def test_hdr_video_colours_are_refused(transfer: int) -> None:
-    data = file_of("PNG")
-    chunk = b"cICP" + bytes((9, transfer, 0, 1))
-    marked = data[:33] + struct.pack(">I", 4) + chunk + struct.pack(">I", zlib.crc32(chunk)) + data[33:]
-    assert_refused(marked, UnsupportedPhoto, "HDR video")
+def png_with_cicp(primaries: int, transfer: int) -> bytes:
+    data, chunk = file_of("PNG"), b"cICP" + bytes((primaries, transfer, 0, 1))
+    return data[:33] + struct.pack(">I", 4) + chunk + struct.pack(">I", zlib.crc32(chunk)) + data[33:]
+
+
+@pytest.mark.parametrize(
+    ("primaries", "transfer"),
+    [(9, 16), (9, 18), (9, 13), (1, 16), (1, 18), (1, 8), (1, 4), (12, 8)],
+    ids=str,
+)
+def test_other_primaries_and_transfer_functions_are_refused(primaries: int, transfer: int) -> None:
+    message = f"the png has the primaries {primaries} and the transfer function {transfer}"
+    assert_refused(png_with_cicp(primaries, transfer), UnsupportedPhoto, message)
+
+
+@pytest.mark.parametrize("transfer", [1, 2, 6, 13, 14, 15])
+def test_transfer_functions_like_that_of_srgb_are_read_as_srgb(transfer: int) -> None:
+    photo = Photo.open(png_with_cicp(1, transfer))
+    assert photo.file_info.icc is None
+    assert np.array_equal(photo.pixels, NOISE)
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])

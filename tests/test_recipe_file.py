@@ -97,7 +97,7 @@ def test_an_error_with_several_problems_can_be_pickled(problems, tmp_path):
     with pytest.raises(RecipeError) as caught:
         read_toml(SceneRecipe, tmp_path / "mine.toml", reference="docs/recipes.md")
     assert str(pickle.loads(pickle.dumps(caught.value))) == str(caught.value)
-    assert len(caught.value.sentences()) == 2
+    assert len(caught.value.messages()) == 2
 
 
 def test_the_command_prints_a_line_for_each_problem(run_without_model, tmp_path):

@@ -1,4 +1,4 @@
-"""A LoRA for few steps beside another LoRA: both changes of the weights are added."""
+"""A few-step LoRA, added to another LoRA: both changes of the weights are added."""
 
 import pytest
 import torch
@@ -39,7 +39,7 @@ def with_random_lora(name):
     return backbone, prompt
 
 
-def fast_layers(name):
+def few_step_layers(name):
     """Random matrices of rank 3 for all linear layers of the blocks: more than those of `with_random_lora`."""
     backbone, _ = tiny(name)
     layers, generator = linear_layers(backbone.transformer), torch.Generator().manual_seed(5)
@@ -51,7 +51,7 @@ def fast_layers(name):
 @pytest.fixture
 def fast_file(tmp_path):
     """A LoRA file of a tiny klein with the keys of diffusers."""
-    tensors = {f"transformer.{key}": value for key, value in to_state_dict(fast_layers("klein")).items()}
+    tensors = {f"transformer.{key}": value for key, value in to_state_dict(few_step_layers("klein")).items()}
     save_file(tensors, tmp_path / "lightning-4steps.safetensors")
     return tmp_path / "lightning-4steps.safetensors"
 
@@ -59,7 +59,7 @@ def fast_file(tmp_path):
 @pytest.mark.parametrize("name", list(BACKBONES))
 def test_a_stacked_lora_is_the_sum_of_both_changes(name):
     stacked, prompt = with_random_lora(name)
-    state, layers = lora_state_dict(stacked), fast_layers(name)
+    state, layers = lora_state_dict(stacked), few_step_layers(name)
     merged, _ = tiny(name)
     merge(merged, state, 4 / 2)
     merge(merged, to_state_dict(layers), 1.0)
@@ -72,8 +72,8 @@ def test_a_stacked_lora_is_the_sum_of_both_changes(name):
 def test_without_another_lora_the_layers_are_the_lora():
     stacked, prompt = tiny("qwen")
     merged, _ = tiny("qwen")
-    stack_layers(stacked, fast_layers("qwen"))
-    merge(merged, to_state_dict(fast_layers("qwen")), 1.0)
+    stack_layers(stacked, few_step_layers("qwen"))
+    merge(merged, to_state_dict(few_step_layers("qwen")), 1.0)
     assert has_lora(stacked)
     torch.testing.assert_close(velocity(stacked, prompt), velocity(merged, prompt), atol=1e-5, rtol=0)
 
@@ -84,7 +84,7 @@ def test_a_lora_for_few_steps_is_an_option_with_its_steps_and_guidance(fast_file
     task = DecompositionTask(PanelLayout(("T",)), 48 * 32)
     save_lora(folder, backbone, prompt, task, base_model="tiny:klein", target_modules=["*.attn.*"])
     pipeline = load_pipeline(str(folder), fast_lora=str(fast_file))
-    stack_layers(backbone, fast_layers("klein"))
+    stack_layers(backbone, few_step_layers("klein"))
     torch.testing.assert_close(
         velocity(pipeline.backbone, prompt), velocity(backbone, prompt), atol=1e-6, rtol=0
     )
@@ -99,7 +99,9 @@ def test_a_lora_for_few_steps_is_an_option_with_its_steps_and_guidance(fast_file
 
 
 def test_a_guidance_that_is_an_input_of_the_transformer_stays(fast_file, tmp_path):
-    tensors = {f"transformer.{key}": value for key, value in to_state_dict(fast_layers("kontext")).items()}
+    tensors = {
+        f"transformer.{key}": value for key, value in to_state_dict(few_step_layers("kontext")).items()
+    }
     save_file(tensors, tmp_path / "turbo.safetensors")
     pipeline = load_pipeline("tiny:kontext", fast_lora=str(tmp_path / "turbo.safetensors"))
     assert pipeline.task.guidance == 4

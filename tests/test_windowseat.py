@@ -220,12 +220,25 @@ def test_damaged_settings_are_model_errors(folder, file, change, message):
         ({"prompt_mask": torch.zeros(1, 9)}, "masks tokens before the end, or all"),
         ({"prompt_mask": torch.tensor([[0, 1, 1, 1, 1, 1, 1, 1, 1]])}, "masks tokens before the end"),
         ({"more": torch.zeros(1)}, "expected prompt_embeds"),
+        ({"prompt_mask": torch.ones(4)}, r"'prompt_mask': \(4,\)"),
+        ({"prompt_mask": torch.ones(1, 12)}, r"'prompt_mask': \(1, 12\)"),
+        ({"prompt_embeds": torch.ones(0, 9, 32), "prompt_mask": torch.ones(0, 9)}, "n of at least 1"),
     ],
 )
 def test_damaged_embeddings_are_model_errors(folder, change, message):
     save_file(load_file(folder / PROMPT_FILE) | change, folder / PROMPT_FILE)
     with pytest.raises(ModelError, match=message):
         load_pipeline(str(folder))
+
+
+@pytest.mark.parametrize(
+    ("file", "change"), [(INDEX_FILE, {"processing_resolution": 2 * SIDE}), (CONFIG_FILE, {"lora_alpha": 4})]
+)
+def test_another_task_or_scale_has_another_digest(model, folder, file, change):
+    assert fingerprint(str(folder)) == fingerprint(str(model))
+    values = json.loads((folder / file).read_text())
+    (folder / file).write_text(json.dumps(values | change))
+    assert fingerprint(str(folder)) != fingerprint(str(model))
 
 
 def test_another_base_is_used_and_has_another_digest(model, base, tmp_path):

@@ -9,9 +9,11 @@
     |-- ManifestError          a list of photos is not a table of paths
     |-- OutputError            an output file cannot be written, for example because it already exists
     |-- ModelError             a model is unknown, damaged, or has the wrong inputs
-    |-- DeviceError            the requested device is not available
+    |-- DeviceError            the requested device is not available or has too little memory; or a cluster, a process group
+    |                          or LLVM is missing
     |-- RecipeError            a recipe is not TOML, or its values are invalid
-    |-- DownloadError          a server cannot be reached, or its file has an unexpected digest
+    |-- DownloadError          a server cannot be reached, or its file has an unexpected digest; or the disk is too small, or
+    |                          a download is not allowed
     `-- MissingExtra           an optional dependency is not installed
 
 Messages have three parts: what happened (with the value), what was expected, what to do. `invalid_value` translates an error
@@ -75,7 +77,7 @@ class BrewsterError(Exception):
     def __str__(self) -> str:
         return f"{self.happened}; {self.expected}; {self.cure}{'' if self.cure.endswith('?') else '.'}"
 
-    def sentences(self) -> list[str]:
+    def messages(self) -> list[str]:
         """Returns the message as a list with one item for each problem. Only a RecipeError has several."""
         return [str(self)]
 
@@ -117,7 +119,7 @@ class ModelError(BrewsterError):
 
 
 class DeviceError(BrewsterError):
-    """The requested device is not available to the installed runtime."""
+    """The requested device is not available or has too little memory; or a cluster, a process group or LLVM is missing."""
 
 
 class RecipeError(BrewsterError):
@@ -132,11 +134,11 @@ class RecipeError(BrewsterError):
         self.others = others
 
     def __str__(self) -> str:
-        return "\n".join(self.sentences())
+        return "\n".join(self.messages())
 
-    def sentences(self) -> list[str]:
+    def messages(self) -> list[str]:
         """Returns one message for each problem of the recipe."""
-        return [super().__str__(), *(sentence for other in self.others for sentence in other.sentences())]
+        return [super().__str__(), *(message for other in self.others for message in other.messages())]
 
     def __reduce__(self) -> tuple[type[BrewsterError], tuple[object, ...]]:
         """Pickles the attributes instead of `args`, as the base class does."""
@@ -144,7 +146,8 @@ class RecipeError(BrewsterError):
 
 
 class DownloadError(BrewsterError):
-    """A server cannot be reached, refuses a request, or sends a file with another digest than expected."""
+    """A server cannot be reached, refuses a request, or sends a file with another digest than expected; or the disk is too
+    small, or a download is not allowed."""
 
 
 INSTALL_COMMAND: Final = "pip install -c constraints.txt -e"

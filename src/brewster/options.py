@@ -1,9 +1,8 @@
 """The options of a separation: type, default, limits and meaning of each, written once.
 
 The command line, its help and the web form are generated from `Options`. The Python API takes its defaults and its
-documentation from it. The metadata of each field are keywords of `pydantic.Field`, so that
-`pydantic.TypeAdapter(Options)` gives an HTTP API its validation and JSON schema, while `brewster --help` needs no
-pydantic.
+documentation from `Options`. The metadata of each field are keywords of `pydantic.Field`: `pydantic.TypeAdapter(Options)` uses
+them to validate requests of the HTTP API and to write its JSON schema. `brewster --help` works without pydantic.
 """
 
 from __future__ import annotations
@@ -93,8 +92,8 @@ class Options:
     model: str = field(
         default="compact",
         metadata=_field_metadata(
-            "The model to use: a name from `brewster models list`, an .onnx file, the folder of a training run, "
-            "or a LoRA's folder or hub id."
+            "The model to use: a name from `brewster models list` (gensirr must be imported first), an .onnx file, the folder "
+            "of a training run, or a LoRA's folder or hub id."
         ),
     )
     device: Device = field(
@@ -131,21 +130,22 @@ class Options:
     fast_lora: str | None = field(
         default=None,
         metadata=_field_metadata(
-            "For diffusion models: a LoRA for sampling in few steps (Lightning, turbo), which is added to the model: "
-            "a .safetensors file, a folder, a hub id or OWNER/NAME/FILE. Set the option steps with it."
+            "For diffusion models: a few-step LoRA, which is added to the model. A few-step LoRA (Lightning, turbo) is trained for "
+            "sampling in few steps, such as 4 or 8. Pass a .safetensors file, a folder, a hub id or OWNER/NAME/FILE, and set the "
+            "option steps."
         ),
     )
     guidance: float | None = field(
         default=None,
         metadata=_field_metadata(
-            "For diffusion models: the guidance scale, by default that of the model; with a LoRA for few steps, 1 for klein and qwen.",
+            "For diffusion models: the guidance scale, by default that of the model; with a few-step LoRA, 1 for klein and qwen.",
             ge=1,
         ),
     )
     steps: int | None = field(
         default=None,
         metadata=_field_metadata(
-            "For diffusion models: sampling steps for each prediction; by default 20, or 4 if the quality is draft.",
+            "For diffusion models: sampling steps for each prediction; by default those of the model, usually 20; at most 4 for draft.",
             ge=1,
         ),
     )

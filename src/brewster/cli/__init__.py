@@ -119,6 +119,6 @@ def main(args: Sequence[str] | None = None) -> int:
         print_status("stopped: finished work is kept; run the same command again to resume")
         return _EXIT_INTERRUPTED
     except BrewsterError as error:
-        for sentence in error.sentences():
-            print_error(sentence)
+        for message in error.messages():
+            print_error(message)
         return 1

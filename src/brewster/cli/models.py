@@ -50,10 +50,10 @@ def list_models(*, as_json: bool) -> None:
         encoder = (
             f"; text encoder: {model.text_encoder_gb:g} GB more to download" if model.text_encoder_gb else ""
         )
-        use = "" if model.is_commercial else " (not for commercial use)"
+        use = "" if model.allows_commercial_use else " (not for commercial use)"
         print_out(f"{model.name:20} {model.download_gb:>7g} GB  {model.licence}{use}")
         print_out(
-            f"{'':33}{model.gives}; {model.memory_gib:g} GiB GPU memory ({model.memory_format}){encoder}"
+            f"{'':33}{model.output}; {model.memory_gib:g} GiB GPU memory ({model.weight_format}){encoder}"
         )
         print_out(f"{'':33}{model.access}; huggingface.co/{model.hub_id}")
 

@@ -56,7 +56,7 @@ class Assets:
     def plane_radiance(self, plane: Plane) -> Float32:
         """Returns the radiance of a picture, (H, W, 3), with brighter highlights (see `Plane.highlight_boost`).
 
-        The file is decoded with its colour profile, or as sRGB.
+        The file is decoded with its colour profile; without a profile as sRGB (integers) or linear Rec.709 (floats).
 
         Raises:
             RecipeError: the file is missing, or has another sha256 than in the scene.
@@ -101,7 +101,7 @@ class Assets:
         return self._open(source).linear().clip(0, 1)
 
     def _open(self, source: AssetSource) -> Photo:
-        with naming_file(source.file):
+        with add_file_name_to_errors(source.file):
             return Photo.open(self._bytes(source))
 
     def _bytes(self, source: AssetSource) -> bytes:
@@ -112,20 +112,20 @@ class Assets:
                 return data
         if paths:
             raise RecipeError(
-                f"{paths[0]} is not the file with which the scene was drawn",
+                f"{paths[0]} is not the file that was chosen when the scene was sampled",
                 f"expected the sha256 {source.sha256}",
                 "choose the folder of the original file",
             )
         searched = ", ".join(map(str, self._folders)) or "no folder"
         raise RecipeError(
             f"{source.file} was not found in {searched}",
-            "expected the file with which the scene was drawn",
+            "expected the file that was chosen when the scene was sampled",
             "choose its folder with --maps or --photos",
         )
 
 
 @contextmanager
-def naming_file(name: str) -> Iterator[None]:
+def add_file_name_to_errors(name: str) -> Iterator[None]:
     """Adds the name of the file to errors raised within this block, unless the error contains the name."""
     try:
         yield
@@ -191,8 +191,9 @@ def _mean_luminance(texels: Float32) -> np.float32:
 
 
 def _parse_builtin(source: AssetSource, known: Iterable[str]) -> tuple[str, int]:
-    _, name, seed = (*source.file.split(":"), "", "")[:3]
-    if name not in known or not seed.isdigit():
+    parts = source.file.split(":")
+    name, seed = parts[1:] if len(parts) == 3 else ("", "")
+    if name not in known or not seed.isdecimal():
         raise RecipeError(
             f"{source.file!r} is not built in",
             f"expected builtin:NAME:SEED with one of the names {', '.join(known)}",

@@ -8,7 +8,7 @@ from collections.abc import Iterator, Sequence
 from fnmatch import fnmatch
 from pathlib import Path
 
-from brewster.environments.assets import BUILTIN_HEIGHT, check_map, naming_file, read_bytes
+from brewster.environments.assets import BUILTIN_HEIGHT, add_file_name_to_errors, check_map, read_bytes
 from brewster.errors import BrewsterError, RecipeError
 from brewster.image_formats import format_of
 from brewster.photo import Photo, read_size
@@ -85,7 +85,7 @@ def _read_folders(
 
 def _read_asset(path: Path, category: str, is_map: bool) -> Asset:
     data = read_bytes(path)
-    with naming_file(str(path)):
+    with add_file_name_to_errors(str(path)):
         width, height = _map_size(data, str(path)) if is_map else read_size(data)
     source = AssetSource(file=path.name, sha256=hashlib.sha256(data).hexdigest())
     return Asset(source=source, width=width, height=height, category=category)

@@ -4,7 +4,7 @@ plan = plan_separation(Options(model="windowseat"), (4000, 3000), CARDS["RTX 409
 print(plan.table())
 plan.check_fits()
 
-The plan needs no GPU and downloads nothing. It counts on a `skeleton` of the backbone, with the tiles that
+The plan needs no GPU and downloads nothing. It counts on the backbone on the device "meta", with the tiles that
 `DiffusionPredictor` would use.
 """
 
@@ -19,7 +19,7 @@ import torch
 
 from brewster.errors import ModelError
 from brewster.inference.diffusion_predictor import DiffusionPredictor
-from brewster.models.diffusion.backbones.registry import hub_id_of, is_registered, skeleton
+from brewster.models.diffusion.backbones.registry import build_on_meta, hub_id_of, is_registered
 from brewster.models.diffusion.cost import (
     EFFICIENCY,
     PROMPT_TOKENS,
@@ -133,8 +133,8 @@ def plan_separation(options: Options, size: tuple[int, int], card: GraphicsCard)
     check_diffusion_model(options.model)
     source = find_model_source(options.model, options.base_model, allow_download=False)
     is_known = is_registered(source.base) or Path(source.base).is_dir()
-    backbone = skeleton(source.base if is_known else source.backbone_class.name, dtype=torch.bfloat16)
-    task = task_with_guidance(source, options.guidance, is_fast=options.fast_lora is not None)
+    backbone = build_on_meta(source.base if is_known else source.backbone_class.name, dtype=torch.bfloat16)
+    task = task_with_guidance(source, options.guidance, has_few_step_lora=options.fast_lora is not None)
     prompt = backbone.random_prompt(backbone.transformer, 0)
     predictor = DiffusionPredictor(
         DecompositionPipeline(backbone, prompt, task),

@@ -112,7 +112,7 @@ class Separator:
         if is_diffusion_model(model):
             if fast_lora and steps is None:
                 raise ModelError(
-                    f"the LoRA for few steps {fast_lora} was given without the number of steps",
+                    f"the few-step LoRA {fast_lora} was given without the number of steps",
                     "expected the number for which it was trained",
                     "set the option steps, for example 4 or 8",
                 )

@@ -17,13 +17,13 @@ class DiffusionModel:
     name: str
     hub_id: str
     licence: str
-    is_commercial: bool
+    allows_commercial_use: bool
     download_gb: float
     """The transformer and the VAE in bfloat16, in GB; for a LoRA those of its base."""
     memory_gib: float
-    """GPU memory for separation, in GiB, with the weights in `memory_format`."""
-    memory_format: str
-    gives: str
+    """GPU memory for separation, in GiB, with the weights in `weight_format`."""
+    weight_format: str
+    output: str
     access: str = _OPEN
     text_encoder_gb: float = 0
     """The download of the text encoders, which encode a prompt once. 0 if the prompt is part of the model."""
@@ -37,31 +37,31 @@ DIFFUSION_MODELS: Final = {
     model.name: model
     for model in (
         DiffusionModel(
-            "windowseat", "huawei-bayerlab/windowseat-reflection-removal-v1-0", "Apache-2.0", is_commercial=True,
-            download_gb=41, memory_gib=24, memory_format="nf4", gives="transmission; reflection derived",
+            "windowseat", "huawei-bayerlab/windowseat-reflection-removal-v1-0", "Apache-2.0", allows_commercial_use=True,
+            download_gb=41, memory_gib=24, weight_format="nf4", output="transmission; reflection derived",
             base_model="Qwen/Qwen-Image-Edit-2509",
         ),
         DiffusionModel(
             "gensirr", "lime-j/GenSIRR", "none stated; its base: FLUX.1 [dev] Non-Commercial License",
-            is_commercial=False, download_gb=24, memory_gib=14, memory_format="int8",
-            gives="transmission; reflection derived",
+            allows_commercial_use=False, download_gb=24, memory_gib=14, weight_format="int8",
+            output="transmission; reflection derived",
             access="download GenSIRR.pt, then run `brewster models import GenSIRR.pt FOLDER`",
             base_model="black-forest-labs/FLUX.1-Kontext-dev", is_opened_by_name=False,
         ),
         DiffusionModel(
             "kontext", "black-forest-labs/FLUX.1-Kontext-dev", "FLUX.1 [dev] Non-Commercial License",
-            is_commercial=False, download_gb=24, memory_gib=14, memory_format="int8",
-            gives="a base for LoRAs; without one, an edit by prompt", access=_GATED, text_encoder_gb=9.8,
+            allows_commercial_use=False, download_gb=24, memory_gib=14, weight_format="int8",
+            output="a base for LoRAs; without one, an edit by prompt", access=_GATED, text_encoder_gb=9.8,
         ),
         DiffusionModel(
-            "klein", "black-forest-labs/FLUX.2-klein-base-4B", "Apache-2.0", is_commercial=True,
-            download_gb=7.9, memory_gib=9, memory_format="bf16",
-            gives="a base for LoRAs; without one, an edit by prompt", text_encoder_gb=8,
+            "klein", "black-forest-labs/FLUX.2-klein-base-4B", "Apache-2.0", allows_commercial_use=True,
+            download_gb=7.9, memory_gib=9, weight_format="bf16",
+            output="a base for LoRAs; without one, an edit by prompt", text_encoder_gb=8,
         ),
         DiffusionModel(
-            "qwen", "Qwen/Qwen-Image-Edit", "Apache-2.0", is_commercial=True,
-            download_gb=41, memory_gib=14, memory_format="nf4",
-            gives="a base for LoRAs; without one, an edit by prompt", text_encoder_gb=16.6,
+            "qwen", "Qwen/Qwen-Image-Edit", "Apache-2.0", allows_commercial_use=True,
+            download_gb=41, memory_gib=14, weight_format="nf4",
+            output="a base for LoRAs; without one, an edit by prompt", text_encoder_gb=16.6,
         ),
     )
 }  # fmt: skip
@@ -70,10 +70,10 @@ DIFFUSION_MODELS: Final = {
 
 def licence_of(hub_id: str) -> str:
     """The licence of a repository on the hub, for a message before its download."""
-    titles = {model.hub_id: model.licence for model in DIFFUSION_MODELS.values()}
-    titles |= {
+    licences = {model.hub_id: model.licence for model in DIFFUSION_MODELS.values()}
+    licences |= {
         model.base_model: model.licence
         for model in DIFFUSION_MODELS.values()
-        if model.base_model and model.base_model not in titles
+        if model.base_model and model.base_model not in licences
     }
-    return titles.get(hub_id, "see its page on the hub")
+    return licences.get(hub_id, "see its page on the hub")

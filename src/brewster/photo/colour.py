@@ -23,7 +23,7 @@ Float64 = NDArray[np.float64]
 Stored = NDArray[Any]
 Matrix = tuple[tuple[float, float, float], ...]
 
-REC709 = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290)
+REC709_CHROMATICITIES = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290)
 _D50 = np.array([0.9642, 1.0, 0.8249])
 _BRADFORD = np.array([[0.8951, 0.2664, -0.1614], [-0.7502, 1.7135, 0.0367], [0.0389, -0.0685, 1.0296]])
 
@@ -87,7 +87,7 @@ class ColourSpace:
         """Converts linear Rec.709 (H, W, 3) to stored pixels with the dtype and the channels of `original`.
 
         `original` has the stored pixels before a change. Pixels with unchanged light keep exactly these stored values.
-        NaN becomes black.
+        In integers, NaN becomes black; floats keep NaN.
         """
         stored = np.empty_like(original)
         curves = self._curves(original)
@@ -109,8 +109,7 @@ class ColourSpace:
     def _curves(self, stored: Stored) -> tuple[ToneCurve, ...]:
         """Returns the curve of each stored channel.
 
-        Grey pixels use the green curve. With a grey profile, the three curves are the same. With an RGB profile, the red,
-        green and blue of a neutral colour are equal.
+        Grey pixels use the green curve. In a grey profile all three curves are the same. In an RGB profile they usually are.
         """
         return self.curves if stored.shape[-1] == 3 else (self.curves[1],)
 
@@ -130,7 +129,7 @@ def colour_space_of(icc: bytes | None, primaries: tuple[float, ...] | None, is_f
     """
     if icc is not None:
         return _profile_space(icc)
-    if primaries is not None and not np.allclose(primaries, REC709, atol=1e-4):
+    if primaries is not None and not np.allclose(primaries, REC709_CHROMATICITIES, atol=1e-4):
         return ColourSpace((ToneCurve(),) * 3, _to_rec709(_to_d50(primaries)))
     return LINEAR_REC709 if is_float else SRGB
 
@@ -209,7 +208,7 @@ def _to_d50(primaries: tuple[float, ...]) -> Float64:
 
 
 def _to_rec709(to_d50: Float64) -> Matrix:
-    return _as_matrix(np.linalg.inv(_to_d50(REC709)) @ to_d50)
+    return _as_matrix(np.linalg.inv(_to_d50(REC709_CHROMATICITIES)) @ to_d50)
 
 
 def _profile_space(icc: bytes) -> ColourSpace:
@@ -268,6 +267,8 @@ def _parse_curve(tag: bytes) -> ToneCurve:
         return ToneCurve()
     numbers = struct.unpack_from(f">{count}H", tag, 12)
     if count == 1:
+        if numbers[0] == 0:  # the exponent 0 has no inverse
+            raise ValueError(numbers)
         return ToneCurve(parameters=(numbers[0] / 256, 1, 0, 0, 0, 0, 0))
     return ToneCurve(samples=tuple(number / 65535 for number in numbers))
 
@@ -276,8 +277,8 @@ def _parse_parametric(function: int, tag: bytes) -> ToneCurve:
     names = _PARAMETRIC_NAMES[function] if function < len(_PARAMETRIC_NAMES) else ""
     values = dict(zip(names, struct.unpack_from(f">{len(names)}i", tag, 12), strict=True))
     g, a, b, c, d, e, f = (values.get(name, 65536 * (name == "a")) / 65536 for name in "gabcdef")
-    if function in (1, 2):  # types 1 and 2 are constant for x < -b/a
-        c, d, e, f = 0.0, -b / a, c, c
     if g <= 0 or a <= 0:
         raise ValueError(names)
+    if function in (1, 2):  # types 1 and 2 are constant for x < -b/a
+        c, d, e, f = 0.0, -b / a, c, c
     return ToneCurve(parameters=(g, a, b, c, d, e, f))

@@ -8,6 +8,7 @@ from __future__ import annotations
 import bisect
 import io
 import logging
+import lzma
 import re
 import zipfile
 import zlib
@@ -85,7 +86,7 @@ def read_size(data: bytes) -> tuple[int, int]:
     if format_name == "ora":
         data, format_name = _merged_image(data, DEFAULT_MAX_PIXELS), "png"
     if format_name == "raw":
-        return read_raw_size(data)
+        return read_raw_size(data, DEFAULT_MAX_PIXELS)
     if format_name in _FLOAT_READERS:
         height, width = decode(data, DEFAULT_MAX_PIXELS).pixels.shape[:2]
         return width, height
@@ -203,8 +204,7 @@ def _check_supported(image: pyvips.Image, data: bytes, format_name: str, max_pix
             "expected grey or RGB, with or without alpha, of 8 or 16 bits or 32-bit floats",
             "convert the image to one of these",
         )
-    is_tiff = format_name == "tiff"
-    if is_tiff and metadata.pixel_data_end(metadata.read_tags(data)) > len(data):
+    if format_name == "tiff" and metadata.pixel_data_end(metadata.read_tags(data)) > len(data):
         raise _unreadable_error("tiff", "pixels are missing")  # libvips reads missing tiles as black
 
 
@@ -233,18 +233,24 @@ def _file_info(image: pyvips.Image, data: bytes, format_name: str) -> FileInfo:
     return replace(file_info, **_EXTRA_INFO[format_name](data)) if format_name in _EXTRA_INFO else file_info
 
 
+_SRGB_TRANSFERS = (1, 2, 6, 13, 14, 15)  # BT.709, unspecified, BT.601, sRGB, BT.2020 of 10 and 12 bits
+
+
 def _profile_of(data: bytes, format_name: str) -> bytes | None:
-    """Returns the ICC profile for the code points (ITU-T H.273) of a file: None for sRGB, or Display P3.
+    """Returns the ICC profile for the code points (ITU-T H.273) of a file.
+
+    Returns Display P3 if the primaries are those of Display P3; otherwise None, which means sRGB.
 
     Raises:
-        UnsupportedPhoto: the file has other primaries, or the transfer functions PQ (16) or HLG (18) of HDR video.
+        UnsupportedPhoto: the file has other primaries, or a transfer function unlike that of sRGB: for example linear (8), or
+            PQ (16) or HLG (18) of HDR video.
     """
     codes = metadata.cicp(data) if FORMATS[format_name].has_cicp else None
     primaries, transfer = codes[:2] if codes else (1, 13)
-    if transfer in (16, 18) or primaries not in (1, 2, 5, 6, 12):
+    if transfer not in _SRGB_TRANSFERS or primaries not in (1, 2, 5, 6, 12):
         raise UnsupportedPhoto(
-            f"the {format_name} has the colours of HDR video (primaries {primaries}, transfer {transfer})",
-            "expected sRGB, Display P3, or an ICC profile",
+            f"the {format_name} has the primaries {primaries} and the transfer function {transfer} of ITU-T H.273",
+            "expected those of sRGB or Display P3, or an ICC profile",
             "export the image with one of these",
         )
     return bytes(pyvips.Image.profile_load("p3")) if primaries == 12 else None
@@ -268,14 +274,8 @@ def _jpeg_quality(data: bytes, bands: int) -> int:
 
 
 _COMPRESSIONS = {
-    1: "none",
-    5: "lzw",
-    7: "jpeg",
-    8: "deflate",
-    32946: "deflate",
-    32773: "packbits",
-    50000: "zstd",
-}
+    1: "none", 5: "lzw", 7: "jpeg", 8: "deflate", 32946: "deflate", 32773: "packbits", 50000: "zstd",
+}  # fmt: skip
 
 
 def _tiff_info(data: bytes) -> dict[str, Any]:
@@ -299,6 +299,10 @@ _EXTRA_INFO = {"jpeg": _jpeg_info, "tiff": _tiff_info, "webp": _webp_info, "avif
 
 # --- OpenRaster
 
+_ZIP_ERRORS = (
+    zipfile.BadZipFile, KeyError, ValueError, OSError, EOFError, RuntimeError, zlib.error, lzma.LZMAError,
+)  # fmt: skip
+
 
 def _merged_image(data: bytes, max_pixels: int) -> bytes:
     """Returns the PNG of the merged image in an OpenRaster file (baseline 0.0.6).
@@ -312,7 +316,7 @@ def _merged_image(data: bytes, max_pixels: int) -> bytes:
             if archive.getinfo("mergedimage.png").file_size > (1 << 20) + 16 * max_pixels:
                 raise _unreadable_error("ora", "the merged image is too large")
             return archive.read("mergedimage.png")
-    except (zipfile.BadZipFile, KeyError, ValueError, OSError, NotImplementedError, zlib.error) as error:
+    except _ZIP_ERRORS as error:  # RuntimeError: the file is encrypted
         raise _unreadable_error("ora", error) from error
 
 

@@ -1,7 +1,8 @@
 """Reads and writes metadata as bytes: JPEG tables, EXIF, PNG and WebP chunks.
 
 libvips writes EXIF with libexif, which drops unknown tags, and libvips ignores EXIF in TIFF files. This module copies the
-EXIF block of the source unchanged. A block begins at its TIFF header, without the "Exif\\0\\0" of JPEG.
+EXIF block of the source with all its tags; only the orientation and the thumbnail change. A block begins at its TIFF header,
+without the "Exif\\0\\0" of JPEG.
 """
 
 from __future__ import annotations
@@ -202,6 +203,7 @@ _CAMERA_TAGS = (
     34853,
 )  # camera, date, author, copyright, and the pointers to Exif and GPS
 _ORIENTATION = 274
+_TIFF_HEADER_BYTES = 8  # byte order, the number 42, and the position of the first directory
 _TYPE_BYTES = {1: 1, 2: 1, 3: 2, 4: 4, 5: 4, 6: 1, 7: 1, 8: 2, 9: 4, 10: 4, 11: 4, 12: 8, 13: 4}
 _RATIONAL_TYPES = (5, 10)  # two numbers: numerator and denominator
 
@@ -209,7 +211,7 @@ _RATIONAL_TYPES = (5, 10)  # two numbers: numerator and denominator
 def read_tags(data: bytes) -> Tags:
     """Returns the first directory of a TIFF or EXIF block with its subdirectories, or an empty dict for other data."""
     byte_order = {b"II*\0": "<", b"MM\0*": ">"}.get(data[:4])
-    if byte_order is None:
+    if byte_order is None or len(data) < _TIFF_HEADER_BYTES:
         return {}
     return _directory(data, byte_order, struct.unpack_from(byte_order + "I", data, 4)[0], _POINTER_TAGS)
 

@@ -3,6 +3,10 @@
 OpenRaster (baseline 0.0.6) is a format of Krita, GIMP and MyPaint: a zip archive with stack.xml and a PNG for each layer.
 The reflection is above the transmission, with the blend mode svg:plus. The sum of both layers is the photo.
 
+svg:plus adds the alpha of the layers, too: alpha = min(1, upper + lower), and likewise for each colour times its alpha (W3C
+Compositing and Blending, "lighter"). This is right where alpha is 0 or 1. For a photo with partly transparent pixels, the
+layers are therefore opaque, in a group that svg:src-atop limits to the alpha of a third layer below it, the photo.
+
 Editors add the stored values, not linear light. Krita always does so, and GIMP does so because it reads svg:plus as its
 legacy mode. Therefore the reflection layer is the difference of the stored values, so that the editor shows the photo. The
 option `additive` writes layers whose linear light sums to the photo.
@@ -26,13 +30,20 @@ _MIME_TYPE: Final = "image/openraster"
 _EPOCH: Final = (1980, 1, 1, 0, 0, 0)
 """The date of all files in a zip archive: the earliest possible one."""
 _THUMBNAIL_PX: Final = 256  # the maximum of the specification
-_STACK: Final = """<?xml version="1.0" encoding="UTF-8"?>
+_IMAGE: Final = """<?xml version="1.0" encoding="UTF-8"?>
 <image version="0.0.6" w="{width}" h="{height}">
  <stack>
+{layers} </stack>
+</image>
+"""
+_LAYERS: Final = """\
   <layer name="reflection" src="data/reflection.png" composite-op="svg:plus" opacity="1.0" visibility="visible" x="0" y="0"/>
   <layer name="transmission" src="data/transmission.png" composite-op="svg:src-over" opacity="1.0" visibility="visible" x="0" y="0"/>
- </stack>
-</image>
+"""
+_LAYERS_WITH_ALPHA: Final = f"""\
+  <stack name="layers" composite-op="svg:src-atop" opacity="1.0" visibility="visible">
+{_LAYERS}  </stack>
+  <layer name="photo" src="data/photo.png" composite-op="svg:src-over" opacity="1.0" visibility="visible" x="0" y="0"/>
 """
 
 
@@ -60,7 +71,7 @@ class LayeredImage:
         """Returns the bytes of an OpenRaster file with the profile of the photo, in 8 or 16 bits.
 
         The stored values of both layers sum to those of the photo exactly. The reflection is never negative, because the
-        transmission is clipped to the photo where it is brighter.
+        transmission is clipped to the photo where it is brighter. The composite has the alpha of the photo.
 
         Raises:
             UnsupportedPhoto: `format_name` is not "ora".
@@ -76,12 +87,18 @@ class LayeredImage:
         behind = np.minimum(photo.pixels, transmission.pixels)
         info = replace(photo.file_info, format_name="png", bits=bits, xmp=self.transmission.file_info.xmp)
         width, height = photo.size
+        merged = Photo(photo.pixels, photo.alpha, info).encode()
+        alpha, photo_layer, layers = photo.alpha, {}, _LAYERS
+        if alpha is not None and ((alpha > 0) & (alpha < np.iinfo(alpha.dtype).max)).any():
+            alpha = np.where(alpha > 0, np.iinfo(alpha.dtype).max, 0).astype(alpha.dtype)
+            photo_layer, layers = {"data/photo.png": merged}, _LAYERS_WITH_ALPHA
         files = {
             "mimetype": _MIME_TYPE.encode(),  # must be the first file, and not compressed
-            "stack.xml": _STACK.format(width=width, height=height).encode(),
-            "data/transmission.png": Photo(behind, photo.alpha, info).encode(),
-            "data/reflection.png": Photo(photo.pixels - behind, photo.alpha, info).encode(),
-            "mergedimage.png": Photo(photo.pixels, photo.alpha, info).encode(),
+            "stack.xml": _IMAGE.format(width=width, height=height, layers=layers).encode(),
+            "data/transmission.png": Photo(behind, alpha, info).encode(),
+            "data/reflection.png": Photo(photo.pixels - behind, alpha, info).encode(),
+            **photo_layer,
+            "mergedimage.png": merged,
             "Thumbnails/thumbnail.png": photo.thumbnail(_THUMBNAIL_PX).encode("png", depth=8),
         }
         return zip_images(files.items())

@@ -47,9 +47,7 @@ def read_raw(data: bytes, max_pixels: int) -> tuple[NDArray[np.uint16], FileInfo
         UnreadablePhoto: the file is damaged or truncated, or LibRaw does not support the camera.
     """
     with _opened(data) as raw:
-        width, height = _upright_size(raw)
-        if width * height > max_pixels:
-            raise too_large_error(width, height, max_pixels)
+        _upright_size(raw, max_pixels)  # checks the limit before the pixels are decoded
         linear = raw.postprocess(
             use_camera_wb=True,
             no_auto_bright=True,
@@ -65,15 +63,16 @@ def read_raw(data: bytes, max_pixels: int) -> tuple[NDArray[np.uint16], FileInfo
     )
 
 
-def read_raw_size(data: bytes) -> tuple[int, int]:
+def read_raw_size(data: bytes, max_pixels: int) -> tuple[int, int]:
     """Returns (width, height) of the upright image of a RAW file.
 
     Raises:
         MissingExtra: rawpy is not installed.
+        PhotoTooLarge: the image has more pixels than `max_pixels`.
         UnreadablePhoto: the file is damaged, or LibRaw does not support the camera.
     """
     with _opened(data) as raw:
-        return _upright_size(raw)
+        return _upright_size(raw, max_pixels)
 
 
 def _rawpy() -> types.ModuleType:
@@ -105,10 +104,13 @@ def _opened(data: bytes) -> Iterator[Any]:
         ) from error
 
 
-def _upright_size(raw: Any) -> tuple[int, int]:  # noqa: ANN401  (rawpy has no types)
+def _upright_size(raw: Any, max_pixels: int) -> tuple[int, int]:  # noqa: ANN401  (rawpy has no types)
     sizes = raw.sizes
     is_transposed = sizes.flip in (4, 5, 6, 7)  # LibRaw's code: bit 2 swaps rows and columns
-    return (sizes.iheight, sizes.iwidth) if is_transposed else (sizes.iwidth, sizes.iheight)
+    width, height = (sizes.iheight, sizes.iwidth) if is_transposed else (sizes.iwidth, sizes.iheight)
+    if width * height > max_pixels:
+        raise too_large_error(width, height, max_pixels)
+    return width, height
 
 
 # --- EXIF

@@ -72,10 +72,10 @@ def _blend(picture: Floats, mask: Floats, colour: Floats) -> None:
 
 
 def _abstract(rng: Generator, height: int, width: int) -> Floats:
-    """Returns brush strokes on a mottled background, from coarse to fine."""
+    """Returns brush strokes, from large to small, on a background with coarse noise."""
     palette = [tint(rng, rng.uniform(0.05, 0.6), rng.uniform(0.2, 1)) for _ in range(6)]
-    mottle = np.clip(0.5 + 0.3 * fractal(rng, height, width, 3), 0, 1)[..., None]
-    picture = palette[0] + (palette[1] - palette[0]) * mottle
+    coarse_noise = np.clip(0.5 + 0.3 * fractal(rng, height, width, 3), 0, 1)[..., None]
+    picture = palette[0] + (palette[1] - palette[0]) * coarse_noise
     bristles = 1 + 0.25 * fractal(rng, 256, 256, 64, 2)
     for length in np.geomspace(0.9, 0.04, 260 if height > 256 else 90):
         _stroke(rng, picture, float(length), (palette[rng.integers(6)], bristles))
@@ -101,8 +101,8 @@ def _stroke(rng: Generator, picture: Floats, length: float, paint: tuple[Floats,
 
 def _poster(rng: Generator, height: int, width: int) -> Floats:
     """Returns a poster: bands, discs and stripes between a title and small print."""
-    ground, *inks = (tint(rng, rng.uniform(0.02, 0.8), rng.uniform(0, 1)) for _ in range(5))
-    picture = np.ones((height, width, 3), np.float32) * ground
+    background_colour, *inks = (tint(rng, rng.uniform(0.02, 0.8), rng.uniform(0, 1)) for _ in range(5))
+    picture = np.ones((height, width, 3), np.float32) * background_colour
     grid = _grid(height, width)
     angle = rng.uniform(0, np.pi)
     slope = grid[0] * np.cos(angle) + grid[1] * np.sin(angle)
@@ -116,7 +116,7 @@ def _poster(rng: Generator, height: int, width: int) -> Floats:
         if rng.uniform() < 0.5:
             disc = np.maximum(disc, np.abs(np.mod(slope * rng.uniform(12, 30), 1) - 0.5) * 0.04 - 0.01)
         _blend(picture, _inside(disc, height), inks[rng.integers(4)])
-    ink = vector(0.9, 0.88, 0.8) if ground.mean() < 0.25 else vector(0.02, 0.02, 0.03)
+    ink = vector(0.9, 0.88, 0.8) if background_colour.mean() < 0.25 else vector(0.02, 0.02, 0.03)
     _print_line(rng, picture, (0.05, rng.uniform(0.1, 0.2), int(rng.integers(4, 11))), ink)
     top = rng.uniform(0.6, 0.75)
     for line in range(rng.integers(2, 7)):
@@ -174,8 +174,8 @@ def _ridge(rng: Generator, width: int, bumps: int = 3) -> Floats:
 def _portrait(rng: Generator, height: int, width: int) -> Floats:
     """Returns a portrait: head and shoulders of a person, with defocused lights in the background."""
     grid = _grid(height, width)
-    ground = tint(rng, rng.uniform(0.05, 0.4), rng.uniform(0.1, 0.6))
-    picture = ground * np.clip(1 + 0.35 * fractal(rng, height, width, 2, 4), 0.2, 3)[..., None]
+    background_colour = tint(rng, rng.uniform(0.05, 0.4), rng.uniform(0.1, 0.6))
+    picture = background_colour * np.clip(1 + 0.35 * fractal(rng, height, width, 2, 4), 0.2, 3)[..., None]
     for _ in range(rng.integers(5, 30)):
         centre = rng.uniform(-0.5, 0.5) * width / height, rng.uniform(-0.5, 0.5)
         radius = rng.uniform(0.02, 0.09)
@@ -234,7 +234,7 @@ def tree(rng: Generator, height: float, density: float) -> Canvas:
     return canvas
 
 
-def figure(rng: Generator, height: float, density: float) -> Canvas:
+def person(rng: Generator, height: float, density: float) -> Canvas:
     """Returns a cut-out standing person, `height` metres tall. `density` is in texels per metre."""
     canvas = Canvas(height * 0.4, height, density)
     rows, columns = canvas.pixels.shape[:2]
@@ -275,8 +275,8 @@ def window_view(rng: Generator) -> Floats:
     return view
 
 
-def wallpaper(rng: Generator, canvas: Canvas) -> None:
-    """Paints plaster, stripes, bricks or panels above a skirting board."""
+def wall_finish(rng: Generator, canvas: Canvas) -> None:
+    """Paints plaster, stripes, bricks or panels above a baseboard at the floor."""
     choice = rng.uniform()
     if choice < 0.2:
         period = round(canvas.density * rng.uniform(0.08, 0.3))

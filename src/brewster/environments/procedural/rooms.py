@@ -22,13 +22,13 @@ from brewster.environments.procedural.canvas import (
 from brewster.environments.procedural.paintings import (
     curtain,
     door,
-    figure,
     flooring,
     hang_pictures,
     painting,
+    person,
     rug,
     tree,
-    wallpaper,
+    wall_finish,
     window_view,
 )
 from brewster.environments.procedural.props import (
@@ -145,7 +145,7 @@ class _BoxRoom:
         rng = self.rng
         foot, length_m = self._wall_base(inward)
         canvas = Canvas(length_m, self.height_m, _TEXELS_PER_M, colour)
-        wallpaper(rng, canvas)
+        wall_finish(rng, canvas)
         left = rng.uniform(0.3, 0.8)
         sill = rng.choice([0.1, 0.9, 0.9])
         while left < length_m - 1.2:
@@ -327,7 +327,7 @@ class _BoxRoom:
             if self._reserve_floor(foot, size, rotation):
                 self._table(foot, size, rotation)
         elif kind == "person" and self._reserve_floor(foot, (0.5, 1.7, 0.4), 0):
-            self.quads.append(vertical_quad(figure(rng, rng.uniform(1.55, 1.85), 90), foot, None, self.light))
+            self.quads.append(vertical_quad(person(rng, rng.uniform(1.55, 1.85), 90), foot, None, self.light))
         elif kind == "lamp" and self._reserve_floor(foot, (0.4, 1.6, 0.4), 0):
             self._floor_lamp(foot)
 

@@ -20,7 +20,7 @@ from brewster.environments.procedural.canvas import (
     unit,
     vector,
 )
-from brewster.environments.procedural.paintings import figure, painting, tree
+from brewster.environments.procedural.paintings import painting, person, tree
 from brewster.environments.procedural.props import (
     UP,
     EnvironmentLighting,
@@ -383,7 +383,7 @@ def _people_and_posters(street: _Street) -> None:
         side = rng.choice([-1, 1])
         x = street.half_width[side] - rng.uniform(0.5, street.pavement - 0.3)
         foot = vector(side * x, street.ground, rng.uniform(-30, 30))
-        street.quads.append(vertical_quad(figure(rng, rng.uniform(1.55, 1.9), 60), foot, None, street.light))
+        street.quads.append(vertical_quad(person(rng, rng.uniform(1.55, 1.9), 60), foot, None, street.light))
     for _ in range(4):  # posters on a column
         side = rng.choice([-1, 1])
         foot = vector(side * (street.half_width[side] - 0.8), street.ground, rng.uniform(-20, 20))

@@ -1,6 +1,6 @@
 """What a prediction costs: parameters, operations and activations of a backbone, and a table of graphics cards.
 
-Parameters and operations are counted on a `skeleton`, which has no storage.
+Parameters and operations are counted on a backbone on the device "meta" (`build_on_meta`), which has no storage.
 """
 
 from __future__ import annotations

@@ -3,8 +3,8 @@ Removal") to a folder in diffusers' layout with its prompt and task.
 
     convert(Path("GenSIRR.pt"), Path("gensirr"))        # then: brewster window.jpg --model gensirr
 
-GenSIRR is FLUX.1 Kontext with other weights of transformer and VAE, and a stored prompt embedding. Its published call takes 28
-steps with guidance 3.5 from sigma 1 to 0.001, and an input with a short side of 768 (or 512) pixels.
+GenSIRR is FLUX.1 Kontext with other weights of transformer and VAE, and a stored prompt embedding. Its published inference
+code takes 28 steps with guidance 3.5 from sigma 1 to 0.001, and an input with a short side of 768 (or 512) pixels.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from torch import Tensor, nn
 from brewster.errors import ModelError
 from brewster.models.diffusion.backbones.backbone import Backbone
 from brewster.models.diffusion.backbones.kontext import Kontext
-from brewster.models.diffusion.backbones.registry import skeleton
+from brewster.models.diffusion.backbones.registry import build_on_meta
 from brewster.models.diffusion.panels import PanelLayout
 from brewster.models.diffusion.prompt import PROMPT_FILE, PromptEmbedding
 from brewster.models.diffusion.task import TASK_FILE, DecompositionTask, save_task
@@ -56,7 +56,7 @@ def convert(
         )
     state = _read_checkpoint(checkpoint)
     prompt = _prompt(checkpoint, state)
-    backbone = skeleton(base_model)
+    backbone = build_on_meta(base_model)
     _load(checkpoint, backbone, state)
     backbone.save(folder)
     prompt.save(folder / PROMPT_FILE)

@@ -38,14 +38,14 @@ def resolve_model_folder(source: str, patterns: list[str]) -> Path:
         return Path(source)
     hub, errors = import_library("huggingface_hub"), import_library("huggingface_hub.errors")
     # If this request fails, the download reports the reason, or finds the files in the cache.
-    with contextlib.suppress(errors.HfHubHTTPError, errors.HFValidationError, errors.DryRunError, OSError):
+    with contextlib.suppress(errors.HTTPError, errors.HFValidationError, errors.DryRunError, OSError):
         _announce_download(hub, source, patterns)
     with _translate_hub_errors(source):
         return Path(hub.snapshot_download(source, allow_patterns=patterns))
 
 
 def cached_model_folder(source: str, patterns: list[str]) -> Path | None:
-    """Returns the local folder of a model if it is a folder or in the cache, and downloads nothing.
+    """Returns the local folder of a model, or None if it is not in the cache. Downloads nothing.
 
     Raises:
         MissingExtra: huggingface_hub is not installed.
@@ -89,7 +89,8 @@ def find_weights_file(source: str, suffixes: tuple[str, ...], companions: Sequen
         companions: other files that are downloaded with it, if they exist.
 
     Raises:
-        ModelError: the folder or repository does not have exactly one such file, or `source` is none of these.
+        ModelError: the file does not exist, the folder or repository does not have exactly one such file, or `source` is none
+            of these.
         DownloadError, MissingExtra: see `resolve_model_folder`.
     """
     if Path(source).is_file():
@@ -105,7 +106,10 @@ def find_weights_file(source: str, suffixes: tuple[str, ...], companions: Sequen
             expected,
             "pass the path of the file, or OWNER/NAME/FILE for a file on the hub",
         )
-    return resolve_model_folder(repository, [*names, *companions]) / names[0]
+    path = resolve_model_folder(repository, [*names, *companions]) / names[0]
+    if not path.is_file():
+        raise ModelError(f"{repository} contains no file {names[0]}", expected, "check the path")
+    return path
 
 
 @contextlib.contextmanager
@@ -140,11 +144,17 @@ def _translate_hub_errors(source: str) -> Iterator[None]:
             "expected a network connection, or a folder with the model's files",
             f"connect, or copy the model from {page} and pass its folder",
         ) from error
+    except errors.HTTPError as error:
+        raise DownloadError(
+            f"{source} could not be downloaded, because the connection failed ({type(error).__name__}: {error})",
+            "expected a network connection until the end of the download",
+            "check the network and the proxy, then try again",
+        ) from error
     except OSError as error:
         raise DownloadError(
             f"{source} could not be downloaded: {error}",
-            "expected enough disk space in the cache folder (HF_HOME)",
-            "free disk space and try again",
+            "expected a writable cache folder (HF_HOME) with enough space",
+            "check the folder, then try again",
         ) from error
 
 
@@ -225,6 +235,6 @@ def _announce_download(hub: Any, source: str, patterns: list[str]) -> None:  # n
 
 
 def free_disk_bytes(folder: Path) -> int:
-    """The free bytes of the disk that has the folder, or will have it: of its nearest existing parent."""
+    """Returns the free bytes of the disk of a folder. If the folder does not exist, its nearest existing parent is used."""
     existing = next(parent for parent in (folder, *folder.absolute().parents) if parent.exists())
     return shutil.disk_usage(existing).free

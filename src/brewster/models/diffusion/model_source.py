@@ -62,7 +62,7 @@ class ModelSource:
         return not self.has_prompt and not self.base.startswith(TINY_PREFIX)
 
     def digest_parts(self) -> list[str]:
-        """What identifies LoRA, prompt and base.
+        """Returns the digests of the LoRA, its settings and its prompt, and that of the base.
 
         A base on the hub is identified by its name. A base in a folder is identified by the names, sizes, and first and
         last MiB of its files, because reading them completely takes a minute.
@@ -70,8 +70,10 @@ class ModelSource:
         base = _digest_folder(Path(self.base)) if self._is_base_folder else self.base
         if not (self.layout and self.folder and self.metadata):
             return [base]
-        weights = hashlib.sha256((self.folder / self.layout.weights).read_bytes()).hexdigest()
-        return [weights, self.metadata.prompt_sha256, base]
+        # The task and the scale of the LoRA are in the file of the weights, or in the JSON files of the layout.
+        files = [self.layout.weights, *(name for name in self.layout.files if name.endswith(".json"))]
+        digests = [hashlib.sha256((self.folder / name).read_bytes()).hexdigest() for name in files]
+        return [*digests, self.metadata.prompt_sha256, base]
 
     @property
     def _is_base_folder(self) -> bool:
@@ -81,13 +83,13 @@ class ModelSource:
 def find_model_source(
     model: str, base_model: str | None = None, *, allow_download: bool = True
 ) -> ModelSource:
-    """Looks up a model. Of a LoRA the files are downloaded, of a backbone only its index.
+    """Looks up a model. Downloads the files of a LoRA. For a backbone it downloads the index, the task and the prompt.
 
     Args:
         model: a LoRA by its folder or hub id, or a backbone by its name, folder or hub id.
         base_model: the folder or hub id of the LoRA's base; by default the one used in training. Only for a LoRA.
-        allow_download: whether files that are not in the cache are downloaded. Otherwise the class of a base that is not in
-            the cache is that in the metadata of the LoRA, and WindowSeat has its published task.
+        allow_download: whether files that are not in the cache are downloaded. If false, and the base is not in the cache, its
+            class is read from the LoRA's metadata. A WindowSeat that is not in the cache gets its published task.
 
     Raises:
         DownloadError: no access to a gated model, an invalid token, no network connection, or a download that is not
@@ -133,12 +135,13 @@ def _default_task() -> DecompositionTask:
 
 
 def _published_source(model: str, base_model: str | None) -> ModelSource:
-    """WindowSeat before its download, for a plan."""
+    """Returns the source of WindowSeat without a download, for `--plan`."""
     row = DIFFUSION_MODELS.get(model)
     if row is None or row.base_model is None or not row.is_opened_by_name:
+        names = [name for name, each in DIFFUSION_MODELS.items() if each.is_opened_by_name]
         raise DownloadError(
             f"{model} is not in the cache, and a plan downloads nothing",
-            f"expected a folder, a model in the cache, or one of {', '.join(DIFFUSION_MODELS)}",
+            f"expected a folder, a model in the cache, or one of {', '.join(names)}",
             "download it first, or plan with its base",
         )
     return ModelSource(

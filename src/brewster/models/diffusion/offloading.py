@@ -51,7 +51,7 @@ def tiled_if_large(vae: Any, pixels: int) -> Iterator[None]:  # noqa: ANN401 - a
 
 
 def free_gpu_bytes(device: torch.device) -> int | None:
-    """The free memory of a GPU in bytes, with that which torch has reserved and does not use; None for a CPU."""
+    """The free memory of a GPU in bytes, including memory that torch has reserved but does not use; None for a CPU."""
     if device.type != "cuda":
         return None
     reserved = torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)

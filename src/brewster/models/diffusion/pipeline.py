@@ -3,7 +3,7 @@
     pipeline = load_pipeline("out/kontext/lora", device="cuda")
     panels = pipeline(photo, steps=20, seeds=[0, 1])     # {"I": ..., "T": ..., "R": ...}
 
-A backbone without a LoRA generates panel T only, with the photo as its control image. This is the baseline of the paper
+A backbone without a LoRA generates panel T only, with the photo as its conditioning image. This is the baseline of the paper
 ("Comparing to original Flux model").
 """
 
@@ -159,22 +159,23 @@ def load_pipeline(
         model: a LoRA by its folder or hub id, or a backbone by its name, folder or hub id.
         device: "auto" uses an NVIDIA or AMD GPU if torch finds one, otherwise the CPU.
         base_model: the folder or hub id of the LoRA's base model; by default the one used in training. Only for a LoRA.
-        quantization: the quantization of the base model; by default the one used in training, or int8 or nf4 if only these fit into
-            the GPU, and none on the CPU.
+        quantization: the quantization of the base model. On a GPU, the default is that of the training; if it does not fit, int8,
+            then nf4. On a CPU, the default is none.
         offload: "layers" keeps the weights of the transformer in host memory and copies each block to the GPU while it
             computes; "auto" does this only if they do not fit into the free GPU memory.
         transformer: a single file (.gguf or .safetensors) whose weights replace those of the base's transformer; see
             `find_weights_file`.
-        fast_lora: a LoRA for sampling in few steps, which is added to that of the model; see `find_weights_file`.
-        guidance: the guidance scale, by default that of the task. With a LoRA for few steps and classifier-free guidance, the
+        fast_lora: a few-step LoRA, which is added to that of the model; see `find_weights_file`. A few-step LoRA (Lightning,
+            turbo) is trained for sampling in few steps, such as 4 or 8.
+        guidance: the guidance scale, by default that of the task. With a few-step LoRA and classifier-free guidance, the
             default is 1, which saves the second prediction.
         prompt: for a backbone without a LoRA: a name in `PROMPTS`, or the text itself. A finetuned backbone with a
             stored prompt uses that one.
 
     Raises:
         DownloadError: no access to a gated model, an invalid token, or no network connection.
-        ModelError: a file is missing or damaged, a LoRA belongs to another backbone, the name is unknown, or a LoRA for
-            few steps is given for a model that takes one step.
+        ModelError: a file is missing or damaged, a LoRA belongs to another backbone, the name is unknown, or a few-step
+            LoRA is given for a model that takes one step.
         DeviceError: there is no such device, it is out of memory, or the weights cannot be offloaded; the message says
             what to change.
         MissingExtra: diffusers, torchao or bitsandbytes is not installed.
@@ -198,15 +199,15 @@ def load_pipeline(
     # The prompt is encoded before the backbone is loaded, because memory may be too small for both.
     embedding = None if source.layout else _embed(source, text, placement.device)
     backbone = _load_base(source.base, placement, transformer_file)
-    fast_layers = read_layers(fast_lora_file, backbone) if fast_lora_file else {}
+    few_step_layers = read_layers(fast_lora_file, backbone) if fast_lora_file else {}
     if source.layout and source.folder:
         _, embedding = source.layout.load(source.folder, backbone)
     assert embedding is not None
-    if fast_layers:
-        stack_layers(backbone, fast_layers)
+    if few_step_layers:
+        stack_layers(backbone, few_step_layers)
     if placement.is_offloaded:
         offload_layers(backbone, placement.device)
-    task = task_with_guidance(source, guidance, is_fast=bool(fast_lora))
+    task = task_with_guidance(source, guidance, has_few_step_lora=bool(fast_lora))
     changes = {
         "transformer": digest_file(transformer_file) if transformer_file else None,
         "fast LoRA": hashlib.sha256(fast_lora_file.read_bytes()).hexdigest() if fast_lora_file else None,
@@ -286,14 +287,16 @@ def _load_base(base: str, placement: Placement, transformer_file: Path | None) -
 def _check_takes_steps(model: str, task: DecompositionTask) -> None:
     if task.objective != "flow":
         raise ModelError(
-            f"a LoRA for few steps was given for {model}, which takes one step",
+            f"a few-step LoRA was given for {model}, which takes one step",
             "expected a model that samples in several steps",
-            "leave the LoRA for few steps out",
+            "leave the few-step LoRA out",
         )
 
 
-def task_with_guidance(source: ModelSource, guidance: float | None, *, is_fast: bool) -> DecompositionTask:
-    """The task of a model with this guidance. By default it is that of the task; see `load_pipeline` for `is_fast`."""
-    if guidance is None and is_fast and not source.backbone_class.guided_by_embedding:
+def task_with_guidance(
+    source: ModelSource, guidance: float | None, *, has_few_step_lora: bool
+) -> DecompositionTask:
+    """Returns the task of a model with this guidance. For the defaults, see `guidance` in `load_pipeline`."""
+    if guidance is None and has_few_step_lora and not source.backbone_class.guided_by_embedding:
         guidance = 1.0
     return source.task if guidance is None else replace(source.task, guidance=guidance)

@@ -26,7 +26,7 @@ def check_text_encoders(folder: Path, parts: Iterable[str]) -> None:
         raise ModelError(
             f"{folder} has no {', '.join(missing) or 'text_encoder'}",
             "expected the text encoders of the model, because the prompt must be encoded",
-            "copy the complete model, or set prompt to an encoded prompt, such as the prompt.safetensors of a LoRA",
+            "copy the complete model, or, in a training recipe, set prompt to an encoded prompt, such as the prompt.safetensors of a LoRA",
         )
 
 

@@ -18,7 +18,7 @@ from typing import Final
 import torch
 from torch import Tensor
 
-from brewster.environments.assets import naming_file
+from brewster.environments.assets import add_file_name_to_errors
 from brewster.errors import RecipeError
 from brewster.photo import Photo
 from brewster.render.camera_response import encode_jpeg, to_uint8
@@ -177,7 +177,10 @@ def _blended_sample(entry: StoredSample) -> Tensor:
 def _read_image(entry: StoredSample, layer: str) -> Tensor:
     """Reads a layer of a sample, (H, W, 3) sRGB uint8."""
     name = f"{layer}.jpg"
-    with _file_errors(entry, name), naming_file(f"{name} of sample {key(entry.index)} in {entry.path}"):
+    with (
+        _file_errors(entry, name),
+        add_file_name_to_errors(f"{name} of sample {key(entry.index)} in {entry.path}"),
+    ):
         return torch.from_numpy(Photo.open(entry.read(name)).pixels.copy())
 
 

@@ -301,7 +301,7 @@ def _licence(recipe: LoraRecipe, backbone_class: type[Backbone]) -> str:
     if _is_tiny(recipe):
         return f"{APACHE_2.title}. It contains no weights of the backbone."
     text = f"{backbone_class.licence.title}, the licence of the backbone."
-    if not backbone_class.licence.is_commercial:
+    if not backbone_class.licence.allows_commercial_use:
         text += " **Not for commercial use.** The backbone is gated: request access on its page."
     return text
 

@@ -17,7 +17,7 @@ import torch
 
 from brewster.models.diffusion.adapter.lora import select_target_modules
 from brewster.models.diffusion.backbones.backbone import Backbone
-from brewster.models.diffusion.backbones.registry import find_backbone_class, skeleton
+from brewster.models.diffusion.backbones.registry import build_on_meta, find_backbone_class
 from brewster.models.diffusion.cost import (
     EFFICIENCY,
     PROMPT_TOKENS,
@@ -132,7 +132,7 @@ def estimate_resources(recipe: LoraRecipe, card: GraphicsCard) -> ResourceEstima
     find_backbone_class(
         recipe.backbone.removeprefix(TINY_PREFIX)
     )  # refuses a source that is not in the table
-    backbone = skeleton(recipe.backbone, dtype=torch.bfloat16)
+    backbone = build_on_meta(recipe.backbone, dtype=torch.bfloat16)
     fit = fit_panel(
         _SQUARE_PHOTO_PX,
         recipe.layout,

@@ -278,7 +278,7 @@ def _remarks(folder: Path, metadata: LoraMetadata, replacements: Mapping[str, st
     licence = find_backbone_class(metadata.backbone).licence
     if _is_tiny(metadata):
         yield f"the base of the LoRA is {metadata.base_model}, a tiny version: the LoRA cannot separate photos"
-    elif not licence.is_commercial:
+    elif not licence.allows_commercial_use:
         yield f"the base of the LoRA has the licence {licence.title}, which also applies to the LoRA: not for commercial use"
     yield from (f"{path} is replaced by {name} in the uploaded files" for path, name in replacements.items())
     other_files = sorted(path.name for path in folder.iterdir() if path.name not in FILES)

@@ -24,7 +24,7 @@ from brewster.models.diffusion.adapter.lora_formats import (
 )
 from brewster.models.diffusion.backbones.backbone import Backbone
 from brewster.models.diffusion.backbones.loading import encode_prompt
-from brewster.models.diffusion.backbones.registry import skeleton
+from brewster.models.diffusion.backbones.registry import build_on_meta
 from brewster.models.diffusion.hub_download import find_weights_file
 from brewster.models.diffusion.panels import Panel, PanelLayout
 from brewster.models.diffusion.prompt import PROMPTS
@@ -65,7 +65,7 @@ def import_lora(
         OutputError: the folder cannot be written.
     """
     task = DecompositionTask(PanelLayout(panels))
-    base = skeleton(base_model)
+    base = build_on_meta(base_model)
     layers = read_layers(find_lora_file(source), base)
     embedding = encode_prompt(base_model, PROMPTS.get(prompt, prompt), device=device)
     rank = max(layer.rank for layer in layers.values())
@@ -80,7 +80,7 @@ def find_lora_file(source: str) -> Path:
 
 
 def read_layers(path: Path, base: Backbone) -> dict[str, LowRankLayer]:
-    """The layers of the LoRA in a file, see `read_lora_layers`. The base must have no LoRA; it may be a `skeleton`.
+    """The layers of the LoRA in a file, see `read_lora_layers`. The base must have no LoRA; it may be on the device "meta".
 
     Raises:
         ModelError: the file is missing or damaged, or a key or shape does not belong to the base.

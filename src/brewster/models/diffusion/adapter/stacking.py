@@ -1,4 +1,4 @@
-"""Adds a second LoRA to a backbone that has one, such as a distilled LoRA for sampling in few steps (Lightning, turbo).
+"""Adds a second LoRA to a backbone that has one, such as a few-step LoRA (Lightning, turbo).
 
 The changes of the weights are summed: B1 A1 + B2 A2 = [B1 B2] [A1; A2]. So the sum of two LoRAs is again a LoRA, whose
 rank is the sum of both ranks, and which also fits a quantized base.

@@ -6,7 +6,7 @@ of Diffusion Transformers"): a peft LoRA of Qwen-Image-Edit that removes reflect
     transformer_lora/pytorch_lora_weights.safetensors
     text_embeddings/state_dict.safetensors              prompt_embeds (n, tokens, width) and prompt_mask (n, tokens)
 
-The values of the task (time 0.499, latents minus prediction, square tiles, no guidance) are those of the published call.
+The values of the task (time 0.499, latents minus prediction, square tiles, no guidance) are those of the published inference code.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ FILES: Final = (INDEX_FILE, CONFIG_FILE, WEIGHTS_FILE, PROMPT_FILE)
 
 BACKBONE: Final = Qwen
 QUANTIZATION: Final[Quantization] = "nf4"
-"""The quantization of the base in the published call."""
+"""The quantization of the base in the published inference code."""
 SIDE_PX: Final = 768
 """The processing resolution of the published model."""
 _TIME: Final = 0.499
@@ -43,7 +43,7 @@ _PROMPT_TEXT: Final = "WindowSeat's trained embedding"
 
 
 def read_metadata(folder: Path) -> LoraMetadata:
-    """The base, rank, task and prompt digest of the model in this folder. The quantization is that of the published call.
+    """The base, rank, task and prompt digest of the model in this folder. The quantization is that of the published inference code.
 
     Raises:
         ModelError: a file is missing or damaged, or lacks a value.
@@ -111,11 +111,13 @@ def _read_prompt(folder: Path) -> PromptEmbedding:
     """The first prompt embedding without its masked tokens, which the transformer would ignore."""
     path = folder / PROMPT_FILE
     tensors, _ = read_tensors(path)
-    if set(tensors) != {"prompt_embeds", "prompt_mask"} or tensors["prompt_embeds"].ndim != 3:
-        shapes = {name: tuple(tensor.shape) for name, tensor in tensors.items()}
+    shapes = {name: tuple(tensor.shape) for name, tensor in tensors.items()}
+    embeds_shape = shapes.get("prompt_embeds", ())
+    is_valid = len(embeds_shape) == 3 and embeds_shape[0] >= 1
+    if not is_valid or shapes != {"prompt_embeds": embeds_shape, "prompt_mask": embeds_shape[:2]}:
         raise ModelError(
             f"{path} contains {shapes}",
-            "expected prompt_embeds (n, tokens, width) and prompt_mask (n, tokens)",
+            "expected prompt_embeds (n, tokens, width) and prompt_mask (n, tokens), with n of at least 1",
             "download the model again",
         )
     tokens = _count_tokens(path, tensors["prompt_mask"][0] > 0)

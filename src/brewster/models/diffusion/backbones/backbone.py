@@ -44,7 +44,7 @@ class Licence:
     title: str
     hub: Mapping[str, str]
     """The fields of the licence in the front matter of a model card on the hub."""
-    is_commercial: bool = True
+    allows_commercial_use: bool = True
 
 
 APACHE_2: Final = Licence("Apache-2.0", {"license": "apache-2.0"})

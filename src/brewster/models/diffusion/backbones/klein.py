@@ -81,7 +81,10 @@ class Klein(ClassifierFreeBackbone):
         return torch.randn(1, self.channels, height, width, generator=torch.Generator().manual_seed(seed))
 
     def shift(self, tokens: int, steps: int) -> float:
-        """mu by the empirical formula of Black Forest Labs: linear in the steps through its values at 10 and 200 steps."""
+        """mu by the empirical formula of Black Forest Labs.
+
+        Up to 4300 tokens it is linear in the steps, through its values at 10 and 200 steps; above, it does not depend on them.
+        """
         at_200 = 0.00016927 * tokens + 0.45666666
         if tokens > 4300:
             return at_200

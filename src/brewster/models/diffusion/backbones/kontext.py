@@ -41,7 +41,7 @@ class Kontext(Backbone):
             "license_name": "flux-1-dev-non-commercial-license",
             "license_link": "https://huggingface.co/black-forest-labs/FLUX.1-Kontext-dev/blob/main/LICENSE.md",
         },
-        is_commercial=False,
+        allows_commercial_use=False,
     )
     diffusers_usage = DiffusersUsage(
         "text_encoder=None, text_encoder_2=None, tokenizer=None, tokenizer_2=None",

@@ -1,7 +1,7 @@
-"""The table of diffusion backbones, and backbones without their real weights: tiny versions and skeletons.
+"""The table of diffusion backbones, and backbones without their real weights: tiny versions, and on the device "meta".
 
     backbone, prompt = tiny("kontext", seed=0)         # random weights
-    backbone = skeleton("someone/finetuned-kontext")   # names and shapes of the weights only; downloads no weights
+    backbone = build_on_meta("someone/finetuned-kontext")   # names and shapes of the weights only; downloads no weights
 
 `loading.py` loads backbones with their weights.
 """
@@ -41,7 +41,8 @@ CONFIG_FILES: Final = {
 """Part of a backbone -> the file with its configuration, in the folder of the part."""
 MEMORY_HINT: Final = "a smaller backbone (klein) or a GPU with more memory"
 _STATISTICS_SPREAD: Final = 0.2
-"""The spread of a tiny version's latent statistics around 0 and 1, so that tests detect code without normalisation."""
+"""The spread of the random batch-norm statistics of a built VAE. With exactly 0 and 1, tests would not detect missing
+normalisation."""
 
 
 def tiny(name: str, seed: int = 0) -> tuple[Backbone, PromptEmbedding]:
@@ -85,7 +86,7 @@ def build(
     return backbone_class(transformer, vae, part_classes["scheduler"](**architecture["scheduler"]))
 
 
-def skeleton(source: str, *, dtype: torch.dtype = torch.float32) -> Backbone:
+def build_on_meta(source: str, *, dtype: torch.dtype = torch.float32) -> Backbone:
     """The backbone on the device "meta": the names and shapes of its weights, which need no memory.
 
     For `source`, see `load_backbone`. For a hub id, only configuration files are downloaded.
@@ -157,9 +158,14 @@ def read_index(folder: Path) -> tuple[type[Backbone], dict[str, Any]]:
     for backbone_class in BACKBONES.values():
         if class_name in (backbone_class.classes["pipeline"], *backbone_class.other_pipelines):
             return backbone_class, index
+    names = [
+        name
+        for backbone_class in BACKBONES.values()
+        for name in (backbone_class.classes["pipeline"], *backbone_class.other_pipelines)
+    ]
     raise ModelError(
-        f"{folder} contains a {class_name}",
-        f"expected one of {', '.join(backbone_class.classes['pipeline'] for backbone_class in BACKBONES.values())}",
+        f"{folder} contains a {class_name}" if class_name else f"{folder / INDEX_FILE} has no _class_name",
+        f"expected one of {', '.join(names)}",
         f"use {', '.join(backbone_class.hub_id for backbone_class in BACKBONES.values())} or a finetune of one",
     )
 
