@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
 # Trains the compact model that is part of brewster, from photos, HDR maps and ImageNet weights.
-#     BREWSTER_DATA=/path/to/data runs/compact.sh          writes to out/compact-*; the model is out/compact-stage5/model.onnx
-# Give the same command again to resume an interrupted run. It takes about 4 hours on two CPU cores with AVX512_BF16.
+#     BREWSTER_DATA=/path/to/data runs/compact.sh          writes to out/compact-*; the model is out/compact-mean/model.onnx
+# Give the same command again to resume an interrupted run. It takes about 12 hours on two CPU cores with AVX512_BF16.
 #
 # BREWSTER_DATA contains photos/permissive (with manifest.csv), hdri/, and real/ (pairs for validation; they are not trained on).
 # First install the extras: pip install -c constraints.txt -e '.[render,train]'
@@ -26,6 +26,6 @@ for set in window:600 shopfront:300 office:300 vitrine:300; do
 done
 
 # 3. Train all stages.
-for stage in stage1 stage2 sharp stage3 stage4 stage5; do
+for stage in stage1 stage2 sharp stage3 stage4 stage5 stage6 stage7 stage8 stage9 stage10 mean; do
     brewster train "recipes/train/compact-$stage.toml" -o "out/compact-$stage"
 done

@@ -50,6 +50,20 @@ def test_fine_stripes_count_at_the_finest_scale_only_and_as_edges():
         assert parts["edges"] == pytest.approx(0.2, rel=1e-5)
 
 
+def test_stripes_of_two_pixels_count_as_edges_at_each_scale_at_which_they_are_visible():
+    stripes = torch.tensor([0.1, 0.1, -0.1, -0.1]).repeat(8)
+    batch = make_batch()
+    layers = torch.cat([batch.transmission_encoded + stripes, batch.reflection_encoded], dim=1)
+    found = [
+        float(separation_loss(layers, batch, 6.0, scales)["edges"])
+        for scales in ((1,), (2,), (4,), (1, 2, 4))
+    ]
+    # 15 of 31 neighbours differ by 0.2; all 15 neighbours of the means of 2 differ; the means of 4 are 0.
+    assert found == pytest.approx(
+        [6 * 0.2 * 15 / 31, 6 * 0.2, 0, 6 * 0.2 * (15 / 31 + 1)], rel=1e-4, abs=1e-6
+    )
+
+
 def test_the_logarithm_of_the_squared_error_is_limited_at_40_db():
     assert loss_of(transmission_error=0.1)["log_mse"] == pytest.approx(
         0.04 * math.log(0.01 + 0.0001), rel=1e-4

@@ -113,7 +113,7 @@ def _train_vae(backbone, layers, steps):
         image = kinds[step % 4]
         return (backbone._vae_decode(backbone._vae_encode(image)) - image).square().mean()
 
-    _minimize(loss, backbone.vae, steps, peak=4e-3)
+    _minimize(loss, backbone.vae, steps, peak=1.5e-3)
 
 
 def _minimize(loss, network, steps, peak):

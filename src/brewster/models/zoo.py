@@ -66,7 +66,7 @@ MODELS: Final = {
         ModelFile(
             "compact",
             _WEIGHTS / "compact.onnx",
-            "95cf2afcc0f9624bdaa472e3491ee5fa60f9007f9512d7f8f4a997d7b587a37c",
+            "98411e63d43fe8a03881d67679d1a3133581debe1a194e40a97cd48dfde78a42",
             "Apache-2.0",
         ),
     )

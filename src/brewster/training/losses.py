@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Final
 
 from torch import Tensor
@@ -25,15 +26,21 @@ _MSE_FLOOR = 1e-4
 """Added to the mean squared error before the logarithm, so that the gradient tends to 0 for an image with a PSNR above 40 dB."""
 
 
-def separation_loss(layers: Float[Tensor, "n 6 h w"], batch: TrainingBatch) -> dict[str, Tensor]:
+def separation_loss(
+    layers: Float[Tensor, "n 6 h w"],
+    batch: TrainingBatch,
+    edge_weight: float = 1.0,
+    edge_scales_px: Sequence[int] = (1,),
+) -> dict[str, Tensor]:
     """Computes the loss of predicted layers: channels 0-2 are the transmission, 3-5 the reflection.
 
     The loss is computed on sRGB-encoded values, like the metrics of benchmarks. It has these parts:
 
     - transmission: mean absolute error at three scales, so that a wrong exposure counts as much as wrong detail.
     - reflection: 0.3 times the same error of the reflection, multiplied by the `reflection_weight` of each image.
-    - edges: mean absolute error of the transmission's horizontal and vertical gradients, so that edges of the reflection
-      are removed (compare the gradient loss of CEILNet, Fan et al. 2017).
+    - edges: `edge_weight` times the mean absolute error of the transmission's horizontal and vertical gradients, summed over
+      averaging windows with the sides `edge_scales_px`, so that edges of the reflection are removed (compare the gradient
+      loss of CEILNet, Fan et al. 2017).
     - log_mse: 0.04 times the mean logarithm of each image's mean squared error, so that easy images count as much as hard
       images. This part is usually negative, because the mean squared error is usually below 1.
 
@@ -41,16 +48,18 @@ def separation_loss(layers: Float[Tensor, "n 6 h w"], batch: TrainingBatch) -> d
         The parts of the loss by name, each a scalar. The loss is their sum.
     """
     transmission, reflection = layers[:, :3], layers[:, 3:]
+    error = transmission - batch.transmission_encoded
     edges = sum(
-        functional.l1_loss(transmission.diff(dim=axis), batch.transmission_encoded.diff(dim=axis))
+        functional.avg_pool2d(error, scale).diff(dim=axis).abs().mean()
+        for scale in edge_scales_px
         for axis in (2, 3)
     )
-    squared = (transmission - batch.transmission_encoded).square().mean(dim=(1, 2, 3))
+    squared = error.square().mean(dim=(1, 2, 3))
     return {
-        "transmission": _multiscale_error(transmission - batch.transmission_encoded).mean(),
+        "transmission": _multiscale_error(error).mean(),
         "reflection": 0.3
         * (_multiscale_error(reflection - batch.reflection_encoded) * batch.reflection_weight).mean(),
-        "edges": edges,  # type: ignore[dict-item]
+        "edges": edge_weight * edges,  # type: ignore[dict-item]
         "log_mse": 0.04 * (squared + _MSE_FLOOR).log().mean(),
     }
 

@@ -127,6 +127,12 @@ class CompactRecipe(TrainingRecipe):
     """Decay per step of the exponential moving average (EMA) of the weights. The exported model has the averaged weights."""
     precision: Literal["float32", "auto"] = "float32"
     """float32: all layers. auto: bfloat16 if the device supports it natively, except for depthwise convolutions and the head."""
+    edge_weight: NonNegativeFloat = 1.0
+    """Weight of the error of the transmission's image gradients in the loss."""
+    edge_scales_px: Annotated[
+        tuple[Annotated[int, Field(ge=1, le=MAX_STRIDE // 2)], ...], Field(min_length=1)
+    ] = (1,)
+    """Sides of the averaging windows, in pixels, after which the image gradients are compared."""
     init_checkpoints: tuple[Path, ...] = ()
     """Checkpoint files, relative to this recipe. The run starts from the mean of their EMA weights."""
     mix: MixRecipe = MixRecipe()

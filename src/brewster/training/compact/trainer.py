@@ -181,7 +181,7 @@ class CompactTrainer:
             self.device.type, torch.bfloat16, enabled=self._uses_bfloat16, cache_enabled=False
         ):
             layers = self.network(_channels_last(batch.photo_encoded))
-        parts = separation_loss(layers, batch)
+        parts = separation_loss(layers, batch, self.recipe.edge_weight, self.recipe.edge_scales_px)
         total = torch.stack(list(parts.values())).sum()
         gradients = torch.autograd.grad(total, tuple(self.network.parameters()))
         return len(batch.photo_encoded), {name: part.detach() for name, part in parts.items()}, gradients
