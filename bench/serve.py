@@ -1,6 +1,6 @@
-"""Measures `brewster serve` with 8 clients and 50 photos, compared with the command line on the same photos.
+"""Measures `brewster serve` with 8 clients and 50 photos (or COUNT), compared with the command line on the same photos.
 
-    BREWSTER_DATA=../shared/data .venv/bin/python bench/serve.py
+    BREWSTER_DATA=../shared/data .venv/bin/python bench/serve.py [COUNT]
 
 Each photo is sent twice. The script prints the ratio of the throughputs, and the memory of the server at the start, in the
 middle and at the end. The bytes of every response must be equal to those of the file that the command line writes for the
@@ -20,7 +20,7 @@ import urllib.request
 from pathlib import Path
 from threading import Thread
 
-PHOTOS, CLIENTS = 50, 8
+PHOTOS, CLIENTS = int(sys.argv[1]) if len(sys.argv) > 1 else 50, 8
 OPTIONS = {"layers": "transmission", "quality": "draft"}
 BREWSTER = [sys.executable, "-m", "brewster"]
 
