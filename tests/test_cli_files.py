@@ -165,6 +165,25 @@ def test_a_contact_sheet_has_a_row_for_each_photo(run, tmp_path):
     assert Photo.open(tmp_path / "sheet.png").size[1] == 272
 
 
+def test_a_contact_sheet_replaces_only_contact_sheets(run, tmp_path):
+    for name in ("a.jpg", "other.jpg"):
+        (tmp_path / name).write_bytes(image_bytes())
+    before = [(tmp_path / name).read_bytes() for name in ("a.jpg", "other.jpg")]
+    for sheet in ("a.jpg", "a.transmission.jpg", "other.jpg"):
+        code, _, err = run("a.jpg", "--contact-sheet", sheet)
+        assert (code, sheet in err) == (2, True)
+    assert [(tmp_path / name).read_bytes() for name in ("a.jpg", "other.jpg")] == before
+    assert run("a.jpg", "--contact-sheet", "other.jpg", "--overwrite")[0] == 0
+    assert contact_sheet.is_contact_sheet(tmp_path / "other.jpg")
+
+
+def test_a_contact_sheet_in_the_folder_of_the_photos_is_not_separated(run, tmp_path):
+    (tmp_path / "a.jpg").write_bytes(image_bytes())
+    for _ in range(3):
+        assert run(".", "-o", "out", "--contact-sheet", "sheet.jpg")[0] == 0
+    assert list_files(tmp_path / "out") == ["a.reflection.jpg", "a.transmission.jpg"]
+
+
 def test_many_rows_give_several_sheets(tmp_path, monkeypatch):
     monkeypatch.setattr(contact_sheet, "_MAX_ROWS", 2)
     (tmp_path / "<a&>.jpg").write_bytes(image_bytes())

@@ -182,9 +182,8 @@ class BatchCommand:
                 f"{summary.counts[status]} {status}" for status in order if summary.counts[status]
             )
             folder = f"in {self.output}" if self.output else "next to the photos"
-            print_status(
-                totals if self.dry_run else f"{totals} in {_duration(seconds)}; the layers are {folder}"
-            )
+            layers = f"; the layers are {folder}" if summary.counts.keys() & {"separated", "skipped"} else ""
+            print_status(totals if self.dry_run else f"{totals} in {_duration(seconds)}{layers}")
         for message in summary.error_messages():
             print_error(message)
 
@@ -193,7 +192,10 @@ class BatchCommand:
         from brewster.photo.contact_sheet import write_contact_sheets  # noqa: PLC0415
 
         for sheet in write_contact_sheets(
-            path, sorted(rows) if self._is_parallel else rows, self.options.max_pixels
+            path,
+            sorted(rows) if self._is_parallel else rows,
+            self.options.max_pixels,
+            overwrite=self.overwrite,
         ):
             if not self.quiet:
                 print_status(f"contact sheet: {sheet}")

@@ -7,7 +7,7 @@ import math
 from collections.abc import Callable
 from pathlib import Path
 from types import NoneType
-from typing import Any, Final, Literal, TypeVar, cast, get_args, get_origin, get_type_hints
+from typing import TYPE_CHECKING, Any, Final, Literal, TypeVar, cast, get_args, get_origin, get_type_hints
 
 import click
 from click.core import ParameterSource
@@ -21,6 +21,9 @@ from brewster.errors import BrewsterError
 from brewster.image_formats import SUFFIXES, FormatName, format_of
 from brewster.models import zoo
 from brewster.options import Options
+
+if TYPE_CHECKING:
+    from brewster.batch.runner import SeparationTask
 
 _METAVARS: Final[dict[object, str]] = {int: "NUMBER", float: "NUMBER", Path | None: "FILE"}
 
@@ -170,7 +173,7 @@ def _param_type(hint: object, field: dataclasses.Field[Any]) -> click.ParamType[
     "--contact-sheet",
     metavar="IMAGE",
     type=click.Path(path_type=Path),
-    help="Also write an overview of all photos and their layers to this image file, and replace an existing file.",
+    help="Also write an overview of all photos and their layers to this image file. An overview of an earlier run is replaced.",
 )
 @click.option(
     "--workers",
@@ -252,6 +255,7 @@ def separate(
         raise click.UsageError("--contact-sheet cannot be combined with --cluster.")
     if contact_sheet:
         _check_contact_sheet(contact_sheet, photos, output)
+        tasks = _without_contact_sheet(tasks, contact_sheet, overwrite=overwrite)
     if videos and not quiet:
         print_status(skipped_videos(videos))
     batch = BatchCommand(
@@ -306,6 +310,35 @@ def _check_contact_sheet(path: Path, photos: tuple[str, ...], output: str | None
         raise click.UsageError(
             "--contact-sheet needs photos and layers that are files, not standard input or output."
         )
+
+
+def _without_contact_sheet(
+    tasks: list[SeparationTask], path: Path, *, overwrite: bool
+) -> list[SeparationTask]:
+    """Returns the tasks without the contact sheets of earlier runs, which may be in the folder of the photos.
+
+    Raises:
+        click.UsageError: the sheet would replace a photo or a layer of the batch, or, without `overwrite`, another file.
+    """
+    from brewster.batch.runner import real_path  # noqa: PLC0415
+    from brewster.photo.contact_sheet import is_contact_sheet  # noqa: PLC0415
+    from brewster.remote_path import Location  # noqa: PLC0415
+
+    def is_sheet(source: object) -> bool:
+        return isinstance(source, Path) and source.stem.startswith(path.stem) and is_contact_sheet(source)
+
+    tasks = [task for task in tasks if not is_sheet(task.source)]
+    target = real_path(path)
+    files = (file for task in tasks for file in (task.source, *task.outputs.values()))
+    if any(isinstance(file, Location) and real_path(file) == target for file in files):
+        raise click.UsageError(
+            f"--contact-sheet {path} is a photo or a layer of the batch; choose another name."
+        )
+    if path.exists() and not overwrite and not is_contact_sheet(path):
+        raise click.UsageError(
+            f"--contact-sheet {path} exists and is not a contact sheet; choose another name, or pass --overwrite."
+        )
+    return tasks
 
 
 def _check_archive_output(single_output: bool, output: str | None, *, needs_folder: bool) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
@@ -11,14 +12,18 @@ import numpy as np
 import pyvips
 from numpy.typing import NDArray
 
+import brewster
 from brewster import srgb
 from brewster.files import write_atomically
 from brewster.photo.file_info import format_name_of
+from brewster.photo.history import recorded_parameters, with_history
 from brewster.photo.photo import Photo
 
 _ROW_PX = 240
 _LABEL_PX = 24
 _GAP_PX = 8
+_LAYER: Final = "contact sheet"
+"""The name of a sheet in its history, where the layers of a photo have theirs."""
 _MAX_ROWS = 200  # their height is 54,400 pixels; a JPEG has at most 65,535
 Encoded = NDArray[np.uint8]
 
@@ -27,21 +32,27 @@ _PACKAGED_FONTS: Final = Path(__file__).with_name("fonts") / "fonts.conf"
 """DejaVu Sans, for systems without fonts. Without it, a caption there consists of boxes, and fontconfig prints an error."""
 
 
+def is_contact_sheet(path: Path) -> bool:
+    """Returns whether a file is a contact sheet that `write_contact_sheets` wrote, by the history in its metadata."""
+    return (recorded_parameters(path, "brewster") or {}).get("layer") == _LAYER
+
+
 def write_contact_sheets(
-    path: Path, rows: Sequence[tuple[Path, Sequence[Path]]], max_pixels: int
+    path: Path, rows: Sequence[tuple[Path, Sequence[Path]]], max_pixels: int, *, overwrite: bool = False
 ) -> Iterator[Path]:
     """Writes the rows to `path`. Yields the path of each sheet.
 
     A sheet has at most 200 rows. Further sheets have a number: `sheet.jpg`, `sheet-2.jpg` and so on.
 
     Args:
-        path: the image file. An existing file is replaced.
+        path: the image file. A contact sheet of an earlier run is replaced.
         rows: the file of each photo, and the files of its layers. The label of a row is the path of the photo.
         max_pixels: files with more pixels are refused.
+        overwrite: whether other existing files are replaced, too.
 
     Raises:
         PhotoError: an image file cannot be read.
-        OutputError: the sheet cannot be written.
+        OutputError: the sheet cannot be written, or another file has its name.
     """
     if not _SYSTEM_FONTS.exists():
         os.environ.setdefault("FONTCONFIG_FILE", str(_PACKAGED_FONTS))  # ignored on Windows and macOS
@@ -56,8 +67,10 @@ def write_contact_sheets(
             for image in images
         ]
         sheet = path if number == 1 else path.with_stem(f"{path.stem}-{number}")
-        data = Photo(np.concatenate(padded)).encode(format_name_of(sheet))
-        write_atomically(sheet, data, overwrite=True)
+        photo = Photo(np.concatenate(padded))
+        file_info = with_history(photo.file_info, f"brewster {brewster.__version__}", {"layer": _LAYER})
+        data = replace(photo, file_info=file_info).encode(format_name_of(sheet))
+        write_atomically(sheet, data, overwrite=overwrite or is_contact_sheet(sheet))
         yield sheet
 
 
