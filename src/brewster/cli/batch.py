@@ -160,8 +160,8 @@ class BatchCommand:
 
     def _different_options(self, result: FileResult) -> str:
         """Returns the options in the metadata of the existing layers that differ from the options of this batch."""
-        from brewster.inference.layer_history import PROGRAM, history_step  # noqa: PLC0415
-        from brewster.photo.history import recorded_parameters  # noqa: PLC0415
+        from brewster.inference.layer_history import history_step  # noqa: PLC0415
+        from brewster.photo.history import PROGRAM, recorded_parameters  # noqa: PLC0415
 
         options = self.options
         expected = history_step(

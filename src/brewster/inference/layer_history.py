@@ -7,12 +7,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
-import brewster
 from brewster.photo import Photo
-from brewster.photo.history import recorded_parameters, sampled_digest, with_history
+from brewster.photo.history import PROGRAM, recorded_parameters, sampled_digest, with_layer_history
 
-PROGRAM: Final = "brewster"
-"""The name under which the metadata of layers record this program."""
 PHOTO: Final = "photo"
 """The name of the parameter that identifies the photo of a layer: its `sampled_digest`."""
 
@@ -29,8 +26,7 @@ def history_step(model: str, *, strength: float, quality: str, additive: bool) -
 
 def with_step(photo: Photo, layer: str, step: dict[str, str]) -> Photo:
     """Returns a layer whose metadata record the program, its version, the name of the layer and the options in `step`."""
-    software = f"{PROGRAM} {brewster.__version__}"
-    return replace(photo, file_info=with_history(photo.file_info, software, {"layer": layer} | step))
+    return replace(photo, file_info=with_layer_history(photo.file_info, layer, step))
 
 
 def find_layer_of_another_photo(photo: Path, layers: Iterable[Path]) -> Path | None:

@@ -12,11 +12,10 @@ import numpy as np
 import pyvips
 from numpy.typing import NDArray
 
-import brewster
 from brewster import srgb
 from brewster.files import write_atomically
 from brewster.photo.file_info import format_name_of
-from brewster.photo.history import recorded_parameters, with_history
+from brewster.photo.history import PROGRAM, recorded_parameters, with_layer_history
 from brewster.photo.photo import Photo
 
 _ROW_PX = 240
@@ -34,7 +33,7 @@ _PACKAGED_FONTS: Final = Path(__file__).with_name("fonts") / "fonts.conf"
 
 def is_contact_sheet(path: Path) -> bool:
     """Returns whether a file is a contact sheet that `write_contact_sheets` wrote, by the history in its metadata."""
-    return (recorded_parameters(path, "brewster") or {}).get("layer") == _LAYER
+    return (recorded_parameters(path, PROGRAM) or {}).get("layer") == _LAYER
 
 
 def write_contact_sheets(
@@ -68,7 +67,7 @@ def write_contact_sheets(
         ]
         sheet = path if number == 1 else path.with_stem(f"{path.stem}-{number}")
         photo = Photo(np.concatenate(padded))
-        file_info = with_history(photo.file_info, f"brewster {brewster.__version__}", {"layer": _LAYER})
+        file_info = with_layer_history(photo.file_info, _LAYER, {})
         data = replace(photo, file_info=file_info).encode(format_name_of(sheet))
         write_atomically(sheet, data, overwrite=overwrite or is_contact_sheet(sheet))
         yield sheet

@@ -16,12 +16,15 @@ import zlib
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import BinaryIO
+from typing import BinaryIO, Final
 from xml.sax.saxutils import quoteattr
 
+import brewster
 from brewster.photo.file_info import FileInfo
 from brewster.photo.metadata import png_chunks
 
+PROGRAM: Final = "brewster"
+"""The name under which the metadata of images record this program."""
 _EXIF_SOFTWARE = 305
 _MAX_EXIF_BYTES = 65527  # a JPEG segment of 65533 bytes without the name of the block
 _SEARCHED_BYTES = 1 << 18
@@ -53,6 +56,11 @@ def with_history(file_info: FileInfo, software: str, parameters: Mapping[str, st
     packet = file_info.xmp or _PACKET.format(software=quoteattr(software)).encode()
     exif = file_info.exif and _with_exif_software(file_info.exif, software)
     return replace(file_info, xmp=_with_entry(packet, entry), exif=exif, software=software)
+
+
+def with_layer_history(file_info: FileInfo, layer: str, parameters: Mapping[str, str]) -> FileInfo:
+    """Returns `with_history` of this program and its version. The first parameter is the name of the layer."""
+    return with_history(file_info, f"{PROGRAM} {brewster.__version__}", {"layer": layer, **parameters})
 
 
 def sampled_digest(file: BinaryIO) -> str:
