@@ -101,7 +101,7 @@ def write_atomically(
             path.write_bytes(data, overwrite=overwrite)
             return
         with _temporary(path) as part:
-            path.parent.mkdir(parents=True, exist_ok=True)
+            _create_folder(path.parent)
             _check_writable(path, overwrite)
             _write_synced(part, data)
             _publish(part, path, overwrite)
@@ -298,6 +298,21 @@ def _check_writable(path: Path, overwrite: bool) -> None:
     if path.exists() and not overwrite:
         raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST))
     if path.exists() and not os.access(path, os.W_OK):
+def _create_folder(folder: Path) -> None:
+    """Creates a folder and its parents where needed.
+
+    Raises:
+        NotADirectoryError: the folder or one of its parents is a file.
+        OSError: the folder cannot be created.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except (
+        FileExistsError
+    ) as error:  # --overwrite, the cure for this error, does not replace a file by a folder
+        raise NotADirectoryError(errno.ENOTDIR, os.strerror(errno.ENOTDIR)) from error
+
+
         raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
 
 
@@ -339,6 +354,10 @@ _REMEDIES = {
     errno.EPERM: ("expected a writable folder", "choose another folder with -o, or change its permissions"),
     errno.EROFS: ("expected a writable folder", "choose another folder with -o"),
     errno.ENAMETOOLONG: ("expected a shorter name", "rename the image"),
+    errno.ENOTDIR: (
+        "expected a folder, but a part of this path is a file",
+        "choose another folder with -o (in Python output)",
+    ),
 }
 _MAX_WINDOWS_PATH = 260
 _DEFAULT_REMEDY = ("expected a writable file", "choose another folder with -o")
