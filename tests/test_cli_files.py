@@ -87,6 +87,14 @@ def test_an_output_folder_that_is_a_file_is_refused(run_without_model, tmp_path,
     assert f"-o is the existing file {name}; expected a folder, or an image file such as clear.jpg" in message
 
 
+@pytest.mark.parametrize("name", ["photo", "x.jpg_large", "photo.v2"])
+def test_a_photo_without_an_image_suffix_gives_layers_of_its_format(run, tmp_path, name):
+    (tmp_path / name).write_bytes(image_bytes())
+    assert run(name)[0] == 0
+    assert list_files(tmp_path) == [name, *layer_files(name)]
+    assert Photo.open(tmp_path / f"{name}.transmission.jpg").file_info.format_name == "jpeg"
+
+
 @pytest.mark.parametrize("name", ["clear.bmp/", "2026.11", "v1.2", "made"])
 def test_a_folder_may_have_a_dot_in_its_name(run, tmp_path, name):
     (tmp_path / "a.jpg").write_bytes(image_bytes())

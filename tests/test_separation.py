@@ -2,6 +2,7 @@
 
 import asyncio
 import io
+import re
 import zipfile
 from pathlib import Path
 from urllib.parse import unquote
@@ -15,6 +16,7 @@ from schemathesis.specs.openapi.checks import negative_data_rejection, positive_
 
 import brewster
 from brewster import Photo
+from brewster.batch import plan_files
 from brewster.inference import Separator
 from brewster.web.application import create_app
 from brewster.web.job_queue import JobQueue
@@ -126,6 +128,37 @@ def test_an_unsafe_file_name_is_replaced_by_a_safe_one(app, name):
     response = separate(app, name=name, layers="transmission")
     assert response.status_code == 200
     assert Path(unquote(response.headers["content-disposition"].partition("''")[2])).suffix == ".png"
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "x.jpg_large",
+        "photo",
+        "IMG 1 ü.JPG",
+        "IMG 1 u\N{COMBINING DIAERESIS}.JPG",  # the form of file names on macOS
+        "Ångström.v2.final.png",
+        ".hidden.png",
+        " a  b .png",
+        "3.04.05\N{NARROW NO-BREAK SPACE}PM.png",
+        "日本 👨\N{ZERO WIDTH JOINER}👩.webp",
+        "100%41 it's;a=b.png",
+    ],
+)
+def test_layers_have_the_file_names_of_the_command_line(app, tmp_path, name):
+    photo = image_bytes(40, 30, "jpeg")
+    (tmp_path / name).write_bytes(photo)
+    (task,) = plan_files(tmp_path / name)
+    (single,) = separate(app, photo, name, layers="transmission").headers.get_list("content-disposition")
+    assert unquote(single.partition("UTF-8''")[2]) == task.outputs["transmission"].name
+    # RFC 6266: an ASCII name in quotes, and the complete name with the characters of RFC 5987
+    assert re.fullmatch(
+        r'attachment; filename="[ -!#-\[\]-~]+"; filename\*=UTF-8\'\'([\w.~-]|%[0-9A-F]{2})+',
+        single,
+        re.ASCII,
+    )
+    with zipfile.ZipFile(io.BytesIO(separate(app, photo, name).content)) as archive:
+        assert archive.namelist() == [path.name for path in task.outputs.values()]
 
 
 # --- errors

@@ -17,14 +17,17 @@ from starlette.requests import Request
 
 from brewster.errors import invalid_value
 from brewster.files import OUTPUT_LAYERS, SeparationPaths
-from brewster.image_formats import SUFFIXES
+from brewster.image_formats import FORMATS, format_of
 from brewster.options import Options
 
 FIELDS: Final = ("layers", "strength", "quality", "format", "additive", "model")
 """The options that a client may set as text. The server sets the other options."""
 _FILES: Final = ("photo", "mask")
 _OPTIONS: Final = TypeAdapter(Options)
-_MAX_NAME_BYTES: Final = 120
+_MAX_NAME_BYTES: Final = 255 - len(".transmission.jpeg")
+"""Maximum length of a name without its suffix. The names of all layers then fit into the 255 bytes of usual file systems."""
+_DIRECTION_MARKS: Final = ("LRE", "RLE", "LRO", "RLO", "PDF", "LRI", "RLI", "FSI", "PDI")
+"""The classes of characters that change the direction of text (Unicode annex 9). They can hide the real suffix of a name."""
 _PHOTO_SCHEMA: Final = {
     "type": "string",
     "contentMediaType": "application/octet-stream",
@@ -45,10 +48,13 @@ class SeparationRequest:
 
     def target(self, layer: str, format_name: str) -> str:
         """Returns the file name of a layer, the same as on the command line. `format_name` is the format of the photo."""
-        source = Path(self.name)
-        if source.suffix.lower() not in SUFFIXES:
-            source = Path(f"{self.name}.{format_name}")
-        return SeparationPaths(source, Path()).target(layer, self.options.suffix(layer, source)).name
+        paths = SeparationPaths(Path(self.name), Path(), FORMATS[format_name])
+        return paths.target(layer, self.options.suffix(layer, paths.suffix)).name
+
+    @property
+    def zip_name(self) -> str:
+        """The file name of a zip of several layers."""
+        return f"{SeparationPaths(Path(self.name), Path()).stem}.zip"
 
 
 async def read_form(request: Request, models: Sequence[str], max_pixels: int) -> SeparationRequest:
@@ -138,16 +144,21 @@ def _as_field(schema: dict[str, Any]) -> dict[str, Any]:
 
 
 def safe_name(name: str) -> str:
-    """Returns the last component of a file name, with at most _MAX_NAME_BYTES bytes before the suffix.
+    """Returns the last component of a file name, with at most `_MAX_NAME_BYTES` bytes before the suffix.
 
-    Characters that file systems or headers forbid are replaced by underscores.
+    The name stays unchanged wherever possible, because the command line names the layers after the unchanged name. Only characters
+    that Windows forbids, control characters and marks that change the direction of text are replaced by underscores.
     """
-    last = unicodedata.normalize("NFC", re.split(r"[/\\]", name)[-1])
-    plain = "".join(letter if letter.isprintable() and letter not in '<>:"|?*' else "_" for letter in last)
-    path = Path(plain.strip(". ") or "photo")
-    suffix = path.suffix if path.suffix.lower() in SUFFIXES else ""
-    stem = path.name.removesuffix(suffix).encode()[:_MAX_NAME_BYTES].decode(errors="ignore")
-    return stem.rstrip(". ") + suffix
+    last = re.split(r"[/\\]", name)[-1]
+    plain = "".join("_" if _is_unsafe(letter) else letter for letter in last)
+    path = Path(plain if plain.strip(". ") else "photo")
+    suffix = path.suffix if format_of(path) else ""
+    return path.name.removesuffix(suffix).encode()[:_MAX_NAME_BYTES].decode(errors="ignore") + suffix
+
+
+def _is_unsafe(letter: str) -> bool:
+    is_control = unicodedata.category(letter) in ("Cc", "Cs", "Zl", "Zp")
+    return is_control or letter in '<>:"|?*' or unicodedata.bidirectional(letter) in _DIRECTION_MARKS
 
 
 def validation_message(errors: Iterable[Any]) -> str:

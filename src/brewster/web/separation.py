@@ -168,11 +168,7 @@ def _separate(model_cache: ModelCache, form: SeparationRequest, on_progress: Pro
         on_progress(1)  # raises JobCancelled if the job is cancelled, because encoding also takes time
         name = form.target(layer, separation.photo.file_info.format_name)
         files[name] = getattr(separation, layer).encode(SUFFIXES[Path(name).suffix.lower()].name)
-    name, data = (
-        next(iter(files.items()))
-        if len(files) == 1
-        else (f"{Path(form.name).stem}.zip", zip_images(files.items()))
-    )
+    name, data = next(iter(files.items())) if len(files) == 1 else (form.zip_name, zip_images(files.items()))
     headers = {
         "Content-Disposition": _content_disposition(name),
         "Brewster-Model": quote(separation.model),
