@@ -12,6 +12,7 @@ from starlette.exceptions import HTTPException
 from starlette.requests import Request
 
 from brewster.batch.layer_names import name_layers
+from brewster.cli.separate import separate as separate_command
 from brewster.errors import BrewsterError
 from brewster.files import OUTPUT_LAYERS
 from brewster.options import Options
@@ -84,6 +85,15 @@ def test_every_client_option_is_read():
         layers=("reflection",),
         max_pixels=1000,
     )
+
+
+@pytest.mark.parametrize(
+    ("text", "name"), [("jpg", "jpeg"), ("JPG", "jpeg"), (".jpe", "jpeg"), ("tif", "tiff"), ("heif", "heic")]
+)
+def test_a_format_may_be_named_by_its_suffix_as_on_the_command_line(text, name):
+    assert parse(format=text).options.format == name
+    option = next(option for option in separate_command.params if option.name == "format")
+    assert option.type.convert(text, option, None) == name
 
 
 @pytest.mark.parametrize("layers", ["confidence,transmission", "transmission,confidence,transmission"])

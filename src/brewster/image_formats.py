@@ -185,6 +185,13 @@ VIDEO_SIGNATURE: Final = (
 )
 """A regular expression for the first bytes of a video: MP4, QuickTime, AVI, Matroska or MPEG."""
 
+
+def canonical_format(text: str) -> str:
+    """Returns the name of a format for one of its suffixes: `JPG`, `.jpg` and `jpeg` give `jpeg`. Other text is returned unchanged."""
+    image_format = SUFFIXES.get(f".{text.lower().removeprefix('.')}")
+    return image_format.name if image_format else text
+
+
 HEAD_BYTES: Final = 1 << 16
 """The number of bytes at the beginning of a file that `format_of_content` reads."""
 

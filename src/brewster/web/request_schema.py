@@ -17,7 +17,7 @@ from starlette.requests import Request
 
 from brewster.errors import invalid_value
 from brewster.files import OUTPUT_LAYERS, SeparationPaths
-from brewster.image_formats import FORMATS, format_of
+from brewster.image_formats import FORMATS, canonical_format, format_of
 from brewster.options import Options
 
 FIELDS: Final = ("layers", "strength", "quality", "format", "additive", "model")
@@ -175,6 +175,8 @@ def _options(form: FormData, models: Sequence[str], max_pixels: int) -> Options:
             f"there is no field {unknown[0][:40]!r}; expected {', '.join((*_FILES, *FIELDS))}; correct the name",
         )
     values_by_name: dict[str, Any] = {name: values[-1] for name, values in texts.items() if values[-1]}
+    if "format" in values_by_name:
+        values_by_name["format"] = canonical_format(values_by_name["format"])
     if "layers" in texts:
         values_by_name["layers"] = _ordered_layers(",".join(texts["layers"]).split(","))
     if values_by_name.setdefault("model", models[0]) not in models:
