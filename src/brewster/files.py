@@ -307,9 +307,7 @@ def _create_folder(folder: Path) -> None:
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
-    except (
-        FileExistsError
-    ) as error:  # --overwrite, the cure for this error, does not replace a file by a folder
+    except FileExistsError as error:  # has another cure: --overwrite does not replace a file by a folder
         raise NotADirectoryError(errno.ENOTDIR, os.strerror(errno.ENOTDIR)) from error
 
 
