@@ -204,7 +204,12 @@ def test_unknown_paths_and_methods_are_refused(app):
     assert request(app, "GET", "/nothing").status_code == 404
     assert request(app, "GET", "/page/../separation.py").status_code == 404
     assert request(app, "GET", "/page/%2e%2e/separation.py").status_code == 404
-    assert request(app, "GET", "/separate").status_code == 405
+    response = request(app, "GET", "/separate")
+    assert (response.status_code, response.headers["allow"]) == (405, "POST")
+    assert (
+        error_of(response)
+        == "/separate does not accept GET; expected POST; repeat the request with this method"
+    )
 
 
 def test_a_bug_is_reported_without_its_traceback():
@@ -307,7 +312,9 @@ def test_progress_is_available_while_the_job_runs():
 def test_an_invalid_job_name_is_refused(app):
     response = request(app, "POST", "/separate?job=../x", **form(SMALL))
     assert response.status_code == 422
-    assert "job" in error_of(response)
+    assert error_of(response) == (
+        "job is '../x'; expected a text that matches ^[A-Za-z0-9-]{8,64}$; correct job."
+    )
 
 
 # --- OpenAPI
@@ -320,6 +327,18 @@ def test_openapi_describes_every_field_and_every_error(app):
     assert {"413", "415", "422", "503", "504"} <= set(post["responses"])
     assert post["requestBody"]["content"]["multipart/form-data"]["schema"]["required"] == ["photo"]
     assert api["info"]["version"] == brewster.__version__
+
+
+def test_the_documentation_has_every_status_and_the_pattern_of_job(app):
+    paths = request(app, "GET", "/openapi.json").json()["paths"]
+    page = (Path(__file__).parents[1] / "docs" / "serving.md").read_text("utf-8")
+    rows = re.findall(r"^\| ([\d, ]+) \|", page, re.MULTILINE)
+    documented = {status.strip() for row in rows for status in row.split(",")}
+    statuses = {status for path in paths.values() for route in path.values() for status in route["responses"]}
+    assert documented == (statuses | {"405"}) - {"200"}
+    (job,) = paths["/separate"]["post"]["parameters"]
+    (pattern,) = (choice["pattern"] for choice in job["schema"]["anyOf"] if "pattern" in choice)
+    assert f"`{pattern.strip('^$')}`" in page
 
 
 def test_no_documentation_page_fetches_assets_from_other_servers(app):

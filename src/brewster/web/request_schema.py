@@ -24,6 +24,7 @@ FIELDS: Final = ("layers", "strength", "quality", "format", "additive", "model")
 """The options that a client may set as text. The server sets the other options."""
 _FILES: Final = ("photo", "mask")
 _OPTIONS: Final = TypeAdapter(Options)
+_REQUEST_PARTS: Final = ("query", "path", "body")
 _MAX_NAME_BYTES: Final = 255 - len(".transmission.jpeg")
 """Maximum length of a name without its suffix. The names of all layers then fit into the 255 bytes of usual file systems."""
 _DIRECTION_MARKS: Final = ("LRE", "RLE", "LRO", "RLO", "PDF", "LRI", "RLI", "FSI", "PDI")
@@ -163,7 +164,16 @@ def _is_unsafe(letter: str) -> bool:
 
 def validation_message(errors: Iterable[Any]) -> str:
     """Returns the validation errors of pydantic as one message, with three parts for each error."""
-    return " ".join(str(invalid_value(error)) for error in errors)
+    return " ".join(str(invalid_value({**error, "loc": _sent_name(error["loc"])})) for error in errors)
+
+
+def _sent_name(location: Sequence[str | int]) -> tuple[str, ...]:
+    """Returns the location of a value with the names that the client has sent: `job` for `("query", "job")`.
+
+    The part of the request is kept only if it is the whole location. The index in a list is left out.
+    """
+    names = tuple(part for part in location if isinstance(part, str))
+    return names[1:] if len(names) > 1 and names[0] in _REQUEST_PARTS else names
 
 
 def _options(form: FormData, models: Sequence[str], max_pixels: int) -> Options:

@@ -65,13 +65,13 @@ _RESPONSES: Final[dict[int | str, dict[str, Any]]] = {
         "description": "One layer, or a zip of several layers.",
         "content": {"image/*": {}, "application/zip": {}},
     },
-    **dict.fromkeys((400, 401, 403, 408, 409, 413, 415, 421, 422, 500, 501, 503, 504), _ERROR),
+    **dict.fromkeys((400, 401, 403, 408, 409, 413, 415, 421, 422, 500, 501, 502, 503, 504), _ERROR),
 }
 JobName = Annotated[
     str | None,
     Query(
         pattern="^[A-Za-z0-9-]{8,64}$",
-        description="A name for this request, chosen by the client, for `GET /progress/{job}`.",
+        description="A name for this request, chosen by the client, for `GET /progress/{job}`: 8 to 64 ASCII letters, digits and hyphens.",
     ),
 ]
 
