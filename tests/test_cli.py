@@ -16,8 +16,9 @@ import pytest
 from pydantic import TypeAdapter, ValidationError
 
 import brewster
-from brewster import Photo, files
+from brewster import Photo, batch, files
 from brewster.cli import cli
+from brewster.cli.api_reference import api_reference
 from brewster.cli.reference import reference
 from brewster.errors import BrewsterError
 from brewster.image_formats import WRITABLE
@@ -50,6 +51,18 @@ def test_every_command_and_every_option_has_a_help_sentence():
 
 def test_the_reference_in_the_docs_is_up_to_date():
     assert (ROOT / "docs" / "reference.md").read_text() == reference(), "run make docs"
+
+
+def test_the_python_reference_in_the_docs_is_up_to_date():
+    assert (ROOT / "docs" / "api.md").read_text("utf-8") == api_reference(), "run make docs"
+
+
+def test_the_python_reference_has_a_meaning_for_every_public_name():
+    rows = dict(re.findall(r"^\| `([\w.]+)(?:\(\))?` \| (.*?) \|", api_reference(), re.MULTILINE))
+    names = {f"brewster.{name}" for name in brewster.__all__} - {"brewster.__version__", "brewster.errors"}
+    names |= {f"brewster.batch.{name}" for name in batch.__all__} | {"Photo.open", "Separator.__call__"}
+    assert names <= set(rows)
+    assert all(meaning.endswith(".") for meaning in rows.values()), rows
 
 
 def test_the_reference_names_every_command_and_every_option():
@@ -326,7 +339,7 @@ def test_a_misspelled_command_gives_a_suggestion_unless_a_photo_has_that_name(
     assert "Did you mean models?" in run_without_model("modles")[2]
     (tmp_path / "modles").write_bytes(image_bytes())
     assert run("modles")[0] == 0
-    assert (tmp_path / "modles.transmission.png").exists()
+    assert (tmp_path / "modles.transmission.jpg").exists()
 
 
 @pytest.mark.parametrize(

@@ -76,6 +76,25 @@ def test_an_output_with_an_unknown_suffix_is_refused(run_without_model, tmp_path
     assert list_files(tmp_path) == ["a.jpg"]
 
 
+@pytest.mark.parametrize("name", ["notes", "notes.txt", "notes.jpg/"])
+@pytest.mark.parametrize("photos", [["a.jpg"], ["a.jpg", "b.jpg"], ["."]])
+def test_an_output_folder_that_is_a_file_is_refused(run_without_model, tmp_path, name, photos):
+    for file in ("a.jpg", "b.jpg", name.strip("/")):
+        (tmp_path / file).write_bytes(image_bytes())
+    code, _, err = run_without_model(*photos, "-o", name, "--overwrite")
+    assert code == 2
+    message = " ".join(err.split())
+    assert f"-o is the existing file {name}; expected a folder, or an image file such as clear.jpg" in message
+
+
+@pytest.mark.parametrize("name", ["photo", "x.jpg_large", "photo.v2"])
+def test_a_photo_without_an_image_suffix_gives_layers_of_its_format(run, tmp_path, name):
+    (tmp_path / name).write_bytes(image_bytes())
+    assert run(name)[0] == 0
+    assert list_files(tmp_path) == [name, *layer_files(name)]
+    assert Photo.open(tmp_path / f"{name}.transmission.jpg").file_info.format_name == "jpeg"
+
+
 @pytest.mark.parametrize("name", ["clear.bmp/", "2026.11", "v1.2", "made"])
 def test_a_folder_may_have_a_dot_in_its_name(run, tmp_path, name):
     (tmp_path / "a.jpg").write_bytes(image_bytes())

@@ -17,7 +17,8 @@ from brewster import files
 from brewster.batch.layer_names import name_layers
 from brewster.errors import OutputError
 from brewster.files import cache_folder, images_in, write_atomically
-from brewster.image_formats import SUFFIXES
+from brewster.image_formats import SUFFIXES, FormatName
+from brewster.options import Options
 
 
 def touch(folder: Path, *names: str) -> Path:
@@ -31,21 +32,23 @@ def touch(folder: Path, *names: str) -> Path:
 LAYERS = ("transmission", "reflection", "confidence")
 
 
-def find(*sources: Path, output: Path | None = None, suffix: str | None = None) -> dict[str, dict[str, str]]:
+def find(
+    *sources: Path, output: Path | None = None, format_name: FormatName | None = None
+) -> dict[str, dict[str, str]]:
     """Returns the names of the images, in their order, with the paths of their layers, relative to the first source or output."""
     images = (pair for source in sources for pair in images_in(source, output))
     return {
         image.name: {
             layer: os.path.relpath(target, output or image.parent) for layer, target in targets.items()
         }
-        for image, targets in name_layers(
-            images, LAYERS, lambda layer, _: suffix if layer != "confidence" else None
-        )
+        for image, targets in name_layers(images, Options(LAYERS, format=format_name))
     }
 
 
-def transmissions(*sources: Path, suffix: str | None = None) -> dict[str, str]:
-    return {name: targets["transmission"] for name, targets in find(*sources, suffix=suffix).items()}
+def transmissions(*sources: Path, format_name: FormatName | None = None) -> dict[str, str]:
+    return {
+        name: targets["transmission"] for name, targets in find(*sources, format_name=format_name).items()
+    }
 
 
 def test_layers_are_next_to_their_image_and_keep_its_suffix(tmp_path: Path) -> None:
@@ -55,12 +58,60 @@ def test_layers_are_next_to_their_image_and_keep_its_suffix(tmp_path: Path) -> N
         "reflection": "view.reflection.jpg",
         "confidence": "view.confidence.png",
     }
-    assert find(path, suffix=".tif")["view.jpg"]["reflection"] == "view.reflection.tif"
+    assert find(path, format_name="tiff")["view.jpg"]["reflection"] == "view.reflection.tiff"
 
 
-@pytest.mark.parametrize("name", ["view.gif", "view.unknown", "view"])
-def test_images_whose_format_is_not_written_get_png_layers(tmp_path: Path, name: str) -> None:
-    assert transmissions(touch(tmp_path, name) / name) == {name: "view.transmission.png"}
+@pytest.mark.parametrize(("name", "suffix"), [("view.gif", "png"), ("view.ora", "png"), ("view.DNG", "tiff")])
+def test_if_a_format_is_not_written_another_one_replaces_it(tmp_path: Path, name: str, suffix: str) -> None:
+    assert transmissions(touch(tmp_path, name) / name) == {name: f"view.transmission.{suffix}"}
+
+
+BEGINNINGS = {
+    ".jpg": b"\xff\xd8\xff\xe0",
+    ".webp": b"RIFF\0\0\0\0WEBP",
+    ".heic": b"\0\0\0\x18ftypmif1" + bytes(100) + b"hvcC",
+    ".avif": b"\0\0\0\x18ftypmif1" + bytes(100),
+    ".tiff": b"II*\0",
+    ".dng": b"FUJIFILMCCD-RAW",
+    ".gif": b"GIF89a",
+    ".png": b"unknown",
+}
+"""The first bytes of files by suffix. Layers of a file that is no known image are named as those of a PNG file."""
+
+
+@pytest.mark.parametrize("suffix", BEGINNINGS)
+@pytest.mark.parametrize("name", ["photo", "x.jpg_large", "a.b", "2026.11", ".jpg"])
+@pytest.mark.parametrize("options", [Options(), Options(format="avif"), Options(additive=True)])
+def test_without_an_image_suffix_the_format_of_the_content_names_the_layers(
+    tmp_path: Path, name: str, suffix: str, options: Options
+) -> None:
+    """The layers are those of the same file with the suffix of its format."""
+    for path in (tmp_path / name, tmp_path / f"{name}{suffix}"):
+        path.write_bytes(BEGINNINGS[suffix])
+        ((_, targets),) = name_layers([(path, tmp_path)], options)
+        assert path.name.startswith(name)
+        expected = options.suffix("transmission", suffix)
+        assert targets["transmission"].name == f"{name}.transmission{expected}"
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="Windows has no named pipes in folders")
+def test_a_pipe_is_not_read_to_name_its_layers(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "photo")  # reading a pipe without a writer would wait forever
+    assert transmissions(tmp_path / "photo") == {"photo": "photo.transmission.png"}
+
+
+def test_a_known_suffix_names_the_layers_whatever_the_content(tmp_path: Path) -> None:
+    (tmp_path / "a.tif").write_bytes(BEGINNINGS[".jpg"])
+    assert transmissions(tmp_path / "a.tif") == {"a.tif": "a.transmission.tif"}
+
+
+def test_a_photo_without_an_image_suffix_has_only_one_name(tmp_path: Path) -> None:
+    for name in ("photo", "photo.jpg"):
+        (tmp_path / name).write_bytes(BEGINNINGS[".jpg"])
+    assert transmissions(tmp_path / "photo.jpg", tmp_path / "photo") == {
+        "photo.jpg": "photo.jpg.transmission.jpg",
+        "photo": "photo.transmission.jpg",
+    }
 
 
 def test_a_folder_is_searched_in_order_and_its_tree_is_mirrored(tmp_path: Path) -> None:
@@ -92,11 +143,11 @@ def test_a_file_given_by_name_is_always_listed(tmp_path: Path) -> None:
     assert list(find(*(tmp_path / name for name in file_names))) == file_names
 
 
-@pytest.mark.parametrize("suffix", [None, ".tiff", ".png", ".jpg"])
+@pytest.mark.parametrize("format_name", [None, "tiff", "png", "jpeg"])
 def test_an_image_that_is_added_to_a_folder_does_not_change_the_layers_of_the_others(
-    tmp_path: Path, suffix: str | None
+    tmp_path: Path, format_name: FormatName | None
 ) -> None:
-    before = find(touch(tmp_path, "a.jpg"), suffix=suffix)["a.jpg"]
+    before = find(touch(tmp_path, "a.jpg"), format_name=format_name)["a.jpg"]
     touch(
         tmp_path,
         "a.CR2",
@@ -109,7 +160,9 @@ def test_an_image_that_is_added_to_a_folder_does_not_change_the_layers_of_the_ot
         "a.jpg.transmission.jpg",
     )
     assert (
-        find(tmp_path / "a.jpg", suffix=suffix)["a.jpg"] == find(tmp_path, suffix=suffix)["a.jpg"] == before
+        find(tmp_path / "a.jpg", format_name=format_name)["a.jpg"]
+        == find(tmp_path, format_name=format_name)["a.jpg"]
+        == before
     )
     assert before["confidence"] == "a.confidence.png"
 
@@ -136,7 +189,7 @@ def test_images_of_one_stem_use_their_full_name_only_if_they_would_write_the_sam
 
 def test_the_case_of_a_suffix_does_not_separate_two_files(tmp_path: Path) -> None:
     touch(tmp_path, "a.JPG", "a.dng")
-    assert transmissions(tmp_path, suffix=".jpg")["a.dng"] == "a.dng.transmission.jpg"
+    assert transmissions(tmp_path, format_name="jpeg")["a.dng"] == "a.dng.transmission.jpg"
     assert transmissions(tmp_path / "a.JPG") == {"a.JPG": "a.transmission.JPG"}
 
 
@@ -145,16 +198,17 @@ def test_the_case_of_a_suffix_does_not_separate_two_files(tmp_path: Path) -> Non
     st.sets(
         st.tuples(
             st.lists(st.sampled_from(["a", "b", "jpg", "png"]), min_size=1, max_size=3),
-            st.sampled_from(sorted(SUFFIXES)),
+            st.sampled_from([*sorted(SUFFIXES), "", ".jpg_large"]),
         ).map(lambda parts: ".".join(parts[0]) + parts[1]),
         max_size=8,
     ),
-    st.sampled_from([None, ".png"]),
+    st.sampled_from([None, "png"]),
 )
 def test_no_two_images_of_a_folder_share_a_target(
-    tmp_path_factory: pytest.TempPathFactory, files: set[str], suffix: str | None
+    tmp_path_factory: pytest.TempPathFactory, files: set[str], format_name: FormatName | None
 ) -> None:
-    found = find(touch(tmp_path_factory.mktemp("images"), *files), suffix=suffix)
+    folder = touch(tmp_path_factory.mktemp("images"), *files)
+    found = find(*(folder / name for name in files), format_name=format_name)
     targets = {target for row in found.values() for target in row.values()}
     assert len(found) == len(files)
     assert len(targets) == len(LAYERS) * len(files)
@@ -170,7 +224,7 @@ def test_link_loops_end_and_linked_folders_are_searched_once(tmp_path: Path) -> 
 def test_an_image_given_twice_is_listed_once(tmp_path: Path) -> None:
     touch(tmp_path, "a.jpg")
     images = (pair for name in (".", "a.jpg", "./a.jpg") for pair in images_in(tmp_path / name))
-    assert len(name_layers(images, LAYERS)) == 1
+    assert len(name_layers(images, Options())) == 1
 
 
 def test_images_of_two_folders_with_one_target_are_refused_before_any_work(tmp_path: Path) -> None:
@@ -305,13 +359,20 @@ def test_files_are_written_on_file_systems_without_hard_links(
 
 
 @pytest.mark.parametrize(
-    ("target", "word"), [("folder", "a file"), ("file/a.png", "not written"), ("n" * 300, "shorter")]
+    ("target", "word"),
+    [
+        ("folder", "expected a file"),
+        ("file/a.png", "expected a folder"),
+        ("file/below/a.png", "expected a folder"),
+        ("n" * 300, "shorter"),
+    ],
 )
 def test_impossible_targets_are_errors(tmp_path: Path, target: str, word: str) -> None:
     (tmp_path / "folder").mkdir()
     (tmp_path / "file").write_bytes(b"")
-    with pytest.raises(OutputError, match=word):
-        write_atomically(tmp_path / target, b"layer", overwrite=True)
+    with pytest.raises(OutputError, match=word) as raised:
+        write_atomically(tmp_path / target, b"layer")
+    assert "--overwrite" not in str(raised.value)
 
 
 @pytest.mark.parametrize(

@@ -2,6 +2,7 @@
 
 import asyncio
 import io
+import re
 import zipfile
 from pathlib import Path
 from urllib.parse import unquote
@@ -15,6 +16,7 @@ from schemathesis.specs.openapi.checks import negative_data_rejection, positive_
 
 import brewster
 from brewster import Photo
+from brewster.batch import plan_files
 from brewster.inference import Separator
 from brewster.web.application import create_app
 from brewster.web.job_queue import JobQueue
@@ -128,6 +130,37 @@ def test_an_unsafe_file_name_is_replaced_by_a_safe_one(app, name):
     assert Path(unquote(response.headers["content-disposition"].partition("''")[2])).suffix == ".png"
 
 
+@pytest.mark.parametrize(
+    "name",
+    [
+        "x.jpg_large",
+        "photo",
+        "IMG 1 ü.JPG",
+        "IMG 1 u\N{COMBINING DIAERESIS}.JPG",  # the form of file names on macOS
+        "Ångström.v2.final.png",
+        ".hidden.png",
+        " a  b .png",
+        "3.04.05\N{NARROW NO-BREAK SPACE}PM.png",
+        "日本 👨\N{ZERO WIDTH JOINER}👩.webp",
+        "100%41 it's;a=b.png",
+    ],
+)
+def test_layers_have_the_file_names_of_the_command_line(app, tmp_path, name):
+    photo = image_bytes(40, 30, "jpeg")
+    (tmp_path / name).write_bytes(photo)
+    (task,) = plan_files(tmp_path / name)
+    (single,) = separate(app, photo, name, layers="transmission").headers.get_list("content-disposition")
+    assert unquote(single.partition("UTF-8''")[2]) == task.outputs["transmission"].name
+    # RFC 6266: an ASCII name in quotes, and the complete name with the characters of RFC 5987
+    assert re.fullmatch(
+        r'attachment; filename="[ -!#-\[\]-~]+"; filename\*=UTF-8\'\'([\w.~-]|%[0-9A-F]{2})+',
+        single,
+        re.ASCII,
+    )
+    with zipfile.ZipFile(io.BytesIO(separate(app, photo, name).content)) as archive:
+        assert archive.namelist() == [path.name for path in task.outputs.values()]
+
+
 # --- errors
 
 
@@ -171,7 +204,12 @@ def test_unknown_paths_and_methods_are_refused(app):
     assert request(app, "GET", "/nothing").status_code == 404
     assert request(app, "GET", "/page/../separation.py").status_code == 404
     assert request(app, "GET", "/page/%2e%2e/separation.py").status_code == 404
-    assert request(app, "GET", "/separate").status_code == 405
+    response = request(app, "GET", "/separate")
+    assert (response.status_code, response.headers["allow"]) == (405, "POST")
+    assert (
+        error_of(response)
+        == "/separate does not accept GET; expected POST; repeat the request with this method"
+    )
 
 
 def test_a_bug_is_reported_without_its_traceback():
@@ -274,7 +312,9 @@ def test_progress_is_available_while_the_job_runs():
 def test_an_invalid_job_name_is_refused(app):
     response = request(app, "POST", "/separate?job=../x", **form(SMALL))
     assert response.status_code == 422
-    assert "job" in error_of(response)
+    assert error_of(response) == (
+        "job is '../x'; expected a text that matches ^[A-Za-z0-9-]{8,64}$; correct job."
+    )
 
 
 # --- OpenAPI
@@ -287,6 +327,18 @@ def test_openapi_describes_every_field_and_every_error(app):
     assert {"413", "415", "422", "503", "504"} <= set(post["responses"])
     assert post["requestBody"]["content"]["multipart/form-data"]["schema"]["required"] == ["photo"]
     assert api["info"]["version"] == brewster.__version__
+
+
+def test_the_documentation_has_every_status_and_the_pattern_of_job(app):
+    paths = request(app, "GET", "/openapi.json").json()["paths"]
+    page = (Path(__file__).parents[1] / "docs" / "serving.md").read_text("utf-8")
+    rows = re.findall(r"^\| ([\d, ]+) \|", page, re.MULTILINE)
+    documented = {status.strip() for row in rows for status in row.split(",")}
+    statuses = {status for path in paths.values() for route in path.values() for status in route["responses"]}
+    assert documented == (statuses | {"405"}) - {"200"}
+    (job,) = paths["/separate"]["post"]["parameters"]
+    (pattern,) = (choice["pattern"] for choice in job["schema"]["anyOf"] if "pattern" in choice)
+    assert f"`{pattern.strip('^$')}`" in page
 
 
 def test_no_documentation_page_fetches_assets_from_other_servers(app):

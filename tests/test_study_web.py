@@ -162,21 +162,21 @@ def test_viewing_conditions_are_stored_and_others_are_refused(app, store):
     [
         (
             {"trial": -1, "choice": "left", "seconds": 1},
-            "body.trial is -1; expected a number of at least 0; correct body.trial.",
+            "trial is -1; expected a number of at least 0; correct trial.",
         ),
         (
             {"trial": 0, "choice": "both", "seconds": 1},
-            "body.choice is 'both'; expected 'left', 'similar' or 'right'; correct body.choice.",
+            "choice is 'both'; expected 'left', 'similar' or 'right'; correct choice.",
         ),
         (
             {"trial": 0, "choice": "left", "seconds": "long"},
-            "body.seconds is 'long'; expected a number; correct body.seconds.",
+            "seconds is 'long'; expected a number; correct seconds.",
         ),
         (
             {"trial": 0, "choice": "left", "seconds": 1, "more": 1},
-            "there is no field body.more (its value is 1); expected known fields only; remove body.more.",
+            "there is no field more (its value is 1); expected known fields only; remove more.",
         ),
-        ({"trial": 0, "choice": "left"}, "body.seconds is missing; expected a value; add body.seconds."),
+        ({"trial": 0, "choice": "left"}, "seconds is missing; expected a value; add seconds."),
         ([], "body is []; expected an object with named values; correct body."),
     ],
 )

@@ -1,7 +1,7 @@
 """Finds input images and writes results atomically, without overwriting other files.
 
 for image, folder in images_in(Path("holiday"), output_folder=Path("clear")):
-    write_atomically(SeparationPaths(image, folder).target("transmission"), data, source=image)
+    write_atomically(SeparationPaths(image, folder).target("transmission", ".png"), data, source=image)
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from pathlib import Path
 import platformdirs
 
 from brewster.errors import OutputError
-from brewster.image_formats import FORMATS, VIDEO_SUFFIXES, format_of
+from brewster.image_formats import FORMATS, VIDEO_SUFFIXES, ImageFormat, format_of
 from brewster.remote_path import Location, RemotePath
 
 DEFAULT_MAX_PIXELS = 200_000_000
@@ -38,25 +38,31 @@ MASK_SUFFIX = ".mask"
 
 @dataclass(frozen=True)
 class SeparationPaths:
-    """An image to separate, and the folder of its layers."""
+    """An image to separate, and the folder of its layers. The command line, Python and the HTTP API name layers with this class."""
 
     source: Location
     folder: Location
+    content_format: ImageFormat | None = None
+    """The format of the content of the image, or None if it is unknown. It is needed only if the name has no image suffix."""
 
-    def target(self, layer: str, suffix: str | None = None, *, has_full_name: bool = False) -> Location:
+    @property
+    def suffix(self) -> str:
+        """The image suffix of the source. If its name has none, the suffix of the format of its content, by default .png."""
+        if format_of(self.source):
+            return self.source.suffix
+        return (self.content_format or FORMATS["png"]).suffixes[0]
+
+    @property
+    def stem(self) -> str:
+        """The name of the source without its image suffix. Any other suffix belongs to the name, as in `x.jpg_large`."""
+        return self.source.stem if format_of(self.source) else self.source.name
+
+    def target(self, layer: str, suffix: str, *, has_full_name: bool = False) -> Location:
         """Returns the path of a layer: `a.transmission.jpg` for `a.jpg`, or `a.jpg.transmission.jpg` with the full name.
 
-        The default suffix is that of the source. If brewster does not write the format of the source, it is the suffix
-        of the format that replaces it: .tiff for RAW files, .png for the others.
+        `suffix` is that of the layer, from `Options.suffix`.
         """
-        fixed, image_format = LAYER_FORMATS.get(layer), format_of(self.source)
-        if fixed is None and image_format is not None and image_format.is_writable:
-            default = self.source.suffix
-        else:
-            name = fixed or (image_format.written_as if image_format else "png")
-            default = FORMATS[name].suffixes[0]
-        name = self.source.name if has_full_name else self.source.stem
-        return self.folder / f"{name}.{layer}{suffix or default}"
+        return self.folder / f"{self.source.name if has_full_name else self.stem}.{layer}{suffix}"
 
 
 def images_in(
@@ -101,7 +107,7 @@ def write_atomically(
             path.write_bytes(data, overwrite=overwrite)
             return
         with _temporary(path) as part:
-            path.parent.mkdir(parents=True, exist_ok=True)
+            _create_folder(path.parent)
             _check_writable(path, overwrite)
             _write_synced(part, data)
             _publish(part, path, overwrite)
@@ -292,6 +298,19 @@ def exists(path: Location) -> bool:
     return path.exists() if isinstance(path, RemotePath) else os.path.lexists(path)
 
 
+def _create_folder(folder: Path) -> None:
+    """Creates a folder and its parents where needed.
+
+    Raises:
+        NotADirectoryError: the folder or one of its parents is a file.
+        OSError: the folder cannot be created.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except FileExistsError as error:  # has another cure: --overwrite does not replace a file by a folder
+        raise NotADirectoryError(errno.ENOTDIR, os.strerror(errno.ENOTDIR)) from error
+
+
 def _check_writable(path: Path, overwrite: bool) -> None:
     if path.is_dir():
         raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
@@ -332,6 +351,10 @@ _REMEDIES = {
     errno.EISDIR: (
         "expected a file, not a folder",
         "choose a file in this folder, or pass the folder with -o",
+    ),
+    errno.ENOTDIR: (
+        "expected a folder, but a part of this path is a file",
+        "choose another folder with -o (in Python output)",
     ),
     errno.ENOSPC: ("expected enough free space on the disk", "free some space and run again"),
     errno.EDQUOT: ("expected enough space in the disk quota", "free some space and run again"),

@@ -5,6 +5,7 @@ To add a format, add a row here. A format with a new `library` also needs a read
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from pathlib import PurePath
 from typing import Final, Literal, final
@@ -185,6 +186,27 @@ VIDEO_SIGNATURE: Final = (
 """A regular expression for the first bytes of a video: MP4, QuickTime, AVI, Matroska or MPEG."""
 
 
+def canonical_format(text: str) -> str:
+    """Returns the name of a format for one of its suffixes: `JPG`, `.jpg` and `jpeg` give `jpeg`. Other text is returned unchanged."""
+    image_format = SUFFIXES.get(f".{text.lower().removeprefix('.')}")
+    return image_format.name if image_format else text
+
+
+HEAD_BYTES: Final = 1 << 16
+"""The number of bytes at the beginning of a file that `format_of_content` reads."""
+
+
 def format_of(path: PurePath) -> ImageFormat | None:
     """Returns the format for the suffix of a file name, or None if the suffix is unknown."""
     return SUFFIXES.get(path.suffix.lower())
+
+
+def format_of_content(data: bytes) -> ImageFormat | None:
+    """Returns the format of a file by its first `HEAD_BYTES` bytes, or None if it is unknown.
+
+    For a RAW file that begins like a TIFF file, the result is tiff, which is also the format of its layers.
+    """
+    # AVIF and HEIC files use these brands. Only HEIC files have a decoder configuration hvcC.
+    if re.match(rb"....ftypmi[fa]", data, re.DOTALL):
+        return FORMATS["heic" if b"hvcC" in data[:HEAD_BYTES] else "avif"]
+    return next((row for row in _ROWS if re.match(row.signature, data, re.DOTALL)), None)

@@ -11,12 +11,12 @@ import inspect
 import re
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from pathlib import Path, PurePath
+from pathlib import Path
 from typing import Any, Final, Literal, TypeVar, final
 
 from brewster.errors import BrewsterError
 from brewster.files import DEFAULT_MAX_PIXELS, LAYER_FORMATS
-from brewster.image_formats import FORMATS, FormatName, format_of
+from brewster.image_formats import FORMATS, SUFFIXES, FormatName
 
 Layer = Literal["transmission", "reflection", "confidence", "layered"]
 Quality = Literal["draft", "standard", "best"]
@@ -186,16 +186,24 @@ class Options:
         """Returns the file format of a layer. `source_format` is the format of the photo. Confidence is always PNG."""
         if layer in LAYER_FORMATS:
             return LAYER_FORMATS[layer]
-        if self.additive and not (source_format in FORMATS and FORMATS[source_format].has_float32):
+        if self.additive and not FORMATS[source_format].has_float32:
             source_format = "tiff"
         return self.format or source_format
 
-    def suffix(self, layer: str, source: PurePath) -> str | None:
-        """Returns the suffix of a layer's file, or None if it is the suffix of the source."""
-        image_format = format_of(source)
-        source_format = image_format.name if image_format else ""
-        format_name = self.format_name(layer, source_format)
-        return None if format_name == source_format else FORMATS[format_name].suffixes[0]
+    def suffix(self, layer: str, photo_suffix: str) -> str:
+        """Returns the suffix of a layer's file: the suffix of the photo if the format is the same, such as `.JPG`.
+
+        If brewster does not write the format of the photo, the suffix is that of the format that replaces it: .tiff for RAW files,
+        .png for GIF and OpenRaster.
+
+        Args:
+            layer: the name of the layer.
+            photo_suffix: an image suffix, from `SeparationPaths.suffix`.
+        """
+        source_format = SUFFIXES[photo_suffix.lower()]
+        format_name = self.format_name(layer, source_format.written_as)
+        is_same = layer not in LAYER_FORMATS and format_name == source_format.name
+        return photo_suffix if is_same else FORMATS[format_name].suffixes[0]
 
 
 def document_options(function: _Function) -> _Function:

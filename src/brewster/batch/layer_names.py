@@ -6,50 +6,53 @@ The names of a photo that is separated alone depend only on this photo. The othe
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable
+from pathlib import Path
 from typing import Final
 
 from brewster.errors import OutputError
 from brewster.files import SeparationPaths, absolute
-from brewster.image_formats import SUFFIXES
+from brewster.image_formats import HEAD_BYTES, SUFFIXES, ImageFormat, format_of, format_of_content
+from brewster.options import Options
 from brewster.remote_path import Location
 
 _SUFFIX_RANKS: Final = {suffix: rank for rank, suffix in enumerate(SUFFIXES)}
 
 
 def name_layers(
-    images: Iterable[tuple[Location, Location]],
-    layers: Sequence[str],
-    suffix: Callable[[str, Location], str | None] = lambda _layer, _image: None,
+    images: Iterable[tuple[Location, Location]], options: Options
 ) -> list[tuple[Location, dict[str, Location]]]:
     """Returns the images with the paths of their layers. An image that occurs several times is included once.
 
     The name of a layer begins with the stem of the image: `a.jpg` gives `a.transmission.jpg`, and `a.png` gives
     `a.transmission.png`. If a layer of two images of a folder would have the same path, as the confidence of these images, the
     image whose suffix comes first in `SUFFIXES` keeps it, and the other one uses its full name: `a.confidence.png` and
-    `a.png.confidence.png`. Therefore `a.jpg` has the same names in all batches, whichever files are added to its folder.
+    `a.png.confidence.png`. Therefore `a.jpg` has the same names in all batches, whichever files are added to its folder. Only an
+    image whose name has no image suffix, which must be given by its name, comes before: its full name is its short name.
 
     Args:
         images: pairs of an image and the folder of its layers, as `images_in` yields them.
-        layers: the names of the layers.
-        suffix: returns the suffix of a layer of an image; None is the default of `SeparationPaths.target`.
+        options: the options of the batch, which contain the layers and their format.
 
     Raises:
         OutputError: a layer of two images of different folders would have the same path.
     """
     found: dict[str, SeparationPaths] = {}
     for image, folder in images:
-        found.setdefault(absolute(image), SeparationPaths(image, folder))
+        key = absolute(image)
+        if key not in found:
+            found[key] = SeparationPaths(image, folder, _content_format(image))
     targets: dict[str, dict[str, Location]] = {key: {} for key in found}
     in_naming_order = sorted(found, key=lambda key: _naming_rank(found[key].source))
-    for layer in layers:
+    for layer in options.layers:
         owners: dict[str, Location] = {}
         for key in in_naming_order:
-            paths, suffix_or_none = found[key], suffix(layer, found[key].source)
-            target = paths.target(layer, suffix_or_none)
+            paths = found[key]
+            suffix = options.suffix(layer, paths.suffix)
+            target = paths.target(layer, suffix)
             owner = owners.get(_case_insensitive(target))
             if owner and owner.parent == paths.source.parent:
-                target = paths.target(layer, suffix_or_none, has_full_name=True)
+                target = paths.target(layer, suffix, has_full_name=True)
             owner = owners.setdefault(_case_insensitive(target), paths.source)
             if owner is not paths.source:
                 raise OutputError(
@@ -61,13 +64,29 @@ def name_layers(
     return [(found[key].source, targets[key]) for key in found]
 
 
+def _content_format(image: Location) -> ImageFormat | None:
+    """Returns the format of the content of an image whose name has no image suffix.
+
+    The result is None for other images, unknown formats, pipes (which can be read only once), and files in an object store: one
+    request for each photo of an archive would take hours.
+    """
+    if format_of(image) or not isinstance(image, Path) or not os.path.isfile(image):  # noqa: PTH113  (is_file may raise)
+        return None
+    try:
+        with image.open("rb") as file:
+            return format_of_content(file.read(HEAD_BYTES))
+    except OSError:  # the separation opens the image later, and reports the error
+        return None
+
+
 def _naming_rank(image: Location) -> tuple[int, int, str]:
     """Returns the key by which `name_layers` sorts the images: the first ones keep their short names.
 
-    Images with short stems are first, because the full name of `a.jpg` is the stem of `a.jpg.png`.
+    Images without an image suffix are first, because they have only one name. Then images with short stems are first, because the
+    full name of `a.jpg` is the stem of `a.jpg.png`.
     """
-    suffix = image.suffix.lower()
-    return len(image.stem), _SUFFIX_RANKS.get(suffix, len(_SUFFIX_RANKS)), image.name
+    rank = _SUFFIX_RANKS.get(image.suffix.lower())
+    return (0, 0, image.name) if rank is None else (len(image.stem), rank, image.name)
 
 
 def _case_insensitive(target: Location) -> str:

@@ -184,10 +184,7 @@ def plan_files(
             read_manifest(source, folder) if is_manifest(source) else images_in(source, folder, videos=videos)
         )
     )
-    tasks = [
-        SeparationTask(image, outputs)
-        for image, outputs in name_layers(images, options.layers, options.suffix)
-    ]
+    tasks = [SeparationTask(image, outputs) for image, outputs in name_layers(images, options)]
     if not tasks:
         found_videos = f" ({len(videos)} videos)" if videos else ""
         raise PhotoError(

@@ -75,6 +75,7 @@ def plan(
 
     if is_single_output(photos, output):
         return [_plan_single_output(photos, output, options)]
+    _check_not_a_file(output)
     _check_output_folder(photos, output)
     return plan_files(photos, output, options, videos=videos)
 
@@ -114,6 +115,19 @@ def _check_format(image_format: ImageFormat | None, options: Options) -> None:
     if layer != "confidence" and options.format_name(layer, name) != name:
         raise click.UsageError(
             f"The output file (-o) is a {name} file, but --format, --additive or --layers requires another format."
+        )
+
+
+def _check_not_a_file(output: str | None) -> None:
+    """Checks that the output folder (-o) is not an existing file. --overwrite does not replace a file by a folder.
+
+    Raises:
+        click.UsageError: -o is an existing file.
+    """
+    if output and "://" not in output and os.path.isfile(Path(output)):  # noqa: PTH113  (Path.is_file raises for names that are too long)
+        raise click.UsageError(
+            f"-o is the existing file {output}; expected a folder, or an image file such as clear.jpg for a single layer; "
+            "choose another name."
         )
 
 

@@ -18,7 +18,7 @@ from brewster.cli.batch_plan import absolute_path, is_single_output, local_path,
 from brewster.cli.extras import require_extra
 from brewster.cli.terminal import print_out, print_status, standard_output
 from brewster.errors import BrewsterError
-from brewster.image_formats import SUFFIXES, FormatName, format_of
+from brewster.image_formats import FormatName, canonical_format, format_of
 from brewster.models import zoo
 from brewster.options import Options
 
@@ -95,8 +95,7 @@ class _FormatChoice(click.Choice[str]):
         Raises:
             click.BadParameter: brewster does not write this format.
         """
-        row = SUFFIXES.get(f".{str(value).lower().removeprefix('.')}")
-        return super().convert(row.name if row else value, param, ctx)
+        return super().convert(canonical_format(str(value)), param, ctx)
 
 
 class _ModelName(click.ParamType[str]):

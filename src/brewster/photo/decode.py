@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from brewster.errors import MissingExtra, PhotoError, UnreadablePhoto, UnsupportedPhoto
 from brewster.files import DEFAULT_MAX_PIXELS
-from brewster.image_formats import FORMATS, VIDEO_SIGNATURE
+from brewster.image_formats import FORMATS, VIDEO_SIGNATURE, format_of_content
 from brewster.photo import metadata
 from brewster.photo.colour import colour_space_of
 from brewster.photo.file_info import FileInfo
@@ -112,13 +112,10 @@ _FLOAT_READERS = {"exr": read_exr, "hdr": read_hdr}
 def _detect_format(data: bytes) -> str:
     if not data:
         raise UnreadablePhoto("the file is empty", "expected an image file", "copy the file again")
-    # AVIF and HEIC files use these brands. Only HEIC files have a decoder configuration hvcC.
-    if re.match(rb"....ftypmi[fa]", data, re.DOTALL):
-        return "heic" if b"hvcC" in data[: 1 << 16] else "avif"
-    for image_format in FORMATS.values():
-        if re.match(image_format.signature, data, re.DOTALL):
-            is_raw_tiff = image_format.name == "tiff" and is_raw(metadata.read_tags(data))
-            return "raw" if is_raw_tiff else image_format.name
+    image_format = format_of_content(data)
+    if image_format:
+        is_raw_tiff = image_format.name == "tiff" and is_raw(metadata.read_tags(data))
+        return "raw" if is_raw_tiff else image_format.name
     if re.match(VIDEO_SIGNATURE, data, re.DOTALL):
         raise UnsupportedPhoto(
             "the file is a video", "expected a photo", "extract single images first, for example with ffmpeg"

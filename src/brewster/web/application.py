@@ -158,4 +158,7 @@ async def _error_response(request: Request, error: Exception) -> Response:
 def _http_error_message(request: Request, error: HTTPException) -> str:
     if error.detail != HTTPStatus(error.status_code).phrase:
         return error.detail
+    if error.status_code == HTTPStatus.METHOD_NOT_ALLOWED:
+        allowed = (error.headers or {}).get("Allow", "another method")
+        return f"{request.url.path} does not accept {request.method}; expected {allowed}; repeat the request with this method"
     return f"{request.method} {request.url.path} does not exist; expected an existing route; choose one from GET /openapi.json"

@@ -17,14 +17,18 @@ from starlette.requests import Request
 
 from brewster.errors import invalid_value
 from brewster.files import OUTPUT_LAYERS, SeparationPaths
-from brewster.image_formats import SUFFIXES
+from brewster.image_formats import FORMATS, canonical_format, format_of
 from brewster.options import Options
 
 FIELDS: Final = ("layers", "strength", "quality", "format", "additive", "model")
 """The options that a client may set as text. The server sets the other options."""
 _FILES: Final = ("photo", "mask")
 _OPTIONS: Final = TypeAdapter(Options)
-_MAX_NAME_BYTES: Final = 120
+_REQUEST_PARTS: Final = ("query", "path", "body")
+_MAX_NAME_BYTES: Final = 255 - len(".transmission.jpeg")
+"""Maximum length of a name without its suffix. The names of all layers then fit into the 255 bytes of usual file systems."""
+_DIRECTION_MARKS: Final = ("LRE", "RLE", "LRO", "RLO", "PDF", "LRI", "RLI", "FSI", "PDI")
+"""The classes of characters that change the direction of text (Unicode annex 9). They can hide the real suffix of a name."""
 _PHOTO_SCHEMA: Final = {
     "type": "string",
     "contentMediaType": "application/octet-stream",
@@ -45,10 +49,13 @@ class SeparationRequest:
 
     def target(self, layer: str, format_name: str) -> str:
         """Returns the file name of a layer, the same as on the command line. `format_name` is the format of the photo."""
-        source = Path(self.name)
-        if source.suffix.lower() not in SUFFIXES:
-            source = Path(f"{self.name}.{format_name}")
-        return SeparationPaths(source, Path()).target(layer, self.options.suffix(layer, source)).name
+        paths = SeparationPaths(Path(self.name), Path(), FORMATS[format_name])
+        return paths.target(layer, self.options.suffix(layer, paths.suffix)).name
+
+    @property
+    def zip_name(self) -> str:
+        """The file name of a zip of several layers."""
+        return f"{SeparationPaths(Path(self.name), Path()).stem}.zip"
 
 
 async def read_form(request: Request, models: Sequence[str], max_pixels: int) -> SeparationRequest:
@@ -138,21 +145,35 @@ def _as_field(schema: dict[str, Any]) -> dict[str, Any]:
 
 
 def safe_name(name: str) -> str:
-    """Returns the last component of a file name, with at most _MAX_NAME_BYTES bytes before the suffix.
+    """Returns the last component of a file name, with at most `_MAX_NAME_BYTES` bytes before the suffix.
 
-    Characters that file systems or headers forbid are replaced by underscores.
+    The name stays unchanged wherever possible, because the command line names the layers after the unchanged name. Only characters
+    that Windows forbids, control characters and marks that change the direction of text are replaced by underscores.
     """
-    last = unicodedata.normalize("NFC", re.split(r"[/\\]", name)[-1])
-    plain = "".join(letter if letter.isprintable() and letter not in '<>:"|?*' else "_" for letter in last)
-    path = Path(plain.strip(". ") or "photo")
-    suffix = path.suffix if path.suffix.lower() in SUFFIXES else ""
-    stem = path.name.removesuffix(suffix).encode()[:_MAX_NAME_BYTES].decode(errors="ignore")
-    return stem.rstrip(". ") + suffix
+    last = re.split(r"[/\\]", name)[-1]
+    plain = "".join("_" if _is_unsafe(letter) else letter for letter in last)
+    path = Path(plain if plain.strip(". ") else "photo")
+    suffix = path.suffix if format_of(path) else ""
+    return path.name.removesuffix(suffix).encode()[:_MAX_NAME_BYTES].decode(errors="ignore") + suffix
+
+
+def _is_unsafe(letter: str) -> bool:
+    is_control = unicodedata.category(letter) in ("Cc", "Cs", "Zl", "Zp")
+    return is_control or letter in '<>:"|?*' or unicodedata.bidirectional(letter) in _DIRECTION_MARKS
 
 
 def validation_message(errors: Iterable[Any]) -> str:
     """Returns the validation errors of pydantic as one message, with three parts for each error."""
-    return " ".join(str(invalid_value(error)) for error in errors)
+    return " ".join(str(invalid_value({**error, "loc": _sent_name(error["loc"])})) for error in errors)
+
+
+def _sent_name(location: Sequence[str | int]) -> tuple[str, ...]:
+    """Returns the location of a value with the names that the client has sent: `job` for `("query", "job")`.
+
+    The part of the request is kept only if it is the whole location. The index in a list is left out.
+    """
+    names = tuple(part for part in location if isinstance(part, str))
+    return names[1:] if len(names) > 1 and names[0] in _REQUEST_PARTS else names
 
 
 def _options(form: FormData, models: Sequence[str], max_pixels: int) -> Options:
@@ -164,6 +185,8 @@ def _options(form: FormData, models: Sequence[str], max_pixels: int) -> Options:
             f"there is no field {unknown[0][:40]!r}; expected {', '.join((*_FILES, *FIELDS))}; correct the name",
         )
     values_by_name: dict[str, Any] = {name: values[-1] for name, values in texts.items() if values[-1]}
+    if "format" in values_by_name:
+        values_by_name["format"] = canonical_format(values_by_name["format"])
     if "layers" in texts:
         values_by_name["layers"] = _ordered_layers(",".join(texts["layers"]).split(","))
     if values_by_name.setdefault("model", models[0]) not in models:

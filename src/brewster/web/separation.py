@@ -65,13 +65,13 @@ _RESPONSES: Final[dict[int | str, dict[str, Any]]] = {
         "description": "One layer, or a zip of several layers.",
         "content": {"image/*": {}, "application/zip": {}},
     },
-    **dict.fromkeys((400, 401, 403, 408, 409, 413, 415, 421, 422, 500, 501, 503, 504), _ERROR),
+    **dict.fromkeys((400, 401, 403, 408, 409, 413, 415, 421, 422, 500, 501, 502, 503, 504), _ERROR),
 }
 JobName = Annotated[
     str | None,
     Query(
         pattern="^[A-Za-z0-9-]{8,64}$",
-        description="A name for this request, chosen by the client, for `GET /progress/{job}`.",
+        description="A name for this request, chosen by the client, for `GET /progress/{job}`: 8 to 64 ASCII letters, digits and hyphens.",
     ),
 ]
 
@@ -168,11 +168,7 @@ def _separate(model_cache: ModelCache, form: SeparationRequest, on_progress: Pro
         on_progress(1)  # raises JobCancelled if the job is cancelled, because encoding also takes time
         name = form.target(layer, separation.photo.file_info.format_name)
         files[name] = getattr(separation, layer).encode(SUFFIXES[Path(name).suffix.lower()].name)
-    name, data = (
-        next(iter(files.items()))
-        if len(files) == 1
-        else (f"{Path(form.name).stem}.zip", zip_images(files.items()))
-    )
+    name, data = next(iter(files.items())) if len(files) == 1 else (form.zip_name, zip_images(files.items()))
     headers = {
         "Content-Disposition": _content_disposition(name),
         "Brewster-Model": quote(separation.model),

@@ -53,7 +53,8 @@ function onEdit() {
 
 async function saveMask() {
   const { file, regions, size } = queue.current;
-  save(`${file.name.replace(/\.[^.]*$/, "")}.mask.png`, await maskFile(regions.list, ...size));
+  const stem = isImage(file.name) ? file.name.replace(/\.[^.]*$/, "") : file.name;
+  save(`${stem}.mask.png`, await maskFile(regions.list, ...size));
 }
 
 // Repeats the request until the server responds, because no photo can be separated before.
