@@ -1,17 +1,21 @@
-"""Writes the figures of docs/rendering.md.
+"""Writes the figures of docs/rendering.md and docs/results.md.
 
 scenes.jpg: samples of all scene recipes except tiny.
 mixtures.jpg: 8-bit mixtures (top row) and rendered photos of the same scenes (bottom row).
+learning-curve.png: validation metrics of the compact model during training, from compact-log.csv.
 
     BREWSTER_DATA=../shared/data .venv/bin/python runs/figures.py   # with the CC0 maps in hdri/
 
 Without BREWSTER_DATA, all scenes have built-in environments.
 """
 
+import csv
 import os
+from itertools import accumulate, pairwise
 from pathlib import Path
 
 import torch
+from matplotlib.figure import Figure
 
 from brewster.environments.assets import Assets
 from brewster.environments.catalog import read_catalog
@@ -26,6 +30,13 @@ DATA = os.environ.get("BREWSTER_DATA")
 MAPS = [Path(DATA) / "hdri"] if DATA else []
 DOCS = Path(__file__).parent.parent / "docs"
 WIDTH, HEIGHT = 256, 192
+CURVES = {
+    "mixtures_db": "held-out mixtures",
+    "real_db": "dev Real",
+    "nature_db": "dev Nature",
+    "real_train_db": "real/train",
+}
+"""Columns of compact-log.csv and their labels."""
 
 
 def render_sample(name, seed, index):
@@ -67,6 +78,31 @@ def save_mixtures():
     )
 
 
+def save_learning_curve():
+    with Path(__file__).with_name("compact-log.csv").open(newline="") as file:
+        rows = [{name: float(value) for name, value in row.items()} for row in csv.DictReader(file)]
+    steps = [
+        row["step"] - (last["step"] if row["stage"] == last["stage"] else 0)
+        for last, row in pairwise([{"step": 0, "stage": 0}, *rows])
+    ]
+    images = list(
+        accumulate(count * row["batch_size"] / 1000 for count, row in zip(steps, rows, strict=True))
+    )
+    figure = Figure(figsize=(8, 4), layout="constrained")
+    axis = figure.subplots()
+    for column, label in CURVES.items():
+        axis.plot(images, [row[column] for row in rows], marker="o", markersize=3, label=label)
+    for end, (last, row) in zip(images, pairwise(rows), strict=False):
+        if row["stage"] != last["stage"]:
+            axis.axvline(end, color="grey", linewidth=0.6, linestyle=":")
+    axis.set_xlabel("training images, thousands")
+    axis.set_ylabel("PSNR gain over the input, dB")
+    axis.grid(alpha=0.25)
+    axis.legend(fontsize=8)
+    figure.savefig(DOCS / "learning-curve.png", dpi=100)
+
+
 if __name__ == "__main__":
     save_scenes()
     save_mixtures()
+    save_learning_curve()
