@@ -46,7 +46,19 @@ def test_an_existing_file_keeps_its_name_even_if_it_has_quotes(tmp_path, monkeyp
 )
 def test_addresses_of_windows_become_its_paths(address, path, monkeypatch):
     monkeypatch.setattr(urllib.request, "url2pathname", nturl2path.url2pathname)
+    monkeypatch.setattr(sys, "platform", "win32")
     assert batch_plan.local_path(address).removeprefix("\\\\?\\") == path
+
+
+@pytest.mark.parametrize("address", ["https://example.org/a.jpg", "file://host/a.jpg"])
+@pytest.mark.parametrize("options", [[], ["--workers", "2"], ["-o", "clear.jpg"]])
+def test_an_address_of_another_machine_is_refused(run, tmp_path, address, options):
+    code, _, err = run(address, *options)
+    (line,) = error_lines(err)
+    assert code == 1
+    assert line.startswith(f"error: {address} is ")
+    assert line.count("; ") == 2
+    assert list_files(tmp_path) == []
 
 
 # --- suffixes

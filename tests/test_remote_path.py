@@ -44,7 +44,6 @@ def test_a_location_is_a_path_or_a_url():
     assert location(Path("a")) == Path("a")
     assert location("file:///scans/box%204/a.jpg") == Path("/scans/box 4/a.jpg")
     assert location("file://localhost/scans/a.jpg") == Path("/scans/a.jpg")
-    assert location("file://server/scans/a.jpg") == Path("//server/scans/a.jpg")
     assert str(location("memory://bucket/a.jpg")) == "memory://bucket/a.jpg"
 
 
@@ -57,6 +56,21 @@ def test_a_protocol_that_is_unknown_or_not_installed_is_reported_before_any_phot
     monkeypatch.setitem(sys.modules, "fsspec", None)
     with pytest.raises(MissingExtra, match=r"pip install -c constraints.txt -e '\.\[cluster\]'"):
         location("memory://bucket/a.jpg")
+
+
+@pytest.mark.parametrize("url", ["https://example.org/a.jpg", "HTTP://example.org/a.jpg"])
+def test_a_web_address_is_refused_with_what_to_do(url):
+    with pytest.raises(BrewsterError) as raised:
+        location(url)
+    assert str(raised.value).startswith(f"{url} is a web address; expected a file or folder of this machine")
+    assert raised.value.cure == "download the photo, and pass the path of the file"
+
+
+@pytest.mark.parametrize("url", ["file://server/scans/a.jpg", "file://a.jpg", "file://localhosts/a.jpg"])
+def test_a_file_of_another_machine_is_refused(url):
+    host = url.split("/")[2]
+    with pytest.raises(BrewsterError, match=f"is a file of the machine {host}; expected a file of this"):
+        location(url)
 
 
 def test_a_file_in_a_store_is_written_once():

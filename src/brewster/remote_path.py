@@ -14,6 +14,7 @@ import errno
 import importlib
 import os
 import re
+import sys
 from collections.abc import Iterator
 from pathlib import Path, PurePosixPath
 from typing import Any, TypeAlias, final
@@ -124,7 +125,7 @@ def location(text: str | os.PathLike[str]) -> Location:
     """Returns the path for a path, a file:// URL, or the URL of an object store.
 
     Raises:
-        BrewsterError: the protocol of the URL is unknown.
+        BrewsterError: the URL is a web address or names a file of another machine, or its protocol is unknown.
         MissingExtra: the package of the store is not installed.
     """
     if isinstance(text, RemotePath | Path) or not re.match(r"[A-Za-z][\w+.-]+://", os.fspath(text)):
@@ -132,17 +133,35 @@ def location(text: str | os.PathLike[str]) -> Location:
     url = os.fspath(text)
     if url.startswith("file:"):
         return Path(path_of_file_url(url))
+    if url.lower().startswith(("http://", "https://")):
+        raise BrewsterError(
+            f"{url} is a web address",
+            "expected a file or folder of this machine, or the URL of an object store such as s3://bucket/folder",
+            "download the photo, and pass the path of the file",
+        )
     path = RemotePath(url)
     path._store()  # raises the errors here once, instead of for every photo
     return path
 
 
 def path_of_file_url(url: str) -> str:
-    """Returns the local path of a file:// URL. The host is empty, localhost, or a Windows server (RFC 8089)."""
+    """Returns the local path of a file:// URL (RFC 8089). Its host is empty or localhost, or on Windows the name of a server.
+
+    Raises:
+        BrewsterError: the URL names another machine, and this machine does not run Windows.
+    """
     from urllib.request import url2pathname  # noqa: PLC0415  (imports http.client: slow, and every command imports this module)
 
-    path = url.removeprefix("file://").removeprefix("localhost")
-    return url2pathname(path if path.startswith("/") else f"//{path}")
+    host, _, path = url.removeprefix("file://").partition("/")
+    if host in ("", "localhost"):
+        return url2pathname(f"/{path}")
+    if sys.platform == "win32":
+        return url2pathname(f"//{host}/{path}")
+    raise BrewsterError(
+        f"{url} is a file of the machine {host}",
+        "expected a file of this machine: a path, or a URL such as file:///home/me/photo.jpg",
+        "copy the file to this machine, or mount its folder and pass the path there",
+    )
 
 
 def _store(protocol: str) -> Any:  # noqa: ANN401  (fsspec has no types)
