@@ -137,7 +137,7 @@ def test_videos_are_counted_and_named(run, run_without_model, tmp_path):
     assert "2 videos (b.mp4, c.MOV) skipped" in err
     code, _, err = run("b.mp4")
     assert code == 1
-    assert "the file is a video" in err
+    assert error_lines(err)[0].startswith("error: b.mp4 is a video; expected a photo; extract single images")
     (tmp_path / "a.jpg").unlink()
     for layer in layer_files("a"):
         (tmp_path / layer).unlink()

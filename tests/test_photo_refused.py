@@ -107,11 +107,35 @@ def test_a_missing_file_and_a_folder_are_refused(tmp_path: Path) -> None:
 
 
 def test_a_file_without_read_permission_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def deny(path: Path) -> bytes:
+    def deny(path: Path, mode: str) -> io.BytesIO:
         raise PermissionError(13, "Permission denied")
 
-    monkeypatch.setattr(Path, "read_bytes", deny)
+    monkeypatch.setattr(Path, "open", deny)
     assert_refused(tmp_path / "a.jpg", UnreadablePhoto, "Permission denied")
+
+
+VIDEO_HEADS = [
+    b"\0\0\0\x18ftypisom",
+    b"\0\0\0\x18ftypdash",
+    b"\0\0\0\x18ftypM4VP",
+    b"\0\0\0\x08wide\0\0\0\0mdat",
+    b"RIFF\0\0\0\0AVI LIST",
+    b"\x1aE\xdf\xa3",
+    b"\0\0\x01\xb3",
+]
+
+
+@pytest.mark.parametrize("head", VIDEO_HEADS)
+def test_a_video_is_refused_by_its_content(head: bytes) -> None:
+    assert_refused(head + bytes(100), UnsupportedPhoto, "^the file is a video; expected a photo; ")
+
+
+@pytest.mark.parametrize("content", [b"", b"damaged", file_of("JPEG")[:100]])
+@pytest.mark.parametrize("name", ["a.mp4", "a.MOV", "a.wmv"])
+def test_a_damaged_video_is_refused_by_its_suffix(tmp_path: Path, name: str, content: bytes) -> None:
+    (tmp_path / name).write_bytes(content)
+    assert_refused(tmp_path / name, UnsupportedPhoto, f"{name} is a video; expected a photo; ")
+    assert_refused(tmp_path / f"no-{name}", UnreadablePhoto, "No such file")
 
 
 @pytest.mark.parametrize("kind", ["BMP", "JPEG2000", "PPM", "ICO"])

@@ -7,10 +7,10 @@ from pathlib import Path
 import pytest
 
 from brewster.batch import plan_files
-from brewster.errors import BrewsterError, MissingExtra, OutputError, UnreadablePhoto
+from brewster.errors import BrewsterError, MissingExtra, OutputError, UnreadablePhoto, UnsupportedPhoto
 from brewster.files import write_atomically
 from brewster.options import Options
-from brewster.remote_path import RemotePath, location
+from brewster.remote_path import RemotePath, check_readable, location, read_image
 
 fsspec = pytest.importorskip("fsspec")
 
@@ -105,6 +105,20 @@ def test_photos_in_a_store_are_found_like_those_in_a_folder(tmp_path):
     assert single.outputs["transmission"] == tmp_path / "a.transmission.jpg"
 
 
+def test_a_file_is_checked_without_reading_it(store, monkeypatch):
+    folder = location("memory://bucket/in")
+    (folder / "a.jpg").write_bytes(b"")
+    monkeypatch.setattr(type(store), "cat_file", fail)
+    check_readable(folder / "a.jpg")
+    with pytest.raises(UnreadablePhoto, match=r"in/b\.jpg cannot be read \(it does not exist\)"):
+        check_readable(folder / "b.jpg")
+    with pytest.raises(UnreadablePhoto, match=r"memory://bucket/in cannot be read \(it is a folder\)"):
+        check_readable(folder)
+    monkeypatch.setattr(type(store), "info", fail)
+    with pytest.raises(UnreadablePhoto, match=r"cannot be read \(503 Slow Down\)"):
+        check_readable(folder / "a.jpg")
+
+
 def test_errors_of_a_store_name_the_file_and_the_reason(store, monkeypatch):
     path = location("memory://bucket/a.jpg")
     with pytest.raises(UnreadablePhoto, match=r"memory://bucket/a.jpg cannot be read \(it does not exist\)"):
@@ -119,5 +133,7 @@ def test_errors_of_a_store_name_the_file_and_the_reason(store, monkeypatch):
         write_atomically(path, b"")
     with pytest.raises(UnreadablePhoto, match="memory://bucket cannot be listed"):
         plan_files(path.parent)
+    with pytest.raises(UnsupportedPhoto, match=r"memory://bucket/b\.mp4 is a video"):
+        read_image(path.parent / "b.mp4")
     assert not path.exists()
     assert list(path.parent.iterdir()) == []

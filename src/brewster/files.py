@@ -19,7 +19,7 @@ from pathlib import Path
 import platformdirs
 
 from brewster.errors import OutputError
-from brewster.image_formats import FORMATS, VIDEO_SUFFIXES, format_of
+from brewster.image_formats import FORMATS, format_of, is_video
 from brewster.remote_path import Location, RemotePath
 
 DEFAULT_MAX_PIXELS = 200_000_000
@@ -193,8 +193,8 @@ def _image_files(source: Location, videos: list[Path]) -> Iterator[Location]:
 
 def _images_and_videos(folder: Path, videos: list[Path]) -> Iterator[Path]:
     """Yields the images below a local folder, and appends the videos to `videos`."""
-    for path in walk(folder, lambda path: _is_input(path) or _is_video(path)):
-        if _is_video(path):
+    for path in walk(folder, lambda path: _is_input(path) or _is_visible_video(path)):
+        if _is_visible_video(path):
             videos.append(path)
         else:
             yield path
@@ -262,8 +262,8 @@ def _is_input(path: Location) -> bool:
     return format_of(path) is not None and not path.name.startswith(".") and not is_result
 
 
-def _is_video(path: Path) -> bool:
-    return path.suffix.lower() in VIDEO_SUFFIXES and not path.name.startswith(".")
+def _is_visible_video(path: Path) -> bool:
+    return is_video(path) and not path.name.startswith(".")
 
 
 def _check_not_source(path: Location, source: Location | None) -> None:

@@ -3,6 +3,8 @@
     photo = location("s3://bucket/scans/a.jpg")
     data = photo.read_bytes()
 
+`location` returns such a file or a local path, and `read_image` reads both.
+
 fsspec loads the package of the store (s3fs for S3, gcsfs for Google Cloud Storage), which has its own settings: for
 example AWS_PROFILE, FSSPEC_S3_ENDPOINT_URL, or the files in ~/.config/fsspec.
 """
@@ -17,9 +19,10 @@ import re
 import sys
 from collections.abc import Iterator
 from pathlib import Path, PurePosixPath
-from typing import Any, TypeAlias, final
+from typing import Any, BinaryIO, TypeAlias, final
 
-from brewster.errors import BrewsterError, MissingExtra, OutputError, UnreadablePhoto
+from brewster.errors import BrewsterError, MissingExtra, OutputError, UnreadablePhoto, video_error
+from brewster.image_formats import is_video
 
 _RETRY = "check the network and the credentials, and run the same command again: finished files are kept"
 
@@ -42,8 +45,29 @@ class RemotePath(PurePosixPath):
             MissingExtra: the package of the store is not installed.
         """
         store = self._store()
-        try:
+        with self._read_errors():
             return bytes(store.cat_file(str(self)))
+
+    def check_readable(self) -> None:
+        """Checks that the URL is that of a file, with one request that does not read its content.
+
+        Raises:
+            UnreadablePhoto: the file does not exist or is a folder, or the store fails.
+            MissingExtra: the package of the store is not installed.
+        """
+        store = self._store()
+        with self._read_errors():
+            kind = store.info(str(self))["type"]
+        if kind == "directory":
+            raise UnreadablePhoto(
+                f"{self} cannot be read (it is a folder)", "expected an image file", "check the URL"
+            )
+
+    @contextlib.contextmanager
+    def _read_errors(self) -> Iterator[None]:
+        """Translates errors of the store within this block into `UnreadablePhoto`."""
+        try:
+            yield
         except FileNotFoundError as error:
             raise UnreadablePhoto(
                 f"{self} cannot be read (it does not exist)", "expected an image file", "check the URL"
@@ -162,6 +186,50 @@ def path_of_file_url(url: str) -> str:
         "expected a file of this machine: a path, or a URL such as file:///home/me/photo.jpg",
         "copy the file to this machine, or mount its folder and pass the path there",
     )
+
+
+def read_image(path: Location) -> bytes:
+    """Returns the bytes of an image file.
+
+    Raises:
+        UnreadablePhoto: the file does not exist, is a folder, or cannot be read.
+        UnsupportedPhoto: the file has the suffix of a video. Its content is not read, because it may not fit into memory.
+        MissingExtra: the package of the object store is not installed.
+    """
+    if isinstance(path, RemotePath):
+        _check_not_video(path)
+        return path.read_bytes()
+    with _opened(path) as file:
+        return file.read()
+
+
+def check_readable(path: Location) -> None:
+    """Checks that an image file exists and can be opened. Raises the errors of `read_image`, but does not read the content."""
+    if isinstance(path, RemotePath):
+        _check_not_video(path)
+        path.check_readable()
+        return
+    with _opened(path):
+        pass
+
+
+@contextlib.contextmanager
+def _opened(path: Path) -> Iterator[BinaryIO]:
+    try:
+        with path.open("rb") as file:
+            _check_not_video(path)
+            yield file
+    except OSError as error:
+        is_folder = os.path.isdir(path)  # noqa: PTH112  (Path.is_dir raises without permission)
+        reason = "it is a folder" if is_folder else error.strerror or str(error)
+        raise UnreadablePhoto(
+            f"{path} cannot be read ({reason})", "expected an image file", "check its name and permissions"
+        ) from error
+
+
+def _check_not_video(path: Location) -> None:
+    if is_video(path):
+        raise video_error(str(path))
 
 
 def _store(protocol: str) -> Any:  # noqa: ANN401  (fsspec has no types)

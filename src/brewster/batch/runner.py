@@ -28,7 +28,7 @@ from brewster.inference.assessment import Assessment
 from brewster.inference.layer_history import find_layer_of_another_photo
 from brewster.inference.separator import Separator
 from brewster.options import Options
-from brewster.remote_path import Location, RemotePath, location
+from brewster.remote_path import Location, RemotePath, check_readable, location, read_image
 
 BatchProgressCallback = Callable[[int, str, float], None]
 """Called with the number of finished files, the name of the current file, and its completed fraction, 0 to 1.
@@ -369,10 +369,16 @@ def check_layers(source: Location | InputStream, layers: Iterable[Location | Out
 
 
 def read_content(source: Location | InputStream) -> Path | bytes:
-    """Returns what a `Separator` reads: a local path, or the bytes of a URL or stream."""
+    """Returns what a `Separator` reads: the path of a local file that can be opened, or the bytes of a URL or stream.
+
+    Raises:
+        UnreadablePhoto: the file does not exist, is a folder, or cannot be opened or read.
+        UnsupportedPhoto: the file has the suffix of a video.
+    """
     if isinstance(source, Path):
+        check_readable(source)
         return source
-    return source.read_bytes() if isinstance(source, RemotePath) else source.read()
+    return read_image(source) if isinstance(source, RemotePath) else source.read()
 
 
 def _sha256(photo: Path | bytes) -> str | None:

@@ -19,7 +19,7 @@ import numpy as np
 import pyvips
 from numpy.typing import NDArray
 
-from brewster.errors import MissingExtra, PhotoError, UnreadablePhoto, UnsupportedPhoto
+from brewster.errors import MissingExtra, PhotoError, UnreadablePhoto, UnsupportedPhoto, video_error
 from brewster.files import DEFAULT_MAX_PIXELS
 from brewster.image_formats import FORMATS, VIDEO_SIGNATURE
 from brewster.photo import metadata
@@ -120,9 +120,7 @@ def _detect_format(data: bytes) -> str:
             is_raw_tiff = image_format.name == "tiff" and is_raw(metadata.read_tags(data))
             return "raw" if is_raw_tiff else image_format.name
     if re.match(VIDEO_SIGNATURE, data, re.DOTALL):
-        raise UnsupportedPhoto(
-            "the file is a video", "expected a photo", "extract single images first, for example with ffmpeg"
-        )
+        raise video_error("the file")
     raise UnreadablePhoto(
         f"the file starts with {data[:12]!r}, which is no known image format",
         f"expected one of {', '.join(FORMATS)}",
