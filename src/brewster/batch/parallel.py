@@ -17,7 +17,8 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import final
 
-from brewster.batch.runner import BatchRunner, FileResult, SeparationTask, real_path, skipped_result
+from brewster.batch.plan import FileResult, SeparationTask
+from brewster.batch.runner import BatchRunner, real_path, skipped_result
 from brewster.errors import OutputError
 from brewster.executors import Executor, run_tasks
 from brewster.files import exists

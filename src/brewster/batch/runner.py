@@ -13,22 +13,26 @@ from __future__ import annotations
 import hashlib
 import os
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Final, Literal, Protocol, final
+from typing import Final, final
 
-from brewster.batch.layer_names import name_layers
-from brewster.batch.manifest import is_manifest, read_manifest
-from brewster.errors import BrewsterError, OutputError, PhotoError
-from brewster.files import exists, images_in, is_same_file, write_atomically
-from brewster.image_formats import SUFFIXES, format_of
-from brewster.inference.assessment import Assessment
+from brewster.batch.plan import (
+    FileResult,
+    InputStream,
+    OutputStream,
+    SeparationTask,
+    display_name,
+    plan_files,
+)
+from brewster.errors import BrewsterError, OutputError
+from brewster.files import exists, is_same_file, write_atomically
+from brewster.image_formats import format_of
 from brewster.inference.layer_history import find_layer_of_another_photo
 from brewster.inference.separator import Separator
 from brewster.options import Options
-from brewster.remote_path import Location, RemotePath, check_readable, location, read_image
+from brewster.remote_path import Location, RemotePath, check_readable, read_image
 
 BatchProgressCallback = Callable[[int, str, float], None]
 """Called with the number of finished files, the name of the current file, and its completed fraction, 0 to 1.
@@ -37,77 +41,7 @@ It is called before each file, several times while a file is separated, and befo
 raise KeyboardInterrupt in the callback. If it raises another exception while a file is separated, this file fails.
 """
 
-_STREAM_NAME: Final = "-"
 _DEFAULT_OPTIONS: Final = Options()
-
-
-class InputStream(Protocol):
-    """A readable object with the bytes of one photo, such as an open binary file."""
-
-    def read(self) -> bytes:
-        """Returns all bytes."""
-
-
-class OutputStream(Protocol):
-    """A writable object for the bytes of one encoded layer, such as an open binary file."""
-
-    def write(self, data: bytes, /) -> object:
-        """Writes all bytes."""
-
-
-@final
-@dataclass(frozen=True)
-class SeparationTask:
-    """One photo, and the output of each of its layers: a path, a URL or a stream."""
-
-    source: Location | InputStream
-    outputs: Mapping[str, Location | OutputStream]
-    """The output of each layer, by layer name (`transmission`, `reflection` or `confidence`)."""
-
-    @property
-    def name(self) -> str:
-        """The path of the photo as the caller passed it, or `-` for a stream."""
-        return _display_name(self.source)
-
-    def split(self) -> list[SeparationTask]:
-        """Returns a list with only this task, which cannot be split. See `brewster.executors.Task`."""
-        return [self]
-
-    def failed_results(self, reason: str) -> list[FileResult]:
-        """Returns the result of a photo that no worker could separate."""
-        cure = "use fewer workers for each node, or a smaller photo"
-        return [_failed(FileResult(self.name), f"{reason}; expected a photo that fits into memory; {cure}.")]
-
-
-@final
-@dataclass
-class FileResult:
-    """The result for one photo. `brewster --json` prints its fields as one line."""
-
-    source: str
-    """The path of the photo as the caller passed it, or `-` for a stream."""
-    status: Literal["separated", "skipped", "planned", "failed"] = "separated"
-    """`skipped`: all layers exist already. `planned`: a dry run would write `outputs`."""
-    outputs: dict[str, str] = field(default_factory=dict)
-    """The path of each written layer by layer name, or `-` for a stream. If the photo failed, the layers written before."""
-    model: str | None = None
-    model_sha256: str | None = None
-    """The digest of the model file."""
-    photo_sha256: str | None = None
-    """The digest of the photo's file."""
-    device: str | None = None
-    seconds: dict[str, float] = field(default_factory=dict)
-    """Wall time of the steps `decode`, `network`, `upsampling` and `encode`."""
-    residual: float | None = None
-    """See `Separation.residual`."""
-    reconstruction_error: float | None = None
-    """See `Separation.reconstruction_error`."""
-    assessment: Assessment | None = None
-    """See `Separation.assessment`."""
-    reflection_is_derived: bool = False
-    """See `Separation.reflection_is_derived`."""
-    error: str | None = None
-    """The error message, or None."""
 
 
 def separate_files(
@@ -153,49 +87,6 @@ def separate_files(
     return separate_tasks(
         tasks, options, separator, overwrite=overwrite, dry_run=dry_run, on_progress=on_progress
     )
-
-
-def plan_files(
-    sources: str | os.PathLike[str] | Iterable[str | os.PathLike[str]],
-    output: str | os.PathLike[str] | None = None,
-    options: Options = _DEFAULT_OPTIONS,
-    *,
-    videos: list[Path] | None = None,
-) -> list[SeparationTask]:
-    """Finds the photos, and returns a task for each photo with the paths of its layers.
-
-    Args:
-        sources, output, options: see `separate_files`.
-        videos: the list to which videos in the folders are appended. They get no task.
-
-    Raises:
-        PhotoError: the sources contain no photo.
-        ManifestError: a manifest is not a table, or a row of it is not a path.
-        OutputError: the layers of two photos would have the same path.
-    """
-    given = [sources] if isinstance(sources, str | os.PathLike) else sources
-    paths = [location(source) for source in given]
-    folder = None if output is None else location(output)
-    videos = [] if videos is None else videos
-    images = (
-        pair
-        for source in paths
-        for pair in (
-            read_manifest(source, folder) if is_manifest(source) else images_in(source, folder, videos=videos)
-        )
-    )
-    tasks = [
-        SeparationTask(image, outputs)
-        for image, outputs in name_layers(images, options.layers, options.suffix)
-    ]
-    if not tasks:
-        found_videos = f" ({len(videos)} videos)" if videos else ""
-        raise PhotoError(
-            f"there is no photo in {', '.join(map(str, paths))}{found_videos}",
-            f"expected files with one of the suffixes {' '.join(SUFFIXES)}",
-            "pass the path of the file itself, or choose another folder",
-        )
-    return tasks
 
 
 def separate_tasks(
@@ -249,11 +140,11 @@ class BatchRunner:
         try:
             outputs = self._outputs_to_write(task)
         except BrewsterError as error:
-            return _failed(result, error)
+            return result.failed(error)
         if not outputs or self._dry_run:
             result.status = "planned" if outputs else "skipped"
             result.outputs = {
-                layer: _display_name(target) for layer, target in (outputs or task.outputs).items()
+                layer: display_name(target) for layer, target in (outputs or task.outputs).items()
             }
             return result
         # This is not in the try block, because no photo can be separated without a model: a model error ends the batch.
@@ -262,18 +153,17 @@ class BatchRunner:
         try:
             self._separate(separator, SeparationTask(task.source, outputs), result, on_progress)
         except BrewsterError as error:
-            return _failed(result, error)
+            return result.failed(error)
         except MemoryError:
-            return _failed(
-                result,
+            return result.failed(
                 "the photo does not fit into memory; expected more free memory; close other programs, or make the photo smaller.",
             )
         except Exception as error:  # noqa: BLE001  (raised again after the last photo)
             self.unexpected_error = (
                 self.unexpected_error or error
             )  # only the first, because each traceback keeps its photo in memory
-            return _failed(
-                result, f"internal error in brewster ({type(error).__name__}: {error}); please report it"
+            return result.failed(
+                f"internal error in brewster ({type(error).__name__}: {error}); please report it"
             )
         return result
 
@@ -334,7 +224,7 @@ class BatchRunner:
                 write_atomically(target, encoded, overwrite=self._overwrite, source=path)
             else:
                 target.write(encoded)
-            result.outputs[layer] = _display_name(target)
+            result.outputs[layer] = display_name(target)
         result.seconds["encode"] = time.perf_counter() - started
 
 
@@ -343,8 +233,8 @@ def skipped_result(task: SeparationTask) -> FileResult:
     try:
         check_layers(task.source, task.outputs.values())
     except OutputError as error:
-        return _failed(FileResult(task.name), error)
-    outputs = {layer: _display_name(target) for layer, target in task.outputs.items()}
+        return FileResult(task.name).failed(error)
+    outputs = {layer: display_name(target) for layer, target in task.outputs.items()}
     return FileResult(task.name, "skipped", outputs)
 
 
@@ -391,12 +281,3 @@ def _sha256(photo: Path | bytes) -> str | None:
 def real_path(path: Location) -> str:
     """Returns the absolute path without symbolic links; a URL is returned unchanged."""
     return str(path) if isinstance(path, RemotePath) else os.path.realpath(path)
-
-
-def _display_name(source_or_target: object) -> str:
-    return str(source_or_target) if isinstance(source_or_target, Location) else _STREAM_NAME
-
-
-def _failed(result: FileResult, error: object) -> FileResult:
-    result.status, result.error = "failed", str(error)
-    return result

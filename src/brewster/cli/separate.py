@@ -23,7 +23,7 @@ from brewster.models import zoo
 from brewster.options import Options
 
 if TYPE_CHECKING:
-    from brewster.batch.runner import SeparationTask
+    from brewster.batch import SeparationTask
 
 _METAVARS: Final[dict[object, str]] = {int: "NUMBER", float: "NUMBER", Path | None: "FILE"}
 
