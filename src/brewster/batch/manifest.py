@@ -16,7 +16,7 @@ import importlib
 import io
 import posixpath
 from collections.abc import Iterator
-from typing import Any, Final
+from typing import Any, Final, NamedTuple, final
 
 from brewster.errors import BrewsterError, ManifestError, MissingExtra, UnreadablePhoto
 from brewster.remote_path import Location, RemotePath, location
@@ -27,6 +27,19 @@ SUFFIXES: Final = (".csv", ".parquet")
 _EXPECTED: Final = f"expected a CSV or Parquet table with the column {COLUMN!r}"
 
 
+@final
+class ManifestRow(NamedTuple):
+    """A row of a manifest, for messages."""
+
+    manifest: Location
+    number: int
+    """Row 1 is the row below the header."""
+
+    def __str__(self) -> str:
+        """Returns `row 3 of scans.csv`."""
+        return f"row {self.number} of {self.manifest}"
+
+
 def is_manifest(source: Location) -> bool:
     """Whether the name of the file has the suffix of a manifest."""
     return source.suffix.lower() in SUFFIXES
@@ -35,7 +48,7 @@ def is_manifest(source: Location) -> bool:
 def read_manifest(
     manifest: Location, output_folder: Location | None = None
 ) -> Iterator[tuple[Location, Location]]:
-    """Yields each photo of a manifest with the folder for its layers. Files that do not exist are included.
+    """Yields the photo of each row of a manifest, with the folder for its layers. Files that do not exist are included.
 
     Args:
         manifest: the path of the table.
@@ -49,7 +62,7 @@ def read_manifest(
     """
     number = 0
     for number, text in enumerate(_paths(manifest), 1):
-        photo, mirrored = _photo(manifest, text, number)
+        photo, mirrored = _photo(ManifestRow(manifest, number), text)
         yield photo, photo.parent if output_folder is None else output_folder.joinpath(*mirrored)
     if number == 0:
         raise ManifestError(
@@ -59,29 +72,29 @@ def read_manifest(
         )
 
 
-def _photo(manifest: Location, text: object, number: int) -> tuple[Location, tuple[str, ...]]:
+def _photo(row: ManifestRow, text: object) -> tuple[Location, tuple[str, ...]]:
     """Returns the photo of a row, and the parts of the folder for its layers below the output folder."""
     if not isinstance(text, str) or not text.strip():
         raise ManifestError(
-            f"row {number} of {manifest} has the path {text!r}",
+            f"{row} has the path {text!r}",
             "expected the path of a photo",
             "correct the row",
         )
     try:
         photo = location(text)
     except BrewsterError as error:
-        error.happened = f"row {number} of {manifest}: {error.happened}"
+        error.happened = f"{row}: {error.happened}"
         raise
     if isinstance(photo, RemotePath) or photo.is_absolute():
         return photo, photo.parent.parts[1:]
     relative = posixpath.normpath(photo.as_posix())
     if relative.startswith("../"):
         raise ManifestError(
-            f"row {number} of {manifest} has the path {text}, which is outside the folder of the manifest",
+            f"{row} has the path {text}, which is outside the folder of the manifest",
             "expected a relative path below this folder, an absolute path, or a URL",
             "move the manifest, or write absolute paths",
         )
-    return manifest.parent / relative, tuple(relative.split("/")[:-1])
+    return row.manifest.parent / relative, tuple(relative.split("/")[:-1])
 
 
 def _paths(manifest: Location) -> Iterator[object]:
@@ -103,7 +116,7 @@ def _csv_paths(manifest: Location, data: bytes) -> Iterator[object]:
         for number, row in enumerate(rows, 1):
             if any(row.get(None, ())):
                 raise ManifestError(
-                    f"row {number} of {manifest} has more values than the header",
+                    f"{ManifestRow(manifest, number)} has more values than the header",
                     "expected one value for each column",
                     f"write a path that contains {delimiter!r} in double quotes",
                 )

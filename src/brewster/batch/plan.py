@@ -7,15 +7,15 @@ for task in plan_files("holiday", "clear"):
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final, Literal, Protocol, final
 
 from brewster.batch.layer_names import name_layers
-from brewster.batch.manifest import is_manifest, read_manifest
+from brewster.batch.manifest import ManifestRow, is_manifest, read_manifest
 from brewster.errors import PhotoError
-from brewster.files import images_in
+from brewster.files import absolute, images_in
 from brewster.image_formats import SUFFIXES
 from brewster.inference.assessment import Assessment
 from brewster.options import Options
@@ -47,6 +47,8 @@ class SeparationTask:
     source: Location | InputStream
     outputs: Mapping[str, Location | OutputStream]
     """The output of each layer, by layer name (`transmission`, `reflection` or `confidence`)."""
+    row: ManifestRow | None = None
+    """The first row of a manifest that lists the photo, or None if no manifest lists it."""
 
     @property
     def name(self) -> str:
@@ -121,16 +123,20 @@ def plan_files(
     paths = [location(source) for source in given]
     folder = None if output is None else location(output)
     videos = [] if videos is None else videos
-    images = (
-        pair
-        for source in paths
-        for pair in (
-            read_manifest(source, folder) if is_manifest(source) else images_in(source, folder, videos=videos)
-        )
-    )
+    rows: dict[str, ManifestRow] = {}
+
+    def images() -> Iterator[tuple[Location, Location]]:
+        for source in paths:
+            if not is_manifest(source):
+                yield from images_in(source, folder, videos=videos)
+                continue
+            for number, (image, image_folder) in enumerate(read_manifest(source, folder), 1):
+                rows.setdefault(absolute(image), ManifestRow(source, number))
+                yield image, image_folder
+
     tasks = [
-        SeparationTask(image, outputs)
-        for image, outputs in name_layers(images, options.layers, options.suffix)
+        SeparationTask(image, outputs, rows.get(absolute(image)))
+        for image, outputs in name_layers(images(), options.layers, options.suffix)
     ]
     if not tasks:
         found_videos = f" ({len(videos)} videos)" if videos else ""

@@ -14,6 +14,8 @@ import hashlib
 import os
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Final, final
@@ -26,7 +28,7 @@ from brewster.batch.plan import (
     display_name,
     plan_files,
 )
-from brewster.errors import BrewsterError, OutputError
+from brewster.errors import BrewsterError, OutputError, PhotoError
 from brewster.files import exists, is_same_file, write_atomically
 from brewster.image_formats import format_of
 from brewster.inference.layer_history import find_layer_of_another_photo
@@ -68,7 +70,9 @@ def separate_files(
         options: layers, strength, quality, format and so on, the same as the options of the command line.
         separator: the model. By default, it is loaded with `options` when the first photo needs it.
         overwrite: whether layers that exist are replaced instead of skipped.
-        dry_run: if true, no file is written and no model is loaded. The results contain the paths of the missing layers.
+        dry_run: if true, no file is written and no model is loaded. The results contain the paths of the missing layers. A
+            photo that does not exist, or cannot be opened, fails as in a real run. In an object store, this needs one request
+            for each photo.
         on_progress: see `BatchProgressCallback`.
 
     Returns:
@@ -139,6 +143,9 @@ class BatchRunner:
         result = FileResult(task.name)
         try:
             outputs = self._outputs_to_write(task)
+            if outputs and self._dry_run and isinstance(task.source, Location):
+                with _row_in_error(task):
+                    check_readable(task.source)
         except BrewsterError as error:
             return result.failed(error)
         if not outputs or self._dry_run:
@@ -151,7 +158,7 @@ class BatchRunner:
         self._separator = separator = self._separator or Separator.load(**self._options.load_options())
         result.model, result.model_sha256, result.device = separator.name, separator.sha256, separator.device
         try:
-            self._separate(separator, SeparationTask(task.source, outputs), result, on_progress)
+            self._separate(separator, replace(task, outputs=outputs), result, on_progress)
         except BrewsterError as error:
             return result.failed(error)
         except MemoryError:
@@ -204,7 +211,8 @@ class BatchRunner:
         on_progress: Callable[[float], None],
     ) -> None:
         path = task.source if isinstance(task.source, Location) else None
-        photo = read_content(task.source)
+        with _row_in_error(task):
+            photo = read_content(task.source)
         result.photo_sha256 = _sha256(photo)
         separation = separator(photo, on_progress=on_progress, **self._options.call_options())
         result.seconds, result.residual = dict(separation.seconds), separation.residual
@@ -269,6 +277,17 @@ def read_content(source: Location | InputStream) -> Path | bytes:
         check_readable(source)
         return source
     return read_image(source) if isinstance(source, RemotePath) else source.read()
+
+
+@contextmanager
+def _row_in_error(task: SeparationTask) -> Iterator[None]:
+    """Adds the row of the manifest to the error of a photo that does not exist or cannot be read."""
+    try:
+        yield
+    except PhotoError as error:
+        if task.row:
+            error.happened = f"{task.row}: {error.happened}"
+        raise
 
 
 def _sha256(photo: Path | bytes) -> str | None:

@@ -250,9 +250,10 @@ def _duration(seconds: float) -> str:
 
 
 def _error_text(result: FileResult) -> str:
-    """Returns the error message of a photo, which begins with its path."""
-    has_source = str(result.error).startswith(f"{result.source} ")
-    return str(result.error) if has_source else f"{result.source}: {result.error}"
+    """Returns the error message of a photo, with its path in front if the message does not begin with it or with its row."""
+    error = str(result.error)
+    has_source = error.startswith(f"{result.source} ") or f": {result.source} " in error
+    return error if has_source else f"{result.source}: {error}"
 
 
 def _json_line(result: FileResult) -> bytes:

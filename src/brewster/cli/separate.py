@@ -167,7 +167,11 @@ def _param_type(hint: object, field: dataclasses.Field[Any]) -> click.ParamType[
     "--json", "as_json", is_flag=True, help="Print one line of JSON for each photo on standard output."
 )
 @click.option("--quiet", is_flag=True, help="Print only errors.")
-@click.option("--dry-run", is_flag=True, help="Print the planned files, and write nothing.")
+@click.option(
+    "--dry-run",
+    is_flag=True,
+    help="Print the planned files, and the photos that cannot be opened. Write nothing.",
+)
 @click.option("--overwrite", is_flag=True, help="Replace existing layers.")
 @click.option(
     "--contact-sheet",
