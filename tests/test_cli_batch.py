@@ -363,7 +363,7 @@ def test_a_missing_layer_is_added_and_the_existing_one_is_kept(run, tmp_path):
     (tmp_path / "a.jpg").write_bytes(image_bytes())
     (tmp_path / "a.transmission.jpg").write_bytes(b"mine")
     code, out, _ = run("a.jpg", "--json")
-    assert (code, json_lines(out)[0]["outputs"]) == (0, {"reflection": "a.reflection.jpg"})
+    assert (code, json_lines(out)[0]["outputs"]) == (0, {layer: f"a.{layer}.jpg" for layer in LAYERS})
     assert (tmp_path / "a.transmission.jpg").read_bytes() == b"mine"
 
 
@@ -418,7 +418,7 @@ def test_rows_without_a_readable_photo_are_errors_with_their_number_also_in_a_dr
     statuses = [line["status"] for line in json_lines(out)]
     assert (code, statuses.count("failed")) == (1, 3)
     assert statuses.count("planned" if "--dry-run" in options else "separated") == 1
-    root = f"{tmp_path}/" if "--workers" in options and "--dry-run" not in options else ""
+    root = f"{tmp_path}/" if "--workers" in options else ""
     assert sorted(error_lines(err)) == [
         (
             f"error: row 2 of {root}list.csv: {root}scans/none.jpg cannot be read (No such file or directory); "

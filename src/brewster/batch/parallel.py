@@ -86,8 +86,6 @@ class SeparationRunner:
         if result.error and not self._overwrite and _is_finished(task, exists):
             # This worker was slow, and another worker got the same task and has already written the layers.
             result = skipped_result(task)
-        if not result.error:
-            result.outputs = {layer: str(target) for layer, target in task.outputs.items()}
         return [result]
 
 

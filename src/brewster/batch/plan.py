@@ -75,7 +75,8 @@ class FileResult:
     status: Literal["separated", "skipped", "planned", "failed"] = "separated"
     """`skipped`: all layers exist already. `planned`: a dry run would write `outputs`."""
     outputs: dict[str, str] = field(default_factory=dict)
-    """The path of each written layer by layer name, or `-` for a stream. If the photo failed, the layers written before."""
+    """The path of each layer by layer name, or `-` for a stream. If the photo failed, the layers that were written before. If it is
+    planned, the missing layers."""
     model: str | None = None
     model_sha256: str | None = None
     """The digest of the model file."""

@@ -13,7 +13,7 @@ from __future__ import annotations
 import hashlib
 import os
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
@@ -150,9 +150,7 @@ class BatchRunner:
             return result.failed(error)
         if not outputs or self._dry_run:
             result.status = "planned" if outputs else "skipped"
-            result.outputs = {
-                layer: display_name(target) for layer, target in (outputs or task.outputs).items()
-            }
+            result.outputs = _names(outputs or task.outputs)
             return result
         # This is not in the try block, because no photo can be separated without a model: a model error ends the batch.
         self._separator = separator = self._separator or Separator.load(**self._options.load_options())
@@ -172,6 +170,7 @@ class BatchRunner:
             return result.failed(
                 f"internal error in brewster ({type(error).__name__}: {error}); please report it"
             )
+        result.outputs = _names(task.outputs)  # also the layers that existed before
         return result
 
     def _outputs_to_write(self, task: SeparationTask) -> dict[str, Location | OutputStream]:
@@ -242,8 +241,11 @@ def skipped_result(task: SeparationTask) -> FileResult:
         check_layers(task.source, task.outputs.values())
     except OutputError as error:
         return FileResult(task.name).failed(error)
-    outputs = {layer: display_name(target) for layer, target in task.outputs.items()}
-    return FileResult(task.name, "skipped", outputs)
+    return FileResult(task.name, "skipped", _names(task.outputs))
+
+
+def _names(outputs: Mapping[str, Location | OutputStream]) -> dict[str, str]:
+    return {layer: display_name(target) for layer, target in outputs.items()}
 
 
 def check_layers(source: Location | InputStream, layers: Iterable[Location | OutputStream]) -> None:

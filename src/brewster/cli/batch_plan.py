@@ -38,7 +38,7 @@ def local_path(text: str) -> str:
 
 
 def absolute_path(path: str) -> str:
-    """Returns the absolute path, or the URL: the workers of a batch may have other working folders."""
+    """Returns the absolute path, or the URL."""
     found = location(path)
     return os.path.abspath(found) if isinstance(found, Path) else str(found)  # noqa: PTH100  (keeps links)
 

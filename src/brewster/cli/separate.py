@@ -248,9 +248,11 @@ def separate(
     if is_plan or gpu_name:
         _print_plan(photos, output, options, gpu_name)
         return
-    if (workers or cluster or index) and not dry_run:
+    if workers or cluster or index:
+        # All paths become absolute: other nodes have other working folders, and the index is read from any folder.
         _check_archive_output(single_output, output, needs_folder=bool(cluster or index))
         photos, output = tuple(map(absolute_path, photos)), output and absolute_path(output)
+        contact_sheet = contact_sheet and contact_sheet.absolute()
     videos: list[Path] = []
     tasks = plan(photos, output, options, videos)
     if single_output and output in (None, "-") and not dry_run:
