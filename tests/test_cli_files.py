@@ -142,6 +142,26 @@ def test_videos_are_counted_and_named(run, run_without_model, tmp_path):
     for layer in layer_files("a"):
         (tmp_path / layer).unlink()
     assert "no photo in . (2 videos)" in run_without_model(".")[2]
+    (tmp_path / "c.MOV").rename(tmp_path / "notes")
+    assert "no photo in . (1 video, 1 other file)" in run_without_model(".")[2]
+
+
+def test_other_files_in_a_folder_are_counted_by_suffix_with_an_example(run, tmp_path):
+    names = ("a.jpg", "a.mask.png", "b/scan", "b/x.BMP", "b/y.bmp", "notes.txt", ".hidden", ".folder/c.bmp")
+    for name in names:
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_bytes(image_bytes())
+    line = (
+        "4 other files skipped (2 .bmp, 1 without a suffix, 1 .txt), for example b/scan: expected the suffix of an image; "
+        "if such a file is a photo, pass its own path, or convert it"
+    )
+    for _ in range(2):  # layers are not counted
+        code, _, err = run(".")
+        assert (code, line in err.splitlines()) == (0, True)
+    assert run(".", "--quiet")[2] == ""
+    code, _, err = run("b/scan")  # named files are read by their content
+    assert (code, "skipped (" in err) == (0, False)
+    assert (tmp_path / "b/scan.transmission.png").is_file()
 
 
 # --- existing layers

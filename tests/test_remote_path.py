@@ -86,7 +86,16 @@ def test_a_file_in_a_store_is_written_once():
 
 
 def test_photos_in_a_store_are_found_like_those_in_a_folder(tmp_path):
-    names = ("b/c.png", "a.jpg", "a.mask.png", "b/c.jpg", ".hidden/d.jpg", "a.transmission.jpg", "notes.txt")
+    names = (
+        "b/c.png",
+        "a.jpg",
+        "a.mask.png",
+        "b/c.jpg",
+        ".hidden/d.jpg",
+        "a.transmission.jpg",
+        "notes.txt",
+        "b/d.mp4",
+    )
     root = location("memory://bucket/in")
     for name in names:
         (root / name).write_bytes(b"")
@@ -95,7 +104,9 @@ def test_photos_in_a_store_are_found_like_those_in_a_folder(tmp_path):
     output = location("memory://out")
 
     def found(folder):
-        tasks = plan_files(folder, output, Options(layers=("reflection",)))
+        skipped = []
+        tasks = plan_files(folder, output, Options(layers=("reflection",)), skipped=skipped)
+        assert [path.relative_to(folder).as_posix() for path in skipped] == ["b/d.mp4", "notes.txt"]
         return {task.source.relative_to(folder).as_posix(): str(task.outputs["reflection"]) for task in tasks}
 
     assert found(root) == found(tmp_path)

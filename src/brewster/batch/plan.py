@@ -9,14 +9,13 @@ from __future__ import annotations
 import os
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Final, Literal, Protocol, final
 
 from brewster.batch.layer_names import name_layers
 from brewster.batch.manifest import ManifestRow, is_manifest, read_manifest
-from brewster.errors import PhotoError
+from brewster.errors import PhotoError, counted
 from brewster.files import absolute, images_in
-from brewster.image_formats import SUFFIXES
+from brewster.image_formats import SUFFIXES, is_video
 from brewster.inference.assessment import Assessment
 from brewster.options import Options
 from brewster.remote_path import Location, location
@@ -107,13 +106,14 @@ def plan_files(
     output: str | os.PathLike[str] | None = None,
     options: Options = _DEFAULT_OPTIONS,
     *,
-    videos: list[Path] | None = None,
+    skipped: list[Location] | None = None,
 ) -> list[SeparationTask]:
     """Finds the photos, and returns a task for each photo with the paths of its layers.
 
     Args:
         sources, output, options: see `separate_files`.
-        videos: the list to which videos in the folders are appended. They get no task.
+        skipped: the list to which the files in the folders are appended that do not have the suffix of an image, such as videos.
+            They get no task. Hidden files are left out.
 
     Raises:
         PhotoError: the sources contain no photo.
@@ -123,13 +123,13 @@ def plan_files(
     given = [sources] if isinstance(sources, str | os.PathLike) else sources
     paths = [location(source) for source in given]
     folder = None if output is None else location(output)
-    videos = [] if videos is None else videos
+    skipped = [] if skipped is None else skipped
     rows: dict[str, ManifestRow] = {}
 
     def images() -> Iterator[tuple[Location, Location]]:
         for source in paths:
             if not is_manifest(source):
-                yield from images_in(source, folder, videos=videos)
+                yield from images_in(source, folder, skipped=skipped)
                 continue
             for number, (image, image_folder) in enumerate(read_manifest(source, folder), 1):
                 rows.setdefault(absolute(image), ManifestRow(source, number))
@@ -140,9 +140,11 @@ def plan_files(
         for image, outputs in name_layers(images(), options.layers, options.suffix)
     ]
     if not tasks:
-        found_videos = f" ({len(videos)} videos)" if videos else ""
+        videos = sum(map(is_video, skipped))
+        counts = {"video": videos, "other file": len(skipped) - videos}
+        found = ", ".join(counted(number, kind) for kind, number in counts.items() if number)
         raise PhotoError(
-            f"there is no photo in {', '.join(map(str, paths))}{found_videos}",
+            f"there is no photo in {', '.join(map(str, paths))}{f' ({found})' if found else ''}",
             f"expected files with one of the suffixes {' '.join(SUFFIXES)}",
             "pass the path of the file itself, or choose another folder",
         )

@@ -14,7 +14,7 @@ from click.core import ParameterSource
 from click.shell_completion import CompletionItem
 
 from brewster.cli.batch import BatchCommand
-from brewster.cli.batch_plan import absolute_path, is_single_output, local_path, plan, skipped_videos
+from brewster.cli.batch_plan import absolute_path, is_single_output, local_path, plan, skipped_files
 from brewster.cli.extras import require_extra
 from brewster.cli.terminal import print_out, print_status, standard_output
 from brewster.errors import BrewsterError
@@ -24,6 +24,7 @@ from brewster.options import Options
 
 if TYPE_CHECKING:
     from brewster.batch import SeparationTask
+    from brewster.remote_path import Location
 
 _METAVARS: Final[dict[object, str]] = {int: "NUMBER", float: "NUMBER", Path | None: "FILE"}
 
@@ -225,7 +226,7 @@ def separate(
 ) -> None:
     """Separate photos taken through glass into transmission and reflection.
 
-    PHOTO is an image file, a folder of image files, a table of paths (.csv or .parquet, with the column path), the URL of one
+    PHOTO is an image file, a folder of image files (other files in it are counted, and skipped), a table of paths (.csv or .parquet, with the column path), the URL of one
     of these in an object store (s3://bucket/folder), or - for standard input. The layers of photo.jpg are written next
     to it as photo.transmission.jpg and photo.reflection.jpg, or into the output folder, which mirrors the tree below an
     input folder. If -o is an image file or standard output, only one layer is written: the layer that --layers selects,
@@ -253,8 +254,8 @@ def separate(
         _check_archive_output(single_output, output, needs_folder=bool(cluster or index))
         photos, output = tuple(map(absolute_path, photos)), output and absolute_path(output)
         contact_sheet = contact_sheet and contact_sheet.absolute()
-    videos: list[Path] = []
-    tasks = plan(photos, output, options, videos)
+    skipped: list[Location] = []
+    tasks = plan(photos, output, options, skipped)
     if single_output and output in (None, "-") and not dry_run:
         _reject_shared_output(as_json=as_json)
     if contact_sheet and cluster:
@@ -262,8 +263,8 @@ def separate(
     if contact_sheet:
         _check_contact_sheet(contact_sheet, photos, output)
         tasks = _without_contact_sheet(tasks, contact_sheet, overwrite=overwrite)
-    if videos and not quiet:
-        print_status(skipped_videos(videos))
+    for line in skipped_files(skipped) if not quiet else ():
+        print_status(line)
     batch = BatchCommand(
         options,
         output=output,
