@@ -214,7 +214,7 @@ def test_floats_that_are_not_finite_are_refused(format_name: str, value: float) 
     broken[2, 1, 0] = value
     bad = Photo(broken, None, whole.file_info)
     if format_name == "tiff" or np.isnan(value):
-        assert_refused(bad.encode(format_name, depth=32), UnsupportedPhoto, "1 pixels")
+        assert_refused(bad.encode(format_name, depth=32), UnsupportedPhoto, "^1 pixel is infinite or NaN")
     with pytest.raises(UnsupportedPhoto, match="finite"):
         Photo.from_array(broken, encoding="linear")
 

@@ -226,10 +226,10 @@ def separate(
 ) -> None:
     """Separate photos taken through glass into transmission and reflection.
 
-    PHOTO is an image file, a folder of image files (other files in it are counted, and skipped), a table of paths (.csv or .parquet, with the column path), the URL of one
-    of these in an object store (s3://bucket/folder), or - for standard input. The layers of photo.jpg are written next
-    to it as photo.transmission.jpg and photo.reflection.jpg, or into the output folder, which mirrors the tree below an
-    input folder. If -o is an image file or standard output, only one layer is written: the layer that --layers selects,
+    PHOTO is an image file, a folder of image files (other files in it are counted, and skipped), a table of paths (.csv or
+    .parquet, with the column path), the URL of one of these in an object store (s3://bucket/folder), or - for standard
+    input. The layers of photo.jpg are written next to it as photo.transmission.jpg and photo.reflection.jpg, or into the
+    output folder, which mirrors the tree below an input folder. If -o is an image file or standard output, only one layer is written: the layer that --layers selects,
     by default the transmission.
 
     Photos whose layers exist are skipped. A photo fails if these layers were made from another photo, for example one with the

@@ -19,7 +19,7 @@ import numpy as np
 import pyvips
 from numpy.typing import NDArray
 
-from brewster.errors import MissingExtra, PhotoError, UnreadablePhoto, UnsupportedPhoto, video_error
+from brewster.errors import MissingExtra, PhotoError, UnreadablePhoto, UnsupportedPhoto, counted, video_error
 from brewster.files import DEFAULT_MAX_PIXELS
 from brewster.image_formats import FORMATS, VIDEO_SIGNATURE
 from brewster.photo import metadata
@@ -66,7 +66,7 @@ def decode(data: bytes, max_pixels: int) -> Decoded:
     if decoded.pixels.dtype.kind == "f" and not np.isfinite(decoded.pixels).all():
         count = int((~np.isfinite(decoded.pixels)).any(axis=2).sum())
         raise UnsupportedPhoto(
-            f"{count} pixels are infinite or NaN",
+            f"{counted(count, 'pixel')} {'is' if count == 1 else 'are'} infinite or NaN",
             "expected finite values",
             "render the image again without such pixels",
         )
