@@ -40,6 +40,10 @@ def assert_refused(source: object, error: type[PhotoError], message: str, **opti
     assert str(raised.value).count("; ") >= 2  # what happened, what was expected, what to do
 
 
+OWN_MESSAGE = r"^the \w+ cannot be read completely( \(pixels are missing\))?; expected "
+"""The message for a damaged file, which does not have the message of the library that reads it."""
+
+
 @pytest.mark.parametrize("fraction", [0.03, 0.3, 0.6, 0.9])
 @pytest.mark.parametrize(
     ("kind", "options"),
@@ -57,7 +61,7 @@ def assert_refused(source: object, error: type[PhotoError], message: str, **opti
 )
 def test_a_truncated_image_is_refused(kind: str, options: dict[str, object], fraction: float) -> None:
     data = file_of(kind, **options)
-    assert_refused(data[: int(len(data) * fraction)], UnreadablePhoto, "read completely")
+    assert_refused(data[: int(len(data) * fraction)], UnreadablePhoto, OWN_MESSAGE)
 
 
 @pytest.mark.parametrize("size", [4, 7])
@@ -77,7 +81,8 @@ def test_a_tiff_with_missing_tiles_is_refused() -> None:
 @pytest.mark.parametrize("format_name", ["exr", "hdr"])
 def test_truncated_floats_are_refused(format_name: str, fraction: float) -> None:
     data = Photo.from_array(NOISE, encoding="srgb").encode(format_name)
-    assert_refused(data[: int(len(data) * fraction)], PhotoError, "; ")
+    message = {"exr": OWN_MESSAGE, "hdr": "; "}[format_name]
+    assert_refused(data[: int(len(data) * fraction)], PhotoError, message)
 
 
 def test_a_heic_without_an_image_is_refused() -> None:
@@ -88,7 +93,7 @@ def test_a_heic_without_an_image_is_refused() -> None:
 def test_a_heic_whose_image_is_longer_than_the_file_is_refused() -> None:
     data = bytearray(Photo.from_array(NOISE, encoding="srgb").encode("heic"))
     data[data.index(b"mdat") + 4] = 0xFF  # the length of the first unit
-    assert_refused(bytes(data), UnreadablePhoto, "end of file")
+    assert_refused(bytes(data), UnreadablePhoto, OWN_MESSAGE)
 
 
 def test_an_empty_file_is_refused(tmp_path: Path) -> None:
