@@ -62,14 +62,14 @@ def test_a_protocol_that_is_unknown_or_not_installed_is_reported_before_any_phot
 def test_a_web_address_is_refused_with_what_to_do(url):
     with pytest.raises(BrewsterError) as raised:
         location(url)
-    assert str(raised.value).startswith(f"{url} is a web address; expected a file or folder of this machine")
+    assert str(raised.value).startswith(f"{url} is a web address; expected a file or folder on this machine")
     assert raised.value.cure == "download the photo, and pass the path of the file"
 
 
 @pytest.mark.parametrize("url", ["file://server/scans/a.jpg", "file://a.jpg", "file://localhosts/a.jpg"])
 def test_a_file_of_another_machine_is_refused(url):
     host = url.split("/")[2]
-    with pytest.raises(BrewsterError, match=f"is a file of the machine {host}; expected a file of this"):
+    with pytest.raises(BrewsterError, match=f"is a file on the machine {host}; expected a file on this"):
         location(url)
 
 

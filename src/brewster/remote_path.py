@@ -160,7 +160,7 @@ def location(text: str | os.PathLike[str]) -> Location:
     if url.lower().startswith(("http://", "https://")):
         raise BrewsterError(
             f"{url} is a web address",
-            "expected a file or folder of this machine, or the URL of an object store such as s3://bucket/folder",
+            "expected a file or folder on this machine, or the URL of an object store such as s3://bucket/folder",
             "download the photo, and pass the path of the file",
         )
     path = RemotePath(url)
@@ -182,8 +182,8 @@ def path_of_file_url(url: str) -> str:
     if sys.platform == "win32":
         return url2pathname(f"//{host}/{path}")
     raise BrewsterError(
-        f"{url} is a file of the machine {host}",
-        "expected a file of this machine: a path, or a URL such as file:///home/me/photo.jpg",
+        f"{url} is a file on the machine {host}",
+        "expected a file on this machine: a path, or a URL such as file:///home/me/photo.jpg",
         "copy the file to this machine, or mount its folder and pass the path there",
     )
 
