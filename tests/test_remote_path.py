@@ -1,5 +1,6 @@
 """Files in object stores. The store is fsspec's memory://, which behaves like S3 without a network."""
 
+import os
 import pickle
 import sys
 from pathlib import Path
@@ -128,6 +129,12 @@ def test_a_file_is_checked_without_reading_it(store, monkeypatch):
     monkeypatch.setattr(type(store), "info", fail)
     with pytest.raises(UnreadablePhoto, match=r"cannot be read \(503 Slow Down\)"):
         check_readable(folder / "a.jpg")
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="Windows has no named pipes in folders")
+def test_a_pipe_is_not_opened_to_check_it(tmp_path):
+    os.mkfifo(tmp_path / "photo.jpg")  # opening a pipe without a writer would wait forever
+    check_readable(tmp_path / "photo.jpg")
 
 
 def test_errors_of_a_store_name_the_file_and_the_reason(store, monkeypatch):

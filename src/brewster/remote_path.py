@@ -204,13 +204,18 @@ def read_image(path: Location) -> bytes:
 
 
 def check_readable(path: Location) -> None:
-    """Checks that an image file exists and can be opened. Raises the errors of `read_image`, but does not read the content."""
+    """Checks that an image file exists and can be opened. Raises the errors of `read_image`, but does not read the content.
+
+    Pipes are not checked, because they can be opened only once.
+    """
     if isinstance(path, RemotePath):
         _check_not_video(path)
         path.check_readable()
         return
-    with _opened(path):
-        pass
+    is_pipe = os.path.exists(path) and not os.path.isfile(path) and not os.path.isdir(path)  # noqa: PTH110, PTH112, PTH113
+    if not is_pipe:
+        with _opened(path):
+            pass
 
 
 @contextlib.contextmanager
