@@ -363,7 +363,7 @@ def test_a_missing_layer_is_added_and_the_existing_one_is_kept(run, tmp_path):
     (tmp_path / "a.jpg").write_bytes(image_bytes())
     (tmp_path / "a.transmission.jpg").write_bytes(b"mine")
     code, out, _ = run("a.jpg", "--json")
-    assert (code, json_lines(out)[0]["outputs"]) == (0, {"reflection": "a.reflection.jpg"})
+    assert (code, json_lines(out)[0]["outputs"]) == (0, {layer: f"a.{layer}.jpg" for layer in LAYERS})
     assert (tmp_path / "a.transmission.jpg").read_bytes() == b"mine"
 
 
@@ -406,6 +406,44 @@ def test_a_dry_run_prints_the_planned_files_and_writes_nothing(run, tmp_path):
     planned = json_lines(run(".", "--dry-run", "--json")[1])
     assert [line["status"] for line in planned] == ["planned", "planned"]
     assert list_files(tmp_path) == before
+
+
+@pytest.mark.parametrize("options", [[], ["--workers", "1"], ["--dry-run"], ["--dry-run", "--workers", "1"]])
+def test_rows_without_a_readable_photo_are_errors_with_their_number_also_in_a_dry_run(run, tmp_path, options):
+    (tmp_path / "scans/folder").mkdir(parents=True)
+    for name in ("a.jpg", "clip.mp4"):
+        (tmp_path / "scans" / name).write_bytes(image_bytes())
+    (tmp_path / "list.csv").write_text("path\nscans/a.jpg\nscans/none.jpg\nscans/folder\nscans/clip.mp4\n")
+    code, out, err = run("list.csv", "-o", "out", "--json", *options)
+    statuses = [line["status"] for line in json_lines(out)]
+    assert (code, statuses.count("failed")) == (1, 3)
+    assert statuses.count("planned" if "--dry-run" in options else "separated") == 1
+    root = f"{tmp_path}/" if "--workers" in options else ""
+    assert sorted(error_lines(err)) == [
+        (
+            f"error: row 2 of {root}list.csv: {root}scans/none.jpg cannot be read (No such file or directory); "
+            "expected an image file; check its name and permissions."
+        ),
+        (
+            f"error: row 3 of {root}list.csv: {root}scans/folder cannot be read (it is a folder); "
+            "expected an image file; check its name and permissions."
+        ),
+        (
+            f"error: row 4 of {root}list.csv: {root}scans/clip.mp4 is a video; expected a photo; "
+            "extract single images first, for example with ffmpeg."
+        ),
+    ]
+
+
+def test_a_dry_run_reports_photos_that_do_not_exist(run, tmp_path):
+    (tmp_path / "a.jpg").write_bytes(image_bytes())
+    code, out, err = run("a.jpg", "b.jpg", "--dry-run", "--layers", "transmission")
+    assert (code, out) == (1, b"a.jpg -> a.transmission.jpg\n")
+    assert error_lines(err) == [
+        "error: b.jpg cannot be read (No such file or directory); expected an image file; check its name and permissions."
+    ]
+    assert run("-", "--dry-run", stdin=image_bytes())[0] == 0
+    assert list_files(tmp_path) == ["a.jpg"]
 
 
 def test_json_has_the_result_of_each_photo(run, tmp_path, model):

@@ -46,7 +46,19 @@ def test_an_existing_file_keeps_its_name_even_if_it_has_quotes(tmp_path, monkeyp
 )
 def test_addresses_of_windows_become_its_paths(address, path, monkeypatch):
     monkeypatch.setattr(urllib.request, "url2pathname", nturl2path.url2pathname)
+    monkeypatch.setattr(sys, "platform", "win32")
     assert batch_plan.local_path(address).removeprefix("\\\\?\\") == path
+
+
+@pytest.mark.parametrize("address", ["https://example.org/a.jpg", "file://host/a.jpg"])
+@pytest.mark.parametrize("options", [[], ["--workers", "2"], ["-o", "clear.jpg"]])
+def test_an_address_of_another_machine_is_refused(run, tmp_path, address, options):
+    code, _, err = run(address, *options)
+    (line,) = error_lines(err)
+    assert code == 1
+    assert line.startswith(f"error: {address} is ")
+    assert line.count("; ") == 2
+    assert list_files(tmp_path) == []
 
 
 # --- suffixes
@@ -144,11 +156,31 @@ def test_videos_are_counted_and_named(run, run_without_model, tmp_path):
     assert "2 videos (b.mp4, c.MOV) skipped" in err
     code, _, err = run("b.mp4")
     assert code == 1
-    assert "the file is a video" in err
+    assert error_lines(err)[0].startswith("error: b.mp4 is a video; expected a photo; extract single images")
     (tmp_path / "a.jpg").unlink()
     for layer in layer_files("a"):
         (tmp_path / layer).unlink()
     assert "no photo in . (2 videos)" in run_without_model(".")[2]
+    (tmp_path / "c.MOV").rename(tmp_path / "notes")
+    assert "no photo in . (1 video, 1 other file)" in run_without_model(".")[2]
+
+
+def test_other_files_in_a_folder_are_counted_by_suffix_with_an_example(run, tmp_path):
+    names = ("a.jpg", "a.mask.png", "b/scan", "b/x.BMP", "b/y.bmp", "notes.txt", ".hidden", ".folder/c.bmp")
+    for name in names:
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_bytes(image_bytes())
+    line = (
+        "4 other files skipped (2 .bmp, 1 without a suffix, 1 .txt), for example b/scan: expected the suffix of an image; "
+        "if such a file is a photo, pass its own path, or convert it"
+    )
+    for _ in range(2):  # layers are not counted
+        code, _, err = run(".")
+        assert (code, line in err.splitlines()) == (0, True)
+    assert run(".", "--quiet")[2] == ""
+    code, _, err = run("b/scan")  # named files are read by their content
+    assert (code, "skipped (" in err) == (0, False)
+    assert (tmp_path / "b/scan.transmission.jpg").is_file()
 
 
 # --- existing layers

@@ -12,13 +12,18 @@ import pytest
 from pydantic import AfterValidator, AwareDatetime, BaseModel, ConfigDict, Field, ValidationError
 
 from brewster import errors
-from brewster.errors import PhotoError
+from brewster.errors import PhotoError, counted
 
 ERROR_CLASSES = [value for value in vars(errors).values() if inspect.isclass(value)]
 
 
 def raise_photo_error():
     raise PhotoError("the width is 7", "expected an even width", "crop the image")
+
+
+@pytest.mark.parametrize(("number", "text"), [(0, "0 videos"), (1, "1 video"), (2, "2 videos")])
+def test_a_noun_has_the_number_in_front_of_it(number, text):
+    assert counted(number, "video") == text
 
 
 @pytest.mark.parametrize("kind", ERROR_CLASSES)

@@ -127,6 +127,15 @@ def test_hidden_files_and_results_are_skipped(tmp_path: Path) -> None:
     assert list(find(tmp_path)) == ["a.jpg"]
 
 
+def test_every_visible_file_of_a_folder_is_an_image_or_skipped(tmp_path: Path) -> None:
+    touch(tmp_path, "a.jpg", "b.mp4", "c.bmp", "d", ".e", "x/f.txt", ".y/g.txt", "a.transmission.jpg")
+    (tmp_path / "h.jp2").symlink_to("nothing")
+    skipped: list[files.Location] = []
+    images = [image.name for image, _ in images_in(tmp_path, skipped=skipped)]
+    assert images == ["a.jpg"]
+    assert [path.name for path in skipped] == ["b.mp4", "c.bmp", "d", "h.jp2", "f.txt"]
+
+
 def test_masks_are_skipped_if_their_photo_is_in_the_same_folder(tmp_path: Path) -> None:
     touch(
         tmp_path, "a.jpg", "a.mask.png", "b.mask.png", "x/a.mask.png", "x/c.mask.png", "x/c.tif", "mask.png"

@@ -8,7 +8,7 @@ from pyarrow import parquet
 
 from brewster.batch import plan_files
 from brewster.batch.manifest import read_manifest
-from brewster.errors import ManifestError, PhotoError
+from brewster.errors import BrewsterError, ManifestError
 from brewster.remote_path import location
 from cli_helpers import image_bytes
 
@@ -52,8 +52,42 @@ def test_a_batch_accepts_manifests_and_missing_photos_are_tasks_too(tmp_path):
     tasks = plan_files(manifest, tmp_path / "out")
     assert [Path(task.name).name for task in tasks] == ["missing.jpg", "a.png"]
     assert tasks[1].outputs["transmission"] == tmp_path / "out/in/a.transmission.png"
-    with pytest.raises(PhotoError, match="there is no photo in"):
-        plan_files(write_manifest(tmp_path / "empty.csv"))
+
+
+@pytest.mark.parametrize("suffix", [".csv", ".parquet"])
+def test_a_manifest_without_rows_is_refused(tmp_path, suffix):
+    manifest = write_manifest(tmp_path / f"empty{suffix}")
+    with pytest.raises(
+        ManifestError, match="has only the names of its columns, and no rows; expected a row for"
+    ):
+        plan_files(manifest)
+
+
+@pytest.mark.parametrize("delimiter", [",", ";", "\t"])
+@pytest.mark.parametrize("quote", ["", '"'])
+def test_the_values_of_a_csv_table_are_separated_by_commas_semicolons_or_tabs(tmp_path, delimiter, quote):
+    rows = [("year", "path"), ("1987", "a.jpg"), ("1988", "b.jpg")]
+    lines = [delimiter.join(f"{quote}{value}{quote}" for value in row) for row in rows]
+    manifest = tmp_path / "list.csv"
+    manifest.write_text("\r\n".join(lines), newline="")
+    assert [photo.name for photo, _ in read_manifest(manifest)] == ["a.jpg", "b.jpg"]
+
+
+def test_the_column_path_decides_which_character_separates_the_values(tmp_path):
+    manifest = tmp_path / "list.csv"
+    manifest.write_text('path;"notes, and more, and more"\na,b.jpg;\n')
+    assert [photo.name for photo, _ in read_manifest(manifest)] == ["a,b.jpg"]
+    manifest.write_text("file;year\na.jpg;1987\n")
+    with pytest.raises(ManifestError, match="has the columns 'file', 'year'; expected"):
+        plan_files(manifest)
+    manifest.write_text("path\na,b.jpg\n")
+    with pytest.raises(
+        ManifestError, match=r"row 1 of .* has more values .*; write a path that contains ','"
+    ):
+        plan_files(manifest)
+    manifest.write_text("")
+    with pytest.raises(ManifestError, match="has no columns; expected"):
+        plan_files(manifest)
 
 
 @pytest.mark.parametrize("suffix", [".csv", ".parquet"])
@@ -79,6 +113,10 @@ def test_rows_that_are_not_paths_below_the_manifest_are_refused(tmp_path):
     ]:
         with pytest.raises(ManifestError, match=message):
             plan_files(write_manifest(tmp_path / "list.parquet", *rows))
+    with pytest.raises(
+        BrewsterError, match=r"row 2 of .*: https://x\.org/a\.jpg is a web address; .*; download"
+    ):
+        plan_files(write_manifest(tmp_path / "list.csv", "a.jpg", "https://x.org/a.jpg"))
     short = tmp_path / "short.csv"
     short.write_text("year,path\n1987\n")
     with pytest.raises(ManifestError, match=r"row 1 of .* has the path None"):

@@ -22,7 +22,7 @@ from brewster.files import discard
 from brewster.options import Options
 from brewster.photo import Photo
 from brewster.remote_path import location
-from cli_helpers import image_bytes, json_lines, layer_files, list_files
+from cli_helpers import image_bytes, json_lines, layer_files, list_files, run_process
 from set_folders import hashes
 
 TESTS = Path(__file__).parent
@@ -324,6 +324,62 @@ def test_the_command_needs_a_folder_for_the_layers_of_an_archive(run, tmp_path, 
     code, _, err = run("in.jpg", *arguments)
     assert code == 2
     assert "give a folder with -o" in err
+
+
+def write_archive(folder):
+    """Writes photos, a damaged photo, a manifest with a missing photo, and one layer. Returns the arguments of a command for them."""
+    for number, name in enumerate(("in/a.jpg", "in/b/c.jpg", "d.jpg")):
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_bytes(image_bytes(seed=number))
+    (folder / "in/damaged.jpg").write_bytes(b"not an image")
+    (folder / "list.csv").write_text("path\nin/b/c.jpg\nin/missing.jpg\n")
+    discard(folder / "out")
+    (folder / "out").mkdir()
+    (folder / "out/d.transmission.jpg").write_bytes(image_bytes())
+    return ["in", "./d.jpg", "nowhere/../list.csv", "-o", "out"]
+
+
+def index_rows(root):
+    """Path, status, layers and error of each row of the index."""
+    return [
+        [row[name] for name in ("path", "status", "outputs", "error")] for row in read_index(root).values()
+    ]
+
+
+def test_the_index_of_one_process_and_of_several_has_the_same_absolute_paths(run, tmp_path):
+    indexes = []
+    for options in ([], ["--workers", "2"]):
+        arguments = [*write_archive(tmp_path), "--index", *options]
+        planned = json_lines(run(*arguments, "--json", "--dry-run")[1])
+        code, out, err = run(*arguments, "--json", "--contact-sheet", "sheet.png")
+        assert code == 1
+        assert f"the layers are in {tmp_path / 'out'}\n" in err
+        assert f"contact sheet: {tmp_path / 'sheet.png'}\n" in err
+        rows = index_rows(tmp_path)
+        printed = {line["source"]: list(line["outputs"].values()) for line in json_lines(out)}
+        assert printed == {path: outputs for path, _, outputs, _ in rows}
+        assert printed.keys() == {line["source"] for line in planned}
+        indexes.append(rows)
+    assert indexes[0] == indexes[1]
+    names = ("d.jpg", "in/a.jpg", "in/b/c.jpg", "in/damaged.jpg", "in/missing.jpg")
+    assert [path for path, *_ in rows] == [str(tmp_path / name) for name in names]
+    assert rows[0][2] == [str(tmp_path / "out" / name) for name in reversed(layer_files("d"))]
+
+
+@pytest.mark.slow
+def test_the_index_of_a_cluster_has_the_paths_of_that_of_one_process(run, tmp_path, model):
+    pytest.importorskip("ray")
+    assert run(*write_archive(tmp_path), "--index")[0] == 1
+    rows = index_rows(tmp_path)
+    done = run_process(
+        *write_archive(tmp_path),
+        *("--cluster", "local", "--workers", "2", "--model", model),
+        cwd=tmp_path,
+        env={**os.environ, "RAY_USAGE_STATS_ENABLED": "0"},
+        timeout=900,
+    )
+    assert done.returncode == 1, done.stderr
+    assert index_rows(tmp_path) == rows
 
 
 LOSES_A_NODE = """

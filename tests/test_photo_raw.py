@@ -73,7 +73,7 @@ def test_a_raw_file_is_upright(orientation):
 @pytest.mark.parametrize("fraction", [0.05, 0.5, 0.95])
 def test_a_truncated_raw_file_is_refused(fraction):
     data = dng_file(mosaic())
-    with pytest.raises(UnreadablePhoto, match="cannot be read completely"):
+    with pytest.raises(UnreadablePhoto, match=r"^the RAW file cannot be read completely; expected "):
         Photo.open(data[: int(fraction * len(data))])
 
 

@@ -40,6 +40,10 @@ def assert_refused(source: object, error: type[PhotoError], message: str, **opti
     assert str(raised.value).count("; ") >= 2  # what happened, what was expected, what to do
 
 
+OWN_MESSAGE = r"^the \w+ cannot be read completely( \(pixels are missing\))?; expected "
+"""The message for a damaged file, which does not have the message of the library that reads it."""
+
+
 @pytest.mark.parametrize("fraction", [0.03, 0.3, 0.6, 0.9])
 @pytest.mark.parametrize(
     ("kind", "options"),
@@ -57,7 +61,7 @@ def assert_refused(source: object, error: type[PhotoError], message: str, **opti
 )
 def test_a_truncated_image_is_refused(kind: str, options: dict[str, object], fraction: float) -> None:
     data = file_of(kind, **options)
-    assert_refused(data[: int(len(data) * fraction)], UnreadablePhoto, "read completely")
+    assert_refused(data[: int(len(data) * fraction)], UnreadablePhoto, OWN_MESSAGE)
 
 
 @pytest.mark.parametrize("size", [4, 7])
@@ -77,7 +81,8 @@ def test_a_tiff_with_missing_tiles_is_refused() -> None:
 @pytest.mark.parametrize("format_name", ["exr", "hdr"])
 def test_truncated_floats_are_refused(format_name: str, fraction: float) -> None:
     data = Photo.from_array(NOISE, encoding="srgb").encode(format_name)
-    assert_refused(data[: int(len(data) * fraction)], PhotoError, "; ")
+    message = {"exr": OWN_MESSAGE, "hdr": "; "}[format_name]
+    assert_refused(data[: int(len(data) * fraction)], PhotoError, message)
 
 
 def test_a_heic_without_an_image_is_refused() -> None:
@@ -88,7 +93,7 @@ def test_a_heic_without_an_image_is_refused() -> None:
 def test_a_heic_whose_image_is_longer_than_the_file_is_refused() -> None:
     data = bytearray(Photo.from_array(NOISE, encoding="srgb").encode("heic"))
     data[data.index(b"mdat") + 4] = 0xFF  # the length of the first unit
-    assert_refused(bytes(data), UnreadablePhoto, "end of file")
+    assert_refused(bytes(data), UnreadablePhoto, OWN_MESSAGE)
 
 
 def test_an_empty_file_is_refused(tmp_path: Path) -> None:
@@ -107,11 +112,35 @@ def test_a_missing_file_and_a_folder_are_refused(tmp_path: Path) -> None:
 
 
 def test_a_file_without_read_permission_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def deny(path: Path) -> bytes:
+    def deny(path: Path, mode: str) -> io.BytesIO:
         raise PermissionError(13, "Permission denied")
 
-    monkeypatch.setattr(Path, "read_bytes", deny)
+    monkeypatch.setattr(Path, "open", deny)
     assert_refused(tmp_path / "a.jpg", UnreadablePhoto, "Permission denied")
+
+
+VIDEO_HEADS = [
+    b"\0\0\0\x18ftypisom",
+    b"\0\0\0\x18ftypdash",
+    b"\0\0\0\x18ftypM4VP",
+    b"\0\0\0\x08wide\0\0\0\0mdat",
+    b"RIFF\0\0\0\0AVI LIST",
+    b"\x1aE\xdf\xa3",
+    b"\0\0\x01\xb3",
+]
+
+
+@pytest.mark.parametrize("head", VIDEO_HEADS)
+def test_a_video_is_refused_by_its_content(head: bytes) -> None:
+    assert_refused(head + bytes(100), UnsupportedPhoto, "^the file is a video; expected a photo; ")
+
+
+@pytest.mark.parametrize("content", [b"", b"damaged", file_of("JPEG")[:100]])
+@pytest.mark.parametrize("name", ["a.mp4", "a.MOV", "a.wmv"])
+def test_a_damaged_video_is_refused_by_its_suffix(tmp_path: Path, name: str, content: bytes) -> None:
+    (tmp_path / name).write_bytes(content)
+    assert_refused(tmp_path / name, UnsupportedPhoto, f"{name} is a video; expected a photo; ")
+    assert_refused(tmp_path / f"no-{name}", UnreadablePhoto, "No such file")
 
 
 @pytest.mark.parametrize("kind", ["BMP", "JPEG2000", "PPM", "ICO"])
@@ -190,7 +219,7 @@ def test_floats_that_are_not_finite_are_refused(format_name: str, value: float) 
     broken[2, 1, 0] = value
     bad = Photo(broken, None, whole.file_info)
     if format_name == "tiff" or np.isnan(value):
-        assert_refused(bad.encode(format_name, depth=32), UnsupportedPhoto, "1 pixels")
+        assert_refused(bad.encode(format_name, depth=32), UnsupportedPhoto, "^1 pixel is infinite or NaN")
     with pytest.raises(UnsupportedPhoto, match="finite"):
         Photo.from_array(broken, encoding="linear")
 

@@ -1,5 +1,6 @@
 """Files in object stores. The store is fsspec's memory://, which behaves like S3 without a network."""
 
+import os
 import pickle
 import sys
 from pathlib import Path
@@ -7,10 +8,10 @@ from pathlib import Path
 import pytest
 
 from brewster.batch import plan_files
-from brewster.errors import BrewsterError, MissingExtra, OutputError, UnreadablePhoto
+from brewster.errors import BrewsterError, MissingExtra, OutputError, UnreadablePhoto, UnsupportedPhoto
 from brewster.files import write_atomically
 from brewster.options import Options
-from brewster.remote_path import RemotePath, location
+from brewster.remote_path import RemotePath, check_readable, location, read_image
 
 fsspec = pytest.importorskip("fsspec")
 
@@ -44,7 +45,6 @@ def test_a_location_is_a_path_or_a_url():
     assert location(Path("a")) == Path("a")
     assert location("file:///scans/box%204/a.jpg") == Path("/scans/box 4/a.jpg")
     assert location("file://localhost/scans/a.jpg") == Path("/scans/a.jpg")
-    assert location("file://server/scans/a.jpg") == Path("//server/scans/a.jpg")
     assert str(location("memory://bucket/a.jpg")) == "memory://bucket/a.jpg"
 
 
@@ -57,6 +57,21 @@ def test_a_protocol_that_is_unknown_or_not_installed_is_reported_before_any_phot
     monkeypatch.setitem(sys.modules, "fsspec", None)
     with pytest.raises(MissingExtra, match=r"pip install -c constraints.txt -e '\.\[cluster\]'"):
         location("memory://bucket/a.jpg")
+
+
+@pytest.mark.parametrize("url", ["https://example.org/a.jpg", "HTTP://example.org/a.jpg"])
+def test_a_web_address_is_refused_with_what_to_do(url):
+    with pytest.raises(BrewsterError) as raised:
+        location(url)
+    assert str(raised.value).startswith(f"{url} is a web address; expected a file or folder on this machine")
+    assert raised.value.cure == "download the photo, and pass the path of the file"
+
+
+@pytest.mark.parametrize("url", ["file://server/scans/a.jpg", "file://a.jpg", "file://localhosts/a.jpg"])
+def test_a_file_of_another_machine_is_refused(url):
+    host = url.split("/")[2]
+    with pytest.raises(BrewsterError, match=f"is a file on the machine {host}; expected a file on this"):
+        location(url)
 
 
 def test_a_file_in_a_store_is_written_once():
@@ -72,7 +87,16 @@ def test_a_file_in_a_store_is_written_once():
 
 
 def test_photos_in_a_store_are_found_like_those_in_a_folder(tmp_path):
-    names = ("b/c.png", "a.jpg", "a.mask.png", "b/c.jpg", ".hidden/d.jpg", "a.transmission.jpg", "notes.txt")
+    names = (
+        "b/c.png",
+        "a.jpg",
+        "a.mask.png",
+        "b/c.jpg",
+        ".hidden/d.jpg",
+        "a.transmission.jpg",
+        "notes.txt",
+        "b/d.mp4",
+    )
     root = location("memory://bucket/in")
     for name in names:
         (root / name).write_bytes(b"")
@@ -81,7 +105,9 @@ def test_photos_in_a_store_are_found_like_those_in_a_folder(tmp_path):
     output = location("memory://out")
 
     def found(folder):
-        tasks = plan_files(folder, output, Options(layers=("reflection",)))
+        skipped = []
+        tasks = plan_files(folder, output, Options(layers=("reflection",)), skipped=skipped)
+        assert [path.relative_to(folder).as_posix() for path in skipped] == ["b/d.mp4", "notes.txt"]
         return {task.source.relative_to(folder).as_posix(): str(task.outputs["reflection"]) for task in tasks}
 
     assert found(root) == found(tmp_path)
@@ -89,6 +115,26 @@ def test_photos_in_a_store_are_found_like_those_in_a_folder(tmp_path):
     assert sorted(found(root)) == ["a.jpg", "b/c.jpg", "b/c.png"]
     (single,) = plan_files(root / "a.jpg", tmp_path)
     assert single.outputs["transmission"] == tmp_path / "a.transmission.jpg"
+
+
+def test_a_file_is_checked_without_reading_it(store, monkeypatch):
+    folder = location("memory://bucket/in")
+    (folder / "a.jpg").write_bytes(b"")
+    monkeypatch.setattr(type(store), "cat_file", fail)
+    check_readable(folder / "a.jpg")
+    with pytest.raises(UnreadablePhoto, match=r"in/b\.jpg cannot be read \(it does not exist\)"):
+        check_readable(folder / "b.jpg")
+    with pytest.raises(UnreadablePhoto, match=r"memory://bucket/in cannot be read \(it is a folder\)"):
+        check_readable(folder)
+    monkeypatch.setattr(type(store), "info", fail)
+    with pytest.raises(UnreadablePhoto, match=r"cannot be read \(503 Slow Down\)"):
+        check_readable(folder / "a.jpg")
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="Windows has no named pipes in folders")
+def test_a_pipe_is_not_opened_to_check_it(tmp_path):
+    os.mkfifo(tmp_path / "photo.jpg")  # opening a pipe without a writer would wait forever
+    check_readable(tmp_path / "photo.jpg")
 
 
 def test_errors_of_a_store_name_the_file_and_the_reason(store, monkeypatch):
@@ -105,5 +151,7 @@ def test_errors_of_a_store_name_the_file_and_the_reason(store, monkeypatch):
         write_atomically(path, b"")
     with pytest.raises(UnreadablePhoto, match="memory://bucket cannot be listed"):
         plan_files(path.parent)
+    with pytest.raises(UnsupportedPhoto, match=r"memory://bucket/b\.mp4 is a video"):
+        read_image(path.parent / "b.mp4")
     assert not path.exists()
     assert list(path.parent.iterdir()) == []

@@ -5,12 +5,14 @@ import re
 import urllib.error
 import urllib.request
 
+import httpx
 import pytest
 
 from brewster.cli import serve as command
 from brewster.cli.serve import serve
+from cli_helpers import image_bytes
 from file_server import loopback_only
-from web_servers import serve_process
+from web_servers import form, serve_process
 
 
 @pytest.fixture
@@ -39,6 +41,20 @@ def test_the_command_serves_requests_until_it_is_interrupted(reachable, model):
         assert (status, [row["name"] for row in json.loads(body)]) == (200, ["pane", "compact"])
         assert get(f"{url}health", Authorization=f"Bearer {token}", Host="evil.com")[0] == 421
         assert get(link)[0] == 200
+
+
+@pytest.mark.parametrize("options", [[], ["--verbose"]])
+def test_the_message_of_a_library_is_only_in_the_log(reachable, model, tmp_path, options):
+    half = image_bytes(600, 400)[:20_000]
+    with (tmp_path / "log").open("w") as log, serve_process("--model", model, *options, stderr=log) as link:
+        response = httpx.post(f"{link}separate", **form(half))
+    assert response.json() == {
+        "error": "the jpeg cannot be read completely; expected a complete file in a common variant of the format; "
+        "copy the file again from its source, or convert it.",
+        "kind": "UnreadablePhoto",
+    }
+    text = (tmp_path / "log").read_text()
+    assert ("POST /separate failed" in text, "VipsJpeg" in text) == (bool(options), bool(options))
 
 
 @pytest.fixture

@@ -223,6 +223,15 @@ def test_a_file_that_is_not_a_photo_shows_an_error_and_can_be_retried_or_removed
     assert page.evaluate("document.activeElement.id") == "undo-remove"
 
 
+@pytest.mark.parametrize("content", [b"\0\0\0\x18ftypisom", b"damaged"])
+def test_a_video_is_called_a_video(open_page, content):
+    page = open_page()
+    video = {"name": "clip.mp4", "mimeType": "video/mp4", "buffer": content + bytes(100)}
+    page.set_input_files("#files", [video])
+    page.wait_for_selector("#error:not([hidden])")
+    assert "This is a video. Only photos can be separated." in page.get_by_role("alert").inner_text()
+
+
 def test_many_photos_are_downloaded_as_one_zip_with_unique_names(open_page, run):
     photos = [
         ("a.png", image_bytes(90, 60, "png", 1)),

@@ -114,10 +114,15 @@ def raw_exchange(port, *pieces):
 
 
 @contextlib.contextmanager
-def serve_process(*args):
+def serve_process(*args, stderr=None):
     """Runs `brewster serve` in a separate process. Yields its first line of output, a link; checks the exit code at the end."""
     command = [sys.executable, "-m", "brewster", "serve", "--port", "0", "--device", "cpu", *map(str, args)]
-    kwargs = {"stdout": subprocess.PIPE, "text": True, "env": {**os.environ, "PYTHONUNBUFFERED": "1"}}
+    kwargs = {
+        "stdout": subprocess.PIPE,
+        "stderr": stderr,
+        "text": True,
+        "env": {**os.environ, "PYTHONUNBUFFERED": "1"},
+    }
     with started(command, **kwargs) as process:
         try:
             yield process.stdout.readline().strip()

@@ -150,6 +150,18 @@ class DownloadError(BrewsterError):
     small, or a download is not allowed."""
 
 
+def counted(number: int, noun: str) -> str:
+    """Returns a number with its noun: `1 video` or `2 videos`."""
+    return f"{number} {noun}{'' if number == 1 else 's'}"
+
+
+def video_error(name: str) -> UnsupportedPhoto:
+    """Returns the error for a video. `name` is its path, or "the file" if the path is unknown."""
+    return UnsupportedPhoto(
+        f"{name} is a video", "expected a photo", "extract single images first, for example with ffmpeg"
+    )
+
+
 INSTALL_COMMAND: Final = "pip install -c constraints.txt -e"
 """Installs brewster from its repository, because it is on no package index. The next argument is the path "." or ".[EXTRA]"."""
 

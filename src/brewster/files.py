@@ -19,7 +19,7 @@ from pathlib import Path
 import platformdirs
 
 from brewster.errors import OutputError
-from brewster.image_formats import FORMATS, VIDEO_SUFFIXES, ImageFormat, format_of
+from brewster.image_formats import FORMATS, ImageFormat, format_of
 from brewster.remote_path import Location, RemotePath
 
 DEFAULT_MAX_PIXELS = 200_000_000
@@ -66,18 +66,18 @@ class SeparationPaths:
 
 
 def images_in(
-    source: Location, output_folder: Location | None = None, *, videos: list[Path] | None = None
+    source: Location, output_folder: Location | None = None, *, skipped: list[Location] | None = None
 ) -> Iterator[tuple[Location, Location]]:
     """Yields the images in a file or folder in a stable order, each with the folder of its layers.
 
     Layers are written next to their image, or below `output_folder`, which mirrors the tree of an input folder.
 
-    In folders, hidden files, files without an image suffix, layers that brewster has written, and masks next to their
-    image (`a.mask.png` next to `a.jpg`) are skipped. A folder that is reached through several links is visited once, so
-    that link loops end. A file given by name is always included. If it is not an image, opening it raises the error.
-    The videos in local folders are appended to `videos`.
+    In folders, hidden files, layers that brewster has written, and masks next to their image (`a.mask.png` next to `a.jpg`)
+    are ignored. All other files without the suffix of an image, such as videos, are appended to `skipped`. A folder that is
+    reached through several links is visited once, so that link loops end. A file given by name is always included. If it
+    is not an image, opening it raises the error.
     """
-    for image in _image_files(source, [] if videos is None else videos):
+    for image in _image_files(source, [] if skipped is None else skipped):
         yield image, _output_folder(image, source, output_folder)
 
 
@@ -188,28 +188,24 @@ def _sync(path: Path) -> None:
         os.close(file)
 
 
-def _image_files(source: Location, videos: list[Path]) -> Iterator[Location]:
+def _image_files(source: Location, skipped: list[Location]) -> Iterator[Location]:
+    def is_included(path: Location) -> bool:
+        if format_of(path) is None and not path.name.startswith("."):
+            skipped.append(path)
+        return _is_input(path)
+
     if isinstance(source, RemotePath):
-        yield from [source] if format_of(source) else _without_masks(_remote_images(source))
+        found = [source] if format_of(source) else filter(is_included, _visible_remote_files(source))
+        yield from _without_masks(found)
     elif _is_folder(source):
-        yield from _without_masks(_images_and_videos(source, videos))
+        yield from _without_masks(walk(source, is_included))
     else:
         yield source
 
 
-def _images_and_videos(folder: Path, videos: list[Path]) -> Iterator[Path]:
-    """Yields the images below a local folder, and appends the videos to `videos`."""
-    for path in walk(folder, lambda path: _is_input(path) or _is_video(path)):
-        if _is_video(path):
-            videos.append(path)
-        else:
-            yield path
-
-
-def _remote_images(folder: RemotePath) -> Iterator[RemotePath]:
+def _visible_remote_files(folder: RemotePath) -> Iterator[RemotePath]:
     for path in folder.walk_files():
-        hidden = any(part.startswith(".") for part in path.relative_to(folder).parts)
-        if _is_input(path) and not hidden:
+        if not any(part.startswith(".") for part in path.relative_to(folder).parts):
             yield path
 
 
@@ -266,10 +262,6 @@ def _is_input(path: Location) -> bool:
     """Returns whether a file has an image suffix, is not hidden, and is not a layer that brewster has written."""
     is_result = Path(path.stem).suffix.lstrip(".") in OUTPUT_LAYERS
     return format_of(path) is not None and not path.name.startswith(".") and not is_result
-
-
-def _is_video(path: Path) -> bool:
-    return path.suffix.lower() in VIDEO_SUFFIXES and not path.name.startswith(".")
 
 
 def _check_not_source(path: Location, source: Location | None) -> None:

@@ -176,12 +176,16 @@ SUFFIXES: Final = {suffix: row for row in _ROWS for suffix in row.suffixes}
 """All formats by file name suffix, in lower case."""
 
 VIDEO_SUFFIXES: Final = frozenset(
-    (".mp4", ".m4v", ".mov", ".avi", ".mkv", ".webm", ".mts", ".m2ts", ".mpg", ".3gp")
+    (
+        *(".mp4", ".m4v", ".mov", ".avi", ".mkv", ".webm", ".mts", ".m2ts"),
+        *(".mpg", ".mpeg", ".3gp", ".3g2", ".wmv", ".flv"),
+    )
 )
 """File name suffixes of videos, in lower case. brewster cannot read videos. It reports those that it skips."""
 
 VIDEO_SIGNATURE: Final = (
-    rb"....ftyp(isom|iso[2-9]|mp4[12]|avc1|qt  |M4V |3gp.|MSNV)|RIFF....AVI |\x1aE\xdf\xa3|\0\0\x01\xba"
+    rb"....(ftyp(iso[m2-9]|mp4[12]|mmp4|avc1|dash|f4v |qt  |M4V.|3g[p2].|MSNV|XAVC)|moov|mdat|wide)"
+    rb"|RIFF....AVI |\x1aE\xdf\xa3|\0\0\x01[\xba\xb3]"
 )
 """A regular expression for the first bytes of a video: MP4, QuickTime, AVI, Matroska or MPEG."""
 
@@ -210,3 +214,8 @@ def format_of_content(data: bytes) -> ImageFormat | None:
     if re.match(rb"....ftypmi[fa]", data, re.DOTALL):
         return FORMATS["heic" if b"hvcC" in data[:HEAD_BYTES] else "avif"]
     return next((row for row in _ROWS if re.match(row.signature, data, re.DOTALL)), None)
+
+
+def is_video(path: PurePath) -> bool:
+    """Returns whether a file name has the suffix of a video."""
+    return path.suffix.lower() in VIDEO_SUFFIXES

@@ -3,6 +3,8 @@
     photo = location("s3://bucket/scans/a.jpg")
     data = photo.read_bytes()
 
+`location` returns such a file or a local path, and `read_image` reads both.
+
 fsspec loads the package of the store (s3fs for S3, gcsfs for Google Cloud Storage), which has its own settings: for
 example AWS_PROFILE, FSSPEC_S3_ENDPOINT_URL, or the files in ~/.config/fsspec.
 """
@@ -14,11 +16,13 @@ import errno
 import importlib
 import os
 import re
+import sys
 from collections.abc import Iterator
 from pathlib import Path, PurePosixPath
-from typing import Any, TypeAlias, final
+from typing import Any, BinaryIO, TypeAlias, final
 
-from brewster.errors import BrewsterError, MissingExtra, OutputError, UnreadablePhoto
+from brewster.errors import BrewsterError, MissingExtra, OutputError, UnreadablePhoto, video_error
+from brewster.image_formats import is_video
 
 _RETRY = "check the network and the credentials, and run the same command again: finished files are kept"
 
@@ -41,8 +45,29 @@ class RemotePath(PurePosixPath):
             MissingExtra: the package of the store is not installed.
         """
         store = self._store()
-        try:
+        with self._read_errors():
             return bytes(store.cat_file(str(self)))
+
+    def check_readable(self) -> None:
+        """Checks that the URL is that of a file, with one request that does not read its content.
+
+        Raises:
+            UnreadablePhoto: the file does not exist or is a folder, or the store fails.
+            MissingExtra: the package of the store is not installed.
+        """
+        store = self._store()
+        with self._read_errors():
+            kind = store.info(str(self))["type"]
+        if kind == "directory":
+            raise UnreadablePhoto(
+                f"{self} cannot be read (it is a folder)", "expected an image file", "check the URL"
+            )
+
+    @contextlib.contextmanager
+    def _read_errors(self) -> Iterator[None]:
+        """Translates errors of the store within this block into `UnreadablePhoto`."""
+        try:
+            yield
         except FileNotFoundError as error:
             raise UnreadablePhoto(
                 f"{self} cannot be read (it does not exist)", "expected an image file", "check the URL"
@@ -124,7 +149,7 @@ def location(text: str | os.PathLike[str]) -> Location:
     """Returns the path for a path, a file:// URL, or the URL of an object store.
 
     Raises:
-        BrewsterError: the protocol of the URL is unknown.
+        BrewsterError: the URL is a web address or names a file of another machine, or its protocol is unknown.
         MissingExtra: the package of the store is not installed.
     """
     if isinstance(text, RemotePath | Path) or not re.match(r"[A-Za-z][\w+.-]+://", os.fspath(text)):
@@ -132,17 +157,84 @@ def location(text: str | os.PathLike[str]) -> Location:
     url = os.fspath(text)
     if url.startswith("file:"):
         return Path(path_of_file_url(url))
+    if url.lower().startswith(("http://", "https://")):
+        raise BrewsterError(
+            f"{url} is a web address",
+            "expected a file or folder on this machine, or the URL of an object store such as s3://bucket/folder",
+            "download the photo, and pass the path of the file",
+        )
     path = RemotePath(url)
     path._store()  # raises the errors here once, instead of for every photo
     return path
 
 
 def path_of_file_url(url: str) -> str:
-    """Returns the local path of a file:// URL. The host is empty, localhost, or a Windows server (RFC 8089)."""
+    """Returns the local path of a file:// URL (RFC 8089). Its host is empty or localhost, or on Windows the name of a server.
+
+    Raises:
+        BrewsterError: the URL names another machine, and this machine does not run Windows.
+    """
     from urllib.request import url2pathname  # noqa: PLC0415  (imports http.client: slow, and every command imports this module)
 
-    path = url.removeprefix("file://").removeprefix("localhost")
-    return url2pathname(path if path.startswith("/") else f"//{path}")
+    host, _, path = url.removeprefix("file://").partition("/")
+    if host in ("", "localhost"):
+        return url2pathname(f"/{path}")
+    if sys.platform == "win32":
+        return url2pathname(f"//{host}/{path}")
+    raise BrewsterError(
+        f"{url} is a file on the machine {host}",
+        "expected a file on this machine: a path, or a URL such as file:///home/me/photo.jpg",
+        "copy the file to this machine, or mount its folder and pass the path there",
+    )
+
+
+def read_image(path: Location) -> bytes:
+    """Returns the bytes of an image file.
+
+    Raises:
+        UnreadablePhoto: the file does not exist, is a folder, or cannot be read.
+        UnsupportedPhoto: the file has the suffix of a video. Its content is not read, because it may not fit into memory.
+        MissingExtra: the package of the object store is not installed.
+    """
+    if isinstance(path, RemotePath):
+        _check_not_video(path)
+        return path.read_bytes()
+    with _opened(path) as file:
+        return file.read()
+
+
+def check_readable(path: Location) -> None:
+    """Checks that an image file exists and can be opened. Raises the errors of `read_image`, but does not read the content.
+
+    Pipes are not checked, because they can be opened only once.
+    """
+    if isinstance(path, RemotePath):
+        _check_not_video(path)
+        path.check_readable()
+        return
+    is_pipe = os.path.exists(path) and not os.path.isfile(path) and not os.path.isdir(path)  # noqa: PTH110, PTH112, PTH113
+    if not is_pipe:
+        with _opened(path):
+            pass
+
+
+@contextlib.contextmanager
+def _opened(path: Path) -> Iterator[BinaryIO]:
+    try:
+        with path.open("rb") as file:
+            _check_not_video(path)
+            yield file
+    except OSError as error:
+        is_folder = os.path.isdir(path)  # noqa: PTH112  (Path.is_dir raises without permission)
+        reason = "it is a folder" if is_folder else error.strerror or str(error)
+        raise UnreadablePhoto(
+            f"{path} cannot be read ({reason})", "expected an image file", "check its name and permissions"
+        ) from error
+
+
+def _check_not_video(path: Location) -> None:
+    if is_video(path):
+        raise video_error(str(path))
 
 
 def _store(protocol: str) -> Any:  # noqa: ANN401  (fsspec has no types)

@@ -17,7 +17,7 @@ from collections.abc import Callable
 from typing import Any, Final, Self, final
 
 from brewster.batch.manifest import import_parquet
-from brewster.batch.runner import FileResult
+from brewster.batch.plan import FileResult
 from brewster.errors import OutputError
 from brewster.files import exists, write_atomically
 from brewster.remote_path import Location

@@ -4,7 +4,7 @@
     1987/box-04/0017.tif
     s3://scans/1987/box-04/0018.tif
 
-A relative path is relative to the folder of the manifest, and its layers are written to the same relative path below the output
+The values of a CSV table are separated by commas, semicolons or tabs, as its header shows. Row 1 is the row below the header. A relative path is relative to the folder of the manifest, and its layers are written to the same relative path below the output
 folder. The layers of an absolute path or a URL are written to this path below the output folder, without the root or the protocol:
 to `OUT/scans/1987/box-04` for the second row. The output folder of a photo therefore does not depend on the other rows.
 """
@@ -16,14 +16,28 @@ import importlib
 import io
 import posixpath
 from collections.abc import Iterator
-from typing import Any, Final
+from typing import Any, Final, NamedTuple, final
 
-from brewster.errors import ManifestError, MissingExtra, UnreadablePhoto
+from brewster.errors import BrewsterError, ManifestError, MissingExtra, UnreadablePhoto
 from brewster.remote_path import Location, RemotePath, location
 
 COLUMN: Final = "path"
+_DELIMITERS: Final = (",", ";", "\t")
 SUFFIXES: Final = (".csv", ".parquet")
 _EXPECTED: Final = f"expected a CSV or Parquet table with the column {COLUMN!r}"
+
+
+@final
+class ManifestRow(NamedTuple):
+    """A row of a manifest, for messages."""
+
+    manifest: Location
+    number: int
+    """Row 1 is the row below the header."""
+
+    def __str__(self) -> str:
+        """Returns `row 3 of scans.csv`."""
+        return f"row {self.number} of {self.manifest}"
 
 
 def is_manifest(source: Location) -> bool:
@@ -34,41 +48,53 @@ def is_manifest(source: Location) -> bool:
 def read_manifest(
     manifest: Location, output_folder: Location | None = None
 ) -> Iterator[tuple[Location, Location]]:
-    """Yields each photo of a manifest with the folder for its layers. Files that do not exist are included.
+    """Yields the photo of each row of a manifest, with the folder for its layers. Files that do not exist are included.
 
     Args:
         manifest: the path of the table.
         output_folder: the folder below which the layers are written. By default, they are written next to their photo.
 
     Raises:
-        ManifestError: the manifest cannot be read, is not a table, or a row has no path or a relative path outside the folder of
-            the manifest.
+        ManifestError: the manifest cannot be read, is not a table, or has no rows; or a row has no path, a relative path outside the
+            folder of the manifest, or more values than the header.
+        BrewsterError: a row has a URL that cannot be read; see `location`.
         MissingExtra: the package is not installed that a Parquet table (pyarrow) or a URL needs.
     """
+    number = 0
     for number, text in enumerate(_paths(manifest), 1):
-        photo, mirrored = _photo(manifest, text, number)
+        photo, mirrored = _photo(ManifestRow(manifest, number), text)
         yield photo, photo.parent if output_folder is None else output_folder.joinpath(*mirrored)
+    if number == 0:
+        raise ManifestError(
+            f"{manifest} has only the names of its columns, and no rows",
+            "expected a row for each photo",
+            "add the paths of the photos",
+        )
 
 
-def _photo(manifest: Location, text: object, number: int) -> tuple[Location, tuple[str, ...]]:
+def _photo(row: ManifestRow, text: object) -> tuple[Location, tuple[str, ...]]:
     """Returns the photo of a row, and the parts of the folder for its layers below the output folder."""
     if not isinstance(text, str) or not text.strip():
         raise ManifestError(
-            f"row {number} of {manifest} has the path {text!r}",
+            f"{row} has the path {text!r}",
             "expected the path of a photo",
             "correct the row",
         )
-    photo = location(text)
+    try:
+        photo = location(text)
+    except BrewsterError as error:
+        error.happened = f"{row}: {error.happened}"
+        raise
     if isinstance(photo, RemotePath) or photo.is_absolute():
         return photo, photo.parent.parts[1:]
     relative = posixpath.normpath(photo.as_posix())
     if relative.startswith("../"):
         raise ManifestError(
-            f"row {number} of {manifest} has the path {text}, which is outside the folder of the manifest",
+            f"{row} has the path {text}, which is outside the folder of the manifest",
             "expected a relative path below this folder, an absolute path, or a URL",
             "move the manifest, or write absolute paths",
         )
-    return manifest.parent / relative, tuple(relative.split("/")[:-1])
+    return row.manifest.parent / relative, tuple(relative.split("/")[:-1])
 
 
 def _paths(manifest: Location) -> Iterator[object]:
@@ -82,12 +108,34 @@ def _paths(manifest: Location) -> Iterator[object]:
 
 def _csv_paths(manifest: Location, data: bytes) -> Iterator[object]:
     try:
-        rows = csv.DictReader(io.StringIO(data.decode("utf-8-sig"), newline=""), strict=True)
+        file = io.StringIO(data.decode("utf-8-sig"), newline="")
+        delimiter = _delimiter(file.readline())
+        file.seek(0)
+        rows = csv.DictReader(file, delimiter=delimiter, strict=True)
         _check_columns(manifest, rows.fieldnames or [])
-        for row in rows:
+        for number, row in enumerate(rows, 1):
+            if any(row.get(None, ())):
+                raise ManifestError(
+                    f"{ManifestRow(manifest, number)} has more values than the header",
+                    "expected one value for each column",
+                    f"write a path that contains {delimiter!r} in double quotes",
+                )
             yield row[COLUMN]
     except (UnicodeDecodeError, csv.Error) as error:
         raise _not_a_table(manifest, error) from error
+
+
+def _delimiter(header: str) -> str:
+    """Returns the delimiter that splits the header of a CSV table into columns with the name `path`, or into the most columns."""
+
+    def split(delimiter: str) -> list[str]:
+        try:
+            return next(csv.reader([header], delimiter=delimiter, strict=True), [])
+        except csv.Error:  # a quoted name is followed by another delimiter
+            return []
+
+    columns = {delimiter: split(delimiter) for delimiter in _DELIMITERS}
+    return max(_DELIMITERS, key=lambda delimiter: (COLUMN in columns[delimiter], len(columns[delimiter])))
 
 
 def _parquet_paths(manifest: Location, data: bytes) -> Iterator[object]:
@@ -103,8 +151,8 @@ def _parquet_paths(manifest: Location, data: bytes) -> Iterator[object]:
 
 def _check_columns(manifest: Location, names: list[str] | Any) -> None:  # noqa: ANN401
     if COLUMN not in names:
-        found = ", ".join(map(repr, list(names)[:8])) or "none"
-        raise ManifestError(f"{manifest} has the columns {found}", _EXPECTED, f"name a column {COLUMN!r}")
+        found = f"the columns {', '.join(map(repr, list(names)[:8]))}" if names else "no columns"
+        raise ManifestError(f"{manifest} has {found}", _EXPECTED, f"name a column {COLUMN!r}")
 
 
 def _not_a_table(manifest: Location, error: Exception) -> ManifestError:

@@ -17,7 +17,8 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import final
 
-from brewster.batch.runner import BatchRunner, FileResult, SeparationTask, real_path, skipped_result
+from brewster.batch.plan import FileResult, SeparationTask
+from brewster.batch.runner import BatchRunner, real_path, skipped_result
 from brewster.errors import OutputError
 from brewster.executors import Executor, run_tasks
 from brewster.files import exists
@@ -85,8 +86,6 @@ class SeparationRunner:
         if result.error and not self._overwrite and _is_finished(task, exists):
             # This worker was slow, and another worker got the same task and has already written the layers.
             result = skipped_result(task)
-        if not result.error:
-            result.outputs = {layer: str(target) for layer, target in task.outputs.items()}
         return [result]
 
 

@@ -14,21 +14,27 @@ import hashlib
 import os
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from contextlib import contextmanager
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Final, Literal, Protocol, final
+from typing import Final, final
 
-from brewster.batch.layer_names import name_layers
-from brewster.batch.manifest import is_manifest, read_manifest
+from brewster.batch.plan import (
+    FileResult,
+    InputStream,
+    OutputStream,
+    SeparationTask,
+    display_name,
+    plan_files,
+)
 from brewster.errors import BrewsterError, OutputError, PhotoError
-from brewster.files import exists, images_in, is_same_file, write_atomically
-from brewster.image_formats import SUFFIXES, format_of
-from brewster.inference.assessment import Assessment
+from brewster.files import exists, is_same_file, write_atomically
+from brewster.image_formats import format_of
 from brewster.inference.layer_history import find_layer_of_another_photo
 from brewster.inference.separator import Separator
 from brewster.options import Options
-from brewster.remote_path import Location, RemotePath, location
+from brewster.remote_path import Location, RemotePath, check_readable, read_image
 
 BatchProgressCallback = Callable[[int, str, float], None]
 """Called with the number of finished files, the name of the current file, and its completed fraction, 0 to 1.
@@ -37,77 +43,7 @@ It is called before each file, several times while a file is separated, and befo
 raise KeyboardInterrupt in the callback. If it raises another exception while a file is separated, this file fails.
 """
 
-_STREAM_NAME: Final = "-"
 _DEFAULT_OPTIONS: Final = Options()
-
-
-class InputStream(Protocol):
-    """A readable object with the bytes of one photo, such as an open binary file."""
-
-    def read(self) -> bytes:
-        """Returns all bytes."""
-
-
-class OutputStream(Protocol):
-    """A writable object for the bytes of one encoded layer, such as an open binary file."""
-
-    def write(self, data: bytes, /) -> object:
-        """Writes all bytes."""
-
-
-@final
-@dataclass(frozen=True)
-class SeparationTask:
-    """One photo, and the output of each of its layers: a path, a URL or a stream."""
-
-    source: Location | InputStream
-    outputs: Mapping[str, Location | OutputStream]
-    """The output of each layer, by layer name (`transmission`, `reflection` or `confidence`)."""
-
-    @property
-    def name(self) -> str:
-        """The path of the photo as the caller passed it, or `-` for a stream."""
-        return _display_name(self.source)
-
-    def split(self) -> list[SeparationTask]:
-        """Returns a list with only this task, which cannot be split. See `brewster.executors.Task`."""
-        return [self]
-
-    def failed_results(self, reason: str) -> list[FileResult]:
-        """Returns the result of a photo that no worker could separate."""
-        cure = "use fewer workers for each node, or a smaller photo"
-        return [_failed(FileResult(self.name), f"{reason}; expected a photo that fits into memory; {cure}.")]
-
-
-@final
-@dataclass
-class FileResult:
-    """The result for one photo. `brewster --json` prints its fields as one line."""
-
-    source: str
-    """The path of the photo as the caller passed it, or `-` for a stream."""
-    status: Literal["separated", "skipped", "planned", "failed"] = "separated"
-    """`skipped`: all layers exist already. `planned`: a dry run would write `outputs`."""
-    outputs: dict[str, str] = field(default_factory=dict)
-    """The path of each written layer by layer name, or `-` for a stream. If the photo failed, the layers written before."""
-    model: str | None = None
-    model_sha256: str | None = None
-    """The digest of the model file."""
-    photo_sha256: str | None = None
-    """The digest of the photo's file."""
-    device: str | None = None
-    seconds: dict[str, float] = field(default_factory=dict)
-    """Wall time of the steps `decode`, `network`, `upsampling` and `encode`."""
-    residual: float | None = None
-    """See `Separation.residual`."""
-    reconstruction_error: float | None = None
-    """See `Separation.reconstruction_error`."""
-    assessment: Assessment | None = None
-    """See `Separation.assessment`."""
-    reflection_is_derived: bool = False
-    """See `Separation.reflection_is_derived`."""
-    error: str | None = None
-    """The error message, or None."""
 
 
 def separate_files(
@@ -134,7 +70,9 @@ def separate_files(
         options: layers, strength, quality, format and so on, the same as the options of the command line.
         separator: the model. By default, it is loaded with `options` when the first photo needs it.
         overwrite: whether layers that exist are replaced instead of skipped.
-        dry_run: if true, no file is written and no model is loaded. The results contain the paths of the missing layers.
+        dry_run: if true, no file is written and no model is loaded. The results contain the paths of the missing layers. A
+            photo that does not exist, or cannot be opened, fails as in a real run. In an object store, this needs one request
+            for each photo.
         on_progress: see `BatchProgressCallback`.
 
     Returns:
@@ -153,46 +91,6 @@ def separate_files(
     return separate_tasks(
         tasks, options, separator, overwrite=overwrite, dry_run=dry_run, on_progress=on_progress
     )
-
-
-def plan_files(
-    sources: str | os.PathLike[str] | Iterable[str | os.PathLike[str]],
-    output: str | os.PathLike[str] | None = None,
-    options: Options = _DEFAULT_OPTIONS,
-    *,
-    videos: list[Path] | None = None,
-) -> list[SeparationTask]:
-    """Finds the photos, and returns a task for each photo with the paths of its layers.
-
-    Args:
-        sources, output, options: see `separate_files`.
-        videos: the list to which videos in the folders are appended. They get no task.
-
-    Raises:
-        PhotoError: the sources contain no photo.
-        ManifestError: a manifest is not a table, or a row of it is not a path.
-        OutputError: the layers of two photos would have the same path.
-    """
-    given = [sources] if isinstance(sources, str | os.PathLike) else sources
-    paths = [location(source) for source in given]
-    folder = None if output is None else location(output)
-    videos = [] if videos is None else videos
-    images = (
-        pair
-        for source in paths
-        for pair in (
-            read_manifest(source, folder) if is_manifest(source) else images_in(source, folder, videos=videos)
-        )
-    )
-    tasks = [SeparationTask(image, outputs) for image, outputs in name_layers(images, options)]
-    if not tasks:
-        found_videos = f" ({len(videos)} videos)" if videos else ""
-        raise PhotoError(
-            f"there is no photo in {', '.join(map(str, paths))}{found_videos}",
-            f"expected files with one of the suffixes {' '.join(SUFFIXES)}",
-            "pass the path of the file itself, or choose another folder",
-        )
-    return tasks
 
 
 def separate_tasks(
@@ -245,33 +143,34 @@ class BatchRunner:
         result = FileResult(task.name)
         try:
             outputs = self._outputs_to_write(task)
+            if outputs and self._dry_run and isinstance(task.source, Location):
+                with _row_in_error(task):
+                    check_readable(task.source)
         except BrewsterError as error:
-            return _failed(result, error)
+            return result.failed(error)
         if not outputs or self._dry_run:
             result.status = "planned" if outputs else "skipped"
-            result.outputs = {
-                layer: _display_name(target) for layer, target in (outputs or task.outputs).items()
-            }
+            result.outputs = _names(outputs or task.outputs)
             return result
         # This is not in the try block, because no photo can be separated without a model: a model error ends the batch.
         self._separator = separator = self._separator or Separator.load(**self._options.load_options())
         result.model, result.model_sha256, result.device = separator.name, separator.sha256, separator.device
         try:
-            self._separate(separator, SeparationTask(task.source, outputs), result, on_progress)
+            self._separate(separator, replace(task, outputs=outputs), result, on_progress)
         except BrewsterError as error:
-            return _failed(result, error)
+            return result.failed(error)
         except MemoryError:
-            return _failed(
-                result,
+            return result.failed(
                 "the photo does not fit into memory; expected more free memory; close other programs, or make the photo smaller.",
             )
         except Exception as error:  # noqa: BLE001  (raised again after the last photo)
             self.unexpected_error = (
                 self.unexpected_error or error
             )  # only the first, because each traceback keeps its photo in memory
-            return _failed(
-                result, f"internal error in brewster ({type(error).__name__}: {error}); please report it"
+            return result.failed(
+                f"internal error in brewster ({type(error).__name__}: {error}); please report it"
             )
+        result.outputs = _names(task.outputs)  # also the layers that existed before
         return result
 
     def _outputs_to_write(self, task: SeparationTask) -> dict[str, Location | OutputStream]:
@@ -311,7 +210,8 @@ class BatchRunner:
         on_progress: Callable[[float], None],
     ) -> None:
         path = task.source if isinstance(task.source, Location) else None
-        photo = read_content(task.source)
+        with _row_in_error(task):
+            photo = read_content(task.source)
         result.photo_sha256 = _sha256(photo)
         separation = separator(photo, on_progress=on_progress, **self._options.call_options())
         result.seconds, result.residual = dict(separation.seconds), separation.residual
@@ -331,7 +231,7 @@ class BatchRunner:
                 write_atomically(target, encoded, overwrite=self._overwrite, source=path)
             else:
                 target.write(encoded)
-            result.outputs[layer] = _display_name(target)
+            result.outputs[layer] = display_name(target)
         result.seconds["encode"] = time.perf_counter() - started
 
 
@@ -340,9 +240,12 @@ def skipped_result(task: SeparationTask) -> FileResult:
     try:
         check_layers(task.source, task.outputs.values())
     except OutputError as error:
-        return _failed(FileResult(task.name), error)
-    outputs = {layer: _display_name(target) for layer, target in task.outputs.items()}
-    return FileResult(task.name, "skipped", outputs)
+        return FileResult(task.name).failed(error)
+    return FileResult(task.name, "skipped", _names(task.outputs))
+
+
+def _names(outputs: Mapping[str, Location | OutputStream]) -> dict[str, str]:
+    return {layer: display_name(target) for layer, target in outputs.items()}
 
 
 def check_layers(source: Location | InputStream, layers: Iterable[Location | OutputStream]) -> None:
@@ -366,10 +269,27 @@ def check_layers(source: Location | InputStream, layers: Iterable[Location | Out
 
 
 def read_content(source: Location | InputStream) -> Path | bytes:
-    """Returns what a `Separator` reads: a local path, or the bytes of a URL or stream."""
+    """Returns what a `Separator` reads: the path of a local file that can be opened, or the bytes of a URL or stream.
+
+    Raises:
+        UnreadablePhoto: the file does not exist, is a folder, or cannot be opened or read.
+        UnsupportedPhoto: the file has the suffix of a video.
+    """
     if isinstance(source, Path):
+        check_readable(source)
         return source
-    return source.read_bytes() if isinstance(source, RemotePath) else source.read()
+    return read_image(source) if isinstance(source, RemotePath) else source.read()
+
+
+@contextmanager
+def _row_in_error(task: SeparationTask) -> Iterator[None]:
+    """Adds the row of the manifest to the error of a photo that does not exist or cannot be read."""
+    try:
+        yield
+    except PhotoError as error:
+        if task.row:
+            error.happened = f"{task.row}: {error.happened}"
+        raise
 
 
 def _sha256(photo: Path | bytes) -> str | None:
@@ -382,12 +302,3 @@ def _sha256(photo: Path | bytes) -> str | None:
 def real_path(path: Location) -> str:
     """Returns the absolute path without symbolic links; a URL is returned unchanged."""
     return str(path) if isinstance(path, RemotePath) else os.path.realpath(path)
-
-
-def _display_name(source_or_target: object) -> str:
-    return str(source_or_target) if isinstance(source_or_target, Location) else _STREAM_NAME
-
-
-def _failed(result: FileResult, error: object) -> FileResult:
-    result.status, result.error = "failed", str(error)
-    return result

@@ -16,7 +16,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, final
 
-from brewster.cli.batch_plan import counted
+from brewster.cli.batch_plan import listed
 from brewster.cli.terminal import (
     interrupts,
     one_line,
@@ -224,7 +224,7 @@ class _Summary:
     def error_messages(self) -> list[str]:
         """Returns a message for each failed photo. Photos that need the same missing extra share a message."""
         grouped = (
-            f"{sources[0] if len(sources) == 1 else counted(sources, 'photo')}: {error}"
+            f"{sources[0] if len(sources) == 1 else listed(sources, 'photo')}: {error}"
             for error, sources in self._sources_by_missing_extra.items()
         )
         return [*self._errors, *grouped]
@@ -250,9 +250,10 @@ def _duration(seconds: float) -> str:
 
 
 def _error_text(result: FileResult) -> str:
-    """Returns the error message of a photo, which begins with its path."""
-    has_source = str(result.error).startswith(f"{result.source} ")
-    return str(result.error) if has_source else f"{result.source}: {result.error}"
+    """Returns the error message of a photo, with its path in front if the message does not begin with it or with its row."""
+    error = str(result.error)
+    has_source = error.startswith(f"{result.source} ") or f": {result.source} " in error
+    return error if has_source else f"{result.source}: {error}"
 
 
 def _json_line(result: FileResult) -> bytes:

@@ -5,17 +5,19 @@ from __future__ import annotations
 import os
 import re
 import sys
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, final
 
 import click
 
 from brewster.cli.terminal import write_out
+from brewster.errors import counted
 from brewster.files import LAYER_FORMATS
-from brewster.image_formats import WRITABLE, ImageFormat, format_of
+from brewster.image_formats import WRITABLE, ImageFormat, format_of, is_video
 from brewster.options import Options
-from brewster.remote_path import location, path_of_file_url
+from brewster.remote_path import Location, location, path_of_file_url
 
 if TYPE_CHECKING:
     from brewster.batch import SeparationTask
@@ -38,20 +40,36 @@ def local_path(text: str) -> str:
 
 
 def absolute_path(path: str) -> str:
-    """Returns the absolute path, or the URL: the workers of a batch may have other working folders."""
+    """Returns the absolute path, or the URL."""
     found = location(path)
     return os.path.abspath(found) if isinstance(found, Path) else str(found)  # noqa: PTH100  (keeps links)
 
 
-def skipped_videos(videos: Sequence[Path]) -> str:
-    """Returns a line about the videos in the folders, at least one."""
-    return f"{counted(videos, 'video')} skipped: brewster separates photos; extract single images first, for example with ffmpeg"
+def skipped_files(files: Sequence[Location]) -> Iterator[str]:
+    """Yields a line about the videos, and a line about all other files, which do not have the suffix of an image either."""
+    videos, others = (
+        [file for file in files if is_video(file)],
+        [file for file in files if not is_video(file)],
+    )
+    if videos:
+        yield f"{listed(videos, 'video')} skipped: brewster separates photos; extract single images first, for example with ffmpeg"
+    if others:
+        suffixes = Counter(file.suffix.lower() or "without a suffix" for file in others)
+        counts = [f"{number} {suffix}" for suffix, number in suffixes.most_common()]
+        yield (
+            f"{counted(len(others), 'other file')} skipped ({_shortened(counts)}), for example {others[0]}: "
+            "expected the suffix of an image; if such a file is a photo, pass its own path, or convert it"
+        )
 
 
-def counted(names: Sequence[object], kind: str) -> str:
+def listed(names: Sequence[object], noun: str) -> str:
     """Returns `2 videos (a.mp4, b.mov)`, with at most `_MAX_NAMES` names."""
+    return f"{counted(len(names), noun)} ({_shortened(names)})"
+
+
+def _shortened(names: Sequence[object]) -> str:
     more = f" and {len(names) - _MAX_NAMES} more" if len(names) > _MAX_NAMES else ""
-    return f"{len(names)} {kind}{'s' * (len(names) != 1)} ({', '.join(map(str, names[:_MAX_NAMES]))}{more})"
+    return f"{', '.join(map(str, names[:_MAX_NAMES]))}{more}"
 
 
 def is_single_output(photos: Sequence[str], output: str | None) -> bool:
@@ -60,11 +78,11 @@ def is_single_output(photos: Sequence[str], output: str | None) -> bool:
 
 
 def plan(
-    photos: Sequence[str], output: str | None, options: Options, videos: list[Path] | None = None
+    photos: Sequence[str], output: str | None, options: Options, skipped: list[Location] | None = None
 ) -> list[SeparationTask]:
     """Returns a task for each photo in the files and folders. A task contains the paths of the photo and of its layers.
 
-    Videos in the folders are appended to the list `videos`.
+    Files in the folders without the suffix of an image, such as videos, are appended to the list `skipped`.
 
     Raises:
         click.UsageError: the arguments contradict each other.
@@ -77,7 +95,7 @@ def plan(
         return [_plan_single_output(photos, output, options)]
     _check_not_a_file(output)
     _check_output_folder(photos, output)
-    return plan_files(photos, output, options, videos=videos)
+    return plan_files(photos, output, options, skipped=skipped)
 
 
 def _plan_single_output(photos: Sequence[str], output: str | None, options: Options) -> SeparationTask:

@@ -14,6 +14,7 @@ import click
 
 from brewster.cli.extras import require_extra
 from brewster.cli.terminal import interrupts, print_error, print_status, progress, write_out
+from brewster.errors import counted
 from brewster.options import Device, Quality
 
 if TYPE_CHECKING:
@@ -249,12 +250,9 @@ class _EvaluateCommand:
         is_complete = print_remarks(benchmarks, quiet=self.quiet)
         check(benchmarks, methods, self._config())
         for benchmark in benchmarks:
-            print_status(f"{benchmark.title}: {len(benchmark.cases)} images")
-            write_out(
-                "".join(f"{benchmark.name}/{case.name}\n" for case in benchmark.cases).encode(
-                    errors=_ENCODE_ERRORS
-                )
-            )
+            print_status(f"{benchmark.title}: {counted(len(benchmark.cases), 'image')}")
+            names = "".join(f"{benchmark.name}/{case.name}\n" for case in benchmark.cases)
+            write_out(names.encode(errors=_ENCODE_ERRORS))
         for method in methods:
             print_status(f"method: {method.name}")
         return is_complete

@@ -14,7 +14,7 @@ from click.core import ParameterSource
 from click.shell_completion import CompletionItem
 
 from brewster.cli.batch import BatchCommand
-from brewster.cli.batch_plan import absolute_path, is_single_output, local_path, plan, skipped_videos
+from brewster.cli.batch_plan import absolute_path, is_single_output, local_path, plan, skipped_files
 from brewster.cli.extras import require_extra
 from brewster.cli.terminal import print_out, print_status, standard_output
 from brewster.errors import BrewsterError
@@ -23,7 +23,8 @@ from brewster.models import zoo
 from brewster.options import Options
 
 if TYPE_CHECKING:
-    from brewster.batch.runner import SeparationTask
+    from brewster.batch import SeparationTask
+    from brewster.remote_path import Location
 
 _METAVARS: Final[dict[object, str]] = {int: "NUMBER", float: "NUMBER", Path | None: "FILE"}
 
@@ -166,7 +167,11 @@ def _param_type(hint: object, field: dataclasses.Field[Any]) -> click.ParamType[
     "--json", "as_json", is_flag=True, help="Print one line of JSON for each photo on standard output."
 )
 @click.option("--quiet", is_flag=True, help="Print only errors.")
-@click.option("--dry-run", is_flag=True, help="Print the planned files, and write nothing.")
+@click.option(
+    "--dry-run",
+    is_flag=True,
+    help="Print the planned files, and the photos that cannot be opened. Write nothing.",
+)
 @click.option("--overwrite", is_flag=True, help="Replace existing layers.")
 @click.option(
     "--contact-sheet",
@@ -220,10 +225,10 @@ def separate(
 ) -> None:
     """Separate photos taken through glass into transmission and reflection.
 
-    PHOTO is an image file, a folder of image files, a table of paths (.csv or .parquet, with the column path), the URL of one
-    of these in an object store (s3://bucket/folder), or - for standard input. The layers of photo.jpg are written next
-    to it as photo.transmission.jpg and photo.reflection.jpg, or into the output folder, which mirrors the tree below an
-    input folder. If -o is an image file or standard output, only one layer is written: the layer that --layers selects,
+    PHOTO is an image file, a folder of image files (other files in it are counted, and skipped), a table of paths (.csv or
+    .parquet, with the column path), the URL of one of these in an object store (s3://bucket/folder), or - for standard
+    input. The layers of photo.jpg are written next to it as photo.transmission.jpg and photo.reflection.jpg, or into the
+    output folder, which mirrors the tree below an input folder. If -o is an image file or standard output, only one layer is written: the layer that --layers selects,
     by default the transmission.
 
     Photos whose layers exist are skipped. A photo fails if these layers were made from another photo, for example one with the
@@ -243,11 +248,13 @@ def separate(
     if is_plan or gpu_name:
         _print_plan(photos, output, options, gpu_name)
         return
-    if (workers or cluster or index) and not dry_run:
+    if workers or cluster or index:
+        # All paths become absolute: other nodes have other working folders, and the index is read from any folder.
         _check_archive_output(single_output, output, needs_folder=bool(cluster or index))
         photos, output = tuple(map(absolute_path, photos)), output and absolute_path(output)
-    videos: list[Path] = []
-    tasks = plan(photos, output, options, videos)
+        contact_sheet = contact_sheet and contact_sheet.absolute()
+    skipped: list[Location] = []
+    tasks = plan(photos, output, options, skipped)
     if single_output and output in (None, "-") and not dry_run:
         _reject_shared_output(as_json=as_json)
     if contact_sheet and cluster:
@@ -255,8 +262,8 @@ def separate(
     if contact_sheet:
         _check_contact_sheet(contact_sheet, photos, output)
         tasks = _without_contact_sheet(tasks, contact_sheet, overwrite=overwrite)
-    if videos and not quiet:
-        print_status(skipped_videos(videos))
+    for line in skipped_files(skipped) if not quiet else ():
+        print_status(line)
     batch = BatchCommand(
         options,
         output=output,

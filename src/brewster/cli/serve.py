@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import logging
 import re
 import secrets
 import webbrowser
@@ -125,6 +126,11 @@ def _read_token(_context: click.Context, _parameter: click.Parameter, token: str
     metavar="SECONDS",
     help="The maximum time for one photo, including the time in the queue.",
 )
+@click.option(
+    "--verbose",
+    is_flag=True,
+    help="Log each photo that fails on standard error, with the messages of the libraries that read it.",
+)
 @click.option("--open", "open_browser", is_flag=True, help="Open the page in the web browser.")
 def serve(
     *,
@@ -137,6 +143,7 @@ def serve(
     max_pixels: int,
     queue: int,
     timeout: float,
+    verbose: bool,
     open_browser: bool,
 ) -> None:
     """Serve the web page and the HTTP API until Ctrl-C.
@@ -152,6 +159,9 @@ def serve(
     from brewster.web.model_cache import ModelCache  # noqa: PLC0415
     from brewster.web.separation import separation_router  # noqa: PLC0415
 
+    if verbose:
+        logging.basicConfig(format="%(asctime)s %(message)s")
+        logging.getLogger("brewster").setLevel(logging.INFO)
     if not is_loopback(host):
         print_status(_WARNING.format(host=host))
         token = token or AUTO

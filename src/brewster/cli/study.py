@@ -18,7 +18,7 @@ from brewster.cli.extras import require_extra
 from brewster.cli.serve import AUTO, address_options, print_link
 from brewster.cli.study_bundle import export_study, import_answers
 from brewster.cli.terminal import print_out, print_status, progress, write_out
-from brewster.errors import BrewsterError
+from brewster.errors import BrewsterError, counted
 
 _HOST_NAME: Final = re.compile(r"[a-z0-9_-]+(\.[a-z0-9_-]+)*", re.IGNORECASE)
 _MAX_BYTES: Final = 10_000  # an answer has about 80 bytes
@@ -171,8 +171,8 @@ def create(
             out, inputs, folders, options, lambda done: update_progress(done, "copying")
         ).description
     print_status(
-        f"{out}: {len(description.comparisons)} comparisons of {len(description.methods)} methods; a participant sees "
-        f"{description.pairs} of them and {description.catch_trials} catch trials (seed {description.seed})"
+        f"{out}: {counted(len(description.comparisons), 'comparison')} of {counted(len(description.methods), 'method')}; "
+        f"a participant sees {description.pairs} of them and {counted(description.catch_trials, 'catch trial')} (seed {description.seed})"
     )
     print_status(f"next: brewster study serve {out}")
 

@@ -53,7 +53,7 @@ def export_study(folder: Path, *, out: Path, participants: int, url: str) -> Non
     root = url if not url or url.endswith("/") else f"{url}/"
     for token in tokens:
         print_out(f"{root}?p={token}")
-    print_status(f"the page is in {out}; send each participant one of the {len(tokens)} links above")
+    print_status(f"the page is in {out}; send one of the links above to each participant")
 
 
 @click.command("import")

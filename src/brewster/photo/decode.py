@@ -19,7 +19,7 @@ import numpy as np
 import pyvips
 from numpy.typing import NDArray
 
-from brewster.errors import MissingExtra, PhotoError, UnreadablePhoto, UnsupportedPhoto
+from brewster.errors import MissingExtra, PhotoError, UnreadablePhoto, UnsupportedPhoto, counted, video_error
 from brewster.files import DEFAULT_MAX_PIXELS
 from brewster.image_formats import FORMATS, VIDEO_SIGNATURE, format_of_content
 from brewster.photo import metadata
@@ -66,7 +66,7 @@ def decode(data: bytes, max_pixels: int) -> Decoded:
     if decoded.pixels.dtype.kind == "f" and not np.isfinite(decoded.pixels).all():
         count = int((~np.isfinite(decoded.pixels)).any(axis=2).sum())
         raise UnsupportedPhoto(
-            f"{count} pixels are infinite or NaN",
+            f"{counted(count, 'pixel')} {'is' if count == 1 else 'are'} infinite or NaN",
             "expected finite values",
             "render the image again without such pixels",
         )
@@ -117,9 +117,7 @@ def _detect_format(data: bytes) -> str:
         is_raw_tiff = image_format.name == "tiff" and is_raw(metadata.read_tags(data))
         return "raw" if is_raw_tiff else image_format.name
     if re.match(VIDEO_SIGNATURE, data, re.DOTALL):
-        raise UnsupportedPhoto(
-            "the file is a video", "expected a photo", "extract single images first, for example with ffmpeg"
-        )
+        raise video_error("the file")
     raise UnreadablePhoto(
         f"the file starts with {data[:12]!r}, which is no known image format",
         f"expected one of {', '.join(FORMATS)}",
@@ -141,7 +139,7 @@ def _decode_vips(data: bytes, format_name: str, max_pixels: int) -> Decoded:
         file_info = _file_info(image, data, format_name)
         array = np.frombuffer(image.write_to_memory(), _DTYPES[image.format])
     except pyvips.Error as error:
-        raise _unreadable_error(format_name, error) from error
+        raise _unreadable_error(format_name) from error
     array = _full_scale(array.reshape(image.height, image.width, image.bands), file_info.bits)
     return split_alpha(apply_orientation(array, _orientation(image, format_name)), file_info)
 
@@ -153,7 +151,7 @@ def _open_vips(data: bytes, format_name: str, max_pixels: int) -> pyvips.Image:
         image = load(data, access="sequential", fail_on=_FAIL_ON.get(format_name, "truncated"))
         _check_supported(image, data, format_name, max_pixels)
     except pyvips.Error as error:
-        raise _unreadable_error(format_name, error) from error
+        raise _unreadable_error(format_name) from error
     return image
 
 
@@ -163,11 +161,10 @@ def _orientation(image: pyvips.Image, format_name: str) -> int:
     return int(image.get("orientation")) if must_be_applied else 1
 
 
-def _unreadable_error(format_name: str, error: Exception | str) -> PhotoError:
-    lines = [line.strip() for line in str(error).splitlines()]
-    message = " ".join(line for line in lines if line and not line.startswith(("unable to", "source:")))
+def _unreadable_error(format_name: str, reason: str = "") -> PhotoError:
+    """Returns the error for a damaged file. The message of a library is only its cause, in tracebacks and the log of the server."""
     return UnreadablePhoto(
-        f"the {format_name} cannot be read completely ({message[:200] or error})",
+        f"the {format_name} cannot be read completely{f' ({reason})' if reason else ''}",
         "expected a complete file in a common variant of the format",
         "copy the file again from its source, or convert it",
     )
@@ -314,7 +311,7 @@ def _merged_image(data: bytes, max_pixels: int) -> bytes:
                 raise _unreadable_error("ora", "the merged image is too large")
             return archive.read("mergedimage.png")
     except _ZIP_ERRORS as error:  # RuntimeError: the file is encrypted
-        raise _unreadable_error("ora", error) from error
+        raise _unreadable_error("ora") from error
 
 
 # --- HEIC
@@ -335,11 +332,11 @@ def _open_heic(data: bytes, max_pixels: int) -> Any:  # noqa: ANN401  (pillow-he
     try:
         heif = pillow_heif.open_heif(data, convert_hdr_to_8bit=False)
         if not len(heif):
-            raise ValueError("no image in the file can be decoded")
+            raise _unreadable_error("heic", "no image in the file can be decoded")
         if heif.size[0] * heif.size[1] > max_pixels:
             raise too_large_error(heif.size[0], heif.size[1], max_pixels)
     except _HEIC_ERRORS as error:
-        raise _unreadable_error("heic", error) from error
+        raise _unreadable_error("heic") from error
     return heif
 
 
@@ -352,7 +349,7 @@ def _decode_heic(data: bytes, max_pixels: int) -> Decoded:
     try:
         array = np.array(heif)
     except _HEIC_ERRORS as error:
-        raise _unreadable_error("heic", error) from error
+        raise _unreadable_error("heic") from error
     exif, xmp = heif.info.get("exif"), heif.info.get("xmp")
     file_info = FileInfo(
         format_name="heic",

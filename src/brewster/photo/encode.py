@@ -67,9 +67,8 @@ def _encode_vips(array: Stored, file_info: FileInfo) -> bytes:
     try:
         return bytes(save(keep=keep, **_save_options(file_info, array.dtype)))
     except pyvips.Error as error:
-        lines = [line.strip() for line in str(error).splitlines() if line.strip()]
         raise UnsupportedPhoto(
-            f"{width} x {height} pixels cannot be written as {file_info.format_name} ({lines[-1]})",
+            f"{width} x {height} pixels cannot be written as {file_info.format_name}",
             "expected a size that the format can store",
             "write PNG or TIFF",
         ) from error

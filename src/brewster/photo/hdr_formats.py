@@ -96,7 +96,7 @@ def _exr_part(data: bytes, *, header_only: bool) -> Any:  # noqa: ANN401  (OpenE
         return exr.File(io.BytesIO(data), separate_channels=True, header_only=header_only).parts[0]
     except (RuntimeError, ValueError, TypeError, IndexError) as error:
         raise UnreadablePhoto(
-            f"the EXR cannot be read completely ({error})",
+            "the EXR cannot be read completely",
             "expected a complete file",
             "export the image again",
         ) from error

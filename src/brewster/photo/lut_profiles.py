@@ -55,9 +55,9 @@ def convert_to_display_p3(pixels: NDArray[Any], file_info: FileInfo) -> tuple[ND
         )
         array = _convert(pixels, icc)
     except pyvips.Error as error:
-        raise _damaged_profile(icc, str(error).strip()) from error
+        raise _damaged_profile(icc) from error
     if profile_is_ignored:
-        raise _damaged_profile(icc, "libvips ignores the profile")
+        raise _damaged_profile(icc)
     return array, replace(file_info, icc=bytes(pyvips.Image.profile_load("p3")))
 
 
@@ -77,9 +77,9 @@ def _convert(pixels: NDArray[Any], icc: bytes) -> NDArray[Any]:
     return np.frombuffer(converted.write_to_memory(), pixels.dtype).reshape(pixels.shape)
 
 
-def _damaged_profile(icc: bytes, reason: str) -> UnsupportedPhoto:
+def _damaged_profile(icc: bytes) -> UnsupportedPhoto:
     return UnsupportedPhoto(
-        f"the LUT-based colour profile ({len(icc)} bytes) cannot be used ({reason})",
+        f"the LUT-based colour profile ({len(icc)} bytes) cannot be used",
         "expected a complete ICC profile",
         "convert the photo to sRGB or Display P3 first",
     )

@@ -13,7 +13,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from brewster.errors import PhotoError, UnreadablePhoto, UnsupportedPhoto
+from brewster.errors import PhotoError, UnsupportedPhoto
 from brewster.files import DEFAULT_MAX_PIXELS, write_atomically
 from brewster.image_formats import FORMATS
 from brewster.photo.colour import SRGB, ColourSpace, colour_space_of
@@ -34,6 +34,7 @@ from brewster.photo.in_memory import (
     pil_image,
 )
 from brewster.photo.lut_profiles import convert_to_display_p3, has_only_tables
+from brewster.remote_path import read_image
 
 Float32 = NDArray[np.float32]
 Stored = NDArray[Any]
@@ -79,7 +80,8 @@ class Photo:
 
         Raises:
             UnreadablePhoto: the file is missing, empty, truncated, or not an image.
-            UnsupportedPhoto: the image has CMYK colours, several frames, five channels, NaN values, or a damaged profile.
+            UnsupportedPhoto: the image has CMYK colours, several frames, five channels, NaN values, or a damaged profile; or
+                the file is a video, by its suffix or by its content.
             PhotoTooLarge: the image has more pixels than `max_pixels`.
             MissingExtra: the reader of EXR, HEIC or RAW is not installed.
             PhotoError: the encoding of an array is missing or unknown, or an encoding was passed for another source.
@@ -371,7 +373,7 @@ def _read_source(source: object) -> bytes:
     if isinstance(source, bytes | bytearray | memoryview):
         return bytes(source)
     if isinstance(source, str | os.PathLike):
-        return _read_file(Path(source))
+        return read_image(Path(source))
     data = source.read() if isinstance(source, BinaryFile) else None
     if isinstance(data, bytes):
         return data
@@ -380,13 +382,3 @@ def _read_source(source: object) -> bytes:
         f"the source of a photo is a {type(source).__name__}{mode}; expected a path, the bytes of a file, an open binary file, "
         "a numpy array, a PIL image or a Photo; pass one of these"
     )
-
-
-def _read_file(path: Path) -> bytes:
-    try:
-        return path.read_bytes()
-    except OSError as error:
-        reason = "it is a folder" if path.is_dir() else error.strerror or str(error)
-        raise UnreadablePhoto(
-            f"{path} cannot be read ({reason})", "expected an image file", "check its name and permissions"
-        ) from error

@@ -96,9 +96,8 @@ def _opened(data: bytes) -> Iterator[Any]:
         with rawpy.imread(io.BytesIO(data)) as raw:
             yield raw
     except rawpy.LibRawError as error:
-        reason = error.args[0].decode() if error.args and isinstance(error.args[0], bytes) else str(error)
         raise UnreadablePhoto(
-            f"the RAW file cannot be read completely ({reason})",
+            "the RAW file cannot be read completely",
             f"expected a complete RAW file of a camera that LibRaw {'.'.join(map(str, rawpy.libraw_version))} supports",
             "copy the file again from the camera, or convert it to DNG or TIFF",
         ) from error

@@ -7,6 +7,7 @@ All files of the pages are part of this package, so that the pages work offline.
 
 from __future__ import annotations
 
+import logging
 import signal
 import socket
 from collections.abc import Callable, Iterator
@@ -37,6 +38,7 @@ from brewster.web.middleware import SECURITY_HEADERS, AccessMiddleware, AccessPo
 from brewster.web.request_schema import validation_message
 from brewster.web.server import create_server
 
+_LOGGER: Final = logging.getLogger(__name__)
 PAGE_FOLDER: Final = Path(__file__).parent / "page"
 _STATUS_CODES: Final[dict[type[BrewsterError], int]] = {
     PhotoTooLarge: 413,
@@ -139,7 +141,10 @@ def _sigterm_as_sigint() -> Iterator[None]:
 
 
 async def _error_response(request: Request, error: Exception) -> Response:
-    """Returns an error as JSON, `{"error": message}`. For a BrewsterError, `kind` is the name of its class."""
+    """Returns an error as JSON, `{"error": message}`. For a BrewsterError, `kind` is the name of its class.
+
+    The traceback of a BrewsterError is logged, because it has the messages of libraries, which the response does not have.
+    """
     if isinstance(error, ClientDisconnect):
         return Response(status_code=499)  # the client has disconnected and does not read the response
     if isinstance(error, HTTPException):
@@ -147,6 +152,7 @@ async def _error_response(request: Request, error: Exception) -> Response:
     if isinstance(error, RequestValidationError):
         return JSONResponse({"error": validation_message(error.errors())}, 422)
     if isinstance(error, BrewsterError):
+        _LOGGER.info("%s %s failed", request.method, request.url.path, exc_info=error)
         body = {"error": str(error), "kind": type(error).__name__}
         return JSONResponse(body, _STATUS_CODES.get(type(error), 422))
     body = {

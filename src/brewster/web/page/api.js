@@ -98,7 +98,7 @@ async function connectionError() {
 async function serverError(request, file) {
   const body = await request.response.text().then(JSON.parse).catch(() => ({}));
   const message = sentence(body.error ?? `the server returned status ${request.status}`);
-  const isVideo = body.kind === "UnreadablePhoto" && file.type.startsWith("video/");
+  const isVideo = ["UnreadablePhoto", "UnsupportedPhoto"].includes(body.kind) && file.type.startsWith("video/");
   const meaning = isVideo ? "This is a video. Only photos can be separated." : MEANINGS[body.kind];
   return Object.assign(new Error(meaning ?? message), { details: meaning ? message : "" });
 }

@@ -1,0 +1,156 @@
+"""Finds the photos of a batch, and plans a task for each photo with the paths of its layers.
+
+for task in plan_files("holiday", "clear"):
+    print(task.source, task.outputs)
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import Final, Literal, Protocol, final
+
+from brewster.batch.layer_names import name_layers
+from brewster.batch.manifest import ManifestRow, is_manifest, read_manifest
+from brewster.errors import PhotoError, counted
+from brewster.files import absolute, images_in
+from brewster.image_formats import SUFFIXES, is_video
+from brewster.inference.assessment import Assessment
+from brewster.options import Options
+from brewster.remote_path import Location, location
+
+_STREAM_NAME: Final = "-"
+_DEFAULT_OPTIONS: Final = Options()
+
+
+class InputStream(Protocol):
+    """A readable object with the bytes of one photo, such as an open binary file."""
+
+    def read(self) -> bytes:
+        """Returns all bytes."""
+
+
+class OutputStream(Protocol):
+    """A writable object for the bytes of one encoded layer, such as an open binary file."""
+
+    def write(self, data: bytes, /) -> object:
+        """Writes all bytes."""
+
+
+@final
+@dataclass(frozen=True)
+class SeparationTask:
+    """One photo, and the output of each of its layers: a path, a URL or a stream."""
+
+    source: Location | InputStream
+    outputs: Mapping[str, Location | OutputStream]
+    """The output of each layer, by layer name (`transmission`, `reflection` or `confidence`)."""
+    row: ManifestRow | None = None
+    """The first row of a manifest that lists the photo, or None if no manifest lists it."""
+
+    @property
+    def name(self) -> str:
+        """The path of the photo as the caller passed it, or `-` for a stream."""
+        return display_name(self.source)
+
+    def split(self) -> list[SeparationTask]:
+        """Returns a list with only this task, which cannot be split. See `brewster.executors.Task`."""
+        return [self]
+
+    def failed_results(self, reason: str) -> list[FileResult]:
+        """Returns the result of a photo that no worker could separate."""
+        cure = "use fewer workers for each node, or a smaller photo"
+        return [FileResult(self.name).failed(f"{reason}; expected a photo that fits into memory; {cure}.")]
+
+
+@final
+@dataclass
+class FileResult:
+    """The result for one photo. `brewster --json` prints its fields as one line."""
+
+    source: str
+    """The path of the photo as the caller passed it, or `-` for a stream."""
+    status: Literal["separated", "skipped", "planned", "failed"] = "separated"
+    """`skipped`: all layers exist already. `planned`: a dry run would write `outputs`."""
+    outputs: dict[str, str] = field(default_factory=dict)
+    """The path of each layer by layer name, or `-` for a stream. If the photo failed, the layers that were written before. If it is
+    planned, the missing layers."""
+    model: str | None = None
+    model_sha256: str | None = None
+    """The digest of the model file."""
+    photo_sha256: str | None = None
+    """The digest of the photo's file."""
+    device: str | None = None
+    seconds: dict[str, float] = field(default_factory=dict)
+    """Wall time of the steps `decode`, `network`, `upsampling` and `encode`."""
+    residual: float | None = None
+    """See `Separation.residual`."""
+    reconstruction_error: float | None = None
+    """See `Separation.reconstruction_error`."""
+    assessment: Assessment | None = None
+    """See `Separation.assessment`."""
+    reflection_is_derived: bool = False
+    """See `Separation.reflection_is_derived`."""
+    error: str | None = None
+    """The error message, or None."""
+
+    def failed(self, error: object) -> FileResult:
+        """Sets the status "failed" and the error message. Returns the result itself."""
+        self.status, self.error = "failed", str(error)
+        return self
+
+
+def plan_files(
+    sources: str | os.PathLike[str] | Iterable[str | os.PathLike[str]],
+    output: str | os.PathLike[str] | None = None,
+    options: Options = _DEFAULT_OPTIONS,
+    *,
+    skipped: list[Location] | None = None,
+) -> list[SeparationTask]:
+    """Finds the photos, and returns a task for each photo with the paths of its layers.
+
+    Args:
+        sources, output, options: see `separate_files`.
+        skipped: the list to which the files in the folders are appended that do not have the suffix of an image, such as videos.
+            They get no task. Hidden files are left out.
+
+    Raises:
+        PhotoError: the sources contain no photo.
+        ManifestError: a manifest is not a table, or a row of it is not a path.
+        OutputError: the layers of two photos would have the same path.
+    """
+    given = [sources] if isinstance(sources, str | os.PathLike) else sources
+    paths = [location(source) for source in given]
+    folder = None if output is None else location(output)
+    skipped = [] if skipped is None else skipped
+    rows: dict[str, ManifestRow] = {}
+
+    def images() -> Iterator[tuple[Location, Location]]:
+        for source in paths:
+            if not is_manifest(source):
+                yield from images_in(source, folder, skipped=skipped)
+                continue
+            for number, (image, image_folder) in enumerate(read_manifest(source, folder), 1):
+                rows.setdefault(absolute(image), ManifestRow(source, number))
+                yield image, image_folder
+
+    tasks = [
+        SeparationTask(image, outputs, rows.get(absolute(image)))
+        for image, outputs in name_layers(images(), options)
+    ]
+    if not tasks:
+        videos = sum(map(is_video, skipped))
+        counts = {"video": videos, "other file": len(skipped) - videos}
+        found = ", ".join(counted(number, kind) for kind, number in counts.items() if number)
+        raise PhotoError(
+            f"there is no photo in {', '.join(map(str, paths))}{f' ({found})' if found else ''}",
+            f"expected files with one of the suffixes {' '.join(SUFFIXES)}",
+            "pass the path of the file itself, or choose another folder",
+        )
+    return tasks
+
+
+def display_name(source_or_target: object) -> str:
+    """Returns the path or the URL, or `-` for a stream."""
+    return str(source_or_target) if isinstance(source_or_target, Location) else _STREAM_NAME
