@@ -305,7 +305,7 @@ def test_help_goes_to_standard_output():
         ["separate"],
         ["a.jpg", "--strength", "2"],
         ["a.jpg", "--strength", "nan"],
-        ["a.jpg", "--quality", "superb"],
+        ["a.jpg", "--quality", "best"],
         ["a.jpg", "--layers", "background"],
         ["a.jpg", "--layers", ""],
         ["a.jpg", "--device", "tpu"],

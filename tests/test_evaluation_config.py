@@ -38,12 +38,12 @@ def test_several_thresholds_give_a_column_each():
 def test_every_setting_is_described():
     description = " ".join(
         EvaluationConfig(
-            short_side_px=420, quality="best", thresholds=(0.05, 0.2), paper_subset=True
+            short_side_px=420, quality="draft", thresholds=(0.05, 0.2), paper_subset=True
         ).describe()
     )
     for word in (
         "420 px",
-        '"best"',
+        '"draft"',
         "0.05 or 0.2",
         "seed 181",
         "bootstrap",

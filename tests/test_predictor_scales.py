@@ -55,7 +55,7 @@ def test_the_documentation_states_the_input_scales_of_every_quality_in_megapixel
 
 
 def test_an_input_is_never_larger_than_the_photo_and_each_size_is_used_once():
-    assert input_pixels("best", 100, 150) == [100 * 150] * 2
+    assert input_pixels("standard", 100, 150) == [100 * 150] * 2
 
 
 @pytest.mark.parametrize("size", [(12_000, 1500), (1500, 12_000), (40_000, 400)])
@@ -73,13 +73,13 @@ def test_the_prediction_is_the_mean_over_all_inputs():
     photo = np.full((900, 1200, 3), 0.5, np.float32)
     heights = [
         height
-        for _, height in MultiScalePredictor(lambda tile: (tile, tile)).input_sizes((1200, 900), "best")
+        for _, height in MultiScalePredictor(lambda tile: (tile, tile)).input_sizes((1200, 900), "standard")
     ]
 
     def backend(tile):
         return tile - np.float32(1e-4 * tile.shape[0]), np.zeros_like(tile)
 
-    result = Separator(backend)(Photo.from_array(photo, encoding="linear"), quality="best")
+    result = Separator(backend)(Photo.from_array(photo, encoding="linear"))
     change = result.transmission.linear() - 0.5
     np.testing.assert_allclose(change, -1e-4 * np.mean(heights), atol=1e-3)
 

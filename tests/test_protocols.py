@@ -28,7 +28,7 @@ def test_the_contest_crops_the_border_and_scores_its_five_metrics():
 
 
 def test_a_changed_setting_is_named():
-    lines = describe_protocol(protocol_config("xreflection", short_side_px=None, quality="best"))
+    lines = describe_protocol(protocol_config("xreflection", short_side_px=None, quality="draft"))
     assert lines[-1] == "This run differs from the protocol xreflection in: short_side_px."
 
 

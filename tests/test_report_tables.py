@@ -72,7 +72,7 @@ def test_csv_has_a_line_for_every_mean_and_every_difference(results):
 @pytest.mark.parametrize("width", [40, 60, 80, 200])
 def test_the_tables_fit_the_terminal(results, width):
     results["metrics"] = {f"psnr{i}": METRICS["psnr"] for i in range(12)}
-    name = "a method with a name of many words, quality best"
+    name = "a method with a name of many words, quality draft"
     results["methods"] = {"input (unprocessed)": {}, name: {}, f"{name} 2": {}}
     row = {f"psnr{i}": entry(20.0 + i, low=18.0, high=21.0) for i in range(12)}
     results["tables"] = {key: dict.fromkeys(results["methods"], row) for key in results["tables"]}

@@ -74,11 +74,11 @@ def test_a_photo_alone_gets_the_default_options():
 
 def test_every_client_option_is_read():
     request = parse(
-        strength="0.5", quality="best", format="tiff", additive="true", model="mine", layers="reflection"
+        strength="0.5", quality="draft", format="tiff", additive="true", model="mine", layers="reflection"
     )
     assert request.options == Options(
         strength=0.5,
-        quality="best",
+        quality="draft",
         format="tiff",
         additive=True,
         model="mine",
@@ -114,7 +114,7 @@ def test_an_empty_field_counts_as_omitted():
         ({"strength": "nan"}, "strength is 'nan'"),
         ({"strength": "-1"}, "strength is '-1'"),
         ({"strength": "a lot"}, "strength is 'a lot'"),
-        ({"quality": "fine"}, "'draft', 'standard' or 'best'"),
+        ({"quality": "best"}, "quality is 'best'; expected 'draft' or 'standard'"),
         ({"format": "gif"}, "format is 'gif'"),
         ({"layers": "transmission,glass"}, "layers is 'glass'"),
         ({"layers": ""}, "layers is ''"),
@@ -138,13 +138,13 @@ def test_a_wrong_value_is_named_in_the_message(fields, part):
 
 def test_every_wrong_value_is_in_the_message():
     data = body(
-        ("photo", b"bytes", "a.jpg"), ("strength", b"1.5"), ("quality", b"fine"), ("additive", b"perhaps")
+        ("photo", b"bytes", "a.jpg"), ("strength", b"1.5"), ("quality", b"best"), ("additive", b"perhaps")
     )
     status, message = refused(data)
     assert status == 422
     assert message == (
         "strength is '1.5'; expected a number of at most 1; correct strength. "
-        "quality is 'fine'; expected 'draft', 'standard' or 'best'; correct quality. "
+        "quality is 'best'; expected 'draft' or 'standard'; correct quality. "
         "additive is 'perhaps'; expected true or false; correct additive."
     )
 

@@ -237,7 +237,7 @@ def test_a_client_that_disconnects_stops_the_work():
 
     async def leave():
         async with client(make_app(backend, job_queue=job_queue)) as http:
-            task = asyncio.create_task(http.post("/separate", **form(SMALL, quality="best")))
+            task = asyncio.create_task(http.post("/separate", **form(SMALL)))
             await asyncio.to_thread(backend.started.wait)
             task.cancel()
             await asyncio.wait([task])
@@ -249,7 +249,7 @@ def test_a_client_that_disconnects_stops_the_work():
     assert backend.tiles == 1
     free_backend = BlockingBackend()
     free_backend.proceed.set()
-    assert separate(make_app(free_backend), quality="best").status_code == 200
+    assert separate(make_app(free_backend)).status_code == 200
     assert free_backend.tiles > 1
 
 

@@ -72,7 +72,7 @@ def test_windowseat_is_planned_before_its_download():
     assert plan.licence == "Apache-2.0"
 
 
-@pytest.mark.parametrize("quality", ["draft", "standard", "best"])
+@pytest.mark.parametrize("quality", ["draft", "standard"])
 @pytest.mark.parametrize("name", ["kontext", "klein"])
 def test_the_planned_passes_are_those_of_the_separation(name, quality, monkeypatch):
     size = (96, 64)

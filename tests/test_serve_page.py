@@ -279,7 +279,7 @@ def test_a_change_of_quality_repeats_the_preview(open_page):
     with page.expect_request("**/preview?*") as request:
         page.get_by_label("Draft", exact=True).check()
     assert request.value.method == "POST"
-    for quality in ("Best", "Standard", "Draft"):  # each before the previous preview is done
+    for quality in ("Standard", "Draft", "Standard"):  # each before the previous preview is done
         page.get_by_label(quality, exact=True).check()
     page.wait_for_selector("li.done")
     page.wait_for_selector("glass-compare:not([hidden])")
@@ -299,14 +299,14 @@ def test_the_previous_quality_shows_the_previous_maps_again(open_page):
     page = open_page()
     upload(page, ("a.png", image_bytes(90, 60, "png")), ("b.png", image_bytes(80, 60, "png")))
     hold_requests(page, "**/preview?*")
-    page.get_by_label("Best", exact=True).check()
+    page.get_by_label("Draft", exact=True).check()
     page.get_by_role("button", name="Cancel").click()
     page.get_by_role("heading", name="Cancelled").wait_for()
     page.get_by_label("Standard", exact=True).check()
     page.wait_for_selector("glass-compare:not([hidden])")
     page.wait_for_selector("li.done >> nth=1")  # the running request for b.png is cancelled, too
     assert page.get_by_role("button", name="Download transmission").is_enabled()
-    page.get_by_label("Best", exact=True).check()
+    page.get_by_label("Draft", exact=True).check()
     page.get_by_role("button", name="Cancel").wait_for()
     page.unroute("**/preview?*")
     page.get_by_label("Draft", exact=True).check()

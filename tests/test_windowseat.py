@@ -13,7 +13,6 @@ from safetensors.torch import load_file, save_file
 
 from brewster import Photo, Separator
 from brewster.errors import ModelError
-from brewster.inference.diffusion_predictor import DiffusionPredictor
 from brewster.models.diffusion.adapter.windowseat import CONFIG_FILE, INDEX_FILE, PROMPT_FILE, WEIGHTS_FILE
 from brewster.models.diffusion.backbones.loading import load_backbone
 from brewster.models.diffusion.pipeline import fingerprint, load_pipeline
@@ -133,13 +132,6 @@ def test_photos_of_any_shape_are_divided_into_squares_of_the_published_side(mode
         )
     assert separation.transmission.size == size
     assert shapes == [(SIDE, SIDE)] * tiles
-
-
-def test_best_quality_adds_an_input_of_twice_the_size(model):
-    predictor = DiffusionPredictor(load_pipeline(str(model)))
-    assert predictor.input_sizes((640, 320), "standard") == [(128, 64)]
-    assert predictor.input_sizes((640, 320), "best") == [(128, 64), (256, 128)]
-    assert predictor.input_sizes((40, 30), "best") == [(40, 30)]
 
 
 def test_steps_and_averages_are_refused(model):

@@ -19,7 +19,7 @@ from brewster.files import DEFAULT_MAX_PIXELS, LAYER_FORMATS
 from brewster.image_formats import FORMATS, SUFFIXES, FormatName
 
 Layer = Literal["transmission", "reflection", "confidence", "layered"]
-Quality = Literal["draft", "standard", "best"]
+Quality = Literal["draft", "standard"]
 Device = Literal["auto", "cuda", "rocm", "directml", "coreml", "cpu"]
 
 Quantization = Literal["int8", "float8", "nf4"]
@@ -69,7 +69,7 @@ class Options:
     )
     quality: Quality = field(
         default="standard",
-        metadata=_field_metadata("Number and size of the input scales: draft is fastest, best is slowest."),
+        metadata=_field_metadata("Number and size of the input scales: draft is faster than standard."),
     )
     mask: Path | None = field(
         default=None,

@@ -8,7 +8,6 @@ the real input.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from threading import Lock
@@ -20,7 +19,7 @@ from numpy.typing import NDArray
 from torch.nn import functional
 
 from brewster.errors import ModelError
-from brewster.inference.guided_upsampling import Floats, GeneratedOverride, upsample_rows
+from brewster.inference.guided_upsampling import Floats, GeneratedOverride
 from brewster.inference.predictor import Prediction, Predictor, ProgressCallback, confidence_from_spread
 from brewster.inference.tiles import run_tiled, tile_slices
 from brewster.models.diffusion.panels import PanelFit
@@ -29,19 +28,13 @@ from brewster.options import Quality
 from brewster.srgb import to_encoded, to_linear
 
 _DRAFT_STEPS: Final = 4
-_SECOND_INPUT_SCALE: Final = 2
-"""Side of the second input for quality "best" relative to the first. The second input is processed in tiles."""
-_MIN_SECOND_INPUT_SCALE: Final = 1.25
-"""A second input with a smaller relative side adds almost no detail, so it is not used."""
 _SQUARE_TILE_OVERLAP_DIVISOR: Final = 12
 """Square tiles overlap by at least their side divided by this: 64 of 768 pixels, as in WindowSeat."""
 
 
 @final
 class DiffusionPredictor(Predictor):
-    """Runs a `DecompositionPipeline` on a copy of the photo that fits into one panel.
-
-    For quality "best", it also runs the pipeline on a second, larger copy in tiles of the size of a panel.
+    """Runs a `DecompositionPipeline` on one copy of the photo: as a whole, or in square tiles if the task has them.
 
     Args:
         pipeline: the model.
@@ -77,43 +70,30 @@ class DiffusionPredictor(Predictor):
         self._steps, self._seeds = steps, range(ensemble_size)
         self._lock = Lock()
 
-    def input_sizes(self, size: tuple[int, int], quality: Quality) -> list[tuple[int, int]]:
-        """Returns the (width, height) of the inputs: one that fits into a panel, and for "best" also a larger one.
-
-        The sides of the larger input are twice those of the first, but not larger than the photo.
+    def input_sizes(
+        self,
+        size: tuple[int, int],
+        quality: Quality,  # noqa: ARG002
+    ) -> list[tuple[int, int]]:
+        """Returns the (width, height) of the only input, which is never larger than the photo.
 
         Raises:
             PhotoError: a side of the photo has fewer than 16 pixels, or its aspect ratio is too large.
         """
-        task, size_divisor = self._pipeline.task, self._pipeline.backbone.size_divisor
-        coarse = task.input_size(size, size_divisor)
-        scale = min(_SECOND_INPUT_SCALE, size[0] / coarse[0])
-        if quality != "best" or scale < _MIN_SECOND_INPUT_SCALE:
-            return [coarse]
-        return [coarse, (round(scale * coarse[0]), round(scale * coarse[1]))]
+        return [self._pipeline.task.input_size(size, self._pipeline.backbone.size_divisor)]
 
     def __call__(
         self, inputs: Sequence[Floats], quality: Quality, on_progress: ProgressCallback
     ) -> Prediction:
-        """Returns the mean prediction over the inputs. The reconstruction error is that of the first input."""
-        size = inputs[-1].shape[:2]
-        tilings = [self._tiling(scaled_input.shape, is_first=i == 0) for i, scaled_input in enumerate(inputs)]
-        tiles = [
-            len(tile_slices(scaled_input.shape[:2], **tiling))
-            for scaled_input, tiling in zip(inputs, tilings, strict=True)
-        ]
-        steps = self.sampling_steps(quality)
-        progress = _ProgressCounter(on_progress, sum(tiles))
-        predictions = []
+        """Returns the prediction for the only input."""
+        (scaled_input,) = inputs
+        height, width, _ = scaled_input.shape
+        tiling, steps = self._tiling((height, width)), self.sampling_steps(quality)
+        progress = _ProgressCounter(on_progress, len(tile_slices((height, width), **tiling)))
         with self._lock:  # two predictions at the same time would need twice the GPU memory
-            for scaled_input, tiling in zip(inputs, tilings, strict=True):
-                predictions.append(
-                    run_tiled(lambda tile: self._predict_tile(tile, steps, progress), scaled_input, **tiling)
-                )
-        change, reflection, generated_transmission, spread, reconstruction_error = (
-            np.mean([upsample_rows(map_, 0, size[0], size) for map_ in maps], axis=0)
-            for maps in zip(*predictions, strict=True)
-        )
+            change, reflection, generated_transmission, spread, reconstruction_error = run_tiled(
+                lambda tile: self._predict_tile(tile, steps, progress), scaled_input, **tiling
+            )
         override, mean_error = None, None
         if self._no_guided_upsampling:
             override = GeneratedOverride(
@@ -122,7 +102,7 @@ class DiffusionPredictor(Predictor):
         elif self._reconstructs_input:
             override = GeneratedOverride.weighted_by_detail(generated_transmission, reflection)
         if self._reconstructs_input:
-            mean_error = float(predictions[0][-1].mean())
+            mean_error = float(reconstruction_error.mean())
         confidence = confidence_from_spread(spread + reconstruction_error)
         return Prediction(
             change,
@@ -140,19 +120,18 @@ class DiffusionPredictor(Predictor):
             return 1
         return self._steps or (min(_DRAFT_STEPS, task.steps) if quality == "draft" else task.steps)
 
-    def panel_sizes(self, size: tuple[int, int], quality: Quality) -> list[tuple[int, int]]:
-        """Returns the (width, height) of the panels for a photo of this (width, height): one for each tile of each input.
+    def panel_sizes(self, size: tuple[int, int]) -> list[tuple[int, int]]:
+        """Returns the (width, height) of the panels for a photo of this (width, height), one for each tile.
 
         Raises:
             PhotoError: see `input_sizes`.
         """
+        size_divisor = self._pipeline.backbone.size_divisor
+        width, height = self._pipeline.task.input_size(size, size_divisor)
         sizes = []
-        for i, (width, height) in enumerate(self.input_sizes(size, quality)):
-            for rows, columns in tile_slices(
-                (height, width), **self._tiling((height, width, 3), is_first=i == 0)
-            ):
-                tile = (columns.stop - columns.start, rows.stop - rows.start)
-                sizes.append(_round_up(self._enlarged(tile), self._pipeline.backbone.size_divisor))
+        for rows, columns in tile_slices((height, width), **self._tiling((height, width))):
+            tile = (columns.stop - columns.start, rows.stop - rows.start)
+            sizes.append(_round_up(self._enlarged(tile), size_divisor))
         return sizes
 
     def _enlarged(self, size: tuple[int, int]) -> tuple[int, int]:
@@ -169,23 +148,10 @@ class DiffusionPredictor(Predictor):
         """Whether a confidence can be computed, from the reconstruction error or from the spread of several samples."""
         return self._reconstructs_input or (len(self._seeds) > 1 and self._pipeline.task.objective == "flow")
 
-    def _tiling(self, shape: tuple[int, ...], *, is_first: bool) -> dict[str, int]:
-        """The side and the overlap of the tiles for an input of this shape (h, w, 3).
-
-        The first input is one tile, unless the task has square tiles. Those of other tasks have the area of a panel.
-        """
-        task, size_divisor = self._pipeline.task, self._pipeline.backbone.size_divisor
-        if task.square_tiles:
-            side = min(*shape[:2], task.short_side_px or max(shape))
-            return {"tile_px": side, "overlap_px": side // _SQUARE_TILE_OVERLAP_DIVISOR}
-        if is_first:
-            side = max(shape)
-        else:
-            side = (
-                max(1, math.isqrt(task.max_composite_pixels // len(task.layout.panels)) // size_divisor)
-                * size_divisor
-            )
-        return {"tile_px": side, "overlap_px": side // 4}
+    def _tiling(self, size: tuple[int, int]) -> dict[str, int]:
+        """The side and the overlap of the tiles for an input of this (height, width): one tile, or squares of its short side."""
+        side = min(size) if self._pipeline.task.square_tiles else max(size)
+        return {"tile_px": side, "overlap_px": side // _SQUARE_TILE_OVERLAP_DIVISOR}
 
     def _predict_tile(self, tile: Floats, steps: int, progress: _ProgressCounter) -> tuple[Floats, ...]:
         """Returns five maps (h, w, 3) for a tile (h, w, 3).

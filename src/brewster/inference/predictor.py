@@ -31,7 +31,6 @@ ProgressCallback = Callable[[float], None]
 QUALITIES: Final[dict[Quality, tuple[int, ...]]] = {
     "draft": (100_000,),
     "standard": (100_000, 200_000),
-    "best": (30_000, 100_000, 200_000, 350_000),
 }
 """The input scales of `MultiScalePredictor`: width times height of each input in pixels, the largest last."""
 

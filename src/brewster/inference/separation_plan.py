@@ -152,7 +152,7 @@ def plan_separation(options: Options, size: tuple[int, int], card: GraphicsCard)
         offload=options.offload,
         is_single_file=file is not None,
     )
-    panels = predictor.panel_sizes(size, options.quality)
+    panels = predictor.panel_sizes(size)
     steps = predictor.sampling_steps(options.quality) * options.ensemble_size
     is_guided_twice = task.guidance > 1 and not backbone.guided_by_embedding and not backbone.distilled
     passes = steps * (2 if is_guided_twice else 1)
