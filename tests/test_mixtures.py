@@ -8,7 +8,8 @@ from hypothesis import strategies as st
 
 from brewster.srgb import to_linear
 from brewster.training.data.data_recipe import MixRecipe
-from brewster.training.data.mixtures import InterleavedStream, Mixtures, Pairs, TrainingBatch
+from brewster.training.data.effects import recolour
+from brewster.training.data.mixtures import InterleavedStream, Mixtures, Pairs, TrainingBatch, rotated_crop
 from brewster.training.data.sample_rng import SampleRng
 
 NO_EFFECTS = MixRecipe(
@@ -52,6 +53,37 @@ def test_the_reflection_has_the_strength_of_the_recipe(photos):
     batch = Mixtures(photos, [], recipe, seed=1)(0, 8, 64)
     ratio = to_linear(batch.reflection_encoded).mean() / to_linear(batch.transmission_encoded).mean()
     assert ratio.item() == pytest.approx(0.25, rel=0.15)
+
+
+def test_a_rotated_crop_turns_the_photo_by_at_most_25_degrees():
+    ramp = np.broadcast_to(np.linspace(100, 200, 300)[None, :, None], (300, 300, 3)).round().astype(np.uint8)
+    angles = []
+    for seed in range(40):
+        crop = rotated_crop(SampleRng(seed, 0, 0), torch.from_numpy(ramp.copy()), (0.5, 0.9), 64)
+        assert crop.shape == (3, 64, 64)
+        across, down = (crop[:, 4:-4, 4:-4].diff(dim=axis).mean().item() for axis in (2, 1))
+        angles.append(math.degrees(math.atan2(abs(down), abs(across))))
+    assert max(angles) == pytest.approx(25, abs=5)
+    assert max(angles) < 27
+
+
+def test_recoloured_photos_differ_and_stay_in_range(photos):
+    image = to_linear(photos[0].permute(2, 0, 1) / 255)
+    assert torch.equal(recolour(SampleRng(1, 0, 0), image, 0.0), image)
+    for seed in range(20):
+        changed = recolour(SampleRng(seed, 0, 0), image, 1.0)
+        assert 0 <= changed.min() <= changed.max() <= 1
+        assert not torch.allclose(changed, image, atol=0.01)
+
+
+def test_augmentation_changes_the_photos_of_a_mixture(photos):
+    plain, augmented = (
+        Mixtures(photos, [], NO_EFFECTS.model_copy(update={"augmentation_probability": share}), seed=1)(
+            0, 4, 64
+        )
+        for share in (0.0, 1.0)
+    )
+    assert not torch.allclose(plain.photo_encoded, augmented.photo_encoded, atol=0.01)
 
 
 def test_a_veil_adds_uniform_light_relative_to_the_photos_mean(photos):

@@ -137,6 +137,9 @@ class MixRecipe(FrozenModel):
     """What the network predicts: the transmission T, or the background B without glass."""
     crop: Range = (0.35, 1.0)
     """Side of the crop divided by the shorter side of the photo."""
+    augmentation_probability: Share = 0.0
+    """Probability of each of four changes to a photo: a rotation, exchanged colour channels, another saturation, and another gamma. They
+    make the photos more diverse, so that a network does not memorise them."""
     temperature: Range = (-0.35, 0.35)
     """Warmth of the light. For a value w, the gains of red and blue are about exp(w) and exp(-w)."""
     background_map_probability: Share = 0.2

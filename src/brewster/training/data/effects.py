@@ -53,6 +53,21 @@ def ghost(rng: SampleRng, image: Image, weight: float, reach_px: float) -> Image
     return (image + weight * copy) / (1 + weight)
 
 
+def recolour(rng: SampleRng, image: Image, probability: float) -> Image:
+    """Exchanges colour channels, changes the saturation, and applies a gamma curve, each with this probability."""
+    if rng.bernoulli(probability):
+        image = image[_CHANNEL_ORDERS[rng.randint(len(_CHANNEL_ORDERS))]]
+    if rng.bernoulli(probability):
+        grey = image.mean(dim=0, keepdim=True)
+        image = (grey + rng.log_uniform((0.5, 1.6)) * (image - grey)).clamp(0, 1)
+    if rng.bernoulli(probability):
+        image = image ** rng.log_uniform((0.75, 1.33))
+    return image
+
+
+_CHANNEL_ORDERS: Final = ([0, 2, 1], [1, 0, 2], [1, 2, 0], [2, 0, 1], [2, 1, 0])
+
+
 def lamps(rng: SampleRng, size: int) -> Image:
     """Returns one to six small lamps on black, (3, size, size). A lamp is a disc with a glow of light that the lens scatters."""
     count = 1 + rng.randint(6)

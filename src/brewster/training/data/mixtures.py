@@ -152,9 +152,16 @@ class Mixtures:
     def _view(self, rng: SampleRng, size: int, map_probability: float) -> Image:
         if self._maps and rng.bernoulli(map_probability):
             return _perspective_view(rng, self._maps[rng.randint(len(self._maps))], size)
-        crop = random_crop(rng, self._photos[self._choose_photo(rng)], self._recipe.crop, size)
+        crop = self._augmented_crop(rng, self._photos[self._choose_photo(rng)], size)
         bright = ((crop.amax(dim=0, keepdim=True) - 0.8) / 0.2).clamp(0, 1)
         return crop * (1 + rng.uniform(self._recipe.highlight_boost) * bright**2)
+
+    def _augmented_crop(self, rng: SampleRng, photo: Tensor, size: int) -> Image:
+        probability = self._recipe.augmentation_probability
+        if not probability:  # draws no numbers, so that recipes without augmentation keep their samples
+            return random_crop(rng, photo, self._recipe.crop, size)
+        take = rotated_crop if rng.bernoulli(probability) else random_crop
+        return effects.recolour(rng, take(rng, photo, self._recipe.crop, size), probability)
 
     def _choose_photo(self, rng: SampleRng) -> int:
         point = rng.uniform((0, float(self._cumulative[-1])))
@@ -245,6 +252,18 @@ def random_crop(rng: SampleRng, image: Tensor, fraction: Range, size: int) -> Te
     return functional.interpolate(window[None], (size, size), mode="bilinear", antialias=True)[0].clamp(min=0)
 
 
+def rotated_crop(rng: SampleRng, image: Tensor, fraction: Range, size: int) -> Tensor:
+    """Returns a random crop like `random_crop`, rotated by up to 25 degrees. The crop lies within the image."""
+    angle = math.radians(rng.uniform((-_MAX_ROTATION_DEG, _MAX_ROTATION_DEG)))
+    cosine, sine = math.cos(angle), math.sin(angle)
+    bounding_side = cosine + abs(sine)  # of a rotated square with sides of 1
+    upright = random_crop(rng, image, fraction, math.ceil(size * bounding_side))
+    turn = torch.tensor([[[cosine, -sine, 0.0], [sine, cosine, 0.0]]]) / bounding_side
+    grid = functional.affine_grid(turn, [1, 3, size, size], align_corners=False)
+    return functional.grid_sample(upright[None], grid, padding_mode="border", align_corners=False)[0]
+
+
+_MAX_ROTATION_DEG: Final = 25.0
 _LINEAR_OF_BYTE: Final = to_linear(torch.arange(256) / 255)
 
 
