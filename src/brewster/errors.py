@@ -50,6 +50,7 @@ _EXPECTED_KINDS: Final = {
     "int": "an integer",
     "float": "a number",
     "string": "a text",
+    "path": "a path",
     "date": "a date such as 2026-01-31",
     "datetime": "a time such as 2026-01-31T12:00:00Z",
     "timezone": "a time with its time zone",

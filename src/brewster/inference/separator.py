@@ -30,7 +30,6 @@ from brewster.inference.guided_upsampling import Floats, GuidedUpsampler
 from brewster.inference.layer_history import PHOTO, history_step, with_step
 from brewster.inference.onnx_backend import OnnxBackend
 from brewster.inference.predictor import (
-    QUALITIES,
     MultiScalePredictor,
     Prediction,
     Predictor,
@@ -209,9 +208,9 @@ class Separator:
             TypeError: the source has another type.
             ModelError: the model returns an invalid output.
             MaskError: the mask cannot be read, is not grey, or has another size than the photo.
-            BrewsterError: strength is out of range, or quality is not a key of `QUALITIES`.
+            BrewsterError: strength is not a number from 0 to 1, or quality is unknown.
         """
-        _check_options(strength, quality)
+        Options(strength=strength, quality=quality)  # checks the values
         seconds: dict[str, float] = {}
         with _timed(seconds, "decode"):
             photo = Photo.open(source, encoding=encoding, max_pixels=max_pixels)
@@ -267,10 +266,10 @@ class Separator:
             assessment.
 
         Raises:
-            BrewsterError: quality is not a key of `QUALITIES`.
+            BrewsterError: quality is unknown.
             ModelError: the model returns an invalid output.
         """
-        _check_options(Options.strength, quality)
+        Options(quality=quality)  # checks the value
         inputs, white = self._inputs(photo, quality)
         prediction = keep_clipped_white(inputs[-1], self._predictor(inputs, quality, on_progress))
         upsampler = _fit_upsampler(inputs[-1], prediction, Options.strength, white)
@@ -349,17 +348,6 @@ def _open_pipeline(model: str, **options: Any) -> DecompositionPipeline:  # noqa
             f"expected {error.name}, because the model {model} needs it",
         ) from error
     return load_pipeline(model, **options)
-
-
-def _check_options(strength: float, quality: str) -> None:
-    if not 0 <= strength <= 1:
-        raise BrewsterError(
-            f"strength is {strength}", "expected a number from 0 to 1", "choose a number in this range"
-        )
-    if quality not in QUALITIES:
-        raise BrewsterError(
-            f"quality is {quality!r}", f"expected one of {', '.join(QUALITIES)}", "choose one of them"
-        )
 
 
 def _assess(largest_input: Floats, prediction: Prediction, strength: float) -> Assessment:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from brewster.errors import PhotoError, UnsupportedPhoto
 from brewster.files import DEFAULT_MAX_PIXELS, write_atomically
-from brewster.image_formats import FORMATS
+from brewster.image_formats import FORMATS, canonical_format
 from brewster.photo.colour import SRGB, ColourSpace, colour_space_of
 from brewster.photo.decode import Decoded, decode
 from brewster.photo.encode import encode
@@ -274,7 +274,8 @@ class Photo:
         A JPEG has the quality and the chroma subsampling of the source.
 
         Args:
-            format_name: a key of `image_formats.FORMATS`, such as "png"; by default, the format of the photo's file.
+            format_name: a key of `image_formats.FORMATS` or one of its suffixes, such as "jpeg" or "jpg"; by default, the
+                format of the photo's file.
             depth: bits per channel (see `image_formats.FORMATS`); by default, the depth of the photo or, if the format does
                 not have it, the next smaller depth.
 
@@ -282,7 +283,7 @@ class Photo:
             UnsupportedPhoto: the format cannot store this photo, or cannot store it at this bit depth.
             MissingExtra: the writer of EXR or HEIC is not installed.
         """
-        format_name = format_name or self.file_info.format_name
+        format_name = canonical_format(format_name) if format_name else self.file_info.format_name
         bits = depth_for(self.file_info, format_name, depth)
         stored = self.stored_as(format_name, bits)
         return encode(
@@ -301,7 +302,7 @@ class Photo:
 
         Args:
             target: a path, or a file opened for writing in binary mode.
-            format: the format, such as "png"; by default, the format of the path's suffix or, for an open file, the format
+            format: the format, such as "png" or "jpg"; by default, the format of the path's suffix or, for an open file, the format
                 of the photo's file.
             depth: bits per channel; see `encode`.
             overwrite: whether to replace an existing file.
