@@ -239,7 +239,7 @@ class Separator:
             prediction.confidence_map,
             residual,
             prediction.reconstruction_error,
-            _assess(inputs[-1], prediction, strength),
+            _assess(inputs[-1], prediction, strength, weights),
             self.name,
             self.sha256,
             self.device,
@@ -273,7 +273,7 @@ class Separator:
         inputs, white = self._inputs(photo, quality)
         prediction = keep_clipped_white(inputs[-1], self._predictor(inputs, quality, on_progress))
         upsampler = _fit_upsampler(inputs[-1], prediction, Options.strength, white)
-        return upsampler, prediction, _assess(inputs[-1], prediction, Options.strength)
+        return upsampler, prediction, _assess(inputs[-1], prediction)
 
     def _inputs(self, photo: Photo, quality: Quality) -> tuple[list[Floats], np.float32]:
         """Returns the inputs of the model in 0..1, smallest first, and the white level by which they are divided."""
@@ -350,12 +350,20 @@ def _open_pipeline(model: str, **options: Any) -> DecompositionPipeline:  # noqa
     return load_pipeline(model, **options)
 
 
-def _assess(largest_input: Floats, prediction: Prediction, strength: float) -> Assessment:
-    """Assesses the prediction at strength 1; at strength 0, assesses the unchanged photo."""
-    if strength == 0:
-        return assess(largest_input, largest_input, prediction.confidence_map)
-    transmission = np.clip(largest_input + prediction.change, 0, 1)
-    return assess(largest_input, transmission, prediction.confidence_map, prediction.reconstruction_error)
+def _assess(
+    largest_input: Floats,
+    prediction: Prediction,
+    strength: float = Options.strength,
+    mask: Mask | None = None,
+) -> Assessment:
+    height, width, _ = largest_input.shape
+    return assess(
+        largest_input,
+        np.clip(largest_input + prediction.change, 0, 1),
+        prediction.confidence_map,
+        prediction.reconstruction_error,
+        float(strength) if mask is None else np.float32(strength) * mask.sampled(width, height),
+    )
 
 
 def _fit_upsampler(
