@@ -163,6 +163,11 @@ def video_error(name: str) -> UnsupportedPhoto:
     )
 
 
+def empty_file_error() -> UnreadablePhoto:
+    """Returns the error for an image file of 0 bytes."""
+    return UnreadablePhoto("the file is empty", "expected an image file", "copy the file again")
+
+
 INSTALL_COMMAND: Final = "pip install -c constraints.txt -e"
 """Installs brewster from its repository, because it is on no package index. The next argument is the path "." or ".[EXTRA]"."""
 
