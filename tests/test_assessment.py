@@ -69,13 +69,42 @@ def test_a_black_photo_is_assessed():
     assert assess(grey(0.0), grey(0.0), certain()).removed_light == 0
 
 
-def test_a_separation_has_the_assessment_of_the_full_prediction_at_any_strength():
-    separator = Separator(lambda tile: (tile * 0.5, tile * 0.5))
+def halving_separator():
+    return Separator(lambda tile: (tile * 0.5, tile * 0.5))
+
+
+def test_the_strength_scales_the_removed_light_but_does_not_change_the_verdict():
     photo = Photo.from_array(grey(0.5), encoding="linear")
-    assessments = [separator(photo, strength=strength).assessment for strength in (0.2, 1.0)]
-    assert assessments[0] == assessments[1]
-    assert assessments[0].removed_light == pytest.approx(0.5, abs=0.01)
-    assert assessments[0].changed_area == 1
+    weak, full = (halving_separator()(photo, strength=strength).assessment for strength in (0.02, 1.0))
+    assert weak.verdict == full.verdict
+    assert weak.confidence == full.confidence
+    assert full.removed_light == pytest.approx(0.5, abs=0.01)
+    assert weak.removed_light == pytest.approx(0.01, abs=0.001)
+    assert (weak.changed_area, full.changed_area) == (0, 1)
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.float32])
+def test_a_mask_limits_the_removed_light_and_the_changed_area_to_its_white_part(dtype):
+    photo = Photo.from_array(grey(0.5), encoding="linear")
+    mask = np.zeros(SIZE, dtype)
+    mask[:6, :8] = 255 if dtype == np.uint8 else 1  # 1/16 of the photo
+    found = halving_separator()(photo, mask=mask)
+    removed = 1 - found.transmission.linear().sum() / photo.linear().sum()
+    assert found.assessment.removed_light == pytest.approx(float(removed), abs=0.002)
+    assert found.assessment.changed_area == pytest.approx(1 / 16)
+    assert found.assessment.verdict == halving_separator()(photo).assessment.verdict == "clear"
+
+
+def test_with_a_black_mask_nothing_is_removed_and_the_verdict_says_so():
+    photo = Photo.from_array(grey(0.5), encoding="linear")
+    found = halving_separator()(photo, mask=np.zeros(SIZE, np.uint8)).assessment
+    assert found == halving_separator()(photo, strength=0).assessment
+    assert (found.verdict, found.removed_light, found.changed_area) == ("little found", 0, 0)
+
+
+def test_a_separation_of_strength_0_is_not_doubtful():
+    assert assess(grey(0.4), grey(0.2), certain(), 1.0, 0.0).verdict == "little found"
+    assert assess(grey(0.4), grey(0.2), certain(), 1.0, 0.1).verdict == "doubtful"
 
 
 def test_a_separation_of_strength_0_removes_nothing_and_its_verdict_says_so():

@@ -199,7 +199,7 @@ def test_an_output_that_cannot_be_written_is_an_error(run, tmp_path):
     code, _, err = run("a.jpg", "-o", "file/below")
     assert code == 1
     assert len(error_lines(err)) == 1
-    assert "file/below/a.transmission.jpg was not written" in error_lines(err)[0]
+    assert "file/below was not written" in error_lines(err)[0]
     assert (tmp_path / "file").read_bytes() == b"kept"
 
 
@@ -421,18 +421,41 @@ def test_rows_without_a_readable_photo_are_errors_with_their_number_also_in_a_dr
     root = f"{tmp_path}/" if "--workers" in options else ""
     assert sorted(error_lines(err)) == [
         (
-            f"error: row 2 of {root}list.csv: {root}scans/none.jpg cannot be read (No such file or directory); "
+            f"error: line 3 of {root}list.csv: {root}scans/none.jpg cannot be read (No such file or directory); "
             "expected an image file; check its name and permissions."
         ),
         (
-            f"error: row 3 of {root}list.csv: {root}scans/folder cannot be read (it is a folder); "
+            f"error: line 4 of {root}list.csv: {root}scans/folder cannot be read (it is a folder); "
             "expected an image file; check its name and permissions."
         ),
         (
-            f"error: row 4 of {root}list.csv: {root}scans/clip.mp4 is a video; expected a photo; "
+            f"error: line 5 of {root}list.csv: {root}scans/clip.mp4 is a video; expected a photo; "
             "extract single images first, for example with ffmpeg."
         ),
     ]
+
+
+@pytest.mark.parametrize("options", [[], ["--dry-run"]])
+def test_an_empty_photo_is_an_error_also_in_a_dry_run(run, tmp_path, options):
+    (tmp_path / "a.jpg").write_bytes(b"")
+    code, _, err = run("a.jpg", *options)
+    message = "error: a.jpg: the file is empty; expected an image file; copy the file again."
+    assert (code, error_lines(err)) == (1, [message])
+
+
+@pytest.mark.parametrize("options", [[], ["--workers", "1"], ["--index"]])
+@pytest.mark.parametrize("output", ["file/out", "/proc/out"])
+def test_an_output_folder_that_cannot_be_created_is_an_error_before_the_first_photo(
+    run, tmp_path, output, options
+):
+    if output == "/proc/out" and sys.platform != "linux":
+        pytest.skip("only Linux has this folder, in which nobody can create a folder")
+    for name in ("a.jpg", "b.jpg", "file"):
+        (tmp_path / name).write_bytes(image_bytes())
+    code, out, err = run("a.jpg", "b.jpg", "-o", output, "--json", *options)
+    (message,) = error_lines(err)
+    assert (code, out) == (1, b"")
+    assert re.search(r"out(/\.brewster-index\S*)? was not written \(", message), message
 
 
 def test_a_dry_run_reports_photos_that_do_not_exist(run, tmp_path):

@@ -115,7 +115,7 @@ def test_open_files_are_read_and_written(tmp_path):
         file = io.BytesIO()
         photo.save(file, format=format_name)
         assert pil(file.getvalue()).format == kind
-    photo.save(tmp_path / "without-suffix", format="tiff", depth=16)
+    photo.save(tmp_path / "without-suffix", format="TIF", depth=16)
     assert Photo.open(tmp_path / "without-suffix").file_info.bits == 16
     separation = brewster.separate(io.BytesIO(image_bytes()), quality="draft")
     assert separation.photo.size == photo.size

@@ -30,13 +30,13 @@ def test_relative_paths_absolute_paths_and_urls_are_mirrored_below_the_output(tm
     rows = ["box, 4/./a.jpg", "/scans/b.tif", "memory://bucket/1987/c.jpg", "d.jpg"]
     manifest = write_manifest(tmp_path / f"list{suffix.lower()}", *rows)
     manifest = manifest.rename(tmp_path / f"list{suffix}")
-    assert list(read_manifest(manifest, Path("out"))) == [
+    assert [(photo, folder) for _, photo, folder in read_manifest(manifest, Path("out"))] == [
         (tmp_path / "box, 4/a.jpg", Path("out/box, 4")),
         (Path("/scans/b.tif"), Path("out/scans")),
         (location("memory://bucket/1987/c.jpg"), Path("out/bucket/1987")),
         (tmp_path / "d.jpg", Path("out")),
     ]
-    assert [folder for _, folder in read_manifest(manifest)] == [
+    assert [folder for _, _, folder in read_manifest(manifest)] == [
         tmp_path / "box, 4",
         Path("/scans"),
         location("memory://bucket/1987"),
@@ -70,19 +70,19 @@ def test_the_values_of_a_csv_table_are_separated_by_commas_semicolons_or_tabs(tm
     lines = [delimiter.join(f"{quote}{value}{quote}" for value in row) for row in rows]
     manifest = tmp_path / "list.csv"
     manifest.write_text("\r\n".join(lines), newline="")
-    assert [photo.name for photo, _ in read_manifest(manifest)] == ["a.jpg", "b.jpg"]
+    assert [photo.name for _, photo, _ in read_manifest(manifest)] == ["a.jpg", "b.jpg"]
 
 
 def test_the_column_path_decides_which_character_separates_the_values(tmp_path):
     manifest = tmp_path / "list.csv"
     manifest.write_text('path;"notes, and more, and more"\na,b.jpg;\n')
-    assert [photo.name for photo, _ in read_manifest(manifest)] == ["a,b.jpg"]
+    assert [photo.name for _, photo, _ in read_manifest(manifest)] == ["a,b.jpg"]
     manifest.write_text("file;year\na.jpg;1987\n")
     with pytest.raises(ManifestError, match="has the columns 'file', 'year'; expected"):
         plan_files(manifest)
     manifest.write_text("path\na,b.jpg\n")
     with pytest.raises(
-        ManifestError, match=r"row 1 of .* has more values .*; write a path that contains ','"
+        ManifestError, match=r"line 2 of .* has more values .*; write a path that contains ','"
     ):
         plan_files(manifest)
     manifest.write_text("")
@@ -114,10 +114,37 @@ def test_rows_that_are_not_paths_below_the_manifest_are_refused(tmp_path):
         with pytest.raises(ManifestError, match=message):
             plan_files(write_manifest(tmp_path / "list.parquet", *rows))
     with pytest.raises(
-        BrewsterError, match=r"row 2 of .*: https://x\.org/a\.jpg is a web address; .*; download"
+        BrewsterError, match=r"line 3 of .*: https://x\.org/a\.jpg is a web address; .*; download"
     ):
         plan_files(write_manifest(tmp_path / "list.csv", "a.jpg", "https://x.org/a.jpg"))
     short = tmp_path / "short.csv"
     short.write_text("year,path\n1987\n")
-    with pytest.raises(ManifestError, match=r"row 1 of .* has the path None"):
+    with pytest.raises(ManifestError, match=r"line 2 of .* has the path None"):
         plan_files(short)
+
+
+def test_blank_lines_are_skipped_and_rows_are_numbered_by_the_lines_of_the_file(tmp_path):
+    manifest = tmp_path / "list.csv"
+    manifest.write_text("path,notes\n\na.jpg,\n\r\n\nb.jpg,1987\n\n")
+    rows = [(str(row), photo.name) for row, photo, _ in read_manifest(manifest)]
+    assert rows == [(f"line 3 of {manifest}", "a.jpg"), (f"line 6 of {manifest}", "b.jpg")]
+    assert [str(task.row) for task in plan_files(manifest)] == [row for row, _ in rows]
+    manifest.write_text("path,notes\n\n,no path\n")
+    with pytest.raises(ManifestError, match=r"line 3 of .* has the path ''"):
+        plan_files(manifest)
+
+
+@pytest.mark.parametrize("suffix", [".csv", ".parquet"])
+@pytest.mark.parametrize("column", ["Path", " PATH "])
+def test_a_column_that_differs_from_path_by_case_or_spaces_is_named(tmp_path, suffix, column):
+    manifest = write_manifest(tmp_path / f"list{suffix}", "a.jpg", column=column)
+    with pytest.raises(ManifestError, match=f"rename the column '{column}' to 'path'"):
+        plan_files(manifest)
+
+
+@pytest.mark.parametrize("encoding", ["latin-1", "utf-16"])
+def test_a_csv_table_in_another_encoding_must_be_saved_as_utf_8(tmp_path, encoding):
+    manifest = tmp_path / "list.csv"
+    manifest.write_text("path\nM\N{LATIN SMALL LETTER U WITH DIAERESIS}nchen.jpg\n", encoding=encoding)
+    with pytest.raises(ManifestError, match=r"is not a table \('utf-8' codec .*save the file as UTF-8"):
+        plan_files(manifest)

@@ -158,3 +158,15 @@ def test_a_photo_whose_size_differs_from_the_mask_fails_and_the_others_are_separ
     assert (tmp_path / "a.transmission.png").exists()
     assert not (tmp_path / "b.transmission.png").exists()
     assert run("a.png", "--mask", "missing.png")[0] == 2
+
+
+@pytest.mark.parametrize("size", [(6, 4), (3, 2), (4, 3), (1, 1)])
+def test_a_sampled_mask_has_the_weights_at_the_centres_of_its_cells(size):
+    values = np.arange(24, dtype=np.uint8).reshape(4, 6)
+    width, height = size
+    sampled = Mask.open(values, (6, 4)).sampled(width, height)
+    expected = [
+        [values[int((y + 0.5) * 4 / height), int((x + 0.5) * 6 / width)] for x in range(width)]
+        for y in range(height)
+    ]
+    np.testing.assert_allclose(255 * sampled[..., 0], expected, rtol=1e-6)

@@ -1,12 +1,18 @@
 """Defaults and documentation of the Python API are those of `Options`."""
 
 import inspect
+import pickle
+import subprocess
+import sys
 from dataclasses import fields
+from pathlib import Path
 
+import numpy as np
 import pytest
 
 import brewster
 from brewster import Separator
+from brewster.errors import BrewsterError
 from brewster.options import DIFFUSION_OPTIONS, Options
 
 LOAD, CALL = (inspect.signature(function) for function in (Separator.load, Separator.__call__))
@@ -35,3 +41,41 @@ def test_help_describes_every_parameter_once(function):
     for name, parameter in inspect.signature(function).parameters.items():
         if name != "self" and parameter.kind is not parameter.VAR_KEYWORD:
             assert text.count(f"    {name}: ") == 1, name
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"format": "gif"}, "format is 'gif'; expected 'jpeg', 'png', .*; correct format"),
+        ({"format": 3}, "format is 3; expected 'jpeg', 'png', "),
+        ({"layers": "transmission"}, "layers is 'transmission'; expected a list; correct layers"),
+        ({"layers": ("transmision",)}, "layers is 'transmision'; expected 'transmission', 'reflection', "),
+        ({"layers": ()}, "layers is empty; expected at least one layer"),
+        ({"quality": "best"}, "quality is 'best'; expected 'draft' or 'standard'; correct quality"),
+        ({"strength": 1.5}, "strength is 1.5; expected a number of at most 1"),
+        ({"strength": float("nan")}, "strength is nan; expected a number"),
+        ({"strength": None}, "strength is None; expected a number"),
+        ({"device": "gpu"}, "device is 'gpu'; expected 'auto', 'cuda', "),
+        ({"steps": 0}, "steps is 0; expected a number of at least 1"),
+        ({"ensemble_size": 1.5}, "ensemble_size is 1.5; expected an integer"),
+        ({"additive": "perhaps"}, "additive is 'perhaps'; expected true or false"),
+        ({"mask": 3}, "mask is 3; expected a path"),
+        ({"model": None}, "model is None; expected a text"),
+        ({"additive": True, "format": "jpg"}, "additive layers were requested as jpeg; expected tiff or exr"),
+    ],
+)
+def test_an_invalid_value_is_refused_when_the_options_are_built(values, message):
+    with pytest.raises(BrewsterError, match=message):
+        Options(**values)
+
+
+def test_values_are_converted_to_the_types_of_their_fields():
+    options = Options(layers=["confidence"], format=".JPG", mask="mask.png", strength=np.float32(0.5))
+    assert options == Options(layers=("confidence",), format="jpeg", mask=Path("mask.png"), strength=0.5)
+    assert type(options.strength) is float
+    assert pickle.loads(pickle.dumps(options)) == options
+
+
+def test_the_default_options_do_not_import_pydantic():
+    code = "import sys; from brewster.options import Options; Options(); assert 'pydantic' not in sys.modules"
+    subprocess.run([sys.executable, "-c", code], check=True)

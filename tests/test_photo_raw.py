@@ -152,3 +152,28 @@ def test_the_tags_of_a_raf_are_those_of_its_jpeg():
 def test_the_tags_of_an_orf_and_of_an_rw2_are_those_of_a_tiff(magic):
     block = exif_block().removeprefix(b"Exif\0\0") if magic[:2] == b"MM" else tiff_block({271: "Sextant"})
     assert metadata.read_tags(raw._exif(magic + block[4:]))[271][2] == b"Sextant\0"
+
+
+@pytest.mark.parametrize("is_installed", [True, False])
+@pytest.mark.parametrize("data", [b"II*\0\x08\0\0\0", b"", b"no image"])
+def test_a_damaged_file_with_the_suffix_of_a_raw_file_is_called_a_raw_file(
+    tmp_path, monkeypatch, data, is_installed
+):
+    if not is_installed:
+        monkeypatch.setattr(raw.importlib.util, "find_spec", lambda _name: None)
+    (tmp_path / "a.NEF").write_bytes(data)
+    with pytest.raises(
+        UnreadablePhoto, match=r"suffix \.NEF is that of a RAW file; expected a complete RAW"
+    ) as raised:
+        Photo.open(tmp_path / "a.NEF")
+    assert ("install the extra raw" in raised.value.cure) != is_installed
+    (tmp_path / "a.tif").write_bytes(data)
+    with pytest.raises(UnreadablePhoto) as raised:
+        Photo.open(tmp_path / "a.tif")
+    assert "RAW" not in str(raised.value).replace("raw", "")
+
+
+def test_a_truncated_raw_file_has_the_error_of_libraw(tmp_path):
+    (tmp_path / "a.dng").write_bytes(dng_file(mosaic())[:-2000])
+    with pytest.raises(UnreadablePhoto, match=r"^the RAW file cannot be read completely; .* LibRaw \d"):
+        Photo.open(tmp_path / "a.dng")

@@ -7,11 +7,13 @@ from pathlib import Path
 
 import pytest
 
+from brewster import Photo
 from brewster.batch import plan_files
 from brewster.errors import BrewsterError, MissingExtra, OutputError, UnreadablePhoto, UnsupportedPhoto
 from brewster.files import write_atomically
 from brewster.options import Options
 from brewster.remote_path import RemotePath, check_readable, location, read_image
+from cli_helpers import image_bytes
 
 fsspec = pytest.importorskip("fsspec")
 
@@ -65,6 +67,13 @@ def test_a_web_address_is_refused_with_what_to_do(url):
         location(url)
     assert str(raised.value).startswith(f"{url} is a web address; expected a file or folder on this machine")
     assert raised.value.cure == "download the photo, and pass the path of the file"
+    with pytest.raises(BrewsterError, match=f"{url} is a web address"):
+        Photo.open(url)
+
+
+def test_a_photo_opens_the_url_of_an_object_store():
+    location("memory://bucket/url.png").write_bytes(image_bytes(6, 4, "png"))
+    assert Photo.open("memory://bucket/url.png").size == (6, 4)
 
 
 @pytest.mark.parametrize("url", ["file://server/scans/a.jpg", "file://a.jpg", "file://localhosts/a.jpg"])
@@ -119,9 +128,12 @@ def test_photos_in_a_store_are_found_like_those_in_a_folder(tmp_path):
 
 def test_a_file_is_checked_without_reading_it(store, monkeypatch):
     folder = location("memory://bucket/in")
-    (folder / "a.jpg").write_bytes(b"")
+    (folder / "a.jpg").write_bytes(b"x")
+    (folder / "empty.jpg").write_bytes(b"")
     monkeypatch.setattr(type(store), "cat_file", fail)
     check_readable(folder / "a.jpg")
+    with pytest.raises(UnreadablePhoto, match="the file is empty; expected an image file"):
+        check_readable(folder / "empty.jpg")
     with pytest.raises(UnreadablePhoto, match=r"in/b\.jpg cannot be read \(it does not exist\)"):
         check_readable(folder / "b.jpg")
     with pytest.raises(UnreadablePhoto, match=r"memory://bucket/in cannot be read \(it is a folder\)"):

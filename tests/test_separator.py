@@ -182,7 +182,7 @@ def test_options_out_of_range_are_refused(options):
 
 
 def test_an_unknown_quality_is_refused_with_the_two_that_exist():
-    message = "quality is 'best'; expected one of draft, standard; choose one of them"
+    message = "quality is 'best'; expected 'draft' or 'standard'; correct quality"
     with pytest.raises(BrewsterError, match=message):
         Separator(identity_backend)(Photo.from_array(random_image(4, 4), encoding="srgb"), quality="best")
 

@@ -50,6 +50,7 @@ _EXPECTED_KINDS: Final = {
     "int": "an integer",
     "float": "a number",
     "string": "a text",
+    "path": "a path",
     "date": "a date such as 2026-01-31",
     "datetime": "a time such as 2026-01-31T12:00:00Z",
     "timezone": "a time with its time zone",
@@ -160,6 +161,11 @@ def video_error(name: str) -> UnsupportedPhoto:
     return UnsupportedPhoto(
         f"{name} is a video", "expected a photo", "extract single images first, for example with ffmpeg"
     )
+
+
+def empty_file_error() -> UnreadablePhoto:
+    """Returns the error for an image file of 0 bytes."""
+    return UnreadablePhoto("the file is empty", "expected an image file", "copy the file again")
 
 
 INSTALL_COMMAND: Final = "pip install -c constraints.txt -e"

@@ -115,6 +115,24 @@ def write_atomically(
         raise _output_error(path, error) from error
 
 
+def create_output_folder(folder: Location) -> None:
+    """Creates the output folder of a batch where needed, so that a folder that is not writable is found before the first photo.
+
+    A folder in an object store exists only as long as it has files, so it is not created.
+
+    Raises:
+        OutputError: the folder cannot be created, or cannot be written to.
+    """
+    if isinstance(folder, RemotePath):
+        return
+    try:
+        _create_folder(folder)
+        if not os.access(folder, os.W_OK):
+            raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
+    except OSError as error:
+        raise _output_error(folder, error) from error
+
+
 @contextlib.contextmanager
 def atomic_path(path: Path) -> Iterator[Path]:
     """Yields a hidden path for a new file or folder. At the end of the block, the file or folder is renamed to `path`.

@@ -1,22 +1,26 @@
 """The options of a separation: type, default, limits and meaning of each, written once.
 
 The command line, its help and the web form are generated from `Options`. The Python API takes its defaults and its
-documentation from `Options`. The metadata of each field are keywords of `pydantic.Field`: `pydantic.TypeAdapter(Options)` uses
-them to validate requests of the HTTP API and to write its JSON schema. `brewster --help` works without pydantic.
+documentation from `Options`. The metadata of each field are keywords of `pydantic.Field`. pydantic uses them to check the values
+of `Options` and of requests of the HTTP API, and to write its JSON schema. `brewster --help` works without pydantic.
 """
 
 from __future__ import annotations
 
 import inspect
 import re
-from collections.abc import Callable
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, fields
+from functools import cache
 from pathlib import Path
-from typing import Any, Final, Literal, TypeVar, final
+from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, TypeVar, final, get_type_hints
 
-from brewster.errors import BrewsterError
+from brewster.errors import BrewsterError, invalid_value
 from brewster.files import DEFAULT_MAX_PIXELS, LAYER_FORMATS
-from brewster.image_formats import FORMATS, SUFFIXES, FormatName
+from brewster.image_formats import FORMATS, SUFFIXES, FormatName, canonical_format
+
+if TYPE_CHECKING:
+    from pydantic import TypeAdapter
 
 Layer = Literal["transmission", "reflection", "confidence", "layered"]
 Quality = Literal["draft", "standard"]
@@ -48,8 +52,11 @@ def _field_metadata(description: str, **limits: int) -> dict[str, Any]:
 class Options:
     """The options of a separation.
 
+    The values are checked, and converted to the types of their fields. The path of a mask may be a text. A format may be
+    one of its suffixes, such as `jpg`.
+
     Raises:
-        BrewsterError: `additive` is set, and the format does not store 32-bit floats.
+        BrewsterError: a value is invalid; or `additive` is set, and the format does not store 32-bit floats.
     """
 
     layers: tuple[Layer, ...] = field(
@@ -165,7 +172,17 @@ class Options:
     )
 
     def __post_init__(self) -> None:
-        """Checks combinations of values."""
+        """Checks and converts all values that differ from their defaults."""
+        if isinstance(self.format, str):
+            object.__setattr__(self, "format", canonical_format(self.format))
+        for option in fields(self):
+            value = getattr(self, option.name)
+            if type(value) is not type(option.default) or value != option.default:
+                object.__setattr__(self, option.name, _checked(option.name, value))
+        if not self.layers:
+            raise BrewsterError(
+                "layers is empty", "expected at least one layer", "add a layer, or leave layers out"
+            )
         if self.additive and self.format and not FORMATS[self.format].has_float32:
             raise BrewsterError(
                 f"additive layers were requested as {self.format}",
@@ -206,13 +223,40 @@ class Options:
         return photo_suffix if is_same else FORMATS[format_name].suffixes[0]
 
 
+def _checked(name: str, value: object) -> object:
+    """Returns the value of an option, converted to the type of its field.
+
+    Raises:
+        BrewsterError: the value is invalid.
+    """
+    from pydantic import ValidationError  # noqa: PLC0415  (slow to import, and not needed for the default options)
+
+    try:
+        return _validators()[name].validate_python(value)
+    except ValidationError as error:
+        raise invalid_value({**error.errors()[0], "loc": (name,)}) from error
+
+
+@cache
+def _validators() -> Mapping[str, TypeAdapter[Any]]:
+    """Returns the validator of each option."""
+    from pydantic import Field, TypeAdapter  # noqa: PLC0415
+
+    hints = get_type_hints(Options)
+    types: dict[str, Any] = {
+        option.name: Annotated[hints[option.name], Field(**option.metadata)] for option in fields(Options)
+    }
+    return {name: TypeAdapter(hint) for name, hint in types.items()}
+
+
 def document_options(function: _Function) -> _Function:
     """Adds the function parameters that are fields of `Options` to the `Args:` section of its docstring."""
-    fields, docstring = Options.__dataclass_fields__, inspect.getdoc(function) or ""
+    descriptions = {option.name: option.metadata["description"] for option in fields(Options)}
+    docstring = inspect.getdoc(function) or ""
     rows = [
-        f"    {name}: {fields[name].metadata['description']}"
+        f"    {name}: {descriptions[name]}"
         for name in inspect.signature(function).parameters
-        if name in fields
+        if name in descriptions
     ]
     section = re.compile(r"^Args:\n(?: +.*\n)*", re.MULTILINE)
     function.__doc__ = section.sub(lambda found: found[0] + "\n".join([*rows, ""]), docstring, count=1)

@@ -21,7 +21,14 @@ from collections.abc import Iterator
 from pathlib import Path, PurePosixPath
 from typing import Any, BinaryIO, TypeAlias, final
 
-from brewster.errors import BrewsterError, MissingExtra, OutputError, UnreadablePhoto, video_error
+from brewster.errors import (
+    BrewsterError,
+    MissingExtra,
+    OutputError,
+    UnreadablePhoto,
+    empty_file_error,
+    video_error,
+)
 from brewster.image_formats import is_video
 
 _RETRY = "check the network and the credentials, and run the same command again: finished files are kept"
@@ -49,19 +56,21 @@ class RemotePath(PurePosixPath):
             return bytes(store.cat_file(str(self)))
 
     def check_readable(self) -> None:
-        """Checks that the URL is that of a file, with one request that does not read its content.
+        """Checks that the URL is that of a file with content, with one request that does not read the content.
 
         Raises:
-            UnreadablePhoto: the file does not exist or is a folder, or the store fails.
+            UnreadablePhoto: the file does not exist, is empty or is a folder, or the store fails.
             MissingExtra: the package of the store is not installed.
         """
         store = self._store()
         with self._read_errors():
-            kind = store.info(str(self))["type"]
-        if kind == "directory":
+            info = store.info(str(self))
+        if info["type"] == "directory":
             raise UnreadablePhoto(
                 f"{self} cannot be read (it is a folder)", "expected an image file", "check the URL"
             )
+        if info.get("size") == 0:
+            raise empty_file_error()
 
     @contextlib.contextmanager
     def _read_errors(self) -> Iterator[None]:
@@ -204,7 +213,7 @@ def read_image(path: Location) -> bytes:
 
 
 def check_readable(path: Location) -> None:
-    """Checks that an image file exists and can be opened. Raises the errors of `read_image`, but does not read the content.
+    """Checks that an image file exists, can be opened and is not empty. Raises the errors of `read_image`, but does not read more.
 
     Pipes are not checked, because they can be opened only once.
     """
@@ -214,8 +223,9 @@ def check_readable(path: Location) -> None:
         return
     is_pipe = os.path.exists(path) and not os.path.isfile(path) and not os.path.isdir(path)  # noqa: PTH110, PTH112, PTH113
     if not is_pipe:
-        with _opened(path):
-            pass
+        with _opened(path) as file:
+            if not file.read(1):
+                raise empty_file_error()
 
 
 @contextlib.contextmanager

@@ -4,9 +4,10 @@
     1987/box-04/0017.tif
     s3://scans/1987/box-04/0018.tif
 
-The values of a CSV table are separated by commas, semicolons or tabs, as its header shows. Row 1 is the row below the header. A relative path is relative to the folder of the manifest, and its layers are written to the same relative path below the output
-folder. The layers of an absolute path or a URL are written to this path below the output folder, without the root or the protocol:
-to `OUT/scans/1987/box-04` for the second row. The output folder of a photo therefore does not depend on the other rows.
+The values of a CSV table are separated by commas, semicolons or tabs, as its header shows. Blank lines are skipped. Messages name the
+line of a CSV file, or the row of a Parquet table. Row 1 is its first row. A relative path is relative to the folder of the manifest,
+and its layers are written to the same relative path below the output folder. The layers of an absolute path or a URL are written to
+this path below the output folder, without the root or the protocol: to `OUT/scans/1987/box-04` for the second row. The output folder of a photo therefore does not depend on the other rows.
 """
 
 from __future__ import annotations
@@ -33,11 +34,12 @@ class ManifestRow(NamedTuple):
 
     manifest: Location
     number: int
-    """Row 1 is the row below the header."""
+    """For CSV, the line of the file, in which the header is line 1. For Parquet, the row of the table: 1 is the first one."""
 
     def __str__(self) -> str:
-        """Returns `row 3 of scans.csv`."""
-        return f"row {self.number} of {self.manifest}"
+        """Returns `line 3 of scans.csv` or `row 3 of scans.parquet`."""
+        unit = "line" if _is_csv(self.manifest) else "row"
+        return f"{unit} {self.number} of {self.manifest}"
 
 
 def is_manifest(source: Location) -> bool:
@@ -47,8 +49,8 @@ def is_manifest(source: Location) -> bool:
 
 def read_manifest(
     manifest: Location, output_folder: Location | None = None
-) -> Iterator[tuple[Location, Location]]:
-    """Yields the photo of each row of a manifest, with the folder for its layers. Files that do not exist are included.
+) -> Iterator[tuple[ManifestRow, Location, Location]]:
+    """Yields each row of a manifest with its photo and the folder for its layers. Files that do not exist are included.
 
     Args:
         manifest: the path of the table.
@@ -60,11 +62,12 @@ def read_manifest(
         BrewsterError: a row has a URL that cannot be read; see `location`.
         MissingExtra: the package is not installed that a Parquet table (pyarrow) or a URL needs.
     """
-    number = 0
-    for number, text in enumerate(_paths(manifest), 1):
-        photo, mirrored = _photo(ManifestRow(manifest, number), text)
-        yield photo, photo.parent if output_folder is None else output_folder.joinpath(*mirrored)
-    if number == 0:
+    row = None
+    for number, text in _paths(manifest):
+        row = ManifestRow(manifest, number)
+        photo, mirrored = _photo(row, text)
+        yield row, photo, photo.parent if output_folder is None else output_folder.joinpath(*mirrored)
+    if row is None:
         raise ManifestError(
             f"{manifest} has only the names of its columns, and no rows",
             "expected a row for each photo",
@@ -97,31 +100,38 @@ def _photo(row: ManifestRow, text: object) -> tuple[Location, tuple[str, ...]]:
     return row.manifest.parent / relative, tuple(relative.split("/")[:-1])
 
 
-def _paths(manifest: Location) -> Iterator[object]:
+def _is_csv(manifest: Location) -> bool:
+    return manifest.suffix.lower() == ".csv"
+
+
+def _paths(manifest: Location) -> Iterator[tuple[int, object]]:
+    """Yields the number of each row, as in `ManifestRow`, and the value of its column `path`."""
     try:
         data = manifest.read_bytes()
     except (OSError, UnreadablePhoto) as error:
         reason = str(error) if isinstance(error, UnreadablePhoto) else error.strerror
         raise ManifestError(f"{manifest} cannot be read ({reason})", _EXPECTED, "check its name") from error
-    return _csv_paths(manifest, data) if manifest.suffix.lower() == ".csv" else _parquet_paths(manifest, data)
+    return _csv_paths(manifest, data) if _is_csv(manifest) else _parquet_paths(manifest, data)
 
 
-def _csv_paths(manifest: Location, data: bytes) -> Iterator[object]:
+def _csv_paths(manifest: Location, data: bytes) -> Iterator[tuple[int, object]]:
     try:
         file = io.StringIO(data.decode("utf-8-sig"), newline="")
         delimiter = _delimiter(file.readline())
         file.seek(0)
         rows = csv.DictReader(file, delimiter=delimiter, strict=True)
         _check_columns(manifest, rows.fieldnames or [])
-        for number, row in enumerate(rows, 1):
+        for row in rows:
             if any(row.get(None, ())):
                 raise ManifestError(
-                    f"{ManifestRow(manifest, number)} has more values than the header",
+                    f"{ManifestRow(manifest, rows.line_num)} has more values than the header",
                     "expected one value for each column",
                     f"write a path that contains {delimiter!r} in double quotes",
                 )
-            yield row[COLUMN]
-    except (UnicodeDecodeError, csv.Error) as error:
+            yield rows.line_num, row[COLUMN]
+    except UnicodeDecodeError as error:
+        raise _not_a_table(manifest, error, "save the file as UTF-8") from error
+    except csv.Error as error:
         raise _not_a_table(manifest, error) from error
 
 
@@ -138,13 +148,13 @@ def _delimiter(header: str) -> str:
     return max(_DELIMITERS, key=lambda delimiter: (COLUMN in columns[delimiter], len(columns[delimiter])))
 
 
-def _parquet_paths(manifest: Location, data: bytes) -> Iterator[object]:
+def _parquet_paths(manifest: Location, data: bytes) -> Iterator[tuple[int, object]]:
     parquet = import_parquet(str(manifest))
     try:
         table = parquet.ParquetFile(io.BytesIO(data))
         _check_columns(manifest, table.schema_arrow.names)
-        for batch in table.iter_batches(columns=[COLUMN]):
-            yield from batch.column(0).to_pylist()
+        batches = table.iter_batches(columns=[COLUMN])
+        yield from enumerate((path for batch in batches for path in batch.column(0).to_pylist()), 1)
     except (OSError, ValueError) as error:  # the errors of pyarrow are subclasses
         raise _not_a_table(manifest, error) from error
 
@@ -152,12 +162,14 @@ def _parquet_paths(manifest: Location, data: bytes) -> Iterator[object]:
 def _check_columns(manifest: Location, names: list[str] | Any) -> None:  # noqa: ANN401
     if COLUMN not in names:
         found = f"the columns {', '.join(map(repr, list(names)[:8]))}" if names else "no columns"
-        raise ManifestError(f"{manifest} has {found}", _EXPECTED, f"name a column {COLUMN!r}")
+        similar = next((name for name in names if name.strip().lower() == COLUMN), None)
+        cure = f"rename the column {similar!r} to {COLUMN!r}" if similar else f"name a column {COLUMN!r}"
+        raise ManifestError(f"{manifest} has {found}", _EXPECTED, cure)
 
 
-def _not_a_table(manifest: Location, error: Exception) -> ManifestError:
+def _not_a_table(manifest: Location, error: Exception, cure: str = "check the file") -> ManifestError:
     reason = str(error).partition("\n")[0][:120]
-    return ManifestError(f"{manifest} is not a table ({reason})", _EXPECTED, "check the file")
+    return ManifestError(f"{manifest} is not a table ({reason})", _EXPECTED, cure)
 
 
 def import_parquet(purpose: str) -> Any:  # noqa: ANN401  (pyarrow has no types)

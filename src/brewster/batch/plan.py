@@ -131,8 +131,8 @@ def plan_files(
             if not is_manifest(source):
                 yield from images_in(source, folder, skipped=skipped)
                 continue
-            for number, (image, image_folder) in enumerate(read_manifest(source, folder), 1):
-                rows.setdefault(absolute(image), ManifestRow(source, number))
+            for row, image, image_folder in read_manifest(source, folder):
+                rows.setdefault(absolute(image), row)
                 yield image, image_folder
 
     tasks = [

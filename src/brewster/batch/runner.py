@@ -71,7 +71,7 @@ def separate_files(
         separator: the model. By default, it is loaded with `options` when the first photo needs it.
         overwrite: whether layers that exist are replaced instead of skipped.
         dry_run: if true, no file is written and no model is loaded. The results contain the paths of the missing layers. A
-            photo that does not exist, or cannot be opened, fails as in a real run. In an object store, this needs one request
+            photo that does not exist, cannot be opened or is empty fails as in a real run. In an object store, this needs one request
             for each photo.
         on_progress: see `BatchProgressCallback`.
 

@@ -18,13 +18,14 @@ from brewster.cli.batch_plan import absolute_path, is_single_output, local_path,
 from brewster.cli.extras import require_extra
 from brewster.cli.terminal import print_out, print_status, standard_output
 from brewster.errors import BrewsterError
+from brewster.files import create_output_folder
 from brewster.image_formats import FormatName, canonical_format, format_of
 from brewster.models import zoo
 from brewster.options import Options
+from brewster.remote_path import Location, location
 
 if TYPE_CHECKING:
     from brewster.batch import SeparationTask
-    from brewster.remote_path import Location
 
 _METAVARS: Final[dict[object, str]] = {int: "NUMBER", float: "NUMBER", Path | None: "FILE"}
 
@@ -264,6 +265,8 @@ def separate(
         tasks = _without_contact_sheet(tasks, contact_sheet, overwrite=overwrite)
     for line in skipped_files(skipped) if not quiet else ():
         print_status(line)
+    if output and not (single_output or dry_run):
+        create_output_folder(location(output))
     batch = BatchCommand(
         options,
         output=output,
@@ -328,7 +331,6 @@ def _without_contact_sheet(
     """
     from brewster.batch.runner import real_path  # noqa: PLC0415
     from brewster.photo.contact_sheet import is_contact_sheet  # noqa: PLC0415
-    from brewster.remote_path import Location  # noqa: PLC0415
 
     def is_sheet(source: object) -> bool:
         return isinstance(source, Path) and source.stem.startswith(path.stem) and is_contact_sheet(source)

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 Verdict = Literal["clear", "partial", "little found", "doubtful"]
 """clear: a reflection was found and removed with high confidence. partial: a reflection was found, and parts of it probably
-remain; also if the model does not estimate its confidence. little found: the result differs little from the photo. doubtful: the
+remain; also if the model does not estimate its confidence. little found: the prediction differs little from the photo. doubtful: the
 result may be worse than the photo."""
 
 RECONSTRUCTION_ERROR_LIMIT: Final = 0.06
@@ -27,8 +27,8 @@ RECONSTRUCTION_ERROR_LIMIT: Final = 0.06
 error of encoding and decoding with the VAE of a diffusion model."""
 _VISIBLE_CHANGE: Final = 0.03
 """The smallest change of a pixel that counts as visible, sRGB-encoded."""
-_MIN_CHANGED_AREA: Final = 0.1
-"""With a smaller changed area, the verdict is "little found"."""
+_MIN_FOUND_AREA: Final = 0.1
+"""If the prediction changes a smaller share of the separated pixels visibly, the verdict is "little found"."""
 _MIN_CLEAR_CONFIDENCE: Final = 0.6
 _MIN_PARTIAL_CONFIDENCE: Final = 0.2
 
@@ -36,7 +36,11 @@ _MIN_PARTIAL_CONFIDENCE: Final = 0.2
 @final
 @dataclass(frozen=True)
 class Assessment:
-    """What a separation found."""
+    """What a separation found.
+
+    `removed_light` and `changed_area` describe the transmission that is written, with its strength and its mask. `verdict` and
+    `confidence` describe the prediction of the model where the strength is above 0.
+    """
 
     verdict: Verdict
     removed_light: float
@@ -44,7 +48,7 @@ class Assessment:
     changed_area: float
     """The pixels that changed visibly (by more than 0.03 in sRGB values of 0..1), divided by all pixels."""
     confidence: float
-    """Mean confidence of all pixels, 0..1, weighted by their change; 1 if nothing changed."""
+    """Mean confidence, 0..1, weighted by the predicted change of each pixel; 1 if nothing changes."""
 
 
 def assess(
@@ -52,6 +56,7 @@ def assess(
     transmission: Float32[NDArray[np.float32], "h w 3"],
     confidence_map: Float32[NDArray[np.float32], "h w 1"],
     reconstruction_error: float | None = None,
+    strength: Float32[NDArray[np.float32], "h w 1"] | float = 1.0,
 ) -> Assessment:
     """Assesses a separation.
 
@@ -60,15 +65,21 @@ def assess(
         transmission: the predicted transmission in linear light.
         confidence_map: the confidence of the prediction, 0..1.
         reconstruction_error: mean of |generated input - input|, sRGB-encoded, or None if the model does not generate the input.
+        strength: the strength of the separation, 0..1, the same for all pixels or, with a mask, one for each pixel.
     """
+    written = photo + np.float32(strength) * (transmission - photo)
     light = float(photo.sum(dtype=np.float64))
-    removed = float(np.maximum(photo - transmission, 0).sum(dtype=np.float64))
-    change = encoded_change(photo, transmission)
+    removed = float(np.maximum(photo - written, 0).sum(dtype=np.float64))
+    is_separated = np.broadcast_to(strength, confidence_map.shape)[..., 0] > 0
+    change = encoded_change(photo, transmission) * is_separated
     total = float(change.sum(dtype=np.float64))
     confidence = float((change * confidence_map[..., 0]).sum(dtype=np.float64)) / total if total else 1.0
     removed_light = removed / light if light else 0.0
-    changed_area = float((change > _VISIBLE_CHANGE).mean())
-    verdict = _verdict(changed_area, confidence, reconstruction_error)
+    changed_area = float((encoded_change(photo, written) > _VISIBLE_CHANGE).mean())
+    if not is_separated.any():
+        return Assessment("little found", removed_light, changed_area, confidence)
+    found_area = float((change[is_separated] > _VISIBLE_CHANGE).mean())
+    verdict = _verdict(found_area, confidence, reconstruction_error)
     return Assessment(verdict, removed_light, changed_area, confidence)
 
 
@@ -79,10 +90,10 @@ def encoded_change(photo: Floats, transmission: Floats) -> Floats:
     return change
 
 
-def _verdict(changed_area: float, confidence: float, reconstruction_error: float | None) -> Verdict:
+def _verdict(found_area: float, confidence: float, reconstruction_error: float | None) -> Verdict:
     if reconstruction_error is not None and reconstruction_error > RECONSTRUCTION_ERROR_LIMIT:
         return "doubtful"
-    if changed_area < _MIN_CHANGED_AREA:
+    if found_area < _MIN_FOUND_AREA:
         return "little found"
     if confidence >= _MIN_CLEAR_CONFIDENCE:
         return "clear"

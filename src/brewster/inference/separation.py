@@ -30,8 +30,8 @@ class Separation:
     reconstruction_error: float | None
     """Mean of |generated input - input|, sRGB-encoded, or None if the model does not generate the input."""
     assessment: Assessment
-    """What the model found in the photo, and how reliable the result is. All strengths above 0 have the assessment of strength 1. At
-    strength 0, nothing is removed, and the verdict is "little found"."""
+    """What the model found in the photo, what was removed, and how reliable the result is. If the strength or the mask is 0
+    everywhere, nothing is removed, and the verdict is "little found"."""
     model: str
     sha256: str | None
     device: str

@@ -30,7 +30,6 @@ from brewster.inference.guided_upsampling import Floats, GuidedUpsampler
 from brewster.inference.layer_history import PHOTO, history_step, with_step
 from brewster.inference.onnx_backend import OnnxBackend
 from brewster.inference.predictor import (
-    QUALITIES,
     MultiScalePredictor,
     Prediction,
     Predictor,
@@ -209,9 +208,9 @@ class Separator:
             TypeError: the source has another type.
             ModelError: the model returns an invalid output.
             MaskError: the mask cannot be read, is not grey, or has another size than the photo.
-            BrewsterError: strength is out of range, or quality is not a key of `QUALITIES`.
+            BrewsterError: strength is not a number from 0 to 1, or quality is unknown.
         """
-        _check_options(strength, quality)
+        Options(strength=strength, quality=quality)  # checks the values
         seconds: dict[str, float] = {}
         with _timed(seconds, "decode"):
             photo = Photo.open(source, encoding=encoding, max_pixels=max_pixels)
@@ -240,7 +239,7 @@ class Separator:
             prediction.confidence_map,
             residual,
             prediction.reconstruction_error,
-            _assess(inputs[-1], prediction, strength),
+            _assess(inputs[-1], prediction, strength, weights),
             self.name,
             self.sha256,
             self.device,
@@ -267,14 +266,14 @@ class Separator:
             assessment.
 
         Raises:
-            BrewsterError: quality is not a key of `QUALITIES`.
+            BrewsterError: quality is unknown.
             ModelError: the model returns an invalid output.
         """
-        _check_options(Options.strength, quality)
+        Options(quality=quality)  # checks the value
         inputs, white = self._inputs(photo, quality)
         prediction = keep_clipped_white(inputs[-1], self._predictor(inputs, quality, on_progress))
         upsampler = _fit_upsampler(inputs[-1], prediction, Options.strength, white)
-        return upsampler, prediction, _assess(inputs[-1], prediction, Options.strength)
+        return upsampler, prediction, _assess(inputs[-1], prediction)
 
     def _inputs(self, photo: Photo, quality: Quality) -> tuple[list[Floats], np.float32]:
         """Returns the inputs of the model in 0..1, smallest first, and the white level by which they are divided."""
@@ -351,23 +350,20 @@ def _open_pipeline(model: str, **options: Any) -> DecompositionPipeline:  # noqa
     return load_pipeline(model, **options)
 
 
-def _check_options(strength: float, quality: str) -> None:
-    if not 0 <= strength <= 1:
-        raise BrewsterError(
-            f"strength is {strength}", "expected a number from 0 to 1", "choose a number in this range"
-        )
-    if quality not in QUALITIES:
-        raise BrewsterError(
-            f"quality is {quality!r}", f"expected one of {', '.join(QUALITIES)}", "choose one of them"
-        )
-
-
-def _assess(largest_input: Floats, prediction: Prediction, strength: float) -> Assessment:
-    """Assesses the prediction at strength 1; at strength 0, assesses the unchanged photo."""
-    if strength == 0:
-        return assess(largest_input, largest_input, prediction.confidence_map)
-    transmission = np.clip(largest_input + prediction.change, 0, 1)
-    return assess(largest_input, transmission, prediction.confidence_map, prediction.reconstruction_error)
+def _assess(
+    largest_input: Floats,
+    prediction: Prediction,
+    strength: float = Options.strength,
+    mask: Mask | None = None,
+) -> Assessment:
+    height, width, _ = largest_input.shape
+    return assess(
+        largest_input,
+        np.clip(largest_input + prediction.change, 0, 1),
+        prediction.confidence_map,
+        prediction.reconstruction_error,
+        float(strength) if mask is None else np.float32(strength) * mask.sampled(width, height),
+    )
 
 
 def _fit_upsampler(

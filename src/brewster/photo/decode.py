@@ -19,7 +19,15 @@ import numpy as np
 import pyvips
 from numpy.typing import NDArray
 
-from brewster.errors import MissingExtra, PhotoError, UnreadablePhoto, UnsupportedPhoto, counted, video_error
+from brewster.errors import (
+    MissingExtra,
+    PhotoError,
+    UnreadablePhoto,
+    UnsupportedPhoto,
+    counted,
+    empty_file_error,
+    video_error,
+)
 from brewster.files import DEFAULT_MAX_PIXELS
 from brewster.image_formats import FORMATS, VIDEO_SIGNATURE, format_of_content
 from brewster.photo import metadata
@@ -88,8 +96,7 @@ def read_size(data: bytes) -> tuple[int, int]:
     if format_name == "raw":
         return read_raw_size(data, DEFAULT_MAX_PIXELS)
     if format_name in _FLOAT_READERS:
-        height, width = decode(data, DEFAULT_MAX_PIXELS).pixels.shape[:2]
-        return width, height
+        return decode(data, DEFAULT_MAX_PIXELS).pixels.shape[1::-1]
     if format_name == "heic":
         heif = _open_heic(data, DEFAULT_MAX_PIXELS)
         _check_profile(_heic_profile(heif, data), is_float=False)
@@ -111,9 +118,8 @@ _FLOAT_READERS = {"exr": read_exr, "hdr": read_hdr}
 
 def _detect_format(data: bytes) -> str:
     if not data:
-        raise UnreadablePhoto("the file is empty", "expected an image file", "copy the file again")
-    image_format = format_of_content(data)
-    if image_format:
+        raise empty_file_error()
+    if image_format := format_of_content(data):
         is_raw_tiff = image_format.name == "tiff" and is_raw(metadata.read_tags(data))
         return "raw" if is_raw_tiff else image_format.name
     if re.match(VIDEO_SIGNATURE, data, re.DOTALL):

@@ -73,10 +73,20 @@ class Mask:
 
     def rows(self, top: int, bottom: int) -> Float32:
         """Returns the weights of the rows `top` to `bottom` (exclusive): (n, W, 1) in 0..1."""
-        weights: NDArray[Any] = self.values[top:bottom, :, None] / np.float32(
-            WHITE_LEVELS[self.values.dtype.name]
+        return _weights(self.values[top:bottom])
+
+    def sampled(self, width: int, height: int) -> Float32:
+        """Returns the weights at the centres of a grid of `width` x `height` cells that covers the mask: (height, width, 1)."""
+        rows, columns = (
+            (2 * np.arange(cells) + 1) * side // (2 * cells)
+            for cells, side in zip((height, width), self.values.shape, strict=True)
         )
-        return weights.astype(np.float32, copy=False)
+        return _weights(self.values[np.ix_(rows, columns)])
+
+
+def _weights(values: Stored) -> Float32:
+    weights: NDArray[Any] = values[..., None] / np.float32(WHITE_LEVELS[values.dtype.name])
+    return weights.astype(np.float32, copy=False)
 
 
 def _open(source: Source) -> Photo:

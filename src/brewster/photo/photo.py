@@ -13,9 +13,9 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from brewster.errors import PhotoError, UnsupportedPhoto
+from brewster.errors import PhotoError, UnreadablePhoto, UnsupportedPhoto
 from brewster.files import DEFAULT_MAX_PIXELS, write_atomically
-from brewster.image_formats import FORMATS
+from brewster.image_formats import FORMATS, canonical_format, format_of
 from brewster.photo.colour import SRGB, ColourSpace, colour_space_of
 from brewster.photo.decode import Decoded, decode
 from brewster.photo.encode import encode
@@ -34,14 +34,15 @@ from brewster.photo.in_memory import (
     pil_image,
 )
 from brewster.photo.lut_profiles import convert_to_display_p3, has_only_tables
-from brewster.remote_path import read_image
+from brewster.photo.raw import with_raw_suffix
+from brewster.remote_path import location, read_image
 
 Float32 = NDArray[np.float32]
 Stored = NDArray[Any]
 Source: TypeAlias = (
     "str | os.PathLike[str] | bytes | bytearray | memoryview | BinaryFile | Stored | PilImage | Photo"
 )
-"""A path, the bytes of a file, an open binary file, a numpy array, a PIL image, or a `Photo`."""
+"""A path or the URL of an object store, the bytes of a file, an open binary file, a numpy array, a PIL image, or a `Photo`."""
 _PREVIEW_PX = 1024
 
 _STRIP_PIXELS = 1 << 18  # a strip of floats needs a few MB; a whole photo may not fit into memory
@@ -73,8 +74,8 @@ class Photo:
         """Opens a photo.
 
         Args:
-            source: a path, the bytes of a file, a file opened for reading in binary mode, a numpy array, a PIL image, or
-                a `Photo`.
+            source: a path, the URL of an object store such as s3://bucket/a.jpg, the bytes of a file, a file opened for
+                reading in binary mode, a numpy array, a PIL image, or a `Photo`.
             encoding: the encoding of an array, "srgb" or "linear"; None for all other sources.
             max_pixels: photos with more pixels are refused before they are decoded.
 
@@ -85,6 +86,7 @@ class Photo:
             PhotoTooLarge: the image has more pixels than `max_pixels`.
             MissingExtra: the reader of EXR, HEIC or RAW is not installed.
             PhotoError: the encoding of an array is missing or unknown, or an encoding was passed for another source.
+            BrewsterError: the URL cannot be read, for example because it is a web address; see `location`.
             TypeError: the source has an unsupported type, such as None, a list or a file in text mode.
         """
         if isinstance(source, np.ndarray):
@@ -103,7 +105,13 @@ class Photo:
             _check_pixel_count(source.width, source.height, max_pixels)
             return cls.from_pil(source)
         data = _read_source(source)
-        decoded = decode(data, max_pixels)
+        try:
+            decoded = decode(data, max_pixels)
+        except UnreadablePhoto as error:
+            path = Path(os.fspath(source)) if isinstance(source, str | os.PathLike) else Path()
+            if format_of(path) == FORMATS["raw"]:
+                raise with_raw_suffix(error, path.suffix) from error
+            raise
         file_info = replace(decoded.file_info, digest=sampled_digest(io.BytesIO(data)))
         return cls._from_decoded(replace(decoded, file_info=file_info))
 
@@ -274,7 +282,8 @@ class Photo:
         A JPEG has the quality and the chroma subsampling of the source.
 
         Args:
-            format_name: a key of `image_formats.FORMATS`, such as "png"; by default, the format of the photo's file.
+            format_name: a key of `image_formats.FORMATS` or one of its suffixes, such as "jpeg" or "jpg"; by default, the
+                format of the photo's file.
             depth: bits per channel (see `image_formats.FORMATS`); by default, the depth of the photo or, if the format does
                 not have it, the next smaller depth.
 
@@ -282,7 +291,7 @@ class Photo:
             UnsupportedPhoto: the format cannot store this photo, or cannot store it at this bit depth.
             MissingExtra: the writer of EXR or HEIC is not installed.
         """
-        format_name = format_name or self.file_info.format_name
+        format_name = canonical_format(format_name) if format_name else self.file_info.format_name
         bits = depth_for(self.file_info, format_name, depth)
         stored = self.stored_as(format_name, bits)
         return encode(
@@ -301,7 +310,7 @@ class Photo:
 
         Args:
             target: a path, or a file opened for writing in binary mode.
-            format: the format, such as "png"; by default, the format of the path's suffix or, for an open file, the format
+            format: the format, such as "png" or "jpg"; by default, the format of the path's suffix or, for an open file, the format
                 of the photo's file.
             depth: bits per channel; see `encode`.
             overwrite: whether to replace an existing file.
@@ -373,7 +382,7 @@ def _read_source(source: object) -> bytes:
     if isinstance(source, bytes | bytearray | memoryview):
         return bytes(source)
     if isinstance(source, str | os.PathLike):
-        return read_image(Path(source))
+        return read_image(location(source))
     data = source.read() if isinstance(source, BinaryFile) else None
     if isinstance(data, bytes):
         return data

@@ -6,6 +6,7 @@ pixels are stored with the tone curve of Display P3, so that all programs show a
 
 from __future__ import annotations
 
+import importlib.util
 import io
 import re
 import types
@@ -17,7 +18,7 @@ import numpy as np
 import pyvips
 from numpy.typing import NDArray
 
-from brewster.errors import MissingExtra, UnreadablePhoto
+from brewster.errors import MissingExtra, UnreadablePhoto, install_command
 from brewster.image_formats import FORMATS
 from brewster.photo import metadata
 from brewster.photo.colour import colour_space_of
@@ -26,6 +27,7 @@ from brewster.photo.hdr_formats import too_large_error
 
 _MAKER_NOTE = 37500
 _EXIF_TAG, _GPS_TAG = 34665, 34853
+_DAMAGED = "the RAW file cannot be read completely"
 
 
 def is_raw(tags: metadata.Tags) -> bool:
@@ -75,6 +77,21 @@ def read_raw_size(data: bytes, max_pixels: int) -> tuple[int, int]:
         return _upright_size(raw, max_pixels)
 
 
+def with_raw_suffix(error: UnreadablePhoto, suffix: str) -> UnreadablePhoto:
+    """Returns the error for a file with the suffix of a RAW file. The content of a damaged RAW file may look like another format."""
+    if error.happened == _DAMAGED:
+        return error
+    is_installed = importlib.util.find_spec("rawpy") is not None
+    extra = (
+        "" if is_installed else f", and install the extra raw, which RAW files need: {install_command('raw')}"
+    )
+    return UnreadablePhoto(
+        f"{error.happened}, and its suffix {suffix} is that of a RAW file",
+        "expected a complete RAW file",
+        f"copy the file again from the camera{extra}",
+    )
+
+
 def _rawpy() -> types.ModuleType:
     try:
         import rawpy  # noqa: PLC0415  (an extra: only RAW files need it)
@@ -97,7 +114,7 @@ def _opened(data: bytes) -> Iterator[Any]:
             yield raw
     except rawpy.LibRawError as error:
         raise UnreadablePhoto(
-            "the RAW file cannot be read completely",
+            _DAMAGED,
             f"expected a complete RAW file of a camera that LibRaw {'.'.join(map(str, rawpy.libraw_version))} supports",
             "copy the file again from the camera, or convert it to DNG or TIFF",
         ) from error
