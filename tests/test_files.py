@@ -16,7 +16,7 @@ from platformdirs import macos, unix
 from brewster import files
 from brewster.batch.layer_names import name_layers
 from brewster.errors import OutputError
-from brewster.files import cache_folder, images_in, write_atomically
+from brewster.files import cache_folder, check_output_folder, images_in, write_atomically
 from brewster.image_formats import SUFFIXES, FormatName
 from brewster.options import Options
 
@@ -417,6 +417,23 @@ def test_ctrl_c_just_after_the_rename_leaves_nothing_else(tmp_path, monkeypatch)
     with pytest.raises(KeyboardInterrupt):
         write_atomically(tmp_path / "a", b"whole")
     assert [path.name for path in tmp_path.iterdir()] == ["a"]
+
+
+def test_the_check_of_an_output_folder_creates_nothing(tmp_path: Path) -> None:
+    touch(tmp_path, "file")
+    (tmp_path / "link").symlink_to("nowhere")
+    before = sorted(tmp_path.iterdir())
+    for good in (".", "new", "new/below/it"):
+        check_output_folder(tmp_path / good)
+    for bad, reason in (
+        ("file", "a file"),
+        ("file/new", "a file"),
+        ("link", "a file"),
+        ("x" * 300, "shorter name"),
+    ):
+        with pytest.raises(OutputError, match=rf"{bad} was not written \(.*; expected .*{reason}"):
+            check_output_folder(tmp_path / bad)
+    assert sorted(tmp_path.iterdir()) == before
 
 
 def test_a_path_too_long_for_windows_is_named_as_such(

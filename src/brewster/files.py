@@ -115,10 +115,11 @@ def write_atomically(
         raise _output_error(path, error) from error
 
 
-def create_output_folder(folder: Location) -> None:
-    """Creates the output folder of a batch where needed, so that a folder that is not writable is found before the first photo.
+def check_output_folder(folder: Location) -> None:
+    """Checks that the output folder of a batch can be created and written to, so that an error is found before the first photo.
 
-    A folder in an object store exists only as long as it has files, so it is not created.
+    The permissions of a folder do not show all errors. Therefore a hidden folder is created in the output folder, or in its nearest
+    parent that exists, and is deleted at once. A folder in an object store is not checked.
 
     Raises:
         OutputError: the folder cannot be created, or cannot be written to.
@@ -126,9 +127,14 @@ def create_output_folder(folder: Location) -> None:
     if isinstance(folder, RemotePath):
         return
     try:
-        _create_folder(folder)
-        if not os.access(folder, os.W_OK):
-            raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
+        for existing in (folder, *folder.parents):
+            with contextlib.suppress(FileNotFoundError):
+                existing.lstat()
+                break
+        if not existing.is_dir():
+            raise NotADirectoryError(errno.ENOTDIR, os.strerror(errno.ENOTDIR))
+        with _temporary(existing / folder.name) as part:
+            part.mkdir()
     except OSError as error:
         raise _output_error(folder, error) from error
 

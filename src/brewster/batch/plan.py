@@ -14,7 +14,7 @@ from typing import Final, Literal, Protocol, final
 from brewster.batch.layer_names import name_layers
 from brewster.batch.manifest import ManifestRow, is_manifest, read_manifest
 from brewster.errors import PhotoError, counted
-from brewster.files import absolute, images_in
+from brewster.files import absolute, check_output_folder, images_in
 from brewster.image_formats import SUFFIXES, is_video
 from brewster.inference.assessment import Assessment
 from brewster.options import Options
@@ -118,7 +118,7 @@ def plan_files(
     Raises:
         PhotoError: the sources contain no photo.
         ManifestError: a manifest is not a table, or a row of it is not a path.
-        OutputError: the layers of two photos would have the same path.
+        OutputError: the layers of two photos would have the same path, or the output folder cannot be created or written to.
     """
     given = [sources] if isinstance(sources, str | os.PathLike) else sources
     paths = [location(source) for source in given]
@@ -148,6 +148,8 @@ def plan_files(
             f"expected files with one of the suffixes {' '.join(SUFFIXES)}",
             "pass the path of the file itself, or choose another folder",
         )
+    if folder is not None:
+        check_output_folder(folder)
     return tasks
 
 

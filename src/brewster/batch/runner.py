@@ -81,7 +81,7 @@ def separate_files(
     Raises:
         PhotoError: the sources contain no photo.
         ManifestError: a manifest is not a table, or a row of it is not a path.
-        OutputError: the layers of two photos would have the same path.
+        OutputError: the layers of two photos would have the same path, or the output folder cannot be created or written to.
         ModelError: the model does not exist or is damaged (raised during iteration).
         DeviceError: the requested device is not available (raised during iteration).
         Exception: an unexpected exception, which is a bug in brewster. The result of its photo has the status `failed`, and

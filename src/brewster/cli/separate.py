@@ -18,11 +18,10 @@ from brewster.cli.batch_plan import absolute_path, is_single_output, local_path,
 from brewster.cli.extras import require_extra
 from brewster.cli.terminal import print_out, print_status, standard_output
 from brewster.errors import BrewsterError
-from brewster.files import create_output_folder
 from brewster.image_formats import FormatName, canonical_format, format_of
 from brewster.models import zoo
 from brewster.options import Options
-from brewster.remote_path import Location, location
+from brewster.remote_path import Location
 
 if TYPE_CHECKING:
     from brewster.batch import SeparationTask
@@ -265,8 +264,6 @@ def separate(
         tasks = _without_contact_sheet(tasks, contact_sheet, overwrite=overwrite)
     for line in skipped_files(skipped) if not quiet else ():
         print_status(line)
-    if output and not (single_output or dry_run):
-        create_output_folder(location(output))
     batch = BatchCommand(
         options,
         output=output,
