@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 from collections.abc import Callable
 from pathlib import Path
 from types import NoneType
@@ -29,21 +28,6 @@ if TYPE_CHECKING:
 _METAVARS: Final[dict[object, str]] = {int: "NUMBER", float: "NUMBER", Path | None: "FILE"}
 
 _Command = TypeVar("_Command", bound=Callable[..., Any])
-
-
-class _RangedNumber(click.FloatRange):
-    """A number in a range. Unlike `click.FloatRange`, it rejects NaN."""
-
-    def convert(self, value: object, param: click.Parameter | None, ctx: click.Context | None) -> float:
-        """Returns the number.
-
-        Raises:
-            click.BadParameter: the value is not a number in the range.
-        """
-        number = float(super().convert(cast("float", value), param, ctx))
-        if math.isnan(number):
-            self.fail(f"{value} is not a number.", param, ctx)
-        return number
 
 
 class _ChoiceList(click.ParamType[tuple[str, ...]]):
@@ -143,7 +127,7 @@ def _param_type(hint: object, field: dataclasses.Field[Any]) -> click.ParamType[
     if NoneType in get_args(hint):
         return _param_type(get_args(hint)[0], field)
     if hint in (int, float):
-        return (_RangedNumber if hint is float else click.IntRange)(low, high)
+        return (click.FloatRange if hint is float else click.IntRange)(low, high)
     if hint is Path:
         return click.Path(exists=True, dir_okay=False, path_type=Path)
     if get_origin(hint) is tuple:
