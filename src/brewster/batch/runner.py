@@ -14,12 +14,12 @@ import hashlib
 import os
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Final, final
 
+from brewster.batch.manifest import row_in_errors
 from brewster.batch.plan import (
     FileResult,
     InputStream,
@@ -28,7 +28,7 @@ from brewster.batch.plan import (
     display_name,
     plan_files,
 )
-from brewster.errors import BrewsterError, OutputError, PhotoError
+from brewster.errors import BrewsterError, OutputError
 from brewster.files import exists, is_same_file, write_atomically
 from brewster.image_formats import format_of
 from brewster.inference.layer_history import find_layer_of_another_photo
@@ -144,7 +144,7 @@ class BatchRunner:
         try:
             outputs = self._outputs_to_write(task)
             if outputs and self._dry_run and isinstance(task.source, Location):
-                with _row_in_error(task):
+                with row_in_errors(task.row):
                     check_readable(task.source)
         except BrewsterError as error:
             return result.failed(error)
@@ -210,7 +210,7 @@ class BatchRunner:
         on_progress: Callable[[float], None],
     ) -> None:
         path = task.source if isinstance(task.source, Location) else None
-        with _row_in_error(task):
+        with row_in_errors(task.row):
             photo = read_content(task.source)
         result.photo_sha256 = _sha256(photo)
         separation = separator(photo, on_progress=on_progress, **self._options.call_options())
@@ -279,17 +279,6 @@ def read_content(source: Location | InputStream) -> Path | bytes:
         check_readable(source)
         return source
     return read_image(source) if isinstance(source, RemotePath) else source.read()
-
-
-@contextmanager
-def _row_in_error(task: SeparationTask) -> Iterator[None]:
-    """Adds the row of the manifest to the error of a photo that does not exist or cannot be read."""
-    try:
-        yield
-    except PhotoError as error:
-        if task.row:
-            error.happened = f"{task.row}: {error.happened}"
-        raise
 
 
 def _sha256(photo: Path | bytes) -> str | None:
