@@ -1,7 +1,7 @@
 """Finds input images and writes results atomically, without overwriting other files.
 
 for image, folder in images_in(Path("holiday"), output_folder=Path("clear")):
-    write_atomically(SeparationPaths(image, folder).target("transmission", ".png"), data, source=image)
+    write_atomically(SeparationPaths(image, folder).target("transmission", ".png"), data)
 """
 
 from __future__ import annotations
@@ -90,18 +90,15 @@ def _output_folder(image: Location, source: Location, output_folder: Location | 
     )
 
 
-def write_atomically(
-    path: Location, data: bytes, *, overwrite: bool = False, source: Location | None = None
-) -> None:
+def write_atomically(path: Location, data: bytes, *, overwrite: bool = False) -> None:
     """Writes a file atomically and creates its folder where needed.
 
     The bytes are written to a hidden file in the same folder and flushed to the disk. Then the file is renamed.
     Therefore a full disk or Ctrl-C leaves no partial file. In an object store, the file is written with one upload.
 
     Raises:
-        OutputError: the file exists and `overwrite` is False, the file is the `source`, or it cannot be written.
+        OutputError: the file exists and `overwrite` is False, or it cannot be written.
     """
-    _check_not_source(path, source)
     try:
         if isinstance(path, RemotePath):
             path.write_bytes(data, overwrite=overwrite)
@@ -288,25 +285,12 @@ def _is_input(path: Location) -> bool:
     return format_of(path) is not None and not path.name.startswith(".") and not is_result
 
 
-def _check_not_source(path: Location, source: Location | None) -> None:
-    with contextlib.suppress(OSError):  # a file that does not exist is not the same file
-        if source is not None and is_same_file(path, source):
-            raise OutputError(
-                f"{path} is the input image itself",
-                "expected another path, because input files are never changed",
-                "choose another name",
-            )
-
-
 def is_same_file(path: Location, other: Location) -> bool:
-    """Whether both paths lead to the same file, through links or hard links, too.
-
-    Raises:
-        OSError: one of the files does not exist.
-    """
-    if isinstance(path, Path) and isinstance(other, Path):
-        return path.samefile(other)
-    return path == other
+    """Whether both paths lead to the same existing file, through links or hard links, too."""
+    try:
+        return path.samefile(other) if isinstance(path, Path) and isinstance(other, Path) else path == other
+    except OSError:  # one of the files does not exist
+        return False
 
 
 def exists(path: Location) -> bool:

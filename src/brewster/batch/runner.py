@@ -13,7 +13,7 @@ from __future__ import annotations
 import hashlib
 import os
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Set
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -132,7 +132,7 @@ class BatchRunner:
         self.unexpected_error: Exception | None = None
         self._options, self._separator = options, separator
         self._overwrite, self._dry_run = overwrite, dry_run
-        self._sources = {real_path(task.source) for task in tasks if isinstance(task.source, Location)}
+        self._photos = real_paths(task.source for task in tasks)
 
     def run(self, task: SeparationTask, on_progress: Callable[[float], None]) -> FileResult:
         """Separates one photo. Returns its result, also if the photo fails.
@@ -179,13 +179,7 @@ class BatchRunner:
         Raises:
             OutputError: a layer would replace a photo of the batch, or an existing layer was made from another photo.
         """
-        for target in task.outputs.values():
-            if isinstance(target, Location) and self._is_source(target, task.source):
-                raise OutputError(
-                    f"{target} is itself a photo of the batch",
-                    "expected another path, because photos of the batch are never overwritten",
-                    "choose another name",
-                )
+        check_outputs(task, self._photos)
         missing = {
             layer: target
             for layer, target in task.outputs.items()
@@ -194,14 +188,6 @@ class BatchRunner:
         check_layers(task.source, [target for layer, target in task.outputs.items() if layer not in missing])
         return missing
 
-    def _is_source(self, target: Location, source: Location | InputStream) -> bool:
-        if real_path(target) in self._sources:
-            return True
-        try:  # unlike realpath, is_same_file finds hard links
-            return isinstance(source, Location) and is_same_file(target, source)
-        except OSError:  # one of the two files does not exist
-            return False
-
     def _separate(
         self,
         separator: Separator,
@@ -209,7 +195,6 @@ class BatchRunner:
         result: FileResult,
         on_progress: Callable[[float], None],
     ) -> None:
-        path = task.source if isinstance(task.source, Location) else None
         with row_in_errors(task.row):
             photo = read_content(task.source)
         result.photo_sha256 = _sha256(photo)
@@ -228,11 +213,29 @@ class BatchRunner:
             encoded = getattr(separation, layer).encode(format_name)
             on_progress(1.0)
             if isinstance(target, Location):
-                write_atomically(target, encoded, overwrite=self._overwrite, source=path)
+                write_atomically(target, encoded, overwrite=self._overwrite)
             else:
                 target.write(encoded)
             result.outputs[layer] = display_name(target)
         result.seconds["encode"] = time.perf_counter() - started
+
+
+def check_outputs(task: SeparationTask, photos: Set[str]) -> None:
+    """Checks that no layer would replace a photo of the batch. `photos` are their paths, from `real_paths`.
+
+    Raises:
+        OutputError: a layer has the path of a photo, or is a hard link to the photo of the task.
+    """
+    for target in task.outputs.values():
+        if not isinstance(target, Location):
+            continue
+        is_own_photo = isinstance(task.source, Location) and is_same_file(target, task.source)
+        if is_own_photo or real_path(target) in photos:
+            raise OutputError(
+                f"{target} is itself a photo of the batch",
+                "expected another path, because photos of the batch are never overwritten",
+                "choose another name or folder",
+            )
 
 
 def skipped_result(task: SeparationTask) -> FileResult:
@@ -286,6 +289,11 @@ def _sha256(photo: Path | bytes) -> str | None:
         return hashlib.sha256(photo if isinstance(photo, bytes) else photo.read_bytes()).hexdigest()
     except OSError:  # the separator opens the photo later, and reports the error
         return None
+
+
+def real_paths(files: Iterable[object]) -> frozenset[str]:
+    """Returns the real paths of the files. Streams have no path, and are left out."""
+    return frozenset(real_path(file) for file in files if isinstance(file, Location))
 
 
 def real_path(path: Location) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import os
 from collections.abc import Callable
 from pathlib import Path
 from types import NoneType
@@ -310,16 +311,15 @@ def _without_contact_sheet(
     Raises:
         click.UsageError: the sheet would replace a photo or a layer of the batch, or, without `overwrite`, another file.
     """
-    from brewster.batch.runner import real_path  # noqa: PLC0415
+    from brewster.batch.runner import real_paths  # noqa: PLC0415
     from brewster.photo.contact_sheet import is_contact_sheet  # noqa: PLC0415
 
     def is_sheet(source: object) -> bool:
         return isinstance(source, Path) and source.stem.startswith(path.stem) and is_contact_sheet(source)
 
     tasks = [task for task in tasks if not is_sheet(task.source)]
-    target = real_path(path)
-    files = (file for task in tasks for file in (task.source, *task.outputs.values()))
-    if any(isinstance(file, Location) and real_path(file) == target for file in files):
+    files = real_paths(file for task in tasks for file in (task.source, *task.outputs.values()))
+    if os.path.realpath(path) in files:
         raise click.UsageError(
             f"--contact-sheet {path} is a photo or a layer of the batch; choose another name."
         )
