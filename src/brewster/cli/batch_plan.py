@@ -47,10 +47,8 @@ def absolute_path(path: str) -> str:
 
 def skipped_files(files: Sequence[Location]) -> Iterator[str]:
     """Yields a line about the videos, and a line about all other files, which do not have the suffix of an image either."""
-    videos, others = (
-        [file for file in files if is_video(file)],
-        [file for file in files if not is_video(file)],
-    )
+    videos = [file for file in files if is_video(file)]
+    others = [file for file in files if not is_video(file)]
     if videos:
         yield f"{listed(videos, 'video')} skipped: brewster separates photos; extract single images first, for example with ffmpeg"
     if others:
