@@ -1,4 +1,4 @@
-"""The metadata of an image file, and the choice of a format and bit depth for writing."""
+"""The metadata of an image file, its largest number of pixels, and the choice of a format and bit depth for writing."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from brewster.errors import UnsupportedPhoto
+from brewster.errors import PhotoTooLarge, UnsupportedPhoto
 from brewster.image_formats import WRITABLE, format_of
 
 
@@ -42,6 +42,20 @@ class FileInfo:
     """The program that created the pixels. It is written to EXR and HDR files, which have neither EXIF nor XMP."""
     digest: str | None = None
     """See `brewster.photo.history.sampled_digest`; None if the photo was not read from a file."""
+
+
+def check_pixel_count(width: int, height: int, max_pixels: int) -> None:
+    """Checks the size of an image in pixels, before the image is decoded.
+
+    Raises:
+        PhotoTooLarge: the image has more pixels than `max_pixels`.
+    """
+    if width * height > max_pixels:
+        raise PhotoTooLarge(
+            f"the image has {width} x {height} pixels ({width * height / 1e6:.3g} million)",
+            f"expected at most {max_pixels / 1e6:g} million",
+            "raise --max-pixels (in Python max_pixels) if you trust the file",
+        )
 
 
 def format_name_of(path: Path) -> str:

@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from brewster.errors import MissingExtra, PhotoTooLarge, UnreadablePhoto, UnsupportedPhoto
-from brewster.photo.file_info import FileInfo
+from brewster.errors import MissingExtra, UnreadablePhoto, UnsupportedPhoto
+from brewster.photo.file_info import FileInfo, check_pixel_count
 
 Float32 = NDArray[np.float32]
 
@@ -28,15 +28,6 @@ class HdrPixels:
     pixels: Float32
     alpha: Float32 | None
     file_info: FileInfo
-
-
-def too_large_error(width: int, height: int, max_pixels: int) -> PhotoTooLarge:
-    """Returns the error for an image with more pixels than the limit."""
-    return PhotoTooLarge(
-        f"the image has {width} x {height} pixels ({width * height / 1e6:.3g} million)",
-        f"expected at most {max_pixels / 1e6:g} million",
-        "raise --max-pixels (in Python max_pixels) if you trust the file",
-    )
 
 
 def _valid_chromaticities(chromaticities: Sequence[float | str]) -> tuple[float, ...] | None:
@@ -84,8 +75,7 @@ def read_exr(data: bytes, max_pixels: int) -> HdrPixels:
     header = _exr_part(data, header_only=True).header
     low, high = header["dataWindow"]
     width, height = (int(side) for side in np.array(high) - np.array(low) + 1)
-    if width * height > max_pixels:
-        raise too_large_error(width, height, max_pixels)
+    check_pixel_count(width, height, max_pixels)
     part = _exr_part(data, header_only=False)
     return _exr_pixels({name: channel.pixels for name, channel in part.channels.items()}, dict(part.header))
 
@@ -254,8 +244,7 @@ def read_hdr(data: bytes, max_pixels: int) -> HdrPixels:
             "expected at least one pixel",
             "export the image again",
         )
-    if width * height > max_pixels:
-        raise too_large_error(width, height, max_pixels)
+    check_pixel_count(width, height, max_pixels)
     return HdrPixels(_from_rgbe(_scan_lines(body, width, height)), None, _hdr_file_info(lines))
 
 

@@ -22,8 +22,7 @@ from brewster.errors import MissingExtra, UnreadablePhoto, install_command
 from brewster.image_formats import FORMATS
 from brewster.photo import metadata
 from brewster.photo.colour import colour_space_of
-from brewster.photo.file_info import FileInfo
-from brewster.photo.hdr_formats import too_large_error
+from brewster.photo.file_info import FileInfo, check_pixel_count
 
 _MAKER_NOTE = 37500
 _EXIF_TAG, _GPS_TAG = 34665, 34853
@@ -124,8 +123,7 @@ def _upright_size(raw: Any, max_pixels: int) -> tuple[int, int]:  # noqa: ANN401
     sizes = raw.sizes
     is_transposed = sizes.flip in (4, 5, 6, 7)  # LibRaw's code: bit 2 swaps rows and columns
     width, height = (sizes.iheight, sizes.iwidth) if is_transposed else (sizes.iwidth, sizes.iheight)
-    if width * height > max_pixels:
-        raise too_large_error(width, height, max_pixels)
+    check_pixel_count(width, height, max_pixels)
     return width, height
 
 
