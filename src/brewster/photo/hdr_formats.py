@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import io
 import re
-import types
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -15,8 +14,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from brewster.errors import MissingExtra, UnreadablePhoto, UnsupportedPhoto
-from brewster.photo.file_info import FileInfo, check_pixel_count
+from brewster.errors import UnreadablePhoto, UnsupportedPhoto
+from brewster.photo.file_info import FileInfo, check_pixel_count, library_of
 
 Float32 = NDArray[np.float32]
 
@@ -48,18 +47,6 @@ def _valid_chromaticities(chromaticities: Sequence[float | str]) -> tuple[float,
 # --- OpenEXR
 
 
-def _openexr() -> types.ModuleType:
-    try:
-        import OpenEXR  # noqa: PLC0415  (an extra: only EXR files need it)
-    except ImportError as error:
-        raise MissingExtra.for_extra(
-            "exr",
-            "the OpenEXR package is not installed",
-            "expected it to be installed, because EXR files need it",
-        ) from error
-    return OpenEXR  # type: ignore[no-any-return]
-
-
 def read_exr(data: bytes, max_pixels: int) -> HdrPixels:
     """Reads the first part of an EXR: the channels R, G and B, or Y alone, and the channel A if there is one.
 
@@ -81,7 +68,7 @@ def read_exr(data: bytes, max_pixels: int) -> HdrPixels:
 
 
 def _exr_part(data: bytes, *, header_only: bool) -> Any:  # noqa: ANN401  (OpenEXR has no types)
-    exr = _openexr()
+    exr = library_of("exr")
     try:
         return exr.File(io.BytesIO(data), separate_channels=True, header_only=header_only).parts[0]
     except (RuntimeError, ValueError, TypeError, IndexError) as error:
@@ -116,7 +103,7 @@ def _exr_pixels(channels: dict[str, NDArray[Any]], header: dict[str, Any]) -> Hd
 
 def write_exr(image: HdrPixels) -> bytes:
     """Encodes an EXR in half (16 `bits`) or single precision (32 `bits`), with the attributes of the source."""
-    exr = _openexr()
+    exr = library_of("exr")
     names = "RGB" if image.pixels.shape[2] == 3 else "Y"
     planes = {name: image.pixels[..., i] for i, name in enumerate(names)}
     if image.alpha is not None:
@@ -161,7 +148,7 @@ def write_exr_layers(layers: Mapping[str, Float32], header: Mapping[str, str]) -
         MissingExtra: OpenEXR is not installed.
         UnsupportedPhoto: the name of an attribute is reserved by OpenEXR.
     """
-    exr = _openexr()
+    exr = library_of("exr")
     if reserved := _RESERVED_ATTRIBUTES & header.keys():
         raise UnsupportedPhoto(
             f"attributes have the names {', '.join(sorted(reserved))}",
