@@ -18,6 +18,7 @@ from web_servers import BlockingBackend, make_app, raw_exchange, served_port
 
 HEAD = "POST /separate HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\nContent-Type: multipart/form-data; boundary=x\r\n"
 PLAIN = b"GET / HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\n\r\n"
+END = b"\r\n\r\n"
 PHOTO = image_bytes(40, 30, "png")
 FORM = b'--x\r\nContent-Disposition: form-data; name="photo"; filename="a.png"\r\n\r\n%b\r\n--x--\r\n' % PHOTO
 
@@ -48,6 +49,19 @@ def test_a_photo_is_separated_over_a_socket():
         response = raw_exchange(port, *post_request())
     assert status(response) == 200
     assert b"server:" not in response.lower().partition(b"\r\n\r\n")[0]
+
+
+@pytest.mark.parametrize("path", [b"/health", b"/", b"/page/style.css"])
+def test_head_returns_the_headers_of_get_without_a_body(path):
+    def response_to(method):
+        head, _, body = raw_exchange(port, PLAIN.replace(b"GET /", method + b" " + path)).partition(END)
+        return status(head), {line for line in head.splitlines() if not line.startswith(b"date:")}, body
+
+    with served_port(make_app()) as port:
+        code, headers, body = response_to(b"GET")
+        assert code == 200
+        assert body
+        assert response_to(b"HEAD") == (code, headers, b"")
 
 
 def test_an_upload_that_is_too_large_gets_a_complete_response():

@@ -105,6 +105,14 @@ def test_names_and_sources_are_checked_before_the_first_photo_is_separated(tmp_p
         plan_files(tmp_path / "empty")
 
 
+@pytest.mark.parametrize("dry_run", [False, True])
+def test_an_output_folder_that_cannot_be_created_is_one_error_before_the_first_photo(photo_folder, dry_run):
+    before = list_files(photo_folder)
+    with pytest.raises(OutputError, match=r"a\.jpg/out was not written \(.*expected a folder"):
+        separate_files(photo_folder, photo_folder / "a.jpg/out", dry_run=dry_run)
+    assert list_files(photo_folder) == before
+
+
 def test_a_photo_is_separated_when_its_result_is_requested(photo_folder, tmp_path, separator):
     batch = separate_files(photo_folder, tmp_path / "out", separator=separator)
     assert not (tmp_path / "out").exists()

@@ -305,6 +305,7 @@ def test_help_goes_to_standard_output():
         ["separate"],
         ["a.jpg", "--strength", "2"],
         ["a.jpg", "--strength", "nan"],
+        ["a.jpg", "--guidance", "inf"],
         ["a.jpg", "--quality", "best"],
         ["a.jpg", "--layers", "background"],
         ["a.jpg", "--layers", ""],

@@ -16,7 +16,7 @@ from platformdirs import macos, unix
 from brewster import files
 from brewster.batch.layer_names import name_layers
 from brewster.errors import OutputError
-from brewster.files import cache_folder, images_in, write_atomically
+from brewster.files import cache_folder, check_output_folder, images_in, write_atomically
 from brewster.image_formats import SUFFIXES, FormatName
 from brewster.options import Options
 
@@ -296,16 +296,6 @@ def test_a_file_that_appears_during_writing_is_not_replaced(
     assert path.read_bytes() == b"other"
 
 
-def test_the_source_is_never_the_target(tmp_path: Path) -> None:
-    source, link = tmp_path / "a.png", tmp_path / "link.png"
-    source.write_bytes(b"image")
-    link.symlink_to(source)
-    for target in (source, link):
-        with pytest.raises(OutputError, match="the input image itself"):
-            write_atomically(target, b"layer", overwrite=True, source=source)
-    assert source.read_bytes() == b"image"
-
-
 @pytest.mark.parametrize(
     ("code", "word"),
     [(errno.ENOSPC, "free some space"), (errno.EROFS, "writable"), (errno.EIO, "was not written")],
@@ -417,6 +407,23 @@ def test_ctrl_c_just_after_the_rename_leaves_nothing_else(tmp_path, monkeypatch)
     with pytest.raises(KeyboardInterrupt):
         write_atomically(tmp_path / "a", b"whole")
     assert [path.name for path in tmp_path.iterdir()] == ["a"]
+
+
+def test_the_check_of_an_output_folder_creates_nothing(tmp_path: Path) -> None:
+    touch(tmp_path, "file")
+    (tmp_path / "link").symlink_to("nowhere")
+    before = sorted(tmp_path.iterdir())
+    for good in (".", "new", "new/below/it"):
+        check_output_folder(tmp_path / good)
+    for bad, reason in (
+        ("file", "a file"),
+        ("file/new", "a file"),
+        ("link", "a file"),
+        ("x" * 300, "shorter name"),
+    ):
+        with pytest.raises(OutputError, match=rf"{bad} was not written \(.*; expected .*{reason}"):
+            check_output_folder(tmp_path / bad)
+    assert sorted(tmp_path.iterdir()) == before
 
 
 def test_a_path_too_long_for_windows_is_named_as_such(

@@ -54,6 +54,12 @@ def test_a_batch_accepts_manifests_and_missing_photos_are_tasks_too(tmp_path):
     assert tasks[1].outputs["transmission"] == tmp_path / "out/in/a.transmission.png"
 
 
+def test_a_photo_that_is_listed_twice_has_the_first_of_its_rows(tmp_path):
+    write_manifest(tmp_path / "list.csv", "b.jpg", "in/../a.jpg", tmp_path / "b.jpg", "a.jpg")
+    tasks = plan_files(tmp_path / "list.csv")
+    assert [(Path(task.name).name, task.row.number) for task in tasks] == [("b.jpg", 2), ("a.jpg", 3)]
+
+
 @pytest.mark.parametrize("suffix", [".csv", ".parquet"])
 def test_a_manifest_without_rows_is_refused(tmp_path, suffix):
     manifest = write_manifest(tmp_path / f"empty{suffix}")

@@ -448,6 +448,18 @@ def test_several_processes_have_the_summary_grouped_errors_and_contact_sheet_of_
     assert Photo.open(tmp_path / "sheet.png").size[1] > 2 * 240
 
 
+def test_a_layer_that_is_its_own_photo_through_a_hard_link_is_refused(options, tmp_path):
+    photo = tmp_path / "a.jpg"
+    photo.write_bytes(image_bytes())
+    (tmp_path / "a.reflection.jpg").hardlink_to(photo)
+    with (
+        SerialExecutor(partial(SeparationRunner, options, overwrite=True)) as executor,
+        pytest.raises(OutputError, match=r"a\.reflection\.jpg is itself a photo of the batch"),
+    ):
+        separate_in_parallel(plan_files(photo, None, options), executor, overwrite=True)
+    assert photo.read_bytes() == image_bytes()
+
+
 def test_a_layer_that_is_another_photo_through_a_link_is_refused(options, tmp_path):
     """Otherwise --overwrite replaces the photo."""
     folder = tmp_path / "photos"

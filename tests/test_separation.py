@@ -191,6 +191,14 @@ def test_an_unsupported_kind_of_image_is_refused(app):
     assert "CMYK" in error_of(response)
 
 
+@pytest.mark.parametrize("path", ["/separate", "/preview", "/photo"])
+def test_a_damaged_video_has_the_message_of_the_command_line(app, path):
+    response = request(app, "POST", path, **form(bytes(100), "holiday/clip.MP4"))
+    assert response.status_code == 415
+    message = "clip.MP4 is a video; expected a photo; extract single images first, for example with ffmpeg."
+    assert response.json() == {"error": message, "kind": "UnsupportedPhoto"}
+
+
 def test_wrong_values_are_refused_before_any_work():
     def fail_if_called(tile):
         raise AssertionError

@@ -1,7 +1,7 @@
 """Finds input images and writes results atomically, without overwriting other files.
 
 for image, folder in images_in(Path("holiday"), output_folder=Path("clear")):
-    write_atomically(SeparationPaths(image, folder).target("transmission", ".png"), data, source=image)
+    write_atomically(SeparationPaths(image, folder).target("transmission", ".png"), data)
 """
 
 from __future__ import annotations
@@ -90,18 +90,15 @@ def _output_folder(image: Location, source: Location, output_folder: Location | 
     )
 
 
-def write_atomically(
-    path: Location, data: bytes, *, overwrite: bool = False, source: Location | None = None
-) -> None:
+def write_atomically(path: Location, data: bytes, *, overwrite: bool = False) -> None:
     """Writes a file atomically and creates its folder where needed.
 
     The bytes are written to a hidden file in the same folder and flushed to the disk. Then the file is renamed.
     Therefore a full disk or Ctrl-C leaves no partial file. In an object store, the file is written with one upload.
 
     Raises:
-        OutputError: the file exists and `overwrite` is False, the file is the `source`, or it cannot be written.
+        OutputError: the file exists and `overwrite` is False, or it cannot be written.
     """
-    _check_not_source(path, source)
     try:
         if isinstance(path, RemotePath):
             path.write_bytes(data, overwrite=overwrite)
@@ -115,10 +112,11 @@ def write_atomically(
         raise _output_error(path, error) from error
 
 
-def create_output_folder(folder: Location) -> None:
-    """Creates the output folder of a batch where needed, so that a folder that is not writable is found before the first photo.
+def check_output_folder(folder: Location) -> None:
+    """Checks that the output folder of a batch can be created and written to, so that an error is found before the first photo.
 
-    A folder in an object store exists only as long as it has files, so it is not created.
+    The permissions of a folder do not show all errors. Therefore a hidden folder is created in the output folder, or in its nearest
+    parent that exists, and is deleted at once. A folder in an object store is not checked.
 
     Raises:
         OutputError: the folder cannot be created, or cannot be written to.
@@ -126,9 +124,14 @@ def create_output_folder(folder: Location) -> None:
     if isinstance(folder, RemotePath):
         return
     try:
-        _create_folder(folder)
-        if not os.access(folder, os.W_OK):
-            raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
+        for existing in (folder, *folder.parents):
+            with contextlib.suppress(FileNotFoundError):
+                existing.lstat()
+                break
+        if not existing.is_dir():
+            raise NotADirectoryError(errno.ENOTDIR, os.strerror(errno.ENOTDIR))
+        with _temporary(existing / folder.name) as part:
+            part.mkdir()
     except OSError as error:
         raise _output_error(folder, error) from error
 
@@ -282,25 +285,12 @@ def _is_input(path: Location) -> bool:
     return format_of(path) is not None and not path.name.startswith(".") and not is_result
 
 
-def _check_not_source(path: Location, source: Location | None) -> None:
-    with contextlib.suppress(OSError):  # a file that does not exist is not the same file
-        if source is not None and is_same_file(path, source):
-            raise OutputError(
-                f"{path} is the input image itself",
-                "expected another path, because input files are never changed",
-                "choose another name",
-            )
-
-
 def is_same_file(path: Location, other: Location) -> bool:
-    """Whether both paths lead to the same file, through links or hard links, too.
-
-    Raises:
-        OSError: one of the files does not exist.
-    """
-    if isinstance(path, Path) and isinstance(other, Path):
-        return path.samefile(other)
-    return path == other
+    """Whether both paths lead to the same existing file, through links or hard links, too."""
+    try:
+        return path.samefile(other) if isinstance(path, Path) and isinstance(other, Path) else path == other
+    except OSError:  # one of the files does not exist
+        return False
 
 
 def exists(path: Location) -> bool:

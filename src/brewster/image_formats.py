@@ -125,7 +125,7 @@ _ROWS: Final = (
         mime_type="image/heic",
         signature=rb"....ftyp(hei[cxms]|hev[cxms])",
         library="pillow-heif",
-        extra="heic",
+        extra="heic",  # not in the core, because of the patents on HEVC
         bit_depths=(8, 10),
         has_cicp=True,
     ),

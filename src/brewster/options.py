@@ -72,6 +72,7 @@ class Options:
             "How much of the separation to apply, from 0 (the unchanged photo) to 1 (the full separation).",
             ge=0,
             le=1,
+            allow_inf_nan=False,
         ),
     )
     quality: Quality = field(
@@ -147,6 +148,7 @@ class Options:
         metadata=_field_metadata(
             "For diffusion models: the guidance scale, by default that of the model; with a few-step LoRA, 1 for klein and qwen.",
             ge=1,
+            allow_inf_nan=False,
         ),
     )
     steps: int | None = field(

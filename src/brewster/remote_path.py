@@ -206,7 +206,7 @@ def read_image(path: Location) -> bytes:
         MissingExtra: the package of the object store is not installed.
     """
     if isinstance(path, RemotePath):
-        _check_not_video(path)
+        check_not_video(path)
         return path.read_bytes()
     with _opened(path) as file:
         return file.read()
@@ -218,7 +218,7 @@ def check_readable(path: Location) -> None:
     Pipes are not checked, because they can be opened only once.
     """
     if isinstance(path, RemotePath):
-        _check_not_video(path)
+        check_not_video(path)
         path.check_readable()
         return
     is_pipe = os.path.exists(path) and not os.path.isfile(path) and not os.path.isdir(path)  # noqa: PTH110, PTH112, PTH113
@@ -232,7 +232,7 @@ def check_readable(path: Location) -> None:
 def _opened(path: Path) -> Iterator[BinaryIO]:
     try:
         with path.open("rb") as file:
-            _check_not_video(path)
+            check_not_video(path)
             yield file
     except OSError as error:
         is_folder = os.path.isdir(path)  # noqa: PTH112  (Path.is_dir raises without permission)
@@ -242,7 +242,12 @@ def _opened(path: Path) -> Iterator[BinaryIO]:
         ) from error
 
 
-def _check_not_video(path: Location) -> None:
+def check_not_video(path: Location) -> None:
+    """Checks that the name of a photo does not have the suffix of a video. A damaged video cannot be recognised by its content.
+
+    Raises:
+        UnsupportedPhoto: the name has such a suffix.
+    """
     if is_video(path):
         raise video_error(str(path))
 

@@ -17,6 +17,7 @@ import importlib
 import io
 import posixpath
 from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any, Final, NamedTuple, final
 
 from brewster.errors import BrewsterError, ManifestError, MissingExtra, UnreadablePhoto
@@ -40,6 +41,17 @@ class ManifestRow(NamedTuple):
         """Returns `line 3 of scans.csv` or `row 3 of scans.parquet`."""
         unit = "line" if _is_csv(self.manifest) else "row"
         return f"{unit} {self.number} of {self.manifest}"
+
+
+@contextmanager
+def row_in_errors(row: ManifestRow | None) -> Iterator[None]:
+    """Adds the row that lists a photo, if there is one, to the errors about this photo in the block."""
+    try:
+        yield
+    except BrewsterError as error:
+        if row:
+            error.happened = f"{row}: {error.happened}"
+        raise
 
 
 def is_manifest(source: Location) -> bool:
@@ -83,11 +95,8 @@ def _photo(row: ManifestRow, text: object) -> tuple[Location, tuple[str, ...]]:
             "expected the path of a photo",
             "correct the row",
         )
-    try:
+    with row_in_errors(row):
         photo = location(text)
-    except BrewsterError as error:
-        error.happened = f"{row}: {error.happened}"
-        raise
     if isinstance(photo, RemotePath) or photo.is_absolute():
         return photo, photo.parent.parts[1:]
     relative = posixpath.normpath(photo.as_posix())

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import final
 
 from brewster.batch.plan import FileResult, SeparationTask
-from brewster.batch.runner import BatchRunner, real_path, skipped_result
+from brewster.batch.runner import BatchRunner, check_outputs, real_paths, skipped_result
 from brewster.errors import OutputError
 from brewster.executors import Executor, run_tasks
 from brewster.files import exists
@@ -46,7 +46,9 @@ def separate_in_parallel(
         ModelError: the model does not exist or is damaged.
         DeviceError: the requested device is not available.
     """
-    _check_outputs(tasks)
+    photos = real_paths(task.source for task in tasks)
+    for task in tasks:  # a worker cannot check this, because it does not get the paths of all photos
+        check_outputs(task, photos)
     unfinished = _unfinished(tasks, on_result, overwrite=overwrite)
     for result in run_tasks(lambda: next(unfinished, None), executor):
         on_result(result)
@@ -87,19 +89,6 @@ class SeparationRunner:
             # This worker was slow, and another worker got the same task and has already written the layers.
             result = skipped_result(task)
         return [result]
-
-
-def _check_outputs(tasks: Sequence[SeparationTask]) -> None:
-    """Raises OutputError if a layer has the path of a photo. A worker cannot check this, because it does not get all paths."""
-    sources = {real_path(task.source) for task in tasks if isinstance(task.source, Location)}
-    for task in tasks:
-        for target in task.outputs.values():
-            if isinstance(target, Location) and real_path(target) in sources:
-                raise OutputError(
-                    f"{target} is itself a photo of the batch",
-                    "expected another path, because photos of the batch are never overwritten",
-                    "choose another output folder",
-                )
 
 
 def _unfinished(

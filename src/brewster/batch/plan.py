@@ -14,7 +14,7 @@ from typing import Final, Literal, Protocol, final
 from brewster.batch.layer_names import name_layers
 from brewster.batch.manifest import ManifestRow, is_manifest, read_manifest
 from brewster.errors import PhotoError, counted
-from brewster.files import absolute, images_in
+from brewster.files import check_output_folder, images_in
 from brewster.image_formats import SUFFIXES, is_video
 from brewster.inference.assessment import Assessment
 from brewster.options import Options
@@ -47,7 +47,7 @@ class SeparationTask:
     outputs: Mapping[str, Location | OutputStream]
     """The output of each layer, by layer name (`transmission`, `reflection` or `confidence`)."""
     row: ManifestRow | None = None
-    """The first row of a manifest that lists the photo, or None if no manifest lists it."""
+    """The first row of a manifest that has the path of the photo, or None if there is none."""
 
     @property
     def name(self) -> str:
@@ -118,13 +118,13 @@ def plan_files(
     Raises:
         PhotoError: the sources contain no photo.
         ManifestError: a manifest is not a table, or a row of it is not a path.
-        OutputError: the layers of two photos would have the same path.
+        OutputError: the layers of two photos would have the same path, or the output folder cannot be created or written to.
     """
     given = [sources] if isinstance(sources, str | os.PathLike) else sources
     paths = [location(source) for source in given]
     folder = None if output is None else location(output)
     skipped = [] if skipped is None else skipped
-    rows: dict[str, ManifestRow] = {}
+    rows: dict[Location, ManifestRow] = {}
 
     def images() -> Iterator[tuple[Location, Location]]:
         for source in paths:
@@ -132,12 +132,11 @@ def plan_files(
                 yield from images_in(source, folder, skipped=skipped)
                 continue
             for row, image, image_folder in read_manifest(source, folder):
-                rows.setdefault(absolute(image), row)
+                rows.setdefault(image, row)
                 yield image, image_folder
 
     tasks = [
-        SeparationTask(image, outputs, rows.get(absolute(image)))
-        for image, outputs in name_layers(images(), options)
+        SeparationTask(image, outputs, rows.get(image)) for image, outputs in name_layers(images(), options)
     ]
     if not tasks:
         videos = sum(map(is_video, skipped))
@@ -148,6 +147,8 @@ def plan_files(
             f"expected files with one of the suffixes {' '.join(SUFFIXES)}",
             "pass the path of the file itself, or choose another folder",
         )
+    if folder is not None:
+        check_output_folder(folder)
     return tasks
 
 

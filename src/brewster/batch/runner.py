@@ -13,13 +13,13 @@ from __future__ import annotations
 import hashlib
 import os
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Set
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Final, final
 
+from brewster.batch.manifest import row_in_errors
 from brewster.batch.plan import (
     FileResult,
     InputStream,
@@ -28,7 +28,7 @@ from brewster.batch.plan import (
     display_name,
     plan_files,
 )
-from brewster.errors import BrewsterError, OutputError, PhotoError
+from brewster.errors import BrewsterError, OutputError
 from brewster.files import exists, is_same_file, write_atomically
 from brewster.image_formats import format_of
 from brewster.inference.layer_history import find_layer_of_another_photo
@@ -81,7 +81,7 @@ def separate_files(
     Raises:
         PhotoError: the sources contain no photo.
         ManifestError: a manifest is not a table, or a row of it is not a path.
-        OutputError: the layers of two photos would have the same path.
+        OutputError: the layers of two photos would have the same path, or the output folder cannot be created or written to.
         ModelError: the model does not exist or is damaged (raised during iteration).
         DeviceError: the requested device is not available (raised during iteration).
         Exception: an unexpected exception, which is a bug in brewster. The result of its photo has the status `failed`, and
@@ -132,7 +132,7 @@ class BatchRunner:
         self.unexpected_error: Exception | None = None
         self._options, self._separator = options, separator
         self._overwrite, self._dry_run = overwrite, dry_run
-        self._sources = {real_path(task.source) for task in tasks if isinstance(task.source, Location)}
+        self._photos = real_paths(task.source for task in tasks)
 
     def run(self, task: SeparationTask, on_progress: Callable[[float], None]) -> FileResult:
         """Separates one photo. Returns its result, also if the photo fails.
@@ -144,7 +144,7 @@ class BatchRunner:
         try:
             outputs = self._outputs_to_write(task)
             if outputs and self._dry_run and isinstance(task.source, Location):
-                with _row_in_error(task):
+                with row_in_errors(task.row):
                     check_readable(task.source)
         except BrewsterError as error:
             return result.failed(error)
@@ -179,13 +179,7 @@ class BatchRunner:
         Raises:
             OutputError: a layer would replace a photo of the batch, or an existing layer was made from another photo.
         """
-        for target in task.outputs.values():
-            if isinstance(target, Location) and self._is_source(target, task.source):
-                raise OutputError(
-                    f"{target} is itself a photo of the batch",
-                    "expected another path, because photos of the batch are never overwritten",
-                    "choose another name",
-                )
+        check_outputs(task, self._photos)
         missing = {
             layer: target
             for layer, target in task.outputs.items()
@@ -194,14 +188,6 @@ class BatchRunner:
         check_layers(task.source, [target for layer, target in task.outputs.items() if layer not in missing])
         return missing
 
-    def _is_source(self, target: Location, source: Location | InputStream) -> bool:
-        if real_path(target) in self._sources:
-            return True
-        try:  # unlike realpath, is_same_file finds hard links
-            return isinstance(source, Location) and is_same_file(target, source)
-        except OSError:  # one of the two files does not exist
-            return False
-
     def _separate(
         self,
         separator: Separator,
@@ -209,8 +195,7 @@ class BatchRunner:
         result: FileResult,
         on_progress: Callable[[float], None],
     ) -> None:
-        path = task.source if isinstance(task.source, Location) else None
-        with _row_in_error(task):
+        with row_in_errors(task.row):
             photo = read_content(task.source)
         result.photo_sha256 = _sha256(photo)
         separation = separator(photo, on_progress=on_progress, **self._options.call_options())
@@ -228,11 +213,29 @@ class BatchRunner:
             encoded = getattr(separation, layer).encode(format_name)
             on_progress(1.0)
             if isinstance(target, Location):
-                write_atomically(target, encoded, overwrite=self._overwrite, source=path)
+                write_atomically(target, encoded, overwrite=self._overwrite)
             else:
                 target.write(encoded)
             result.outputs[layer] = display_name(target)
         result.seconds["encode"] = time.perf_counter() - started
+
+
+def check_outputs(task: SeparationTask, photos: Set[str]) -> None:
+    """Checks that no layer would replace a photo of the batch. `photos` are their paths, from `real_paths`.
+
+    Raises:
+        OutputError: a layer has the path of a photo, or is a hard link to the photo of the task.
+    """
+    for target in task.outputs.values():
+        if not isinstance(target, Location):
+            continue
+        is_own_photo = isinstance(task.source, Location) and is_same_file(target, task.source)
+        if is_own_photo or real_path(target) in photos:
+            raise OutputError(
+                f"{target} is itself a photo of the batch",
+                "expected another path, because photos of the batch are never overwritten",
+                "choose another name or folder",
+            )
 
 
 def skipped_result(task: SeparationTask) -> FileResult:
@@ -281,22 +284,16 @@ def read_content(source: Location | InputStream) -> Path | bytes:
     return read_image(source) if isinstance(source, RemotePath) else source.read()
 
 
-@contextmanager
-def _row_in_error(task: SeparationTask) -> Iterator[None]:
-    """Adds the row of the manifest to the error of a photo that does not exist or cannot be read."""
-    try:
-        yield
-    except PhotoError as error:
-        if task.row:
-            error.happened = f"{task.row}: {error.happened}"
-        raise
-
-
 def _sha256(photo: Path | bytes) -> str | None:
     try:
         return hashlib.sha256(photo if isinstance(photo, bytes) else photo.read_bytes()).hexdigest()
     except OSError:  # the separator opens the photo later, and reports the error
         return None
+
+
+def real_paths(files: Iterable[object]) -> frozenset[str]:
+    """Returns the real paths of the files. Streams have no path, and are left out."""
+    return frozenset(real_path(file) for file in files if isinstance(file, Location))
 
 
 def real_path(path: Location) -> str:

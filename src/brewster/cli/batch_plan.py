@@ -47,10 +47,8 @@ def absolute_path(path: str) -> str:
 
 def skipped_files(files: Sequence[Location]) -> Iterator[str]:
     """Yields a line about the videos, and a line about all other files, which do not have the suffix of an image either."""
-    videos, others = (
-        [file for file in files if is_video(file)],
-        [file for file in files if not is_video(file)],
-    )
+    videos = [file for file in files if is_video(file)]
+    others = [file for file in files if not is_video(file)]
     if videos:
         yield f"{listed(videos, 'video')} skipped: brewster separates photos; extract single images first, for example with ffmpeg"
     if others:
@@ -86,7 +84,7 @@ def plan(
 
     Raises:
         click.UsageError: the arguments contradict each other.
-        OutputError: the layers of two photos would have the same path.
+        OutputError: the layers of two photos would have the same path, or the output folder cannot be created or written to.
         PhotoError: the files and folders contain no photo.
     """
     from brewster.batch import plan_files  # noqa: PLC0415  (imports ONNX Runtime and pyvips)
@@ -94,7 +92,7 @@ def plan(
     if is_single_output(photos, output):
         return [_plan_single_output(photos, output, options)]
     _check_not_a_file(output)
-    _check_output_folder(photos, output)
+    _check_output_suffix(photos, output)
     return plan_files(photos, output, options, skipped=skipped)
 
 
@@ -149,7 +147,7 @@ def _check_not_a_file(output: str | None) -> None:
         )
 
 
-def _check_output_folder(photos: Sequence[str], output: str | None) -> None:
+def _check_output_suffix(photos: Sequence[str], output: str | None) -> None:
     """Checks that -o for a single photo is not an image file of an unknown format.
 
     Raises:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-import math
+import os
 from collections.abc import Callable
 from pathlib import Path
 from types import NoneType
@@ -18,11 +18,10 @@ from brewster.cli.batch_plan import absolute_path, is_single_output, local_path,
 from brewster.cli.extras import require_extra
 from brewster.cli.terminal import print_out, print_status, standard_output
 from brewster.errors import BrewsterError
-from brewster.files import create_output_folder
 from brewster.image_formats import FormatName, canonical_format, format_of
 from brewster.models import zoo
 from brewster.options import Options
-from brewster.remote_path import Location, location
+from brewster.remote_path import Location
 
 if TYPE_CHECKING:
     from brewster.batch import SeparationTask
@@ -30,21 +29,6 @@ if TYPE_CHECKING:
 _METAVARS: Final[dict[object, str]] = {int: "NUMBER", float: "NUMBER", Path | None: "FILE"}
 
 _Command = TypeVar("_Command", bound=Callable[..., Any])
-
-
-class _RangedNumber(click.FloatRange):
-    """A number in a range. Unlike `click.FloatRange`, it rejects NaN."""
-
-    def convert(self, value: object, param: click.Parameter | None, ctx: click.Context | None) -> float:
-        """Returns the number.
-
-        Raises:
-            click.BadParameter: the value is not a number in the range.
-        """
-        number = float(super().convert(cast("float", value), param, ctx))
-        if math.isnan(number):
-            self.fail(f"{value} is not a number.", param, ctx)
-        return number
 
 
 class _ChoiceList(click.ParamType[tuple[str, ...]]):
@@ -144,7 +128,7 @@ def _param_type(hint: object, field: dataclasses.Field[Any]) -> click.ParamType[
     if NoneType in get_args(hint):
         return _param_type(get_args(hint)[0], field)
     if hint in (int, float):
-        return (_RangedNumber if hint is float else click.IntRange)(low, high)
+        return (click.FloatRange if hint is float else click.IntRange)(low, high)
     if hint is Path:
         return click.Path(exists=True, dir_okay=False, path_type=Path)
     if get_origin(hint) is tuple:
@@ -265,8 +249,6 @@ def separate(
         tasks = _without_contact_sheet(tasks, contact_sheet, overwrite=overwrite)
     for line in skipped_files(skipped) if not quiet else ():
         print_status(line)
-    if output and not (single_output or dry_run):
-        create_output_folder(location(output))
     batch = BatchCommand(
         options,
         output=output,
@@ -329,16 +311,15 @@ def _without_contact_sheet(
     Raises:
         click.UsageError: the sheet would replace a photo or a layer of the batch, or, without `overwrite`, another file.
     """
-    from brewster.batch.runner import real_path  # noqa: PLC0415
+    from brewster.batch.runner import real_paths  # noqa: PLC0415
     from brewster.photo.contact_sheet import is_contact_sheet  # noqa: PLC0415
 
     def is_sheet(source: object) -> bool:
         return isinstance(source, Path) and source.stem.startswith(path.stem) and is_contact_sheet(source)
 
     tasks = [task for task in tasks if not is_sheet(task.source)]
-    target = real_path(path)
-    files = (file for task in tasks for file in (task.source, *task.outputs.values()))
-    if any(isinstance(file, Location) and real_path(file) == target for file in files):
+    files = real_paths(file for task in tasks for file in (task.source, *task.outputs.values()))
+    if os.path.realpath(path) in files:
         raise click.UsageError(
             f"--contact-sheet {path} is a photo or a layer of the batch; choose another name."
         )

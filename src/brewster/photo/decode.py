@@ -20,7 +20,6 @@ import pyvips
 from numpy.typing import NDArray
 
 from brewster.errors import (
-    MissingExtra,
     PhotoError,
     UnreadablePhoto,
     UnsupportedPhoto,
@@ -32,8 +31,8 @@ from brewster.files import DEFAULT_MAX_PIXELS
 from brewster.image_formats import FORMATS, VIDEO_SIGNATURE, format_of_content
 from brewster.photo import metadata
 from brewster.photo.colour import colour_space_of
-from brewster.photo.file_info import FileInfo
-from brewster.photo.hdr_formats import read_exr, read_hdr, too_large_error
+from brewster.photo.file_info import FileInfo, check_pixel_count, library_of
+from brewster.photo.hdr_formats import read_exr, read_hdr
 from brewster.photo.lut_profiles import has_only_tables
 from brewster.photo.raw import is_raw, read_raw, read_raw_size
 
@@ -183,8 +182,7 @@ def _check_supported(image: pyvips.Image, data: bytes, format_name: str, max_pix
         PhotoTooLarge: the image has more pixels than `max_pixels`.
         UnsupportedPhoto: the image is an animation, has several pages, CMYK colours, or unsupported channels.
     """
-    if image.width * image.height > max_pixels:
-        raise too_large_error(image.width, image.height, max_pixels)
+    check_pixel_count(image.width, image.height, max_pixels)
     if _has_frames(image, data, format_name):
         raise UnsupportedPhoto(
             f"the {format_name} is an animation or has several pages",
@@ -327,20 +325,12 @@ _HEIC_ERRORS = (ValueError, RuntimeError, OSError, SyntaxError, EOFError)
 
 def _open_heic(data: bytes, max_pixels: int) -> Any:  # noqa: ANN401  (pillow-heif has no types)
     """Opens a HEIC file and checks its header. pillow-heif decodes the pixels later."""
-    try:
-        import pillow_heif  # noqa: PLC0415  (an extra, because of the patents on HEVC)
-    except ImportError as error:
-        raise MissingExtra.for_extra(
-            "heic",
-            "the pillow-heif package is not installed",
-            "expected it to be installed, because HEIC files need it",
-        ) from error
+    pillow_heif = library_of("heic")
     try:
         heif = pillow_heif.open_heif(data, convert_hdr_to_8bit=False)
         if not len(heif):
             raise _unreadable_error("heic", "no image in the file can be decoded")
-        if heif.size[0] * heif.size[1] > max_pixels:
-            raise too_large_error(heif.size[0], heif.size[1], max_pixels)
+        check_pixel_count(heif.size[0], heif.size[1], max_pixels)
     except _HEIC_ERRORS as error:
         raise _unreadable_error("heic") from error
     return heif

@@ -9,10 +9,10 @@ import numpy as np
 import pyvips
 from numpy.typing import NDArray
 
-from brewster.errors import MissingExtra, UnsupportedPhoto
+from brewster.errors import UnsupportedPhoto
 from brewster.image_formats import FORMATS, WRITABLE
 from brewster.photo import metadata
-from brewster.photo.file_info import FileInfo
+from brewster.photo.file_info import FileInfo, library_of
 from brewster.photo.hdr_formats import HdrPixels, write_exr, write_hdr
 
 Stored = NDArray[Any]
@@ -135,14 +135,7 @@ def _with_exif(data: bytes, array: Stored, file_info: FileInfo) -> bytes:
 
 
 def _encode_heic(array: Stored, file_info: FileInfo) -> bytes:
-    try:
-        import pillow_heif  # noqa: PLC0415  (an extra, because of the patents on HEVC)
-    except ImportError as error:
-        raise MissingExtra.for_extra(
-            "heic",
-            "the pillow-heif package is not installed",
-            "expected it to be installed, because HEIC files need it",
-        ) from error
+    pillow_heif = library_of("heic")
     height, width, channels = array.shape
     mode = {1: "L", 2: "LA", 3: "RGB", 4: "RGBA"}[channels] + (";16" if file_info.bits > 8 else "")
     heif = pillow_heif.from_bytes(mode, (width, height), np.ascontiguousarray(array).tobytes())

@@ -1,14 +1,15 @@
-"""The metadata of an image file, and the choice of a format and bit depth for writing."""
+"""The metadata of an image file, the library and the pixel limit for reading, and the format and bit depth for writing."""
 
 from __future__ import annotations
 
+import importlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from brewster.errors import UnsupportedPhoto
-from brewster.image_formats import WRITABLE, format_of
+from brewster.errors import MissingExtra, PhotoTooLarge, UnsupportedPhoto
+from brewster.image_formats import FORMATS, WRITABLE, format_of
 
 
 @dataclass(frozen=True)
@@ -42,6 +43,37 @@ class FileInfo:
     """The program that created the pixels. It is written to EXR and HDR files, which have neither EXIF nor XMP."""
     digest: str | None = None
     """See `brewster.photo.history.sampled_digest`; None if the photo was not read from a file."""
+
+
+def library_of(format_name: str) -> Any:  # noqa: ANN401  (these libraries have no types)
+    """Imports and returns the library that reads and writes a format. An extra of brewster installs it.
+
+    Raises:
+        MissingExtra: the library is not installed.
+    """
+    row = FORMATS[format_name]
+    try:
+        return importlib.import_module(row.library.replace("-", "_"))
+    except ImportError as error:
+        raise MissingExtra.for_extra(
+            row.extra or "",
+            f"the {row.library} package is not installed",
+            f"expected it to be installed, because {format_name.upper()} files need it",
+        ) from error
+
+
+def check_pixel_count(width: int, height: int, max_pixels: int) -> None:
+    """Checks the size of an image in pixels, before the image is decoded.
+
+    Raises:
+        PhotoTooLarge: the image has more pixels than `max_pixels`.
+    """
+    if width * height > max_pixels:
+        raise PhotoTooLarge(
+            f"the image has {width} x {height} pixels ({width * height / 1e6:.3g} million)",
+            f"expected at most {max_pixels / 1e6:g} million",
+            "raise --max-pixels (in Python max_pixels) if you trust the file",
+        )
 
 
 def format_name_of(path: Path) -> str:

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import io
 import re
-import types
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -15,8 +14,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from brewster.errors import MissingExtra, PhotoTooLarge, UnreadablePhoto, UnsupportedPhoto
-from brewster.photo.file_info import FileInfo
+from brewster.errors import UnreadablePhoto, UnsupportedPhoto
+from brewster.photo.file_info import FileInfo, check_pixel_count, library_of
 
 Float32 = NDArray[np.float32]
 
@@ -28,15 +27,6 @@ class HdrPixels:
     pixels: Float32
     alpha: Float32 | None
     file_info: FileInfo
-
-
-def too_large_error(width: int, height: int, max_pixels: int) -> PhotoTooLarge:
-    """Returns the error for an image with more pixels than the limit."""
-    return PhotoTooLarge(
-        f"the image has {width} x {height} pixels ({width * height / 1e6:.3g} million)",
-        f"expected at most {max_pixels / 1e6:g} million",
-        "raise --max-pixels (in Python max_pixels) if you trust the file",
-    )
 
 
 def _valid_chromaticities(chromaticities: Sequence[float | str]) -> tuple[float, ...] | None:
@@ -57,18 +47,6 @@ def _valid_chromaticities(chromaticities: Sequence[float | str]) -> tuple[float,
 # --- OpenEXR
 
 
-def _openexr() -> types.ModuleType:
-    try:
-        import OpenEXR  # noqa: PLC0415  (an extra: only EXR files need it)
-    except ImportError as error:
-        raise MissingExtra.for_extra(
-            "exr",
-            "the OpenEXR package is not installed",
-            "expected it to be installed, because EXR files need it",
-        ) from error
-    return OpenEXR  # type: ignore[no-any-return]
-
-
 def read_exr(data: bytes, max_pixels: int) -> HdrPixels:
     """Reads the first part of an EXR: the channels R, G and B, or Y alone, and the channel A if there is one.
 
@@ -84,14 +62,13 @@ def read_exr(data: bytes, max_pixels: int) -> HdrPixels:
     header = _exr_part(data, header_only=True).header
     low, high = header["dataWindow"]
     width, height = (int(side) for side in np.array(high) - np.array(low) + 1)
-    if width * height > max_pixels:
-        raise too_large_error(width, height, max_pixels)
+    check_pixel_count(width, height, max_pixels)
     part = _exr_part(data, header_only=False)
     return _exr_pixels({name: channel.pixels for name, channel in part.channels.items()}, dict(part.header))
 
 
 def _exr_part(data: bytes, *, header_only: bool) -> Any:  # noqa: ANN401  (OpenEXR has no types)
-    exr = _openexr()
+    exr = library_of("exr")
     try:
         return exr.File(io.BytesIO(data), separate_channels=True, header_only=header_only).parts[0]
     except (RuntimeError, ValueError, TypeError, IndexError) as error:
@@ -126,7 +103,7 @@ def _exr_pixels(channels: dict[str, NDArray[Any]], header: dict[str, Any]) -> Hd
 
 def write_exr(image: HdrPixels) -> bytes:
     """Encodes an EXR in half (16 `bits`) or single precision (32 `bits`), with the attributes of the source."""
-    exr = _openexr()
+    exr = library_of("exr")
     names = "RGB" if image.pixels.shape[2] == 3 else "Y"
     planes = {name: image.pixels[..., i] for i, name in enumerate(names)}
     if image.alpha is not None:
@@ -171,7 +148,7 @@ def write_exr_layers(layers: Mapping[str, Float32], header: Mapping[str, str]) -
         MissingExtra: OpenEXR is not installed.
         UnsupportedPhoto: the name of an attribute is reserved by OpenEXR.
     """
-    exr = _openexr()
+    exr = library_of("exr")
     if reserved := _RESERVED_ATTRIBUTES & header.keys():
         raise UnsupportedPhoto(
             f"attributes have the names {', '.join(sorted(reserved))}",
@@ -254,8 +231,7 @@ def read_hdr(data: bytes, max_pixels: int) -> HdrPixels:
             "expected at least one pixel",
             "export the image again",
         )
-    if width * height > max_pixels:
-        raise too_large_error(width, height, max_pixels)
+    check_pixel_count(width, height, max_pixels)
     return HdrPixels(_from_rgbe(_scan_lines(body, width, height)), None, _hdr_file_info(lines))
 
 

@@ -19,8 +19,7 @@ from brewster.image_formats import FORMATS, canonical_format, format_of
 from brewster.photo.colour import SRGB, ColourSpace, colour_space_of
 from brewster.photo.decode import Decoded, decode
 from brewster.photo.encode import encode
-from brewster.photo.file_info import FileInfo, depth_for, format_name_of
-from brewster.photo.hdr_formats import too_large_error
+from brewster.photo.file_info import FileInfo, check_pixel_count, depth_for, format_name_of
 from brewster.photo.history import sampled_digest
 from brewster.photo.in_memory import (
     WHITE_LEVELS,
@@ -91,7 +90,7 @@ class Photo:
         """
         if isinstance(source, np.ndarray):
             height, width = (*source.shape, 1, 1)[:2]
-            _check_pixel_count(width, height, max_pixels)
+            check_pixel_count(width, height, max_pixels)
             return cls.from_array(source, encoding=check_encoding(encoding))
         if encoding is not None:
             raise PhotoError(
@@ -102,7 +101,7 @@ class Photo:
         if isinstance(source, Photo):
             return source
         if isinstance(source, PilImage):
-            _check_pixel_count(source.width, source.height, max_pixels)
+            check_pixel_count(source.width, source.height, max_pixels)
             return cls.from_pil(source)
         data = _read_source(source)
         try:
@@ -360,11 +359,6 @@ def _area_means(row: Float32, width: int) -> Float32:
     edges = np.linspace(0, len(row), width + 1)
     sums_at_edges = np.column_stack([np.interp(edges, np.arange(len(sums)), sums[:, i]) for i in range(3)])
     return (np.diff(sums_at_edges, axis=0) * (width / len(row))).astype(np.float32)
-
-
-def _check_pixel_count(width: int, height: int, max_pixels: int) -> None:
-    if width * height > max_pixels:
-        raise too_large_error(width, height, max_pixels)
 
 
 def _check_arrays(pixels: Stored, alpha: Stored | None) -> None:

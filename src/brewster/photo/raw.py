@@ -9,7 +9,6 @@ from __future__ import annotations
 import importlib.util
 import io
 import re
-import types
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -18,12 +17,11 @@ import numpy as np
 import pyvips
 from numpy.typing import NDArray
 
-from brewster.errors import MissingExtra, UnreadablePhoto, install_command
+from brewster.errors import UnreadablePhoto, install_command
 from brewster.image_formats import FORMATS
 from brewster.photo import metadata
 from brewster.photo.colour import colour_space_of
-from brewster.photo.file_info import FileInfo
-from brewster.photo.hdr_formats import too_large_error
+from brewster.photo.file_info import FileInfo, check_pixel_count, library_of
 
 _MAKER_NOTE = 37500
 _EXIF_TAG, _GPS_TAG = 34665, 34853
@@ -55,7 +53,7 @@ def read_raw(data: bytes, max_pixels: int) -> tuple[NDArray[np.uint16], FileInfo
             no_auto_bright=True,
             gamma=(1, 1),
             output_bps=16,
-            output_color=_rawpy().ColorSpace.P3D65,
+            output_color=library_of("raw").ColorSpace.P3D65,
         )
     icc = bytes(pyvips.Image.profile_load("p3"))
     curve = colour_space_of(icc, None, is_float=False).curves[1]
@@ -92,23 +90,10 @@ def with_raw_suffix(error: UnreadablePhoto, suffix: str) -> UnreadablePhoto:
     )
 
 
-def _rawpy() -> types.ModuleType:
-    try:
-        import rawpy  # noqa: PLC0415  (an extra: only RAW files need it)
-    except ImportError as error:
-        raise MissingExtra.for_extra(
-            "raw",
-            "the rawpy package is not installed",
-            "expected it to be installed, because RAW files need it",
-        ) from error
-    module: types.ModuleType = rawpy
-    return module
-
-
 @contextmanager
 def _opened(data: bytes) -> Iterator[Any]:
     """Yields the file as a `rawpy.RawPy`. Errors of LibRaw in the block are raised as `UnreadablePhoto`."""
-    rawpy = _rawpy()
+    rawpy = library_of("raw")
     try:
         with rawpy.imread(io.BytesIO(data)) as raw:
             yield raw
@@ -124,8 +109,7 @@ def _upright_size(raw: Any, max_pixels: int) -> tuple[int, int]:  # noqa: ANN401
     sizes = raw.sizes
     is_transposed = sizes.flip in (4, 5, 6, 7)  # LibRaw's code: bit 2 swaps rows and columns
     width, height = (sizes.iheight, sizes.iwidth) if is_transposed else (sizes.iwidth, sizes.iheight)
-    if width * height > max_pixels:
-        raise too_large_error(width, height, max_pixels)
+    check_pixel_count(width, height, max_pixels)
     return width, height
 
 

@@ -79,7 +79,8 @@ def page_response(name: str) -> Response:
 
 
 def _add_page(app: FastAPI, path: str, name: str) -> None:
-    app.get(path, include_in_schema=False)(lambda: page_response(name))
+    # Unlike FastAPI.get, this method of Starlette also adds HEAD.
+    app.add_route(path, lambda _: page_response(name), include_in_schema=False)
 
 
 def listen(host: str, port: int) -> socket.socket:

@@ -19,6 +19,7 @@ from brewster.errors import invalid_value
 from brewster.files import OUTPUT_LAYERS, SeparationPaths
 from brewster.image_formats import FORMATS, canonical_format, format_of
 from brewster.options import Options
+from brewster.remote_path import check_not_video
 
 FIELDS: Final = ("layers", "strength", "quality", "format", "additive", "model")
 """The options that a client may set as text. The server sets the other options."""
@@ -69,6 +70,7 @@ async def read_form(request: Request, models: Sequence[str], max_pixels: int) ->
     Raises:
         HTTPException: 415 if the body is not a form; 400 if the form is damaged; 422 if a field or a value is invalid.
         BrewsterError: two options contradict each other.
+        UnsupportedPhoto: the name of the photo has the suffix of a video.
         ClientDisconnect: the upload is incomplete.
     """
     if not request.headers.get("content-type", "").lower().startswith("multipart/form-data"):
@@ -111,8 +113,10 @@ async def _build_request(form: FormData, options: Options) -> SeparationRequest:
         raise HTTPException(
             422, "the field mask contains no file; expected an image file; send the mask as a file"
         )
+    name = safe_name(photo.filename or "")
+    check_not_video(Path(name))
     values = await mask.read() if mask else None
-    return SeparationRequest(await photo.read(), safe_name(photo.filename or ""), options, values)
+    return SeparationRequest(await photo.read(), name, options, values)
 
 
 @final

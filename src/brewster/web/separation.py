@@ -120,6 +120,7 @@ def separation_router(model_cache: ModelCache, job_queue: JobQueue, *, max_pixel
         """Returns the available models, the default first."""
         return model_cache.rows()
 
+    @router.head("/health", include_in_schema=False)
     @router.get("/health")
     async def health() -> HealthResponse:
         """Returns the version of the server and the number of its jobs."""
