@@ -81,6 +81,12 @@ def list_models(*, as_json: bool) -> None:
     help="For a LoRA: what it generates, separated by commas: T is the transmission, R the reflection, I the photo.",
 )
 @click.option(
+    "--alpha",
+    type=click.IntRange(min=1),
+    metavar="NUMBER",
+    help="For a LoRA of peft without its adapter_config.json: the value lora_alpha with which it was trained.",
+)
+@click.option(
     "--device",
     type=click.Choice(["cpu", "cuda"]),
     default="cpu",
@@ -88,7 +94,14 @@ def list_models(*, as_json: bool) -> None:
     help="For a LoRA: the device that encodes the prompt.",
 )
 def import_model(
-    *, source: str, folder: Path, base_model: str, prompt: str | None, panels: str, device: str
+    *,
+    source: str,
+    folder: Path,
+    base_model: str,
+    prompt: str | None,
+    panels: str,
+    alpha: int | None,
+    device: str,
 ) -> None:
     """Convert a model of another program to a FOLDER that --model opens.
 
@@ -107,7 +120,9 @@ def import_model(
         from brewster.models.diffusion.adapter.importer import import_lora  # noqa: PLC0415  (imports torch)
 
         names = cast("tuple[Panel, ...]", tuple(panels.split(",")))
-        import_lora(source, folder, base_model=base_model, prompt=prompt, panels=names, device=device)
+        import_lora(
+            source, folder, base_model=base_model, prompt=prompt, panels=names, alpha=alpha, device=device
+        )
     print_status(f"{source} -> {folder}; use it with: --model {folder}")
 
 

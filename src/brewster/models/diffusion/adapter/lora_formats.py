@@ -123,7 +123,7 @@ def read_lora_layers(
         tensors: the content of the file. Its alphas have precedence over `scale`.
         transformer: the transformer of the base; only names and shapes are read, so it may be on the device "meta".
         backbone: the name of the backbone.
-        scale: alpha / rank, for files without alphas; by default 1.
+        scale: alpha / rank, for files without alphas; by default 1, as in diffusers, sd-scripts and ComfyUI.
 
     Raises:
         ModelError: a key is not understood, a matrix is missing, or a layer or shape is not that of the transformer.
@@ -157,6 +157,11 @@ def to_state_dict(layers: Mapping[str, LowRankLayer]) -> dict[str, Tensor]:
     for name, layer in sorted(layers.items()):
         state |= {name + DOWN_SUFFIX: layer.down, name + UP_SUFFIX: layer.up}
     return state
+
+
+def has_alphas(tensors: Mapping[str, Tensor]) -> bool:
+    """Whether a LoRA file has the alpha of a layer, as those of sd-scripts do."""
+    return any(key.endswith(".alpha") for key in tensors)
 
 
 def lora_format(tensors: Mapping[str, Tensor]) -> str:
