@@ -286,6 +286,27 @@ def test_what_is_not_understood_is_one_clear_sentence(tensors, message, tmp_path
     assert not (tmp_path / "out").exists()
 
 
+TO_Q, QKV = f"{BLOCK}attn.to_q", "double_blocks.0.img_attn.qkv"
+
+
+@pytest.mark.parametrize(
+    ("first", "second"),
+    [
+        ((TO_Q, "transformer.", ""), (TO_Q, "diffusion_model.", "")),
+        ((TO_Q, "transformer.", ""), (TO_Q.replace(".", "_"), "lora_transformer_", "")),
+        ((TO_Q, "transformer.", ""), (QKV, "diffusion_model.", "")),
+        ((TO_Q, "transformer.", ".first"), (TO_Q, "transformer.", ".second")),
+    ],
+)
+def test_a_layer_that_occurs_twice_is_refused(first, second):
+    transformer, tensors = tiny("kontext", seed=1)[0].transformer, {}
+    for name, prefix, adapter in (first, second):
+        pairs = weights("kontext", original=name == QKV)
+        tensors |= peft({name: pairs[QKV if name == QKV else TO_Q]}, prefix, adapter)
+    with pytest.raises(ModelError, match=r"more than one LoRA for the layer .*to_q"):
+        read_lora_layers(tensors, transformer, "kontext")
+
+
 def test_a_folder_must_contain_one_file_and_panels_need_t(tmp_path):
     with pytest.raises(ModelError, match=r"contains no such file; expected one \.safetensors file"):
         import_lora(str(tmp_path), tmp_path / "out", base_model="tiny:qwen", prompt="x", panels=("T",))

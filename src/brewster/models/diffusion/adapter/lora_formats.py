@@ -126,8 +126,8 @@ def read_lora_layers(
         scale: alpha / rank, for files without alphas; by default 1, as in diffusers, sd-scripts and ComfyUI.
 
     Raises:
-        ModelError: a key is not understood, a matrix is missing, or a layer or shape is not that of the transformer.
-            The message names the style of the keys.
+        ModelError: a key is not understood, a matrix is missing, a layer occurs twice, or a layer or shape is not that of the
+            transformer. The message names the style of the keys.
     """
     matrices, alphas = _parse(tensors, backbone)
     targets = _layer_names(transformer, backbone)
@@ -142,7 +142,10 @@ def read_lora_layers(
         rank = len(pair["down"])
         factor = alphas[name] / rank if name in alphas else scale(name, rank) if scale else 1.0
         layer = LowRankLayer(pair["down"].float(), pair["up"].float() * factor)
-        layers |= _split(name, layer, targets[name], transformer)
+        parts = _split(name, layer, targets[name], transformer)
+        if repeated := sorted(parts.keys() & layers.keys()):
+            raise _repeated(repeated[0])
+        layers |= parts
     return layers
 
 
@@ -183,11 +186,13 @@ def _parse(
         match = _KEY.fullmatch(key)
         if not match:
             raise _unknown(key, tensors, backbone)
-        name = _without_prefix(match["module"])
+        name, part = _without_prefix(match["module"]), "down" if match["matrix"] in _DOWN else "up"
+        if name in alphas if match["alpha"] else part in matrices.get(name, {}):
+            raise _repeated(name)
         if match["alpha"]:
             alphas[name] = float(tensor)
         else:
-            matrices.setdefault(name, {})["down" if match["matrix"] in _DOWN else "up"] = tensor
+            matrices.setdefault(name, {})[part] = tensor
     if unused := sorted(alphas.keys() - matrices.keys()):
         raise _unknown(f"{unused[0]}.alpha", tensors, backbone)
     if not matrices:
@@ -260,6 +265,14 @@ def check_shape(name: str, layer: LowRankLayer, module: Any) -> None:  # noqa: A
             else "expected a linear layer",
             "use the base with which it was trained",
         )
+
+
+def _repeated(layer: str) -> ModelError:
+    return ModelError(
+        f"the file has more than one LoRA for the layer {layer}",
+        "expected each layer once",
+        "use a file with one LoRA, in one style of keys",
+    )
 
 
 def _unknown(key: str, tensors: Mapping[str, Tensor], backbone: str) -> ModelError:
