@@ -148,11 +148,12 @@ def find_model(name: str) -> ModelFile:
             "for the source of this model, run: brewster models list; for the card of a LoRA: brewster models card FOLDER",
         )
     path = Path(name)
-    if path.suffix == ".safetensors":
+    if path.suffix == ".safetensors" and path.is_file():
         raise ModelError(
             f"{name} is a file of weights",
             "expected an .onnx file, or the folder or hub id of a LoRA",
-            f"pass the folder of the LoRA, which also has its prompt: --model {path.parent}",
+            f"if brewster wrote it, pass its folder: --model {path.parent}; convert another LoRA with: "
+            f"brewster models import {name} FOLDER --base-model BASE --prompt TEXT",
         )
     if path.is_file():
         return ModelFile(path.stem, path, None, "unknown")

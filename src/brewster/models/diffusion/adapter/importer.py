@@ -33,7 +33,8 @@ from brewster.models.diffusion.prompt import PROMPTS
 from brewster.models.diffusion.task import DecompositionTask
 from brewster.models.diffusion.tensors import read_json, read_tensors
 
-_PEFT_CONFIG_FILE: Final = "adapter_config.json"
+PEFT_CONFIG_FILE: Final = "adapter_config.json"
+"""The file with peft's settings of a LoRA, next to its weights."""
 _DIFFUSERS_KEY: Final = "lora_adapter_metadata"
 _PREFIX: Final = "transformer."
 
@@ -81,7 +82,7 @@ def import_lora(
 
 def find_lora_file(source: str) -> Path:
     """The file with the weights of a LoRA, see `find_weights_file`."""
-    return find_weights_file(source, (".safetensors",), companions=[_PEFT_CONFIG_FILE])
+    return find_weights_file(source, (".safetensors",), companions=[PEFT_CONFIG_FILE])
 
 
 def read_layers(path: Path, base: Backbone, alpha: int | None = None) -> dict[str, LowRankLayer]:
@@ -111,8 +112,8 @@ def read_layers(path: Path, base: Backbone, alpha: int | None = None) -> dict[st
 def _refuse_unknown_alpha(name: str, rank: int) -> float:  # noqa: ARG001  (a ScalingFunction)
     raise ModelError(
         f"the LoRA has no alpha for {name}",
-        f"expected {_PEFT_CONFIG_FILE} next to the file, where peft stores alpha",
-        f"copy {_PEFT_CONFIG_FILE} into its folder, or state alpha: brewster models import --alpha NUMBER",
+        f"expected {PEFT_CONFIG_FILE} next to the file, where peft stores alpha",
+        f"copy {PEFT_CONFIG_FILE} into its folder, or state alpha: brewster models import --alpha NUMBER",
     )
 
 
@@ -121,7 +122,7 @@ def _scale(path: Path, metadata: Mapping[str, str]) -> ScalingFunction | None:
 
     Returns None if there are no settings.
     """
-    config = path.with_name(_PEFT_CONFIG_FILE)
+    config = path.with_name(PEFT_CONFIG_FILE)
     if _DIFFUSERS_KEY not in metadata:
         return scaling_from_config(read_json(config)) if config.is_file() else None
     try:

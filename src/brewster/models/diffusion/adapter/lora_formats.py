@@ -40,7 +40,16 @@ UP_SUFFIX: Final = ".lora_B.weight"
 """The suffixes of the keys of a layer's two matrices in a state dict of brewster, peft and diffusers."""
 _DOWN: Final = ("lora_A", "lora_down")
 _TEXT_ENCODERS: Final = ("lora_te", "text_encoder", "te1_", "te2_")
-_OTHER_METHODS: Final = {"dora_scale": "DoRA", "lora_magnitude": "DoRA", "lokr_": "LoKr", "hada_": "LoHa"}
+_UNSUPPORTED: Final = {
+    r"dora_scale|lora_magnitude": "DoRA matrices",
+    r"lokr_": "LoKr matrices",
+    r"hada_": "LoHa matrices",
+    r"\.diff(_b)?$": "differences of whole weights",
+    r"\.bias$": "biases",
+    r"\.processor\.(qkv|proj)_lora": "keys of XLabs",
+    r"lora\.(down|up)\.": "keys of an old version of diffusers",
+}
+"""Regular expression for a part of a key -> what a file with this key contains."""
 
 _STREAM_NAMES: Final = {
     "img_attn.qkv": ("attn.to_q", "attn.to_k", "attn.to_v"),
@@ -277,13 +286,13 @@ def _repeated(layer: str) -> ModelError:
 
 def _unknown(key: str, tensors: Mapping[str, Tensor], backbone: str) -> ModelError:
     style = lora_format(tensors)
-    method = next(
-        (method for part, method in _OTHER_METHODS.items() if any(part in name for name in tensors)), ""
-    )
-    if method:
-        return ModelError(
-            f"the file has {method} matrices ({key})", "expected a LoRA", "use a LoRA without this method"
-        )
+    for pattern, kind in _UNSUPPORTED.items():
+        if found := next((name for name in tensors if re.search(pattern, name)), ""):
+            return ModelError(
+                f"the file has {kind} ({found})",
+                "expected only LoRA matrices, with the keys of peft, diffusers, sd-scripts or ComfyUI",
+                "use another file of this LoRA, or another LoRA",
+            )
     if key.startswith(_TEXT_ENCODERS):
         return ModelError(
             f"the LoRA also changes a text encoder ({key})",
