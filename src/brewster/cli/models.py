@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 _JSON = click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 _NAME = click.argument("name", default="compact")
 _CARD_FILE = "README.md"
-_CHECKPOINT_SUFFIXES = (".pt", ".ckpt")
+_CHECKPOINT_SUFFIXES = (".pt", ".pth", ".ckpt")
 
 
 @click.group
@@ -87,6 +87,14 @@ def list_models(*, as_json: bool) -> None:
     help="For a LoRA of peft without its adapter_config.json: the value lora_alpha with which it was trained.",
 )
 @click.option(
+    "--short-side",
+    type=click.IntRange(min=16),
+    default=768,
+    show_default=True,
+    metavar="PIXELS",
+    help="For GenSIRR: the short side of its input. Its authors use 768 or 512, whichever is better on a data set.",
+)
+@click.option(
     "--device",
     type=click.Choice(["cpu", "cuda"]),
     default="cpu",
@@ -101,6 +109,7 @@ def import_model(
     prompt: str | None,
     panels: str,
     alpha: int | None,
+    short_side: int,
     device: str,
 ) -> None:
     """Convert a model of another program to a FOLDER that --model opens.
@@ -113,7 +122,7 @@ def import_model(
     if Path(source).suffix in _CHECKPOINT_SUFFIXES:
         from brewster.models.diffusion import gensirr  # noqa: PLC0415  (imports torch)
 
-        gensirr.convert(Path(source), folder, base_model=base_model)
+        gensirr.convert(Path(source), folder, base_model=base_model, short_side_px=short_side)
     else:
         if not prompt:
             raise click.UsageError("A LoRA needs --prompt: the prompt with which it was trained.")

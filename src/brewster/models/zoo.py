@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Final, final
 
 from brewster.errors import ModelError
-from brewster.models.diffusion_models import DIFFUSION_MODELS
+from brewster.models.diffusion_models import DIFFUSION_MODELS, check_is_converted
 
 _WEIGHTS: Final = Path(__file__).parent / "weights"
 
@@ -159,6 +159,7 @@ def find_model(name: str) -> ModelFile:
         return ModelFile(path.stem, path, None, "unknown")
     if exported := _run_model(name):
         return ModelFile(path.resolve().name, exported, None, "unknown")
+    check_is_converted(name)
     close = difflib.get_close_matches(name, (*MODELS, *DIFFUSION_NAMES), n=1) if path.name == name else []
     raise ModelError(
         f"there is no model {name!r}",

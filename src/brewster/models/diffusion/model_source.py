@@ -33,7 +33,7 @@ from brewster.models.diffusion.hub_download import (
 from brewster.models.diffusion.panels import PanelLayout
 from brewster.models.diffusion.prompt import PROMPT_FILE
 from brewster.models.diffusion.task import TASK_FILE, DecompositionTask, load_task
-from brewster.models.diffusion_models import DIFFUSION_MODELS
+from brewster.models.diffusion_models import DIFFUSION_MODELS, check_is_converted
 from brewster.models.zoo import TINY_PREFIX
 from brewster.options import Quantization
 
@@ -106,7 +106,9 @@ def find_model_source(
         _check_no_base(model, base_model)
         return ModelSource(model, find_backbone_class(model.removeprefix(TINY_PREFIX)), _default_task())
     row = DIFFUSION_MODELS.get(model)
-    source = row.hub_id if row else model
+    source = row.hub_id if row and row.is_opened_by_name else model
+    if not Path(source).is_dir():
+        check_is_converted(source)
     folder = resolve_model_folder(source, _FILES) if allow_download else cached_model_folder(source, _FILES)
     if folder is None:
         return _published_source(model, base_model)
@@ -155,7 +157,7 @@ def _default_task() -> DecompositionTask:
 def _published_source(model: str, base_model: str | None) -> ModelSource:
     """Returns the source of WindowSeat without a download, for `--plan`."""
     row = DIFFUSION_MODELS.get(model)
-    if row is None or row.base_model is None or not row.is_opened_by_name:
+    if row is None or row.base_model is None:
         names = [name for name, each in DIFFUSION_MODELS.items() if each.is_opened_by_name]
         raise DownloadError(
             f"{model} is not in the cache, and a plan downloads nothing",
