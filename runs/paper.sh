@@ -8,7 +8,7 @@
 # https://huggingface.co/black-forest-labs/FLUX.1-Kontext-dev (not for commercial use), and run `hf auth login`.
 # BREWSTER_DATA must contain photos/ (200 photos of people, animals and artworks), pairs/real and pairs/nature (the 89 + 200
 # training pairs), real20, nature20 and SIR2 (the benchmarks; docs/evaluation.md describes their layouts), and real/dev/nature
-# (any pairs, for validation during training).
+# (any pairs, for validation during training). LPIPS needs a download of 233 MiB, or weights/lpips_alexnet_features.pth.
 #
 # "est." marks estimates, which come from `brewster train recipes/train/kontext.toml --plan` or are calculated.
 # runs/full_size_check.sh measures memory and time per step on your GPU.
@@ -25,7 +25,7 @@ if $tiny; then
     size=96x72 test_count=2 suffix=-tiny
     assets=() syn=recipes/train/lora-tiny.toml real=recipes/train/lora-real-tiny.toml set=sets/tiny count=4
     options=(--quality draft --metrics "psnr,ssim,removed_white,kept_reflection")
-    benchmarks=() quality=(--quality draft) workers=(--workers 0)
+    benchmarks=(--benchmark "rendered=$BREWSTER_DATA/sets/test") quality=(--quality draft) workers=(--workers 0)
 else
     : "${BREWSTER_DATA:?is not set; expected the folder of the data, with 20 GB free; export BREWSTER_DATA=/path/to/data}"
     BREWSTER_DATA="$(realpath "$BREWSTER_DATA")"
@@ -59,10 +59,15 @@ if $tiny; then
     done
 fi
 
-# 3. Estimate memory, download and time, and read the data, before anything is downloaded. The script stops here if the training
-#    does not fit into the GPU's memory: est. 17.7 GiB (base model in int8 11.2, activations 3.5, LoRA and AdamW 1.3, other 1.7).
+# 3. Estimate memory, download and time, and read the training data, before a model is downloaded. The script stops here if the
+#    training does not fit into the GPU's memory: est. 17.7 GiB (base model in int8 11.2, activations 3.5, LoRA and AdamW 1.3,
+#    other 1.7).
 brewster train "$syn" --plan
 brewster train "$real" --plan
+#    Evaluate the compact model. The script stops here if a benchmark is missing or incomplete, or if LPIPS has no weights.
+#    Step 6 and the ablations in step 7 need both. Step 6 keeps these scores.
+evaluate() { brewster evaluate "${benchmarks[@]}" "${options[@]}" --model compact -o "$out/evaluate" "$@"; }
+evaluate
 
 # 4. Train "syn" and "syn + real". The base model is downloaded once (est. 34 GB, 10 GB of which are the text encoders).
 #    A step takes est. 5.3 s on an RTX 4090, and each training run 5.9 hours. A checkpoint has est. 1 GB, a LoRA 344 MB.
@@ -74,11 +79,10 @@ brewster tests/pictures/mixture-coffee-rocket.jpg --model "$out/syn/lora" -o "$o
 
 # 6. Evaluate both LoRAs, the compact model, and the unprocessed input. This takes est. 5-6 hours for each model. The paper's
 #    Table 1 is table.tex. The rendered test set is for the paper's failure cases: removed white areas, and kept reflections.
-evaluate() { brewster evaluate "$@" --model compact --model "syn=$out/syn/lora" --model "syn+real=$out/syn+real/lora"; }
-evaluate --benchmark "rendered=$BREWSTER_DATA/sets/test" "${quality[@]}" \
+loras=(--model "syn=$out/syn/lora" --model "syn+real=$out/syn+real/lora")
+brewster evaluate --benchmark "rendered=$BREWSTER_DATA/sets/test" "${quality[@]}" --model compact "${loras[@]}" \
     --metrics psnr,ssim,removed_content,removed_white,kept_reflection -o "$out/failures"
-$tiny && benchmarks=(--benchmark "rendered=$BREWSTER_DATA/sets/test")
-evaluate "${benchmarks[@]}" "${options[@]}" -o "$out/evaluate"
+evaluate "${loras[@]}"
 cp "$out/evaluate/table.tex" "$out/table1.tex"
 
 # 7. Run the paper's ablations on the diffusion model: 8-bit blends, number of samples, prompts without training. est. 2-3 days.

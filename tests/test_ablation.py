@@ -32,11 +32,8 @@ def names(paths):
     return [path.stem for path in paths]
 
 
-TINY = {"prompt": "no-lora-tiny.toml"}
-"""study -> tiny base recipe, if it is not tiny.toml."""
-
-SMALL_STUDIES = [path for path in STUDIES if not path.stem.startswith("lora-")]
-"""The studies that need no rendered set. runs/paper.sh --tiny runs those of the diffusion model."""
+SMALL_STUDIES = [path for path in STUDIES if not path.with_stem(f"{path.stem}-tiny").is_file()]
+"""The studies of the compact model. runs/paper.sh --tiny runs the tiny variants of those of the diffusion model."""
 
 
 def test_every_ablation_of_the_paper_has_a_study():
@@ -215,8 +212,9 @@ def few_pairs(data, tmp_path):
 def test_every_study_runs_end_to_end_at_tiny_size(path, few_pairs, tmp_path):
     """Nothing is replaced: the study renders, trains on four real pairs, and evaluates."""
     environment = {**os.environ, "BREWSTER_DATA": str(few_pairs)}
-    base = RECIPES / TINY.get(path.stem, "tiny.toml")
-    result = run_process("ablate", path, "--base", base, "-o", tmp_path / "out", env=environment)
+    result = run_process(
+        "ablate", path, "--base", RECIPES / "tiny.toml", "-o", tmp_path / "out", env=environment
+    )
     assert result.returncode == 0, result.stderr.decode()
     text = result.stdout.decode()
     for value in read_study(path).values:

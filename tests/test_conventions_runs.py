@@ -12,6 +12,8 @@ import click
 import pytest
 
 from brewster.cli import cli
+from brewster.evaluate.ablation import read_study
+from brewster.evaluate.protocols import protocol_config
 from brewster.models.diffusion.adapter.hub import FILES
 from brewster.photo import Photo
 
@@ -99,8 +101,8 @@ def test_every_command_of_the_paper_experiment_is_valid(tmp_path):
     run_script("paper.sh", tmp_path / "out", path=stub.parent, BREWSTER_DATA=str(tmp_path))
     commands = [json.loads(line) for line in calls.read_text().splitlines()]
     assert [arguments[0] for arguments in commands] == [
-        "assets", "render", "render", "train", "train", "train", "train", "tests/pictures/mixture-coffee-rocket.jpg",
-        "evaluate", "evaluate", "ablate", "ablate", "ablate", "models", "models",
+        "assets", "render", "render", "train", "train", "evaluate", "train", "train",
+        "tests/pictures/mixture-coffee-rocket.jpg", "evaluate", "evaluate", "ablate", "ablate", "ablate", "models", "models",
     ]  # fmt: skip
     for arguments in commands:
         parse(arguments)
@@ -110,6 +112,15 @@ def test_every_command_of_the_paper_experiment_is_valid(tmp_path):
     studies = {f"recipes/ablations/{name}.toml" for name in ("lora-blend-space", "lora-size", "prompt")}
     assert recipes == {"recipes/train/kontext.toml", "recipes/train/kontext-real.toml"} | studies
     assert all((ROOT / name).is_file() for name in recipes)
+    check, final = commands[5], commands[10]
+    assert (
+        final[: len(check)] == check
+    )  # with the same benchmarks, metrics and folder, so its scores are kept
+    checked = {value.partition("=")[2] for value in check if "=" in value}
+    for name in studies:
+        study = read_study(ROOT / name)
+        assert {str(tmp_path / folder) for folder in study.benchmarks.values()} <= checked
+        assert set(study.metrics) <= set(protocol_config(check[check.index("--protocol") + 1]).metrics)
 
 
 @pytest.mark.slow

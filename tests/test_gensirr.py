@@ -14,6 +14,7 @@ from brewster.inference.diffusion_predictor import DiffusionPredictor
 from brewster.models.diffusion.backbones.loading import encode_prompt
 from brewster.models.diffusion.backbones.registry import tiny
 from brewster.models.diffusion.gensirr import convert
+from brewster.models.diffusion.model_source import find_model_source
 from brewster.models.diffusion.pipeline import load_pipeline
 from brewster.models.diffusion.task import TASK_FILE
 
@@ -116,9 +117,22 @@ def test_a_photo_that_is_smaller_is_enlarged_and_separated(model):
     assert separation.reflection_is_derived
 
 
-def test_the_name_is_not_opened_without_a_conversion():
-    with pytest.raises(ModelError, match="there is no model 'gensirr'"):
-        Separator.load("gensirr")
+@pytest.mark.parametrize("name", ["gensirr", "lime-j/GenSIRR"])
+def test_the_name_is_not_opened_without_a_conversion(name):
+    with pytest.raises(
+        ModelError, match=r"hf download lime-j/GenSIRR .*brewster models import GenSIRR\.pt FOLDER"
+    ):
+        Separator.load(name)
+
+
+def test_the_command_of_the_documentation_converts_with_a_short_side(run_without_model, tmp_path):
+    """The folder has the name of the model, and it is opened in its place."""
+    torch.save(checkpoint_values(), tmp_path / "GenSIRR.pth")
+    arguments = ("GenSIRR.pth", "gensirr", "--base-model", "tiny:kontext", "--short-side", 48)
+    code, _, err = run_without_model("models", "import", *arguments)
+    assert (code, "use it with: --model gensirr" in err) == (0, True)
+    task = find_model_source("gensirr").task
+    assert (task.short_side_px, task.max_composite_pixels, task.steps) == (48, 48**2, 28)
 
 
 @pytest.mark.parametrize(

@@ -78,8 +78,9 @@ def test_a_connection_that_fails_during_the_download_is_an_error(monkeypatch):
 
 
 def test_a_file_that_does_not_exist_is_refused(tmp_path, monkeypatch):
-    with pytest.raises(ModelError, match=r"contains no file missing\.gguf; expected one \.gguf file"):
-        find_weights_file(str(tmp_path / "missing.gguf"), (".gguf",))
+    for path in ("missing.gguf", tmp_path / "missing.gguf", tmp_path / "no" / "folder" / "missing.gguf"):
+        with pytest.raises(ModelError, match=r"there is no file .*missing\.gguf; expected one \.gguf file"):
+            find_weights_file(str(path), (".gguf",))
 
     def snapshot_download(source, *, allow_patterns, dry_run=False):
         return [] if dry_run else str(tmp_path)
@@ -89,6 +90,24 @@ def test_a_file_that_does_not_exist_is_refused(tmp_path, monkeypatch):
         find_weights_file("someone/model/missing.gguf", (".gguf",))
     (tmp_path / "missing.gguf").write_bytes(b"")
     assert find_weights_file(str(tmp_path / "missing.gguf"), (".gguf",)).is_file()
+
+
+def test_a_file_in_a_subfolder_of_a_repository_is_found_with_its_companion(tmp_path, monkeypatch):
+    """Published few-step LoRAs are in subfolders, such as that of Qwen-Image-Edit-2509."""
+    requests = []
+
+    def snapshot_download(source, *, allow_patterns, dry_run=False):
+        requests.append((source, *allow_patterns))
+        return [] if dry_run else str(tmp_path)
+
+    monkeypatch.setattr(huggingface_hub, "snapshot_download", snapshot_download)
+    (tmp_path / "steps" / "4").mkdir(parents=True)
+    (tmp_path / "steps" / "4" / "lora.safetensors").touch()
+    found = find_weights_file(
+        "someone/fast/steps/4/lora.safetensors", (".safetensors",), ["adapter_config.json"]
+    )
+    assert found == tmp_path / "steps" / "4" / "lora.safetensors"
+    assert set(requests) == {("someone/fast", "steps/4/lora.safetensors", "steps/4/adapter_config.json")}
 
 
 @pytest.mark.parametrize("name", list(BACKBONES))

@@ -10,7 +10,7 @@ from safetensors.torch import save_file
 from brewster import Separator
 from brewster.errors import ModelError, RecipeError
 from brewster.models.diffusion.adapter import importer
-from brewster.models.diffusion.adapter.importer import import_lora
+from brewster.models.diffusion.adapter.importer import import_lora, read_layers
 from brewster.models.diffusion.adapter.lora import LORA_FILE, load_lora, read_lora_metadata
 from brewster.models.diffusion.adapter.lora_formats import LowRankLayer, read_lora_layers, scaling_from_config
 from brewster.models.diffusion.backbones.registry import tiny
@@ -99,9 +99,16 @@ STYLES = {
 }
 
 
-def imported(path, name, folder):
+def imported(path, name, folder, alpha=None):
     """The backbone with the imported LoRA, opened as a user opens it."""
-    import_lora(str(path), folder, base_model=f"tiny:{name}", prompt="remove the reflection", panels=("T",))
+    import_lora(
+        str(path),
+        folder,
+        base_model=f"tiny:{name}",
+        prompt="remove the reflection",
+        panels=("T",),
+        alpha=alpha,
+    )
     backbone, _ = tiny(name, seed=1)
     load_lora(folder, backbone)
     return backbone
@@ -125,11 +132,14 @@ def test_each_style_predicts_as_in_stock_diffusers(name, style, tmp_path):
     ("prefix", "adapter"), [("base_model.model.", ""), ("", ".default"), ("transformer.", ".x")]
 )
 def test_the_styles_of_peft_predict_as_that_of_diffusers(prefix, adapter, tmp_path):
-    pairs = weights("kontext", original=False)
+    """peft also needs alpha. With the rank of the layer, it has no effect, as in diffusers."""
+    pairs = {name: pair for name, pair in weights("kontext", original=False).items() if len(pair[0]) == 2}
     predictions = []
+    alpha = None if prefix == "transformer." else 2
     for index, tensors in enumerate((peft(pairs, "transformer."), peft(pairs, prefix, adapter))):
         save_file(tensors, tmp_path / f"{index}.safetensors")
-        backbone = imported(tmp_path / f"{index}.safetensors", "kontext", tmp_path / str(index))
+        path, folder = tmp_path / f"{index}.safetensors", tmp_path / str(index)
+        backbone = imported(path, "kontext", folder, alpha if index else None)
         predictions.append(velocity(backbone, tiny("kontext", seed=1)[1]))
     assert torch.equal(*predictions)
 
@@ -218,6 +228,28 @@ def test_alphas_come_from_the_metadata_of_diffusers_and_the_settings_of_peft(tmp
             torch.testing.assert_close(tensors[f"transformer.{name}.lora_B.weight"], expected)
 
 
+@pytest.mark.parametrize("prefix", ["base_model.model.", ""])
+def test_a_lora_of_peft_without_its_settings_needs_its_alpha(prefix, tmp_path):
+    name, path = f"{BLOCK}attn.to_q", tmp_path / "adapter_model.safetensors"
+    pair, (backbone, _) = weights("qwen", original=False)[name], tiny("qwen", seed=1)
+    save_file({key: value.bfloat16() for key, value in peft({name: pair}, prefix).items()}, path)
+    with pytest.raises(
+        ModelError, match=r"no alpha for .*to_q; expected adapter_config\.json .*--alpha NUMBER"
+    ):
+        read_layers(path, backbone)
+    expected = 8 / len(pair[0]) * pair[1].bfloat16().float()
+    torch.testing.assert_close(read_layers(path, backbone, alpha=8)[name].up, expected)
+    (tmp_path / "adapter_config.json").write_text(json.dumps({"lora_alpha": 8}))
+    torch.testing.assert_close(read_layers(path, backbone)[name].up, expected)
+    with pytest.raises(ModelError, match=r"alpha = 4 was given for .*, which has its own alpha"):
+        read_layers(path, backbone, alpha=4)
+    path = tmp_path / "kohya" / "lora.safetensors"
+    path.parent.mkdir()
+    save_file(kohya({name: pair}), path)
+    with pytest.raises(ModelError, match="which has its own alpha"):
+        read_layers(path, backbone, alpha=4)
+
+
 def test_rank_stabilised_loras_have_their_own_scale():
     assert scaling_from_config({"lora_alpha": 8, "use_rslora": True})("x", 4) == 4
     assert scaling_from_config({"lora_alpha": 8})("x", 4) == 2
@@ -231,9 +263,15 @@ def test_rank_stabilised_loras_have_their_own_scale():
         ({"lora_unet_double_blocks_0_img_attn_qkv.lora_down.weight": torch.zeros(2, 32)}, "in the style of kohya, belongs to no layer of qwen"),
         ({"transformer.x.dora_scale": torch.zeros(2)}, "has DoRA matrices"),
         ({"lycoris_a.lokr_w1": torch.zeros(2)}, "has LoKr matrices"),
+        ({"diffusion_model.img_in.diff_b": torch.zeros(2)}, "has differences of whole weights .*use another file of this LoRA"),
+        ({f"base_model.model.{BLOCK}attn.to_q.lora_B.bias": torch.zeros(2)}, "has biases"),
+        ({f"{BLOCK}attn.to_q.lora.down.weight": torch.zeros(2, 32)}, "has keys of an old version of diffusers"),
+        ({f"{BLOCK}attn.processor.to_q_lora.up.weight": torch.zeros(32, 2)}, "has keys of an old version of diffusers"),
+        ({"double_blocks.0.processor.proj_lora1.down.weight": torch.zeros(2, 32)}, "has keys of XLabs"),
         ({"lora_te1_text_model.lora_down.weight": torch.zeros(2, 2)}, "also changes a text encoder"),
         ({f"transformer.{BLOCK}attn.to_q.lora_A.weight": torch.zeros(2, 32)}, "only one of two matrices"),
         ({"weight": torch.zeros(2)}, "in the style of unknown"),
+        ({"model.diffusion_model.x.lora_A.weight": torch.zeros(2, 32)}, "the key x of the LoRA, in the style of ComfyUI"),
         ({}, "contains no LoRA"),
         (
             {f"transformer.{BLOCK}attn.to_q.lora_A.weight": torch.zeros(2, 33), f"transformer.{BLOCK}attn.to_q.lora_B.weight": torch.zeros(32, 2)},
@@ -252,6 +290,27 @@ def test_what_is_not_understood_is_one_clear_sentence(tensors, message, tmp_path
             panels=("T",),
         )
     assert not (tmp_path / "out").exists()
+
+
+TO_Q, QKV = f"{BLOCK}attn.to_q", "double_blocks.0.img_attn.qkv"
+
+
+@pytest.mark.parametrize(
+    ("first", "second"),
+    [
+        ((TO_Q, "transformer.", ""), (TO_Q, "diffusion_model.", "")),
+        ((TO_Q, "transformer.", ""), (TO_Q.replace(".", "_"), "lora_transformer_", "")),
+        ((TO_Q, "transformer.", ""), (QKV, "diffusion_model.", "")),
+        ((TO_Q, "transformer.", ".first"), (TO_Q, "transformer.", ".second")),
+    ],
+)
+def test_a_layer_that_occurs_twice_is_refused(first, second):
+    transformer, tensors = tiny("kontext", seed=1)[0].transformer, {}
+    for name, prefix, adapter in (first, second):
+        pairs = weights("kontext", original=name == QKV)
+        tensors |= peft({name: pairs[QKV if name == QKV else TO_Q]}, prefix, adapter)
+    with pytest.raises(ModelError, match=r"more than one LoRA for the layer .*to_q"):
+        read_lora_layers(tensors, transformer, "kontext")
 
 
 def test_a_folder_must_contain_one_file_and_panels_need_t(tmp_path):
@@ -310,8 +369,14 @@ def test_a_lora_and_a_checkpoint_are_imported(run_without_model, tmp_path):
     arguments = ("models", "import", "lora.safetensors", "imported", "--base-model", "tiny:kontext")
     code, _, err = run_without_model(*arguments)
     assert (code, "A LoRA needs --prompt" in err) == (2, True)
-    code, _, err = run_without_model(*arguments, "--prompt", "remove the reflection", "--panels", "T,R")
+    code, _, err = run_without_model(
+        *arguments, "--prompt", "remove the reflection", "--panels", "T,R", "--alpha", "4"
+    )
     assert (code, "use it with: --model imported" in err) == (0, True)
+    (up,) = (
+        value for key, value in read_tensors(tmp_path / "imported" / LORA_FILE)[0].items() if "lora_B" in key
+    )
+    assert torch.equal(up, 4 / 2 * matrices["B"])
     assert read_lora_metadata(tmp_path / "imported").task.layout.panels == ("T", "R")
     (tmp_path / "model.pt").write_bytes(b"nothing")
     code, _, err = run_without_model("models", "import", "model.pt", "out")

@@ -47,7 +47,7 @@ def test_a_plan_requests_only_the_cache(tmp_path, monkeypatch):
     assert (source.trained_quantization, source.needs_text_encoders) == ("nf4", False)
     with pytest.raises(DownloadError, match="me/glass is not in the cache, and a plan downloads nothing"):
         find_model_source("me/glass", allow_download=False)
-    with pytest.raises(DownloadError, match=r"one of windowseat, kontext, klein, qwen;"):
+    with pytest.raises(ModelError, match=r"expected the folder that `brewster models import` writes"):
         find_model_source("gensirr", allow_download=False)
 
 

@@ -22,9 +22,15 @@ def test_a_misspelt_model_name_gets_a_suggestion():
         find_model("compct")
 
 
-def test_a_file_of_weights_is_refused_with_the_folder_to_pass():
-    with pytest.raises(ModelError, match=r"is a file of weights; .*--model out/kontext/lora"):
-        find_model("out/kontext/lora/pytorch_lora_weights.safetensors")
+def test_a_file_of_weights_is_refused_with_the_folder_to_pass_and_the_command_that_converts_it(tmp_path):
+    file = tmp_path / "glass.safetensors"
+    with pytest.raises(ModelError, match=r"there is no model .*glass"):
+        find_model(str(file))
+    file.touch()
+    with pytest.raises(
+        ModelError, match=f"is a file of weights; .*--model {tmp_path}; .*models import {file} "
+    ):
+        find_model(str(file))
 
 
 def test_a_damaged_file_is_refused(tmp_path):

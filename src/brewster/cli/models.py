@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 _JSON = click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 _NAME = click.argument("name", default="compact")
 _CARD_FILE = "README.md"
-_CHECKPOINT_SUFFIXES = (".pt", ".ckpt")
+_CHECKPOINT_SUFFIXES = (".pt", ".pth", ".ckpt")
 
 
 @click.group
@@ -81,6 +81,20 @@ def list_models(*, as_json: bool) -> None:
     help="For a LoRA: what it generates, separated by commas: T is the transmission, R the reflection, I the photo.",
 )
 @click.option(
+    "--alpha",
+    type=click.IntRange(min=1),
+    metavar="NUMBER",
+    help="For a LoRA of peft without its adapter_config.json: the value lora_alpha with which it was trained.",
+)
+@click.option(
+    "--short-side",
+    type=click.IntRange(min=16),
+    default=768,
+    show_default=True,
+    metavar="PIXELS",
+    help="For GenSIRR: the short side of its input. Its authors use 768 or 512, whichever is better on a data set.",
+)
+@click.option(
     "--device",
     type=click.Choice(["cpu", "cuda"]),
     default="cpu",
@@ -88,7 +102,15 @@ def list_models(*, as_json: bool) -> None:
     help="For a LoRA: the device that encodes the prompt.",
 )
 def import_model(
-    *, source: str, folder: Path, base_model: str, prompt: str | None, panels: str, device: str
+    *,
+    source: str,
+    folder: Path,
+    base_model: str,
+    prompt: str | None,
+    panels: str,
+    alpha: int | None,
+    short_side: int,
+    device: str,
 ) -> None:
     """Convert a model of another program to a FOLDER that --model opens.
 
@@ -100,14 +122,16 @@ def import_model(
     if Path(source).suffix in _CHECKPOINT_SUFFIXES:
         from brewster.models.diffusion import gensirr  # noqa: PLC0415  (imports torch)
 
-        gensirr.convert(Path(source), folder, base_model=base_model)
+        gensirr.convert(Path(source), folder, base_model=base_model, short_side_px=short_side)
     else:
         if not prompt:
             raise click.UsageError("A LoRA needs --prompt: the prompt with which it was trained.")
         from brewster.models.diffusion.adapter.importer import import_lora  # noqa: PLC0415  (imports torch)
 
         names = cast("tuple[Panel, ...]", tuple(panels.split(",")))
-        import_lora(source, folder, base_model=base_model, prompt=prompt, panels=names, device=device)
+        import_lora(
+            source, folder, base_model=base_model, prompt=prompt, panels=names, alpha=alpha, device=device
+        )
     print_status(f"{source} -> {folder}; use it with: --model {folder}")
 
 

@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Final, final
 
+from brewster.errors import ModelError
+
 _OPEN: Final = "no account needed"
 _GATED: Final = "gated: accept the licence on its page, then run `hf auth login`"
 
@@ -45,7 +47,7 @@ DIFFUSION_MODELS: Final = {
             "gensirr", "lime-j/GenSIRR", "none stated; its base: FLUX.1 [dev] Non-Commercial License",
             allows_commercial_use=False, download_gb=24, memory_gib=14, weight_format="int8",
             output="transmission; reflection derived",
-            access="download GenSIRR.pt, then run `brewster models import GenSIRR.pt FOLDER`",
+            access="run `hf download lime-j/GenSIRR GenSIRR.pt --local-dir .`, then `brewster models import GenSIRR.pt FOLDER`",
             base_model="black-forest-labs/FLUX.1-Kontext-dev", is_opened_by_name=False,
         ),
         DiffusionModel(
@@ -66,6 +68,21 @@ DIFFUSION_MODELS: Final = {
     )
 }  # fmt: skip
 """name -> model."""
+
+
+def check_is_converted(model: str) -> None:
+    """Checks that this is not the name or hub id of a published model that must be converted first.
+
+    Raises:
+        ModelError: it is. The message says how to get and convert the model.
+    """
+    for row in DIFFUSION_MODELS.values():
+        if model in (row.name, row.hub_id) and not row.is_opened_by_name:
+            raise ModelError(
+                f"{model} is a checkpoint of another program, which --model does not open",
+                "expected the folder that `brewster models import` writes",
+                row.access,
+            )
 
 
 def licence_of(hub_id: str) -> str:

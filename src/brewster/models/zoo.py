@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Final, final
 
 from brewster.errors import ModelError
-from brewster.models.diffusion_models import DIFFUSION_MODELS
+from brewster.models.diffusion_models import DIFFUSION_MODELS, check_is_converted
 
 _WEIGHTS: Final = Path(__file__).parent / "weights"
 
@@ -148,16 +148,18 @@ def find_model(name: str) -> ModelFile:
             "for the source of this model, run: brewster models list; for the card of a LoRA: brewster models card FOLDER",
         )
     path = Path(name)
-    if path.suffix == ".safetensors":
+    if path.suffix == ".safetensors" and path.is_file():
         raise ModelError(
             f"{name} is a file of weights",
             "expected an .onnx file, or the folder or hub id of a LoRA",
-            f"pass the folder of the LoRA, which also has its prompt: --model {path.parent}",
+            f"if brewster wrote it, pass its folder: --model {path.parent}; convert another LoRA with: "
+            f"brewster models import {name} FOLDER --base-model BASE --prompt TEXT",
         )
     if path.is_file():
         return ModelFile(path.stem, path, None, "unknown")
     if exported := _run_model(name):
         return ModelFile(path.resolve().name, exported, None, "unknown")
+    check_is_converted(name)
     close = difflib.get_close_matches(name, (*MODELS, *DIFFUSION_NAMES), n=1) if path.name == name else []
     raise ModelError(
         f"there is no model {name!r}",

@@ -9,7 +9,7 @@ import contextlib
 import shutil
 import sys
 from collections.abc import Iterator, Sequence
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any, Final
 
 from brewster.errors import DownloadError, ModelError
@@ -83,10 +83,10 @@ def find_weights_file(source: str, suffixes: tuple[str, ...], companions: Sequen
     """The file with the weights of a LoRA or a transformer, downloaded if it is on the hub.
 
     Args:
-        source: a file, a folder or hub id with one file that has such a suffix, or OWNER/NAME/FILE on the hub. Subfolders
-            are not searched.
+        source: a file, a folder or hub id with one file that has such a suffix, or OWNER/NAME/FILE on the hub, where FILE may
+            contain folders. Subfolders are not searched.
         suffixes: the possible suffixes.
-        companions: other files that are downloaded with it, if they exist.
+        companions: other files of the same folder that are downloaded with it, if they exist.
 
     Raises:
         ModelError: the file does not exist, the folder or repository does not have exactly one such file, or `source` is none
@@ -95,18 +95,23 @@ def find_weights_file(source: str, suffixes: tuple[str, ...], companions: Sequen
     """
     if Path(source).is_file():
         return Path(source)
-    repository, _, name = source.rpartition("/") if source.endswith(suffixes) else (source, "", "")
     expected = f"expected one {' or '.join(suffixes)} file"
-    if not repository:
-        raise ModelError(f"there is no file {source}", expected, "check the path")
+    repository, name = source, ""
+    if source.endswith(suffixes):
+        owner, _, rest = source.partition("/")
+        model, _, name = rest.partition("/")
+        if not (owner and name) or Path(source).parent.is_dir():
+            raise ModelError(f"there is no file {source}", expected, "check the path")
+        repository = f"{owner}/{model}"
     names = [name] if name else [each for each in list_root_files(source) if each.endswith(suffixes)]
     if len(names) != 1:
         raise ModelError(
             f"{source} contains {', '.join(names) or 'no such file'}",
             expected,
-            "pass the path of the file, or OWNER/NAME/FILE for a file on the hub",
+            "pass the path of the file, or OWNER/NAME/FILE for a file on the hub; FILE may contain folders",
         )
-    path = resolve_model_folder(repository, [*names, *companions]) / names[0]
+    companion_paths = [str(PurePosixPath(names[0]).with_name(each)) for each in companions]
+    path = resolve_model_folder(repository, [*names, *companion_paths]) / names[0]
     if not path.is_file():
         raise ModelError(f"{repository} contains no file {names[0]}", expected, "check the path")
     return path

@@ -7,12 +7,14 @@ source.base, source.backbone_class.name, source.task     # "Qwen/Qwen-Image-Edit
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, final
 
 from brewster.errors import DownloadError, ModelError
 from brewster.models.diffusion.adapter import windowseat
+from brewster.models.diffusion.adapter.importer import PEFT_CONFIG_FILE
 from brewster.models.diffusion.adapter.layouts import LAYOUTS, LoraLayout, layout_of
 from brewster.models.diffusion.adapter.lora import LORA_FILE, LoraMetadata
 from brewster.models.diffusion.backbones.backbone import Backbone
@@ -23,11 +25,15 @@ from brewster.models.diffusion.backbones.registry import (
     is_registered,
     read_index,
 )
-from brewster.models.diffusion.hub_download import cached_model_folder, resolve_model_folder
+from brewster.models.diffusion.hub_download import (
+    cached_model_folder,
+    list_root_files,
+    resolve_model_folder,
+)
 from brewster.models.diffusion.panels import PanelLayout
 from brewster.models.diffusion.prompt import PROMPT_FILE
 from brewster.models.diffusion.task import TASK_FILE, DecompositionTask, load_task
-from brewster.models.diffusion_models import DIFFUSION_MODELS
+from brewster.models.diffusion_models import DIFFUSION_MODELS, check_is_converted
 from brewster.models.zoo import TINY_PREFIX
 from brewster.options import Quantization
 
@@ -100,7 +106,9 @@ def find_model_source(
         _check_no_base(model, base_model)
         return ModelSource(model, find_backbone_class(model.removeprefix(TINY_PREFIX)), _default_task())
     row = DIFFUSION_MODELS.get(model)
-    source = row.hub_id if row else model
+    source = row.hub_id if row and row.is_opened_by_name else model
+    if not Path(source).is_dir():
+        check_is_converted(source)
     folder = resolve_model_folder(source, _FILES) if allow_download else cached_model_folder(source, _FILES)
     if folder is None:
         return _published_source(model, base_model)
@@ -118,16 +126,28 @@ def find_model_source(
             metadata=metadata,
         )
     if not (folder / INDEX_FILE).is_file():
-        raise ModelError(
-            f"{model} contains no model",
-            f"expected a LoRA ({LORA_FILE}) or a backbone in diffusers' layout ({INDEX_FILE})",
-            "pass the folder lora/ that brewster train wrote, or convert a LoRA with: brewster models import",
-        )
+        raise _unknown_layout(model, list_root_files(source if allow_download else str(folder)))
     _check_no_base(model, base_model)
     path = folder / TASK_FILE
     task = load_task(path) if path.is_file() else _default_task()
     has_prompt = (folder / PROMPT_FILE).is_file()
     return ModelSource(source, read_index(folder)[0], task, has_prompt=has_prompt, folder=folder)
+
+
+def _unknown_layout(model: str, files: Sequence[str]) -> ModelError:
+    """The error for a folder that is neither a LoRA nor a backbone. `files` are the names of its files."""
+    expected = f"expected a LoRA ({LORA_FILE}) or a backbone in diffusers' layout ({INDEX_FILE})"
+    weights = [name for name in files if name.endswith(".safetensors")]
+    if not weights:
+        return ModelError(
+            f"{model} contains no model", expected, "pass the folder lora/ that brewster train wrote"
+        )
+    layout = "the layout of peft" if PEFT_CONFIG_FILE in files else "an unknown layout"
+    return ModelError(
+        f"{model} contains {', '.join(weights)}, in {layout}",
+        expected,
+        f"if it is a LoRA, convert it with: brewster models import {model} FOLDER --base-model BASE --prompt TEXT",
+    )
 
 
 def _default_task() -> DecompositionTask:
@@ -137,7 +157,7 @@ def _default_task() -> DecompositionTask:
 def _published_source(model: str, base_model: str | None) -> ModelSource:
     """Returns the source of WindowSeat without a download, for `--plan`."""
     row = DIFFUSION_MODELS.get(model)
-    if row is None or row.base_model is None or not row.is_opened_by_name:
+    if row is None or row.base_model is None:
         names = [name for name, each in DIFFUSION_MODELS.items() if each.is_opened_by_name]
         raise DownloadError(
             f"{model} is not in the cache, and a plan downloads nothing",

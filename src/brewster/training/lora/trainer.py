@@ -94,13 +94,22 @@ class LoraTrainer:
         self._samples.check_sizes(recipe, self._backbone_class.size_divisor)
         self._validation_samples = _read_validation_samples(recipe, self._samples)
         _check_optimizer(recipe, self._device)
-        check_machine(
-            recipe.backbone,
-            self._backbone_class,
-            Placement(self._device, recipe.quantization),
-            requested=device,
-            with_text_encoders=not recipe.prompt.endswith(ENCODED_SUFFIX),
-        )
+        try:
+            check_machine(
+                recipe.backbone,
+                self._backbone_class,
+                Placement(self._device, recipe.quantization),
+                requested=device,
+                with_text_encoders=not recipe.prompt.endswith(ENCODED_SUFFIX),
+            )
+        except DeviceError as error:
+            if self._device != "cpu" or device == "cpu":
+                raise
+            raise DeviceError(
+                error.happened,
+                "expected an NVIDIA or AMD GPU, because training takes weeks on a CPU",
+                "train on a machine with a GPU, or choose --device cpu explicitly",
+            ) from error
         self._prompt: PromptEmbedding | None = None
 
     @cached_property

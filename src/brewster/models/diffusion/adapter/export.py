@@ -13,12 +13,17 @@ from typing import Final
 import torch
 from torch import Tensor, nn
 
-from brewster.errors import ModelError, OutputError
+from brewster.errors import DeviceError, ModelError, OutputError
 from brewster.models.diffusion.adapter.lora import read_lora, read_prompt
 from brewster.models.diffusion.adapter.lora_formats import DOWN_SUFFIX, UP_SUFFIX, adapted_layers
 from brewster.models.diffusion.backbones.backbone import Backbone
 from brewster.models.diffusion.backbones.loading import load_backbone
+from brewster.models.diffusion.backbones.registry import backbone_class_of
+from brewster.models.diffusion.hub_download import free_disk_bytes
+from brewster.models.diffusion.lazy_imports import import_library
+from brewster.models.diffusion.memory import GIB, VAE_PARAMETERS, count_weights, weights_gib
 from brewster.models.diffusion.prompt import PROMPT_FILE
+from brewster.models.diffusion.task import TASK_FILE, save_task
 from brewster.models.diffusion.tensors import write_tensors
 
 _PREFIX: Final = "transformer."
@@ -48,8 +53,8 @@ def export_comfyui(folder: Path, target: Path) -> None:
 def export_merged(folder: Path, target: Path, base_model: str | None = None) -> None:
     """Adds the LoRA to the weights of its base, and writes the result as a folder in diffusers' layout, in bfloat16.
 
-    The sums are computed in float32 on the CPU. The folder also gets the encoded prompt, but no text encoders. The folder is
-    for programs that cannot load a LoRA. For brewster use the LoRA, because its metadata contain the panels.
+    The sums are computed in float32 on the CPU. The folder also gets the encoded prompt and the task, but no text encoders.
+    It is for programs that cannot load a LoRA; `load_pipeline` opens it, too.
 
     Args:
         folder: the folder of the LoRA.
@@ -59,21 +64,26 @@ def export_merged(folder: Path, target: Path, base_model: str | None = None) -> 
     Raises:
         ModelError: the LoRA or its base is missing or damaged, or they do not match.
         DownloadError: the base cannot be downloaded.
-        OutputError: `target` exists or cannot be written.
+        DeviceError: the free memory is too small.
+        OutputError: `target` exists or cannot be written, or its disk is too small.
     """
     _check_target(target)
     state, metadata = read_lora(folder)
     prompt = read_prompt(folder, metadata)
-    backbone = load_backbone(base_model or metadata.base_model, dtype=torch.bfloat16)
-    if backbone.name != metadata.backbone:
+    base = base_model or metadata.base_model
+    backbone_class = backbone_class_of(base)
+    if backbone_class.name != metadata.backbone:
         raise ModelError(
             f"{folder} is a LoRA of {metadata.backbone}",
-            f"expected a base of {metadata.backbone}, not of {backbone.name}",
+            f"expected a base of {metadata.backbone}, not of {backbone_class.name}",
             "choose another base",
         )
+    _check_space(base, count_weights(base, backbone_class) + VAE_PARAMETERS, target)
+    backbone = load_backbone(base, dtype=torch.bfloat16)
     merge(backbone, state, 1.0 if metadata.imported else metadata.alpha / metadata.rank)
     backbone.save(target)
     prompt.save(target / PROMPT_FILE)
+    save_task(metadata.task, target / TASK_FILE)
 
 
 @torch.no_grad()
@@ -95,6 +105,25 @@ def merge(backbone: Backbone, state: Mapping[str, Tensor], scale: float) -> None
         weight = backbone.transformer.get_submodule(layer).weight
         change = scale * state[layer + UP_SUFFIX].float() @ state[layer + DOWN_SUFFIX].float()
         weight.copy_(weight.float() + change.to(weight.device))
+
+
+def _check_space(base: str, parameters: int, target: Path) -> None:
+    """Checks the host memory and the disk of `target` for this number of parameters in bfloat16."""
+    needed = weights_gib(parameters, None)
+    memory = import_library("psutil").virtual_memory().available / GIB
+    if needed > memory:
+        raise DeviceError(
+            f"{base} needs about {needed:.1f} GiB of host memory, and {memory:.1f} GiB are free",
+            "expected enough memory for all weights in bfloat16",
+            "close other programs, or export on another machine",
+        )
+    disk = free_disk_bytes(target) / GIB
+    if needed > disk:
+        raise OutputError(
+            f"{target} needs about {needed:.1f} GiB on the disk, and {disk:.1f} GiB are free",
+            "expected enough free disk for all weights in bfloat16",
+            "free disk space, or choose a folder on a larger disk",
+        )
 
 
 def _check_target(target: Path) -> None:

@@ -2,8 +2,8 @@
 
     import_lora("someone/glass-lora", Path("glass"), base_model="kontext", prompt="remove the reflection", panels=("T",))
 
-The file of a LoRA contains neither its base model nor its prompt nor its panels, so the user states them. The prompt is
-encoded once, during the import. The names and shapes of the layers are compared with the configuration of the base model; its weights are not
+The file of a LoRA contains neither its base model nor its prompt nor its panels, so the user states them. peft stores alpha in
+another file; without it, the user also states alpha. The prompt is encoded once, during the import. The names and shapes of the layers are compared with the configuration of the base model; its weights are not
 loaded.
 """
 
@@ -19,6 +19,8 @@ from brewster.models.diffusion.adapter.lora import LoraMetadata, save_layers
 from brewster.models.diffusion.adapter.lora_formats import (
     LowRankLayer,
     ScalingFunction,
+    has_alphas,
+    lora_format,
     read_lora_layers,
     scaling_from_config,
 )
@@ -31,7 +33,8 @@ from brewster.models.diffusion.prompt import PROMPTS
 from brewster.models.diffusion.task import DecompositionTask
 from brewster.models.diffusion.tensors import read_json, read_tensors
 
-_PEFT_CONFIG_FILE: Final = "adapter_config.json"
+PEFT_CONFIG_FILE: Final = "adapter_config.json"
+"""The file with peft's settings of a LoRA, next to its weights."""
 _DIFFUSERS_KEY: Final = "lora_adapter_metadata"
 _PREFIX: Final = "transformer."
 
@@ -43,6 +46,7 @@ def import_lora(
     base_model: str,
     prompt: str,
     panels: tuple[Panel, ...],
+    alpha: int | None = None,
     device: str = "cpu",
 ) -> LoraMetadata:
     """Reads the LoRA, encodes the prompt, and writes the folder.
@@ -53,20 +57,22 @@ def import_lora(
         base_model: the base model of the LoRA: a name in `BACKBONES`, a folder or a hub id.
         prompt: a name in `PROMPTS`, or the text itself.
         panels: the panels that the LoRA generates from the photo.
+        alpha: see `read_layers`.
         device: the device that encodes the prompt.
 
     Returns:
         The metadata of the written LoRA.
 
     Raises:
-        ModelError: there is no LoRA, or a key or shape does not belong to the base model; the message names the key style.
+        ModelError: there is no LoRA, or a key or shape does not belong to the base model (the message names the key style), or
+            alpha is missing or given twice.
         RecipeError: the panels do not contain T, or are repeated.
         DownloadError, DeviceError, MissingExtra: see `encode_prompt`.
         OutputError: the folder cannot be written.
     """
     task = DecompositionTask(PanelLayout(panels))
     base = build_on_meta(base_model)
-    layers = read_layers(find_lora_file(source), base)
+    layers = read_layers(find_lora_file(source), base, alpha)
     embedding = encode_prompt(base_model, PROMPTS.get(prompt, prompt), device=device)
     rank = max(layer.rank for layer in layers.values())
     written = LoraMetadata(base.name, base_model, None, rank, rank, task, embedding.sha256, imported=True)
@@ -76,17 +82,39 @@ def import_lora(
 
 def find_lora_file(source: str) -> Path:
     """The file with the weights of a LoRA, see `find_weights_file`."""
-    return find_weights_file(source, (".safetensors",), companions=[_PEFT_CONFIG_FILE])
+    return find_weights_file(source, (".safetensors",), companions=[PEFT_CONFIG_FILE])
 
 
-def read_layers(path: Path, base: Backbone) -> dict[str, LowRankLayer]:
+def read_layers(path: Path, base: Backbone, alpha: int | None = None) -> dict[str, LowRankLayer]:
     """The layers of the LoRA in a file, see `read_lora_layers`. The base must have no LoRA; it may be on the device "meta".
 
+    `alpha` is that of all layers, for a LoRA of peft without its adapter_config.json.
+
     Raises:
-        ModelError: the file is missing or damaged, or a key or shape does not belong to the base.
+        ModelError: the file is missing or damaged, a key or shape does not belong to the base, a LoRA of peft has no alpha,
+            or alpha is given for a LoRA that has its own.
     """
     tensors, metadata = read_tensors(path)
-    return read_lora_layers(tensors, base.transformer, base.name, _scale(path, metadata))
+    scale = _scale(path, metadata)
+    if alpha is not None:
+        if scale or has_alphas(tensors):
+            raise ModelError(
+                f"alpha = {alpha} was given for {path}, which has its own alpha",
+                "expected alpha only for a LoRA without one",
+                "leave alpha out",
+            )
+        scale = scaling_from_config({"lora_alpha": alpha})
+    elif scale is None and lora_format(tensors) == "peft":
+        scale = _refuse_unknown_alpha
+    return read_lora_layers(tensors, base.transformer, base.name, scale)
+
+
+def _refuse_unknown_alpha(name: str, rank: int) -> float:  # noqa: ARG001  (a ScalingFunction)
+    raise ModelError(
+        f"the LoRA has no alpha for {name}",
+        f"expected {PEFT_CONFIG_FILE} next to the file, where peft stores alpha",
+        f"copy {PEFT_CONFIG_FILE} into its folder, or state alpha: brewster models import --alpha NUMBER",
+    )
 
 
 def _scale(path: Path, metadata: Mapping[str, str]) -> ScalingFunction | None:
@@ -94,7 +122,7 @@ def _scale(path: Path, metadata: Mapping[str, str]) -> ScalingFunction | None:
 
     Returns None if there are no settings.
     """
-    config = path.with_name(_PEFT_CONFIG_FILE)
+    config = path.with_name(PEFT_CONFIG_FILE)
     if _DIFFUSERS_KEY not in metadata:
         return scaling_from_config(read_json(config)) if config.is_file() else None
     try:

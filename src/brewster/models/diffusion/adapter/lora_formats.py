@@ -40,7 +40,16 @@ UP_SUFFIX: Final = ".lora_B.weight"
 """The suffixes of the keys of a layer's two matrices in a state dict of brewster, peft and diffusers."""
 _DOWN: Final = ("lora_A", "lora_down")
 _TEXT_ENCODERS: Final = ("lora_te", "text_encoder", "te1_", "te2_")
-_OTHER_METHODS: Final = {"dora_scale": "DoRA", "lora_magnitude": "DoRA", "lokr_": "LoKr", "hada_": "LoHa"}
+_UNSUPPORTED: Final = {
+    r"dora_scale|lora_magnitude": "DoRA matrices",
+    r"lokr_": "LoKr matrices",
+    r"hada_": "LoHa matrices",
+    r"\.diff(_b)?$": "differences of whole weights",
+    r"\.bias$": "biases",
+    r"\.processor\.(qkv|proj)_lora": "keys of XLabs",
+    r"lora\.(down|up)\.": "keys of an old version of diffusers",
+}
+"""Regular expression for a part of a key -> what a file with this key contains."""
 
 _STREAM_NAMES: Final = {
     "img_attn.qkv": ("attn.to_q", "attn.to_k", "attn.to_v"),
@@ -123,11 +132,11 @@ def read_lora_layers(
         tensors: the content of the file. Its alphas have precedence over `scale`.
         transformer: the transformer of the base; only names and shapes are read, so it may be on the device "meta".
         backbone: the name of the backbone.
-        scale: alpha / rank, for files without alphas; by default 1.
+        scale: alpha / rank, for files without alphas; by default 1, as in diffusers, sd-scripts and ComfyUI.
 
     Raises:
-        ModelError: a key is not understood, a matrix is missing, or a layer or shape is not that of the transformer.
-            The message names the style of the keys.
+        ModelError: a key is not understood, a matrix is missing, a layer occurs twice, or a layer or shape is not that of the
+            transformer. The message names the style of the keys.
     """
     matrices, alphas = _parse(tensors, backbone)
     targets = _layer_names(transformer, backbone)
@@ -142,7 +151,10 @@ def read_lora_layers(
         rank = len(pair["down"])
         factor = alphas[name] / rank if name in alphas else scale(name, rank) if scale else 1.0
         layer = LowRankLayer(pair["down"].float(), pair["up"].float() * factor)
-        layers |= _split(name, layer, targets[name], transformer)
+        parts = _split(name, layer, targets[name], transformer)
+        if repeated := sorted(parts.keys() & layers.keys()):
+            raise _repeated(repeated[0])
+        layers |= parts
     return layers
 
 
@@ -157,6 +169,11 @@ def to_state_dict(layers: Mapping[str, LowRankLayer]) -> dict[str, Tensor]:
     for name, layer in sorted(layers.items()):
         state |= {name + DOWN_SUFFIX: layer.down, name + UP_SUFFIX: layer.up}
     return state
+
+
+def has_alphas(tensors: Mapping[str, Tensor]) -> bool:
+    """Whether a LoRA file has the alpha of a layer, as those of sd-scripts do."""
+    return any(key.endswith(".alpha") for key in tensors)
 
 
 def lora_format(tensors: Mapping[str, Tensor]) -> str:
@@ -178,11 +195,13 @@ def _parse(
         match = _KEY.fullmatch(key)
         if not match:
             raise _unknown(key, tensors, backbone)
-        name = _without_prefix(match["module"])
+        name, part = _without_prefix(match["module"]), "down" if match["matrix"] in _DOWN else "up"
+        if name in alphas if match["alpha"] else part in matrices.get(name, {}):
+            raise _repeated(name)
         if match["alpha"]:
             alphas[name] = float(tensor)
         else:
-            matrices.setdefault(name, {})["down" if match["matrix"] in _DOWN else "up"] = tensor
+            matrices.setdefault(name, {})[part] = tensor
     if unused := sorted(alphas.keys() - matrices.keys()):
         raise _unknown(f"{unused[0]}.alpha", tensors, backbone)
     if not matrices:
@@ -257,15 +276,23 @@ def check_shape(name: str, layer: LowRankLayer, module: Any) -> None:  # noqa: A
         )
 
 
+def _repeated(layer: str) -> ModelError:
+    return ModelError(
+        f"the file has more than one LoRA for the layer {layer}",
+        "expected each layer once",
+        "use a file with one LoRA, in one style of keys",
+    )
+
+
 def _unknown(key: str, tensors: Mapping[str, Tensor], backbone: str) -> ModelError:
     style = lora_format(tensors)
-    method = next(
-        (method for part, method in _OTHER_METHODS.items() if any(part in name for name in tensors)), ""
-    )
-    if method:
-        return ModelError(
-            f"the file has {method} matrices ({key})", "expected a LoRA", "use a LoRA without this method"
-        )
+    for pattern, kind in _UNSUPPORTED.items():
+        if found := next((name for name in tensors if re.search(pattern, name)), ""):
+            return ModelError(
+                f"the file has {kind} ({found})",
+                "expected only LoRA matrices, with the keys of peft, diffusers, sd-scripts or ComfyUI",
+                "use another file of this LoRA, or another LoRA",
+            )
     if key.startswith(_TEXT_ENCODERS):
         return ModelError(
             f"the LoRA also changes a text encoder ({key})",
