@@ -4,6 +4,7 @@ import gc
 import importlib.util
 import json
 import shutil
+import sys
 from types import SimpleNamespace
 
 import huggingface_hub
@@ -13,7 +14,7 @@ import torch
 import transformers
 from tokenizers.pre_tokenizers import ByteLevel
 
-from brewster.errors import DeviceError, DownloadError, ModelError
+from brewster.errors import DeviceError, DownloadError, MissingExtra, ModelError
 from brewster.models.diffusion import lazy_imports
 from brewster.models.diffusion.adapter.lora import add_lora
 from brewster.models.diffusion.backbones import loading
@@ -285,6 +286,28 @@ def test_the_quantization_is_chosen_by_the_memory_of_the_gpu(monkeypatch):
     assert place("klein", 24) == (None, False)
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
     assert place("kontext", 12) == ("int8", True)
+
+
+@pytest.mark.parametrize(("memory", "is_offloaded"), [(12, True), (16, True), (24, False), (80, False)])
+def test_without_bitsandbytes_int8_replaces_nf4(monkeypatch, memory, is_offloaded):
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    assert place("qwen", memory, preferred="nf4") == ("int8", is_offloaded)
+    assert place("qwen", memory, preferred="nf4", offload="none") == ("int8", False)
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: object())
+    assert place("qwen", 24, preferred="nf4") == ("nf4", False)
+
+
+def test_nf4_without_bitsandbytes_is_refused_before_any_download(machine, monkeypatch):
+    monkeypatch.setitem(sys.modules, "bitsandbytes", None)
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(huggingface_hub, "snapshot_download", lambda *_, **__: pytest.fail("downloaded"))
+    cure = (
+        r"bitsandbytes cannot be imported .*; run: pip install bitsandbytes, or choose the quantization int8"
+    )
+    with pytest.raises(MissingExtra, match=cure):
+        check_machine("qwen", BACKBONES["qwen"], Placement("cuda", "nf4"), requested="auto")
+    with pytest.raises(MissingExtra, match=cure):
+        load_backbone("qwen", device="cuda", quantization="nf4")
 
 
 def test_the_weights_are_offloaded_only_if_they_do_not_fit_or_on_request(monkeypatch):

@@ -18,7 +18,7 @@ from brewster.errors import DeviceError, DownloadError
 from brewster.models.diffusion.backbones.backbone import Backbone
 from brewster.models.diffusion.backbones.registry import hub_id_of
 from brewster.models.diffusion.hub_download import free_disk_bytes, is_transformer_cached
-from brewster.models.diffusion.lazy_imports import import_library
+from brewster.models.diffusion.lazy_imports import import_bitsandbytes, import_library
 from brewster.models.zoo import TINY_PREFIX
 from brewster.options import Offload, Quantization
 
@@ -172,9 +172,10 @@ def place_on_gpu(
 ) -> Placement:
     """The placement on a GPU with this memory.
 
-    If no quantization is given, it is the first of (`preferred`, int8, nf4) with which the weights fit into the GPU; nf4 only if
-    bitsandbytes is installed. The total memory decides, not the free one: the same machine always gives the same
-    result. If none fits, or the weights are offloaded on request, it is `preferred`, or int8 instead of nf4.
+    If no quantization is given, it is the first of (`preferred`, int8, nf4) with which the weights fit into the GPU. The
+    total memory decides, not the free one: the same machine always gives the same result. If none fits, or the weights
+    are offloaded on request, it is `preferred`. Int8 replaces nf4 if bitsandbytes is not installed, or the weights are
+    offloaded.
 
     Weights in a single file stay as they are. With `offload` "auto", the weights are offloaded if they do not fit into the free memory.
 
@@ -188,12 +189,15 @@ def place_on_gpu(
             "use --quantization int8, or leave offload out",
         )
     movable: Quantization | None = "int8" if preferred == "nf4" else preferred
+    has_nf4 = importlib.util.find_spec("bitsandbytes") is not None
+    if not has_nf4:
+        preferred = movable
     chosen = quantization
     if quantization is None and offload == "layers" and not is_single_file:
         chosen = movable
     elif quantization is None and not is_single_file:
         candidates: list[Quantization | None] = [preferred, "int8"]
-        if importlib.util.find_spec("bitsandbytes"):
+        if has_nf4:
             candidates.append("nf4")
         fitting = fitting_quantizations(weights, total_gib - INFERENCE_OVERHEAD_GIB, candidates)
         fallback = preferred if offload == "none" else movable or "int8"
@@ -226,6 +230,7 @@ def check_machine(
     Raises:
         DeviceError: there is no GPU and the CPU was not chosen explicitly, or the free memory is too small.
         DownloadError: the free disk is too small.
+        MissingExtra: the weights will be stored in nf4, and bitsandbytes is not installed.
     """
     weights = count_weights(source, backbone_class, transformer_file)
     if weights < _MIN_LARGE:
@@ -237,6 +242,8 @@ def check_machine(
             "use the model compact, or choose --device cpu explicitly",
         )
     _check_memory(source, weights, placement)
+    if placement.quantization == "nf4" and placement.device != "cpu":
+        import_bitsandbytes()
     hub_id = hub_id_of(source)
     if not transformer_file and not Path(source).is_dir() and not is_transformer_cached(hub_id):
         _check_disk(

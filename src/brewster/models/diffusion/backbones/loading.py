@@ -35,6 +35,7 @@ from brewster.models.diffusion.hub_download import resolve_model_folder
 from brewster.models.diffusion.lazy_imports import (
     diffusers_class,
     disable_progress_bars_in_pipes,
+    import_bitsandbytes,
     import_library,
 )
 from brewster.models.diffusion.out_of_memory import explain_out_of_memory
@@ -259,7 +260,7 @@ def _quantization_options(quantization: str, device: str) -> dict[str, Any]:
             raise DeviceError(
                 f"nf4 does not run on {device}", "expected an NVIDIA GPU", 'use quantization="int8"'
             )
-        import_library("bitsandbytes")
+        import_bitsandbytes()
         config = diffusers_class("BitsAndBytesConfig")(
             load_in_4bit=True, bnb_4bit_quant_type="nf4", bnb_4bit_compute_dtype=torch.bfloat16
         )
