@@ -42,7 +42,7 @@ from brewster.models.diffusion.memory import (
 from brewster.models.diffusion.model_source import find_model_source
 from brewster.models.diffusion.offloading import DECODING_BYTES_PER_PIXEL
 from brewster.models.diffusion.panels import count_tokens
-from brewster.models.diffusion.pipeline import DecompositionPipeline, task_with_guidance
+from brewster.models.diffusion.pipeline import DecompositionPipeline, task_with_options
 from brewster.models.diffusion.task import DecompositionTask
 from brewster.models.diffusion_models import licence_of
 from brewster.models.zoo import TINY_PREFIX, check_diffusion_model
@@ -134,7 +134,12 @@ def plan_separation(options: Options, size: tuple[int, int], card: GraphicsCard)
     source = find_model_source(options.model, options.base_model, allow_download=False)
     is_known = is_registered(source.base) or Path(source.base).is_dir()
     backbone = build_on_meta(source.base if is_known else source.backbone_class.name, dtype=torch.bfloat16)
-    task = task_with_guidance(source, options.guidance, has_few_step_lora=options.fast_lora is not None)
+    task = task_with_options(
+        source,
+        guidance=options.guidance,
+        timestep_shift=options.timestep_shift,
+        has_few_step_lora=options.fast_lora is not None,
+    )
     prompt = backbone.random_prompt(backbone.transformer, 0)
     predictor = DiffusionPredictor(
         DecompositionPipeline(backbone, prompt, task),
