@@ -1,5 +1,7 @@
 """The plan of a separation: the numbers of the estimates for training, and of the pipeline that it plans."""
 
+import importlib.util
+
 import huggingface_hub
 import numpy as np
 import pytest
@@ -63,11 +65,20 @@ def test_the_plan_of_the_papers_lora_has_the_known_numbers(lora):
         plan_separation(Options(model=lora, offload="none"), (4096, 4096), CARDS["RTX 4060"]).check_fits()
 
 
-def test_windowseat_is_planned_before_its_download():
+@pytest.mark.parametrize(("has_bitsandbytes", "quantization"), [(True, "nf4"), (False, "int8")])
+def test_windowseat_is_planned_before_its_download(monkeypatch, has_bitsandbytes, quantization):
+    find_spec = importlib.util.find_spec
+    monkeypatch.setattr(
+        importlib.util,
+        "find_spec",
+        lambda name, *package: (
+            (has_bitsandbytes or None) if name == "bitsandbytes" else find_spec(name, *package)
+        ),
+    )
     plan = plan_separation(Options(model="windowseat"), (1600, 800), CARD)
     assert set(plan.panels) == {(768, 768)}
     assert plan.passes == len(plan.panels) == 3
-    assert (plan.placement.quantization, plan.text_encoder_gb) == ("nf4", 0)
+    assert (plan.placement.quantization, plan.text_encoder_gb) == (quantization, 0)
     assert plan.download_gb == pytest.approx(41, abs=0.5)
     assert plan.licence == "Apache-2.0"
 
