@@ -1,5 +1,6 @@
 """The table of diffusion backbones: loading of tiny versions from folders, and all errors for damaged or wrong folders."""
 
+import functools
 import gc
 import importlib.util
 import json
@@ -336,10 +337,21 @@ def test_an_offloaded_base_needs_host_memory_instead_of_gpu_memory(machine, monk
     with pytest.raises(DeviceError, match=r"about 14\.\d GiB of memory on cuda, and 5\.0"):
         check_machine("kontext", KONTEXT, Placement("cuda", "int8"), requested="auto")
     machine["memory"] = 12
-    with pytest.raises(
-        DeviceError, match=r"about 13\.\d GiB of memory in host memory, because it is offloaded"
-    ):
+    with pytest.raises(DeviceError, match=r"about 13\.\d GiB of host memory, because it is offloaded"):
         check_machine("kontext", KONTEXT, offloaded, requested="auto")
+
+
+def test_text_encoders_need_host_memory(machine, monkeypatch):
+    monkeypatch.setattr(torch.cuda, "mem_get_info", lambda device: [80 << 30] * 2)
+    machine["memory"] = 15
+    check = functools.partial(check_machine, placement=Placement("cuda"), requested="auto")
+    check("qwen", BACKBONES["qwen"])
+    check("kontext", KONTEXT, with_text_encoders=True)
+    with pytest.raises(
+        DeviceError,
+        match=r"qwen needs about 17\.4 GiB of host memory, because its text encoders .* 15\.0 GiB",
+    ):
+        check("qwen", BACKBONES["qwen"], with_text_encoders=True)
 
 
 def test_memory_and_disk_are_checked_before_the_download(machine):

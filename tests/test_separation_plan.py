@@ -54,6 +54,7 @@ def test_the_plan_of_the_papers_lora_has_the_known_numbers(lora):
         f"{plan.seconds:.1f} s (estimate)",
     ):
         assert text in plan.table()
+    assert "host memory             0.0 GiB for the weights" in plan.table()
     small = plan_separation(Options(model=lora, steps=4), (4096, 4096), CARDS["RTX 4060"])
     assert small.placement.is_offloaded
     assert small.total_gib < 8
@@ -81,6 +82,14 @@ def test_windowseat_is_planned_before_its_download(monkeypatch, has_bitsandbytes
     assert (plan.placement.quantization, plan.text_encoder_gb) == (quantization, 0)
     assert plan.download_gb == pytest.approx(41, abs=0.5)
     assert plan.licence == "Apache-2.0"
+
+
+def test_the_plan_counts_the_text_encoders():
+    plan = plan_separation(Options(model="kontext"), (512, 512), CARD)
+    assert "host memory             9.1 GiB while the text encoders encode the prompt" in plan.table()
+    assert plan.text_encoder_gb == pytest.approx(9.8, abs=0.1)
+    offloaded = plan_separation(Options(model="kontext", offload="layers"), (512, 512), CARD)
+    assert "host memory             22.2 GiB for the weights" in offloaded.table()
 
 
 @pytest.mark.parametrize("quality", ["draft", "standard"])

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Final, final
 import torch
 from torch import Tensor
 
-from brewster.errors import ModelError
+from brewster.errors import DownloadError, ModelError
 from brewster.models.diffusion.adapter.importer import find_lora_file, read_layers
 from brewster.models.diffusion.adapter.stacking import stack_layers
 from brewster.models.diffusion.backbones.backbone import Backbone
@@ -26,6 +26,7 @@ from brewster.models.diffusion.backbones.loading import encode_prompt, load_back
 from brewster.models.diffusion.hub_download import find_weights_file
 from brewster.models.diffusion.memory import (
     Placement,
+    check_device,
     check_machine,
     choose_placement,
     count_weights,
@@ -183,7 +184,14 @@ def load_pipeline(
             what to change.
         MissingExtra: diffusers, torchao or bitsandbytes is not installed.
     """
-    torch_device(device)
+    _check_before_download(
+        model,
+        base_model,
+        device=device,
+        quantization=quantization,
+        offload=offload,
+        has_transformer_file=transformer is not None,
+    )
     source = find_model_source(model, base_model)
     for option, value in {"few-step LoRA": fast_lora, "timestep shift": timestep_shift}.items():
         if value is not None:
@@ -252,6 +260,36 @@ def _digest(source: ModelSource, quantization: str | None, text: str, changes: M
         parts.append(text)
     parts += [f"{name} {value}" for name, value in changes.items() if value is not None]
     return hashlib.sha256("\0".join(parts).encode()).hexdigest()
+
+
+def _check_before_download(
+    model: str,
+    base_model: str | None,
+    *,
+    device: str,
+    quantization: Quantization | None,
+    offload: Offload,
+    has_transformer_file: bool,
+) -> None:
+    """Checks the machine before the files of a LoRA are downloaded, if its base is known without them.
+
+    The memory for the text encoders is checked later, because the files of the model show whether its prompt is stored. If
+    the transformer is in a file, only the device is checked, because the size of a file on the hub is not known.
+
+    Raises:
+        DeviceError, DownloadError, MissingExtra: see `check_machine`.
+    """
+    chosen_device = torch_device(device)
+    try:
+        source = find_model_source(model, base_model, allow_download=False)
+    except (DownloadError, ModelError):
+        return  # files are missing or damaged: `load_pipeline` downloads them, or reports the error
+    if has_transformer_file:
+        weights = count_weights(source.base, source.backbone_class)
+        check_device(source.base, weights, chosen_device, requested=device)
+        return
+    placement = _choose_placement(source, device, quantization, offload, None)
+    check_machine(source.base, source.backbone_class, placement, requested=device)
 
 
 def _choose_placement(
