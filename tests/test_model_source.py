@@ -1,6 +1,6 @@
 """What a value of --model is, and how often its files are requested."""
 
-import huggingface_hub
+import huggingface_hub.constants
 import pytest
 
 from brewster.errors import DeviceError, DownloadError, ModelError
