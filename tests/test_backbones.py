@@ -2,11 +2,12 @@
 
 import functools
 import gc
+import importlib.metadata
 import importlib.util
 import json
 import shutil
 import sys
-from types import SimpleNamespace
+from types import ModuleType, SimpleNamespace
 
 import huggingface_hub
 import psutil
@@ -150,6 +151,50 @@ def test_a_base_computes_in_the_dtype_in_which_it_was_loaded(tiny_folders, name)
     assert loaded.transformer.dtype == torch.float32
     backbone = type(loaded)(loaded.transformer, loaded.vae, loaded.scheduler, dtype=torch.bfloat16)
     assert loaded.dtype == backbone.dtype == torch.bfloat16
+
+
+class StoredIn4Bits(torch.nn.Parameter):
+    """A parameter of another type than those in full precision, like that of bitsandbytes."""
+
+
+@pytest.mark.parametrize(
+    ("name", "skipped"), [("qwen", ["transformer_blocks.0.img_mod"]), ("kontext", None), ("klein", None)]
+)
+def test_nf4_leaves_the_layers_in_full_precision_that_the_backbone_names(
+    tiny_folders, monkeypatch, name, skipped
+):
+    """The stand-in for the loader of diffusers stores all other layers in 4 bits, as bitsandbytes does on a GPU."""
+    version = importlib.metadata.version
+    monkeypatch.setattr(
+        importlib.metadata,
+        "version",
+        lambda package: "0.50.2" if package == "bitsandbytes" else version(package),
+    )
+    monkeypatch.setitem(sys.modules, "bitsandbytes", ModuleType("bitsandbytes"))
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(loading, "_device_map", lambda device: {})
+    load_part, configs = loading._load_part, []
+
+    def load(folder, backbone_class, part, *, quantization_config=None, **options):
+        model = load_part(folder, backbone_class, part, **options)
+        if quantization_config:
+            configs.append(quantization_config)
+            for layer, module in model.named_modules():
+                is_skipped = layer.startswith(tuple(quantization_config.llm_int8_skip_modules or ()))
+                if isinstance(module, torch.nn.Linear) and not is_skipped:
+                    module.weight = StoredIn4Bits(module.weight, requires_grad=False)
+        return model
+
+    monkeypatch.setattr(loading, "_load_part", load)
+    backbone = load_backbone(str(tiny_folders / name), device="cuda", quantization="nf4")
+    assert [config.llm_int8_skip_modules for config in configs] == [skipped]
+    assert [config.quantization_method() for config in configs] == ["nf4"]
+    kept = [
+        target
+        for target in backbone.lora_targets()
+        if type(backbone.transformer.get_submodule(target).weight) is torch.nn.Parameter
+    ]
+    assert kept == (["transformer_blocks.0.img_mod.1"] if skipped else [])
 
 
 def test_nf4_needs_an_nvidia_gpu():

@@ -308,7 +308,8 @@ def _check_channels(backbone: Backbone, folder: Path) -> None:
 
 def _check_quantized(backbone: Backbone, quantization: str) -> None:
     """Checks that the weights are quantized: diffusers silently leaves parts on the CPU unquantized."""
-    weight = backbone.transformer.get_submodule(backbone.lora_targets()[0]).weight
+    name = next(name for name in backbone.lora_targets() if not name.startswith(backbone.unquantized))
+    weight = backbone.transformer.get_submodule(name).weight
     if type(weight) in {Tensor, nn.Parameter}:
         raise ModelError(
             f"the weights were loaded as {weight.dtype}",
