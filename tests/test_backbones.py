@@ -1,10 +1,13 @@
 """The table of diffusion backbones: loading of tiny versions from folders, and all errors for damaged or wrong folders."""
 
+import functools
 import gc
+import importlib.metadata
 import importlib.util
 import json
 import shutil
-from types import SimpleNamespace
+import sys
+from types import ModuleType, SimpleNamespace
 
 import huggingface_hub
 import psutil
@@ -13,7 +16,7 @@ import torch
 import transformers
 from tokenizers.pre_tokenizers import ByteLevel
 
-from brewster.errors import DeviceError, DownloadError, ModelError
+from brewster.errors import DeviceError, DownloadError, MissingExtra, ModelError
 from brewster.models.diffusion import lazy_imports
 from brewster.models.diffusion.adapter.lora import add_lora
 from brewster.models.diffusion.backbones import loading
@@ -148,6 +151,50 @@ def test_a_base_computes_in_the_dtype_in_which_it_was_loaded(tiny_folders, name)
     assert loaded.transformer.dtype == torch.float32
     backbone = type(loaded)(loaded.transformer, loaded.vae, loaded.scheduler, dtype=torch.bfloat16)
     assert loaded.dtype == backbone.dtype == torch.bfloat16
+
+
+class StoredIn4Bits(torch.nn.Parameter):
+    """A parameter of another type than those in full precision, like that of bitsandbytes."""
+
+
+@pytest.mark.parametrize(
+    ("name", "skipped"), [("qwen", ["transformer_blocks.0.img_mod"]), ("kontext", None), ("klein", None)]
+)
+def test_nf4_leaves_the_layers_in_full_precision_that_the_backbone_names(
+    tiny_folders, monkeypatch, name, skipped
+):
+    """The stand-in for the loader of diffusers stores all other layers in 4 bits, as bitsandbytes does on a GPU."""
+    version = importlib.metadata.version
+    monkeypatch.setattr(
+        importlib.metadata,
+        "version",
+        lambda package: "0.50.2" if package == "bitsandbytes" else version(package),
+    )
+    monkeypatch.setitem(sys.modules, "bitsandbytes", ModuleType("bitsandbytes"))
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(loading, "_device_map", lambda device: {})
+    load_part, configs = loading._load_part, []
+
+    def load(folder, backbone_class, part, *, quantization_config=None, **options):
+        model = load_part(folder, backbone_class, part, **options)
+        if quantization_config:
+            configs.append(quantization_config)
+            for layer, module in model.named_modules():
+                is_skipped = layer.startswith(tuple(quantization_config.llm_int8_skip_modules or ()))
+                if isinstance(module, torch.nn.Linear) and not is_skipped:
+                    module.weight = StoredIn4Bits(module.weight, requires_grad=False)
+        return model
+
+    monkeypatch.setattr(loading, "_load_part", load)
+    backbone = load_backbone(str(tiny_folders / name), device="cuda", quantization="nf4")
+    assert [config.llm_int8_skip_modules for config in configs] == [skipped]
+    assert [config.quantization_method() for config in configs] == ["nf4"]
+    kept = [
+        target
+        for target in backbone.lora_targets()
+        if type(backbone.transformer.get_submodule(target).weight) is torch.nn.Parameter
+    ]
+    assert kept == (["transformer_blocks.0.img_mod.1"] if skipped else [])
 
 
 def test_nf4_needs_an_nvidia_gpu():
@@ -287,6 +334,28 @@ def test_the_quantization_is_chosen_by_the_memory_of_the_gpu(monkeypatch):
     assert place("kontext", 12) == ("int8", True)
 
 
+@pytest.mark.parametrize(("memory", "is_offloaded"), [(12, True), (16, True), (24, False), (80, False)])
+def test_without_bitsandbytes_int8_replaces_nf4(monkeypatch, memory, is_offloaded):
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    assert place("qwen", memory, preferred="nf4") == ("int8", is_offloaded)
+    assert place("qwen", memory, preferred="nf4", offload="none") == ("int8", False)
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: object())
+    assert place("qwen", 24, preferred="nf4") == ("nf4", False)
+
+
+def test_nf4_without_bitsandbytes_is_refused_before_any_download(machine, monkeypatch):
+    monkeypatch.setitem(sys.modules, "bitsandbytes", None)
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(huggingface_hub, "snapshot_download", lambda *_, **__: pytest.fail("downloaded"))
+    cure = (
+        r"bitsandbytes cannot be imported .*; run: pip install bitsandbytes, or choose the quantization int8"
+    )
+    with pytest.raises(MissingExtra, match=cure):
+        check_machine("qwen", BACKBONES["qwen"], Placement("cuda", "nf4"), requested="auto")
+    with pytest.raises(MissingExtra, match=cure):
+        load_backbone("qwen", device="cuda", quantization="nf4")
+
+
 def test_the_weights_are_offloaded_only_if_they_do_not_fit_or_on_request(monkeypatch):
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: object())
     assert place("kontext", 24, free_gib=10) == ("int8", True)
@@ -313,10 +382,21 @@ def test_an_offloaded_base_needs_host_memory_instead_of_gpu_memory(machine, monk
     with pytest.raises(DeviceError, match=r"about 14\.\d GiB of memory on cuda, and 5\.0"):
         check_machine("kontext", KONTEXT, Placement("cuda", "int8"), requested="auto")
     machine["memory"] = 12
-    with pytest.raises(
-        DeviceError, match=r"about 13\.\d GiB of memory in host memory, because it is offloaded"
-    ):
+    with pytest.raises(DeviceError, match=r"about 13\.\d GiB of host memory, because it is offloaded"):
         check_machine("kontext", KONTEXT, offloaded, requested="auto")
+
+
+def test_text_encoders_need_host_memory(machine, monkeypatch):
+    monkeypatch.setattr(torch.cuda, "mem_get_info", lambda device: [80 << 30] * 2)
+    machine["memory"] = 15
+    check = functools.partial(check_machine, placement=Placement("cuda"), requested="auto")
+    check("qwen", BACKBONES["qwen"])
+    check("kontext", KONTEXT, with_text_encoders=True)
+    with pytest.raises(
+        DeviceError,
+        match=r"qwen needs about 17\.4 GiB of host memory, because its text encoders .* 15\.0 GiB",
+    ):
+        check("qwen", BACKBONES["qwen"], with_text_encoders=True)
 
 
 def test_memory_and_disk_are_checked_before_the_download(machine):

@@ -63,9 +63,9 @@ def test_errors_of_the_hub_are_explained(monkeypatch, error, message, load):
 
 
 def test_a_missing_library_names_the_extra(monkeypatch):
-    monkeypatch.setitem(sys.modules, "bitsandbytes", None)
+    monkeypatch.setitem(sys.modules, "peft", None)
     with pytest.raises(MissingExtra, match=r"pip install -c constraints.txt -e '\.\[diffusion\]'"):
-        import_library("bitsandbytes")
+        import_library("peft")
 
 
 def test_a_class_that_diffusers_does_not_have_or_cannot_import_is_an_error(monkeypatch):

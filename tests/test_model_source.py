@@ -1,9 +1,9 @@
 """What a value of --model is, and how often its files are requested."""
 
-import huggingface_hub
+import huggingface_hub.constants
 import pytest
 
-from brewster.errors import DownloadError, ModelError
+from brewster.errors import DeviceError, DownloadError, ModelError
 from brewster.models.diffusion import pipeline
 from brewster.models.diffusion.adapter.windowseat import published_task
 from brewster.models.diffusion.model_source import find_model_source
@@ -16,16 +16,18 @@ WINDOWSEAT = "huawei-bayerlab/windowseat-reflection-removal-v1-0"
 
 @pytest.fixture
 def hub(tmp_path, monkeypatch):
-    """A hub with a tiny WindowSeat and its base, and the list of requests."""
+    """A hub with a tiny WindowSeat and its base, an empty cache, and the list of downloads."""
     folders = {
         BASE: write_qwen_edit_plus(tmp_path / "base"),
         WINDOWSEAT: write_windowseat(tmp_path / "windowseat", BASE),
     }
     requests = []
 
-    def snapshot_download(source, *, allow_patterns, dry_run=False):
+    def snapshot_download(source, *, allow_patterns, dry_run=False, local_files_only=False):
         if dry_run:
             return []
+        if local_files_only:
+            raise OSError("not in the cache")
         requests.append(source)
         return str(folders[source])
 
@@ -38,6 +40,14 @@ def test_each_file_of_a_model_is_requested_once(hub, monkeypatch):
     load_pipeline("windowseat", device="cpu")
     # The LoRA, the index of the base, and then its weights.
     assert hub == [WINDOWSEAT, BASE, BASE]
+
+
+@pytest.mark.parametrize("transformer", [None, "someone/windowseat-gguf/model.gguf"])
+def test_the_machine_is_checked_before_any_download(hub, transformer):
+    """This machine has no GPU."""
+    with pytest.raises(DeviceError, match=f"finds no GPU, and {BASE} has 20.4 billion parameters"):
+        load_pipeline("windowseat", transformer=transformer)
+    assert hub == []
 
 
 def test_a_plan_requests_only_the_cache(tmp_path, monkeypatch):

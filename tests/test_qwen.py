@@ -1,8 +1,11 @@
 """Qwen's prompt through the real pipeline of diffusers, with a tiny version of its text and image encoder."""
 
 import importlib.util
+import math
 
+import diffusers
 import huggingface_hub
+import numpy as np
 import pytest
 import torch
 import transformers
@@ -102,6 +105,22 @@ def test_the_embedding_guides_the_tiny_version(pipeline):
         )
     assert guided.isfinite().all()
     assert not torch.allclose(plain, guided, atol=1e-4)
+
+
+@pytest.mark.parametrize("steps", [4, 8])
+def test_a_shift_of_three_gives_the_published_sigmas_of_few_step_loras(steps):
+    """Qwen-Image-Lightning: the exponential shift by log 3 for all sizes, without a terminal sigma."""
+    published = diffusers.FlowMatchEulerDiscreteScheduler(
+        base_shift=math.log(3),
+        max_shift=math.log(3),
+        base_image_seq_len=256,
+        max_image_seq_len=8192,
+        use_dynamic_shifting=True,
+        shift_terminal=None,
+    )
+    published.set_timesteps(sigmas=np.linspace(1, 1 / steps, steps), mu=math.log(3))
+    sigmas = tiny("qwen")[0].schedule(3072, steps, timestep_shift=3.0)
+    torch.testing.assert_close(sigmas, published.sigmas, atol=1e-6, rtol=0)
 
 
 @pytest.mark.skipif(bool(importlib.util.find_spec("torchvision")), reason="torchvision is installed")

@@ -1,6 +1,9 @@
 """The plan of a separation: the numbers of the estimates for training, and of the pipeline that it plans."""
 
-import huggingface_hub
+import importlib.util
+import math
+
+import huggingface_hub.constants
 import numpy as np
 import pytest
 import torch
@@ -15,6 +18,8 @@ from brewster.models.diffusion.cost import CARDS, GraphicsCard
 from brewster.models.diffusion.memory import weights_gib
 from brewster.models.diffusion.pipeline import load_pipeline
 from brewster.models.diffusion.task import DecompositionTask
+from brewster.models.diffusion_models import DIFFUSION_MODELS
+from brewster.models.zoo import DIFFUSION_NAMES
 from brewster.options import Options
 
 CARD = CARDS["RTX 4090"]
@@ -52,6 +57,7 @@ def test_the_plan_of_the_papers_lora_has_the_known_numbers(lora):
         f"{plan.seconds:.1f} s (estimate)",
     ):
         assert text in plan.table()
+    assert "host memory             0.0 GiB for the weights" in plan.table()
     small = plan_separation(Options(model=lora, steps=4), (4096, 4096), CARDS["RTX 4060"])
     assert small.placement.is_offloaded
     assert small.total_gib < 8
@@ -63,13 +69,44 @@ def test_the_plan_of_the_papers_lora_has_the_known_numbers(lora):
         plan_separation(Options(model=lora, offload="none"), (4096, 4096), CARDS["RTX 4060"]).check_fits()
 
 
-def test_windowseat_is_planned_before_its_download():
+@pytest.mark.parametrize(("has_bitsandbytes", "quantization"), [(True, "nf4"), (False, "int8")])
+def test_windowseat_is_planned_before_its_download(monkeypatch, has_bitsandbytes, quantization):
+    find_spec = importlib.util.find_spec
+    monkeypatch.setattr(
+        importlib.util,
+        "find_spec",
+        lambda name, *package: (
+            (has_bitsandbytes or None) if name == "bitsandbytes" else find_spec(name, *package)
+        ),
+    )
     plan = plan_separation(Options(model="windowseat"), (1600, 800), CARD)
     assert set(plan.panels) == {(768, 768)}
     assert plan.passes == len(plan.panels) == 3
-    assert (plan.placement.quantization, plan.text_encoder_gb) == ("nf4", 0)
+    assert (plan.placement.quantization, plan.text_encoder_gb) == (quantization, 0)
     assert plan.download_gb == pytest.approx(41, abs=0.5)
     assert plan.licence == "Apache-2.0"
+
+
+@pytest.mark.parametrize("name", DIFFUSION_NAMES)
+def test_the_list_of_models_agrees_with_the_plan(name):
+    model = DIFFUSION_MODELS[name]
+    quantization = None if model.weight_format == "bf16" else model.weight_format
+    plan = plan_separation(Options(model=name, quantization=quantization), (4096, 4096), CARD)
+    assert model.memory_gib == math.ceil(plan.placement.gpu_gib(plan.parameter_count))
+    assert model.memory_gib - 1 < plan.total_gib <= model.memory_gib
+    assert plan.download_gb == pytest.approx(model.download_gb + model.text_encoder_gb, abs=0.5)
+    assert plan.text_encoder_gb == pytest.approx(model.text_encoder_gb, abs=0.1)
+    offloaded = plan_separation(Options(model=name, offload="layers"), (4096, 4096), CARD)
+    assert model.offloaded_memory_gib == offloaded.placement.gpu_gib(plan.parameter_count)
+    assert offloaded.total_gib == pytest.approx(model.offloaded_memory_gib, abs=0.6)
+
+
+def test_the_plan_counts_the_text_encoders():
+    plan = plan_separation(Options(model="kontext"), (512, 512), CARD)
+    assert "host memory             9.1 GiB while the text encoders encode the prompt" in plan.table()
+    assert plan.text_encoder_gb == pytest.approx(9.8, abs=0.1)
+    offloaded = plan_separation(Options(model="kontext", offload="layers"), (512, 512), CARD)
+    assert "host memory             22.2 GiB for the weights" in offloaded.table()
 
 
 @pytest.mark.parametrize("quality", ["draft", "standard"])

@@ -16,6 +16,7 @@ from brewster.models.diffusion.adapter.lora import (
 )
 from brewster.models.diffusion.adapter.lora_formats import LowRankLayer, to_state_dict
 from brewster.models.diffusion.adapter.stacking import stack_layers
+from brewster.models.diffusion.backbones.qwen import Qwen
 from brewster.models.diffusion.backbones.registry import BACKBONES, tiny
 from brewster.models.diffusion.panels import PanelLayout
 from brewster.models.diffusion.pipeline import load_pipeline
@@ -109,6 +110,27 @@ def test_a_guidance_that_is_an_input_of_the_transformer_stays(fast_file, tmp_pat
         load_pipeline("tiny:kontext", fast_lora=str(fast_file))
 
 
+def test_a_few_step_lora_for_qwen_is_sampled_at_the_times_of_its_training(tmp_path, monkeypatch):
+    tensors = {f"transformer.{key}": value for key, value in to_state_dict(few_step_layers("qwen")).items()}
+    save_file(tensors, tmp_path / "lightning.safetensors")
+    predict, sigmas = Qwen.predict, []
+
+    def record(self, latents, condition, sigma, *arguments):
+        sigmas.append(round(sigma.item(), 3))
+        return predict(self, latents, condition, sigma, *arguments)
+
+    monkeypatch.setattr(Qwen, "predict", record)
+    plain = load_pipeline("tiny:qwen")
+    fast = load_pipeline("tiny:qwen", fast_lora=str(tmp_path / "lightning.safetensors"))
+    other = load_pipeline("tiny:qwen", fast_lora=str(tmp_path / "lightning.safetensors"), timestep_shift=1.0)
+    fast(torch.zeros(1, 3, 32, 48), steps=4)
+    assert sigmas == [1, 0.9, 0.75, 0.5]
+    shifts = [pipeline.task.timestep_shift for pipeline in (plain, fast, other)]
+    assert shifts == [None, 3, 1]
+    assert len({plain.sha256, fast.sha256, other.sha256}) == 3
+    assert load_pipeline("tiny:qwen", timestep_shift=3.0).task.timestep_shift == 3
+
+
 def test_a_model_of_one_step_takes_no_lora_for_few_steps(fast_file, tmp_path):
     backbone, prompt = with_random_lora("klein")
     save_lora(
@@ -118,3 +140,5 @@ def test_a_model_of_one_step_takes_no_lora_for_few_steps(fast_file, tmp_path):
         ModelError, match="which takes one step; expected a model that samples in several steps"
     ):
         load_pipeline(str(tmp_path / "lora"), fast_lora=str(fast_file))
+    with pytest.raises(ModelError, match=r"a timestep shift was given for .*, which takes one step"):
+        load_pipeline(str(tmp_path / "lora"), timestep_shift=3.0)

@@ -33,8 +33,8 @@ Offload = Literal["auto", "none", "layers"]
 """Whether the weights of a diffusion model are kept in host memory and copied to the GPU layer by layer."""
 
 DIFFUSION_OPTIONS: Final = (
-    "base_model", "quantization", "offload", "transformer", "fast_lora", "guidance", "steps", "ensemble_size",
-    "no_guided_upsampling",
+    "base_model", "quantization", "offload", "transformer", "fast_lora", "guidance", "timestep_shift", "steps",
+    "ensemble_size", "no_guided_upsampling",
 )  # fmt: skip
 """The options of diffusion models only."""
 
@@ -149,6 +149,14 @@ class Options:
             "For diffusion models: the guidance scale, by default that of the model; with a few-step LoRA, 1 for klein and qwen.",
             ge=1,
             allow_inf_nan=False,
+        ),
+    )
+    timestep_shift: float | None = field(
+        default=None,
+        metadata=_field_metadata(
+            "For diffusion models: the factor by which the sampling times are shifted towards noise, by default that of the model; "
+            "with a few-step LoRA, 3 for qwen. 1 is no shift.",
+            ge=1,
         ),
     )
     steps: int | None = field(

@@ -36,7 +36,8 @@ def list_models(*, as_json: bool) -> None:
     """List the models that are installed with brewster, and diffusion models that are downloaded at first use or imported.
 
     An entry has the name, the size of the file or download, and the licence. A diffusion model has two more lines: the layers
-    that it predicts, its GPU memory (with the format of the weights), the download of its text encoder, and how to get it.
+    that it predicts, its GPU memory (with the format of the weights, and with the weights offloaded to host memory), the
+    download of its text encoder, and how to get it.
     Sizes and memory of diffusion models are estimates.
     """
     rows = [describe(model) for model in zoo.MODELS.values()]
@@ -53,7 +54,8 @@ def list_models(*, as_json: bool) -> None:
         use = "" if model.allows_commercial_use else " (not for commercial use)"
         print_out(f"{model.name:20} {model.download_gb:>7g} GB  {model.licence}{use}")
         print_out(
-            f"{'':33}{model.output}; {model.memory_gib:g} GiB GPU memory ({model.weight_format}){encoder}"
+            f"{'':33}{model.output}; {model.memory_gib:g} GiB GPU memory ({model.weight_format}), "
+            f"{model.offloaded_memory_gib:g} GiB offloaded{encoder}"
         )
         print_out(f"{'':33}{model.access}; huggingface.co/{model.hub_id}")
 

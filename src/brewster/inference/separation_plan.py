@@ -42,7 +42,7 @@ from brewster.models.diffusion.memory import (
 from brewster.models.diffusion.model_source import find_model_source
 from brewster.models.diffusion.offloading import DECODING_BYTES_PER_PIXEL
 from brewster.models.diffusion.panels import count_tokens
-from brewster.models.diffusion.pipeline import DecompositionPipeline, task_with_guidance
+from brewster.models.diffusion.pipeline import DecompositionPipeline, task_with_options
 from brewster.models.diffusion.task import DecompositionTask
 from brewster.models.diffusion_models import licence_of
 from brewster.models.zoo import TINY_PREFIX, check_diffusion_model
@@ -60,7 +60,8 @@ class SeparationPlan:
     """The estimated resources of the separation of one photo on a graphics card.
 
     `panels` are the (width, height) of the panels of each tile, in px. `passes` is the number of passes of the transformer, and `tflop` that of
-    their operations. `memory_gib` contains the GPU memory of each part.
+    their operations. `memory_gib` contains the GPU memory of each part. `text_encoder_gib` is the host memory in which the
+    text encoders are loaded; 0 if the prompt is part of the model.
     """
 
     model: str
@@ -74,6 +75,12 @@ class SeparationPlan:
     memory_gib: dict[str, float]
     download_gb: float
     text_encoder_gb: float
+    text_encoder_gib: float
+
+    @property
+    def host_gib(self) -> float:
+        """The peak host memory in GiB. The text encoders are released before the transformer is loaded."""
+        return max(self.placement.host_gib(self.parameter_count), self.text_encoder_gib)
 
     @property
     def total_gib(self) -> float:
@@ -91,11 +98,11 @@ class SeparationPlan:
         tiles = ", ".join(
             f"{count} of {width} x {height}" for (width, height), count in Counter(self.panels).items()
         )
-        host = self.placement.host_gib(self.parameter_count)
+        is_for_prompt = self.host_gib == self.text_encoder_gib > 0
         model = {
             "model": f"{self.model}, {self.parameter_count / 1e9:.2f} billion parameters",
             "licence": self.licence,
-            "weights": f"{self.placement.quantization or 'bf16'}, {'offloaded by layers' if host else 'on the GPU'}",
+            "weights": f"{self.placement.quantization or 'bf16'}, {'offloaded by layers' if self.placement.is_offloaded else 'on the GPU'}",
             "tiles": f"{tiles} pixels a panel; {self.passes} passes of the transformer",
         }
         return cost_table(
@@ -103,7 +110,7 @@ class SeparationPlan:
             {"per photo": f"{self.tflop:.0f} TFLOP, {self.seconds:.1f} s (estimate)"},
             memory_gib=self.memory_gib,
             card=self.card,
-            host_memory=f"{host:.1f} GiB for the weights",
+            host_memory=f"{self.host_gib:.1f} GiB {'while the text encoders encode the prompt' if is_for_prompt else 'for the weights'}",
             download_gb=self.download_gb,
             text_encoder_gb=self.text_encoder_gb,
         )
@@ -134,7 +141,12 @@ def plan_separation(options: Options, size: tuple[int, int], card: GraphicsCard)
     source = find_model_source(options.model, options.base_model, allow_download=False)
     is_known = is_registered(source.base) or Path(source.base).is_dir()
     backbone = build_on_meta(source.base if is_known else source.backbone_class.name, dtype=torch.bfloat16)
-    task = task_with_guidance(source, options.guidance, has_few_step_lora=options.fast_lora is not None)
+    task = task_with_options(
+        source,
+        guidance=options.guidance,
+        timestep_shift=options.timestep_shift,
+        has_few_step_lora=options.fast_lora is not None,
+    )
     prompt = backbone.random_prompt(backbone.transformer, 0)
     predictor = DiffusionPredictor(
         DecompositionPipeline(backbone, prompt, task),
@@ -163,7 +175,8 @@ def plan_separation(options: Options, size: tuple[int, int], card: GraphicsCard)
     block = max(block_bytes(backbone, sum(pair) + PROMPT_TOKENS) for pair in tokens)
     is_stored = source.base.startswith(TINY_PREFIX) or Path(source.base).is_dir()
     is_stored = is_stored or is_transformer_cached(hub_id_of(source.base))
-    encoders = 2e-9 * backbone.text_encoder_parameters if source.needs_text_encoders else 0.0
+    encoders_gib = weights_gib(backbone.text_encoder_parameters, None) if source.needs_text_encoders else 0.0
+    encoders_gb = 0.0 if is_stored else encoders_gib * GIB / 1e9
     vae = count_parameters(backbone.vae)
     return SeparationPlan(
         options.model,
@@ -184,8 +197,9 @@ def plan_separation(options: Options, size: tuple[int, int], card: GraphicsCard)
             "activations": max(block, pixels * DECODING_BYTES_PER_PIXEL) / GIB,
             "CUDA": _CONTEXT_GIB,
         },
-        0.0 if is_stored else 2e-9 * (vae + (0 if file else parameters)) + encoders,
-        0.0 if is_stored else encoders,
+        0.0 if is_stored else 2e-9 * (vae + (0 if file else parameters)) + encoders_gb,
+        encoders_gb,
+        encoders_gib,
     )
 
 

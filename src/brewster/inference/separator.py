@@ -85,6 +85,7 @@ class Separator:
         transformer: str | None = Options.transformer,
         fast_lora: str | None = Options.fast_lora,
         guidance: float | None = Options.guidance,
+        timestep_shift: float | None = Options.timestep_shift,
         steps: int | None = Options.steps,
         ensemble_size: int = Options.ensemble_size,
         no_guided_upsampling: bool = Options.no_guided_upsampling,
@@ -101,7 +102,7 @@ class Separator:
         """
         pipeline_options: dict[str, Any] = {
             "base_model": base_model, "quantization": quantization, "offload": offload, "transformer": transformer,
-            "fast_lora": fast_lora, "guidance": guidance,
+            "fast_lora": fast_lora, "guidance": guidance, "timestep_shift": timestep_shift,
         }  # fmt: skip
         predictor_options: dict[str, Any] = {
             "steps": steps,
@@ -300,6 +301,7 @@ def separate(
     transformer: str | None = Options.transformer,
     fast_lora: str | None = Options.fast_lora,
     guidance: float | None = Options.guidance,
+    timestep_shift: float | None = Options.timestep_shift,
     steps: int | None = Options.steps,
     ensemble_size: int = Options.ensemble_size,
     no_guided_upsampling: bool = Options.no_guided_upsampling,
@@ -323,6 +325,7 @@ def separate(
         transformer=transformer,
         fast_lora=fast_lora,
         guidance=guidance,
+        timestep_shift=timestep_shift,
         steps=steps,
         ensemble_size=ensemble_size,
         no_guided_upsampling=no_guided_upsampling,

@@ -23,7 +23,7 @@ class DiffusionModel:
     download_gb: float
     """The transformer and the VAE in bfloat16, in GB; for a LoRA those of its base."""
     memory_gib: float
-    """GPU memory for separation, in GiB, with the weights in `weight_format`."""
+    """GPU memory for separation, in GiB, with the weights in `weight_format`: `Placement.gpu_gib`, rounded up."""
     weight_format: str
     output: str
     access: str = _OPEN
@@ -31,6 +31,8 @@ class DiffusionModel:
     """The download of the text encoders, which encode a prompt once. 0 if the prompt is part of the model."""
     base_model: str | None = None
     """The hub id of the base of a LoRA or finetuned model."""
+    offloaded_memory_gib: float = 4.5
+    """GPU memory for separation, in GiB, with the weights offloaded to host memory."""
     is_opened_by_name: bool = True
     """Whether --model takes the name. Otherwise `brewster models import` converts the model first."""
 
@@ -40,29 +42,29 @@ DIFFUSION_MODELS: Final = {
     for model in (
         DiffusionModel(
             "windowseat", "huawei-bayerlab/windowseat-reflection-removal-v1-0", "Apache-2.0", allows_commercial_use=True,
-            download_gb=41, memory_gib=24, weight_format="nf4", output="transmission; reflection derived",
+            download_gb=41, memory_gib=13, weight_format="nf4", output="transmission; reflection derived",
             base_model="Qwen/Qwen-Image-Edit-2509",
         ),
         DiffusionModel(
             "gensirr", "lime-j/GenSIRR", "none stated; its base: FLUX.1 [dev] Non-Commercial License",
-            allows_commercial_use=False, download_gb=24, memory_gib=14, weight_format="int8",
+            allows_commercial_use=False, download_gb=24, memory_gib=15, weight_format="int8",
             output="transmission; reflection derived",
             access="run `hf download lime-j/GenSIRR GenSIRR.pt --local-dir .`, then `brewster models import GenSIRR.pt FOLDER`",
             base_model="black-forest-labs/FLUX.1-Kontext-dev", is_opened_by_name=False,
         ),
         DiffusionModel(
             "kontext", "black-forest-labs/FLUX.1-Kontext-dev", "FLUX.1 [dev] Non-Commercial License",
-            allows_commercial_use=False, download_gb=24, memory_gib=14, weight_format="int8",
+            allows_commercial_use=False, download_gb=24, memory_gib=15, weight_format="int8",
             output="a base for LoRAs; without one, an edit by prompt", access=_GATED, text_encoder_gb=9.8,
         ),
         DiffusionModel(
             "klein", "black-forest-labs/FLUX.2-klein-base-4B", "Apache-2.0", allows_commercial_use=True,
-            download_gb=7.9, memory_gib=9, weight_format="bf16",
+            download_gb=7.9, memory_gib=11, weight_format="bf16",
             output="a base for LoRAs; without one, an edit by prompt", text_encoder_gb=8,
         ),
         DiffusionModel(
             "qwen", "Qwen/Qwen-Image-Edit", "Apache-2.0", allows_commercial_use=True,
-            download_gb=41, memory_gib=14, weight_format="nf4",
+            download_gb=41, memory_gib=13, weight_format="nf4",
             output="a base for LoRAs; without one, an edit by prompt", text_encoder_gb=16.6,
         ),
     )

@@ -29,6 +29,22 @@ def import_library(name: str) -> Any:  # noqa: ANN401 - a module of a library th
         ) from error
 
 
+def import_bitsandbytes() -> None:
+    """Imports bitsandbytes, which stores weights in nf4. The extra `diffusion` does not install it.
+
+    Raises:
+        MissingExtra: it is not installed, or cannot be imported.
+    """
+    try:
+        import_library("bitsandbytes")
+    except MissingExtra as error:
+        raise MissingExtra(
+            error.happened,
+            "expected it to be installed, because it stores the weights in nf4",
+            "run: pip install bitsandbytes, or choose the quantization int8",
+        ) from error
+
+
 def diffusers_class(name: str) -> Any:  # noqa: ANN401 - diffusers has no types that mypy reads
     """A class of diffusers by its name; diffusers imports the module of the class at this first access.
 

@@ -18,7 +18,7 @@ from brewster.errors import DeviceError, DownloadError
 from brewster.models.diffusion.backbones.backbone import Backbone
 from brewster.models.diffusion.backbones.registry import hub_id_of
 from brewster.models.diffusion.hub_download import free_disk_bytes, is_transformer_cached
-from brewster.models.diffusion.lazy_imports import import_library
+from brewster.models.diffusion.lazy_imports import import_bitsandbytes, import_library
 from brewster.models.zoo import TINY_PREFIX
 from brewster.options import Offload, Quantization
 
@@ -172,9 +172,10 @@ def place_on_gpu(
 ) -> Placement:
     """The placement on a GPU with this memory.
 
-    If no quantization is given, it is the first of (`preferred`, int8, nf4) with which the weights fit into the GPU; nf4 only if
-    bitsandbytes is installed. The total memory decides, not the free one: the same machine always gives the same
-    result. If none fits, or the weights are offloaded on request, it is `preferred`, or int8 instead of nf4.
+    If no quantization is given, it is the first of (`preferred`, int8, nf4) with which the weights fit into the GPU. The
+    total memory decides, not the free one: the same machine always gives the same result. If none fits, or the weights
+    are offloaded on request, it is `preferred`. Int8 replaces nf4 if bitsandbytes is not installed, or the weights are
+    offloaded.
 
     Weights in a single file stay as they are. With `offload` "auto", the weights are offloaded if they do not fit into the free memory.
 
@@ -188,12 +189,15 @@ def place_on_gpu(
             "use --quantization int8, or leave offload out",
         )
     movable: Quantization | None = "int8" if preferred == "nf4" else preferred
+    has_nf4 = importlib.util.find_spec("bitsandbytes") is not None
+    if not has_nf4:
+        preferred = movable
     chosen = quantization
     if quantization is None and offload == "layers" and not is_single_file:
         chosen = movable
     elif quantization is None and not is_single_file:
         candidates: list[Quantization | None] = [preferred, "int8"]
-        if importlib.util.find_spec("bitsandbytes"):
+        if has_nf4:
             candidates.append("nf4")
         fitting = fitting_quantizations(weights, total_gib - INFERENCE_OVERHEAD_GIB, candidates)
         fallback = preferred if offload == "none" else movable or "int8"
@@ -220,23 +224,25 @@ def check_machine(
         backbone_class: the class of the backbone.
         placement: where its weights will be.
         requested: the device that the user chose, or "auto".
-        with_text_encoders: whether the prompt must be encoded, so that the text encoders are downloaded too.
+        with_text_encoders: whether the prompt must be encoded, so that the text encoders are downloaded too. They are
+            loaded in host memory, also if they compute on the GPU, and released before the transformer is loaded.
         transformer_file: see `load_backbone`.
 
     Raises:
         DeviceError: there is no GPU and the CPU was not chosen explicitly, or the free memory is too small.
         DownloadError: the free disk is too small.
+        MissingExtra: the weights will be stored in nf4, and bitsandbytes is not installed.
     """
     weights = count_weights(source, backbone_class, transformer_file)
     if weights < _MIN_LARGE:
         return
-    if placement.device == "cpu" and requested != "cpu":
-        raise DeviceError(
-            f"torch finds no GPU, and {source} has {weights / 1e9:.1f} billion parameters",
-            "expected an NVIDIA or AMD GPU, because one photo takes hours on a CPU",
-            "use the model compact, or choose --device cpu explicitly",
-        )
+    check_device(source, weights, placement.device, requested=requested)
+    if with_text_encoders:
+        encoders = weights_gib(backbone_class.text_encoder_parameters, None)
+        _check_host_memory(source, encoders, "of host memory, because its text encoders are loaded there")
     _check_memory(source, weights, placement)
+    if placement.quantization == "nf4" and placement.device != "cpu":
+        import_bitsandbytes()
     hub_id = hub_id_of(source)
     if not transformer_file and not Path(source).is_dir() and not is_transformer_cached(hub_id):
         _check_disk(
@@ -244,23 +250,43 @@ def check_machine(
         )
 
 
+def check_device(source: str, weights: int, device: str, *, requested: str) -> None:
+    """Checks that a transformer with this number of weights does not run on the CPU, unless the user chose the CPU.
+
+    Raises:
+        DeviceError: there is no GPU, and the CPU was not chosen explicitly.
+    """
+    if weights >= _MIN_LARGE and device == "cpu" and requested != "cpu":
+        raise DeviceError(
+            f"torch finds no GPU, and {source} has {weights / 1e9:.1f} billion parameters",
+            "expected an NVIDIA or AMD GPU, because one photo takes hours on a CPU",
+            "use the model compact, or choose --device cpu explicitly",
+        )
+
+
 def _check_memory(source: str, weights: int, placement: Placement) -> None:
     if host := placement.host_gib(weights):
-        available = import_library("psutil").virtual_memory().available / GIB
-        where = "on cpu" if placement.device == "cpu" else "in host memory, because it is offloaded"
-        _check_fits(source, host + _HOST_OVERHEAD_GIB, available, where, _SMALLER_MODEL)
+        is_cpu = placement.device == "cpu"
+        _check_host_memory(
+            source, host, "of memory on cpu" if is_cpu else "of host memory, because it is offloaded"
+        )
     if placement.device == "cpu":
         return
     free = torch.cuda.mem_get_info(placement.device)[0] / GIB
     fitting = fitting_quantizations(weights, free - INFERENCE_OVERHEAD_GIB)
     cure = f"choose quantization {fitting[0]}" if fitting else _SMALLER_MODEL
-    _check_fits(source, placement.gpu_gib(weights), free, f"on {placement.device}", cure)
+    _check_fits(source, placement.gpu_gib(weights), free, f"of memory on {placement.device}", cure)
+
+
+def _check_host_memory(source: str, needed_gib: float, where: str) -> None:
+    available = import_library("psutil").virtual_memory().available / GIB
+    _check_fits(source, needed_gib + _HOST_OVERHEAD_GIB, available, where, _SMALLER_MODEL)
 
 
 def _check_fits(source: str, needed_gib: float, free_gib: float, where: str, cure: str) -> None:
     if needed_gib > free_gib:
         raise DeviceError(
-            f"{source} needs about {needed_gib:.1f} GiB of memory {where}, and {free_gib:.1f} GiB are free",
+            f"{source} needs about {needed_gib:.1f} GiB {where}, and {free_gib:.1f} GiB are free",
             "expected enough memory for the weights and one prediction",
             cure,
         )

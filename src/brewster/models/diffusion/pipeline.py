@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Final, final
 import torch
 from torch import Tensor
 
-from brewster.errors import ModelError
+from brewster.errors import DownloadError, ModelError
 from brewster.models.diffusion.adapter.importer import find_lora_file, read_layers
 from brewster.models.diffusion.adapter.stacking import stack_layers
 from brewster.models.diffusion.backbones.backbone import Backbone
@@ -26,6 +26,7 @@ from brewster.models.diffusion.backbones.loading import encode_prompt, load_back
 from brewster.models.diffusion.hub_download import find_weights_file
 from brewster.models.diffusion.memory import (
     Placement,
+    check_device,
     check_machine,
     choose_placement,
     count_weights,
@@ -151,6 +152,7 @@ def load_pipeline(
     transformer: str | None = None,
     fast_lora: str | None = None,
     guidance: float | None = None,
+    timestep_shift: float | None = None,
     prompt: str = "detailed",
 ) -> DecompositionPipeline:
     """Loads a LoRA with its base model, or a backbone without a LoRA.
@@ -169,21 +171,31 @@ def load_pipeline(
             turbo) is trained for sampling in few steps, such as 4 or 8.
         guidance: the guidance scale, by default that of the task. With a few-step LoRA and classifier-free guidance, the
             default is 1, which saves the second prediction.
+        timestep_shift: the factor by which the sampling times are shifted towards noise, by default that of the task. With
+            a few-step LoRA for qwen, the default is 3. See `Backbone.schedule`.
         prompt: for a backbone without a LoRA: a name in `PROMPTS`, or the text itself. A finetuned backbone with a
             stored prompt uses that one.
 
     Raises:
         DownloadError: no access to a gated model, an invalid token, or no network connection.
         ModelError: a file is missing or damaged, a LoRA belongs to another backbone, the name is unknown, or a few-step
-            LoRA is given for a model that takes one step.
+            LoRA or a timestep shift is given for a model that takes one step.
         DeviceError: there is no such device, it is out of memory, or the weights cannot be offloaded; the message says
             what to change.
         MissingExtra: diffusers, torchao or bitsandbytes is not installed.
     """
-    torch_device(device)
+    _check_before_download(
+        model,
+        base_model,
+        device=device,
+        quantization=quantization,
+        offload=offload,
+        has_transformer_file=transformer is not None,
+    )
     source = find_model_source(model, base_model)
-    if fast_lora:
-        _check_takes_steps(model, source.task)
+    for option, value in {"few-step LoRA": fast_lora, "timestep shift": timestep_shift}.items():
+        if value is not None:
+            _check_takes_steps(model, source.task, option)
     transformer_file = find_weights_file(transformer, TRANSFORMER_SUFFIXES) if transformer else None
     placement = _choose_placement(source, device, quantization, offload, transformer_file)
     check_machine(
@@ -207,11 +219,14 @@ def load_pipeline(
         stack_layers(backbone, few_step_layers)
     if placement.is_offloaded:
         offload_layers(backbone, placement.device)
-    task = task_with_guidance(source, guidance, has_few_step_lora=bool(fast_lora))
+    task = task_with_options(
+        source, guidance=guidance, timestep_shift=timestep_shift, has_few_step_lora=bool(fast_lora)
+    )
     changes = {
         "transformer": digest_file(transformer_file) if transformer_file else None,
         "fast LoRA": hashlib.sha256(fast_lora_file.read_bytes()).hexdigest() if fast_lora_file else None,
         "guidance": None if task.guidance == source.task.guidance else task.guidance,
+        "shift": None if task.timestep_shift == source.task.timestep_shift else task.timestep_shift,
     }
     digest = _digest(source, placement.quantization, text, changes)
     return DecompositionPipeline(backbone, embedding, task, model_name(model), digest)
@@ -245,6 +260,36 @@ def _digest(source: ModelSource, quantization: str | None, text: str, changes: M
         parts.append(text)
     parts += [f"{name} {value}" for name, value in changes.items() if value is not None]
     return hashlib.sha256("\0".join(parts).encode()).hexdigest()
+
+
+def _check_before_download(
+    model: str,
+    base_model: str | None,
+    *,
+    device: str,
+    quantization: Quantization | None,
+    offload: Offload,
+    has_transformer_file: bool,
+) -> None:
+    """Checks the machine before the files of a LoRA are downloaded, if its base is known without them.
+
+    The memory for the text encoders is checked later, because the files of the model show whether its prompt is stored. If
+    the transformer is in a file, only the device is checked, because the size of a file on the hub is not known.
+
+    Raises:
+        DeviceError, DownloadError, MissingExtra: see `check_machine`.
+    """
+    chosen_device = torch_device(device)
+    try:
+        source = find_model_source(model, base_model, allow_download=False)
+    except (DownloadError, ModelError):
+        return  # files are missing or damaged: `load_pipeline` downloads them, or reports the error
+    if has_transformer_file:
+        weights = count_weights(source.base, source.backbone_class)
+        check_device(source.base, weights, chosen_device, requested=device)
+        return
+    placement = _choose_placement(source, device, quantization, offload, None)
+    check_machine(source.base, source.backbone_class, placement, requested=device)
 
 
 def _choose_placement(
@@ -284,19 +329,26 @@ def _load_base(base: str, placement: Placement, transformer_file: Path | None) -
     )
 
 
-def _check_takes_steps(model: str, task: DecompositionTask) -> None:
+def _check_takes_steps(model: str, task: DecompositionTask, option: str) -> None:
     if task.objective != "flow":
         raise ModelError(
-            f"a few-step LoRA was given for {model}, which takes one step",
+            f"a {option} was given for {model}, which takes one step",
             "expected a model that samples in several steps",
-            "leave the few-step LoRA out",
+            f"leave the {option} out",
         )
 
 
-def task_with_guidance(
-    source: ModelSource, guidance: float | None, *, has_few_step_lora: bool
+def task_with_options(
+    source: ModelSource, *, guidance: float | None, timestep_shift: float | None, has_few_step_lora: bool
 ) -> DecompositionTask:
-    """Returns the task of a model with this guidance. For the defaults, see `guidance` in `load_pipeline`."""
-    if guidance is None and has_few_step_lora and not source.backbone_class.guided_by_embedding:
-        guidance = 1.0
-    return source.task if guidance is None else replace(source.task, guidance=guidance)
+    """Returns the task of a model with the options that are not None. For their defaults, see `load_pipeline`."""
+    task, backbone_class = source.task, source.backbone_class
+    if has_few_step_lora:
+        if guidance is None and not backbone_class.guided_by_embedding:
+            guidance = 1.0
+        timestep_shift = timestep_shift or backbone_class.few_step_shift
+    return replace(
+        task,
+        guidance=task.guidance if guidance is None else guidance,
+        timestep_shift=timestep_shift or task.timestep_shift,
+    )

@@ -85,6 +85,8 @@ class Backbone(ABC):
     """Class names in diffusers of other pipelines for the same transformer, VAE and scheduler."""
     unquantized: ClassVar[tuple[str, ...]] = ()
     """Layers that stay in full precision with nf4."""
+    few_step_shift: ClassVar[float | None] = None
+    """The timestep shift with which few-step LoRAs are trained. None: the shift of the scheduler."""
     text_encoder_requirements: ClassVar[tuple[str, ...]] = ()
     """Libraries that the text encoders need in addition to the extra `diffusion`."""
     size_divisor: ClassVar[int] = 16
@@ -239,13 +241,14 @@ class Backbone(ABC):
         """The sigmas of the scheduler of diffusers: steps + 1 decreasing values from 1 to 0.
 
         Before the shift towards noise, they are evenly spaced from 1 to `last_sigma`, by default 1 / steps, and then 0.
-        If `timestep_shift` is None, the scheduler's own shift is used (see `shift`). A value replaces it (see
-        `shifted`).
+        If `timestep_shift` is None, the scheduler's own shift is used (see `shift`). Some schedulers then also stretch the
+        sigmas, so that the last one above 0 is their `shift_terminal`. A value replaces both (see `shifted`).
         """
         # A shift does not change sigma 1, but stretching to `shift_terminal` would divide 0 by 0.
         if steps == 1:
             return torch.tensor([1.0, 0.0])
-        scheduler = type(self.scheduler).from_config(self.scheduler.config)
+        terminal = {} if timestep_shift is None else {"shift_terminal": None}
+        scheduler = type(self.scheduler).from_config(self.scheduler.config, **terminal)
         options = {}
         if scheduler.config.use_dynamic_shifting:
             # The exponential shift by mu is the shift by the factor exp(mu).

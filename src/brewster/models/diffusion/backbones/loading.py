@@ -35,6 +35,7 @@ from brewster.models.diffusion.hub_download import resolve_model_folder
 from brewster.models.diffusion.lazy_imports import (
     diffusers_class,
     disable_progress_bars_in_pipes,
+    import_bitsandbytes,
     import_library,
 )
 from brewster.models.diffusion.out_of_memory import explain_out_of_memory
@@ -259,7 +260,7 @@ def _quantization_options(quantization: str, device: str) -> dict[str, Any]:
             raise DeviceError(
                 f"nf4 does not run on {device}", "expected an NVIDIA GPU", 'use quantization="int8"'
             )
-        import_library("bitsandbytes")
+        import_bitsandbytes()
         config = diffusers_class("BitsAndBytesConfig")(
             load_in_4bit=True, bnb_4bit_quant_type="nf4", bnb_4bit_compute_dtype=torch.bfloat16
         )
@@ -307,7 +308,8 @@ def _check_channels(backbone: Backbone, folder: Path) -> None:
 
 def _check_quantized(backbone: Backbone, quantization: str) -> None:
     """Checks that the weights are quantized: diffusers silently leaves parts on the CPU unquantized."""
-    weight = backbone.transformer.get_submodule(backbone.lora_targets()[0]).weight
+    name = next(name for name in backbone.lora_targets() if not name.startswith(backbone.unquantized))
+    weight = backbone.transformer.get_submodule(name).weight
     if type(weight) in {Tensor, nn.Parameter}:
         raise ModelError(
             f"the weights were loaded as {weight.dtype}",

@@ -37,6 +37,7 @@ class Qwen(ClassifierFreeBackbone):
     diffusers_usage = "but resizes the conditioning image to one megapixel, so that its panels differ from those in training"
     other_pipelines = ("QwenImageEditPlusPipeline",)
     unquantized = ("transformer_blocks.0.img_mod",)
+    few_step_shift = 3.0  # that of Qwen-Image-Lightning
     text_encoder_requirements = ("torchvision",)
     classes: ClassVar = {
         "pipeline": "QwenImageEditPipeline", "transformer": "QwenImageTransformer2DModel",
