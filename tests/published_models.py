@@ -2,12 +2,14 @@
 
 import json
 
+import huggingface_hub.constants
 import torch
 from safetensors.torch import save_file
 from torch import nn
 
 from brewster.models.diffusion.backbones.registry import tiny
 
+KLEIN_9B = "black-forest-labs/FLUX.2-klein-9B"
 SIDE = 64
 """The processing resolution of the tiny WindowSeat model."""
 TOKENS, ACTIVE_TOKENS = 9, 6
@@ -26,6 +28,23 @@ def random_pair(module, rank, generator):
 def write_json(path, value):
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(json.dumps(value))
+
+
+def write_klein_9b(folder, monkeypatch):
+    """Writes a cache of the hub with the configuration of FLUX.2-klein-9B, and makes it the cache of this process."""
+    snapshot = folder / f"models--{KLEIN_9B.replace('/', '--')}" / "snapshots" / ("1" * 40)
+    transformer = {
+        "guidance_embeds": False, "num_layers": 8, "num_single_layers": 24, "num_attention_heads": 32,
+        "joint_attention_dim": 12288,
+    }  # fmt: skip
+    write_json(snapshot / "model_index.json", {"_class_name": "Flux2KleinPipeline", "is_distilled": True})
+    write_json(snapshot / "transformer" / "config.json", transformer)
+    write_json(snapshot / "vae" / "config.json", {})
+    write_json(snapshot / "scheduler" / "scheduler_config.json", {})
+    (snapshot.parents[1] / "refs").mkdir()
+    (snapshot.parents[1] / "refs" / "main").write_text(snapshot.name)
+    monkeypatch.setattr(huggingface_hub.constants, "HF_HUB_OFFLINE", True)
+    monkeypatch.setattr(huggingface_hub.constants, "HF_HUB_CACHE", str(folder))
 
 
 def write_qwen_edit_plus(folder):

@@ -1,34 +1,25 @@
 """The table of diffusion backbones: loading of tiny versions from folders, and all errors for damaged or wrong folders."""
 
-import functools
 import gc
 import importlib.metadata
 import importlib.util
 import json
 import shutil
 import sys
-from types import ModuleType, SimpleNamespace
+from types import ModuleType
 
 import huggingface_hub
-import psutil
 import pytest
 import torch
 import transformers
 from tokenizers.pre_tokenizers import ByteLevel
 
-from brewster.errors import DeviceError, DownloadError, MissingExtra, ModelError
+from brewster.errors import DeviceError, DownloadError, ModelError
 from brewster.models.diffusion import lazy_imports
 from brewster.models.diffusion.adapter.lora import add_lora
 from brewster.models.diffusion.backbones import loading
 from brewster.models.diffusion.backbones.loading import encode_prompt, load_backbone
 from brewster.models.diffusion.backbones.registry import BACKBONES, build, tiny
-from brewster.models.diffusion.memory import (
-    Placement,
-    check_machine,
-    choose_placement,
-    count_weights,
-    place_on_gpu,
-)
 from brewster.models.diffusion.prompt import PROMPT
 
 KONTEXT = BACKBONES["kontext"]
@@ -290,129 +281,6 @@ def test_missing_text_encoders_are_named(tiny_folders, text_encoder_folders, tmp
     shutil.rmtree(folder / "tokenizer")
     with pytest.raises(ModelError, match=f"klein has no tokenizer; .*{cure}"):
         encode_prompt(str(folder))
-
-
-@pytest.fixture
-def machine(monkeypatch, tmp_path):
-    """Sets the free memory and the free disk of this machine in GiB; by default both are large."""
-    monkeypatch.setattr(huggingface_hub.constants, "HF_HUB_CACHE", str(tmp_path / "none" / "yet"))
-    available = {"memory": 500.0, "disk": 500.0}
-    gib = 1 << 30
-    monkeypatch.setattr(
-        psutil, "virtual_memory", lambda: SimpleNamespace(available=available["memory"] * gib)
-    )
-    monkeypatch.setattr(
-        shutil, "disk_usage", lambda folder: SimpleNamespace(free=int(available["disk"] * gib))
-    )
-    monkeypatch.setattr(torch.cuda, "mem_get_info", lambda device: [int(available["memory"] * gib)] * 2)
-    return available
-
-
-def test_a_large_base_needs_a_gpu_unless_the_cpu_is_chosen(machine, tiny_folders):
-    with pytest.raises(DeviceError, match=r"finds no GPU, and kontext has 11\.9 billion .*--device cpu"):
-        check_machine("kontext", KONTEXT, Placement("cpu"), requested="auto")
-    check_machine("kontext", KONTEXT, Placement("cpu"), requested="cpu")
-    for small in ("tiny:kontext", str(tiny_folders / "kontext")):
-        check_machine(small, KONTEXT, Placement("cpu"), requested="auto")
-
-
-def place(name, memory_gib, free_gib=None, **options):
-    weights = count_weights(name, BACKBONES[name])
-    placement = place_on_gpu(weights, free_gib=free_gib or memory_gib, total_gib=memory_gib, **options)
-    return placement.quantization, placement.is_offloaded
-
-
-def test_the_quantization_is_chosen_by_the_memory_of_the_gpu(monkeypatch):
-    monkeypatch.setattr(importlib.util, "find_spec", lambda name: object())
-    chosen = {memory: place("kontext", memory) for memory in (40, 24, 16, 12, 8)}
-    assert chosen == {
-        40: (None, False), 24: ("int8", False), 16: ("int8", False), 12: ("nf4", False), 8: ("int8", True)
-    }  # fmt: skip
-    assert place("kontext", 24, preferred="float8") == ("float8", False)
-    assert place("klein", 24) == (None, False)
-    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
-    assert place("kontext", 12) == ("int8", True)
-
-
-@pytest.mark.parametrize(("memory", "is_offloaded"), [(12, True), (16, True), (24, False), (80, False)])
-def test_without_bitsandbytes_int8_replaces_nf4(monkeypatch, memory, is_offloaded):
-    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
-    assert place("qwen", memory, preferred="nf4") == ("int8", is_offloaded)
-    assert place("qwen", memory, preferred="nf4", offload="none") == ("int8", False)
-    monkeypatch.setattr(importlib.util, "find_spec", lambda name: object())
-    assert place("qwen", 24, preferred="nf4") == ("nf4", False)
-
-
-def test_nf4_without_bitsandbytes_is_refused_before_any_download(machine, monkeypatch):
-    monkeypatch.setitem(sys.modules, "bitsandbytes", None)
-    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
-    monkeypatch.setattr(huggingface_hub, "snapshot_download", lambda *_, **__: pytest.fail("downloaded"))
-    cure = (
-        r"bitsandbytes cannot be imported .*; run: pip install bitsandbytes, or choose the quantization int8"
-    )
-    with pytest.raises(MissingExtra, match=cure):
-        check_machine("qwen", BACKBONES["qwen"], Placement("cuda", "nf4"), requested="auto")
-    with pytest.raises(MissingExtra, match=cure):
-        load_backbone("qwen", device="cuda", quantization="nf4")
-
-
-def test_the_weights_are_offloaded_only_if_they_do_not_fit_or_on_request(monkeypatch):
-    monkeypatch.setattr(importlib.util, "find_spec", lambda name: object())
-    assert place("kontext", 24, free_gib=10) == ("int8", True)
-    assert place("kontext", 24, free_gib=10, offload="none") == ("int8", False)
-    assert place("kontext", 80, offload="layers") == (None, True)
-    assert place("kontext", 12, quantization="float8") == ("float8", True)
-    assert place("qwen", 80, preferred="nf4", offload="layers") == ("int8", True)
-    assert place("qwen", 12, free_gib=4, quantization="nf4") == ("nf4", False)
-    with pytest.raises(DeviceError, match=r"with quantization = nf4; .*cannot be moved"):
-        place("qwen", 80, quantization="nf4", offload="layers")
-
-
-def test_on_a_cpu_nothing_is_quantized_by_default_and_nothing_is_offloaded():
-    weights = count_weights("kontext", KONTEXT)
-    assert choose_placement(weights, requested="cpu", preferred="int8") == Placement("cpu")
-    with pytest.raises(DeviceError, match="layers was requested on the CPU; expected a GPU"):
-        choose_placement(weights, requested="cpu", offload="layers")
-
-
-def test_an_offloaded_base_needs_host_memory_instead_of_gpu_memory(machine, monkeypatch):
-    monkeypatch.setattr(torch.cuda, "mem_get_info", lambda device: [5 << 30] * 2)
-    offloaded = Placement("cuda", "int8", is_offloaded=True)
-    check_machine("kontext", KONTEXT, offloaded, requested="auto")
-    with pytest.raises(DeviceError, match=r"about 14\.\d GiB of memory on cuda, and 5\.0"):
-        check_machine("kontext", KONTEXT, Placement("cuda", "int8"), requested="auto")
-    machine["memory"] = 12
-    with pytest.raises(DeviceError, match=r"about 13\.\d GiB of host memory, because it is offloaded"):
-        check_machine("kontext", KONTEXT, offloaded, requested="auto")
-
-
-def test_text_encoders_need_host_memory(machine, monkeypatch):
-    monkeypatch.setattr(torch.cuda, "mem_get_info", lambda device: [80 << 30] * 2)
-    machine["memory"] = 15
-    check = functools.partial(check_machine, placement=Placement("cuda"), requested="auto")
-    check("qwen", BACKBONES["qwen"])
-    check("kontext", KONTEXT, with_text_encoders=True)
-    with pytest.raises(
-        DeviceError,
-        match=r"qwen needs about 17\.4 GiB of host memory, because its text encoders .* 15\.0 GiB",
-    ):
-        check("qwen", BACKBONES["qwen"], with_text_encoders=True)
-
-
-def test_memory_and_disk_are_checked_before_the_download(machine):
-    machine["memory"] = 40
-    with pytest.raises(DeviceError, match=r"kontext needs about 46\.\d GiB of memory on cpu, and 40\.0"):
-        check_machine("kontext", KONTEXT, Placement("cpu"), requested="cpu")
-    machine["memory"] = 16
-    with pytest.raises(DeviceError, match=r"about 25\.\d GiB of memory on cuda.*; choose quantization int8"):
-        check_machine("kontext", KONTEXT, Placement("cuda"), requested="auto")
-    check_machine("kontext", KONTEXT, Placement("cuda", "int8"), requested="auto")
-    machine["disk"] = 30
-    check_machine("kontext", KONTEXT, Placement("cuda", "int8"), requested="auto")
-    with pytest.raises(DownloadError, match=r"Kontext-dev needs about 34 GB on the disk, .* 32 GB free"):
-        check_machine(
-            "kontext", KONTEXT, Placement("cuda", "int8"), requested="auto", with_text_encoders=True
-        )
 
 
 def test_the_offline_error_of_huggingface_hub_is_explained(tmp_path, monkeypatch):

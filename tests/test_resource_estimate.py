@@ -6,10 +6,12 @@ from pathlib import Path
 import pytest
 import torch
 
-from brewster.errors import DeviceError, ModelError
+from brewster.errors import DeviceError, DownloadError
+from brewster.models.diffusion.backbones.registry import tiny
 from brewster.models.diffusion.cost import CARDS, GraphicsCard, find_gpu
 from brewster.training.lora.resource_estimate import estimate_resources
 from brewster.training.recipe import read_recipe, with_value
+from published_models import KLEIN_9B, write_klein_9b
 from set_folders import render_set
 
 RECIPES = Path(__file__).parents[1] / "recipes" / "train"
@@ -83,9 +85,18 @@ def test_gpus_are_found_by_name_and_that_of_the_paper_is_the_default_without_a_g
     assert find_gpu() == CARD
 
 
-def test_an_unknown_backbone_has_no_estimate():
-    with pytest.raises(ModelError, match="there is no backbone 'somebody/else'"):
-        estimate_resources(with_value(read_recipe(RECIPES / "klein.toml"), "backbone", "somebody/else"), CARD)
+def test_a_backbone_on_the_hub_or_in_a_folder_is_counted_by_its_configuration(tmp_path, monkeypatch):
+    recipe = read_recipe(RECIPES / "klein.toml")
+    write_klein_9b(tmp_path, monkeypatch)
+    estimate = estimate_resources(with_value(recipe, "backbone", KLEIN_9B), CARD)
+    assert estimate.parameter_count == pytest.approx(9.08e9, rel=0.01)
+    assert re.search(r"download +26 GB, of which 8 GB are text encoders", estimate.table())
+    with pytest.raises(DownloadError, match="somebody/else is not in the cache"):
+        estimate_resources(with_value(recipe, "backbone", "somebody/else"), CARD)
+    tiny("klein")[0].save(tmp_path / "klein")
+    folder = estimate_resources(with_value(recipe, "backbone", str(tmp_path / "klein")), CARD)
+    assert folder.parameter_count == tiny("klein")[0].transformer.num_parameters()
+    assert re.search(r"download +0 GB, of which 0 GB are text encoders", folder.table())
 
 
 def test_the_command_prints_the_estimate_and_trains_nothing(run_without_model, tmp_path, monkeypatch):

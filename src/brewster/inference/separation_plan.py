@@ -19,7 +19,12 @@ import torch
 
 from brewster.errors import ModelError
 from brewster.inference.diffusion_predictor import DiffusionPredictor
-from brewster.models.diffusion.backbones.registry import build_on_meta, hub_id_of, is_registered
+from brewster.models.diffusion.backbones.registry import (
+    build_on_meta,
+    find_description,
+    hub_id_of,
+    is_registered,
+)
 from brewster.models.diffusion.cost import (
     EFFICIENCY,
     PROMPT_TOKENS,
@@ -128,7 +133,7 @@ class SeparationPlan:
 def plan_separation(options: Options, size: tuple[int, int], card: GraphicsCard) -> SeparationPlan:
     """Estimates the separation of a photo of this (width, height) on a card. This takes a few seconds.
 
-    A base that is neither a folder nor in the table of backbones is assumed to have the size of its backbone.
+    A base on the hub whose configuration is not in the cache is assumed to have the size of its backbone.
 
     Raises:
         ModelError: the model is unknown, is no diffusion model, or its files are damaged.
@@ -139,8 +144,8 @@ def plan_separation(options: Options, size: tuple[int, int], card: GraphicsCard)
     """
     check_diffusion_model(options.model)
     source = find_model_source(options.model, options.base_model, allow_download=False)
-    is_known = is_registered(source.base) or Path(source.base).is_dir()
-    backbone = build_on_meta(source.base if is_known else source.backbone_class.name, dtype=torch.bfloat16)
+    description = source.base if is_registered(source.base) else find_description(source.base)
+    backbone = build_on_meta(str(description or source.backbone_class.name), dtype=torch.bfloat16)
     task = task_with_options(
         source,
         guidance=options.guidance,

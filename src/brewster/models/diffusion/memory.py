@@ -16,7 +16,12 @@ import torch
 
 from brewster.errors import DeviceError, DownloadError
 from brewster.models.diffusion.backbones.backbone import Backbone
-from brewster.models.diffusion.backbones.registry import hub_id_of
+from brewster.models.diffusion.backbones.registry import (
+    build_on_meta,
+    find_description,
+    hub_id_of,
+    is_registered,
+)
 from brewster.models.diffusion.hub_download import free_disk_bytes, is_transformer_cached
 from brewster.models.diffusion.lazy_imports import import_bitsandbytes, import_library
 from brewster.models.zoo import TINY_PREFIX
@@ -88,18 +93,21 @@ def torch_device(device: str) -> str:
 
 
 def count_weights(source: str, backbone_class: type[Backbone], transformer_file: Path | None = None) -> int:
-    """The number of parameters of the transformer: of the files in a folder, otherwise of the backbone; 0 for a tiny version.
+    """The number of parameters of the transformer; 0 for a tiny version.
 
-    For a `transformer_file` it is the number of bf16 weights that need the same memory.
+    They are counted by the configuration of a folder or of a hub id in the cache. For another source it is the number of
+    the backbone, and for a `transformer_file` the number of bf16 weights that need the same memory.
+
+    Raises:
+        ModelError: the configuration is damaged.
     """
     if transformer_file:
         return transformer_file.stat().st_size // _FILE_BYTES_PER_WEIGHT
     if source.startswith(TINY_PREFIX):
         return 0
-    if not Path(source).is_dir():
+    if is_registered(source) or (folder := find_description(source)) is None:
         return backbone_class.parameter_count
-    size = sum(path.stat().st_size for path in (Path(source) / "transformer").glob("*.safetensors"))
-    return size // _FILE_BYTES_PER_WEIGHT
+    return int(build_on_meta(str(folder)).transformer.num_parameters())
 
 
 def weights_gib(parameters: int, quantization: Quantization | None) -> float:

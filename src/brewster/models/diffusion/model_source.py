@@ -19,9 +19,11 @@ from brewster.models.diffusion.adapter.layouts import LAYOUTS, LoraLayout, layou
 from brewster.models.diffusion.adapter.lora import LORA_FILE, LoraMetadata
 from brewster.models.diffusion.backbones.backbone import Backbone
 from brewster.models.diffusion.backbones.registry import (
+    DESCRIPTION_FILES,
     INDEX_FILE,
     backbone_class_of,
     find_backbone_class,
+    find_description,
     is_registered,
     read_index,
 )
@@ -39,7 +41,12 @@ from brewster.options import Quantization
 
 _FINGERPRINT_BYTES: Final = 1 << 20
 """The number of bytes at the start and at the end of a file that a digest reads."""
-_FILES: Final = [name for layout in LAYOUTS for name in layout.files] + [INDEX_FILE, PROMPT_FILE, TASK_FILE]
+_FILES: Final = [
+    *(name for layout in LAYOUTS for name in layout.files),
+    *DESCRIPTION_FILES,
+    PROMPT_FILE,
+    TASK_FILE,
+]
 
 
 @final
@@ -183,7 +190,7 @@ def _find_base(
             f"expected a {metadata.backbone} in diffusers' layout",
             "pass its folder or hub id with --base-model",
         )
-    if not allow_download and not is_registered(base) and not cached_model_folder(base, [INDEX_FILE]):
+    if not allow_download and not is_registered(base) and not find_description(base):
         return base, find_backbone_class(metadata.backbone)
     backbone_class = backbone_class_of(base)  # checked before the download, which may take an hour
     if backbone_class.name != metadata.backbone:

@@ -1,4 +1,4 @@
-"""Estimates the tokens, memory and time of a LoRA recipe before anything is downloaded.
+"""Estimates the tokens, memory and time of a LoRA recipe before any weights are downloaded.
 
 estimate = estimate_resources(recipe, CARDS["RTX 4090"])
 print(estimate.table())
@@ -11,13 +11,14 @@ these counts.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Final, final
 
 import torch
 
 from brewster.models.diffusion.adapter.lora import select_target_modules
 from brewster.models.diffusion.backbones.backbone import Backbone
-from brewster.models.diffusion.backbones.registry import build_on_meta, find_backbone_class
+from brewster.models.diffusion.backbones.registry import build_on_meta
 from brewster.models.diffusion.cost import (
     EFFICIENCY,
     PROMPT_TOKENS,
@@ -83,9 +84,10 @@ class ResourceEstimate:
         recipe, (width, height) = self.recipe, self.panel
         # A tiny version has random weights and no text encoders.
         is_tiny = recipe.backbone.startswith(TINY_PREFIX)
+        is_stored = is_tiny or Path(recipe.backbone).is_dir()
         is_encoded = is_tiny or recipe.prompt.endswith(ENCODED_SUFFIX)
         encoders = 0 if is_encoded else 2 * self.text_encoder_parameters
-        download = 0 if is_tiny else 2 * self.parameter_count + self.memory_gib["VAE"] * GIB + encoders
+        download = 0 if is_stored else 2 * self.parameter_count + self.memory_gib["VAE"] * GIB + encoders
         model = {
             "backbone": f"{recipe.backbone}, {self.parameter_count / 1e9:.2f} billion parameters",
             "LoRA": f"rank {recipe.rank}, {self.lora_parameters / 1e6:.1f} million parameters",
@@ -103,7 +105,7 @@ class ResourceEstimate:
             card=self.card,
             host_memory=f"{encoders / GIB + _HOST_OVERHEAD_GIB:.1f} GiB{'' if is_encoded else ', while the text encoders encode the prompt'}",
             download_gb=download / 1e9,
-            text_encoder_gb=encoders / 1e9,
+            text_encoder_gb=0 if is_stored else encoders / 1e9,
         )
 
     def check_fits(self) -> None:
@@ -125,13 +127,12 @@ class ResourceEstimate:
 def estimate_resources(recipe: LoraRecipe, card: GraphicsCard) -> ResourceEstimate:
     """Estimates the resources of a recipe on a GPU. This takes a few seconds.
 
+    For a backbone on the hub that is not in the table of backbones, its configuration files are downloaded.
+
     Raises:
-        ModelError: the backbone is not in the table of backbones.
+        DownloadError, ModelError: the backbone is unknown or damaged, or its configuration cannot be downloaded.
         MissingExtra: diffusers is not installed.
     """
-    find_backbone_class(
-        recipe.backbone.removeprefix(TINY_PREFIX)
-    )  # refuses a source that is not in the table
     backbone = build_on_meta(recipe.backbone, dtype=torch.bfloat16)
     fit = fit_panel(
         _SQUARE_PHOTO_PX,

@@ -20,8 +20,8 @@ from torch import nn
 
 from brewster.errors import ModelError
 from brewster.models.diffusion.backbones.backbone import Architecture, Backbone
-from brewster.models.diffusion.hub_download import resolve_model_folder
-from brewster.models.diffusion.lazy_imports import diffusers_class
+from brewster.models.diffusion.hub_download import cached_model_folder, resolve_model_folder
+from brewster.models.diffusion.lazy_imports import diffusers_class, suppress_log_messages
 from brewster.models.diffusion.out_of_memory import explain_out_of_memory
 from brewster.models.diffusion.prompt import PromptEmbedding
 from brewster.models.diffusion.tensors import read_json
@@ -39,6 +39,8 @@ CONFIG_FILES: Final = {
     "scheduler": "scheduler_config.json",
 }
 """Part of a backbone -> the file with its configuration, in the folder of the part."""
+DESCRIPTION_FILES: Final = (INDEX_FILE, *(f"{part}/{file}" for part, file in CONFIG_FILES.items()))
+"""The files without weights that `build_on_meta` reads."""
 MEMORY_HINT: Final = "a smaller backbone (klein) or a GPU with more memory"
 _STATISTICS_SPREAD: Final = 0.2
 """The spread of the random batch-norm statistics of a built VAE. With exactly 0 and 1, tests would not detect missing
@@ -99,15 +101,25 @@ def build_on_meta(source: str, *, dtype: torch.dtype = torch.float32) -> Backbon
         is_tiny = source.startswith(TINY_PREFIX)
         architecture = backbone_class.tiny if is_tiny else backbone_class.full_size
         return build(backbone_class.name, architecture, device="meta", dtype=dtype)
-    configs = [f"{part}/{file}" for part, file in CONFIG_FILES.items()]
-    folder = resolve_model_folder(source, [INDEX_FILE, *configs])
+    folder = resolve_model_folder(source, list(DESCRIPTION_FILES))
     backbone_class, index = read_index(folder)
-    parts = {}
     with torch.device("meta"), _default_dtype(dtype):
-        for part, file in CONFIG_FILES.items():
-            config = read_json(folder / part / file)
-            parts[part] = diffusers_class(backbone_class.classes[part]).from_config(config)
+        parts = {
+            part: _build_part(folder / part / file, backbone_class.classes[part])
+            for part, file in CONFIG_FILES.items()
+        }
     return backbone_class(**parts, distilled=bool(index.get("is_distilled")))
+
+
+def find_description(source: str) -> Path | None:
+    """The folder with the index and the configuration of a backbone, or None if they are not in the cache. Downloads nothing.
+
+    `source` is a folder, which is returned unchanged, or a hub id.
+    """
+    folder = cached_model_folder(source, list(DESCRIPTION_FILES))
+    if folder is None or Path(source).is_dir():
+        return folder
+    return folder if all((folder / name).is_file() for name in DESCRIPTION_FILES) else None
 
 
 def find_backbone_class(name: str) -> type[Backbone]:
@@ -127,14 +139,14 @@ def find_backbone_class(name: str) -> type[Backbone]:
 
 
 def backbone_class_of(source: str) -> type[Backbone]:
-    """The Backbone class that `load_backbone` would use for this source. No weights are downloaded.
+    """The Backbone class that `load_backbone` would use for this source. The files of its description are downloaded, but no weights.
 
     Raises:
         DownloadError, ModelError, MissingExtra: see `load_backbone`.
     """
     if is_registered(source):
         return find_backbone_class(source.removeprefix(TINY_PREFIX))
-    return read_index(resolve_model_folder(source, [INDEX_FILE]))[0]
+    return read_index(resolve_model_folder(source, list(DESCRIPTION_FILES)))[0]
 
 
 def is_registered(source: str) -> bool:
@@ -168,6 +180,20 @@ def read_index(folder: Path) -> tuple[type[Backbone], dict[str, Any]]:
         f"expected one of {', '.join(names)}",
         f"use {', '.join(backbone_class.hub_id for backbone_class in BACKBONES.values())} or a finetune of one",
     )
+
+
+def _build_part(config_file: Path, class_name: str) -> Any:  # noqa: ANN401 - a class of diffusers
+    """Builds the transformer, VAE or scheduler of a configuration, on the default device."""
+    part_class, config = diffusers_class(class_name), read_json(config_file)
+    try:
+        with suppress_log_messages():  # diffusers warns about settings that the class does not have
+            return part_class.from_config(config)
+    except (ArithmeticError, LookupError, RuntimeError, TypeError, ValueError) as error:
+        raise ModelError(
+            f"{config_file} has invalid settings ({' '.join(str(error).split())[:200]})",
+            f"expected the settings of a {class_name}",
+            "copy the model again",
+        ) from error
 
 
 @contextlib.contextmanager
