@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from brewster.render.rays.emitters import CameraView, SideEmitters
+from brewster.render.rays.emitters import CameraView, Rays, SideEmitters
 from brewster.render.rays.envmap_sampling import EnvmapDistribution, direction_to_uv, uv_to_direction
 from synthetic_scenes import ASSETS, map_side, map_with_bright_texel
 
@@ -58,7 +58,9 @@ def test_texture_coordinates_and_directions_are_inverse():
 def test_the_density_integrates_to_one_over_the_sphere(outward, u_offset):
     distribution = EnvmapDistribution(random_map(), torch.tensor(outward, dtype=torch.float32), u_offset)
     directions, solid_angle = texel_directions(u_offset)
-    assert float((distribution.pdf(directions, u_offset) * solid_angle).sum()) == pytest.approx(1, rel=1e-3)
+    assert float(
+        (distribution.pdf(*direction_to_uv(directions, u_offset)) * solid_angle).sum()
+    ) == pytest.approx(1, rel=1e-3)
 
 
 def test_no_direction_is_sampled_on_the_other_side_of_the_glass():
@@ -66,8 +68,8 @@ def test_no_direction_is_sampled_on_the_other_side_of_the_glass():
     distribution = EnvmapDistribution(random_map(), outward, 0.2)
     sampled = distribution.sample(uniforms(5000), 0.2)
     assert float((outward @ sampled).min()) > -0.05 - math.pi / HEIGHT
-    assert (distribution.pdf(sampled, 0.2) > 0).all()
-    assert float(distribution.pdf(-outward[:, None], 0.2)) == 0
+    assert (distribution.pdf(*direction_to_uv(sampled, 0.2)) > 0).all()
+    assert float(distribution.pdf(*direction_to_uv(-outward[:, None], 0.2))) == 0
 
 
 def test_nearly_all_samples_hit_the_sun():
@@ -89,11 +91,11 @@ def test_the_density_matches_the_frequency_of_samples(u_offset):
     cell = (v * HEIGHT).long().clamp(max=HEIGHT - 1) * 2 * HEIGHT + (u * 2 * HEIGHT).long() % (2 * HEIGHT)
     counts = torch.bincount(cell, minlength=2 * HEIGHT**2)
     directions, solid_angle = texel_directions(u_offset)
-    expected = distribution.pdf(directions, u_offset) * solid_angle * count
+    expected = distribution.pdf(*direction_to_uv(directions, u_offset)) * solid_angle * count
     is_frequent = expected > 20
     chi_squared = ((counts - expected) ** 2 / expected.clamp(min=1))[is_frequent].mean()
     assert float(chi_squared) == pytest.approx(1, abs=0.15)
-    assert float(distribution.pdf(sampled, u_offset).min()) > 0
+    assert float(distribution.pdf(u, v).min()) > 0
 
 
 @pytest.mark.parametrize("radius_mm", [math.inf, 1500.0], ids=["far", "dome"])
@@ -102,12 +104,15 @@ def test_the_mean_of_one_over_the_density_is_the_solid_angle(radius_mm, behind):
     """A cone of half-angle 60 degrees has a solid angle of pi, from any point inside a dome."""
     emitters = make_emitters(map_side("soft", radius_mm=radius_mm, heading_deg=25), behind)
     origin = torch.tensor([[300.0], [-200.0], [0.0]]).expand(3, 200_000)
-    direction, pdf = emitters.towards(emitters.sample_map(uniforms(200_000)), origin)
+    samples = emitters.sample_map(uniforms(200_000)[0], 1.0)
+    direction, radiance, pdf = emitters.towards(samples, Rays(origin, origin, 1.0))
     outward = -direction[2] if behind else direction[2]
     is_inside = outward > 0.5
     assert float((is_inside / pdf.clamp(min=1e-9)).mean()) == pytest.approx(math.pi, rel=0.01)
     torch.testing.assert_close(direction.norm(dim=0), torch.ones(200_000))
-    torch.testing.assert_close(emitters.pdf(origin, direction), pdf)
+    expected_radiance, expected_pdf = emitters.radiance_and_pdf(Rays(origin, direction, 1.0))
+    torch.testing.assert_close(radiance, expected_radiance, rtol=1e-3, atol=1e-4)
+    torch.testing.assert_close(pdf, expected_pdf)
 
 
 def test_a_black_map_can_be_sampled():

@@ -14,10 +14,11 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 from torch.nn import functional
+from torch.quasirandom import SobolEngine
 
 from brewster.environments.assets import Assets
 from brewster.render.rays.envmap_sampling import EnvmapDistribution, direction_to_uv
-from brewster.render.rays.vectors import dot, normalize
+from brewster.render.rays.vectors import dot
 from brewster.scene.camera import axes
 from brewster.scene.world import Plane, Side
 
@@ -25,6 +26,8 @@ Device = torch.device | str
 
 _MAX_TEXELS_PER_LOOKUP = 1.2
 """A lookup with a larger footprint uses a coarser mipmap level. With a higher limit, a sun of one texel flickers."""
+_LIGHT_TABLE_SIZE = 1 << 16
+"""The number of points of a map from which `SideEmitters.sample_map` chooses."""
 
 
 class MipmappedTexture:
@@ -92,6 +95,22 @@ class Rays:
 
 
 @dataclass(frozen=True)
+class LightSamples:
+    """Random points of a map, as unit directions from its centre in the glass frame, (3, N); the light there, (3, N).
+
+    `pdf` is the density of the points per steradian at the centre, (N,).
+    """
+
+    point: Tensor
+    radiance: Tensor
+    pdf: Tensor
+
+    def at(self, indices: Tensor) -> LightSamples:
+        """Returns the samples with these indices."""
+        return LightSamples(self.point[:, indices], self.radiance[:, indices], self.pdf[indices])
+
+
+@dataclass(frozen=True)
 class CameraView:
     """The values that determine the footprint of a pixel: height above the glass, angle of a pixel, and thin lens.
 
@@ -134,6 +153,7 @@ class SideEmitters:
         device: Device,
     ) -> None:
         self._distribution: EnvmapDistribution | None = None
+        self._light_table: LightSamples | None = None
         self.radius_mm = side.map.radius_mm if side.map else math.inf
         self.envmap = (
             MipmappedTexture(torch.from_numpy(assets.map_radiance(side.map)).to(device), wraps=True)
@@ -186,27 +206,6 @@ class SideEmitters:
             return None
         return self.lookup_map(direction, relative_footprint)
 
-    def near_radiance(
-        self, origin: Tensor, direction: Tensor, relative_footprint: float
-    ) -> tuple[Tensor, Tensor | None]:
-        """Returns the light of the dome and the plane along rays, and the visibility of the far light.
-
-        Returns:
-            Radiance (3, N), and the fraction of the far light that the plane does not hide, (N,) in 0..1. The fraction
-            is None if there is no far light.
-        """
-        radiance, visibility = torch.zeros_like(direction), None
-        if self.has_dome:
-            point, _ = self._intersect_dome(origin, direction)
-            radiance = self.lookup_map(point, relative_footprint)
-        elif self.envmap is not None:
-            visibility = torch.ones_like(direction[0])
-        if self.plane is not None:
-            image, coverage = self._plane_radiance(self.plane, origin, direction, relative_footprint)
-            radiance = radiance + coverage * (image - radiance)
-            visibility = None if visibility is None else visibility * (1 - coverage)
-        return radiance, visibility
-
     def radiance(self, origin: Tensor, direction: Tensor, relative_footprint: float) -> Tensor:
         """Returns all light along rays from `origin` in unit `direction`, (3, N) each: (3, N)."""
         return self.add_near(
@@ -220,10 +219,10 @@ class SideEmitters:
 
         Far light does not depend on origins, so rays with the same directions need only one call of `far_radiance`.
         """
-        if not self.has_near_light:
-            return torch.zeros_like(direction) if far is None else far
-        near, visibility = self.near_radiance(origin, direction, relative_footprint)
-        return near if far is None or visibility is None else near + visibility * far
+        if self.has_dome:
+            far = self.lookup_map(self._intersect_dome(origin, direction)[0], relative_footprint)
+        light = torch.zeros_like(direction) if far is None else far
+        return self._add_plane(light, origin, direction, relative_footprint)
 
     def lookup_map(self, direction: Tensor, relative_footprint: float) -> Tensor:
         """Returns the light of the map in unit directions (3, N) from its centre: (3, N)."""
@@ -231,36 +230,62 @@ class SideEmitters:
         u, v = direction_to_uv(self._to_world @ direction, self._u_offset)
         return self.envmap(u, v, self._map_footprint(relative_footprint))
 
-    def sample_map(self, uniforms: Tensor) -> Tensor:
+    def sample_map(self, uniforms: Tensor, relative_footprint: float) -> LightSamples:
         """Draws points of the map with a density proportional to its luminance, for `towards`.
 
-        `uniforms` are random numbers in [0, 1), (2, N).
+        `uniforms` are random numbers in [0, 1), (N,). They choose from a table of stratified points, because inverting the
+        distribution for each ray takes several times as long. `relative_footprint` must be the same in all calls.
+        """
+        if self._light_table is None:
+            self._light_table = self._tabulate_light(relative_footprint)
+        return self._light_table.at((uniforms * _LIGHT_TABLE_SIZE).long())
+
+    def _tabulate_light(self, relative_footprint: float) -> LightSamples:
+        """Returns _LIGHT_TABLE_SIZE points of the map, in the order of its texels."""
+        engine = SobolEngine(2, scramble=True, seed=0)  # type: ignore[no-untyped-call]
+        points = engine.draw(_LIGHT_TABLE_SIZE).to(self._to_world.device)
+        points = points[points[:, 0].argsort()].T
+        distribution = self._map_distribution()
+        direction = distribution.sample(points, self._u_offset)
+        u, v = direction_to_uv(direction, self._u_offset)
+        assert self.envmap is not None
+        radiance = self.envmap(u, v, self._map_footprint(relative_footprint))
+        return LightSamples(self._to_world.T @ direction, radiance, distribution.pdf(u, v))
+
+    def towards(self, samples: LightSamples, rays: Rays) -> tuple[Tensor, Tensor, Tensor]:
+        """Returns the unit directions from the origins of `rays` to points of the map, and the light from there.
 
         Returns:
-            Unit directions from the centre of the map, (3, N).
+            Directions (3, N), light (3, N) and the densities of the directions per steradian (N,).
         """
-        return self._to_world.T @ self._map_distribution().sample(uniforms, self._u_offset)
+        direction, pdf = samples.point, samples.pdf
+        if self.has_dome:
+            offset = samples.point * self.radius_mm - rays.origin
+            distance = torch.sqrt(dot(offset, offset))
+            direction = offset / distance
+            pdf = pdf * self._dome_density_ratio(samples.point, direction, distance)
+        light = self._add_plane(samples.radiance, rays.origin, direction, rays.relative_footprint)
+        return direction, light, pdf
 
-    def towards(self, point: Tensor, origin: Tensor) -> tuple[Tensor, Tensor]:
-        """Returns the unit directions from `origin` to points of the map, (3, N), and their densities per steradian, (N,).
+    def radiance_and_pdf(self, rays: Rays) -> tuple[Tensor, Tensor]:
+        """Returns all light along rays, (3, N), and the density of `towards` at their directions, per steradian: (N,)."""
+        assert self.envmap is not None
+        point, ratio = rays.direction, None
+        if self.has_dome:
+            point, distance = self._intersect_dome(rays.origin, rays.direction)
+            ratio = self._dome_density_ratio(point, rays.direction, distance)
+        u, v = direction_to_uv(self._to_world @ point, self._u_offset)
+        light = self.envmap(u, v, self._map_footprint(rays.relative_footprint))
+        pdf = self._map_distribution().pdf(u, v)
+        light = self._add_plane(light, rays.origin, rays.direction, rays.relative_footprint)
+        return light, pdf if ratio is None else pdf * ratio
 
-        `point` is a result of `sample_map`.
+    def _dome_density_ratio(self, point: Tensor, direction: Tensor, distance: Tensor) -> Tensor:
+        """Returns the density per steradian at a ray's origin divided by that at the dome's centre, (N,).
+
+        The same area of the dome has the solid angle A / r^2 at the centre and A cos / distance^2 at the origin.
         """
-        direction = normalize(point * self.radius_mm - origin) if self.has_dome else point
-        return direction, self.pdf(origin, direction)
-
-    def pdf(self, origin: Tensor, direction: Tensor) -> Tensor:
-        """Returns the density of `towards` at unit directions (3, N), per steradian at `origin`: (N,)."""
-        if not self.has_dome:
-            return self._map_distribution().pdf(self._to_world @ direction, self._u_offset)
-        point, distance = self._intersect_dome(origin, direction)
-        # The same area of the dome has the solid angle A / r^2 at the centre and A cos / distance^2 at `origin`.
-        cosine = dot(point, direction).clamp(min=1e-6)
-        return (
-            self._map_distribution().pdf(self._to_world @ point, self._u_offset)
-            * (distance / self.radius_mm) ** 2
-            / cosine
-        )
+        return (distance / self.radius_mm) ** 2 / dot(point, direction).clamp(min=1e-6)
 
     def _intersect_dome(self, origin: Tensor, direction: Tensor) -> tuple[Tensor, Tensor]:
         """Intersects rays with the dome.
@@ -279,6 +304,15 @@ class SideEmitters:
             outward = self._to_world @ self._to_world.new_tensor([0, 0, -1 if self._is_behind else 1])
             self._distribution = EnvmapDistribution(self.envmap.texels, outward, self._u_offset)
         return self._distribution
+
+    def _add_plane(
+        self, light: Tensor, origin: Tensor, direction: Tensor, relative_footprint: float
+    ) -> Tensor:
+        """Returns the light along rays, with the plane in front of `light`: (3, N)."""
+        if self.plane is None:
+            return light
+        image, coverage = self._plane_radiance(self.plane, origin, direction, relative_footprint)
+        return light + coverage * (image - light)
 
     def _plane_radiance(
         self, plane: _PlaneEmitter, origin: Tensor, direction: Tensor, relative_footprint: float

@@ -70,10 +70,9 @@ class EnvmapDistribution:
         v = torch.acos((top + (bottom - top) * uniforms[1]).clamp(-1, 1)) / math.pi
         return uv_to_direction(u, v, u_offset)
 
-    def pdf(self, direction: Tensor, u_offset: float) -> Tensor:
-        """Returns the density of `sample` at unit directions (3, N), per steradian: (N,)."""
+    def pdf(self, u: Tensor, v: Tensor) -> Tensor:
+        """Returns the density of `sample` at texture coordinates, (N,) each in 0..1, per steradian: (N,)."""
         height, width = self._pdf.shape
-        u, v = direction_to_uv(direction, u_offset)
         row, column = (v * height).long().clamp(0, height - 1), (u * width).long().clamp(0, width - 1)
         pdf: Tensor = self._pdf[row, column]
         return pdf

@@ -28,6 +28,8 @@ so these rays would be traced for a long time."""
 _ROULETTE_WEIGHT: Final = 0.04
 """A ray with a smaller weight is continued with the probability weight / _ROULETTE_WEIGHT. Its weight is then _ROULETTE_WEIGHT, so
 that the mean does not change. At normal incidence, a surface of glass reflects about this fraction."""
+_MAX_CONTINUED_SHARE: Final = 0.8
+"""If a larger share of the rays would be continued, all are, because their selection takes longer than tracing the others."""
 _MAX_DISTANCE_MM: Final = 1e7
 _MIN_LIGHT_SAMPLING_WEIGHT: Final = 3e-3
 """Orders with a smaller weight, averaged over all rays, use microfacet samples only; their noise is too faint to see."""
@@ -35,10 +37,13 @@ _MIN_LIGHT_SAMPLING_WEIGHT: Final = 3e-3
 
 @dataclass(frozen=True)
 class Surface:
-    """One surface of a pane: its height on the z axis, its normal towards the camera, (3, 1), and its material."""
+    """One surface of a pane: its height on the z axis, its frame and its material.
+
+    The rows of `axes`, (3, 3), are the axes of the surface's frame. The last is its normal towards the camera.
+    """
 
     height_mm: float
-    normal: Tensor
+    axes: Tensor
     alpha: float
     refractive_index: float
     glass_is_below: bool
@@ -87,11 +92,12 @@ def surfaces(glass: Glazing, like: Tensor) -> list[Surface]:
         absorption = like.new_tensor(pane.absorption_per_m)[:, None] / 1000
         for is_far in (False, True):
             wedge = torch.tensor(pane.wedge_deg if is_far else 0.0).deg2rad()
-            normal = like.new_tensor([wedge.sin(), 0, wedge.cos()])[:, None]
+            sine, cosine = float(wedge.sin()), float(wedge.cos())
+            axes = like.new_tensor([[cosine, 0, -sine], [0, 1, 0], [sine, 0, cosine]])
             height_mm -= pane.thickness_mm if is_far else 0.0
             # Without refraction there is no scattering.
             alpha = pane.roughness if pane.refractive_index > 1 else 0.0
-            stack.append(Surface(height_mm, normal, alpha, pane.refractive_index, not is_far, absorption))
+            stack.append(Surface(height_mm, axes, alpha, pane.refractive_index, not is_far, absorption))
         height_mm -= glass.gap_mm
     return stack
 
@@ -108,10 +114,8 @@ def trace_orders(
     count = rays.direction.shape[1]
     ones, indices = torch.ones_like(rays.direction), torch.arange(count, device=rays.direction.device)
     # All orders of a side share their light samples.
-    light_samples = {
-        emitters: emitters.sample_map(sobol.next_2d())
-        for emitters in (behind, front)
-        if emitters.envmap and glass.is_rough
+    light_uniforms = {
+        emitters: sobol.next_1d() for emitters in (behind, front) if emitters.envmap and glass.is_rough
     }
     pending = [_PathState(rays.origin, rays.direction, ones, ones, 0, True, 0, False, indices)]
     while pending:
@@ -126,8 +130,8 @@ def trace_orders(
             is_behind = branch.surface > 0
             emitters = behind if is_behind else front
             samples_light = interaction.alpha and _mean_weight(branch, count) > _MIN_LIGHT_SAMPLING_WEIGHT
-            samples = light_samples.get(emitters) if samples_light else None
-            light = _exit_radiance(branch, interaction, emitters, rays.relative_footprint, samples)
+            uniforms = light_uniforms[emitters][branch.rays] if samples_light and emitters.envmap else None
+            light = _exit_radiance(branch, interaction, emitters, rays.relative_footprint, uniforms)
             in_truncated_layers = branch.reflections == 0 if is_behind else not branch.entered_last_pane
             yield ExitingLight(is_behind, in_truncated_layers, light, branch.rays)
 
@@ -143,10 +147,11 @@ def _mean_weight(path: _PathState, count: int) -> float:
 def _continue_at_random(path: _PathState, sobol: SobolPoints) -> _PathState:
     """Ends rays of small weight at random, and raises the weights of the others by the inverse of their probability."""
     weight = (path.s + path.p).mean(dim=0) / 2
-    if not (weight < _ROULETTE_WEIGHT).any():
+    probability = (weight / _ROULETTE_WEIGHT).clamp(max=1)
+    if probability.mean() > _MAX_CONTINUED_SHARE:
         return path
-    kept = (sobol.next_2d(path.rays)[0] * _ROULETTE_WEIGHT < weight).nonzero()[:, 0]
-    scale = (_ROULETTE_WEIGHT / weight[kept]).clamp(min=1)
+    kept = (sobol.next_1d(path.rays) < probability).nonzero()[:, 0]
+    scale = 1 / probability[kept]
     return replace(
         path,
         origin=path.origin[:, kept],
@@ -159,12 +164,12 @@ def _continue_at_random(path: _PathState, sobol: SobolPoints) -> _PathState:
 
 @dataclass(frozen=True)
 class _SurfaceInteraction:
-    """Rays at a surface, with the values that light sampling needs to evaluate other directions there."""
+    """Rays at a surface that reflects or transmits them. Directions are unit vectors, (3, N), in the frame of `axes`."""
 
+    axes: Tensor
+    """The axes of the surface's frame, as rows, (3, 3). The last is the normal on the side of `wi`."""
     wi: Tensor
-    """Unit directions back along the rays, (3, N)."""
-    normal: Tensor
-    """Surface normal on the side of `wi`, (3, 1)."""
+    """Directions back along the rays."""
     alpha: float
     index_in: float
     """Refractive index on the side of `wi`."""
@@ -172,6 +177,10 @@ class _SurfaceInteraction:
     reflects: bool
     before: _PathState
     """The path at the surface, with its weights before the interaction."""
+    wo: Tensor
+    """Directions of the rays after the interaction."""
+    facet: Tensor
+    """Normals of the microfacets that scatter `wi` into `wo`, (3, N) or (3, 1)."""
 
 
 def _interact(
@@ -180,46 +189,46 @@ def _interact(
     """Splits a path at its next surface. Yields the reflected path, then the transmitted path."""
     surface = stack[path.surface]
     in_glass = surface.glass_is_below != path.is_downward
-    distance = (_plane_offset(surface) - dot(surface.normal, path.origin)) / dot(
-        surface.normal, path.direction
-    )
+    side = 1.0 if path.is_downward else -1.0
+    axes = surface.axes * surface.axes.new_tensor([1, 1, side])[:, None]
+    wi = -axes @ path.direction
+    distance = (axes[2] @ path.origin - axes[2, 2] * surface.height_mm) / wi[2]
     # Paths of weight 0 may be parallel to the glass. Their distance must stay finite, because 0 * inf gives NaN.
     distance = distance.nan_to_num(0, 0, 0).clamp(0, _MAX_DISTANCE_MM)
-    point = path.origin + distance * path.direction
-    # Beer-Lambert law over the length of each ray.
-    transmittance = (
-        torch.exp(-surface.absorption * distance) if in_glass else torch.ones_like(surface.absorption)
-    )
-    before = replace(path, origin=point, s=path.s * transmittance, p=path.p * transmittance)
-    normal = surface.normal if path.is_downward else -surface.normal
-    wi = -path.direction
+    point = torch.addcmul(path.origin, distance, path.direction)
+    s, p = path.s, path.p
+    if in_glass:
+        # Beer-Lambert law over the length of each ray.
+        transmittance = torch.exp(-surface.absorption * distance)
+        s, p = s * transmittance, p * transmittance
+    before = replace(path, origin=point, s=s, p=p)
     facet = (
-        sample_visible_normal(wi, normal, surface.alpha, sobol.next_2d(path.rays))
+        sample_visible_normal(wi, surface.alpha, sobol.next_2d(path.rays))
         if surface.alpha
-        else normal
+        else wi.new_tensor([0, 0, 1])[:, None]
     )
+    cosine = dot(wi, facet)
     index_in, index_out = (surface.refractive_index, 1.0) if in_glass else (1.0, surface.refractive_index)
+    reflectances = _reflectances(cosine, index_in, index_out)
     for reflects in (True, False):
-        interaction = _SurfaceInteraction(wi, normal, surface.alpha, index_in, index_out, reflects, before)
-        direction = _scattered_direction(interaction, facet)
-        weights = _facet_weights(interaction, facet, direction)
+        wo = _scattered_direction(wi, facet, cosine, None if reflects else index_in / index_out)
+        interaction = _SurfaceInteraction(
+            axes, wi, surface.alpha, index_in, index_out, reflects, before, wo, facet
+        )
+        weights = _facet_weights(interaction, cosine, reflectances, wo)
         is_last_pane = path.surface == len(stack) - 2
-        yield _path_after(interaction, direction, weights, is_last_pane=is_last_pane), interaction
+        yield _path_after(interaction, weights, is_last_pane=is_last_pane), interaction
 
 
 def _path_after(
-    interaction: _SurfaceInteraction,
-    direction: Tensor,
-    weights: tuple[Tensor, Tensor],
-    *,
-    is_last_pane: bool,
+    interaction: _SurfaceInteraction, weights: tuple[Tensor, Tensor], *, is_last_pane: bool
 ) -> _PathState:
     """Returns the path after a surface. `is_last_pane` is True at the first surface of the last pane."""
     before = interaction.before
     is_downward = before.is_downward != interaction.reflects
     return _PathState(
         before.origin,
-        direction,
+        interaction.axes.T @ interaction.wo,
         before.s * weights[0],
         before.p * weights[1],
         before.surface + (1 if is_downward else -1),
@@ -230,39 +239,31 @@ def _path_after(
     )
 
 
-def _plane_offset(surface: Surface) -> Tensor:
-    """Returns d of the plane equation dot(normal, x) = d, in mm."""
-    return surface.normal[2] * surface.height_mm
-
-
-def _scattered_direction(interaction: _SurfaceInteraction, facet: Tensor) -> Tensor:
+def _scattered_direction(wi: Tensor, facet: Tensor, cosine: Tensor, ratio: float | None) -> Tensor:
     """Returns the directions after reflection or refraction at microfacets (Walter et al. 2007, eq. 39 and 40).
 
-    Under total reflection there is no refracted direction. The result is then arbitrary and its weight is 0.
+    `cosine` is dot(wi, facet). `ratio` is the refractive index on the side of `wi` divided by that on the other side; None
+    for reflection. Under total reflection there is no refracted direction. The result is then arbitrary and its weight is 0.
     """
-    cosine = dot(interaction.wi, facet)
-    if interaction.reflects:
-        return 2 * cosine * facet - interaction.wi
-    ratio = interaction.index_in / interaction.index_out
+    if ratio is None:
+        return 2 * cosine * facet - wi
     cosine_out = (1 - ratio**2 * (1 - cosine**2)).clamp(min=0).sqrt()
-    return (ratio * cosine - cosine_out) * facet - ratio * interaction.wi
+    return (ratio * cosine - cosine_out) * facet - ratio * wi
 
 
 def _facet_weights(
-    interaction: _SurfaceInteraction, facet: Tensor, direction: Tensor
+    interaction: _SurfaceInteraction, cosine: Tensor, reflectances: tuple[Tensor, Tensor], wo: Tensor
 ) -> tuple[Tensor, Tensor]:
     """Returns BSDF times cosine divided by density, for s- and p-polarised light, (N,) each.
 
-    With visible normals and the separable Smith term G1(wi) G1(wo), everything except the Fresnel factor and G1(wo) cancels
-    (Heitz 2018).
+    `cosine` is dot(wi, facet), `reflectances` are those of the facets, `wo` are the scattered directions. With visible normals and
+    the separable Smith term G1(wi) G1(wo), everything except the Fresnel factor and G1(wo) cancels (Heitz 2018).
     """
-    cosine = dot(interaction.wi, facet)
-    reflected = _reflectances(cosine, interaction.index_in, interaction.index_out)
-    cosine_out = dot(direction, interaction.normal) * (1 if interaction.reflects else -1)
+    cosine_out = wo[2] if interaction.reflects else -wo[2]
     # Facets seen from behind have weight 0, and so do facets that scatter light to the wrong side of the surface.
     valid = (cosine_out > 0) & (cosine > 0)
     visible = smith_g1(cosine_out, interaction.alpha) * valid if interaction.alpha else valid.float()
-    s, p = ((r if interaction.reflects else 1 - r) * visible for r in reflected)
+    s, p = ((r if interaction.reflects else 1 - r) * visible for r in reflectances)
     return s, p
 
 
@@ -281,50 +282,52 @@ def _exit_radiance(
     interaction: _SurfaceInteraction,
     emitters: SideEmitters,
     relative_footprint: float,
-    light_samples: Tensor | None,
+    light_uniforms: Tensor | None,
 ) -> Tensor:
     """Returns the light of an order, (3, N): a microfacet sample and a light sample, combined by the balance heuristic.
 
-    `light_samples` are points of the map for all rays; None if microfacet samples are sufficient. The
-    heuristic weights a sample by its density divided by the sum of both densities (Veach 1997, eq. 9.8).
+    `light_uniforms` are random numbers for light samples, (N,); None if microfacet samples are sufficient. The heuristic
+    weights a sample by its density divided by the sum of both densities (Veach 1997, eq. 9.8).
     """
     weight = (path.s + path.p) / 2
-    radiance = emitters.radiance(path.origin, path.direction, relative_footprint)
-    if light_samples is None:
-        return weight * radiance
-    facet_pdf = _scattering_pdf(interaction, path.direction)
-    balance = facet_pdf / (facet_pdf + emitters.pdf(path.origin, path.direction)).clamp(min=1e-20)
-    direction, light_pdf = emitters.towards(light_samples[:, path.rays], path.origin)
-    facet = _half_vector(interaction, direction)
-    s, p = _facet_weights(interaction, facet, direction)
-    facet_pdf = _scattering_pdf(interaction, direction)
+    if light_uniforms is None:
+        return weight * emitters.radiance(path.origin, path.direction, relative_footprint)
+    rays = Rays(path.origin, path.direction, relative_footprint)
+    radiance, light_pdf = emitters.radiance_and_pdf(rays)
+    cosine = dot(interaction.wi, interaction.facet)
+    facet_pdf = _scattering_pdf(interaction, interaction.facet, cosine, interaction.wo)
+    light = weight * radiance * (facet_pdf / (facet_pdf + light_pdf).clamp(min=1e-20))
+    direction, radiance, light_pdf = emitters.towards(
+        emitters.sample_map(light_uniforms, relative_footprint), rays
+    )
+    wo = interaction.axes @ direction
+    facet = _half_vector(interaction, wo)
+    cosine = dot(interaction.wi, facet)
+    reflectances = _reflectances(cosine, interaction.index_in, interaction.index_out)
+    s, p = _facet_weights(interaction, cosine, reflectances, wo)
+    facet_pdf = _scattering_pdf(interaction, facet, cosine, wo)
     # The weights s and p are f cos / facet_pdf. The light sample needs f cos / light_pdf, times the heuristic's
     # light_pdf / (light_pdf + facet_pdf): light_pdf cancels.
     ratio = facet_pdf / (light_pdf + facet_pdf).clamp(min=1e-20)
-    light_weight = (interaction.before.s * s + interaction.before.p * p) / 2 * ratio
-    return weight * radiance * balance + light_weight * emitters.radiance(
-        path.origin, direction, relative_footprint
-    )
+    return light + (interaction.before.s * s + interaction.before.p * p) / 2 * ratio * radiance
 
 
-def _half_vector(interaction: _SurfaceInteraction, direction: Tensor) -> Tensor:
-    """Returns the normals of the facets that scatter `wi` into `direction` (Walter et al. 2007, eq. 13 and 16)."""
+def _half_vector(interaction: _SurfaceInteraction, wo: Tensor) -> Tensor:
+    """Returns the normals of the facets that scatter `wi` into `wo` (Walter et al. 2007, eq. 13 and 16)."""
     if interaction.reflects:
-        half = interaction.wi + direction
+        half = interaction.wi + wo
     else:
-        half = -(interaction.index_in * interaction.wi + interaction.index_out * direction)
-    half = normalize(half)
-    return half * torch.sign(dot(half, interaction.normal))
+        half = -(interaction.index_in * interaction.wi + interaction.index_out * wo)
+    return normalize(half) * torch.sign(half[2])
 
 
-def _scattering_pdf(interaction: _SurfaceInteraction, direction: Tensor) -> Tensor:
-    """Returns the density of microfacet samples at `direction`, per steradian, (N,).
+def _scattering_pdf(interaction: _SurfaceInteraction, facet: Tensor, cosine: Tensor, wo: Tensor) -> Tensor:
+    """Returns the density of microfacet samples at `wo`, per steradian, (N,). `cosine` is dot(wi, facet).
 
     It is the density of the facet's normal times the Jacobian of the half vector (Walter et al. 2007, eq. 14 and 17).
     """
-    facet = _half_vector(interaction, direction)
-    cosine, cosine_out = dot(interaction.wi, facet), dot(direction, facet)
-    normal_pdf = vndf_over_cosine(interaction.wi, interaction.normal, facet, interaction.alpha)
+    cosine_out = dot(wo, facet)
+    normal_pdf = vndf_over_cosine(interaction.wi, facet, interaction.alpha)
     if interaction.reflects:
         # The Jacobian 1 / (4 cosine) cancels the cosine that `vndf_over_cosine` leaves out.
         pdf, is_right_side = normal_pdf / 4, cosine_out > 0

@@ -34,12 +34,19 @@ class SobolPoints:
 
     def next_2d(self, subset: Tensor | None = None) -> Tensor:
         """Returns the next point of each selected pixel, (2, n) in [0, 1), or only of the pixels with the indices `subset`."""
+        return self._next_point(subset, slice(None))
+
+    def next_1d(self, subset: Tensor | None = None) -> Tensor:
+        """Returns the first coordinate of the next points, (n,); see `next_2d`."""
+        return self._next_point(subset, slice(1))[0]
+
+    def _next_point(self, subset: Tensor | None, axes: slice) -> Tensor:
         if self._next == len(self._sequences):
             self._sequences.append(self._new_sequence())
         points, shift = self._sequences[self._next]
         self._next += 1
-        shift = shift[:, self._pixels] if subset is None else shift[:, self._pixels.start + subset]
-        shifted = points[self._sample][:, None] + shift
+        shift = shift[axes, self._pixels] if subset is None else shift[axes, self._pixels.start + subset]
+        shifted = points[self._sample, axes, None] + shift
         return shifted - shifted.floor()
 
     def next_disc(self) -> Tensor:

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import torch
 from torch import Tensor
 
 
 def dot(a: Tensor, b: Tensor) -> Tensor:
     """Returns the inner products of two arrays of vectors, (N,)."""
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+    return torch.addcmul(torch.addcmul(a[0] * b[0], a[1], b[1]), a[2], b[2])
 
 
 def normalize(vectors: Tensor) -> Tensor:
