@@ -1,6 +1,6 @@
 """Compares the cost of the analytic renderer and of Mitsuba at equal error, and measures the cost of a stored sample.
 
-    python bench/render.py
+    BREWSTER_DATA=../shared/data python bench/render.py
 
 Costs are CPU-seconds. The error is relMSE = mean((x - reference)^2 / (reference^2 + 0.01 mean(reference)^2)), averaged
 over the five images of a sample. The reference is an image of the analytic renderer at four times the width and height,
@@ -12,6 +12,7 @@ second case, the cost without the denoiser is extrapolated, because the error is
 
 from __future__ import annotations
 
+import os
 import tempfile
 import time
 from collections import defaultdict
@@ -23,7 +24,7 @@ from compare_renderers import DOME, STREET, TINTED
 from torch.nn.functional import avg_pool2d
 
 from brewster.environments.assets import Assets
-from brewster.environments.catalog import BUILTIN_CATALOG
+from brewster.environments.catalog import BUILTIN_CATALOG, read_catalog
 from brewster.executors import SerialExecutor
 from brewster.render.analytic import needs_monte_carlo, render
 from brewster.render.mitsuba.renderer import trace
@@ -137,14 +138,18 @@ def cost_per_sample() -> None:
             print(f"| {count} | {(time.process_time() - start) / count:.2f} |", flush=True)
 
 
-def cost_by_method(count: int = 60) -> None:
-    """Prints CPU-seconds per rendered and encoded sample of 512x384 of the recipe of the paper, by the method that renders the scene."""
+def cost_by_method(data: Path, count: int = 60) -> None:
+    """Prints CPU-seconds per sample of 512x384 of the recipe of the paper, by the method that renders the scene.
+
+    The scenes show the maps and photos of the folder `data`. All files of a sample are encoded.
+    """
     recipe = read_scene_recipe(str(PAPER_RECIPE))
     camera = recipe.camera.model_copy(update={"width": 512, "height": 384})
-    recipe, assets = recipe.model_copy(update={"camera": camera}), Assets()
+    recipe, assets = recipe.model_copy(update={"camera": camera}), Assets([data / "hdri", data / "photos/permissive"])
+    catalog, _ = read_catalog([data / "hdri"], [data / "photos/permissive"])
     seconds: defaultdict[str, list[float]] = defaultdict(list)
     for index in range(count):
-        scene = draw(recipe, BUILTIN_CATALOG, 7, index)
+        scene = draw(recipe, catalog, 7, index)
         start = time.process_time()
         encode_sample(render(scene, assets), "analytic")
         if scene.glass.is_rough:
@@ -159,13 +164,13 @@ def cost_by_method(count: int = 60) -> None:
         print(f"| {method} | {len(spent)} | {sum(spent) / len(spent):.2f} |", flush=True)
 
 
-def main(_: Path) -> None:
+def main(data: Path) -> None:
     """Prints all tables. Uses one thread."""
     torch.set_num_threads(1)
-    cost_by_method()
+    cost_by_method(data)
     compare_costs()
     cost_per_sample()
 
 
 if __name__ == "__main__":
-    main(Path())
+    main(Path(os.environ["BREWSTER_DATA"]))
