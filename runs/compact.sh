@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
 # Trains the compact model that is part of brewster, from photos, HDR maps and ImageNet weights.
-#     BREWSTER_DATA=/path/to/data runs/compact.sh          writes to out/compact-*; the model is out/compact-mean/model.onnx
-# Give the same command again to resume an interrupted run. It takes about 12 hours on two CPU cores with AVX512_BF16.
+#     BREWSTER_DATA=/path/to/data runs/compact.sh          writes to out/compact-*; the model is out/compact-final/model.onnx
+# Give the same command again to resume an interrupted run. It takes about 15 hours on two CPU cores with AVX512_BF16.
 #
 # BREWSTER_DATA contains photos/permissive (with manifest.csv), hdri/, and real/ (pairs for validation; they are not trained on).
 # First install the extras: pip install -c constraints.txt -e '.[render,train]'
@@ -18,7 +18,7 @@ find "$BREWSTER_DATA/photos/permissive" -name '*.jpg' ! -name 'debian_wallpapers
     ! -name 'gianni-rosato-gb82*' -exec ln -sf -t "$clean/photos" {} +
 find "$BREWSTER_DATA/hdri" \( -name '*.hdr' -o -name '*.exr' \) ! -name 'blender_*' -exec ln -sf -t "$clean/maps" {} +
 
-# 2. Render 1,500 samples, in about an hour.
+# 2. Render 1,500 samples, in a few minutes.
 seed=50
 for set in window:600 shopfront:300 office:300 vitrine:300; do
     brewster render "$BREWSTER_DATA/sets/${set%:*}" --recipe "${set%:*}" --count "${set#*:}" --seed $((seed++)) \
@@ -26,6 +26,6 @@ for set in window:600 shopfront:300 office:300 vitrine:300; do
 done
 
 # 3. Train all stages.
-for stage in stage1 stage2 sharp stage3 stage4 stage5 stage6 stage7 stage8 stage9 stage10 mean; do
+for stage in stage1 stage2 sharp stage3 stage4 stage5 stage6 stage7 stage8 stage9 stage10 mean stage11 stage12 final; do
     brewster train "recipes/train/compact-$stage.toml" -o "out/compact-$stage"
 done

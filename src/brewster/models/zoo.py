@@ -66,7 +66,7 @@ MODELS: Final = {
         ModelFile(
             "compact",
             _WEIGHTS / "compact.onnx",
-            "98411e63d43fe8a03881d67679d1a3133581debe1a194e40a97cd48dfde78a42",
+            "339dee6c35a1838068966bb9dbfde42f53f6371bab24ccb00f1eff50143d9ae6",
             "Apache-2.0",
         ),
     )
