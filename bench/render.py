@@ -145,11 +145,9 @@ def cost_by_method(data: Path, count: int = 60) -> None:
     """
     recipe = read_scene_recipe(str(PAPER_RECIPE))
     camera = recipe.camera.model_copy(update={"width": 512, "height": 384})
-    recipe, assets = (
-        recipe.model_copy(update={"camera": camera}),
-        Assets([data / "hdri", data / "photos/permissive"]),
-    )
-    catalog, _ = read_catalog([data / "hdri"], [data / "photos/permissive"])
+    recipe = recipe.model_copy(update={"camera": camera})
+    maps, photos = data / "hdri", data / "photos/permissive"
+    assets, (catalog, _) = Assets([maps, photos]), read_catalog([maps], [photos])
     seconds: defaultdict[str, list[float]] = defaultdict(list)
     for index in range(count):
         scene = draw(recipe, catalog, 7, index)

@@ -181,6 +181,8 @@ class _SurfaceInteraction:
     """Directions of the rays after the interaction."""
     facet: Tensor
     """Normals of the microfacets that scatter `wi` into `wo`, (3, N) or (3, 1)."""
+    cosine: Tensor
+    """dot(wi, facet), (N,)."""
 
 
 def _interact(
@@ -213,7 +215,7 @@ def _interact(
     for reflects in (True, False):
         wo = _scattered_direction(wi, facet, cosine, None if reflects else index_in / index_out)
         interaction = _SurfaceInteraction(
-            axes, wi, surface.alpha, index_in, index_out, reflects, before, wo, facet
+            axes, wi, surface.alpha, index_in, index_out, reflects, before, wo, facet, cosine
         )
         weights = _facet_weights(interaction, cosine, reflectances, wo)
         is_last_pane = path.surface == len(stack) - 2
@@ -294,8 +296,7 @@ def _exit_radiance(
         return weight * emitters.radiance(path.origin, path.direction, relative_footprint)
     rays = Rays(path.origin, path.direction, relative_footprint)
     radiance, light_pdf = emitters.radiance_and_pdf(rays)
-    cosine = dot(interaction.wi, interaction.facet)
-    facet_pdf = _scattering_pdf(interaction, interaction.facet, cosine, interaction.wo)
+    facet_pdf = _scattering_pdf(interaction, interaction.facet, interaction.cosine, interaction.wo)
     light = weight * radiance * (facet_pdf / (facet_pdf + light_pdf).clamp(min=1e-20))
     direction, radiance, light_pdf = emitters.towards(
         emitters.sample_map(light_uniforms, relative_footprint), rays
