@@ -55,5 +55,10 @@ NETWORKS: Final[dict[str, NetworkEntry]] = {
         _imported("brewster.models.compact:with_imagenet_features"),
         stride=32,
     ),
+    "lite2-dense": NetworkEntry(
+        _imported("brewster.models.dense:DenseNetwork"),
+        _imported("brewster.models.dense:from_shipped_network"),
+        stride=32,
+    ),
 }
 """The networks by name. The key `network` of a training recipe is such a name."""

@@ -133,6 +133,10 @@ class CompactRecipe(TrainingRecipe):
         tuple[Annotated[int, Field(ge=1, le=MAX_STRIDE // 2)], ...], Field(min_length=1)
     ] = (1,)
     """Sides of the averaging windows, in pixels, after which the image gradients are compared."""
+    clipped_weight: NonNegativeFloat = 0.0
+    """Weight of the error of values that are clipped in the photo and in the transmission, in the loss."""
+    hint_probability: Share = 0.0
+    """Probability of a sample with simulated hints, for networks with hints."""
     init_checkpoints: tuple[Path, ...] = ()
     """Checkpoint files, relative to this recipe. The run starts from the mean of their EMA weights."""
     mix: MixRecipe = MixRecipe()
