@@ -31,6 +31,8 @@ class NetworkEntry:
     """Returns the network from which training starts: its encoder has pretrained weights. May raise MissingExtra."""
     stride: int
     """Height and width of the input must be multiples of this; it must divide MAX_STRIDE."""
+    takes_hints: bool = False
+    """Whether the network has a second input: hints of a person (N, 2, H, W), see `brewster.training.data.hints`."""
 
 
 MAX_STRIDE: Final = 32
@@ -59,6 +61,7 @@ NETWORKS: Final[dict[str, NetworkEntry]] = {
         _imported("brewster.models.dense:DenseNetwork"),
         _imported("brewster.models.dense:from_shipped_network"),
         stride=32,
+        takes_hints=True,
     ),
 }
 """The networks by name. The key `network` of a training recipe is such a name."""

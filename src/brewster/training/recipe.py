@@ -136,7 +136,7 @@ class CompactRecipe(TrainingRecipe):
     clipped_weight: NonNegativeFloat = 0.0
     """Weight of the error of values that are clipped in the photo and in the transmission, in the loss."""
     hint_probability: Share = 0.0
-    """Probability of a sample with simulated hints, for networks with hints."""
+    """Probability of a sample with simulated hints of a person: where there is reflection, and where only the scene."""
     init_checkpoints: tuple[Path, ...] = ()
     """Checkpoint files, relative to this recipe. The run starts from the mean of their EMA weights."""
     mix: MixRecipe = MixRecipe()
@@ -145,6 +145,10 @@ class CompactRecipe(TrainingRecipe):
     def _check_shares(self) -> Self:
         pair_count = _sample_count(self.batch_size, "pairs_share", self.data.pairs_share)
         _sample_count(self.batch_size - pair_count, "rendered.share", self.data.rendered_share)
+        if self.hint_probability and not NETWORKS[self.network].takes_hints:
+            raise ValueError(
+                f"expected hint_probability 0, because the network {self.network} takes no hints"
+            )
         return self
 
     def size_at(self, step: int) -> int:

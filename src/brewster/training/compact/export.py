@@ -15,36 +15,42 @@ from torch import nn
 
 from brewster.files import write_atomically
 from brewster.models.compact import LinearSeparator
+from brewster.models.networks import NetworkEntry
 
 _OPSET = 18
 _MIN_HALF_SIZE = 16
 """Tensors with fewer values stay float32: they are constants of the graph, such as the coefficients of the sRGB curve."""
 
 
-def export_onnx(network: nn.Module, path: Path, stride: int) -> None:
+def export_onnx(network: nn.Module, path: Path, entry: NetworkEntry) -> None:
     """Writes the network as an ONNX file: input `photo`, outputs `transmission` and `reflection`.
 
-    Input and outputs are linear light, (1, 3, H, W), with H and W multiples of `stride`. The weights are stored in half
+    Input and outputs are linear light, (1, 3, H, W), with H and W multiples of the stride. Networks that take hints have a second
+    input `hints`, (1, 2, H, W). The weights are stored in half
     precision, which halves the size of the file. The network still computes in float32.
 
     Raises:
         OutputError: the file cannot be written.
     """
     height, width = (torch.export.Dim(name, min=1, max=256) for name in ("rows", "columns"))
-    example = torch.rand(1, 3, 4 * stride, 5 * stride)
+    stride, names = entry.stride, ["photo", "hints"][: 1 + entry.takes_hints]
+    examples = [torch.rand(1, channels, 4 * stride, 5 * stride) for channels in (3, 2)]
     with _without_warnings():
         program = torch.onnx.export(
             LinearSeparator(network).eval(),
-            (example,),
-            input_names=["photo"],
+            tuple(examples[: len(names)]),
+            input_names=names,
             output_names=["transmission", "reflection"],
-            dynamic_shapes={"photo": {2: stride * height, 3: stride * width}},
+            dynamic_shapes={name: {2: stride * height, 3: stride * width} for name in names},
             opset_version=_OPSET,
             dynamo=True,
             verbose=False,
         )
     assert program is not None
-    write_atomically(path, with_half_weights(program.model_proto).SerializeToString(), overwrite=True)
+    model = with_half_weights(program.model_proto)
+    for node in model.graph.node:
+        del node.metadata_props[:]  # stack traces with the paths of this machine
+    write_atomically(path, model.SerializeToString(), overwrite=True)
 
 
 def with_half_weights(model: ModelProto) -> ModelProto:

@@ -207,7 +207,7 @@ class CompactTrainer:
         Raises:
             OutputError: the file cannot be written.
         """
-        export_onnx(self.ema_network(), folder / MODEL_FILE, self._entry.stride)
+        export_onnx(self.ema_network(), folder / MODEL_FILE, self._entry)
         return folder / MODEL_FILE
 
     def ema_network(self) -> nn.Module:

@@ -21,7 +21,7 @@ from brewster.training.data.sample_rng import SampleRng
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-    Mask = Float[Tensor, "s s"]
+    Mask = Float[Tensor, "_ _"]
 
 _SEED_OFFSET: Final = 77
 """Separates the random numbers of the hints from those of the samples."""
