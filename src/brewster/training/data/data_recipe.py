@@ -45,7 +45,7 @@ class RenderedRecipe(FrozenModel):
     maps: tuple[Path, ...] = ()
     """Folders of environment maps for `recipe`, relative to BREWSTER_DATA. Empty: built-in environments."""
     photos: tuple[Path, ...] = ()
-    """Folders of photos for `recipe`, relative to BREWSTER_DATA. Empty: built-in paintings."""
+    """Folders of photos for `recipe`, relative to BREWSTER_DATA. Empty: built-in photos."""
 
     @model_validator(mode="after")
     def _check_source(self) -> Self:
