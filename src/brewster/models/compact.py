@@ -16,7 +16,6 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from brewster.errors import MissingExtra
-from brewster.models.zoo import find_model
 from brewster.srgb import to_encoded, to_linear
 
 if TYPE_CHECKING:
@@ -207,32 +206,6 @@ class LinearSeparator(nn.Module):
         layers = self.network(photo_encoded) if hints is None else self.network(photo_encoded, hints)
         layers = layers.clamp(0, 1)
         return to_linear(layers[:, :3]), to_linear(layers[:, 3:])
-
-
-def with_shipped_weights() -> CompactNetwork:
-    """Returns the network with the weights of the packaged model, in the half precision of its file.
-
-    Raises:
-        MissingExtra: onnx, which reads the file, is not installed.
-    """
-    try:
-        import onnx  # noqa: PLC0415 - an extra
-        from onnx import numpy_helper  # noqa: PLC0415
-    except ImportError as error:
-        raise MissingExtra.for_extra(
-            "train", "onnx is not installed", "expected it to read the weights from which training starts"
-        ) from error
-    network, graph = CompactNetwork(), onnx.load(find_model("compact").path).graph
-    prefix, suffix = "network.", "_half"
-    weights = {
-        tensor.name.removeprefix(prefix).removesuffix(suffix): torch.tensor(
-            numpy_helper.to_array(tensor)
-        ).float()
-        for tensor in graph.initializer
-        if tensor.name.startswith(prefix)
-    }
-    network.load_state_dict(weights)
-    return network
 
 
 def with_imagenet_features() -> CompactNetwork:

@@ -21,7 +21,7 @@ from brewster.models.compact import (
     CompactNetwork,
     in_float32,
     layers_from_maps,
-    with_shipped_weights,
+    with_imagenet_features,
 )
 
 if TYPE_CHECKING:
@@ -137,10 +137,10 @@ class DenseNetwork(nn.Module):
         return in_float32(self.head, self.head_norm(x))
 
 
-def from_shipped_network() -> DenseNetwork:
-    """Returns a new network whose encoder is the compact network with the weights that are part of the package."""
+def with_imagenet_encoder() -> DenseNetwork:
+    """Returns a new network whose encoder is a new compact network with ImageNet features. May raise MissingExtra."""
     network = DenseNetwork()
-    network.encoder = with_shipped_weights()
+    network.encoder = with_imagenet_features()
     return network
 
 

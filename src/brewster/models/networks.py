@@ -59,7 +59,7 @@ NETWORKS: Final[dict[str, NetworkEntry]] = {
     ),
     "lite2-dense": NetworkEntry(
         _imported("brewster.models.dense:DenseNetwork"),
-        _imported("brewster.models.dense:from_shipped_network"),
+        _imported("brewster.models.dense:with_imagenet_encoder"),
         stride=32,
         takes_hints=True,
     ),

@@ -9,15 +9,21 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
+import onnx
 import torch
 from onnx import ModelProto, TensorProto, helper, numpy_helper
-from torch import nn
+from torch import Tensor, nn
 
+from brewster.errors import ModelError
 from brewster.files import write_atomically
 from brewster.models.compact import LinearSeparator
 from brewster.models.networks import NetworkEntry
 
 _OPSET = 18
+_PREFIX = "network."
+"""The prefix of the weights' names: `LinearSeparator` contains the network."""
+_HALF = "_half"
+"""The suffix of the names of weights in half precision."""
 _MIN_HALF_SIZE = 16
 """Tensors with fewer values stay float32: they are constants of the graph, such as the coefficients of the sRGB curve."""
 
@@ -63,7 +69,7 @@ def with_half_weights(model: ModelProto) -> ModelProto:
     for index, weight in enumerate(graph.initializer):
         values = numpy_helper.to_array(weight)
         if values.dtype == np.float32 and values.size >= _MIN_HALF_SIZE:
-            half = f"{weight.name}_half"
+            half = weight.name + _HALF
             casts.append(helper.make_node("Cast", [half], [weight.name], to=TensorProto.FLOAT))
             graph.initializer[index].CopyFrom(numpy_helper.from_array(values.astype(np.float16), half))
     nodes = [*casts, *graph.node]
@@ -72,15 +78,40 @@ def with_half_weights(model: ModelProto) -> ModelProto:
     return model
 
 
+def read_weights(path: Path) -> dict[str, Tensor]:
+    """Returns the weights of a network in a file of `export_onnx`, in the half precision of the file, by name.
+
+    Raises:
+        ModelError: the file cannot be read.
+    """
+    try:
+        graph = onnx.load(path).graph
+    except Exception as error:
+        raise ModelError(
+            f"{path} cannot be read ({error})",
+            "expected a model that brewster train has exported",
+            "check the file",
+        ) from error
+    return {
+        tensor.name.removeprefix(_PREFIX).removesuffix(_HALF): torch.tensor(
+            numpy_helper.to_array(tensor)
+        ).float()
+        for tensor in graph.initializer
+        if tensor.name.startswith(_PREFIX)
+    }
+
+
 @contextmanager
 def _without_warnings() -> Iterator[None]:
-    """Hides two warnings of the exporter: torchvision is missing (it is not needed), and the exporter calls deprecated functions."""
+    """Hides warnings of the exporter: torchvision is missing (it is not needed), the exporter calls deprecated functions, and photo
+    and hints have the same size."""
     logger = logging.getLogger("torch.onnx")
     before = logger.level
     logger.setLevel(logging.ERROR)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", FutureWarning)
+            warnings.filterwarnings("ignore", message=".*axis name", category=UserWarning)
             yield
     finally:
         logger.setLevel(before)

@@ -5,7 +5,6 @@ network = train(read_recipe(Path("recipes/train/compact-stage1.toml")), Path("ou
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -18,10 +17,9 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from brewster.errors import ModelError
-from brewster.models.networks import DEFAULT_NETWORK, NETWORKS
-from brewster.models.zoo import MODEL_FILE
-from brewster.training.checkpoint import Checkpoint, mismatch_as_model_error
-from brewster.training.compact.export import export_onnx
+from brewster.models.networks import NETWORKS
+from brewster.models.zoo import MODEL_FILE, find_model
+from brewster.training.compact.export import export_onnx, read_weights
 from brewster.training.data.hints import simulate_hints
 from brewster.training.data.mixtures import Stream, TrainingBatch
 from brewster.training.distributed import best_device
@@ -48,7 +46,6 @@ _SAMPLE_COLUMNS: Final = (
     "predicted reflection R",
 )
 _MAX_GRADIENT_NORM: Final = 1.0
-_START_FROM_CURE: Final = "train the recipe that writes it first, or correct init_checkpoints in this recipe"
 
 
 def train(recipe: CompactRecipe, out: Path, on_step: StepCallback) -> nn.Module:
@@ -64,9 +61,7 @@ def train(recipe: CompactRecipe, out: Path, on_step: StepCallback) -> nn.Module:
         OutputError: `out` cannot be written to.
     """
     trainer = CompactTrainer(recipe)
-    # This limits torch to one core in the current thread. The thread pools of the trainer do the same in their threads.
-    with single_torch_thread():
-        run(trainer, out, on_step)
+    run(trainer, out, on_step)
     return trainer.ema_network()
 
 
@@ -108,24 +103,27 @@ class CompactTrainer:
             fused=True,
         )
 
-    @torch.no_grad()
     def initialize(self) -> None:
-        """Loads the mean of the EMA weights of all checkpoints in `init_checkpoints`.
-
-        The mean of the weights of several runs with a common start is often better than each of them (model soups,
-        Wortsman et al. 2022).
+        """Loads the weights of `init` into the network, or into its encoder if the file contains only this part.
 
         Raises:
-            ModelError: a checkpoint is missing, damaged or of another network.
+            ModelError: the model is unknown or damaged, or contains another network.
         """
-        for count, path in enumerate(self.recipe.init_checkpoints, start=1):
-            loaded, checkpoint = self._entry.build(), Checkpoint.read(path, _START_FROM_CURE)
-            with mismatch_as_model_error(path, _START_FROM_CURE):
-                _check_network(path, checkpoint, self.recipe.network)
-                loaded.load_state_dict(checkpoint.state.get("average", {}))
-            for parameter, start in zip(self.network.parameters(), loaded.parameters(), strict=True):
-                parameter.lerp_(start.to(self.device), 1 / count)
-        self._reset_ema()
+        if self.recipe.init is None:
+            return
+        weights = read_weights(find_model(self.recipe.init).path)
+        for part in (self.network, self.network.get_submodule("encoder")):
+            if {name: value.shape for name, value in part.state_dict().items()} == {
+                name: value.shape for name, value in weights.items()
+            }:
+                part.load_state_dict(weights)
+                self._reset_ema()
+                return
+        raise ModelError(
+            f"{self.recipe.init} contains another network",
+            f"expected the network {self.recipe.network} or its encoder",
+            "correct init in the recipe",
+        )
 
     def state_dict(self) -> dict[str, Any]:
         """Returns the weights, their EMA, and the state of the optimiser."""
@@ -148,14 +146,16 @@ class CompactTrainer:
             ModelError: the loss is NaN or infinite. The last checkpoint is still valid.
         """
         batch, hints = self._batch(step)
-        parts = self._compute_gradients(batch.to(self.device), hints)
-        loss = check_finite(torch.stack(list(parts.values())).sum(), step)
-        self._set_learning_rates(step)
-        norm = nn.utils.clip_grad_norm_(self.network.parameters(), _MAX_GRADIENT_NORM)
-        # Skip the batch if its gradient is infinite: one such step makes all weights invalid.
-        if norm.isfinite():
-            self.optimizer.step()
-            self._update_ema(step + 1)
+        # With two threads for the optimiser, each waits actively for the other: a quarter of the time on a busy machine.
+        with single_torch_thread():
+            parts = self._compute_gradients(batch.to(self.device), hints)
+            loss = check_finite(torch.stack(list(parts.values())).sum(), step)
+            self._set_learning_rates(step)
+            norm = nn.utils.clip_grad_norm_(self.network.parameters(), _MAX_GRADIENT_NORM)
+            # Skip the batch if its gradient is infinite: one such step makes all weights invalid.
+            if norm.isfinite():
+                self.optimizer.step()
+                self._update_ema(step + 1)
         return {"loss": loss.item(), **{f"loss_{name}": part.item() for name, part in parts.items()}}
 
     def _compute_gradients(self, batch: TrainingBatch, hints: Tensor | None) -> dict[str, Tensor]:
@@ -293,20 +293,6 @@ def _resize_pairs(folders: ValidationPairs, stride: int) -> dict[str, list[tuple
         name: [(_resize(photo, stride), _resize(ground_truth, stride)) for photo, ground_truth in pairs]
         for name, pairs in folders.items()
     }
-
-
-def _check_network(path: Path, checkpoint: Checkpoint, expected: str) -> None:
-    """Checks that the checkpoint contains the expected network.
-
-    A checkpoint without the recipe key `network` was written before the key existed, and contains the default network.
-    """
-    found = json.loads(checkpoint.recipe).get("network", DEFAULT_NETWORK)
-    if found != expected:
-        raise ModelError(
-            f"{path} contains the network {found}",
-            f"expected a checkpoint of {expected}, the network that the recipe trains",
-            _START_FROM_CURE,
-        )
 
 
 def _single_thread_pool(count: int) -> ThreadPoolExecutor:
