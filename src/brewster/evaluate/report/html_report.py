@@ -13,7 +13,6 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, Final
 
-from brewster.errors import MissingExtra
 from brewster.evaluate.methods import BASELINE
 from brewster.evaluate.report.images import COLOUR_MAP, MAX_ERROR, MAX_SIDE_PX, CaseThumbnails
 from brewster.evaluate.report.tables import is_complete, ranking, remarks, unavailable_metrics
@@ -34,14 +33,9 @@ def write_report(results: Results, cases: Iterable[CaseThumbnails], path: Path) 
 
     Raises:
         OutputError: the file cannot be written.
-        MissingExtra: Jinja2 is not installed.
     """
-    try:
-        import jinja2  # noqa: PLC0415 - an extra
-    except ImportError as error:
-        raise MissingExtra.for_extra(
-            "evaluate", "Jinja2 is not installed", "expected jinja2, which brewster needs for report.html"
-        ) from error
+    import jinja2  # noqa: PLC0415 - an extra
+
     environment = jinja2.Environment(
         loader=jinja2.FileSystemLoader(_FOLDER), autoescape=True, trim_blocks=True, lstrip_blocks=True
     )
