@@ -40,7 +40,10 @@ class LayerMotion:
     reflection: Float32
 
     def relative_px(self) -> float:
-        """Returns the median distance by which the layers move relative to each other, in px; NaN without content."""
+        """Returns the median distance by which the layers move relative to each other, in px; NaN without content.
+
+        Glass without effect also has a relative motion, although its reflection is black.
+        """
         difference = self.reflection - self.transmission
         lengths = np.hypot(difference[..., 0], difference[..., 1])
         lengths = lengths[np.isfinite(lengths)]
@@ -70,7 +73,8 @@ def _motion(content: _Content, camera: Camera, moved: Camera) -> Float32:
     points = content.intersect(content.origin(camera), rays)
     positions = _project(content, moved, points)
     y, x = np.mgrid[: camera.height, : camera.width]
-    return (positions.reshape(camera.height, camera.width, 2) - np.stack([x, y], -1)).astype(np.float32)
+    motion = positions.reshape(camera.height, camera.width, 2) - np.stack([x, y], -1)
+    return np.asarray(motion, np.float32)
 
 
 class _Content:
@@ -88,7 +92,8 @@ class _Content:
 
     def origin(self, camera: Camera) -> _Doubles:
         """Returns the position of the camera, (3,)."""
-        return self.to_glass @ (np.array(camera.position_mm) - np.array(self._glass.position_mm))
+        position: _Doubles = self.to_glass @ np.subtract(camera.position_mm, self._glass.position_mm)
+        return position
 
     def shift(self, rays: _Doubles) -> _Doubles:
         """Returns how far the refraction moves rays along the glass, compared with straight lines."""
@@ -188,7 +193,9 @@ def _check_same_burst(reference: Scene, frame: Scene) -> None:
     for name in ("glass", "behind", "front"):
         if getattr(reference, name) != getattr(frame, name):
             raise RecipeError(
-                f"the two scenes differ in {name}", "expected two frames of one burst", "choose frames of one burst"
+                f"the two scenes differ in {name}",
+                "expected two frames of one burst",
+                "choose frames of one burst",
             )
     sizes = [(scene.camera.width, scene.camera.height) for scene in (reference, frame)]
     if sizes[0] != sizes[1]:

@@ -185,7 +185,9 @@ class BurstRecipe(FrozenModel):
     @model_validator(mode="after")
     def _check_baseline(self) -> Self:
         if self.baseline_mm[0] < 0:
-            raise ValueError(f"expected a baseline_mm of at least 0, but it starts at {self.baseline_mm[0]:g}")
+            raise ValueError(
+                f"expected a baseline_mm of at least 0, but it starts at {self.baseline_mm[0]:g}"
+            )
         return self
 
 

@@ -53,7 +53,9 @@ class BurstFrame(FrozenModel):
     @model_validator(mode="after")
     def _check_frame(self) -> BurstFrame:
         if self.frame >= self.frames:
-            raise ValueError(f"expected a frame below {self.frames}, the number of frames, but it is {self.frame}")
+            raise ValueError(
+                f"expected a frame below {self.frames}, the number of frames, but it is {self.frame}"
+            )
         return self
 
     @property
