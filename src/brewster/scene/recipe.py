@@ -174,8 +174,8 @@ class BurstRecipe(FrozenModel):
     """Standard deviation of the position of the camera from the line, for each of its three coordinates."""
     tremble_deg: NonNegativeFloat = 0.3
     """Standard deviation of the rotation of the camera about each of its three axes."""
-    exposure_jitter_ev: NonNegativeFloat = 0.1
-    """Standard deviation of the exposure, in stops."""
+    exposure_jitter_ev: Annotated[NonNegativeFloat, KeyNote(unit="stops")] = 0.1
+    """Standard deviation of the exposure."""
     equal_distance_probability: Share = 0.0
     """Probability that both layers have the same distance: the content behind the glass gets the distances, positions and
     sizes of the mirrored content. The layers then do not move relative to each other."""
