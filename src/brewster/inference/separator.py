@@ -71,6 +71,7 @@ class Separator:
     ) -> None:
         self._predictor = model if isinstance(model, Predictor) else MultiScalePredictor(model)
         self.name, self.sha256, self.device = name, sha256, device
+        self.takes_hints = self._predictor.takes_hints
 
     @classmethod
     @document_options
@@ -292,7 +293,7 @@ class Separator:
         """Returns the inputs with two more channels if there are hints."""
         if hints is None:
             return inputs
-        if not self._predictor.takes_hints:
+        if not self.takes_hints:
             raise ModelError(
                 f"hints were given to the model {self.name}, which takes none",
                 "expected a model with an input for hints",
