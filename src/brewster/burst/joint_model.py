@@ -13,7 +13,7 @@ influence each other. In the spirit of neural spline fields (Chugunov et al. 202
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Final, final
 
 import torch
@@ -27,6 +27,8 @@ OFFSET: Final = 0.003
 _CHARBONNIER_EPSILON: Final = 0.01
 _CLIPPED: Final = 0.98
 """Above this value, a pixel of a frame is clipped, and a brighter sum of the layers is no error."""
+_ERROR_AT_1_E: Final = 0.05
+"""The mean error of the frames, as a difference of square roots of light, at which the confidence is 1/e."""
 _GAIN_PENALTY: Final = 0.5
 _SPLINE_CURVATURE: Final = 5.0
 _SPLINE_SIZE: Final = 1.0
@@ -59,17 +61,22 @@ class JointModel:
     """(2, C, K, 2, rows, columns), the offsets that are added to the homographies."""
     log_gains: Tensor
     """(C, K, 3)"""
+    is_locked: Tensor
+    """(C,): whether R moves with T, so that both are one layer."""
     reference: int
     losses: list[float] = field(default_factory=list)
     """The loss of each candidate at the end of the last optimisation."""
+    data_losses: list[float] = field(default_factory=list)
+    """The part of `losses` that compares the frames with their prediction."""
 
     @classmethod
-    def start(cls, frames: Tensor, motions: Tensor, reference: int) -> JointModel:
+    def start(cls, frames: Tensor, motions: Tensor, is_locked: Tensor, reference: int) -> JointModel:
         """Returns a model with first images: T is the second darkest of the frames aligned with its motion, R a part of the darkest.
 
         Args:
             frames: (K, 3, h, w) linear light.
             motions: (2, C, K, 3, 3), frame to reference, of T and R.
+            is_locked: (C,), whether R moves with T.
             reference: the index of the reference frame.
         """
         _, count, frame_count = motions.shape[:3]
@@ -89,30 +96,31 @@ class JointModel:
                 layers[layer, candidate] = image.clamp(min=1e-4 if layer == 0 else 4e-3).sqrt()
         homographies = motions.flatten(3)[..., :8] / motions[..., 2, 2, None]
         splines = torch.zeros(2, count, frame_count, 2, 2, 2)
-        return cls(layers, homographies, splines, torch.zeros(count, frame_count, 3), reference)
+        return cls(layers, homographies, splines, torch.zeros(count, frame_count, 3), is_locked, reference)
 
     def selected(self, candidates: Sequence[int]) -> JointModel:
         """Returns a model with these candidates only."""
         chosen = list(candidates)
         return JointModel(
             self.layers[:, chosen], self.homographies[:, chosen], self.splines[:, chosen], self.log_gains[chosen],
-            self.reference, [self.losses[i] for i in chosen],
+            self.is_locked[chosen], self.reference, [self.losses[i] for i in chosen], [self.data_losses[i] for i in chosen],
         )  # fmt: skip
 
-    def resized(self, frames: Tensor, spline_size: tuple[int, int]) -> JointModel:
+    def resized(self, frames: Tensor, spline_size: tuple[int, int] | None) -> JointModel:
         """Returns the model for larger frames (K, 3, h, w) and finer splines."""
         layers = _resize(self.layers, _canvas_size(frames), align_corners=False)
-        splines = _resize(self.splines, spline_size, align_corners=True)
-        return JointModel(layers, self.homographies, splines, self.log_gains, self.reference, self.losses)
+        splines = _resize(self.splines, spline_size, align_corners=True) if spline_size else self.splines
+        return replace(self, layers=layers, splines=splines)
 
     def positions(self, height: int, width: int) -> Tensor:
         """Returns the coordinates in the reference frame of each pixel of each frame: (2, C, K, h, w, 2)."""
         moves = self._moves()
         identity = torch.eye(3).flatten()[:8]
-        homographies = identity + moves * (self.homographies - identity)
+        homographies = identity + moves * (self._locked(self.homographies) - identity)
         positions = _project(homographies, pixel_grid(height, width))
-        splines = moves[:, None, None] * self.splines
-        return positions + _resize(splines, (height, width), align_corners=True).movedim(-3, -1)
+        rows, columns = (_interpolation(size, n) for size, n in zip((height, width), self.splines.shape[-2:], strict=True))
+        offsets = rows @ (moves[:, None, None] * self._locked(self.splines)) @ columns.T
+        return positions + offsets.movedim(-3, -1)
 
     def render(self, height: int, width: int) -> tuple[Tensor, Tensor]:
         """Returns the layers of each frame, (2, C, K, 3, h, w) linear light, and the gains of the frames, (C, K, 3, 1, 1)."""
@@ -131,6 +139,34 @@ class JointModel:
         """Returns both layers of the reference frame: (2, C, 3, h, w) linear light."""
         rendered, _ = self.render(height, width)
         return rendered[:, :, self.reference]
+
+    def relative_motion(self, height: int, width: int) -> float:
+        """Returns the largest mean motion of R relative to T between two frames, as a share of the width, for one candidate."""
+        transmission, reflection = self.positions(height, width)[:, 0]
+        offsets = (reflection - transmission).mean((1, 2)) * torch.tensor([0.5, 0.5 * height / width])
+        return float(torch.cdist(offsets, offsets).max())
+
+    def confidence(self, frames: Tensor) -> Tensor:
+        """Returns how well the frames agree with their prediction at each pixel of the reference frame, (C, 1, h, w) in 0..1.
+
+        The mean errors of the frames are collected on the canvas of T, in the opposite direction of the rendering.
+        """
+        height, width = frames.shape[-2:]
+        count, frame_count = self.log_gains.shape[:2]
+        rendered, gains = self.render(height, width)
+        errors = data_errors(rendered.sum(0) * gains, frames).abs().mean(2)
+        positions = self.positions(height, width)[0].reshape(count, frame_count * height, width, 2)
+        canvas = torch.zeros(count, 2, height, width, requires_grad=True)
+        with torch.enable_grad():
+            sampled = functional.grid_sample(canvas, positions, align_corners=False)
+            values = torch.stack([errors.flatten(1, 2), torch.ones_like(errors).flatten(1, 2)], 1)
+            (collected,) = torch.autograd.grad((sampled * values).sum(), canvas)
+        return torch.exp(-collected[:, :1] / (collected[:, 1:] + 1e-3) / _ERROR_AT_1_E)
+
+    def _locked(self, motion: Tensor) -> Tensor:
+        """Returns the homographies or splines, with those of T for the reflection of locked candidates."""
+        is_locked = self.is_locked.reshape(-1, *[1] * (motion.ndim - 2))
+        return torch.stack([motion[0], torch.where(is_locked, motion[0], motion[1])])
 
     def _moves(self) -> Tensor:
         """Returns (K, 1): 0 for the reference frame, whose motion is the identity and whose gain is 1, and 1 for others."""
@@ -180,7 +216,7 @@ def optimise(
         (model.log_gains, rates.gains),
     ]  # fmt: skip
     parameters = [tensor.detach().clone().requires_grad_(rate > 0) for tensor, rate in groups]
-    current = JointModel(*parameters, model.reference)
+    current = JointModel(*parameters, model.is_locked, model.reference)
     optimiser = torch.optim.Adam(
         [{"params": [parameter], "lr": rate} for parameter, (_, rate) in zip(parameters, groups, strict=True) if rate],
         betas=(0.9, 0.99),
@@ -191,19 +227,20 @@ def optimise(
         for i, (group, rate) in enumerate(zip(optimiser.param_groups, base_rates, strict=True)):
             group["lr"] = rate * decay * (min(1.0, step / 10) if i else 1)
         optimiser.zero_grad()
-        losses = loss(current, frames, prior, weights)
+        losses, data_losses = loss(current, frames, prior, weights)
         losses.sum().backward()
         optimiser.step()
         on_step()
     detached = [parameter.detach() for parameter in parameters]
-    return JointModel(*detached, model.reference, losses.detach().tolist())
+    return JointModel(*detached, model.is_locked, model.reference, losses.tolist(), data_losses.tolist())
 
 
-def loss(model: JointModel, frames: Tensor, prior: Tensor, weights: Weights) -> Tensor:
-    """Returns the loss of each candidate, (C,)."""
+def loss(model: JointModel, frames: Tensor, prior: Tensor, weights: Weights) -> tuple[Tensor, Tensor]:
+    """Returns the loss of each candidate, (C,), and the part of it that compares the frames with their prediction."""
     rendered, gains = model.render(*frames.shape[-2:])
     errors = data_errors(rendered.sum(0) * gains, frames)
-    terms = charbonnier(errors).mean((1, 2, 3, 4))
+    data = charbonnier(errors).mean((1, 2, 3, 4))
+    terms = data
     for layer, weight in zip(model.layers, (weights.transmission_gradients, weights.reflection_gradients), strict=True):
         terms = terms + weight * sum(charbonnier(d).mean((1, 2, 3)) for d in _differences(layer))
     if weights.common_edges:
@@ -219,7 +256,7 @@ def loss(model: JointModel, frames: Tensor, prior: Tensor, weights: Weights) -> 
             curvature = sum(d.diff(dim=axis).square().mean((1, 2, 3, 4)) for axis, d in ((-1, splines.diff(dim=-1)), (-2, splines.diff(dim=-2))))
             cost = cost + _SPLINE_CURVATURE * curvature
         terms = terms + rigidity * cost
-    return terms
+    return terms, data
 
 
 def data_errors(predicted: Tensor, frames: Tensor) -> Tensor:
@@ -256,6 +293,12 @@ def _resize(maps: Tensor, size: tuple[int, int], *, align_corners: bool) -> Tens
     """Returns maps (..., channels, h, w) at another size, by bicubic interpolation."""
     resized = functional.interpolate(maps.flatten(0, -4), size=size, mode="bicubic", align_corners=align_corners)
     return resized.unflatten(0, maps.shape[:-3])
+
+
+def _interpolation(length: int, knots: int) -> Tensor:
+    """Returns the matrix (length, knots) of bicubic interpolation. Its products are faster than `interpolate`."""
+    unit = torch.eye(knots)[None, None]
+    return functional.interpolate(unit, size=(length, knots), mode="bicubic", align_corners=True)[0, 0]
 
 
 def _encode(light: Tensor) -> Tensor:

@@ -20,10 +20,13 @@ from brewster.srgb import to_encoded
 Floats = NDArray[np.float32]
 Matrices = NDArray[np.float64]
 
+ONE_LAYER: Final = "one layer"
+"""The name of the candidate whose layers move together. The other candidates are compared with it."""
+
 _FEATURES: Final = 4000
 _RATIO: Final = 0.85
 _INLIER_PX: Final = 2.0
-_MIN_MATCHES: Final = 10
+_MIN_MATCHES: Final = 12
 _MAX_MOTIONS: Final = 4
 _MIN_DIFFERENCE: Final = 0.007
 """Two motions of a frame are different if they differ by this share of the frame's width."""
@@ -39,22 +42,44 @@ class MotionCandidate:
     name: str
     transmission: Matrices
     reflection: Matrices
+    is_locked: bool = False
+    """Whether both layers are one: the reflection keeps the motion of the transmission."""
 
 
-def motion_candidates(frames: Sequence[Floats], reference: int, prior: Floats) -> list[MotionCandidate]:
-    """Returns candidates for the motion.
+Motions = list[tuple[Matrices, float]]
+"""The motions of one frame: homographies from the reference frame in pixels, and how likely each is the motion of T."""
+
+
+def frame_motions(frames: Sequence[Floats], reference: int, prior: Floats) -> list[Motions]:
+    """Returns the motions of each frame: those with the most matches first, and none for a frame of another scene.
+
+    A homography is fitted to the matches with MAGSAC, its matches are removed, and the next one is fitted to the rest.
+    The likelihood is the number of matches times the mean share of T in the detail at these matches.
 
     Args:
         frames: (h, w, 3) linear light.
         reference: the index of the reference frame.
         prior: T of the reference frame from a single photo. It decides which of several motions is that of T.
     """
-    height, width = frames[0].shape[:2]
-    motions = [
-        [(np.eye(3), 1.0)] if k == reference else found
-        for k, found in enumerate(_motions_of_each_frame(frames, reference, _transmission_share(frames[reference], prior)))
+    share = _transmission_share(frames[reference], prior)
+    detector = cv2.SIFT_create(nfeatures=_FEATURES, contrastThreshold=0.008)
+    features = [detector.detectAndCompute(_detail_8bit(frame), None) for frame in frames]
+    return [
+        [(np.eye(3), 1.0)] if k == reference else _fitted_motions(_matches(features[reference], feature), share)
+        for k, feature in enumerate(features)
     ]
-    transmission = np.stack([max(found, key=lambda motion: motion[1])[0] if found else np.eye(3) for found in motions])
+
+
+def motion_candidates(frames: Sequence[Floats], reference: int, motions: Sequence[Motions]) -> list[MotionCandidate]:
+    """Returns candidates for the motion of both layers. The first one is locked: both layers are one.
+
+    Args:
+        frames: (h, w, 3) linear light.
+        reference: the index of the reference frame.
+        motions: the motions of each frame, from `frame_motions`; each frame has at least one.
+    """
+    height, width = frames[0].shape[:2]
+    transmission = np.stack([max(found, key=lambda motion: motion[1])[0] for found in motions])
     times = np.arange(len(frames)) - reference
     times = times / np.abs(times).max()
 
@@ -62,7 +87,7 @@ def motion_candidates(frames: Sequence[Floats], reference: int, prior: Floats) -
         """The reflection moves along a line relative to the transmission, in pixels at the end of the path."""
         return np.stack([_translation(x * t, y * t) @ matrix for t, matrix in zip(times, transmission, strict=True)])
 
-    candidates = {"no relative motion": transmission}
+    candidates = {ONE_LAYER: transmission}
     aligned = [
         cv2.warpPerspective(frame, matrix, (width, height), flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP, borderMode=cv2.BORDER_REPLICATE)
         for frame, matrix in zip(frames, transmission, strict=True)
@@ -91,34 +116,29 @@ def motion_candidates(frames: Sequence[Floats], reference: int, prior: Floats) -
         return inverse / inverse[:, 2:, 2:]
 
     return [
-        MotionCandidate(name, normalised(transmission), normalised(reflection))
+        MotionCandidate(name, normalised(transmission), normalised(reflection), reflection is transmission)
         for name, reflection in candidates.items()
     ]
 
 
-def _motions_of_each_frame(
-    frames: Sequence[Floats], reference: int, share: Floats
-) -> list[list[tuple[Matrices, float]]]:
-    """Returns, for each frame, homographies from the reference frame in pixels, and how likely each is the motion of T.
+def _fitted_motions(matches: Floats, share: Floats) -> Motions:
+    motions: Motions = []
+    while len(motions) < _MAX_MOTIONS and len(matches) >= _MIN_MATCHES:
+        matrix, inliers = _fit(matches)
+        if matrix is None or inliers.sum() < _MIN_MATCHES or not _is_camera_motion(matrix, share.shape):
+            break
+        x, y = matches[inliers, :2].astype(int).T
+        motions.append((matrix, float(share[y, x].sum())))
+        matches = matches[~inliers]
+    return motions
 
-    A homography is fitted to the matches with MAGSAC, its matches are removed, and the next one is fitted to the rest.
-    The likelihood is the number of matches times the mean share of T in the detail at these matches.
-    """
-    detector = cv2.SIFT_create(nfeatures=_FEATURES, contrastThreshold=0.008)
-    features = [detector.detectAndCompute(_detail_8bit(frame), None) for frame in frames]
-    found: list[list[tuple[Matrices, float]]] = []
-    for k, feature in enumerate(features):
-        motions: list[tuple[Matrices, float]] = []
-        matches = np.zeros((0, 4), np.float32) if k == reference else _matches(features[reference], feature)
-        while len(motions) < _MAX_MOTIONS and len(matches) >= _MIN_MATCHES:
-            matrix, inliers = _fit(matches)
-            if matrix is None or inliers.sum() < _MIN_MATCHES:
-                break
-            x, y = matches[inliers, :2].astype(int).T
-            motions.append((matrix, float(share[y, x].sum())))
-            matches = matches[~inliers]
-        found.append(motions)
-    return found
+
+def _is_camera_motion(matrix: Matrices, size: tuple[int, ...]) -> bool:
+    """Returns whether a homography keeps the frame convex and of similar size. Matches of unrelated photos do not."""
+    height, width = size
+    corners = np.array([[[0, 0]], [[width, 0]], [[width, height]], [[0, height]]], np.float32)
+    moved = cv2.perspectiveTransform(corners, matrix)
+    return bool(cv2.isContourConvex(moved)) and 0.5 < cv2.contourArea(moved) / (width * height) < 2
 
 
 def _fit(matches: Floats) -> tuple[Matrices | None, NDArray[np.bool_]]:
@@ -149,7 +169,7 @@ def _matches(first: tuple[Sequence[cv2.KeyPoint], Floats | None], second: tuple[
 
 
 def _second_motion(
-    motions: list[tuple[Matrices, float]], transmission: Matrices, size: tuple[int, int]
+    motions: Motions, transmission: Matrices, size: tuple[int, int]
 ) -> Matrices | None:
     """Returns the motion, other than that of T, with the most matches."""
     height, width = size

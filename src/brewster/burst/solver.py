@@ -20,36 +20,43 @@ Floats = NDArray[np.float32]
 
 @final
 @dataclass(frozen=True)
-class _Level:
+class Level:
     """A step from coarse to fine."""
 
     long_side_px: int
     steps: int
-    spline_size: tuple[int, int]
-    """Rows and columns of the splines; 2 x 2 splines are zero at the start, and their rate is 0."""
+    spline_size: tuple[int, int] | None
+    """Rows and columns of the splines; None: the motion is a homography."""
     kept: int
-    """The number of candidates that are optimised at this level."""
+    """The number of candidates that are optimised at this level, besides the one with locked layers."""
 
 
-_LEVELS: Final = (
-    _Level(80, 60, (2, 2), 99),
-    _Level(160, 90, (4, 6), 4),
-    _Level(320, 70, (6, 8), 1),
-    _Level(640, 35, (8, 12), 1),
+COMPARED_PX: Final = 160
+"""The size at which the best candidate is compared with one layer; larger frames are optimised for the best candidate only."""
+LEVELS: Final = (
+    Level(80, 60, None, 99),
+    Level(COMPARED_PX, 90, (4, 6), 3),
+    Level(320, 70, (6, 8), 1),
+    Level(640, 35, (8, 12), 1),
 )
 
 
 @final
 @dataclass(frozen=True)
 class Solution:
-    """Both layers of the reference frame, (h, w, 3) linear light, and the model that explains the burst."""
+    """Both layers of the reference frame, and how well they explain the burst."""
 
     transmission: Floats
+    """(h, w, 3) linear light."""
     reflection: Floats
-    model: JointModel
-    candidate: MotionCandidate
+    confidence: Floats
+    """(h, w, 1) in 0..1: how well the frames agree with their prediction at each pixel of the transmission."""
+    relative_motion: float
+    """The largest motion of R relative to T between two frames, as a share of the width of a frame."""
+    explained: float
+    """The share of the errors of a one-layer model that the second motion explains."""
     losses: dict[str, float]
-    """The loss of each candidate at the last level that optimised it."""
+    """The loss of each candidate, by name, at the last level that optimised it. The last one is the best."""
 
 
 def solve(
@@ -59,7 +66,7 @@ def solve(
     candidates: Sequence[MotionCandidate],
     *,
     weights: Weights = Weights(),
-    levels: Sequence[_Level] = _LEVELS,
+    levels: Sequence[Level] = LEVELS,
     on_progress: Callable[[float], None] = lambda _fraction: None,
 ) -> Solution:
     """Returns the layers of the reference frame for the best of the candidates.
@@ -68,42 +75,66 @@ def solve(
         frames: (h, w, 3) linear light, of one size.
         reference: the index of the reference frame.
         prior: T of the reference frame from a single photo, (h, w, 3).
-        candidates: guesses for the motions.
+        candidates: guesses for the motions. One of them is locked.
         weights: the weights of the loss.
         levels: the sizes of the frames.
         on_progress: called with the completed fraction.
     """
-    model, names, losses = None, list(range(len(candidates))), {}
+    losses: dict[str, float] = {}
+    work = [level.steps * level.long_side_px for level in levels]
+    done = 0.0
+    motions = np.stack([[c.transmission for c in candidates], [c.reflection for c in candidates]])
+    is_locked = torch.tensor([candidate.is_locked for candidate in candidates])
+    model, names, explained = None, [candidate.name for candidate in candidates], 0.0
     for index, level in enumerate(levels):
-        small = _packed(frames, level.long_side_px)
-        small_prior = _packed([prior], level.long_side_px)[0]
+        small, small_prior = _packed(frames, level.long_side_px), _packed([prior], level.long_side_px)[0]
         if model is None:
-            motions = np.stack([[c.transmission for c in candidates], [c.reflection for c in candidates]])
-            model = JointModel.start(small, torch.from_numpy(motions).float(), reference)
+            model = JointModel.start(small, torch.from_numpy(motions).float(), is_locked, reference)
         else:
-            best = sorted(range(len(names)), key=model.losses.__getitem__)[: level.kept]
-            model, names = model.selected(best), [names[i] for i in best]
+            kept = _best(model, level.kept, with_locked=level.long_side_px <= COMPARED_PX)
+            model, names = model.selected(kept), [names[i] for i in kept]
             model = model.resized(small, level.spline_size)
-        rates = Rates() if index == 0 else Rates().scaled(80 / level.long_side_px)
-        if min(level.spline_size) <= 2:
-            rates = Rates(splines=0)
-        model = optimise(model, small, small_prior, level.steps, rates=rates, weights=weights)
-        losses |= {candidates[i].name: loss for i, loss in zip(names, model.losses, strict=True)}
-        on_progress((index + 1) / len(levels))
+        rates = Rates().scaled(min(1.0, 80 / level.long_side_px)) if index else Rates(splines=0)
+
+        def on_step(work_done: float = done, level: Level = level) -> None:
+            nonlocal done
+            done += level.long_side_px
+            on_progress(done / sum(work))
+
+        model = optimise(model, small, small_prior, level.steps, rates=rates, weights=weights, on_step=on_step)
+        losses |= dict(zip(names, model.losses, strict=True))
+        if level.long_side_px <= COMPARED_PX:
+            explained = _explained(model)
     assert model
-    best_candidate = int(np.argmin(model.losses))
+    model = model.selected(_best(model, 1, with_locked=False))
     with torch.no_grad():
-        layers = model.selected([best_candidate]).reference_layers(*small.shape[-2:])[:, 0]
-    transmission, reflection = (layer.movedim(0, -1).numpy() for layer in layers)
-    return Solution(transmission, reflection, model, candidates[names[best_candidate]], losses)
+        layers = model.reference_layers(*small.shape[-2:])[:, 0]
+        confidence = model.confidence(small)[0]
+        motion = model.relative_motion(*small.shape[-2:])
+    transmission, reflection, confidence = (layer.movedim(0, -1).numpy() for layer in (*layers, confidence))
+    return Solution(transmission, reflection, confidence, motion, explained, losses)
+
+
+def _best(model: JointModel, count: int, *, with_locked: bool) -> list[int]:
+    """Returns the indices of the candidates with the smallest losses, and of the locked ones."""
+    locked = model.is_locked.tolist()
+    free = sorted((i for i, is_locked in enumerate(locked) if not is_locked), key=model.losses.__getitem__)
+    return free[:count] + [i for i, is_locked in enumerate(locked) if is_locked and with_locked]
+
+
+def _explained(model: JointModel) -> float:
+    """Returns the share of the data loss of the locked candidates that the best other candidate avoids."""
+    best = _best(model, 1, with_locked=False)[0]
+    locked = [loss for loss, is_locked in zip(model.data_losses, model.is_locked.tolist(), strict=True) if is_locked]
+    return 1 - model.data_losses[best] / max(min(locked, default=1.0), 1e-9)
 
 
 def resized(image: Floats, long_side_px: int) -> Floats:
-    """Returns an image, resized so that its long side has this length."""
+    """Returns an image, resized so that its long side has this length. Smaller images are enlarged."""
     height, width = image.shape[:2]
     scale = long_side_px / max(height, width)
     size = max(8, round(width * scale)), max(8, round(height * scale))
-    return cv2.resize(image, size, interpolation=cv2.INTER_AREA if scale < 1 else cv2.INTER_CUBIC)
+    return cv2.resize(image, size, interpolation=cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR)
 
 
 def _packed(images: Sequence[Floats], long_side_px: int) -> Tensor:
