@@ -21,6 +21,7 @@ from typing import Final, final
 
 from brewster.batch.manifest import row_in_errors
 from brewster.batch.plan import (
+    Burst,
     FileResult,
     InputStream,
     OutputStream,
@@ -30,10 +31,12 @@ from brewster.batch.plan import (
 )
 from brewster.errors import BrewsterError, OutputError
 from brewster.files import exists, is_same_file, write_atomically
-from brewster.image_formats import format_of
+from brewster.image_formats import format_of, is_video
 from brewster.inference.layer_history import find_layer_of_another_photo
+from brewster.inference.separation import Separation
 from brewster.inference.separator import Separator
 from brewster.options import Options
+from brewster.photo import Source
 from brewster.remote_path import Location, RemotePath, check_readable, read_image
 
 BatchProgressCallback = Callable[[int, str, float], None]
@@ -143,9 +146,11 @@ class BatchRunner:
         result = FileResult(task.name)
         try:
             outputs = self._outputs_to_write(task)
-            if outputs and self._dry_run and isinstance(task.source, Location):
-                with row_in_errors(task.row):
-                    check_readable(task.source)
+            if outputs and self._dry_run:
+                for source in task.burst.photos if task.burst else (task.source,):
+                    if isinstance(source, Location) and not (task.burst and is_video(source)):
+                        with row_in_errors(task.row):
+                            check_readable(source)
         except BrewsterError as error:
             return result.failed(error)
         if not outputs or self._dry_run:
@@ -195,10 +200,13 @@ class BatchRunner:
         result: FileResult,
         on_progress: Callable[[float], None],
     ) -> None:
-        with row_in_errors(task.row):
-            photo = read_content(task.source)
-        result.photo_sha256 = _sha256(photo)
-        separation = separator(photo, on_progress=on_progress, **self._options.call_options())
+        if task.burst:
+            photo, separation = _separate_burst(task.burst, separator, self._options, on_progress)
+        else:
+            with row_in_errors(task.row):
+                photo = read_content(task.source)
+            separation = separator(photo, on_progress=on_progress, **self._options.call_options())
+        result.photo_sha256, result.burst = _sha256(photo), separation.burst
         result.seconds, result.residual = dict(separation.seconds), separation.residual
         result.assessment = separation.assessment
         result.reconstruction_error = separation.reconstruction_error
@@ -218,6 +226,29 @@ class BatchRunner:
                 target.write(encoded)
             result.outputs[layer] = display_name(target)
         result.seconds["encode"] = time.perf_counter() - started
+
+
+def _separate_burst(
+    burst: Burst, separator: Separator, options: Options, on_progress: Callable[[float], None]
+) -> tuple[Path | bytes, Separation]:
+    """Returns the content of the reference photo, or of the video, and its separation."""
+    from brewster.burst import read_video, separate_burst  # noqa: PLC0415  (imports torch)
+
+    content: Path | bytes
+    if is_video(burst.photos[0]):
+        content = Path(burst.photos[0])
+        photos: list[Source] = [*read_video(content, burst.frames, max_pixels=options.max_pixels)]
+    else:
+        photos = [read_content(photo) for photo in burst.photos]
+        content = read_content(burst.photos[len(photos) // 2 if burst.reference is None else burst.reference])
+    separation = separate_burst(
+        photos,
+        reference=burst.reference,
+        separator=separator,
+        on_progress=on_progress,
+        **options.call_options(),
+    )
+    return content, separation
 
 
 def check_outputs(task: SeparationTask, photos: Set[str]) -> None:

@@ -57,7 +57,7 @@ def find_translations(aligned: Sequence[Floats], reference: int) -> list[NDArray
     for _ in range(_REFINEMENT_STEPS):
         optimiser.zero_grad()
         costs = _costs(spectra, frequencies, weights, reference, offsets)
-        costs.sum().backward()
+        costs.sum().backward()  # type: ignore[no-untyped-call]
         optimiser.step()
     found = offsets.detach() - offsets.detach()[:, reference : reference + 1]
     order = costs.argsort()
@@ -67,7 +67,9 @@ def find_translations(aligned: Sequence[Floats], reference: int) -> list[NDArray
 def _spectra(aligned: Sequence[Floats]) -> tuple[Tensor, Tensor, Tensor]:
     """Returns the spectra (K, n), their angular frequencies (n, 2) and weights (n,) that whiten the changes."""
     height = round(_WIDTH_PX * aligned[0].shape[0] / aligned[0].shape[1])
-    grey = np.stack([cv2.resize(frame.mean(-1), (_WIDTH_PX, height), interpolation=cv2.INTER_AREA) for frame in aligned])
+    grey = np.stack(
+        [cv2.resize(frame.mean(-1), (_WIDTH_PX, height), interpolation=cv2.INTER_AREA) for frame in aligned]
+    )
     window = np.outer(np.hanning(height), np.hanning(_WIDTH_PX))
     spectra = np.fft.fft2((grey - grey.mean((1, 2), keepdims=True)) * window)
     y, x = np.meshgrid(np.fft.fftfreq(height), np.fft.fftfreq(_WIDTH_PX), indexing="ij")
@@ -91,4 +93,5 @@ def _costs(spectra: Tensor, frequencies: Tensor, weights: Tensor, reference: int
     turns = turns - share * turns.mean(1, keepdim=True)
     explained = (turns.conj() * changes).sum(1).abs().square() / (turns.abs().square().sum(1) + 1e-3)
     total = changes.abs().square().sum(0)
-    return (weights * (total - explained)).sum(1) / (weights * total).sum()
+    unexplained: Tensor = (weights * (total - explained)).sum(1) / (weights * total).sum()
+    return unexplained

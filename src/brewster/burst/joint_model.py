@@ -48,6 +48,9 @@ class Weights:
     """The pull of the low frequencies of T to those of the single-photo result."""
 
 
+DEFAULT_WEIGHTS: Final = Weights()
+
+
 @final
 @dataclass
 class JointModel:
@@ -86,8 +89,13 @@ class JointModel:
         layers = torch.empty(2, count, 3, height, width)
         for candidate in range(count):
             for layer in range(2):
-                positions = _project(to_frames[layer, candidate].flatten(1)[:, :8] / to_frames[layer, candidate, :, 2:, 2], canvas)
-                aligned = functional.grid_sample(frames, positions, align_corners=False, padding_mode="border")
+                positions = _project(
+                    to_frames[layer, candidate].flatten(1)[:, :8] / to_frames[layer, candidate, :, 2:, 2],
+                    canvas,
+                )
+                aligned = functional.grid_sample(
+                    frames, positions, align_corners=False, padding_mode="border"
+                )
                 is_outside = (positions.abs().amax(-1) > 1)[:, None]
                 darkest = (aligned + 9 * is_outside).sort(0).values
                 second = torch.where(darkest[1] < 2, darkest[:2].mean(0), darkest[0])
@@ -118,7 +126,9 @@ class JointModel:
         identity = torch.eye(3).flatten()[:8]
         homographies = identity + moves * (self._locked(self.homographies) - identity)
         positions = _project(homographies, pixel_grid(height, width))
-        rows, columns = (_interpolation(size, n) for size, n in zip((height, width), self.splines.shape[-2:], strict=True))
+        rows, columns = (
+            _interpolation(size, n) for size, n in zip((height, width), self.splines.shape[-2:], strict=True)
+        )
         offsets = rows @ (moves[:, None, None] * self._locked(self.splines)) @ columns.T
         return positions + offsets.movedim(-3, -1)
 
@@ -216,9 +226,14 @@ def optimise(
         (model.log_gains, rates.gains),
     ]  # fmt: skip
     parameters = [tensor.detach().clone().requires_grad_(rate > 0) for tensor, rate in groups]
-    current = JointModel(*parameters, model.is_locked, model.reference)
+    layers, homographies, splines, log_gains = parameters
+    current = JointModel(layers, homographies, splines, log_gains, model.is_locked, model.reference)
     optimiser = torch.optim.Adam(
-        [{"params": [parameter], "lr": rate} for parameter, (_, rate) in zip(parameters, groups, strict=True) if rate],
+        [
+            {"params": [parameter], "lr": rate}
+            for parameter, (_, rate) in zip(parameters, groups, strict=True)
+            if rate
+        ],
         betas=(0.9, 0.99),
     )
     base_rates = [group["lr"] for group in optimiser.param_groups]
@@ -228,11 +243,14 @@ def optimise(
             group["lr"] = rate * decay * (min(1.0, step / 10) if i else 1)
         optimiser.zero_grad()
         losses, data_losses = loss(current, frames, prior, weights)
-        losses.sum().backward()
+        losses.sum().backward()  # type: ignore[no-untyped-call]
         optimiser.step()
         on_step()
-    detached = [parameter.detach() for parameter in parameters]
-    return JointModel(*detached, model.is_locked, model.reference, losses.tolist(), data_losses.tolist())
+    layers, homographies, splines, log_gains = (parameter.detach() for parameter in parameters)
+    return replace(
+        model, layers=layers, homographies=homographies, splines=splines, log_gains=log_gains,
+        losses=losses.tolist(), data_losses=data_losses.tolist(),
+    )  # fmt: skip
 
 
 def loss(model: JointModel, frames: Tensor, prior: Tensor, weights: Weights) -> tuple[Tensor, Tensor]:
@@ -241,7 +259,9 @@ def loss(model: JointModel, frames: Tensor, prior: Tensor, weights: Weights) -> 
     errors = data_errors(rendered.sum(0) * gains, frames)
     data = charbonnier(errors).mean((1, 2, 3, 4))
     terms = data
-    for layer, weight in zip(model.layers, (weights.transmission_gradients, weights.reflection_gradients), strict=True):
+    for layer, weight in zip(
+        model.layers, (weights.transmission_gradients, weights.reflection_gradients), strict=True
+    ):
         terms = terms + weight * sum(charbonnier(d).mean((1, 2, 3)) for d in _differences(layer))
     if weights.common_edges:
         terms = terms + weights.common_edges * _common_edges(*model.layers)
@@ -253,7 +273,10 @@ def loss(model: JointModel, frames: Tensor, prior: Tensor, weights: Weights) -> 
     for splines, rigidity in zip(model.splines, (1.0, _REFLECTION_RIGIDITY), strict=True):
         cost = _SPLINE_SIZE * splines.square().mean((1, 2, 3, 4))
         if min(splines.shape[-2:]) > 2:
-            curvature = sum(d.diff(dim=axis).square().mean((1, 2, 3, 4)) for axis, d in ((-1, splines.diff(dim=-1)), (-2, splines.diff(dim=-2))))
+            curvature = sum(
+                d.diff(dim=axis).square().mean((1, 2, 3, 4))
+                for axis, d in ((-1, splines.diff(dim=-1)), (-2, splines.diff(dim=-2)))
+            )
             cost = cost + _SPLINE_CURVATURE * curvature
         terms = terms + rigidity * cost
     return terms, data
@@ -278,10 +301,13 @@ def pixel_grid(height: int, width: int) -> Tensor:
 
 def _project(homographies: Tensor, grid: Tensor) -> Tensor:
     """Applies homographies (..., 8) to a grid (h, w, 2). Returns (..., h, w, 2)."""
-    matrices = torch.cat([homographies, torch.ones_like(homographies[..., :1])], -1).unflatten(-1, (3, 3))
+    matrices = torch.cat([homographies, torch.ones_like(homographies[..., :1])], -1).reshape(
+        *homographies.shape[:-1], 3, 3
+    )
     points = torch.cat([grid, torch.ones_like(grid[..., :1])], -1).flatten(0, 1)
     projected = points @ matrices.transpose(-1, -2)
-    return (projected[..., :2] / projected[..., 2:]).unflatten(-2, grid.shape[:2])
+    points = projected[..., :2] / projected[..., 2:]
+    return points.reshape(*homographies.shape[:-1], *grid.shape)
 
 
 def _canvas_size(frames: Tensor) -> tuple[int, int]:
@@ -291,8 +317,10 @@ def _canvas_size(frames: Tensor) -> tuple[int, int]:
 
 def _resize(maps: Tensor, size: tuple[int, int], *, align_corners: bool) -> Tensor:
     """Returns maps (..., channels, h, w) at another size, by bicubic interpolation."""
-    resized = functional.interpolate(maps.flatten(0, -4), size=size, mode="bicubic", align_corners=align_corners)
-    return resized.unflatten(0, maps.shape[:-3])
+    resized = functional.interpolate(
+        maps.flatten(0, -4), size=size, mode="bicubic", align_corners=align_corners
+    )
+    return resized.reshape(*maps.shape[:-2], *size)
 
 
 def _interpolation(length: int, knots: int) -> Tensor:

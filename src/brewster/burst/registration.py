@@ -32,6 +32,8 @@ _MIN_DIFFERENCE: Final = 0.007
 """Two motions of a frame are different if they differ by this share of the frame's width."""
 _SHIFTS: Final = (0.015, 0.045, 0.12)
 """Sideways shifts of the reflection at the end of the path, as shares of the width: a safety net for the other candidates."""
+_MIN_FRAMES_FOR_LARGE_SHIFTS: Final = 4
+"""With fewer frames, a large shift leaves parts of the reflection in one frame only, where it explains everything."""
 
 
 @final
@@ -62,15 +64,19 @@ def frame_motions(frames: Sequence[Floats], reference: int, prior: Floats) -> li
         prior: T of the reference frame from a single photo. It decides which of several motions is that of T.
     """
     share = _transmission_share(frames[reference], prior)
-    detector = cv2.SIFT_create(nfeatures=_FEATURES, contrastThreshold=0.008)
+    detector = cv2.SIFT.create(nfeatures=_FEATURES, contrastThreshold=0.008)
     features = [detector.detectAndCompute(_detail_8bit(frame), None) for frame in frames]
     return [
-        [(np.eye(3), 1.0)] if k == reference else _fitted_motions(_matches(features[reference], feature), share)
+        [(np.eye(3), 1.0)]
+        if k == reference
+        else _fitted_motions(_matches(features[reference], feature), share)
         for k, feature in enumerate(features)
     ]
 
 
-def motion_candidates(frames: Sequence[Floats], reference: int, motions: Sequence[Motions]) -> list[MotionCandidate]:
+def motion_candidates(
+    frames: Sequence[Floats], reference: int, motions: Sequence[Motions]
+) -> list[MotionCandidate]:
     """Returns candidates for the motion of both layers. The first one is locked: both layers are one.
 
     Args:
@@ -85,7 +91,9 @@ def motion_candidates(frames: Sequence[Floats], reference: int, motions: Sequenc
 
     def line(x: float, y: float) -> Matrices:
         """The reflection moves along a line relative to the transmission, in pixels at the end of the path."""
-        return np.stack([_translation(x * t, y * t) @ matrix for t, matrix in zip(times, transmission, strict=True)])
+        return np.stack(
+            [_translation(x * t, y * t) @ matrix for t, matrix in zip(times, transmission, strict=True)]
+        )
 
     candidates = {ONE_LAYER: transmission}
     aligned = [
@@ -96,7 +104,10 @@ def motion_candidates(frames: Sequence[Floats], reference: int, motions: Sequenc
         candidates[f"Fourier {rank + 1}"] = np.stack(
             [matrix @ _translation(*offset) for matrix, offset in zip(transmission, offsets, strict=True)]
         )
-    second = [_second_motion(found, matrix, (height, width)) for found, matrix in zip(motions, transmission, strict=True)]
+    second = [
+        _second_motion(found, matrix, (height, width))
+        for found, matrix in zip(motions, transmission, strict=True)
+    ]
     slopes = [
         (_centre(matrix, (height, width)) - _centre(transmission[k], (height, width))) / times[k]
         for k, matrix in enumerate(second)
@@ -104,9 +115,11 @@ def motion_candidates(frames: Sequence[Floats], reference: int, motions: Sequenc
     ]
     if slopes:
         path = line(*np.median(slopes, axis=0))
-        candidates["second homography"] = np.stack([path[k] if matrix is None else matrix for k, matrix in enumerate(second)])
+        candidates["second homography"] = np.stack(
+            [path[k] if matrix is None else matrix for k, matrix in enumerate(second)]
+        )
         candidates["second homography, line"] = path
-    for share in _SHIFTS:
+    for share in _SHIFTS if len(frames) >= _MIN_FRAMES_FOR_LARGE_SHIFTS else _SHIFTS[:-1]:
         for sign in (-1, 1):
             candidates[f"shift {sign * share:+.1%}"] = line(sign * share * width, 0.0)
     scale = np.array([[2 / width, 0, 1 / width - 1], [0, 2 / height, 1 / height - 1], [0, 0, 1]])
@@ -138,7 +151,8 @@ def _is_camera_motion(matrix: Matrices, size: tuple[int, ...]) -> bool:
     height, width = size
     corners = np.array([[[0, 0]], [[width, 0]], [[width, height]], [[0, height]]], np.float32)
     moved = cv2.perspectiveTransform(corners, matrix)
-    return bool(cv2.isContourConvex(moved)) and 0.5 < cv2.contourArea(moved) / (width * height) < 2
+    area: float = cv2.contourArea(moved) / (width * height)
+    return bool(cv2.isContourConvex(moved)) and 0.5 < area < 2
 
 
 def _fit(matches: Floats) -> tuple[Matrices | None, NDArray[np.bool_]]:
@@ -158,7 +172,9 @@ def _fit(matches: Floats) -> tuple[Matrices | None, NDArray[np.bool_]]:
     return matrix, inliers.ravel().astype(bool)
 
 
-def _matches(first: tuple[Sequence[cv2.KeyPoint], Floats | None], second: tuple[Sequence[cv2.KeyPoint], Floats | None]) -> Floats:
+def _matches(
+    first: tuple[Sequence[cv2.KeyPoint], Floats | None], second: tuple[Sequence[cv2.KeyPoint], Floats | None]
+) -> Floats:
     """Returns matching points (n, 4): x, y in the first frame, and x, y in the second."""
     if first[1] is None or second[1] is None or len(second[0]) < 2:
         return np.zeros((0, 4), np.float32)
@@ -168,9 +184,7 @@ def _matches(first: tuple[Sequence[cv2.KeyPoint], Floats | None], second: tuple[
     return np.array(points, np.float32).reshape(-1, 4)
 
 
-def _second_motion(
-    motions: Motions, transmission: Matrices, size: tuple[int, int]
-) -> Matrices | None:
+def _second_motion(motions: Motions, transmission: Matrices, size: tuple[int, int]) -> Matrices | None:
     """Returns the motion, other than that of T, with the most matches."""
     height, width = size
     y, x = np.mgrid[0:height:40, 0:width:40]
@@ -189,7 +203,8 @@ def _second_motion(
 def _transmission_share(reference: Floats, prior: Floats) -> Floats:
     """Returns the share of T in the local detail of the reference frame, (h, w) in 0..1."""
     details = [
-        cv2.GaussianBlur(np.abs(_high_pass(layer, 3.0)), (0, 0), 4) for layer in (prior, np.maximum(reference - prior, 0))
+        cv2.GaussianBlur(np.abs(_high_pass(layer, 3.0)), (0, 0), 4)
+        for layer in (prior, np.maximum(reference - prior, 0))
     ]
     share: Floats = details[0] / (details[0] + details[1] + 1e-4)
     return share
@@ -203,7 +218,9 @@ def _high_pass(frame: Floats, sigma: float) -> Floats:
 
 def _detail_8bit(frame: Floats) -> NDArray[np.uint8]:
     detail = _high_pass(frame, 20.0)
-    scaled: NDArray[np.uint8] = np.clip(detail / (3 * detail.std() + 1e-6) * 90 + 128, 0, 255).astype(np.uint8)
+    scaled: NDArray[np.uint8] = np.clip(detail / (3 * detail.std() + 1e-6) * 90 + 128, 0, 255).astype(
+        np.uint8
+    )
     return scaled
 
 

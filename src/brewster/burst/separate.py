@@ -14,13 +14,13 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
-from typing import Final, final
+from typing import Final, Literal, final
 
 import cv2
 import numpy as np
 
 from brewster.burst.registration import frame_motions, motion_candidates
-from brewster.burst.solver import Floats, Solution, resized, solve
+from brewster.burst.solver import Floats, Solution, solve
 from brewster.errors import PhotoError
 from brewster.inference.burst_report import BurstReport
 from brewster.inference.predictor import Prediction, Predictor, ProgressCallback
@@ -34,11 +34,11 @@ MAX_FRAMES: Final = 15
 """Larger bursts take longer and are hardly better."""
 _WORKING_PX: Final = 1000
 """The long side of the frames from which the motion is estimated."""
-_MIN_MOTION_PX: Final = 6.0
+_MIN_MOTION_PX: Final = 10.0
 """The smallest relative motion that separates the layers, in pixels of a photo that is 1,000 pixels wide."""
-_MIN_EXPLAINED: Final = 0.05
+_MIN_EXPLAINED: Final = 0.2
 """The smallest share of the errors of one layer that a second motion must explain."""
-_USEFUL_MOTION_PX: Final = 10
+_USEFUL_MOTION_PX: Final = 16
 _DETAIL_LIMITS: Final = (0.5, 2.0)
 """The detail of the reference photo changes the sum of the layers by no more than these factors."""
 
@@ -88,17 +88,20 @@ def separate_burst(
         if len(used) > 1:
             chosen, middle = [frames[k] for k in used], used.index(reference)
             candidates = motion_candidates(chosen, middle, [motions[k] for k in used])
-            solution = solve(chosen, middle, prior, candidates, on_progress=lambda done: on_progress(0.9 * done))
+            solution = solve(
+                chosen, middle, prior, candidates, on_progress=lambda done: on_progress(0.9 * done)
+            )
     seconds["motion"] = time.perf_counter() - started
     left_out = tuple(k for k, found in enumerate(motions) if not found)
     report = _report(solution, single.verdict == "little found", len(photos), left_out, reference)
-    chosen_separator = {
-        "burst": lambda: Separator(
-            _FixedPredictor(solution), name=f"burst with {separator.name}", sha256=separator.sha256, device=separator.device
-        ),
-        "single photo": lambda: separator,
-        "unchanged": lambda: Separator(lambda tile: (tile, np.zeros_like(tile)), name="unchanged"),
-    }[report.method]()
+    chosen_separator = separator
+    if solution and report.method == "burst":
+        name = f"burst with {separator.name}"
+        chosen_separator = Separator(
+            _FixedPredictor(solution), name=name, sha256=separator.sha256, device=separator.device
+        )
+    elif report.method == "unchanged":
+        chosen_separator = Separator(lambda tile: (tile, np.zeros_like(tile)), name="unchanged")
     separation = chosen_separator(
         photo,
         strength=strength,
@@ -120,7 +123,9 @@ def _checked_reference(count: int, reference: int | None) -> int:
     reference = count // 2 if reference is None else reference
     if not 0 <= reference < count:
         raise PhotoError(
-            f"the reference photo is {reference}", f"expected an index from 0 to {count - 1}", "correct the reference"
+            f"the reference photo is {reference}",
+            f"expected an index from 0 to {count - 1}",
+            "correct the reference",
         )
     return reference
 
@@ -153,29 +158,30 @@ def _applied(apply: Callable[[Floats, int, int], tuple[Floats, Floats]], frame: 
 def _report(
     solution: Solution | None, is_clear: bool, count: int, left_out: tuple[int, ...], reference: int
 ) -> BurstReport:
-    """Decides whether the motion separates the layers."""
+    """Decides whether the motion separates the layers. `is_clear`: the model found little reflection in the reference photo."""
     motion = 1000 * solution.relative_motion if solution else 0.0
-    explained = max(0.0, solution.explained) if solution else 0.0
-    method, message = _decision(solution is not None, motion, explained, is_clear)
+    explained = (
+        max(0.0, 1 - solution.two_layer_error / (solution.one_layer_error + 1e-9)) if solution else 0.0
+    )
+    method: Literal["burst", "single photo", "unchanged"] = "single photo"
+    advice = "Move the camera 5 to 10 cm sideways between the photos."
+    if solution is None:
+        message = "No other photo shows the same scene as the reference photo."
+    elif explained >= _MIN_EXPLAINED and motion >= _MIN_MOTION_PX:
+        method, message = "burst", f"The layers moved {motion:.0f} px apart in a photo of 1,000 px."
+    elif is_clear:
+        method = "unchanged"
+        message = "One layer explains all photos, and no reflection was found in the reference photo."
+    elif explained < _MIN_EXPLAINED:
+        message = f"No relative motion of two layers was found. {advice}"
+    else:
+        message = f"The layers moved {motion:.0f} px apart; about {_USEFUL_MOTION_PX} are needed. {advice}"
     if left_out:
         names = ", ".join(str(k + 1) for k in left_out)
-        message += f" Photo {names} does not show the same scene as the reference photo and was left out."
+        message += f" Left out, because they do not show the same scene as the reference photo: {names}."
     return BurstReport(
         method, message, count - len(left_out), left_out, reference, round(motion, 2), round(explained, 4)
     )
-
-
-def _decision(is_solved: bool, motion: float, explained: float, is_clear: bool) -> tuple[str, str]:
-    advice = "Move the camera 5 to 10 cm sideways between the photos."
-    if not is_solved:
-        return "single photo", "No other photo shows the same scene as the reference photo."
-    if explained >= _MIN_EXPLAINED and motion >= _MIN_MOTION_PX:
-        return "burst", f"The layers moved {motion:.0f} px apart in a photo of 1,000 px."
-    if is_clear:
-        return "unchanged", "One layer explains all photos, and no reflection was found in the reference photo."
-    if explained < _MIN_EXPLAINED:
-        return "single photo", f"No relative motion of two layers was found. {advice}"
-    return "single photo", f"The layers moved {motion:.0f} px apart; about {_USEFUL_MOTION_PX} are needed. {advice}"
 
 
 @final
@@ -190,14 +196,18 @@ class _FixedPredictor(Predictor):
         height, width = self._solution.transmission.shape[:2]
         return [(width, height)]
 
-    def __call__(self, inputs: Sequence[Floats], quality: Quality, on_progress: ProgressCallback) -> Prediction:  # noqa: ARG002
+    def __call__(
+        self,
+        inputs: Sequence[Floats],
+        quality: Quality,  # noqa: ARG002
+        on_progress: ProgressCallback,  # noqa: ARG002
+    ) -> Prediction:
         """Returns the layers, with the detail of the reference photo."""
         (photo,) = inputs
         solution = self._solution
-        layers = solution.transmission, solution.reflection
-        total = np.maximum(sum(layers), 1e-4)
+        total = np.maximum(solution.transmission + solution.reflection, np.float32(1e-4))
         detail = np.clip(photo / total, *_DETAIL_LIMITS)
-        transmission, reflection = (layer * detail for layer in layers)
+        transmission, reflection = solution.transmission * detail, solution.reflection * detail
         return Prediction(transmission - photo, np.minimum(reflection, photo), solution.confidence)
 
 

@@ -12,7 +12,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from brewster.burst.joint_model import JointModel, Rates, Weights, optimise
+from brewster.burst.joint_model import DEFAULT_WEIGHTS, JointModel, Rates, Weights, optimise
 from brewster.burst.registration import MotionCandidate
 
 Floats = NDArray[np.float32]
@@ -33,6 +33,8 @@ class Level:
 
 COMPARED_PX: Final = 160
 """The size at which the best candidate is compared with one layer; larger frames are optimised for the best candidate only."""
+_MAX_ENLARGEMENT: Final = 1.3
+"""Levels that would enlarge the frames by more than this factor are left out."""
 LEVELS: Final = (
     Level(80, 60, None, 99),
     Level(COMPARED_PX, 90, (4, 6), 3),
@@ -53,8 +55,10 @@ class Solution:
     """(h, w, 1) in 0..1: how well the frames agree with their prediction at each pixel of the transmission."""
     relative_motion: float
     """The largest motion of R relative to T between two frames, as a share of the width of a frame."""
-    explained: float
-    """The share of the errors of a one-layer model that the second motion explains."""
+    one_layer_error: float
+    """The mean error of the frames if both layers move together: the data term of the loss at `COMPARED_PX`."""
+    two_layer_error: float
+    """The same for the best candidate."""
     losses: dict[str, float]
     """The loss of each candidate, by name, at the last level that optimised it. The last one is the best."""
 
@@ -65,7 +69,7 @@ def solve(
     prior: Floats,
     candidates: Sequence[MotionCandidate],
     *,
-    weights: Weights = Weights(),
+    weights: Weights = DEFAULT_WEIGHTS,
     levels: Sequence[Level] = LEVELS,
     on_progress: Callable[[float], None] = lambda _fraction: None,
 ) -> Solution:
@@ -81,11 +85,13 @@ def solve(
         on_progress: called with the completed fraction.
     """
     losses: dict[str, float] = {}
+    largest = _MAX_ENLARGEMENT * max(frames[0].shape)
+    levels = [level for level in levels if level.long_side_px <= largest] or levels[:1]
     work = [level.steps * level.long_side_px for level in levels]
     done = 0.0
     motions = np.stack([[c.transmission for c in candidates], [c.reflection for c in candidates]])
     is_locked = torch.tensor([candidate.is_locked for candidate in candidates])
-    model, names, explained = None, [candidate.name for candidate in candidates], 0.0
+    model, names, errors = None, [candidate.name for candidate in candidates], (0.0, 0.0)
     for index, level in enumerate(levels):
         small, small_prior = _packed(frames, level.long_side_px), _packed([prior], level.long_side_px)[0]
         if model is None:
@@ -96,15 +102,17 @@ def solve(
             model = model.resized(small, level.spline_size)
         rates = Rates().scaled(min(1.0, 80 / level.long_side_px)) if index else Rates(splines=0)
 
-        def on_step(work_done: float = done, level: Level = level) -> None:
+        def on_step(level: Level = level) -> None:
             nonlocal done
             done += level.long_side_px
             on_progress(done / sum(work))
 
-        model = optimise(model, small, small_prior, level.steps, rates=rates, weights=weights, on_step=on_step)
+        model = optimise(
+            model, small, small_prior, level.steps, rates=rates, weights=weights, on_step=on_step
+        )
         losses |= dict(zip(names, model.losses, strict=True))
         if level.long_side_px <= COMPARED_PX:
-            explained = _explained(model)
+            errors = _errors(model)
     assert model
     model = model.selected(_best(model, 1, with_locked=False))
     with torch.no_grad():
@@ -112,7 +120,7 @@ def solve(
         confidence = model.confidence(small)[0]
         motion = model.relative_motion(*small.shape[-2:])
     transmission, reflection, confidence = (layer.movedim(0, -1).numpy() for layer in (*layers, confidence))
-    return Solution(transmission, reflection, confidence, motion, explained, losses)
+    return Solution(transmission, reflection, confidence, motion, *errors, losses)
 
 
 def _best(model: JointModel, count: int, *, with_locked: bool) -> list[int]:
@@ -122,11 +130,10 @@ def _best(model: JointModel, count: int, *, with_locked: bool) -> list[int]:
     return free[:count] + [i for i, is_locked in enumerate(locked) if is_locked and with_locked]
 
 
-def _explained(model: JointModel) -> float:
-    """Returns the share of the data loss of the locked candidates that the best other candidate avoids."""
-    best = _best(model, 1, with_locked=False)[0]
-    locked = [loss for loss, is_locked in zip(model.data_losses, model.is_locked.tolist(), strict=True) if is_locked]
-    return 1 - model.data_losses[best] / max(min(locked, default=1.0), 1e-9)
+def _errors(model: JointModel) -> tuple[float, float]:
+    """Returns the data losses of the locked candidate and of the best other one."""
+    (best,), (locked,) = _best(model, 1, with_locked=False), _best(model, 0, with_locked=True)
+    return model.data_losses[locked], model.data_losses[best]
 
 
 def resized(image: Floats, long_side_px: int) -> Floats:
@@ -134,7 +141,9 @@ def resized(image: Floats, long_side_px: int) -> Floats:
     height, width = image.shape[:2]
     scale = long_side_px / max(height, width)
     size = max(8, round(width * scale)), max(8, round(height * scale))
-    return cv2.resize(image, size, interpolation=cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR)
+    interpolation = cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR
+    small: Floats = cv2.resize(image, size, interpolation=interpolation)
+    return small
 
 
 def _packed(images: Sequence[Floats], long_side_px: int) -> Tensor:

@@ -157,6 +157,8 @@ class BatchCommand:
             hint = ": check the layers" if verdict == "doubtful" else ""
             seconds = sum(result.seconds.values())
             print_status(f"{result.source} -> {outputs} ({seconds:.1f} s, {verdict}{hint})")
+            if result.burst:
+                print_status(f"  {result.burst.method}: {result.burst.message}")
 
     def _different_options(self, result: FileResult) -> str:
         """Returns the options in the metadata of the existing layers that differ from the options of this batch."""

@@ -100,7 +100,7 @@ class _ModelName(click.ParamType[str]):
         return [*map(CompletionItem, names), CompletionItem(incomplete, type="file")]
 
 
-def _with_options(command: _Command) -> _Command:
+def with_options(command: _Command) -> _Command:
     """Adds one option for each field of `Options` to a command."""
     hints = get_type_hints(Options)
     for field in reversed(dataclasses.fields(Options)):
@@ -147,7 +147,7 @@ def _param_type(hint: object, field: dataclasses.Field[Any]) -> click.ParamType[
     type=click.Path(),
     help="Where to write the layers: a folder, an image file for a single layer, or - for standard output.",
 )
-@_with_options
+@with_options
 @click.option(
     "--json", "as_json", is_flag=True, help="Print one line of JSON for each photo on standard output."
 )
