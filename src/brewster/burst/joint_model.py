@@ -20,6 +20,9 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+_ALL: Final = slice(None)
+_CHUNK_PIXELS: Final = 300_000
+"""The errors of at most this many pixels are computed at once: smaller tensors are faster, because they stay in the caches."""
 MARGIN: Final = 0.15
 """The canvases extend beyond each edge of the reference frame by this share of its size."""
 OFFSET: Final = 0.003
@@ -120,35 +123,35 @@ class JointModel:
         splines = _resize(self.splines, spline_size, align_corners=True) if spline_size else self.splines
         return replace(self, layers=layers, splines=splines)
 
-    def positions(self, height: int, width: int) -> Tensor:
-        """Returns the coordinates in the reference frame of each pixel of each frame: (2, C, K, h, w, 2)."""
-        moves = self._moves()
+    def positions(self, height: int, width: int, frames: slice = _ALL) -> Tensor:
+        """Returns the coordinates in the reference frame of each pixel of K frames: (2, C, K, h, w, 2)."""
+        moves = self._moves()[frames]
         identity = torch.eye(3).flatten()[:8]
-        homographies = identity + moves * (self._locked(self.homographies) - identity)
+        homographies = identity + moves * (self._locked(self.homographies)[:, :, frames] - identity)
         positions = _project(homographies, pixel_grid(height, width))
         rows, columns = (
             _interpolation(size, n) for size, n in zip((height, width), self.splines.shape[-2:], strict=True)
         )
-        offsets = rows @ (moves[:, None, None] * self._locked(self.splines)) @ columns.T
+        offsets = rows @ (moves[:, None, None] * self._locked(self.splines)[:, :, frames]) @ columns.T
         return positions + offsets.movedim(-3, -1)
 
-    def render(self, height: int, width: int) -> tuple[Tensor, Tensor]:
-        """Returns the layers of each frame, (2, C, K, 3, h, w) linear light, and the gains of the frames, (C, K, 3, 1, 1)."""
-        count, frame_count = self.log_gains.shape[:2]
-        positions = self.positions(height, width) / (1 + 2 * MARGIN)
+    def render(self, height: int, width: int, frames: slice = _ALL) -> tuple[Tensor, Tensor]:
+        """Returns the layers of K frames, (2, C, K, 3, h, w) linear light, and the gains of the frames, (C, K, 3, 1, 1)."""
+        positions = self.positions(height, width, frames) / (1 + 2 * MARGIN)
+        count, frame_count = positions.shape[1:3]
         # One tall grid for all frames: the gradient of the layers is accumulated in place
         grid = positions.reshape(2 * count, frame_count * height, width, 2)
         rendered = functional.grid_sample(
             self.layers.flatten(0, 1).square(), grid, align_corners=False, padding_mode="border"
         )
         rendered = rendered.reshape(2, count, 3, frame_count, height, width).transpose(2, 3)
-        gains = torch.exp(self._moves() * self.log_gains)[..., None, None]
+        gains = torch.exp(self._moves() * self.log_gains)[:, frames, :, None, None]
         return rendered, gains
 
     def reference_layers(self, height: int, width: int) -> Tensor:
         """Returns both layers of the reference frame: (2, C, 3, h, w) linear light."""
-        rendered, _ = self.render(height, width)
-        return rendered[:, :, self.reference]
+        rendered, _ = self.render(height, width, slice(self.reference, self.reference + 1))
+        return rendered[:, :, 0]
 
     def relative_motion(self, height: int, width: int) -> float:
         """Returns the largest mean motion of R relative to T between two frames, as a share of the width, for one candidate."""
@@ -237,28 +240,39 @@ def optimise(
         betas=(0.9, 0.99),
     )
     base_rates = [group["lr"] for group in optimiser.param_groups]
+    size = max(1, _CHUNK_PIXELS // (len(model.is_locked) * frames[0, 0].numel()))
+    chunks = [slice(first, first + size) for first in range(0, len(frames), size)]
     for step in range(steps):
         decay = min(1.0, 0.2 + 0.8 * (steps - step) / (0.4 * steps))
         for i, (group, rate) in enumerate(zip(optimiser.param_groups, base_rates, strict=True)):
             group["lr"] = rate * decay * (min(1.0, step / 10) if i else 1)
         optimiser.zero_grad()
-        losses, data_losses = loss(current, frames, prior, weights)
-        losses.sum().backward()  # type: ignore[no-untyped-call]
+        penalty = _penalties(current, frames, prior, weights)
+        penalty.sum().backward()  # type: ignore[no-untyped-call]
+        data_losses = torch.zeros_like(penalty)
+        for chunk in chunks:
+            data_loss = _data_loss(current, frames, chunk)
+            data_loss.sum().backward()  # type: ignore[no-untyped-call]
+            data_losses += data_loss.detach()
         optimiser.step()
         on_step()
     layers, homographies, splines, log_gains = (parameter.detach() for parameter in parameters)
     return replace(
         model, layers=layers, homographies=homographies, splines=splines, log_gains=log_gains,
-        losses=losses.tolist(), data_losses=data_losses.tolist(),
+        losses=(penalty.detach() + data_losses).tolist(), data_losses=data_losses.tolist(),
     )  # fmt: skip
 
 
-def loss(model: JointModel, frames: Tensor, prior: Tensor, weights: Weights) -> tuple[Tensor, Tensor]:
-    """Returns the loss of each candidate, (C,), and the part of it that compares the frames with their prediction."""
-    rendered, gains = model.render(*frames.shape[-2:])
-    errors = data_errors(rendered.sum(0) * gains, frames)
-    data = charbonnier(errors).mean((1, 2, 3, 4))
-    terms = data
+def _data_loss(model: JointModel, frames: Tensor, chunk: slice) -> Tensor:
+    """Returns the part of the data term that comes from some of the frames, (C,)."""
+    rendered, gains = model.render(*frames.shape[-2:], frames=chunk)
+    errors = data_errors(rendered.sum(0) * gains, frames[chunk])
+    return charbonnier(errors).sum((1, 2, 3, 4)) / frames.numel()
+
+
+def _penalties(model: JointModel, frames: Tensor, prior: Tensor, weights: Weights) -> Tensor:
+    """Returns the terms of the loss of each candidate that do not compare the frames with their prediction, (C,)."""
+    terms = torch.zeros(len(model.is_locked))
     for layer, weight in zip(
         model.layers, (weights.transmission_gradients, weights.reflection_gradients), strict=True
     ):
@@ -266,7 +280,7 @@ def loss(model: JointModel, frames: Tensor, prior: Tensor, weights: Weights) -> 
     if weights.common_edges:
         terms = terms + weights.common_edges * _common_edges(*model.layers)
     if weights.prior:
-        transmission = rendered[0, :, model.reference]
+        transmission = model.reference_layers(*frames.shape[-2:])[0]
         low = _low_pass(_encode(transmission)) - _low_pass(_encode(prior))
         terms = terms + weights.prior * low.abs().mean((1, 2, 3))
     terms = terms + _GAIN_PENALTY * model.log_gains.square().mean((1, 2))
@@ -279,7 +293,7 @@ def loss(model: JointModel, frames: Tensor, prior: Tensor, weights: Weights) -> 
             )
             cost = cost + _SPLINE_CURVATURE * curvature
         terms = terms + rigidity * cost
-    return terms, data
+    return terms
 
 
 def data_errors(predicted: Tensor, frames: Tensor) -> Tensor:

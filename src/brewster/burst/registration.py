@@ -125,7 +125,7 @@ def motion_candidates(
     scale = np.array([[2 / width, 0, 1 / width - 1], [0, 2 / height, 1 / height - 1], [0, 0, 1]])
 
     def normalised(matrices: Matrices) -> Matrices:
-        inverse = scale @ np.linalg.inv(matrices) @ np.linalg.inv(scale)
+        inverse: Matrices = scale @ np.linalg.inv(matrices) @ np.linalg.inv(scale)
         return inverse / inverse[:, 2:, 2:]
 
     return [
