@@ -54,11 +54,14 @@ dist:
 bench: .venv/dev
 	$(BIN)/python bench/run.py
 
+# Changes the modules listed in pyproject.toml one expression at a time, and prints the changes that no test notices.
+# ONLY names some of them: make mutants ONLY='brewster.srgb.*'
 mutants: .venv/dev
-	$(BIN)/python bench/mutants.py
+	$(BIN)/mutmut run $(ONLY)
+	$(BIN)/mutmut results
 
 clean:
-	rm -rf .venv out build dist src/*.egg-info
+	rm -rf .venv out build dist mutants src/*.egg-info
 
 .venv/core: pyproject.toml constraints.txt
 	test -x $(BIN)/python || $(PYTHON) -m venv .venv

@@ -38,7 +38,7 @@ DIFFUSION_OPTIONS: Final = (
 )  # fmt: skip
 """The options of diffusion models only."""
 
-_CALL_OPTIONS: Final = ("strength", "quality", "mask", "additive", "max_pixels")
+_CALL_OPTIONS: Final = ("strength", "quality", "mask", "hints", "additive", "max_pixels")
 
 _Function = TypeVar("_Function", bound=Callable[..., Any])
 
@@ -83,6 +83,13 @@ class Options:
         default=None,
         metadata=_field_metadata(
             "A grey image of the size of the photo that scales the strength: white is separated, black stays unchanged."
+        ),
+    )
+    hints: Path | None = field(
+        default=None,
+        metadata=_field_metadata(
+            "An image of the size of the photo that helps the model: red where there is reflection, green where there is only the "
+            "scene, rough strokes on black or transparent."
         ),
     )
     additive: bool = field(

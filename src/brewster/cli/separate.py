@@ -14,7 +14,14 @@ from click.core import ParameterSource
 from click.shell_completion import CompletionItem
 
 from brewster.cli.batch import BatchCommand
-from brewster.cli.batch_plan import absolute_path, is_single_output, local_path, plan, skipped_files
+from brewster.cli.batch_plan import (
+    absolute_path,
+    gpu_for_plan,
+    is_single_output,
+    local_path,
+    plan,
+    skipped_files,
+)
 from brewster.cli.extras import require_extra
 from brewster.cli.terminal import print_out, print_status, standard_output
 from brewster.errors import BrewsterError
@@ -228,11 +235,11 @@ def separate(
         options = Options(**cast("dict[str, Any]", values))
     except BrewsterError as error:
         raise click.UsageError(str(error)) from error
-    # An unknown name is an error, even if no photo needs the model. Nothing is loaded.
-    zoo.model_name(options.model)
     if is_plan or gpu_name:
         _print_plan(photos, output, options, gpu_name)
         return
+    # An unknown name is an error, even if no photo needs the model. Nothing is loaded.
+    zoo.model_name(options.model)
     if workers or cluster or index:
         # All paths become absolute: other nodes have other working folders, and the index is read from any folder.
         _check_archive_output(single_output, output, needs_folder=bool(cluster or index))
@@ -266,19 +273,15 @@ def separate(
 
 def _print_plan(photos: tuple[str, ...], output: str | None, options: Options, gpu_name: str | None) -> None:
     """Prints the estimated resources of the first photo. Raises DeviceError if they exceed the GPU."""
-    from brewster.models.zoo import check_diffusion_model  # noqa: PLC0415
-
-    check_diffusion_model(options.model)
-    require_extra("diffusion", "a plan")
+    zoo.check_diffusion_model(options.model)
     from brewster.batch.runner import read_content  # noqa: PLC0415
-    from brewster.inference.separation_plan import plan_separation  # noqa: PLC0415  (imports torch)
-    from brewster.models.diffusion.cost import find_gpu, is_local_gpu  # noqa: PLC0415
+    from brewster.inference.separation_plan import find_row, plan_separation  # noqa: PLC0415
     from brewster.photo import Photo  # noqa: PLC0415
 
+    if find_row(options) is None:
+        require_extra("diffusion", "the plan of a model that is not in `brewster models list`")
     tasks = plan(photos, output, options)
-    gpu = find_gpu(gpu_name)
-    if gpu_name is None and not is_local_gpu(gpu):
-        print_status(f"no GPU found: the estimate is for the {gpu.name}; choose another GPU with --gpu")
+    gpu = gpu_for_plan(gpu_name)
     photo = Photo.open(read_content(tasks[0].source), max_pixels=options.max_pixels)
     estimate = plan_separation(options, photo.size, gpu)
     print_out(estimate.table())

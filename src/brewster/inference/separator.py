@@ -39,7 +39,7 @@ from brewster.inference.separation import Separation
 from brewster.inference.tiles import Backend
 from brewster.models.zoo import find_model, is_diffusion_model
 from brewster.options import Offload, Options, Quality, Quantization, document_options
-from brewster.photo import Encoding, Mask, Photo, Source
+from brewster.photo import Encoding, Hints, Mask, Photo, Source
 
 if TYPE_CHECKING:
     from brewster.models.diffusion.pipeline import DecompositionPipeline
@@ -191,6 +191,7 @@ class Separator:
         strength: float = Options.strength,
         quality: Quality = Options.quality,
         mask: Source | None = Options.mask,
+        hints: Source | None = Options.hints,
         additive: bool = Options.additive,
         encoding: Encoding | None = None,
         max_pixels: int = Options.max_pixels,
@@ -207,8 +208,8 @@ class Separator:
         Raises:
             PhotoError: the source cannot be read, or is too large.
             TypeError: the source has another type.
-            ModelError: the model returns an invalid output.
-            MaskError: the mask cannot be read, is not grey, or has another size than the photo.
+            ModelError: the model returns an invalid output, or takes no hints.
+            MaskError: the mask or the hints cannot be read, or have another size than the photo; or the mask is not grey.
             BrewsterError: strength is not a number from 0 to 1, or quality is unknown.
         """
         Options(strength=strength, quality=quality)  # checks the values
@@ -217,9 +218,10 @@ class Separator:
             photo = Photo.open(source, encoding=encoding, max_pixels=max_pixels)
             weights = None if mask is None else Mask.open(mask, photo.size)
             inputs, white = self._inputs(photo, quality)
+            images = self._with_hints(inputs, photo, hints)
         on_progress(0.0)
         with _timed(seconds, "network"):
-            prediction = self._predictor(inputs, quality, lambda done: on_progress(_NETWORK_SHARE * done))
+            prediction = self._predictor(images, quality, lambda done: on_progress(_NETWORK_SHARE * done))
             prediction = keep_clipped_white(inputs[-1], prediction)
         with _timed(seconds, "upsampling"):
             upsampler = _fit_upsampler(inputs[-1], prediction, strength, white)
@@ -253,6 +255,7 @@ class Separator:
         photo: Photo,
         *,
         quality: Quality = Options.quality,
+        hints: Source | None = Options.hints,
         on_progress: ProgressCallback = lambda _fraction: None,
     ) -> tuple[GuidedUpsampler, Prediction, Assessment]:
         """Predicts the layers of a photo, but does not compute them at full size.
@@ -260,6 +263,7 @@ class Separator:
         Args:
             photo: the photo.
             quality: see the call of a separator.
+            hints: see the call of a separator.
             on_progress: see the call of a separator.
 
         Returns:
@@ -268,11 +272,13 @@ class Separator:
 
         Raises:
             BrewsterError: quality is unknown.
-            ModelError: the model returns an invalid output.
+            ModelError: the model returns an invalid output, or takes no hints.
+            MaskError: the hints cannot be read, or have another size than the photo.
         """
         Options(quality=quality)  # checks the value
         inputs, white = self._inputs(photo, quality)
-        prediction = keep_clipped_white(inputs[-1], self._predictor(inputs, quality, on_progress))
+        images = self._with_hints(inputs, photo, hints)
+        prediction = keep_clipped_white(inputs[-1], self._predictor(images, quality, on_progress))
         upsampler = _fit_upsampler(inputs[-1], prediction, Options.strength, white)
         return upsampler, prediction, _assess(inputs[-1], prediction)
 
@@ -281,6 +287,19 @@ class Separator:
         inputs = [photo.resized(*size) for size in self._predictor.input_sizes(photo.size, quality)]
         white = np.float32(max(1.0, float(np.percentile(inputs[-1], _WHITE_PERCENTILE))))
         return [np.clip(scaled_input / white, 0, 1) for scaled_input in inputs], white
+
+    def _with_hints(self, inputs: list[Floats], photo: Photo, hints: Source | None) -> list[Floats]:
+        """Returns the inputs with two more channels if there are hints."""
+        if hints is None:
+            return inputs
+        if not self._predictor.takes_hints:
+            raise ModelError(
+                f"hints were given to the model {self.name}, which takes none",
+                "expected a model with an input for hints",
+                "leave the hints out, or choose another model",
+            )
+        painted = Hints.open(hints, photo.size)
+        return [np.concatenate([image, painted.sampled(*image.shape[1::-1])], axis=2) for image in inputs]
 
 
 @document_options
@@ -292,6 +311,7 @@ def separate(
     strength: float = Options.strength,
     quality: Quality = Options.quality,
     mask: Source | None = Options.mask,
+    hints: Source | None = Options.hints,
     additive: bool = Options.additive,
     encoding: Encoding | None = None,
     max_pixels: int = Options.max_pixels,
@@ -335,6 +355,7 @@ def separate(
         strength=strength,
         quality=quality,
         mask=mask,
+        hints=hints,
         additive=additive,
         encoding=encoding,
         max_pixels=max_pixels,

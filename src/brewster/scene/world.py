@@ -9,14 +9,11 @@ from pydantic import Field, PlainSerializer, model_validator
 
 from brewster.scene.values import FrozenModel, NonNegativeFloat, PositiveFloat
 
-BUILTIN = "builtin:"
-"""Prefix of sources that are computed, not read from a file: `builtin:street:7` is the street with seed 7."""
-
 Radius = Annotated[float, Field(gt=0, allow_inf_nan=True), PlainSerializer(float)]
 
 
 class AssetSource(FrozenModel):
-    """The name of a file in an assets folder and the sha256 of its bytes, or a built-in source without sha256."""
+    """The name of a file in an assets folder or of a built-in map or photo, and the sha256 of its bytes."""
 
     file: str
     sha256: str = ""

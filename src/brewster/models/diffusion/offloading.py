@@ -8,17 +8,15 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Iterator
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any
 
 import torch
 
 from brewster.models.diffusion.lazy_imports import import_library
+from brewster.models.diffusion_resources import DECODING_BYTES_PER_PIXEL
 
 if TYPE_CHECKING:
     from brewster.models.diffusion.backbones.backbone import Backbone
-
-DECODING_BYTES_PER_PIXEL: Final = 3000
-"""Activations of a full-size VAE in bf16 for one pixel of the decoded image: about six maps of 256 channels."""
 
 
 def offload_layers(backbone: Backbone, device: str) -> None:
