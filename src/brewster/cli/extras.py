@@ -42,7 +42,7 @@ EXTRAS: Final = {
         "tensorboard": "tensorboard",
         "torch": "torch",
     },
-    "evaluate": {"matplotlib": "matplotlib", "torch": "torch"},
+    "evaluate": {"jinja2": "jinja2", "matplotlib": "matplotlib", "torch": "torch"},
     "diffusion": {
         "accelerate": "accelerate",
         "diffusers": "diffusers",

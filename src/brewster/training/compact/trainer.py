@@ -1,6 +1,6 @@
 """Trains the compact network with AdamW and an exponential moving average (EMA) of the weights, on a GPU if there is one.
 
-network = train(read_recipe(Path("recipes/train/compact-stage1.toml")), Path("out/compact-stage1"), on_step)
+network = train(read_recipe(Path("recipes/train/compact.toml")), Path("out/compact"), on_step)
 """
 
 from __future__ import annotations

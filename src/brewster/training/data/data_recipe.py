@@ -129,7 +129,7 @@ class DataRecipe(FrozenModel):
 class MixRecipe(FrozenModel):
     """Distributions of mixtures of photos: a background behind glass plus a reflection, in linear light.
 
-    `recipes/train/compact-stage4.toml` uses the defaults, except for `crop`. Luminances are linear. Lengths in pixels refer to an
+    Luminances are linear. Lengths in pixels refer to an
     image of 256 px and scale with the size of the training images, unless their description says otherwise.
     """
 
