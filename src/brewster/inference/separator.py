@@ -24,7 +24,7 @@ import numpy as np
 
 from brewster.errors import BrewsterError, MissingExtra, ModelError
 from brewster.inference.assessment import Assessment, assess
-from brewster.inference.clipping import keep_clipped_white
+from brewster.inference.clipping import keep_clipped_light
 from brewster.inference.full_size import upsample_layers
 from brewster.inference.guided_upsampling import Floats, GuidedUpsampler
 from brewster.inference.layer_history import PHOTO, history_step, with_step
@@ -222,7 +222,7 @@ class Separator:
         on_progress(0.0)
         with _timed(seconds, "network"):
             prediction = self._predictor(images, quality, lambda done: on_progress(_NETWORK_SHARE * done))
-            prediction = keep_clipped_white(inputs[-1], prediction)
+            prediction = keep_clipped_light(inputs[-1], prediction)
         with _timed(seconds, "upsampling"):
             upsampler = _fit_upsampler(inputs[-1], prediction, strength, white)
             transmission, reflection, residual = upsample_layers(
@@ -278,7 +278,7 @@ class Separator:
         Options(quality=quality)  # checks the value
         inputs, white = self._inputs(photo, quality)
         images = self._with_hints(inputs, photo, hints)
-        prediction = keep_clipped_white(inputs[-1], self._predictor(images, quality, on_progress))
+        prediction = keep_clipped_light(inputs[-1], self._predictor(images, quality, on_progress))
         upsampler = _fit_upsampler(inputs[-1], prediction, Options.strength, white)
         return upsampler, prediction, _assess(inputs[-1], prediction)
 
