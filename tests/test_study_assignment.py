@@ -117,9 +117,11 @@ def test_each_half_of_a_session_has_each_comparison_equally_often_and_on_both_si
         flipped_first[trials[0].flipped] += 1
     assert len(first_half) == 20
     assert min(first_half.values()) > 75  # of 200; the standard deviation is 7
+    assert len(flipped_first) == 2
     assert min(flipped_first.values()) > 70
 
 
 def test_each_round_begins_with_another_side():
     starts = Counter(next(comparison_sequence(6, 3, seed))[1] for seed in range(100))
+    assert len(starts) == 2
     assert min(starts.values()) > 30
