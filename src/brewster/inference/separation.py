@@ -9,6 +9,7 @@ from typing import final
 import numpy as np
 
 from brewster.inference.assessment import Assessment
+from brewster.inference.burst_report import BurstReport
 from brewster.inference.guided_upsampling import Floats, upsample_rows
 from brewster.photo import Photo
 from brewster.photo.contact_sheet import side_by_side
@@ -39,6 +40,8 @@ class Separation:
     """Wall time of the steps `decode`, `network` and `upsampling`."""
     reflection_is_derived: bool = False
     """Whether the reflection is photo - transmission in linear light, because the model predicts no reflection."""
+    burst: BurstReport | None = None
+    """How a burst was separated; None for a single photo."""
 
     def _repr_png_(self) -> bytes:
         """For notebooks: photo, transmission and reflection side by side, as a PNG."""
