@@ -32,13 +32,13 @@ from picture_files import smooth
 from synthetic_scenes import ASSETS, make_scene, map_side, plane_side
 
 PREDICTIONS = {
-    1: {
+    2: {
         "draft": [
             7,
-            217,
+            227,
             149,
             104,
-            55,
+            59,
             201,
             163,
             127,
@@ -47,10 +47,10 @@ PREDICTIONS = {
             191,
             169,
             17,
-            143,
+            96,
             98,
             71,
-            33,
+            9,
             131,
             107,
             82,
@@ -61,10 +61,10 @@ PREDICTIONS = {
         ],
         "standard": [
             0,
-            218,
+            227,
             149,
             102,
-            55,
+            60,
             202,
             163,
             127,
@@ -73,10 +73,10 @@ PREDICTIONS = {
             192,
             169,
             17,
-            142,
+            98,
             98,
             71,
-            33,
+            4,
             130,
             106,
             81,
@@ -218,6 +218,7 @@ def compute_scores(names):
 
 def test_a_changed_score_needs_a_new_score_format():
     others = ("dists", "niqe")  # they need weights and a larger image
+    others += ("lost_clipped", "lost_near_white", "near_white_cast")  # this image has no clipped light
     names = tuple(name for name in METRICS if not name.startswith("lpips") and name not in others)
     output = compute_scores(names)
     assert None not in output.values()
