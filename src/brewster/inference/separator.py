@@ -69,8 +69,17 @@ class Separator:
         sha256: str | None = None,
         device: str = "cpu",
     ) -> None:
+        if not callable(model):
+            raise TypeError(
+                f"the model is of type {type(model).__name__}; expected a function tile -> (transmission, reflection); "
+                "pass one, or load a model by its name with Separator.load"
+            )
         self._predictor = model if isinstance(model, Predictor) else MultiScalePredictor(model)
         self.name, self.sha256, self.device = name, sha256, device
+
+    def __repr__(self) -> str:
+        """Returns `Separator(compact, cpu)`."""
+        return f"Separator({self.name}, {self.device})"
 
     @classmethod
     @document_options
@@ -202,7 +211,7 @@ class Separator:
         Args:
             source: a path, the bytes of a file, an open binary file, a PIL image, a `Photo`, or an array (see
                 `Photo.from_array`).
-            encoding: the encoding of an array, "srgb" or "linear"; for arrays only.
+            encoding: the encoding of an array, "srgb" or "linear"; by default, "srgb" for integers. For arrays only.
             on_progress: called with the completed fraction, 0 to 1. An exception raised in it stops the work.
 
         Raises:
@@ -331,7 +340,7 @@ def separate(
     Args:
         source: a path, the bytes of a file, an open binary file, a PIL image, a `Photo`, or an array (see
             `Photo.from_array`).
-        encoding: the encoding of an array, "srgb" or "linear"; for arrays only.
+        encoding: the encoding of an array, "srgb" or "linear"; by default, "srgb" for integers. For arrays only.
 
     Raises:
         BrewsterError: an error of `Separator.load` or of a call of the `Separator`.
