@@ -61,6 +61,8 @@ def find_translations(aligned: Sequence[Floats], reference: int) -> list[NDArray
         optimiser.step()
     found = offsets.detach() - offsets.detach()[:, reference : reference + 1]
     order = costs.argsort()
+    if not torch.isfinite(found).all():  # the frames are equal
+        return []
     return list(found[order].double().numpy() * (aligned[0].shape[1] / _WIDTH_PX))
 
 
