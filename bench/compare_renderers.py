@@ -29,15 +29,13 @@ from brewster.scene.glass import Glazing, Pane
 from brewster.scene.scene import Scene
 from brewster.scene.world import AssetSource, EnvironmentMap, Plane, Side
 
-STREET = EnvironmentMap(source=AssetSource(file="builtin:street:3"), heading_deg=200)
-ROOM = EnvironmentMap(source=AssetSource(file="builtin:room:2"), heading_deg=70)
+STREET = EnvironmentMap(source=AssetSource(file="potsdamer_platz.exr"), heading_deg=200)
+ROOM = EnvironmentMap(source=AssetSource(file="vestibule.exr"), heading_deg=70)
 DOME = ROOM.model_copy(update={"radius_mm": 4000.0})
 NEAR_PAINTING = Plane(
-    source=AssetSource(file="builtin:painting:5"), distance_mm=60, width_mm=700, luminance=0.6
+    source=AssetSource(file="cathedral_roof.jpg"), distance_mm=60, width_mm=700, luminance=0.6
 )
-FAR_PAINTING = Plane(
-    source=AssetSource(file="builtin:painting:8"), distance_mm=900, width_mm=800, luminance=2.0
-)
+FAR_PAINTING = Plane(source=AssetSource(file="tiger.jpg"), distance_mm=900, width_mm=800, luminance=2.0)
 CAMERA = Camera(width=128, height=96, fov_deg=36, heading_deg=4, position_mm=(-40, 0, 700), focus_mm=2500)
 LENS = CAMERA.model_copy(update={"aperture_mm": 20.0})
 CLEAR, THICK = Pane(), Pane(thickness_mm=20)

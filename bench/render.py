@@ -24,7 +24,7 @@ from compare_renderers import DOME, STREET, TINTED
 from torch.nn.functional import avg_pool2d
 
 from brewster.environments.assets import Assets
-from brewster.environments.catalog import BUILTIN_CATALOG, read_catalog
+from brewster.environments.catalog import builtin_catalog, read_catalog
 from brewster.executors import SerialExecutor
 from brewster.render.analytic import needs_monte_carlo, render
 from brewster.render.mitsuba.renderer import trace
@@ -43,8 +43,8 @@ TARGET_ERROR = 1e-3
 MAX_CPU_S = 60.0
 PAPER_RECIPE = Path(__file__).parents[1] / "recipes" / "render" / "paper.toml"
 CAMERA = Camera(fov_deg=50, position_mm=(0, 0, 800), heading_deg=10)
-ROOM = EnvironmentMap(source=AssetSource(file="builtin:room:2"))
-PAINTING = Plane(source=AssetSource(file="builtin:painting:5"), distance_mm=500, width_mm=2500)
+ROOM = EnvironmentMap(source=AssetSource(file="vestibule.exr"))
+PAINTING = Plane(source=AssetSource(file="cathedral_roof.jpg"), distance_mm=500, width_mm=2500)
 SCENES = {
     "one smooth pane, sun": Scene(camera=CAMERA, behind=Side(map=STREET), front=Side(map=ROOM)),
     "two tinted panes, near photo": Scene(
@@ -126,7 +126,7 @@ def cost_per_sample() -> None:
     print("| samples | CPU-s per sample |\n|---|---|")
     for count in (10, 30, 90):
         with tempfile.TemporaryDirectory() as folder:
-            job = RenderJob(Path(folder) / "set", recipe, BUILTIN_CATALOG, 7, "analytic", ())
+            job = RenderJob(Path(folder) / "set", recipe, builtin_catalog(), 7, "analytic", ())
             start = time.process_time()
             build(
                 job,

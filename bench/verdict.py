@@ -28,7 +28,7 @@ BATCH_SIZE = 8
 SIZE_PX = 320
 EVERY = 7
 """Every seventh pair of real/train is measured, because many of its pairs are similar."""
-RECIPE = Path(__file__).parents[1] / "recipes/train/compact-stage3.toml"
+RECIPE = Path(__file__).parents[1] / "recipes/train/compact.toml"
 
 Pair = tuple[Photo, NDArray[np.uint8]]
 

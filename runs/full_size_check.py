@@ -211,7 +211,7 @@ def cap_memory():
 
 def estimate(name, quantization):
     """Returns the estimate of `brewster train --plan` for the recipe of this name on the paper's GPU."""
-    from brewster.models.diffusion.cost import CARDS  # noqa: PLC0415
+    from brewster.models.diffusion_resources import CARDS  # noqa: PLC0415
     from brewster.training.lora.resource_estimate import estimate_resources  # noqa: PLC0415  (its libraries may be missing)
     from brewster.training.recipe import read_recipe  # noqa: PLC0415
 
@@ -223,7 +223,7 @@ def estimate(name, quantization):
     passes = STEPS * (1 if find_backbone_class(name).guided_by_embedding else 2)
     return Row(
         name, quantization, "ESTIMATED from meta tensors, not measured", card.name,
-        parameters=resources.parameter_count / 1e9, lora=resources.lora_parameters / 1e6,
+        parameters=resources.cost.parameters / 1e9, lora=resources.lora_parameters / 1e6,
         tokens=f"{resources.generated_tokens}, {resources.condition_tokens}, {PROMPT_TOKENS}", base_gib=resources.memory_gib["backbone"] + resources.memory_gib["VAE"],
         training_gib=resources.total_gib, step_s=resources.seconds, steps_h=resources.seconds * PAPER_STEPS / 3600,
         photo_s=passes * forward_s, fits=resources.total_gib <= card.memory_gib,

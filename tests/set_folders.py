@@ -3,7 +3,7 @@
 import hashlib
 from functools import partial
 
-from brewster.environments.catalog import BUILTIN_CATALOG
+from brewster.environments.catalog import builtin_catalog
 from brewster.executors import SerialExecutor
 from brewster.rendered.generation.job import RenderJob, build
 from brewster.rendered.generation.workers import TaskRunner
@@ -11,7 +11,7 @@ from brewster.scene.recipe import read_scene_recipe
 
 
 def make_job(out, renderer="render", seed=7, recipe="tiny"):
-    return RenderJob(out, read_scene_recipe(recipe), BUILTIN_CATALOG, seed, f"fake_renderer:{renderer}")
+    return RenderJob(out, read_scene_recipe(recipe), builtin_catalog(), seed, f"fake_renderer:{renderer}")
 
 
 def render_set(out, count=4, first=0, executor=SerialExecutor, shards=False, **job_values):

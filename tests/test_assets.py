@@ -1,3 +1,4 @@
+import csv
 import hashlib
 import io
 
@@ -100,31 +101,20 @@ def test_negative_values_are_set_to_zero(folder, rng):
     assert not light[3, 4].any()
 
 
-def test_builtin_maps_need_no_folder(monkeypatch, rng):
-    calls = []
-    monkeypatch.setitem(
-        assets_module.ENVIRONMENTS, "street", lambda seed, height: calls.append((seed, height)) or sky(rng)
-    )
-    light = Assets().map_radiance(EnvironmentMap(source=AssetSource(file="builtin:street:7"), luminance=3))
-    assert sphere_mean(luminance(light)) == pytest.approx(3, rel=1e-4)
-    assert calls == [(7, assets_module.BUILTIN_HEIGHT)]
+def test_builtin_maps_need_no_folder_and_a_file_of_the_user_takes_their_place(folder, rng):
+    environment = EnvironmentMap(source=AssetSource(file="spree_bank.exr"), luminance=3)
+    light = Assets().map_radiance(environment)
+    assert light.shape == (512, 1024, 3)
+    assert sphere_mean(luminance(light)) == pytest.approx(3, rel=0.01)
+    assert map_radiance(folder, "spree_bank.exr", exr_of(sky(rng))).shape != light.shape
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        "builtin:beach:1",
-        "builtin:street",
-        "builtin:street:-1",
-        "builtin:street:\u00b2",
-        "builtin:street:7:more",
-        "builtin:painting:1",
-    ],
-)
-def test_maps_that_are_not_built_in_are_refused(name):
-    with pytest.raises(RecipeError, match="is not built in") as error:
-        Assets().map_radiance(EnvironmentMap(source=AssetSource(file=name)))
-    check_message(error, name, "street, room, night")
+@pytest.mark.parametrize("folder", [assets_module.BUILTIN_MAPS, assets_module.BUILTIN_PHOTOS])
+def test_the_origin_and_licence_of_each_builtin_file_is_listed(folder):
+    with (folder / "manifest.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert {row["file"] for row in rows} == {path.name for path in folder.iterdir()} - {"manifest.csv"}
+    assert all(row["licence"] == "CC0 1.0" and row["origin"] for row in rows)
 
 
 # --- files that cannot be used
@@ -134,8 +124,6 @@ def test_a_missing_file_is_named_with_the_folders_that_were_searched(folder):
     with pytest.raises(RecipeError, match="was not found") as error:
         Assets([folder]).map_radiance(EnvironmentMap(source=AssetSource(file="gone.hdr")))
     check_message(error, "gone.hdr", str(folder), "--maps")
-    with pytest.raises(RecipeError, match="no folder"):
-        Assets().map_radiance(EnvironmentMap(source=AssetSource(file="gone.hdr")))
 
 
 def test_another_file_of_the_same_name_is_refused(folder, rng):
@@ -279,16 +267,6 @@ def test_a_picture_whose_pixels_are_missing_is_refused_by_name(folder):
     with pytest.raises(UnreadablePhoto) as caught:
         plane_radiance(folder, "photo.jpg", data[: len(data) // 2])
     check_message(caught, "photo.jpg")
-
-
-def test_builtin_paintings_and_no_others():
-    def plane(name):
-        return Plane(source=AssetSource(file=name), distance_mm=1, width_mm=1)
-
-    assert Assets().plane_radiance(plane("builtin:painting:3")).shape == (512, 768, 3)
-    with pytest.raises(RecipeError, match="is not built in") as error:
-        Assets().plane_radiance(plane("builtin:street:3"))
-    check_message(error, "builtin:street:3", "painting")
 
 
 # --- memory

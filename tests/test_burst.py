@@ -1,247 +1,325 @@
-"""Several photos of one window: the joint model, the motion candidates, videos, and both entry points."""
+"""The motion of both layers between the frames of a burst is exact, and the frames differ in nothing else."""
 
-import json
-from functools import partial
-from pathlib import Path
+import math
 
-import av
 import numpy as np
 import pytest
 import torch
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
-from PIL import Image
+from torch.nn import functional
 
-import brewster
-from brewster.batch.plan import plan_bursts
-from brewster.burst import read_video, separate_burst
-from brewster.burst.fourier_search import find_translations
-from brewster.burst.joint_model import DEFAULT_WEIGHTS, JointModel, Rates, optimise, pixel_grid
-from brewster.burst.registration import frame_motions, motion_candidates
-from brewster.burst.solver import Level, solve
-from brewster.burst.video import choose_frames
-from brewster.cli import main
-from brewster.errors import PhotoError, PhotoTooLarge, UnreadablePhoto
-from brewster.srgb import to_encoded
-from simulated_bursts import read_photo, simulate_burst
+from brewster.environments.catalog import builtin_catalog
+from brewster.errors import RecipeError
+from brewster.render.analytic import render
+from brewster.render.camera_response import develop
+from brewster.scene.burst import layer_motion
+from brewster.scene.glass import Glazing
+from brewster.scene.recipe import BurstRecipe, SceneRecipe, read_scene_recipe
+from brewster.scene.recipe_file import validated
+from brewster.scene.sampler import draw, draw_frames
+from brewster.scene.scene import Scene
+from synthetic_scenes import SyntheticAssets, camera_towards_glass, make_scene, map_side, plane_side
 
-PICTURES = sorted((Path(__file__).parent / "pictures").glob("*.jpg"))
-
-
-def linear_pictures(size):
-    return [np.clip(read_photo(path, size), 0, 1) for path in (PICTURES[2], PICTURES[1])]
+STILL = {"baseline_mm": (0.0, 0.0), "tremble_mm": 0.0, "tremble_deg": 0.0}
 
 
-@pytest.fixture
-def few_steps(monkeypatch):
-    """For tests that do not measure the separation."""
-    monkeypatch.setattr("brewster.burst.separate.solve", partial(solve, levels=(Level(48, 2, None, 99),)))
+def waves(height, width):
+    """A smooth picture (H, W, 3) with a few waves in both directions."""
+    y, x = np.mgrid[:height, :width] / (height, width)[0]
+    light = [1 + 0.5 * np.sin(17 * x + phase) * np.cos(19 * y - phase) for phase in (0, 1, 2)]
+    return np.stack(light, -1).astype(np.float32)
 
 
-def run_burst(capfd, *args):
-    """Runs the command, and returns the exit code and the standard output."""
-    code = main(["burst", *map(str, args)])
-    return code, capfd.readouterr().out
+ASSETS = SyntheticAssets(waves=waves(256, 512), picture=waves(512, 768))
 
 
-@pytest.fixture(scope="module")
-def small_burst():
-    """Five frames of 120 x 90 pixels, in which the reflection moves by 12 pixels."""
-    return simulate_burst(
-        *linear_pictures((160, 120)), relative_px=12, common_px=3, strength=0.4, noise=0, size=(120, 90)
+class AnyAssets:
+    """Smooth content for every source of the built-in catalog. Pictures have their real size."""
+
+    def map_radiance(self, environment):
+        return ASSETS.pictures["waves"] * np.float32(environment.luminance)
+
+    def plane_radiance(self, plane):
+        asset = next(asset for asset in builtin_catalog().pictures if asset.source == plane.source)
+        return waves(asset.height, asset.width) * np.float32(plane.luminance)
+
+
+ANY_ASSETS = AnyAssets()
+
+
+def burst_recipe(name="burst", size=(48, 32), **values):
+    """A packaged recipe in a small size, with a changed table [burst]."""
+    recipe = read_scene_recipe(name)
+    camera = recipe.camera.model_copy(update={"width": size[0], "height": size[1]})
+    burst = (recipe.burst or BurstRecipe()).model_copy(update=values)
+    return recipe.model_copy(update={"camera": camera, "burst": burst})
+
+
+def frames_of(index=0, seed=7, **values):
+    return draw_frames(burst_recipe(**values), builtin_catalog(), seed, index)
+
+
+def moved(scene, offset_mm=(0.0, 0.0, 0.0), turn_deg=(0.0, 0.0, 0.0)):
+    return scene.model_copy(update={"camera": scene.camera.moved(offset_mm, turn_deg)})
+
+
+def warped(layer, motion):
+    """A layer (3, H, W) of the second frame at the positions of the first frame, and the mask of positions inside."""
+    height, width = layer.shape[1:]
+    y, x = np.mgrid[:height, :width]
+    position = motion + np.stack([x, y], -1)
+    grid = torch.from_numpy(((position + 0.5) / (width, height) * 2 - 1).astype(np.float32))
+    image = functional.grid_sample(layer[None], grid[None], mode="bicubic", align_corners=False)[0]
+    return image, ((position > 2) & (position < (width - 3, height - 3))).all(-1)
+
+
+# --- the motion
+
+
+@given(
+    offset=st.tuples(*[st.floats(-60, 60)] * 3),
+    turn=st.tuples(*[st.floats(-3, 3)] * 3),
+    heading=st.floats(-25, 25),
+    panes=st.sampled_from([({},), ({"thickness_mm": 20.0}, {"refractive_index": 1.6})]),
+    behind=st.sampled_from(
+        [
+            plane_side("picture", distance_mm=2500, width_mm=9000, height_mm=6000, heading_deg=25),
+            map_side("waves", radius_mm=3000.0),
+            map_side("waves"),
+        ]
+    ),
+    front=st.sampled_from(
+        [
+            plane_side(
+                "picture", distance_mm=1500, width_mm=5000, height_mm=6000, heading_deg=-20, pitch_deg=9
+            ),
+            map_side("waves", radius_mm=1500.0, heading_deg=50),
+        ]
+    ),
+)
+@settings(max_examples=25, deadline=None)
+def test_both_layers_of_a_frame_warped_by_their_motion_are_those_of_the_reference(
+    offset, turn, heading, panes, behind, front
+):
+    camera = camera_towards_glass(heading, 4.0, 700.0, width=96, height=72, fov_deg=50)
+    scene = make_scene(camera, panes, behind=behind, front=front, orders="truncated", samples_per_pixel=1)
+    other = moved(scene, offset, turn)
+    motion, reference, frame = layer_motion(scene, other), render(scene, ASSETS), render(other, ASSETS)
+    for name, steps in (
+        ("background", motion.transmission),
+        ("transmission", motion.transmission),
+        ("mirror", motion.reflection),
+    ):
+        image, inside = warped(getattr(frame, name), steps)
+        truth = getattr(reference, name)
+        error = (image / truth - 1).abs().mean(0).numpy()[inside & (truth > 0).all(0).numpy()]
+        assert np.median(error) < 0.01, name  # 0.02 px at the steepest part of a wave
+        assert np.quantile(error, 0.9) < 0.03, name
+
+
+def test_a_sideways_move_shifts_a_plane_by_the_focal_length_over_the_distance():
+    """A plane at Z moves by f b / Z; the mirrored plane has the distance camera - glass - plane."""
+    scene = make_scene(
+        camera_towards_glass(0.0, distance_mm=600.0, width=100, height=80, fov_deg=60),
+        behind=plane_side(distance_mm=2400, width_mm=1e5, height_mm=1e5),
+        front=plane_side(distance_mm=900, width_mm=1e5, height_mm=1e5),
+        glass=Glazing().without_effect(),
+    )
+    motion = layer_motion(scene, moved(scene, (30.0, 0.0, 0.0)))
+    focal_px = 50 / math.tan(math.radians(30))
+    np.testing.assert_allclose(
+        motion.transmission, np.broadcast_to((-focal_px * 30 / 3000, 0), (80, 100, 2)), atol=1e-4
+    )
+    np.testing.assert_allclose(
+        motion.reflection, np.broadcast_to((-focal_px * 30 / 1500, 0), (80, 100, 2)), atol=1e-4
+    )
+    assert motion.relative_px() == pytest.approx(focal_px * 30 * (1 / 1500 - 1 / 3000), abs=1e-4)
+
+
+def test_a_camera_that_rolls_clockwise_turns_the_photo_counterclockwise():
+    scene = make_scene(camera_towards_glass(0.0, width=101, height=101))
+    motion = layer_motion(scene, moved(scene, turn_deg=(0, 0, 1.0))).transmission
+    assert motion[50, 50] == pytest.approx([0, 0], abs=1e-4)
+    assert motion[50, 100] == pytest.approx(
+        [50 * (math.cos(math.radians(1)) - 1), -50 * math.sin(math.radians(1))], abs=1e-3
     )
 
 
-@pytest.fixture(scope="module")
-def burst_files(small_burst, tmp_path_factory):
-    folder = tmp_path_factory.mktemp("burst")
-    for k, frame in enumerate(small_burst.frames):
-        Image.fromarray(frame).save(folder / f"{k}.png")
-    return sorted(folder.iterdir())
+def test_motion_forth_and_back_is_no_motion_and_the_same_scene_does_not_move():
+    scene = frames_of(3)[2]
+    still = layer_motion(scene, scene)
+    for layer in (still.transmission, still.reflection):
+        assert layer.shape == (32, 48, 2)
+        assert layer.dtype == np.float32
+        np.testing.assert_allclose(layer, 0, atol=1e-4)
 
 
-def psnr_db(image, truth):
-    """PSNR of sRGB-encoded images after a gain for each channel, as the gain of each layer is unknown."""
-    image = image * ((image * truth).sum((0, 1)) / (image * image).sum((0, 1)))
-    error = to_encoded(np.clip(image, 0, 1)) - to_encoded(np.clip(truth, 0, 1))
-    return -10 * np.log10(np.mean(error**2))
+def test_pixels_without_content_have_no_motion():
+    narrow = plane_side(width_mm=200, height_mm=100)
+    scene = make_scene(camera_towards_glass(0.0), behind=narrow, front=Scene().front)
+    motion = layer_motion(scene, moved(scene, (5.0, 0.0, 0.0)))
+    assert np.isnan(motion.reflection).all()
+    assert np.isfinite(motion.transmission).any()
+    assert np.isnan(motion.transmission[0]).all()
+    assert math.isnan(motion.relative_px())
 
 
-def test_layers_with_known_motion_are_separated_to_30_db():
-    transmission, reflection = (
-        picture * scale for picture, scale in zip(linear_pictures((96, 72)), (0.6, 0.3), strict=True)
+def test_scenes_without_exact_motion_are_refused():
+    scene = make_scene(camera_towards_glass(0.0), behind=plane_side(), front=map_side())
+    with pytest.raises(RecipeError, match="has no height_mm"):
+        layer_motion(scene, scene)
+    first, second = frames_of(0)[0], frames_of(1)[0]
+    with pytest.raises(RecipeError, match="differ in glass"):
+        layer_motion(first, second)
+    smaller = first.model_copy(update={"camera": first.camera.model_copy(update={"width": 20})})
+    with pytest.raises(RecipeError, match="sizes"):
+        layer_motion(first, smaller)
+    framed = make_scene(camera_towards_glass(0.0), glass=Glazing(opening_mm=(100.0, 100.0)))
+    with pytest.raises(RecipeError, match="framed or curved"):
+        layer_motion(framed, framed)
+
+
+# --- drawing
+
+
+def test_the_reference_frame_is_the_scene_that_the_recipe_draws_without_bursts():
+    recipe = burst_recipe("tiny", frames=3)
+    for index in range(20):
+        single = draw(recipe.model_copy(update={"burst": None}), builtin_catalog(), 7, index)
+        reference = draw_frames(recipe, builtin_catalog(), 7, index)[1]
+        heightless = reference.model_dump(
+            exclude={"burst": True, "behind": {"plane": {"height_mm"}}, "front": {"plane": {"height_mm"}}}
+        )
+        expected = single.model_dump(
+            exclude={"burst": True, "behind": {"plane": {"height_mm"}}, "front": {"plane": {"height_mm"}}}
+        )
+        assert heightless == expected
+        assert reference.noise_seeds == single.noise_seeds
+
+
+def test_a_burst_without_motion_has_the_light_of_the_single_photo_in_every_frame():
+    recipe = burst_recipe("tiny", frames=3, exposure_jitter_ev=0.0, **STILL)
+    for index in (0, 3, 8):
+        single = render(
+            draw(recipe.model_copy(update={"burst": None}), builtin_catalog(), 7, index), ANY_ASSETS
+        )
+        frames = [render(scene, ANY_ASSETS) for scene in draw_frames(recipe, builtin_catalog(), 7, index)]
+        for frame in frames:
+            for name, light in single.images().items():
+                assert torch.equal(frame.images()[name], light)
+        photos = [develop(frame).photo_encoded for frame in frames]
+        assert torch.equal(photos[1], develop(single).photo_encoded)
+        assert not torch.equal(photos[0], photos[2])  # each frame has its own noise
+
+
+def test_frames_are_numbered_through():
+    recipe = burst_recipe(frames=3)
+    assert [draw(recipe, builtin_catalog(), 7, index) for index in range(6, 9)] == draw_frames(
+        recipe, builtin_catalog(), 7, 2
     )
-    shifts = [-8, -4, 0, 4, 8]
-    frames = np.stack([transmission + np.roll(reflection, shift, 1) for shift in shifts])[:, :, 16:-16]
-    truth = transmission[:, 16:-16]
-    motions = torch.eye(3).repeat(2, 1, 5, 1, 1)
-    motions[1, 0, :, 0, 2] = -torch.tensor(shifts) * 2 / frames.shape[2]
-    tensor = torch.from_numpy(frames.transpose(0, 3, 1, 2).astype(np.float32))
-    start = JointModel.start(tensor, motions, torch.tensor([False]), 2)
-    prior = torch.from_numpy(truth.transpose(2, 0, 1).astype(np.float32))
-    model = optimise(
-        start, tensor, prior, 150, rates=Rates(homographies=0, splines=0, gains=0), weights=DEFAULT_WEIGHTS
-    )
-    layers = model.reference_layers(*tensor.shape[-2:])[:, 0].movedim(1, -1).numpy()
-    assert psnr_db(layers[0][8:-8, 8:-8], truth[8:-8, 8:-8]) > 30
-    assert model.losses[0] < 0.01
 
 
-def test_the_reflection_of_a_locked_candidate_moves_with_the_transmission():
-    motions = torch.eye(3).repeat(2, 2, 3, 1, 1)
-    motions[1, :, 0, 0, 2] = 0.3
-    model = JointModel.start(torch.rand(3, 3, 8, 12), motions, torch.tensor([True, False]), 1)
-    positions = model.positions(8, 12)
-    assert torch.equal(positions[0, 0], positions[1, 0])
-    assert not torch.equal(positions[0, 1], positions[1, 1])
-    assert torch.allclose(positions[:, :, 1], pixel_grid(8, 12))  # the reference frame does not move
-    assert model.selected([1]).relative_motion(8, 12) == pytest.approx(0.15, abs=1e-3)
-    assert model.selected([0]).relative_motion(8, 12) == 0
+def test_the_frames_of_a_burst_differ_in_camera_exposure_and_number_only():
+    frames = frames_of(4, frames=4)
+    varying = {"camera", "camera_response", "burst"}
+    assert len({str(frame.model_dump(exclude=varying)) for frame in frames}) == 1
+    assert [frame.burst.frame for frame in frames] == [0, 1, 2, 3]
+    assert [frame.burst.is_reference for frame in frames] == [False, False, True, False]
+    assert len({frame.camera for frame in frames}) == len({frame.noise_seeds for frame in frames}) == 4
+    lens = {"position_mm", "heading_deg", "pitch_deg", "roll_deg"}
+    assert len({str(frame.camera.model_dump(exclude=lens)) for frame in frames}) == 1
 
 
-@pytest.mark.parametrize("end", [(6.0, 0.0), (-9.0, 2.0)])
-def test_the_fourier_search_finds_the_translation_of_the_second_layer(end):
-    transmission, reflection = linear_pictures((300, 200))
-    times = np.array([-1, -0.5, 0, 0.5, 1])
-    moved = [np.roll(reflection, np.rint((t * end[1], t * end[0])).astype(int), (0, 1)) for t in times]
-    found = find_translations([0.6 * transmission + 0.4 * layer for layer in moved], 2)[0]
-    assert np.abs(found - np.rint(times[:, None] * end)).max() < 1
+@pytest.mark.parametrize("frames", [2, 3, 5, 8])
+def test_the_baseline_is_the_distance_between_the_first_and_the_last_position(frames):
+    steady = {"tremble_mm": 0.0, "tremble_deg": 0.0, "frames": frames}
+    for index in range(10):
+        cameras = [scene.camera for scene in frames_of(index, baseline_mm=(40.0, 40.0), **steady)]
+        steps = np.diff([camera.position_mm for camera in cameras], axis=0)
+        np.testing.assert_allclose(np.linalg.norm(steps, axis=1), 40 / (frames - 1), rtol=1e-4)
+        np.testing.assert_allclose(steps @ np.array(cameras[0].axes[2]), 0, atol=1e-3)
+        assert np.abs(steps @ np.array(cameras[0].axes[1])).max() < 40 / (frames - 1) * math.sin(
+            math.radians(21)
+        )
 
 
-def test_unrelated_photos_have_no_motion_and_equal_ones_do_not_move():
-    first, second = linear_pictures((400, 300))
-    motions = frame_motions([first, first, second], 0, first)
-    assert not motions[2]
-    candidates = motion_candidates([first, first], 0, motions[:2])
-    assert candidates[0].is_locked
-    assert np.allclose(candidates[0].transmission, np.eye(3), atol=1e-3)
+def test_the_tremble_has_the_requested_size_on_all_axes():
+    turns, moves = [], []
+    for index in range(60):
+        frames = frames_of(index, tremble_mm=3.0, tremble_deg=0.5, baseline_mm=(0.0, 0.0))
+        reference = frames[2].camera
+        for camera in (frames[0].camera, frames[4].camera):
+            moves.append(np.array(reference.axes) @ np.subtract(camera.position_mm, reference.position_mm))
+            turns.append(
+                (
+                    camera.heading_deg - reference.heading_deg,
+                    camera.pitch_deg - reference.pitch_deg,
+                    camera.roll_deg,
+                )
+            )
+    np.testing.assert_allclose(np.std(moves, axis=0), 3.0, rtol=0.25)
+    np.testing.assert_allclose(np.std(turns, axis=0), 0.5, rtol=0.25)
 
 
-def test_a_burst_is_separated_by_its_motion(small_burst, burst_files):
-    result = brewster.separate_burst(burst_files)
-    report = result.burst
-    assert report.method == "burst"
-    assert 60 < report.relative_motion_px < 160  # 100 px in a photo of 1,000 px
-    single = brewster.separate(burst_files[2])
-    scores = [psnr_db(layers.transmission.linear(), small_burst.transmission) for layers in (result, single)]
-    assert scores[0] > scores[1]
-    assert result.transmission.size == result.reflection.size == result.photo.size
+def test_the_packaged_recipe_covers_relative_motions_up_to_60_px():
+    """In px at a width of 1,000 px, between the first and the last frame."""
+    found = []
+    for index in range(80):
+        frames = frames_of(index, size=(32, 24))
+        found.append(layer_motion(frames[0], frames[-1]).relative_px() * 1000 / 32)
+    assert 14 < np.median(found) < 28
+    assert min(found) < 5
+    assert 45 < max(found) < 100
 
 
-def test_a_burst_keeps_depth_and_respects_strength_and_reference(small_burst, few_steps):
-    frames = [frame.astype(np.uint16) * 257 for frame in small_burst.frames]
-    photos = [brewster.Photo.from_array(frame, encoding="srgb") for frame in frames]
-    result = separate_burst(photos, reference=1, strength=0)
-    assert result.transmission.pixels.dtype == np.uint16
-    assert (result.transmission.pixels == frames[1]).all()
-    assert result.burst.reference == 1
+def test_a_still_camera_does_not_move_the_layers_apart():
+    for index in range(10):
+        frames = frames_of(index, still_probability=1.0, tremble_mm=0.0)
+        assert layer_motion(frames[0], frames[-1]).relative_px() < 0.05  # it still turns
+    assert any(frame.camera.roll_deg for frame in frames)
 
 
-def test_photos_without_relative_motion_are_not_separated_by_motion(small_burst):
-    photo = brewster.Photo.from_array(small_burst.frames[0], encoding="srgb")
-    result = separate_burst([photo] * 3)
-    assert result.burst.method != "burst"
-    assert result.burst.relative_motion_px < 10 or result.burst.explained < 0.2
+def test_at_equal_distance_the_layers_move_alike():
+    compared = []
+    for index in range(12):
+        frames = frames_of(index, equal_distance_probability=1.0, baseline_mm=(80.0, 80.0))
+        motion = layer_motion(frames[0], frames[-1])
+        assert motion.relative_px() < 0.1
+        assert np.nanmedian(np.abs(motion.transmission[..., 0])) > 0.5
+        compared.append((frames[0].behind.plane is None, frames[0].behind.map is None))
+    assert len(set(compared)) > 1
+    impossible = burst_recipe("vitrine", equal_distance_probability=1.0)
+    front = impossible.front.model_copy(update={"plane_probability": 0.0})
+    with pytest.raises(RecipeError, match="a map on both sides of the glass, or a picture on both sides"):
+        draw_frames(impossible.model_copy(update={"front": front}), builtin_catalog(), 7, 0)
 
 
-def test_a_photo_of_another_scene_is_left_out_and_alone_gives_the_single_result():
-    photos = [brewster.Photo.open(path) for path in PICTURES[:2]]
-    pixels = [photo.srgb_8bit()[:300, :300] for photo in photos]
-    first, second = (brewster.Photo.from_array(array, encoding="srgb") for array in pixels)
-    result = separate_burst([first, second], reference=0)
-    assert (result.burst.method, result.burst.left_out) == ("single photo", (1,))
-    assert (result.transmission.pixels == brewster.separate(first).transmission.pixels).all()
+def test_without_glass_the_photo_is_the_background():
+    recipe = burst_recipe("tiny", without_glass_probability=1.0, frames=2)
+    for index in range(6):
+        sample = render(draw(recipe, builtin_catalog(), 7, index), ANY_ASSETS)
+        assert float(sample.reflection.abs().max()) < 1e-6
+        torch.testing.assert_close(sample.photo, sample.background, rtol=1e-4, atol=1e-5)
+
+
+def test_every_frame_is_the_sum_of_its_layers():
+    for scene in frames_of(2, frames=3):
+        sample = render(scene, ANY_ASSETS)
+        torch.testing.assert_close(
+            sample.photo, sample.transmission + sample.reflection, rtol=1e-5, atol=1e-6
+        )
 
 
 @pytest.mark.parametrize(
-    ("shapes", "reference"), [([(8, 9)], 0), ([(8, 9), (9, 8)], 0), ([(8, 9)] * 2, 2), ([(8, 9)] * 16, 0)]
+    ("values", "message"),
+    [
+        ({"baseline_mm": [-3.0, 5.0]}, "baseline_mm of at least 0"),
+        ({"frames": 1}, "frames is 1; expected an integer, from 2 to 99"),
+        ({"tremble_mm": -1.0}, "tremble_mm is -1.0; expected a number, at least 0"),
+        ({"shake": 1.0}, "no key burst.shake"),
+    ],
 )
-def test_bad_bursts_are_refused(shapes, reference):
-    photos = [brewster.Photo.from_array(np.zeros((*shape, 3), np.uint8), encoding="srgb") for shape in shapes]
-    with pytest.raises(PhotoError):
-        separate_burst(photos, reference=reference)
-
-
-def write_video(path, frames):
-    with av.open(str(path), "w") as container:
-        stream = container.add_stream("mpeg4", rate=10)
-        stream.width, stream.height, stream.pix_fmt = frames[0].shape[1], frames[0].shape[0], "yuv420p"
-        for frame in frames:
-            container.mux(stream.encode(av.VideoFrame.from_ndarray(frame, format="rgb24")))
-        container.mux(stream.encode())
-
-
-def test_frames_of_a_video_are_chosen_along_its_path(tmp_path):
-    picture = read_photo(PICTURES[0], (200, 96))
-    encoded = np.rint(to_encoded(np.clip(picture, 0, 1)) * 255).astype(np.uint8)
-    offsets = [0] * 10 + list(range(0, 40, 2)) + [38] * 10  # still, moving, still
-    write_video(tmp_path / "a.mp4", [np.ascontiguousarray(encoded[:, x : x + 128]) for x in offsets])
-    photos = read_video(tmp_path / "a.mp4", 5)
-    assert [photo.size for photo in photos] == [(128, 96)] * 5
-    truth = [encoded[:, x : x + 128].astype(float) for x in offsets]
-    nearest = [int(np.argmin([np.abs(photo.pixels - frame).mean() for frame in truth])) for photo in photos]
-    assert max(offsets[i] for i in nearest) - min(offsets[i] for i in nearest) >= 20
-    with pytest.raises(PhotoTooLarge):
-        read_video(tmp_path / "a.mp4", 5, max_pixels=100)
-
-
-@given(st.lists(st.tuples(st.floats(0, 0.1), st.floats(0, 1)), min_size=1, max_size=60), st.integers(2, 15))
-def test_chosen_frames_are_distinct_and_ordered(steps, count):
-    moves, sharpness = np.array(steps).T
-    chosen = choose_frames(np.cumsum(moves), sharpness, count)
-    assert chosen == sorted(set(chosen))
-    assert len(chosen) == min(count, len(steps))
-    assert chosen[-1] < len(steps)
-
-
-@pytest.mark.parametrize("content", [b"", b"no video", None])
-def test_a_damaged_video_is_refused(tmp_path, content):
-    path = tmp_path / "a.mp4"
-    if content is not None:
-        path.write_bytes(content)
-    with pytest.raises(UnreadablePhoto):
-        read_video(path, 5)
-
-
-def test_each_folder_and_video_is_one_burst_and_named_photos_are_one(tmp_path, burst_files):
-    for folder in ("a", "b/c"):
-        (tmp_path / folder).mkdir(parents=True)
-        for file in burst_files[:3]:
-            (tmp_path / folder / file.name).write_bytes(file.read_bytes())
-    tasks = plan_bursts([tmp_path], tmp_path / "out")
-    assert [len(task.burst.photos) for task in tasks] == [3, 3]
-    assert [task.source.name for task in tasks] == ["1.png", "1.png"]
-    assert tasks[1].outputs["transmission"] == tmp_path / "out/b/c/1.transmission.png"
-    (task,) = plan_bursts(burst_files, reference=0)
-    assert (task.source, len(task.burst.photos)) == (burst_files[0], 5)
-    with pytest.raises(PhotoError):
-        plan_bursts(burst_files, reference=5)
-
-
-def test_the_command_writes_the_layers_and_the_report(tmp_path, burst_files, few_steps, capfd):
-    arguments = (*burst_files, "-o", tmp_path / "out", "--json", "--reference", "2")
-    code, out = run_burst(capfd, *arguments)
-    report = json.loads(out)
-    assert (code, report["status"], report["burst"]["reference"]) == (0, "separated", 1)
-    assert {path.name for path in (tmp_path / "out").iterdir()} == {"1.transmission.png", "1.reflection.png"}
-    assert json.loads(run_burst(capfd, *arguments)[1])["status"] == "skipped"
-
-
-def test_the_command_reports_bursts_that_cannot_be_separated(tmp_path, burst_files, capfd):
-    bad = tmp_path / "bursts/bad"
-    bad.mkdir(parents=True)
-    (bad / "alone.png").write_bytes(burst_files[0].read_bytes())
-    video = tmp_path / "window.mp4"
-    video.write_bytes(b"cut")
-    code, out = run_burst(capfd, tmp_path / "bursts", video, "-o", tmp_path / "out", "--json")
-    reports = [json.loads(line) for line in out.splitlines()]
-    assert (code, [report["status"] for report in reports]) == (1, ["failed", "failed"])
-    assert "1 photo" in reports[0]["error"]
-    assert "window.mp4" in reports[1]["error"]
-
-
-def test_a_dry_run_writes_nothing(tmp_path, burst_files, capfd):
-    code, out = run_burst(capfd, *burst_files, "-o", tmp_path / "clear.png", "--dry-run")
-    assert code == 0
-    assert "clear.png" in out
-    assert not list(tmp_path.iterdir())
+def test_an_impossible_burst_is_refused(values, message):
+    with pytest.raises(RecipeError, match=message):
+        validated(SceneRecipe, {"name": "a", "about": "b", "burst": values}, source="x", reference="y")

@@ -1,6 +1,7 @@
 """The commands models, doctor and train."""
 
 import json
+import re
 import tomllib
 from pathlib import Path
 
@@ -46,8 +47,10 @@ def test_large_models_are_listed_with_size_memory_licence_and_access(run_without
     windowseat, kontext = (
         text.split(f"\n{name} ")[1].split("\nklein")[0] for name in ("windowseat", "kontext")
     )
-    assert "41 GB  Apache-2.0\n" in windowseat
-    assert "reflection derived; 13 GiB GPU memory (nf4), 4.5 GiB offloaded\n" in windowseat
+    assert "41.1 GB  Apache-2.0\n" in windowseat
+    assert re.search(
+        r"reflection derived; \d\d\.\d GiB GPU memory \((int8|nf4)\), 4\.\d GiB offloaded\n", windowseat
+    )
     assert "Non-Commercial License (not for commercial use)" in kontext
     assert "gated: accept the licence" in kontext
 

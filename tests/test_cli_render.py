@@ -15,7 +15,6 @@ from pyarrow import parquet
 
 from brewster import Photo
 from brewster.cli import main
-from brewster.environments import assets
 from brewster.rendered import store
 from brewster.rendered.generation import workers
 from cli_helpers import error_lines, json_lines, run_process
@@ -50,11 +49,8 @@ def start_with_fake_renderer(*args, renderer="render", **options):
     return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, env=path, **options)
 
 
-def test_a_dataset_is_rendered_with_preview_and_each_scene_can_be_rendered_again(
-    run_without_model, tmp_path, monkeypatch
-):
-    """Uses the real renderer and small environments, because each large environment takes seconds."""
-    monkeypatch.setattr(assets, "BUILTIN_HEIGHT", 32)
+def test_a_dataset_is_rendered_with_preview_and_each_scene_can_be_rendered_again(run_without_model, tmp_path):
+    """Uses the real renderer and the built-in maps and photos."""
     options = ("--recipe", "tiny", "--count", 2, "--seed", 7, "--size", "48x32", "--orders", "truncated")
     code, out, err = run_without_model("render", "set", *options, "--workers", 0, "--json", "--preview")
     assert code == 0, err

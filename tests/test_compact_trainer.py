@@ -1,7 +1,6 @@
 import copy
 import math
 from contextlib import contextmanager
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -115,18 +114,30 @@ def test_a_batch_whose_gradient_is_infinite_is_skipped(recipe):
     assert all(torch.equal(value, before[name]) for name, value in trainer.network.state_dict().items())
 
 
-def test_a_run_starts_from_the_mean_of_the_ema_weights_of_its_checkpoints(recipe, tmp_path):
-    checkpoint, starts = initial_checkpoint(recipe), (tmp_path / "one.pt", tmp_path / "three.pt")
-    for path, value in zip(starts, (1.0, 3.0), strict=True):
-        same = {
-            name: torch.full_like(weights, value) for name, weights in checkpoint.state["average"].items()
-        }
-        replace(checkpoint, state=checkpoint.state | {"average": same}).write(path)
-    for init_checkpoints, mean in ((starts[:1], 1), (starts, 2)):
-        trainer = CompactTrainer(recipe.model_copy(update={"init_checkpoints": init_checkpoints}))
-        trainer.initialize()
-        assert all((value == mean).all() for value in trainer.network.state_dict().values())
-        assert all((value == mean).all() for value in trainer.ema_weights.values())
+def test_a_run_starts_from_an_exported_model_as_the_network_or_as_its_encoder(recipe, tmp_path):
+    trainer = CompactTrainer(recipe)
+    with torch.no_grad():
+        for parameter in trainer.network.parameters():
+            parameter.normal_().copy_(parameter.half())  # the precision of the file
+    trainer._reset_ema()
+    model = trainer.export(tmp_path)
+    expected = trainer.network.state_dict()
+    same = CompactTrainer(with_value(recipe, "init", str(model)))
+    same.initialize()
+    dense = CompactTrainer(with_value(with_value(recipe, "network", "lite2-dense"), "init", str(model)))
+    dense.initialize()
+    encoder = dense.network.get_submodule("encoder").state_dict()
+    for name, value in expected.items():
+        assert torch.equal(same.network.state_dict()[name], value)
+        assert torch.equal(same.ema_weights[name], value)
+        assert torch.equal(encoder[name], value)
+
+
+def test_a_run_does_not_start_from_a_model_of_another_network(recipe, model):
+    with pytest.raises(ModelError, match="another network"):
+        CompactTrainer(with_value(recipe, "init", str(model))).initialize()
+    with pytest.raises(ModelError, match=r"gone\.onnx"):
+        CompactTrainer(with_value(recipe, "init", "gone.onnx")).initialize()
 
 
 def test_held_out_mixtures_do_not_depend_on_seed_and_distributions_of_the_recipe(recipe):

@@ -1,5 +1,6 @@
-"""The scripts in runs/ work: the tiny experiment completely, the large ones as far as possible on a CPU."""
+"""The scripts in runs/ and bench/ work: the tiny experiment completely, the large ones as far as possible on a CPU."""
 
+import importlib
 import json
 import os
 import re
@@ -7,9 +8,11 @@ import runpy
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import click
 import pytest
+import torch
 
 from brewster.cli import cli
 from brewster.evaluate.ablation import read_study
@@ -160,3 +163,17 @@ def test_scripts_stop_at_the_first_error_and_begin_with_a_comment():
         subprocess.run(["bash", "-n", path], check=True)
         files = re.findall(r"(?:runs|recipes|docs|tests)/[\w/.-]+\.(?:sh|py|toml|md|jpg)", text)
         assert all((ROOT / name).exists() for name in files)
+
+
+@pytest.mark.parametrize("count", [0, 5, 8, 201, 400])
+def test_the_verdicts_are_measured_on_the_given_number_of_mixtures(monkeypatch, count):
+    def stream(step, batch_size, size_px):
+        images = torch.full((batch_size, 3, 2, 2), step / 255)
+        return SimpleNamespace(photo_encoded=images, transmission_encoded=images)
+
+    monkeypatch.syspath_prepend(ROOT / "bench")
+    verdict = importlib.import_module("verdict")
+    monkeypatch.setattr(verdict, "read_recipe", lambda _: None)
+    monkeypatch.setattr(verdict, "held_out_mixtures", lambda _: stream)
+    steps = [pixels[0, 0, 0] for _, pixels in verdict.mixtures(count)]
+    assert steps == [index // 8 for index in range(count)]

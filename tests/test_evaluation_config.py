@@ -60,6 +60,5 @@ def test_by_default_every_metric_but_the_second_ssim_is_measured():
         "ssim_gaussian",
         "ssim_clipped",
         "psnr_channels",
-        "dists",
         "niqe",
     }

@@ -227,27 +227,6 @@ def test_a_resumed_run_logs_every_step_once(recipe, tmp_path):
     assert logged_steps(tmp_path) == [1, 2, 3, 4]
 
 
-def test_a_run_resumes_when_the_checkpoint_that_it_started_from_is_missing(recipe, tmp_path):
-    start = tmp_path / "start.pt"
-    initial_checkpoint(recipe).write(start)
-    with pytest.raises(Killed):
-        train(recipe.model_copy(update={"init_checkpoints": (start,)}), tmp_path / "run", kill_after(5))
-    start.unlink()
-    train(
-        recipe.model_copy(update={"init_checkpoints": (Path("elsewhere.pt"),)}), tmp_path / "run", ignore_step
-    )
-    assert logged_steps(tmp_path / "run") == [3, 6]
-
-
-def test_a_missing_checkpoint_in_start_from_is_named_with_its_cure(recipe, tmp_path):
-    with pytest.raises(ModelError, match=r"gone\.pt cannot be read .* correct init_checkpoints"):
-        train(
-            recipe.model_copy(update={"init_checkpoints": (tmp_path / "gone.pt",)}),
-            tmp_path / "run",
-            ignore_step,
-        )
-
-
 def test_a_checkpoint_is_written_every_checkpoint_every_steps_and_at_the_end(recipe, tmp_path):
     path, steps = tmp_path / "checkpoint.pt", []
 
@@ -263,11 +242,6 @@ def test_a_checkpoint_of_another_network_is_named(recipe, tmp_path):
     other.write(tmp_path / "checkpoint.pt")
     with pytest.raises(ModelError, match=r"checkpoint\.pt contains another network; .* with -o"):
         train(recipe, tmp_path, ignore_step)
-    started = recipe.model_copy(update={"init_checkpoints": (tmp_path / "checkpoint.pt",)})
-    with pytest.raises(
-        ModelError, match=r"checkpoint\.pt contains another network; .* correct init_checkpoints"
-    ):
-        train(started, tmp_path / "run", ignore_step)
 
 
 def test_a_damaged_checkpoint_is_named(tmp_path):

@@ -1,6 +1,7 @@
 """The parts of the loss, compared with values computed by hand."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -71,8 +72,22 @@ def test_the_logarithm_of_the_squared_error_is_limited_at_40_db():
     assert loss_of()["log_mse"] == pytest.approx(0.04 * math.log(0.0001), rel=1e-4)
 
 
-def test_the_loss_has_four_parts():
-    assert loss_of().keys() == {"transmission", "reflection", "edges", "log_mse"}
+@pytest.mark.parametrize(
+    ("photo", "truth", "expected"), [(1.0, 1.0, 3 * 0.2), (0.9, 1.0, 0.0), (1.0, 0.9, 0.0)]
+)
+def test_an_error_counts_as_clipped_only_where_photo_and_transmission_are_white(photo, truth, expected):
+    batch = replace(make_batch(truth), photo_encoded=make_batch(photo).photo_encoded)
+    layers = torch.cat([batch.transmission_encoded - 0.2, batch.reflection_encoded], dim=1)
+    assert float(separation_loss(layers, batch, clipped_weight=3.0)["clipped"]) == pytest.approx(
+        expected, abs=1e-6
+    )
+
+
+@pytest.mark.parametrize(("truth", "expected"), [(1.0, 0.0), (0.9, 3 * 0.2)])
+def test_light_above_white_is_an_error_only_where_the_true_light_is_known(truth, expected):
+    batch = make_batch(truth)
+    layers = torch.cat([batch.transmission_encoded + 0.2, batch.reflection_encoded], dim=1)
+    assert float(separation_loss(layers, batch)["transmission"]) == pytest.approx(expected, abs=1e-6)
 
 
 def test_a_tenth_of_the_error_is_a_gain_of_twenty_decibels():

@@ -14,13 +14,8 @@ import torch
 from brewster.errors import DeviceError, DownloadError, MissingExtra, ModelError
 from brewster.models.diffusion.backbones.loading import load_backbone
 from brewster.models.diffusion.backbones.registry import BACKBONES, tiny
-from brewster.models.diffusion.memory import (
-    Placement,
-    check_machine,
-    choose_placement,
-    count_weights,
-    place_on_gpu,
-)
+from brewster.models.diffusion.memory import check_machine, choose_placement, count_weights
+from brewster.models.diffusion_resources import Placement, place_on_gpu
 from published_models import KLEIN_9B, write_klein_9b
 
 KONTEXT = BACKBONES["kontext"]
@@ -41,7 +36,7 @@ def test_the_weights_of_a_hub_id_are_counted_by_its_configuration(tmp_path, monk
     write_klein_9b(tmp_path, monkeypatch)
     klein = BACKBONES["klein"]
     assert count_weights(KLEIN_9B, klein) == pytest.approx(9.08e9, rel=0.01)
-    assert count_weights("someone/not-in-the-cache", klein) == klein.parameter_count
+    assert count_weights("someone/not-in-the-cache", klein) == klein.cost.parameters
     config = next(tmp_path.rglob("transformer/config.json"))
     config.write_text('{"num_layers": "many"}')
     with pytest.raises(

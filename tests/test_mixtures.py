@@ -115,12 +115,13 @@ def test_a_reflection_that_fades_or_ends_is_darker_somewhere_and_brighter_nowher
     assert faded.mean() < 0.95 * mirrored.mean()
 
 
-def test_lamps_are_added_to_the_reflection_alone(photos):
-    _, behind, mirrored = layers_of(photos)
-    _, same, lit = layers_of(photos, lamp_probability=1.0)
-    assert (same - behind).abs().max() < 0.04  # the tint of the pane uses other random numbers
-    assert (lit >= mirrored - 1e-6).all()
-    assert lit.amax(dim=(1, 2, 3)).min() > mirrored.amax()
+@pytest.mark.parametrize("option", ["lamp_probability", "sign_probability"])
+def test_lamps_and_signs_are_on_both_sides_of_the_glass(photos, option):
+    """With lamps in reflections alone, a network learns that a lamp is a reflection."""
+    _, *plain = layers_of(photos)
+    _, *changed = layers_of(photos, **{option: 1.0})
+    for before, after in zip(plain, changed, strict=True):
+        assert (after - before).abs().mean() > 0.005
 
 
 def test_a_reflection_that_is_not_sharp_is_blurred_and_keeps_its_light(photos):
@@ -150,10 +151,10 @@ def test_a_background_out_of_focus_is_blurred_and_its_reflection_is_not(photos):
 
 @pytest.mark.parametrize(
     "changes",
-    [{"ghost_probability": 1.0}, {"sign_probability": 1.0}, {"reflection_contrast": (1.6, 1.6)}],
+    [{"ghost_probability": 1.0}, {"reflection_contrast": (1.6, 1.6)}],
     ids=lambda changes: next(iter(changes)),
 )
-def test_ghosts_signs_and_contrast_change_the_reflection_alone(photos, changes):
+def test_ghosts_and_contrast_change_the_reflection_alone(photos, changes):
     _, behind, mirrored = layers_of(photos)
     _, same, changed = layers_of(photos, **changes)
     assert (same - behind).abs().max() < 0.04  # the tint of the pane uses other random numbers

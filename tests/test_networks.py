@@ -1,12 +1,10 @@
 """The table of compact networks: what the trainer and the exported file require of a row."""
 
-from dataclasses import replace
-
 import pytest
 import torch
 from torch import nn
 
-from brewster.errors import ModelError, RecipeError
+from brewster.errors import RecipeError
 from brewster.inference.onnx_backend import OnnxBackend
 from brewster.models.compact import CompactNetwork
 from brewster.models.networks import DEFAULT_NETWORK, MAX_STRIDE, NETWORKS, NetworkEntry
@@ -68,36 +66,7 @@ def test_a_recipe_trains_and_exports_the_network_that_it_names(recipe, small_net
     assert transmission.shape == reflection.shape == photo.shape
 
 
-def test_a_run_of_one_network_does_not_start_from_a_checkpoint_of_another(recipe, small_network, tmp_path):
-    trainer = CompactTrainer(recipe)
-    Checkpoint(0, recipe.model_dump_json(), trainer.state_dict()).write(tmp_path / "start.pt")
-    other = with_value(recipe, "network", small_network).model_copy(
-        update={"init_checkpoints": (tmp_path / "start.pt",)}
-    )
-    with pytest.raises(
-        ModelError,
-        match=r"start.pt contains the network lite2-unet; expected a checkpoint of small, .*; train the recipe",
-    ):
-        CompactTrainer(other).initialize()
-
-
 def test_a_run_of_one_network_is_not_resumed_with_another(recipe, small_network, tmp_path):
     train(recipe, tmp_path, ignore_progress)
     with pytest.raises(RecipeError, match=r"belongs to a run of another recipe: network was"):
         train(with_value(recipe, "network", small_network), tmp_path, ignore_progress)
-
-
-def test_a_checkpoint_with_an_older_recipe_contains_the_default_network(recipe, tmp_path):
-    trainer = CompactTrainer(recipe)
-    older = recipe.model_dump_json(exclude={"network"}).replace('"batch_size"', '"batch"')
-    assert "network" not in older
-    assert "batch_size" not in older
-    average = {name: torch.full_like(value, 2.0) for name, value in trainer.ema_weights.items()}
-    checkpoint = replace(
-        Checkpoint(0, older, trainer.state_dict()),
-        state=trainer.state_dict() | {"average": average},
-    )
-    checkpoint.write(tmp_path / "start.pt")
-    started = CompactTrainer(recipe.model_copy(update={"init_checkpoints": (tmp_path / "start.pt",)}))
-    started.initialize()
-    assert all((value == 2).all() for value in started.network.state_dict().values())

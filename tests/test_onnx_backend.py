@@ -8,7 +8,8 @@ from brewster.errors import DeviceError, ModelError
 from brewster.inference import onnx_backend
 from brewster.inference.onnx_backend import OnnxBackend, available_devices
 from brewster.models.compact import LinearSeparator, with_imagenet_features
-from brewster.models.networks import MAX_STRIDE
+from brewster.models.dense import DenseNetwork
+from brewster.models.networks import DEFAULT_NETWORK, NETWORKS
 from brewster.training.compact.export import export_onnx
 
 
@@ -26,7 +27,24 @@ def network():
 @pytest.fixture(scope="module")
 def model_file(network, tmp_path_factory):
     path = tmp_path_factory.mktemp("model") / "model.onnx"
-    export_onnx(network, path, MAX_STRIDE)
+    export_onnx(network, path, NETWORKS[DEFAULT_NETWORK])
+    return path
+
+
+@pytest.fixture(scope="module")
+def dense_network():
+    torch.manual_seed(2)
+    network = DenseNetwork().eval()
+    with torch.no_grad():
+        for parameter in network.parameters():
+            parameter.add_(0.02 * torch.randn_like(parameter)).copy_(parameter.half())
+    return network
+
+
+@pytest.fixture(scope="module")
+def dense_model_file(dense_network, tmp_path_factory):
+    path = tmp_path_factory.mktemp("dense") / "model.onnx"
+    export_onnx(dense_network, path, NETWORKS["lite2-dense"])
     return path
 
 
@@ -37,6 +55,23 @@ def test_the_exported_model_equals_the_network_at_any_size(network, model_file, 
         expected = LinearSeparator(network)(torch.from_numpy(tile).permute(2, 0, 1)[None])
     for layer, expected_layer in zip(OnnxBackend(model_file, "cpu")(tile), expected, strict=True):
         np.testing.assert_allclose(layer, expected_layer[0].permute(1, 2, 0).numpy(), atol=2e-4)
+
+
+@pytest.mark.parametrize("has_hints", [True, False])
+def test_an_exported_model_with_hints_equals_its_network(dense_network, dense_model_file, has_hints):
+    rng = np.random.default_rng(3)
+    tile, hints = rng.random((64, 96, 3), np.float32), rng.random((64, 96, 2), np.float32)
+    hints_tensor = torch.from_numpy(hints * has_hints).permute(2, 0, 1)[None]
+    with torch.no_grad():
+        expected = LinearSeparator(dense_network)(torch.from_numpy(tile).permute(2, 0, 1)[None], hints_tensor)
+    layers = OnnxBackend(dense_model_file, "cpu")(tile, hints if has_hints else None)
+    for layer, expected_layer in zip(layers, expected, strict=True):
+        np.testing.assert_allclose(layer, expected_layer[0].permute(1, 2, 0).numpy(), atol=5e-4)
+
+
+def test_the_file_contains_no_paths_of_the_machine_that_wrote_it(model_file):
+    assert b"site-packages" not in model_file.read_bytes()
+    assert b"/src/brewster" not in model_file.read_bytes()
 
 
 def test_the_file_has_two_bytes_for_each_weight(network, model_file):

@@ -20,10 +20,10 @@ def test_the_default_protocol_has_the_default_settings():
     assert protocol_config("brewster") == EvaluationConfig()
 
 
-def test_the_contest_crops_the_border_and_scores_its_five_metrics():
+def test_the_contest_crops_the_border_and_scores_its_metrics():
     config = protocol_config("ntire2026")
     assert config.border == 4
-    assert config.metrics == ("psnr", "ssim_clipped", "lpips", "dists", "niqe")
+    assert config.metrics == ("psnr", "ssim_clipped", "lpips", "niqe")
     assert any("outermost 4 pixels" in line for line in config.describe())
 
 

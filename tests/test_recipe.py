@@ -27,7 +27,7 @@ def test_there_are_recipes_and_all_of_them_can_be_read():
 
 
 def test_recipes_without_a_mix_table_have_the_default_mixtures():
-    assert read_recipe(TINY.with_stem("compact-stage4")).mix == MixRecipe(crop=(0.4, 1.0))
+    assert read_recipe(TINY.with_stem("rendered")).mix == MixRecipe()
     assert read_recipe(TINY).mix == MixRecipe(reflection_map_probability=0, background_map_probability=0)
 
 

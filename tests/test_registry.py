@@ -16,8 +16,9 @@ from benchmark_folders import (
     write,
 )
 from brewster.benchmarks import registry
+from brewster.benchmarks.image_files import ImageFile
 from brewster.benchmarks.pairing import natural_key
-from brewster.benchmarks.registry import BENCHMARKS, Benchmark, Case, ImageFile, read_benchmark
+from brewster.benchmarks.registry import BENCHMARKS, Benchmark, Case, read_benchmark
 from brewster.benchmarks.selection import PAPER_SEED, paper_subset, with_unique_names
 from brewster.errors import PhotoError, UnreadablePhoto
 from brewster.photo import Photo

@@ -19,7 +19,7 @@ from brewster.scene.recipe import read_scene_recipe
 from brewster.scene.sampler import draw
 from brewster.scene.scene import read_scene
 from fake_renderer import render
-from set_folders import BUILTIN_CATALOG, hashes, render_set
+from set_folders import builtin_catalog, hashes, render_set
 
 
 @pytest.fixture(scope="module")
@@ -31,7 +31,7 @@ def four_samples(tmp_path_factory):
 
 @pytest.fixture
 def scene():
-    return draw(read_scene_recipe("tiny"), BUILTIN_CATALOG, seed=7, index=3)
+    return draw(read_scene_recipe("tiny"), builtin_catalog(), seed=7, index=3)
 
 
 def test_a_sample_is_five_photographs_their_light_and_their_scene(four_samples, scene):

@@ -86,7 +86,7 @@ def test_the_papers_draw_replaces_the_whole_benchmark(results):
     assert "Postcard (20)" not in text
 
 
-@pytest.mark.parametrize("names", [["psnr_channels", "ssim"], ["psnr", "ssim_clipped", "lpips", "dists"]])
+@pytest.mark.parametrize("names", [["psnr_channels", "ssim"], ["psnr", "ssim_clipped", "lpips", "niqe"]])
 def test_requested_metrics_are_in_the_table_and_in_the_overview(results, names):
     results["metrics"] = {name: results["metrics"]["psnr"] | {"title": name.upper()} for name in names}
     titles = [name.upper() for name in names[:3]]

@@ -37,9 +37,9 @@ def test_markdown_lists_excluded_files_errors_and_every_setting(results):
 
 
 def test_metrics_with_the_same_problem_share_one_line(results):
-    results["unavailable"] = {"lpips": "no weights", "dists": "no disk", "lpips_region": "no weights"}
+    results["unavailable"] = {"lpips": "no weights", "niqe": "no disk", "lpips_region": "no weights"}
     lines = [line for line in to_markdown(results).splitlines() if line.startswith("- not computed")]
-    assert lines == ["- not computed: lpips, lpips_region: no weights", "- not computed: dists: no disk"]
+    assert lines == ["- not computed: lpips, lpips_region: no weights", "- not computed: niqe: no disk"]
 
 
 def test_all_lines_of_a_table_have_the_same_number_of_cells_with_any_names(results):

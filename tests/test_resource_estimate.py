@@ -8,7 +8,7 @@ import torch
 
 from brewster.errors import DeviceError, DownloadError
 from brewster.models.diffusion.backbones.registry import tiny
-from brewster.models.diffusion.cost import CARDS, GraphicsCard, find_gpu
+from brewster.models.diffusion_resources import CARDS, GraphicsCard, find_gpu, local_gpu
 from brewster.training.lora.resource_estimate import estimate_resources
 from brewster.training.recipe import read_recipe, with_value
 from published_models import KLEIN_9B, write_klein_9b
@@ -26,7 +26,7 @@ def klein():
 def test_klein_fits_the_papers_gpu_with_the_known_sizes(klein):
     assert klein.panel == (512, 512)
     assert klein.generated_tokens == klein.condition_tokens == 3 * 32 * 32
-    assert klein.parameter_count == pytest.approx(3.88e9, rel=0.01)
+    assert klein.cost.parameters == pytest.approx(3.88e9, rel=0.01)
     assert klein.memory_gib["backbone"] == pytest.approx(7.2, abs=0.1)
     klein.check_fits()
     assert klein.total_gib < 16
@@ -47,7 +47,7 @@ def test_the_table_lists_tokens_memory_and_time(klein):
 
 def test_the_estimate_for_kontext_agrees_with_the_counts_for_the_paper():
     estimate = estimate_resources(read_recipe(RECIPES / "kontext.toml"), CARD)
-    assert estimate.parameter_count == pytest.approx(11.9e9, rel=0.01)
+    assert estimate.cost.parameters == pytest.approx(11.9e9, rel=0.01)
     assert estimate.memory_gib["backbone"] == pytest.approx(11.2, abs=0.2)
     assert estimate.memory_gib["LoRA and AdamW"] == pytest.approx(1.3, abs=0.1)
     assert estimate.memory_gib["activations"] == pytest.approx(3.7, abs=0.2)
@@ -81,21 +81,23 @@ def test_gpus_are_found_by_name_and_that_of_the_paper_is_the_default_without_a_g
     assert find_gpu("rtx 4090") == CARD
     with pytest.raises(DeviceError, match=r"no GPU 'rtx 4099' .*; did you mean RTX 4090"):
         find_gpu("rtx 4099")
+    with pytest.raises(DeviceError, match="M3 Max is by Apple; expected an NVIDIA or AMD GPU"):
+        find_gpu("M3 Max")
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-    assert find_gpu() == CARD
+    assert local_gpu() is None
 
 
 def test_a_backbone_on_the_hub_or_in_a_folder_is_counted_by_its_configuration(tmp_path, monkeypatch):
     recipe = read_recipe(RECIPES / "klein.toml")
     write_klein_9b(tmp_path, monkeypatch)
     estimate = estimate_resources(with_value(recipe, "backbone", KLEIN_9B), CARD)
-    assert estimate.parameter_count == pytest.approx(9.08e9, rel=0.01)
+    assert estimate.cost.parameters == pytest.approx(9.08e9, rel=0.01)
     assert re.search(r"download +26 GB, of which 8 GB are text encoders", estimate.table())
     with pytest.raises(DownloadError, match="somebody/else is not in the cache"):
         estimate_resources(with_value(recipe, "backbone", "somebody/else"), CARD)
     tiny("klein")[0].save(tmp_path / "klein")
     folder = estimate_resources(with_value(recipe, "backbone", str(tmp_path / "klein")), CARD)
-    assert folder.parameter_count == tiny("klein")[0].transformer.num_parameters()
+    assert folder.cost.parameters == tiny("klein")[0].transformer.num_parameters()
     assert re.search(r"download +0 GB, of which 0 GB are text encoders", folder.table())
 
 

@@ -5,7 +5,8 @@ import json
 import pytest
 
 from benchmark_folders import repacked, sir2
-from brewster.benchmarks.registry import Benchmark, Case, ImageFile, read_benchmark
+from brewster.benchmarks.image_files import ImageFile
+from brewster.benchmarks.registry import Benchmark, Case, read_benchmark
 from brewster.errors import BrewsterError
 from brewster.evaluate.config import EvaluationConfig
 from brewster.evaluate.methods import IdentityBaseline, PredictionFolder

@@ -5,7 +5,7 @@ import tomllib
 
 import pytest
 
-from brewster.environments.catalog import BUILTIN_CATALOG
+from brewster.environments.catalog import builtin_catalog
 from brewster.errors import RecipeError
 from brewster.scene.camera import Camera
 from brewster.scene.recipe import RECIPES, read_scene_recipe
@@ -13,7 +13,7 @@ from brewster.scene.sampler import draw
 from brewster.scene.scene import Scene, read_scene
 from synthetic_scenes import pixel_directions
 
-MAP = "source.file = 'builtin:street:1'"
+MAP = "source.file = 'spree_bank.exr'"
 
 
 @pytest.fixture
@@ -28,7 +28,7 @@ def written(tmp_path):
 @pytest.mark.parametrize("recipe", RECIPES)
 def test_a_scene_that_is_written_and_read_is_the_same(recipe, written):
     for index in range(12):
-        scene = draw(read_scene_recipe(recipe), BUILTIN_CATALOG, 3, index)
+        scene = draw(read_scene_recipe(recipe), builtin_catalog(), 3, index)
         assert read_scene(written(scene.to_toml())) == scene
 
 
@@ -41,7 +41,7 @@ def test_an_empty_file_is_the_plainest_scene_and_a_map_is_infinitely_far(written
 
 
 def test_the_outcome_of_a_scene_is_ignored(written):
-    scene = draw(read_scene_recipe("window"), BUILTIN_CATALOG, 3, 1)
+    scene = draw(read_scene_recipe("window"), builtin_catalog(), 3, 1)
     text = scene.to_toml(outcome={"exposure_ev": -1.5, "white_balance_gains": [1.0, 1.1, 0.9]})
     assert "[outcome]" in text
     found = read_scene(written(text))

@@ -200,14 +200,8 @@ def test_features_are_computed_once_for_each_image(triplet, monkeypatch):
 def test_every_metric_gives_the_score_of_its_function(data, monkeypatch):
     """A direct call of each function shows that no row of METRICS has the function of another."""
     monkeypatch.setenv("BREWSTER_DATA", str(data))
-    others = (
-        "dists",
-        "niqe",
-    )  # test_metrics_dists.py and test_metrics_naturalness.py: weights, and larger images
-    names = tuple(
-        name
-        for name, metric in METRICS.items()
-        if metric.ground_truth == "transmission" and name not in others
+    names = tuple(  # NIQE needs a larger image, see test_metrics_naturalness.py
+        name for name, metric in METRICS.items() if metric.ground_truth == "transmission" and name != "niqe"
     )
     truth, scorer = open_case(
         data / "real/dev/nature", EvaluationConfig(metrics=names, short_side_px=96), "nature20"

@@ -1,7 +1,9 @@
 """The plan of a separation: the numbers of the estimates for training, and of the pipeline that it plans."""
 
 import importlib.util
-import math
+import json
+import subprocess
+import sys
 
 import huggingface_hub.constants
 import numpy as np
@@ -14,12 +16,10 @@ from brewster.inference.diffusion_predictor import DiffusionPredictor
 from brewster.inference.separation_plan import plan_separation
 from brewster.models.diffusion.adapter.lora import add_lora, save_lora
 from brewster.models.diffusion.backbones.registry import tiny
-from brewster.models.diffusion.cost import CARDS, GraphicsCard
-from brewster.models.diffusion.memory import weights_gib
 from brewster.models.diffusion.pipeline import load_pipeline
 from brewster.models.diffusion.task import DecompositionTask
 from brewster.models.diffusion_models import DIFFUSION_MODELS
-from brewster.models.zoo import DIFFUSION_NAMES
+from brewster.models.diffusion_resources import CARDS, GraphicsCard, weights_gib
 from brewster.options import Options
 
 CARD = CARDS["RTX 4090"]
@@ -61,7 +61,7 @@ def test_the_plan_of_the_papers_lora_has_the_known_numbers(lora):
     small = plan_separation(Options(model=lora, steps=4), (4096, 4096), CARDS["RTX 4060"])
     assert small.placement.is_offloaded
     assert small.total_gib < 8
-    copies = 4 * weights_gib(small.parameter_count, "int8") * 1.0737 / 10
+    copies = 4 * weights_gib(small.cost.parameters, "int8") * 1.0737 / 10
     assert small.seconds == pytest.approx(4 * 117 / (0.4 * 30) + copies, rel=0.01)
     with pytest.raises(
         DeviceError, match="GiB; expected at most the 8 GiB of RTX 4060; use --offload layers"
@@ -87,18 +87,64 @@ def test_windowseat_is_planned_before_its_download(monkeypatch, has_bitsandbytes
     assert plan.licence == "Apache-2.0"
 
 
-@pytest.mark.parametrize("name", DIFFUSION_NAMES)
-def test_the_list_of_models_agrees_with_the_plan(name):
-    model = DIFFUSION_MODELS[name]
-    quantization = None if model.weight_format == "bf16" else model.weight_format
-    plan = plan_separation(Options(model=name, quantization=quantization), (4096, 4096), CARD)
-    assert model.memory_gib == math.ceil(plan.placement.gpu_gib(plan.parameter_count))
-    assert model.memory_gib - 1 < plan.total_gib <= model.memory_gib
-    assert plan.download_gb == pytest.approx(model.download_gb + model.text_encoder_gb, abs=0.5)
-    assert plan.text_encoder_gb == pytest.approx(model.text_encoder_gb, abs=0.1)
-    offloaded = plan_separation(Options(model=name, offload="layers"), (4096, 4096), CARD)
-    assert model.offloaded_memory_gib == offloaded.placement.gpu_gib(plan.parameter_count)
-    assert offloaded.total_gib == pytest.approx(model.offloaded_memory_gib, abs=0.6)
+@pytest.mark.parametrize("name", list(DIFFUSION_MODELS))
+def test_the_list_of_models_agrees_with_the_plan(name, run_without_model):
+    plan = plan_separation(Options(model=name), (4000, 3000), CARD)
+    rows = {row["name"]: row for row in json.loads(run_without_model("models", "list", "--json")[1])}
+    assert rows[name]["memory_gib"] == pytest.approx(plan.total_gib, abs=0.05)
+    assert rows[name]["download_gb"] + rows[name]["text_encoder_gb"] == pytest.approx(
+        plan.download_gb, abs=0.1
+    )
+    assert (rows[name]["weight_format"], rows[name]["licence"]) == (
+        plan.placement.quantization or "bf16",
+        DIFFUSION_MODELS[name].licence,
+    )
+    assert rows[name]["offloaded_memory_gib"] < 5
+
+
+def test_a_listed_model_is_planned_without_torch_or_the_libraries_of_diffusion(tmp_path):
+    Photo.from_array(np.full((64, 96, 3), 0.3, np.float32), encoding="linear").save(tmp_path / "photo.png")
+    missing = [
+        "torch",
+        "diffusers",
+        "transformers",
+        "peft",
+        "huggingface_hub",
+        "psutil",
+        "safetensors",
+        "accelerate",
+    ]
+    code = (
+        f"import importlib.util, runpy, sys; missing = {missing}; find = importlib.util.find_spec\n"
+        "importlib.util.find_spec = lambda name, *a: None if name in missing else find(name, *a)\n"
+        "sys.modules.update(dict.fromkeys(missing)); runpy.run_module('brewster', run_name='__main__')"
+    )
+    for name in DIFFUSION_MODELS:
+        command = [sys.executable, "-c", code, "photo.png", "--model", name, "--gpu", "rx 7900 xtx"]
+        run = subprocess.run(command, check=False, cwd=tmp_path, capture_output=True, text=True)
+        assert (run.returncode, run.stderr) == (0, ""), name
+        assert f"model                   {name}, " in run.stdout
+        assert "of 24 on RX 7900 XTX" in run.stdout
+
+
+def test_a_plan_advises_only_what_works_and_names_bitsandbytes_if_it_is_missing(monkeypatch):
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name, *_: None)
+    plan = plan_separation(Options(model="windowseat"), (1600, 800), CARD)
+    assert "int8, on the GPU; nf4, on the GPU after: pip install bitsandbytes" in plan.table()
+    for options, memory, cure in (
+        (
+            {"quantization": "int8", "offload": "none"},
+            16,
+            "use --quantization nf4 after: pip install bitsandbytes",
+        ),
+        ({"quantization": "nf4"}, 8, "use --quantization int8 --offload layers, which needs"),
+        ({"offload": "layers"}, 2, "use a GPU with more memory, or the model compact"),
+    ):
+        plan = plan_separation(
+            Options(model="windowseat", **options), (1600, 800), GraphicsCard("toy", memory, 100)
+        )
+        with pytest.raises(DeviceError, match=cure):
+            plan.check_fits()
 
 
 def test_the_plan_counts_the_text_encoders():

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from brewster.environments.assets import Assets
-from brewster.environments.catalog import BUILTIN_CATALOG
+from brewster.environments.catalog import builtin_catalog
 from brewster.errors import RecipeError, UnsupportedPhoto
 from brewster.photo import Photo
 from brewster.scene.recipe import read_scene_recipe
@@ -91,7 +91,7 @@ def test_datasets_have_a_path_in_the_data_folder_or_an_absolute_path(recipe, roo
 
 def test_online_samples_of_builtin_environments_need_no_data_folder(recipe, builtin):
     endless = with_value(recipe, "data.rendered.count", None)
-    plain = OnlineRendered(read_scene_recipe("tiny"), BUILTIN_CATALOG, builtin, seed=recipe.seed)
+    plain = OnlineRendered(read_scene_recipe("tiny"), builtin_catalog(), builtin, seed=recipe.seed)
     assert same(open_stream(endless)(1, 2, 32), plain(1, 2, 32))
 
 

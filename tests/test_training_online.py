@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from brewster.environments.assets import Assets
-from brewster.environments.catalog import BUILTIN_CATALOG
+from brewster.environments.catalog import builtin_catalog
 from brewster.photo import Photo
 from brewster.render.camera_response import encode_jpeg
 from brewster.scene.recipe import read_scene_recipe
@@ -17,7 +17,7 @@ def assets():
 
 
 def stream(assets, **options):
-    catalog = BUILTIN_CATALOG.model_copy(update={"maps": BUILTIN_CATALOG.maps[:2]})
+    catalog = builtin_catalog().model_copy(update={"maps": builtin_catalog().maps[:2]})
     return OnlineRendered(read_scene_recipe("tiny"), catalog, assets, seed=7, **options)
 
 

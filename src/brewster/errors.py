@@ -5,7 +5,7 @@
     |   |-- UnreadablePhoto    the file does not exist, is not an image, is empty or is truncated
     |   |-- UnsupportedPhoto   an unsupported kind of image (five channels, animation, NaN)
     |   |-- PhotoTooLarge      the image has more pixels than the limit
-    |   `-- MaskError          a mask cannot be read, or does not fit its photo
+    |   `-- MaskError          a mask or hints cannot be read, or do not fit their photo
     |-- ManifestError          a list of photos is not a table of paths
     |-- OutputError            an output file cannot be written, for example because it already exists
     |-- ModelError             a model is unknown, damaged, or has the wrong inputs
@@ -108,7 +108,7 @@ class ManifestError(BrewsterError):
 
 
 class MaskError(PhotoError):
-    """A mask cannot be read, is not grey, or does not have the size of its photo."""
+    """A mask or hints cannot be read, have unexpected colours, or do not have the size of their photo."""
 
 
 class OutputError(BrewsterError):

@@ -12,12 +12,13 @@ from __future__ import annotations
 import difflib
 import os
 import re
-import tarfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final, final
 
+from brewster.benchmarks.bursts import find_bursts
+from brewster.benchmarks.image_files import ImageFile, files_of, read_samples
 from brewster.benchmarks.pairing import (
     SIR2_TREES,
     FolderListing,
@@ -32,51 +33,12 @@ from brewster.benchmarks.pairing import (
     read_folders,
     read_tree,
 )
-from brewster.errors import MissingExtra, PhotoError, UnreadablePhoto
+from brewster.errors import PhotoError
 from brewster.photo import read_size
 
 _RENDERED_FILES: Final = ("photo.jpg", "background.jpg", "reflection.jpg")
 _MAX_SCENES: Final = 20
 """Postcard and SolidObject have 20 scenes each. If a pattern finds more scenes, the names do not identify the scenes."""
-
-
-@final
-@dataclass(frozen=True)
-class ImageFile:
-    """The location of an encoded image: a whole file, or a part of a tar shard.
-
-    `span` is the (offset, length) of the part in bytes, or None for a whole file.
-    """
-
-    path: Path
-    span: tuple[int, int] | None = None
-
-    def read(self) -> bytes:
-        """Returns the encoded bytes of the image.
-
-        Raises:
-            UnreadablePhoto: the file is missing, cannot be read, or ends before the end of the span.
-        """
-        try:
-            return self._read()
-        except OSError as error:
-            raise UnreadablePhoto(
-                f"{self} cannot be read ({error.strerror or error})",
-                "expected a complete image file",
-                "restore the file or its permissions, and run again",
-            ) from error
-
-    def __str__(self) -> str:
-        return f"{self.path}" if self.span is None else f"{self.path} from byte {self.span[0]}"
-
-    def _read(self) -> bytes:
-        offset, length = self.span or (0, -1)
-        with self.path.open("rb") as file:
-            file.seek(offset)
-            data = file.read(length)
-        if len(data) < length:
-            raise OSError(f"the file has only {len(data)} of {length} bytes")
-        return data
 
 
 @final
@@ -89,7 +51,8 @@ class Case:
     `relative_path` is the photo's path relative to the benchmark folder, without the suffix and with forward slashes.
     `ground_truth` is the ground truth of the transmission, and `reflection` is the ground truth of the reflection. If
     `rendered` is True, both are exact: `ground_truth` is the background without the glass, and `reflection` is the light
-    that the glass adds.
+    that the glass adds. `frames` are the photos of a burst in order, of which `photo` is the middle one; they are empty for a
+    single photo. The ground truth of a burst is that of `photo`.
     """
 
     benchmark: str
@@ -100,6 +63,7 @@ class Case:
     ground_truth: ImageFile
     reflection: ImageFile | None = None
     rendered: bool = False
+    frames: tuple[ImageFile, ...] = ()
 
 
 @final
@@ -197,7 +161,8 @@ def _read_sir2(_: str, folder: Path) -> list[Benchmark]:
 
 def _read_rendered(name: str, folder: Path) -> list[Benchmark]:
     benchmark_name, cases, excluded = _benchmark_name(name, folder), [], []
-    for key, files in _rendered_samples(folder):
+    for sample in read_samples(folder):
+        key, files = sample.name, files_of(sample, _RENDERED_FILES)
         if len(files) < len(_RENDERED_FILES):
             excluded.append(f"{key} is incomplete: expected {', '.join(_RENDERED_FILES)}")
             continue
@@ -208,42 +173,23 @@ def _read_rendered(name: str, folder: Path) -> list[Benchmark]:
     return [_make_benchmark(name, folder, cases, FolderListing(excluded=tuple(excluded)))]
 
 
-def _rendered_samples(folder: Path) -> list[tuple[str, list[ImageFile]]]:
-    """Returns the name and the existing files of each sample of a rendered dataset."""
-    try:
-        from brewster.rendered.store import key, read_dataset  # noqa: PLC0415  (needs torch, an optional dependency)
-
-        entries = list(read_dataset(folder))
-    except ImportError as error:
-        raise MissingExtra.for_extra(
-            "render",
-            "torch is not installed",
-            "expected torch, which brewster needs to read rendered datasets",
-        ) from error
-    except (OSError, tarfile.TarError, ValueError) as error:
-        raise _not_a_rendered_dataset(folder, str(error)) from error
-    if not entries:
-        raise _not_a_rendered_dataset(folder, "it has no samples")
-    return [
-        (
-            key(entry.index),
-            [ImageFile(entry.path, entry.spans[name]) for name in _RENDERED_FILES if name in entry.spans],
+def _read_bursts(name: str, folder: Path) -> list[Benchmark]:
+    bursts, listing = find_bursts(folder)
+    benchmark_name = _benchmark_name(name, folder)
+    cases = [
+        Case(
+            benchmark_name,
+            burst.name,
+            burst.name,
+            burst.relative_path,
+            burst.frames[len(burst.frames) // 2],
+            burst.transmission,
+            burst.reflection,
+            frames=burst.frames,
         )
-        if entry.spans
-        else (
-            key(entry.index),
-            [ImageFile(entry.path / name) for name in _RENDERED_FILES if (entry.path / name).exists()],
-        )
-        for entry in entries
+        for burst in bursts
     ]
-
-
-def _not_a_rendered_dataset(folder: Path, reason: str) -> PhotoError:
-    return PhotoError(
-        f"{folder} is not a rendered dataset ({reason})",
-        "expected the folders 000000, 000001 ... or files such as shard-000000.tar",
-        "give the path of an output folder of `brewster render`",
-    )
+    return [_make_benchmark(name, folder, cases, listing)]
 
 
 # --- from groups of files to cases
@@ -349,6 +295,7 @@ def folder_name(folder: Path) -> str:
 def _unusable_reason(case: Case) -> str:
     """Compares the sizes in the file headers. Returns the reason why the case cannot be scored, or "" for a valid case."""
     files = {"photo": case.photo, "ground truth": case.ground_truth, "reflection": case.reflection}
+    files |= {f"frame {number}": file for number, file in enumerate(case.frames, 1)}
     sizes: dict[str, tuple[int, int]] = {}
     for role, file in files.items():
         try:
@@ -382,5 +329,6 @@ BENCHMARKS: Final[dict[str, BenchmarkLayout]] = {
     "openrr": BenchmarkLayout("OpenRR", (), _read_split),
     "pairs": BenchmarkLayout("", (), _read_sets),
     "rendered": BenchmarkLayout("", (), _read_rendered),
+    "bursts": BenchmarkLayout("", (), _read_bursts),
 }
 """The layouts of the benchmarks that `read_benchmark` supports, by name. docs/evaluation.md describes the folders."""

@@ -267,7 +267,8 @@ def optimise(
 
 def _data_loss(model: JointModel, frames: Tensor, chunk: slice) -> Tensor:
     """Returns the part of the data term that comes from some of the frames, (C,)."""
-    rendered, gains = model.render(*frames.shape[-2:], frames=chunk)
+    height, width = frames.shape[-2:]
+    rendered, gains = model.render(height, width, chunk)
     errors = data_errors(rendered.sum(0) * gains, frames[chunk])
     return charbonnier(errors).sum((1, 2, 3, 4)) / frames.numel()
 

@@ -27,7 +27,7 @@ from brewster.inference.guided_upsampling import GeneratedOverride
 from brewster.inference.predictor import Prediction, Predictor, ProgressCallback
 from brewster.inference.separation import Separation
 from brewster.inference.separator import Separator
-from brewster.options import Options, Quality, document_options
+from brewster.options import Options, Quality
 from brewster.photo import Photo, Source
 from brewster.worker_setup import single_torch_thread
 
@@ -44,7 +44,6 @@ _DETAIL_LIMITS: Final = (0.5, 2.0)
 """The detail of the reference photo changes the sum of the layers by no more than these factors."""
 
 
-@document_options
 def separate_burst(
     photos: Sequence[Source],
     *,
@@ -53,6 +52,7 @@ def separate_burst(
     strength: float = Options.strength,
     quality: Quality = Options.quality,
     mask: Source | None = Options.mask,
+    hints: Source | None = Options.hints,
     additive: bool = Options.additive,
     max_pixels: int = Options.max_pixels,
     on_progress: ProgressCallback = lambda _fraction: None,
@@ -64,6 +64,7 @@ def separate_burst(
         reference: the index of the photo to separate, by default the middle one.
         separator: separates the single photo. Its result is the start, and the result if the motion is not enough. By default, the
             compact model.
+        strength, quality, mask, hints, additive, max_pixels: see the call of a `Separator`. The hints are for the single photo.
         on_progress: called with the completed fraction, 0 to 1. An exception raised in it stops the work.
 
     Returns:
@@ -80,7 +81,7 @@ def separate_burst(
     seconds = {"frames": time.perf_counter() - started}
     separator = separator or Separator.load()
     started = time.perf_counter()
-    upsampler, _, single = separator.fit(photo, quality=quality)
+    upsampler, _, single = separator.fit(photo, quality=quality, hints=hints)
     prior = _applied(upsampler.apply, frames[reference])
     with single_torch_thread(), _single_opencv_thread():
         motions = frame_motions(frames, reference, prior)

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Final, final
 
 import click
 
-from brewster.cli.terminal import write_out
+from brewster.cli.terminal import print_status, write_out
 from brewster.errors import counted
 from brewster.files import LAYER_FORMATS
 from brewster.image_formats import WRITABLE, ImageFormat, format_of, is_video
@@ -21,6 +21,7 @@ from brewster.remote_path import Location, location, path_of_file_url
 
 if TYPE_CHECKING:
     from brewster.batch import SeparationTask
+    from brewster.models.diffusion_resources import GraphicsCard
 
 
 _MAX_NAMES: Final = 10
@@ -183,6 +184,20 @@ def _is_image_file(output: str | None) -> bool:
         and format_of(Path(output)) is not None
         and not Path(output).is_dir()
     )
+
+
+def gpu_for_plan(name: str | None) -> GraphicsCard:
+    """Returns the GPU of this name, or that of this machine, or else that of the paper, with a message.
+
+    Raises:
+        DeviceError: the name is unknown.
+    """
+    from brewster.models.diffusion_resources import PAPER_GPU, find_gpu, local_gpu  # noqa: PLC0415
+
+    gpu = find_gpu(name) if name else local_gpu()
+    if gpu is None:
+        print_status(f"no GPU found: the estimate is for the {PAPER_GPU.name}; choose another GPU with --gpu")
+    return gpu or PAPER_GPU
 
 
 @final

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, cast
 import click
 from click.core import ParameterSource
 
-from brewster.cli.batch import BatchCommand
+from brewster.cli.batch import BatchReport
 from brewster.cli.batch_plan import check_output, is_single_output, local_path, plan
 from brewster.cli.extras import require_extra
 from brewster.cli.separate import with_options
@@ -85,10 +85,18 @@ def burst(
     tasks = _plan(
         photos, output, options, reference=None if reference is None else reference - 1, frames=frames
     )
-    command = BatchCommand(
-        options, output=output, overwrite=overwrite, dry_run=dry_run, as_json=as_json, quiet=quiet
+    report = BatchReport(
+        options,
+        output,
+        len(tasks),
+        dry_run=dry_run,
+        as_json=as_json,
+        quiet=quiet,
+        is_parallel=False,
+        contact_sheet=None,
+        overwrite=overwrite,
     )
-    context.exit(0 if command.run(tasks) else 1)
+    context.exit(report.run(tasks))
 
 
 def _plan(

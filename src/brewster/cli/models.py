@@ -14,7 +14,9 @@ from brewster.cli.terminal import print_error, print_out, print_status
 from brewster.errors import BrewsterError, ModelError
 from brewster.files import write_atomically
 from brewster.models import zoo
-from brewster.models.diffusion_models import DIFFUSION_MODELS
+from brewster.models.diffusion_models import DIFFUSION_MODELS, DiffusionModel
+from brewster.models.diffusion_resources import PAPER_GPU
+from brewster.options import Options
 
 if TYPE_CHECKING:
     from brewster.models.diffusion.panels import Panel
@@ -22,6 +24,8 @@ if TYPE_CHECKING:
 _JSON = click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 _NAME = click.argument("name", default="compact")
 _CARD_FILE = "README.md"
+_PHOTO_SIZE = (4000, 3000)
+"""The (width, height) of the photo for which `brewster models list` estimates memory."""
 _CHECKPOINT_SUFFIXES = (".pt", ".pth", ".ckpt")
 
 
@@ -37,27 +41,50 @@ def list_models(*, as_json: bool) -> None:
 
     An entry has the name, the size of the file or download, and the licence. A diffusion model has two more lines: the layers
     that it predicts, its GPU memory (with the format of the weights, and with the weights offloaded to host memory), the
-    download of its text encoder, and how to get it.
-    Sizes and memory of diffusion models are estimates.
+    download of its text encoder, and how to get it. Sizes and memory of diffusion models are estimates for a photo of 12
+    megapixels on an RTX 4090; --plan estimates them for another photo or GPU.
     """
     rows = [describe(model) for model in zoo.MODELS.values()]
     if as_json:
-        print_out(json.dumps([*rows, *map(asdict, DIFFUSION_MODELS.values())]))
+        print_out(
+            json.dumps([*rows, *(asdict(model) | _resources(model) for model in DIFFUSION_MODELS.values())])
+        )
         return
     for row in rows:
         size = f"{row['bytes'] / 1e6:.1f} MB" if row["error"] is None else "damaged"
         print_out(f"{row['name']:20} {size:>10}  {row['licence']}")
     for model in DIFFUSION_MODELS.values():
+        needs = _resources(model)
         encoder = (
-            f"; text encoder: {model.text_encoder_gb:g} GB more to download" if model.text_encoder_gb else ""
+            f"; text encoder: {needs['text_encoder_gb']} GB more to download"
+            if needs["text_encoder_gb"]
+            else ""
         )
         use = "" if model.allows_commercial_use else " (not for commercial use)"
-        print_out(f"{model.name:20} {model.download_gb:>7g} GB  {model.licence}{use}")
+        print_out(f"{model.name:20} {needs['download_gb']:>7g} GB  {model.licence}{use}")
         print_out(
-            f"{'':33}{model.output}; {model.memory_gib:g} GiB GPU memory ({model.weight_format}), "
-            f"{model.offloaded_memory_gib:g} GiB offloaded{encoder}"
+            f"{'':33}{model.output}; {needs['memory_gib']:g} GiB GPU memory ({needs['weight_format']}), "
+            f"{needs['offloaded_memory_gib']:g} GiB offloaded{encoder}"
         )
         print_out(f"{'':33}{model.access}; huggingface.co/{model.hub_id}")
+
+
+def _resources(model: DiffusionModel) -> dict[str, Any]:
+    """Returns the memory and the download of a diffusion model by its plan."""
+    from brewster.inference.separation_plan import plan_separation  # noqa: PLC0415  (imports ONNX Runtime)
+
+    plan, offloaded = (
+        plan_separation(Options(model=model.name, offload=offload), _PHOTO_SIZE, PAPER_GPU)
+        for offload in ("auto", "layers")
+    )
+    encoder = 2e-9 * plan.cost.text_encoder_parameters if plan.text_encoder_gib else 0
+    return {
+        "download_gb": round(2e-9 * (plan.cost.parameters + plan.cost.vae_parameters), 1),
+        "text_encoder_gb": round(encoder, 1),
+        "memory_gib": round(plan.total_gib, 1),
+        "weight_format": plan.placement.quantization or "bf16",
+        "offloaded_memory_gib": round(offloaded.total_gib, 1),
+    }
 
 
 @models.command("import")

@@ -28,7 +28,7 @@ from brewster.cli.terminal import (
 if TYPE_CHECKING:
     from brewster.executors import Executor
     from brewster.rendered.generation.job import RenderJob, RenderResult
-    from brewster.scene.recipe import SceneRecipe
+    from brewster.scene.recipe import BurstRecipe, SceneRecipe
 
 _MITSUBA_PACKAGES: Final = frozenset({"mitsuba", "mitsuba-oidn"})
 _SCENE_OPTIONS: Final = {"out", "output", "scene", "renderer", "maps", "photos", "quiet"}
@@ -78,7 +78,7 @@ class _Size(click.ParamType[tuple[int, int]]):
     default="window",
     show_default=True,
     metavar="NAME|FILE",
-    help="The distribution of scenes: window, shopfront, vitrine, office, tiny, or a TOML file.",
+    help="The distribution of scenes: window, shopfront, vitrine, office, burst, tiny, or a TOML file.",
 )
 @click.option(
     "--show-recipe",
@@ -102,6 +102,18 @@ class _Size(click.ParamType[tuple[int, int]]):
     "--size",
     type=_Size(),
     help="The size of the images in pixels, such as 512x384; by default, the size in the recipe.",
+)
+@click.option(
+    "--burst",
+    type=click.IntRange(2, 99),
+    metavar="N",
+    help="Render N photos of each scene, by a camera that moves sideways; --count and --first then count bursts. By default, the number in the recipe.",
+)
+@click.option(
+    "--baseline-mm",
+    type=click.FloatRange(min=0, max=1e6),
+    metavar="B",
+    help="The distance in mm between the first and the last position of the camera in a burst; by default, a random distance from the recipe.",
 )
 @click.option(
     "--orders",
@@ -166,6 +178,9 @@ def render(
     linear light. scene.toml describes the scene; `brewster render --scene` renders the same files from it.
     index.parquet lists all samples.
 
+    With --burst, or with the recipe burst, each scene has several photos by a moving camera, and each photo is a sample:
+    with five photos, burst 2 has the samples 000010 to 000014. The reference frame is the middle one.
+
     Existing samples are kept. To resume an interrupted run, run the same command again. To add samples, increase
     --count. If a sample fails, the other samples are still rendered, the failed sample is listed, and the exit code is 1.
     """
@@ -194,6 +209,8 @@ class _RenderCommand:
     first: int
     seed: int
     size: tuple[int, int] | None
+    burst: int | None
+    baseline_mm: float | None
     orders: str | None
     renderer: str | None
     maps: tuple[Path, ...]
@@ -220,14 +237,15 @@ class _RenderCommand:
 
         job, printer = self._job(), _RenderPrinter(self.as_json, self.quiet)
         shares_terminal = self.as_json and standard_output.stream.isatty()
-        with progress(self.count, shown=not self.quiet and not shares_terminal) as update_progress:
+        frames = job.recipe.frames
+        with progress(self.count * frames, shown=not self.quiet and not shares_terminal) as update_progress:
 
             def on_result(result: RenderResult) -> None:
                 printer.print_result(result)
                 update_progress(printer.counts.total(), f"sample {result.index}")
                 interrupts.raise_pending()
 
-            indices = range(self.first, self.first + self.count)
+            indices = range(self.first * frames, (self.first + self.count) * frames)
             build(job, indices, self._executor(job), shards=self.shards, report=on_result)
         if self.preview:
             write_preview(self.out)
@@ -246,7 +264,7 @@ class _RenderCommand:
         return RenderJob(self.out.resolve(), recipe, catalog, self.seed, self.renderer or "analytic", folders)
 
     def _recipe(self) -> SceneRecipe:
-        """Reads the recipe, and replaces its size and orders with the options --size and --orders if they are given."""
+        """Reads the recipe, and replaces the values for which options are given."""
         from brewster.scene.recipe import read_scene_recipe  # noqa: PLC0415
 
         recipe = read_scene_recipe(self.recipe)
@@ -254,7 +272,24 @@ class _RenderCommand:
             width, height = self.size
             camera = recipe.camera.model_copy(update={"width": width, "height": height})
             recipe = recipe.model_copy(update={"camera": camera})
-        return recipe.model_copy(update={"orders": self.orders}) if self.orders else recipe
+        if self.orders:
+            recipe = recipe.model_copy(update={"orders": self.orders})
+        return recipe.model_copy(update={"burst": self._burst_recipe(recipe)})
+
+    def _burst_recipe(self, recipe: SceneRecipe) -> BurstRecipe | None:
+        from brewster.scene.recipe import BurstRecipe  # noqa: PLC0415
+
+        if self.burst is None and recipe.burst is None:
+            if self.baseline_mm is not None:
+                raise click.UsageError(
+                    f"--baseline-mm is an option for bursts, but the recipe {recipe.name!r} has single photos:"
+                    " add --burst, or use --recipe burst."
+                )
+            return None
+        changes: dict[str, Any] = {} if self.burst is None else {"frames": self.burst}
+        if self.baseline_mm is not None:
+            changes |= {"baseline_mm": (self.baseline_mm, self.baseline_mm), "still_probability": 0.0}
+        return (recipe.burst or BurstRecipe()).model_copy(update=changes)
 
     def _executor(self, job: RenderJob) -> Executor[RenderResult]:
         from brewster.executors import ProcessExecutor, SerialExecutor  # noqa: PLC0415

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, final
 
 import click
 
+from brewster.cli.batch_plan import gpu_for_plan
 from brewster.cli.extras import require_extra
 from brewster.cli.terminal import interrupts, print_out, print_status, progress, standard_output
 from brewster.errors import OutputError, RecipeError
@@ -165,7 +166,6 @@ def _show_recipe(name: str) -> None:
 
 
 def _print_plan(recipe: CompactRecipe | LoraRecipe, gpu_name: str | None) -> None:
-    from brewster.models.diffusion.cost import find_gpu, is_local_gpu  # noqa: PLC0415
     from brewster.training.lora.resource_estimate import estimate_resources  # noqa: PLC0415
     from brewster.training.recipe import LoraRecipe  # noqa: PLC0415
 
@@ -175,12 +175,7 @@ def _print_plan(recipe: CompactRecipe | LoraRecipe, gpu_name: str | None) -> Non
             "expected a recipe with the key backbone for --plan",
             "train it without --plan",
         )
-    gpu = find_gpu(gpu_name)
-    if gpu_name is None and not is_local_gpu(gpu):
-        print_status(
-            f"no GPU found: the estimate is for the {gpu.name} of the paper; choose another GPU with --gpu"
-        )
-    estimate = estimate_resources(recipe, gpu)
+    estimate = estimate_resources(recipe, gpu_for_plan(gpu_name))
     print_out(estimate.table())
     estimate.check_fits()
     _print_data(recipe)

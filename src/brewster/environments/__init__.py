@@ -1,1 +1,1 @@
-"""Environment maps and pictures of scenes, which are read from files or procedurally generated."""
+"""Environment maps and pictures of scenes, which are files of the user or part of brewster."""

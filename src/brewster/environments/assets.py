@@ -1,40 +1,44 @@
-"""Loads the environment maps and pictures of scenes: files by name and sha256, and built-in sources.
+"""Loads the environment maps and pictures of scenes: files by name and sha256.
 
 assets = Assets([Path("hdri"), Path("photos")])
-assets.map_radiance(EnvironmentMap(source=AssetSource(file="builtin:street:7")))  # (H, 2 H, 3) float32
+assets.map_radiance(EnvironmentMap(source=AssetSource(file="spree_bank.exr")))  # (H, 2 H, 3) float32
 """
 
 from __future__ import annotations
 
 import hashlib
 from collections import OrderedDict
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from brewster.environments.procedural.paintings import painting
-from brewster.environments.procedural.registry import ENVIRONMENTS
 from brewster.errors import BrewsterError, RecipeError, UnsupportedPhoto
 from brewster.photo import Photo
-from brewster.scene.world import BUILTIN, AssetSource, EnvironmentMap, Plane
+from brewster.scene.world import AssetSource, EnvironmentMap, Plane
 from brewster.srgb import REC709_LUMINANCE
 
 Float32 = NDArray[np.float32]
 
-BUILTIN_HEIGHT = 512
+BUILTIN_MAPS = Path(__file__).with_name("maps")
+BUILTIN_PHOTOS = Path(__file__).with_name("photos")
+"""CC0 maps and photos that are part of brewster. The `manifest.csv` of each folder has their origins and licences."""
+
 _MAX_CACHE_BYTES = 300_000_000
 _MAX_CLIPPED_FRACTION = 0.002
 _LUMINANCE = np.array(REC709_LUMINANCE, np.float32)
 
 
 class Assets:
-    """Loads sources from the first folder that contains the exact file. The most recently used sources are cached."""
+    """Loads sources from the first folder that contains the exact file, or else from the built-in maps and photos.
+
+    The most recently used sources are cached.
+    """
 
     def __init__(self, folders: Sequence[Path] = ()) -> None:
-        self._folders = tuple(folders)
+        self._folders = (*folders, BUILTIN_MAPS, BUILTIN_PHOTOS)
         self._cache: OrderedDict[tuple[str, str, str], Float32] = OrderedDict()
 
     def map_radiance(self, environment: EnvironmentMap) -> Float32:
@@ -85,19 +89,12 @@ class Assets:
         return self._cache[key]
 
     def _read_map(self, source: AssetSource) -> Float32:
-        if source.file.startswith(BUILTIN):
-            name, seed = _parse_builtin(source, ENVIRONMENTS)
-            texels = ENVIRONMENTS[name](seed, BUILTIN_HEIGHT)
-        else:
-            texels = check_map(self._open(source).linear(), source.file)
+        texels = check_map(self._open(source).linear(), source.file)
         light: Float32 = np.maximum(texels, np.float32(0))
         light /= _mean_luminance(texels)
         return light
 
     def _read_picture(self, source: AssetSource) -> Float32:
-        if source.file.startswith(BUILTIN):
-            _, seed = _parse_builtin(source, ("painting",))
-            return painting(seed, 768, 512)
         return self._open(source).linear().clip(0, 1)
 
     def _open(self, source: AssetSource) -> Photo:
@@ -116,7 +113,7 @@ class Assets:
                 f"expected the sha256 {source.sha256}",
                 "choose the folder of the original file",
             )
-        searched = ", ".join(map(str, self._folders)) or "no folder"
+        searched = ", ".join(map(str, self._folders))
         raise RecipeError(
             f"{source.file} was not found in {searched}",
             "expected the file that was chosen when the scene was sampled",
@@ -188,15 +185,3 @@ def _mean_luminance(texels: Float32) -> np.float32:
     weights = np.broadcast_to(solid_angle / solid_angle.sum() / luminance.shape[1], luminance.shape)
     limit = 10 * (luminance * weights).sum()
     return np.float32((np.minimum(luminance, limit) * weights).sum())
-
-
-def _parse_builtin(source: AssetSource, known: Iterable[str]) -> tuple[str, int]:
-    parts = source.file.split(":")
-    name, seed = parts[1:] if len(parts) == 3 else ("", "")
-    if name not in known or not seed.isdecimal():
-        raise RecipeError(
-            f"{source.file!r} is not built in",
-            f"expected builtin:NAME:SEED with one of the names {', '.join(known)}",
-            "correct the source in the scene",
-        )
-    return name, int(seed)

@@ -1,41 +1,32 @@
-"""Catalogs of environment maps and pictures for random scenes: from folders of files, or built in."""
+"""Catalogs of environment maps and pictures for random scenes: from folders of files; by default, those of brewster."""
 
 from __future__ import annotations
 
 import csv
+import functools
 import hashlib
 from collections.abc import Iterator, Sequence
 from fnmatch import fnmatch
 from pathlib import Path
 
-from brewster.environments.assets import BUILTIN_HEIGHT, add_file_name_to_errors, check_map, read_bytes
+from brewster.environments.assets import (
+    BUILTIN_MAPS,
+    BUILTIN_PHOTOS,
+    add_file_name_to_errors,
+    check_map,
+    read_bytes,
+)
 from brewster.errors import BrewsterError, RecipeError
 from brewster.image_formats import format_of
 from brewster.photo import Photo, read_size
 from brewster.scene.sampler import Asset, Catalog
-from brewster.scene.world import BUILTIN, AssetSource
+from brewster.scene.world import AssetSource
 
-_ENVIRONMENT_COUNT = 8
-_PAINTING_COUNT = 64
-_CATEGORIES = {"street": "outdoor", "room": "indoor", "night": "night"}
 
-BUILTIN_CATALOG = Catalog(
-    maps=tuple(
-        Asset(
-            source=AssetSource(file=f"{BUILTIN}{name}:{seed}"),
-            width=2 * BUILTIN_HEIGHT,
-            height=BUILTIN_HEIGHT,
-            category=category,
-        )
-        for name, category in _CATEGORIES.items()
-        for seed in range(_ENVIRONMENT_COUNT)
-    ),
-    pictures=tuple(
-        Asset(source=AssetSource(file=f"{BUILTIN}painting:{seed}"), width=768, height=512)
-        for seed in range(_PAINTING_COUNT)
-    ),
-)
-"""Maps and pictures that are computed: streets, rooms, streets at night, and paintings."""
+@functools.cache
+def builtin_catalog() -> Catalog:
+    """Returns the maps and photos that are part of brewster."""
+    return read_catalog([], [])[0]
 
 
 def read_catalog(
@@ -54,11 +45,11 @@ def read_catalog(
         RecipeError: a folder or its manifest cannot be read, or none of the files can be used.
     """
     refused: list[BrewsterError] = []
-    found_maps = _read_folders(maps, exclude, refused, are_maps=True) if maps else BUILTIN_CATALOG.maps
-    found_pictures = (
-        _read_folders(pictures, exclude, refused, are_maps=False) if pictures else BUILTIN_CATALOG.pictures
+    catalog = Catalog(
+        maps=_read_folders(maps or [BUILTIN_MAPS], exclude, refused, are_maps=True),
+        pictures=_read_folders(pictures or [BUILTIN_PHOTOS], exclude, refused, are_maps=False),
     )
-    return Catalog(maps=found_maps, pictures=found_pictures), refused
+    return catalog, refused
 
 
 def _read_folders(

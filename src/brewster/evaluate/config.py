@@ -6,14 +6,14 @@ from dataclasses import dataclass, replace
 from typing import Final, final
 
 from brewster.benchmarks.selection import PAPER_SEED
+from brewster.bootstrap import RESAMPLES
 from brewster.errors import BrewsterError
-from brewster.evaluate.statistics import RESAMPLES
 from brewster.metrics import DEFAULT_THRESHOLD, IDENTICAL_DB, METRICS, Metric, find_metric
 from brewster.options import Quality
 
-_ON_REQUEST: Final = ("ssim_gaussian", "ssim_clipped", "psnr_channels", "dists", "niqe")
+_ON_REQUEST: Final = ("ssim_gaussian", "ssim_clipped", "psnr_channels", "niqe")
 DEFAULT_METRICS: Final = tuple(name for name in METRICS if name not in _ON_REQUEST)
-"""All metrics except other definitions of PSNR and SSIM, and those of single contests (DISTS needs a download of 528 MiB)."""
+"""All metrics except other definitions of PSNR and SSIM, and those of single contests."""
 
 
 @final

@@ -19,8 +19,9 @@ from tempfile import TemporaryDirectory
 from typing import Final, final
 from urllib.parse import quote
 
+from brewster.benchmarks.image_files import ImageFile
 from brewster.benchmarks.pairing import join_names
-from brewster.benchmarks.registry import Benchmark, Case, ImageFile
+from brewster.benchmarks.registry import Benchmark, Case
 from brewster.errors import BrewsterError, PhotoError
 from brewster.evaluate.config import EvaluationConfig
 from brewster.evaluate.methods import (

@@ -10,8 +10,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
+from brewster.benchmarks.image_files import ImageFile
 from brewster.benchmarks.pairing import find_numbered_splits, image_files
-from brewster.benchmarks.registry import Case, ImageFile
+from brewster.benchmarks.registry import Case
 from brewster.errors import BrewsterError, PhotoError
 from brewster.evaluate.methods import Method
 from brewster.files import write_atomically

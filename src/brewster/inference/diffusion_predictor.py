@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from threading import Lock
-from typing import Final, final
+from typing import final
 
 import numpy as np
 import torch
@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from torch.nn import functional
 
 from brewster.errors import ModelError
+from brewster.inference.diffusion_work import DiffusionWork
 from brewster.inference.guided_upsampling import Floats, GeneratedOverride
 from brewster.inference.predictor import Prediction, Predictor, ProgressCallback, confidence_from_spread
 from brewster.inference.tiles import run_tiled, tile_slices
@@ -27,10 +28,6 @@ from brewster.models.diffusion.pipeline import DecompositionPipeline
 from brewster.options import Quality
 from brewster.srgb import to_encoded, to_linear
 
-_DRAFT_STEPS: Final = 4
-_SQUARE_TILE_OVERLAP_DIVISOR: Final = 12
-"""Square tiles overlap by at least their side divided by this: 64 of 768 pixels, as in WindowSeat."""
-
 
 @final
 class DiffusionPredictor(Predictor):
@@ -38,12 +35,12 @@ class DiffusionPredictor(Predictor):
 
     Args:
         pipeline: the model.
-        steps: the number of sampling steps; by default those of the task (20 as in the paper), and at most 4 for "draft".
+        steps: see `DiffusionWork`.
         ensemble_size: the number of samples with different seeds whose mean is the prediction; the mean has less invented detail.
         no_guided_upsampling: whether the transmission is the generated panel, upsampled, without the detail of the photo.
 
     Raises:
-        ModelError: `steps` or `ensemble_size` is below 1, or one of them is set for a one-step model.
+        ModelError: see `DiffusionWork`.
     """
 
     def __init__(
@@ -54,20 +51,9 @@ class DiffusionPredictor(Predictor):
         ensemble_size: int = 1,
         no_guided_upsampling: bool = False,
     ) -> None:
-        if (steps is not None and steps < 1) or ensemble_size < 1:
-            raise ModelError(
-                f"steps = {steps}, ensemble_size = {ensemble_size}",
-                "expected both to be at least 1",
-                "set them to 1 or more",
-            )
-        if pipeline.task.objective != "flow" and (steps not in (None, 1) or ensemble_size > 1):
-            raise ModelError(
-                f"steps = {steps}, ensemble_size = {ensemble_size} were set for a one-step model",
-                "expected neither, because it takes one step and is deterministic",
-                "leave them out",
-            )
+        self._work = DiffusionWork(pipeline.task, pipeline.backbone.size_divisor, steps, ensemble_size)
         self._pipeline, self._no_guided_upsampling = pipeline, no_guided_upsampling
-        self._steps, self._seeds = steps, range(ensemble_size)
+        self._seeds = range(ensemble_size)
         self._lock = Lock()
 
     def input_sizes(
@@ -80,7 +66,7 @@ class DiffusionPredictor(Predictor):
         Raises:
             PhotoError: a side of the photo has fewer than 16 pixels, or its aspect ratio is too large.
         """
-        return [self._pipeline.task.input_size(size, self._pipeline.backbone.size_divisor)]
+        return [self._work.input_size(size)]
 
     def __call__(
         self, inputs: Sequence[Floats], quality: Quality, on_progress: ProgressCallback
@@ -88,7 +74,7 @@ class DiffusionPredictor(Predictor):
         """Returns the prediction for the only input."""
         (scaled_input,) = inputs
         height, width, _ = scaled_input.shape
-        tiling, steps = self._tiling((height, width)), self.sampling_steps(quality)
+        tiling, steps = self._work.tiling((height, width)), self._work.sampling_steps(quality)
         progress = _ProgressCounter(on_progress, len(tile_slices((height, width), **tiling)))
         with self._lock:  # two predictions at the same time would need twice the GPU memory
             change, reflection, generated_transmission, spread, reconstruction_error = run_tiled(
@@ -113,32 +99,6 @@ class DiffusionPredictor(Predictor):
             reflection_is_derived="R" not in self._pipeline.task.layout.panels,
         )
 
-    def sampling_steps(self, quality: Quality) -> int:
-        """Returns the number of sampling steps of each prediction."""
-        task = self._pipeline.task
-        if task.objective != "flow":
-            return 1
-        return self._steps or (min(_DRAFT_STEPS, task.steps) if quality == "draft" else task.steps)
-
-    def panel_sizes(self, size: tuple[int, int]) -> list[tuple[int, int]]:
-        """Returns the (width, height) of the panels for a photo of this (width, height), one for each tile.
-
-        Raises:
-            PhotoError: see `input_sizes`.
-        """
-        size_divisor = self._pipeline.backbone.size_divisor
-        width, height = self._pipeline.task.input_size(size, size_divisor)
-        sizes = []
-        for rows, columns in tile_slices((height, width), **self._tiling((height, width))):
-            tile = (columns.stop - columns.start, rows.stop - rows.start)
-            sizes.append(_round_up(self._enlarged(tile), size_divisor))
-        return sizes
-
-    def _enlarged(self, size: tuple[int, int]) -> tuple[int, int]:
-        """The (width, height) of a tile that the model gets: at least the short side of the task."""
-        scale = max(1.0, (self._pipeline.task.short_side_px or 0) / min(size))
-        return round(scale * size[0]), round(scale * size[1])
-
     @property
     def _reconstructs_input(self) -> bool:
         return bool({"I", "R"} & set(self._pipeline.task.layout.panels))
@@ -148,11 +108,6 @@ class DiffusionPredictor(Predictor):
         """Whether a confidence can be computed, from the reconstruction error or from the spread of several samples."""
         return self._reconstructs_input or (len(self._seeds) > 1 and self._pipeline.task.objective == "flow")
 
-    def _tiling(self, size: tuple[int, int]) -> dict[str, int]:
-        """The side and the overlap of the tiles for an input of this (height, width): one tile, or squares of its short side."""
-        side = min(size) if self._pipeline.task.square_tiles else max(size)
-        return {"tile_px": side, "overlap_px": side // _SQUARE_TILE_OVERLAP_DIVISOR}
-
     def _predict_tile(self, tile: Floats, steps: int, progress: _ProgressCounter) -> tuple[Floats, ...]:
         """Returns five maps (h, w, 3) for a tile (h, w, 3).
 
@@ -160,14 +115,12 @@ class DiffusionPredictor(Predictor):
         of the transmission over the samples, and the reconstruction error.
         """
         height, width, _ = tile.shape
-        enlarged_size = self._enlarged((width, height))
+        enlarged_size = self._work.enlarged((width, height))
         if enlarged_size != (width, height):
             enlarged = np.clip(_resize(tile, enlarged_size[::-1], "bicubic"), 0, 1)
             maps = self._predict_tile(enlarged, steps, progress)
             return tuple(_resize(map_, (height, width), "bilinear") for map_ in maps)
-        panel_fit = PanelFit(
-            (width, height), _round_up((width, height), self._pipeline.backbone.size_divisor)
-        )
+        panel_fit = PanelFit((width, height), self._work.panel_size((width, height)))
         panel_input = torch.from_numpy(2 * to_encoded(tile) - 1).permute(2, 0, 1)[None]
         panels = self._pipeline(
             panel_fit.pad(panel_input), steps=steps, seeds=self._seeds, on_progress=progress.within_tile
@@ -232,8 +185,3 @@ def _resize(image: Floats, size: tuple[int, ...], mode: str) -> Floats:
     resized = functional.interpolate(tensor, size, mode=mode, antialias=True, align_corners=False)
     result: Floats = resized[0].permute(1, 2, 0).numpy()
     return result
-
-
-def _round_up(size: tuple[int, int], size_divisor: int) -> tuple[int, int]:
-    width, height = (-(-side // size_divisor) * size_divisor for side in size)
-    return width, height

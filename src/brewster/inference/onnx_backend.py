@@ -10,7 +10,7 @@ import numpy as np
 import onnxruntime as ort
 
 from brewster.errors import DeviceError, ModelError
-from brewster.inference.tiles import Image
+from brewster.inference.tiles import Hints, Image
 
 _STRIDE_PX: Final = 32
 """The sides of the input of a network are multiples of this number. Tiles are padded by mirroring their edges."""
@@ -36,7 +36,7 @@ def available_devices() -> list[str]:
 class OnnxBackend:
     """A `Backend` from an ONNX file with the input `photo` (1, 3, H, W) and the outputs `transmission` and `reflection`.
 
-    Thread-safe.
+    `takes_hints` tells whether it has a second input `hints` (1, 2, H, W), see `brewster.photo.Hints`. Thread-safe.
 
     Args:
         model: the path of the .onnx file.
@@ -61,17 +61,21 @@ class OnnxBackend:
             "install them, or use --device auto or cpu",
         )
 
-    def __call__(self, tile: Image) -> tuple[Image, Image]:
+    def __call__(self, tile: Image, hints: Hints | None = None) -> tuple[Image, Image]:
         """Returns the transmission and the reflection of a tile. All three arrays are (H, W, 3), of any size, in linear light,
-        about 0..1.
+        about 0..1. `hints` are (H, W, 2) in 0..1, for models that take hints.
 
         Raises:
             ModelError: the model fails on this tile.
         """
         height, width, _ = tile.shape
         margins = [(0, -side % _STRIDE_PX) for side in (height, width)]
-        padded = np.pad(tile, [*margins, (0, 0)], mode="symmetric")
-        feed = {"photo": np.ascontiguousarray(padded.transpose(2, 0, 1)[None], dtype=np.float32)}
+        feed = {"photo": tile}
+        if self.takes_hints:
+            feed["hints"] = np.zeros((height, width, 2), np.float32) if hints is None else hints
+        for name, image in feed.items():
+            padded = np.pad(image, [*margins, (0, 0)], mode="symmetric")
+            feed[name] = np.ascontiguousarray(padded.transpose(2, 0, 1)[None], dtype=np.float32)
         try:
             outputs = self._session.run(["transmission", "reflection"], feed)
         except Exception as error:
@@ -93,10 +97,15 @@ class OnnxBackend:
     def _check_names(self, model: Path) -> None:
         inputs = [value.name for value in self._session.get_inputs()]
         outputs = {value.name for value in self._session.get_outputs()}
-        if inputs != ["photo"] or not outputs >= {"transmission", "reflection"}:
+        self.takes_hints = inputs == ["photo", "hints"]
+        if (
+            inputs[:1] != ["photo"]
+            or len(inputs) > 1 + self.takes_hints
+            or not outputs >= {"transmission", "reflection"}
+        ):
             raise ModelError(
                 f"{model} has the inputs {inputs} and the outputs {sorted(outputs)}",
-                "expected a model with the input photo and the outputs transmission and reflection",
+                "expected a model with the input photo, perhaps a second input hints, and the outputs transmission and reflection",
                 "export it with brewster train",
             )
 

@@ -4,54 +4,39 @@ plan = plan_separation(Options(model="windowseat"), (4000, 3000), CARDS["RTX 409
 print(plan.table())
 plan.check_fits()
 
-The plan needs no GPU and downloads nothing. It counts on the backbone on the device "meta", with the tiles that
-`DiffusionPredictor` would use.
+The plan of a model in `brewster models list` needs neither torch nor a download. That of another model reads its files.
 """
 
 from __future__ import annotations
 
+import importlib.util
 from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, final
 
-import torch
-
 from brewster.errors import ModelError
-from brewster.inference.diffusion_predictor import DiffusionPredictor
-from brewster.models.diffusion.backbones.registry import (
-    build_on_meta,
-    find_description,
-    hub_id_of,
-    is_registered,
-)
-from brewster.models.diffusion.cost import (
+from brewster.inference.diffusion_work import DiffusionWork
+from brewster.models.diffusion.hub_download import is_transformer_cached
+from brewster.models.diffusion.panels import count_tokens
+from brewster.models.diffusion.task import DecompositionTask, named_task
+from brewster.models.diffusion_models import DIFFUSION_MODELS, DiffusionModel, licence_of
+from brewster.models.diffusion_resources import (
+    BACKBONE_COSTS,
+    DECODING_BYTES_PER_PIXEL,
     EFFICIENCY,
-    PROMPT_TOKENS,
+    GIB,
+    BackboneCost,
     GraphicsCard,
-    block_bytes,
+    Placement,
     check_gpu_memory,
     cost_table,
-    count_parameters,
-    forward_tflop,
-)
-from brewster.models.diffusion.hub_download import is_transformer_cached
-from brewster.models.diffusion.memory import (
-    GIB,
-    OFFLOADED_WEIGHTS_GIB,
-    Placement,
-    count_weights,
+    has_bitsandbytes,
     place_on_gpu,
     weights_gib,
 )
-from brewster.models.diffusion.model_source import find_model_source
-from brewster.models.diffusion.offloading import DECODING_BYTES_PER_PIXEL
-from brewster.models.diffusion.panels import count_tokens
-from brewster.models.diffusion.pipeline import DecompositionPipeline, task_with_options
-from brewster.models.diffusion.task import DecompositionTask
-from brewster.models.diffusion_models import licence_of
 from brewster.models.zoo import TINY_PREFIX, check_diffusion_model
-from brewster.options import Options
+from brewster.options import Options, Quantization
 
 _CONTEXT_GIB: Final = 0.6
 """GPU memory of the CUDA context."""
@@ -64,28 +49,41 @@ _COPY_GB_PER_SECOND: Final = 10.0
 class SeparationPlan:
     """The estimated resources of the separation of one photo on a graphics card.
 
-    `panels` are the (width, height) of the panels of each tile, in px. `passes` is the number of passes of the transformer, and `tflop` that of
-    their operations. `memory_gib` contains the GPU memory of each part. `text_encoder_gib` is the host memory in which the
-    text encoders are loaded; 0 if the prompt is part of the model.
+    `weights` is the number of bf16 weights of the transformer, or of its file. `panels` are the (width, height) of the panels of
+    each tile, in px. `passes` is the number of passes of the transformer, and `tflop` that of their operations.
+    `text_encoder_gib` is the host memory in which the text encoders are loaded; 0 if the prompt is part of the model.
     """
 
     model: str
     licence: str
     card: GraphicsCard
-    parameter_count: int
+    cost: BackboneCost
+    weights: int
     placement: Placement
+    placement_with_nf4: Placement
     panels: tuple[tuple[int, int], ...]
     passes: int
     tflop: float
-    memory_gib: dict[str, float]
+    activation_gib: float
     download_gb: float
     text_encoder_gb: float
     text_encoder_gib: float
+    is_single_file: bool = False
+
+    @property
+    def memory_gib(self) -> dict[str, float]:
+        """The GPU memory of each part in GiB."""
+        return {
+            "weights": self.placement.resident_gib(self.weights),
+            "VAE": 2 * self.cost.vae_parameters / GIB,
+            "activations": self.activation_gib,
+            "CUDA": _CONTEXT_GIB,
+        }
 
     @property
     def host_gib(self) -> float:
         """The peak host memory in GiB. The text encoders are released before the transformer is loaded."""
-        return max(self.placement.host_gib(self.parameter_count), self.text_encoder_gib)
+        return max(self.placement.host_gib(self.weights), self.text_encoder_gib)
 
     @property
     def total_gib(self) -> float:
@@ -94,8 +92,8 @@ class SeparationPlan:
 
     @property
     def seconds(self) -> float:
-        """The time for the photo, in seconds, without loading. Offloaded weights are copied in each pass."""
-        copies = self.passes * self.placement.host_gib(self.parameter_count) * GIB / 1e9
+        """The time of the predictions for the photo, in seconds. Offloaded weights are copied in each pass."""
+        copies = self.passes * self.placement.host_gib(self.weights) * GIB / 1e9
         return self.tflop / (EFFICIENCY * self.card.tflops) + copies / _COPY_GB_PER_SECOND
 
     def table(self) -> str:
@@ -103,16 +101,23 @@ class SeparationPlan:
         tiles = ", ".join(
             f"{count} of {width} x {height}" for (width, height), count in Counter(self.panels).items()
         )
+        without_nf4 = (
+            f"; {self.placement_with_nf4} after: pip install bitsandbytes"
+            if self.placement_with_nf4 != self.placement
+            else ""
+        )
         is_for_prompt = self.host_gib == self.text_encoder_gib > 0
-        model = {
-            "model": f"{self.model}, {self.parameter_count / 1e9:.2f} billion parameters",
-            "licence": self.licence,
-            "weights": f"{self.placement.quantization or 'bf16'}, {'offloaded by layers' if self.placement.is_offloaded else 'on the GPU'}",
-            "tiles": f"{tiles} pixels a panel; {self.passes} passes of the transformer",
-        }
         return cost_table(
-            model,
-            {"per photo": f"{self.tflop:.0f} TFLOP, {self.seconds:.1f} s (estimate)"},
+            {
+                "model": f"{self.model}, {self.cost.parameters / 1e9:.2f} billion parameters",
+                "licence": self.licence,
+                "weights": f"{self.placement}{without_nf4}",
+                "tiles": f"{tiles} pixels a panel; {self.passes} passes of the transformer",
+            },
+            {
+                "per photo": f"{self.tflop:.0f} TFLOP, {self.seconds:.1f} s (estimate); plus loading the model once, and "
+                "decoding, VAE and guided upsampling of each photo"
+            },
             memory_gib=self.memory_gib,
             card=self.card,
             host_memory=f"{self.host_gib:.1f} GiB {'while the text encoders encode the prompt' if is_for_prompt else 'for the weights'}",
@@ -124,14 +129,42 @@ class SeparationPlan:
         """Checks that the separation fits into the memory of the card.
 
         Raises:
-            DeviceError: it does not fit.
+            DeviceError: it does not fit. The message names the first change with which it fits.
         """
-        cure = "use --offload layers, --quantization int8 or nf4, the model klein, or a larger card"
-        check_gpu_memory(self.model, self.total_gib, self.card, cure)
+        check_gpu_memory(self.model, self.total_gib, self.card, self._cure())
+
+    def _cure(self) -> str:
+        others = self.total_gib - self.memory_gib["weights"]
+        install = "" if has_bitsandbytes() else " after: pip install bitsandbytes"
+        int8, nf4, offloaded = (
+            ("--quantization int8", Placement("cuda", "int8")),
+            (f"--quantization nf4{install}", Placement("cuda", "nf4")),
+            ("--offload layers", Placement("cuda", is_offloaded=True)),
+        )
+        if self.placement.quantization == "nf4":
+            offloaded = ("--quantization int8 --offload layers", offloaded[1])
+        for option, placement in (offloaded,) if self.is_single_file else (int8, nf4, offloaded):
+            needed = others + placement.resident_gib(self.weights)
+            if needed <= self.card.memory_gib:
+                return f"use {option}, which needs {needed:.1f} GiB"
+        return "use a GPU with more memory, or the model compact"
+
+
+@final
+@dataclass(frozen=True)
+class _Model:
+    """What a plan needs of a model. `is_local` is whether nothing is downloaded."""
+
+    hub_id: str
+    task: DecompositionTask
+    cost: BackboneCost
+    quantization: Quantization | None
+    needs_text_encoders: bool
+    is_local: bool
 
 
 def plan_separation(options: Options, size: tuple[int, int], card: GraphicsCard) -> SeparationPlan:
-    """Estimates the separation of a photo of this (width, height) on a card. This takes a few seconds.
+    """Estimates the separation of a photo of this (width, height) on a card.
 
     A base on the hub whose configuration is not in the cache is assumed to have the size of its backbone.
 
@@ -140,72 +173,104 @@ def plan_separation(options: Options, size: tuple[int, int], card: GraphicsCard)
         DownloadError: the metadata of the model is not in the cache.
         PhotoError: the photo is too small for the model.
         DeviceError: the weights cannot be offloaded with the requested quantization.
-        MissingExtra: diffusers is not installed.
+        MissingExtra: the model is not in `brewster models list`, and diffusers is not installed.
     """
     check_diffusion_model(options.model)
-    source = find_model_source(options.model, options.base_model, allow_download=False)
-    description = source.base if is_registered(source.base) else find_description(source.base)
-    backbone = build_on_meta(str(description or source.backbone_class.name), dtype=torch.bfloat16)
-    task = task_with_options(
-        source,
-        guidance=options.guidance,
-        timestep_shift=options.timestep_shift,
-        has_few_step_lora=options.fast_lora is not None,
-    )
-    prompt = backbone.random_prompt(backbone.transformer, 0)
-    predictor = DiffusionPredictor(
-        DecompositionPipeline(backbone, prompt, task),
-        steps=options.steps,
-        ensemble_size=options.ensemble_size,
-    )
-    parameters = count_parameters(backbone.transformer)
+    model = _find_model(options)
+    cost, task = model.cost, model.task
+    work = DiffusionWork(task, cost.size_divisor, options.steps, options.ensemble_size)
+    panels = work.panel_sizes(size)
     file = _local_file(options.transformer) if options.transformer else None
-    placement = place_on_gpu(
-        count_weights(source.base, source.backbone_class, file) if file else parameters,
-        free_gib=card.memory_gib,
-        total_gib=card.memory_gib,
-        quantization=options.quantization,
-        preferred=source.trained_quantization,
-        offload=options.offload,
-        is_single_file=file is not None,
+    weights = file.stat().st_size // 2 if file else cost.parameters
+    placement, with_nf4 = (
+        place_on_gpu(
+            weights,
+            free_gib=card.memory_gib,
+            total_gib=card.memory_gib,
+            quantization=options.quantization,
+            preferred=model.quantization,
+            offload=options.offload,
+            is_single_file=file is not None,
+            has_nf4=has_nf4,
+        )
+        for has_nf4 in (None, True)
     )
-    panels = predictor.panel_sizes(size)
-    steps = predictor.sampling_steps(options.quality) * options.ensemble_size
-    is_guided_twice = task.guidance > 1 and not backbone.guided_by_embedding and not backbone.distilled
-    passes = steps * (2 if is_guided_twice else 1)
-    tokens = [_tokens(panel, task=task, size_divisor=backbone.size_divisor) for panel in panels]
-    tflop = {pair: forward_tflop(backbone, *pair) for pair in set(tokens)}
-    composites = 1 if task.objective == "direct" else len(task.layout.panels)
-    pixels = composites * max(width * height for width, height in panels)
-    block = max(block_bytes(backbone, sum(pair) + PROMPT_TOKENS) for pair in tokens)
-    is_stored = source.base.startswith(TINY_PREFIX) or Path(source.base).is_dir()
-    is_stored = is_stored or is_transformer_cached(hub_id_of(source.base))
-    encoders_gib = weights_gib(backbone.text_encoder_parameters, None) if source.needs_text_encoders else 0.0
-    encoders_gb = 0.0 if is_stored else encoders_gib * GIB / 1e9
-    vae = count_parameters(backbone.vae)
+    # A few-step LoRA is trained without classifier-free guidance.
+    guidance = options.guidance or (
+        1 if options.fast_lora and cost.predictions_per_step == 2 else task.guidance
+    )
+    steps = work.sampling_steps(options.quality) * options.ensemble_size
+    passes = steps * (cost.predictions_per_step if guidance > 1 else 1)
+    is_direct = task.objective == "direct"  # generates one panel after the other, without condition
+    tokens = [
+        width * height // cost.size_divisor**2
+        if is_direct
+        else sum(count_tokens((width, height), task.layout, cost.size_divisor))
+        for width, height in panels
+    ]
+    pixels = (1 if is_direct else len(task.layout.panels)) * max(width * height for width, height in panels)
+    encoders_gib = weights_gib(cost.text_encoder_parameters, None) if model.needs_text_encoders else 0.0
+    encoders_gb = 0.0 if model.is_local else encoders_gib * GIB / 1e9
     return SeparationPlan(
         options.model,
-        licence_of(hub_id_of(source.base)),
+        licence_of(model.hub_id),
         card,
-        parameters,
+        cost,
+        weights,
         placement,
+        with_nf4,
         tuple(panels),
         passes * len(panels),
-        passes * sum(tflop[pair] for pair in tokens),
-        {
-            "weights": OFFLOADED_WEIGHTS_GIB
-            if placement.is_offloaded
-            else file.stat().st_size / GIB
-            if file
-            else weights_gib(parameters, placement.quantization),
-            "VAE": 2 * vae / GIB,
-            "activations": max(block, pixels * DECODING_BYTES_PER_PIXEL) / GIB,
-            "CUDA": _CONTEXT_GIB,
-        },
-        0.0 if is_stored else 2e-9 * (vae + (0 if file else parameters)) + encoders_gb,
+        passes * sum(map(cost.forward_tflop, tokens)),
+        max(cost.block_bytes(max(tokens)), pixels * DECODING_BYTES_PER_PIXEL) / GIB,
+        0.0
+        if model.is_local
+        else 2e-9 * (cost.vae_parameters + (0 if file else cost.parameters)) + encoders_gb,
         encoders_gb,
         encoders_gib,
+        file is not None,
     )
+
+
+def find_row(options: Options) -> DiffusionModel | None:
+    """The row of the model in the table, which is enough for a plan; None if its files, or those of another base, are needed."""
+    name = options.model.removeprefix(TINY_PREFIX)
+    is_known = name in (DIFFUSION_MODELS if name == options.model else BACKBONE_COSTS)
+    is_from_files = options.base_model or Path(options.model).is_dir()
+    return DIFFUSION_MODELS[name] if is_known and not is_from_files else None
+
+
+def _find_model(options: Options) -> _Model:
+    """The model by the table, which needs no torch; or by its files, or those of another base."""
+    if row := find_row(options):
+        is_tiny, hub_id = options.model.startswith(TINY_PREFIX), row.base_model or row.hub_id
+        cost = BACKBONE_COSTS[row.backbone]
+        return _Model(
+            hub_id,
+            named_task(row.name),
+            cost.tiny() if is_tiny else cost,
+            row.quantization,
+            not row.has_prompt and not is_tiny,
+            is_tiny or _is_cached(hub_id),
+        )
+    from brewster.models.diffusion.backbones.registry import hub_id_of  # noqa: PLC0415  (imports torch)
+    from brewster.models.diffusion.memory import backbone_cost  # noqa: PLC0415
+    from brewster.models.diffusion.model_source import find_model_source  # noqa: PLC0415
+
+    source = find_model_source(options.model, options.base_model, allow_download=False)
+    hub_id, is_tiny = hub_id_of(source.base), source.base.startswith(TINY_PREFIX)
+    return _Model(
+        hub_id,
+        source.task,
+        backbone_cost(source.base, source.backbone_class),
+        source.trained_quantization,
+        source.needs_text_encoders,
+        is_tiny or Path(source.base).is_dir() or _is_cached(hub_id),
+    )
+
+
+def _is_cached(hub_id: str) -> bool:
+    return importlib.util.find_spec("huggingface_hub") is not None and is_transformer_cached(hub_id)
 
 
 def _local_file(transformer: str) -> Path:
@@ -217,10 +282,3 @@ def _local_file(transformer: str) -> Path:
         "expected a file of this machine, because a plan downloads nothing",
         "download the file first",
     )
-
-
-def _tokens(panel: tuple[int, int], *, task: DecompositionTask, size_divisor: int) -> tuple[int, int]:
-    """The numbers of generated tokens and of conditioning tokens. The objective "direct" generates one panel, without condition."""
-    if task.objective == "direct":
-        return panel[0] * panel[1] // size_divisor**2, 0
-    return count_tokens(panel, task.layout, size_divisor)

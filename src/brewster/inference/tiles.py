@@ -13,8 +13,10 @@ if TYPE_CHECKING:
     from jaxtyping import Float32
 
     Image = Float32[NDArray[np.float32], "h w 3"]
+    Hints = Float32[NDArray[np.float32], "h w 2"]
+    Channels = Float32[NDArray[np.float32], "h w c"]
 else:
-    Image = NDArray
+    Image = Hints = Channels = NDArray
 
 Backend = Callable[[Image], tuple[Image, Image]]
 """Any callable that takes a tile (H, W, 3), float32 linear light in 0..1, and returns its transmission and
@@ -22,9 +24,9 @@ reflection, both of the same shape and dtype."""
 
 
 def run_tiled(
-    backend: Callable[[Image], tuple[Image, ...]], image: Image, *, tile_px: int, overlap_px: int
+    backend: Callable[[Channels], tuple[Image, ...]], image: Channels, *, tile_px: int, overlap_px: int
 ) -> tuple[Image, ...]:
-    """Returns the outputs of the backend, (H, W, 3) each, for an image of any size.
+    """Returns the outputs of the backend, (H, W, 3) each, for an image (H, W, C) of any size.
 
     Tiles are squares of `tile_px` pixels. Neighbouring tiles overlap by at least `overlap_px` pixels. In the overlap
     their outputs are blended linearly. If the image is not larger than a tile, it is passed to the backend directly.

@@ -5,7 +5,6 @@
 
     fidelity     PSNR, SSIM and the error in linear light
     perceptual   LPIPS; imports torch at its first use
-    dists        DISTS; imports torch at its first use
     naturalness  NIQE, without ground truth
     region       the reflection region: pixels that the glass has visibly changed
     failures     removed content and remaining reflection, for rendered samples
@@ -24,7 +23,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brewster.errors import BrewsterError
-from brewster.metrics.dists import Dists, DistsFeatures
 from brewster.metrics.failures import kept_reflection, removed_content, removed_white
 from brewster.metrics.fidelity import (
     PairCounts,
@@ -52,7 +50,6 @@ __all__ = [
     "CachedImage",
     "Comparison",
     "DifferenceMaps",
-    "Dists",
     "Features",
     "Image",
     "Lpips",
@@ -132,17 +129,6 @@ def _lpips_features(image: Image) -> Features:
 @functools.lru_cache(maxsize=4)
 def _lpips_features_of_black(shape: tuple[int, ...]) -> Features:
     return Lpips.load().features(np.zeros(shape, np.uint8))
-
-
-def _dists(comparison: Comparison) -> float:
-    prediction, truth = (
-        image.features(_dists_features) for image in (comparison.prediction, comparison.truth)
-    )
-    return Dists.load().distance(prediction, truth)
-
-
-def _dists_features(image: Image) -> DistsFeatures:
-    return Dists.load().features(image)
 
 
 def _niqe(comparison: Comparison) -> float:
@@ -251,18 +237,6 @@ _ROWS: Final = (
         f"{_LINEAR}.",
         "transmission",
         _linear_rmse,
-    ),
-    Metric(
-        "dists",
-        "DISTS",
-        "",
-        False,
-        3,
-        "DISTS (Ding 2022): distance of structure and texture with VGG16, 8-bit sRGB scaled to 0..1, at the size of the"
-        " ground truth.",
-        "transmission",
-        _dists,
-        prepare=Dists.load,
     ),
     Metric(
         "niqe",

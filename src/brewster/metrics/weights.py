@@ -1,12 +1,9 @@
-"""Loads the networks of LPIPS and DISTS, which are downloaded once. The small files of channel weights are part of brewster.
+"""Loads the AlexNet of LPIPS, which is downloaded once. The small file of channel weights is part of brewster.
 
-Both are networks of torchvision (BSD-3-Clause). Their files are searched for in the folder `brewster/weights` of the user's
-cache folder, then in the folder `weights` of BREWSTER_DATA. Their content is always checked, because other weights define
-a different metric:
-
-    LPIPS   AlexNet: the layers `features.0`, 3, 6, 8 and 10 of alexnet-owt-7be5be79.pth, stored as a state dict of ten
-            tensors, `lpips_alexnet_features.pth`. The digest of the values is checked.
-    DISTS   VGG16: the whole file, vgg16-397923af.pth (528 MiB). Its SHA-256 is checked.
+The network is that of torchvision (BSD-3-Clause): the layers `features.0`, 3, 6, 8 and 10 of alexnet-owt-7be5be79.pth,
+stored as a state dict of ten tensors, `lpips_alexnet_features.pth`. It is searched for in the folder `brewster/weights` of
+the user's cache folder, then in the folder `weights` of BREWSTER_DATA. The digest of the values is always checked, because
+other weights define a different metric.
 """
 
 from __future__ import annotations
@@ -24,7 +21,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from brewster.download import Downloader, RemoteFile, file_digest
+from brewster.download import Downloader, RemoteFile
 from brewster.errors import DownloadError, ModelError
 from brewster.files import cache_folder, write_atomically
 
@@ -45,21 +42,6 @@ TORCHVISION_ALEXNET: Final = RemoteFile(
     size=244_408_911,
     algorithm="sha256",
     digest="7be5be791159472b1fbf3c69796f7cb30dca7ad8466c2df70058c37116cdee02",
-)
-
-VGG16_FILE: Final = "vgg16-397923af.pth"
-
-TORCHVISION_VGG16: Final = RemoteFile(
-    f"https://download.pytorch.org/models/{VGG16_FILE}",
-    size=553_433_881,
-    algorithm="sha256",
-    digest="397923af8e79cdbb6a7127f12361acd7a2f83e06b05044ddf496e83de57a5bf0",
-)
-
-VGG16_TENSORS: Final = tuple(
-    f"features.{i}.{kind}"
-    for i in (0, 2, 5, 7, 10, 12, 14, 17, 19, 21, 24, 26, 28)
-    for kind in ("weight", "bias")
 )
 
 _LOAD_ERRORS: Final = (
@@ -93,47 +75,11 @@ def load_alexnet(
         DownloadError: there is no file, and the download fails.
         OutputError: the cache folder cannot be written.
     """
-    path = _find(ALEXNET_FILE)
-    if path:
-        return read_alexnet(path, digest)
-    return _fetch(remote, digest, _cached(ALEXNET_FILE), downloader or Downloader())
-
-
-def load_vgg16(
-    remote: RemoteFile = TORCHVISION_VGG16, *, downloader: Downloader | None = None
-) -> list[Tensor]:
-    """Returns VGG16's 26 tensors in the order of `VGG16_TENSORS`, float32: from the cache, BREWSTER_DATA, or downloaded.
-
-    Raises:
-        ModelError: the file is damaged, or is another file.
-        DownloadError: there is no file, and the download fails.
-        OutputError: the cache folder cannot be written.
-    """
-    import torch  # noqa: PLC0415 - an extra
-
-    path = _find(VGG16_FILE)
-    if not path:
-        path = _cached(VGG16_FILE)  # the download checks the digest
-        _download(remote, path, downloader or Downloader(), ("VGG16", "DISTS", VGG16_FILE))
-    elif (actual := file_digest(path, remote.algorithm)) != remote.digest:
-        raise ModelError(
-            f"{path} has the {remote.algorithm} {actual:.12}...",
-            f"expected {remote.digest:.12}..., the file {VGG16_FILE} of torchvision",
-            "delete the file, so that brewster downloads it again (528 MiB), or replace it with the correct one",
-        )
-    state = torch.load(path, map_location="cpu", weights_only=True)
-    return [state[name].detach().float().contiguous() for name in VGG16_TENSORS]
-
-
-def _cached(name: str) -> Path:
-    return cache_folder() / "weights" / name
-
-
-def _find(name: str) -> Path | None:
-    """Returns the path of the file in the cache, else in BREWSTER_DATA, or None if it is in neither."""
-    data = os.environ.get("BREWSTER_DATA")
-    paths = [_cached(name), *([Path(data) / "weights" / name] if data else [])]
-    return next((path for path in paths if path.is_file()), None)
+    cached, data = cache_folder() / "weights" / ALEXNET_FILE, os.environ.get("BREWSTER_DATA")
+    for path in (cached, *([Path(data) / "weights" / ALEXNET_FILE] if data else [])):
+        if path.is_file():
+            return read_alexnet(path, digest)
+    return _fetch(remote, digest, cached, downloader or Downloader())
 
 
 def read_alexnet(path: Path, digest: str = ALEXNET_DIGEST) -> dict[str, Tensor]:
@@ -172,12 +118,26 @@ def alexnet_digest(tensors: dict[str, Tensor]) -> str:
 def _fetch(remote: RemoteFile, digest: str, cached: Path, downloader: Downloader) -> dict[str, Tensor]:
     """Downloads the whole network, stores ten of its tensors in `cached`, and deletes the download.
 
-    The other tensors, 96 % of the file, are not needed.
+    The other tensors, 96 % of the file, are not needed. Before the download, its size and licence are printed on standard
+    error, and how to avoid it.
     """
     import torch  # noqa: PLC0415 - an extra
 
+    size = f"{remote.size / 2**20:.0f} MiB"
+    sys.stderr.write(
+        f"downloading {size}, AlexNet's weights for LPIPS, to {cached.parent}; licence: BSD-3-Clause; to avoid the download, "
+        f"put {ALEXNET_FILE} into the folder weights of BREWSTER_DATA, or leave LPIPS out with --metrics\n"
+    )
+    sys.stderr.flush()
     download = cached.with_name(remote.url.rsplit("/", 1)[-1])
-    _download(remote, download, downloader, ("AlexNet", "LPIPS", ALEXNET_FILE))
+    try:
+        downloader.fetch(remote, download)
+    except DownloadError as error:
+        raise DownloadError(
+            f"AlexNet's weights for LPIPS ({size}) could not be downloaded: {error.happened}",
+            f"expected a network connection, or {ALEXNET_FILE} in the folder weights of BREWSTER_DATA",
+            "connect and try again, or leave LPIPS out with --metrics",
+        ) from error
     try:
         tensors = read_alexnet(download, digest)
         buffer = io.BytesIO()
@@ -186,28 +146,6 @@ def _fetch(remote: RemoteFile, digest: str, cached: Path, downloader: Downloader
     finally:
         download.unlink(missing_ok=True)
     return tensors
-
-
-def _download(remote: RemoteFile, target: Path, downloader: Downloader, names: tuple[str, str, str]) -> None:
-    """Downloads the weights of a network. `names` are the network, its metric, and the file that replaces the download.
-
-    Before the download, its size and licence are printed on standard error, and how to avoid it.
-    """
-    network, metric, file_name = names
-    size = f"{remote.size / 2**20:.0f} MiB"
-    sys.stderr.write(
-        f"downloading {size}, {network}'s weights for {metric}, to {target.parent}; licence: BSD-3-Clause; to avoid the download, "
-        f"put {file_name} into the folder weights of BREWSTER_DATA, or leave {metric} out with --metrics\n"
-    )
-    sys.stderr.flush()
-    try:
-        downloader.fetch(remote, target)
-    except DownloadError as error:
-        raise DownloadError(
-            f"{network}'s weights for {metric} ({size}) could not be downloaded: {error.happened}",
-            f"expected a network connection, or {file_name} in the folder weights of BREWSTER_DATA",
-            f"connect and try again, or leave {metric} out with --metrics",
-        ) from error
 
 
 def _not_alexnet(path: Path, reason: str) -> ModelError:

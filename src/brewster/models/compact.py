@@ -31,6 +31,10 @@ _SKIP_STAGES: Final = (0, 1, 2, 4, 6)
 """The indices of the stages whose output is a feature map of the encoder, at strides 2, 4, 8, 16 and 32."""
 _SKIP_WIDTHS: Final = tuple(_STAGES[stage][3] for stage in _SKIP_STAGES)
 _DECODER_WIDTHS: Final = (32, 64, 128, 224)
+FEATURE_WIDTHS: Final = (*_DECODER_WIDTHS[1:], _SKIP_WIDTHS[-1])
+"""Channels of the features at strides 4, 8, 16 and 32 that `CompactNetwork.maps` returns."""
+MAP_COUNT: Final = 12
+"""Channels of the head: four maps of three colours (see `layers_from_maps`)."""
 _BATCH_NORM_EPSILON: Final = 1e-3
 _FULL_WIDTH: Final = 16
 _LARGEST_GAIN: Final = 1.5
@@ -51,7 +55,7 @@ class _Convolution(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         padded = functional.pad(x, self._pad) if self._pad else x
-        return _in_float32(self.conv, padded) if self.conv.groups > 1 else self.conv(padded)
+        return in_float32(self.conv, padded) if self.conv.groups > 1 else self.conv(padded)
 
 
 @final
@@ -106,7 +110,7 @@ def _leaky(x: Tensor) -> Tensor:
     return functional.leaky_relu(x, 0.1)
 
 
-def _in_float32(convolution: nn.Conv2d, x: Tensor) -> Tensor:
+def in_float32(convolution: nn.Conv2d, x: Tensor) -> Tensor:
     """Applies the convolution in float32, even under bfloat16 autocast.
 
     The output layers need the precision. The gradient of depthwise convolutions is three times slower in bfloat16
@@ -153,28 +157,39 @@ class CompactNetwork(nn.Module):
     def __init__(self) -> None:
         super().__init__()
         self.encoder = _Encoder()
-        below = [*_DECODER_WIDTHS[1:], _SKIP_WIDTHS[-1]]
+        below = FEATURE_WIDTHS
         self.decoders = nn.ModuleList(
             _Decoder(*sizes) for sizes in zip(below, _SKIP_WIDTHS[:-1], _DECODER_WIDTHS, strict=True)
         )
         self.squeeze = nn.Conv2d(_DECODER_WIDTHS[0], _FULL_WIDTH, 1)
         self.join = nn.Conv2d(_FULL_WIDTH + 3, _FULL_WIDTH, 3, padding=1)
-        self.head = nn.Conv2d(_FULL_WIDTH, 12, 3, padding=1)
+        self.head = nn.Conv2d(_FULL_WIDTH, MAP_COUNT, 3, padding=1)
         nn.init.zeros_(self.head.weight)  # an untrained network returns the photo and no reflection
         nn.init.zeros_(self.head.bias)  # type: ignore[arg-type]
 
     def forward(self, photo_encoded: Float[Tensor, "n 3 h w"]) -> Float[Tensor, "n 6 h w"]:
         """Returns the encoded transmission and reflection of encoded photos, concatenated along the channels."""
+        return layers_from_maps(photo_encoded, self.maps(photo_encoded)[0])
+
+    def maps(self, photo_encoded: Float[Tensor, "n 3 h w"]) -> tuple[Tensor, list[Tensor]]:
+        """Returns the four maps, (N, 12, H, W), and the features at strides 4, 8, 16 and 32."""
         normal = photo_encoded * (255 / 128) - 127 / 128  # what the ImageNet weights expect
         *skips, x = self.encoder(normal)
+        features: list[Tensor] = []
         for decoder, skip in zip(reversed(self.decoders), reversed(skips), strict=True):
+            features.insert(0, x)
             x = decoder(x, skip)
         x = functional.interpolate(self.squeeze(x), scale_factor=2.0, mode="bilinear")
-        x = _in_float32(self.head, _leaky(_in_float32(self.join, torch.cat([x, normal], dim=1))))
-        added, gain, transmission_correction, reflection_correction = x.chunk(4, dim=1)
-        gain = (_LARGEST_GAIN * torch.tanh(gain / _LARGEST_GAIN)).exp()
-        transmission = to_encoded((to_linear(photo_encoded) - added) * gain) + transmission_correction
-        return torch.cat([transmission, to_encoded(added + reflection_correction)], dim=1)
+        x = in_float32(self.head, _leaky(in_float32(self.join, torch.cat([x, normal], dim=1))))
+        return x, features
+
+
+def layers_from_maps(photo_encoded: Tensor, maps: Tensor) -> Tensor:
+    """Returns the encoded layers (N, 6, H, W) of the image formation in the docstring of `CompactNetwork`."""
+    added, gain, transmission_correction, reflection_correction = maps.chunk(4, dim=1)
+    gain = (_LARGEST_GAIN * torch.tanh(gain / _LARGEST_GAIN)).exp()
+    transmission = to_encoded((to_linear(photo_encoded) - added) * gain) + transmission_correction
+    return torch.cat([transmission, to_encoded(added + reflection_correction)], dim=1)
 
 
 @final
@@ -185,9 +200,11 @@ class LinearSeparator(nn.Module):
         super().__init__()
         self.network = network
 
-    def forward(self, photo: Float[Tensor, "n 3 h w"]) -> tuple[Tensor, Tensor]:
+    def forward(self, photo: Float[Tensor, "n 3 h w"], hints: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """Returns the linear transmission and reflection of linear photos, both (N, 3, H, W) in 0..1."""
-        layers = self.network(to_encoded(photo.clamp(0, 1))).clamp(0, 1)
+        photo_encoded = to_encoded(photo.clamp(0, 1))
+        layers = self.network(photo_encoded) if hints is None else self.network(photo_encoded, hints)
+        layers = layers.clamp(0, 1)
         return to_linear(layers[:, :3]), to_linear(layers[:, 3:])
 
 

@@ -6,7 +6,9 @@ from dataclasses import dataclass
 from typing import Final, final
 
 from brewster.errors import ModelError
+from brewster.options import Quantization
 
+_BASE: Final = "a base for LoRAs; without one, an edit by prompt"
 _OPEN: Final = "no account needed"
 _GATED: Final = "gated: accept the licence on its page, then run `hf auth login`"
 
@@ -14,25 +16,22 @@ _GATED: Final = "gated: accept the licence on its page, then run `hf auth login`
 @final
 @dataclass(frozen=True)
 class DiffusionModel:
-    """A row of the table. Sizes are computed from the numbers of parameters, not measured."""
+    """A row of the table."""
 
     name: str
     hub_id: str
     licence: str
     allows_commercial_use: bool
-    download_gb: float
-    """The transformer and the VAE in bfloat16, in GB; for a LoRA those of its base."""
-    memory_gib: float
-    """GPU memory for separation, in GiB, with the weights in `weight_format`: `Placement.gpu_gib`, rounded up."""
-    weight_format: str
+    backbone: str
+    """The key in `BACKBONE_COSTS`, from which memory, operations and download are computed."""
     output: str
     access: str = _OPEN
-    text_encoder_gb: float = 0
-    """The download of the text encoders, which encode a prompt once. 0 if the prompt is part of the model."""
+    quantization: Quantization | None = None
+    """The quantization of the base in the published inference code."""
+    has_prompt: bool = False
+    """Whether the encoded prompt is part of the model, so that no text encoder is needed."""
     base_model: str | None = None
     """The hub id of the base of a LoRA or finetuned model."""
-    offloaded_memory_gib: float = 4.5
-    """GPU memory for separation, in GiB, with the weights offloaded to host memory."""
     is_opened_by_name: bool = True
     """Whether --model takes the name. Otherwise `brewster models import` converts the model first."""
 
@@ -42,30 +41,25 @@ DIFFUSION_MODELS: Final = {
     for model in (
         DiffusionModel(
             "windowseat", "huawei-bayerlab/windowseat-reflection-removal-v1-0", "Apache-2.0", allows_commercial_use=True,
-            download_gb=41, memory_gib=13, weight_format="nf4", output="transmission; reflection derived",
+            backbone="qwen", output="transmission; reflection derived", quantization="nf4", has_prompt=True,
             base_model="Qwen/Qwen-Image-Edit-2509",
         ),
         DiffusionModel(
             "gensirr", "lime-j/GenSIRR", "none stated; its base: FLUX.1 [dev] Non-Commercial License",
-            allows_commercial_use=False, download_gb=24, memory_gib=15, weight_format="int8",
-            output="transmission; reflection derived",
+            allows_commercial_use=False, backbone="kontext", output="transmission; reflection derived", has_prompt=True,
             access="run `hf download lime-j/GenSIRR GenSIRR.pt --local-dir .`, then `brewster models import GenSIRR.pt FOLDER`",
             base_model="black-forest-labs/FLUX.1-Kontext-dev", is_opened_by_name=False,
         ),
         DiffusionModel(
             "kontext", "black-forest-labs/FLUX.1-Kontext-dev", "FLUX.1 [dev] Non-Commercial License",
-            allows_commercial_use=False, download_gb=24, memory_gib=15, weight_format="int8",
-            output="a base for LoRAs; without one, an edit by prompt", access=_GATED, text_encoder_gb=9.8,
+            allows_commercial_use=False, backbone="kontext", output=_BASE, access=_GATED,
         ),
         DiffusionModel(
             "klein", "black-forest-labs/FLUX.2-klein-base-4B", "Apache-2.0", allows_commercial_use=True,
-            download_gb=7.9, memory_gib=11, weight_format="bf16",
-            output="a base for LoRAs; without one, an edit by prompt", text_encoder_gb=8,
+            backbone="klein", output=_BASE,
         ),
         DiffusionModel(
-            "qwen", "Qwen/Qwen-Image-Edit", "Apache-2.0", allows_commercial_use=True,
-            download_gb=41, memory_gib=13, weight_format="nf4",
-            output="a base for LoRAs; without one, an edit by prompt", text_encoder_gb=16.6,
+            "qwen", "Qwen/Qwen-Image-Edit", "Apache-2.0", allows_commercial_use=True, backbone="qwen", output=_BASE,
         ),
     )
 }  # fmt: skip

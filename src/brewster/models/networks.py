@@ -31,6 +31,8 @@ class NetworkEntry:
     """Returns the network from which training starts: its encoder has pretrained weights. May raise MissingExtra."""
     stride: int
     """Height and width of the input must be multiples of this; it must divide MAX_STRIDE."""
+    takes_hints: bool = False
+    """Whether the network has a second input: hints of a person (N, 2, H, W), see `brewster.training.data.hints`."""
 
 
 MAX_STRIDE: Final = 32
@@ -54,6 +56,12 @@ NETWORKS: Final[dict[str, NetworkEntry]] = {
         _imported("brewster.models.compact:CompactNetwork"),
         _imported("brewster.models.compact:with_imagenet_features"),
         stride=32,
+    ),
+    "lite2-dense": NetworkEntry(
+        _imported("brewster.models.dense:DenseNetwork"),
+        _imported("brewster.models.dense:with_imagenet_encoder"),
+        stride=32,
+        takes_hints=True,
     ),
 }
 """The networks by name. The key `network` of a training recipe is such a name."""

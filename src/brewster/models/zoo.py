@@ -100,8 +100,11 @@ def check_diffusion_model(name: str) -> None:
     """Checks that `name` is that of a diffusion model, because only these need a plan. Needs no torch.
 
     Raises:
-        ModelError: it is not.
+        ModelError: it is not, or it is unknown.
     """
+    if name in DIFFUSION_MODELS:  # also one that must be imported first
+        return
+    model_name(name)
     if not is_diffusion_model(name):
         raise ModelError(
             f"a plan was requested for the model {name}",

@@ -41,19 +41,8 @@ class Mask:
                 have the size of the photo.
         """
         mask = f"the mask {source}" if isinstance(source, str | os.PathLike) else "the mask"
-        try:
-            photo = _open(source)
-        except PhotoError as error:
-            raise MaskError(
-                f"the mask cannot be read: {error.happened}", error.expected, error.cure
-            ) from error
+        photo = open_painted(source, size, mask)
         pixels = photo.pixels
-        if photo.size != size:
-            raise MaskError(
-                f"{mask} has {' x '.join(map(str, photo.size))} pixels",
-                f"expected {' x '.join(map(str, size))}, the size of the photo",
-                "resize the mask, or leave it out for this photo",
-            )
         if (pixels != pixels[..., :1]).any():
             raise MaskError(f"{mask} has colours", "expected grey values", "convert the mask to grey")
         if photo.alpha is not None and (photo.alpha != WHITE_LEVELS[photo.alpha.dtype.name]).any():
@@ -89,9 +78,25 @@ def _weights(values: Stored) -> Float32:
     return weights.astype(np.float32, copy=False)
 
 
-def _open(source: Source) -> Photo:
-    if not isinstance(source, np.ndarray):
-        return Photo.open(source)
-    array = np.uint8(255) * source if source.dtype == np.bool_ else source
-    # Integers with the encoding "srgb" and floats with the encoding "linear" are stored unchanged.
-    return Photo.from_array(array, encoding="linear" if array.dtype.kind == "f" else "srgb")
+def open_painted(source: Source, size: tuple[int, int], name: str) -> Photo:
+    """Opens an image that was painted for a photo of this (width, height). `name` is its name in messages.
+
+    Raises:
+        MaskError: the source cannot be read, or has another size.
+    """
+    try:
+        if isinstance(source, np.ndarray):
+            array = np.uint8(255) * source if source.dtype == np.bool_ else source
+            # Integers with the encoding "srgb" and floats with the encoding "linear" are stored unchanged.
+            photo = Photo.from_array(array, encoding="linear" if array.dtype.kind == "f" else "srgb")
+        else:
+            photo = Photo.open(source)
+    except PhotoError as error:
+        raise MaskError(f"{name} cannot be read: {error.happened}", error.expected, error.cure) from error
+    if photo.size != size:
+        raise MaskError(
+            f"the size of {name} is {' x '.join(map(str, photo.size))} pixels",
+            f"expected {' x '.join(map(str, size))}, the size of the photo",
+            "resize the image, or leave it out for this photo",
+        )
+    return photo

@@ -104,7 +104,7 @@ def render(scene: Scene, assets: Assets, device: Device = "cpu") -> LinearSample
 def ghost_distance_px(scene: Scene) -> float:
     """Returns the distance between the first two reflections of a point at the image centre, in px; 0 at infinity."""
     _, _, normal = axes(scene.glass.heading_deg, scene.glass.pitch_deg)
-    _, _, back = axes(scene.camera.heading_deg, scene.camera.pitch_deg)
+    _, _, back = scene.camera.axes
     incidence = math.degrees(math.acos(min(1.0, dot(back, normal))))
     distance_mm = scene.camera_above_glass_mm + scene.front.distance_mm
     return ghost_distance_mm(scene.glass.panes[0], incidence) / (scene.camera.pixel_rad * distance_mm)
@@ -114,8 +114,7 @@ def _prepare(scene: Scene, assets: Assets, device: Device) -> _PreparedScene:
     to_glass = torch.tensor(axes(scene.glass.heading_deg, scene.glass.pitch_deg), device=device)
     position = torch.tensor(scene.camera.position_mm, device=device)
     origin = to_glass @ (position - torch.tensor(scene.glass.position_mm, device=device))
-    right, up, back = (to_glass @ axis for axis in torch.tensor(
-        axes(scene.camera.heading_deg, scene.camera.pitch_deg), device=device))  # fmt: skip
+    right, up, back = (to_glass @ axis for axis in torch.tensor(scene.camera.axes, device=device))
     # Only lookups of Monte Carlo rays are filtered to the circle of confusion. The deterministic renderer applies the blur later,
     # as a convolution.
     view = CameraView(

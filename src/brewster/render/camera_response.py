@@ -238,13 +238,13 @@ def _add_noise(exposed: Tensor, scene: Scene) -> Tensor:
     """Adds shot noise (variance proportional to light) and read noise (constant variance) to light (3, H, W).
 
     Both are nearly Gaussian, and so is their sum (A. Foi et al., IEEE Trans. Image Proc. 17, 2008). The noise depends
-    on the scene's seed and index only.
+    on the scene's seed and index, and on the frame of a burst.
     """
     response = scene.camera_response
     if response.shot_noise == response.read_noise == 0:
         return exposed
     # torch's generator on the CPU uses only 32 bits of its seed, so seed and index are hashed into 32 bits.
-    seed = int(np.random.SeedSequence((scene.seed, scene.index)).generate_state(1)[0])
+    seed = int(np.random.SeedSequence(scene.noise_seeds).generate_state(1)[0])
     normal = torch.randn(exposed.shape, generator=Generator().manual_seed(seed)).to(exposed.device)
     variance = response.shot_noise**2 * exposed.clamp(0, 1) + response.read_noise**2
     return exposed + variance.sqrt() * normal

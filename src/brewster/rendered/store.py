@@ -181,6 +181,11 @@ class StoredSample:
     path: Path
     spans: Mapping[str, tuple[int, int]] = field(default_factory=dict, repr=False)
 
+    @property
+    def name(self) -> str:
+        """The name of the sample (see `key`)."""
+        return key(self.index)
+
     def read(self, name: str) -> bytes:
         """Returns the bytes of a file. `name` is one of SAMPLE_FILES."""
         if not self.spans:

@@ -17,18 +17,50 @@ Axes = tuple[Point, Point, Point]
 class Camera(FrozenModel):
     """Position, orientation and thin lens of a camera with square pixels.
 
-    `fov_deg` is the horizontal field of view. `aperture_mm` is the diameter of the lens; with 0, the camera is a pinhole.
+    `roll_deg` turns the camera about its optical axis, clockwise for the photographer. `fov_deg` is the horizontal field of view. `aperture_mm` is the diameter of the lens; with 0, the camera is a pinhole.
     `focus_mm` is the distance from the lens to the plane in focus, along the optical axis. `width` and `height` are in px.
     """
 
     position_mm: Point = (0.0, 0.0, 1000.0)
     heading_deg: float = 0.0
     pitch_deg: Annotated[float, Field(ge=-80, le=80)] = 0.0
+    roll_deg: Annotated[float, Field(ge=-180, le=180, exclude_if=lambda roll: roll == 0)] = 0.0
     fov_deg: Annotated[float, Field(gt=0.5, lt=150)] = 50.0
     focus_mm: PositiveFloat = 3000.0
     aperture_mm: NonNegativeFloat = 0.0
     width: Annotated[int, Field(ge=16, le=16384)] = 512
     height: Annotated[int, Field(ge=16, le=16384)] = 384
+
+    @property
+    def axes(self) -> Axes:
+        """Unit vectors (right, up, back) in world coordinates. `back` is opposite to the viewing direction."""
+        right, up, back = axes(self.heading_deg, self.pitch_deg)
+        cosine, sine = math.cos(math.radians(self.roll_deg)), math.sin(math.radians(self.roll_deg))
+        return (
+            _add(_scale(right, cosine), _scale(up, -sine)),
+            _add(_scale(up, cosine), _scale(right, sine)),
+            back,
+        )
+
+    def moved(self, offset_mm: Point, turn_deg: Point) -> Camera:
+        """Returns the camera at another position, with another orientation and the same lens.
+
+        Args:
+            offset_mm: the move to the right, up and back.
+            turn_deg: what is added to heading, pitch and roll.
+
+        Raises:
+            ValidationError: the pitch is above 80 degrees.
+        """
+        moves = (_scale(axis, distance) for axis, distance in zip(self.axes, offset_mm, strict=True))
+        heading, pitch, roll = turn_deg
+        values = {
+            "position_mm": _add(self.position_mm, *moves),
+            "heading_deg": self.heading_deg + heading,
+            "pitch_deg": self.pitch_deg + pitch,
+            "roll_deg": self.roll_deg + roll,
+        }
+        return Camera.model_validate(dict(self) | values)
 
     @property
     def half_width(self) -> float:
@@ -42,7 +74,7 @@ class Camera(FrozenModel):
 
     def corners(self) -> list[Point]:
         """Returns the directions through the four corners of the image. They are not normalised."""
-        right, up, back = axes(self.heading_deg, self.pitch_deg)
+        right, up, back = self.axes
         across, down = self.half_width, self.half_width * self.height / self.width
         return [
             _add(_scale(right, x), _scale(up, y), _scale(back, -1))

@@ -159,6 +159,38 @@ class CameraResponseRecipe(FrozenModel):
     """JPEG quality of the photo I. The other images have a quality of 95."""
 
 
+class BurstRecipe(FrozenModel):
+    """Several photos of each scene, by a camera that moves."""
+
+    frames: Annotated[int, Field(ge=2, le=99)] = 5
+    """Number of photos in a burst."""
+    baseline_mm: Range = (0.0, 120.0)
+    """Distance between the first and the last position of the camera; at least 0."""
+    direction_deg: Range = (-20.0, 20.0)
+    """Angle between the move of the camera and the horizontal axis of the photo."""
+    still_probability: Share = 0.0
+    """Probability that the camera does not move sideways. It still trembles."""
+    tremble_mm: NonNegativeFloat = 2.0
+    """Standard deviation of the position of the camera from the line, for each of its three coordinates."""
+    tremble_deg: NonNegativeFloat = 0.3
+    """Standard deviation of the rotation of the camera about each of its three axes."""
+    exposure_jitter_ev: Annotated[NonNegativeFloat, KeyNote(unit="stops")] = 0.1
+    """Standard deviation of the exposure."""
+    equal_distance_probability: Share = 0.0
+    """Probability that both layers have the same distance: the content behind the glass gets the distances, positions and
+    sizes of the mirrored content. The layers then do not move relative to each other."""
+    without_glass_probability: Share = 0.0
+    """Probability that the glass has no effect: its refractive index is 1, so that R is black and I = T = B."""
+
+    @model_validator(mode="after")
+    def _check_baseline(self) -> Self:
+        if self.baseline_mm[0] < 0:
+            raise ValueError(
+                f"expected a baseline_mm of at least 0, but it starts at {self.baseline_mm[0]:g}"
+            )
+        return self
+
+
 class SceneRecipe(FrozenModel):
     """Distributions of the parameters of random scenes."""
 
@@ -181,7 +213,7 @@ class SceneRecipe(FrozenModel):
             'keys "map|map", "map|plane", "plane|map"; weights from 0 to 1',
             replaces_constraints=True,
         ),
-    ] = Field(default_factory=dict)
+    ] = Field(default={})
     """Relative frequencies of the kinds of content behind|in front of the glass: an environment map, or a picture on a plane
     without a map. They replace map_probability and plane_probability of both sides. With an empty table, each side is
     drawn independently."""
@@ -192,6 +224,14 @@ class SceneRecipe(FrozenModel):
     front: SideRecipe = SideRecipe()
     """The content in front of the glass, which is visible in the reflection. It has the same keys as [behind]."""
     camera_response: CameraResponseRecipe = CameraResponseRecipe()
+    burst: BurstRecipe | None = None
+    """Bursts: several photos of each scene. The camera moves sideways along a line and trembles; exposure and noise of the
+    photos differ. The middle photo, the reference frame, is the photo that the recipe gives without this table."""
+
+    @property
+    def frames(self) -> int:
+        """The number of photos of each scene: 1 without the table [burst]."""
+        return self.burst.frames if self.burst else 1
 
     @model_validator(mode="after")
     def _check_setups(self) -> Self:

@@ -16,10 +16,17 @@ from brewster import __version__
 from brewster.errors import RecipeError, expected_value
 from brewster.scene.camera import Camera, axes, dot
 from brewster.scene.glass import Glazing, Pane, Point
-from brewster.scene.recipe import CameraRecipe, CameraResponseRecipe, GlassRecipe, SceneRecipe, SideRecipe
-from brewster.scene.scene import CameraResponse, Scene
+from brewster.scene.recipe import (
+    BurstRecipe,
+    CameraRecipe,
+    CameraResponseRecipe,
+    GlassRecipe,
+    SceneRecipe,
+    SideRecipe,
+)
+from brewster.scene.scene import BurstFrame, CameraResponse, Scene
 from brewster.scene.values import FrozenModel
-from brewster.scene.world import AssetSource, EnvironmentMap, Plane, Side
+from brewster.scene.world import AssetSource, EnvironmentMap, Plane, Side, at_equal_distance
 
 _MAX_ATTEMPTS: Final = 100
 _MAX_FOCUS_MM: Final = 1e6
@@ -47,13 +54,28 @@ def draw(recipe: SceneRecipe, catalog: Catalog, seed: int, index: int) -> Scene:
     Raises:
         RecipeError: the catalog has no suitable maps or pictures, or all of 100 attempts gave an impossible scene.
     """
-    rng = _SceneRng(f"{recipe.name}/{seed}/{index}")
+    number, frame = divmod(index, recipe.frames)
+    return draw_frames(recipe, catalog, seed, number)[frame]
+
+
+def draw_frames(recipe: SceneRecipe, catalog: Catalog, seed: int, index: int) -> list[Scene]:
+    """Draws the scenes of all frames of the burst with this index: one scene if the recipe has no table [burst].
+
+    Raises:
+        RecipeError: as `draw`.
+    """
+    key = f"{recipe.name}/{seed}/{index}"
+    rng = _SceneRng(key)
+    motion = _draw_motion(recipe.burst, _SceneRng(f"{key}/burst")) if recipe.burst else None
     reason = ""
     for _ in range(_MAX_ATTEMPTS):
         try:
-            return _draw_once(recipe, catalog, rng, seed, index)
+            scene = _draw_once(recipe, catalog, rng, seed, index)
+            return _frames(scene, motion, catalog) if motion else [scene]
         except ValidationError as error:
             reason = expected_value(error.errors()[0])
+        except ValueError as error:
+            reason = str(error)
     raise RecipeError(
         f"the recipe {recipe.name!r} gave no possible scene in {_MAX_ATTEMPTS} attempts",
         reason,
@@ -267,7 +289,7 @@ def _focus_camera(recipe: CameraRecipe, partial: _PartialScene, behind: Side, fr
         rng.from_log_range(recipe.aperture_mm),
     )
     distance_mm = _camera_in_glass_frame(camera, partial.glass)[2] + focused_side.distance_mm
-    cosine = _to_glass_frame(axes(camera.heading_deg, camera.pitch_deg)[2], partial.glass)[2]
+    cosine = _to_glass_frame(camera.axes[2], partial.glass)[2]
     return camera.model_copy(
         update={
             "focus_mm": _six_digits(min(distance_mm / max(cosine, 0.1), _MAX_FOCUS_MM)),
@@ -286,3 +308,84 @@ def _draw_camera_response(recipe: CameraResponseRecipe, rng: _SceneRng) -> Camer
         read_noise=rng.from_range(recipe.read_noise),
         jpeg_quality=rng.randint(*recipe.jpeg_quality),
     )
+
+
+# --- bursts
+
+
+@dataclass(frozen=True)
+class _CameraMove:
+    """A frame relative to the reference frame: the move in mm to the right, up and back, the turn, and the exposure.
+
+    `turn_deg` is added to heading, pitch and roll.
+    """
+
+    offset_mm: Point = (0.0, 0.0, 0.0)
+    turn_deg: Point = (0.0, 0.0, 0.0)
+    exposure_ev: float = 0.0
+
+
+@dataclass(frozen=True)
+class _BurstMotion:
+    """What a burst adds to a scene. It does not depend on the scene, so a scene that is drawn again keeps it."""
+
+    moves: tuple[_CameraMove, ...]
+    at_equal_distance: bool
+    without_glass: bool
+
+
+def _draw_motion(recipe: BurstRecipe, rng: _SceneRng) -> _BurstMotion:
+    at_equal_distance, without_glass = (
+        rng.bernoulli(recipe.equal_distance_probability),
+        rng.bernoulli(recipe.without_glass_probability),
+    )
+    is_still = rng.bernoulli(recipe.still_probability)
+    baseline_mm = 0.0 if is_still else rng.from_range(recipe.baseline_mm) * rng.choice((-1, 1))
+    direction = math.radians(rng.from_range(recipe.direction_deg))
+    reference = recipe.frames // 2
+    moves = []
+    for frame in range(recipe.frames):
+        along_mm = baseline_mm * (frame - reference) / (recipe.frames - 1)
+        line = along_mm * math.cos(direction), along_mm * math.sin(direction), 0.0
+        x, y, z = (_six_digits(place + rng.gauss(0, recipe.tremble_mm)) for place in line)
+        heading, pitch, roll = (_six_digits(rng.gauss(0, recipe.tremble_deg)) for _ in range(3))
+        exposure_ev = rng.gauss(0, recipe.exposure_jitter_ev)
+        moves.append(_CameraMove((x, y, z), (heading, pitch, roll), exposure_ev))
+    moves[reference] = _CameraMove()
+    return _BurstMotion(tuple(moves), at_equal_distance, without_glass)
+
+
+def _frames(scene: Scene, motion: _BurstMotion, catalog: Catalog) -> list[Scene]:
+    """Returns the scenes of a burst. `scene` is that of the reference frame without the effects of the burst."""
+    behind, front = (_with_height(side, catalog) for side in (scene.behind, scene.front))
+    if motion.at_equal_distance:
+        behind, front = at_equal_distance(behind, front)
+    glass = scene.glass.without_effect() if motion.without_glass else scene.glass
+    values = dict(scene) | {"behind": behind, "front": front, "glass": glass}
+    return [
+        Scene(
+            **values
+            | {
+                "camera": scene.camera.moved(move.offset_mm, move.turn_deg),
+                "camera_response": _exposed(scene.camera_response, move.exposure_ev),
+                "burst": BurstFrame(frame=frame, frames=len(motion.moves)),
+            }
+        )
+        for frame, move in enumerate(motion.moves)
+    ]
+
+
+def _exposed(response: CameraResponse, exposure_ev: float) -> CameraResponse:
+    """Returns the camera response with another target of the automatic exposure."""
+    target = min(1.0, _six_digits(response.target_luminance * 2**exposure_ev))
+    return response.model_copy(update={"target_luminance": target})
+
+
+def _with_height(side: Side, catalog: Catalog) -> Side:
+    """Returns the side with the height of its picture, so that `layer_motion` does not need the file."""
+    plane = side.plane
+    if plane is None:
+        return side
+    asset = next(asset for asset in catalog.pictures if asset.source == plane.source)
+    height_mm = plane.width_mm * asset.height / asset.width
+    return side.model_copy(update={"plane": plane.model_copy(update={"height_mm": height_mm})})

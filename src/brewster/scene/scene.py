@@ -44,6 +44,26 @@ class CameraResponse(FrozenModel):
     """JPEG quality of I. The ground truth is written with quality 95."""
 
 
+class BurstFrame(FrozenModel):
+    """The position of a photo in its burst. All scenes of a burst differ only in the camera, the exposure and the noise."""
+
+    frame: Annotated[int, Field(ge=0)]
+    frames: Annotated[int, Field(ge=2)]
+
+    @model_validator(mode="after")
+    def _check_frame(self) -> BurstFrame:
+        if self.frame >= self.frames:
+            raise ValueError(
+                f"expected a frame below {self.frames}, the number of frames, but it is {self.frame}"
+            )
+        return self
+
+    @property
+    def is_reference(self) -> bool:
+        """Whether this is the reference frame: the middle one."""
+        return self.frame == self.frames // 2
+
+
 class Scene(FrozenModel):
     """All data that determine a sample: the same scene and the same version of brewster give the same bytes.
 
@@ -65,6 +85,8 @@ class Scene(FrozenModel):
     behind: Side = Side()
     front: Side = Side()
     camera_response: CameraResponse = CameraResponse()
+    burst: BurstFrame | None = None
+    """The position in a burst; None for a single photo. All frames of a burst have the same `seed` and `index`."""
 
     @model_validator(mode="after")
     def _check_geometry(self) -> Scene:
@@ -87,6 +109,12 @@ class Scene(FrozenModel):
         x, y, z = (a - b for a, b in zip(self.camera.position_mm, self.glass.position_mm, strict=True))
         return dot((x, y, z), normal)
 
+    @property
+    def noise_seeds(self) -> tuple[int, ...]:
+        """The seeds of the noise in I. The reference frame of a burst has the noise of the single photo."""
+        seeds = self.seed, self.index
+        return seeds if self.burst is None or self.burst.is_reference else (*seeds, self.burst.frame + 1)
+
     def _check_incidence(self, normal: tuple[float, float, float]) -> None:
         for corner in self.camera.corners():
             cosine = -dot(corner, normal) / math.sqrt(dot(corner, corner))
@@ -97,7 +125,7 @@ class Scene(FrozenModel):
                 )
 
     def _check_focus(self, normal: tuple[float, float, float], above_glass_mm: float) -> None:
-        _, _, back = axes(self.camera.heading_deg, self.camera.pitch_deg)
+        _, _, back = self.camera.axes
         focus_depth_mm = self.camera.focus_mm * dot(back, normal) - above_glass_mm
         if self.camera.aperture_mm > 0 and 0 <= focus_depth_mm <= self.glass.depth_mm:
             raise ValueError(

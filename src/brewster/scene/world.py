@@ -9,14 +9,11 @@ from pydantic import Field, PlainSerializer, model_validator
 
 from brewster.scene.values import FrozenModel, NonNegativeFloat, PositiveFloat
 
-BUILTIN = "builtin:"
-"""Prefix of sources that are computed, not read from a file: `builtin:street:7` is the street with seed 7."""
-
 Radius = Annotated[float, Field(gt=0, allow_inf_nan=True), PlainSerializer(float)]
 
 
 class AssetSource(FrozenModel):
-    """The name of a file in an assets folder and the sha256 of its bytes, or a built-in source without sha256."""
+    """The name of a file in an assets folder or of a built-in map or photo, and the sha256 of its bytes."""
 
     file: str
     sha256: str = ""
@@ -35,7 +32,7 @@ class EnvironmentMap(FrozenModel):
 
 
 class Plane(FrozenModel):
-    """A picture on a plane. The height of the plane is computed from the aspect ratio of the picture.
+    """A picture on a plane.
 
     A plane in front of the glass is visible in the reflection only. If it is between the glass and the camera, choose a
     position outside the direct view, because the analytic renderer does not show the plane in that view.
@@ -47,6 +44,8 @@ class Plane(FrozenModel):
     offset_mm: tuple[float, float] = (0.0, 0.0)
     """Offset of the centre to the right and up, as seen by a camera that looks through the glass."""
     width_mm: PositiveFloat
+    height_mm: PositiveFloat | None = None
+    """None: the height that keeps the aspect ratio of the picture. Motion between frames needs a height."""
     heading_deg: Annotated[float, Field(gt=-80, lt=80)] = 0.0
     pitch_deg: Annotated[float, Field(gt=-80, lt=80)] = 0.0
     luminance: NonNegativeFloat = 1.0
@@ -81,3 +80,31 @@ class Side(FrozenModel):
         distances = [self.plane.distance_mm] if self.plane else []
         distances += [self.map.radius_mm] if self.map else []
         return min(distances, default=math.inf)
+
+
+def at_equal_distance(behind: Side, front: Side) -> tuple[Side, Side]:
+    """Moves the content behind the glass to the mirror image of the content in front, so that both layers move alike.
+
+    What only one side has, a map or a picture, is removed. The sides keep their textures and luminances.
+
+    Returns:
+        The new sides behind and in front of the glass.
+
+    Raises:
+        ValueError: one side has only a map, and the other has only a picture.
+    """
+    near: dict[str, EnvironmentMap | Plane] = {}
+    far: dict[str, EnvironmentMap | Plane] = {}
+    if behind.map and front.map:
+        near["map"], far["map"] = front.map, behind.map.model_copy(update={"radius_mm": front.map.radius_mm})
+    if behind.plane and front.plane:
+        near["plane"], far["plane"] = front.plane, _mirrored(front.plane, behind.plane)
+    if not near:
+        raise ValueError("expected a map on both sides of the glass, or a picture on both sides")
+    return Side.model_validate(far), Side.model_validate(near)
+
+
+def _mirrored(plane: Plane, texture: Plane) -> Plane:
+    """Returns a plane with the picture of `texture` where the glass mirrors `plane`."""
+    picture = texture.model_dump(include={"source", "luminance", "highlight_boost"})
+    return Plane(**plane.model_dump() | picture | {"heading_deg": -plane.heading_deg})

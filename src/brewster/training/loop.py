@@ -37,7 +37,7 @@ CHECKPOINT_FILE: Final = "checkpoint.pt"
 LOG_FILE: Final = "log.jsonl"
 SAMPLES_FILE: Final = "samples.png"
 CURVES_FILE: Final = "results.png"
-_NOT_COMPARED: Final = ("steps", "report_every", "checkpoint_every", "init_checkpoints")
+_NOT_COMPARED: Final = ("steps", "report_every", "checkpoint_every", "init")
 """Recipe values that may change when a run is resumed."""
 
 

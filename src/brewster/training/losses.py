@@ -6,6 +6,7 @@ import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Final
 
+import torch
 from torch import Tensor
 from torch.nn import functional
 
@@ -22,6 +23,8 @@ _SCALES = (1, 4, 16)
 """Side of the averaging windows of the loss, in pixels."""
 _MAX_ADDED_FRACTION = 0.05
 """A pixel counts as unchanged if the glass added less light than about this fraction of the photo's light."""
+_CLIPPED = 0.98
+"""An encoded value from which a channel counts as clipped: 250 of 255."""
 _MSE_FLOOR = 1e-4
 """Added to the mean squared error before the logarithm, so that the gradient tends to 0 for an image with a PSNR above 40 dB."""
 
@@ -31,6 +34,7 @@ def separation_loss(
     batch: TrainingBatch,
     edge_weight: float = 1.0,
     edge_scales_px: Sequence[int] = (1,),
+    clipped_weight: float = 0.0,
 ) -> dict[str, Tensor]:
     """Computes the loss of predicted layers: channels 0-2 are the transmission, 3-5 the reflection.
 
@@ -41,14 +45,19 @@ def separation_loss(
     - edges: `edge_weight` times the mean absolute error of the transmission's horizontal and vertical gradients, summed over
       averaging windows with the sides `edge_scales_px`, so that edges of the reflection are removed (compare the gradient
       loss of CEILNet, Fan et al. 2017).
+    - clipped: `clipped_weight` times the mean absolute error of the values that are clipped in the photo and in the
+      transmission, so that white stays white.
     - log_mse: 0.04 times the mean logarithm of each image's mean squared error, so that easy images count as much as hard
       images. This part is usually negative, because the mean squared error is usually below 1.
+
+    A prediction above 1 is no error where the ground truth is clipped: the true light there is unknown.
 
     Returns:
         The parts of the loss by name, each a scalar. The loss is their sum.
     """
     transmission, reflection = layers[:, :3], layers[:, 3:]
-    error = transmission - batch.transmission_encoded
+    is_white = batch.transmission_encoded >= _CLIPPED
+    error = torch.where(is_white, transmission.clamp(max=1), transmission) - batch.transmission_encoded
     edges = sum(
         functional.avg_pool2d(error, scale).diff(dim=axis).abs().mean()
         for scale in edge_scales_px
@@ -60,6 +69,7 @@ def separation_loss(
         "reflection": 0.3
         * (_multiscale_error(reflection - batch.reflection_encoded) * batch.reflection_weight).mean(),
         "edges": edge_weight * edges,  # type: ignore[dict-item]
+        "clipped": clipped_weight * (error.abs() * (is_white & (batch.photo_encoded >= _CLIPPED))).mean(),
         "log_mse": 0.04 * (squared + _MSE_FLOOR).log().mean(),
     }
 

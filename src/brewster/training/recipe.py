@@ -133,14 +133,23 @@ class CompactRecipe(TrainingRecipe):
         tuple[Annotated[int, Field(ge=1, le=MAX_STRIDE // 2)], ...], Field(min_length=1)
     ] = (1,)
     """Sides of the averaging windows, in pixels, after which the image gradients are compared."""
-    init_checkpoints: tuple[Path, ...] = ()
-    """Checkpoint files, relative to this recipe. The run starts from the mean of their EMA weights."""
+    clipped_weight: NonNegativeFloat = 0.0
+    """Weight of the error of values that are clipped in the photo and in the transmission, in the loss."""
+    hint_probability: Share = 0.0
+    """Probability of a sample with simulated hints of a person: where there is reflection, and where only the scene."""
+    init: str | None = None
+    """The model from which training starts: a name from `brewster models list`, or an .onnx file, relative to this recipe. It
+    contains this network or its encoder. Not set: ImageNet features."""
     mix: MixRecipe = MixRecipe()
 
     @model_validator(mode="after")
     def _check_shares(self) -> Self:
         pair_count = _sample_count(self.batch_size, "pairs_share", self.data.pairs_share)
         _sample_count(self.batch_size - pair_count, "rendered.share", self.data.rendered_share)
+        if self.hint_probability and not NETWORKS[self.network].takes_hints:
+            raise ValueError(
+                f"expected hint_probability 0, because the network {self.network} takes no hints"
+            )
         return self
 
     def size_at(self, step: int) -> int:
@@ -189,7 +198,7 @@ class LoraRecipe(TrainingRecipe):
         KeyNote(
             "table of panel = weight", 'panels "I", "T", "R"; weights at least 0', replaces_constraints=True
         ),
-    ] = Field(default_factory=dict)
+    ] = Field(default={})
     """Weight of each panel in the loss; 1 for panels that are not listed."""
     objective: Objective = "flow"
     """flow: flow matching, from noise to panels in many steps. one_step: from the photo to the panels in one step."""
@@ -283,8 +292,8 @@ def read_recipe(path: Path) -> CompactRecipe | LoraRecipe:
     """
     recipe = _read_unresolved(path)
     changes: dict[str, Any] = {}
-    if isinstance(recipe, CompactRecipe):
-        changes["init_checkpoints"] = tuple(path.parent / start for start in recipe.init_checkpoints)
+    if isinstance(recipe, CompactRecipe) and recipe.init and recipe.init.endswith(".onnx"):
+        changes["init"] = str(path.parent / recipe.init)
     if isinstance(recipe, LoraRecipe) and recipe.prompt.endswith(ENCODED_SUFFIX):
         changes["prompt"] = str(path.parent / recipe.prompt)
     rendered = recipe.data.rendered

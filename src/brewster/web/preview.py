@@ -44,7 +44,11 @@ MAX_LEVEL: Final = 8
 
 
 def preview(
-    separator: Separator, photo: Photo, options: Options, on_progress: Callable[[float], None]
+    separator: Separator,
+    photo: Photo,
+    options: Options,
+    on_progress: Callable[[float], None],
+    hints: bytes | None = None,
 ) -> bytes:
     """Separates a photo for the page.
 
@@ -53,6 +57,7 @@ def preview(
         photo: the photo at full size.
         options: the options of the request; only `quality` is used.
         on_progress: called with the completed fraction, 0 to 1.
+        hints: an image file with hints for the model, see the call of a `Separator`.
 
     Returns:
         One line of JSON, then the reduced photo (3 bytes for each pixel, sRGB), and then maps of little-endian 16-bit
@@ -62,7 +67,9 @@ def preview(
     Raises:
         BrewsterError: `Separator` cannot separate the photo.
     """
-    upsampler, prediction, assessment = separator.fit(photo, quality=options.quality, on_progress=on_progress)
+    upsampler, prediction, assessment = separator.fit(
+        photo, quality=options.quality, hints=hints, on_progress=on_progress
+    )
     width, height = _preview_size(photo.size)
     maps = {
         "change_slope": upsampler.change.slope,

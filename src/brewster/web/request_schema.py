@@ -23,7 +23,7 @@ from brewster.remote_path import check_not_video
 
 FIELDS: Final = ("layers", "strength", "quality", "format", "additive", "model")
 """The options that a client may set as text. The server sets the other options."""
-_FILES: Final = ("photo", "mask")
+_FILES: Final = ("photo", "mask", "hints")
 _OPTIONS: Final = TypeAdapter(Options)
 _REQUEST_PARTS: Final = ("query", "path", "body")
 _MAX_NAME_BYTES: Final = 255 - len(".transmission.jpeg")
@@ -47,6 +47,7 @@ class SeparationRequest:
     """The file name of the photo, as returned by `safe_name`."""
     options: Options
     mask: bytes | None = None
+    hints: bytes | None = None
 
     def target(self, layer: str, format_name: str) -> str:
         """Returns the file name of a layer, the same as on the command line. `format_name` is the format of the photo."""
@@ -108,15 +109,17 @@ async def _build_request(form: FormData, options: Options) -> SeparationRequest:
         raise HTTPException(
             422, "the form contains no photo; expected an image file; send it in the field photo"
         )
-    mask = form.get("mask")
-    if mask is not None and not isinstance(mask, UploadFile):
-        raise HTTPException(
-            422, "the field mask contains no file; expected an image file; send the mask as a file"
-        )
+    painted: dict[str, bytes | None] = {}
+    for field in _FILES[1:]:
+        upload = form.get(field)
+        if upload is not None and not isinstance(upload, UploadFile):
+            raise HTTPException(
+                422, f"the field {field} contains no file; expected an image file; send the {field} as a file"
+            )
+        painted[field] = await upload.read() if upload else None
     name = safe_name(photo.filename or "")
     check_not_video(Path(name))
-    values = await mask.read() if mask else None
-    return SeparationRequest(await photo.read(), name, options, values)
+    return SeparationRequest(await photo.read(), name, options, **painted)
 
 
 @final
@@ -129,8 +132,8 @@ class _InMemoryParser(MultiPartParser):
 def form_schema(models: Sequence[str]) -> dict[str, Any]:
     """Returns the JSON schema of the form, for the OpenAPI document."""
     known = _OPTIONS.json_schema()["properties"]
-    mask = {**_PHOTO_SCHEMA, "description": known["mask"]["description"]}
-    fields = {"photo": _PHOTO_SCHEMA, "mask": mask, **{name: _as_field(known[name]) for name in FIELDS}}
+    painted = {name: {**_PHOTO_SCHEMA, "description": known[name]["description"]} for name in _FILES[1:]}
+    fields = {"photo": _PHOTO_SCHEMA, **painted, **{name: _as_field(known[name]) for name in FIELDS}}
     description = "The model to use, one of `GET /models`."
     fields["model"] = known["model"] | {
         "default": models[0],

@@ -162,7 +162,9 @@ def _separate(model_cache: ModelCache, form: SeparationRequest, on_progress: Pro
     started = time.perf_counter()
     options = form.options
     separation = model_cache.separator(options.model)(
-        form.photo, on_progress=on_progress, **options.call_options() | {"mask": form.mask}
+        form.photo,
+        on_progress=on_progress,
+        **options.call_options() | {"mask": form.mask, "hints": form.hints},
     )
     files = {}
     for layer in options.layers:
@@ -190,7 +192,10 @@ def _preview(
     photos: PhotoCache, model_cache: ModelCache, form: SeparationRequest, on_progress: ProgressCallback
 ) -> Response:
     photo, headers = _open_photo(photos, form)
-    maps = preview(model_cache.separator(form.options.model), photo, form.options, on_progress)
+    separator = model_cache.separator(form.options.model)
+    maps = preview(separator, photo, form.options, on_progress, form.hints)
+    if separator.takes_hints:
+        headers["Brewster-Takes-Hints"] = "yes"
     return Response(gzip.compress(maps, _GZIP_LEVEL, mtime=0), headers=headers, media_type="application/gzip")
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from html import escape
@@ -12,7 +11,6 @@ from typing import Any, Final, final
 import numpy as np
 from numpy.typing import NDArray
 
-from brewster import srgb
 from brewster.photo import FileInfo, Photo
 
 Pixels = NDArray[np.uint8]
@@ -55,7 +53,6 @@ COLOUR_MAP: Final = _colour_map()
 """Colours of error maps, sRGB uint8 (16, 3), from "inferno" of matplotlib (CC0). The lightness increases evenly, so that a
 grey print is readable. Each colour covers MAX_ERROR / 16. Images with only 16 colours give small lossless files."""
 
-_LINEAR: Final = srgb.to_linear(np.linspace(0, 1, 256, dtype=np.float32))
 _OVERLAY_COLOUR: Final = (255, 40, 150)
 _OVERLAY_ALPHA: Final = 115
 
@@ -178,8 +175,8 @@ def encode_photo(image: Pixels) -> bytes:
     WebP files are 1/8 smaller, but their encoder takes seven times as long.
     """
     if embedded_size(image) != image.shape[1::-1]:
-        encoded = srgb.to_encoded(_area_means(_LINEAR[image]))
-        image = np.rint(encoded * 255).clip(0, 255).astype(np.uint8)
+        light = Photo.from_array(image, encoding="srgb").resized(*embedded_size(image))
+        image = Photo.from_array(light, encoding="linear").srgb_8bit()
     return Photo(image, None, FileInfo(format_name="jpeg", jpeg_quality=_JPEG_QUALITY)).encode()
 
 
@@ -189,8 +186,7 @@ def error_map(prediction: Pixels, truth: Pixels) -> Pixels:
     The error is max over channels |prediction - truth|, averaged over the area of each new pixel.
     """
     red, green, blue = np.moveaxis(np.abs(prediction.astype(np.int16) - truth), 2, 0)
-    errors = np.maximum(np.maximum(red, green), blue)  # much faster than max(axis=2)
-    means = _area_means(errors.astype(np.float32)[..., None])[..., 0]
+    means = _area_means(np.maximum(np.maximum(red, green), blue))  # much faster than max(axis=2)
     colours: Pixels = COLOUR_MAP[(means / MAX_ERROR * _COLOUR_COUNT).astype(int).clip(0, _COLOUR_COUNT - 1)]
     return colours
 
@@ -205,33 +201,13 @@ def overlay(region: NDArray[np.bool_]) -> bytes:
 
     A new pixel is inside if at least half of its area is in the region.
     """
-    inside = _area_means(region.astype(np.float32)[..., None])[..., 0] >= 0.5
+    inside = _area_means(region) >= 0.5
     alpha = np.where(inside, np.uint8(_OVERLAY_ALPHA), np.uint8(0))
     colour = np.broadcast_to(np.array(_OVERLAY_COLOUR, np.uint8), (*alpha.shape, 3)).copy()
     return encode_lossless(colour, alpha)
 
 
-def _area_means(values: Float32) -> Float32:
-    """Downscales (H, W, C) to the embedded size. Each new pixel is the mean over its area.
-
-    Photo.resized computes the same row by row to save memory. This function is faster.
-    """
-    width, height = embedded_size(values)
-    return _area_means_along(_area_means_along(values, height, axis=0), width, axis=1)
-
-
-def _area_means_along(values: Float32, new: int, *, axis: int) -> Float32:
-    """Downscales one axis to `new` pixels. Each new pixel is a weighted sum of a few neighbouring old pixels."""
-    old = values.shape[axis]
-    if new == old:
-        return values
-    edges = np.arange(new + 1) * old / new
-    first = np.floor(edges[:-1]).astype(int)
-    means = np.zeros((*values.shape[:axis], new, *values.shape[axis + 1 :]), np.float32)
-    for pixel in (first + i for i in range(math.ceil(old / new) + 1)):
-        overlap = np.minimum(edges[1:], pixel + 1) - np.maximum(edges[:-1], pixel)
-        weights = (overlap.clip(0) * new / old).astype(np.float32)
-        shape = [1] * values.ndim
-        shape[axis] = new
-        means += weights.reshape(shape) * values.take(pixel, axis, mode="clip")
-    return means
+def _area_means(values: NDArray[Any]) -> Float32:
+    """Downscales (H, W) to the embedded size. Each new pixel is the mean over its area."""
+    photo = Photo.from_array(values.astype(np.float32)[..., None].repeat(3, axis=2), encoding="linear")
+    return photo.resized(*embedded_size(values))[..., 0]

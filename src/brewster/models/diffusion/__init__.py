@@ -3,9 +3,8 @@
     backbones/    one Backbone class for each model (kontext, klein, qwen), their table, and how they are loaded
     model_source  finds out what a value of --model is: a backbone, or a LoRA with its base
     panels        composes I, T and R into one image, and splits it again
-    memory        chooses where the weights are, and checks device, memory and disk before a download
+    memory        checks device, memory and disk before a download (../diffusion_resources.py has the tables and formulas)
     offloading    weights in host memory, and decoding in tiles, for small GPUs
-    cost          counts parameters and operations; the table of graphics cards
     prompt        the paper's prompt, encoded once
     text_encoders where the text encoders are loaded
     task          which panels to generate, their size, and the sampling method
@@ -18,5 +17,5 @@
     out_of_memory converts out-of-memory errors
     lazy_imports  imports diffusers, transformers and peft at their first use
 
-Importing this package imports torch, but none of the other libraries.
+`panels`, `task` and `hub_download` need no torch; no module imports the other libraries before their first use.
 """

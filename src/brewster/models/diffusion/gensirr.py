@@ -3,8 +3,8 @@ Removal") to a folder in diffusers' layout with its prompt and task.
 
     convert(Path("GenSIRR.pt"), Path("gensirr"))        # then: brewster window.jpg --model gensirr
 
-GenSIRR is FLUX.1 Kontext with other weights of transformer and VAE, and a stored prompt embedding. Its published inference
-code takes 28 steps with guidance 3.5 from sigma 1 to 0.001, and an input with a short side of 768 (or 512) pixels.
+GenSIRR is FLUX.1 Kontext with other weights of transformer and VAE, and a stored prompt embedding. For its task, see
+`gensirr_task`.
 """
 
 from __future__ import annotations
@@ -21,21 +21,17 @@ from brewster.errors import ModelError
 from brewster.models.diffusion.backbones.backbone import Backbone
 from brewster.models.diffusion.backbones.kontext import Kontext
 from brewster.models.diffusion.backbones.registry import build_on_meta
-from brewster.models.diffusion.panels import PanelLayout
 from brewster.models.diffusion.prompt import PROMPT_FILE, PromptEmbedding
-from brewster.models.diffusion.task import TASK_FILE, DecompositionTask, save_task
+from brewster.models.diffusion.task import TASK_FILE, gensirr_task, save_task
 from brewster.models.zoo import TINY_PREFIX
 
-SHORT_SIDE_PX: Final = 768
 _PREFIX: Final = "net_g."
 _PROMPT_TEXT: Final = "GenSIRR's stored embedding"
 _IGNORED: Final = ("text_encoder.",)
 """Weights that inference does not use."""
 
 
-def convert(
-    checkpoint: Path, folder: Path, *, base_model: str = "kontext", short_side_px: int = SHORT_SIDE_PX
-) -> None:
+def convert(checkpoint: Path, folder: Path, *, base_model: str = "kontext", short_side_px: int = 768) -> None:
     """Reads the checkpoint and writes the folder. The weights keep their precision.
 
     Args:
@@ -60,15 +56,7 @@ def convert(
     _load(checkpoint, backbone, state)
     backbone.save(folder)
     prompt.save(folder / PROMPT_FILE)
-    task = DecompositionTask(
-        PanelLayout(("T",)),
-        max_composite_pixels=short_side_px**2,
-        guidance=3.5,
-        steps=28,
-        last_sigma=0.001,
-        short_side_px=short_side_px,
-    )
-    save_task(task, folder / TASK_FILE)
+    save_task(gensirr_task(short_side_px), folder / TASK_FILE)
 
 
 def _read_checkpoint(path: Path) -> dict[str, Tensor]:

@@ -6,11 +6,10 @@ check_machine("kontext", Kontext, placement, requested="auto")
 
 from __future__ import annotations
 
-import importlib.util
-from collections.abc import Sequence
-from dataclasses import dataclass
+import sys
+from dataclasses import replace
 from pathlib import Path
-from typing import Final, final
+from typing import Final
 
 import torch
 
@@ -24,57 +23,28 @@ from brewster.models.diffusion.backbones.registry import (
 )
 from brewster.models.diffusion.hub_download import free_disk_bytes, is_transformer_cached
 from brewster.models.diffusion.lazy_imports import import_bitsandbytes, import_library
+from brewster.models.diffusion_resources import (
+    GIB,
+    INFERENCE_OVERHEAD_GIB,
+    BackboneCost,
+    Placement,
+    fitting_quantizations,
+    place_on_gpu,
+    weights_gib,
+)
 from brewster.models.zoo import TINY_PREFIX
 from brewster.options import Offload, Quantization
 
-GIB: Final = 1 << 30
-BYTES_PER_WEIGHT: Final[dict[Quantization | None, float]] = {
-    None: 2.0, "int8": 1.01, "float8": 1.01, "nf4": 0.52,
-}  # fmt: skip
-"""Bytes with the quantization scales. The weights of FLUX.1 Kontext need 22.2, 11.2 (8 bits) and 5.8 GiB (4 bits)."""
-_CPU_BYTES_PER_WEIGHT: Final = 4
-"""On a CPU the transformer computes in float32, because most CPUs have no fast bfloat16."""
 _FILE_BYTES_PER_WEIGHT: Final = 2
-VAE_PARAMETERS: Final = 130_000_000
-"""The VAE of Qwen-Image-Edit, the largest one."""
-INFERENCE_OVERHEAD_GIB: Final = 3.0
-"""CUDA context, VAE and activations of one prediction at the paper's size, without gradients."""
-OFFLOADED_WEIGHTS_GIB: Final = 1.5
-"""Weights on the GPU during offloading: the largest block (0.7 GiB), and the layers outside of the blocks."""
 _HOST_OVERHEAD_GIB: Final = 2.0
 _MIN_LARGE: Final = 500_000_000
 """A transformer with fewer parameters runs on any machine, so nothing is checked."""
-_SMALLER_MODEL: Final = "close other programs, or choose a smaller backbone (klein) or another machine"
+_SMALLER_MODEL: Final = "close other programs, or choose another machine"
+_WINDOWS_HINT: Final = (
+    "; if this machine has an NVIDIA GPU: pip installs torch for Windows without CUDA, so install the CUDA build "
+    "with the line that pytorch.org/get-started shows"
+)
 _DEVICES: Final = {"auto": "", "cuda": "cuda", "rocm": "cuda", "cpu": "cpu"}
-
-
-@final
-@dataclass(frozen=True)
-class Placement:
-    """Where and how the weights of the transformer are stored.
-
-    `device` is torch's name of the device that computes. If `is_offloaded`, the weights are in host memory, and each
-    block is copied to the device only while it computes.
-    """
-
-    device: str
-    quantization: Quantization | None = None
-    is_offloaded: bool = False
-
-    def gpu_gib(self, weights: int) -> float:
-        """The GPU memory in GiB for this number of weights and one prediction."""
-        resident = OFFLOADED_WEIGHTS_GIB if self.is_offloaded else weights_gib(weights, self.quantization)
-        return resident + INFERENCE_OVERHEAD_GIB
-
-    def host_gib(self, weights: int) -> float:
-        """The host memory in GiB for this number of weights. Without offloading, a GPU needs none for them."""
-        if self.device != "cpu":
-            return weights_gib(weights, self.quantization) if self.is_offloaded else 0
-        return (
-            weights_gib(weights, self.quantization)
-            if self.quantization
-            else weights * _CPU_BYTES_PER_WEIGHT / GIB
-        )
 
 
 def torch_device(device: str) -> str:
@@ -92,34 +62,42 @@ def torch_device(device: str) -> str:
     return _DEVICES[device] or ("cuda" if torch.cuda.is_available() else "cpu")
 
 
+def backbone_cost(source: str, backbone_class: type[Backbone]) -> BackboneCost:
+    """The cost of a backbone. A folder, or a hub id in the cache, is counted by its configuration.
+
+    For another source it is the cost of its class.
+
+    Raises:
+        ModelError: the configuration is damaged.
+    """
+    cost = backbone_class.cost
+    if source.startswith(TINY_PREFIX):
+        return cost.tiny()
+    if is_registered(source) or (folder := find_description(source)) is None:
+        return cost
+    backbone = build_on_meta(str(folder))
+    config = backbone.transformer.config
+    blocks = len(backbone.transformer.transformer_blocks)
+    blocks += len(getattr(backbone.transformer, "single_transformer_blocks", ()))
+    width = int(config.num_attention_heads * config.attention_head_dim)
+    cost = cost.scaled(int(backbone.transformer.num_parameters()), blocks=blocks, width=width)
+    vae = sum(parameter.numel() for parameter in backbone.vae.parameters())
+    return replace(
+        cost, vae_parameters=vae, predictions_per_step=1 if backbone.distilled else cost.predictions_per_step
+    )
+
+
 def count_weights(source: str, backbone_class: type[Backbone], transformer_file: Path | None = None) -> int:
     """The number of parameters of the transformer; 0 for a tiny version.
 
-    They are counted by the configuration of a folder or of a hub id in the cache. For another source it is the number of
-    the backbone, and for a `transformer_file` the number of bf16 weights that need the same memory.
+    For a `transformer_file`, it is the number of bf16 weights that need the same memory.
 
     Raises:
         ModelError: the configuration is damaged.
     """
     if transformer_file:
         return transformer_file.stat().st_size // _FILE_BYTES_PER_WEIGHT
-    if source.startswith(TINY_PREFIX):
-        return 0
-    if is_registered(source) or (folder := find_description(source)) is None:
-        return backbone_class.parameter_count
-    return int(build_on_meta(str(folder)).transformer.num_parameters())
-
-
-def weights_gib(parameters: int, quantization: Quantization | None) -> float:
-    """The memory in GiB of a transformer with this number of parameters."""
-    return parameters * BYTES_PER_WEIGHT[quantization] / GIB
-
-
-def fitting_quantizations(
-    parameters: int, budget_gib: float, candidates: Sequence[Quantization | None] = ("int8", "nf4")
-) -> Sequence[Quantization | None]:
-    """The candidates with which the weights fit into the budget, in their order."""
-    return [each for each in candidates if weights_gib(parameters, each) <= budget_gib]
+    return backbone_cost(source, backbone_class).parameters
 
 
 def choose_placement(
@@ -167,55 +145,6 @@ def choose_placement(
     )
 
 
-def place_on_gpu(
-    weights: int,
-    *,
-    device: str = "cuda",
-    free_gib: float,
-    total_gib: float,
-    quantization: Quantization | None = None,
-    preferred: Quantization | None = None,
-    offload: Offload = "auto",
-    is_single_file: bool = False,
-) -> Placement:
-    """The placement on a GPU with this memory.
-
-    If no quantization is given, it is the first of (`preferred`, int8, nf4) with which the weights fit into the GPU. The
-    total memory decides, not the free one: the same machine always gives the same result. If none fits, or the weights
-    are offloaded on request, it is `preferred`. Int8 replaces nf4 if bitsandbytes is not installed, or the weights are
-    offloaded.
-
-    Weights in a single file stay as they are. With `offload` "auto", the weights are offloaded if they do not fit into the free memory.
-
-    Raises:
-        DeviceError: offloading was requested with nf4, which cannot be offloaded.
-    """
-    if offload == "layers" and quantization == "nf4":
-        raise DeviceError(
-            "offload = layers was requested with quantization = nf4",
-            "expected int8, float8 or no quantization, because weights in nf4 cannot be moved between devices",
-            "use --quantization int8, or leave offload out",
-        )
-    movable: Quantization | None = "int8" if preferred == "nf4" else preferred
-    has_nf4 = importlib.util.find_spec("bitsandbytes") is not None
-    if not has_nf4:
-        preferred = movable
-    chosen = quantization
-    if quantization is None and offload == "layers" and not is_single_file:
-        chosen = movable
-    elif quantization is None and not is_single_file:
-        candidates: list[Quantization | None] = [preferred, "int8"]
-        if has_nf4:
-            candidates.append("nf4")
-        fitting = fitting_quantizations(weights, total_gib - INFERENCE_OVERHEAD_GIB, candidates)
-        fallback = preferred if offload == "none" else movable or "int8"
-        chosen = fitting[0] if fitting else fallback
-    resident = Placement(device, chosen)
-    fits = resident.gpu_gib(weights) <= free_gib
-    is_offloaded = offload == "layers" or (offload == "auto" and not fits and chosen != "nf4" and weights > 0)
-    return Placement(device, chosen, is_offloaded)
-
-
 def check_machine(
     source: str,
     backbone_class: type[Backbone],
@@ -246,16 +175,16 @@ def check_machine(
         return
     check_device(source, weights, placement.device, requested=requested)
     if with_text_encoders:
-        encoders = weights_gib(backbone_class.text_encoder_parameters, None)
+        encoders = weights_gib(backbone_class.cost.text_encoder_parameters, None)
         _check_host_memory(source, encoders, "of host memory, because its text encoders are loaded there")
     _check_memory(source, weights, placement)
     if placement.quantization == "nf4" and placement.device != "cpu":
         import_bitsandbytes()
     hub_id = hub_id_of(source)
     if not transformer_file and not Path(source).is_dir() and not is_transformer_cached(hub_id):
-        _check_disk(
-            hub_id, weights + VAE_PARAMETERS + with_text_encoders * backbone_class.text_encoder_parameters
-        )
+        cost = backbone_class.cost
+        encoders = with_text_encoders * cost.text_encoder_parameters
+        _check_disk(hub_id, weights + cost.vae_parameters + encoders)
 
 
 def check_device(source: str, weights: int, device: str, *, requested: str) -> None:
@@ -268,7 +197,7 @@ def check_device(source: str, weights: int, device: str, *, requested: str) -> N
         raise DeviceError(
             f"torch finds no GPU, and {source} has {weights / 1e9:.1f} billion parameters",
             "expected an NVIDIA or AMD GPU, because one photo takes hours on a CPU",
-            "use the model compact, or choose --device cpu explicitly",
+            f"use the model compact, or choose --device cpu explicitly{_WINDOWS_HINT if sys.platform == 'win32' else ''}",
         )
 
 

@@ -32,9 +32,8 @@ from brewster.models.diffusion.hub_download import (
     list_root_files,
     resolve_model_folder,
 )
-from brewster.models.diffusion.panels import PanelLayout
 from brewster.models.diffusion.prompt import PROMPT_FILE
-from brewster.models.diffusion.task import TASK_FILE, DecompositionTask, load_task
+from brewster.models.diffusion.task import TASK_FILE, DecompositionTask, load_task, named_task
 from brewster.models.diffusion_models import DIFFUSION_MODELS, check_is_converted
 from brewster.models.zoo import TINY_PREFIX
 from brewster.options import Quantization
@@ -111,7 +110,7 @@ def find_model_source(
     """
     if is_registered(model):
         _check_no_base(model, base_model)
-        return ModelSource(model, find_backbone_class(model.removeprefix(TINY_PREFIX)), _default_task())
+        return ModelSource(model, find_backbone_class(model.removeprefix(TINY_PREFIX)), named_task(model))
     row = DIFFUSION_MODELS.get(model)
     source = row.hub_id if row and row.is_opened_by_name else model
     if not Path(source).is_dir():
@@ -136,7 +135,7 @@ def find_model_source(
         raise _unknown_layout(model, list_root_files(source if allow_download else str(folder)))
     _check_no_base(model, base_model)
     path = folder / TASK_FILE
-    task = load_task(path) if path.is_file() else _default_task()
+    task = load_task(path) if path.is_file() else named_task(model)
     has_prompt = (folder / PROMPT_FILE).is_file()
     return ModelSource(source, read_index(folder)[0], task, has_prompt=has_prompt, folder=folder)
 
@@ -157,10 +156,6 @@ def _unknown_layout(model: str, files: Sequence[str]) -> ModelError:
     )
 
 
-def _default_task() -> DecompositionTask:
-    return DecompositionTask(PanelLayout(("T",)))
-
-
 def _published_source(model: str, base_model: str | None) -> ModelSource:
     """Returns the source of WindowSeat without a download, for `--plan`."""
     row = DIFFUSION_MODELS.get(model)
@@ -174,8 +169,8 @@ def _published_source(model: str, base_model: str | None) -> ModelSource:
     return ModelSource(
         base_model or row.base_model,
         windowseat.BACKBONE,
-        windowseat.published_task(),
-        windowseat.QUANTIZATION,
+        named_task(model),
+        row.quantization,
         has_prompt=True,
     )
 

@@ -25,7 +25,6 @@ from brewster.models.diffusion.backbones.backbone import Backbone
 from brewster.models.diffusion.backbones.loading import encode_prompt, load_backbone
 from brewster.models.diffusion.hub_download import find_weights_file
 from brewster.models.diffusion.memory import (
-    Placement,
     check_device,
     check_machine,
     choose_placement,
@@ -39,6 +38,7 @@ from brewster.models.diffusion.panels import PanelLayout, compose, conditioning_
 from brewster.models.diffusion.prompt import PROMPT_FILE, PROMPTS, PromptEmbedding, load_prompt
 from brewster.models.diffusion.sampling import euler, sample
 from brewster.models.diffusion.task import DecompositionTask
+from brewster.models.diffusion_resources import Placement
 from brewster.models.zoo import model_name
 from brewster.options import Offload, Quantization
 
@@ -218,7 +218,7 @@ def load_pipeline(
     if few_step_layers:
         stack_layers(backbone, few_step_layers)
     if placement.is_offloaded:
-        offload_layers(backbone, placement.device)
+        offload_layers(backbone.transformer, backbone.vae, placement.device)
     task = task_with_options(
         source, guidance=guidance, timestep_shift=timestep_shift, has_few_step_lora=bool(fast_lora)
     )

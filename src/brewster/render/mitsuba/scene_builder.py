@@ -92,9 +92,7 @@ class MitsubaSceneBuilder:
     def _sensor(self) -> Plugin:
         """Returns the camera. Mitsuba's cameras look along +z with +x to the left. The pixel filter is a box."""
         camera = self.scene.camera
-        right, up, back = (
-            self._to_glass @ axis for axis in np.array(axes(camera.heading_deg, camera.pitch_deg))
-        )
+        right, up, back = (self._to_glass @ axis for axis in np.array(camera.axes))
         lens = {
             "type": "thinlens",
             "aperture_radius": camera.aperture_mm / 2,
@@ -305,7 +303,8 @@ class MitsubaSceneBuilder:
         picture = self._select_channel(self._assets.plane_radiance(plane))
         facing = 1 if is_behind else -1
         columns = np.array(axes(plane.heading_deg, plane.pitch_deg)) * (facing, 1, facing)
-        half = plane.width_mm / 2, plane.width_mm / 2 * picture.shape[0] / picture.shape[1]
+        height_mm = plane.height_mm or plane.width_mm * picture.shape[0] / picture.shape[1]
+        half = plane.width_mm / 2, height_mm / 2
         texture = self._bitmap(picture[::-1], wrap_mode="clamp")  # v increases upwards
         emitter = {"emitter": {"type": "area", "radiance": texture}} if is_lit else {}
         return self._rectangle(

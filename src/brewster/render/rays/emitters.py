@@ -353,5 +353,5 @@ def _plane_emitter(plane: Plane, assets: Assets, is_behind: bool, device: Device
         right=right,
         up=up,
         half_width_mm=plane.width_mm / 2,
-        half_height_mm=plane.width_mm / 2 * height / width,
+        half_height_mm=(plane.height_mm or plane.width_mm * height / width) / 2,
     )

@@ -52,6 +52,8 @@ COLUMNS: Final = {
             (distance_key, "float64", distance_key),
         )
     },
+    "burst_frame": ("int64", "burst.frame"),
+    "burst_frames": ("int64", "burst.frames"),
     "jpeg_quality": ("int64", "camera_response.jpeg_quality"),
     "exposure_ev": ("float64", "outcome.exposure_ev"),
     "mirror_exposure_ev": ("float64", "outcome.mirror_exposure_ev"),

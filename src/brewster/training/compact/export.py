@@ -9,42 +9,54 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
+import onnx
 import torch
 from onnx import ModelProto, TensorProto, helper, numpy_helper
-from torch import nn
+from torch import Tensor, nn
 
+from brewster.errors import ModelError
 from brewster.files import write_atomically
 from brewster.models.compact import LinearSeparator
+from brewster.models.networks import NetworkEntry
 
 _OPSET = 18
+_PREFIX = "network."
+"""The prefix of the weights' names: `LinearSeparator` contains the network."""
+_HALF = "_half"
+"""The suffix of the names of weights in half precision."""
 _MIN_HALF_SIZE = 16
 """Tensors with fewer values stay float32: they are constants of the graph, such as the coefficients of the sRGB curve."""
 
 
-def export_onnx(network: nn.Module, path: Path, stride: int) -> None:
+def export_onnx(network: nn.Module, path: Path, entry: NetworkEntry) -> None:
     """Writes the network as an ONNX file: input `photo`, outputs `transmission` and `reflection`.
 
-    Input and outputs are linear light, (1, 3, H, W), with H and W multiples of `stride`. The weights are stored in half
+    Input and outputs are linear light, (1, 3, H, W), with H and W multiples of the stride. Networks that take hints have a second
+    input `hints`, (1, 2, H, W). The weights are stored in half
     precision, which halves the size of the file. The network still computes in float32.
 
     Raises:
         OutputError: the file cannot be written.
     """
     height, width = (torch.export.Dim(name, min=1, max=256) for name in ("rows", "columns"))
-    example = torch.rand(1, 3, 4 * stride, 5 * stride)
+    stride, names = entry.stride, ["photo", "hints"][: 1 + entry.takes_hints]
+    examples = [torch.rand(1, channels, 4 * stride, 5 * stride) for channels in (3, 2)]
     with _without_warnings():
         program = torch.onnx.export(
             LinearSeparator(network).eval(),
-            (example,),
-            input_names=["photo"],
+            tuple(examples[: len(names)]),
+            input_names=names,
             output_names=["transmission", "reflection"],
-            dynamic_shapes={"photo": {2: stride * height, 3: stride * width}},
+            dynamic_shapes={name: {2: stride * height, 3: stride * width} for name in names},
             opset_version=_OPSET,
             dynamo=True,
             verbose=False,
         )
     assert program is not None
-    write_atomically(path, with_half_weights(program.model_proto).SerializeToString(), overwrite=True)
+    model = with_half_weights(program.model_proto)
+    for node in model.graph.node:
+        del node.metadata_props[:]  # stack traces with the paths of this machine
+    write_atomically(path, model.SerializeToString(), overwrite=True)
 
 
 def with_half_weights(model: ModelProto) -> ModelProto:
@@ -57,7 +69,7 @@ def with_half_weights(model: ModelProto) -> ModelProto:
     for index, weight in enumerate(graph.initializer):
         values = numpy_helper.to_array(weight)
         if values.dtype == np.float32 and values.size >= _MIN_HALF_SIZE:
-            half = f"{weight.name}_half"
+            half = weight.name + _HALF
             casts.append(helper.make_node("Cast", [half], [weight.name], to=TensorProto.FLOAT))
             graph.initializer[index].CopyFrom(numpy_helper.from_array(values.astype(np.float16), half))
     nodes = [*casts, *graph.node]
@@ -66,15 +78,40 @@ def with_half_weights(model: ModelProto) -> ModelProto:
     return model
 
 
+def read_weights(path: Path) -> dict[str, Tensor]:
+    """Returns the weights of a network in a file of `export_onnx`, in the half precision of the file, by name.
+
+    Raises:
+        ModelError: the file cannot be read.
+    """
+    try:
+        graph = onnx.load(path).graph
+    except Exception as error:
+        raise ModelError(
+            f"{path} cannot be read ({error})",
+            "expected a model that brewster train has exported",
+            "check the file",
+        ) from error
+    return {
+        tensor.name.removeprefix(_PREFIX).removesuffix(_HALF): torch.tensor(
+            numpy_helper.to_array(tensor)
+        ).float()
+        for tensor in graph.initializer
+        if tensor.name.startswith(_PREFIX)
+    }
+
+
 @contextmanager
 def _without_warnings() -> Iterator[None]:
-    """Hides two warnings of the exporter: torchvision is missing (it is not needed), and the exporter calls deprecated functions."""
+    """Hides warnings of the exporter: torchvision is missing (it is not needed), the exporter calls deprecated functions, and photo
+    and hints have the same size."""
     logger = logging.getLogger("torch.onnx")
     before = logger.level
     logger.setLevel(logging.ERROR)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", FutureWarning)
+            warnings.filterwarnings("ignore", message=".*axis name", category=UserWarning)
             yield
     finally:
         logger.setLevel(before)

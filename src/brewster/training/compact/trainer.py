@@ -1,11 +1,10 @@
 """Trains the compact network with AdamW and an exponential moving average (EMA) of the weights, on a GPU if there is one.
 
-network = train(read_recipe(Path("recipes/train/compact-stage1.toml")), Path("out/compact-stage1"), on_step)
+network = train(read_recipe(Path("recipes/train/compact.toml")), Path("out/compact"), on_step)
 """
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -18,10 +17,10 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from brewster.errors import ModelError
-from brewster.models.networks import DEFAULT_NETWORK, NETWORKS
-from brewster.models.zoo import MODEL_FILE
-from brewster.training.checkpoint import Checkpoint, mismatch_as_model_error
-from brewster.training.compact.export import export_onnx
+from brewster.models.networks import NETWORKS
+from brewster.models.zoo import MODEL_FILE, find_model
+from brewster.training.compact.export import export_onnx, read_weights
+from brewster.training.data.hints import simulate_hints
 from brewster.training.data.mixtures import Stream, TrainingBatch
 from brewster.training.distributed import best_device
 from brewster.training.loop import StepCallback, run
@@ -47,7 +46,6 @@ _SAMPLE_COLUMNS: Final = (
     "predicted reflection R",
 )
 _MAX_GRADIENT_NORM: Final = 1.0
-_START_FROM_CURE: Final = "train the recipe that writes it first, or correct init_checkpoints in this recipe"
 
 
 def train(recipe: CompactRecipe, out: Path, on_step: StepCallback) -> nn.Module:
@@ -63,9 +61,7 @@ def train(recipe: CompactRecipe, out: Path, on_step: StepCallback) -> nn.Module:
         OutputError: `out` cannot be written to.
     """
     trainer = CompactTrainer(recipe)
-    # This limits torch to one core in the current thread. The thread pools of the trainer do the same in their threads.
-    with single_torch_thread():
-        run(trainer, out, on_step)
+    run(trainer, out, on_step)
     return trainer.ema_network()
 
 
@@ -90,7 +86,7 @@ class CompactTrainer:
         self._chunk_count = torch.get_num_threads() if self.device.type == "cpu" else 1
         self._chunk_pool = _single_thread_pool(self._chunk_count)
         self._data_pool = _single_thread_pool(self._data_workers)
-        self._prefetched: dict[int, Future[TrainingBatch]] = {}
+        self._prefetched: dict[int, Future[tuple[TrainingBatch, Tensor | None]]] = {}
         torch.manual_seed(recipe.seed)
         network = self._entry.pretrained()
         self.network = network.to(self.device, memory_format=torch.channels_last)  # type: ignore[call-overload]
@@ -107,24 +103,27 @@ class CompactTrainer:
             fused=True,
         )
 
-    @torch.no_grad()
     def initialize(self) -> None:
-        """Loads the mean of the EMA weights of all checkpoints in `init_checkpoints`.
-
-        The mean of the weights of several runs with a common start is often better than each of them (model soups,
-        Wortsman et al. 2022).
+        """Loads the weights of `init` into the network, or into its encoder if the file contains only this part.
 
         Raises:
-            ModelError: a checkpoint is missing, damaged or of another network.
+            ModelError: the model is unknown or damaged, or contains another network.
         """
-        for count, path in enumerate(self.recipe.init_checkpoints, start=1):
-            loaded, checkpoint = self._entry.build(), Checkpoint.read(path, _START_FROM_CURE)
-            with mismatch_as_model_error(path, _START_FROM_CURE):
-                _check_network(path, checkpoint, self.recipe.network)
-                loaded.load_state_dict(checkpoint.state.get("average", {}))
-            for parameter, start in zip(self.network.parameters(), loaded.parameters(), strict=True):
-                parameter.lerp_(start.to(self.device), 1 / count)
-        self._reset_ema()
+        if self.recipe.init is None:
+            return
+        weights = read_weights(find_model(self.recipe.init).path)
+        for part in (self.network, self.network.get_submodule("encoder")):
+            if {name: value.shape for name, value in part.state_dict().items()} == {
+                name: value.shape for name, value in weights.items()
+            }:
+                part.load_state_dict(weights)
+                self._reset_ema()
+                return
+        raise ModelError(
+            f"{self.recipe.init} contains another network",
+            f"expected the network {self.recipe.network} or its encoder",
+            "correct init in the recipe",
+        )
 
     def state_dict(self) -> dict[str, Any]:
         """Returns the weights, their EMA, and the state of the optimiser."""
@@ -146,26 +145,30 @@ class CompactTrainer:
         Raises:
             ModelError: the loss is NaN or infinite. The last checkpoint is still valid.
         """
-        parts = self._compute_gradients(self._batch(step).to(self.device))
-        loss = check_finite(torch.stack(list(parts.values())).sum(), step)
-        self._set_learning_rates(step)
-        norm = nn.utils.clip_grad_norm_(self.network.parameters(), _MAX_GRADIENT_NORM)
-        # Skip the batch if its gradient is infinite: one such step makes all weights invalid.
-        if norm.isfinite():
-            self.optimizer.step()
-            self._update_ema(step + 1)
+        batch, hints = self._batch(step)
+        # With two threads for the optimiser, each waits actively for the other: a quarter of the time on a busy machine.
+        with single_torch_thread():
+            parts = self._compute_gradients(batch.to(self.device), hints)
+            loss = check_finite(torch.stack(list(parts.values())).sum(), step)
+            self._set_learning_rates(step)
+            norm = nn.utils.clip_grad_norm_(self.network.parameters(), _MAX_GRADIENT_NORM)
+            # Skip the batch if its gradient is infinite: one such step makes all weights invalid.
+            if norm.isfinite():
+                self.optimizer.step()
+                self._update_ema(step + 1)
         return {"loss": loss.item(), **{f"loss_{name}": part.item() for name, part in parts.items()}}
 
-    def _compute_gradients(self, batch: TrainingBatch) -> dict[str, Tensor]:
+    def _compute_gradients(self, batch: TrainingBatch, hints: Tensor | None) -> dict[str, Tensor]:
         """Computes the gradient of the batch's mean loss for each parameter. Returns the parts of the loss.
 
         On a CPU, the batch is split into one chunk per core, and one thread computes each chunk. For 16 images of 128 px on two
         cores, this is 1.2-1.3 times as fast as splitting each operation over all cores.
         """
         count = len(batch.photo_encoded)
-        results = list(
-            self._chunk_pool.map(self._chunk_gradients, batch.split(-(-count // self._chunk_count)))
-        )
+        size = -(-count // self._chunk_count)
+        chunks = batch.split(size)
+        hint_chunks = [None] * len(chunks) if hints is None else torch.split(hints.to(self.device), size)
+        results = list(self._chunk_pool.map(self._chunk_gradients, chunks, hint_chunks))
         for parameter in self.network.parameters():
             # The fused optimiser ignores strides: a gradient needs its parameter's memory layout (docs/training.md).
             parameter.grad = torch.zeros_like(parameter)
@@ -176,12 +179,18 @@ class CompactTrainer:
         names = results[0][1]
         return {name: torch.stack([part[name] * n / count for n, part, _ in results]).sum() for name in names}
 
-    def _chunk_gradients(self, batch: TrainingBatch) -> tuple[int, dict[str, Tensor], tuple[Tensor, ...]]:
+    def _chunk_gradients(
+        self, batch: TrainingBatch, hints: Tensor | None
+    ) -> tuple[int, dict[str, Tensor], tuple[Tensor, ...]]:
         with torch.autocast(
             self.device.type, torch.bfloat16, enabled=self._uses_bfloat16, cache_enabled=False
         ):
-            layers = self.network(_channels_last(batch.photo_encoded))
-        parts = separation_loss(layers, batch, self.recipe.edge_weight, self.recipe.edge_scales_px)
+            photo = _channels_last(batch.photo_encoded)
+            layers = self.network(photo) if hints is None else self.network(photo, hints)
+        recipe = self.recipe
+        parts = separation_loss(
+            layers, batch, recipe.edge_weight, recipe.edge_scales_px, recipe.clipped_weight
+        )
         total = torch.stack(list(parts.values())).sum()
         gradients = torch.autograd.grad(total, tuple(self.network.parameters()))
         return len(batch.photo_encoded), {name: part.detach() for name, part in parts.items()}, gradients
@@ -198,7 +207,7 @@ class CompactTrainer:
         Raises:
             OutputError: the file cannot be written.
         """
-        export_onnx(self.ema_network(), folder / MODEL_FILE, self._entry.stride)
+        export_onnx(self.ema_network(), folder / MODEL_FILE, self._entry)
         return folder / MODEL_FILE
 
     def ema_network(self) -> nn.Module:
@@ -210,15 +219,19 @@ class CompactTrainer:
     def _reset_ema(self) -> None:
         self.ema_weights = {name: value.clone() for name, value in self.network.state_dict().items()}
 
-    def _batch(self, step: int) -> TrainingBatch:
-        """Returns the batch of this step, and starts to compute the next batches in background threads."""
+    def _batch(self, step: int) -> tuple[TrainingBatch, Tensor | None]:
+        """Returns the batch of this step with its hints, and starts to compute the next batches in background threads."""
         for ahead in range(step, step + 1 + self._data_workers):
             if ahead not in self._prefetched:
-                size = self.recipe.size_at(ahead)
-                self._prefetched[ahead] = self._data_pool.submit(
-                    self.stream, ahead, self.recipe.batch_size, size
-                )
+                self._prefetched[ahead] = self._data_pool.submit(self._read_batch, ahead)
         return self._prefetched.pop(step).result()
+
+    def _read_batch(self, step: int) -> tuple[TrainingBatch, Tensor | None]:
+        recipe = self.recipe
+        batch = self.stream(step, recipe.batch_size, recipe.size_at(step))
+        if not recipe.hint_probability:
+            return batch, None
+        return batch, simulate_hints(batch, probability=recipe.hint_probability, seed=recipe.seed, step=step)
 
     def _set_learning_rates(self, step: int) -> None:
         for group in self.optimizer.param_groups:
@@ -280,20 +293,6 @@ def _resize_pairs(folders: ValidationPairs, stride: int) -> dict[str, list[tuple
         name: [(_resize(photo, stride), _resize(ground_truth, stride)) for photo, ground_truth in pairs]
         for name, pairs in folders.items()
     }
-
-
-def _check_network(path: Path, checkpoint: Checkpoint, expected: str) -> None:
-    """Checks that the checkpoint contains the expected network.
-
-    A checkpoint without the recipe key `network` was written before the key existed, and contains the default network.
-    """
-    found = json.loads(checkpoint.recipe).get("network", DEFAULT_NETWORK)
-    if found != expected:
-        raise ModelError(
-            f"{path} contains the network {found}",
-            f"expected a checkpoint of {expected}, the network that the recipe trains",
-            _START_FROM_CURE,
-        )
 
 
 def _single_thread_pool(count: int) -> ThreadPoolExecutor:

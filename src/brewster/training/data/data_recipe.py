@@ -45,7 +45,7 @@ class RenderedRecipe(FrozenModel):
     maps: tuple[Path, ...] = ()
     """Folders of environment maps for `recipe`, relative to BREWSTER_DATA. Empty: built-in environments."""
     photos: tuple[Path, ...] = ()
-    """Folders of photos for `recipe`, relative to BREWSTER_DATA. Empty: built-in paintings."""
+    """Folders of photos for `recipe`, relative to BREWSTER_DATA. Empty: built-in photos."""
 
     @model_validator(mode="after")
     def _check_source(self) -> Self:
@@ -129,7 +129,7 @@ class DataRecipe(FrozenModel):
 class MixRecipe(FrozenModel):
     """Distributions of mixtures of photos: a background behind glass plus a reflection, in linear light.
 
-    `recipes/train/compact-stage4.toml` uses the defaults, except for `crop`. Luminances are linear. Lengths in pixels refer to an
+    Luminances are linear. Lengths in pixels refer to an
     image of 256 px and scale with the size of the training images, unless their description says otherwise.
     """
 
@@ -173,9 +173,9 @@ class MixRecipe(FrozenModel):
     reflection_contrast: LogRange = (0.8, 1.8)
     """Exponent on the luminance of the reflected scene. Values above 1 increase the contrast of its light sources."""
     lamp_probability: Share = 0.15
-    """Probability of small lamps in the reflection."""
+    """Probability of small lamps, for the background and for the reflection."""
     sign_probability: Share = 0.08
-    """Probability of a sign with letters in the reflection."""
+    """Probability of a sign with letters, for the background and for the reflection."""
     reflection_sharp_probability: Share = 0.35
     """Probability of a reflection without defocus blur."""
     reflection_blur_sigma_px: LogRange = (0.3, 9.0)

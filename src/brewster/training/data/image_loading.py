@@ -21,7 +21,7 @@ from brewster.srgb import to_encoded
 
 _MAPS = {suffix for suffix, image_format in SUFFIXES.items() if image_format.is_linear}
 _PHOTOS = SUFFIXES.keys() - _MAPS
-_PHOTO_SIDE_PX = 640
+_PHOTO_SIDE_PX = 1024
 _MAP_HEIGHT_PX = 512
 _MAX_FLOAT16 = 65504.0
 _WORD_END = re.compile(r"[^0-9A-Za-z]")
@@ -31,7 +31,7 @@ _FOLDER_CURE = "choose another folder in the recipe, or set BREWSTER_DATA to the
 def read_photos(
     folders: Sequence[Path], exclude: Sequence[str] = (), only: Sequence[str] = ("*",)
 ) -> list[Tensor]:
-    """Reads every photo of the folders: uint8 sRGB (H, W, 3), longest side at most 640 px, sorted by path.
+    """Reads every photo of the folders: uint8 sRGB (H, W, 3), longest side at most 1,024 px, sorted by path.
 
     `exclude` and `only` are patterns of file names, as in `fnmatch`.
 
@@ -46,14 +46,14 @@ def source_weights(folders: Sequence[Path], exclude: Sequence[str] = ()) -> list
     """Returns sampling weights for the photos of `read_photos`, so that no single source dominates.
 
     Photos whose file names start with the same word (letters and digits) belong to one source. The n photos of a source
-    have the total weight sqrt(n).
+    have the total weight n^(2/3): a large source counts more, but does not dominate.
 
     Raises:
         RecipeError: a folder cannot be read, or none of the folders contains a photo.
     """
     sources = [_WORD_END.split(path.name)[0] for path in _list_images(folders, _PHOTOS, exclude)]
     counts = Counter(sources)
-    return [counts[source] ** -0.5 for source in sources]
+    return [counts[source] ** (-1 / 3) for source in sources]
 
 
 def read_maps(

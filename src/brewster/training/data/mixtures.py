@@ -120,8 +120,13 @@ class Mixtures:
             view = effects.blur(view, sigma_px, disc=rng.bernoulli(0.5))
         if rng.bernoulli(recipe.shadow_probability):
             view = view * effects.shadow(rng, size)
-        level = rng.log_uniform(recipe.background_level)
-        return view * _temperature(rng, recipe.temperature) * (level / _mean_without_highlights(view))
+        view = view / _mean_without_highlights(view)
+        # Lamps and signs are as frequent behind the glass as in it: a network must not learn that they are reflections.
+        if rng.bernoulli(recipe.sign_probability):
+            view = effects.sign(rng, view)
+        if rng.bernoulli(recipe.lamp_probability):
+            view = view + effects.lamps(rng, size)
+        return view * _temperature(rng, recipe.temperature) * rng.log_uniform(recipe.background_level)
 
     def _reflection(self, rng: SampleRng, size: int) -> Image:
         """Returns a reflection in linear light, as a multiple of the mean of the background.
@@ -238,10 +243,12 @@ def _expose_and_develop(rng: SampleRng, recipe: MixRecipe, *layers: Image) -> tu
 def random_crop(rng: SampleRng, image: Tensor, fraction: Range, size: int) -> Tensor:
     """Returns a random crop, mirrored with probability 0.5, in linear light: (H, W, C) sRGB uint8 to (C, size, size).
 
-    `fraction` is the range of the side of the crop divided by the shorter side of the image.
+    `fraction` is the range of the side of the crop divided by the shorter side of the image. Where the image allows it, the crop is
+    enlarged by at most 1.25: an enlarged crop is soft, and a network would learn that backgrounds are soft.
     """
     height, width, _ = image.shape
     side = min(height, width) * rng.uniform(fraction)
+    side = max(side, min(height, width, size / _MAX_ENLARGEMENT))
     stretch = math.sqrt(rng.log_uniform((0.85, 1.18)))
     rows, columns = (max(8, min(limit, round(length))) for limit, length in (
         (height, side * stretch), (width, side / stretch)))  # fmt: skip
@@ -264,6 +271,7 @@ def rotated_crop(rng: SampleRng, image: Tensor, fraction: Range, size: int) -> T
 
 
 _MAX_ROTATION_DEG: Final = 25.0
+_MAX_ENLARGEMENT: Final = 1.25
 _LINEAR_OF_BYTE: Final = to_linear(torch.arange(256) / 255)
 
 

@@ -4,8 +4,7 @@ estimate = estimate_resources(recipe, CARDS["RTX 4090"])
 print(estimate.table())
 estimate.check_fits()
 
-Parameters and operations are counted on a backbone without storage (torch's device "meta"). Memory and time are computed from
-these counts.
+The layers of the LoRA are counted on a backbone without storage (torch's device "meta"); the rest is that of `BACKBONE_COSTS`.
 """
 
 from __future__ import annotations
@@ -19,20 +18,19 @@ import torch
 from brewster.models.diffusion.adapter.lora import select_target_modules
 from brewster.models.diffusion.backbones.backbone import Backbone
 from brewster.models.diffusion.backbones.registry import build_on_meta
-from brewster.models.diffusion.cost import (
+from brewster.models.diffusion.memory import backbone_cost
+from brewster.models.diffusion.panels import count_tokens, fit_panel
+from brewster.models.diffusion_resources import (
     EFFICIENCY,
+    GIB,
     PROMPT_TOKENS,
+    BackboneCost,
     GraphicsCard,
-    block_bytes,
     check_gpu_memory,
     cost_table,
-    count_blocks,
-    count_parameters,
-    forward_tflop,
-    hidden_state_bytes,
+    fitting_quantizations,
+    weights_gib,
 )
-from brewster.models.diffusion.memory import GIB, fitting_quantizations, weights_gib
-from brewster.models.diffusion.panels import count_tokens, fit_panel
 from brewster.models.zoo import TINY_PREFIX
 from brewster.training.recipe import ENCODED_SUFFIX, LoraRecipe
 
@@ -63,11 +61,10 @@ class ResourceEstimate:
     panel: tuple[int, int]
     generated_tokens: int
     condition_tokens: int
-    parameter_count: int
+    cost: BackboneCost
     lora_parameters: int
     memory_gib: dict[str, float]
     tflop: float
-    text_encoder_parameters: int
 
     @property
     def total_gib(self) -> float:
@@ -86,10 +83,10 @@ class ResourceEstimate:
         is_tiny = recipe.backbone.startswith(TINY_PREFIX)
         is_stored = is_tiny or Path(recipe.backbone).is_dir()
         is_encoded = is_tiny or recipe.prompt.endswith(ENCODED_SUFFIX)
-        encoders = 0 if is_encoded else 2 * self.text_encoder_parameters
-        download = 0 if is_stored else 2 * self.parameter_count + self.memory_gib["VAE"] * GIB + encoders
+        encoders = 0 if is_encoded else 2 * self.cost.text_encoder_parameters
+        download = 0 if is_stored else 2 * self.cost.parameters + self.memory_gib["VAE"] * GIB + encoders
         model = {
-            "backbone": f"{recipe.backbone}, {self.parameter_count / 1e9:.2f} billion parameters",
+            "backbone": f"{recipe.backbone}, {self.cost.parameters / 1e9:.2f} billion parameters",
             "LoRA": f"rank {recipe.rank}, {self.lora_parameters / 1e6:.1f} million parameters",
             "panels": f"{' '.join(recipe.panels)}, {width} x {height} each, for a square photo",
             "tokens": f"{self.generated_tokens} generated, {self.condition_tokens} condition, {PROMPT_TOKENS} text",
@@ -118,8 +115,8 @@ class ResourceEstimate:
 
     def _cure(self) -> str:
         others = self.total_gib - self.memory_gib["backbone"]
-        if fitting := fitting_quantizations(self.parameter_count, self.card.memory_gib - others):
-            total = others + weights_gib(self.parameter_count, fitting[0])
+        if fitting := fitting_quantizations(self.cost.parameters, self.card.memory_gib - others):
+            total = others + weights_gib(self.cost.parameters, fitting[0])
             return f'set quantization = "{fitting[0]}", which needs {total:.1f} GiB'
         return "lower max_composite_pixels or rank, or choose a smaller backbone (klein) or a GPU with more memory"
 
@@ -141,42 +138,34 @@ def estimate_resources(recipe: LoraRecipe, card: GraphicsCard) -> ResourceEstima
         size_divisor=backbone.size_divisor,
     )
     generated_tokens, condition_tokens = count_tokens(fit.panel, recipe.layout, backbone.size_divisor)
-    parameters, vae, lora_parameters = (
-        count_parameters(backbone.transformer),
-        count_parameters(backbone.vae),
+    cost, lora_parameters = (
+        backbone_cost(recipe.backbone, type(backbone)),
         _count_lora_parameters(backbone, recipe),
     )
+    tokens = generated_tokens + condition_tokens
+    # The inputs of all blocks are kept, and the activations of one block while it computes.
+    activations = cost.blocks * cost.hidden_state_bytes(tokens) + cost.block_bytes(tokens)
     memory = {
-        "backbone": weights_gib(parameters, recipe.quantization),
-        "VAE": 2 * vae / GIB,
+        "backbone": weights_gib(cost.parameters, recipe.quantization),
+        "VAE": 2 * cost.vae_parameters / GIB,
         "LoRA and AdamW": lora_parameters * _BYTES_PER_LORA_WEIGHT[recipe.optimizer] / GIB,
-        "activations": _activation_bytes(backbone, generated_tokens + condition_tokens + PROMPT_TOKENS) / GIB,
+        "activations": activations / GIB,
         "rest": _OVERHEAD_GIB,
     }
-    tflop = (
-        _FORWARD_PASSES_PER_STEP
-        * recipe.batch_size
-        * forward_tflop(backbone, generated_tokens, condition_tokens)
-    )
+    tflop = _FORWARD_PASSES_PER_STEP * recipe.batch_size * cost.forward_tflop(tokens)
     return ResourceEstimate(
         recipe,
         card,
         fit.panel,
         generated_tokens,
         condition_tokens,
-        parameters,
+        cost,
         lora_parameters,
         memory,
         tflop,
-        backbone.text_encoder_parameters,
     )
 
 
 def _count_lora_parameters(backbone: Backbone, recipe: LoraRecipe) -> int:
     layers = map(backbone.transformer.get_submodule, select_target_modules(backbone, recipe.target_modules))
     return sum(recipe.rank * (layer.in_features + layer.out_features) for layer in layers)
-
-
-def _activation_bytes(backbone: Backbone, tokens: int) -> int:
-    """Returns the memory in bytes of the inputs of all blocks and the activations of one block, in bf16."""
-    return count_blocks(backbone) * hidden_state_bytes(backbone, tokens) + block_bytes(backbone, tokens)

@@ -36,11 +36,12 @@ from brewster.models.diffusion.adapter.lora import (
 from brewster.models.diffusion.backbones.backbone import Backbone
 from brewster.models.diffusion.backbones.loading import encode_prompt, load_backbone
 from brewster.models.diffusion.backbones.registry import backbone_class_of
-from brewster.models.diffusion.memory import Placement, check_machine
+from brewster.models.diffusion.memory import check_machine
 from brewster.models.diffusion.out_of_memory import explain_out_of_memory
 from brewster.models.diffusion.panels import PanelFit, split
 from brewster.models.diffusion.pipeline import DecompositionPipeline
 from brewster.models.diffusion.prompt import PROMPTS, PromptEmbedding, load_prompt
+from brewster.models.diffusion_resources import Placement
 from brewster.training import distributed
 from brewster.training.data.sample_rng import SampleRng
 from brewster.training.loop import read_log

@@ -21,10 +21,11 @@ from brewster.models.diffusion.backbones.loading import load_backbone
 from brewster.models.diffusion.backbones.registry import backbone_class_of
 from brewster.models.diffusion.hub_download import free_disk_bytes
 from brewster.models.diffusion.lazy_imports import import_library
-from brewster.models.diffusion.memory import GIB, VAE_PARAMETERS, count_weights, weights_gib
+from brewster.models.diffusion.memory import count_weights
 from brewster.models.diffusion.prompt import PROMPT_FILE
 from brewster.models.diffusion.task import TASK_FILE, save_task
 from brewster.models.diffusion.tensors import write_tensors
+from brewster.models.diffusion_resources import GIB, weights_gib
 
 _PREFIX: Final = "transformer."
 _ALPHA: Final = ".alpha"
@@ -78,7 +79,7 @@ def export_merged(folder: Path, target: Path, base_model: str | None = None) -> 
             f"expected a base of {metadata.backbone}, not of {backbone_class.name}",
             "choose another base",
         )
-    _check_space(base, count_weights(base, backbone_class) + VAE_PARAMETERS, target)
+    _check_space(base, count_weights(base, backbone_class) + backbone_class.cost.vae_parameters, target)
     backbone = load_backbone(base, dtype=torch.bfloat16)
     merge(backbone, state, 1.0 if metadata.imported else metadata.alpha / metadata.rank)
     backbone.save(target)

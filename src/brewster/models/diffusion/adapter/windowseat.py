@@ -6,7 +6,7 @@ of Diffusion Transformers"): a peft LoRA of Qwen-Image-Edit that removes reflect
     transformer_lora/pytorch_lora_weights.safetensors
     text_embeddings/state_dict.safetensors              prompt_embeds (n, tokens, width) and prompt_mask (n, tokens)
 
-The values of the task (time 0.499, latents minus prediction, square tiles, no guidance) are those of the published inference code.
+For its task, see `windowseat_task`.
 """
 
 from __future__ import annotations
@@ -21,11 +21,10 @@ from brewster.models.diffusion.adapter.lora import LoraMetadata, attach_layers
 from brewster.models.diffusion.adapter.lora_formats import read_lora_layers, scaling_from_config
 from brewster.models.diffusion.backbones.backbone import Backbone
 from brewster.models.diffusion.backbones.qwen import Qwen
-from brewster.models.diffusion.panels import PanelLayout
 from brewster.models.diffusion.prompt import PromptEmbedding
-from brewster.models.diffusion.task import DecompositionTask
+from brewster.models.diffusion.task import windowseat_task
 from brewster.models.diffusion.tensors import read_json, read_tensors
-from brewster.options import Quantization
+from brewster.models.diffusion_models import DIFFUSION_MODELS
 
 INDEX_FILE: Final = "model_index.json"
 CONFIG_FILE: Final = "transformer_lora/adapter_config.json"
@@ -34,11 +33,6 @@ PROMPT_FILE: Final = "text_embeddings/state_dict.safetensors"
 FILES: Final = (INDEX_FILE, CONFIG_FILE, WEIGHTS_FILE, PROMPT_FILE)
 
 BACKBONE: Final = Qwen
-QUANTIZATION: Final[Quantization] = "nf4"
-"""The quantization of the base in the published inference code."""
-SIDE_PX: Final = 768
-"""The processing resolution of the published model."""
-_TIME: Final = 0.499
 _PROMPT_TEXT: Final = "WindowSeat's trained embedding"
 
 
@@ -71,21 +65,13 @@ def read_metadata(folder: Path) -> LoraMetadata:
             "download the model again",
         )
     return LoraMetadata(
-        BACKBONE.name, base, QUANTIZATION, rank, alpha, published_task(side), _read_prompt(folder).sha256
-    )
-
-
-def published_task(side_px: int = SIDE_PX) -> DecompositionTask:
-    """The task of a model with this processing resolution."""
-    # Panel I is the encoded photo, decoded again. It separates the errors of the VAE from the change by the model.
-    return DecompositionTask(
-        PanelLayout(("I", "T")),
-        max_composite_pixels=2 * side_px**2,
-        objective="direct",
-        guidance=1.0,
-        time=_TIME,
-        short_side_px=side_px,
-        square_tiles=True,
+        BACKBONE.name,
+        base,
+        DIFFUSION_MODELS["windowseat"].quantization,
+        rank,
+        alpha,
+        windowseat_task(side),
+        _read_prompt(folder).sha256,
     )
 
 

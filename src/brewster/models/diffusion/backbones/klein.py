@@ -15,6 +15,7 @@ from brewster.models.diffusion.backbones.backbone import (
     tokens_to_grid,
 )
 from brewster.models.diffusion.prompt import PromptEmbedding
+from brewster.models.diffusion_resources import BACKBONE_COSTS
 
 _SCHEDULER: Final = {
     "shift": 3.0, "use_dynamic_shifting": True, "base_shift": 0.5, "max_shift": 1.15,
@@ -61,8 +62,7 @@ class Klein(ClassifierFreeBackbone):
         "scheduler": _SCHEDULER,
     }  # fmt: skip
 
-    parameter_count = 3_876_000_000
-    text_encoder_parameters = 4_022_000_000  # Qwen3-4B
+    cost = BACKBONE_COSTS["klein"]
 
     def statistics(self) -> tuple[Tensor, Tensor]:
         """See `Backbone.statistics`: the running statistics of the VAE's batch norm, one value per packed channel."""

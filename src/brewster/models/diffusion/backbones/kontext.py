@@ -16,6 +16,7 @@ from brewster.models.diffusion.backbones.backbone import (
     tokens_to_grid,
 )
 from brewster.models.diffusion.prompt import PromptEmbedding
+from brewster.models.diffusion_resources import BACKBONE_COSTS
 
 _SCHEDULER: Final = {
     "shift": 3.0, "use_dynamic_shifting": True, "base_shift": 0.5, "max_shift": 1.15,
@@ -67,8 +68,7 @@ class Kontext(Backbone):
         "scheduler": _SCHEDULER,
     }  # fmt: skip
     guided_by_embedding = True
-    parameter_count = 11_901_000_000
-    text_encoder_parameters = 4_885_000_000  # T5-XXL encoder 4.762, CLIP-L 0.123
+    cost = BACKBONE_COSTS["kontext"]
 
     def statistics(self) -> tuple[Tensor, Tensor]:
         """See `Backbone.statistics`: (1, 1, 1, 1), because FLUX.1's VAE has one shift and one scale for all channels."""

@@ -281,7 +281,7 @@ def _memory_hint(quantization: str | None) -> str:
         "int8": 'use quantization="nf4"',
         "float8": 'use quantization="nf4"',
     }
-    return f"{hints.get(quantization, 'close other programs that use the GPU')}, {MEMORY_HINT}"
+    return f"{hints.get(quantization, 'close other programs that use the GPU')}, or {MEMORY_HINT}"
 
 
 def _check_device(device: str) -> None:

@@ -15,6 +15,7 @@ from brewster.models.diffusion.backbones.backbone import (
     tokens_to_grid,
 )
 from brewster.models.diffusion.prompt import PromptEmbedding
+from brewster.models.diffusion_resources import BACKBONE_COSTS
 
 _SCHEDULER: Final = {
     "shift": 1.0, "use_dynamic_shifting": True, "base_shift": 0.5, "max_shift": 0.9,
@@ -53,8 +54,7 @@ class Qwen(ClassifierFreeBackbone):
         "scheduler": _SCHEDULER,
     }  # fmt: skip
 
-    parameter_count = 20_430_000_000
-    text_encoder_parameters = 8_292_000_000  # Qwen2.5-VL-7B
+    cost = BACKBONE_COSTS["qwen"]
 
     def statistics(self) -> tuple[Tensor, Tensor]:
         """See `Backbone.statistics`: one value per channel of the VAE, repeated for the four cells of a patch."""

@@ -41,7 +41,7 @@ CONFIG_FILES: Final = {
 """Part of a backbone -> the file with its configuration, in the folder of the part."""
 DESCRIPTION_FILES: Final = (INDEX_FILE, *(f"{part}/{file}" for part, file in CONFIG_FILES.items()))
 """The files without weights that `build_on_meta` reads."""
-MEMORY_HINT: Final = "a smaller backbone (klein) or a GPU with more memory"
+MEMORY_HINT: Final = "a GPU with more memory"
 _STATISTICS_SPREAD: Final = 0.2
 """The spread of the random batch-norm statistics of a built VAE. With exactly 0 and 1, tests would not detect missing
 normalisation."""

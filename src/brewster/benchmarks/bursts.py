@@ -1,0 +1,137 @@
+"""Finds bursts with ground truth: several photos of one window by a moving camera, and the layers of the middle photo.
+
+Two layouts are supported:
+
+- A folder for each burst, with frame1.jpg, frame2.jpg ... and transmission3.jpg, reflection3.jpg for frame 3. A single such
+  folder may also be given.
+- A dataset of `brewster render --burst`.
+"""
+
+from __future__ import annotations
+
+import re
+from collections import defaultdict
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final, final
+
+from brewster.benchmarks.image_files import ImageFile, files_of, read_samples
+from brewster.benchmarks.pairing import FolderListing, image_files, list_folder
+from brewster.errors import PhotoError
+
+_ROLE: Final = re.compile(r"(frame|transmission|reflection)[-_ ]?([0-9]+)", re.IGNORECASE)
+_RENDERED: Final = re.compile(r"[0-9]{6,}|shard-[0-9]{6,}\.tar|set\.toml")
+_LAYER_FILES: Final = ("photo.jpg", "transmission.jpg", "reflection.jpg")
+
+
+@final
+@dataclass(frozen=True)
+class BurstFiles:
+    """The files of a burst. `transmission` and `reflection` (None if unknown) are the ground truth of the middle frame.
+
+    `relative_path` is the path of the middle frame relative to the benchmark folder, without the suffix.
+    """
+
+    name: str
+    relative_path: str
+    frames: tuple[ImageFile, ...]
+    transmission: ImageFile
+    reflection: ImageFile | None
+
+
+def find_bursts(folder: Path) -> tuple[list[BurstFiles], FolderListing]:
+    """Returns the bursts in a folder, and a listing without groups: what is ignored and excluded.
+
+    Raises:
+        PhotoError: the folder cannot be read, or contains no burst.
+        RecipeError: the folder is a rendered dataset of single photos, or a scene file is damaged.
+        MissingExtra: torch is not installed, which brewster needs to read rendered datasets.
+    """
+    folders, files = list_folder(folder)
+    if any(_RENDERED.fullmatch(path.name) for path in (*folders, *files)):
+        return _rendered_bursts(folder)
+    bursts, remarks, excluded = [], [], []
+    for path in [folder, *folders]:
+        roles = _read_roles(path)
+        if not roles["frame"]:
+            remarks += [f"{path.name} has no frames"] if path != folder else []
+        elif reason := _exclusion_reason(roles):
+            excluded.append(f"{path.name}: {reason}")
+        else:
+            bursts.append(_burst(folder, path, roles))
+    if not bursts and not excluded:
+        raise PhotoError(
+            f"{folder} contains no burst",
+            "expected folders with frame1.jpg, frame2.jpg ... and transmission2.jpg, or a dataset of brewster render --burst",
+            "give the path of the parent folder of the bursts",
+        )
+    return bursts, FolderListing(remarks=tuple(remarks), excluded=tuple(excluded))
+
+
+_Roles = Mapping[str, Mapping[int, list[Path]]]
+
+
+def _read_roles(folder: Path) -> _Roles:
+    """Returns the images of a folder by role and by the number in the name."""
+    roles: dict[str, dict[int, list[Path]]] = {
+        role: defaultdict(list) for role in ("frame", "transmission", "reflection")
+    }
+    for path in image_files(folder)[0]:
+        if match := _ROLE.fullmatch(path.stem):
+            roles[match[1].lower()][int(match[2])].append(path)
+    return roles
+
+
+def _exclusion_reason(roles: _Roles) -> str:
+    for role, files in roles.items():
+        for number, paths in files.items():
+            if len(paths) > 1:
+                return f"{role} {number} is ambiguous: {paths[0].name} and {paths[1].name}"
+    if len(roles["frame"]) < 2:
+        return "expected two or more frames, but there is one"
+    middle = _middle(roles)
+    return (
+        ""
+        if middle in roles["transmission"]
+        else f"there is no transmission of the middle frame, frame {middle}"
+    )
+
+
+def _middle(roles: _Roles) -> int:
+    numbers = sorted(roles["frame"])
+    return numbers[len(numbers) // 2]
+
+
+def _burst(root: Path, folder: Path, roles: _Roles) -> BurstFiles:
+    middle = _middle(roles)
+    frames = roles["frame"]
+    reflection = roles["reflection"].get(middle)
+    return BurstFiles(
+        folder.absolute().name,
+        frames[middle][0].relative_to(root).with_suffix("").as_posix(),
+        tuple(ImageFile(frames[number][0]) for number in sorted(frames)),
+        ImageFile(roles["transmission"][middle][0]),
+        ImageFile(reflection[0]) if reflection else None,
+    )
+
+
+def _rendered_bursts(folder: Path) -> tuple[list[BurstFiles], FolderListing]:
+    samples = {sample.index: sample.name for sample in read_samples(folder)}
+    from brewster.rendered.bursts import read_bursts  # noqa: PLC0415  (needs torch, which read_samples has checked)
+
+    bursts, excluded = [], []
+    for burst in read_bursts(folder):
+        reference = burst.frames[burst.reference]
+        layers = files_of(reference, _LAYER_FILES)
+        frames = [file for frame in burst.frames for file in files_of(frame, ["photo.jpg"])]
+        for frame in burst.frames:
+            del samples[frame.index]
+        if len(layers) < len(_LAYER_FILES) or len(frames) < len(burst.frames):
+            excluded.append(f"burst {burst.index} is incomplete: expected {', '.join(_LAYER_FILES)}")
+            continue
+        _, transmission, reflection = layers
+        path = f"{reference.name}/photo"
+        bursts.append(BurstFiles(f"burst-{burst.index:06d}", path, tuple(frames), transmission, reflection))
+    excluded += [f"{name} is a frame of an incomplete burst" for name in samples.values()]
+    return bursts, FolderListing(excluded=tuple(excluded))

@@ -1,0 +1,92 @@
+"""Locations of encoded images: whole files, and the images of rendered samples in folders and shards."""
+
+from __future__ import annotations
+
+import tarfile
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, final
+
+from brewster.errors import MissingExtra, PhotoError, UnreadablePhoto
+
+if TYPE_CHECKING:
+    from brewster.rendered.store import StoredSample
+
+
+@final
+@dataclass(frozen=True)
+class ImageFile:
+    """The location of an encoded image: a whole file, or a part of a tar shard.
+
+    `span` is the (offset, length) of the part in bytes, or None for a whole file.
+    """
+
+    path: Path
+    span: tuple[int, int] | None = None
+
+    def read(self) -> bytes:
+        """Returns the encoded bytes of the image.
+
+        Raises:
+            UnreadablePhoto: the file is missing, cannot be read, or ends before the end of the span.
+        """
+        try:
+            return self._read()
+        except OSError as error:
+            raise UnreadablePhoto(
+                f"{self} cannot be read ({error.strerror or error})",
+                "expected a complete image file",
+                "restore the file or its permissions, and run again",
+            ) from error
+
+    def __str__(self) -> str:
+        return f"{self.path}" if self.span is None else f"{self.path} from byte {self.span[0]}"
+
+    def _read(self) -> bytes:
+        offset, length = self.span or (0, -1)
+        with self.path.open("rb") as file:
+            file.seek(offset)
+            data = file.read(length)
+        if len(data) < length:
+            raise OSError(f"the file has only {len(data)} of {length} bytes")
+        return data
+
+
+def read_samples(folder: Path) -> list[StoredSample]:
+    """Returns the samples of a rendered dataset.
+
+    Raises:
+        PhotoError: the folder is not a rendered dataset.
+        MissingExtra: torch is not installed.
+    """
+    try:
+        from brewster.rendered.store import read_dataset  # noqa: PLC0415  (needs torch, an optional dependency)
+
+        entries = list(read_dataset(folder))
+    except ImportError as error:
+        raise MissingExtra.for_extra(
+            "render",
+            "torch is not installed",
+            "expected torch, which brewster needs to read rendered datasets",
+        ) from error
+    except (OSError, tarfile.TarError, ValueError) as error:
+        raise _not_a_rendered_dataset(folder, str(error)) from error
+    if not entries:
+        raise _not_a_rendered_dataset(folder, "it has no samples")
+    return entries
+
+
+def files_of(entry: StoredSample, names: Sequence[str]) -> list[ImageFile]:
+    """Returns the files of a rendered sample that exist, in the order of `names`."""
+    if entry.spans:
+        return [ImageFile(entry.path, entry.spans[name]) for name in names if name in entry.spans]
+    return [ImageFile(entry.path / name) for name in names if (entry.path / name).exists()]
+
+
+def _not_a_rendered_dataset(folder: Path, reason: str) -> PhotoError:
+    return PhotoError(
+        f"{folder} is not a rendered dataset ({reason})",
+        "expected the folders 000000, 000001 ... or files such as shard-000000.tar",
+        "give the path of an output folder of `brewster render`",
+    )

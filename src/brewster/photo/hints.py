@@ -1,0 +1,64 @@
+"""Hints: an image of the size of a photo, on which a person has painted where there is reflection, and where only the scene.
+
+hints = Hints.open("hints.png", photo.size)
+hints.sampled(516, 387)  # (387, 516, 2) float32: reflection (red), scene (green); 0 is no hint
+"""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from typing import Self, final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from brewster.errors import MaskError
+from brewster.photo.in_memory import WHITE_LEVELS
+from brewster.photo.mask import open_painted
+from brewster.photo.photo import Float32, Source
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Hints:
+    """Two soft masks of a photo. Immutable and thread-safe."""
+
+    values: NDArray[np.uint8]
+    """(H, W, 2): 255 where the image is pure red (reflection here), and where it is pure green (only the scene here)."""
+
+    @classmethod
+    def open(cls, source: Source, size: tuple[int, int]) -> Self:
+        """Opens hints for a photo. Black, white, grey and transparent pixels are no hint.
+
+        Args:
+            source: a path, the bytes of a file, a PIL image, or an array (H, W, 3) of uint8, uint16, or floats in 0..1.
+            size: the (width, height) of the photo, with its EXIF orientation applied.
+
+        Raises:
+            MaskError: the source cannot be read, has neither red nor green pixels, or does not have the size of the photo.
+        """
+        name = f"the hints {source}" if isinstance(source, str | os.PathLike) else "the hints"
+        photo = open_painted(source, size, name)
+        alpha = 1.0 if photo.alpha is None else photo.alpha / WHITE_LEVELS[photo.alpha.dtype.name]
+        scale = 255 * alpha / WHITE_LEVELS[photo.pixels.dtype.name]
+        red, green, blue = np.moveaxis(
+            np.broadcast_to(photo.pixels, (*photo.pixels.shape[:2], 3)), 2, 0
+        ).astype(np.float32)
+        values = np.stack([red - np.maximum(green, blue), green - np.maximum(red, blue)], axis=2)
+        values = np.clip(values * np.atleast_3d(scale), 0, 255).astype(np.uint8)
+        if not values.any():
+            raise MaskError(
+                f"{name} have neither red nor green pixels",
+                "expected red where there is reflection, or green where there is only the scene",
+                "paint with pure red and pure green, or leave the hints out",
+            )
+        return cls(values)
+
+    def sampled(self, width: int, height: int) -> Float32:
+        """Returns the hints in a grid of `width` x `height` cells that covers the photo: (height, width, 2) in 0..1."""
+        rows, columns = (
+            (2 * np.arange(cells) + 1) * side // (2 * cells)
+            for cells, side in zip((height, width), self.values.shape[:2], strict=True)
+        )
+        return self.values[np.ix_(rows, columns)].astype(np.float32) / np.float32(255)

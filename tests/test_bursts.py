@@ -1,0 +1,236 @@
+"""Rendered bursts on disk, the command that renders them, and bursts as a benchmark."""
+
+import shutil
+
+import numpy as np
+import pytest
+from pyarrow import parquet
+
+from benchmark_folders import picture, write
+from brewster.benchmarks.registry import read_benchmark
+from brewster.cli import main
+from brewster.errors import PhotoError, RecipeError
+from brewster.evaluate.config import EvaluationConfig
+from brewster.evaluate.scoring import GroundTruth
+from brewster.rendered import store
+from brewster.rendered.bursts import read_bursts
+from brewster.rendered.generation import workers
+from brewster.scene.burst import layer_motion
+from brewster.scene.scene import read_scene
+from cli_helpers import error_lines, json_lines
+from set_folders import hashes, names, render_set
+
+ROLES = ("frame", "transmission", "reflection")
+
+
+@pytest.fixture(scope="module")
+def two_bursts(tmp_path_factory):
+    """Two bursts of five frames, rendered by a fake renderer."""
+    out = tmp_path_factory.mktemp("set") / "bursts"
+    render_set(out, count=10, recipe="burst")
+    return out
+
+
+@pytest.fixture
+def fake_renderer(monkeypatch):
+    monkeypatch.setitem(workers.RENDERERS, "analytic", "fake_renderer:render")
+
+
+# --- on disk
+
+
+def test_a_burst_has_its_frames_its_scenes_and_its_motion(two_bursts):
+    bursts = list(read_bursts(two_bursts))
+    assert [burst.index for burst in bursts] == [0, 1]
+    for burst in bursts:
+        assert [frame.index for frame in burst.frames] == list(range(5 * burst.index, 5 * burst.index + 5))
+        assert (len(burst.scenes), burst.reference) == (5, 2)
+        assert burst.scenes[burst.reference].burst.is_reference
+        np.testing.assert_allclose(burst.motion(2).transmission, 0, atol=1e-3)
+        expected = layer_motion(burst.scenes[2], burst.scenes[4])
+        np.testing.assert_array_equal(burst.motion(4).reflection, expected.reflection)
+        light, scene = store.open_sample(burst.frames[0])
+        assert light["photo"].shape == (16, 24, 3)
+        assert scene == burst.scenes[0]
+
+
+def test_a_burst_with_a_missing_frame_is_left_out_until_it_is_rendered(two_bursts, tmp_path):
+    shutil.copytree(two_bursts, tmp_path / "set")
+    shutil.rmtree(tmp_path / "set" / "000003")
+    assert [burst.index for burst in read_bursts(tmp_path / "set")] == [1]
+    render_set(tmp_path / "set", count=10, recipe="burst")
+    assert hashes(tmp_path / "set") == hashes(two_bursts)
+
+
+def test_bursts_in_shards_are_the_same(two_bursts, tmp_path):
+    render_set(tmp_path / "set", count=10, recipe="burst", shards=True)
+    assert "shard-000000.tar" in names(tmp_path / "set")
+    pairs = zip(read_bursts(two_bursts), read_bursts(tmp_path / "set"), strict=True)
+    for one, other in pairs:
+        assert one.scenes == other.scenes
+        for frame, same in zip(one.frames, other.frames, strict=True):
+            assert all(frame.read(name) == same.read(name) for name in store.SAMPLE_FILES)
+
+
+def test_single_photos_are_not_read_as_bursts(tmp_path):
+    render_set(tmp_path / "set", count=1)
+    for read in (
+        lambda: list(read_bursts(tmp_path / "set")),
+        lambda: read_benchmark("bursts", tmp_path / "set"),
+    ):
+        with pytest.raises(RecipeError, match=r"sample 0 .* is a single photo"):
+            read()
+
+
+def test_the_index_has_the_number_of_each_frame(two_bursts):
+    table = parquet.read_table(two_bursts / "index.parquet")
+    assert table["burst_frame"].to_pylist() == [*range(5)] * 2
+    assert set(table["burst_frames"].to_pylist()) == {5}
+
+
+# --- the command
+
+
+def test_the_option_burst_renders_frames_of_any_recipe_and_resumes(
+    run_without_model, fake_renderer, tmp_path
+):
+    command = (
+        "render",
+        "set",
+        "--recipe",
+        "tiny",
+        "--burst",
+        3,
+        "--baseline-mm",
+        50,
+        "--workers",
+        0,
+        "--json",
+    )
+    code, out, err = run_without_model(*command, "--count", 1, "--first", 2)
+    assert code == 0, err
+    assert [line["index"] for line in json_lines(out)] == [6, 7, 8]
+    code, out, _ = run_without_model(*command, "--count", 3)
+    assert code == 0
+    assert (
+        sorted((line["status"] for line in json_lines(out)), reverse=True)
+        == ["skipped"] * 3 + ["rendered"] * 6
+    )
+    bursts = list(read_bursts(tmp_path / "set"))
+    assert [burst.index for burst in bursts] == [0, 1, 2]
+    assert {scene.burst.frames for burst in bursts for scene in burst.scenes} == {3}
+
+
+def test_the_baseline_of_the_recipe_is_replaced(run_without_model, fake_renderer, tmp_path):
+    run_without_model("render", "set", "--recipe", "burst", "--count", 1, "--workers", 0, "--baseline-mm", 0)
+    (burst,) = read_bursts(tmp_path / "set")
+    positions = np.array([scene.camera.position_mm for scene in burst.scenes])
+    assert np.abs(positions - positions[2]).max() < 12  # only the tremble
+    code, _, err = run_without_model("render", "set", "--recipe", "burst", "--count", 1, "--workers", 0)
+    assert code == 1
+    assert "baseline_mm" in error_lines(err)[0]
+
+
+def test_a_frame_can_be_rendered_again(run_without_model, fake_renderer, tmp_path, two_bursts):
+    scene = two_bursts / "000004" / "scene.toml"
+    code, _, err = run_without_model("render", "--scene", scene, "-o", "again", "--renderer", "analytic")
+    assert code == 0, err
+    assert read_scene(tmp_path / "again" / "scene.toml") == read_scene(scene)
+
+
+@pytest.mark.parametrize(
+    ("args", "message"),
+    [
+        (("set", "--baseline-mm", "50"), "add --burst, or use --recipe burst"),
+        (("set", "--burst", "1"), "2<=x<=99"),
+        (("set", "--burst", "3", "--baseline-mm", "-1"), "is not in the range 0<=x"),
+        (("set", "--scene", "scene.toml", "--burst", "3"), "--burst is an option for datasets"),
+    ],
+)
+def test_a_wrong_usage_is_explained(run_without_model, args, message):
+    code, _, err = run_without_model("render", *args)
+    assert code == 2
+    assert message in err
+
+
+# --- the benchmark
+
+
+def test_rendered_bursts_are_cases_with_frames_and_exact_layers(two_bursts):
+    (benchmark,) = read_benchmark("bursts", two_bursts)
+    assert [case.name for case in benchmark.cases] == ["burst-000000", "burst-000001"]
+    assert not benchmark.excluded
+    assert not benchmark.remarks
+    case = benchmark.cases[1]
+    assert case.relative_path == "000007/photo"
+    assert case.photo == case.frames[2]
+    assert len(set(case.frames)) == 5
+    assert case.ground_truth.path == two_bursts / "000007" / "transmission.jpg"
+    GroundTruth.open(case, EvaluationConfig())
+
+
+def test_an_incomplete_rendered_burst_is_excluded(two_bursts, tmp_path):
+    shutil.copytree(two_bursts, tmp_path / "set")
+    shutil.rmtree(tmp_path / "set" / "000003")
+    (tmp_path / "set" / "000007" / "transmission.jpg").unlink()
+    (benchmark,) = read_benchmark("bursts", tmp_path / "set")
+    assert not benchmark.cases
+    assert len(benchmark.excluded) == 5
+    assert all("incomplete" in reason for reason in benchmark.excluded)
+
+
+def photographed(root, numbers=(1, 2, 3), truths=(2,)):
+    write(root, *(f"frame{number}.jpg" for number in numbers))
+    return write(root, *(f"{role}{number}.png" for role in ROLES[1:] for number in truths))
+
+
+def test_photographed_bursts_have_the_middle_frame_as_photo(tmp_path):
+    photographed(tmp_path / "stone", (1, 2, 3, 4, 10), truths=(1, 3))
+    photographed(tmp_path / "toy")
+    (tmp_path / "xue").mkdir()
+    (benchmark,) = read_benchmark("bursts", tmp_path)
+    assert [(case.name, case.relative_path) for case in benchmark.cases] == [
+        ("stone", "stone/frame3"), ("toy", "toy/frame2"),
+    ]  # fmt: skip
+    stone = benchmark.cases[0]
+    assert [file.path.stem for file in stone.frames] == ["frame1", "frame2", "frame3", "frame4", "frame10"]
+    assert (stone.ground_truth.path.stem, stone.reflection.path.stem) == ("transmission3", "reflection3")
+    assert benchmark.remarks == ("xue has no frames",)
+    (alone,) = read_benchmark("bursts", tmp_path / "toy")
+    assert [case.name for case in alone.cases] == ["toy"]
+
+
+@pytest.mark.parametrize(
+    ("numbers", "truths", "change", "reason"),
+    [
+        ((1, 2, 3), (1,), {}, "no transmission of the middle frame, frame 2"),
+        ((2,), (2,), {}, "there is one"),
+        ((1, 2, 3), (2,), {"frame2.png": picture()}, "frame 2 is ambiguous"),
+        ((1, 2, 3), (2,), {"frame3.jpg": picture((16, 6))}, "the frame 3 is 16x6"),
+        ((1, 2, 3), (2,), {"frame3.jpg": b""}, "the frame 3 cannot be read"),
+    ],
+)
+def test_an_unusable_burst_is_excluded_with_the_reason(tmp_path, numbers, truths, change, reason):
+    photographed(tmp_path / "fine")
+    photographed(tmp_path / "other", numbers, truths)
+    for name, data in change.items():
+        write(tmp_path / "other", name, data=data)
+    (benchmark,) = read_benchmark("bursts", tmp_path)
+    assert [case.name for case in benchmark.cases] == ["fine"]
+    assert len(benchmark.excluded) == 1
+    assert reason in benchmark.excluded[0]
+
+
+def test_a_folder_without_bursts_is_refused(tmp_path):
+    (tmp_path / "holiday").mkdir()
+    with pytest.raises(PhotoError, match="contains no burst"):
+        read_benchmark("bursts", tmp_path)
+
+
+def test_evaluate_scores_bursts(tmp_path, monkeypatch):
+    photographed(tmp_path / "bursts" / "toy")
+    monkeypatch.chdir(tmp_path)
+    assert (
+        main(["evaluate", "--benchmark", "bursts=bursts", "--metrics", "psnr", "-o", "out", "--quiet"]) == 0
+    )
+    assert "toy" in (tmp_path / "out" / "scores.csv").read_text()

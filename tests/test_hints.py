@@ -1,0 +1,116 @@
+"""Hints: what a person paints, and how it reaches the network."""
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from brewster.errors import MaskError, ModelError
+from brewster.inference.separator import Separator
+from brewster.photo import Hints
+from brewster.srgb import to_linear
+from brewster.training.data.hints import simulate_hints
+from brewster.training.data.mixtures import TrainingBatch
+
+RED, GREEN = (255, 0, 0), (0, 255, 0)
+
+
+def painted(width=40, height=30, background=(0, 0, 0)):
+    image = np.full((height, width, 3), background, np.uint8)
+    image[:10, :20] = RED
+    image[20:, 20:] = GREEN
+    return image
+
+
+@pytest.mark.parametrize("background", [(0, 0, 0), (255, 255, 255), (90, 90, 90), (0, 0, 255)])
+def test_red_is_reflection_green_is_scene_and_other_colours_are_no_hint(background):
+    hints = Hints.open(painted(background=background), (40, 30)).sampled(40, 30)
+    expected = np.zeros((30, 40, 2))
+    expected[:10, :20, 0] = expected[20:, 20:, 1] = 1
+    np.testing.assert_array_equal(hints, expected)
+
+
+@pytest.mark.parametrize(("dtype", "white"), [(np.uint16, 65535), (np.float32, 1.0)])
+def test_hints_of_other_depths_are_the_same(dtype, white):
+    image = (painted() / 255 * white).astype(dtype)
+    assert (Hints.open(image, (40, 30)).values == Hints.open(painted(), (40, 30)).values).all()
+
+
+def test_transparent_paint_is_a_soft_hint(tmp_path):
+    alpha = np.full((30, 40, 1), 51, np.uint8)
+    Image.fromarray(np.concatenate([painted(), alpha], axis=2)).save(tmp_path / "hints.png")
+    assert Hints.open(tmp_path / "hints.png", (40, 30)).sampled(4, 3).max() == pytest.approx(0.2, abs=0.01)
+
+
+@pytest.mark.parametrize(
+    "image", [np.zeros((30, 40, 3), np.uint8), painted(41), np.zeros((30, 40), np.uint8)]
+)
+def test_an_image_without_paint_or_of_another_size_is_an_error(image):
+    with pytest.raises(MaskError):
+        Hints.open(image, (40, 30))
+
+
+class Eraser:
+    """Removes all light where the hint says reflection. Stores the hints of each call."""
+
+    takes_hints = True
+
+    def __init__(self):
+        self.calls = []
+
+    def __call__(self, tile, hints=None):
+        self.calls.append(hints)
+        share = np.zeros_like(tile[..., :1]) if hints is None else hints[..., :1]
+        return tile * (1 - share), tile * share
+
+
+def test_hints_reach_the_model_at_every_scale_and_in_place_together_with_a_mask():
+    eraser = Eraser()
+    photo = np.full((300, 400, 3), 120, np.uint8)
+    image = np.zeros_like(photo)
+    image[:, :200] = RED
+    mask = np.zeros(photo.shape[:2], np.uint8)
+    mask[:150] = 255
+    separate = Separator(eraser)
+    transmission = separate(photo, encoding="srgb", hints=image, mask=mask).transmission.pixels
+    assert all(call is not None for call in eraser.calls)
+    assert transmission[20:130, 20:180].max() < 20  # hinted and inside the mask
+    assert (transmission[:130, 220:] > 110).all()  # no hint
+    assert (transmission[170:] == 120).all()  # outside the mask
+    without = separate(photo, encoding="srgb").transmission.pixels
+    assert (without == 120).all()
+
+
+def test_a_model_without_hints_refuses_them():
+    with pytest.raises(ModelError, match="takes none"):
+        Separator(lambda tile: (tile, 0 * tile))(
+            np.zeros((30, 40, 3), np.uint8), encoding="srgb", hints=painted()
+        )
+
+
+def test_the_command_line_names_hints_of_another_size(run, tmp_path):
+    Image.fromarray(np.full((30, 40, 3), 90, np.uint8)).save(tmp_path / "window.png")
+    Image.fromarray(painted(41)).save(tmp_path / "hints.png")
+    code, _, stderr = run(str(tmp_path / "window.png"), "--hints", str(tmp_path / "hints.png"))
+    assert code != 0
+    assert "hints" in stderr
+
+
+def batch_with_reflection_on_the_left(count=64, side=128):
+    transmission = torch.full((count, 3, side, side), 0.5)
+    reflection = torch.zeros_like(transmission)
+    reflection[..., : side // 2] = 0.6
+    return TrainingBatch(transmission, transmission, reflection, torch.ones(count, 1, 1, 1))
+
+
+def test_simulated_hints_lie_mostly_where_they_are_true_and_half_of_the_samples_have_none():
+    batch = batch_with_reflection_on_the_left()
+    hints = simulate_hints(batch, probability=0.5, seed=1, step=3)
+    assert torch.equal(hints, simulate_hints(batch, probability=0.5, seed=1, step=3))
+    assert not torch.equal(hints, simulate_hints(batch, probability=0.5, seed=1, step=4))
+    has_hints = hints.flatten(1).any(dim=1)
+    assert 16 < has_hints.sum() < 48
+    reflection_hint, scene_hint = hints.sum(dim=0)
+    assert reflection_hint[:, :64].sum() > 5 * reflection_hint[:, 64:].sum()
+    assert scene_hint[:, 64:].sum() > 5 * scene_hint[:, :64].sum()
+    assert to_linear(batch.reflection_encoded).max() > 0
