@@ -109,6 +109,7 @@ def separate_burst(
         strength=strength,
         quality=quality,
         mask=mask,
+        hints=hints if report.method == "single photo" else None,
         additive=additive,
         on_progress=lambda done: on_progress(0.9 + 0.1 * done),
     )
