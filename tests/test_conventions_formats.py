@@ -31,14 +31,14 @@ from picture_files import smooth
 from synthetic_scenes import ASSETS, make_scene, map_side, plane_side
 
 PREDICTIONS = {
-    1: {
+    2: {
         "draft": [
-            7, 217, 149, 104, 55, 201, 163, 127, 35, 120, 191, 169,
-            17, 143, 98, 71, 33, 131, 107, 82, 22, 85, 123, 111,
+            7, 227, 149, 104, 59, 201, 163, 127, 35, 120, 191, 169,
+            17, 96, 98, 71, 9, 131, 107, 82, 22, 85, 123, 111,
         ],
         "standard": [
-            0, 218, 149, 102, 55, 202, 163, 127, 33, 119, 192, 169,
-            17, 142, 98, 71, 33, 130, 106, 81, 23, 88, 120, 109,
+            0, 227, 149, 102, 60, 202, 163, 127, 33, 119, 192, 169,
+            17, 98, 98, 71, 4, 130, 106, 81, 23, 88, 120, 109,
         ],
     },
 }  # fmt: skip
@@ -154,9 +154,9 @@ def compute_scores(names):
 
 
 def test_a_changed_score_needs_a_new_score_format():
-    names = tuple(
-        name for name in METRICS if not name.startswith("lpips") and name != "niqe"
-    )  # a larger image
+    # NIQE needs a larger image, and this image has no clipped light.
+    others = ("niqe", "lost_clipped", "lost_near_white", "near_white_cast")
+    names = tuple(name for name in METRICS if not name.startswith("lpips") and name not in others)
     output = compute_scores(names)
     assert None not in output.values()
     check_output("evaluate.score_log.SCORE_FORMAT_VERSION", SCORE_FORMAT_VERSION, SCORES, output, 2e-6)

@@ -169,3 +169,16 @@ def test_an_address_that_refuses_connections_is_reported(tmp_path, monkeypatch, 
     monkeypatch.setattr(socket, "create_connection", refuse)
     with pytest.raises(DeviceError, match=f"no cluster at {address}"):
         render_set(tmp_path / "set", executor=partial(ray_cluster.RayExecutor, address=address))
+
+
+def test_ray_tries_a_task_as_often_as_several_processes_do(monkeypatch):
+    options = {}
+    ray = SimpleNamespace(
+        init=lambda *_, **__: None,
+        remote=lambda **given: options.update(given) or (lambda function: function),
+        put=lambda value: value,
+        shutdown=lambda: None,
+    )
+    monkeypatch.setattr(ray_cluster, "_ray", lambda: ray)
+    with ray_cluster.RayExecutor(partial(TaskRunner, None)):
+        assert 1 + options["max_retries"] == ray_cluster.MAX_ATTEMPTS

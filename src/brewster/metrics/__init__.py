@@ -7,6 +7,7 @@
     perceptual   LPIPS; imports torch at its first use
     naturalness  NIQE, without ground truth
     region       the reflection region: pixels that the glass has visibly changed
+    bright       loss of clipped light and of white
     failures     removed content and remaining reflection, for rendered samples
 
 `METRICS` is the table of all metrics, with the definition of each.
@@ -24,6 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brewster.errors import BrewsterError
+from brewster.metrics.bright import lost_clipped, lost_near_white, near_white_cast
 from brewster.metrics.failures import kept_reflection, removed_content, removed_white
 from brewster.metrics.fidelity import (
     PairCounts,
@@ -60,7 +62,10 @@ __all__ = [
     "find_metric",
     "kept_reflection",
     "linear_rmse",
+    "lost_clipped",
+    "lost_near_white",
     "lpips",
+    "near_white_cast",
     "niqe",
     "psnr",
     "psnr_of_channels",
@@ -136,6 +141,11 @@ def _niqe(comparison: Comparison) -> float:
     return niqe(comparison.prediction.pixels)
 
 
+def _bright_score(score: Callable[[Image, Image, Image], float]) -> Callable[[Comparison], float]:
+    """Converts a function of prediction, truth and photo to the `score` function of a metric."""
+    return lambda comparison: score(comparison.prediction.pixels, comparison.truth.pixels, comparison.photo)
+
+
 def _rendered_score(
     score: Callable[[Image, Image, Image, Image], float],
 ) -> Callable[[Comparison], float]:
@@ -201,6 +211,13 @@ def _on_rendered(name: str, title: str, definition: str, score: Callable[..., fl
     return Metric(name, title, "", False, 3, f"{definition} {_GAIN}", "rendered", _rendered_score(score))
 
 
+_NEAR_WHITE: Final = "of the pixels above 200 in all channels of photo and ground truth, in 8-bit levels"
+_BRIGHT_ROWS: Final = (
+    ("lost_clipped", "Lost clipped light", 3, "Share of the 8-bit channel values of at least 250 in photo and ground truth that are below 240 in the prediction.", lost_clipped),
+    ("lost_near_white", "Lost near white", 1, f"Mean of truth - prediction {_NEAR_WHITE}.", lost_near_white),
+    ("near_white_cast", "Cast of near white", 1, f"Largest - smallest channel of the mean truth - prediction {_NEAR_WHITE}.", near_white_cast),
+)  # fmt: skip
+
 _ROWS: Final = (
     _PSNR_ROW,
     _SSIM_ROW,
@@ -251,6 +268,10 @@ _ROWS: Final = (
         "As SSIM (Gaussian), but negative local values count as 0, as in the package pyiqa.",
         "transmission",
         _ssim_clipped,
+    ),
+    *(
+        Metric(name, title, "", False, digits, definition, "transmission", _bright_score(score))
+        for name, title, digits, definition, score in _BRIGHT_ROWS
     ),
     _of_reflection(_PSNR_ROW, "PSNR of R"),
     _of_reflection(_SSIM_ROW, "SSIM of R"),
