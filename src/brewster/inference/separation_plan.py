@@ -29,6 +29,7 @@ from brewster.models.diffusion_resources import (
     BackboneCost,
     GraphicsCard,
     Placement,
+    WeightChoice,
     check_gpu_memory,
     cost_table,
     has_bitsandbytes,
@@ -182,17 +183,9 @@ def plan_separation(options: Options, size: tuple[int, int], card: GraphicsCard)
     panels = work.panel_sizes(size)
     file = _local_file(options.transformer) if options.transformer else None
     weights = file.stat().st_size // 2 if file else cost.parameters
+    choice = WeightChoice(options.quantization, model.quantization, options.offload, file is not None)
     placement, with_nf4 = (
-        place_on_gpu(
-            weights,
-            free_gib=card.memory_gib,
-            total_gib=card.memory_gib,
-            quantization=options.quantization,
-            preferred=model.quantization,
-            offload=options.offload,
-            is_single_file=file is not None,
-            has_nf4=has_nf4,
-        )
+        place_on_gpu(weights, choice, free_gib=card.memory_gib, total_gib=card.memory_gib, has_nf4=has_nf4)
         for has_nf4 in (None, True)
     )
     # A few-step LoRA is trained without classifier-free guidance.
