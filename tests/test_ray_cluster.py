@@ -136,6 +136,20 @@ def test_the_items_of_a_lost_task_are_tried_again_one_by_one(are_arguments_lost)
     assert results_if(errors.RayTaskError("run", "", lost) if are_arguments_lost else lost) == [(1,), (2,)]
 
 
+def test_a_task_is_submitted_with_one_retry_less_than_its_attempts(monkeypatch):
+    """Ray counts retries, and the error message counts attempts."""
+    submitted = {}
+    ray = SimpleNamespace(
+        init=lambda *_, **__: None,
+        put=lambda value: value,
+        remote=lambda **options: submitted.update(options) or (lambda function: function),
+    )
+    monkeypatch.setattr(ray_cluster, "_ray", lambda: ray)
+    ray_cluster.RayExecutor(partial(TaskRunner, None), address="local").__enter__()
+    assert submitted["max_retries"] == ray_cluster.MAX_ATTEMPTS - 1
+    assert submitted["num_cpus"] == 1
+
+
 @pytest.mark.slow
 def test_a_cluster_on_this_machine_renders_the_set_of_one_process(tmp_path):
     pytest.importorskip("ray")

@@ -21,6 +21,7 @@ from typing import Final
 
 from brewster.batch.manifest import row_in_errors
 from brewster.batch.plan import (
+    Burst,
     FileResult,
     InputStream,
     OutputStream,
@@ -30,11 +31,13 @@ from brewster.batch.plan import (
 )
 from brewster.errors import BrewsterError, OutputError
 from brewster.files import exists, is_same_file, write_atomically
-from brewster.image_formats import format_of
+from brewster.image_formats import format_of, is_video
 from brewster.inference.layer_history import find_layer_of_another_photo
 from brewster.inference.predictor import ProgressCallback
+from brewster.inference.separation import Separation
 from brewster.inference.separator import Separator
 from brewster.options import Options
+from brewster.photo import Source
 from brewster.remote_path import Location, RemotePath, check_readable, read_image
 
 BatchProgressCallback = Callable[[int, str, float], None]
@@ -111,9 +114,8 @@ def separate_tasks(
         try:
             check_outputs(task, photos)
             outputs = _missing_outputs(task, overwrite=overwrite)
-            if outputs and dry_run and isinstance(task.source, Location):
-                with row_in_errors(task.row):
-                    check_readable(task.source)
+            if outputs and dry_run:
+                _check_sources(task)
         except BrewsterError as error:
             yield result.failed(error)
             continue
@@ -165,10 +167,13 @@ def separate_task(
         BrewsterError: the photo cannot be read or separated, or a layer cannot be written.
     """
     result.model, result.model_sha256, result.device = separator.name, separator.sha256, separator.device
-    with row_in_errors(task.row):
-        photo = read_content(task.source)
-    result.photo_sha256 = _sha256(photo)
-    separation = separator(photo, on_progress=on_progress, **options.call_options())
+    if task.burst:
+        photo, separation = _separate_burst(task.burst, separator, options, on_progress)
+    else:
+        with row_in_errors(task.row):
+            photo = read_content(task.source)
+        separation = separator(photo, on_progress=on_progress, **options.call_options())
+    result.photo_sha256, result.burst = _sha256(photo), separation.burst
     result.seconds, result.residual = dict(separation.seconds), separation.residual
     result.assessment = separation.assessment
     result.reconstruction_error = separation.reconstruction_error
@@ -188,6 +193,18 @@ def separate_task(
     result.seconds["encode"] = time.perf_counter() - started
 
 
+def _check_sources(task: SeparationTask) -> None:
+    """Checks that the files of a task can be read. The frames of a video are not read.
+
+    Raises:
+        BrewsterError: a file cannot be read.
+    """
+    for source in task.burst.photos if task.burst else (task.source,):
+        if isinstance(source, Location) and not (task.burst and is_video(source)):
+            with row_in_errors(task.row):
+                check_readable(source)
+
+
 def _missing_outputs(task: SeparationTask, *, overwrite: bool) -> dict[str, Location | OutputStream]:
     """Returns the layers that must be written, with their outputs.
 
@@ -201,6 +218,29 @@ def _missing_outputs(task: SeparationTask, *, overwrite: bool) -> dict[str, Loca
     }
     check_layers(task.source, [target for layer, target in task.outputs.items() if layer not in missing])
     return missing
+
+
+def _separate_burst(
+    burst: Burst, separator: Separator, options: Options, on_progress: Callable[[float], None]
+) -> tuple[Path | bytes, Separation]:
+    """Returns the content of the reference photo, or of the video, and its separation."""
+    from brewster.burst import read_video, separate_burst  # noqa: PLC0415  (imports torch)
+
+    content: Path | bytes
+    if is_video(burst.photos[0]):
+        content = Path(burst.photos[0])
+        photos: list[Source] = [*read_video(content, burst.frames, max_pixels=options.max_pixels)]
+    else:
+        photos = [read_content(photo) for photo in burst.photos]
+        content = read_content(burst.photos[len(photos) // 2 if burst.reference is None else burst.reference])
+    separation = separate_burst(
+        photos,
+        reference=burst.reference,
+        separator=separator,
+        on_progress=on_progress,
+        **options.call_options(),
+    )
+    return content, separation
 
 
 def check_outputs(task: SeparationTask, photos: Set[str]) -> None:

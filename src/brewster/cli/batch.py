@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import time
 from collections import Counter, defaultdict
+from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import asdict
 from functools import partial
@@ -13,14 +14,14 @@ from types import TracebackType
 from typing import TYPE_CHECKING, Self, final
 
 from brewster.cli.batch_plan import listed
-from brewster.cli.terminal import interrupts, one_line, print_error, print_status, write_out
+from brewster.cli.terminal import interrupts, one_line, print_error, print_status, progress, write_out
 from brewster.errors import INSTALL_COMMAND, ModelError
 from brewster.models import zoo
 from brewster.options import Options
 from brewster.remote_path import location
 
 if TYPE_CHECKING:
-    from brewster.batch import FileResult
+    from brewster.batch import FileResult, SeparationTask
     from brewster.batch.index import IndexWriter
     from brewster.executors import Executor
 
@@ -79,6 +80,47 @@ class BatchReport:
         if self.output and not self.dry_run:
             self._index = stack.enter_context(IndexWriter(location(self.output)))
 
+    def run(
+        self,
+        tasks: Sequence[SeparationTask],
+        *,
+        workers: int | None = None,
+        cluster: str | None = None,
+        has_index: bool = False,
+    ) -> int:
+        """Separates the photos or bursts of the tasks, and prints their results. Returns the exit code."""
+        from brewster.batch import separate_tasks  # noqa: PLC0415  (imports ONNX Runtime and pyvips)
+        from brewster.batch.parallel import separate_in_parallel  # noqa: PLC0415
+
+        with self, ExitStack() as stack:
+            if has_index:
+                self.open_index(stack)
+            is_shown = not (self.quiet or self.as_json)
+            update_progress = stack.enter_context(progress(self.count, shown=is_shown))
+
+            def on_progress(done: int, name: str, fraction: float) -> None:
+                interrupts.raise_pending()
+                update_progress(done + fraction, name)
+
+            if self.is_parallel:
+                executor = open_executor(
+                    self.options, self.output, overwrite=self.overwrite, workers=workers, cluster=cluster
+                )
+                results = separate_in_parallel(tasks, stack.enter_context(executor), overwrite=self.overwrite)
+            else:
+                results = separate_tasks(
+                    tasks,
+                    self.options,
+                    overwrite=self.overwrite,
+                    dry_run=self.dry_run,
+                    on_progress=on_progress,
+                )
+            for result in results:
+                self.add(result)
+                update_progress(self.counts.total(), result.source)
+                interrupts.raise_pending()
+        return 1 if self.counts["failed"] else 0
+
     def __enter__(self) -> Self:
         return self
 
@@ -129,6 +171,8 @@ class BatchReport:
             hint = ": check the layers" if verdict == "doubtful" else ""
             seconds = sum(result.seconds.values())
             print_status(f"{result.source} -> {outputs} ({seconds:.1f} s, {verdict}{hint})")
+            if result.burst:
+                print_status(f"  {result.burst.method}: {result.burst.message}")
 
     def _different_options(self, result: FileResult) -> str:
         """Returns the options in the metadata of the existing layers that differ from the options of this batch."""

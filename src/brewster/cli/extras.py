@@ -55,6 +55,7 @@ EXTRAS: Final = {
         "torchao": "torchao",
         "transformers": "transformers",
     },
+    "burst": {"av": "av", "opencv-python-headless": "cv2", "torch": "torch"},
     "web": {
         "fastapi": "fastapi",
         "matplotlib": "matplotlib",

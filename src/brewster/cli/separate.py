@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import os
 from collections.abc import Callable
-from contextlib import ExitStack
 from pathlib import Path
 from types import NoneType
 from typing import TYPE_CHECKING, Any, Final, Literal, TypeVar, get_args, get_origin, get_type_hints
@@ -14,7 +13,7 @@ import click
 from click.core import ParameterSource
 from click.shell_completion import CompletionItem
 
-from brewster.cli.batch import BatchReport, open_executor
+from brewster.cli.batch import BatchReport
 from brewster.cli.batch_plan import (
     absolute_path,
     gpu_for_plan,
@@ -24,7 +23,7 @@ from brewster.cli.batch_plan import (
     skipped_files,
 )
 from brewster.cli.extras import require_extra
-from brewster.cli.terminal import interrupts, print_out, print_status, progress, standard_output
+from brewster.cli.terminal import print_out, print_status, standard_output
 from brewster.errors import BrewsterError
 from brewster.image_formats import FormatName, canonical_format, format_of
 from brewster.models import zoo
@@ -108,7 +107,7 @@ class _ModelName(click.ParamType[str]):
         return [*map(CompletionItem, names), CompletionItem(incomplete, type="file")]
 
 
-def _with_options(command: _Command) -> _Command:
+def with_options(command: _Command) -> _Command:
     """Adds one option for each field of `Options` to a command."""
     hints = get_type_hints(Options)
     for field in reversed(dataclasses.fields(Options)):
@@ -155,7 +154,7 @@ def _param_type(hint: object, field: dataclasses.Field[Any]) -> click.ParamType[
     type=click.Path(),
     help="Where to write the layers: a folder, an image file for a single layer, or - for standard output.",
 )
-@_with_options
+@with_options
 @click.option(
     "--json", "as_json", is_flag=True, help="Print one line of JSON for each photo on standard output."
 )
@@ -228,8 +227,6 @@ def separate(
     same name in another folder. If a photo fails, the other photos are still separated, the failed photo is listed at the
     end, and the exit code is 1.
     """
-    from brewster.batch import separate_tasks  # noqa: PLC0415  (imports ONNX Runtime and pyvips)
-    from brewster.batch.parallel import separate_in_parallel  # noqa: PLC0415
 
     photos, output = tuple(map(local_path, photos)), output and local_path(output)
     options = _options(context, values, single_output=is_single_output(photos, output))
@@ -258,27 +255,7 @@ def separate(
         contact_sheet=contact_sheet,
         overwrite=overwrite,
     )
-    with report, ExitStack() as stack:
-        if index or cluster:
-            report.open_index(stack)
-        update_progress = stack.enter_context(progress(len(tasks), shown=not (quiet or as_json)))
-
-        def on_progress(done: int, name: str, fraction: float) -> None:
-            interrupts.raise_pending()
-            update_progress(done + fraction, name)
-
-        if report.is_parallel:
-            executor = open_executor(options, output, overwrite=overwrite, workers=workers, cluster=cluster)
-            results = separate_in_parallel(tasks, stack.enter_context(executor), overwrite=overwrite)
-        else:
-            results = separate_tasks(
-                tasks, options, overwrite=overwrite, dry_run=dry_run, on_progress=on_progress
-            )
-        for result in results:
-            report.add(result)
-            update_progress(report.counts.total(), result.source)
-            interrupts.raise_pending()
-    context.exit(1 if report.counts["failed"] else 0)
+    context.exit(report.run(tasks, workers=workers, cluster=cluster, has_index=bool(index or cluster)))
 
 
 def _options(context: click.Context, values: dict[str, Any], *, single_output: bool) -> Options:

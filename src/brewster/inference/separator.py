@@ -24,7 +24,7 @@ import numpy as np
 
 from brewster.errors import BrewsterError, MissingExtra, ModelError
 from brewster.inference.assessment import Assessment, assess
-from brewster.inference.clipping import keep_clipped_white
+from brewster.inference.clipping import keep_clipped_light
 from brewster.inference.full_size import upsample_layers
 from brewster.inference.guided_upsampling import Floats, GuidedUpsampler
 from brewster.inference.layer_history import PHOTO, history_step, with_step
@@ -68,8 +68,18 @@ class Separator:
         sha256: str | None = None,
         device: str = "cpu",
     ) -> None:
+        if not callable(model):
+            raise TypeError(
+                f"the model is of type {type(model).__name__}; expected a function tile -> (transmission, reflection); "
+                "pass one, or load a model by its name with Separator.load"
+            )
         self._predictor = model if isinstance(model, Predictor) else MultiScalePredictor(model)
         self.name, self.sha256, self.device = name, sha256, device
+        self.takes_hints = self._predictor.takes_hints
+
+    def __repr__(self) -> str:
+        """Returns `Separator(compact, cpu)`."""
+        return f"Separator({self.name}, {self.device})"
 
     @classmethod
     def load(cls, model: str = Options.model, **options: Unpack[LoadOptions]) -> Separator:
@@ -200,7 +210,7 @@ class Separator:
             hints: an image of the size of the photo with rough strokes: red where there is reflection, green where there is
                 only the scene; for models that take hints.
             additive: whether the layers sum to the photo exactly, as 32-bit floats in linear light.
-            encoding: the encoding of an array, "srgb" or "linear"; for arrays only.
+            encoding: the encoding of an array, "srgb" or "linear"; by default, "srgb" for integers. For arrays only.
             max_pixels: refuse photos with more pixels than this, before they are decoded.
             on_progress: called with the completed fraction, 0 to 1. An exception raised in it stops the work.
 
@@ -221,7 +231,7 @@ class Separator:
         on_progress(0.0)
         with _timed(seconds, "network"):
             prediction = self._predictor(images, quality, lambda done: on_progress(_NETWORK_SHARE * done))
-            prediction = keep_clipped_white(inputs[-1], prediction)
+            prediction = keep_clipped_light(inputs[-1], prediction)
         with _timed(seconds, "upsampling"):
             upsampler = _fit_upsampler(inputs[-1], prediction, strength, white)
             transmission, reflection, residual = upsample_layers(
@@ -277,7 +287,7 @@ class Separator:
         Options(quality=quality)  # checks the value
         inputs, white = self._inputs(photo, quality)
         images = self._with_hints(inputs, photo, hints)
-        prediction = keep_clipped_white(inputs[-1], self._predictor(images, quality, on_progress))
+        prediction = keep_clipped_light(inputs[-1], self._predictor(images, quality, on_progress))
         upsampler = _fit_upsampler(inputs[-1], prediction, Options.strength, white)
         return upsampler, prediction, _assess(inputs[-1], prediction)
 
@@ -291,7 +301,7 @@ class Separator:
         """Returns the inputs with two more channels if there are hints."""
         if hints is None:
             return inputs
-        if not self._predictor.takes_hints:
+        if not self.takes_hints:
             raise ModelError(
                 f"hints were given to the model {self.name}, which takes none",
                 "expected a model with an input for hints",
@@ -318,7 +328,7 @@ def separate(
         model: see `Separator.load`.
         mask: see `Separator.__call__`.
         hints: see `Separator.__call__`.
-        encoding: the encoding of an array, "srgb" or "linear"; for arrays only.
+        encoding: the encoding of an array, "srgb" or "linear"; by default, "srgb" for integers. For arrays only.
         options: the keywords of `brewster.options.SeparateOptions`: strength, quality, additive and max_pixels (see
             `Separator.__call__`), and those of `Separator.load`.
 
