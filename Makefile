@@ -36,12 +36,10 @@ check: .venv/dev
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 	$(BIN)/python -m brewster.cli.reference | diff docs/reference.md - || { echo "docs/reference.md is out of date: run make docs"; exit 1; }
-	$(BIN)/python -m brewster.cli.api_reference | diff docs/api.md - || { echo "docs/api.md is out of date: run make docs"; exit 1; }
 	$(BIN)/python -m brewster.cli.recipe_reference | diff docs/recipes.md - || { echo "docs/recipes.md is out of date: run make docs"; exit 1; }
 
 docs: .venv/dev
 	$(BIN)/python -m brewster.cli.reference > docs/reference.md
-	$(BIN)/python -m brewster.cli.api_reference > docs/api.md
 	$(BIN)/python -m brewster.cli.recipe_reference > docs/recipes.md
 
 # The site of the documentation in out/site; needs no network, and a broken link ends it.

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch.nn import functional
 
-from brewster.environments.catalog import BUILTIN_CATALOG
+from brewster.environments.catalog import builtin_catalog
 from brewster.errors import RecipeError
 from brewster.render.analytic import render
 from brewster.render.camera_response import develop
@@ -35,13 +35,14 @@ ASSETS = SyntheticAssets(waves=waves(256, 512), picture=waves(512, 768))
 
 
 class AnyAssets:
-    """Smooth content for every source. Pictures have the size of the built-in paintings."""
+    """Smooth content for every source of the built-in catalog. Pictures have their real size."""
 
     def map_radiance(self, environment):
         return ASSETS.pictures["waves"] * np.float32(environment.luminance)
 
     def plane_radiance(self, plane):
-        return ASSETS.pictures["picture"] * np.float32(plane.luminance)
+        asset = next(asset for asset in builtin_catalog().pictures if asset.source == plane.source)
+        return waves(asset.height, asset.width) * np.float32(plane.luminance)
 
 
 ANY_ASSETS = AnyAssets()
@@ -56,7 +57,7 @@ def burst_recipe(name="burst", size=(48, 32), **values):
 
 
 def frames_of(index=0, seed=7, **values):
-    return draw_frames(burst_recipe(**values), BUILTIN_CATALOG, seed, index)
+    return draw_frames(burst_recipe(**values), builtin_catalog(), seed, index)
 
 
 def moved(scene, offset_mm=(0.0, 0.0, 0.0), turn_deg=(0.0, 0.0, 0.0)):
@@ -185,8 +186,8 @@ def test_scenes_without_exact_motion_are_refused():
 def test_the_reference_frame_is_the_scene_that_the_recipe_draws_without_bursts():
     recipe = burst_recipe("tiny", frames=3)
     for index in range(20):
-        single = draw(recipe.model_copy(update={"burst": None}), BUILTIN_CATALOG, 7, index)
-        reference = draw_frames(recipe, BUILTIN_CATALOG, 7, index)[1]
+        single = draw(recipe.model_copy(update={"burst": None}), builtin_catalog(), 7, index)
+        reference = draw_frames(recipe, builtin_catalog(), 7, index)[1]
         heightless = reference.model_dump(
             exclude={"burst": True, "behind": {"plane": {"height_mm"}}, "front": {"plane": {"height_mm"}}}
         )
@@ -201,9 +202,9 @@ def test_a_burst_without_motion_has_the_light_of_the_single_photo_in_every_frame
     recipe = burst_recipe("tiny", frames=3, exposure_jitter_ev=0.0, **STILL)
     for index in (0, 3, 8):
         single = render(
-            draw(recipe.model_copy(update={"burst": None}), BUILTIN_CATALOG, 7, index), ANY_ASSETS
+            draw(recipe.model_copy(update={"burst": None}), builtin_catalog(), 7, index), ANY_ASSETS
         )
-        frames = [render(scene, ANY_ASSETS) for scene in draw_frames(recipe, BUILTIN_CATALOG, 7, index)]
+        frames = [render(scene, ANY_ASSETS) for scene in draw_frames(recipe, builtin_catalog(), 7, index)]
         for frame in frames:
             for name, light in single.images().items():
                 assert torch.equal(frame.images()[name], light)
@@ -214,8 +215,8 @@ def test_a_burst_without_motion_has_the_light_of_the_single_photo_in_every_frame
 
 def test_frames_are_numbered_through():
     recipe = burst_recipe(frames=3)
-    assert [draw(recipe, BUILTIN_CATALOG, 7, index) for index in range(6, 9)] == draw_frames(
-        recipe, BUILTIN_CATALOG, 7, 2
+    assert [draw(recipe, builtin_catalog(), 7, index) for index in range(6, 9)] == draw_frames(
+        recipe, builtin_catalog(), 7, 2
     )
 
 
@@ -291,13 +292,13 @@ def test_at_equal_distance_the_layers_move_alike():
     impossible = burst_recipe("vitrine", equal_distance_probability=1.0)
     front = impossible.front.model_copy(update={"plane_probability": 0.0})
     with pytest.raises(RecipeError, match="a map on both sides of the glass, or a picture on both sides"):
-        draw_frames(impossible.model_copy(update={"front": front}), BUILTIN_CATALOG, 7, 0)
+        draw_frames(impossible.model_copy(update={"front": front}), builtin_catalog(), 7, 0)
 
 
 def test_without_glass_the_photo_is_the_background():
     recipe = burst_recipe("tiny", without_glass_probability=1.0, frames=2)
     for index in range(6):
-        sample = render(draw(recipe, BUILTIN_CATALOG, 7, index), ANY_ASSETS)
+        sample = render(draw(recipe, builtin_catalog(), 7, index), ANY_ASSETS)
         assert float(sample.reflection.abs().max()) < 1e-6
         torch.testing.assert_close(sample.photo, sample.background, rtol=1e-4, atol=1e-5)
 

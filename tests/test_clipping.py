@@ -1,59 +1,175 @@
-"""White stays white: small changes of clipped pixels are removed, and all other predictions are kept."""
+"""Clipped light is left alone or removed whole, region by region, and all other predictions are kept."""
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from brewster import Separator
-from brewster.inference.clipping import keep_clipped_white
+from brewster.inference import tiles
+from brewster.inference.clipping import keep_clipped_light, label_regions
 from brewster.inference.predictor import Prediction
 from brewster.photo import Photo
-from brewster.srgb import to_linear
+from brewster.srgb import to_encoded, to_linear
+
+SIZE = (64, 80)
+LAMP = np.s_[16:28, 20:34]
+COLOURS = {
+    "white": (255, 255, 255),
+    "warm": (253, 254, 178),
+    "red": (254, 60, 40),
+    "unclipped": (225, 220, 210),
+}
 
 
-def predict(photo_level, transmission_level):
-    """A prediction for a uniform photo; the levels are sRGB-encoded, in 0..1."""
-    photo, transmission = (
-        to_linear(np.full((2, 3, 3), level, np.float32)) for level in (photo_level, transmission_level)
-    )
-    confidence = np.ones((2, 3, 1), np.float32)
-    return photo, Prediction(transmission - photo, photo - transmission, confidence)
+def lamp_photo(colour=(253, 254, 178), wall=(60, 50, 40), size=SIZE, lamp=LAMP):
+    pixels = np.empty((*size, 3), np.uint8)
+    pixels[:] = wall
+    pixels[lamp] = colour
+    return pixels
 
 
-@pytest.mark.parametrize(
-    ("photo_level", "transmission_level", "is_kept"),
-    [(1.0, 0.85, True), (0.985, 0.9, True), (1.0, 0.7, False), (0.84, 0.78, False), (0.5, 0.1, False)],
-)
-def test_only_small_changes_of_clipped_pixels_are_removed(photo_level, transmission_level, is_kept):
-    photo, prediction = predict(photo_level, transmission_level)
-    kept = keep_clipped_white(photo, prediction)
-    for layer in ("change", "reflection"):
-        expected = np.zeros_like(photo) if is_kept else getattr(prediction, layer)
-        np.testing.assert_allclose(getattr(kept, layer), expected, atol=1e-6)
+def linear(pixels):
+    return to_linear(pixels.astype(np.float32) / 255)
 
 
-def test_a_coloured_pixel_with_one_clipped_channel_is_not_white():
-    photo, prediction = predict(1.0, 0.95)
-    photo[..., 2] = 0.5
-    np.testing.assert_array_equal(keep_clipped_white(photo, prediction).change, prediction.change)
+def predict(photo, transmission):
+    confidence = np.ones((*photo.shape[:2], 1), np.float32)
+    return Prediction(transmission - photo, photo - transmission, confidence)
+
+
+def separate(pixels, keeps, **options):
+    """Separates a photo with a model that keeps a share of the light of all pixels brighter than the wall."""
+
+    def model(tile):
+        is_lamp = tile.max(axis=2, keepdims=True) > 0.2
+        transmission = np.where(is_lamp, keeps * tile, tile).astype(np.float32)
+        return transmission, tile - transmission
+
+    return Separator(model, name="lamp")(Photo.from_array(pixels, encoding="srgb"), **options)
+
+
+@pytest.mark.parametrize("colour", COLOURS.values(), ids=COLOURS)
+def test_a_half_removed_lamp_is_left_alone_in_all_channels(colour):
+    pixels = lamp_photo(colour)
+    separation = separate(pixels, 0.6)
+    np.testing.assert_array_equal(separation.transmission.pixels, pixels)
+    assert separation.reflection.pixels.max() == 0
+
+
+@pytest.mark.parametrize("colour", COLOURS.values(), ids=COLOURS)
+def test_a_bright_reflection_that_disappears_is_removed_whole(colour):
+    photo = linear(lamp_photo(colour))
+    prediction = predict(photo, linear(lamp_photo((66, 56, 46))))
+    np.testing.assert_array_equal(keep_clipped_light(photo, prediction).change, prediction.change)
+
+
+def test_each_region_has_its_own_decision():
+    pixels = lamp_photo(size=(64, 96))
+    pixels[16:28, 60:74] = 255
+    transmission = linear(pixels)
+    transmission[LAMP] *= 0.5
+    transmission[16:28, 60:74] = transmission[0, 0]
+    photo = linear(pixels)
+    kept = keep_clipped_light(photo, predict(photo, transmission)).change
+    assert (kept[LAMP] == 0).all()
+    np.testing.assert_array_equal(kept[16:28, 60:74], (transmission - photo)[16:28, 60:74])
+
+
+@settings(deadline=None)
+@given(st.floats(0, 1), st.integers(0, 2**32 - 1), st.sampled_from(list(COLOURS.values())))
+def test_a_bright_region_is_changed_in_all_of_its_pixels_or_in_none(keeps, seed, colour):
+    random = np.random.default_rng(seed)
+    photo = linear(lamp_photo(colour))
+    transmission = photo.copy()
+    transmission[LAMP] *= np.float32(keeps) * random.uniform(0.9, 1.0, (12, 14, 1)).astype(np.float32)
+    prediction = predict(photo, transmission)
+    kept = keep_clipped_light(photo, prediction)
+    is_visible = np.abs(np.subtract(*map(to_encoded, (photo, transmission)))).max(axis=2)[LAMP] > 0.021
+    changes, predicted = kept.change[LAMP][is_visible], prediction.change[LAMP][is_visible]
+    assert (changes == 0).all() or (changes == predicted).all()
+    assert (np.abs(kept.change) <= np.abs(prediction.change)).all()
+    assert (kept.change * prediction.change >= 0).all()
+    np.testing.assert_array_equal(kept.change, -kept.reflection)
 
 
 @given(st.floats(0, 1), st.floats(0, 1))
-def test_a_change_is_never_enlarged_or_inverted(photo_level, transmission_level):
-    photo, prediction = predict(photo_level, transmission_level)
-    kept = keep_clipped_white(photo, prediction)
-    assert (np.abs(kept.change) <= np.abs(prediction.change) + 1e-7).all()
-    assert (kept.change * prediction.change >= 0).all()
-    np.testing.assert_allclose(kept.change + kept.reflection, 0, atol=1e-6)
+def test_a_photo_without_bright_light_keeps_its_prediction(photo_level, transmission_level):
+    photo = to_linear(np.full((6, 8, 3), 0.75 * photo_level, np.float32))
+    prediction = predict(photo, np.full_like(photo, transmission_level))
+    np.testing.assert_array_equal(keep_clipped_light(photo, prediction).change, prediction.change)
 
 
-def test_a_separator_keeps_white_and_separates_the_rest():
-    pixels = np.full((64, 64, 3), 255, np.uint8)
-    pixels[32:] = 120
-    separation = Separator(lambda tile: (0.8 * tile, 0.2 * tile), name="pane")(
-        Photo.from_array(pixels, encoding="srgb")
+def test_a_veil_over_a_wide_white_wall_is_removed_but_over_a_clipped_one_it_is_left():
+    for level, is_kept in ((0.85, False), (1.0, True)):
+        photo = to_linear(np.full((40, 40, 3), level, np.float32))
+        kept = keep_clipped_light(photo, predict(photo, photo * np.float32(0.8)))
+        assert (kept.change == 0).all() == is_kept
+
+
+@given(st.integers(1, 12), st.integers(1, 12), st.integers(0, 2**32 - 1))
+def test_two_pixels_have_the_same_label_if_a_path_connects_them(height, width, seed):
+    mask = np.random.default_rng(seed).random((height, width)) < 0.6
+    labels = label_regions(mask)
+    assert ((labels > 0) == mask).all()
+    for axis in (0, 1):
+        one, other = (np.delete(labels, end, axis) for end in (0, -1))
+        assert (one == other)[(one > 0) & (other > 0)].all()
+    expected = set()  # the regions, by flood fill
+    for start in zip(*np.nonzero(mask), strict=True):
+        region, open_pixels = set(), [tuple(map(int, start))]
+        while open_pixels:
+            row, column = open_pixels.pop()
+            if (
+                (row, column) in region
+                or not (0 <= row < height and 0 <= column < width)
+                or not mask[row, column]
+            ):
+                continue
+            region.add((row, column))
+            open_pixels += [(row + 1, column), (row - 1, column), (row, column + 1), (row, column - 1)]
+        expected.add(frozenset(region))
+    assert labels.max() == len(expected)
+
+
+@pytest.mark.parametrize("strength", [0.3, 1.0])
+@pytest.mark.parametrize("quality", ["draft", "standard"])
+def test_a_lamp_is_kept_at_any_strength_and_quality_level_and_with_a_mask(strength, quality):
+    pixels = lamp_photo(size=(400, 600), lamp=np.s_[100:160, 200:270])
+    pixels[200:] = 150  # a grey floor from which the model removes light
+    mask = np.full((400, 600), 255, np.uint8)
+    mask[:, 300:] = 0
+    separation = separate(pixels, 0.6, strength=strength, quality=quality, mask=mask)
+    transmission = separation.transmission.pixels
+    difference = np.abs(transmission[:190].astype(int) - pixels[:190])
+    assert (
+        difference.max() <= 8
+    )  # no rim: reduced photos have pixels between the light of the lamp and that of the wall
+    assert difference[102:158, 202:268].max() == 0
+    np.testing.assert_array_equal(transmission[:, 302:], pixels[:, 302:])
+    assert (transmission[210:, :290] < 150).all()
+
+
+def test_a_lamp_at_the_edge_of_two_tiles_is_kept(monkeypatch):
+    pixels = lamp_photo(size=(64, 160), lamp=np.s_[20:44, 60:100])
+    original = tiles.run_tiled
+    monkeypatch.setattr(
+        "brewster.inference.predictor.run_tiled",
+        lambda backend, image, **_: original(backend, image, tile_px=96, overlap_px=32),
     )
-    assert (separation.transmission.pixels[:24] == 255).all()
-    assert (separation.reflection.pixels[:24] == 0).all()
-    assert (separation.transmission.pixels[40:] < 112).all()
+    np.testing.assert_array_equal(separate(pixels, 0.6).transmission.pixels, pixels)
+
+
+def test_a_lamp_keeps_16_bits_and_values_above_white():
+    deep = lamp_photo((253, 254, 178)).astype(np.uint16) * 257
+    np.testing.assert_array_equal(separate(deep, 0.6).transmission.pixels, deep)
+    light = linear(lamp_photo())
+    light[LAMP] = 12.0  # an HDR photo: the 99th percentile becomes white
+    separation = Separator(lambda tile: (0.6 * tile, 0.4 * tile))(Photo.from_array(light, encoding="linear"))
+    np.testing.assert_allclose(separation.transmission.linear()[LAMP], 12.0, rtol=1e-5)
+
+
+def test_the_layers_still_add_up_to_the_photo():
+    separation = separate(lamp_photo(), 0.6, additive=True)
+    total = separation.transmission.linear() + separation.reflection.linear()
+    np.testing.assert_array_equal(total, separation.photo.linear())

@@ -9,6 +9,7 @@ import re
 import subprocess
 import sys
 from pathlib import Path
+from typing import get_type_hints
 
 import jaxtyping
 import numpy as np
@@ -19,7 +20,7 @@ import brewster.errors
 import brewster.inference
 import brewster.photo
 from brewster.inference.tiles import run_tiled
-from brewster.options import Options
+from brewster.options import Options, SeparateOptions
 
 ROOT = Path(__file__).parents[1]
 SOURCE = ROOT / "src" / "brewster"
@@ -84,8 +85,9 @@ def test_inference_imports_no_torch():
 def test_the_signature_of_separate_shows_the_source_and_every_option():
     signature = inspect.signature(brewster.separate)
     assert signature == inspect.signature(brewster.inference.separate)
-    assert list(signature.parameters)[:3] == ["source", "model", "device"]
-    assert set(Options.__dataclass_fields__) - {"layers", "format"} <= set(signature.parameters)
+    assert list(signature.parameters)[:3] == ["source", "model", "mask"]
+    keywords = {*signature.parameters, *get_type_hints(SeparateOptions)}
+    assert set(Options.__dataclass_fields__) - {"layers", "format"} <= keywords
 
 
 def test_type_checkers_accept_every_public_name_and_no_other(tmp_path):

@@ -43,7 +43,7 @@ def test_an_offloaded_transformer_with_a_lora_predicts_the_same_bits(name, copie
     )
     call = (latents, condition, torch.tensor([0.7]), prompt, 1.0)
     expected = backbone.predict(*call)
-    offload_layers(backbone, "cpu")
+    offload_layers(backbone.transformer, backbone.vae, "cpu")
     assert torch.equal(backbone.predict(*call), expected)
     transformer = backbone.transformer
     blocks = [*transformer.transformer_blocks, *getattr(transformer, "single_transformer_blocks", [])]
@@ -63,7 +63,7 @@ def test_quantized_weights_are_offloaded_with_their_lora(tmp_path, copies):
     call = (latents, condition, torch.tensor([0.7]), prompt, 1.0)
     with torch.no_grad():
         expected = backbone.predict(*call)
-        offload_layers(backbone, "cpu")
+        offload_layers(backbone.transformer, backbone.vae, "cpu")
         assert torch.equal(backbone.predict(*call), expected)
     assert copies
 

@@ -5,7 +5,9 @@ import pickle
 import subprocess
 import sys
 from dataclasses import fields
+from functools import partial
 from pathlib import Path
+from typing import get_type_hints
 
 import numpy as np
 import pytest
@@ -13,7 +15,7 @@ import pytest
 import brewster
 from brewster import Separator
 from brewster.errors import BrewsterError
-from brewster.options import DIFFUSION_OPTIONS, Options
+from brewster.options import LoadOptions, Options, SeparateOptions
 
 LOAD, CALL = (inspect.signature(function) for function in (Separator.load, Separator.__call__))
 SEPARATE = inspect.signature(brewster.separate)
@@ -28,18 +30,31 @@ def test_defaults_are_those_of_the_options(signature):
 
 
 def test_options_are_passed_to_the_functions_that_take_them():
-    names = {field.name for field in fields(Options)}
-    assert set(Options().load_options()) == names & set(LOAD.parameters)
-    assert set(Options().call_options()) == names & set(CALL.parameters)
-    assert set(SEPARATE.parameters) & names == set(Options().load_options()) | set(Options().call_options())
-    assert set(DIFFUSION_OPTIONS) < set(LOAD.parameters)
+    """Each option but the layers and their format is a keyword of Python, with the type that `Options` has."""
+    types, keywords = get_type_hints(Options), get_type_hints(SeparateOptions)
+    assert types.keys() - keywords.keys() == {"layers", "format", "model", "mask", "hints"}
+    assert {name: types[name] for name in keywords} == keywords
+    assert set(Options().load_options()) == {"model", *get_type_hints(LoadOptions)}
+    assert set(Options().call_options()) == types.keys() & set(CALL.parameters)
+    assert (
+        set(CALL.parameters) - {"self", "source", "encoding", "on_progress", "mask", "hints"}
+        < keywords.keys()
+    )
+
+
+@pytest.mark.parametrize(
+    "function", [Separator.load, partial(brewster.separate, np.zeros((8, 8, 3), np.uint8))]
+)
+def test_an_unknown_option_is_refused(function):
+    with pytest.raises(TypeError, match="there is no option strenght; expected device, "):
+        function(strenght=0.5)
 
 
 @pytest.mark.parametrize("function", [Separator.load, Separator.__call__, brewster.separate])
 def test_help_describes_every_parameter_once(function):
     text = inspect.getdoc(function)
-    for name, parameter in inspect.signature(function).parameters.items():
-        if name != "self" and parameter.kind is not parameter.VAR_KEYWORD:
+    for name in inspect.signature(function).parameters:
+        if name != "self":
             assert text.count(f"    {name}: ") == 1, name
 
 

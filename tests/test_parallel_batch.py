@@ -62,12 +62,10 @@ def run_archive(root, options, *, source=None, executor=SerialExecutor, index=Tr
     writer = IndexWriter(out) if index else None
     try:
         with executor(partial(SeparationRunner, options, **settings)) as running:
-            separate_in_parallel(
-                tasks,
-                running,
-                on_result=lambda result: (results.append(result), writer and writer.append(result)),
-                **settings,
-            )
+            for result in separate_in_parallel(tasks, running, **settings):
+                results.append(result)
+                if writer:
+                    writer.append(result)
     finally:
         if writer:
             writer.close()
@@ -406,7 +404,8 @@ with IndexWriter(root / "out") as index, RayExecutor(partial(SeparationRunner, o
         if len(done) == 10:
             nodes.remove_node(lost_node, allow_graceful=False)
 
-    separate_in_parallel(plan_files(root / "in", root / "out", options), executor, on_result=report)
+    for result in separate_in_parallel(plan_files(root / "in", root / "out", options), executor):
+        report(result)
 nodes.shutdown()
 print(len(done), sorted(set(done) - {"skipped"}))
 """
@@ -456,7 +455,7 @@ def test_a_layer_that_is_its_own_photo_through_a_hard_link_is_refused(options, t
         SerialExecutor(partial(SeparationRunner, options, overwrite=True)) as executor,
         pytest.raises(OutputError, match=r"a\.reflection\.jpg is itself a photo of the batch"),
     ):
-        separate_in_parallel(plan_files(photo, None, options), executor, overwrite=True)
+        list(separate_in_parallel(plan_files(photo, None, options), executor, overwrite=True))
     assert photo.read_bytes() == image_bytes()
 
 
@@ -472,4 +471,4 @@ def test_a_layer_that_is_another_photo_through_a_link_is_refused(options, tmp_pa
         SerialExecutor(partial(SeparationRunner, options, overwrite=True)) as executor,
         pytest.raises(OutputError, match="is itself a photo of the batch"),
     ):
-        separate_in_parallel(tasks, executor, overwrite=True)
+        list(separate_in_parallel(tasks, executor, overwrite=True))

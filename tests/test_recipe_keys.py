@@ -42,7 +42,7 @@ def test_a_key_has_type_allowed_values_unit_default_and_meaning():
     found = keys(Outer)
     assert list(found) == ["length_mm", "shares", "inner.width_px", "inner.mode"]
     length = found["length_mm"]
-    assert (length.kind, length.unit, length.default) == ("range [low, high]", "mm", (1.0, 2.0))
+    assert (length.kind, length.unit, length.default) == ("range [low, high]", "mm", [1.0, 2.0])
     assert length.allowed == "each above 0, sampled log-uniformly"
     assert length.meaning == "A length, over two lines."
     shares = found["shares"]

@@ -3,11 +3,14 @@
 import math
 
 import numpy as np
+import onnx
 import pytest
+from onnx import TensorProto, helper
 
 from brewster import Photo
 from cli_helpers import image_bytes
 from page_helpers import canvas, downloaded, settle, upload
+from web_servers import serve_process
 
 SIZE = 300, 200
 
@@ -170,3 +173,58 @@ def test_regions_are_copied_to_photos_of_other_sizes_and_reset(page):
     assert covered == pytest.approx(math.pi * radius**2, rel=0.1)
     page.get_by_role("button", name="Reset").click()
     assert page.get_by_role("button", name="Save the mask").is_disabled()
+
+
+@pytest.fixture
+def hint_page(chromium, tmp_path):
+    """The page of a server whose model halves the light where the hint says reflection, and only there."""
+    model, shape = tmp_path / "hinted.onnx", [1, 3, "height", "width"]
+    nodes = [
+        helper.make_node("Slice", ["hints", "zero", "one", "one"], ["red"]),  # 0 to 1 of axis 1
+        helper.make_node("Mul", ["red", "half"], ["share"]),
+        helper.make_node("Mul", ["photo", "share"], ["reflection"]),
+        helper.make_node("Sub", ["photo", "reflection"], ["transmission"]),
+    ]
+    values = [
+        helper.make_tensor("zero", TensorProto.INT64, [1], [0]),
+        helper.make_tensor("one", TensorProto.INT64, [1], [1]),
+        helper.make_tensor("half", TensorProto.FLOAT, [], [0.5]),
+    ]
+    graph = helper.make_graph(
+        nodes, "hinted",
+        [helper.make_tensor_value_info("photo", TensorProto.FLOAT, shape),
+         helper.make_tensor_value_info("hints", TensorProto.FLOAT, [1, 2, "height", "width"])],
+        [helper.make_tensor_value_info(name, TensorProto.FLOAT, shape) for name in ("transmission", "reflection")],
+        values,
+    )  # fmt: skip
+    onnx.save(helper.make_model(graph, opset_imports=[helper.make_opsetid("", 18)], ir_version=10), model)
+    with serve_process("--model", model, "--token", "auto") as link:
+        page = chromium.new_context(viewport={"width": 1100, "height": 760}, accept_downloads=True).new_page()
+        page.goto(link)
+        page.wait_for_selector("#model option", state="attached")
+        upload(page, ("window.png", image_bytes(*SIZE, "png")))
+        yield page
+        page.context.close()
+
+
+def test_a_hint_on_the_page_separates_again_and_reaches_the_file_together_with_a_mask(hint_page):
+    page = hint_page
+    assert (canvas(page, "left") == canvas(page, "right")).all()
+    page.get_by_label("Reflection is here").check()
+    page.get_by_label("Rectangle").check()
+    drag(page, (60, 50), (200, 150))
+    page.wait_for_function("() => !document.querySelector('#photos .working, #photos .waiting')")
+    settle(page)
+    page.get_by_label("Not here").check()
+    drag(page, (140, 50), (220, 160))
+    settle(page)
+    _, made = downloaded(page, page.get_by_role("button", name="Download transmission").click)
+    photo, result, shown = canvas(page, "left"), Photo.open(made).pixels, canvas(page, "right")
+    for pixels in (result, shown):
+        assert pixels[80:120, 80:120].mean() < 0.85 * photo[80:120, 80:120].mean()  # hint: half of the light
+        assert (pixels[80:120, 150:190] == photo[80:120, 150:190]).all()  # hint, but protected by the mask
+        assert (pixels[170:, :] == photo[170:, :]).all()
+
+
+def test_a_model_without_hints_has_no_tools_for_them(page):
+    assert page.get_by_label("Reflection is here").is_hidden()

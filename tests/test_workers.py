@@ -1,11 +1,11 @@
 """Several processes render the same bytes as one process, even if workers die."""
 
+import concurrent.futures
 import os
 import signal
 import subprocess
 import sys
 from functools import partial
-from multiprocessing import connection
 from pathlib import Path
 
 import pytest
@@ -103,7 +103,7 @@ def test_leaving_the_context_before_a_result_is_read_prints_no_traceback(tmp_pat
     with ProcessExecutor(partial(TaskRunner, job), 1) as executor:
         executor.submit(RenderTask("render", (0,)))
         if is_finished:
-            connection.wait(list(executor._busy))
+            concurrent.futures.wait(executor._busy)
     assert (tmp_path / "000000").is_dir()
     assert capfd.readouterr().err == ""
 

@@ -1,19 +1,17 @@
 """The options of a separation: type, default, limits and meaning of each, written once.
 
-The command line, its help and the web form are generated from `Options`. The Python API takes its defaults and its
-documentation from `Options`. The metadata of each field are keywords of `pydantic.Field`. pydantic uses them to check the values
+The command line, its help and the web form are generated from `Options`. The Python API takes its defaults from `Options`, and
+names the keywords of its functions in `LoadOptions` and `SeparateOptions`. The metadata of each field are keywords of `pydantic.Field`. pydantic uses them to check the values
 of `Options` and of requests of the HTTP API, and to write its JSON schema. `brewster --help` works without pydantic.
 """
 
 from __future__ import annotations
 
-import inspect
-import re
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, TypeVar, final, get_type_hints
+from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, TypedDict, final, get_type_hints
 
 from brewster.errors import BrewsterError, invalid_value
 from brewster.files import DEFAULT_MAX_PIXELS, LAYER_FORMATS
@@ -32,15 +30,33 @@ Quantization = Literal["int8", "float8", "nf4"]
 Offload = Literal["auto", "none", "layers"]
 """Whether the weights of a diffusion model are kept in host memory and copied to the GPU layer by layer."""
 
-DIFFUSION_OPTIONS: Final = (
-    "base_model", "quantization", "offload", "transformer", "fast_lora", "guidance", "timestep_shift", "steps",
-    "ensemble_size", "no_guided_upsampling",
-)  # fmt: skip
-"""The options of diffusion models only."""
+
+class LoadOptions(TypedDict, total=False):
+    """The keywords of `Separator.load`; for their meaning and defaults, see `Options`. All but the device are for diffusion models."""
+
+    device: Device
+    base_model: str | None
+    quantization: Quantization | None
+    offload: Offload
+    transformer: str | None
+    fast_lora: str | None
+    guidance: float | None
+    timestep_shift: float | None
+    steps: int | None
+    ensemble_size: int
+    no_guided_upsampling: bool
+
+
+class SeparateOptions(LoadOptions, total=False):
+    """The keywords of `brewster.separate` that are options of the command line; see `Options`."""
+
+    strength: float
+    quality: Quality
+    additive: bool
+    max_pixels: int
+
 
 _CALL_OPTIONS: Final = ("strength", "quality", "mask", "hints", "additive", "max_pixels")
-
-_Function = TypeVar("_Function", bound=Callable[..., Any])
 
 
 def _field_metadata(description: str, **limits: int) -> dict[str, Any]:
@@ -209,7 +225,7 @@ class Options:
 
     def load_options(self) -> dict[str, Any]:
         """Returns the keywords for `Separator.load`."""
-        names = ("model", "device", *DIFFUSION_OPTIONS)
+        names = ("model", *LoadOptions.__annotations__)
         return {name: getattr(self, name) for name in names}
 
     def call_options(self) -> dict[str, Any]:
@@ -264,17 +280,3 @@ def _validators() -> Mapping[str, TypeAdapter[Any]]:
         option.name: Annotated[hints[option.name], Field(**option.metadata)] for option in fields(Options)
     }
     return {name: TypeAdapter(hint) for name, hint in types.items()}
-
-
-def document_options(function: _Function) -> _Function:
-    """Adds the function parameters that are fields of `Options` to the `Args:` section of its docstring."""
-    descriptions = {option.name: option.metadata["description"] for option in fields(Options)}
-    docstring = inspect.getdoc(function) or ""
-    rows = [
-        f"    {name}: {descriptions[name]}"
-        for name in inspect.signature(function).parameters
-        if name in descriptions
-    ]
-    section = re.compile(r"^Args:\n(?: +.*\n)*", re.MULTILINE)
-    function.__doc__ = section.sub(lambda found: found[0] + "\n".join([*rows, ""]), docstring, count=1)
-    return function

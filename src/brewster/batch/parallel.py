@@ -3,9 +3,10 @@
     tasks = plan_files("scans.parquet", "s3://bucket/clear", options)
     create_runner = partial(SeparationRunner, options)
     with RayExecutor(create_runner, "10.0.0.1:6379") as executor, IndexWriter(location("s3://bucket/clear")) as index:
-        separate_in_parallel(tasks, executor, on_result=index.append)
+        for result in separate_in_parallel(tasks, executor):
+            index.append(result)
 
-A worker separates one photo at a time, with the same code as a batch in one process (`BatchRunner`). The worker itself reads the
+A worker separates one photo at a time, with the same code as a batch in one process (`separate_tasks`). The worker itself reads the
 photo and writes the layers. Without `overwrite`, a layer that exists is never written again, even if two workers separate the same
 photo. If a node is lost, only the photos that it was separating are separated again. The same command resumes a stopped run.
 """
@@ -14,44 +15,53 @@ from __future__ import annotations
 
 import socket
 from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from pathlib import Path
 from typing import final
 
 from brewster.batch.plan import FileResult, SeparationTask
-from brewster.batch.runner import BatchRunner, check_outputs, real_paths, skipped_result
+from brewster.batch.runner import check_outputs, real_paths, separate_tasks, skipped_result
 from brewster.errors import OutputError
 from brewster.executors import Executor, run_tasks
 from brewster.files import exists
+from brewster.inference.separator import Separator
 from brewster.options import Options
 from brewster.remote_path import Location
 
 
 def separate_in_parallel(
-    tasks: Sequence[SeparationTask],
-    executor: Executor[FileResult],
-    *,
-    overwrite: bool = False,
-    on_result: Callable[[FileResult], None] = lambda _: None,
-) -> None:
-    """Separates the photos of the tasks, in the order in which workers finish them.
+    tasks: Sequence[SeparationTask], executor: Executor[FileResult], *, overwrite: bool = False
+) -> Iterator[FileResult]:
+    """Separates the photos of the tasks, and yields the results in the order in which workers finish them.
 
     Args:
         tasks: the photos and the paths of their layers, from `plan_files`.
         executor: runs a `SeparationRunner` in its workers. The caller enters its context.
         overwrite: whether tasks whose layers exist are given to a worker. The runner needs the same value.
-        on_result: called with the result of every photo. An exception raised in it stops the run.
 
     Raises:
         OutputError: a layer would replace a photo of the archive, or a node cannot reach the output folder.
         ModelError: the model does not exist or is damaged.
         DeviceError: the requested device is not available.
     """
-    photos = real_paths(task.source for task in tasks)
+    photos, cache = real_paths(task.source for task in tasks), _FileNameCache()
     for task in tasks:  # a worker cannot check this, because it does not get the paths of all photos
         check_outputs(task, photos)
-    unfinished = _unfinished(tasks, on_result, overwrite=overwrite)
-    for result in run_tasks(lambda: next(unfinished, None), executor):
-        on_result(result)
+    finished: list[FileResult] = []
+
+    def unfinished() -> Iterator[SeparationTask]:
+        for task in tasks:
+            if not overwrite and _is_finished(task, cache.has):
+                finished.append(skipped_result(task))  # without a worker
+            else:
+                yield task
+
+    next_task = partial(next, unfinished(), None)
+    for result in run_tasks(next_task, executor):
+        yield from finished
+        finished.clear()
+        yield result
+    yield from finished
 
 
 @final
@@ -76,7 +86,8 @@ class SeparationRunner:
                 "expected a folder that all nodes share",
                 "mount it on this node, or write to an object store",
             )
-        self._batch, self._overwrite = BatchRunner((), options, overwrite=overwrite), overwrite
+        self._options, self._overwrite = options, overwrite
+        self._separator: Separator | None = None
 
     def __call__(self, task: SeparationTask) -> list[FileResult]:
         """Separates one photo. If the photo fails, its result has the status "failed".
@@ -84,23 +95,12 @@ class SeparationRunner:
         Raises:
             ModelError, DeviceError, MissingExtra: the model cannot be loaded.
         """
-        result = self._batch.run(task, lambda _fraction: None)
+        self._separator = self._separator or Separator.load(**self._options.load_options())
+        result = next(separate_tasks([task], self._options, self._separator, overwrite=self._overwrite))
         if result.error and not self._overwrite and _is_finished(task, exists):
             # This worker was slow, and another worker got the same task and has already written the layers.
             result = skipped_result(task)
         return [result]
-
-
-def _unfinished(
-    tasks: Sequence[SeparationTask], on_result: Callable[[FileResult], None], *, overwrite: bool
-) -> Iterator[SeparationTask]:
-    """Yields the tasks with missing layers, or all tasks with `overwrite`. Reports the other tasks as skipped, without a worker."""
-    cache = _FileNameCache()
-    for task in tasks:
-        if not overwrite and _is_finished(task, cache.has):
-            on_result(skipped_result(task))
-        else:
-            yield task
 
 
 def _is_finished(task: SeparationTask, has: Callable[[Location], bool]) -> bool:

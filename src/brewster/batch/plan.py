@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Final, Literal, Protocol, final
 
 from brewster.batch.layer_names import name_layers
@@ -17,9 +17,12 @@ from brewster.errors import PhotoError, counted
 from brewster.files import check_output_folder, images_in
 from brewster.image_formats import SUFFIXES, is_video
 from brewster.inference.assessment import Assessment
+from brewster.inference.burst_report import BurstReport
 from brewster.options import Options
 from brewster.remote_path import Location, location
 
+DEFAULT_FRAMES: Final = 7
+"""The number of frames that are chosen from a video."""
 _STREAM_NAME: Final = "-"
 _DEFAULT_OPTIONS: Final = Options()
 
@@ -40,6 +43,19 @@ class OutputStream(Protocol):
 
 @final
 @dataclass(frozen=True)
+class Burst:
+    """Several photos of one window, or a video. The photo of the task is the reference photo, or the video."""
+
+    photos: tuple[Location, ...]
+    """The photos in the order in which they were taken, or one video."""
+    reference: int | None
+    """The index of the photo that is separated, or None for the middle one."""
+    frames: int
+    """The number of frames that are chosen from a video."""
+
+
+@final
+@dataclass(frozen=True)
 class SeparationTask:
     """One photo, and the output of each of its layers: a path, a URL or a stream."""
 
@@ -48,6 +64,8 @@ class SeparationTask:
     """The output of each layer, by layer name (`transmission`, `reflection` or `confidence`)."""
     row: ManifestRow | None = None
     """The first row of a manifest that has the path of the photo, or None if there is none."""
+    burst: Burst | None = None
+    """The photos that show the same window, or None if the photo is separated alone."""
 
     @property
     def name(self) -> str:
@@ -92,6 +110,8 @@ class FileResult:
     """See `Separation.assessment`."""
     reflection_is_derived: bool = False
     """See `Separation.reflection_is_derived`."""
+    burst: BurstReport | None = None
+    """See `Separation.burst`."""
     error: str | None = None
     """The error message, or None."""
 
@@ -150,6 +170,50 @@ def plan_files(
     if folder is not None:
         check_output_folder(folder)
     return tasks
+
+
+def plan_bursts(
+    sources: Iterable[str | os.PathLike[str]],
+    output: str | os.PathLike[str] | None = None,
+    options: Options = _DEFAULT_OPTIONS,
+    *,
+    reference: int | None = None,
+    frames: int = DEFAULT_FRAMES,
+) -> list[SeparationTask]:
+    """Groups photos into bursts, and returns a task for each burst with the paths of the layers of its reference photo.
+
+    The photos that are given by name are one burst, in their order. The photos of each folder are one burst, in the order of their
+    names. Each video that is given by name is one burst.
+
+    Args:
+        sources: photos, folders and videos.
+        output, options: see `separate_files`.
+        reference: the index of the reference photo in each burst, by default the middle one.
+        frames: the number of frames that are chosen from a video.
+
+    Raises:
+        PhotoError: the sources contain no photo, or a burst has no photo with the index `reference`.
+        OutputError: see `plan_files`.
+    """
+    given = [location(source) for source in sources]
+    groups: dict[object, list[SeparationTask]] = {}
+    for task in plan_files(map(str, given), output, options):
+        source = task.source
+        assert isinstance(source, Location)
+        group = source if is_video(source) else "given" if source in given else source.parent
+        groups.setdefault(group, []).append(task)
+    bursts = []
+    for tasks in groups.values():
+        photos = tuple(task.source for task in tasks if isinstance(task.source, Location))
+        index = len(photos) // 2 if reference is None or is_video(photos[0]) else reference
+        if not 0 <= index < len(photos):
+            raise PhotoError(
+                f"photo {index + 1} is the reference of a burst of {counted(len(photos), 'photo')} ({photos[0]})",
+                f"expected a number from 1 to {len(photos)}",
+                "correct --reference (in Python reference, which begins at 0), or leave it out for the middle photo",
+            )
+        bursts.append(replace(tasks[index], burst=Burst(photos, reference, frames)))
+    return bursts
 
 
 def display_name(source_or_target: object) -> str:

@@ -17,10 +17,11 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Set
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Final, final
+from typing import Final
 
 from brewster.batch.manifest import row_in_errors
 from brewster.batch.plan import (
+    Burst,
     FileResult,
     InputStream,
     OutputStream,
@@ -30,10 +31,13 @@ from brewster.batch.plan import (
 )
 from brewster.errors import BrewsterError, OutputError
 from brewster.files import exists, is_same_file, write_atomically
-from brewster.image_formats import format_of
+from brewster.image_formats import format_of, is_video
 from brewster.inference.layer_history import find_layer_of_another_photo
+from brewster.inference.predictor import ProgressCallback
+from brewster.inference.separation import Separation
 from brewster.inference.separator import Separator
 from brewster.options import Options
+from brewster.photo import Source
 from brewster.remote_path import Location, RemotePath, check_readable, read_image
 
 BatchProgressCallback = Callable[[int, str, float], None]
@@ -103,121 +107,140 @@ def separate_tasks(
     on_progress: BatchProgressCallback = lambda _done, _name, _fraction: None,
 ) -> Iterator[FileResult]:
     """Separates the photos of the tasks. For the other arguments, results and errors, see `separate_files`."""
-    batch = BatchRunner(tasks, options, separator, overwrite=overwrite, dry_run=dry_run)
+    photos, unexpected = real_paths(task.source for task in tasks), None
     for done, task in enumerate(tasks):
         on_progress(done, task.name, 0.0)
-        yield batch.run(task, partial(on_progress, done, task.name))
-    if batch.unexpected_error:
-        raise batch.unexpected_error
-
-
-@final
-class BatchRunner:
-    """Separates the photos of a batch one by one, and stores the first unexpected exception. The model is loaded on first use.
-
-    Args:
-        tasks: the tasks of the batch, whose photos are never overwritten.
-        options, separator, overwrite, dry_run: see `separate_files`.
-    """
-
-    def __init__(
-        self,
-        tasks: Iterable[SeparationTask],
-        options: Options,
-        separator: Separator | None = None,
-        *,
-        overwrite: bool = False,
-        dry_run: bool = False,
-    ) -> None:
-        self.unexpected_error: Exception | None = None
-        self._options, self._separator = options, separator
-        self._overwrite, self._dry_run = overwrite, dry_run
-        self._photos = real_paths(task.source for task in tasks)
-
-    def run(self, task: SeparationTask, on_progress: Callable[[float], None]) -> FileResult:
-        """Separates one photo. Returns its result, also if the photo fails.
-
-        Raises:
-            ModelError, DeviceError: the model cannot be loaded.
-        """
         result = FileResult(task.name)
         try:
-            outputs = self._outputs_to_write(task)
-            if outputs and self._dry_run and isinstance(task.source, Location):
-                with row_in_errors(task.row):
-                    check_readable(task.source)
+            check_outputs(task, photos)
+            outputs = _missing_outputs(task, overwrite=overwrite)
+            if outputs and dry_run:
+                _check_sources(task)
         except BrewsterError as error:
-            return result.failed(error)
-        if not outputs or self._dry_run:
+            yield result.failed(error)
+            continue
+        if not outputs or dry_run:
             result.status = "planned" if outputs else "skipped"
             result.outputs = _names(outputs or task.outputs)
-            return result
-        # This is not in the try block, because no photo can be separated without a model: a model error ends the batch.
-        self._separator = separator = self._separator or Separator.load(**self._options.load_options())
-        result.model, result.model_sha256, result.device = separator.name, separator.sha256, separator.device
+            yield result
+            continue
+        # This is not in a try block, because no photo can be separated without a model: a model error ends the batch.
+        separator = separator or Separator.load(**options.load_options())
         try:
-            self._separate(separator, replace(task, outputs=outputs), result, on_progress)
+            separate_task(
+                replace(task, outputs=outputs),
+                options,
+                separator,
+                result,
+                overwrite=overwrite,
+                on_progress=partial(on_progress, done, task.name),
+            )
+            result.outputs = _names(task.outputs)  # also the layers that existed before
         except BrewsterError as error:
-            return result.failed(error)
+            result.failed(error)
         except MemoryError:
-            return result.failed(
+            result.failed(
                 "the photo does not fit into memory; expected more free memory; close other programs, or make the photo smaller.",
             )
         except Exception as error:  # noqa: BLE001  (raised again after the last photo)
-            self.unexpected_error = (
-                self.unexpected_error or error
+            unexpected = (
+                unexpected or error
             )  # only the first, because each traceback keeps its photo in memory
-            return result.failed(
-                f"internal error in brewster ({type(error).__name__}: {error}); please report it"
-            )
-        result.outputs = _names(task.outputs)  # also the layers that existed before
-        return result
+            result.failed(f"internal error in brewster ({type(error).__name__}: {error}); please report it")
+        yield result
+    if unexpected:
+        raise unexpected
 
-    def _outputs_to_write(self, task: SeparationTask) -> dict[str, Location | OutputStream]:
-        """Returns the layers that must be written, with their outputs.
 
-        Raises:
-            OutputError: a layer would replace a photo of the batch, or an existing layer was made from another photo.
-        """
-        check_outputs(task, self._photos)
-        missing = {
-            layer: target
-            for layer, target in task.outputs.items()
-            if not isinstance(target, Location) or self._overwrite or not exists(target)
-        }
-        check_layers(task.source, [target for layer, target in task.outputs.items() if layer not in missing])
-        return missing
+def separate_task(
+    task: SeparationTask,
+    options: Options,
+    separator: Separator,
+    result: FileResult,
+    *,
+    overwrite: bool,
+    on_progress: ProgressCallback,
+) -> None:
+    """Separates one photo, writes its layers, and enters both into the result.
 
-    def _separate(
-        self,
-        separator: Separator,
-        task: SeparationTask,
-        result: FileResult,
-        on_progress: Callable[[float], None],
-    ) -> None:
+    Raises:
+        BrewsterError: the photo cannot be read or separated, or a layer cannot be written.
+    """
+    result.model, result.model_sha256, result.device = separator.name, separator.sha256, separator.device
+    if task.burst:
+        photo, separation = _separate_burst(task.burst, separator, options, on_progress)
+    else:
         with row_in_errors(task.row):
             photo = read_content(task.source)
-        result.photo_sha256 = _sha256(photo)
-        separation = separator(photo, on_progress=on_progress, **self._options.call_options())
-        result.seconds, result.residual = dict(separation.seconds), separation.residual
-        result.assessment = separation.assessment
-        result.reconstruction_error = separation.reconstruction_error
-        result.reflection_is_derived = separation.reflection_is_derived
-        started = time.perf_counter()
-        for layer, target in task.outputs.items():
-            target_format = format_of(target) if isinstance(target, Location) else None
-            source_format = separation.photo.file_info.format_name
-            format_name = (
-                target_format.name if target_format else self._options.format_name(layer, source_format)
-            )
-            encoded = getattr(separation, layer).encode(format_name)
-            on_progress(1.0)
-            if isinstance(target, Location):
-                write_atomically(target, encoded, overwrite=self._overwrite)
-            else:
-                target.write(encoded)
-            result.outputs[layer] = display_name(target)
-        result.seconds["encode"] = time.perf_counter() - started
+        separation = separator(photo, on_progress=on_progress, **options.call_options())
+    result.photo_sha256, result.burst = _sha256(photo), separation.burst
+    result.seconds, result.residual = dict(separation.seconds), separation.residual
+    result.assessment = separation.assessment
+    result.reconstruction_error = separation.reconstruction_error
+    result.reflection_is_derived = separation.reflection_is_derived
+    started = time.perf_counter()
+    for layer, target in task.outputs.items():
+        target_format = format_of(target) if isinstance(target, Location) else None
+        source_format = separation.photo.file_info.format_name
+        format_name = target_format.name if target_format else options.format_name(layer, source_format)
+        encoded = getattr(separation, layer).encode(format_name)
+        on_progress(1.0)
+        if isinstance(target, Location):
+            write_atomically(target, encoded, overwrite=overwrite)
+        else:
+            target.write(encoded)
+        result.outputs[layer] = display_name(target)
+    result.seconds["encode"] = time.perf_counter() - started
+
+
+def _check_sources(task: SeparationTask) -> None:
+    """Checks that the files of a task can be read. The frames of a video are not read.
+
+    Raises:
+        BrewsterError: a file cannot be read.
+    """
+    for source in task.burst.photos if task.burst else (task.source,):
+        if isinstance(source, Location) and not (task.burst and is_video(source)):
+            with row_in_errors(task.row):
+                check_readable(source)
+
+
+def _missing_outputs(task: SeparationTask, *, overwrite: bool) -> dict[str, Location | OutputStream]:
+    """Returns the layers that must be written, with their outputs.
+
+    Raises:
+        OutputError: an existing layer was made from another photo.
+    """
+    missing = {
+        layer: target
+        for layer, target in task.outputs.items()
+        if not isinstance(target, Location) or overwrite or not exists(target)
+    }
+    check_layers(task.source, [target for layer, target in task.outputs.items() if layer not in missing])
+    return missing
+
+
+def _separate_burst(
+    burst: Burst, separator: Separator, options: Options, on_progress: Callable[[float], None]
+) -> tuple[Path | bytes, Separation]:
+    """Returns the content of the reference photo, or of the video, and its separation."""
+    from brewster.burst import read_video, separate_burst  # noqa: PLC0415  (imports torch)
+
+    content: Path | bytes
+    if is_video(burst.photos[0]):
+        content = Path(burst.photos[0])
+        photos: list[Source] = [*read_video(content, burst.frames, max_pixels=options.max_pixels)]
+    else:
+        photos = [read_content(photo) for photo in burst.photos]
+        content = read_content(burst.photos[len(photos) // 2 if burst.reference is None else burst.reference])
+    separation = separate_burst(
+        photos,
+        reference=burst.reference,
+        separator=separator,
+        on_progress=on_progress,
+        **options.call_options(),
+    )
+    return content, separation
 
 
 def check_outputs(task: SeparationTask, photos: Set[str]) -> None:

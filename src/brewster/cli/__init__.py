@@ -13,7 +13,19 @@ import click
 from click.shell_completion import CompletionItem
 
 import brewster
-from brewster.cli import ablate, assets, doctor, evaluate, models, render, separate, serve, study, train
+from brewster.cli import (
+    ablate,
+    assets,
+    burst,
+    doctor,
+    evaluate,
+    models,
+    render,
+    separate,
+    serve,
+    study,
+    train,
+)
 from brewster.cli.terminal import interrupts, print_error, print_status, standard_output
 from brewster.errors import BrewsterError
 
@@ -75,6 +87,7 @@ def cli() -> None:
 
 for _command in (
     separate.separate,
+    burst.burst,
     models.models,
     doctor.doctor,
     train.train,

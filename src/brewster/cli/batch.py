@@ -1,30 +1,20 @@
-"""Runs `brewster separate` and prints its output: progress, one line for each photo, a summary.
-
-The photos are separated by `brewster.batch.runner`, or in several processes or on a cluster by
-`brewster.batch.parallel`.
-"""
+"""The results of `brewster separate`, and how they are printed: one line for each photo, and a summary."""
 
 from __future__ import annotations
 
 import json
 import time
 from collections import Counter, defaultdict
-from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager, nullcontext
-from dataclasses import asdict, dataclass
+from collections.abc import Sequence
+from contextlib import ExitStack
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, final
+from types import TracebackType
+from typing import TYPE_CHECKING, Self, final
 
 from brewster.cli.batch_plan import listed
-from brewster.cli.terminal import (
-    interrupts,
-    one_line,
-    print_error,
-    print_status,
-    progress,
-    write_out,
-)
+from brewster.cli.terminal import interrupts, one_line, print_error, print_status, progress, write_out
 from brewster.errors import INSTALL_COMMAND, ModelError
 from brewster.models import zoo
 from brewster.options import Options
@@ -36,107 +26,131 @@ if TYPE_CHECKING:
     from brewster.executors import Executor
 
 
+def open_executor(
+    options: Options, output: str | None, *, overwrite: bool, workers: int | None, cluster: str | None
+) -> Executor[FileResult]:
+    """Returns the executor of a batch in several processes, or on a cluster. The caller enters its context."""
+    from brewster.batch.parallel import SeparationRunner  # noqa: PLC0415
+    from brewster.executors import ProcessExecutor  # noqa: PLC0415
+
+    shared_folder = location(output) if cluster and output else None
+    create_runner = partial(SeparationRunner, options, shared_folder, overwrite=overwrite)
+    if not cluster:
+        return ProcessExecutor(create_runner, workers or 1)
+    from brewster.executors.ray_cluster import RayExecutor  # noqa: PLC0415
+
+    return RayExecutor(create_runner, cluster, workers)
+
+
 @final
-@dataclass(frozen=True)
-class BatchCommand:
-    """The options of a batch. `run` separates the photos and prints the results."""
+class BatchReport:
+    """Prints a line for each result, and at the end a summary, and writes the contact sheet and the index.
 
-    options: Options
-    output: str | None = None
-    overwrite: bool = False
-    dry_run: bool = False
-    as_json: bool = False
-    quiet: bool = False
-    contact_sheet: Path | None = None
-    workers: int | None = None
-    cluster: str | None = None
-    writes_index: bool = False
+    A context manager: its exit prints the summary if all `count` photos have a result, also after an error. The results are not
+    kept in memory, because an archive can have millions of photos.
+    """
 
-    def run(self, tasks: Sequence[SeparationTask]) -> bool:
-        """Separates all photos and prints the results.
-
-        The results are not kept in memory, because an archive can have millions of photos.
-
-        Returns:
-            Whether no photo failed.
-
-        Raises:
-            BrewsterError: see `separate_tasks` and `separate_in_parallel`.
-        """
-        summary, started = _Summary(), time.perf_counter()
-        try:
-            with (
-                self._index_writer() as index,
-                progress(len(tasks), shown=not (self.quiet or self.as_json)) as update_progress,
-            ):
-
-                def on_result(result: FileResult) -> None:
-                    if result.error:
-                        interrupts.raise_pending()  # a Ctrl-C that Python dropped may have caused the error
-                    if index:
-                        index.append(result)
-                    summary.add(result, has_contact_sheet=self.contact_sheet is not None)
-                    self._print_result(result)
-                    update_progress(summary.counts.total(), result.source)
-                    interrupts.raise_pending()
-
-                if self._is_parallel:
-                    self._separate_in_parallel(tasks, on_result)
-                else:
-                    self._separate(tasks, on_result, update_progress)
-            if self.contact_sheet and not self.dry_run:
-                self._write_contact_sheet(self.contact_sheet, summary.contact_sheet_rows)
-        finally:
-            # All photos have a result. `separate_tasks` may still raise, after the last photo.
-            if summary.counts.total() == len(tasks):
-                self._print_summary(summary, time.perf_counter() - started)
-        return not summary.counts["failed"]
-
-    @property
-    def _is_parallel(self) -> bool:
-        return bool(self.workers or self.cluster) and not self.dry_run
-
-    def _separate(
+    def __init__(
         self,
-        tasks: Sequence[SeparationTask],
-        on_result: Callable[[FileResult], None],
-        update_progress: Callable[[float, str], None],
+        options: Options,
+        output: str | None,
+        count: int,
+        *,
+        dry_run: bool,
+        as_json: bool,
+        quiet: bool,
+        is_parallel: bool,
+        contact_sheet: Path | None,
+        overwrite: bool,
     ) -> None:
-        from brewster.batch.runner import separate_tasks  # noqa: PLC0415
+        self.options, self.output, self.count, self.dry_run = options, output, count, dry_run
+        self.as_json, self.quiet, self.is_parallel = as_json, quiet, is_parallel
+        self.contact_sheet, self.overwrite = None if dry_run else contact_sheet, overwrite
+        self.counts: Counter[str] = Counter()
+        self._contact_sheet_rows: list[tuple[Path, list[Path]]] = []
+        self._errors: list[str] = []
+        self._sources_by_missing_extra: defaultdict[str, list[str]] = defaultdict(list)
+        self._index: IndexWriter | None = None
+        self._started = time.perf_counter()
 
-        def on_progress(done: int, name: str, fraction: float) -> None:
-            interrupts.raise_pending()
-            update_progress(done + fraction, name)
-
-        for result in separate_tasks(
-            tasks, self.options, overwrite=self.overwrite, dry_run=self.dry_run, on_progress=on_progress
-        ):
-            on_result(result)
-
-    def _separate_in_parallel(
-        self, tasks: Sequence[SeparationTask], on_result: Callable[[FileResult], None]
-    ) -> None:
-        from brewster.batch.parallel import SeparationRunner, separate_in_parallel  # noqa: PLC0415
-        from brewster.executors import ProcessExecutor  # noqa: PLC0415
-
-        shared_folder = location(self.output) if self.cluster and self.output else None
-        create_runner = partial(SeparationRunner, self.options, shared_folder, overwrite=self.overwrite)
-        executor: Executor[FileResult] = ProcessExecutor(create_runner, self.workers or 1)
-        if self.cluster:
-            from brewster.executors.ray_cluster import RayExecutor  # noqa: PLC0415
-
-            executor = RayExecutor(create_runner, self.cluster, self.workers)
-        with executor:
-            separate_in_parallel(tasks, executor, overwrite=self.overwrite, on_result=on_result)
-
-    def _index_writer(self) -> AbstractContextManager[IndexWriter | None]:
+    def open_index(self, stack: ExitStack) -> None:
+        """Opens the index of the output folder, which `stack` closes. A dry run has none."""
         from brewster.batch.index import IndexWriter  # noqa: PLC0415
 
-        is_written = (self.writes_index or self.cluster) and self.output and not self.dry_run
-        return IndexWriter(location(self.output or "")) if is_written else nullcontext()
+        if self.output and not self.dry_run:
+            self._index = stack.enter_context(IndexWriter(location(self.output)))
 
-    def _print_result(self, result: FileResult) -> None:
-        """Prints the line of a result: JSON on standard output, or a status line on standard error."""
+    def run(
+        self,
+        tasks: Sequence[SeparationTask],
+        *,
+        workers: int | None = None,
+        cluster: str | None = None,
+        has_index: bool = False,
+    ) -> int:
+        """Separates the photos or bursts of the tasks, and prints their results. Returns the exit code."""
+        from brewster.batch import separate_tasks  # noqa: PLC0415  (imports ONNX Runtime and pyvips)
+        from brewster.batch.parallel import separate_in_parallel  # noqa: PLC0415
+
+        with self, ExitStack() as stack:
+            if has_index:
+                self.open_index(stack)
+            is_shown = not (self.quiet or self.as_json)
+            update_progress = stack.enter_context(progress(self.count, shown=is_shown))
+
+            def on_progress(done: int, name: str, fraction: float) -> None:
+                interrupts.raise_pending()
+                update_progress(done + fraction, name)
+
+            if self.is_parallel:
+                executor = open_executor(
+                    self.options, self.output, overwrite=self.overwrite, workers=workers, cluster=cluster
+                )
+                results = separate_in_parallel(tasks, stack.enter_context(executor), overwrite=self.overwrite)
+            else:
+                results = separate_tasks(
+                    tasks,
+                    self.options,
+                    overwrite=self.overwrite,
+                    dry_run=self.dry_run,
+                    on_progress=on_progress,
+                )
+            for result in results:
+                self.add(result)
+                update_progress(self.counts.total(), result.source)
+                interrupts.raise_pending()
+        return 1 if self.counts["failed"] else 0
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Writes the contact sheet if there was no error, and prints the summary."""
+        try:
+            if kind is None and self.contact_sheet:
+                self._write_contact_sheet(self.contact_sheet)
+        finally:
+            if self.counts.total() == self.count:
+                self._print_summary()
+
+    def add(self, result: FileResult) -> None:
+        """Counts a result, and prints its line: JSON on standard output, or a status line on standard error."""
+        if result.error:
+            interrupts.raise_pending()  # a Ctrl-C that Python dropped may have caused the error
+        if self._index:
+            self._index.append(result)
+        self.counts[result.status] += 1
+        if result.error and INSTALL_COMMAND in result.error:
+            self._sources_by_missing_extra[result.error].append(result.source)
+        elif result.error:
+            self._errors.append(_error_text(result))
+        elif self.contact_sheet and "-" not in (result.source, *result.outputs.values()):
+            self._contact_sheet_rows.append((Path(result.source), [*map(Path, result.outputs.values())]))
+        self._print(result)
+
+    def _print(self, result: FileResult) -> None:
         outputs = ", ".join(result.outputs.values())
         if self.as_json:
             write_out(_json_line(result))
@@ -147,7 +161,7 @@ class BatchCommand:
         if result.status == "skipped":
             # A parallel batch does not read an existing layer a second time to compare its options with the current ones,
             # because that takes time.
-            different_options = "" if self._is_parallel else self._different_options(result)
+            different_options = "" if self.is_parallel else self._different_options(result)
             note = f", made with other options ({different_options})" if different_options else ""
             print_status(
                 f"{result.source}: skipped, because all of its layers exist{note} (--overwrite replaces them)"
@@ -157,6 +171,8 @@ class BatchCommand:
             hint = ": check the layers" if verdict == "doubtful" else ""
             seconds = sum(result.seconds.values())
             print_status(f"{result.source} -> {outputs} ({seconds:.1f} s, {verdict}{hint})")
+            if result.burst:
+                print_status(f"  {result.burst.method}: {result.burst.message}")
 
     def _different_options(self, result: FileResult) -> str:
         """Returns the options in the metadata of the existing layers that differ from the options of this batch."""
@@ -175,59 +191,28 @@ class BatchCommand:
             if value is not None and recorded_options.get(name, value) != value
         )
 
-    def _print_summary(self, summary: _Summary, seconds: float) -> None:
-        if summary.counts.total() > 1 and not self.quiet:
+    def _print_summary(self) -> None:
+        """Prints the counts, the time and the errors. Photos that need the same missing extra share a message."""
+        if self.counts.total() > 1 and not self.quiet:
             order = ("separated", "planned", "skipped", "failed")
-            totals = ", ".join(
-                f"{summary.counts[status]} {status}" for status in order if summary.counts[status]
-            )
+            totals = ", ".join(f"{self.counts[status]} {status}" for status in order if self.counts[status])
             folder = f"in {self.output}" if self.output else "next to the photos"
-            layers = f"; the layers are {folder}" if summary.counts.keys() & {"separated", "skipped"} else ""
+            layers = f"; the layers are {folder}" if self.counts.keys() & {"separated", "skipped"} else ""
+            seconds = time.perf_counter() - self._started
             print_status(totals if self.dry_run else f"{totals} in {_duration(seconds)}{layers}")
-        for message in summary.error_messages():
+        for message in self._errors:
             print_error(message)
+        for message, sources in self._sources_by_missing_extra.items():
+            print_error(f"{sources[0] if len(sources) == 1 else listed(sources, 'photo')}: {message}")
 
-    def _write_contact_sheet(self, path: Path, rows: list[tuple[Path, list[Path]]]) -> None:
-        """Writes the contact sheet of the photos whose layers are files, in the order of their names."""
+    def _write_contact_sheet(self, path: Path) -> None:
+        """Writes the contact sheet of the photos whose layers are files; a parallel batch is sorted by name."""
         from brewster.photo.contact_sheet import write_contact_sheets  # noqa: PLC0415
 
-        for sheet in write_contact_sheets(
-            path,
-            sorted(rows) if self._is_parallel else rows,
-            self.options.max_pixels,
-            overwrite=self.overwrite,
-        ):
+        rows = sorted(self._contact_sheet_rows) if self.is_parallel else self._contact_sheet_rows
+        for sheet in write_contact_sheets(path, rows, self.options.max_pixels, overwrite=self.overwrite):
             if not self.quiet:
                 print_status(f"contact sheet: {sheet}")
-
-
-@final
-class _Summary:
-    """The counts and errors of a batch."""
-
-    def __init__(self) -> None:
-        self.counts: Counter[str] = Counter()
-        self.contact_sheet_rows: list[tuple[Path, list[Path]]] = []
-        self._errors: list[str] = []
-        self._sources_by_missing_extra: defaultdict[str, list[str]] = defaultdict(list)
-
-    def add(self, result: FileResult, *, has_contact_sheet: bool) -> None:
-        """Counts a result."""
-        self.counts[result.status] += 1
-        if result.error and INSTALL_COMMAND in result.error:
-            self._sources_by_missing_extra[result.error].append(result.source)
-        elif result.error:
-            self._errors.append(_error_text(result))
-        elif has_contact_sheet and "-" not in (result.source, *result.outputs.values()):
-            self.contact_sheet_rows.append((Path(result.source), [*map(Path, result.outputs.values())]))
-
-    def error_messages(self) -> list[str]:
-        """Returns a message for each failed photo. Photos that need the same missing extra share a message."""
-        grouped = (
-            f"{sources[0] if len(sources) == 1 else listed(sources, 'photo')}: {error}"
-            for error, sources in self._sources_by_missing_extra.items()
-        )
-        return [*self._errors, *grouped]
 
 
 def _model_name(model: str) -> str | None:

@@ -92,8 +92,7 @@ def plan(
 
     if is_single_output(photos, output):
         return [_plan_single_output(photos, output, options)]
-    _check_not_a_file(output)
-    _check_output_suffix(photos, output)
+    check_output(photos, output)
     return plan_files(photos, output, options, skipped=skipped)
 
 
@@ -133,6 +132,16 @@ def _check_format(image_format: ImageFormat | None, options: Options) -> None:
         raise click.UsageError(
             f"The output file (-o) is a {name} file, but --format, --additive or --layers requires another format."
         )
+
+
+def check_output(photos: Sequence[str], output: str | None) -> None:
+    """Checks that the output (-o) is not an existing file, and does not end in the suffix of a format that cannot be written.
+
+    Raises:
+        click.UsageError: it is or does.
+    """
+    _check_not_a_file(output)
+    _check_output_suffix(photos, output)
 
 
 def _check_not_a_file(output: str | None) -> None:

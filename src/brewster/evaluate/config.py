@@ -6,8 +6,8 @@ from dataclasses import dataclass, replace
 from typing import Final, final
 
 from brewster.benchmarks.selection import PAPER_SEED
+from brewster.bootstrap import RESAMPLES
 from brewster.errors import BrewsterError
-from brewster.evaluate.statistics import RESAMPLES
 from brewster.metrics import DEFAULT_THRESHOLD, IDENTICAL_DB, METRICS, Metric, find_metric
 from brewster.options import Quality
 

@@ -14,10 +14,11 @@ from typing import TYPE_CHECKING, Final, final
 import numpy as np
 from numpy.typing import NDArray
 
+from brewster.bootstrap import cluster_draws
+
 if TYPE_CHECKING:
     from jaxtyping import Float64
 
-RESAMPLES: Final = 10_000
 SEED: Final = 20_260_725
 _PERCENTILES: Final = (2.5, 97.5)
 
@@ -79,9 +80,7 @@ def _resample(stratum: Stratum) -> tuple[NDArray[np.float64], NDArray[np.float64
     sums, counts = (np.zeros((len(index_of), stratum.values.shape[1])) for _ in range(2))
     np.add.at(sums, scene_index, np.nan_to_num(stratum.values))
     np.add.at(counts, scene_index, np.isfinite(stratum.values))
-    rng = np.random.default_rng([SEED, zlib.crc32(stratum.name.encode())])
-    # How often each resample contains each scene: drawing k of k scenes with replacement is a multinomial distribution.
-    draws = rng.multinomial(len(index_of), np.full(len(index_of), 1 / len(index_of)), RESAMPLES).astype(float)
+    draws = cluster_draws(len(index_of), [SEED, zlib.crc32(stratum.name.encode())])
     return draws @ sums, draws @ counts
 
 

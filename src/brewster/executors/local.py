@@ -14,15 +14,13 @@ import signal
 import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager, contextmanager, suppress
-from dataclasses import dataclass
-from multiprocessing import connection, get_context, parent_process, resource_tracker
-from multiprocessing.connection import Connection
-from multiprocessing.context import SpawnProcess
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import AbstractContextManager, contextmanager
+from multiprocessing import active_children, get_context, parent_process, resource_tracker
+from multiprocessing.process import BaseProcess
 from types import TracebackType
 from typing import Any, Final, Generic, Protocol, Self, TypeVar, final
-
-from brewster.errors import BrewsterError
 
 ResultT = TypeVar("ResultT")
 
@@ -139,22 +137,19 @@ class SerialExecutor(Generic[ResultT]):
 
 
 @final
-@dataclass(frozen=True, eq=False)
-class _Worker:
-    process: SpawnProcess
-    pipe: Connection
-
-
-@final
 class ProcessExecutor(Generic[ResultT]):
-    """Runs tasks in several processes, one task in each. If a process dies, another process runs its task again."""
+    """Runs tasks in several processes, one task in each. If a process dies, another process runs its task again.
+
+    Each process is a pool of its own, because the death of one breaks its whole pool.
+    """
 
     chunk_size = 1
 
     def __init__(self, create_runner: Callable[[], Runner[ResultT]], worker_count: int) -> None:
         self._create_runner, self._worker_count = create_runner, worker_count
-        self._idle: list[_Worker] = []
-        self._busy: dict[Connection, tuple[_Worker, Task[ResultT], int]] = {}
+        self._processes: dict[ProcessPoolExecutor, BaseProcess] = {}
+        self._idle: list[ProcessPoolExecutor] = []
+        self._busy: dict[Future[list[ResultT]], tuple[ProcessPoolExecutor, Task[ResultT], int]] = {}
 
     def has_capacity(self) -> bool:
         """Whether a worker is idle or can be started."""
@@ -170,42 +165,36 @@ class ProcessExecutor(Generic[ResultT]):
 
     def wait(self) -> list[ResultT]:
         """Returns the results of the next finished task. The list is empty if a worker has died and its task is tried again."""
-        pipe = connection.wait(list(self._busy))[0]
-        assert isinstance(pipe, Connection)
-        worker, task, attempt = self._busy.pop(pipe)
+        future = next(iter(wait(self._busy, return_when=FIRST_COMPLETED).done))
+        pool, task, attempt = self._busy.pop(future)
         try:
-            results: list[ResultT] | BrewsterError = pipe.recv()
-        except (EOFError, OSError):
-            return self._handle_dead_worker(worker, task, attempt)
-        self._idle.append(worker)
-        if isinstance(results, BrewsterError):
-            raise results
+            results = future.result()
+        except BrokenProcessPool:
+            exit_code = self._processes.pop(pool).exitcode
+            if attempt < MAX_ATTEMPTS:
+                self._assign(task, attempt + 1)
+                return []
+            return task.failed_results(f"the worker died {MAX_ATTEMPTS} times (exit code {exit_code})")
+        self._idle.append(pool)
         return results
 
     def _assign(self, task: Task[ResultT], attempt: int) -> None:
-        worker = self._idle.pop() if self._idle else self._spawn()
-        self._busy[worker.pipe] = (worker, task, attempt)
-        with suppress(OSError):  # the worker is dead: its pipe is closed, which wait() detects
-            worker.pipe.send(task)
+        others = active_children()
+        with _interrupts_blocked():  # the first task starts the process
+            pool = self._idle.pop() if self._idle else self._new_pool()
+            try:
+                future = pool.submit(_run_task, self._create_runner, task)
+            except BrokenProcessPool:  # the process died while it was idle
+                self._processes.pop(pool)
+                pool = self._new_pool()
+                future = pool.submit(_run_task, self._create_runner, task)
+        for process in active_children():
+            if process not in others:
+                self._processes[pool] = process
+        self._busy[future] = (pool, task, attempt)
 
-    def _spawn(self) -> _Worker:
-        context = get_context("spawn")
-        parent_end, child_end = context.Pipe()
-        process = context.Process(target=_worker_main, args=(child_end, self._create_runner), daemon=True)
-        with _interrupts_blocked():
-            process.start()
-        child_end.close()
-        return _Worker(process, parent_end)
-
-    def _handle_dead_worker(self, worker: _Worker, task: Task[ResultT], attempt: int) -> list[ResultT]:
-        worker.pipe.close()
-        worker.process.join()
-        if attempt < MAX_ATTEMPTS:
-            self._assign(task, attempt + 1)
-            return []
-        return task.failed_results(
-            f"the worker died {MAX_ATTEMPTS} times (exit code {worker.process.exitcode})"
-        )
+    def _new_pool(self) -> ProcessPoolExecutor:
+        return ProcessPoolExecutor(1, get_context("spawn"), _start_worker)
 
     def __enter__(self) -> Self:
         return self
@@ -213,15 +202,15 @@ class ProcessExecutor(Generic[ResultT]):
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Closes all pipes, and waits until the workers exit: at once if they are idle, otherwise after their task.
+        """Waits until the workers exit: at once if they are idle, otherwise after their task.
 
         After an error, all workers are killed.
         """
-        for worker in [*self._idle, *(worker for worker, _, _ in self._busy.values())]:
-            worker.pipe.close()
+        for pool, process in self._processes.items():
             if error:
-                worker.process.kill()
-            worker.process.join()
+                process.kill()
+            pool.shutdown()
+        self._processes.clear()
         self._idle.clear()
         self._busy.clear()
 
@@ -232,7 +221,7 @@ def _interrupts_blocked() -> Iterator[None]:
 
     A terminal sends Ctrl-C to all processes of a group, but only the parent process may stop its workers.
     """
-    if sys.platform == "win32":  # Windows has no signal masks; _worker_main ignores Ctrl-C as soon as it runs
+    if sys.platform == "win32":  # Windows has no signal masks; _start_worker ignores Ctrl-C
         yield
         return
     resource_tracker.ensure_running()  # otherwise the tracker starts within this block, and unblocks the signal
@@ -243,28 +232,22 @@ def _interrupts_blocked() -> Iterator[None]:
         signal.pthread_sigmask(signal.SIG_SETMASK, previous)
 
 
-def _worker_main(pipe: Connection, create_runner: Callable[[], Runner[Any]]) -> None:
-    """The main function of a worker: runs tasks until the pipe closes."""
+def _start_worker() -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     # One processor for each worker. The ONNX backend reads this variable. If torch is already imported, the variable has no
     # effect on torch, and the runner limits its threads (see worker_setup.py).
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     exit_with_parent()  # otherwise this worker and a resumed run could work on the same task
-    runner: Runner[Any] | None = None
-    while True:
-        try:
-            task = pipe.recv()
-        except (EOFError, ConnectionError):  # the parent process has closed the pipe
-            return
-        try:
-            runner = runner or create_runner()
-            results: list[Any] | BrewsterError = runner(task)
-        except BrewsterError as error:
-            results = error
-        try:
-            pipe.send(results)
-        except ConnectionError:  # the parent process has closed the pipe during the task
-            return
+
+
+_runner: Runner[Any] | None = None
+"""The runner of a worker, which is created for its first task."""
+
+
+def _run_task(create_runner: Callable[[], Runner[Any]], task: Task[Any]) -> list[Any]:
+    global _runner  # noqa: PLW0603  (a worker process has one runner)
+    _runner = _runner or create_runner()
+    return _runner(task)
 
 
 def exit_with_parent() -> None:

@@ -1,16 +1,20 @@
-"""Keeps white areas white: sky and lamps whose light is clipped in the photo.
+"""Leaves clipped light alone or removes it whole: lamps, sky and white things, and the reflections that are as bright.
 
-A clipped pixel received at least the light of white, and how much more is unknown. If the predicted change is small, the
-transmission of such a pixel is assumed to be white, too. On the development pairs, 94 % of the clipped pixels that the compact model
-darkened by 10 to 30 of 255 levels are above 245 in the ground truth, and none of those that it darkened by more than 55.
+A clipped pixel received at least the light of white, and how much more is unknown. A model that subtracts a part of it turns a lamp
+olive and a sky grey. The decision is made for each connected region of bright pixels: if the region still stands out from its
+surroundings in the prediction, it is not a reflection that the model can remove, and keeps the photo. If it disappears, the prediction
+is kept. On the development pairs, the least squares weight of the predicted change is -.24 to .08 in the regions that keep more than
+.3 of their contrast (16,700 px), and .98 to 1.28 in the others (14,400 px).
 """
 
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import reduce
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from brewster.inference.assessment import encoded_change
 from brewster.inference.guided_upsampling import Floats, box_mean
@@ -18,32 +22,46 @@ from brewster.inference.predictor import Prediction
 from brewster.srgb import to_encoded
 
 if TYPE_CHECKING:
-    from jaxtyping import Float32
+    from jaxtyping import Bool, Float32, Int
 
-_CLIPPING_RAMP: Final = (0.85, 0.97)
-"""Darkest channel of the photo, sRGB-encoded: below the first value, a pixel is not clipped; above the second, it is.
-The ramp is wide, because a clipped area with a hard edge is visible in a bright sky."""
-_CHANGE_RAMP: Final = (0.2, 0.25)
-"""Predicted change, sRGB-encoded: below the first value, a clipped pixel keeps the photo; above the second, the prediction."""
-_SMOOTHINGS: Final = 3
-"""Number of 5 x 5 box filters that smooth the edges of kept areas."""
+Labels = NDArray[np.int32]
+
+_CLIPPED: Final = 0.95
+"""A pixel with a brighter channel, sRGB-encoded, is bright: the other channels of a coloured lamp are not clipped."""
+_WHITES: Final = ((0.93, 1.0), (0.78, 0.05))
+"""Pairs: a pixel whose darkest channel is above the first value, sRGB-encoded, is bright, too; the largest area of a region, divided by
+that of the photo. A wide area that is not clipped is a wall or a veil rather than a lamp."""
+_MIN_CHANGE: Final = 0.02
+"""Smaller predicted changes, sRGB-encoded, are not visible. Without them, a reflection in front of a white wall is its own region."""
+_MAX_CONTRAST: Final = 0.35
+"""A region disappears in the prediction if it keeps at most this fraction of its contrast to its surroundings, in linear light."""
+_MIN_CONTRAST: Final = 0.02
+"""A region with less contrast in the photo, in linear light, has no surroundings in which it could disappear."""
+_SURROUNDINGS_PX: Final = (3, 8)
+"""The surroundings of a region are the pixels between these distances. The nearer ones have the glow of a lamp."""
+_HALO_PX: Final = 3
+"""A kept region is enlarged by the radius of the filter that smooths its edges (2 px), so that its own pixels are kept whole, and by one
+pixel, because reduced photos have darker pixels at the edges of a lamp."""
 
 
-def keep_clipped_white(photo: Float32[Floats, "h w 3"], prediction: Prediction) -> Prediction:
-    """Returns the prediction without small changes of clipped pixels.
+def keep_clipped_light(photo: Float32[Floats, "h w 3"], prediction: Prediction) -> Prediction:
+    """Returns the prediction without the changes of bright regions that it does not remove whole.
 
     Args:
         photo: the photo at the largest input scale of the model, linear light in 0..1.
         prediction: the prediction at this input scale.
     """
     transmission = np.clip(photo + prediction.change, 0, 1)
-    clipped = _smooth_step(to_encoded(photo.min(axis=2, keepdims=True)), _CLIPPING_RAMP)
-    changed = _smooth_step(encoded_change(photo, transmission)[..., None], _CHANGE_RAMP)
-    kept = clipped * (1 - changed)
-    for _ in range(_SMOOTHINGS):
-        kept = box_mean(kept)
-    weight = 1 - kept
-    override = prediction.override
+    darkest, brightest = (
+        reduce(pick, np.moveaxis(to_encoded(photo), 2, 0)) for pick in (np.minimum, np.maximum)
+    )
+    is_changed = encoded_change(photo, transmission) >= _MIN_CHANGE
+    is_kept = np.zeros(photo.shape[:2], np.bool_)
+    for white, max_share in _WHITES:
+        is_bright = (brightest > _CLIPPED) | (darkest > white)
+        regions = label_regions(is_bright & is_changed)
+        is_kept |= _is_half_removed(regions, photo, transmission, max_share)[_grow(regions, _HALO_PX)]
+    weight, override = 1 - box_mean(is_kept[..., None].astype(np.float32)), prediction.override
     return replace(
         prediction,
         change=prediction.change * weight,
@@ -52,9 +70,58 @@ def keep_clipped_white(photo: Float32[Floats, "h w 3"], prediction: Prediction) 
     )
 
 
-def _smooth_step(values: Floats, limits: tuple[float, float]) -> Floats:
-    """Returns 0 below the first limit, 1 above the second, and a cubic polynomial with derivative 0 at both limits between."""
-    low, high = limits
-    share = np.clip((values - np.float32(low)) / np.float32(high - low), 0, 1)
-    smooth: Floats = share * share * (3 - 2 * share)
-    return smooth
+def _is_half_removed(
+    regions: Labels, photo: Floats, transmission: Floats, max_share: float
+) -> Bool[NDArray[np.bool_], " labels"]:
+    """Returns for each label whether the region stands out from its surroundings in the photo and in the transmission."""
+    near, far = (_grow(regions, distance) for distance in _SURROUNDINGS_PX)
+    surroundings = np.where(near == 0, far, 0)
+    count = int(regions.max()) + 1
+    areas = np.bincount(regions.ravel())
+
+    def contrast(image: Floats) -> NDArray[np.float64]:
+        light = reduce(np.maximum, np.moveaxis(image, 2, 0))
+        inside, around = (
+            np.bincount(labels.ravel(), light.ravel(), count)
+            / np.maximum(np.bincount(labels.ravel(), minlength=count), 1)
+            for labels in (regions, surroundings)
+        )
+        return inside - around
+
+    before, after = contrast(photo), contrast(transmission)
+    is_half_removed = (before < _MIN_CONTRAST) | (after > _MAX_CONTRAST * before)
+    is_half_removed &= areas <= max_share * regions.size
+    is_half_removed[0] = False
+    return is_half_removed
+
+
+def label_regions(mask: Bool[NDArray[np.bool_], "h w"]) -> Int[Labels, "h w"]:
+    """Returns the number of the connected region of each pixel, from 1; 0 outside the mask. Edges connect, corners do not.
+
+    Each pixel points to a pixel of its region with a smaller index, until all point to the first one (Shiloach and Vishkin 1982).
+    """
+    index = np.arange(mask.size, dtype=np.int32).reshape(mask.shape)
+    root = index.ravel().copy()
+    beside, below = mask[:, 1:] & mask[:, :-1], mask[1:] & mask[:-1]
+    one = np.concatenate((index[:, 1:][beside], index[1:][below]))
+    other = np.concatenate((index[:, :-1][beside], index[:-1][below]))
+    while one.size:
+        np.minimum.at(root, np.maximum(root[one], root[other]), np.minimum(root[one], root[other]))
+        while (root != (root := root[root])).any():
+            pass
+        is_open = root[one] != root[other]
+        one, other = one[is_open], other[is_open]
+    is_first = mask.ravel() & (root == index.ravel())
+    labels: Labels = np.where(
+        mask, np.cumsum(is_first, dtype=np.int32)[root].reshape(mask.shape), np.int32(0)
+    )
+    return labels
+
+
+def _grow(regions: Labels, radius: int) -> Labels:
+    """Returns the labels with each region enlarged by a number of pixels; where two regions meet, the larger label."""
+    rows, columns = regions.shape
+    padded = np.pad(regions, radius)
+    wide = reduce(np.maximum, (padded[:, i : i + columns] for i in range(2 * radius + 1)))
+    grown = reduce(np.maximum, (wide[i : i + rows] for i in range(2 * radius + 1)))
+    return np.where(regions > 0, regions, grown)

@@ -9,8 +9,9 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import product
 from typing import TYPE_CHECKING, Final, final
 
 import numpy as np
@@ -116,29 +117,25 @@ class MultiScalePredictor(Predictor):
         """Returns the mean over input scales and flips. The confidence is high where the outputs agree."""
         size = inputs[-1].shape[:2]
         changes, reflections = [], []
-        for scaled_input in inputs:
-            for transmission, reflection in self._predict_with_flip(scaled_input):
-                changes.append(upsample_rows(transmission - scaled_input[..., :3], 0, size[0], size))
-                reflections.append(upsample_rows(reflection, 0, size[0], size))
-                on_progress(len(changes) / (2 * len(inputs)))
+        for scaled_input, direction in product(
+            inputs, (1, -1)
+        ):  # -1 flips the input, and flips the outputs back
+            layers = run_tiled(
+                self._run_backend,
+                np.ascontiguousarray(scaled_input[:, ::direction]),
+                tile_px=_TILE_PX,
+                overlap_px=_OVERLAP_PX,
+            )
+            transmission, reflection = (layer[:, ::direction] for layer in layers)
+            changes.append(upsample_rows(transmission - scaled_input[..., :3], 0, size[0], size))
+            reflections.append(upsample_rows(reflection, 0, size[0], size))
+            on_progress(len(changes) / (2 * len(inputs)))
         transmissions_encoded = to_encoded(np.maximum(inputs[-1][..., :3] + np.stack(changes), 0))
         return Prediction(
             np.mean(changes, axis=0),
             np.mean(reflections, axis=0),
             confidence_from_spread(np.ptp(transmissions_encoded, axis=0)),
         )
-
-    def _predict_with_flip(self, scaled_input: Floats) -> Iterator[tuple[Floats, Floats]]:
-        """Yields both layers of an input twice: predicted directly, and predicted from the flipped input and flipped back."""
-        yield self._predict(scaled_input)
-        transmission, reflection = self._predict(np.ascontiguousarray(scaled_input[:, ::-1]))
-        yield transmission[:, ::-1], reflection[:, ::-1]
-
-    def _predict(self, scaled_input: Floats) -> tuple[Floats, Floats]:
-        transmission, reflection = run_tiled(
-            self._run_backend, scaled_input, tile_px=_TILE_PX, overlap_px=_OVERLAP_PX
-        )
-        return transmission, reflection
 
     def _run_backend(self, tile: Floats) -> tuple[Floats, Floats]:
         photo, hints = tile[..., :3], tile[..., 3:]

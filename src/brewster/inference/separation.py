@@ -10,6 +10,7 @@ from typing import final
 import numpy as np
 
 from brewster.inference.assessment import Assessment
+from brewster.inference.burst_report import BurstReport
 from brewster.inference.guided_upsampling import Floats, upsample_rows
 from brewster.photo import Photo
 from brewster.photo.contact_sheet import side_by_side
@@ -40,6 +41,8 @@ class Separation:
     """Wall time of the steps `decode`, `network` and `upsampling`."""
     reflection_is_derived: bool = False
     """Whether the reflection is photo - transmission in linear light, because the model predicts no reflection."""
+    burst: BurstReport | None = None
+    """How a burst was separated; None for a single photo."""
 
     def __repr__(self) -> str:
         """Returns a short description: `Separation(4000 x 3000, compact, clear)`."""

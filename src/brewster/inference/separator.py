@@ -18,13 +18,13 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import replace
 from itertools import islice
-from typing import TYPE_CHECKING, Any, Final, final
+from typing import Any, Final, Unpack, final
 
 import numpy as np
 
 from brewster.errors import BrewsterError, MissingExtra, ModelError
 from brewster.inference.assessment import Assessment, assess
-from brewster.inference.clipping import keep_clipped_white
+from brewster.inference.clipping import keep_clipped_light
 from brewster.inference.full_size import upsample_layers
 from brewster.inference.guided_upsampling import Floats, GuidedUpsampler
 from brewster.inference.layer_history import PHOTO, history_step, with_step
@@ -38,14 +38,13 @@ from brewster.inference.predictor import (
 from brewster.inference.separation import Separation
 from brewster.inference.tiles import Backend
 from brewster.models.zoo import find_model, is_diffusion_model
-from brewster.options import Offload, Options, Quality, Quantization, document_options
+from brewster.options import LoadOptions, Options, Quality, SeparateOptions
 from brewster.photo import Encoding, Hints, Mask, Photo, Source
-
-if TYPE_CHECKING:
-    from brewster.models.diffusion.pipeline import DecompositionPipeline
 
 _WHITE_PERCENTILE: Final = 99.0
 """If this percentile of the photo is above 1, as in an EXR file, the input of the network is divided by the percentile."""
+_CALL_OPTIONS: Final = SeparateOptions.__annotations__.keys() - LoadOptions.__annotations__.keys()
+_PREDICTOR_OPTIONS: Final = ("steps", "ensemble_size", "no_guided_upsampling")
 _NETWORK_SHARE: Final = 0.6
 """Estimated time of the network divided by the total time, for the progress."""
 
@@ -76,60 +75,45 @@ class Separator:
             )
         self._predictor = model if isinstance(model, Predictor) else MultiScalePredictor(model)
         self.name, self.sha256, self.device = name, sha256, device
+        self.takes_hints = self._predictor.takes_hints
 
     def __repr__(self) -> str:
         """Returns `Separator(compact, cpu)`."""
         return f"Separator({self.name}, {self.device})"
 
     @classmethod
-    @document_options
-    def load(
-        cls,
-        model: str = Options.model,
-        *,
-        device: str = Options.device,
-        base_model: str | None = Options.base_model,
-        quantization: Quantization | None = Options.quantization,
-        offload: Offload = Options.offload,
-        transformer: str | None = Options.transformer,
-        fast_lora: str | None = Options.fast_lora,
-        guidance: float | None = Options.guidance,
-        timestep_shift: float | None = Options.timestep_shift,
-        steps: int | None = Options.steps,
-        ensemble_size: int = Options.ensemble_size,
-        no_guided_upsampling: bool = Options.no_guided_upsampling,
-    ) -> Separator:
+    def load(cls, model: str = Options.model, **options: Unpack[LoadOptions]) -> Separator:
         """Loads a model and returns its separator.
 
         Args:
+            model: a name from `brewster models list`, an .onnx file, the folder of a training run, or a LoRA's folder or hub id.
+            options: the keywords of `brewster.options.LoadOptions`: device ("auto" selects the fastest one), and for diffusion
+                models base_model, quantization, offload, transformer, fast_lora, guidance, timestep_shift, steps,
+                ensemble_size and no_guided_upsampling. `brewster separate --help` explains them.
 
         Raises:
             ModelError: the model is unknown or damaged, or an option of diffusion models is set for another model.
             DeviceError: the device is not available, or the model does not fit into its memory.
             DownloadError: a diffusion model cannot be downloaded, for example because access was not granted.
             MissingExtra: a diffusion model needs the extra `diffusion`.
+            TypeError: there is no such option.
         """
-        pipeline_options: dict[str, Any] = {
-            "base_model": base_model, "quantization": quantization, "offload": offload, "transformer": transformer,
-            "fast_lora": fast_lora, "guidance": guidance, "timestep_shift": timestep_shift,
-        }  # fmt: skip
-        predictor_options: dict[str, Any] = {
-            "steps": steps,
-            "ensemble_size": ensemble_size,
-            "no_guided_upsampling": no_guided_upsampling,
-        }
+        if unknown := options.keys() - LoadOptions.__annotations__.keys():
+            raise TypeError(
+                f"there is no option {min(unknown)}; expected {', '.join(LoadOptions.__annotations__)}"
+            )
+        changed = {name: value for name, value in options.items() if value != getattr(Options, name)}
+        device: str = options.pop("device", Options.device)
+        changed.pop("device", None)
         if is_diffusion_model(model):
-            if fast_lora and steps is None:
+            if options.get("fast_lora") and options.get("steps") is None:
                 raise ModelError(
-                    f"the few-step LoRA {fast_lora} was given without the number of steps",
+                    f"the few-step LoRA {options['fast_lora']} was given without the number of steps",
                     "expected the number for which it was trained",
                     "set the option steps, for example 4 or 8",
                 )
-            return cls._from_pipeline(
-                _open_pipeline(model, device=device, **pipeline_options), predictor_options
-            )
-        chosen = pipeline_options | predictor_options
-        if changed := [name for name, value in chosen.items() if value != getattr(Options, name)]:
+            return cls._load_diffusion_model(model, device, changed)
+        if changed:
             raise ModelError(
                 f"{', '.join(changed)} was set for the model {model}",
                 "expected a diffusion model or a LoRA for this option",
@@ -141,12 +125,22 @@ class Separator:
         return cls(backend, name=model_file.name, sha256=digest, device=backend.device)
 
     @classmethod
-    def _from_pipeline(cls, pipeline: DecompositionPipeline, options: dict[str, Any]) -> Separator:
-        from brewster.inference.diffusion_predictor import DiffusionPredictor  # noqa: PLC0415  (imports torch)
-
-        predictor = DiffusionPredictor(pipeline, **options)
-        device = str(pipeline.backbone.device)
-        return cls(predictor, name=pipeline.name, sha256=pipeline.sha256, device=device)
+    def _load_diffusion_model(cls, model: str, device: str, options: dict[str, Any]) -> Separator:
+        try:
+            from brewster.inference.diffusion_predictor import DiffusionPredictor  # noqa: PLC0415  (imports torch)
+            from brewster.models.diffusion.pipeline import load_pipeline  # noqa: PLC0415
+        except ImportError as error:
+            raise MissingExtra.for_extra(
+                "diffusion",
+                f"{error.name} is not installed",
+                f"expected {error.name}, because the model {model} needs it",
+            ) from error
+        of_predictor = {name: options.pop(name) for name in _PREDICTOR_OPTIONS if name in options}
+        pipeline = load_pipeline(model, device=device, **options)
+        predictor = DiffusionPredictor(pipeline, **of_predictor)
+        return cls(
+            predictor, name=pipeline.name, sha256=pipeline.sha256, device=str(pipeline.backbone.device)
+        )
 
     def many(
         self,
@@ -192,7 +186,6 @@ class Separator:
                 for future in running:
                     future.cancel()
 
-    @document_options
     def __call__(
         self,
         source: Source,
@@ -211,7 +204,14 @@ class Separator:
         Args:
             source: a path, the bytes of a file, an open binary file, a PIL image, a `Photo`, or an array (see
                 `Photo.from_array`).
+            strength: how much of the separation to apply, from 0 (the unchanged photo) to 1.
+            quality: the number and size of the input scales: "draft" is faster than "standard".
+            mask: a grey image of the size of the photo that scales the strength: white is separated, black stays unchanged.
+            hints: an image of the size of the photo with rough strokes: red where there is reflection, green where there is
+                only the scene; for models that take hints.
+            additive: whether the layers sum to the photo exactly, as 32-bit floats in linear light.
             encoding: the encoding of an array, "srgb" or "linear"; by default, "srgb" for integers. For arrays only.
+            max_pixels: refuse photos with more pixels than this, before they are decoded.
             on_progress: called with the completed fraction, 0 to 1. An exception raised in it stops the work.
 
         Raises:
@@ -231,7 +231,7 @@ class Separator:
         on_progress(0.0)
         with _timed(seconds, "network"):
             prediction = self._predictor(images, quality, lambda done: on_progress(_NETWORK_SHARE * done))
-            prediction = keep_clipped_white(inputs[-1], prediction)
+            prediction = keep_clipped_light(inputs[-1], prediction)
         with _timed(seconds, "upsampling"):
             upsampler = _fit_upsampler(inputs[-1], prediction, strength, white)
             transmission, reflection, residual = upsample_layers(
@@ -287,7 +287,7 @@ class Separator:
         Options(quality=quality)  # checks the value
         inputs, white = self._inputs(photo, quality)
         images = self._with_hints(inputs, photo, hints)
-        prediction = keep_clipped_white(inputs[-1], self._predictor(images, quality, on_progress))
+        prediction = keep_clipped_light(inputs[-1], self._predictor(images, quality, on_progress))
         upsampler = _fit_upsampler(inputs[-1], prediction, Options.strength, white)
         return upsampler, prediction, _assess(inputs[-1], prediction)
 
@@ -301,7 +301,7 @@ class Separator:
         """Returns the inputs with two more channels if there are hints."""
         if hints is None:
             return inputs
-        if not self._predictor.takes_hints:
+        if not self.takes_hints:
             raise ModelError(
                 f"hints were given to the model {self.name}, which takes none",
                 "expected a model with an input for hints",
@@ -311,76 +311,35 @@ class Separator:
         return [np.concatenate([image, painted.sampled(*image.shape[1::-1])], axis=2) for image in inputs]
 
 
-@document_options
 def separate(
     source: Source,
     *,
     model: str = Options.model,
-    device: str = Options.device,
-    strength: float = Options.strength,
-    quality: Quality = Options.quality,
-    mask: Source | None = Options.mask,
-    hints: Source | None = Options.hints,
-    additive: bool = Options.additive,
+    mask: Source | None = None,
+    hints: Source | None = None,
     encoding: Encoding | None = None,
-    max_pixels: int = Options.max_pixels,
-    base_model: str | None = Options.base_model,
-    quantization: Quantization | None = Options.quantization,
-    offload: Offload = Options.offload,
-    transformer: str | None = Options.transformer,
-    fast_lora: str | None = Options.fast_lora,
-    guidance: float | None = Options.guidance,
-    timestep_shift: float | None = Options.timestep_shift,
-    steps: int | None = Options.steps,
-    ensemble_size: int = Options.ensemble_size,
-    no_guided_upsampling: bool = Options.no_guided_upsampling,
+    **options: Unpack[SeparateOptions],
 ) -> Separation:
     """Separates one photo. For several photos, use `Separator.load` once and call the separator for each.
 
     Args:
         source: a path, the bytes of a file, an open binary file, a PIL image, a `Photo`, or an array (see
             `Photo.from_array`).
+        model: see `Separator.load`.
+        mask: see `Separator.__call__`.
+        hints: see `Separator.__call__`.
         encoding: the encoding of an array, "srgb" or "linear"; by default, "srgb" for integers. For arrays only.
+        options: the keywords of `brewster.options.SeparateOptions`: strength, quality, additive and max_pixels (see
+            `Separator.__call__`), and those of `Separator.load`.
 
     Raises:
         BrewsterError: an error of `Separator.load` or of a call of the `Separator`.
+        TypeError: there is no such option.
     """
-    separator = Separator.load(
-        model,
-        device=device,
-        base_model=base_model,
-        quantization=quantization,
-        offload=offload,
-        transformer=transformer,
-        fast_lora=fast_lora,
-        guidance=guidance,
-        timestep_shift=timestep_shift,
-        steps=steps,
-        ensemble_size=ensemble_size,
-        no_guided_upsampling=no_guided_upsampling,
-    )
-    return separator(
-        source,
-        strength=strength,
-        quality=quality,
-        mask=mask,
-        hints=hints,
-        additive=additive,
-        encoding=encoding,
-        max_pixels=max_pixels,
-    )
-
-
-def _open_pipeline(model: str, **options: Any) -> DecompositionPipeline:  # noqa: ANN401  (those of load_pipeline)
-    try:
-        from brewster.models.diffusion.pipeline import load_pipeline  # noqa: PLC0415  (imports torch)
-    except ImportError as error:
-        raise MissingExtra.for_extra(
-            "diffusion",
-            f"{error.name} is not installed",
-            f"expected {error.name}, because the model {model} needs it",
-        ) from error
-    return load_pipeline(model, **options)
+    load_options: dict[str, Any] = dict(options)
+    call = {name: load_options.pop(name) for name in _CALL_OPTIONS if name in load_options}
+    separator = Separator.load(model, **load_options)
+    return separator(source, mask=mask, hints=hints, encoding=encoding, **call)
 
 
 def _assess(

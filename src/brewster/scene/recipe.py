@@ -213,7 +213,7 @@ class SceneRecipe(FrozenModel):
             'keys "map|map", "map|plane", "plane|map"; weights from 0 to 1',
             replaces_constraints=True,
         ),
-    ] = Field(default_factory=dict)
+    ] = Field(default={})
     """Relative frequencies of the kinds of content behind|in front of the glass: an environment map, or a picture on a plane
     without a map. They replace map_probability and plane_probability of both sides. With an empty table, each side is
     drawn independently."""

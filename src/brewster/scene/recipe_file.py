@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any, Final, TypeVar
 
 from pydantic import ValidationError
-from pydantic_core import ErrorDetails, to_jsonable_python
+from pydantic_core import ErrorDetails
 
 from brewster.errors import RecipeError, expected_value
 from brewster.scene.recipe_keys import (
@@ -177,7 +177,8 @@ def commented_toml(recipe: FrozenModel) -> str:
         if table.path:
             lines += ["", *_comment(table.meaning), _line(f"[{table.path}]", is_set=is_set)]
         for key in table.keys:
-            value = _value_at(values, key.path) if is_set else _plain_default(key)
+            default = None if key.default is REQUIRED else key.default
+            value = _value_at(values, key.path) if is_set else default
             lines += _key_lines(key, value, is_set=is_set)
     return "\n".join(lines) + "\n"
 
@@ -202,14 +203,9 @@ def _facts(key: RecipeKey) -> Iterator[str]:
 
 def describe_default(key: RecipeKey) -> str:
     """Returns the default of a key in words."""
-    value = _plain_default(key)
     if key.default is REQUIRED:
         return "required"
-    return "not set by default" if value is None else f"default {_toml(value)}"
-
-
-def _plain_default(key: RecipeKey) -> object:
-    return None if key.default is REQUIRED else to_jsonable_python(key.default)
+    return "not set by default" if key.default is None else f"default {_toml(key.default)}"
 
 
 def _comment(text: str) -> list[str]:

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Annotated
+from dataclasses import asdict, dataclass
+from typing import Annotated, Any
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, GetJsonSchemaHandler
+from pydantic_core import CoreSchema
 
 
 class FrozenModel(BaseModel):
@@ -29,6 +30,13 @@ class KeyNote:
     """The unit, for keys whose name has no suffix such as `_mm`."""
     replaces_constraints: bool = False
     """Whether `allowed` replaces the description of the constraints."""
+
+    def __get_pydantic_json_schema__(
+        self, core_schema: CoreSchema, handler: GetJsonSchemaHandler
+    ) -> dict[str, Any]:
+        """Adds this note to the JSON schema of the key, where `recipe_keys` reads it."""
+        schema = handler(core_schema)
+        return {**schema, "notes": [*schema.get("notes", ()), asdict(self)]}
 
 
 def _ascending(bounds: tuple[float, float]) -> tuple[float, float]:

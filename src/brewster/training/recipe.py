@@ -198,7 +198,7 @@ class LoraRecipe(TrainingRecipe):
         KeyNote(
             "table of panel = weight", 'panels "I", "T", "R"; weights at least 0', replaces_constraints=True
         ),
-    ] = Field(default_factory=dict)
+    ] = Field(default={})
     """Weight of each panel in the loss; 1 for panels that are not listed."""
     objective: Objective = "flow"
     """flow: flow matching, from noise to panels in many steps. one_step: from the photo to the panels in one step."""

@@ -12,6 +12,7 @@ from pydantic import BaseModel
 from brewster.errors import ModelError
 from brewster.inference import Separator
 from brewster.models import zoo
+from brewster.options import Device
 
 
 @final
@@ -37,7 +38,7 @@ class ModelCache:
         ModelError: a model does not exist, or two models have the same name.
     """
 
-    def __init__(self, models: Sequence[str] = (), *, device: str = "auto") -> None:
+    def __init__(self, models: Sequence[str] = (), *, device: Device = "auto") -> None:
         self._sources: dict[str, str] = {}
         for source in dict.fromkeys((*models, *zoo.MODELS)):
             self._add(source)

@@ -192,7 +192,10 @@ def _preview(
     photos: PhotoCache, model_cache: ModelCache, form: SeparationRequest, on_progress: ProgressCallback
 ) -> Response:
     photo, headers = _open_photo(photos, form)
-    maps = preview(model_cache.separator(form.options.model), photo, form.options, on_progress, form.hints)
+    separator = model_cache.separator(form.options.model)
+    maps = preview(separator, photo, form.options, on_progress, form.hints)
+    if separator.takes_hints:
+        headers["Brewster-Takes-Hints"] = "yes"
     return Response(gzip.compress(maps, _GZIP_LEVEL, mtime=0), headers=headers, media_type="application/gzip")
 
 

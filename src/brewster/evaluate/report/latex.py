@@ -7,6 +7,7 @@ from typing import Any, Final
 
 from brewster.evaluate.report.tables import is_complete, main_metrics, ranking
 from brewster.evaluate.results import AVERAGE, Results
+from brewster.tables import escape_latex
 
 _SIR2: Final = ("postcard", "solidobject", "wildscene")
 _MARKS: Final = ("\\textbf", "\\underline", "\\uuline")
@@ -16,10 +17,6 @@ _PACKAGES: Final = {
     "\\uuline": "\\usepackage[normalem]{ulem}",
 }
 _DAGGER: Final = "$^\\dagger$"
-_ESCAPES: Final = str.maketrans(
-    {letter: f"\\{letter}" for letter in "&%$#_{}"}
-    | {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\^{}"}
-)
 
 
 def to_latex(results: Results, *, intervals: bool = False) -> str:
@@ -38,7 +35,7 @@ def to_latex(results: Results, *, intervals: bool = False) -> str:
     rows = [
         _line(
             [
-                _escape(method),
+                escape_latex(method),
                 *(cell for key in keys for cell in _cells(results, key, method, metrics, intervals)),
             ]
         )
@@ -84,7 +81,7 @@ def _header_rows(results: Results, keys: Sequence[str], width: int) -> list[str]
     def heading(key: str, rows: int) -> str:
         selection = results["selections"][key]
         name = selection["title"].partition(",")[0].removeprefix("SIR2 ")
-        text = f"{_escape(name)} ({selection['cases']})"
+        text = f"{escape_latex(name)} ({selection['cases']})"
         return _multicolumn(width, _multirow(text) if rows > 1 else text, is_last=key == keys[-1])
 
     if len(sir2) < 2:
@@ -140,8 +137,3 @@ def _cells(results: Results, key: str, method: str, metrics: Iterable[str], inte
             continue
         marks = dict(zip(ranking(table, metric, metric_info)[:-1], _MARKS, strict=False))
         yield (f"{marks[text]}{{{text}}}" if text in marks else text) + interval
-
-
-def _escape(text: str) -> str:
-    """Escapes the special characters of LaTeX."""
-    return text.translate(_ESCAPES)

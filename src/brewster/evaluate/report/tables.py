@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Iterable, Mapping
 from typing import Any, Final
 
 from brewster.evaluate.results import Results
+from brewster.tables import csv_table, markdown_table, plain_table
 
 _MAIN_METRICS: Final = ("psnr", "ssim", "lpips")
 
@@ -75,7 +74,7 @@ def _terminal_table(results: Results, key: str, width: int, intervals: bool) -> 
             used = max(map(len, names))
         blocks[-1].append(column)
         used += column_width
-    return "\n".join(_aligned(block) for block in blocks)
+    return "\n".join(plain_table(zip(*block, strict=True), align=">") for block in blocks)
 
 
 def _terminal_cell(
@@ -95,18 +94,6 @@ def _shortened(names: list[str], width: int) -> list[str]:
     return [name if len(name) <= width else f"{name[:left]}…{name[-right:]}" for name in names]
 
 
-def _aligned(columns: list[list[str]]) -> str:
-    widths = [max(map(len, column)) for column in columns]
-    lines = (
-        "  ".join(
-            cell.ljust(width) if not i else cell.rjust(width)
-            for i, (cell, width) in enumerate(zip(row, widths, strict=True))
-        )
-        for row in zip(*columns, strict=True)
-    )
-    return "\n".join(line.rstrip() for line in lines)
-
-
 def _overview(results: Results) -> str:
     """Returns a table with one row per method and one column per selection. Each cell has the main metrics."""
     metrics = main_metrics(results)
@@ -123,7 +110,7 @@ def _overview(results: Results) -> str:
         [method, *(_cell(results, key, method, metrics) for key in results["selections"])]
         for method in results["methods"]
     ]
-    return f"{titles}\n\n{_grid(rows)}{_UNEQUAL_COUNTS_NOTE if _has_unequal_counts(results, metrics) else ''}"
+    return f"{titles}\n\n{markdown_table(rows)}{_UNEQUAL_COUNTS_NOTE if _has_unequal_counts(results, metrics) else ''}"
 
 
 def _has_unequal_counts(results: Results, metrics: Iterable[str]) -> bool:
@@ -163,7 +150,7 @@ def _details(results: Results, key: str) -> str:
                 *(_difference_cell(results, metric, by_pair.get(pair)) for pair in pairs),
             ]
         )
-    return f"### {selection['title']} ({selection['cases']} images)\n\n{_grid(rows)}"
+    return f"### {selection['title']} ({selection['cases']} images)\n\n{markdown_table(rows)}"
 
 
 def _mean(results: Results, metric: str, entry: Mapping[str, Any] | None, image_count: int) -> str:
@@ -232,16 +219,6 @@ def _settings(results: Results) -> str:
     return "\n".join(["### Settings and definitions", "", *(f"- {line}" for line in lines)])
 
 
-def _grid(rows: Iterable[Iterable[str]]) -> str:
-    header, *body = [[cell.replace("|", "\\|") for cell in row] for row in rows]
-    widths = [max(map(len, column)) for column in zip(header, *body, strict=True)]
-    lines = [header, [":" + "-" * max(2, width - 1) for width in widths], *body]
-    return "\n".join(
-        f"| {' | '.join(cell.ljust(width) for cell, width in zip(line, widths, strict=True))} |"
-        for line in lines
-    )
-
-
 def _heading(results: Results, metric: str) -> str:
     entry = results["metrics"][metric]
     unit = f", {entry['unit']}" if entry["unit"] else ""
@@ -276,41 +253,26 @@ def is_complete(table: Mapping[str, Any], method: str, metric: str) -> bool:
 
 def to_csv(results: Results) -> str:
     """Returns a CSV table: one line for each mean, and one for each difference of `method` minus `reference`."""
-    text = io.StringIO()
-    table = csv.writer(text, lineterminator="\n")
-    table.writerow(
-        ["set", "method", "reference", "metric", "unit", "mean", "low", "high", "improved_count", "count"]
-    )
+    rows: list[list[Any]] = [["set", "method", "reference", "metric", "unit", "mean", "low", "high", "improved_count", "count"]]  # fmt: skip
     for key in results["selections"]:
         for method, row in results["tables"][key].items():
-            for metric, entry in row.items():
-                table.writerow([key, method, "", *_csv_cells(results, metric, entry)])
+            rows += [[key, method, "", *_csv_cells(results, name, entry)] for name, entry in row.items()]
         for row in results["differences"][key]:
-            table.writerow([key, row["method"], row["reference"], *_csv_cells(results, row["metric"], row)])
-    return text.getvalue()
+            rows.append([key, row["method"], row["reference"], *_csv_cells(results, row["metric"], row)])
+    return csv_table(rows)
 
 
 def scores_to_csv(results: Results) -> str:
     """Returns a CSV table in long form: one line for each image, method and metric with a score."""
-    text = io.StringIO()
-    table = csv.writer(text, lineterminator="\n")
-    table.writerow(["benchmark", "image", "scene", "method", "metric", "value"])
+    rows: list[list[Any]] = [["benchmark", "image", "scene", "method", "metric", "value"]]
     for image in results["cases"]:
         for method, scores in image["scores"].items():
-            for metric, value in scores.items():
+            for name, value in scores.items():
                 if value is not None:
-                    table.writerow([image["benchmark"], image["name"], image["scene"], method, metric, value])
-    return text.getvalue()
+                    rows.append([image["benchmark"], image["name"], image["scene"], method, name, value])
+    return csv_table(rows)
 
 
 def _csv_cells(results: Results, metric: str, entry: Mapping[str, Any]) -> list[Any]:
-    unit = results["metrics"][metric]["unit"]
-    return [
-        metric,
-        unit,
-        entry["mean"],
-        entry["low"],
-        entry["high"],
-        entry.get("improved_count", ""),
-        entry["count"],
-    ]
+    unit, ends = results["metrics"][metric]["unit"], [entry[key] for key in ("mean", "low", "high")]
+    return [metric, unit, *ends, entry.get("improved_count"), entry["count"]]

@@ -8,25 +8,22 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Iterator
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 
 from brewster.models.diffusion.lazy_imports import import_library
 from brewster.models.diffusion_resources import DECODING_BYTES_PER_PIXEL
 
-if TYPE_CHECKING:
-    from brewster.models.diffusion.backbones.backbone import Backbone
 
-
-def offload_layers(backbone: Backbone, device: str) -> None:
+def offload_layers(transformer: Any, vae: Any, device: str) -> None:  # noqa: ANN401 - modules of diffusers
     """Keeps the weights of the transformer in host memory, and copies each block to the device while it computes.
 
     The VAE is moved to the device. A LoRA must be added before this call.
     """
-    backbone.vae.to(device)
+    vae.to(device)
     import_library("diffusers.hooks").apply_group_offloading(
-        backbone.transformer,
+        transformer,
         onload_device=torch.device(device),
         offload_device=torch.device("cpu"),
         offload_type="block_level",

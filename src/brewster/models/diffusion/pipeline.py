@@ -218,7 +218,7 @@ def load_pipeline(
     if few_step_layers:
         stack_layers(backbone, few_step_layers)
     if placement.is_offloaded:
-        offload_layers(backbone, placement.device)
+        offload_layers(backbone.transformer, backbone.vae, placement.device)
     task = task_with_options(
         source, guidance=guidance, timestep_shift=timestep_shift, has_few_step_lora=bool(fast_lora)
     )

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, fields
 from typing import Final
 
+from brewster.tables import csv_table
 from brewster.user_study.assignment import Trial
 from brewster.user_study.report.participants import OUTCOMES, ParticipantAnswers, outcome
 from brewster.user_study.store import StoredAnswer, ViewingConditions
@@ -15,24 +14,9 @@ from brewster.user_study.study import StudyDescription
 
 _CONDITIONS: Final = tuple(field.name for field in fields(ViewingConditions))
 COLUMNS: Final = (
-    "participant",
-    "position",
-    "kind",
-    "dataset",
-    "name",
-    "first",
-    "second",
-    "left",
-    "right",
-    "choice",
-    "outcome",
-    "expected",
-    "seconds",
-    "answered_at",
-    "withdrawn",
-    *_CONDITIONS,
-    "left_out",
-)
+    "participant", "position", "kind", "dataset", "name", "first", "second", "left", "right",
+    "choice", "outcome", "expected", "seconds", "answered_at", "withdrawn", *_CONDITIONS, "left_out",
+)  # fmt: skip
 """docs/study.md describes the columns."""
 
 
@@ -46,23 +30,16 @@ def answers_csv(
         participants: the participants with their answers.
         left_out: number of a participant -> reason of the exclusion. A participant who is not in it is included.
     """
-    text = io.StringIO()
-    table = csv.DictWriter(text, COLUMNS, restval="", lineterminator="\n")
-    table.writeheader()
+    rows: list[Sequence[object]] = [COLUMNS]
     for participant in participants:
         for position, trial, answer in participant.trials:
             shown = _comparison(description, trial) if trial.expected is None else _catch(description, trial)
-            table.writerow(
-                shown
-                | _answer(answer)
-                | {
-                    "participant": participant.number,
-                    "position": position + 1,
-                    "outcome": "" if trial.expected else OUTCOMES[outcome(trial, answer.choice)],
-                    "left_out": left_out.get(str(participant.number), ""),
-                }
-            )
-    return text.getvalue()
+            row = shown | _answer(answer)
+            row |= {"participant": participant.number, "position": position + 1}
+            row["outcome"] = None if trial.expected else OUTCOMES[outcome(trial, answer.choice)]
+            row["left_out"] = left_out.get(str(participant.number))
+            rows.append([row.get(name) for name in COLUMNS])
+    return csv_table(rows)
 
 
 def _comparison(description: StudyDescription, trial: Trial) -> dict[str, object]:

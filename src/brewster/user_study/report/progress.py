@@ -6,6 +6,7 @@ from collections import Counter
 from collections.abc import Iterable, Mapping
 from typing import Any
 
+from brewster.tables import plain_table
 from brewster.user_study.report.participants import ExclusionRule, collect_answers
 from brewster.user_study.store import Participant, StoredAnswer
 from brewster.user_study.study import StudyDescription
@@ -83,6 +84,4 @@ def progress_text(progress: Mapping[str, Any]) -> str:
         )
         for row in progress["rows"]
     ]
-    widths = [max(map(len, column)) for column in zip(*table, strict=True)]
-    cells = ("  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)) for row in table)
-    return "\n".join([total, "", *(line.rstrip() for line in cells)]) + "\n"
+    return f"{total}\n\n{plain_table(table)}\n"

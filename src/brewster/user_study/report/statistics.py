@@ -13,10 +13,11 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from brewster.bootstrap import RESAMPLES, cluster_draws
+
 if TYPE_CHECKING:
     from jaxtyping import Float64
 
-RESAMPLES: Final = 10_000
 SEED: Final = 20_261_121
 MIN_PARTICIPANTS: Final = 6
 """With fewer participants, `sign_flip_test` cannot reach the 5 % level: its smallest p-value with n participants is 2 / 2^n."""
@@ -26,15 +27,8 @@ Floats = NDArray[np.float64]
 
 
 def bootstrap_weights(participants: int, resamples: int = RESAMPLES) -> Float64[Floats, "r p"]:
-    """Draw resamples of the cluster bootstrap (Davison and Hinkley 1997, section 3.8), with a fixed seed.
-
-    Each resample draws as many participants as there are, with replacement, each with all their answers.
-
-    Returns:
-        How often each participant is in each resample.
-    """
-    rng = np.random.default_rng([SEED, participants])
-    return rng.multinomial(participants, np.full(participants, 1 / participants), resamples).astype(float)
+    """How often each participant, with all answers, is in each resample. The seed is fixed."""
+    return cluster_draws(participants, [SEED, participants], resamples)
 
 
 def resampled_counts(

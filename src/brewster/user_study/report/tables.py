@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Iterable, Mapping
 from typing import Any, Final
+
+from brewster.tables import csv_table, escape_latex, markdown_table
 
 _GROUPS: Final = {"included": "After the exclusion rule", "everyone": "All participants"}
 _DEFINITIONS: Final = """\
@@ -23,11 +23,6 @@ the mean is 0.
 Agreement is Krippendorff's alpha of win, tie and lose over comparisons; 1 is perfect, 0 is chance."""
 
 Results = Mapping[str, Any]
-
-_ESCAPES: Final = str.maketrans(
-    {letter: f"\\{letter}" for letter in "&%$#_{}"}
-    | {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\^{}"}
-)
 
 
 # --- Markdown
@@ -73,7 +68,7 @@ def _group(results: Results, key: str, heading: str) -> str:
             *([name, _strength_text(row)] for name, row in group["strengths"].items()),
         ]
         agreement = "has no value" if group["agreement"] is None else f"is {group['agreement']:.3f}"
-        parts += [_markdown_table(rows), f"Krippendorff's alpha {agreement}."]
+        parts += [markdown_table(rows), f"Krippendorff's alpha {agreement}."]
     return "\n\n".join(parts)
 
 
@@ -98,7 +93,7 @@ def _table(table: Mapping[str, Any]) -> str:
         if table["intraclass_correlation"] is None
         else f"\n\nCorrelation: {table['intraclass_correlation']:.3f}"
     )
-    return f"### {table['first']} and {table['second']}\n\n{_markdown_table(rows)}{correlation}"
+    return f"### {table['first']} and {table['second']}\n\n{markdown_table(rows)}{correlation}"
 
 
 def _filled(rows: Iterable[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
@@ -128,16 +123,6 @@ def _strength_text(entry: Mapping[str, Any]) -> str:
     return mean if entry["low"] is None else f"{mean} ({entry['low']:+.3f} to {entry['high']:+.3f})"
 
 
-def _markdown_table(rows: Iterable[Iterable[str]]) -> str:
-    head, *body = [[cell.replace("|", "\\|") for cell in row] for row in rows]
-    widths = [max(map(len, column)) for column in zip(head, *body, strict=True)]
-    lines = [head, [":" + "-" * max(2, width - 1) for width in widths], *body]
-    return "\n".join(
-        f"| {' | '.join(cell.ljust(width) for cell, width in zip(line, widths, strict=True))} |"
-        for line in lines
-    )
-
-
 # --- LaTeX
 
 
@@ -158,7 +143,7 @@ def to_latex(results: Results) -> str:
         "% brewster study report; needs \\usepackage{booktabs}; below each rate its 95\\% interval",
         f"\\begin{{tabular}}{{c|{'|'.join('ccc' for _ in tables)}}}",
         "\\toprule",
-        " & ".join(map(_escape, ["Dataset", *heads])) + r" \\",
+        " & ".join(map(escape_latex, ["Dataset", *heads])) + r" \\",
         "\\midrule",
         *lines,
         *(["\\midrule"] if lines else []),
@@ -177,7 +162,12 @@ def _latex_row(tables: Iterable[Mapping[str, Any]], key: str) -> str:
         "" if entry["low"] is None else f"\\scriptsize {_interval_text(entry, join='--')}"
         for entry in entries
     ]
-    return " & ".join([_escape(rows[0]["title"]), *rates]) + " \\\\\n" + " & ".join(["", *intervals]) + r" \\"
+    return (
+        " & ".join([escape_latex(rows[0]["title"]), *rates])
+        + " \\\\\n"
+        + " & ".join(["", *intervals])
+        + r" \\"
+    )
 
 
 # --- CSV
@@ -188,24 +178,8 @@ def to_csv(results: Results) -> str:
 
     The key is the name of the dataset, or begins with a slash for an average.
     """
-    text = io.StringIO()
-    table = csv.writer(text, lineterminator="\n")
-    table.writerow(
-        [
-            "group",
-            "first",
-            "second",
-            "key",
-            "dataset",
-            "rate",
-            "mean",
-            "low",
-            "high",
-            "answers",
-            "participants",
-            "p",
-        ]
-    )
+    header = ["group", "first", "second", "key", "dataset", "rate", "mean", "low", "high", "answers", "participants", "p"]  # fmt: skip
+    rows: list[list[Any]] = [header]
     for key in _GROUPS:
         for pair in results[key]["tables"]:
             for row in _filled(pair["rows"]):
@@ -213,10 +187,5 @@ def to_csv(results: Results) -> str:
                     ends = row[name].values()
                     columns = [key, pair["first"], pair["second"], row["key"], row["title"]]
                     p = row["p"] if name == "difference" else None
-                    table.writerow([*columns, name, *ends, row["answers"], row["participants"], p])
-    return text.getvalue()
-
-
-def _escape(text: str) -> str:
-    """The text with LaTeX's special characters escaped."""
-    return text.translate(_ESCAPES)
+                    rows.append([*columns, name, *ends, row["answers"], row["participants"], p])
+    return csv_table(rows)

@@ -21,7 +21,7 @@ const RETRY_MODELS_MS = 3000;
 
 const byId = (id) => document.getElementById(id);
 const compare = byId("compare");
-let shown = null; // the current photo: {preview, layers, mask: {list, codes}}
+let shown = null; // the current photo: {photo, preview, layers, mask: {list, codes}}
 let removed = null; // {photo, index} of the photo that was removed last
 let isPaintScheduled = false;
 let exporting = null; // the AbortController of the running download
@@ -31,6 +31,7 @@ let exporting = null; // the AbortController of the running download
 const chosen = (name) => document.querySelector(`input[name=${name}]:checked`).value;
 const settings = () => ({ quality: chosen("quality"), model: byId("model").value });
 const queue = new SeparationQueue(settings, { onChange: refresh, onEnd: finish });
+const exportSettings = () => ({ ...settings(), takesHints: queue.hintModels.has(byId("model").value) });
 const tools = createTools({ onEdit, onPaint: () => compare.paint(), saveMask, announce });
 compare.editor = tools.editor;
 
@@ -48,6 +49,7 @@ function change(photo, values) {
 
 function onEdit() {
   change(queue.current, {});
+  queue.applyHints(queue.current);
   paint();
 }
 
@@ -186,12 +188,15 @@ async function show() {
   if (photo?.state !== "done") return;
   const preview = await readPreview(photo.preview);
   if (photo !== queue.current || photo.state !== "done") return; // another photo was selected in the meantime
-  close();
-  shown = { preview, layers: Layers.ofPreview(preview), mask: { list: null, codes: null } };
+  const isUpdate = shown?.photo === photo;
+  if (isUpdate) compare.tiles?.close();
+  else close();
+  shown = { photo, preview, layers: Layers.ofPreview(preview), mask: { list: null, codes: null } };
   draw(compare.left, shown.layers, "photo");
   compare.fullSize = preview.full;
   if (preview.full[0] > preview.width) compare.tiles = tilesOf(photo, preview);
-  tools.show(photo.regions, preview.full);
+  tools.offerHints(queue.takesHints(photo));
+  if (!isUpdate) tools.show(photo.regions, preview.full); // a region that is being drawn goes on
   refresh();
   paint();
 }
@@ -246,13 +251,13 @@ function refresh(photo = null) {
   for (const id of ["stage", "panel", "add"]) byId(id).hidden = !hasPhoto;
   byId("strip").hidden = !hasPhoto && byId("removed").hidden;
   if (!hasPhoto) return;
-  const isReady = current.state === "done" && shown !== null;
+  const isReady = (current.state === "done" || current.isUpdating) && shown !== null;
   const focusedPart = [byId("waiting"), byId("error")].find((part) => part.contains(document.activeElement));
   compare.hidden = byId("modes").hidden = !isReady;
   byId("error").hidden = current.state !== "failed";
   byId("waiting").hidden = isReady || current.state === "failed";
   if (focusedPart?.hidden) (isReady ? compare : byId(current.state === "failed" ? "retry" : "cancel")).focus();
-  enable("download", isReady && exporting === null);
+  enable("download", isReady && !current.isUpdating && exporting === null);
   enable("copy", queue.photos.length > 1);
   byId("status").textContent = statusText(current);
   setBar(byId("bar"), fraction(current.progress));
@@ -260,7 +265,7 @@ function refresh(photo = null) {
   byId("error-text").textContent = current.error?.message ?? "";
   byId("error-details").hidden = !current.error?.details;
   byId("error-message").textContent = current.error?.details ?? "";
-  byId("facts").textContent = isReady ? describePreview(shown.preview) : "";
+  byId("facts").textContent = current.isUpdating ? statusText(current) : isReady ? describePreview(shown.preview) : "";
 }
 
 // Uses aria-disabled, because a button with the attribute `disabled` loses the focus.
@@ -316,13 +321,13 @@ function showExportProgress(progress, which = "") {
 }
 
 const downloadLayer = (signal) =>
-  exportLayer(queue.current, chosen("view"), settings(), { signal, onProgress: (progress) => showExportProgress(progress) });
+  exportLayer(queue.current, chosen("view"), exportSettings(), { signal, onProgress: (progress) => showExportProgress(progress) });
 
 function downloadAll(signal) {
   let which = "";
   const onPhoto = (index, count) => (which = count > 1 ? `Photo ${index + 1} of ${count}: ` : "");
   const onProgress = (progress) => showExportProgress(progress, which);
-  return exportAll([...queue.photos], settings(), { signal, onPhoto, onProgress });
+  return exportAll([...queue.photos], exportSettings(), { signal, onPhoto, onProgress });
 }
 
 // --- event handlers
@@ -354,6 +359,7 @@ byId("copy").addEventListener("click", (event) => {
 byId("reset").addEventListener("click", () => {
   change(queue.current, { strength: 1 });
   queue.current.regions.clear();
+  queue.applyHints(queue.current);
   tools.update();
   paint();
 });

@@ -1,21 +1,21 @@
-// Draws regions on <glass-compare> with a pointer or with the keyboard, and a hatching over the areas that are not separated.
+// Draws regions on <glass-compare> with a pointer or with the keyboard, and a tint: dark over the areas that are not separated, red and
+// green over hints. The tint is visible while the pointer or the keyboard cursor is on the photo.
 
-import { maskCodes } from "./regions.js";
+import { hintCodes, maskCodes } from "./regions.js";
 
 const KEY_STEP = 0.01; // of the longer side of the photo; five times as much with Shift
-const HATCH_PX = 8; // width of the stripes, which are dark and light, so that they are visible on any photo
-const HATCH_OPACITY = 0.45;
-const HATCH_MAX_PX = 800; // longer side of the image of the hatching
+const TINT_OPACITY = 0.4;
+const TINT_MAX_PX = 800; // longer side of the image of the tint
 const MIN_STEP = 0.2; // minimum distance of the points of a stroke, as a fraction of the brush radius
 
 export class RegionEditor {
   isActive = false;
   #drawn = null; // the region that is being drawn
   #cursor = null; // position of the pointer or of the keyboard cursor, in fractions of the longer side
-  #hatching = document.createElement("canvas");
-  #hatchingKey = null; // the regions and the size of the hatching, as text
+  #tint = document.createElement("canvas");
+  #tintKey = null; // the regions and the size of the tint, as text
 
-  // `tool()` returns {shape, value, radius, feather} of the next region. `onChange()` is called when `list` or the cursor
+  // `tool()` returns {shape, value, hint, radius, feather} of the next region. `onChange()` is called when `list` or the cursor
   // has changed, `onAdd(region)` with each finished region, and `announce(text)` to tell screen readers what happened.
   constructor({ tool, onChange, onAdd, announce }) {
     Object.assign(this, { tool, onChange, onAdd, announce });
@@ -83,12 +83,11 @@ export class RegionEditor {
     return true;
   }
 
-  // Draws the hatching and the cursor above an image at `origin` with `size`, in screen pixels.
+  // Draws the tint and the cursor above an image at `origin` with `size`, in screen pixels.
   paint(context, origin, size) {
-    if (!this.isActive) return;
-    this.#updateHatching();
-    if (this.list.length) context.drawImage(this.#hatching, origin.x, origin.y, size.width, size.height);
-    if (!this.#cursor) return;
+    if (!this.isActive || !this.#cursor) return;
+    this.#updateTint();
+    if (this.list.length) context.drawImage(this.#tint, origin.x, origin.y, size.width, size.height);
     const longer = Math.max(size.width, size.height);
     const [x, y] = [origin.x + this.#cursor[0] * longer, origin.y + this.#cursor[1] * longer];
     const { shape, radius } = this.tool();
@@ -105,22 +104,22 @@ export class RegionEditor {
     }
   }
 
-  #updateHatching() {
+  #updateTint() {
     const { list } = this;
-    const scale = Math.min(1, HATCH_MAX_PX / Math.max(...this.size));
+    const scale = Math.min(1, TINT_MAX_PX / Math.max(...this.size));
     const [width, height] = this.size.map((side) => Math.max(1, Math.round(side * scale)));
     const key = JSON.stringify([list, width, height]);
-    if (key === this.#hatchingKey) return;
-    this.#hatchingKey = key;
-    Object.assign(this.#hatching, { width, height });
-    const codes = maskCodes(list, width, height);
-    if (!codes) return;
-    const context = this.#hatching.getContext("2d");
+    if (key === this.#tintKey) return;
+    this.#tintKey = key;
+    Object.assign(this.#tint, { width, height });
+    const context = this.#tint.getContext("2d");
     const image = context.createImageData(width, height);
-    for (let i = 0; i < codes.length; i++) {
-      const isLight = (((i % width) + Math.floor(i / width)) / HATCH_PX) & 1;
-      image.data.fill(isLight ? 255 : 0, 4 * i, 4 * i + 3);
-      image.data[4 * i + 3] = HATCH_OPACITY * (255 - codes[i]);
+    const mask = maskCodes(list, width, height);
+    const [red, green] = ["reflection", "scene"].map((kind) => hintCodes(list, kind, width, height));
+    for (let i = 0; i < red.length; i++) {
+      const hint = Math.max(red[i], green[i]);
+      if (hint) image.data.set([red[i] >= green[i] ? 255 : 0, red[i] >= green[i] ? 0 : 200, 60], 4 * i);
+      image.data[4 * i + 3] = TINT_OPACITY * Math.max(hint, mask ? 255 - mask[i] : 0);
     }
     context.putImageData(image, 0, 0);
   }

@@ -1,16 +1,17 @@
 // Downloads at full size, with the same files as on the command line, and the report in the zip of all photos.
 
 import { send } from "./api.js";
-import { maskFile } from "./regions.js";
+import { hintsFile, maskFile } from "./regions.js";
 import { createZip, crc32, readZip, withUniqueNames } from "./zip.js";
 
 const ZIP_LAYERS = "transmission,reflection"; // the layers in the zip of all photos
 const REPORT_NAME = "brewster-report.txt";
 
 // Requests layers of a photo at full size. Returns the result of `send`.
-async function requestLayers(photo, layers, settings, context) {
+async function requestLayers(photo, layers, { takesHints, ...settings }, context) {
   const mask = await maskFile(photo.regions.list, ...photo.size);
-  return send("separate", photo.file, { layers, strength: photo.strength, mask, ...settings }, context);
+  const hints = takesHints ? await hintsFile(photo.regions.list, ...photo.size) : null;
+  return send("separate", photo.file, { layers, strength: photo.strength, mask, hints, ...settings }, context);
 }
 
 // Creates one layer of a photo. Returns {name, blob, problem, saved}, where `saved` are the photos whose results the file contains.

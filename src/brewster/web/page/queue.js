@@ -1,7 +1,7 @@
 // The photos of the page and their separation. The current photo is separated first.
 
 import { send } from "./api.js";
-import { Regions } from "./regions.js";
+import { Regions, hintsFile } from "./regions.js";
 
 const MAX_CONCURRENT = 2; // one photo is separated while the next photo is uploaded
 
@@ -9,6 +9,7 @@ export class SeparationQueue {
   photos = [];
   current = null; // the photo that is shown
   isReady = false; // whether the settings are known; no separation starts before that
+  hintModels = new Set(); // the names of the models that take hints, as far as they are known
 
   // `settings()` returns the settings of the next request. `onChange(photo)` is called after each change of a photo, and
   // `onEnd(photo)` when its separation has ended.
@@ -36,9 +37,26 @@ export class SeparationQueue {
     if (photo.state !== "failed") photo.state = this.hasCurrentMaps(photo) ? "done" : "waiting";
   }
 
-  // Whether the maps of a photo were computed with the current settings.
+  // Whether the maps of a photo were computed with the current settings and hints.
   hasCurrentMaps(photo) {
-    return photo.mapSettings === JSON.stringify(this.settings());
+    return photo.mapSettings === this.#mapSettings(photo);
+  }
+
+  takesHints(photo) {
+    return photo.size !== undefined && this.hintModels.has(this.settings().model);
+  }
+
+  // Separates a photo again after a change of its hints. The old result is shown until then.
+  applyHints(photo) {
+    if (this.hasCurrentMaps(photo) || photo.state === "failed") return;
+    this.#supersede(photo);
+    Object.assign(photo, { state: "waiting", isUpdating: true });
+    this.startNext();
+  }
+
+  #mapSettings(photo) {
+    const marks = this.takesHints(photo) ? photo.regions.list.filter(({ hint, value }) => hint || value === null) : [];
+    return JSON.stringify([this.settings(), marks.some(({ hint }) => hint) ? marks : []]);
   }
 
   // Call this after a change of the settings. A photo is separated again unless its maps were computed with the new settings.
@@ -80,7 +98,7 @@ export class SeparationQueue {
   }
 
   async #separate(photo) {
-    const requestSettings = this.settings();
+    const [requestSettings, mapSettings] = [this.settings(), this.#mapSettings(photo)];
     const { signal } = (photo.controller = new AbortController());
     Object.assign(photo, { state: "waiting", progress: null, error: null, isSuperseded: false });
     const onProgress = (progress) => {
@@ -88,11 +106,13 @@ export class SeparationQueue {
       this.onChange(photo);
     };
     try {
-      const { blob, header } = await send("preview", photo.file, requestSettings, { signal, onProgress });
+      const hints = this.takesHints(photo) ? await hintsFile(photo.regions.list, ...photo.size) : null;
+      const { blob, header } = await send("preview", photo.file, { ...requestSettings, hints }, { signal, onProgress });
+      if (header("Brewster-Takes-Hints")) this.hintModels.add(requestSettings.model);
       photo.preview = blob;
       photo.key = header("Brewster-Photo"); // the key of the photo on the server, for its tiles
       photo.size = header("Brewster-Size").split("x").map(Number);
-      Object.assign(photo, { state: "done", mapSettings: JSON.stringify(requestSettings), isSaved: false });
+      Object.assign(photo, { state: "done", mapSettings, isSaved: false });
     } catch (error) {
       const isStopped = error.name === "AbortError";
       const previousState = this.hasCurrentMaps(photo) ? "done" : "waiting"; // the old maps are valid if the settings were changed back
@@ -100,6 +120,7 @@ export class SeparationQueue {
       Object.assign(photo, { state, error: isStopped ? null : error });
     }
     photo.controller = null;
+    photo.isUpdating &&= photo.state === "waiting";
     if (!this.photos.includes(photo)) return;
     if (photo.state === "done" && !this.hasCurrentMaps(photo)) photo.state = "waiting"; // the settings have changed since the request
     this.onChange(photo);

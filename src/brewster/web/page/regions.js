@@ -1,8 +1,9 @@
-// The regions of a photo: brush strokes and rectangles that define where, and how strongly, it is separated. They are drawn into a
-// mask of any size. The values of the mask scale the strength, like those of `--mask FILE` on the command line.
+// The regions of a photo: brush strokes and rectangles that define where, and how strongly, it is separated, or hints for the model.
+// They are drawn into a mask of any size. The values of the mask scale the strength, like those of `--mask FILE` on the command line.
+// Hints are drawn into an image like that of `--hints FILE`.
 //
-// A region is {shape: "brush" | "rectangle", value, points, radius, feather}. `value` is the strength in the region, 0 to 1, or null
-// for the eraser. Positions and lengths are fractions of the longer side of the photo. The points of a rectangle are two opposite
+// A region is {shape: "brush" | "rectangle", value, hint, points, radius, feather}. `value` is the strength in the region, 0 to 1, or
+// null for the eraser, which also erases hints. `hint` is "reflection" or "scene" for a hint, otherwise null. Positions and lengths are fractions of the longer side of the photo. The points of a rectangle are two opposite
 // corners.
 
 import { crc32 } from "./zip.js";
@@ -64,10 +65,21 @@ const outsideValue = (list) => (list.length && list[0].value > 0 ? 0 : 1);
 // Returns the mask of regions as codes, 0 to 255, or null if there are no regions. The mask of the whole photo has `width` x `height`
 // pixels; `part` selects a part of it: {left, top, columns, rows}.
 export function maskCodes(list, width, height, part = { left: 0, top: 0, columns: width, rows: height }) {
-  if (!list.length) return null;
-  const outside = outsideValue(list);
+  const scaling = list.filter(({ hint }) => !hint);
+  if (!scaling.length) return null;
+  const outside = outsideValue(scaling);
+  return toCodes(scaling.map((region) => [region, region.value ?? outside]), outside, width, height, part);
+}
+
+// Returns where the regions are hints of this kind, as codes like those of `maskCodes`. Later regions replace earlier ones.
+export function hintCodes(list, kind, width, height, part = { left: 0, top: 0, columns: width, rows: height }) {
+  const marks = list.filter(({ hint, value }) => hint || value === null);
+  return toCodes(marks.map((region) => [region, Number(region.hint === kind)]), 0, width, height, part);
+}
+
+function toCodes(drawn, outside, width, height, part) {
   const mask = new Float32Array(part.columns * part.rows).fill(outside);
-  for (const region of list) drawRegion(mask, region, region.value ?? outside, Math.max(width, height), part);
+  for (const [region, value] of drawn) drawRegion(mask, region, value, Math.max(width, height), part);
   const codes = new Uint8Array(mask.length);
   for (let i = 0; i < codes.length; i++) codes[i] = 255 * mask[i] + 0.5;
   return codes;
@@ -125,25 +137,42 @@ function measureRectangle(distances, [[ax, ay], [bx, by]], { x0, y0, x1, y1 }) {
   }
 }
 
-// Returns the mask of regions as a grey 8-bit PNG file of the size of the photo (PNG specification, third edition), or null if there
-// are no regions.
+// Returns the mask of regions as a grey 8-bit PNG file of the size of the photo, or null if there are none.
 export async function maskFile(list, width, height) {
-  if (!list.length) return null;
+  if (list.every(({ hint }) => hint)) return null;
+  return pngFile(width, height, (part) => [maskCodes(list, width, height, part)]);
+}
+
+// Returns the hints as an 8-bit PNG file of the size of the photo, red for the reflection and green for the scene, or null if there are none.
+export async function hintsFile(list, width, height) {
+  if (!list.some(({ hint }) => hint)) return null;
+  const codes = (kind, part) => hintCodes(list, kind, width, height, part);
+  return pngFile(width, height, (part) => [codes("reflection", part), codes("scene", part), new Uint8Array(part.columns * part.rows)]);
+}
+
+// Writes a PNG file (PNG specification, third edition) from the codes of each channel of a part: one channel (grey), or three (RGB).
+async function pngFile(width, height, channelsOf) {
   const compression = new CompressionStream("deflate");
   const compressed = new Response(compression.readable).arrayBuffer();
   const writer = compression.writable.getWriter();
+  let count = 1;
   for (let top = 0; top < height; top += BAND_ROWS) {
     const rows = Math.min(BAND_ROWS, height - top);
-    const codes = maskCodes(list, width, height, { left: 0, top, columns: width, rows });
-    const lines = new Uint8Array(rows * (width + 1)); // each line begins with the filter type 0
-    for (let row = 0; row < rows; row++) lines.set(codes.subarray(row * width, (row + 1) * width), row * (width + 1) + 1);
+    const channels = channelsOf({ left: 0, top, columns: width, rows });
+    count = channels.length;
+    const lines = new Uint8Array(rows * (count * width + 1)); // each line begins with the filter type 0
+    for (let row = 0, from = 0, to = 0; row < rows; row++) {
+      to++;
+      for (let column = 0; column < width; column++, from++) for (const codes of channels) lines[to++] = codes[from];
+    }
     await writer.write(lines);
   }
   await writer.close();
   const header = new DataView(new ArrayBuffer(13));
   header.setUint32(0, width);
   header.setUint32(4, height);
-  header.setUint8(8, 8); // bits; the colour type 0 is grey
+  header.setUint8(8, 8); // bits
+  header.setUint8(9, count === 3 ? 2 : 0); // colour type: RGB or grey
   const parts = [chunk("IHDR", new Uint8Array(header.buffer)), chunk("IDAT", new Uint8Array(await compressed)), chunk("IEND", new Uint8Array())];
   return new Blob([new Uint8Array(PNG_SIGNATURE), ...parts.flat()], { type: "image/png" });
 }

@@ -7,10 +7,13 @@ const byId = (id) => document.getElementById(id);
 const chosen = (name) => document.querySelector(`input[name=${name}]:checked`).value;
 const DESCRIPTIONS = {
   move: "Mark where the photo is separated, or where it stays as it is.",
-  here: "The marked regions are separated. If the first region is of this kind, the rest of the photo stays as it is (hatched).",
+  reflection: "Paint roughly over reflections that remain. The model computes the layers again.",
+  scene: "Paint roughly over parts that are not reflected. The model computes the layers again.",
+  here: "The marked regions are separated. If the first region is of this kind, the rest of the photo stays as it is (dark).",
   protect: "The marked regions stay as they are.",
   erase: "The eraser removes marks.",
 };
+const HINTS = ["reflection", "scene"];
 
 // Creates the editor of regions and connects its controls. `onEdit()` is called when the regions of the current photo have changed,
 // `onPaint()` when the view must be painted again, `saveMask()` to download the mask, and `announce(text)` to tell screen readers what
@@ -19,7 +22,8 @@ export function createTools({ onEdit, onPaint, saveMask, announce }) {
   const number = (id) => Number(byId(id).value);
   const tool = () => ({
     shape: chosen("shape"),
-    value: { here: number("region-strength"), protect: 0, erase: null }[chosen("tool")] ?? null,
+    value: { here: number("region-strength"), protect: 0, reflection: 1, scene: 1 }[chosen("tool")] ?? null,
+    hint: HINTS.find((hint) => hint === chosen("tool")) ?? null,
     radius: number("brush-size") / 2,
     feather: number("feather"),
   });
@@ -34,6 +38,8 @@ export function createTools({ onEdit, onPaint, saveMask, announce }) {
     if (!editor.regions) return;
     work(editor.regions);
     update();
+    const count = editor.regions.list.length;
+    announce(count === 1 ? "1 mark" : `${count || "No"} marks`);
     onEdit();
   }
 
@@ -76,6 +82,12 @@ export function createTools({ onEdit, onPaint, saveMask, announce }) {
 
   return {
     editor,
+    // Shows the tools for hints if the model takes them.
+    offerHints(isOffered) {
+      byId("hint-tools").hidden = !isOffered;
+      if (!isOffered && HINTS.includes(chosen("tool"))) document.querySelector("input[name=tool][value=move]").checked = true;
+      update();
+    },
     // Shows the regions of a photo of `size` (width, height), or no regions if `regions` is null.
     show(regions, size = [1, 1]) {
       editor.cancel();

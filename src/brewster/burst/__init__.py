@@ -1,0 +1,14 @@
+"""Several photos of one window: the layers move differently, so that they can be measured instead of guessed."""
+
+from brewster.errors import MissingExtra
+
+try:
+    from brewster.burst.separate import MAX_FRAMES, separate_burst
+    from brewster.burst.video import read_video
+except ImportError as error:
+    raise MissingExtra.for_extra(
+        "burst", f"{error.name} is not installed", f"expected {error.name}, because bursts need it"
+    ) from error
+from brewster.inference.burst_report import BurstReport
+
+__all__ = ["MAX_FRAMES", "BurstReport", "read_video", "separate_burst"]

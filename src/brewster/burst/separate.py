@@ -1,0 +1,223 @@
+"""Separates a burst: several photos of one window, with the camera moved sideways between them.
+
+    separation = separate_burst(["a.jpg", "b.jpg", "c.jpg"])
+    separation.transmission.save("clear.jpg")
+    print(separation.burst.message)
+
+The layers of the reference photo are measured from the motion at 640 pixels (solver.py), and applied to the photo at full size as
+a prediction of a model is. If the motion does not separate the layers, the result is that of the single photo.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
+from typing import Final, Literal, final
+
+import cv2
+import numpy as np
+
+from brewster.burst.registration import frame_motions, motion_candidates
+from brewster.burst.solver import Floats, Solution, solve
+from brewster.errors import PhotoError
+from brewster.inference.burst_report import BurstReport
+from brewster.inference.predictor import Prediction, Predictor, ProgressCallback
+from brewster.inference.separation import Separation
+from brewster.inference.separator import Separator
+from brewster.options import Options, Quality
+from brewster.photo import Photo, Source
+from brewster.worker_setup import single_torch_thread
+
+MAX_FRAMES: Final = 15
+"""Larger bursts take longer and are hardly better."""
+_WORKING_PX: Final = 1000
+"""The long side of the frames from which the motion is estimated."""
+_MIN_MOTION_PX: Final = 10.0
+"""The smallest relative motion that separates the layers, in pixels of a photo that is 1,000 pixels wide."""
+_MIN_EXPLAINED: Final = 0.2
+"""The smallest share of the errors of one layer that a second motion must explain."""
+_USEFUL_MOTION_PX: Final = 16
+_DETAIL_LIMITS: Final = (0.5, 2.0)
+"""The detail of the reference photo changes the sum of the layers by no more than these factors."""
+
+
+def separate_burst(
+    photos: Sequence[Source],
+    *,
+    reference: int | None = None,
+    separator: Separator | None = None,
+    strength: float = Options.strength,
+    quality: Quality = Options.quality,
+    mask: Source | None = Options.mask,
+    hints: Source | None = Options.hints,
+    additive: bool = Options.additive,
+    max_pixels: int = Options.max_pixels,
+    on_progress: ProgressCallback = lambda _fraction: None,
+) -> Separation:
+    """Separates one of several photos of the same window, by the motion of the layers between the photos.
+
+    Args:
+        photos: 2 to 15 photos of one size, in the order in which they were taken; see `Photo.open`.
+        reference: the index of the photo to separate, by default the middle one.
+        separator: separates the single photo. Its result is the start, and the result if the motion is not enough. By default, the
+            compact model.
+        strength, quality, mask, hints, additive, max_pixels: see the call of a `Separator`. The hints are for the single photo.
+        on_progress: called with the completed fraction, 0 to 1. An exception raised in it stops the work.
+
+    Returns:
+        The separation of the reference photo. `burst` reports the method and the reason.
+
+    Raises:
+        PhotoError: there are fewer than 2 or more than 15 photos, their sizes differ, or one of them cannot be read.
+        BrewsterError: see the call of a `Separator`.
+    """
+    reference = _checked_reference(len(photos), reference)
+    started = time.perf_counter()
+    photo = Photo.open(photos[reference], max_pixels=max_pixels)
+    frames = _working_frames(photos, reference, photo, max_pixels)
+    seconds = {"frames": time.perf_counter() - started}
+    separator = separator or Separator.load()
+    started = time.perf_counter()
+    upsampler, _, single = separator.fit(photo, quality=quality, hints=hints)
+    prior = _applied(upsampler.apply, frames[reference])
+    with single_torch_thread(), _single_opencv_thread():
+        motions = frame_motions(frames, reference, prior)
+        used = [k for k, found in enumerate(motions) if found]
+        solution = None
+        if len(used) > 1:
+            chosen, middle = [frames[k] for k in used], used.index(reference)
+            candidates = motion_candidates(chosen, middle, [motions[k] for k in used])
+            solution = solve(
+                chosen, middle, prior, candidates, on_progress=lambda done: on_progress(0.9 * done)
+            )
+    seconds["motion"] = time.perf_counter() - started
+    left_out = tuple(k for k, found in enumerate(motions) if not found)
+    report = _report(solution, single.verdict == "little found", len(photos), left_out, reference)
+    chosen_separator = separator
+    if solution and report.method == "burst":
+        name = f"burst with {separator.name}"
+        chosen_separator = Separator(
+            _FixedPredictor(solution), name=name, sha256=separator.sha256, device=separator.device
+        )
+    elif report.method == "unchanged":
+        chosen_separator = Separator(lambda tile: (tile, np.zeros_like(tile)), name="unchanged")
+    separation = chosen_separator(
+        photo,
+        strength=strength,
+        quality=quality,
+        mask=mask,
+        additive=additive,
+        on_progress=lambda done: on_progress(0.9 + 0.1 * done),
+    )
+    return replace(separation, burst=report, seconds=seconds | separation.seconds)
+
+
+def _checked_reference(count: int, reference: int | None) -> int:
+    if not 2 <= count <= MAX_FRAMES:
+        raise PhotoError(
+            f"a burst has {count} photo{'' if count == 1 else 's'}",
+            f"expected 2 to {MAX_FRAMES} photos of one window",
+            "separate a single photo with brewster.separate, or select some of the photos",
+        )
+    reference = count // 2 if reference is None else reference
+    if not 0 <= reference < count:
+        raise PhotoError(
+            f"the reference photo is {reference}",
+            f"expected an index from 0 to {count - 1}",
+            "correct the reference",
+        )
+    return reference
+
+
+def _working_frames(photos: Sequence[Source], reference: int, photo: Photo, max_pixels: int) -> list[Floats]:
+    """Returns the photos at the working size, in linear light of 0..1. One photo at a time is in memory at full size."""
+    scale = min(1.0, _WORKING_PX / max(photo.size))
+    width, height = (max(8, round(length * scale)) for length in photo.size)
+    frames = []
+    for k, source in enumerate(photos):
+        frame = photo if k == reference else Photo.open(source, max_pixels=max_pixels)
+        if frame.size != photo.size:
+            raise PhotoError(
+                f"photo {k + 1} of the burst has {frame.size[0]} x {frame.size[1]} pixels",
+                f"expected {photo.size[0]} x {photo.size[1]}, as photo {reference + 1}",
+                "leave it out, or pass photos that were taken with the same camera, orientation and zoom",
+            )
+        frames.append(frame.resized(width, height))
+    white = max(1.0, float(np.percentile(frames[reference], 99)))  # as in Separator
+    return [np.clip(frame / np.float32(white), 0, 1) for frame in frames]
+
+
+def _applied(apply: Callable[[Floats, int, int], tuple[Floats, Floats]], frame: Floats) -> Floats:
+    """Returns T of the working frame."""
+    transmission, _ = apply(frame, 0, len(frame))
+    prior: Floats = np.clip(transmission, 0, frame)
+    return prior
+
+
+def _report(
+    solution: Solution | None, is_clear: bool, count: int, left_out: tuple[int, ...], reference: int
+) -> BurstReport:
+    """Decides whether the motion separates the layers. `is_clear`: the model found little reflection in the reference photo."""
+    motion = 1000 * solution.relative_motion if solution else 0.0
+    explained = (
+        max(0.0, 1 - solution.two_layer_error / (solution.one_layer_error + 1e-9)) if solution else 0.0
+    )
+    method: Literal["burst", "single photo", "unchanged"] = "single photo"
+    advice = "Move the camera 5 to 10 cm sideways between the photos."
+    if solution is None:
+        message = "No other photo shows the same scene as the reference photo."
+    elif explained >= _MIN_EXPLAINED and motion >= _MIN_MOTION_PX:
+        method, message = "burst", f"The layers moved {motion:.0f} px apart in a photo of 1,000 px."
+    elif is_clear:
+        method = "unchanged"
+        message = "One layer explains all photos, and no reflection was found in the reference photo."
+    elif explained < _MIN_EXPLAINED:
+        message = f"No relative motion of two layers was found. {advice}"
+    else:
+        message = f"The layers moved {motion:.0f} px apart; about {_USEFUL_MOTION_PX} are needed. {advice}"
+    if left_out:
+        names = ", ".join(str(k + 1) for k in left_out)
+        message += f" Left out, because they do not show the same scene as the reference photo: {names}."
+    return BurstReport(
+        method, message, count - len(left_out), left_out, reference, round(motion, 2), round(explained, 4)
+    )
+
+
+@final
+class _FixedPredictor(Predictor):
+    """Returns the solution of a burst as the prediction for its reference photo."""
+
+    def __init__(self, solution: Solution) -> None:
+        self._solution = solution
+
+    def input_sizes(self, size: tuple[int, int], quality: Quality) -> list[tuple[int, int]]:  # noqa: ARG002
+        """Returns the size of the solution."""
+        height, width = self._solution.transmission.shape[:2]
+        return [(width, height)]
+
+    def __call__(
+        self,
+        inputs: Sequence[Floats],
+        quality: Quality,  # noqa: ARG002
+        on_progress: ProgressCallback,  # noqa: ARG002
+    ) -> Prediction:
+        """Returns the layers, with the detail of the reference photo."""
+        (photo,) = inputs
+        solution = self._solution
+        total = np.maximum(solution.transmission + solution.reflection, np.float32(1e-4))
+        detail = np.clip(photo / total, *_DETAIL_LIMITS)
+        transmission, reflection = solution.transmission * detail, solution.reflection * detail
+        return Prediction(transmission - photo, np.minimum(reflection, photo), solution.confidence)
+
+
+@contextmanager
+def _single_opencv_thread() -> Iterator[None]:
+    """Limits OpenCV to one thread in the block, because threads of two libraries slow each other down."""
+    previous_count = cv2.getNumThreads()
+    cv2.setNumThreads(1)
+    try:
+        yield
+    finally:
+        cv2.setNumThreads(previous_count)

@@ -1,0 +1,152 @@
+"""Finds both layers and their motions, from coarse to fine: many candidates on small frames, the best one on larger frames."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Final, final
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from brewster.burst.joint_model import DEFAULT_WEIGHTS, JointModel, Rates, Weights, optimise
+from brewster.burst.registration import MotionCandidate
+
+Floats = NDArray[np.float32]
+
+
+@final
+@dataclass(frozen=True)
+class Level:
+    """A step from coarse to fine."""
+
+    long_side_px: int
+    steps: int
+    spline_size: tuple[int, int] | None
+    """Rows and columns of the splines; None: the motion is a homography."""
+    kept: int
+    """The number of candidates that are optimised at this level, besides the one with locked layers."""
+
+
+COMPARED_PX: Final = 160
+"""The size at which the best candidate is compared with one layer; larger frames are optimised for the best candidate only."""
+_MAX_ENLARGEMENT: Final = 1.3
+"""Levels that would enlarge the frames by more than this factor are left out."""
+LEVELS: Final = (
+    Level(80, 60, None, 99),
+    Level(COMPARED_PX, 90, (4, 6), 3),
+    Level(320, 70, (6, 8), 1),
+    Level(640, 35, (8, 12), 1),
+)
+
+
+@final
+@dataclass(frozen=True)
+class Solution:
+    """Both layers of the reference frame, and how well they explain the burst."""
+
+    transmission: Floats
+    """(h, w, 3) linear light."""
+    reflection: Floats
+    confidence: Floats
+    """(h, w, 1) in 0..1: how well the frames agree with their prediction at each pixel of the transmission."""
+    relative_motion: float
+    """The largest motion of R relative to T between two frames, as a share of the width of a frame."""
+    one_layer_error: float
+    """The mean error of the frames if both layers move together: the data term of the loss at `COMPARED_PX`."""
+    two_layer_error: float
+    """The same for the best candidate."""
+    losses: dict[str, float]
+    """The loss of each candidate, by name, at the last level that optimised it. The last one is the best."""
+
+
+def solve(
+    frames: Sequence[Floats],
+    reference: int,
+    prior: Floats,
+    candidates: Sequence[MotionCandidate],
+    *,
+    weights: Weights = DEFAULT_WEIGHTS,
+    levels: Sequence[Level] = LEVELS,
+    on_progress: Callable[[float], None] = lambda _fraction: None,
+) -> Solution:
+    """Returns the layers of the reference frame for the best of the candidates.
+
+    Args:
+        frames: (h, w, 3) linear light, of one size.
+        reference: the index of the reference frame.
+        prior: T of the reference frame from a single photo, (h, w, 3).
+        candidates: guesses for the motions. One of them is locked.
+        weights: the weights of the loss.
+        levels: the sizes of the frames.
+        on_progress: called with the completed fraction.
+    """
+    losses: dict[str, float] = {}
+    largest = _MAX_ENLARGEMENT * max(frames[0].shape)
+    levels = [level for level in levels if level.long_side_px <= largest] or levels[:1]
+    work = [level.steps * level.long_side_px for level in levels]
+    done = 0.0
+    motions = np.stack([[c.transmission for c in candidates], [c.reflection for c in candidates]])
+    is_locked = torch.tensor([candidate.is_locked for candidate in candidates])
+    model, names, errors = None, [candidate.name for candidate in candidates], (0.0, 0.0)
+    for index, level in enumerate(levels):
+        small, small_prior = _packed(frames, level.long_side_px), _packed([prior], level.long_side_px)[0]
+        if model is None:
+            model = JointModel.start(small, torch.from_numpy(motions).float(), is_locked, reference)
+        else:
+            kept = _best(model, level.kept, with_locked=level.long_side_px <= COMPARED_PX)
+            model, names = model.selected(kept), [names[i] for i in kept]
+            model = model.resized(small, level.spline_size)
+        rates = Rates().scaled(min(1.0, 80 / level.long_side_px)) if index else Rates(splines=0)
+
+        def on_step(level: Level = level) -> None:
+            nonlocal done
+            done += level.long_side_px
+            on_progress(done / sum(work))
+
+        model = optimise(
+            model, small, small_prior, level.steps, rates=rates, weights=weights, on_step=on_step
+        )
+        losses |= dict(zip(names, model.losses, strict=True))
+        if level.long_side_px <= COMPARED_PX:
+            errors = _errors(model)
+    assert model
+    model = model.selected(_best(model, 1, with_locked=False))
+    with torch.no_grad():
+        layers = model.reference_layers(*small.shape[-2:])[:, 0]
+        confidence = model.confidence(small)[0]
+        motion = model.relative_motion(*small.shape[-2:])
+    transmission, reflection, confidence = (layer.movedim(0, -1).numpy() for layer in (*layers, confidence))
+    return Solution(transmission, reflection, confidence, motion, *errors, losses)
+
+
+def _best(model: JointModel, count: int, *, with_locked: bool) -> list[int]:
+    """Returns the indices of the candidates with the smallest losses, and of the locked ones."""
+    locked = model.is_locked.tolist()
+    free = sorted((i for i, is_locked in enumerate(locked) if not is_locked), key=model.losses.__getitem__)
+    return free[:count] + [i for i, is_locked in enumerate(locked) if is_locked and with_locked]
+
+
+def _errors(model: JointModel) -> tuple[float, float]:
+    """Returns the data losses of the locked candidate and of the best other one."""
+    (best,), (locked,) = _best(model, 1, with_locked=False), _best(model, 0, with_locked=True)
+    return model.data_losses[locked], model.data_losses[best]
+
+
+def resized(image: Floats, long_side_px: int) -> Floats:
+    """Returns an image, resized so that its long side has this length. Smaller images are enlarged."""
+    height, width = image.shape[:2]
+    scale = long_side_px / max(height, width)
+    size = max(8, round(width * scale)), max(8, round(height * scale))
+    interpolation = cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR
+    small: Floats = cv2.resize(image, size, interpolation=interpolation)
+    return small
+
+
+def _packed(images: Sequence[Floats], long_side_px: int) -> Tensor:
+    """Returns resized images as a tensor (K, 3, h, w)."""
+    small = np.stack([resized(image, long_side_px) for image in images])
+    return torch.from_numpy(np.ascontiguousarray(small.transpose(0, 3, 1, 2), dtype=np.float32))

@@ -1,0 +1,29 @@
+"""`BurstReport`: what a burst, several photos of one window, added to the separation of its reference photo."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal, final
+
+
+@final
+@dataclass(frozen=True)
+class BurstReport:
+    """How a burst was separated, and why."""
+
+    method: Literal["burst", "single photo", "unchanged"]
+    """burst: by the motion of the layers. single photo: by the model alone, because the motion does not separate the layers.
+    unchanged: no reflection was found."""
+    message: str
+    """The reason for the method, and what to change in the next burst."""
+    frames: int
+    """The number of photos that were used."""
+    left_out: tuple[int, ...]
+    """The indices of photos that do not show the window of the reference photo."""
+    reference: int
+    """The index of the photo that was separated."""
+    relative_motion_px: float
+    """The largest motion of the reflection relative to the transmission between two photos, in pixels of a photo that is
+    1,000 pixels wide."""
+    explained: float
+    """The share of the errors of a model with one layer that the motion of a second layer explains, 0..1."""
