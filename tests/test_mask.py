@@ -106,7 +106,7 @@ def rgba(alpha):
 @pytest.mark.parametrize(
     ("mask", "message"),
     [
-        (b"no image", "the mask cannot be read: the file starts with"),
+        (b"no image", "the mask cannot be read: the file is text"),
         ("missing.png", "the mask cannot be read: missing.png cannot be read"),
         (np.zeros((40, 61), np.uint8), "61 x 40 pixels; expected 60 x 40"),
         (image_bytes(*SIZE, "png"), "the mask has colours"),
