@@ -6,7 +6,7 @@ import threading
 
 import numpy as np
 import pytest
-from PIL import Image
+from PIL import Image, ImageOps
 
 import brewster
 from brewster import Photo, Separation, Separator
@@ -274,3 +274,11 @@ def test_the_folder_of_a_training_run_is_a_model(tmp_path):
     assert not zoo.is_diffusion_model(str(folder))
     (folder / "model.onnx").unlink()
     assert zoo.is_diffusion_model(str(folder))  # the folder of a LoRA
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_a_pil_image_is_turned_as_pillow_turns_it(orientation):
+    image, exif = Image.fromarray(smooth()), Image.Exif()
+    exif[274] = orientation
+    image.info["exif"] = exif.tobytes()
+    assert np.array_equal(Photo.from_pil(image).pixels, np.asarray(ImageOps.exif_transpose(image)))

@@ -401,3 +401,13 @@ def test_cmyk_is_converted_by_its_profile_or_a_default_one_with_a_note(format_na
     assert ("default" in str(photo.file_info.note)) != has_profile
     assert np.abs(photo.srgb_8bit().astype(int) - pixels).max() < 12
     assert Photo.open(photo.encode()).file_info.icc == photo.file_info.icc
+
+
+def test_a_pixel_whose_light_changes_in_one_channel_is_stored_anew() -> None:
+    icc = bytes(pyvips.Image.profile_load("p3"))
+    photo = Photo(np.full((2, 2, 3), 100, np.uint8), file_info=FileInfo(icc=icc))
+    light = photo.linear()
+    light[0, 0, 0] += 0.2
+    changed = photo.with_linear(light)
+    np.testing.assert_allclose(changed.linear()[0, 0], light[0, 0], atol=5e-3)
+    assert (changed.pixels.reshape(4, 3)[1:] == 100).all()

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 from brewster import errors
 
 if TYPE_CHECKING:
+    from brewster.burst import separate_burst
     from brewster.inference import Separation, Separator, separate
     from brewster.photo import Photo
 
@@ -30,13 +31,14 @@ else:  # not for type checkers, which accept misspelt names if a module has __ge
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 
-__all__ = ["Photo", "Separation", "Separator", "__version__", "errors", "separate"]
+__all__ = ["Photo", "Separation", "Separator", "__version__", "errors", "separate", "separate_burst"]
 
 _MODULES = {
     "Photo": "brewster.photo",
     "Separation": "brewster.inference",
     "Separator": "brewster.inference",
     "separate": "brewster.inference",
+    "separate_burst": "brewster.burst",
 }
 
 

@@ -42,10 +42,11 @@ def find_translations(aligned: Sequence[Floats], reference: int) -> list[NDArray
     lengths = torch.logspace(-1, math.log10(_MAX_TRANSLATION * _WIDTH_PX), _GRID)
     ends = torch.cat([-lengths.flip(0), torch.zeros(1), lengths])
     grid = torch.cartesian_prod(ends, ends)
-    grid = grid[grid.abs().sum(1) > 0]
-    costs = torch.cat([
-        _costs(spectra, frequencies, weights, reference, end[None, None] * times[None, :, None]) for end in grid
-    ])  # fmt: skip
+    x_turns, y_turns = (
+        torch.exp(-1j * torch.einsum("e,k,n->ekn", ends, times, axis)) for axis in frequencies.T
+    )
+    costs = torch.cat([_costs(spectra, weights, reference, x_turn * y_turns) for x_turn in x_turns])
+    costs[(grid == 0).all(1)] = torch.inf
     chosen: list[Tensor] = []
     for index in costs.argsort().tolist():  # the best ends that are not neighbours
         if all((grid[index] - other).norm() > 0.3 * other.norm() + 0.5 for other in chosen):
@@ -56,11 +57,13 @@ def find_translations(aligned: Sequence[Floats], reference: int) -> list[NDArray
     optimiser = torch.optim.Adam([offsets], lr=0.1)
     for _ in range(_REFINEMENT_STEPS):
         optimiser.zero_grad()
-        costs = _costs(spectra, frequencies, weights, reference, offsets)
+        costs = _costs(spectra, weights, reference, torch.exp(-1j * (offsets @ frequencies.T)))
         costs.sum().backward()  # type: ignore[no-untyped-call]
         optimiser.step()
     found = offsets.detach() - offsets.detach()[:, reference : reference + 1]
     order = costs.argsort()
+    if not torch.isfinite(found).all():  # the frames are equal
+        return []
     return list(found[order].double().numpy() * (aligned[0].shape[1] / _WIDTH_PX))
 
 
@@ -81,9 +84,8 @@ def _spectra(aligned: Sequence[Floats]) -> tuple[Tensor, Tensor, Tensor]:
     return selected, torch.from_numpy(frequencies).float(), (energy + energy.median()) ** -0.75
 
 
-def _costs(spectra: Tensor, frequencies: Tensor, weights: Tensor, reference: int, offsets: Tensor) -> Tensor:
-    """Returns the share of the change that translations (C, K, 2) leave unexplained, (C,)."""
-    phases = torch.exp(-1j * (offsets @ frequencies.T))
+def _costs(spectra: Tensor, weights: Tensor, reference: int, phases: Tensor) -> Tensor:
+    """Returns the share of the change that translations leave unexplained, (C,), from their phase factors (C, K, n)."""
     others = [k for k in range(len(spectra)) if k != reference]
     # The noise of the reference frame is in all differences: subtracting a share of their mean makes it independent
     share = 1 - 1 / np.sqrt(len(spectra))

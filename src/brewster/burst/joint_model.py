@@ -13,7 +13,7 @@ influence each other. In the spirit of neural spline fields (Chugunov et al. 202
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Final, final
 
 import torch
@@ -30,6 +30,8 @@ OFFSET: Final = 0.003
 _CHARBONNIER_EPSILON: Final = 0.01
 _CLIPPED: Final = 0.98
 """Above this value, a pixel of a frame is clipped, and a brighter sum of the layers is no error."""
+_MIN_DENOMINATOR: Final = 0.1
+"""Of a projection: points at infinity would end the program in `grid_sample`."""
 _ERROR_AT_1_E: Final = 0.05
 """The mean error of the frames, as a difference of square roots of light, at which the confidence is 1/e."""
 _GAIN_PENALTY: Final = 0.5
@@ -46,7 +48,6 @@ class Weights:
 
     transmission_gradients: float = 0.03
     reflection_gradients: float = 0.05
-    common_edges: float = 0.02
     prior: float = 0.02
     """The pull of the low frequencies of T to those of the single-photo result."""
 
@@ -70,10 +71,10 @@ class JointModel:
     is_locked: Tensor
     """(C,): whether R moves with T, so that both are one layer."""
     reference: int
-    losses: list[float] = field(default_factory=list)
-    """The loss of each candidate at the end of the last optimisation."""
-    data_losses: list[float] = field(default_factory=list)
-    """The part of `losses` that compares the frames with their prediction."""
+    losses: Tensor
+    """(C,): the loss at the end of the last optimisation."""
+    data_losses: Tensor
+    """(C,): the part of `losses` that compares the frames with their prediction."""
 
     @classmethod
     def start(cls, frames: Tensor, motions: Tensor, is_locked: Tensor, reference: int) -> JointModel:
@@ -107,14 +108,15 @@ class JointModel:
                 layers[layer, candidate] = image.clamp(min=1e-4 if layer == 0 else 4e-3).sqrt()
         homographies = motions.flatten(3)[..., :8] / motions[..., 2, 2, None]
         splines = torch.zeros(2, count, frame_count, 2, 2, 2)
-        return cls(layers, homographies, splines, torch.zeros(count, frame_count, 3), is_locked, reference)
+        log_gains, losses = torch.zeros(count, frame_count, 3), torch.full((count,), torch.inf)
+        return cls(layers, homographies, splines, log_gains, is_locked, reference, losses, losses)
 
     def selected(self, candidates: Sequence[int]) -> JointModel:
         """Returns a model with these candidates only."""
         chosen = list(candidates)
         return JointModel(
             self.layers[:, chosen], self.homographies[:, chosen], self.splines[:, chosen], self.log_gains[chosen],
-            self.is_locked[chosen], self.reference, [self.losses[i] for i in chosen], [self.data_losses[i] for i in chosen],
+            self.is_locked[chosen], self.reference, self.losses[chosen], self.data_losses[chosen],
         )  # fmt: skip
 
     def resized(self, frames: Tensor, spline_size: tuple[int, int] | None) -> JointModel:
@@ -230,7 +232,7 @@ def optimise(
     ]  # fmt: skip
     parameters = [tensor.detach().clone().requires_grad_(rate > 0) for tensor, rate in groups]
     layers, homographies, splines, log_gains = parameters
-    current = JointModel(layers, homographies, splines, log_gains, model.is_locked, model.reference)
+    current = replace(model, layers=layers, homographies=homographies, splines=splines, log_gains=log_gains)
     optimiser = torch.optim.Adam(
         [
             {"params": [parameter], "lr": rate}
@@ -259,7 +261,7 @@ def optimise(
     layers, homographies, splines, log_gains = (parameter.detach() for parameter in parameters)
     return replace(
         model, layers=layers, homographies=homographies, splines=splines, log_gains=log_gains,
-        losses=(penalty.detach() + data_losses).tolist(), data_losses=data_losses.tolist(),
+        losses=penalty.detach() + data_losses, data_losses=data_losses,
     )  # fmt: skip
 
 
@@ -278,8 +280,6 @@ def _penalties(model: JointModel, frames: Tensor, prior: Tensor, weights: Weight
         model.layers, (weights.transmission_gradients, weights.reflection_gradients), strict=True
     ):
         terms = terms + weight * sum(charbonnier(d).mean((1, 2, 3)) for d in _differences(layer))
-    if weights.common_edges:
-        terms = terms + weights.common_edges * _common_edges(*model.layers)
     if weights.prior:
         transmission = model.reference_layers(*frames.shape[-2:])[0]
         low = _low_pass(_encode(transmission)) - _low_pass(_encode(prior))
@@ -321,7 +321,7 @@ def _project(homographies: Tensor, grid: Tensor) -> Tensor:
     )
     points = torch.cat([grid, torch.ones_like(grid[..., :1])], -1).flatten(0, 1)
     projected = points @ matrices.transpose(-1, -2)
-    points = projected[..., :2] / projected[..., 2:]
+    points = projected[..., :2] / projected[..., 2:].clamp(min=_MIN_DENOMINATOR)
     return points.reshape(*homographies.shape[:-1], *grid.shape)
 
 
@@ -354,15 +354,3 @@ def _low_pass(images: Tensor) -> Tensor:
 
 def _differences(images: Tensor) -> tuple[Tensor, Tensor]:
     return images.diff(dim=-1), images.diff(dim=-2)
-
-
-def _common_edges(transmission: Tensor, reflection: Tensor) -> Tensor:
-    """Returns how much the edges of both layers (C, 3, H, W) coincide, at three scales (Zhang et al. 2018): (C,)."""
-    total = torch.zeros(len(transmission))
-    for _ in range(3):
-        for pair in zip(_differences(transmission), _differences(reflection), strict=True):
-            edges = [d.abs().mean(1) for d in pair]
-            limited = [torch.tanh(e / (2 * e.detach().mean((1, 2), keepdim=True) + 1e-4)) for e in edges]
-            total = total + (limited[0] * limited[1]).mean((1, 2)) / 6
-        transmission, reflection = (functional.avg_pool2d(image, 2) for image in (transmission, reflection))
-    return total

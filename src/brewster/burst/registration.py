@@ -158,13 +158,14 @@ def _is_camera_motion(matrix: Matrices, size: tuple[int, ...]) -> bool:
 def _fit(matches: Floats) -> tuple[Matrices | None, NDArray[np.bool_]]:
     """Fits a homography, or to few matches a similarity, which has fewer degrees of freedom."""
     cv2.setRNGSeed(0)
+    first, second = (np.ascontiguousarray(points) for points in np.split(matches, 2, axis=1))
     if len(matches) >= 40:
         matrix, inliers = cv2.findHomography(
-            matches[:, :2], matches[:, 2:], cv2.USAC_MAGSAC, _INLIER_PX, maxIters=5000, confidence=0.9999
+            first, second, cv2.USAC_MAGSAC, _INLIER_PX, maxIters=5000, confidence=0.9999
         )
     else:
         affine, inliers = cv2.estimateAffinePartial2D(
-            matches[:, :2], matches[:, 2:], ransacReprojThreshold=_INLIER_PX, maxIters=5000
+            first, second, ransacReprojThreshold=_INLIER_PX, maxIters=5000
         )
         matrix = None if affine is None else np.vstack([affine, [0, 0, 1]])
     if matrix is None or inliers is None or abs(np.linalg.det(matrix)) < 1e-3:

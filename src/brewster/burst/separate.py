@@ -23,6 +23,7 @@ from brewster.burst.registration import frame_motions, motion_candidates
 from brewster.burst.solver import Floats, Solution, solve
 from brewster.errors import PhotoError
 from brewster.inference.burst_report import BurstReport
+from brewster.inference.guided_upsampling import GeneratedOverride
 from brewster.inference.predictor import Prediction, Predictor, ProgressCallback
 from brewster.inference.separation import Separation
 from brewster.inference.separator import Separator
@@ -108,6 +109,7 @@ def separate_burst(
         strength=strength,
         quality=quality,
         mask=mask,
+        hints=hints if report.method == "single photo" else None,
         additive=additive,
         on_progress=lambda done: on_progress(0.9 + 0.1 * done),
     )
@@ -209,7 +211,9 @@ class _FixedPredictor(Predictor):
         total = np.maximum(solution.transmission + solution.reflection, np.float32(1e-4))
         detail = np.clip(photo / total, *_DETAIL_LIMITS)
         transmission, reflection = solution.transmission * detail, solution.reflection * detail
-        return Prediction(transmission - photo, np.minimum(reflection, photo), solution.confidence)
+        # At full size, edges of a strong reflection would remain in the transmission: there it takes no detail of the photo
+        override = GeneratedOverride.weighted_by_detail(solution.transmission, solution.reflection)
+        return Prediction(transmission - photo, np.minimum(reflection, photo), solution.confidence, override)
 
 
 @contextmanager

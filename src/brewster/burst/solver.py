@@ -110,7 +110,7 @@ def solve(
         model = optimise(
             model, small, small_prior, level.steps, rates=rates, weights=weights, on_step=on_step
         )
-        losses |= dict(zip(names, model.losses, strict=True))
+        losses |= dict(zip(names, model.losses.tolist(), strict=True))
         if level.long_side_px <= COMPARED_PX:
             errors = _errors(model)
     assert model
@@ -126,14 +126,16 @@ def solve(
 def _best(model: JointModel, count: int, *, with_locked: bool) -> list[int]:
     """Returns the indices of the candidates with the smallest losses, and of the locked ones."""
     locked = model.is_locked.tolist()
-    free = sorted((i for i, is_locked in enumerate(locked) if not is_locked), key=model.losses.__getitem__)
+    free = sorted(
+        (i for i, is_locked in enumerate(locked) if not is_locked), key=model.losses.tolist().__getitem__
+    )
     return free[:count] + [i for i, is_locked in enumerate(locked) if is_locked and with_locked]
 
 
 def _errors(model: JointModel) -> tuple[float, float]:
     """Returns the data losses of the locked candidate and of the best other one."""
     (best,), (locked,) = _best(model, 1, with_locked=False), _best(model, 0, with_locked=True)
-    return model.data_losses[locked], model.data_losses[best]
+    return float(model.data_losses[locked]), float(model.data_losses[best])
 
 
 def resized(image: Floats, long_side_px: int) -> Floats:

@@ -1,0 +1,247 @@
+"""Several photos of one window: the joint model, the motion candidates, videos, and both entry points."""
+
+import json
+from functools import partial
+from pathlib import Path
+
+import av
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from PIL import Image
+
+import brewster
+from brewster.batch.plan import plan_bursts
+from brewster.burst import read_video, separate_burst
+from brewster.burst.fourier_search import find_translations
+from brewster.burst.joint_model import DEFAULT_WEIGHTS, JointModel, Rates, optimise, pixel_grid
+from brewster.burst.registration import frame_motions, motion_candidates
+from brewster.burst.solver import Level, solve
+from brewster.burst.video import choose_frames
+from brewster.cli import main
+from brewster.errors import PhotoError, PhotoTooLarge, UnreadablePhoto
+from brewster.srgb import to_encoded
+from simulated_bursts import read_photo, simulate_burst
+
+PICTURES = sorted((Path(__file__).parent / "pictures").glob("*.jpg"))
+
+
+def linear_pictures(size):
+    return [np.clip(read_photo(path, size), 0, 1) for path in (PICTURES[2], PICTURES[1])]
+
+
+@pytest.fixture
+def few_steps(monkeypatch):
+    """For tests that do not measure the separation."""
+    monkeypatch.setattr("brewster.burst.separate.solve", partial(solve, levels=(Level(48, 2, None, 99),)))
+
+
+def run_burst(capfd, *args):
+    """Runs the command, and returns the exit code and the standard output."""
+    code = main(["burst", *map(str, args)])
+    return code, capfd.readouterr().out
+
+
+@pytest.fixture(scope="module")
+def small_burst():
+    """Five frames of 120 x 90 pixels, in which the reflection moves by 12 pixels."""
+    return simulate_burst(
+        *linear_pictures((160, 120)), relative_px=12, common_px=3, strength=0.4, noise=0, size=(120, 90)
+    )
+
+
+@pytest.fixture(scope="module")
+def burst_files(small_burst, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("burst")
+    for k, frame in enumerate(small_burst.frames):
+        Image.fromarray(frame).save(folder / f"{k}.png")
+    return sorted(folder.iterdir())
+
+
+def psnr_db(image, truth):
+    """PSNR of sRGB-encoded images after a gain for each channel, as the gain of each layer is unknown."""
+    image = image * ((image * truth).sum((0, 1)) / (image * image).sum((0, 1)))
+    error = to_encoded(np.clip(image, 0, 1)) - to_encoded(np.clip(truth, 0, 1))
+    return -10 * np.log10(np.mean(error**2))
+
+
+def test_layers_with_known_motion_are_separated_to_30_db():
+    transmission, reflection = (
+        picture * scale for picture, scale in zip(linear_pictures((96, 72)), (0.6, 0.3), strict=True)
+    )
+    shifts = [-8, -4, 0, 4, 8]
+    frames = np.stack([transmission + np.roll(reflection, shift, 1) for shift in shifts])[:, :, 16:-16]
+    truth = transmission[:, 16:-16]
+    motions = torch.eye(3).repeat(2, 1, 5, 1, 1)
+    motions[1, 0, :, 0, 2] = -torch.tensor(shifts) * 2 / frames.shape[2]
+    tensor = torch.from_numpy(frames.transpose(0, 3, 1, 2).astype(np.float32))
+    start = JointModel.start(tensor, motions, torch.tensor([False]), 2)
+    prior = torch.from_numpy(truth.transpose(2, 0, 1).astype(np.float32))
+    model = optimise(
+        start, tensor, prior, 150, rates=Rates(homographies=0, splines=0, gains=0), weights=DEFAULT_WEIGHTS
+    )
+    layers = model.reference_layers(*tensor.shape[-2:])[:, 0].movedim(1, -1).numpy()
+    assert psnr_db(layers[0][8:-8, 8:-8], truth[8:-8, 8:-8]) > 30
+    assert model.losses[0] < 0.01
+
+
+def test_the_reflection_of_a_locked_candidate_moves_with_the_transmission():
+    motions = torch.eye(3).repeat(2, 2, 3, 1, 1)
+    motions[1, :, 0, 0, 2] = 0.3
+    model = JointModel.start(torch.rand(3, 3, 8, 12), motions, torch.tensor([True, False]), 1)
+    positions = model.positions(8, 12)
+    assert torch.equal(positions[0, 0], positions[1, 0])
+    assert not torch.equal(positions[0, 1], positions[1, 1])
+    assert torch.allclose(positions[:, :, 1], pixel_grid(8, 12))  # the reference frame does not move
+    assert model.selected([1]).relative_motion(8, 12) == pytest.approx(0.15, abs=1e-3)
+    assert model.selected([0]).relative_motion(8, 12) == 0
+
+
+@pytest.mark.parametrize("end", [(6.0, 0.0), (-9.0, 2.0)])
+def test_the_fourier_search_finds_the_translation_of_the_second_layer(end):
+    transmission, reflection = linear_pictures((300, 200))
+    times = np.array([-1, -0.5, 0, 0.5, 1])
+    moved = [np.roll(reflection, np.rint((t * end[1], t * end[0])).astype(int), (0, 1)) for t in times]
+    found = find_translations([0.6 * transmission + 0.4 * layer for layer in moved], 2)[0]
+    assert np.abs(found - np.rint(times[:, None] * end)).max() < 1
+
+
+def test_unrelated_photos_have_no_motion_and_equal_ones_do_not_move():
+    first, second = linear_pictures((400, 300))
+    motions = frame_motions([first, first, second], 0, first)
+    assert not motions[2]
+    candidates = motion_candidates([first, first], 0, motions[:2])
+    assert candidates[0].is_locked
+    assert np.allclose(candidates[0].transmission, np.eye(3), atol=1e-3)
+
+
+def test_a_burst_is_separated_by_its_motion(small_burst, burst_files):
+    result = brewster.separate_burst(burst_files)
+    report = result.burst
+    assert report.method == "burst"
+    assert 60 < report.relative_motion_px < 160  # 100 px in a photo of 1,000 px
+    single = brewster.separate(burst_files[2])
+    scores = [psnr_db(layers.transmission.linear(), small_burst.transmission) for layers in (result, single)]
+    assert scores[0] > scores[1]
+    assert result.transmission.size == result.reflection.size == result.photo.size
+
+
+def test_a_burst_keeps_depth_and_respects_strength_and_reference(small_burst, few_steps):
+    frames = [frame.astype(np.uint16) * 257 for frame in small_burst.frames]
+    photos = [brewster.Photo.from_array(frame, encoding="srgb") for frame in frames]
+    result = separate_burst(photos, reference=1, strength=0)
+    assert result.transmission.pixels.dtype == np.uint16
+    assert (result.transmission.pixels == frames[1]).all()
+    assert result.burst.reference == 1
+
+
+def test_photos_without_relative_motion_are_not_separated_by_motion(small_burst):
+    photo = brewster.Photo.from_array(small_burst.frames[0], encoding="srgb")
+    result = separate_burst([photo] * 3)
+    assert result.burst.method != "burst"
+    assert result.burst.relative_motion_px < 10 or result.burst.explained < 0.2
+
+
+def test_a_photo_of_another_scene_is_left_out_and_alone_gives_the_single_result():
+    photos = [brewster.Photo.open(path) for path in PICTURES[:2]]
+    pixels = [photo.srgb_8bit()[:300, :300] for photo in photos]
+    first, second = (brewster.Photo.from_array(array, encoding="srgb") for array in pixels)
+    result = separate_burst([first, second], reference=0)
+    assert (result.burst.method, result.burst.left_out) == ("single photo", (1,))
+    assert (result.transmission.pixels == brewster.separate(first).transmission.pixels).all()
+
+
+@pytest.mark.parametrize(
+    ("shapes", "reference"), [([(8, 9)], 0), ([(8, 9), (9, 8)], 0), ([(8, 9)] * 2, 2), ([(8, 9)] * 16, 0)]
+)
+def test_bad_bursts_are_refused(shapes, reference):
+    photos = [brewster.Photo.from_array(np.zeros((*shape, 3), np.uint8), encoding="srgb") for shape in shapes]
+    with pytest.raises(PhotoError):
+        separate_burst(photos, reference=reference)
+
+
+def write_video(path, frames):
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("mpeg4", rate=10)
+        stream.width, stream.height, stream.pix_fmt = frames[0].shape[1], frames[0].shape[0], "yuv420p"
+        for frame in frames:
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(frame, format="rgb24")))
+        container.mux(stream.encode())
+
+
+def test_frames_of_a_video_are_chosen_along_its_path(tmp_path):
+    picture = read_photo(PICTURES[0], (200, 96))
+    encoded = np.rint(to_encoded(np.clip(picture, 0, 1)) * 255).astype(np.uint8)
+    offsets = [0] * 10 + list(range(0, 40, 2)) + [38] * 10  # still, moving, still
+    write_video(tmp_path / "a.mp4", [np.ascontiguousarray(encoded[:, x : x + 128]) for x in offsets])
+    photos = read_video(tmp_path / "a.mp4", 5)
+    assert [photo.size for photo in photos] == [(128, 96)] * 5
+    truth = [encoded[:, x : x + 128].astype(float) for x in offsets]
+    nearest = [int(np.argmin([np.abs(photo.pixels - frame).mean() for frame in truth])) for photo in photos]
+    assert max(offsets[i] for i in nearest) - min(offsets[i] for i in nearest) >= 20
+    with pytest.raises(PhotoTooLarge):
+        read_video(tmp_path / "a.mp4", 5, max_pixels=100)
+
+
+@given(st.lists(st.tuples(st.floats(0, 0.1), st.floats(0, 1)), min_size=1, max_size=60), st.integers(2, 15))
+def test_chosen_frames_are_distinct_and_ordered(steps, count):
+    moves, sharpness = np.array(steps).T
+    chosen = choose_frames(np.cumsum(moves), sharpness, count)
+    assert chosen == sorted(set(chosen))
+    assert len(chosen) == min(count, len(steps))
+    assert chosen[-1] < len(steps)
+
+
+@pytest.mark.parametrize("content", [b"", b"no video", None])
+def test_a_damaged_video_is_refused(tmp_path, content):
+    path = tmp_path / "a.mp4"
+    if content is not None:
+        path.write_bytes(content)
+    with pytest.raises(UnreadablePhoto):
+        read_video(path, 5)
+
+
+def test_each_folder_and_video_is_one_burst_and_named_photos_are_one(tmp_path, burst_files):
+    for folder in ("a", "b/c"):
+        (tmp_path / folder).mkdir(parents=True)
+        for file in burst_files[:3]:
+            (tmp_path / folder / file.name).write_bytes(file.read_bytes())
+    tasks = plan_bursts([tmp_path], tmp_path / "out")
+    assert [len(task.burst.photos) for task in tasks] == [3, 3]
+    assert [task.source.name for task in tasks] == ["1.png", "1.png"]
+    assert tasks[1].outputs["transmission"] == tmp_path / "out/b/c/1.transmission.png"
+    (task,) = plan_bursts(burst_files, reference=0)
+    assert (task.source, len(task.burst.photos)) == (burst_files[0], 5)
+    with pytest.raises(PhotoError):
+        plan_bursts(burst_files, reference=5)
+
+
+def test_the_command_writes_the_layers_and_the_report(tmp_path, burst_files, few_steps, capfd):
+    arguments = (*burst_files, "-o", tmp_path / "out", "--json", "--reference", "2")
+    code, out = run_burst(capfd, *arguments)
+    report = json.loads(out)
+    assert (code, report["status"], report["burst"]["reference"]) == (0, "separated", 1)
+    assert {path.name for path in (tmp_path / "out").iterdir()} == {"1.transmission.png", "1.reflection.png"}
+    assert json.loads(run_burst(capfd, *arguments)[1])["status"] == "skipped"
+
+
+def test_the_command_reports_bursts_that_cannot_be_separated(tmp_path, burst_files, capfd):
+    bad = tmp_path / "bursts/bad"
+    bad.mkdir(parents=True)
+    (bad / "alone.png").write_bytes(burst_files[0].read_bytes())
+    video = tmp_path / "window.mp4"
+    video.write_bytes(b"cut")
+    code, out = run_burst(capfd, tmp_path / "bursts", video, "-o", tmp_path / "out", "--json")
+    reports = [json.loads(line) for line in out.splitlines()]
+    assert (code, [report["status"] for report in reports]) == (1, ["failed", "failed"])
+    assert "1 photo" in reports[0]["error"]
+    assert "window.mp4" in reports[1]["error"]
+
+
+def test_a_dry_run_writes_nothing(tmp_path, burst_files, capfd):
+    code, out = run_burst(capfd, *burst_files, "-o", tmp_path / "clear.png", "--dry-run")
+    assert code == 0
+    assert "clear.png" in out
+    assert not list(tmp_path.iterdir())
