@@ -457,6 +457,10 @@ def test_an_output_folder_that_cannot_be_created_is_an_error_before_the_first_ph
     assert (code, out) == (1, b"")
     reason = "Not a directory" if output == "file/out" else "No such file or directory"
     assert f"{output} was not written ({reason}); expected " in message
+    if not options or options == ["--dry-run"]:
+        code, out, err = run("a.jpg", "-o", f"{output}/clear.jpg", *options)
+        assert (code, out) == (1, b"")
+        assert f"{output} was not written ({reason}); expected " in error_lines(err)[0]
 
 
 def test_a_dry_run_reports_photos_that_do_not_exist(run, tmp_path):
@@ -486,7 +490,7 @@ def test_json_has_the_result_of_each_photo(run, tmp_path, model):
         "reconstruction_error",
         "assessment",
     }
-    model_keys |= {"reflection_is_derived", "burst"}
+    model_keys |= {"reflection_is_derived", "burst", "note"}
     keys = {"source", "status", "outputs", "error", "photo_sha256"} | model_keys
     assert keys == set(separated) == set(failed)
     assert separated["outputs"] == {layer: f"a.{layer}.jpg" for layer in LAYERS}
