@@ -217,11 +217,8 @@ def test_a_refused_header_has_no_size(monkeypatch):
     frames = [Image.fromarray(smooth()), Image.fromarray(smooth() // 2)]
     file = io.BytesIO()
     frames[0].save(file, "GIF", save_all=True, append_images=frames[1:])
-    cmyk = io.BytesIO()
-    Image.new("CMYK", (8, 8)).save(cmyk, "JPEG")
-    for data, word in ((file.getvalue(), "animation"), (cmyk.getvalue(), "CMYK")):
-        with pytest.raises(UnsupportedPhoto, match=word):
-            read_size(data)
+    with pytest.raises(UnsupportedPhoto, match="animation"):
+        read_size(file.getvalue())
     monkeypatch.setattr(decoding, "DEFAULT_MAX_PIXELS", 1000)
     with pytest.raises(PhotoTooLarge, match="64 x 48"):
         read_size(file_of(smooth(), "PNG"))

@@ -35,10 +35,6 @@ def five_channel_tiff():
     return pyvips.Image.black(8, 8, bands=5).tiffsave_buffer()
 
 
-def cmyk_jpeg():
-    return pyvips.Image.black(8, 8, bands=4).copy(interpretation="cmyk").jpegsave_buffer()
-
-
 def write_exr_with_nan(folder):
     pixels = np.ones((4, 4, 3), np.float32)
     pixels[1, 2] = np.nan
@@ -53,7 +49,6 @@ def test_damaged_photos_are_named_at_the_end_and_the_others_are_separated(run, t
     damaged = {
         "animated.gif": animation(".gif"),
         "animated.webp": animation(".webp"),
-        "cmyk.jpg": cmyk_jpeg(),
         "empty.jpg": b"",
         "five.tiff": five_channel_tiff(),
         "half.jpg": truncated_jpeg(),
@@ -299,6 +294,11 @@ def test_finished_photos_are_skipped_without_loading_the_model(run, tmp_path):
     assert "a.jpg: skipped" in err
     assert json_lines(out)[0]["status"] == "skipped"
     assert times == {path: path.stat().st_mtime_ns for path in tmp_path.iterdir()}
+    (tmp_path / "b.jpg").write_bytes(image_bytes())
+    run("b.jpg")
+    assert [line for line in run(".")[2].splitlines() if "skipped, " in line] == [
+        "2 photos: skipped, because all layers exist (--overwrite replaces them)"
+    ]
 
 
 @pytest.mark.parametrize("options", [[], ["--dry-run"], ["--workers", 1, "-o", "."]])
@@ -457,6 +457,10 @@ def test_an_output_folder_that_cannot_be_created_is_an_error_before_the_first_ph
     assert (code, out) == (1, b"")
     reason = "Not a directory" if output == "file/out" else "No such file or directory"
     assert f"{output} was not written ({reason}); expected " in message
+    if not options or options == ["--dry-run"]:
+        code, out, err = run("a.jpg", "-o", f"{output}/clear.jpg", *options)
+        assert (code, out) == (1, b"")
+        assert f"{output} was not written ({reason}); expected " in error_lines(err)[0]
 
 
 def test_a_dry_run_reports_photos_that_do_not_exist(run, tmp_path):
@@ -486,7 +490,7 @@ def test_json_has_the_result_of_each_photo(run, tmp_path, model):
         "reconstruction_error",
         "assessment",
     }
-    model_keys |= {"reflection_is_derived", "burst"}
+    model_keys |= {"reflection_is_derived", "burst", "note"}
     keys = {"source", "status", "outputs", "error", "photo_sha256"} | model_keys
     assert keys == set(separated) == set(failed)
     assert separated["outputs"] == {layer: f"a.{layer}.jpg" for layer in LAYERS}

@@ -5,7 +5,7 @@ import pytest
 import torch
 from PIL import Image
 
-from brewster.errors import MaskError, ModelError
+from brewster.errors import MaskError
 from brewster.inference.separator import Separator
 from brewster.photo import Hints
 from brewster.srgb import to_linear
@@ -82,7 +82,7 @@ def test_hints_reach_the_model_at_every_scale_and_in_place_together_with_a_mask(
 
 
 def test_a_model_without_hints_refuses_them():
-    with pytest.raises(ModelError, match="takes none"):
+    with pytest.raises(MaskError, match="takes none"):
         Separator(lambda tile: (tile, 0 * tile))(
             np.zeros((30, 40, 3), np.uint8), encoding="srgb", hints=painted()
         )

@@ -383,6 +383,26 @@ def test_curves_without_an_inverse_are_refused(
         colour_space_of(profile(curve, colourants), None, is_float=False)
 
 
+@pytest.mark.parametrize("format_name", ["jpeg", "tiff"])
+@pytest.mark.parametrize("has_profile", [True, False])
+def test_cmyk_is_converted_by_its_profile_or_a_default_one_with_a_note(format_name, has_profile) -> None:
+    """Paper white and the grey of black ink stay neutral; the colours come back by the inverse of the separation."""
+    pixels = np.kron(
+        np.uint8([[[255] * 3, [180, 90, 60]], [[90, 120, 80], [128] * 3]]), np.ones((16, 16, 1))
+    ).astype(np.uint8)
+    image = pyvips.Image.new_from_array(pixels).copy(interpretation="srgb")
+    cmyk = image.icc_transform("cmyk", input_profile="srgb", intent="relative")
+    if not has_profile:
+        cmyk = cmyk.copy()
+        cmyk.remove("icc-profile-data")
+    data = cmyk.write_to_buffer(f".{format_name}", **({"Q": 97} if format_name == "jpeg" else {}))
+    photo = Photo.open(data)
+    assert read_size(data) == photo.size == (32, 32)
+    assert ("default" in str(photo.file_info.note)) != has_profile
+    assert np.abs(photo.srgb_8bit().astype(int) - pixels).max() < 12
+    assert Photo.open(photo.encode()).file_info.icc == photo.file_info.icc
+
+
 def test_a_pixel_whose_light_changes_in_one_channel_is_stored_anew() -> None:
     icc = bytes(pyvips.Image.profile_load("p3"))
     photo = Photo(np.full((2, 2, 3), 100, np.uint8), file_info=FileInfo(icc=icc))

@@ -1,6 +1,7 @@
 """Resource estimates, compared with values that were counted and measured independently."""
 
 import re
+import types
 from pathlib import Path
 
 import pytest
@@ -78,11 +79,24 @@ def test_a_recipe_that_does_not_fit_is_refused_with_a_change_that_fits(klein):
 
 
 def test_gpus_are_found_by_name_and_that_of_the_paper_is_the_default_without_a_gpu(monkeypatch):
-    assert find_gpu("rtx 4090") == CARD
+    assert find_gpu("rtx 4090") == find_gpu("NVIDIA GeForce RTX 4090") == CARD
+    assert find_gpu("AMD Radeon RX 7900 XTX") == find_gpu("rx 7900 xtx") == CARDS["RX 7900 XTX"]
     with pytest.raises(DeviceError, match=r"no GPU 'rtx 4099' .*; did you mean RTX 4090"):
         find_gpu("rtx 4099")
     with pytest.raises(DeviceError, match="M3 Max is by Apple; expected an NVIDIA or AMD GPU"):
         find_gpu("M3 Max")
+    with pytest.raises(DeviceError, match="Intel Arc A770 is by Intel"):
+        find_gpu("Intel Arc A770")
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    for name, known in {
+        "AMD Radeon RX 7900 XTX": "RX 7900 XTX",
+        "NVIDIA A100-SXM4-80GB": "A100",
+        "NVIDIA GeForce RTX 4060 Ti 16 GB": "RTX 4060 Ti 16 GB",
+        "toy": "RTX 4090",
+    }.items():
+        found = types.SimpleNamespace(name=name, total_memory=2**34)
+        monkeypatch.setattr(torch.cuda, "get_device_properties", lambda _device, found=found: found)
+        assert local_gpu() == GraphicsCard(name, 16, CARDS[known].tflops)
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     assert local_gpu() is None
 

@@ -112,6 +112,8 @@ class FileResult:
     """See `Separation.reflection_is_derived`."""
     burst: BurstReport | None = None
     """See `Separation.burst`."""
+    note: str | None = None
+    """What changed when the photo was read, such as a conversion of CMYK colours, or None."""
     error: str | None = None
     """The error message, or None."""
 

@@ -175,7 +175,7 @@ def separate_task(
         separation = separator(photo, on_progress=on_progress, **options.call_options())
     result.photo_sha256, result.burst = _sha256(photo), separation.burst
     result.seconds, result.residual = dict(separation.seconds), separation.residual
-    result.assessment = separation.assessment
+    result.assessment, result.note = separation.assessment, separation.photo.file_info.note
     result.reconstruction_error = separation.reconstruction_error
     result.reflection_is_derived = separation.reflection_is_derived
     started = time.perf_counter()

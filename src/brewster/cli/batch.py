@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Self, final
 
 from brewster.cli.batch_plan import listed
 from brewster.cli.terminal import interrupts, one_line, print_error, print_status, progress, write_out
-from brewster.errors import INSTALL_COMMAND, ModelError
+from brewster.errors import INSTALL_COMMAND, ModelError, counted
 from brewster.models import zoo
 from brewster.options import Options
 from brewster.remote_path import location
@@ -70,6 +70,8 @@ class BatchReport:
         self._contact_sheet_rows: list[tuple[Path, list[Path]]] = []
         self._errors: list[str] = []
         self._sources_by_missing_extra: defaultdict[str, list[str]] = defaultdict(list)
+        self._skipped: dict[str, tuple[int, str]] = {}
+        """The number of skipped photos, and the last one, by the options of their layers that differ from those of this batch."""
         self._index: IndexWriter | None = None
         self._started = time.perf_counter()
 
@@ -162,15 +164,15 @@ class BatchReport:
             # A parallel batch does not read an existing layer a second time to compare its options with the current ones,
             # because that takes time.
             different_options = "" if self.is_parallel else self._different_options(result)
-            note = f", made with other options ({different_options})" if different_options else ""
-            print_status(
-                f"{result.source}: skipped, because all of its layers exist{note} (--overwrite replaces them)"
-            )
+            number, _ = self._skipped.get(different_options, (0, ""))
+            self._skipped[different_options] = number + 1, result.source
         elif result.status == "separated":
             verdict = result.assessment.verdict if result.assessment else ""
             hint = ": check the layers" if verdict == "doubtful" else ""
             seconds = sum(result.seconds.values())
             print_status(f"{result.source} -> {outputs} ({seconds:.1f} s, {verdict}{hint})")
+            if result.note:
+                print_status(f"  {result.note}")
             if result.burst:
                 print_status(f"  {result.burst.method}: {result.burst.message}")
 
@@ -193,6 +195,10 @@ class BatchReport:
 
     def _print_summary(self) -> None:
         """Prints the counts, the time and the errors. Photos that need the same missing extra share a message."""
+        for different_options, (number, source) in self._skipped.items():
+            photos = source if number == 1 else counted(number, "photo")
+            note = f", made with other options ({different_options})" if different_options else ""
+            print_status(f"{photos}: skipped, because all layers exist{note} (--overwrite replaces them)")
         if self.counts.total() > 1 and not self.quiet:
             order = ("separated", "planned", "skipped", "failed")
             totals = ", ".join(f"{self.counts[status]} {status}" for status in order if self.counts[status])

@@ -14,7 +14,7 @@ import click
 
 from brewster.cli.terminal import print_status, write_out
 from brewster.errors import counted
-from brewster.files import LAYER_FORMATS
+from brewster.files import LAYER_FORMATS, check_output_folder
 from brewster.image_formats import WRITABLE, ImageFormat, format_of, is_video
 from brewster.options import Options
 from brewster.remote_path import Location, location, path_of_file_url
@@ -111,6 +111,8 @@ def _plan_single_output(photos: Sequence[str], output: str | None, options: Opti
         _check_format(format_of(Path(output)), options)
     source = _StandardStream() if photos[0] == "-" else location(photos[0])
     target = _StandardStream() if output in (None, "-") else location(output)
+    if not isinstance(target, _StandardStream):
+        check_output_folder(target.parent)
     return SeparationTask(source, {options.layers[0]: target})
 
 

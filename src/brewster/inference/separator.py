@@ -22,7 +22,7 @@ from typing import Any, Final, Unpack, final
 
 import numpy as np
 
-from brewster.errors import BrewsterError, MissingExtra, ModelError
+from brewster.errors import BrewsterError, MaskError, MissingExtra, ModelError
 from brewster.inference.assessment import Assessment, assess
 from brewster.inference.clipping import keep_clipped_light
 from brewster.inference.full_size import upsample_layers
@@ -224,8 +224,9 @@ class Separator:
         Raises:
             PhotoError: the source cannot be read, or is too large.
             TypeError: the source has another type.
-            ModelError: the model returns an invalid output, or takes no hints.
-            MaskError: the mask or the hints cannot be read, or have another size than the photo; or the mask is not grey.
+            ModelError: the model returns an invalid output.
+            MaskError: the mask or the hints cannot be read, or have another size than the photo; or the mask is not grey; or
+                the model takes no hints.
             BrewsterError: strength is not a number from 0 to 1, or quality is unknown.
         """
         Options(strength=strength, quality=quality)  # checks the values
@@ -288,8 +289,8 @@ class Separator:
 
         Raises:
             BrewsterError: quality is unknown.
-            ModelError: the model returns an invalid output, or takes no hints.
-            MaskError: the hints cannot be read, or have another size than the photo.
+            ModelError: the model returns an invalid output.
+            MaskError: the model takes no hints, or the hints cannot be read, or have another size than the photo.
         """
         Options(quality=quality)  # checks the value
         inputs, white = self._inputs(photo, quality)
@@ -326,7 +327,7 @@ class Separator:
         if hints is None:
             return inputs
         if not self.takes_hints:
-            raise ModelError(
+            raise MaskError(
                 f"hints were given to the model {self.name}, which takes none",
                 "expected a model with an input for hints",
                 "leave the hints out, or choose another model",

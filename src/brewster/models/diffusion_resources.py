@@ -131,25 +131,33 @@ CARDS: Final = {
 }  # fmt: skip
 """Name -> GPU. The paper uses the RTX 4090."""
 PAPER_GPU: Final = CARDS["RTX 4090"]
-_APPLE: Final = ("apple", "m1", "m2", "m3", "m4", "m5")
+_OTHER_MAKERS: Final = {"Apple": ("apple", "m1", "m2", "m3", "m4", "m5"), "Intel": ("intel", "arc")}
+"""The first words of the names of GPUs that run no diffusion models, by maker."""
+_MAKER_WORDS: Final = {"nvidia", "geforce", "amd", "radeon", "instinct"}
+
+
+def _model_number(name: str) -> str:
+    """Returns the name in lower case without the words of its maker: `rtx 4090` for `NVIDIA GeForce RTX 4090`."""
+    return " ".join(word for word in name.lower().split() if word not in _MAKER_WORDS)
 
 
 def find_gpu(name: str) -> GraphicsCard:
-    """Returns the GPU of this name.
+    """Returns the GPU of this name, such as `RTX 4090`, `nvidia geforce rtx 4090` or `AMD Radeon RX 7900 XTX`.
 
     Raises:
         DeviceError: the name is not in `CARDS`.
     """
-    known = {other.lower(): card for other, card in CARDS.items()}
-    if name.lower() in known:
-        return known[name.lower()]
-    if name.lower().startswith(_APPLE):
-        raise DeviceError(
-            f"the GPU {name} is by Apple",
-            "expected an NVIDIA or AMD GPU, because diffusion models run on no other",
-            "use the model compact, which runs on any machine",
-        )
-    matches = get_close_matches(name.lower(), known, n=1)
+    known = {_model_number(other): card for other, card in CARDS.items()}
+    if (number := _model_number(name)) in known:
+        return known[number]
+    for maker, words in _OTHER_MAKERS.items():
+        if number.startswith(words):
+            raise DeviceError(
+                f"the GPU {name} is by {maker}",
+                "expected an NVIDIA or AMD GPU, because diffusion models run on no other",
+                "use the model compact, which runs on any machine",
+            )
+    matches = get_close_matches(number, known, n=1)
     raise DeviceError(
         f"there is no GPU {name!r} in the table",
         f"expected one of {', '.join(CARDS)}",
@@ -160,7 +168,7 @@ def find_gpu(name: str) -> GraphicsCard:
 def local_gpu() -> GraphicsCard | None:
     """Returns the GPU of this machine, or None. torch finds it, or the driver of NVIDIA if torch is not installed.
 
-    Its speed is that of the GPU in `CARDS` with its name, or of the RTX 4090 if there is none.
+    Its speed is that of the GPU in `CARDS` whose name it begins with, or of the RTX 4090 if there is none.
     """
     if importlib.util.find_spec("torch"):
         import torch  # noqa: PLC0415  (slow to import)
@@ -176,9 +184,8 @@ def local_gpu() -> GraphicsCard | None:
             memory_gib = float(mib) / 1024
         except (OSError, subprocess.SubprocessError, ValueError, IndexError):
             return None
-    return GraphicsCard(
-        name, memory_gib, next((c.tflops for key, c in CARDS.items() if key in name), PAPER_GPU.tflops)
-    )
+    similar = [key for key in CARDS if _model_number(name).startswith(_model_number(key))]
+    return GraphicsCard(name, memory_gib, CARDS[max(similar, key=len, default=PAPER_GPU.name)].tflops)
 
 
 @final

@@ -33,7 +33,7 @@ from brewster.photo import metadata
 from brewster.photo.colour import colour_space_of
 from brewster.photo.file_info import FileInfo, check_pixel_count, library_of
 from brewster.photo.hdr_formats import read_exr, read_hdr
-from brewster.photo.lut_profiles import has_only_tables
+from brewster.photo.lut_profiles import convert_cmyk, has_only_tables
 from brewster.photo.raw import is_raw, read_raw, read_raw_size
 
 pyvips.cache_set_max(0)  # each image is read once, so the operation cache of libvips has no use
@@ -102,7 +102,8 @@ def read_size(data: bytes) -> tuple[int, int]:
         return heif.size[0], heif.size[1]
     image = _open_vips(data, format_name, DEFAULT_MAX_PIXELS)
     icc = image.get("icc-profile-data") if image.get_typeof("icc-profile-data") else None
-    _check_profile(icc or _profile_of(data, format_name), is_float=image.format == "float")
+    if image.interpretation != _CMYK:
+        _check_profile(icc or _profile_of(data, format_name), is_float=image.format == "float")
     sides = int(image.width), int(image.height)
     return sides[::-1] if _orientation(image, format_name) in _TRANSPOSED else sides
 
@@ -123,8 +124,9 @@ def _detect_format(data: bytes) -> str:
         return "raw" if is_raw_tiff else image_format.name
     if re.match(VIDEO_SIGNATURE, data, re.DOTALL):
         raise video_error("the file")
+    is_text = data[:12].isascii() and data[:12].decode().isprintable()
     raise UnreadablePhoto(
-        f"the file starts with {data[:12]!r}, which is no known image format",
+        f"the file is {'text' if is_text else 'of another kind'}, which is no known image format",
         f"expected one of {', '.join(FORMATS)}",
         "convert the file, or check that its content matches its name",
     )
@@ -134,6 +136,7 @@ def _detect_format(data: bytes) -> str:
 
 _FAIL_ON = {"tiff": "error"}  # libvips reports missing strips as errors, not as truncation
 _GREY = ("b-w", "grey16")
+_CMYK = "cmyk"
 _RGB = ("srgb", "rgb", "rgb16", "scrgb")
 _DTYPES = {"uchar": np.uint8, "ushort": np.uint16, "float": np.float32}
 
@@ -142,6 +145,8 @@ def _decode_vips(data: bytes, format_name: str, max_pixels: int) -> Decoded:
     image = _open_vips(data, format_name, max_pixels)
     try:
         file_info = _file_info(image, data, format_name)
+        if image.interpretation == _CMYK:
+            image, file_info = convert_cmyk(image, file_info)
         array = np.frombuffer(image.write_to_memory(), _DTYPES[image.format])
     except pyvips.Error as error:
         raise _unreadable_error(format_name) from error
@@ -180,7 +185,7 @@ def _check_supported(image: pyvips.Image, data: bytes, format_name: str, max_pix
 
     Raises:
         PhotoTooLarge: the image has more pixels than `max_pixels`.
-        UnsupportedPhoto: the image is an animation, has several pages, CMYK colours, or unsupported channels.
+        UnsupportedPhoto: the image is an animation, has several pages, or unsupported channels.
     """
     check_pixel_count(image.width, image.height, max_pixels)
     if _has_frames(image, data, format_name):
@@ -189,17 +194,11 @@ def _check_supported(image: pyvips.Image, data: bytes, format_name: str, max_pix
             "expected a single image",
             "extract the frames first, for example with ffmpeg or vips",
         )
-    if image.interpretation == "cmyk":
-        raise UnsupportedPhoto(
-            f"the {format_name} has CMYK colours",
-            "expected an RGB or grey image",
-            "convert the image to sRGB first",
-        )
-    interpretations = {1: _GREY, 2: _GREY, 3: _RGB, 4: _RGB}.get(image.bands, ())
+    interpretations = {1: _GREY, 2: _GREY, 3: _RGB, 4: (*_RGB, _CMYK)}.get(image.bands, ())
     if image.interpretation not in interpretations or image.format not in _DTYPES:
         raise UnsupportedPhoto(
             f"the {format_name} has {image.bands} channels of {image.format} ({image.interpretation})",
-            "expected grey or RGB, with or without alpha, of 8 or 16 bits or 32-bit floats",
+            "expected grey or RGB, with or without alpha, or CMYK, of 8 or 16 bits or 32-bit floats",
             "convert the image to one of these",
         )
     if format_name == "tiff" and metadata.pixel_data_end(metadata.read_tags(data)) > len(data):

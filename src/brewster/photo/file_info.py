@@ -41,6 +41,8 @@ class FileInfo:
     """The other attributes of an EXR or HDR."""
     software: str | None = None
     """The program that created the pixels. It is written to EXR and HDR files, which have neither EXIF nor XMP."""
+    note: str | None = None
+    """What changed when the file was read, for its user: for example, that CMYK colours were converted."""
     digest: str | None = None
     """See `brewster.photo.history.sampled_digest`; None if the photo was not read from a file."""
 

@@ -1,4 +1,4 @@
-"""Converts photos with LUT-based ICC profiles, which scanners and some cameras write, to Display P3.
+"""Converts photos with LUT-based ICC profiles, which scanners and some cameras write, and CMYK photos to Display P3.
 
 colour.py uses profiles with curves and a matrix, and converts in both directions. A photo with another RGB profile is
 converted to Display P3 when it is opened, by littleCMS in libvips. Display P3 is the largest colour space whose profile
@@ -59,6 +59,21 @@ def convert_to_display_p3(pixels: NDArray[Any], file_info: FileInfo) -> tuple[ND
     if profile_is_ignored:
         raise _damaged_profile(icc)
     return array, replace(file_info, icc=bytes(pyvips.Image.profile_load("p3")))
+
+
+def convert_cmyk(image: pyvips.Image, file_info: FileInfo) -> tuple[pyvips.Image, FileInfo]:
+    """Returns a CMYK image in Display P3 (relative colorimetric), and `file_info` with its profile and a note.
+
+    Without a usable CMYK profile, the default profile of libvips is used.
+    """
+    is_cmyk = file_info.icc is not None and file_info.icc[16:20] == b"CMYK"
+    profile = "its profile" if is_cmyk else "a default profile, because it has none"
+    depth = 16 if image.format == "ushort" else 8
+    converted = image.icc_transform(
+        "p3", embedded=is_cmyk, input_profile="cmyk", intent="relative", depth=depth
+    )
+    note = f"its CMYK colours were converted to RGB (Display P3) with {profile}"
+    return converted, replace(file_info, icc=bytes(pyvips.Image.profile_load("p3")), note=note)
 
 
 _PROBE_LEVELS = np.arange(0, 256, 51).astype(np.uint8)

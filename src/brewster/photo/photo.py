@@ -79,7 +79,7 @@ class Photo:
 
         Raises:
             UnreadablePhoto: the file is missing, empty, truncated, or not an image.
-            UnsupportedPhoto: the image has CMYK colours, several frames, five channels, NaN values, or a damaged profile; or
+            UnsupportedPhoto: the image has several frames, five channels, NaN values, or a damaged profile; or
                 the file is a video, by its suffix or by its content.
             PhotoTooLarge: the image has more pixels than `max_pixels`.
             MissingExtra: the reader of EXR, HEIC or RAW is not installed.

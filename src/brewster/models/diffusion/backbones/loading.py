@@ -290,7 +290,7 @@ def _check_device(device: str) -> None:
         raise DeviceError(
             "there is no CUDA device",
             "expected an NVIDIA or AMD GPU and a torch built for it",
-            "use device cpu",
+            "use device cpu, or install torch with CUDA (on Windows, pip alone installs it without: see pytorch.org)",
         )
     if device_type == "mps" and not torch.backends.mps.is_available():
         raise DeviceError("there is no MPS device", "expected an Apple GPU", "use device cpu")
