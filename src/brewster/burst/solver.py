@@ -60,7 +60,7 @@ class Solution:
     two_layer_error: float
     """The same for the best candidate."""
     losses: dict[str, float]
-    """The loss of each candidate, by name, at the last level that optimised it. The last one is the best."""
+    """The loss of each candidate, by name, at the last level that optimised it."""
 
 
 def solve(
