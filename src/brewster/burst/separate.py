@@ -39,6 +39,9 @@ _MIN_MOTION_PX: Final = 10.0
 """The smallest relative motion that separates the layers, in pixels of a photo that is 1,000 pixels wide."""
 _MIN_EXPLAINED: Final = 0.2
 """The smallest share of the errors of one layer that a second motion must explain."""
+_LARGE_MOTION_PX: Final = 60.0
+_MIN_EXPLAINED_IF_LARGE: Final = 0.4
+"""A larger motion must explain more: the parts of a layer that only one frame shows explain everything there."""
 _USEFUL_MOTION_PX: Final = 16
 _DETAIL_LIMITS: Final = (0.5, 2.0)
 """The detail of the reference photo changes the sum of the layers by no more than these factors."""
@@ -166,16 +169,17 @@ def _report(
     explained = (
         max(0.0, 1 - solution.two_layer_error / (solution.one_layer_error + 1e-9)) if solution else 0.0
     )
+    needed = _MIN_EXPLAINED if motion < _LARGE_MOTION_PX else _MIN_EXPLAINED_IF_LARGE
     method: Literal["burst", "single photo", "unchanged"] = "single photo"
     advice = "Move the camera 5 to 10 cm sideways between the photos."
     if solution is None:
         message = "No other photo shows the same scene as the reference photo."
-    elif explained >= _MIN_EXPLAINED and motion >= _MIN_MOTION_PX:
+    elif explained >= needed and motion >= _MIN_MOTION_PX:
         method, message = "burst", f"The layers moved {motion:.0f} px apart in a photo of 1,000 px."
     elif is_clear:
         method = "unchanged"
         message = "One layer explains all photos, and no reflection was found in the reference photo."
-    elif explained < _MIN_EXPLAINED:
+    elif explained < needed:
         message = f"No relative motion of two layers was found. {advice}"
     else:
         message = f"The layers moved {motion:.0f} px apart; about {_USEFUL_MOTION_PX} are needed. {advice}"
