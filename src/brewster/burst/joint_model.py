@@ -156,11 +156,11 @@ class JointModel:
         rendered, _ = self.render(height, width, slice(self.reference, self.reference + 1))
         return rendered[:, :, 0]
 
-    def relative_motion(self, height: int, width: int) -> float:
-        """Returns the largest mean motion of R relative to T between two frames, as a share of the width, for one candidate."""
-        transmission, reflection = self.positions(height, width)[:, 0]
-        offsets = (reflection - transmission).mean((1, 2)) * torch.tensor([0.5, 0.5 * height / width])
-        return float(torch.cdist(offsets, offsets).max())
+    def relative_motion(self, height: int, width: int) -> Tensor:
+        """Returns the largest mean motion of R relative to T between two frames, as a share of the width, (C,)."""
+        transmission, reflection = self.positions(height, width)
+        offsets = (reflection - transmission).mean((2, 3)) * torch.tensor([0.5, 0.5 * height / width])
+        return torch.cdist(offsets, offsets).amax((1, 2))
 
     def confidence(self, frames: Tensor) -> Tensor:
         """Returns how well the frames agree with their prediction at each pixel of the reference frame, (C, 1, h, w) in 0..1.

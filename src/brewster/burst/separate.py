@@ -86,19 +86,11 @@ def separate_burst(
     started = time.perf_counter()
     upsampler, _, single = separator.fit(photo, quality=quality, hints=hints)
     prior = _applied(upsampler.apply, frames[reference])
-    with single_torch_thread(), _single_opencv_thread():
-        motions = frame_motions(frames, reference, prior)
-        used = [k for k, found in enumerate(motions) if found]
-        solution = None
-        if len(used) > 1:
-            chosen, middle = [frames[k] for k in used], used.index(reference)
-            candidates = motion_candidates(chosen, middle, [motions[k] for k in used])
-            solution = solve(
-                chosen, middle, prior, candidates, on_progress=lambda done: on_progress(0.9 * done)
-            )
+    solution, left_out = measure_layers(
+        frames, reference, prior, on_progress=lambda done: on_progress(0.9 * done)
+    )
     seconds["motion"] = time.perf_counter() - started
-    left_out = tuple(k for k, found in enumerate(motions) if not found)
-    report = _report(solution, single.verdict == "little found", len(photos), left_out, reference)
+    report = burst_report(solution, single.verdict == "little found", len(photos), left_out, reference)
     chosen_separator = separator
     if solution and report.method == "burst":
         name = f"burst with {separator.name}"
@@ -117,6 +109,35 @@ def separate_burst(
         on_progress=lambda done: on_progress(0.9 + 0.1 * done),
     )
     return replace(separation, burst=report, seconds=seconds | separation.seconds)
+
+
+def measure_layers(
+    frames: Sequence[Floats],
+    reference: int,
+    prior: Floats,
+    *,
+    on_progress: ProgressCallback = lambda _fraction: None,
+) -> tuple[Solution | None, tuple[int, ...]]:
+    """Measures the layers of the reference frame from the motion, with one thread.
+
+    Args:
+        frames: (h, w, 3) linear light in 0..1, of one size.
+        reference: the index of the reference frame.
+        prior: T of the reference frame from a single photo, (h, w, 3).
+        on_progress: called with the completed fraction, 0 to 1.
+
+    Returns:
+        The solution, or None if no other frame shows the scene of the reference frame; and the indices of the frames that do not.
+    """
+    with single_torch_thread(), _single_opencv_thread():
+        motions = frame_motions(frames, reference, prior)
+        used = [k for k, found in enumerate(motions) if found]
+        left_out = tuple(k for k, found in enumerate(motions) if not found)
+        if len(used) < 2:
+            return None, left_out
+        chosen, middle = [frames[k] for k in used], used.index(reference)
+        candidates = motion_candidates(chosen, middle, [motions[k] for k in used])
+        return solve(chosen, middle, prior, candidates, on_progress=on_progress), left_out
 
 
 def _checked_reference(count: int, reference: int | None) -> int:
@@ -161,7 +182,7 @@ def _applied(apply: Callable[[Floats, int, int], tuple[Floats, Floats]], frame: 
     return prior
 
 
-def _report(
+def burst_report(
     solution: Solution | None, is_clear: bool, count: int, left_out: tuple[int, ...], reference: int
 ) -> BurstReport:
     """Decides whether the motion separates the layers. `is_clear`: the model found little reflection in the reference photo."""
