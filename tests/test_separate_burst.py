@@ -161,6 +161,11 @@ def test_bad_bursts_are_refused(shapes, reference):
         separate_burst(photos, reference=reference)
 
 
+def test_an_unreadable_photo_is_named_by_its_number(burst_files):
+    with pytest.raises(UnreadablePhoto, match="photo 3 of the burst"):
+        separate_burst([*burst_files[:2], burst_files[2].read_bytes()[:200], burst_files[3]], reference=0)
+
+
 def write_video(path, frames):
     with av.open(str(path), "w") as container:
         stream = container.add_stream("mpeg4", rate=10)

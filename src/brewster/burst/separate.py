@@ -79,7 +79,7 @@ def separate_burst(
     """
     reference = _checked_reference(len(photos), reference)
     started = time.perf_counter()
-    photo = Photo.open(photos[reference], max_pixels=max_pixels)
+    photo = _open(photos, reference, max_pixels)
     frames = _working_frames(photos, reference, photo, max_pixels)
     seconds = {"frames": time.perf_counter() - started}
     separator = separator or Separator.load()
@@ -157,13 +157,22 @@ def _checked_reference(count: int, reference: int | None) -> int:
     return reference
 
 
+def _open(photos: Sequence[Source], index: int, max_pixels: int) -> Photo:
+    """Opens a photo of the burst. An error names its number."""
+    try:
+        return Photo.open(photos[index], max_pixels=max_pixels)
+    except PhotoError as error:
+        happened = f"photo {index + 1} of the burst: {error.happened}"
+        raise type(error)(happened, error.expected, error.cure) from error
+
+
 def _working_frames(photos: Sequence[Source], reference: int, photo: Photo, max_pixels: int) -> list[Floats]:
     """Returns the photos at the working size, in linear light of 0..1. One photo at a time is in memory at full size."""
     scale = min(1.0, _WORKING_PX / max(photo.size))
     width, height = (max(8, round(length * scale)) for length in photo.size)
     frames = []
-    for k, source in enumerate(photos):
-        frame = photo if k == reference else Photo.open(source, max_pixels=max_pixels)
+    for k in range(len(photos)):
+        frame = photo if k == reference else _open(photos, k, max_pixels)
         if frame.size != photo.size:
             raise PhotoError(
                 f"photo {k + 1} of the burst has {frame.size[0]} x {frame.size[1]} pixels",
