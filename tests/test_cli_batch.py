@@ -486,7 +486,7 @@ def test_json_has_the_result_of_each_photo(run, tmp_path, model):
         "reconstruction_error",
         "assessment",
     }
-    model_keys |= {"reflection_is_derived"}
+    model_keys |= {"reflection_is_derived", "burst"}
     keys = {"source", "status", "outputs", "error", "photo_sha256"} | model_keys
     assert keys == set(separated) == set(failed)
     assert separated["outputs"] == {layer: f"a.{layer}.jpg" for layer in LAYERS}

@@ -31,13 +31,13 @@ from picture_files import smooth
 from synthetic_scenes import ASSETS, make_scene, map_side, plane_side
 
 PREDICTIONS = {
-    1: {
+    2: {
         "draft": [
             7,
-            217,
+            227,
             149,
             104,
-            55,
+            59,
             201,
             163,
             127,
@@ -46,10 +46,10 @@ PREDICTIONS = {
             191,
             169,
             17,
-            143,
+            96,
             98,
             71,
-            33,
+            9,
             131,
             107,
             82,
@@ -60,10 +60,10 @@ PREDICTIONS = {
         ],
         "standard": [
             0,
-            218,
+            227,
             149,
             102,
-            55,
+            60,
             202,
             163,
             127,
@@ -72,10 +72,10 @@ PREDICTIONS = {
             192,
             169,
             17,
-            142,
+            98,
             98,
             71,
-            33,
+            4,
             130,
             106,
             81,
@@ -198,9 +198,9 @@ def compute_scores(names):
 
 
 def test_a_changed_score_needs_a_new_score_format():
-    names = tuple(
-        name for name in METRICS if not name.startswith("lpips") and name != "niqe"
-    )  # a larger image
+    # NIQE needs a larger image, and this image has no clipped light.
+    others = ("niqe", "lost_clipped", "lost_near_white", "near_white_cast")
+    names = tuple(name for name in METRICS if not name.startswith("lpips") and name not in others)
     output = compute_scores(names)
     assert None not in output.values()
     check_output("evaluate.score_log.SCORE_FORMAT_VERSION", SCORE_FORMAT_VERSION, SCORES, output, 2e-6)

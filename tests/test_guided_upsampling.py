@@ -110,3 +110,13 @@ def test_without_fine_reflections_the_photo_keeps_its_detail(rng):
     detail = rng.random((40, 60, 3), np.float32)
     soft = np.full_like(detail, 0.2)
     assert GeneratedOverride.weighted_by_detail(detail, soft).weight.max() < 1e-3
+
+
+def test_the_slope_of_a_pixel_is_the_mean_of_all_windows_that_contain_it(rng):
+    """He et al. 2013, eq. 8. A change of one pixel is in 5 x 5 windows, which reach 4 pixels far."""
+    photo, change = rng.random((21, 21, 3), np.float32), np.zeros((21, 21, 3), np.float32)
+    change[10, 10] = 1
+    reached = GuidedUpsampler.fit(photo, change, None).change.slope.any(axis=2)
+    expected = np.zeros_like(reached)
+    expected[6:15, 6:15] = True
+    assert (reached == expected).all()

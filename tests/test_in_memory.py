@@ -6,11 +6,18 @@ import threading
 
 import numpy as np
 import pytest
-from PIL import Image
+from PIL import Image, ImageOps
 
 import brewster
 from brewster import Photo, Separation, Separator
-from brewster.errors import BrewsterError, MissingExtra, ModelError, UnreadablePhoto, UnsupportedPhoto
+from brewster.errors import (
+    BrewsterError,
+    MissingExtra,
+    ModelError,
+    PhotoError,
+    UnreadablePhoto,
+    UnsupportedPhoto,
+)
 from brewster.models import zoo
 from brewster.photo import FileInfo
 from cli_helpers import image_bytes, write_pane
@@ -103,7 +110,42 @@ def test_the_text_of_a_photo_names_size_kind_and_metadata():
     assert repr(photo) == "Photo(64 x 48, RGB, uint8, jpeg, EXIF)"
     grey = Photo.from_array(np.zeros((2, 3), np.uint16), encoding="srgb")
     assert repr(grey) == "Photo(3 x 2, grey, uint16, png)"
-    assert len(repr(SEPARATOR(photo))) < 2000
+    assert repr(SEPARATOR(photo)) == f"Separation(64 x 48, custom, {SEPARATOR(photo).assessment.verdict})"
+    assert repr(SEPARATOR) == "Separator(custom, cpu)"
+
+
+def test_integers_are_srgb_encoded_by_default_and_floats_need_an_encoding():
+    for array in (smooth(), 257 * smooth().astype(np.uint16)):
+        expected = SEPARATOR(array, encoding="srgb")
+        (result,) = SEPARATOR.many([array])
+        transmission, reflection = result
+        assert np.array_equal(transmission.pixels, expected.transmission.pixels)
+        assert np.array_equal(reflection.pixels, expected.reflection.pixels)
+    with pytest.raises(PhotoError, match="float64 is None"):
+        SEPARATOR(smooth() / 255)
+
+
+@pytest.mark.parametrize(
+    ("array", "advice"),
+    [
+        (smooth().transpose(2, 0, 1), r"array\.transpose\(1, 2, 0\)"),
+        (smooth()[None], "one by one"),
+        (smooth()[:0], "at least one pixel"),
+    ],
+)
+def test_an_array_of_another_shape_is_refused_with_the_way_out(array, advice):
+    with pytest.raises(UnsupportedPhoto, match=advice):
+        SEPARATOR(array)
+
+
+def test_the_quality_of_lossy_files_can_be_chosen():
+    photo = Photo.open(file_of(np.random.default_rng(0).integers(0, 256, (64, 64, 3), np.uint8), "PNG"))
+    for format_name in ("jpeg", "webp", "avif"):
+        sizes = [len(photo.encode(format_name, quality=quality)) for quality in (30, 95)]
+        assert 2 * sizes[0] < sizes[1]
+    for format_name, quality in (("png", 95), ("jpeg", 0), ("webp", 101)):
+        with pytest.raises(UnsupportedPhoto, match=rf"quality={quality} was passed for {format_name}"):
+            photo.save(io.BytesIO(), format=format_name, quality=quality)
 
 
 def test_open_files_are_read_and_written(tmp_path):
@@ -129,6 +171,14 @@ def test_a_source_of_another_type_is_a_type_error_that_names_it(source):
         Photo.open(source)
     with pytest.raises(TypeError):
         SEPARATOR(source)
+
+
+def test_a_model_that_is_no_function_and_a_tensor_are_type_errors_with_the_way_out():
+    with pytest.raises(TypeError, match=r"the model is of type int.*; pass"):
+        Separator(3)
+    tensor = pytest.importorskip("torch").zeros(3, 4, 5)
+    with pytest.raises(TypeError, match=r"permute\(1, 2, 0\)"):
+        Photo.open(tensor)
 
 
 @pytest.mark.parametrize(("low", "high"), [(0, 255), (-1, 1), (0, 1.01)])
@@ -224,3 +274,11 @@ def test_the_folder_of_a_training_run_is_a_model(tmp_path):
     assert not zoo.is_diffusion_model(str(folder))
     (folder / "model.onnx").unlink()
     assert zoo.is_diffusion_model(str(folder))  # the folder of a LoRA
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_a_pil_image_is_turned_as_pillow_turns_it(orientation):
+    image, exif = Image.fromarray(smooth()), Image.Exif()
+    exif[274] = orientation
+    image.info["exif"] = exif.tobytes()
+    assert np.array_equal(Photo.from_pil(image).pixels, np.asarray(ImageOps.exif_transpose(image)))

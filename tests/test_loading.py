@@ -10,8 +10,8 @@ from safetensors.torch import save_file
 
 from brewster.errors import ModelError
 from brewster.models.diffusion.adapter.export import merge
+from brewster.models.diffusion.adapter.lora import attach_layers
 from brewster.models.diffusion.adapter.lora_formats import LowRankLayer, to_state_dict
-from brewster.models.diffusion.adapter.stacking import stack_layers
 from brewster.models.diffusion.backbones.loading import load_backbone
 from brewster.models.diffusion.backbones.registry import BACKBONES, tiny
 from brewster.models.diffusion.pipeline import load_pipeline
@@ -72,7 +72,7 @@ def test_a_gguf_file_and_a_lora_predict_as_its_dequantized_weights(name, bases, 
     lora = {
         target: LowRankLayer(*random_pair(layers[target], 2, generator)) for target in expected.lora_targets()
     }
-    stack_layers(found, lora)
+    attach_layers(found, lora)
     merge(expected, to_state_dict(lora), 1.0)
     torch.testing.assert_close(velocity(found, prompt), velocity(expected, prompt), atol=1e-4, rtol=0)
 

@@ -323,11 +323,11 @@ def test_memory_and_disk_are_checked_before_the_base_of_an_export_is_loaded(kont
     monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(free=free["disk"] * export.GIB))
     monkeypatch.setattr(export, "load_backbone", lambda *_, **__: backbone)
     free["memory"] = 20
-    with pytest.raises(DeviceError, match=r"needs about 22\.4 GiB of host memory, and 20\.0 GiB are free"):
+    with pytest.raises(DeviceError, match=r"needs about 22\.3 GiB of host memory, and 20\.0 GiB are free"):
         export.export_merged(tmp_path / "lora", tmp_path / "merged")
     free |= {"memory": 25, "disk": 20}
     with pytest.raises(
-        OutputError, match=r"merged needs about 22\.4 GiB on the disk, and 20\.0 GiB are free"
+        OutputError, match=r"merged needs about 22\.3 GiB on the disk, and 20\.0 GiB are free"
     ):
         export.export_merged(tmp_path / "lora", tmp_path / "merged")
     assert not (tmp_path / "merged").exists()

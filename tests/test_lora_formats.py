@@ -381,3 +381,13 @@ def test_a_lora_and_a_checkpoint_are_imported(run_without_model, tmp_path):
     (tmp_path / "model.pt").write_bytes(b"nothing")
     code, _, err = run_without_model("models", "import", "model.pt", "out")
     assert (code, err.startswith("error: model.pt cannot be read")) == (1, True)
+
+
+def test_the_alphas_of_a_file_have_precedence_over_its_settings():
+    name = f"{BLOCK}attn.to_q"
+    tensors, transformer = kohya({name: weights("qwen", original=False)[name]}), tiny("qwen")[0].transformer
+    layers = [
+        read_lora_layers(tensors, transformer, "qwen", scale)
+        for scale in (None, scaling_from_config({"lora_alpha": 100}))
+    ]
+    assert torch.equal(*(each[name].up for each in layers))

@@ -235,12 +235,6 @@ def test_a_missing_extra_names_the_command_that_installs_it(
 # --- arrays, PIL images, resizing, saving
 
 
-def test_an_array_needs_its_encoding() -> None:
-    with pytest.raises(PhotoError, match="encoding"):
-        Photo.open(smooth())
-    assert np.array_equal(Photo.open(smooth(), encoding="srgb").pixels, smooth())
-
-
 @pytest.mark.parametrize("dtype", [np.uint8, np.float32])
 def test_an_unknown_encoding_is_refused(dtype: type) -> None:
     for create in (Photo.open, Photo.from_array):

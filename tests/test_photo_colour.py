@@ -381,3 +381,13 @@ def test_curves_without_an_inverse_are_refused(
 ) -> None:
     with pytest.raises(UnsupportedPhoto, match="curves and a matrix"):
         colour_space_of(profile(curve, colourants), None, is_float=False)
+
+
+def test_a_pixel_whose_light_changes_in_one_channel_is_stored_anew() -> None:
+    icc = bytes(pyvips.Image.profile_load("p3"))
+    photo = Photo(np.full((2, 2, 3), 100, np.uint8), file_info=FileInfo(icc=icc))
+    light = photo.linear()
+    light[0, 0, 0] += 0.2
+    changed = photo.with_linear(light)
+    np.testing.assert_allclose(changed.linear()[0, 0], light[0, 0], atol=5e-3)
+    assert (changed.pixels.reshape(4, 3)[1:] == 100).all()

@@ -133,6 +133,20 @@ def test_the_items_of_a_lost_task_are_tried_again_one_by_one(are_arguments_lost)
     assert [task.indices for task in executor._tasks.values()] == [(1,), (2,)]
 
 
+def test_a_task_is_submitted_with_one_retry_less_than_its_attempts(monkeypatch):
+    """Ray counts retries, and the error message counts attempts."""
+    submitted = {}
+    ray = SimpleNamespace(
+        init=lambda *_, **__: None,
+        put=lambda value: value,
+        remote=lambda **options: submitted.update(options) or (lambda function: function),
+    )
+    monkeypatch.setattr(ray_cluster, "_ray", lambda: ray)
+    ray_cluster.RayExecutor(partial(TaskRunner, None), address="local").__enter__()
+    assert submitted["max_retries"] == ray_cluster.MAX_ATTEMPTS - 1
+    assert submitted["num_cpus"] == 1
+
+
 @pytest.mark.slow
 def test_a_cluster_on_this_machine_renders_the_set_of_one_process(tmp_path):
     pytest.importorskip("ray")
@@ -169,3 +183,16 @@ def test_an_address_that_refuses_connections_is_reported(tmp_path, monkeypatch, 
     monkeypatch.setattr(socket, "create_connection", refuse)
     with pytest.raises(DeviceError, match=f"no cluster at {address}"):
         render_set(tmp_path / "set", executor=partial(ray_cluster.RayExecutor, address=address))
+
+
+def test_ray_tries_a_task_as_often_as_several_processes_do(monkeypatch):
+    options = {}
+    ray = SimpleNamespace(
+        init=lambda *_, **__: None,
+        remote=lambda **given: options.update(given) or (lambda function: function),
+        put=lambda value: value,
+        shutdown=lambda: None,
+    )
+    monkeypatch.setattr(ray_cluster, "_ray", lambda: ray)
+    with ray_cluster.RayExecutor(partial(TaskRunner, None)):
+        assert 1 + options["max_retries"] == ray_cluster.MAX_ATTEMPTS

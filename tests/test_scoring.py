@@ -219,6 +219,7 @@ def test_every_metric_gives_the_score_of_its_function(data, monkeypatch):
         "linear_rmse": pytest.approx(linear_rmse(photo, background), abs=1e-6),
         "psnr_channels": pytest.approx(psnr_of_channels(photo, background), abs=1e-6),
         "ssim_clipped": pytest.approx(ssim(photo, background, window="gaussian"), abs=1e-3),
+        **dict.fromkeys(("lost_clipped", "lost_near_white", "near_white_cast")),  # too few bright pixels
     }
 
 

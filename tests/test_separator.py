@@ -10,6 +10,8 @@ import brewster
 from brewster import Photo, Separator
 from brewster.errors import BrewsterError, PhotoError
 from brewster.inference import QUALITIES
+from brewster.inference.guided_upsampling import GeneratedOverride
+from brewster.inference.predictor import Prediction, Predictor
 from brewster.metrics import psnr, ssim
 from brewster.photo import FileInfo
 
@@ -262,3 +264,25 @@ def test_an_exception_in_on_progress_stops_the_work(calls_until_error):
         )
     assert len(progress) == calls_until_error
     assert len(tiles) <= calls_until_error
+
+
+class Generating(Predictor):
+    """A predictor that replaces the transmission by a generated one, half of its input."""
+
+    def input_sizes(self, size, quality):
+        return [size]
+
+    def __call__(self, inputs, quality, on_progress):
+        (image,) = inputs
+        ones = np.ones_like(image[..., :1])
+        return Prediction(-image / 4, image / 4, ones, GeneratedOverride(image / 2, ones))
+
+
+def test_the_generated_layers_of_a_photo_brighter_than_white_scale_with_its_light(rng):
+    light = 0.5 * rng.random((24, 32, 3), np.float32)
+    light[:, :2] = 1  # a lamp, which stays as it is
+    once, twice = (
+        Separator(Generating())(Photo.from_array(scale * light, encoding="linear")) for scale in (2, 4)
+    )
+    np.testing.assert_allclose(twice.transmission.pixels, 2 * once.transmission.pixels, rtol=1e-5)
+    np.testing.assert_allclose(once.transmission.pixels[:, 12:].mean(), light[:, 12:].mean(), rtol=0.02)

@@ -109,3 +109,21 @@ def test_every_pair_of_methods_is_compared():
     rows = differences([make_stratum(np.arange(6.0).reshape(2, 3))], series, {"psnr": True})
     assert [(row.method, row.reference) for row in rows] == [("b", "a"), ("c", "a"), ("c", "b")]
     assert differences([make_stratum([1.0])], series[:1], {"psnr": True}) == []
+
+
+def test_each_benchmark_has_its_own_resamples():
+    """With equal resamples, the errors of benchmarks would be added up in the interval of their average."""
+    values = np.arange(12.0)
+    one, other, same = (
+        estimate_one([make_stratum(values, name=name)]) for name in ("nature20", "real20", "nature20")
+    )
+    assert one == same
+    assert (one.mean, one.count) == (other.mean, other.count)
+    assert (one.low, one.high) != (other.low, other.high)
+
+
+def test_the_interval_of_an_average_assumes_independent_benchmarks(rng):
+    values = rng.normal(size=40)
+    alone = estimate_one([make_stratum(values)])
+    both = estimate_one([make_stratum(values, name=name) for name in ("a", "b")])
+    assert both.high - both.low == pytest.approx((alone.high - alone.low) / 2**0.5, rel=0.1)

@@ -105,3 +105,23 @@ def test_the_order_does_not_reveal_the_catch_trials():
     )
     assert len(positions) == 10
     assert min(positions.values()) > 10
+
+
+def test_each_half_of_a_session_has_each_comparison_equally_often_and_on_both_sides():
+    """Participants tire: the order of presentation must not depend on the comparison or on its sides."""
+    description = make_description(pictures=10, pairs=20, catch_trials=0)
+    first_half, flipped_first = Counter(), Counter()
+    for number in range(200):
+        trials = draw_trials(description, number)
+        first_half.update(trial.comparison for trial in trials[:10])
+        flipped_first[trials[0].flipped] += 1
+    assert len(first_half) == 20
+    assert min(first_half.values()) > 75  # of 200; the standard deviation is 7
+    assert len(flipped_first) == 2
+    assert min(flipped_first.values()) > 70
+
+
+def test_each_round_begins_with_another_side():
+    starts = Counter(next(comparison_sequence(6, 3, seed))[1] for seed in range(100))
+    assert len(starts) == 2
+    assert min(starts.values()) > 30

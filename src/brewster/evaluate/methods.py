@@ -29,7 +29,7 @@ from brewster.options import Device, Quality
 from brewster.photo import Photo
 
 BASELINE: Final = "input (unprocessed)"
-PREDICTION_FORMAT_VERSION: Final = 1
+PREDICTION_FORMAT_VERSION: Final = 2
 """Increase this version when the code changes the predictions of a model. Stored predictions of other versions are not
 reused. test_conventions_formats checks it."""
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import final
@@ -24,7 +25,7 @@ class Separation:
     photo: Photo
     transmission: Photo
     reflection: Photo
-    confidence_map: Floats = field(repr=False, compare=False)
+    confidence_map: Floats = field(compare=False)
     """Confidence in 0..1, (h, w, 1), at the size of the largest input of the network."""
     residual: float
     """Mean of |photo - transmission - reflection| in linear light."""
@@ -42,6 +43,15 @@ class Separation:
     """Whether the reflection is photo - transmission in linear light, because the model predicts no reflection."""
     burst: BurstReport | None = None
     """How a burst was separated; None for a single photo."""
+
+    def __repr__(self) -> str:
+        """Returns a short description: `Separation(4000 x 3000, compact, clear)`."""
+        width, height = self.photo.size
+        return f"Separation({width} x {height}, {self.model}, {self.assessment.verdict})"
+
+    def __iter__(self) -> Iterator[Photo]:
+        """Yields both layers: `transmission, reflection = separation`."""
+        yield from (self.transmission, self.reflection)
 
     def _repr_png_(self) -> bytes:
         """For notebooks: photo, transmission and reflection side by side, as a PNG."""

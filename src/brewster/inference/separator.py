@@ -68,9 +68,18 @@ class Separator:
         sha256: str | None = None,
         device: str = "cpu",
     ) -> None:
+        if not callable(model):
+            raise TypeError(
+                f"the model is of type {type(model).__name__}; expected a function tile -> (transmission, reflection); "
+                "pass one, or load a model by its name with Separator.load"
+            )
         self._predictor = model if isinstance(model, Predictor) else MultiScalePredictor(model)
         self.name, self.sha256, self.device = name, sha256, device
         self.takes_hints = self._predictor.takes_hints
+
+    def __repr__(self) -> str:
+        """Returns `Separator(compact, cpu)`."""
+        return f"Separator({self.name}, {self.device})"
 
     @classmethod
     def load(cls, model: str = Options.model, **options: Unpack[LoadOptions]) -> Separator:
@@ -201,7 +210,7 @@ class Separator:
             hints: an image of the size of the photo with rough strokes: red where there is reflection, green where there is
                 only the scene; for models that take hints.
             additive: whether the layers sum to the photo exactly, as 32-bit floats in linear light.
-            encoding: the encoding of an array, "srgb" or "linear"; for arrays only.
+            encoding: the encoding of an array, "srgb" or "linear"; by default, "srgb" for integers. For arrays only.
             max_pixels: refuse photos with more pixels than this, before they are decoded.
             on_progress: called with the completed fraction, 0 to 1. An exception raised in it stops the work.
 
@@ -319,7 +328,7 @@ def separate(
         model: see `Separator.load`.
         mask: see `Separator.__call__`.
         hints: see `Separator.__call__`.
-        encoding: the encoding of an array, "srgb" or "linear"; for arrays only.
+        encoding: the encoding of an array, "srgb" or "linear"; by default, "srgb" for integers. For arrays only.
         options: the keywords of `brewster.options.SeparateOptions`: strength, quality, additive and max_pixels (see
             `Separator.__call__`), and those of `Separator.load`.
 

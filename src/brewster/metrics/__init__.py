@@ -7,6 +7,7 @@
     perceptual   LPIPS; imports torch at its first use
     naturalness  NIQE, without ground truth
     region       the reflection region: pixels that the glass has visibly changed
+    bright       loss of clipped light and of white
     failures     removed content and remaining reflection, for rendered samples
 
 `METRICS` is the table of all metrics, with the definition of each.
@@ -23,6 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brewster.errors import BrewsterError
+from brewster.metrics.bright import lost_clipped, lost_near_white, near_white_cast
 from brewster.metrics.failures import kept_reflection, removed_content, removed_white
 from brewster.metrics.fidelity import (
     PairCounts,
@@ -59,7 +61,10 @@ __all__ = [
     "find_metric",
     "kept_reflection",
     "linear_rmse",
+    "lost_clipped",
+    "lost_near_white",
     "lpips",
+    "near_white_cast",
     "niqe",
     "psnr",
     "psnr_of_channels",
@@ -135,6 +140,11 @@ def _niqe(comparison: Comparison) -> float:
     return niqe(comparison.prediction.pixels)
 
 
+def _bright_score(score: Callable[[Image, Image, Image], float]) -> Callable[[Comparison], float]:
+    """Converts a function of prediction, truth and photo to the `score` function of a metric."""
+    return lambda comparison: score(comparison.prediction.pixels, comparison.truth.pixels, comparison.photo)
+
+
 def _rendered_score(
     score: Callable[[Image, Image, Image, Image], float],
 ) -> Callable[[Comparison], float]:
@@ -168,6 +178,13 @@ _GAIN: Final = (
     "The prediction is first multiplied by one gain: the median of background / prediction in linear luminance where there"
     " is no reflection."
 )
+
+_NEAR_WHITE: Final = "of the pixels above 200 in all channels of photo and ground truth, in 8-bit levels"
+_BRIGHT_ROWS: Final = (
+    ("lost_clipped", "Lost clipped light", 3, "Share of the 8-bit channel values of at least 250 in photo and ground truth that are below 240 in the prediction.", lost_clipped),
+    ("lost_near_white", "Lost near white", 1, f"Mean of truth - prediction {_NEAR_WHITE}.", lost_near_white),
+    ("near_white_cast", "Cast of near white", 1, f"Largest - smallest channel of the mean truth - prediction {_NEAR_WHITE}.", near_white_cast),
+)  # fmt: skip
 
 _ROWS: Final = (
     Metric("psnr", "PSNR", "dB", True, 2, f"{_PSNR} of all pixels.", "transmission", _psnr),
@@ -269,6 +286,10 @@ _ROWS: Final = (
         "As SSIM (Gaussian), but negative local values count as 0, as in the package pyiqa.",
         "transmission",
         _ssim_clipped,
+    ),
+    *(
+        Metric(name, title, "", False, digits, definition, "transmission", _bright_score(score))
+        for name, title, digits, definition, score in _BRIGHT_ROWS
     ),
     Metric("psnr_reflection", "PSNR of R", "dB", True, 2, f"{_PSNR} of all pixels.", "reflection", _psnr),
     Metric("ssim_reflection", "SSIM of R", "", True, 3, f"Mean local SSIM, {_UNIFORM}.", "reflection", _ssim),

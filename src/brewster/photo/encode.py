@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -20,16 +21,16 @@ Stored = NDArray[Any]
 _KEPT_METADATA = 2 | 4 | 8  # libvips flags for XMP, IPTC and ICC; EXIF is inserted unchanged afterwards
 # For AVIF, libvips also writes the EXIF item, whose content is replaced afterwards.
 _KEPT_AVIF_METADATA = _KEPT_METADATA | 1
-_DEFAULT_QUALITY = 95  # for lossy files, if the quality of the source is unknown
-_DEFAULT_AVIF_QUALITY = 90  # the quality scale of AV1 differs from that of JPEG
+_DEFAULT_QUALITIES = {"jpeg": 95, "webp": 95, "avif": 90, "heic": 90}
+"""Of the lossy formats. For a JPEG, only if the quality of the source is unknown. The scale of AV1 and HEVC is another one."""
 _DEFAULT_RESOLUTION = (72 / 25.4, 72 / 25.4)
 
 
-def encode(pixels: Stored, alpha: Stored | None, file_info: FileInfo) -> bytes:
+def encode(pixels: Stored, alpha: Stored | None, file_info: FileInfo, quality: int | None = None) -> bytes:
     """Returns the bytes of a file. `pixels` (H, W, 1|3) and `alpha` (H, W) have the dtype for `file_info.bits`.
 
     Raises:
-        UnsupportedPhoto: the format cannot store the image.
+        UnsupportedPhoto: the format cannot store the image, or the quality is not 1..100 or the format has none.
         MissingExtra: the writer of EXR or HEIC is not installed.
     """
     if alpha is not None and not FORMATS[file_info.format_name].has_alpha:
@@ -38,17 +39,28 @@ def encode(pixels: Stored, alpha: Stored | None, file_info: FileInfo) -> bytes:
             "expected a format with alpha, because brewster drops no channel",
             f"write {', '.join(name for name, row in WRITABLE.items() if row.has_alpha)}",
         )
+    if quality is None:
+        default = _DEFAULT_QUALITIES.get(file_info.format_name, 0)
+        quality = (file_info.jpeg_quality if file_info.format_name == "jpeg" else None) or default
+    elif file_info.format_name in _DEFAULT_QUALITIES and 1 <= quality <= 100:
+        file_info = replace(file_info, lossless=False)
+    else:
+        raise UnsupportedPhoto(
+            f"quality={quality} was passed for {file_info.format_name}",
+            f"expected 1..100 for {', '.join(_DEFAULT_QUALITIES)}, and no quality for other formats",
+            "correct the quality, or choose one of these formats",
+        )
     if file_info.format_name == "exr":
         return write_exr(HdrPixels(pixels, alpha, file_info))
     if file_info.format_name == "hdr":
         return write_hdr(HdrPixels(pixels, alpha, file_info))
     array = pixels if alpha is None else np.concatenate([pixels, alpha[..., None]], axis=2)
     if file_info.format_name == "heic":
-        return _encode_heic(array, file_info)
-    return _with_exif(_encode_vips(array, file_info), array, file_info)
+        return _encode_heic(array, file_info, quality)
+    return _with_exif(_encode_vips(array, file_info, quality), array, file_info)
 
 
-def _encode_vips(array: Stored, file_info: FileInfo) -> bytes:
+def _encode_vips(array: Stored, file_info: FileInfo, quality: int) -> bytes:
     height, width, channels = array.shape
     across, down = file_info.resolution_px_per_mm or _DEFAULT_RESOLUTION
     contiguous = np.ascontiguousarray(array)
@@ -65,7 +77,7 @@ def _encode_vips(array: Stored, file_info: FileInfo) -> bytes:
     keep = _KEPT_AVIF_METADATA if file_info.format_name == "avif" else _KEPT_METADATA
     save = getattr(image, FORMATS[file_info.format_name].vips_saver or "")
     try:
-        return bytes(save(keep=keep, **_save_options(file_info, array.dtype)))
+        return bytes(save(keep=keep, **_save_options(file_info, array.dtype, quality)))
     except pyvips.Error as error:
         raise UnsupportedPhoto(
             f"{width} x {height} pixels cannot be written as {file_info.format_name}",
@@ -83,37 +95,33 @@ def _interpretation(array: Stored) -> str:
     )
 
 
-def _save_options(file_info: FileInfo, dtype: np.dtype[Any]) -> dict[str, Any]:
+def _save_options(file_info: FileInfo, dtype: np.dtype[Any], quality: int) -> dict[str, Any]:
     """Returns the options of the libvips saver for a format. The chroma of a JPEG is subsampled only if
     that of the source is; that of an AVIF never is. Lossy WebP has no format without chroma subsampling (RFC 6386).
     """
     match file_info.format_name:
         case "jpeg":
             mode = "on" if file_info.subsampling == "4:2:0" else "off"
-            quality = file_info.jpeg_quality or _DEFAULT_QUALITY
             return {"Q": quality, "subsample_mode": mode, "optimize_coding": True}
         case "png":
             return {}
         case "webp":
-            return {"Q": _DEFAULT_QUALITY, "lossless": file_info.lossless, "exact": True}
+            return {"Q": quality, "lossless": file_info.lossless, "exact": True}
         case "avif":
-            quality_options = {
-                "Q": _DEFAULT_AVIF_QUALITY,
-                "lossless": file_info.lossless,
-                "subsample_mode": "off",
-            }
             # Effort 1 takes 1/7 of the time of the default effort. The files are 1/8 larger.
             return {
                 "compression": "av1",
                 "bitdepth": file_info.bits,
                 "effort": 1,
-                **quality_options,
+                "Q": quality,
+                "lossless": file_info.lossless,
+                "subsample_mode": "off",
             }
     compression = file_info.compression or "deflate"
     if compression == "jpeg" and dtype != np.uint8:
         compression = "deflate"
     predictor = "float" if dtype.kind == "f" else "horizontal"
-    return {"compression": compression, "predictor": predictor, "Q": _DEFAULT_QUALITY, "resunit": "inch"}
+    return {"compression": compression, "predictor": predictor, "Q": 95, "resunit": "inch"}
 
 
 def _with_exif(data: bytes, array: Stored, file_info: FileInfo) -> bytes:
@@ -134,7 +142,7 @@ def _with_exif(data: bytes, array: Stored, file_info: FileInfo) -> bytes:
     return metadata.with_tiff_exif(data, file_info.exif)
 
 
-def _encode_heic(array: Stored, file_info: FileInfo) -> bytes:
+def _encode_heic(array: Stored, file_info: FileInfo, quality: int) -> bytes:
     pillow_heif = library_of("heic")
     height, width, channels = array.shape
     mode = {1: "L", 2: "LA", 3: "RGB", 4: "RGBA"}[channels] + (";16" if file_info.bits > 8 else "")
@@ -147,7 +155,7 @@ def _encode_heic(array: Stored, file_info: FileInfo) -> bytes:
     file = io.BytesIO()
     heif.save(
         file,
-        quality=_DEFAULT_AVIF_QUALITY,
+        quality=quality,
         chroma=444,
         enc_params={"preset": "ultrafast"},  # 1/7 of the time of the default, with files that are 1/10 larger
         **{key: value for key, value in metadata_items.items() if value},

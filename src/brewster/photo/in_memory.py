@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal, Protocol, cast, get_args, runtime_checkable
+from typing import Any, Literal, Protocol, get_args, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -63,25 +63,10 @@ class PilImage(Protocol):
         """Returns a converted image."""
 
 
-def check_encoding(encoding: str | None) -> Encoding:
-    """Returns the encoding.
-
-    Raises:
-        PhotoError: the encoding is neither "srgb" nor "linear".
-    """
-    if encoding in get_args(Encoding):
-        return cast("Encoding", encoding)
-    raise PhotoError(
-        f"the encoding of the array is {encoding!r}",
-        'expected "srgb" or "linear", because an array has no metadata',
-        'pass encoding="srgb" or encoding="linear"',
-    )
-
-
-def decode_array(array: Stored, encoding: Encoding) -> Decoded:
+def decode_array(array: Stored, encoding: Encoding | None) -> Decoded:
     """Converts an array; see `Photo.from_array`."""
-    encoding = check_encoding(encoding)
     array = np.array(array)[..., None] if np.ndim(array) == 2 else np.array(array)
+    encoding = encoding or ("srgb" if array.dtype.kind == "u" else None)
     _check_array(array, encoding)
     decoded = split_alpha(array, FileInfo())
     pixels, alpha = decoded.pixels, decoded.alpha
@@ -98,12 +83,24 @@ def decode_array(array: Stored, encoding: Encoding) -> Decoded:
     )
 
 
-def _check_array(array: Stored, encoding: Encoding) -> None:
-    if array.ndim != 3 or array.shape[2] not in (1, 3, 4) or array.dtype.name not in WHITE_LEVELS:
+def _check_array(array: Stored, encoding: Encoding | None) -> None:
+    is_image = array.ndim == 3 and array.shape[2] in (1, 3, 4) and array.size > 0
+    if not is_image or array.dtype.name not in WHITE_LEVELS:
+        advice = "reshape or convert the array"
+        if array.ndim == 4:
+            advice = "pass the images one by one, for example with Separator.many"
+        elif not is_image and array.ndim == 3 and array.shape[0] in (1, 3, 4) and array.size > 0:
+            advice = "pass array.transpose(1, 2, 0)"
         raise UnsupportedPhoto(
             f"the array has the shape {array.shape} and the dtype {array.dtype}",
-            "expected (H, W) or (H, W, 1|3|4) of uint8, uint16 or float",
-            "reshape or convert the array",
+            "expected (H, W) or (H, W, 1|3|4) of uint8, uint16 or float, with at least one pixel",
+            advice,
+        )
+    if encoding not in get_args(Encoding):
+        raise PhotoError(
+            f"the encoding of the array of {array.dtype} is {encoding!r}",
+            'expected "srgb" or "linear"; only an array of uint8 or uint16 needs none, because it is sRGB-encoded by default',
+            'pass encoding="srgb" or encoding="linear"',
         )
     if not np.isfinite(array).all():
         raise UnsupportedPhoto(
@@ -111,7 +108,7 @@ def _check_array(array: Stored, encoding: Encoding) -> None:
             "expected finite values",
             "replace these values first",
         )
-    if array.dtype.kind != "f" or array.size == 0:
+    if array.dtype.kind != "f":
         return
     bounded = array if encoding == "srgb" else array[..., 3:]  # linear light has no limits; alpha has
     low, high = (float(bounded.min()), float(bounded.max())) if bounded.size else (0.0, 1.0)

@@ -27,7 +27,6 @@ from brewster.photo.in_memory import (
     Encoding,
     PilImage,
     WritableFile,
-    check_encoding,
     decode_array,
     decode_pil,
     pil_image,
@@ -75,7 +74,7 @@ class Photo:
         Args:
             source: a path, the URL of an object store such as s3://bucket/a.jpg, the bytes of a file, a file opened for
                 reading in binary mode, a numpy array, a PIL image, or a `Photo`.
-            encoding: the encoding of an array, "srgb" or "linear"; None for all other sources.
+            encoding: the encoding of an array, "srgb" or "linear" (see `from_array`); None for all other sources.
             max_pixels: photos with more pixels are refused before they are decoded.
 
         Raises:
@@ -84,14 +83,14 @@ class Photo:
                 the file is a video, by its suffix or by its content.
             PhotoTooLarge: the image has more pixels than `max_pixels`.
             MissingExtra: the reader of EXR, HEIC or RAW is not installed.
-            PhotoError: the encoding of an array is missing or unknown, or an encoding was passed for another source.
+            PhotoError: the encoding of an array is unknown, or missing for floats; or an encoding was passed for another source.
             BrewsterError: the URL cannot be read, for example because it is a web address; see `location`.
             TypeError: the source has an unsupported type, such as None, a list or a file in text mode.
         """
         if isinstance(source, np.ndarray):
             height, width = (*source.shape, 1, 1)[:2]
             check_pixel_count(width, height, max_pixels)
-            return cls.from_array(source, encoding=check_encoding(encoding))
+            return cls.from_array(source, encoding=encoding)
         if encoding is not None:
             raise PhotoError(
                 f"encoding={encoding!r} was passed with a {type(source).__name__}",
@@ -124,14 +123,15 @@ class Photo:
         return photo
 
     @classmethod
-    def from_array(cls, array: Stored, *, encoding: Encoding) -> Photo:
+    def from_array(cls, array: Stored, *, encoding: Encoding | None = None) -> Photo:
         """Creates a photo from an array (H, W) or (H, W, 1|3|4) of uint8, uint16 or floats; for floats, 1.0 is white.
 
-        sRGB-encoded integers are stored unchanged. All other values are stored as linear float32.
+        Integers are sRGB-encoded by default, as in most files; floats need an `encoding`. sRGB-encoded integers are stored
+        unchanged. All other values are stored as linear float32.
 
         Raises:
-            UnsupportedPhoto: the array has another shape or dtype, values that are not finite, sRGB-encoded floats or an
-                alpha channel outside 0..1.
+            UnsupportedPhoto: the array has another shape or dtype, no pixel, values that are not finite, sRGB-encoded floats
+                or an alpha channel outside 0..1.
             PhotoError: the encoding is neither "srgb" nor "linear".
         """
         decoded = decode_array(array, encoding)
@@ -275,27 +275,28 @@ class Photo:
             out[row] = _area_means(mean_row, width)
         return out
 
-    def encode(self, format_name: str | None = None, *, depth: int | None = None) -> bytes:
+    def encode(
+        self, format_name: str | None = None, *, depth: int | None = None, quality: int | None = None
+    ) -> bytes:
         """Returns the bytes of a file.
-
-        A JPEG has the quality and the chroma subsampling of the source.
 
         Args:
             format_name: a key of `image_formats.FORMATS` or one of its suffixes, such as "jpeg" or "jpg"; by default, the
                 format of the photo's file.
             depth: bits per channel (see `image_formats.FORMATS`); by default, the depth of the photo or, if the format does
                 not have it, the next smaller depth.
+            quality: 1..100, for JPEG, WebP, AVIF and HEIC. By default, a JPEG has the quality of the source and the other
+                formats have 95 (WebP) or 90. The chroma subsampling of a JPEG is that of the source.
 
         Raises:
-            UnsupportedPhoto: the format cannot store this photo, or cannot store it at this bit depth.
+            UnsupportedPhoto: the format cannot store this photo, cannot store it at this bit depth, or has no quality.
             MissingExtra: the writer of EXR or HEIC is not installed.
         """
         format_name = canonical_format(format_name) if format_name else self.file_info.format_name
         bits = depth_for(self.file_info, format_name, depth)
         stored = self.stored_as(format_name, bits)
-        return encode(
-            stored.pixels, stored.alpha, replace(stored.file_info, format_name=format_name, bits=bits)
-        )
+        file_info = replace(stored.file_info, format_name=format_name, bits=bits)
+        return encode(stored.pixels, stored.alpha, file_info, quality)
 
     def save(
         self,
@@ -303,6 +304,7 @@ class Photo:
         *,
         format: str | None = None,  # noqa: A002  (as in Pillow)
         depth: int | None = None,
+        quality: int | None = None,
         overwrite: bool = False,
     ) -> None:
         """Writes the photo to a path atomically, or to an open binary file such as an `io.BytesIO`.
@@ -312,17 +314,19 @@ class Photo:
             format: the format, such as "png" or "jpg"; by default, the format of the path's suffix or, for an open file, the format
                 of the photo's file.
             depth: bits per channel; see `encode`.
+            quality: 1..100, for lossy formats; see `encode`.
             overwrite: whether to replace an existing file.
 
         Raises:
             OutputError: the file exists and `overwrite` is False, or the file cannot be written.
-            UnsupportedPhoto: the format cannot store this photo, or cannot store it at this bit depth.
+            UnsupportedPhoto: the format cannot store this photo, cannot store it at this bit depth, or has no quality.
         """
         if isinstance(target, WritableFile):
-            target.write(self.encode(format, depth=depth))
+            target.write(self.encode(format, depth=depth, quality=quality))
             return
         path = Path(target)
-        write_atomically(path, self.encode(format or format_name_of(path), depth=depth), overwrite=overwrite)
+        data = self.encode(format or format_name_of(path), depth=depth, quality=quality)
+        write_atomically(path, data, overwrite=overwrite)
 
     def stored_as(self, format_name: str, bits: int) -> Photo:
         """Returns the photo with the dtype for a format and bit depth. The light changes only by rounding and clipping."""
@@ -381,7 +385,9 @@ def _read_source(source: object) -> bytes:
     if isinstance(data, bytes):
         return data
     mode = " in text mode" if isinstance(data, str) else ""
+    is_tensor = hasattr(source, "permute")
+    advice = "a tensor (C, H, W) as tensor.permute(1, 2, 0).cpu().numpy()" if is_tensor else "one of these"
     raise TypeError(
         f"the source of a photo is a {type(source).__name__}{mode}; expected a path, the bytes of a file, an open binary file, "
-        "a numpy array, a PIL image or a Photo; pass one of these"
+        f"a numpy array, a PIL image or a Photo; pass {advice}"
     )

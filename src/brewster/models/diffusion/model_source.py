@@ -7,15 +7,14 @@ source.base, source.backbone_class.name, source.task     # "Qwen/Qwen-Image-Edit
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, final
 
 from brewster.errors import DownloadError, ModelError
-from brewster.models.diffusion.adapter import windowseat
+from brewster.models.diffusion.adapter import lora, windowseat
 from brewster.models.diffusion.adapter.importer import PEFT_CONFIG_FILE
-from brewster.models.diffusion.adapter.layouts import LAYOUTS, LoraLayout, layout_of
 from brewster.models.diffusion.adapter.lora import LORA_FILE, LoraMetadata
 from brewster.models.diffusion.backbones.backbone import Backbone
 from brewster.models.diffusion.backbones.registry import (
@@ -32,11 +31,44 @@ from brewster.models.diffusion.hub_download import (
     list_root_files,
     resolve_model_folder,
 )
-from brewster.models.diffusion.prompt import PROMPT_FILE
+from brewster.models.diffusion.prompt import PROMPT_FILE, PromptEmbedding
 from brewster.models.diffusion.task import TASK_FILE, DecompositionTask, load_task, named_task
 from brewster.models.diffusion_models import DIFFUSION_MODELS, check_is_converted
 from brewster.models.zoo import TINY_PREFIX
 from brewster.options import Quantization
+
+
+@final
+@dataclass(frozen=True)
+class LoraLayout:
+    """A row of LAYOUTS."""
+
+    name: str
+    weights: str
+    """The file with the weights. A folder with this file has this layout."""
+    files: tuple[str, ...]
+    """All files to download."""
+    read_metadata: Callable[[Path], LoraMetadata]
+    """Reads the metadata of a folder. May raise ModelError."""
+    load: Callable[[Path, Backbone], tuple[LoraMetadata, PromptEmbedding]]
+    """Adds the LoRA of a folder to a backbone, and returns its metadata and prompt. May raise ModelError."""
+
+
+LAYOUTS: Final = (
+    LoraLayout(
+        "brewster", LORA_FILE, (LORA_FILE, PROMPT_FILE), lora.read_lora_metadata, lora.load_lora
+    ),
+    LoraLayout(
+        "windowseat", windowseat.WEIGHTS_FILE, windowseat.FILES, windowseat.read_metadata, windowseat.load
+    ),
+)  # fmt: skip
+"""The layouts of LoRA folders. To support another published layout, write a module and add a row."""
+
+
+def layout_of(folder: Path) -> LoraLayout | None:
+    """The layout of a folder, or None if it contains no LoRA."""
+    return next((layout for layout in LAYOUTS if (folder / layout.weights).is_file()), None)
+
 
 _FINGERPRINT_BYTES: Final = 1 << 20
 """The number of bytes at the start and at the end of a file that a digest reads."""

@@ -20,7 +20,7 @@ from torch import Tensor
 
 from brewster.errors import DownloadError, ModelError
 from brewster.models.diffusion.adapter.importer import find_lora_file, read_layers
-from brewster.models.diffusion.adapter.stacking import stack_layers
+from brewster.models.diffusion.adapter.lora import attach_layers
 from brewster.models.diffusion.backbones.backbone import Backbone
 from brewster.models.diffusion.backbones.loading import encode_prompt, load_backbone
 from brewster.models.diffusion.hub_download import find_weights_file
@@ -216,7 +216,7 @@ def load_pipeline(
         _, embedding = source.layout.load(source.folder, backbone)
     assert embedding is not None
     if few_step_layers:
-        stack_layers(backbone, few_step_layers)
+        attach_layers(backbone, few_step_layers, adapter="few_step")
     if placement.is_offloaded:
         offload_layers(backbone.transformer, backbone.vae, placement.device)
     task = task_with_options(

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import json
 import re
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from fnmatch import fnmatchcase
@@ -147,26 +148,32 @@ def add_lora(
     return lora_parameters(backbone)
 
 
-def attach_layers(backbone: Backbone, layers: Mapping[str, LowRankLayer]) -> None:
+def attach_layers(
+    backbone: Backbone, layers: Mapping[str, LowRankLayer], *, adapter: str = ADAPTER_NAME
+) -> None:
     """Adds a LoRA with these layers to a backbone for inference. Each layer has its own rank.
 
-    The weights are in the dtype in which the backbone computes, see `load_lora`.
+    A second LoRA, such as a few-step LoRA (Lightning, turbo), needs another name as `adapter`: both changes of the weights are
+    added. The weights are in the dtype in which the backbone computes, see `load_lora`.
 
     Raises:
-        ModelError: the backbone already has a LoRA, or a layer is not in it or has another shape.
+        ModelError: the backbone already has a LoRA of this name, or a layer is not in it or has another shape.
         MissingExtra: peft is not installed.
     """
-    _check_no_lora(backbone)
+    others = [*(getattr(backbone.transformer, "peft_config", None) or ())]
+    if adapter in others:
+        _check_no_lora(backbone)
     modules = dict(backbone.transformer.named_modules())
     for name, layer in layers.items():
         lora_formats.check_shape(name, layer, modules.get(name))
     peft = import_library("peft")
-    config = peft.LoraConfig(**_layer_settings(layers))
-    _add_adapter(backbone, config)
+    _add_adapter(backbone, peft.LoraConfig(**_layer_settings(layers)), adapter)
     _convert_for_inference(backbone)
     peft.set_peft_model_state_dict(
-        backbone.transformer, lora_formats.to_state_dict(layers), adapter_name=ADAPTER_NAME
+        backbone.transformer, lora_formats.to_state_dict(layers), adapter_name=adapter
     )
+    if others:
+        backbone.transformer.set_adapters([*others, adapter])
 
 
 def _check_no_lora(backbone: Backbone) -> None:
@@ -376,9 +383,11 @@ def _check_weights(expected: Mapping[str, Tensor], actual: Mapping[str, Tensor])
             )
 
 
-def _add_adapter(backbone: Backbone, config: Any) -> None:  # noqa: ANN401 - peft's configuration
+def _add_adapter(backbone: Backbone, config: Any, name: str = ADAPTER_NAME) -> None:  # noqa: ANN401 - peft's configuration
     """Adds a LoRA with random A matrices, float32. peft creates it in the dtype of the base, which may be bf16."""
-    backbone.transformer.add_adapter(config, adapter_name=ADAPTER_NAME)
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "Already found a `peft_config`")  # a second LoRA is intended
+        backbone.transformer.add_adapter(config, adapter_name=name)
     import_library("diffusers.training_utils").cast_training_params(backbone.transformer, torch.float32)
 
 

@@ -9,13 +9,13 @@ from brewster.errors import ModelError
 from brewster.models.diffusion.adapter.export import merge
 from brewster.models.diffusion.adapter.lora import (
     add_lora,
+    attach_layers,
     has_lora,
     lora_parameters,
     lora_state_dict,
     save_lora,
 )
 from brewster.models.diffusion.adapter.lora_formats import LowRankLayer, to_state_dict
-from brewster.models.diffusion.adapter.stacking import stack_layers
 from brewster.models.diffusion.backbones.qwen import Qwen
 from brewster.models.diffusion.backbones.registry import BACKBONES, tiny
 from brewster.models.diffusion.panels import PanelLayout
@@ -65,7 +65,7 @@ def test_a_stacked_lora_is_the_sum_of_both_changes(name):
     merge(merged, state, 4 / 2)
     merge(merged, to_state_dict(layers), 1.0)
     alone = velocity(stacked, prompt)
-    stack_layers(stacked, layers)
+    attach_layers(stacked, layers, adapter="few_step")
     torch.testing.assert_close(velocity(stacked, prompt), velocity(merged, prompt), atol=1e-5, rtol=0)
     assert (velocity(stacked, prompt) - alone).abs().max() > 1e-2
 
@@ -73,7 +73,7 @@ def test_a_stacked_lora_is_the_sum_of_both_changes(name):
 def test_without_another_lora_the_layers_are_the_lora():
     stacked, prompt = tiny("qwen")
     merged, _ = tiny("qwen")
-    stack_layers(stacked, few_step_layers("qwen"))
+    attach_layers(stacked, few_step_layers("qwen"), adapter="few_step")
     merge(merged, to_state_dict(few_step_layers("qwen")), 1.0)
     assert has_lora(stacked)
     torch.testing.assert_close(velocity(stacked, prompt), velocity(merged, prompt), atol=1e-5, rtol=0)
@@ -85,7 +85,7 @@ def test_a_lora_for_few_steps_is_an_option_with_its_steps_and_guidance(fast_file
     task = DecompositionTask(PanelLayout(("T",)), 48 * 32)
     save_lora(folder, backbone, prompt, task, base_model="tiny:klein", target_modules=["*.attn.*"])
     pipeline = load_pipeline(str(folder), fast_lora=str(fast_file))
-    stack_layers(backbone, few_step_layers("klein"))
+    attach_layers(backbone, few_step_layers("klein"), adapter="few_step")
     torch.testing.assert_close(
         velocity(pipeline.backbone, prompt), velocity(backbone, prompt), atol=1e-6, rtol=0
     )

@@ -1,0 +1,79 @@
+"""Harm to bright light: lamps and skies that turn grey, and whites that turn dark or coloured. For photos with a real ground truth.
+
+The pixels are those that are bright in the photo *and* in the ground truth, so that removing a bright reflection costs nothing.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from brewster.metrics.windows import Image, check_images
+
+MIN_CLIPPED: Final = 250
+MAX_LOST: Final = 240
+"""An 8-bit value of a channel is clipped from MIN_CLIPPED, and lost if the prediction is below MAX_LOST."""
+MIN_NEAR_WHITE: Final = 200
+"""A pixel is near white if all its 8-bit channels are above this value."""
+MIN_COUNT: Final = 64
+"""A score over fewer values is too noisy to report."""
+
+
+def lost_clipped(prediction: Image, truth: Image, photo: Image) -> float:
+    """Returns the share of the clipped channel values that the prediction loses.
+
+    The channels of a pixel are counted apart, because a coloured lamp clips in one or two of them.
+
+    Returns:
+        The share of the values of at least 250 in photo and truth that are below 240 in the prediction, 0..1; lower is better.
+
+    Raises:
+        ValueError: the images are not uint8 (H, W, 3) or differ in shape, or fewer than 64 values are clipped.
+    """
+    check_images(prediction, truth, photo)
+    is_clipped = np.minimum(photo, truth) >= MIN_CLIPPED
+    _check_count(int(is_clipped.sum()), f"channel values are at least {MIN_CLIPPED}")
+    return float((prediction[is_clipped] < MAX_LOST).mean())
+
+
+def lost_near_white(prediction: Image, truth: Image, photo: Image) -> float:
+    """Returns the mean of truth - prediction over the near-white pixels, in 8-bit levels.
+
+    Returns:
+        The mean over pixels and channels; 0 is best, and a negative value is a brighter prediction.
+
+    Raises:
+        ValueError: the images are not uint8 (H, W, 3) or differ in shape, or fewer than 64 pixels are above 200 in all channels
+            of photo and truth.
+    """
+    return float(_near_white_losses(prediction, truth, photo).mean())
+
+
+def near_white_cast(prediction: Image, truth: Image, photo: Image) -> float:
+    """Returns the colour cast of the near-white pixels, in 8-bit levels: the largest minus the smallest channel of their mean loss.
+
+    Returns:
+        A number of at least 0, which is best.
+
+    Raises:
+        ValueError: see `lost_near_white`.
+    """
+    return float(np.ptp(_near_white_losses(prediction, truth, photo)))
+
+
+def _near_white_losses(prediction: Image, truth: Image, photo: Image) -> NDArray[np.float64]:
+    """Returns the mean of truth - prediction of each channel."""
+    check_images(prediction, truth, photo)
+    is_near_white = (np.minimum(photo, truth) > MIN_NEAR_WHITE).all(axis=2)
+    _check_count(int(is_near_white.sum()), f"pixels are above {MIN_NEAR_WHITE} in all channels")
+    losses: NDArray[np.float64] = np.mean(
+        truth[is_near_white].astype(np.int16) - prediction[is_near_white], axis=0
+    )
+    return losses
+
+
+def _check_count(count: int, condition: str) -> None:
+    if count < MIN_COUNT:
+        raise ValueError(f"{count} {condition} of photo and truth; a score needs at least {MIN_COUNT}")
