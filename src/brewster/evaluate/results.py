@@ -11,7 +11,7 @@ import numpy as np
 import brewster
 from brewster.benchmarks.registry import Benchmark, Case
 from brewster.benchmarks.selection import PAPER_SEED, paper_subset
-from brewster.evaluate.config import DEFAULT_METRICS, EvaluationConfig
+from brewster.evaluate.config import DEFAULT_METRICS, PAPER_METRICS, EvaluationConfig
 from brewster.evaluate.methods import Method
 from brewster.evaluate.protocols import describe_protocol
 from brewster.evaluate.score_log import ScoreRow
@@ -88,7 +88,9 @@ def summarise(
         "unavailable": dict(unavailable or {}),
         "unmeasured": [
             name
-            for name in ([] if config.metrics == DEFAULT_METRICS else _unmeasured(config, measured))
+            for name in (
+                [] if config.metrics in (DEFAULT_METRICS, PAPER_METRICS) else _unmeasured(config, measured)
+            )
             if name not in (unavailable or {})
         ],
         "draw": {"seed": PAPER_SEED}
