@@ -1,12 +1,16 @@
 """The assessment of a separation: what was removed, where, how reliably, and the verdict."""
 
+from pathlib import Path
+from typing import get_args
+
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from brewster import Photo, Separator
-from brewster.inference.assessment import assess
+from brewster.inference.assessment import Verdict, assess
+from brewster.models.zoo import MODELS
 
 SIZE = (24, 32)
 
@@ -29,12 +33,12 @@ def test_half_of_the_light_removed_from_a_quarter_of_the_photo_is_measured():
     transmission = grey(0.4)
     transmission[:12, :16] = 0.2
     confidence = certain(0.9)
-    confidence[12:] = 0.0  # where nothing changed
+    confidence[12:] = 0.5  # where nothing changed
     found = assess(grey(0.4), transmission, confidence)
     assert found.removed_light == pytest.approx(1 / 8)
     assert found.changed_area == pytest.approx(1 / 4)
     assert found.confidence == pytest.approx(0.9)
-    assert found.verdict == "clear"
+    assert found.verdict == "partly removed"
 
 
 def test_light_that_was_added_is_not_removed_light():
@@ -47,14 +51,43 @@ def test_a_large_reconstruction_error_is_doubtful(error, is_doubtful):
     assert (verdict == "doubtful") == is_doubtful
 
 
-def test_less_confidence_never_gives_a_better_verdict():
-    order = ["clear", "partial", "doubtful"]
+@pytest.mark.parametrize("is_calibrated", [True, False])
+def test_less_confidence_never_gives_a_better_verdict(is_calibrated):
+    order = [name for name in get_args(Verdict) if name != "little found"]
     verdicts = [
-        assess(grey(0.4), grey(0.2), certain(value)).verdict for value in (1, 0.8, 0.6, 0.4, 0.2, 0.1)
+        assess(grey(0.4), grey(0.2), certain(value), is_calibrated=is_calibrated).verdict
+        for value in (1, 0.6, 0.3, 0.1, 0.05, 0.01, 0.003, 1e-5)
     ]
     ranks = [order.index(verdict) for verdict in verdicts]
     assert ranks == sorted(ranks)
-    assert {"clear", "doubtful"} <= set(verdicts)
+    assert set(verdicts) == set(order if is_calibrated else order[1:])
+
+
+@given(st.floats(0, 1), st.integers(0, 2**32 - 1))
+def test_an_uncalibrated_model_never_removes_a_reflection_and_has_else_the_same_verdict(confidence, seed):
+    photo, transmission = np.random.default_rng(seed).random((2, 8, 9, 3), np.float32)
+    confidence_map = np.full((8, 9, 1), confidence, np.float32)
+    calibrated, own = (
+        assess(photo, transmission, confidence_map, is_calibrated=value).verdict for value in (True, False)
+    )
+    assert own == ("partly removed" if calibrated == "removed" else calibrated)
+
+
+def test_only_a_shipped_model_is_calibrated(tmp_path):
+    shipped = MODELS["compact"].path
+    own = tmp_path / "own.onnx"
+    own.write_bytes(shipped.read_bytes())
+    photo = Path(__file__).parent / "pictures/mixture-chelsea-astronaut.jpg"
+    verdicts = [Separator.load(str(model))(photo).assessment.verdict for model in ("compact", own)]
+    assert verdicts == ["removed", "partly removed"]
+
+
+def test_a_model_without_confidence_has_partly_removed_a_reflection():
+    assert assess(grey(0.4), grey(0.2), certain(0), is_calibrated=True).verdict == "partly removed"
+
+
+def test_a_small_change_with_a_large_spread_leaves_the_reflection():
+    assert assess(grey(0.4), grey(0.36), certain(0.5)).verdict == "reflection remains"
 
 
 @given(st.integers(0, 2**32 - 1))
@@ -92,7 +125,7 @@ def test_a_mask_limits_the_removed_light_and_the_changed_area_to_its_white_part(
     removed = 1 - found.transmission.linear().sum() / photo.linear().sum()
     assert found.assessment.removed_light == pytest.approx(float(removed), abs=0.002)
     assert found.assessment.changed_area == pytest.approx(1 / 16)
-    assert found.assessment.verdict == halving_separator()(photo).assessment.verdict == "clear"
+    assert found.assessment.verdict == halving_separator()(photo).assessment.verdict == "partly removed"
 
 
 def test_with_a_black_mask_nothing_is_removed_and_the_verdict_says_so():

@@ -40,11 +40,11 @@ class InterruptedExecutor(SerialExecutor):
 
     remaining = 3
 
-    def wait(self):
+    def start(self, task):
         if self.remaining == 0:
             raise KeyboardInterrupt
         self.remaining -= 1
-        return super().wait()
+        return super().start(task)
 
 
 def test_existing_samples_are_skipped_and_nothing_changes(four_samples):
@@ -83,9 +83,9 @@ def test_shards_are_packed_as_they_become_complete_and_grow_with_the_dataset(tmp
     folders_at_submit = {}
 
     class RecordingExecutor(SerialExecutor):
-        def submit(self, task):
+        def start(self, task):
             folders_at_submit[task.kind, task.indices[0]] = sorted(path.name for path in out.glob("0*"))
-            super().submit(task)
+            return super().start(task)
 
     out = tmp_path / "set"
     render_set(out, count=7, shards=True, executor=RecordingExecutor)

@@ -43,6 +43,17 @@ def test_the_loss_of_a_reflection_is_scaled_by_its_weight():
     assert loss_of(reflection_error=0.1, weight=0.5)["reflection"] == pytest.approx(0.3 * 3 * 0.05, rel=1e-5)
 
 
+def test_the_weight_of_an_image_scales_only_its_own_reflection():
+    """A batch mixes samples with and without a known reflection."""
+    batch = make_batch()
+    batch = replace(batch, reflection_weight=torch.tensor([1.0, 0.0]))
+    wrong = batch.reflection_encoded.clone()
+    wrong[1] += 0.1
+    for reflection, expected in ((wrong, 0), (wrong.flip(0), 0.3 * 3 * 0.1 / 2)):
+        layers = torch.cat([batch.transmission_encoded, reflection], dim=1)
+        assert float(separation_loss(layers, batch)["reflection"]) == pytest.approx(expected, rel=1e-4)
+
+
 def test_fine_stripes_count_at_the_finest_scale_only_and_as_edges():
     stripes = torch.tensor([0.1, -0.1]).repeat(16)  # neighbours differ by 0.2, means of 4 and of 16 are 0
     for error in (stripes, stripes[:, None]):

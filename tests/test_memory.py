@@ -15,7 +15,7 @@ from brewster.errors import DeviceError, DownloadError, MissingExtra, ModelError
 from brewster.models.diffusion.backbones.loading import load_backbone
 from brewster.models.diffusion.backbones.registry import BACKBONES, tiny
 from brewster.models.diffusion.memory import check_machine, choose_placement, count_weights
-from brewster.models.diffusion_resources import Placement, place_on_gpu
+from brewster.models.diffusion_resources import Placement, WeightChoice, place_on_gpu
 from published_models import KLEIN_9B, write_klein_9b
 
 KONTEXT = BACKBONES["kontext"]
@@ -72,7 +72,9 @@ def test_a_large_base_needs_a_gpu_unless_the_cpu_is_chosen(machine, tmp_path):
 
 def place(name, memory_gib, free_gib=None, **options):
     weights = count_weights(name, BACKBONES[name])
-    placement = place_on_gpu(weights, free_gib=free_gib or memory_gib, total_gib=memory_gib, **options)
+    placement = place_on_gpu(
+        weights, WeightChoice(**options), free_gib=free_gib or memory_gib, total_gib=memory_gib
+    )
     return placement.quantization, placement.is_offloaded
 
 
@@ -124,9 +126,9 @@ def test_the_weights_are_offloaded_only_if_they_do_not_fit_or_on_request(monkeyp
 
 def test_on_a_cpu_nothing_is_quantized_by_default_and_nothing_is_offloaded():
     weights = count_weights("kontext", KONTEXT)
-    assert choose_placement(weights, requested="cpu", preferred="int8") == Placement("cpu")
+    assert choose_placement(weights, WeightChoice(preferred="int8"), "cpu") == Placement("cpu")
     with pytest.raises(DeviceError, match="layers was requested on the CPU; expected a GPU"):
-        choose_placement(weights, requested="cpu", offload="layers")
+        choose_placement(weights, WeightChoice(offload="layers"), "cpu")
 
 
 def test_an_offloaded_base_needs_host_memory_instead_of_gpu_memory(machine, monkeypatch):

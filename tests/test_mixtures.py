@@ -100,6 +100,17 @@ def test_a_veil_adds_uniform_light_relative_to_the_photos_mean(photos):
     assert veil.mean() > 0.03
 
 
+def test_a_veil_is_only_on_the_glass_of_a_partial_pane(photos):
+    changes = {"partial_probability": 1.0, "veil_probability": 1.0, "veil": (0.3, 0.3)}
+    batch = Mixtures(photos, [], NO_EFFECTS.model_copy(update=changes), seed=1)(0, 8, 64)
+    photo, transmission, reflection = map(
+        to_linear, (batch.photo_encoded, batch.transmission_encoded, batch.reflection_encoded)
+    )
+    outside = (reflection < 1e-4).all(dim=1, keepdim=True).expand_as(photo) & (photo < 0.95)
+    assert 0.02 < outside.float().mean() < 0.98
+    torch.testing.assert_close(photo[outside], transmission[outside], atol=0.02, rtol=0)
+
+
 def layers_of(photos, maps=(), **changes):
     """Returns photo, transmission and reflection of four samples, encoded. The random numbers do not depend on the changes."""
     batch = Mixtures(photos, list(maps), NO_EFFECTS.model_copy(update=changes), seed=1)(0, 4, 64)

@@ -18,7 +18,7 @@ from picture_files import CAMERA_NEUTRAL, dng_file, exif_block, file_of, mosaic,
 rawpy = pytest.importorskip("rawpy")
 pytestmark = pytest.mark.filterwarnings(
     "ignore:rawpy is being used in a process:RuntimeWarning"
-)  # bench/mutants.py
+)  # mutmut forks
 
 
 def developed(data, space):

@@ -5,6 +5,7 @@ import socket
 import subprocess
 import sys
 import threading
+from concurrent.futures import Future
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
@@ -12,10 +13,10 @@ from types import SimpleNamespace
 import pytest
 
 from brewster.errors import DeviceError, MissingExtra
-from brewster.executors import ray_cluster
+from brewster.executors import ray_cluster, run_tasks
 from brewster.rendered.generation.job import RenderTask
 from brewster.rendered.generation.workers import TaskRunner
-from set_folders import hashes, make_job, render_set, statuses
+from set_folders import hashes, render_set, statuses
 
 TESTS = Path(__file__).parent
 
@@ -75,10 +76,9 @@ def test_without_ray_the_error_has_the_command_that_installs_it(tmp_path, monkey
         render_set(tmp_path / "set", executor=ray_cluster.RayExecutor)
 
 
-def test_an_executor_does_not_import_ray_before_it_is_used(tmp_path):
+def test_an_executor_does_not_import_ray_before_it_is_used():
     code = "import sys, brewster.executors.ray_cluster; assert 'ray' not in sys.modules"
     subprocess.run([sys.executable, "-c", code], check=True)
-    assert not ray_cluster.RayExecutor(partial(TaskRunner, make_job(tmp_path))).is_busy()
 
 
 class UnpicklableError(Exception):
@@ -87,20 +87,27 @@ class UnpicklableError(Exception):
         self.cannot_be_pickled = threading.Lock()
 
 
-def executor_whose_task_raises(error):
-    """Returns an executor with a task of two items, whose result raises the error."""
-
-    def get(_task_id):
-        raise error
-
+def results_if(error):
+    """Runs a task of two items, whose future has the error at first."""
     executor = ray_cluster.RayExecutor(partial(TaskRunner, None))
     executor._ray = SimpleNamespace(
-        wait=lambda ids, num_returns: (ids, []), get=get, exceptions=pytest.importorskip("ray").exceptions
+        exceptions=pytest.importorskip("ray").exceptions, cluster_resources=lambda: {"CPU": 1}
     )
     executor._run_id = executor._create_runner_ref = None
-    executor._run_task = SimpleNamespace(remote=lambda *_: object())
-    executor._tasks = {"lost": RenderTask("render", (1, 2))}
-    return executor
+    started = []
+
+    def remote(_run, _runner, task):
+        started.append(task.indices)
+        future = Future()
+        if len(started) == 1:
+            future.set_exception(error)
+        else:
+            future.set_result([task.indices])
+        return SimpleNamespace(future=lambda: future)
+
+    executor._run_task = SimpleNamespace(remote=remote)
+    tasks = iter([RenderTask("render", (1, 2))])
+    return sorted(run_tasks(lambda: next(tasks, None), executor))
 
 
 @pytest.mark.parametrize(
@@ -110,7 +117,7 @@ def test_an_exception_of_the_runner_is_raised_with_the_traceback_of_the_worker(r
     errors = pytest.importorskip("ray").exceptions
     in_worker = errors.RayTaskError("run", "traceback of the worker", raised).as_instanceof_cause()
     with pytest.raises(type(raised)) as caught:
-        executor_whose_task_raises(in_worker).wait()
+        results_if(in_worker)
     assert caught.value is raised
     assert "traceback of the worker" in str(caught.value.__cause__)
 
@@ -119,32 +126,14 @@ def test_an_exception_of_the_runner_that_cannot_be_pickled_is_raised():
     errors = pytest.importorskip("ray").exceptions
     in_worker = errors.RayTaskError("run", "traceback of the worker", UnpicklableError())
     with pytest.raises(errors.RayError, match="UnpicklableError"):
-        executor_whose_task_raises(in_worker).wait()
+        results_if(in_worker)
 
 
 @pytest.mark.parametrize("are_arguments_lost", [False, True])
 def test_the_items_of_a_lost_task_are_tried_again_one_by_one(are_arguments_lost):
     errors = pytest.importorskip("ray").exceptions
     lost = errors.ObjectLostError("00", None, "") if are_arguments_lost else errors.WorkerCrashedError()
-    executor = executor_whose_task_raises(
-        errors.RayTaskError("run", "", lost) if are_arguments_lost else lost
-    )
-    assert executor.wait() == []
-    assert [task.indices for task in executor._tasks.values()] == [(1,), (2,)]
-
-
-def test_a_task_is_submitted_with_one_retry_less_than_its_attempts(monkeypatch):
-    """Ray counts retries, and the error message counts attempts."""
-    submitted = {}
-    ray = SimpleNamespace(
-        init=lambda *_, **__: None,
-        put=lambda value: value,
-        remote=lambda **options: submitted.update(options) or (lambda function: function),
-    )
-    monkeypatch.setattr(ray_cluster, "_ray", lambda: ray)
-    ray_cluster.RayExecutor(partial(TaskRunner, None), address="local").__enter__()
-    assert submitted["max_retries"] == ray_cluster.MAX_ATTEMPTS - 1
-    assert submitted["num_cpus"] == 1
+    assert results_if(errors.RayTaskError("run", "", lost) if are_arguments_lost else lost) == [(1,), (2,)]
 
 
 @pytest.mark.slow

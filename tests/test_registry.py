@@ -17,10 +17,10 @@ from benchmark_folders import (
 )
 from brewster.benchmarks import registry
 from brewster.benchmarks.image_files import ImageFile
-from brewster.benchmarks.pairing import natural_key
 from brewster.benchmarks.registry import BENCHMARKS, Benchmark, Case, read_benchmark
 from brewster.benchmarks.selection import PAPER_SEED, paper_subset, with_unique_names
 from brewster.errors import PhotoError, UnreadablePhoto
+from brewster.files import natural_key
 from brewster.photo import Photo
 from picture_files import exif_block, file_of, smooth
 from set_folders import render_set

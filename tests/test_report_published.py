@@ -57,7 +57,7 @@ def test_published_scores_have_a_heading_that_separates_them_from_measured_score
 
 
 def test_the_markdown_has_the_digits_that_the_paper_printed():
-    text = to_markdown(ROWS)
+    text = re.sub(" +", " ", to_markdown(ROWS))
     assert "| 26.60 / 0.934 / 0.072 |" in text
     assert "| 23.418 / 0.8881 / 0.1380 |" in text
     assert "| ERRNet | 22.9 |" in text
@@ -75,7 +75,7 @@ def test_a_missing_set_or_metric_is_a_dash():
             "b", "other paper", "Table 2", "twenty", {"real20": {"ssim": 0.8}, "nature20": {"psnr": 21.0}}
         ),
     ]
-    text = to_markdown(rows)
+    text = re.sub(" +", " ", to_markdown(rows))
     assert "| a | 20.5 / 0.9 | - |" in text
     assert "| b | - / 0.8 | 21.0 / - |" in text
     assert "- a: paper; copied from Table 1\n- b: other paper; copied from Table 2" in text

@@ -279,9 +279,10 @@ class Generating(Predictor):
 
 
 def test_the_generated_layers_of_a_photo_brighter_than_white_scale_with_its_light(rng):
-    light = rng.random((24, 32, 3), np.float32)
+    light = 0.5 * rng.random((24, 32, 3), np.float32)
+    light[:, :2] = 1  # a lamp, which stays as it is
     once, twice = (
         Separator(Generating())(Photo.from_array(scale * light, encoding="linear")) for scale in (2, 4)
     )
     np.testing.assert_allclose(twice.transmission.pixels, 2 * once.transmission.pixels, rtol=1e-5)
-    np.testing.assert_allclose(once.transmission.pixels.mean(), light.mean(), rtol=0.02)
+    np.testing.assert_allclose(once.transmission.pixels[:, 12:].mean(), light[:, 12:].mean(), rtol=0.02)

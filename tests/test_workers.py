@@ -1,6 +1,5 @@
 """Several processes render the same bytes as one process, even if workers die."""
 
-import concurrent.futures
 import os
 import signal
 import subprocess
@@ -12,7 +11,7 @@ import pytest
 import torch
 
 from brewster.errors import DeviceError, OutputError, RecipeError
-from brewster.executors import ProcessExecutor, SerialExecutor, local
+from brewster.executors import ProcessExecutor, local
 from brewster.rendered import store
 from brewster.rendered.generation import workers
 from brewster.rendered.generation.job import RenderTask
@@ -101,9 +100,9 @@ def test_a_fatal_error_in_a_worker_ends_the_run(tmp_path):
 def test_leaving_the_context_before_a_result_is_read_prints_no_traceback(tmp_path, capfd, is_finished):
     job = make_job(tmp_path, "slow")
     with ProcessExecutor(partial(TaskRunner, job), 1) as executor:
-        executor.submit(RenderTask("render", (0,)))
+        future = executor.start(RenderTask("render", (0,)))
         if is_finished:
-            concurrent.futures.wait(executor._busy)
+            future.result()
     assert (tmp_path / "000000").is_dir()
     assert capfd.readouterr().err == ""
 
@@ -151,4 +150,3 @@ def test_a_task_that_is_tried_again_renders_missing_samples_only(tmp_path):
     before = (tmp_path / "000000").stat().st_ino
     assert [result.status for result in runner(task)] == ["rendered", "rendered"]
     assert (tmp_path / "000000").stat().st_ino == before
-    assert not SerialExecutor(partial(workers.TaskRunner, job)).is_busy()

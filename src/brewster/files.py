@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import errno
 import os
+import re
 import secrets
 import shutil
 import sys
@@ -380,3 +381,9 @@ def _output_error(path: Location, error: OSError) -> OutputError:
 def cache_folder() -> Path:
     """Returns the folder for downloads. It is in the cache folder that the operating system defines for the user."""
     return platformdirs.user_cache_path("brewster", appauthor=False)
+
+
+def natural_key(name: str) -> tuple[list[str | int], str]:
+    """Returns the sort key for natural order: 2 before 10."""
+    pieces = re.split(r"(\d+)", name)
+    return [int(piece) if i % 2 else piece for i, piece in enumerate(pieces)], name

@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import Final, final
 
 from brewster.errors import PhotoError
+from brewster.files import natural_key
 from brewster.image_formats import SUFFIXES
 
 ROLES: Final[dict[str, tuple[str, ...]]] = {
@@ -78,12 +79,6 @@ class FolderListing:
     groups: tuple[ImageGroup, ...] = ()
     remarks: tuple[str, ...] = ()
     excluded: tuple[str, ...] = ()
-
-
-def natural_key(name: str) -> tuple[list[str | int], str]:
-    """Returns the sort key for natural order: 2 before 10."""
-    pieces = re.split(r"(\d+)", name)
-    return [int(piece) if i % 2 else piece for i, piece in enumerate(pieces)], name
 
 
 def list_folder(folder: Path) -> tuple[list[Path], list[Path]]:

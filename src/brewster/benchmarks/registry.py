@@ -29,11 +29,11 @@ from brewster.benchmarks.pairing import (
     find_split,
     find_subsets,
     join_names,
-    natural_key,
     read_folders,
     read_tree,
 )
 from brewster.errors import PhotoError
+from brewster.files import natural_key
 from brewster.photo import read_size
 
 _RENDERED_FILES: Final = ("photo.jpg", "background.jpg", "reflection.jpg")

@@ -10,9 +10,9 @@ from pathlib import Path
 from random import Random
 from typing import Final
 
-from brewster.benchmarks.pairing import natural_key
 from brewster.benchmarks.registry import BENCHMARKS, Benchmark, Case, safe_name
 from brewster.errors import PhotoError
+from brewster.files import natural_key
 
 PAPER_SEED: Final = 181
 """The seed of `paper_subset`. The value is arbitrary; 181 is also the number of images in the paper's average."""

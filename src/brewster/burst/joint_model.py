@@ -48,6 +48,7 @@ class Weights:
 
     transmission_gradients: float = 0.03
     reflection_gradients: float = 0.05
+    common_edges: float = 0.02
     prior: float = 0.02
     """The pull of the low frequencies of T to those of the single-photo result."""
 
@@ -155,11 +156,11 @@ class JointModel:
         rendered, _ = self.render(height, width, slice(self.reference, self.reference + 1))
         return rendered[:, :, 0]
 
-    def relative_motion(self, height: int, width: int) -> float:
-        """Returns the largest mean motion of R relative to T between two frames, as a share of the width, for one candidate."""
-        transmission, reflection = self.positions(height, width)[:, 0]
-        offsets = (reflection - transmission).mean((1, 2)) * torch.tensor([0.5, 0.5 * height / width])
-        return float(torch.cdist(offsets, offsets).max())
+    def relative_motion(self, height: int, width: int) -> Tensor:
+        """Returns the largest mean motion of R relative to T between two frames, as a share of the width, (C,)."""
+        transmission, reflection = self.positions(height, width)
+        offsets = (reflection - transmission).mean((2, 3)) * torch.tensor([0.5, 0.5 * height / width])
+        return torch.cdist(offsets, offsets).amax((1, 2))
 
     def confidence(self, frames: Tensor) -> Tensor:
         """Returns how well the frames agree with their prediction at each pixel of the reference frame, (C, 1, h, w) in 0..1.
@@ -280,6 +281,8 @@ def _penalties(model: JointModel, frames: Tensor, prior: Tensor, weights: Weight
         model.layers, (weights.transmission_gradients, weights.reflection_gradients), strict=True
     ):
         terms = terms + weight * sum(charbonnier(d).mean((1, 2, 3)) for d in _differences(layer))
+    if weights.common_edges:
+        terms = terms + weights.common_edges * _common_edges(*model.layers)
     if weights.prior:
         transmission = model.reference_layers(*frames.shape[-2:])[0]
         low = _low_pass(_encode(transmission)) - _low_pass(_encode(prior))
@@ -354,3 +357,15 @@ def _low_pass(images: Tensor) -> Tensor:
 
 def _differences(images: Tensor) -> tuple[Tensor, Tensor]:
     return images.diff(dim=-1), images.diff(dim=-2)
+
+
+def _common_edges(transmission: Tensor, reflection: Tensor) -> Tensor:
+    """Returns how much the edges of both layers (C, 3, H, W) coincide, at three scales (Zhang et al. 2018): (C,)."""
+    total = torch.zeros(len(transmission))
+    for _ in range(3):
+        for pair in zip(_differences(transmission), _differences(reflection), strict=True):
+            edges = [d.abs().mean(1) for d in pair]
+            limited = [torch.tanh(e / (2 * e.detach().mean((1, 2), keepdim=True) + 1e-4)) for e in edges]
+            total = total + (limited[0] * limited[1]).mean((1, 2)) / 6
+        transmission, reflection = (functional.avg_pool2d(image, 2) for image in (transmission, reflection))
+    return total

@@ -30,7 +30,7 @@ _MIN_MATCHES: Final = 12
 _MAX_MOTIONS: Final = 4
 _MIN_DIFFERENCE: Final = 0.007
 """Two motions of a frame are different if they differ by this share of the frame's width."""
-_SHIFTS: Final = (0.015, 0.045, 0.12)
+_SHIFTS: Final = (0.015, 0.045, 0.08)
 """Sideways shifts of the reflection at the end of the path, as shares of the width: a safety net for the other candidates."""
 _MIN_FRAMES_FOR_LARGE_SHIFTS: Final = 4
 """With fewer frames, a large shift leaves parts of the reflection in one frame only, where it explains everything."""
@@ -39,13 +39,15 @@ _MIN_FRAMES_FOR_LARGE_SHIFTS: Final = 4
 @final
 @dataclass(frozen=True)
 class MotionCandidate:
-    """A guess for the motion of both layers, and how it was found."""
+    """A guess for the motion of both layers."""
 
     name: str
+    family: str
+    """How it was found: candidates of one family compete first with each other."""
     transmission: Matrices
     reflection: Matrices
     is_locked: bool = False
-    """Whether both layers are one: the reflection keeps the motion of the transmission."""
+    """Whether both layers are one: the reflection keeps the motion of the transmission. The only one of its family."""
 
 
 Motions = list[tuple[Matrices, float]]
@@ -129,7 +131,9 @@ def motion_candidates(
         return inverse / inverse[:, 2:, 2:]
 
     return [
-        MotionCandidate(name, normalised(transmission), normalised(reflection), reflection is transmission)
+        MotionCandidate(
+            name, name.split()[0], normalised(transmission), normalised(reflection), name == ONE_LAYER
+        )
         for name, reflection in candidates.items()
     ]
 

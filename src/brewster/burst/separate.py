@@ -39,6 +39,9 @@ _MIN_MOTION_PX: Final = 10.0
 """The smallest relative motion that separates the layers, in pixels of a photo that is 1,000 pixels wide."""
 _MIN_EXPLAINED: Final = 0.2
 """The smallest share of the errors of one layer that a second motion must explain."""
+_LARGE_MOTION_PX: Final = 60.0
+_MIN_EXPLAINED_IF_LARGE: Final = 0.4
+"""A larger motion must explain more: the parts of a layer that only one frame shows explain everything there."""
 _USEFUL_MOTION_PX: Final = 16
 _DETAIL_LIMITS: Final = (0.5, 2.0)
 """The detail of the reference photo changes the sum of the layers by no more than these factors."""
@@ -76,26 +79,18 @@ def separate_burst(
     """
     reference = _checked_reference(len(photos), reference)
     started = time.perf_counter()
-    photo = Photo.open(photos[reference], max_pixels=max_pixels)
+    photo = _open(photos, reference, max_pixels)
     frames = _working_frames(photos, reference, photo, max_pixels)
     seconds = {"frames": time.perf_counter() - started}
     separator = separator or Separator.load()
     started = time.perf_counter()
     upsampler, _, single = separator.fit(photo, quality=quality, hints=hints)
     prior = _applied(upsampler.apply, frames[reference])
-    with single_torch_thread(), _single_opencv_thread():
-        motions = frame_motions(frames, reference, prior)
-        used = [k for k, found in enumerate(motions) if found]
-        solution = None
-        if len(used) > 1:
-            chosen, middle = [frames[k] for k in used], used.index(reference)
-            candidates = motion_candidates(chosen, middle, [motions[k] for k in used])
-            solution = solve(
-                chosen, middle, prior, candidates, on_progress=lambda done: on_progress(0.9 * done)
-            )
+    solution, left_out = measure_layers(
+        frames, reference, prior, on_progress=lambda done: on_progress(0.9 * done)
+    )
     seconds["motion"] = time.perf_counter() - started
-    left_out = tuple(k for k, found in enumerate(motions) if not found)
-    report = _report(solution, single.verdict == "little found", len(photos), left_out, reference)
+    report = burst_report(solution, single.verdict == "little found", len(photos), left_out, reference)
     chosen_separator = separator
     if solution and report.method == "burst":
         name = f"burst with {separator.name}"
@@ -116,6 +111,35 @@ def separate_burst(
     return replace(separation, burst=report, seconds=seconds | separation.seconds)
 
 
+def measure_layers(
+    frames: Sequence[Floats],
+    reference: int,
+    prior: Floats,
+    *,
+    on_progress: ProgressCallback = lambda _fraction: None,
+) -> tuple[Solution | None, tuple[int, ...]]:
+    """Measures the layers of the reference frame from the motion, with one thread.
+
+    Args:
+        frames: (h, w, 3) linear light in 0..1, of one size.
+        reference: the index of the reference frame.
+        prior: T of the reference frame from a single photo, (h, w, 3).
+        on_progress: called with the completed fraction, 0 to 1.
+
+    Returns:
+        The solution, or None if no other frame shows the scene of the reference frame; and the indices of the frames that do not.
+    """
+    with single_torch_thread(), _single_opencv_thread():
+        motions = frame_motions(frames, reference, prior)
+        used = [k for k, found in enumerate(motions) if found]
+        left_out = tuple(k for k, found in enumerate(motions) if not found)
+        if len(used) < 2:
+            return None, left_out
+        chosen, middle = [frames[k] for k in used], used.index(reference)
+        candidates = motion_candidates(chosen, middle, [motions[k] for k in used])
+        return solve(chosen, middle, prior, candidates, on_progress=on_progress), left_out
+
+
 def _checked_reference(count: int, reference: int | None) -> int:
     if not 2 <= count <= MAX_FRAMES:
         raise PhotoError(
@@ -133,13 +157,22 @@ def _checked_reference(count: int, reference: int | None) -> int:
     return reference
 
 
+def _open(photos: Sequence[Source], index: int, max_pixels: int) -> Photo:
+    """Opens a photo of the burst. An error names its number."""
+    try:
+        return Photo.open(photos[index], max_pixels=max_pixels)
+    except PhotoError as error:
+        happened = f"photo {index + 1} of the burst: {error.happened}"
+        raise type(error)(happened, error.expected, error.cure) from error
+
+
 def _working_frames(photos: Sequence[Source], reference: int, photo: Photo, max_pixels: int) -> list[Floats]:
     """Returns the photos at the working size, in linear light of 0..1. One photo at a time is in memory at full size."""
     scale = min(1.0, _WORKING_PX / max(photo.size))
     width, height = (max(8, round(length * scale)) for length in photo.size)
     frames = []
-    for k, source in enumerate(photos):
-        frame = photo if k == reference else Photo.open(source, max_pixels=max_pixels)
+    for k in range(len(photos)):
+        frame = photo if k == reference else _open(photos, k, max_pixels)
         if frame.size != photo.size:
             raise PhotoError(
                 f"photo {k + 1} of the burst has {frame.size[0]} x {frame.size[1]} pixels",
@@ -158,7 +191,7 @@ def _applied(apply: Callable[[Floats, int, int], tuple[Floats, Floats]], frame: 
     return prior
 
 
-def _report(
+def burst_report(
     solution: Solution | None, is_clear: bool, count: int, left_out: tuple[int, ...], reference: int
 ) -> BurstReport:
     """Decides whether the motion separates the layers. `is_clear`: the model found little reflection in the reference photo."""
@@ -166,16 +199,17 @@ def _report(
     explained = (
         max(0.0, 1 - solution.two_layer_error / (solution.one_layer_error + 1e-9)) if solution else 0.0
     )
+    needed = _MIN_EXPLAINED if motion < _LARGE_MOTION_PX else _MIN_EXPLAINED_IF_LARGE
     method: Literal["burst", "single photo", "unchanged"] = "single photo"
     advice = "Move the camera 5 to 10 cm sideways between the photos."
     if solution is None:
         message = "No other photo shows the same scene as the reference photo."
-    elif explained >= _MIN_EXPLAINED and motion >= _MIN_MOTION_PX:
+    elif explained >= needed and motion >= _MIN_MOTION_PX:
         method, message = "burst", f"The layers moved {motion:.0f} px apart in a photo of 1,000 px."
     elif is_clear:
         method = "unchanged"
         message = "One layer explains all photos, and no reflection was found in the reference photo."
-    elif explained < _MIN_EXPLAINED:
+    elif explained < needed:
         message = f"No relative motion of two layers was found. {advice}"
     else:
         message = f"The layers moved {motion:.0f} px apart; about {_USEFUL_MOTION_PX} are needed. {advice}"

@@ -27,19 +27,20 @@ class Level:
     steps: int
     spline_size: tuple[int, int] | None
     """Rows and columns of the splines; None: the motion is a homography."""
-    kept: int
-    """The number of candidates that are optimised at this level, besides the one with locked layers."""
 
 
 COMPARED_PX: Final = 160
 """The size at which the best candidate is compared with one layer; larger frames are optimised for the best candidate only."""
+_MAX_RELATIVE_MOTION: Final = 0.2
+"""As a share of the width. With a larger motion, the reflection becomes an offset of each frame, and explains all but edges."""
+_MOTION_SAMPLES: Final = (9, 12)
 _MAX_ENLARGEMENT: Final = 1.3
 """Levels that would enlarge the frames by more than this factor are left out."""
 LEVELS: Final = (
-    Level(80, 60, None, 99),
-    Level(COMPARED_PX, 90, (4, 6), 3),
-    Level(320, 70, (6, 8), 1),
-    Level(640, 35, (8, 12), 1),
+    Level(80, 60, None),
+    Level(COMPARED_PX, 90, (4, 6)),
+    Level(320, 70, (6, 8)),
+    Level(640, 35, (8, 12)),
 )
 
 
@@ -60,7 +61,7 @@ class Solution:
     two_layer_error: float
     """The same for the best candidate."""
     losses: dict[str, float]
-    """The loss of each candidate, by name, at the last level that optimised it. The last one is the best."""
+    """The loss of each candidate, by name, at the last level that optimised it."""
 
 
 def solve(
@@ -97,7 +98,11 @@ def solve(
         if model is None:
             model = JointModel.start(small, torch.from_numpy(motions).float(), is_locked, reference)
         else:
-            kept = _best(model, level.kept, with_locked=level.long_side_px <= COMPARED_PX)
+            kept = (
+                _best_of_families(model, candidates)
+                if index == 1
+                else _best(model, with_locked=level.long_side_px <= COMPARED_PX)
+            )
             model, names = model.selected(kept), [names[i] for i in kept]
             model = model.resized(small, level.spline_size)
         rates = Rates().scaled(min(1.0, 80 / level.long_side_px)) if index else Rates(splines=0)
@@ -114,27 +119,45 @@ def solve(
         if level.long_side_px <= COMPARED_PX:
             errors = _errors(model)
     assert model
-    model = model.selected(_best(model, 1, with_locked=False))
+    model = model.selected(_best(model, with_locked=False))
     with torch.no_grad():
         layers = model.reference_layers(*small.shape[-2:])[:, 0]
         confidence = model.confidence(small)[0]
-        motion = model.relative_motion(*small.shape[-2:])
+        motion = float(model.relative_motion(*small.shape[-2:]))
     transmission, reflection, confidence = (layer.movedim(0, -1).numpy() for layer in (*layers, confidence))
     return Solution(transmission, reflection, confidence, motion, *errors, losses)
 
 
-def _best(model: JointModel, count: int, *, with_locked: bool) -> list[int]:
-    """Returns the indices of the candidates with the smallest losses, and of the locked ones."""
-    locked = model.is_locked.tolist()
-    free = sorted(
-        (i for i, is_locked in enumerate(locked) if not is_locked), key=model.losses.tolist().__getitem__
-    )
-    return free[:count] + [i for i, is_locked in enumerate(locked) if is_locked and with_locked]
+def _best_of_families(model: JointModel, candidates: Sequence[MotionCandidate]) -> list[int]:
+    """Returns the index of the best candidate of each family.
+
+    On very small frames, a wrong motion may be better than a true motion of a pixel. Therefore none of the families is left out.
+    """
+    families: dict[str, list[int]] = {}
+    for i, candidate in enumerate(candidates):
+        families.setdefault(candidate.family, []).append(i)
+    losses = _selection_losses(model)
+    return [min(family, key=losses.__getitem__) for family in families.values()]
+
+
+def _best(model: JointModel, *, with_locked: bool) -> list[int]:
+    """Returns the index of the best candidate with two layers, and that of the locked one."""
+    locked, losses = model.is_locked.tolist(), _selection_losses(model)
+    best = min((i for i, is_locked in enumerate(locked) if not is_locked), key=losses.__getitem__)
+    return [best, locked.index(True)] if with_locked else [best]
+
+
+def _selection_losses(model: JointModel) -> list[float]:
+    """Returns the losses, larger by 1 for implausible motions."""
+    with torch.no_grad():
+        is_implausible = model.relative_motion(*_MOTION_SAMPLES) > _MAX_RELATIVE_MOTION
+    losses: list[float] = (model.losses + is_implausible).tolist()
+    return losses
 
 
 def _errors(model: JointModel) -> tuple[float, float]:
     """Returns the data losses of the locked candidate and of the best other one."""
-    (best,), (locked,) = _best(model, 1, with_locked=False), _best(model, 0, with_locked=True)
+    best, locked = _best(model, with_locked=True)
     return float(model.data_losses[locked]), float(model.data_losses[best])
 
 

@@ -77,14 +77,11 @@ def _read_folders(
 def _read_asset(path: Path, category: str, is_map: bool) -> Asset:
     data = read_bytes(path)
     with add_file_name_to_errors(str(path)):
-        width, height = _map_size(data, str(path)) if is_map else read_size(data)
+        width, height = (
+            check_map(Photo.open(data).linear(), str(path)).shape[1::-1] if is_map else read_size(data)
+        )
     source = AssetSource(file=path.name, sha256=hashlib.sha256(data).hexdigest())
     return Asset(source=source, width=width, height=height, category=category)
-
-
-def _map_size(data: bytes, name: str) -> tuple[int, int]:
-    height, width = check_map(Photo.open(data).linear(), name).shape[:2]
-    return width, height
 
 
 def _list_files(folder: Path, are_maps: bool) -> Iterator[Path]:

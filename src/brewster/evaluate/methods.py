@@ -27,6 +27,7 @@ from brewster.inference import Separator
 from brewster.models.zoo import find_model, is_diffusion_model
 from brewster.options import Device, Quality
 from brewster.photo import Photo
+from brewster.remote_path import read_image
 
 BASELINE: Final = "input (unprocessed)"
 PREDICTION_FORMAT_VERSION: Final = 2
@@ -178,7 +179,7 @@ class ModelMethod:
         files = self.files(case)
         if not all(path.is_file() for path in files.values()):
             return None
-        return MethodOutput.decode({layer: _read(path) for layer, path in files.items()})
+        return MethodOutput.decode({layer: read_image(path) for layer, path in files.items()})
 
     @cached_property
     def _sha256(self) -> str:
@@ -251,7 +252,7 @@ class PredictionFolder:
         return MethodOutput.decode(self._last_read.pop(case, {}) or self._read(case))
 
     def _read(self, case: Case) -> dict[str, bytes]:
-        return {layer: _read(path) for layer, path in self.files(case).items()}
+        return {layer: read_image(path) for layer, path in self.files(case).items()}
 
     def files(self, case: Case) -> dict[str, Path]:
         """Returns layer -> file for a case: the transmission and, if there is one, the reflection.
@@ -353,17 +354,6 @@ def _is_image(path: Path) -> bool:
 def _normalised(path: Path) -> Path:
     """Returns the path in Unicode form NFC. Some file systems store an accented letter as two characters."""
     return Path(unicodedata.normalize("NFC", str(path)))
-
-
-def _read(path: Path) -> bytes:
-    try:
-        return path.read_bytes()
-    except OSError as error:
-        raise PhotoError(
-            f"{path} cannot be read ({error.strerror or error})",
-            "expected a readable image file",
-            "make the file readable and run again",
-        ) from error
 
 
 def _digest(data: Iterable[bytes]) -> str:

@@ -62,10 +62,10 @@ def summarise(
     ]
     subsets = paper_subsets(benchmarks) if config.paper_subset else []
     tables = [[selection] for selection in (*full, *subsets)]
-    averaged = _average_selections(
-        [selection for selection in full if selection.key in PAPER_COUNTS] if config.paper_subset else full,
-        subsets,
-    )
+    # the average is over the subset of each benchmark, or over the whole benchmark if it has no subset
+    subset_of = {subset.key.partition(":")[0]: subset for subset in subsets}
+    whole = [selection for selection in full if not config.paper_subset or selection.key in PAPER_COUNTS]
+    averaged = [subset_of.get(selection.key, selection) for selection in whole] if len(whole) > 1 else []
     selections = {group[0].key: group for group in tables} | ({AVERAGE: averaged} if averaged else {})
     series = [(method, column) for method in method_names for column in columns]
     directions = {name: metric.higher_is_better for name, metric in columns.items()}
@@ -83,15 +83,20 @@ def summarise(
         },
         "metrics": {name: metric.to_dict() for name, metric in columns.items()},
         "benchmarks": {benchmark.name: _describe_benchmark(benchmark) for benchmark in benchmarks},
-        "selections": {key: _describe_selection(key, group) for key, group in selections.items()},
+        "selections": {
+            key: {
+                "title": "Average" if key == AVERAGE else group[0].title,
+                "cases": sum(len(selection.cases) for selection in group),
+            }
+            for key, group in selections.items()
+        },
         "methods": {method.name: method.about() for method in methods},
         "unavailable": dict(unavailable or {}),
         "unmeasured": [
             name
-            for name in (
-                [] if config.metrics in (DEFAULT_METRICS, PAPER_METRICS) else _unmeasured(config, measured)
-            )
-            if name not in (unavailable or {})
+            for name in config.columns()  # no case has the ground truth that they need
+            if config.metrics not in (DEFAULT_METRICS, PAPER_METRICS)
+            and name not in {*measured, *(unavailable or {})}
         ],
         "draw": {"seed": PAPER_SEED}
         | {subset.key: [case.name for case in subset.cases] for subset in subsets},
@@ -103,17 +108,12 @@ def summarise(
         "tables": {key: _table(strata[key], series) for key in selections},
         "differences": {
             key: [
-                _describe_difference(difference)
-                for difference in differences(strata[key], series, directions)
+                _rounded(row.pop("estimate") | row)
+                for row in map(asdict, differences(strata[key], series, directions))
             ]
             for key in selections
         },
     }
-
-
-def _unmeasured(config: EvaluationConfig, measured: set[str]) -> list[str]:
-    """Returns the requested metrics without a score: no case has the ground truth that they need."""
-    return [name for name in config.columns() if name not in measured]
 
 
 def paper_subsets(benchmarks: Sequence[Benchmark]) -> list[Selection]:
@@ -128,20 +128,6 @@ def paper_subsets(benchmarks: Sequence[Benchmark]) -> list[Selection]:
         for benchmark, cases in subsets
         if len(cases) < len(benchmark.cases)
     ]
-
-
-def _average_selections(full: Sequence[Selection], subsets: Sequence[Selection]) -> list[Selection]:
-    """Returns the selections of the average: the subset of each benchmark, or the whole benchmark if it has no subset.
-
-    The list is empty if there is only one benchmark.
-    """
-    subset_of = {subset.key.partition(":")[0]: subset for subset in subsets}
-    return [subset_of.get(whole.key, whole) for whole in full] if len(full) > 1 else []
-
-
-def _describe_selection(key: str, group: Sequence[Selection]) -> dict[str, Any]:
-    image_count = sum(len(selection.cases) for selection in group)
-    return {"title": "Average" if key == AVERAGE else group[0].title, "cases": image_count}
 
 
 def _choices(config: EvaluationConfig, averaged: Sequence[Selection]) -> list[str]:
@@ -163,17 +149,12 @@ def _stratum(
     selection: Selection, series: Sequence[tuple[str, str]], rows: Mapping[tuple[str, str, str], ScoreRow]
 ) -> Stratum:
     values = [
-        [_score(rows[case.benchmark, case.name, method], column) for method, column in series]
+        [rows[case.benchmark, case.name, method].scores.get(column) for method, column in series]
         for case in selection.cases
     ]
     shape = len(selection.cases), len(series)
     scenes = [case.scene for case in selection.cases]
-    return Stratum(selection.key, scenes, np.array(values, float).reshape(shape))
-
-
-def _score(row: ScoreRow, column: str) -> float:
-    score = row.scores.get(column)
-    return float("nan") if score is None else score
+    return Stratum(selection.key, scenes, np.array(values, float).reshape(shape))  # None becomes NaN
 
 
 def _table(strata: Sequence[Stratum], series: Sequence[tuple[str, str]]) -> dict[str, dict[str, Any]]:
@@ -182,11 +163,6 @@ def _table(strata: Sequence[Stratum], series: Sequence[tuple[str, str]]) -> dict
         if mean:
             table[method][column] = _rounded(asdict(mean))
     return table
-
-
-def _describe_difference(difference: Any) -> dict[str, Any]:  # noqa: ANN401  (a Difference)
-    row = asdict(difference)
-    return _rounded(row.pop("estimate") | row)
 
 
 def _rounded(row: dict[str, Any]) -> dict[str, Any]:

@@ -13,8 +13,8 @@ from __future__ import annotations
 import hashlib
 import json
 import signal
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import Future, ProcessPoolExecutor, as_completed
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import asdict, dataclass, replace
 from multiprocessing import get_context
@@ -352,15 +352,12 @@ def _run_tasks(
         ) from error
     except KeyboardInterrupt:
         pool.shutdown(cancel_futures=True)
-        for rows in _finished(futures):
-            on_rows(rows)
+        for future in futures:
+            if not future.cancelled() and not future.exception():
+                on_rows(future.result())
         raise
     finally:
         pool.shutdown(cancel_futures=True)
-
-
-def _finished(futures: set[Future[list[ScoreRow]]]) -> Iterator[list[ScoreRow]]:
-    return (future.result() for future in futures if not future.cancelled() and not future.exception())
 
 
 _worker_state: list[_WorkerState] = []  # empty, or with one element in a worker process

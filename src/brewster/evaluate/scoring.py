@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, Final, TypeVar, cast, final
@@ -154,9 +154,7 @@ class Scorer:
         }
         all_columns = self._config.columns()
         return {
-            column: _round_or_none(
-                lambda column=column: self._compute(column, all_columns[column], comparisons)  # type: ignore[misc]
-            )
+            column: self._compute(column, all_columns[column], comparisons)
             for column in (all_columns if columns is None else columns)
             if self._applies(all_columns[column], comparisons)
         }
@@ -168,11 +166,14 @@ class Scorer:
             else metric.ground_truth in comparisons
         )
 
-    def _compute(self, column: str, metric: Metric, comparisons: Mapping[str, Comparison]) -> float:
+    def _compute(self, column: str, metric: Metric, comparisons: Mapping[str, Comparison]) -> float | None:
         comparison = comparisons["transmission" if metric.ground_truth == "rendered" else metric.ground_truth]
         if metric.area == "region":
             comparison = replace(comparison, region=self._region(self._config.threshold(column)))
-        return metric.score(comparison)
+        try:
+            return round(metric.score(comparison), _DIGITS)
+        except ValueError:  # the score is undefined
+            return None
 
     def _inside(self, image: _Array) -> _Array:
         """The part of an image or region that is scored. It has no pixels if the border covers the image."""
@@ -184,14 +185,6 @@ class Scorer:
         if threshold not in self._regions:
             self._regions[threshold] = self._inside(self._truth.region(threshold))
         return self._regions[threshold]
-
-
-def _round_or_none(score: Callable[[], float]) -> float | None:
-    """Returns the rounded score. Metrics raise ValueError if a score is undefined; the result is then None."""
-    try:
-        return round(score(), _DIGITS)
-    except ValueError:
-        return None
 
 
 def _check_size(name: str, photo: Photo, size: tuple[int, int], suggestion: str) -> None:

@@ -17,6 +17,7 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import AbstractContextManager, contextmanager
+from functools import partial
 from multiprocessing import active_children, get_context, parent_process, resource_tracker
 from multiprocessing.process import BaseProcess
 from types import TracebackType
@@ -43,7 +44,7 @@ Runner = Callable[[Any], list[ResultT]]
 
 
 class Executor(AbstractContextManager[Any], Protocol[ResultT]):
-    """Runs a limited number of tasks at a time.
+    """Starts tasks. `run_tasks` waits for them, and starts those again whose worker was lost.
 
     If the context is left with an error, the running tasks are stopped. Otherwise, the exit may wait for them, and their
     results are lost.
@@ -51,21 +52,20 @@ class Executor(AbstractContextManager[Any], Protocol[ResultT]):
 
     chunk_size: int
     """Number of items per task."""
+    attempts: int
+    """How often `run_tasks` starts a task whose worker is lost."""
 
-    def has_capacity(self) -> bool:
-        """Whether another task can be submitted now."""
+    def capacity(self) -> int:
+        """The number of tasks that may run now."""
 
-    def is_busy(self) -> bool:
-        """Whether any task is running."""
+    def start(self, task: Task[ResultT]) -> Future[list[ResultT]]:
+        """Starts a task, and returns its results."""
 
-    def submit(self, task: Task[ResultT]) -> None:
-        """Starts a task."""
-
-    def wait(self) -> Sequence[ResultT]:
-        """Waits until a task ends. Returns the results of finished tasks. The list is empty if a task is tried again.
+    def lost_reason(self, error: Exception) -> str:
+        """Returns how the worker was lost whose future has this exception.
 
         Raises:
-            BrewsterError: raised by the runner.
+            Exception: the exception that the runner raised; no worker was lost.
         """
 
 
@@ -74,66 +74,67 @@ def run_tasks(
 ) -> Iterator[ResultT]:
     """Runs tasks until there are no more, and yields their results in the order in which the tasks end.
 
+    If a task is lost in all its attempts, each of its items is a task of its own, because one item may be the cause.
+
     Args:
         next_task: returns the next task, or None if there is no task before the next result.
-        executor: runs the tasks; its context is entered by the caller.
+        executor: starts the tasks; its context is entered by the caller.
 
     Raises:
         BrewsterError: raised by the runner.
     """
+    running: dict[Future[list[ResultT]], tuple[Task[ResultT], int]] = {}
     while True:
-        task = next_task() if executor.has_capacity() else None
-        if task:
-            executor.submit(task)
-        elif executor.is_busy():
-            yield from executor.wait()
-        else:
+        while len(running) < executor.capacity() and (task := next_task()):
+            running[executor.start(task)] = task, 1
+        if not running:
             return
-
-
-# --- this process
+        for future in wait(running, return_when=FIRST_COMPLETED).done:
+            task, attempt = running.pop(future)
+            try:
+                results = future.result()
+            except Exception as error:  # noqa: BLE001  (raised again if no worker was lost)
+                reason, results = executor.lost_reason(error), []
+                parts = [task] if attempt < executor.attempts else task.split()
+                if attempt < executor.attempts or len(parts) > 1:
+                    running |= {
+                        executor.start(part): (part, attempt % executor.attempts + 1) for part in parts
+                    }
+                else:
+                    results = task.failed_results(reason)
+            yield from results
 
 
 @final
 class SerialExecutor(Generic[ResultT]):
     """Runs tasks in this process, one at a time."""
 
-    chunk_size = 1
+    chunk_size = attempts = 1
 
     def __init__(self, create_runner: Callable[[], Runner[ResultT]]) -> None:
         self._create_runner = create_runner
         self._runner: Runner[ResultT] | None = None
-        self._task: Task[ResultT] | None = None
 
-    def has_capacity(self) -> bool:
-        """Whether no task is stored."""
-        return self._task is None
+    def capacity(self) -> int:
+        """One task."""
+        return 1
 
-    def is_busy(self) -> bool:
-        """Whether a task is stored."""
-        return self._task is not None
-
-    def submit(self, task: Task[ResultT]) -> None:
-        """Stores the task. `wait` runs it."""
-        self._task = task
-
-    def wait(self) -> list[ResultT]:
-        """Runs the stored task. Returns its results."""
-        task, self._task = self._task, None
+    def start(self, task: Task[ResultT]) -> Future[list[ResultT]]:
+        """Runs a task. Its exceptions are raised at once."""
         self._runner = self._runner or self._create_runner()
-        return self._runner(task) if task else []
+        future: Future[list[ResultT]] = Future()
+        future.set_result(self._runner(task))
+        return future
+
+    def lost_reason(self, error: Exception) -> str:
+        """Raises the exception: there is no worker."""
+        raise error
 
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        """Discards the stored task."""
-        self._task = None
-
-
-# --- several processes
+    def __exit__(self, *_: object) -> None:
+        """Does nothing."""
 
 
 @final
@@ -146,55 +147,48 @@ class ProcessExecutor(Generic[ResultT]):
     chunk_size = 1
 
     def __init__(self, create_runner: Callable[[], Runner[ResultT]], worker_count: int) -> None:
+        self.attempts = MAX_ATTEMPTS
         self._create_runner, self._worker_count = create_runner, worker_count
         self._processes: dict[ProcessPoolExecutor, BaseProcess] = {}
         self._idle: list[ProcessPoolExecutor] = []
-        self._busy: dict[Future[list[ResultT]], tuple[ProcessPoolExecutor, Task[ResultT], int]] = {}
+        self._broken: list[ProcessPoolExecutor] = []
 
-    def has_capacity(self) -> bool:
-        """Whether a worker is idle or can be started."""
-        return len(self._busy) < self._worker_count
+    def capacity(self) -> int:
+        """One task for each worker."""
+        return self._worker_count
 
-    def is_busy(self) -> bool:
-        """Whether any worker has a task."""
-        return bool(self._busy)
-
-    def submit(self, task: Task[ResultT]) -> None:
-        """Sends the task to a worker."""
-        self._assign(task, 1)
-
-    def wait(self) -> list[ResultT]:
-        """Returns the results of the next finished task. The list is empty if a worker has died and its task is tried again."""
-        future = next(iter(wait(self._busy, return_when=FIRST_COMPLETED).done))
-        pool, task, attempt = self._busy.pop(future)
-        try:
-            results = future.result()
-        except BrokenProcessPool:
-            exit_code = self._processes.pop(pool).exitcode
-            if attempt < MAX_ATTEMPTS:
-                self._assign(task, attempt + 1)
-                return []
-            return task.failed_results(f"the worker died {MAX_ATTEMPTS} times (exit code {exit_code})")
-        self._idle.append(pool)
-        return results
-
-    def _assign(self, task: Task[ResultT], attempt: int) -> None:
+    def start(self, task: Task[ResultT]) -> Future[list[ResultT]]:
+        """Sends the task to an idle worker, or to a new one."""
         others = active_children()
         with _interrupts_blocked():  # the first task starts the process
-            pool = self._idle.pop() if self._idle else self._new_pool()
+            pool = (
+                self._idle.pop()
+                if self._idle
+                else ProcessPoolExecutor(1, get_context("spawn"), _start_worker)
+            )
             try:
                 future = pool.submit(_run_task, self._create_runner, task)
             except BrokenProcessPool:  # the process died while it was idle
                 self._processes.pop(pool)
-                pool = self._new_pool()
-                future = pool.submit(_run_task, self._create_runner, task)
+                return self.start(task)
         for process in active_children():
             if process not in others:
                 self._processes[pool] = process
-        self._busy[future] = (pool, task, attempt)
+        future.add_done_callback(partial(self._release, pool))
+        return future
 
-    def _new_pool(self) -> ProcessPoolExecutor:
-        return ProcessPoolExecutor(1, get_context("spawn"), _start_worker)
+    def _release(self, pool: ProcessPoolExecutor, future: Future[list[ResultT]]) -> None:
+        """Called in a thread of the pool when its task ends."""
+        is_broken = isinstance(future.exception(), BrokenProcessPool)
+        (self._broken if is_broken else self._idle).append(pool)
+
+    def lost_reason(self, error: Exception) -> str:
+        """Returns the exit code of the worker that died."""
+        if not isinstance(error, BrokenProcessPool):
+            raise error
+        pool = self._broken.pop()
+        pool.shutdown()
+        return f"the worker died {self.attempts} times (exit code {self._processes.pop(pool).exitcode})"
 
     def __enter__(self) -> Self:
         return self
@@ -212,7 +206,6 @@ class ProcessExecutor(Generic[ResultT]):
             pool.shutdown()
         self._processes.clear()
         self._idle.clear()
-        self._busy.clear()
 
 
 @contextmanager

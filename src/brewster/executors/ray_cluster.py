@@ -7,6 +7,7 @@ import os
 import secrets
 import socket
 from collections.abc import Callable
+from concurrent.futures import Future
 from types import ModuleType, TracebackType
 from typing import Any, Final, Generic, Self, final
 
@@ -27,6 +28,8 @@ class RayExecutor(Generic[ResultT]):
     """
 
     chunk_size = 4
+    attempts = 1
+    """Ray itself tries a task several times."""
 
     def __init__(
         self,
@@ -35,48 +38,34 @@ class RayExecutor(Generic[ResultT]):
         worker_count: int | None = None,
     ) -> None:
         self._create_runner, self._address, self._worker_count = create_runner, address, worker_count
-        self._tasks: dict[Any, Task[ResultT]] = {}
 
-    def has_capacity(self) -> bool:
-        """Whether more tasks can be submitted. The limit depends on the current number of nodes."""
+    def capacity(self) -> int:
+        """Two tasks for each processor of the current nodes."""
         processors = int(self._ray.cluster_resources().get("CPU", 1))
-        return len(self._tasks) < _TASKS_PER_CPU * max(1, processors)
+        return _TASKS_PER_CPU * max(1, processors)
 
-    def is_busy(self) -> bool:
-        """Whether any task is running."""
-        return bool(self._tasks)
-
-    def submit(self, task: Task[ResultT]) -> None:
+    def start(self, task: Task[ResultT]) -> Future[list[ResultT]]:
         """Sends a task to the cluster."""
-        self._tasks[self._run_task.remote(self._run_id, self._create_runner_ref, task)] = task
+        future: Future[list[ResultT]] = self._run_task.remote(
+            self._run_id, self._create_runner_ref, task
+        ).future()
+        return future
 
-    def wait(self) -> list[ResultT]:
-        """Returns the results of the next finished task. The list is empty if the task was lost and is tried again.
+    def lost_reason(self, error: Exception) -> str:
+        """Returns how the process or the node was lost.
 
         Raises:
             Exception: raised by the runner; its cause is Ray's error with the traceback of the worker.
         """
-        (done, *_), _ = self._ray.wait(list(self._tasks), num_returns=1)
-        task, ray_error = self._tasks.pop(done), self._ray.exceptions.RayError
-        try:
-            results: list[ResultT] = self._ray.get(done)
-        except ray_error as error:
-            cause = getattr(error, "cause", None)  # the exception that a task has raised
-            # A subclass of RayError is not from the runner: the arguments of the task were lost with a node, for example.
-            # RayError itself replaces an exception of the runner that cannot be pickled.
-            if cause is None or (isinstance(cause, ray_error) and type(cause) is not ray_error):
-                return self._handle_lost_task(task, type(error).__name__)
-            raise cause from error
-        return results
-
-    def _handle_lost_task(self, task: Task[ResultT], reason: str) -> list[ResultT]:
-        """Submits each item of a lost task as a separate task, because one item may be the cause."""
-        parts = task.split()
-        if len(parts) == 1:
-            return task.failed_results(f"the process or the node was lost {MAX_ATTEMPTS} times ({reason})")
-        for part in parts:
-            self.submit(part)
-        return []
+        ray_error = self._ray.exceptions.RayError
+        if not isinstance(error, ray_error):
+            raise error
+        cause = getattr(error, "cause", None)  # the exception that a task has raised
+        # A subclass of RayError is not from the runner: the arguments of the task were lost with a node, for example.
+        # RayError itself replaces an exception of the runner that cannot be pickled.
+        if cause is None or (isinstance(cause, ray_error) and type(cause) is not ray_error):
+            return f"the process or the node was lost {MAX_ATTEMPTS} times ({type(error).__name__})"
+        raise cause from error
 
     def __enter__(self) -> Self:
         """Connects to the cluster, or starts a cluster on this machine if the address is "local".
@@ -107,7 +96,6 @@ class RayExecutor(Generic[ResultT]):
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         """Disconnects from the cluster, which ends the running tasks."""
-        self._tasks.clear()
         self._ray.shutdown()
 
 

@@ -12,15 +12,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brewster.inference.guided_upsampling import Floats
+from brewster.inference.predictor import SPREAD_AT_1_E
 from brewster.srgb import to_encoded
 
 if TYPE_CHECKING:
     from jaxtyping import Float32
 
-Verdict = Literal["clear", "partial", "little found", "doubtful"]
-"""clear: a reflection was found and removed with high confidence. partial: a reflection was found, and parts of it probably
-remain; also if the model does not estimate its confidence. little found: the prediction differs little from the photo. doubtful: the
-result may be worse than the photo."""
+Verdict = Literal["removed", "partly removed", "reflection remains", "little found", "doubtful"]
+"""What the user sees, in the order of the measured gain. removed: the outputs of the model agree about a large change; only for a
+calibrated model. partly removed: a part of the reflection remains; also the best verdict of an uncalibrated model, and that of a model
+that does not estimate its confidence. reflection remains: the outputs differ about as much as they change; most of the reflection
+remains, as sharp reflections do. little found: the prediction differs little from the photo. doubtful: the result may be worse than
+the photo."""
 
 RECONSTRUCTION_ERROR_LIMIT: Final = 0.06
 """A separation with a larger reconstruction error is doubtful. The value is chosen, not measured: about three times the
@@ -29,8 +32,14 @@ _VISIBLE_CHANGE: Final = 0.03
 """The smallest change of a pixel that counts as visible, sRGB-encoded."""
 _MIN_FOUND_AREA: Final = 0.1
 """If the prediction changes a smaller share of the separated pixels visibly, the verdict is "little found"."""
-_MIN_CLEAR_CONFIDENCE: Final = 0.6
-_MIN_PARTIAL_CONFIDENCE: Final = 0.2
+_AGREEMENTS: Final[tuple[tuple[float, Verdict], ...]] = (
+    (3.0, "removed"),
+    (1.5, "partly removed"),
+    (0.7, "reflection remains"),
+)
+"""The smallest agreement of each verdict: the mean change divided by the mean spread of the outputs. bench/verdict.py fits them."""
+_UNKNOWN_CONFIDENCE: Final = 1e-6
+"""Lower confidences count as this one, so that the spread is finite."""
 
 
 @final
@@ -57,6 +66,8 @@ def assess(
     confidence_map: Float32[NDArray[np.float32], "h w 1"],
     reconstruction_error: float | None = None,
     strength: Float32[NDArray[np.float32], "h w 1"] | float = 1.0,
+    *,
+    is_calibrated: bool = False,
 ) -> Assessment:
     """Assesses a separation.
 
@@ -66,6 +77,7 @@ def assess(
         confidence_map: the confidence of the prediction, 0..1.
         reconstruction_error: mean of |generated input - input|, sRGB-encoded, or None if the model does not generate the input.
         strength: the strength of the separation, 0..1, the same for all pixels or, with a mask, one for each pixel.
+        is_calibrated: whether the verdicts were fitted to the model. Otherwise the verdict is never "removed".
     """
     written = photo + np.float32(strength) * (transmission - photo)
     light = float(photo.sum(dtype=np.float64))
@@ -79,7 +91,17 @@ def assess(
     if not is_separated.any():
         return Assessment("little found", removed_light, changed_area, confidence)
     found_area = float((change[is_separated] > _VISIBLE_CHANGE).mean())
-    verdict = _verdict(found_area, confidence, reconstruction_error)
+    if reconstruction_error is not None and reconstruction_error > RECONSTRUCTION_ERROR_LIMIT:
+        verdict: Verdict = "doubtful"
+    elif found_area < _MIN_FOUND_AREA:
+        verdict = "little found"
+    elif not confidence:  # the model does not estimate its confidence
+        verdict = "partly removed"
+    else:
+        spread = spread_from_confidence(confidence_map[..., 0])[is_separated].sum(dtype=np.float64)
+        verdict = next((name for limit, name in _AGREEMENTS if total >= limit * spread), "doubtful")
+    if verdict == "removed" and not is_calibrated:
+        verdict = "partly removed"
     return Assessment(verdict, removed_light, changed_area, confidence)
 
 
@@ -90,12 +112,9 @@ def encoded_change(photo: Floats, transmission: Floats) -> Floats:
     return change
 
 
-def _verdict(found_area: float, confidence: float, reconstruction_error: float | None) -> Verdict:
-    if reconstruction_error is not None and reconstruction_error > RECONSTRUCTION_ERROR_LIMIT:
-        return "doubtful"
-    if found_area < _MIN_FOUND_AREA:
-        return "little found"
-    if confidence >= _MIN_CLEAR_CONFIDENCE:
-        return "clear"
-    is_unknown = confidence == 0  # the model does not estimate its confidence
-    return "partial" if is_unknown or confidence >= _MIN_PARTIAL_CONFIDENCE else "doubtful"
+def spread_from_confidence(confidence: Floats) -> Floats:
+    """Returns the spread of the outputs, sRGB-encoded: the inverse of `confidence_from_spread`."""
+    spread: Floats = -np.float32(SPREAD_AT_1_E) * np.log(
+        np.maximum(confidence, np.float32(_UNKNOWN_CONFIDENCE))
+    )
+    return spread

@@ -41,7 +41,7 @@ _MAX_ENLARGEMENT: Final = 3.0
 """Maximum factor of this enlargement."""
 _TILE_PX: Final = 1024
 _OVERLAP_PX: Final = 192
-_SPREAD_AT_1_E: Final = 0.05
+SPREAD_AT_1_E: Final = 0.05
 """The spread of outputs (maximum - minimum), in sRGB-encoded units, at which the confidence is 1/e."""
 
 
@@ -177,5 +177,5 @@ def checked_layers(outputs: object, tile: Floats) -> tuple[Floats, Floats]:
 
 def confidence_from_spread(spread: Float32[Floats, "h w 3"]) -> Float32[Floats, "h w 1"]:
     """Returns exp(-s / 0.05), where s is the largest spread of the three channels. `spread` is sRGB-encoded."""
-    confidence: Floats = np.exp(-spread.max(axis=2, keepdims=True) / np.float32(_SPREAD_AT_1_E))
+    confidence: Floats = np.exp(-spread.max(axis=2, keepdims=True) / np.float32(SPREAD_AT_1_E))
     return confidence

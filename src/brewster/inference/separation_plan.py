@@ -12,6 +12,7 @@ from __future__ import annotations
 import importlib.util
 from collections import Counter
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Final, final
 
@@ -29,6 +30,7 @@ from brewster.models.diffusion_resources import (
     BackboneCost,
     GraphicsCard,
     Placement,
+    WeightChoice,
     check_gpu_memory,
     cost_table,
     has_bitsandbytes,
@@ -55,7 +57,7 @@ class SeparationPlan:
     """
 
     model: str
-    licence: str
+    hub_id: str
     card: GraphicsCard
     cost: BackboneCost
     weights: int
@@ -65,10 +67,9 @@ class SeparationPlan:
     passes: int
     tflop: float
     activation_gib: float
-    download_gb: float
-    text_encoder_gb: float
     text_encoder_gib: float
-    is_single_file: bool = False
+    is_local: bool
+    is_single_file: bool
 
     @property
     def memory_gib(self) -> dict[str, float]:
@@ -79,6 +80,25 @@ class SeparationPlan:
             "activations": self.activation_gib,
             "CUDA": _CONTEXT_GIB,
         }
+
+    @cached_property
+    def is_downloaded(self) -> bool:
+        """Whether nothing is downloaded: a tiny version, a folder, or a base in the cache."""
+        has_hub = importlib.util.find_spec("huggingface_hub") is not None
+        return self.is_local or (has_hub and is_transformer_cached(self.hub_id))
+
+    @property
+    def text_encoder_gb(self) -> float:
+        """The download of the text encoders."""
+        return 0.0 if self.is_downloaded else self.text_encoder_gib * GIB / 1e9
+
+    @property
+    def download_gb(self) -> float:
+        """The size of all downloads."""
+        if self.is_downloaded:
+            return 0.0
+        transformer = 0 if self.is_single_file else self.cost.parameters
+        return 2e-9 * (self.cost.vae_parameters + transformer) + self.text_encoder_gb
 
     @property
     def host_gib(self) -> float:
@@ -110,7 +130,7 @@ class SeparationPlan:
         return cost_table(
             {
                 "model": f"{self.model}, {self.cost.parameters / 1e9:.2f} billion parameters",
-                "licence": self.licence,
+                "licence": licence_of(self.hub_id),
                 "weights": f"{self.placement}{without_nf4}",
                 "tiles": f"{tiles} pixels a panel; {self.passes} passes of the transformer",
             },
@@ -153,7 +173,7 @@ class SeparationPlan:
 @final
 @dataclass(frozen=True)
 class _Model:
-    """What a plan needs of a model. `is_local` is whether nothing is downloaded."""
+    """What a plan needs of a model. `is_local` is whether it is a folder or a tiny version."""
 
     hub_id: str
     task: DecompositionTask
@@ -182,17 +202,9 @@ def plan_separation(options: Options, size: tuple[int, int], card: GraphicsCard)
     panels = work.panel_sizes(size)
     file = _local_file(options.transformer) if options.transformer else None
     weights = file.stat().st_size // 2 if file else cost.parameters
+    choice = WeightChoice(options.quantization, model.quantization, options.offload, file is not None)
     placement, with_nf4 = (
-        place_on_gpu(
-            weights,
-            free_gib=card.memory_gib,
-            total_gib=card.memory_gib,
-            quantization=options.quantization,
-            preferred=model.quantization,
-            offload=options.offload,
-            is_single_file=file is not None,
-            has_nf4=has_nf4,
-        )
+        place_on_gpu(weights, choice, free_gib=card.memory_gib, total_gib=card.memory_gib, has_nf4=has_nf4)
         for has_nf4 in (None, True)
     )
     # A few-step LoRA is trained without classifier-free guidance.
@@ -210,10 +222,9 @@ def plan_separation(options: Options, size: tuple[int, int], card: GraphicsCard)
     ]
     pixels = (1 if is_direct else len(task.layout.panels)) * max(width * height for width, height in panels)
     encoders_gib = weights_gib(cost.text_encoder_parameters, None) if model.needs_text_encoders else 0.0
-    encoders_gb = 0.0 if model.is_local else encoders_gib * GIB / 1e9
     return SeparationPlan(
         options.model,
-        licence_of(model.hub_id),
+        model.hub_id,
         card,
         cost,
         weights,
@@ -223,11 +234,8 @@ def plan_separation(options: Options, size: tuple[int, int], card: GraphicsCard)
         passes * len(panels),
         passes * sum(map(cost.forward_tflop, tokens)),
         max(cost.block_bytes(max(tokens)), pixels * DECODING_BYTES_PER_PIXEL) / GIB,
-        0.0
-        if model.is_local
-        else 2e-9 * (cost.vae_parameters + (0 if file else cost.parameters)) + encoders_gb,
-        encoders_gb,
         encoders_gib,
+        model.is_local,
         file is not None,
     )
 
@@ -251,7 +259,7 @@ def _find_model(options: Options) -> _Model:
             cost.tiny() if is_tiny else cost,
             row.quantization,
             not row.has_prompt and not is_tiny,
-            is_tiny or _is_cached(hub_id),
+            is_tiny,
         )
     from brewster.models.diffusion.backbones.registry import hub_id_of  # noqa: PLC0415  (imports torch)
     from brewster.models.diffusion.memory import backbone_cost  # noqa: PLC0415
@@ -265,12 +273,8 @@ def _find_model(options: Options) -> _Model:
         backbone_cost(source.base, source.backbone_class),
         source.trained_quantization,
         source.needs_text_encoders,
-        is_tiny or Path(source.base).is_dir() or _is_cached(hub_id),
+        is_tiny or Path(source.base).is_dir(),
     )
-
-
-def _is_cached(hub_id: str) -> bool:
-    return importlib.util.find_spec("huggingface_hub") is not None and is_transformer_cached(hub_id)
 
 
 def _local_file(transformer: str) -> Path:

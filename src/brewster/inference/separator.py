@@ -58,6 +58,8 @@ class Separator:
         name: the name of the model, for `Separation.model`.
         sha256: the digest of the model file, for `Separation.sha256`.
         device: the device that runs the model, for `Separation.device`.
+        is_calibrated: whether the verdicts were fitted to this model (bench/verdict.py), as for the shipped models. The verdict
+            of another model is never "removed".
     """
 
     def __init__(
@@ -67,6 +69,7 @@ class Separator:
         name: str = "custom",
         sha256: str | None = None,
         device: str = "cpu",
+        is_calibrated: bool = False,
     ) -> None:
         if not callable(model):
             raise TypeError(
@@ -76,6 +79,7 @@ class Separator:
         self._predictor = model if isinstance(model, Predictor) else MultiScalePredictor(model)
         self.name, self.sha256, self.device = name, sha256, device
         self.takes_hints = self._predictor.takes_hints
+        self._is_calibrated = is_calibrated
 
     def __repr__(self) -> str:
         """Returns `Separator(compact, cpu)`."""
@@ -122,7 +126,10 @@ class Separator:
         model_file = find_model(model)
         digest = model_file.verify()
         backend = OnnxBackend(model_file.path, device)
-        return cls(backend, name=model_file.name, sha256=digest, device=backend.device)
+        is_shipped = model_file.sha256 is not None
+        return cls(
+            backend, name=model_file.name, sha256=digest, device=backend.device, is_calibrated=is_shipped
+        )
 
     @classmethod
     def _load_diffusion_model(cls, model: str, device: str, options: dict[str, Any]) -> Separator:
@@ -252,7 +259,7 @@ class Separator:
             prediction.confidence_map,
             residual,
             prediction.reconstruction_error,
-            _assess(inputs[-1], prediction, strength, weights),
+            self._assess(inputs[-1], prediction, strength, weights),
             self.name,
             self.sha256,
             self.device,
@@ -290,7 +297,24 @@ class Separator:
         images = self._with_hints(inputs, photo, hints)
         prediction = keep_clipped_light(inputs[-1], self._predictor(images, quality, on_progress))
         upsampler = _fit_upsampler(inputs[-1], prediction, Options.strength, white)
-        return upsampler, prediction, _assess(inputs[-1], prediction)
+        return upsampler, prediction, self._assess(inputs[-1], prediction)
+
+    def _assess(
+        self,
+        largest_input: Floats,
+        prediction: Prediction,
+        strength: float = Options.strength,
+        mask: Mask | None = None,
+    ) -> Assessment:
+        height, width, _ = largest_input.shape
+        return assess(
+            largest_input,
+            np.clip(largest_input + prediction.change, 0, 1),
+            prediction.confidence_map,
+            prediction.reconstruction_error,
+            float(strength) if mask is None else np.float32(strength) * mask.sampled(width, height),
+            is_calibrated=self._is_calibrated,
+        )
 
     def _inputs(self, photo: Photo, quality: Quality) -> tuple[list[Floats], np.float32]:
         """Returns the inputs of the model in 0..1, smallest first, and the white level by which they are divided."""
@@ -341,22 +365,6 @@ def separate(
     call = {name: load_options.pop(name) for name in _CALL_OPTIONS if name in load_options}
     separator = Separator.load(model, **load_options)
     return separator(source, mask=mask, hints=hints, encoding=encoding, **call)
-
-
-def _assess(
-    largest_input: Floats,
-    prediction: Prediction,
-    strength: float = Options.strength,
-    mask: Mask | None = None,
-) -> Assessment:
-    height, width, _ = largest_input.shape
-    return assess(
-        largest_input,
-        np.clip(largest_input + prediction.change, 0, 1),
-        prediction.confidence_map,
-        prediction.reconstruction_error,
-        float(strength) if mask is None else np.float32(strength) * mask.sampled(width, height),
-    )
 
 
 def _fit_upsampler(

@@ -18,6 +18,7 @@ from __future__ import annotations
 import difflib
 import functools
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Final
 
 import numpy as np
@@ -179,6 +180,37 @@ _GAIN: Final = (
     " is no reflection."
 )
 
+_PSNR_ROW: Final = Metric("psnr", "PSNR", "dB", True, 2, f"{_PSNR} of all pixels.", "transmission", _psnr)
+_SSIM_ROW: Final = Metric("ssim", "SSIM", "", True, 3, f"Mean local SSIM, {_UNIFORM}.", "transmission", _ssim)
+_LPIPS_ROW: Final = Metric(
+    "lpips",
+    "LPIPS",
+    "",
+    False,
+    3,
+    f"{_LPIPS}, each layer averaged over its map.",
+    "transmission",
+    _lpips,
+    prepare=Lpips.load,
+)
+_RMSE_ROW: Final = Metric(
+    "linear_rmse", "RMSE (linear light)", "", False, 4, f"{_LINEAR}.", "transmission", _linear_rmse
+)
+
+
+def _in_region(metric: Metric, definition: str) -> Metric:
+    name, title = f"{metric.name}_region", f"{metric.title} in region"
+    return replace(metric, name=name, title=title, definition=f"{definition} {_REGION}.", area="region")
+
+
+def _of_reflection(metric: Metric, title: str) -> Metric:
+    return replace(metric, name=f"{metric.name}_reflection", title=title, ground_truth="reflection")
+
+
+def _on_rendered(name: str, title: str, definition: str, score: Callable[..., float]) -> Metric:
+    return Metric(name, title, "", False, 3, f"{definition} {_GAIN}", "rendered", _rendered_score(score))
+
+
 _NEAR_WHITE: Final = "of the pixels above 200 in all channels of photo and ground truth, in 8-bit levels"
 _BRIGHT_ROWS: Final = (
     ("lost_clipped", "Lost clipped light", 3, "Share of the 8-bit channel values of at least 250 in photo and ground truth that are below 240 in the prediction.", lost_clipped),
@@ -187,8 +219,8 @@ _BRIGHT_ROWS: Final = (
 )  # fmt: skip
 
 _ROWS: Final = (
-    Metric("psnr", "PSNR", "dB", True, 2, f"{_PSNR} of all pixels.", "transmission", _psnr),
-    Metric("ssim", "SSIM", "", True, 3, f"Mean local SSIM, {_UNIFORM}.", "transmission", _ssim),
+    _PSNR_ROW,
+    _SSIM_ROW,
     Metric(
         "ssim_gaussian",
         "SSIM (Gaussian)",
@@ -200,61 +232,11 @@ _ROWS: Final = (
         "transmission",
         _ssim_gaussian,
     ),
-    Metric(
-        "lpips",
-        "LPIPS",
-        "",
-        False,
-        3,
-        f"{_LPIPS}, each layer averaged over its map.",
-        "transmission",
-        _lpips,
-        prepare=Lpips.load,
-    ),
-    Metric(
-        "psnr_region",
-        "PSNR in region",
-        "dB",
-        True,
-        2,
-        f"{_PSNR} of {_REGION}.",
-        "transmission",
-        _psnr,
-        "region",
-    ),
-    Metric(
-        "ssim_region",
-        "SSIM in region",
-        "",
-        True,
-        3,
-        f"Mean local SSIM, {_UNIFORM}, over {_REGION}.",
-        "transmission",
-        _ssim,
-        "region",
-    ),
-    Metric(
-        "lpips_region",
-        "LPIPS in region",
-        "",
-        False,
-        3,
-        f"{_LPIPS}, each layer's map enlarged to the image (bilinear), averaged over {_REGION}.",
-        "transmission",
-        _lpips,
-        "region",
-        prepare=Lpips.load,
-    ),
-    Metric(
-        "linear_rmse",
-        "RMSE (linear light)",
-        "",
-        False,
-        4,
-        f"{_LINEAR}.",
-        "transmission",
-        _linear_rmse,
-    ),
+    _LPIPS_ROW,
+    _in_region(_PSNR_ROW, f"{_PSNR} of"),
+    _in_region(_SSIM_ROW, f"Mean local SSIM, {_UNIFORM}, over"),
+    _in_region(_LPIPS_ROW, f"{_LPIPS}, each layer's map enlarged to the image (bilinear), averaged over"),
+    _RMSE_ROW,
     Metric(
         "niqe",
         "NIQE",
@@ -291,62 +273,29 @@ _ROWS: Final = (
         Metric(name, title, "", False, digits, definition, "transmission", _bright_score(score))
         for name, title, digits, definition, score in _BRIGHT_ROWS
     ),
-    Metric("psnr_reflection", "PSNR of R", "dB", True, 2, f"{_PSNR} of all pixels.", "reflection", _psnr),
-    Metric("ssim_reflection", "SSIM of R", "", True, 3, f"Mean local SSIM, {_UNIFORM}.", "reflection", _ssim),
-    Metric(
-        "lpips_reflection",
-        "LPIPS of R",
-        "",
-        False,
-        3,
-        f"{_LPIPS}, each layer averaged over its map.",
-        "reflection",
-        _lpips,
-        prepare=Lpips.load,
-    ),
-    Metric(
-        "linear_rmse_reflection",
-        "RMSE of R (linear light)",
-        "",
-        False,
-        4,
-        f"{_LINEAR}.",
-        "reflection",
-        _linear_rmse,
-    ),
-    Metric(
+    _of_reflection(_PSNR_ROW, "PSNR of R"),
+    _of_reflection(_SSIM_ROW, "SSIM of R"),
+    _of_reflection(_LPIPS_ROW, "LPIPS of R"),
+    _of_reflection(_RMSE_ROW, "RMSE of R (linear light)"),
+    _on_rendered(
         "removed_content",
         "Removed content",
-        "",
-        False,
-        3,
-        "Fraction of the background's light that the prediction lacks where the reflection is below 2 % of the photo."
-        f" {_GAIN}",
-        "rendered",
-        _rendered_score(removed_content),
+        "Fraction of the background's light that the prediction lacks where the reflection is below 2 % of the photo.",
+        removed_content,
     ),
-    Metric(
+    _on_rendered(
         "removed_white",
         "Removed white",
-        "",
-        False,
-        3,
         "Fraction of the background's light that the prediction lacks where the reflection is below 2 % of the photo and"
-        " the background is white (encoded channels above 0.75 and less than 0.12 apart)."
-        f" {_GAIN}",
-        "rendered",
-        _rendered_score(removed_white),
+        " the background is white (encoded channels above 0.75 and less than 0.12 apart).",
+        removed_white,
     ),
-    Metric(
+    _on_rendered(
         "kept_reflection",
         "Kept reflection",
-        "",
-        False,
-        3,
         "Fraction of the reflection's light that the prediction still has above the background, where the reflection is at"
-        f" least 10 % of the photo and the photo is not clipped. {_GAIN}",
-        "rendered",
-        _rendered_score(kept_reflection),
+        " least 10 % of the photo and the photo is not clipped.",
+        kept_reflection,
     ),
 )
 

@@ -1,7 +1,7 @@
 """What a diffusion model needs: the table of backbones, the table of GPUs, and the formulas for memory and operations.
 
     cost = BACKBONE_COSTS["kontext"]
-    placement = place_on_gpu(cost.parameters, free_gib=24, total_gib=24)
+    placement = place_on_gpu(cost.parameters, WeightChoice(), free_gib=24, total_gib=24)
     placement.resident_gib(cost.parameters), cost.forward_tflop(6144)
 
 Plans and the checks before a download use the same numbers. The module needs neither torch nor a download.
@@ -241,16 +241,28 @@ def has_bitsandbytes() -> bool:
     return importlib.util.find_spec("bitsandbytes") is not None
 
 
+@final
+@dataclass(frozen=True)
+class WeightChoice:
+    """How the weights of a transformer may be stored.
+
+    `quantization` is what the user chose; None: it is chosen. `preferred` is the one with which the model was trained. Weights in
+    a single file cannot be quantized again.
+    """
+
+    quantization: Quantization | None = None
+    preferred: Quantization | None = None
+    offload: Offload = "auto"
+    is_single_file: bool = False
+
+
 def place_on_gpu(
     weights: int,
+    choice: WeightChoice,
     *,
-    device: str = "cuda",
     free_gib: float,
     total_gib: float,
-    quantization: Quantization | None = None,
-    preferred: Quantization | None = None,
-    offload: Offload = "auto",
-    is_single_file: bool = False,
+    device: str = "cuda",
     has_nf4: bool | None = None,
 ) -> Placement:
     """The placement on a GPU with this memory.
@@ -258,13 +270,12 @@ def place_on_gpu(
     If no quantization is given, it is the first of (`preferred`, int8, nf4) with which the weights fit into the GPU. The
     total memory decides, not the free one: the same machine always gives the same result. If none fits, or the weights
     are offloaded on request, it is `preferred`. Int8 replaces nf4 without `has_nf4` (by default, if bitsandbytes is not
-    installed), or if the weights are offloaded.
-
-    Weights in a single file stay as they are. With `offload` "auto", the weights are offloaded if they do not fit into the free memory.
+    installed), or if the weights are offloaded. With `offload` "auto", they are offloaded if they do not fit into the free memory.
 
     Raises:
         DeviceError: offloading was requested with nf4, which cannot be offloaded.
     """
+    quantization, preferred, offload = choice.quantization, choice.preferred, choice.offload
     if offload == "layers" and quantization == "nf4":
         raise DeviceError(
             "offload = layers was requested with quantization = nf4",
@@ -275,9 +286,9 @@ def place_on_gpu(
     movable: Quantization | None = "int8" if preferred == "nf4" else preferred
     preferred = preferred if has_nf4 else movable
     chosen = quantization
-    if quantization is None and offload == "layers" and not is_single_file:
+    if quantization is None and offload == "layers" and not choice.is_single_file:
         chosen = movable
-    elif quantization is None and not is_single_file:
+    elif quantization is None and not choice.is_single_file:
         candidates = [preferred, "int8", *(("nf4",) if has_nf4 else ())]
         fitting = fitting_quantizations(weights, total_gib - INFERENCE_OVERHEAD_GIB, candidates)
         fallback = preferred if offload == "none" else movable or "int8"

@@ -15,10 +15,33 @@ from pydantic import AwareDatetime, ConfigDict, Field, TypeAdapter, ValidationEr
 
 from brewster.errors import BrewsterError, invalid_value
 from brewster.user_study.assignment import Choice
-from brewster.user_study.store import ViewingConditions
 
 MAX_ANSWER_FILE_BYTES: Final = 2_000_000
 """A file with 44 answers has about 15,000 bytes."""
+
+Px = Annotated[int, Field(ge=0, le=100_000)]
+
+
+@final
+@dataclass(frozen=True)
+class ViewingConditions:
+    """How the pictures of a trial were shown. Lengths are in CSS px. Multiply them by `pixel_ratio` to get screen pixels.
+
+    `view` is the arrangement at the time of the answer: three pictures, the pair A and B, or one picture at a time. `switches` counts how often
+    the picture was replaced by another one in place; `zoomed` is true if the pictures were enlarged at any time.
+    """
+
+    __pydantic_config__ = ConfigDict(extra="forbid")
+
+    viewport_width: Px
+    viewport_height: Px
+    pixel_ratio: Annotated[float, Field(gt=0, le=100)]
+    picture_width: Px
+    theme: Literal["light", "dark"]
+    pointer: Literal["fine", "coarse"]
+    view: Literal["all", "pair", "single"]
+    switches: Annotated[int, Field(ge=0, le=100_000)]
+    zoomed: bool
 
 
 @final

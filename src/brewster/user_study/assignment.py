@@ -47,7 +47,10 @@ def draw_trials(description: StudyDescription, number: int) -> tuple[Trial, ...]
     assigned = list(itertools.islice(sequence, number * pairs, (number + 1) * pairs))
     rng = Random(f"{description.seed}/participant/{number}")  # noqa: S311  (not a secret: the seed is published)
     trials = [_comparison_trial(description, comparison, flipped) for comparison, flipped in assigned]
-    pool = _catch_pool(description, {comparison for comparison, _ in assigned}, rng)
+    # catch trials in random order; those of photos that the participant does not see otherwise come first
+    photos = {description.comparisons[comparison].photo for comparison, _ in assigned}
+    pool = rng.sample(description.catch_pool, len(description.catch_pool))
+    pool.sort(key=lambda catch: catch.photo in photos)
     trials += [_catch_trial(catch, i, rng) for i, catch in enumerate(pool[: description.catch_trials])]
     rng.shuffle(trials)
     return tuple(trials)
@@ -116,17 +119,6 @@ def _comparison_trial(description: StudyDescription, number: int, flipped: bool)
     comparison = description.comparisons[number]
     left, right = comparison.outputs[::-1] if flipped else comparison.outputs
     return Trial(comparison.photo, left, right, number, flipped)
-
-
-def _catch_pool(description: StudyDescription, assigned: Collection[int], rng: Random) -> list[CatchTrial]:
-    """The pictures for catch trials in random order; those of photos that the participant does not see otherwise are first.
-
-    `assigned` contains the numbers of the comparisons of the participant.
-    """
-    photos = {description.comparisons[number].photo for number in assigned}
-    pool = rng.sample(description.catch_pool, len(description.catch_pool))
-    pool.sort(key=lambda catch: catch.photo in photos)
-    return pool
 
 
 def _catch_trial(catch: CatchTrial, i: int, rng: Random) -> Trial:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import unicodedata
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
@@ -10,6 +9,7 @@ from pathlib import Path
 from typing import Final
 
 from brewster.errors import BrewsterError
+from brewster.files import natural_key
 from brewster.image_formats import SUFFIXES
 from brewster.user_study.study import UNNAMED_DATASET
 
@@ -44,7 +44,7 @@ def find_pictures(folder: Path, datasets: Sequence[str] = ()) -> dict[Key, Path]
         for subfolder in folder.iterdir()
         if subfolder.is_dir() and subfolder.name[0] != "."
     }
-    subfolders = {name: subfolders[name] for name in sorted(subfolders, key=_natural_key)}
+    subfolders = {name: subfolders[name] for name in sorted(subfolders, key=natural_key)}
     stems_by_dataset = {
         name: stems for name, subfolder in subfolders.items() if (stems := _list_pictures(subfolder))
     }
@@ -139,14 +139,9 @@ def _list_pictures(folder: Path) -> dict[Path, str]:
     stems = {
         path: stem.removesuffix(_TRANSMISSION) for path, stem in pictures.items() if stem not in other_layers
     }
-    return dict(sorted(stems.items(), key=lambda pair: (_natural_key(pair[1]), pair[0])))
+    return dict(sorted(stems.items(), key=lambda pair: (natural_key(pair[1]), pair[0])))
 
 
 def _normalised(name: str) -> str:
     """The name in Unicode form NFC; some file systems store an accented letter as two code points."""
     return unicodedata.normalize("NFC", name)
-
-
-def _natural_key(name: str) -> list[tuple[int, str]]:
-    """A sort key that orders 2 before 10."""
-    return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", name)]

@@ -22,16 +22,14 @@ from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from threading import Lock
-from typing import TYPE_CHECKING, Annotated, Final, Literal, final
+from typing import Final, Literal, final
 
-from pydantic import ConfigDict, Field, TypeAdapter
+from pydantic import TypeAdapter
 
 from brewster.errors import BrewsterError, OutputError
+from brewster.user_study.answer_file import AnswerFile, ExportedAnswer, ViewingConditions
 from brewster.user_study.assignment import CHOICES, Choice, Trial, draw_practice, draw_trials
 from brewster.user_study.study import ANSWERS_FILE, Study
-
-if TYPE_CHECKING:
-    from brewster.user_study.answer_file import AnswerFile, ExportedAnswer
 
 MAX_SECONDS: Final = 3600.0
 """Longer times are stored as this value."""
@@ -53,8 +51,6 @@ CREATE TABLE IF NOT EXISTS withdrawn (
 ) STRICT;
 """
 
-Px = Annotated[int, Field(ge=0, le=100_000)]
-
 
 @final
 @dataclass(frozen=True)
@@ -64,28 +60,6 @@ class Participant:
     number: int
     trials: tuple[Trial, ...]
     practice: Trial | None = None
-
-
-@final
-@dataclass(frozen=True)
-class ViewingConditions:
-    """How the pictures of a trial were shown. Lengths are in CSS px. Multiply them by `pixel_ratio` to get screen pixels.
-
-    `view` is the arrangement at the time of the answer: three pictures, the pair A and B, or one picture at a time. `switches` counts how often
-    the picture was replaced by another one in place; `zoomed` is true if the pictures were enlarged at any time.
-    """
-
-    __pydantic_config__ = ConfigDict(extra="forbid")
-
-    viewport_width: Px
-    viewport_height: Px
-    pixel_ratio: Annotated[float, Field(gt=0, le=100)]
-    picture_width: Px
-    theme: Literal["light", "dark"]
-    pointer: Literal["fine", "coarse"]
-    view: Literal["all", "pair", "single"]
-    switches: Annotated[int, Field(ge=0, le=100_000)]
-    zoomed: bool
 
 
 _CONDITIONS: Final = TypeAdapter(ViewingConditions | None)

@@ -39,7 +39,7 @@ def write_report(results: Results, cases: Iterable[CaseThumbnails], path: Path) 
     environment = jinja2.Environment(
         loader=jinja2.FileSystemLoader(_FOLDER), autoescape=True, trim_blocks=True, lstrip_blocks=True
     )
-    environment.filters |= {"number": _number, "count": _count, "verdict": _verdict}
+    environment.filters |= {"has": _has, "number": _number, "count": _count, "verdict": _verdict}
     environment.policies["json.dumps_kwargs"] = {"separators": (",", ":")}
     entries = {(entry["benchmark"], entry["name"]): entry for entry in results["cases"]}
     scores: list[Any] = []
@@ -140,6 +140,11 @@ def _count(number: int, noun: str) -> str:
     """Returns a number and its noun. The first word of the noun has the plural."""
     first, *rest = noun.split()
     return " ".join([f"{number:,}", first if number == 1 else f"{first}s", *rest])
+
+
+def _has(rows: Iterable[Mapping[str, float | None]], metric: str) -> bool:
+    """Returns whether a row has a score. Jinja's own filters split a name at its points, as in psnr_region@0.01."""
+    return any(row.get(metric) is not None for row in rows)
 
 
 def _number(value: float | None, metric: Mapping[str, Any], sign: str = "") -> str:

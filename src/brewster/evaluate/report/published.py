@@ -13,6 +13,8 @@ from itertools import groupby
 from pathlib import Path
 from typing import Final, TypeVar, final
 
+from brewster.tables import markdown_table
+
 _PUBLISHED_FILE: Final = Path(__file__).with_name("published.toml")
 _HEADING: Final = "Published scores of other methods (not measured here; the protocols differ)"
 _METRICS: Final = {"psnr": "PSNR (dB)", "ssim": "SSIM", "lpips": "LPIPS", "lpips_region": "regional LPIPS"}
@@ -80,9 +82,10 @@ def _table(protocol: str, rows: list[PublishedScores]) -> str:
         "",
         *_sources(rows),
         "",
-        _line([f"published: {titles}", *benchmarks]),
-        _line(["---"] * (1 + len(benchmarks))),
-        *(_line([row.method, *(_cell(row, name, metrics) for name in benchmarks)]) for row in rows),
+        markdown_table(
+            [[f"published: {titles}", *benchmarks]]
+            + [[row.method, *(_cell(row, name, metrics) for name in benchmarks)] for row in rows]
+        ),
     ]
     return "\n".join(lines)
 
@@ -100,10 +103,6 @@ def _sources(rows: list[PublishedScores]) -> list[str]:
 def _cell(row: PublishedScores, name: str, metrics: list[str]) -> str:
     scores = row.scores.get(name)
     return " / ".join(str(scores.get(metric, "-")) for metric in metrics) if scores else "-"
-
-
-def _line(cells: Iterable[str]) -> str:
-    return f"| {' | '.join(cells)} |"
 
 
 def _distinct(items: Iterable[_Item]) -> list[_Item]:

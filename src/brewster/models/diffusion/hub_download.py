@@ -10,12 +10,15 @@ import shutil
 import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path, PurePosixPath
-from typing import Any, Final
+from typing import Any, Final, Literal
 
 from brewster.errors import DownloadError, ModelError
 from brewster.models.diffusion.lazy_imports import import_library
 from brewster.models.diffusion_models import licence_of
 
+LOGIN_HINT: Final = (
+    "create one at https://huggingface.co/settings/tokens, then run `hf auth login` or set HF_TOKEN"
+)
 _MIN_ANNOUNCED_BYTES: Final = 50_000_000
 """Smaller downloads, such as configuration files, are not announced."""
 _RESERVE_BYTES: Final = 1_000_000_000
@@ -40,7 +43,7 @@ def resolve_model_folder(source: str, patterns: list[str]) -> Path:
     # If this request fails, the download reports the reason, or finds the files in the cache.
     with contextlib.suppress(errors.HTTPError, errors.HFValidationError, errors.DryRunError, OSError):
         _announce_download(hub, source, patterns)
-    with _translate_hub_errors(source):
+    with translate_hub_errors(source):
         return Path(hub.snapshot_download(source, allow_patterns=patterns))
 
 
@@ -69,7 +72,7 @@ def list_root_files(source: str) -> list[str]:
     if folder := Path(source) if Path(source).is_dir() else None:
         return sorted(path.name for path in folder.iterdir() if path.is_file())
     hub, errors = import_library("huggingface_hub"), import_library("huggingface_hub.errors")
-    with _translate_hub_errors(source):
+    with translate_hub_errors(source):
         try:
             return sorted(name for name in hub.HfApi().list_repo_files(source) if "/" not in name)
         except (errors.HfHubHTTPError, errors.HFValidationError):
@@ -118,8 +121,8 @@ def find_weights_file(source: str, suffixes: tuple[str, ...], companions: Sequen
 
 
 @contextlib.contextmanager
-def _translate_hub_errors(source: str) -> Iterator[None]:
-    """Converts the exceptions of huggingface_hub to brewster's errors."""
+def translate_hub_errors(source: str, access: Literal["read", "write"] = "read") -> Iterator[None]:
+    """Converts the exceptions of huggingface_hub to brewster's errors. `access` is what the token needs."""
     errors = import_library("huggingface_hub.errors")
     page = f"https://huggingface.co/{source}"
     try:
@@ -133,7 +136,7 @@ def _translate_hub_errors(source: str) -> Iterator[None]:
             f"check {page}, then run `hf auth login` or set HF_TOKEN",
         ) from error
     except errors.HfHubHTTPError as error:
-        raise _http_error(error, source) from error
+        raise _http_error(error, source, access) from error
     except errors.HFValidationError as error:
         raise ModelError(
             f"there is no folder {source}, and {source} is not a hub id",
@@ -143,7 +146,7 @@ def _translate_hub_errors(source: str) -> Iterator[None]:
     except (errors.LocalEntryNotFoundError, errors.OfflineModeIsEnabled) as error:
         # If the cache is empty, huggingface_hub reports a missing file and chains the HTTP error as its cause.
         if isinstance(error.__cause__, errors.HfHubHTTPError):
-            raise _http_error(error.__cause__, source) from error
+            raise _http_error(error.__cause__, source, access) from error
         raise DownloadError(
             f"{source} is not in the cache and the hub cannot be reached",
             "expected a network connection, or a folder with the model's files",
@@ -192,16 +195,18 @@ def _gated_error(error: Exception, source: str, page: str) -> DownloadError:
     )
 
 
-def _http_error(error: Exception, source: str) -> DownloadError:
+def _http_error(error: Exception, source: str, access: str) -> DownloadError:
     status = _status(error)
     if status in {401, 403}:
         return DownloadError(
             f"the hub refused the token for {source} (HTTP {status})",
-            "expected a valid token with read access",
-            "create one at https://huggingface.co/settings/tokens, then run `hf auth login` or set HF_TOKEN",
+            f"expected a valid token with {access} access to the repositories of {source.partition('/')[0]}",
+            LOGIN_HINT,
         )
     return DownloadError(
-        f"the hub returned HTTP {status} for {source}", "expected the model's files", "try again later"
+        f"the hub returned HTTP {status} for {source}",
+        "expected that it accepts the request",
+        "try again later",
     )
 
 

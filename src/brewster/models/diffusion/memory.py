@@ -1,6 +1,6 @@
 """What a backbone needs of the machine: device, memory and disk. It is checked before anything is downloaded.
 
-placement = choose_placement(count_weights("kontext", Kontext), requested="auto")
+placement = choose_placement(count_weights("kontext", Kontext), WeightChoice(), "auto")
 check_machine("kontext", Kontext, placement, requested="auto")
 """
 
@@ -28,12 +28,12 @@ from brewster.models.diffusion_resources import (
     INFERENCE_OVERHEAD_GIB,
     BackboneCost,
     Placement,
+    WeightChoice,
     fitting_quantizations,
     place_on_gpu,
     weights_gib,
 )
 from brewster.models.zoo import TINY_PREFIX
-from brewster.options import Offload, Quantization
 
 _FILE_BYTES_PER_WEIGHT: Final = 2
 _HOST_OVERHEAD_GIB: Final = 2.0
@@ -100,49 +100,25 @@ def count_weights(source: str, backbone_class: type[Backbone], transformer_file:
     return backbone_cost(source, backbone_class).parameters
 
 
-def choose_placement(
-    weights: int,
-    *,
-    requested: str,
-    quantization: Quantization | None = None,
-    preferred: Quantization | None = None,
-    offload: Offload = "auto",
-    is_single_file: bool = False,
-) -> Placement:
-    """The placement of a transformer with this number of weights on this machine.
+def choose_placement(weights: int, choice: WeightChoice, device: str) -> Placement:
+    """The placement of a transformer with this number of weights on this machine. `device` is what the user chose, or "auto".
 
-    Args:
-        weights: the number of parameters of the transformer.
-        requested: the device that the user chose, or "auto".
-        quantization: the quantization that the user chose. By default it is chosen: see `place_on_gpu`. On a CPU the default
-            is none, because int8 is slower there.
-        preferred: the quantization with which the model was trained.
-        offload: whether to offload the weights.
-        is_single_file: whether the weights are in a file that cannot be quantized again.
+    On a CPU the default is no quantization, because int8 is slower there.
 
     Raises:
         DeviceError: diffusion models do not run on this device, or cannot be offloaded in this way.
     """
-    device = torch_device(requested)
+    device = torch_device(device)
     if device == "cpu":
-        if offload == "layers":
+        if choice.offload == "layers":
             raise DeviceError(
                 "offload = layers was requested on the CPU",
                 "expected a GPU, because on a CPU all weights are in host memory already",
                 "leave offload out",
             )
-        return Placement(device, quantization)
+        return Placement(device, choice.quantization)
     free, total = (memory / GIB for memory in torch.cuda.mem_get_info(device))
-    return place_on_gpu(
-        weights,
-        device=device,
-        free_gib=free,
-        total_gib=total,
-        quantization=quantization,
-        preferred=preferred,
-        offload=offload,
-        is_single_file=is_single_file,
-    )
+    return place_on_gpu(weights, choice, device=device, free_gib=free, total_gib=total)
 
 
 def check_machine(

@@ -38,7 +38,7 @@ from brewster.models.diffusion.panels import PanelLayout, compose, conditioning_
 from brewster.models.diffusion.prompt import PROMPT_FILE, PROMPTS, PromptEmbedding, load_prompt
 from brewster.models.diffusion.sampling import euler, sample
 from brewster.models.diffusion.task import DecompositionTask
-from brewster.models.diffusion_resources import Placement
+from brewster.models.diffusion_resources import Placement, WeightChoice
 from brewster.models.zoo import model_name
 from brewster.options import Offload, Quantization
 
@@ -249,7 +249,7 @@ def fingerprint(
         DeviceError: diffusion models do not run on this device.
     """
     source = find_model_source(model, base_model)
-    placement = _choose_placement(source, device, quantization, "auto", None)
+    placement = _choose_placement(source, device, quantization)
     return _digest(source, placement.quantization, PROMPTS.get(prompt, prompt), {})
 
 
@@ -288,7 +288,7 @@ def _check_before_download(
         weights = count_weights(source.base, source.backbone_class)
         check_device(source.base, weights, chosen_device, requested=device)
         return
-    placement = _choose_placement(source, device, quantization, offload, None)
+    placement = _choose_placement(source, device, quantization, offload)
     check_machine(source.base, source.backbone_class, placement, requested=device)
 
 
@@ -296,17 +296,12 @@ def _choose_placement(
     source: ModelSource,
     device: str,
     quantization: Quantization | None,
-    offload: Offload,
-    transformer_file: Path | None,
+    offload: Offload = "auto",
+    transformer_file: Path | None = None,
 ) -> Placement:
-    return choose_placement(
-        count_weights(source.base, source.backbone_class, transformer_file),
-        requested=device,
-        quantization=quantization,
-        preferred=source.trained_quantization,
-        offload=offload,
-        is_single_file=transformer_file is not None,
-    )
+    weights = count_weights(source.base, source.backbone_class, transformer_file)
+    choice = WeightChoice(quantization, source.trained_quantization, offload, transformer_file is not None)
+    return choose_placement(weights, choice, device)
 
 
 def _embed(source: ModelSource, text: str, device: str) -> PromptEmbedding:

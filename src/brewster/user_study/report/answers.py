@@ -7,9 +7,10 @@ from dataclasses import asdict, fields
 from typing import Final
 
 from brewster.tables import csv_table
+from brewster.user_study.answer_file import ViewingConditions
 from brewster.user_study.assignment import Trial
 from brewster.user_study.report.participants import OUTCOMES, ParticipantAnswers, outcome
-from brewster.user_study.store import StoredAnswer, ViewingConditions
+from brewster.user_study.store import StoredAnswer
 from brewster.user_study.study import StudyDescription
 
 _CONDITIONS: Final = tuple(field.name for field in fields(ViewingConditions))

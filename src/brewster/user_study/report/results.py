@@ -125,9 +125,14 @@ def _group(study: Study, participants: Sequence[ParticipantAnswers]) -> dict[str
     }
     if not participants:
         return summary
-    counts, pictures = _counts(study, participants), _picture_counts(study)
+    counts = _counts(study, participants)
+    pictures = np.zeros((len(study.pairs_of_methods), len(study.description.datasets)))
+    np.add.at(pictures, tuple(np.array(_table_indices(study)).T), 1)
+    ratings = np.zeros((len(study.description.comparisons), len(OUTCOMES)))
+    for participant in participants:
+        np.add.at(ratings, (list(participant.votes), list(participant.votes.values())), 1)
     weights = bootstrap_weights(len(participants))
-    agreement = alpha(_ratings(study, participants))
+    agreement = alpha(ratings)
     return summary | {
         "tables": _tables(study, counts, pictures, weights),
         "strengths": _strengths(study, counts, weights),
@@ -154,21 +159,6 @@ def _table_indices(study: Study) -> list[tuple[int, int]]:
     pairs = {pair: i for i, pair in enumerate(study.pairs_of_methods)}
     datasets = {name: i for i, name in enumerate(study.description.datasets)}
     return [(pairs[row.methods], datasets[row.dataset]) for row in study.description.comparisons]
-
-
-def _picture_counts(study: Study) -> Floats:
-    """Number of pictures: (pairs of methods, datasets)."""
-    pictures = np.zeros((len(study.pairs_of_methods), len(study.description.datasets)))
-    np.add.at(pictures, tuple(np.array(_table_indices(study)).T), 1)
-    return pictures
-
-
-def _ratings(study: Study, participants: Sequence[ParticipantAnswers]) -> Floats:
-    """Number of answers: (comparisons, outcomes)."""
-    ratings = np.zeros((len(study.description.comparisons), len(OUTCOMES)))
-    for participant in participants:
-        np.add.at(ratings, (list(participant.votes), list(participant.votes.values())), 1)
-    return ratings
 
 
 # --- estimating

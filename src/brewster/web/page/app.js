@@ -276,8 +276,9 @@ function enable(id, isEnabled) {
 const isEnabled = (button) => button.getAttribute("aria-disabled") !== "true";
 
 const VERDICTS = {
-  clear: "A reflection was found and removed.",
-  partial: "A reflection was found. Parts of it probably remain.",
+  removed: "A reflection was found and removed.",
+  "partly removed": "A reflection was found and partly removed.",
+  "reflection remains": "A reflection was found, but most of it remains.",
   "little found": "Little reflection was found.",
   doubtful: "The layers may be wrong. Check them.",
 };

@@ -23,6 +23,7 @@ from typing import Any, Final, final
 from brewster.errors import DownloadError, ModelError
 from brewster.models.diffusion.adapter.lora import LORA_FILE, LoraMetadata, read_lora_metadata, read_prompt
 from brewster.models.diffusion.backbones.registry import BACKBONES, find_backbone_class
+from brewster.models.diffusion.hub_download import LOGIN_HINT, translate_hub_errors
 from brewster.models.diffusion.lazy_imports import import_library
 from brewster.models.diffusion.prompt import PROMPT_FILE
 from brewster.models.diffusion.tensors import read_metadata, with_metadata
@@ -34,9 +35,6 @@ FILES: Final = (CARD_FILE, LORA_FILE, PROMPT_FILE, RECIPE_FILE)
 """The files to upload. diffusers and the hub find the LoRA and the model card by these names."""
 
 _HOME_FOLDERS: Final = re.compile(r"(?:(?<![\w.])/home/|/Users/|/root/|[A-Za-z]:\\+Users\\+)[^\s\"'`,;)\]]*")
-_LOGIN_HINT: Final = (
-    "create one at https://huggingface.co/settings/tokens, then run `hf auth login` or set HF_TOKEN"
-)
 _CARD_HINT: Final = "correct the model card, or train again to write a new one"
 
 
@@ -128,13 +126,13 @@ def push(plan: UploadPlan, token: str | None = None) -> str:
     hub = import_library("huggingface_hub")
     if not (token or hub.get_token()):
         raise DownloadError(
-            f"there is no token to write to {plan.repo_id}", "expected a token with write access", _LOGIN_HINT
+            f"there is no token to write to {plan.repo_id}", "expected a token with write access", LOGIN_HINT
         )
     if not sys.stderr.isatty():
         import_library("huggingface_hub.utils").disable_progress_bars()
     api = hub.HfApi(token=token, library_name="brewster")
     added = [hub.CommitOperationAdd(file.name, file.data) for file in plan.files]
-    with _translate_hub_errors(plan.repo_id):
+    with _translate_push_errors(plan.repo_id):
         api.create_repo(plan.repo_id, private=plan.is_private, exist_ok=True)
         is_private = bool(api.model_info(plan.repo_id).private)
         if plan.is_private != is_private:
@@ -287,19 +285,11 @@ def _remarks(folder: Path, metadata: LoraMetadata, replacements: Mapping[str, st
 
 
 @contextlib.contextmanager
-def _translate_hub_errors(repo_id: str) -> Iterator[None]:
+def _translate_push_errors(repo_id: str) -> Iterator[None]:
     """Converts the exceptions of huggingface_hub to DownloadError."""
-    errors = import_library("huggingface_hub.errors")
     try:
-        yield
-    except errors.HfHubHTTPError as error:
-        raise _http_error(error.response.status_code, repo_id) from error
-    except (errors.HTTPError, errors.OfflineModeIsEnabled) as error:
-        raise DownloadError(
-            f"the hub cannot be reached ({error})",
-            "expected a network connection",
-            "connect and push again (no commit was made)",
-        ) from error
+        with translate_hub_errors(repo_id, "write"):
+            yield
     except json.JSONDecodeError as error:
         raise DownloadError(
             f"the server's response is not JSON ({error})",
@@ -310,24 +300,3 @@ def _translate_hub_errors(repo_id: str) -> Iterator[None]:
         raise DownloadError(
             f"the hub refused {CARD_FILE}: {error}", "expected valid front matter", _CARD_HINT
         ) from error
-
-
-def _http_error(status: int, repo_id: str) -> DownloadError:
-    if status == 401:
-        return DownloadError(
-            f"the hub refused the token for {repo_id} (HTTP 401)",
-            "expected a valid token with write access",
-            _LOGIN_HINT,
-        )
-    if status == 403:
-        owner = repo_id.partition("/")[0]
-        return DownloadError(
-            f"the token may not write to {repo_id} (HTTP 403)",
-            f"expected a token with write access to the repositories of {owner}",
-            _LOGIN_HINT,
-        )
-    return DownloadError(
-        f"the hub returned HTTP {status} for {repo_id}",
-        "expected the hub to accept the commit (HTTP 200)",
-        "try again later",
-    )
