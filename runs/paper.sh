@@ -19,6 +19,7 @@ if [ "${1:-}" = --tiny ]; then tiny=true; shift; fi
 $tiny && default=$root/out/paper-tiny || default=$root/out/paper
 out=$(realpath -m "${1:-$default}")
 command -v brewster > /dev/null || export PATH="$PWD/.venv/bin:$PATH"
+brewster doctor --needs render,train,diffusion,evaluate
 if $tiny; then
     export BREWSTER_DATA="$out/data" OMP_NUM_THREADS=1 HF_HUB_OFFLINE=1
     mkdir -p "$BREWSTER_DATA"

@@ -8,6 +8,7 @@ root="$(realpath "$(dirname "$0")/..")"
 out=$(realpath -m "${1:-$root/out/tiny}")
 cd "$root"
 command -v brewster > /dev/null || export PATH="$PWD/.venv/bin:$PATH"
+brewster doctor --needs render,train,diffusion,evaluate
 export BREWSTER_DATA="$out" OMP_NUM_THREADS=1 HF_HUB_OFFLINE=1
 
 # 1. Render samples with known ground truth: four for training, two more for evaluation.

@@ -66,6 +66,11 @@ def test_a_dry_run_scores_nothing(run_without_model, benchmark, tmp_path):
     assert (code, out.decode().split()) == (0, ["real20/1", "real20/2", "real20/3"])
     assert "Real20: 3 images" in err
     assert not (tmp_path / "out").exists()
+    code, out, err = run_without_model(
+        "evaluate", "--benchmark", benchmark, "--dry-run", "--limit", 2, *QUICK_OPTIONS
+    )
+    assert (code, out.decode().split()) == (0, ["real20/1", "real20/2"])
+    assert "2 of 3 images are scored (--limit)" in err
 
 
 def test_photos_without_ground_truth_are_listed_and_the_others_are_scored(

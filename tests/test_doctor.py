@@ -1,8 +1,13 @@
 """`brewster doctor`: the checks of packages and for diffusion models."""
 
+import importlib.util
+
+import click
 import huggingface_hub
+import pytest
 
 from brewster.cli import doctor
+from brewster.errors import MissingExtra
 
 
 def check_diffusion(monkeypatch, versions):
@@ -30,3 +35,15 @@ def test_a_token_is_found_wherever_the_hub_client_finds_it_and_never_shown(monke
     found = check_diffusion(monkeypatch, {"diffusers": "1", "bitsandbytes": "2"})
     assert {check.status for check in found.values()} == {"ok"}
     assert "secret" not in found["hub token"].detail
+
+
+def test_a_script_is_told_all_missing_extras_and_one_command_that_installs_them(monkeypatch):
+    find_spec = importlib.util.find_spec
+    monkeypatch.setattr(
+        importlib.util, "find_spec", lambda name: name not in {"peft", "mitsuba"} and find_spec(name)
+    )
+    with pytest.raises(MissingExtra, match=r"mitsuba, peft; .*'\.\[render,web,diffusion\]'"):
+        doctor.doctor.main(["--needs", "render,web,diffusion"], standalone_mode=False)
+    doctor.doctor.main(["--needs", "evaluate,web"], standalone_mode=False)
+    with pytest.raises(click.BadParameter, match="no extra 'trian'"):
+        doctor.doctor.main(["--needs", "trian"], standalone_mode=False)

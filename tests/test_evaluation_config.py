@@ -55,8 +55,11 @@ def test_every_setting_is_described():
     assert "nothing is resized" in EvaluationConfig().describe()[0]
 
 
-def test_by_default_every_metric_but_the_second_ssim_is_measured():
+def test_by_default_every_metric_is_measured_that_needs_no_download_and_is_no_second_definition():
     assert set(METRICS) - set(EvaluationConfig().metrics) == {
+        "lpips",
+        "lpips_region",
+        "lpips_reflection",
         "ssim_gaussian",
         "ssim_clipped",
         "psnr_channels",

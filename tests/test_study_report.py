@@ -369,6 +369,8 @@ def test_few_participants_are_named_and_rows_without_answers_are_left_out(hundre
     assert "| too few participants | 1 | 1" in re.sub(" +", " ", text)
     assert "nature" not in text
     assert "| -" not in text
+    assert "1 participant (" in text
+    assert text.count("| too few participants") == 2  # once for each group; no averages of a single dataset
     assert re.search(r"\| Average .*\| p < 0\.001 +\| 90 ", to_markdown(results))
 
 

@@ -1,4 +1,4 @@
-"""Draws a random subset like the paper's, whose cases are unknown. Gives the benchmarks of a run unique names."""
+"""Draws a random subset like the paper's, whose cases are unknown, or a small one for a first look. Gives the benchmarks of a run unique names."""
 
 from __future__ import annotations
 
@@ -44,6 +44,19 @@ def paper_subset(benchmark: Benchmark, seed: int = PAPER_SEED) -> tuple[Case, ..
         )
     rng = {scene: Random(f"{seed}/{benchmark.name}/{scene}") for scene in sorted(scenes, key=natural_key)}  # noqa: S311
     return tuple(rng[scene].choice(scenes[scene]) for scene in rng)
+
+
+def spread(benchmark: Benchmark, limit: int) -> Benchmark:
+    """Returns the benchmark with at most `limit` cases, evenly spread over the order of their names, and a remark."""
+    count = len(benchmark.cases)
+    if count <= limit:
+        return benchmark
+    cases = tuple(benchmark.cases[index * count // limit] for index in range(limit))
+    return replace(
+        benchmark,
+        cases=cases,
+        remarks=(*benchmark.remarks, f"{limit} of {count} images are scored (--limit)"),
+    )
 
 
 def with_unique_names(benchmarks: Sequence[Benchmark], folders: Sequence[Path]) -> list[Benchmark]:

@@ -48,13 +48,21 @@ class Check:
 
 @click.command
 @click.option("--json", "as_json", is_flag=True, help="Print JSON.")
+@click.option(
+    "--needs",
+    metavar="EXTRA,...",
+    help="Only check that these extras are installed, and print one command that installs all of them. For the start of scripts.",
+)
 @click.pass_context
-def doctor(context: click.Context, *, as_json: bool) -> None:
+def doctor(context: click.Context, *, as_json: bool, needs: str | None) -> None:
     """Check what works on this machine and what is missing.
 
     The command that installs a missing part is printed below it. Commands with constraints.txt must be run in the root of the
     repository of brewster. The exit code is 1 if a required part does not work.
     """
+    if needs is not None:
+        _require_extras(needs.split(","))
+        return
     checks = list(run_checks())
     is_healthy = all(check.status == "ok" for check in checks if check.needed)
     if as_json:
@@ -67,6 +75,16 @@ def doctor(context: click.Context, *, as_json: bool) -> None:
             else "A required part does not work: see the lines with !! and -- above."
         )
     context.exit(0 if is_healthy else 1)
+
+
+def _require_extras(names: list[str]) -> None:
+    if unknown := [name for name in names if name not in EXTRAS]:
+        raise click.BadParameter(f"there is no extra {unknown[0]!r}; expected some of {', '.join(EXTRAS)}.")
+    packages = {package: module for name in names for package, module in EXTRAS[name].items()}
+    if missing := [package for package, module in packages.items() if not importlib.util.find_spec(module)]:
+        raise MissingExtra.for_extra(
+            ",".join(names), f"not installed: {', '.join(missing)}", f"expected the extras {', '.join(names)}"
+        )
 
 
 def run_checks() -> Iterator[Check]:

@@ -182,6 +182,12 @@ class _Size(click.ParamType["int | str"]):
     help="The number of processes that compute scores; by default one for each processor, or fewer if there are fewer than 50 images.",
 )
 @click.option(
+    "--limit",
+    type=click.IntRange(min=1),
+    metavar="NUMBER",
+    help="For a first look: score at most this number of images of each benchmark, evenly spread over it.",
+)
+@click.option(
     "--pictures",
     type=click.IntRange(min=0),
     default=50,
@@ -235,6 +241,7 @@ class _EvaluateCommand:
     quality: Quality
     device: Device
     workers: int | None
+    limit: int | None
     pictures: int
     intervals: bool
     export: str | None
@@ -312,14 +319,15 @@ class _EvaluateCommand:
 
     def _read_benchmarks(self) -> list[Benchmark]:
         from brewster.benchmarks.registry import read_benchmark  # noqa: PLC0415
-        from brewster.benchmarks.selection import with_unique_names  # noqa: PLC0415
+        from brewster.benchmarks.selection import spread, with_unique_names  # noqa: PLC0415
 
         read = [
             (benchmark, Path(folder))
             for name, folder in self.benchmarks
             for benchmark in read_benchmark(name, Path(folder))
         ]
-        return with_unique_names([part for part, _ in read], [folder for _, folder in read])
+        unique = with_unique_names([part for part, _ in read], [folder for _, folder in read])
+        return [spread(benchmark, self.limit) for benchmark in unique] if self.limit else unique
 
     def _config(self) -> EvaluationConfig:
         from brewster.evaluate.protocols import protocol_config  # noqa: PLC0415

@@ -16,7 +16,7 @@ from typing import Annotated, Any, Final, final
 from pydantic import AfterValidator, Field
 
 from brewster.benchmarks.registry import Benchmark, read_benchmark
-from brewster.evaluate.config import DEFAULT_METRICS, EvaluationConfig
+from brewster.evaluate.config import PAPER_METRICS, EvaluationConfig
 from brewster.evaluate.evaluation import evaluate
 from brewster.evaluate.methods import IdentityBaseline, ModelMethod
 from brewster.evaluate.results import AVERAGE, Results
@@ -61,7 +61,7 @@ class AblationStudy(FrozenModel):
         KeyNote("table of name = folder", "at least 1 entry", replaces_constraints=True),
     ]
     """The benchmarks to score on: a name and a folder relative to BREWSTER_DATA for each."""
-    metrics: tuple[str, ...] = DEFAULT_METRICS
+    metrics: tuple[str, ...] = PAPER_METRICS
     """The metrics to compute. Metrics of the reflection (`*_reflection`) need benchmarks with a ground-truth reflection, and
     removed_content, removed_white and kept_reflection need rendered sets."""
 

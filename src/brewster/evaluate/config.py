@@ -12,8 +12,12 @@ from brewster.metrics import DEFAULT_THRESHOLD, IDENTICAL_DB, METRICS, Metric, f
 from brewster.options import Quality
 
 _ON_REQUEST: Final = ("ssim_gaussian", "ssim_clipped", "psnr_channels", "niqe")
-DEFAULT_METRICS: Final = tuple(name for name in METRICS if name not in _ON_REQUEST)
-"""All metrics except other definitions of PSNR and SSIM, and those of single contests."""
+DEFAULT_METRICS: Final = tuple(
+    name for name, metric in METRICS.items() if name not in _ON_REQUEST and not metric.prepare
+)
+"""All metrics except other definitions of PSNR and SSIM, those of single contests, and LPIPS, which needs a download."""
+PAPER_METRICS: Final = (*DEFAULT_METRICS, "lpips", "lpips_region")
+"""For the tables of the paper and for ablations."""
 
 
 @final

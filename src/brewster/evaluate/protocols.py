@@ -11,7 +11,7 @@ from dataclasses import dataclass, fields, replace
 from typing import Any, Final, final
 
 from brewster.errors import BrewsterError
-from brewster.evaluate.config import EvaluationConfig
+from brewster.evaluate.config import PAPER_METRICS, EvaluationConfig
 
 
 @final
@@ -60,7 +60,7 @@ _OPENRR: Final = "repository OpenRR-5k, evaluate.py"
 PROTOCOLS: Final[dict[str, ProtocolPreset]] = {
     "brewster": ProtocolPreset(
         "all images of each benchmark at the size of the ground truth, with the border",
-        (("PSNR over all channels, SSIM with the uniform 7x7 window, LPIPS 0.1 with AlexNet", "brewster"),),
+        (("PSNR over all channels, SSIM with the uniform 7x7 window; LPIPS 0.1 with AlexNet on request", "brewster"),),
         EvaluationConfig(),
     ),
     "paper": ProtocolPreset(
@@ -70,7 +70,7 @@ PROTOCOLS: Final[dict[str, ProtocolPreset]] = {
             ("PSNR, SSIM and LPIPS of the transmission; LPIPS in the reflection region", f"{_PAPER}, section 5"),
             ("The paper does not state image size, SSIM window, LPIPS backbone, threshold and selected images; brewster uses its own", _PAPER),
         ),
-        EvaluationConfig(paper_subset=True),
+        EvaluationConfig(metrics=PAPER_METRICS, paper_subset=True),
     ),
     "xreflection": ProtocolPreset(
         "the validation of the toolbox XReflection, as for DSRNet, DSIT and RDNet",

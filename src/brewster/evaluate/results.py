@@ -11,7 +11,7 @@ import numpy as np
 import brewster
 from brewster.benchmarks.registry import Benchmark, Case
 from brewster.benchmarks.selection import PAPER_SEED, paper_subset
-from brewster.evaluate.config import DEFAULT_METRICS, EvaluationConfig
+from brewster.evaluate.config import DEFAULT_METRICS, PAPER_METRICS, EvaluationConfig
 from brewster.evaluate.methods import Method
 from brewster.evaluate.protocols import describe_protocol
 from brewster.evaluate.score_log import ScoreRow
@@ -95,7 +95,8 @@ def summarise(
         "unmeasured": [
             name
             for name in config.columns()  # no case has the ground truth that they need
-            if config.metrics != DEFAULT_METRICS and name not in measured and name not in (unavailable or {})
+            if config.metrics not in (DEFAULT_METRICS, PAPER_METRICS)
+            and name not in {*measured, *(unavailable or {})}
         ],
         "draw": {"seed": PAPER_SEED}
         | {subset.key: [case.name for case in subset.cases] for subset in subsets},

@@ -6,6 +6,7 @@ from collections import Counter
 from collections.abc import Iterable, Mapping
 from typing import Any
 
+from brewster.errors import counted
 from brewster.tables import plain_table
 from brewster.user_study.report.participants import ExclusionRule, collect_answers
 from brewster.user_study.store import Participant, StoredAnswer
@@ -64,8 +65,8 @@ def progress_text(progress: Mapping[str, Any]) -> str:
     """The progress as text for a terminal: a line of totals, and a table of participants."""
     low, high = progress["answers_per_comparison"]
     total = (
-        f"{progress['participants']} participants, {progress['complete']} complete, {progress['excluded']} excluded by the rule "
-        f"so far; {progress['answers']} answers, {low} to {high} for each comparison."
+        f"{counted(progress['participants'], 'participant')}, {progress['complete']} complete, {progress['excluded']} excluded by the rule "
+        f"so far; {counted(progress['answers'], 'answer')}, {low} to {high} for each comparison."
     )
     if not progress["rows"]:
         return f"{total}\n"

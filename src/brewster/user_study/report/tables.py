@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from typing import Any, Final
 
+from brewster.errors import counted
 from brewster.tables import csv_table, escape_latex, markdown_table
 
 _GROUPS: Final = {"included": "After the exclusion rule", "everyone": "All participants"}
@@ -74,19 +75,22 @@ def _group(results: Results, key: str, heading: str) -> str:
 
 def _counts_line(group: Mapping[str, Any]) -> str:
     return (
-        f"{group['participants']} participants ({group['complete']} complete), {group['answers']} answers; "
+        f"{counted(group['participants'], 'participant')} ({group['complete']} complete), {counted(group['answers'], 'answer')}; "
         f"{group['failed']} of {group['catch_trials']} catch trials failed."
     )
 
 
 def _table(table: Mapping[str, Any]) -> str:
+    filled = _filled(table["rows"])
+    if sum(not row["key"].startswith("/") for row in filled) == 1:
+        filled = filled[:1]  # the averages over a single dataset are equal to its row
     rows = [["", table["first"], "Tie", table["second"], "Difference", "Test", "N", "Answers"]]
     rows += [
         [
             row["title"], *(_percent(row[name]) for name in ("win", "tie", "lose")), _percent(row["difference"], "+"),
             _p_value(row["p"]), str(row["participants"]), str(row["answers"]),
         ]
-        for row in _filled(table["rows"])
+        for row in filled
     ]  # fmt: skip
     correlation = (
         ""
