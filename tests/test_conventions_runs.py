@@ -104,13 +104,13 @@ def test_every_command_of_the_paper_experiment_is_valid(tmp_path):
     run_script("paper.sh", tmp_path / "out", path=stub.parent, BREWSTER_DATA=str(tmp_path))
     commands = [json.loads(line) for line in calls.read_text().splitlines()]
     assert [arguments[0] for arguments in commands] == [
-        "assets", "render", "render", "train", "train", "evaluate", "train", "train",
+        "doctor", "assets", "render", "render", "train", "train", "evaluate", "train", "train",
         "tests/pictures/mixture-coffee-rocket.jpg", "evaluate", "evaluate", "ablate", "ablate", "ablate", "models", "models",
     ]  # fmt: skip
     for arguments in commands:
         parse(arguments)
     with pytest.raises(click.UsageError):
-        parse([*commands[1], "--no-such-option"])
+        parse([*commands[2], "--no-such-option"])
     recipes = {arguments[1] for arguments in commands if arguments[0] in ("train", "ablate")}
     studies = {f"recipes/ablations/{name}.toml" for name in ("lora-blend-space", "lora-size", "prompt")}
     assert recipes == {"recipes/train/kontext.toml", "recipes/train/kontext-real.toml"} | studies

@@ -182,7 +182,7 @@ def test_a_body_that_is_not_a_form_is_refused(kind):
 
 def test_the_schema_has_the_descriptions_and_limits_of_options():
     fields = form_schema(MODELS)["properties"]
-    assert set(fields) == {"photo", "mask", *FIELDS}
+    assert set(fields) == {"photo", "mask", "hints", *FIELDS}
     assert (fields["strength"]["minimum"], fields["strength"]["maximum"]) == (0, 1)
     assert fields["model"]["enum"] == ["compact", "mine"]
     about = Options.__dataclass_fields__

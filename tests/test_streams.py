@@ -150,13 +150,13 @@ def test_a_map_that_cannot_light_a_scene_is_refused_unless_it_is_excluded(recipe
     open_stream(with_data(recipe, **data, exclude=["clip*"]))
 
 
-def test_the_total_weight_of_a_source_is_the_square_root_of_its_number_of_photos(recipe, root):
+def test_the_total_weight_of_a_source_is_the_power_two_thirds_of_its_number_of_photos(recipe, root):
     for name in ("many_1", "many_2", "many_3", "many_4", "few-1"):
         Photo.from_array(np.zeros((8, 8, 3), np.uint8), encoding="srgb").save(
             root / "sources" / f"{name}.png"
         )
-    assert source_weights([root / "sources"]) == [1, 0.5, 0.5, 0.5, 0.5]
-    assert source_weights([root / "sources"], ["few*"]) == [0.5] * 4
+    assert source_weights([root / "sources"]) == pytest.approx([1, *4 * [4 ** (-1 / 3)]])
+    assert source_weights([root / "sources"], ["few*"]) == pytest.approx(4 * [4 ** (-1 / 3)])
 
 
 def test_pairs_to_validate_on_are_evenly_spaced_in_order_of_name(recipe, root):
