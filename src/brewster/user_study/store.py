@@ -192,9 +192,9 @@ class AnswerStore:
         """
         key = (participant.number, trial)
         with self._transaction("IMMEDIATE") as database:
-            (last,) = database.execute(
+            last = database.execute(
                 "SELECT max(trial) FROM answers WHERE participant = ?", key[:1]
-            ).fetchone()
+            ).fetchone()[0]
             if last is not None and last > trial:
                 raise BrewsterError(
                     f"the answer to pair {trial + 1} cannot be withdrawn",
