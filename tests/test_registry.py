@@ -205,13 +205,6 @@ def test_an_incomplete_rendered_sample_is_excluded(tmp_path):
     assert read.excluded == ("000001 is incomplete: expected photo.jpg, background.jpg, reflection.jpg",)
 
 
-def test_the_dev_pairs_are_ten_each(data):
-    for name in ("nature", "real"):
-        read = only("pairs", data / "real" / "dev" / name)
-        assert (read.name, len(read.cases), read.remarks, read.excluded) == (name, 10, (), ())
-    assert only("nature20", data / "real" / "dev" / "nature").remarks == ("found 10 images, expected 20",)
-
-
 # --- the order of the listing does not matter
 
 

@@ -202,12 +202,6 @@ def test_an_automatic_token_is_stored_for_its_owner_only_and_links_survive_a_res
         stop_server(second)
 
 
-def test_an_invalid_token_file_is_refused(run_without_model, study):
-    (study.folder / "token").write_text("short\n")
-    code, _, err = run_without_model("study", "serve", "study", "--token", "auto")
-    assert (code, "contains no valid token" in err) == (1, True)
-
-
 @pytest.mark.parametrize(
     "name", ["study.example.org:443", "https://study.example.org", "study.example.org/", "", "bücher.example"]
 )
