@@ -9,7 +9,7 @@ from pyarrow import parquet
 from benchmark_folders import picture, write
 from brewster.benchmarks.registry import read_benchmark
 from brewster.cli import main
-from brewster.errors import PhotoError, RecipeError
+from brewster.errors import RecipeError
 from brewster.evaluate.config import EvaluationConfig
 from brewster.evaluate.scoring import GroundTruth
 from brewster.rendered import store
@@ -138,21 +138,6 @@ def test_a_frame_can_be_rendered_again(run_without_model, fake_renderer, tmp_pat
     assert read_scene(tmp_path / "again" / "scene.toml") == read_scene(scene)
 
 
-@pytest.mark.parametrize(
-    ("args", "message"),
-    [
-        (("set", "--baseline-mm", "50"), "add --burst, or use --recipe burst"),
-        (("set", "--burst", "1"), "2<=x<=99"),
-        (("set", "--burst", "3", "--baseline-mm", "-1"), "is not in the range 0<=x"),
-        (("set", "--scene", "scene.toml", "--burst", "3"), "--burst is an option for datasets"),
-    ],
-)
-def test_a_wrong_usage_is_explained(run_without_model, args, message):
-    code, _, err = run_without_model("render", *args)
-    assert code == 2
-    assert message in err
-
-
 # --- the benchmark
 
 
@@ -219,12 +204,6 @@ def test_an_unusable_burst_is_excluded_with_the_reason(tmp_path, numbers, truths
     assert [case.name for case in benchmark.cases] == ["fine"]
     assert len(benchmark.excluded) == 1
     assert reason in benchmark.excluded[0]
-
-
-def test_a_folder_without_bursts_is_refused(tmp_path):
-    (tmp_path / "holiday").mkdir()
-    with pytest.raises(PhotoError, match="contains no burst"):
-        read_benchmark("bursts", tmp_path)
 
 
 def test_evaluate_scores_bursts(tmp_path, monkeypatch):

@@ -51,12 +51,6 @@ def test_tables_go_to_standard_output_and_all_results_into_a_folder(
     assert (tmp_path / "out" / "predictions" / "pane" / "real20" / "3.reflection.png").is_file()
 
 
-def test_json_prints_the_results(run_without_model, benchmark, tmp_path):
-    code, out, _ = run_without_model("evaluate", "--benchmark", benchmark, "--json", *QUICK_OPTIONS)
-    assert code == 0
-    assert json.loads(out) == json.loads((tmp_path / "out" / "results.json").read_text())
-
-
 def test_quiet_prints_nothing(run_without_model, benchmark):
     assert run_without_model("evaluate", "--benchmark", benchmark, "--quiet", *QUICK_OPTIONS) == (0, b"", "")
 

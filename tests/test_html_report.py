@@ -9,7 +9,6 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 
-from brewster.errors import OutputError
 from brewster.evaluate.report.html_report import write_report
 from brewster.evaluate.report.images import (
     COLOUR_MAP,
@@ -268,31 +267,6 @@ def test_a_missing_score_is_a_dash_and_a_metric_without_scores_has_no_column(pag
     assert re.search("compact\\s*\N{EN DASH}", page(given).text)
 
 
-def test_an_estimate_over_fewer_pictures_shows_their_number_and_may_have_no_interval(page):
-    given = results()
-    given["tables"]["nature20"]["compact"]["psnr"] = estimate(21.5, count=1)
-    text = page(given).text
-    assert "21.501 of 2" in text
-    assert "★ best 21.501 of 2" not in text
-
-
-def test_settings_metrics_remarks_and_excluded_files_are_listed(page):
-    text = page().text
-    for expected in (
-        "Nothing is resized.",
-        "Definition of PSNR. (higher is better)",
-        "found 2 images, expected 20",
-    ):
-        assert expected in text
-    assert "1 file excluded" in text
-    assert "c.png has no partner" in text
-    assert "sha256 7adb" in text
-    assert "No method failed on any image." in text
-    given = results()
-    given["methods"]["compact"]["remark"] = "the predictions equal the ground truth for 2 images"
-    assert "compact: the predictions equal the ground truth" in page(given).text
-
-
 def test_errors_are_listed_at_the_top_and_at_their_case(page):
     given = results()
     given["cases"][0] |= {
@@ -304,17 +278,6 @@ def test_errors_are_listed_at_the_top_and_at_their_case(page):
     assert "nature20/a, compact: no prediction" in made.text
     assert "Failed: no prediction" in made.text
     assert "compact, a" not in [has["alt"] for has in made.all("img")]
-
-
-def test_a_long_list_of_errors_is_collapsed(page):
-    given = results([f"{number}" for number in range(9)], errors={"compact": "no prediction"})
-    made = page(given, [make_thumbnails("0")])
-    assert "Failed: compact on 9 of 9 images" in made.text
-    assert [has for has in made.all("details") if has.get("class") == "note" and "open" not in has]
-    assert (
-        "This page shows 1 of 9 images: for each benchmark, first the images on which the first method after the baseline failed"
-        in made.text
-    )
 
 
 # --- pictures
@@ -329,12 +292,6 @@ def test_images_are_downscaled_to_480_px_and_never_enlarged(page, size, embedded
     assert {photo.size for photo in pictures(made).values()} == {embedded}
     assert {(has["width"], has["height"]) for has in made.all("img")} == {tuple(map(str, embedded))}
     assert max(embedded) <= MAX_SIDE_PX
-
-
-def test_images_keep_their_orientation_and_their_values(page):
-    photo = pictures(page(cases=[make_thumbnails("a", size=(700, 500))]))["photo, a"].pixels
-    assert abs(photo[:200].astype(int) - 200).max() <= 6
-    assert abs(photo[-200:].astype(int) - 90).max() <= 6
 
 
 def test_images_are_downscaled_like_photo_resized(page, rng):
@@ -380,11 +337,6 @@ def test_error_maps_are_embedded_losslessly(page, rng):
     assert (made["error of the photo, a"].pixels == error_map(photo, truth)).all()
 
 
-def test_the_lightness_of_the_colour_map_increases():
-    lightness = np.sqrt(COLOUR_MAP.astype(float) @ (0.2126, 0.7152, 0.0722))
-    assert (np.diff(lightness) > 0).all()
-
-
 # --- the file
 
 
@@ -399,7 +351,7 @@ def test_cases_are_read_and_freed_one_at_a_time(tmp_path):
             yield case
             del case
 
-    write_report(results(), cases(), tmp_path / "report.html")
+    write_report(results([*"012345"]), cases(), tmp_path / "report.html")
     assert len(alive) == 6
 
 
@@ -417,14 +369,3 @@ def test_a_report_replaces_an_older_one_atomically(tmp_path):
     write_report(results(), [make_thumbnails("b")], path)
     assert path.read_bytes() != before
     assert [file.name for file in path.parent.iterdir()] == ["report.html"]
-
-
-def test_a_path_that_cannot_be_written_is_an_error_that_names_it(tmp_path):
-    (tmp_path / "report.html").mkdir()
-    with pytest.raises(OutputError, match=r"report\.html was not written \(.*\); .* run again"):
-        write_report(results(), [make_thumbnails("a")], tmp_path / "report.html")
-    assert not list(tmp_path.glob(".brewster-*"))
-
-
-def test_a_case_that_is_not_in_the_results_is_shown_without_scores(page):
-    assert page(cases=[make_thumbnails("unknown")]).data()["scores"] == [{}]

@@ -69,11 +69,6 @@ def test_a_similar_name_is_not_a_prediction(path, case, tmp_path):
         write_predictions(tmp_path, path).files(case)
 
 
-def test_a_copy_of_the_photos_is_not_a_prediction(case, tmp_path):
-    with pytest.raises(PhotoError, match="no prediction"):
-        write_predictions(tmp_path, "blended/1.png").files(case)
-
-
 def test_two_files_for_one_case_are_an_error_that_names_both(case, tmp_path):
     with pytest.raises(PhotoError, match=r"2 files for the transmission.*1\.jpg, 1\.png"):
         write_predictions(tmp_path, "1.png", "1.jpg").files(case)
@@ -152,16 +147,6 @@ def test_methods_can_be_pickled(model, tmp_path):
         write_predictions(tmp_path, "1.png"),
     ):
         assert pickle.loads(pickle.dumps(method)) == method
-
-
-def test_an_empty_list_of_methods_is_an_error():
-    with pytest.raises(BrewsterError, match="there is no method"):
-        check_names([])
-
-
-def test_two_methods_with_the_same_name_are_an_error(tmp_path):
-    with pytest.raises(BrewsterError, match=r"2 methods have the name 'input \(unprocessed\)'"):
-        check_names([IdentityBaseline(), PredictionFolder("input (unprocessed)", tmp_path)])
 
 
 @pytest.mark.parametrize("name", ["../out", "a/b", "a\\b", "..", ".", "", "two\nlines", "\udcff"])

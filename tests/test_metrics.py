@@ -10,7 +10,6 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
-import brewster.metrics
 from brewster.errors import BrewsterError
 from brewster.metrics import METRICS, Metric, find_metric, linear_rmse, psnr, psnr_of_channels, ssim
 from brewster.srgb import to_linear
@@ -198,12 +197,6 @@ def test_a_metric_is_found_by_name_and_a_typing_error_gets_a_suggestion():
         find_metric("lpisp")
     with pytest.raises(BrewsterError, match=r"expected one of psnr, ssim, .* choose one"):
         find_metric("sharpness")
-
-
-def test_exports_are_in_order():
-    names = brewster.metrics.__all__
-    assert names == sorted(names, key=lambda name: (not name.isupper(), name))
-    assert all(hasattr(brewster.metrics, name) for name in names)
 
 
 def test_importing_metrics_does_not_import_torch():

@@ -16,7 +16,6 @@ from brewster.benchmarks.pairing import (
     find_roles,
     find_split,
     find_subsets,
-    join_names,
     list_folder,
     natural_key,
     read_folders,
@@ -119,14 +118,6 @@ def test_system_files_are_ignored_silently_and_other_files_with_a_remark(tmp_pat
     assert names(read_folders(tmp_path)) == ["a"]
 
 
-def test_two_folders_for_one_role_are_an_error_that_names_both(tmp_path):
-    repacked(tmp_path, ["a"], ("blended", "gt", "transmission_layer"))
-    with pytest.raises(
-        PhotoError, match=r"two subfolders for transmission, gt and transmission_layer; .*; .*"
-    ):
-        read_folders(tmp_path)
-
-
 def test_a_missing_or_empty_folder_of_a_role_is_an_error(tmp_path):
     with pytest.raises(PhotoError, match=r"no subfolder for the photo; .*blended.*; "):
         read_folders(tmp_path)
@@ -136,14 +127,6 @@ def test_a_missing_or_empty_folder_of_a_role_is_an_error(tmp_path):
     write(tmp_path, "blended/a.png")
     with pytest.raises(PhotoError, match=r"no subfolder for the transmission; "):
         read_folders(tmp_path)
-
-
-def test_a_folder_that_cannot_be_listed_is_an_error(tmp_path):
-    write(tmp_path, "file.png")
-    with pytest.raises(PhotoError, match=r"gone cannot be read \(No such file or directory\); .*; "):
-        read_folders(tmp_path / "gone")
-    with pytest.raises(PhotoError, match=r"file.png cannot be read \(Not a directory\)"):
-        read_folders(tmp_path / "file.png")
 
 
 def test_links_are_followed(tmp_path):
@@ -235,19 +218,6 @@ def test_shots_with_the_same_name_in_two_folders_are_both_excluded(tmp_path):
     assert all("ambiguous" in line for line in found.excluded)
 
 
-def test_other_files_in_a_tree_are_ignored_with_a_remark(tmp_path):
-    wildscene(tmp_path, 2)
-    write(tmp_path, "README.txt", "1s/notes.txt", "1s/.DS_Store")
-    assert read_tree(tmp_path, "wildscene").remarks == ["ignored 1s/notes.txt", "ignored README.txt"]
-
-
-@pytest.mark.parametrize("subset", ["postcard", "solidobject", "wildscene"])
-def test_a_folder_without_a_tree_is_an_error_that_shows_the_expected_tree(tmp_path, subset):
-    write(tmp_path, "a.png")
-    with pytest.raises(PhotoError, match=rf"contains no shot of SIR2 {subset}; .*<scene>.*; "):
-        read_tree(tmp_path, subset)
-
-
 def test_subsets_are_recognised_by_the_start_of_their_names(tmp_path):
     for name in ("Postcard Dataset", "Solid_Object-2", "WildSceneDataset", "others"):
         (tmp_path / name).mkdir()
@@ -289,12 +259,6 @@ def test_natural_order_is_total_and_puts_2_before_10(texts, order):
     assert sorted(["a10", "a2", "10", "2", "a"], key=natural_key) == ["2", "10", "a", "a2", "a10"]
 
 
-def test_long_lists_are_shortened():
-    assert join_names(["a"]) == "a"
-    assert join_names(["a", "b", "c"], " or ") == "a, b or c"
-    assert join_names([str(number) for number in range(100)]) == "0, 1, 2, 3, 4 and 95 more"
-
-
 # --- training
 
 
@@ -314,13 +278,6 @@ def test_a_training_pair_of_two_sizes_is_an_error_that_names_both(tmp_path):
     write(tmp_path, "gt/a.png", size=(4, 3))
     with pytest.raises(RecipeError, match=r"blended/a.png and .*gt/a.png differ in size; "):
         read_pairs([tmp_path])
-
-
-def test_a_missing_folder_of_training_pairs_is_a_recipe_error(tmp_path):
-    with pytest.raises(
-        RecipeError, match=r"gone cannot be read \(No such file or directory\); .*BREWSTER_DATA"
-    ):
-        read_pairs([tmp_path / "gone"])
 
 
 def test_a_folder_with_a_semicolon_in_its_name_is_named_in_full(tmp_path):

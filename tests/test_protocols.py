@@ -3,8 +3,6 @@
 import pytest
 
 from brewster.cli.evaluate import evaluate
-from brewster.errors import BrewsterError
-from brewster.evaluate.config import EvaluationConfig
 from brewster.evaluate.protocols import PROTOCOLS, describe_protocol, protocol_config
 
 
@@ -14,10 +12,6 @@ def test_each_choice_of_a_protocol_has_a_source(name):
     assert lines[0].startswith(f"Protocol {name}: ")
     assert len(lines) == 1 + len(PROTOCOLS[name].choices) > 1
     assert all(choice and source for choice, source in PROTOCOLS[name].choices)
-
-
-def test_the_default_protocol_has_the_default_settings():
-    assert protocol_config("brewster") == EvaluationConfig()
 
 
 def test_the_contest_crops_the_border_and_scores_its_metrics():
@@ -35,8 +29,3 @@ def test_a_changed_setting_is_named():
 def test_the_command_offers_all_protocols():
     (option,) = (option for option in evaluate.params if option.name == "protocol")
     assert [name.lower() for name in option.type.choices] == [*PROTOCOLS]
-
-
-def test_an_unknown_protocol_is_an_error_with_the_known_names():
-    with pytest.raises(BrewsterError, match="expected one of brewster, paper, xreflection"):
-        protocol_config("ntire2020")

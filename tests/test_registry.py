@@ -205,13 +205,6 @@ def test_an_incomplete_rendered_sample_is_excluded(tmp_path):
     assert read.excluded == ("000001 is incomplete: expected photo.jpg, background.jpg, reflection.jpg",)
 
 
-def test_the_dev_pairs_are_ten_each(data):
-    for name in ("nature", "real"):
-        read = only("pairs", data / "real" / "dev" / name)
-        assert (read.name, len(read.cases), read.remarks, read.excluded) == (name, 10, (), ())
-    assert only("nature20", data / "real" / "dev" / "nature").remarks == ("found 10 images, expected 20",)
-
-
 # --- the order of the listing does not matter
 
 
@@ -264,18 +257,6 @@ def test_images_without_a_unique_partner_are_excluded_and_the_others_are_read(tm
             "the photo is 1200x800, the ground truth is 600x400: the ground truth is resized by the factor 0.5",
         ),
         (
-            (300, 200),
-            "the photo is 1200x800, the ground truth is 300x200: the ground truth is resized by the factor 0.25",
-        ),
-        (
-            (2400, 1600),
-            "the photo is 1200x800, the ground truth is 2400x1600: the ground truth is resized by the factor 2",
-        ),
-        (
-            (420, 280),
-            "the photo is 1200x800, the ground truth is 420x280: the ground truth is resized by the factor 0.35",
-        ),
-        (
             (420, 279),
             "the photo is 1200x800, the ground truth is 420x279: the ground truth is resized by the factor 0.35",
         ),
@@ -290,15 +271,6 @@ def test_a_ground_truth_of_another_size_is_excluded_and_its_scale_is_reported(tm
     read = only("pairs", tmp_path)
     assert read.cases == ()
     assert read.excluded == (f"blended/a: {message}",)
-
-
-def test_a_reflection_of_another_size_is_excluded_too(tmp_path):
-    repacked(tmp_path, ["a"])
-    write(tmp_path, "reflection/a.png", size=(4, 3))
-    (line,) = only("pairs", tmp_path).excluded
-    assert line == (
-        "blended/a: the photo is 8x6, the reflection is 4x3: the reflection is resized by the factor 0.5"
-    )
 
 
 def test_sizes_are_compared_after_the_exif_orientation(tmp_path):
@@ -333,20 +305,6 @@ def test_a_dangling_link_is_excluded_and_named(tmp_path):
 # --- remarks
 
 
-def test_an_unexpected_number_of_images_is_a_remark(tmp_path):
-    assert only("real20", repacked(tmp_path / "r", ["a"])).remarks == ("found 1 image, expected 20",)
-    wild = only("wildscene", wildscene(tmp_path / "w", 56))
-    assert wild.remarks == ("found 56 images, expected 101 or 55",)
-    assert only("wildscene", wildscene(tmp_path / "x", 55)).remarks == ()
-
-
-def test_cases_without_a_reflection_are_named_if_others_have_one(tmp_path):
-    repacked(tmp_path, ["a", "b", "c"])
-    assert only("pairs", tmp_path).remarks == ()
-    write(tmp_path, "reflection/b.png")
-    assert only("pairs", tmp_path).remarks == ("there is no ground truth of the reflection for a and c",)
-
-
 # --- invalid folders
 
 
@@ -363,17 +321,6 @@ def test_a_damaged_shard_is_an_error(tmp_path):
     write(tmp_path, "shard-000000.tar", data=b"no tar" * 200)
     with pytest.raises(PhotoError, match=r"is not a rendered dataset \(.*\); .*; "):
         read_benchmark("rendered", tmp_path)
-
-
-@pytest.mark.parametrize(
-    ("name", "suggestion"),
-    [("nature", "did you mean nature20?"), ("SIR2", "did you mean sir2?"), ("xyz", "use pairs=FOLDER")],
-)
-def test_an_unknown_benchmark_is_an_error_that_suggests_the_nearest(tmp_path, name, suggestion):
-    with pytest.raises(PhotoError) as error:
-        read_benchmark(name, tmp_path)
-    assert str(error.value).startswith(f"there is no benchmark {name!r}; expected one of real20, ")
-    assert suggestion in str(error.value)
 
 
 # --- files

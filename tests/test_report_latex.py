@@ -27,11 +27,6 @@ def test_the_table_has_the_papers_layout(results):
     assert widths == [12] * 5
 
 
-def test_the_average_has_as_many_digits_as_the_benchmarks(results):
-    row = next(line for line in to_latex(results).splitlines() if line.startswith("A"))
-    assert row.endswith(r"& \textbf{21.50} & \textbf{0.123} \\")
-
-
 def test_intervals_are_printed_on_demand(results):
     assert "18.50" not in to_latex(results)
     text = to_latex(results, intervals=True)
@@ -98,10 +93,3 @@ def test_psnr_ssim_and_lpips_come_first_if_the_results_have_all_of_them(results)
     psnr = results["metrics"]["psnr"]
     results["metrics"] = {name: psnr | {"title": name} for name in ("psnr", "ssim", "psnr_region", "lpips")}
     assert "psnr_region" not in to_latex(results)
-
-
-def test_without_sir2_the_header_has_one_row(results):
-    for part in ("selections", "tables", "differences"):
-        results[part] = {key: results[part][key] for key in ("real20", "average")}
-    assert "SIR" not in to_latex(results)
-    assert r"\multicolumn{2}{c|}{Real20 (20)}" in to_latex(results)

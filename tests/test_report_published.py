@@ -34,13 +34,6 @@ def test_a_printed_average_is_the_mean_weighted_by_the_numbers_of_images(row):
         assert abs(mean - average) <= 0.5001 * 10**-digits, metric
 
 
-def test_every_row_has_a_source_an_origin_and_a_protocol():
-    for row in ROWS:
-        assert all((row.method, row.source, row.copied_from, row.protocol))
-        assert row.scores
-        assert all(row.scores.values())
-
-
 def test_every_score_is_in_a_plausible_range():
     for row in ROWS:
         for scores in row.scores.values():

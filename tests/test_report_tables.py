@@ -24,24 +24,6 @@ def test_markdown_shows_means_intervals_and_paired_differences(results):
     assert "21.50 / 0.123" in text
 
 
-def test_markdown_lists_excluded_files_errors_and_every_setting(results):
-    text = to_markdown(results)
-    for line in (
-        "excluded: x.png has no partner",
-        "- A_b|c failed on real20/3",
-        "2 images in the folder match no case",
-        "Nothing is resized.",
-        "Definition of LPIPS.",
-    ):
-        assert line in text
-
-
-def test_metrics_with_the_same_problem_share_one_line(results):
-    results["unavailable"] = {"lpips": "no weights", "niqe": "no disk", "lpips_region": "no weights"}
-    lines = [line for line in to_markdown(results).splitlines() if line.startswith("- not computed")]
-    assert lines == ["- not computed: lpips, lpips_region: no weights", "- not computed: niqe: no disk"]
-
-
 def test_all_lines_of_a_table_have_the_same_number_of_cells_with_any_names(results):
     for block in re.findall(r"(?:^\|.*\n)+", tables_to_markdown(results), re.M):
         assert len({len(re.findall(r"(?<!\\)\|", line)) for line in block.splitlines()}) == 1
@@ -104,10 +86,3 @@ def test_a_note_warns_of_means_over_fewer_images(results):
         "A_b|c": {"psnr": entry(21.5, count=19)},
     }
     assert note in tables_to_markdown(results)
-
-
-def test_a_cell_with_several_counts_shows_the_smallest_and_the_largest(results):
-    results["metrics"]["ssim"] = METRICS["psnr"]
-    counts = {"psnr": entry(20.0, count=5), "ssim": entry(0.9, count=3), "lpips": entry(0.2, count=1)}
-    results["tables"]["real20"] = {"input (unprocessed)": counts, "A_b|c": counts}
-    assert "(1 to 5 of 20)" in tables_to_markdown(results)

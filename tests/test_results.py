@@ -142,13 +142,6 @@ def test_the_papers_average_uses_only_the_papers_benchmarks_and_reports_missing_
     )
 
 
-def test_a_requested_metric_without_a_score_is_listed(methods):
-    parts = [make_benchmark("a", 2)]
-    config = EvaluationConfig(metrics=("psnr", "kept_reflection"))
-    results = summarise(parts, methods, config, make_rows(parts, methods, lambda *_: 1.0))
-    assert results["unmeasured"] == ["kept_reflection"]
-
-
 def test_the_subset_of_the_paper_is_an_error_if_names_do_not_identify_the_scenes(tmp_path, methods):
     repacked(tmp_path / "postcard", ["001", "002"])
     parts = read_benchmark("postcard", tmp_path / "postcard")

@@ -297,23 +297,6 @@ def test_grey_images_alpha_and_sixteen_bits_are_compared_by_their_8_bit_colours(
     assert row.scores == {"psnr": 100.0, "ssim": 1.0}
 
 
-def test_the_order_of_the_files_in_a_folder_does_not_matter(tmp_path):
-    for order, folder in ((NAMES, "a"), (NAMES[::-1], "b")):
-        for name in order:
-            paint(tmp_path / folder / "transmission_layer" / f"{name}.png", int(name))
-            paint(tmp_path / folder / "blended" / f"{name}.png", int(name), noise=9)
-    rows = [
-        score(
-            read_benchmark("real20", tmp_path / folder),
-            [IdentityBaseline()],
-            QUICK,
-            tmp_path / f"out-{folder}",
-        )
-        for folder in "ab"
-    ]
-    assert comparable(rows[0]) == comparable(rows[1])
-
-
 def test_photos_are_downscaled_before_any_method_runs(tmp_path):
     repacked(tmp_path / "real20", ["1"], size=(80, 40))
     fake = FakeMethod()
@@ -333,18 +316,6 @@ def test_an_output_folder_that_cannot_be_written_is_an_error(real20, tmp_path):
     write(tmp_path, "out", data=b"a file")
     with pytest.raises(OutputError, match="was not written"):
         score(real20, [FakeMethod()], QUICK, tmp_path / "out")
-
-
-def test_progress_is_reported_after_every_prediction(real20, tmp_path):
-    calls = []
-    score(
-        real20,
-        [IdentityBaseline(), FakeMethod()],
-        QUICK,
-        tmp_path / "out",
-        on_progress=lambda *now: calls.append(now[:2]),
-    )
-    assert calls == [(i, 6) for i in range(1, 7)]
 
 
 def test_lines_of_another_version_are_ignored(real20, tmp_path):

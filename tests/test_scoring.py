@@ -97,13 +97,6 @@ def test_without_a_reflection_the_region_has_no_score(tmp_path):
     assert scorer.region_share == 0
 
 
-def test_a_larger_threshold_gives_a_smaller_region_and_a_lower_psnr(triplet):
-    config = EvaluationConfig(metrics=("psnr_region",), thresholds=(0.01, 0.1))
-    truth, scorer = open_case(triplet, config)
-    scores = scorer.score(MethodOutput(truth.photo))
-    assert scores["psnr_region@0.1"] < scores["psnr_region@0.01"]
-
-
 def test_the_failure_cases_are_scored_on_rendered_samples_only(triplet, rendered):
     config = EvaluationConfig(metrics=("psnr", "removed_content", "kept_reflection"))
     truth, scorer = open_case(triplet, config)
@@ -121,20 +114,6 @@ def test_images_that_are_too_small_for_a_metric_have_no_score(tmp_path):
         paint(tmp_path / "mine" / role / "a.png", 1, size=(8, 4))
     truth, scorer = open_case(tmp_path / "mine", EvaluationConfig(metrics=("psnr", "ssim")))
     assert scorer.score(MethodOutput(truth.photo)) == {"psnr": 100.0, "ssim": None}
-
-
-def test_lpips_of_the_dev_pairs_is_zero_for_the_ground_truth_and_large_for_noise(data, monkeypatch):
-    monkeypatch.setenv("BREWSTER_DATA", str(data))
-    config = EvaluationConfig(metrics=("lpips", "lpips_region"))
-    truth, scorer = open_case(data / "real/dev/nature", config, "nature20")
-    perfect = Photo.from_array(truth.images["transmission"], encoding="srgb")
-    noise = np.random.default_rng(1).integers(0, 256, truth.images["photo"].shape, np.uint8)
-    scores = [
-        scorer.score(MethodOutput(photo))["lpips"]
-        for photo in (perfect, truth.photo, Photo.from_array(noise, encoding="srgb"))
-    ]
-    assert scores[0] == 0 < scores[1] < 0.5 < scores[2]
-    assert scorer.score(MethodOutput(truth.photo))["lpips_region"] > scores[1]
 
 
 def make_metric(name, score, **more):
@@ -176,25 +155,6 @@ def test_a_metric_is_prepared_once_before_the_first_score(triplet, tmp_path, mon
     (again,) = score(benchmarks, [IdentityBaseline()], config, tmp_path / "out")
     assert first.scores == again.scores == {"late": 1.0}
     assert order == ["prepared"]
-
-
-def test_features_are_computed_once_for_each_image(triplet, monkeypatch):
-    """Two metrics share the features. All predictions share the features of the ground truth."""
-    computed = []
-
-    def compute(picture):
-        computed.append(picture)
-        return float(picture.mean())
-
-    def measure(case):
-        return case.prediction.features(compute) - case.truth.features(compute)
-
-    for name in ("one", "two"):
-        monkeypatch.setitem(METRICS, name, make_metric(name, measure))
-    truth, scorer = open_case(triplet, EvaluationConfig(metrics=("one", "two")))
-    scores = [scorer.score(MethodOutput(photo)) for photo in (truth.photo, truth.photo)]
-    assert scores[0] == scores[1]
-    assert [picture is truth.images["transmission"] for picture in computed] == [False, True, False]
 
 
 def test_every_metric_gives_the_score_of_its_function(data, monkeypatch):

@@ -119,13 +119,6 @@ def test_all_problems_of_the_files_are_listed_at_once_and_nothing_is_written(tmp
     assert sorted(path.name for path in tmp_path.iterdir()) == ["RDNet", "inputs", "ours"]
 
 
-def test_two_files_with_the_same_name_are_refused(tmp_path, folders):
-    inputs, methods = folders
-    write_pictures(methods["ours"], ["real/2"], suffix=".jpg")
-    with pytest.raises(BrewsterError, match=r"2\.jpg and .*2\.png have the same name"):
-        create_study(tmp_path / "study", inputs, methods)
-
-
 @pytest.mark.parametrize(
     ("options", "message"),
     [
@@ -137,17 +130,6 @@ def test_two_files_with_the_same_name_are_refused(tmp_path, folders):
 def test_options_beyond_the_available_pictures_are_refused(tmp_path, folders, options, message):
     with pytest.raises(BrewsterError, match=message):
         create_study(tmp_path / "study", *folders, options)
-
-
-def test_one_method_and_empty_folders_are_refused(tmp_path, folders):
-    inputs, methods = folders
-    with pytest.raises(BrewsterError, match="two or more"):
-        create_study(tmp_path / "study", inputs, {"ours": methods["ours"]})
-    (tmp_path / "empty").mkdir()
-    with pytest.raises(BrewsterError, match="contains no picture"):
-        create_study(tmp_path / "study", tmp_path / "empty", methods)
-    with pytest.raises(BrewsterError, match="is not a folder"):
-        create_study(tmp_path / "study", tmp_path / "nowhere", methods)
 
 
 def test_a_study_is_never_overwritten(tmp_path, folders):

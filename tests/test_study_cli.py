@@ -50,15 +50,6 @@ def add_answers(study, participants, rng):
     store.close()
 
 
-def test_create_prints_a_summary_and_the_next_command(run_without_model, folders):
-    code, out, err = run_without_model(
-        "study", "create", "study", *folders, "--seed", 4, "--comparisons", 3, "--catch-trials", 2
-    )
-    assert (code, out) == (0, b"")
-    assert "4 comparisons of 2 methods; a participant sees 3 of them and 2 catch trials (seed 4)" in err
-    assert "next: brewster study serve study" in err
-
-
 @pytest.mark.parametrize("names", [("inputs", "ours", "rdnet"), ("inputs", "ours", "inputs")])
 def test_the_progress_of_create_ends_at_its_total(run_without_model, folders, names, monkeypatch):
     totals, counts = [], []
@@ -131,13 +122,6 @@ def test_create_uses_only_the_inputs_of_a_list(run_without_model, folders, tmp_p
         (tmp_path / "list.txt").write_text(text)
         code, _, err = run_without_model("study", "create", "other", *folders, "--list", "list.txt")
         assert (code, message in err) == (1, True)
-
-
-def test_report_without_answers_or_without_a_study_is_an_error(run_without_model, study):
-    code, _, err = run_without_model("study", "report", "study")
-    assert (code, "has no answers yet" in err) == (1, True)
-    code, _, err = run_without_model("study", "report", "nowhere")
-    assert (code, "cannot be read" in err) == (1, True)
 
 
 def test_plan_prints_text_or_json(run_without_model):
@@ -218,12 +202,6 @@ def test_an_automatic_token_is_stored_for_its_owner_only_and_links_survive_a_res
         stop_server(second)
 
 
-def test_an_invalid_token_file_is_refused(run_without_model, study):
-    (study.folder / "token").write_text("short\n")
-    code, _, err = run_without_model("study", "serve", "study", "--token", "auto")
-    assert (code, "contains no valid token" in err) == (1, True)
-
-
 @pytest.mark.parametrize(
     "name", ["study.example.org:443", "https://study.example.org", "study.example.org/", "", "bücher.example"]
 )
@@ -253,16 +231,3 @@ def test_a_read_only_study_is_reported_into_another_folder(study, rng, tmp_path)
     assert done.returncode == 0, done.stderr
     assert "3 participants" in done.stdout
     assert refused.returncode == 1  # checks that the folder was read-only
-
-
-def test_create_limits_the_number_of_catch_trials(run_without_model, tmp_path):
-    names = [f"{i}" for i in range(26)]
-    for seed, name in enumerate(("inputs", "ours", "rdnet")):
-        write_pictures(tmp_path / name, names, size=(4, 3), seed=seed)
-    args = ["--inputs", "inputs", "--method", "ours=ours", "--method", "RDNet=rdnet", "--catch-trials"]
-    code, _, err = run_without_model("study", "create", "study", *args, 25)
-    assert (code, "25 catch trials for each participant were requested; at most 24 are available" in err) == (
-        1,
-        True,
-    )
-    assert "26 of them and 24 catch trials" in run_without_model("study", "create", "study", *args, 24)[2]

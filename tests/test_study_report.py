@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 from brewster import Photo
-from brewster.errors import BrewsterError
 from brewster.user_study.assignment import Trial, draw_trials
 from brewster.user_study.report import figure
 from brewster.user_study.report.bradley_terry import strengths
@@ -356,12 +355,6 @@ def test_markdown_is_complete_and_csv_has_a_line_for_each_number(hundred_partici
     assert {line["group"] for line in lines} == {"included", "everyone"}
 
 
-def test_without_answers_there_is_no_report(hundred_participants):
-    study, *_ = hundred_participants
-    with pytest.raises(BrewsterError, match="no answers yet"):
-        summarise(study, [], ExclusionRule())
-
-
 def test_few_participants_are_named_and_rows_without_answers_are_left_out(hundred_participants):
     study, _, results = hundred_participants
     one_answer = participant_answers(number=1, votes={0: 0}, seconds=9.0)
@@ -429,15 +422,6 @@ def test_the_plot_has_a_bar_for_each_row_and_does_not_interpret_names_as_formula
     assert len(axis.patches) == 3 * 3
     assert len({patch.get_y() for patch in axis.patches}) == 3
     assert not [str(warning.message) for warning in recwarn]
-
-
-def test_a_plot_of_all_participants_has_a_title(hundred_participants, monkeypatch):
-    study, participants, _ = hundred_participants
-    titles = []
-    monkeypatch.setattr("matplotlib.figure.Figure.suptitle", lambda _self, text, **_how: titles.append(text))
-    for count in (20, 5):  # the rule excludes the first five
-        plot(summarise(study, participants[:count], ExclusionRule()))
-    assert titles == ["All participants: the rule excludes everyone"]
 
 
 def test_answers_csv_has_the_reason_of_each_exclusion(hundred_participants, tmp_path):

@@ -90,24 +90,19 @@ def _exclusion_reason(roles: _Roles) -> str:
                 return f"{role} {number} is ambiguous: {paths[0].name} and {paths[1].name}"
     if len(roles["frame"]) < 2:
         return "expected two or more frames, but there is one"
-    middle = _middle(roles)
+    middle = sorted(roles["frame"])[len(roles["frame"]) // 2]
     missing = f"there is no transmission of the middle frame, frame {middle}"
     return "" if middle in roles["transmission"] else missing
 
 
-def _middle(roles: _Roles) -> int:
-    numbers = sorted(roles["frame"])
-    return numbers[len(numbers) // 2]
-
-
 def _burst(root: Path, folder: Path, roles: _Roles) -> BurstFiles:
-    middle = _middle(roles)
-    frames = roles["frame"]
+    frames, numbers = roles["frame"], sorted(roles["frame"])
+    middle = numbers[len(numbers) // 2]
     reflection = roles["reflection"].get(middle)
     return BurstFiles(
         folder.absolute().name,
         frames[middle][0].relative_to(root).with_suffix("").as_posix(),
-        tuple(ImageFile(frames[number][0]) for number in sorted(frames)),
+        tuple(ImageFile(frames[number][0]) for number in numbers),
         ImageFile(roles["transmission"][middle][0]),
         ImageFile(reflection[0]) if reflection else None,
     )

@@ -31,26 +31,23 @@ class ImageFile:
         Raises:
             UnreadablePhoto: the file is missing, cannot be read, or ends before the end of the span.
         """
+        offset, length = self.span or (0, -1)
         try:
-            return self._read()
+            with self.path.open("rb") as file:
+                file.seek(offset)
+                data = file.read(length)
+            if len(data) < length:
+                raise OSError(f"the file has only {len(data)} of {length} bytes")  # noqa: TRY301
         except OSError as error:
             raise UnreadablePhoto(
                 f"{self} cannot be read ({error.strerror or error})",
                 "expected a complete image file",
                 "restore the file or its permissions, and run again",
             ) from error
+        return data
 
     def __str__(self) -> str:
         return f"{self.path}" if self.span is None else f"{self.path} from byte {self.span[0]}"
-
-    def _read(self) -> bytes:
-        offset, length = self.span or (0, -1)
-        with self.path.open("rb") as file:
-            file.seek(offset)
-            data = file.read(length)
-        if len(data) < length:
-            raise OSError(f"the file has only {len(data)} of {length} bytes")
-        return data
 
 
 def read_samples(folder: Path) -> list[StoredSample]:

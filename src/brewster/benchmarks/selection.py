@@ -33,17 +33,19 @@ def paper_subset(benchmark: Benchmark, seed: int = PAPER_SEED) -> tuple[Case, ..
     """
     if benchmark.name not in BENCHMARKS or not BENCHMARKS[benchmark.name].scene_pattern:
         return benchmark.cases
-    scenes: dict[str, list[Case]] = defaultdict(list)
-    for case in benchmark.cases:
-        scenes[case.scene].append(case)
     if any(case.scene == case.name for case in benchmark.cases):
         raise PhotoError(
             f"names such as {benchmark.cases[0].name!r} do not identify the scenes of {benchmark.title}",
             "expected file names that begin with the scene, because the paper's protocol draws one case of each scene",
             "use the original folders of SIR2, or another --protocol",
         )
-    rng = {scene: Random(f"{seed}/{benchmark.name}/{scene}") for scene in sorted(scenes, key=natural_key)}  # noqa: S311
-    return tuple(rng[scene].choice(scenes[scene]) for scene in rng)
+    scenes: dict[str, list[Case]] = defaultdict(list)
+    for case in benchmark.cases:
+        scenes[case.scene].append(case)
+    return tuple(
+        Random(f"{seed}/{benchmark.name}/{scene}").choice(scenes[scene])  # noqa: S311
+        for scene in sorted(scenes, key=natural_key)
+    )
 
 
 def spread(benchmark: Benchmark, limit: int) -> Benchmark:
@@ -71,7 +73,9 @@ def with_unique_names(benchmarks: Sequence[Benchmark], folders: Sequence[Path]) 
     """
     names = [benchmark.name for benchmark in benchmarks]
     unique_names = list(names)
-    parents = [_parent_names(folder) for folder in folders]
+    # the names of all folders above each folder; links are not resolved
+    above = [Path(os.path.abspath(folder)).parts[1:-1] for folder in folders]  # noqa: PTH100
+    parents = [[name for part in parts if (name := safe_name(part))] for parts in above]
     for name, count in Counter(names).items():
         group = [i for i in range(len(names)) if names[i] == name]
         depth = 0
@@ -79,18 +83,10 @@ def with_unique_names(benchmarks: Sequence[Benchmark], folders: Sequence[Path]) 
             depth += 1
             for i in group:
                 unique_names[i] = "-".join([*parents[i][-depth:], name])
-    return [
-        benchmark if name == benchmark.name else _renamed(benchmark, name)
-        for benchmark, name in zip(benchmarks, unique_names, strict=True)
-    ]
-
-
-def _parent_names(folder: Path) -> list[str]:
-    """Returns the names of all folders above a folder. Links are not resolved."""
-    parts = Path(os.path.abspath(folder)).parts[1:-1]  # noqa: PTH100  (do not resolve links)
-    return [name for part in parts if (name := safe_name(part))]
-
-
-def _renamed(benchmark: Benchmark, name: str) -> Benchmark:
-    cases = tuple(replace(case, benchmark=name) for case in benchmark.cases)
-    return replace(benchmark, name=name, title=f"{benchmark.title} ({name})", cases=cases)
+    renamed = list(benchmarks)
+    for i, name in enumerate(unique_names):
+        if name != names[i]:
+            cases = tuple(replace(case, benchmark=name) for case in benchmarks[i].cases)
+            title = f"{benchmarks[i].title} ({name})"
+            renamed[i] = replace(benchmarks[i], name=name, title=title, cases=cases)
+    return renamed

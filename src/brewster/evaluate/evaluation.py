@@ -11,6 +11,7 @@ import hashlib
 import json
 import math
 import os
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -22,7 +23,7 @@ from urllib.parse import quote
 from brewster.benchmarks.image_files import ImageFile
 from brewster.benchmarks.pairing import join_names
 from brewster.benchmarks.registry import Benchmark, Case
-from brewster.errors import BrewsterError, PhotoError
+from brewster.errors import BrewsterError, PhotoError, counted
 from brewster.evaluate.config import EvaluationConfig
 from brewster.evaluate.methods import (
     BASELINE,
@@ -120,12 +121,24 @@ def evaluate(
             on_case_scored=thumbnails,
         )
         if config.resizes:
-            _write_missing_inputs(cases, config, out / INPUTS_FOLDER)
+            for case in cases:  # that this run did not decode
+                path = _input_path(out / INPUTS_FOLDER, case)
+                if not path.exists():
+                    with suppress(PhotoError):  # an unreadable photo has a row with the error
+                        resize(Photo.open(case.photo.read()), config).save(path)
         results = summarise(benchmarks, methods, config, rows, unavailable)
         for method in methods:
             if remarks := list(_method_remarks(method, cases, rows)):
                 results["methods"][method.name]["remark"] = "; ".join(remarks)
-        _write_tables(results, out, intervals=intervals)
+        tables = {
+            RESULTS_FILE: json.dumps(results, indent=1, allow_nan=False) + "\n",
+            "tables.md": f"{to_markdown(results)}\n{published_to_markdown(read_published())}",
+            "table.tex": to_latex(results, intervals=intervals),
+            "table.csv": to_csv(results),
+            SCORES_TABLE_FILE: scores_to_csv(results),
+        }
+        for name, text in tables.items():
+            write_atomically(out / name, text.encode(errors="backslashreplace"), overwrite=True)
         write_report(
             results, _report_cases(cases, methods, rows, max_report_cases, thumbnails), out / REPORT_FILE
         )
@@ -141,10 +154,10 @@ def check(benchmarks: Sequence[Benchmark], methods: Sequence[Method], config: Ev
     """
     check_names(methods)
     names = [benchmark.name for benchmark in benchmarks]
-    for name in names:
-        if names.count(name) > 1:
+    for name, count in Counter(names).items():
+        if count > 1:
             raise BrewsterError(
-                f"{names.count(name)} benchmarks have the name {name!r}",
+                f"{count} benchmarks have the name {name!r}",
                 "expected unique names",
                 "rename one of the folders",
             )
@@ -171,45 +184,17 @@ def _method_remarks(method: Method, cases: Sequence[Case], rows: Sequence[ScoreR
     unchanged = {row.id[:2] for row in identical if row.method == BASELINE}
     copied = [row for row in identical if row.method == method.name and row.id[:2] not in unchanged]
     if copied:
-        yield f"the predictions equal the ground truth for {_count_images(len(copied))}: check the folder"
+        yield f"the predictions equal the ground truth for {counted(len(copied), 'image')}: check the folder"
     misregistered = [row for row in rows if row.method == method.name and row.registration]
     if misregistered:
         named = join_names([f"{row.benchmark}/{row.case} is {row.registration}" for row in misregistered])
-        yield f"{_count_images(len(misregistered))} of {len(cases)} not registered with the photo: {named}"
+        yield f"{counted(len(misregistered), 'image')} of {len(cases)} not registered with the photo: {named}"
     if unmatched := method.count_unmatched(cases):
-        yield f"{_count_images(unmatched)} in the folder {'matches' if unmatched == 1 else 'match'} no case"
-
-
-def _count_images(count: int) -> str:
-    return f"{count} {'image' if count == 1 else 'images'}"
-
-
-def _write_missing_inputs(cases: Sequence[Case], config: EvaluationConfig, folder: Path) -> None:
-    """Writes the resized photos of the cases that this run did not decode.
-
-    Skips unreadable photos, because their rows have the error.
-    """
-    for case in cases:
-        path = _input_path(folder, case)
-        if not path.exists():
-            with suppress(PhotoError):
-                resize(Photo.open(case.photo.read()), config).save(path)
+        yield f"{counted(unmatched, 'image')} in the folder {'matches' if unmatched == 1 else 'match'} no case"
 
 
 def _input_path(folder: Path, case: Case) -> Path:
     return folder / case.benchmark / f"{case.name}.png"
-
-
-def _write_tables(results: Results, out: Path, *, intervals: bool) -> None:
-    tables = {
-        RESULTS_FILE: json.dumps(results, indent=1, allow_nan=False) + "\n",
-        "tables.md": f"{to_markdown(results)}\n{published_to_markdown(read_published())}",
-        "table.tex": to_latex(results, intervals=intervals),
-        "table.csv": to_csv(results),
-        SCORES_TABLE_FILE: scores_to_csv(results),
-    }
-    for name, text in tables.items():
-        write_atomically(out / name, text.encode(errors="backslashreplace"), overwrite=True)
 
 
 # --- images of the report

@@ -57,7 +57,12 @@ def find_misregistration(prediction: Image, photo: Image) -> str:
     best = max(flips, key=flips.__getitem__)
     if flips[best] > max(direct + _MIN_FLIP_GAIN, _MIN_FLIP_CORRELATION):
         return best
-    return _describe_shift(*_phase_shift(one, other), factor)
+    rows, columns = _phase_shift(one, other)
+    if np.hypot(rows, columns) < MIN_SHIFT_PX:
+        return ""
+    vertical = f"{abs(rows) * factor} px {'down' if rows > 0 else 'up'}" if rows else ""
+    horizontal = f"{abs(columns) * factor} px to the {'right' if columns > 0 else 'left'}" if columns else ""
+    return f"shifted by about {' and '.join(filter(None, (vertical, horizontal)))}"
 
 
 def _reduced(image: Image, factor: int) -> _Plane:
@@ -87,14 +92,3 @@ def _phase_shift(one: _Plane, other: _Plane) -> tuple[int, int]:
         return 0, 0
     height, width = one.shape
     return int((row + height // 2) % height - height // 2), int((column + width // 2) % width - width // 2)
-
-
-def _describe_shift(rows: int, columns: int, factor: int) -> str:
-    if np.hypot(rows, columns) < MIN_SHIFT_PX:
-        return ""
-    parts = [
-        f"{abs(count) * factor} px {'to the ' + words[count > 0] if axis else words[count > 0]}"
-        for axis, (count, words) in enumerate(((rows, ("up", "down")), (columns, ("left", "right"))))
-        if count
-    ]
-    return f"shifted by about {' and '.join(parts)}"

@@ -82,7 +82,16 @@ def summarise(
             "choices": _choices(config, averaged),
         },
         "metrics": {name: metric.to_dict() for name, metric in columns.items()},
-        "benchmarks": {benchmark.name: _describe_benchmark(benchmark) for benchmark in benchmarks},
+        "benchmarks": {
+            benchmark.name: {
+                "title": benchmark.title,
+                "cases": len(benchmark.cases),
+                "expected": list(benchmark.expected_counts),
+                "remarks": list(benchmark.remarks),
+                "excluded": list(benchmark.excluded),
+            }
+            for benchmark in benchmarks
+        },
         "selections": {
             key: {
                 "title": "Average" if key == AVERAGE else group[0].title,
@@ -101,7 +110,9 @@ def summarise(
         "draw": {"seed": PAPER_SEED}
         | {subset.key: [case.name for case in subset.cases] for subset in subsets},
         "cases": [
-            _describe_case(case, method_names, by_id, columns)
+            _describe_case(
+                [by_id[case.benchmark, case.name, method] for method in method_names], case, columns
+            )
             for benchmark in benchmarks
             for case in benchmark.cases
         ],
@@ -169,24 +180,8 @@ def _rounded(row: dict[str, Any]) -> dict[str, Any]:
     return {name: round(value, _DIGITS) if isinstance(value, float) else value for name, value in row.items()}
 
 
-def _describe_benchmark(benchmark: Benchmark) -> dict[str, Any]:
-    return {
-        "title": benchmark.title,
-        "cases": len(benchmark.cases),
-        "expected": list(benchmark.expected_counts),
-        "remarks": list(benchmark.remarks),
-        "excluded": list(benchmark.excluded),
-    }
-
-
-def _describe_case(
-    case: Case,
-    methods: Sequence[str],
-    rows: Mapping[tuple[str, str, str], ScoreRow],
-    columns: Collection[str],
-) -> dict[str, Any]:
-    case_rows = {method: rows[case.benchmark, case.name, method] for method in methods}
-    scored = next((row for row in case_rows.values() if not row.error), None)
+def _describe_case(rows: Sequence[ScoreRow], case: Case, columns: Collection[str]) -> dict[str, Any]:
+    scored = next((row for row in rows if not row.error), None)
     return {
         "benchmark": case.benchmark,
         "name": case.name,
@@ -195,9 +190,9 @@ def _describe_case(
         "height": scored.height if scored else None,
         "region_share": scored.region_share if scored else None,
         "scores": {
-            method: {column: row.scores[column] for column in columns if column in row.scores}
-            for method, row in case_rows.items()
+            row.method: {column: row.scores[column] for column in columns if column in row.scores}
+            for row in rows
             if not row.error
         },
-        "errors": {method: row.error for method, row in case_rows.items() if row.error},
+        "errors": {row.method: row.error for row in rows if row.error},
     }

@@ -29,8 +29,8 @@ from brewster.evaluate.score_log import (
     SCORE_FORMAT_VERSION,
     SCORES_FILE,
     RowId,
-    ScoreLog,
     ScoreRow,
+    append_row,
     read_score_rows,
 )
 from brewster.evaluate.scoring import CaseFiles, GroundTruth, Scorer
@@ -89,13 +89,13 @@ def score(
         unavailable = ()
         for prepare, _ in _missing_metrics(cases.values(), methods, config, logged):
             prepare()
-    log, rows = ScoreLog(out / SCORES_FILE), dict[RowId, ScoreRow]()
+    rows = dict[RowId, ScoreRow]()
 
     def log_rows(case_rows: Sequence[ScoreRow]) -> None:
         for row in case_rows:
             rows[row.id] = row
             if row != logged.get(row.id):
-                log.write(row)
+                append_row(out / SCORES_FILE, row)
                 on_progress(len(rows), len(ids), row)
 
     columns = tuple(column for column in config.columns() if column not in unavailable)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any, Final, final
+from typing import Final, final
 
 from brewster.errors import OutputError
 
@@ -49,36 +49,26 @@ class ScoreRow:
         return self.benchmark, self.case, self.method
 
 
-@final
-class ScoreLog:
-    """The file scores.jsonl at `path`. The first call of `write` creates it."""
+def append_row(path: Path, row: ScoreRow) -> None:
+    """Appends a line to scores.jsonl, which the first call creates.
 
-    def __init__(self, path: Path) -> None:
-        self._path = path
-
-    def write(self, row: ScoreRow) -> None:
-        """Appends a line.
-
-        Raises:
-            OutputError: the file cannot be written.
-        """
-        try:
-            self._path.parent.mkdir(parents=True, exist_ok=True)
-            with self._path.open("ab+") as file:
-                file.write(self._missing_newline(file) + json.dumps(asdict(row)).encode() + b"\n")
-        except OSError as error:
-            raise OutputError(
-                f"{self._path} was not written ({error.strerror or error})",
-                "expected a writable output folder",
-                "free disk space or choose another folder with -o, and run again (the finished scores are saved)",
-            ) from error
-
-    def _missing_newline(self, file: Any) -> bytes:  # noqa: ANN401  (the type that open returns)
-        """Returns a newline if the file does not end with one: a killed run can leave an incomplete line."""
-        if not file.seek(0, 2):
-            return b""
-        file.seek(-1, 2)
-        return b"" if file.read(1) == b"\n" else b"\n"
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with path.open("ab+") as file:
+            size = file.seek(0, 2)
+            file.seek(max(0, size - 1))
+            # a killed run can leave an incomplete line, which must not swallow this one
+            newline = b"" if file.read(1) in (b"", b"\n") else b"\n"
+            file.write(newline + json.dumps(asdict(row)).encode() + b"\n")
+    except OSError as error:
+        raise OutputError(
+            f"{path} was not written ({error.strerror or error})",
+            "expected a writable output folder",
+            "free disk space or choose another folder with -o, and run again (the finished scores are saved)",
+        ) from error
 
 
 def read_score_rows(path: Path) -> dict[RowId, ScoreRow]:

@@ -152,22 +152,17 @@ class Scorer:
             for layer, photo in layers.items()
             if photo and layer in self._cached_images
         }
+        if self._truth.case.rendered:
+            comparisons["rendered"] = comparisons["transmission"]
         all_columns = self._config.columns()
         return {
             column: self._compute(column, all_columns[column], comparisons)
             for column in (all_columns if columns is None else columns)
-            if self._applies(all_columns[column], comparisons)
+            if all_columns[column].ground_truth in comparisons
         }
 
-    def _applies(self, metric: Metric, comparisons: Mapping[str, Comparison]) -> bool:
-        return (
-            self._truth.case.rendered
-            if metric.ground_truth == "rendered"
-            else metric.ground_truth in comparisons
-        )
-
     def _compute(self, column: str, metric: Metric, comparisons: Mapping[str, Comparison]) -> float | None:
-        comparison = comparisons["transmission" if metric.ground_truth == "rendered" else metric.ground_truth]
+        comparison = comparisons[metric.ground_truth]
         if metric.area == "region":
             comparison = replace(comparison, region=self._region(self._config.threshold(column)))
         try:

@@ -81,19 +81,15 @@ def export_ntire2026(
         )
     paths = []
     for split, photos in splits.items():
-        path = out / f"{split}_output.zip"
-        write_atomically(path, _packed(split, photos, method, on_progress), overwrite=True)
-        paths.append(path)
+
+        def predictions(split: str = split, photos: Path = photos) -> Iterator[tuple[str, bytes]]:
+            for path in image_files(photos)[0]:
+                on_progress(path.stem)
+                yield f"{path.stem}.jpg", _prediction(split, photos, path, method)
+
+        paths.append(out / f"{split}_output.zip")
+        write_atomically(paths[-1], zip_images(predictions()), overwrite=True)
     return paths
-
-
-def _packed(split: str, photos: Path, method: Method, on_progress: Callable[[str], None]) -> bytes:
-    def predictions() -> Iterator[tuple[str, bytes]]:
-        for path in image_files(photos)[0]:
-            on_progress(path.stem)
-            yield f"{path.stem}.jpg", _prediction(split, photos, path, method)
-
-    return zip_images(predictions())
 
 
 def _prediction(split: str, photos: Path, path: Path, method: Method) -> bytes:

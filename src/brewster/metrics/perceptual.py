@@ -14,7 +14,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final, NamedTuple, final
+from typing import TYPE_CHECKING, Final, final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,21 +38,9 @@ _SCALE: Final = np.array([0.458, 0.448, 0.450])
 """The mean and the standard deviation of ImageNet's values in -1..1, rounded as in LPIPS 0.1."""
 
 
-class _Layer(NamedTuple):
-    """A convolution of AlexNet. If `pooled_before` is True, a 3x3 max pooling with stride 2 precedes it."""
-
-    stride: int
-    padding: int
-    pooled_before: bool
-
-
-_LAYERS: Final = (
-    _Layer(4, 2, pooled_before=False),
-    _Layer(1, 2, pooled_before=True),
-    _Layer(1, 1, pooled_before=True),
-    _Layer(1, 1, pooled_before=False),
-    _Layer(1, 1, pooled_before=False),
-)
+_STRIDES_AND_PADDINGS: Final = ((4, 2), (1, 2), (1, 1), (1, 1), (1, 1))
+"""Of AlexNet's convolutions. A 3x3 max pooling with stride 2 precedes those of _POOLED."""
+_POOLED: Final = (1, 2)
 
 
 @final
@@ -131,12 +119,12 @@ class Lpips:
         maps = []
         with torch.inference_mode():
             activations = torch.from_numpy(_normalised(image)).permute(2, 0, 1)[None]
-            for (weight, bias), layer in zip(self.convolutions, _LAYERS, strict=True):
-                if layer.pooled_before:
+            for i, ((weight, bias), how) in enumerate(
+                zip(self.convolutions, _STRIDES_AND_PADDINGS, strict=True)
+            ):
+                if i in _POOLED:
                     activations = functional.max_pool2d(activations, 3, 2)
-                activations = functional.conv2d(
-                    activations, weight, bias, layer.stride, layer.padding
-                ).relu_()
+                activations = functional.conv2d(activations, weight, bias, *how).relu_()
                 maps.append(activations[0] / (torch.linalg.vector_norm(activations[0], dim=0) + 1e-10))
         return Features(tuple(maps), shape)
 

@@ -26,7 +26,10 @@ def load_or_create_token(folder: Path) -> str:
     path = folder / "token"
     try:
         if not path.exists():
-            _write(path, secrets.token_urlsafe(16))
+            with os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w") as file:
+                file.write(f"{secrets.token_urlsafe(16)}\n")
+                file.flush()
+                os.fsync(file.fileno())
         token = path.read_text("latin-1").strip()
     except OSError as error:
         raise OutputError(
@@ -41,10 +44,3 @@ def load_or_create_token(folder: Path) -> str:
             "restore the file, or delete it to create a new token, which makes the links sent out earlier invalid",
         )
     return token
-
-
-def _write(path: Path, token: str) -> None:
-    with os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w") as file:
-        file.write(f"{token}\n")
-        file.flush()
-        os.fsync(file.fileno())

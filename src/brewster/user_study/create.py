@@ -18,7 +18,7 @@ from random import Random
 from typing import Final, final
 
 import brewster
-from brewster.errors import BrewsterError, OutputError, PhotoError
+from brewster.errors import BrewsterError, OutputError, PhotoError, counted
 from brewster.files import atomic_path, write_atomically
 from brewster.photo import Photo
 from brewster.user_study.degrade import degrade
@@ -71,13 +71,8 @@ class StudyOptions:
     consent: str = DEFAULT_CONSENT
 
 
-@final
-@dataclass(frozen=True)
-class _StudyFiles:
-    """The source files of a study by (dataset, stem): the inputs, and the outputs of each method."""
-
-    inputs: Mapping[Key, Path]
-    outputs: Mapping[str, Mapping[Key, Path]]
+_Outputs = Mapping[str, Mapping[Key, Path]]
+"""The outputs of each method, by (dataset, stem)."""
 
 
 def create_study(
@@ -105,18 +100,26 @@ def create_study(
         OutputError: `out` is not empty or cannot be written.
     """
     require_empty(out)
-    files = _pair_pictures(inputs, methods, options)
+    photos, outputs = _pair_pictures(inputs, methods, options)
     all_pairs = list(combinations(methods, 2))
     pairs = all_pairs if options.all_pairs else all_pairs[: len(methods) - 1]
     seed = secrets.randbelow(1 << 32) if options.seed is None else options.seed
-    pairs_each = _limited(options.pairs, DEFAULT_PAIRS, len(pairs) * len(files.inputs), "pairs")
-    catch_trials = _limited(
-        options.catch_trials, DEFAULT_CATCHES, min(CATCH_POOL_SIZE, len(files.inputs)), "catch trials"
-    )
+    pairs_each = _limited(options.pairs, DEFAULT_PAIRS, len(pairs) * len(photos), "pairs")
+    pool_size = min(CATCH_POOL_SIZE, len(photos))
+    catch_trials = _limited(options.catch_trials, DEFAULT_CATCHES, pool_size, "catch trials")
     with atomic_path(out) as folder:
         copier = _Copier(folder / PICTURES_FOLDER, Random(f"{seed}/names"), on_progress)  # noqa: S311  (the seed is published)
-        comparisons = tuple(_comparisons(files, pairs, copier))
-        pool = tuple(_catch_pool(files, copier, Random(f"{seed}/catch_trials")))  # noqa: S311
+        comparisons = tuple(
+            PairedComparison(
+                *key,
+                (first, second),
+                outputs=(copier.copy(outputs[first][key]), copier.copy(outputs[second][key])),
+                photo=copier.copy(photo),
+            )
+            for key, photo in photos.items()
+            for first, second in pairs
+        )
+        pool = tuple(_catch_pool(photos, outputs, copier, Random(f"{seed}/catch_trials")))  # noqa: S311
         description = StudyDescription(
             brewster=brewster.__version__,
             seed=seed,
@@ -124,7 +127,7 @@ def create_study(
             catch_trials=catch_trials,
             consent=options.consent,
             methods=tuple(methods),
-            datasets=tuple(dict.fromkeys(dataset for dataset, _ in files.inputs)),
+            datasets=tuple(dict.fromkeys(dataset for dataset, _ in photos)),
             pictures=tuple(sorted(copier.pictures.values(), key=lambda picture: picture.name)),
             comparisons=comparisons,
             catch_pool=pool,
@@ -136,51 +139,46 @@ def create_study(
 # --- checking the source files
 
 
-def _pair_pictures(inputs: Path, methods: Mapping[str, Path], options: StudyOptions) -> _StudyFiles:
+def _pair_pictures(
+    inputs: Path, methods: Mapping[str, Path], options: StudyOptions
+) -> tuple[Mapping[Key, Path], _Outputs]:
+    """Returns the inputs and the outputs, after checking them. One error lists all problems."""
     if len(methods) < 2:
         raise BrewsterError(
             f"the number of methods is {len(methods)}",
             "expected two or more methods",
             "add another --method NAME=FOLDER",
         )
-    files = _StudyFiles(
-        select_pictures(find_pictures(inputs, options.datasets), options.names, inputs),
-        {
-            name: select_pictures(find_pictures(path, options.datasets), options.names, path)
-            for name, path in methods.items()
-        },
+    photos, *found = (
+        select_pictures(find_pictures(path, options.datasets), options.names, path)
+        for path in (inputs, *methods.values())
     )
-    problems = [*_pairing_problems(files, inputs, methods), *_file_problems(files)]
+    outputs = dict(zip(methods, found, strict=True))
+    problems = []
+    for name, paths in outputs.items():
+        missing, extra = photos.keys() - paths.keys(), paths.keys() - photos.keys()
+        problems += [f"{name} has no {methods[name] / dataset / stem}.*" for dataset, stem in missing]
+        problems += [f"{paths[key]} has no input in {inputs / key[0]}" for key in extra]
+    problems += _file_problems(photos, outputs)
     if problems:
         raise BrewsterError(
-            f"the pictures have {len(problems)} {'problem' if len(problems) == 1 else 'problems'}: {shorten_list(problems)}",
+            f"the pictures have {counted(len(problems), 'problem')}: {shorten_list(problems)}",
             "expected one output of each method for every input, with the size of the input",
             "fix these files and run the command again; nothing was written",
         )
-    return files
+    return photos, outputs
 
 
-def _pairing_problems(files: _StudyFiles, inputs: Path, methods: Mapping[str, Path]) -> Iterator[str]:
-    for name, outputs in files.outputs.items():
-        for dataset, stem in files.inputs.keys() - outputs.keys():
-            yield f"{name} has no {methods[name] / dataset / stem}.*"
-        for key in outputs.keys() - files.inputs.keys():
-            yield f"{outputs[key]} has no input in {inputs / key[0]}"
-
-
-def _file_problems(files: _StudyFiles) -> Iterator[str]:
+def _file_problems(photos: Mapping[Key, Path], outputs: _Outputs) -> Iterator[str]:
     """Yield a message for each file that cannot be decoded, and for each output whose size differs from that of its input."""
     sizes: dict[Path, tuple[int, int]] = {}
-    for path in [
-        *files.inputs.values(),
-        *(path for paths in files.outputs.values() for path in paths.values()),
-    ]:
+    for path in (path for paths in (photos, *outputs.values()) for path in paths.values()):
         try:
             sizes[path] = Photo.open(path).size
         except PhotoError as error:
             yield f"{path}: {error}".rstrip(".")
-    for outputs, (key, photo) in product(files.outputs.values(), files.inputs.items()):
-        output = outputs.get(key)
+    for paths, (key, photo) in product(outputs.values(), photos.items()):
+        output = paths.get(key)
         if output in sizes and photo in sizes and sizes[output] != sizes[photo]:
             (output_width, output_height), (width, height) = sizes[output], sizes[photo]
             yield f"{output} has {output_width}x{output_height} pixels, but its input has {width}x{height}"
@@ -215,46 +213,29 @@ class _Copier:
     on_progress: Callable[[int], None]
     pictures: dict[Path, StudyPicture] = field(default_factory=dict)
 
-    def copy(self, path: Path) -> str:
-        """Copy a picture, unless it is copied already. Returns its new name."""
-        if path not in self.pictures:
-            data = path.read_bytes()
-            self.pictures[path] = self.write(Photo.open(data), hashlib.sha256(data).hexdigest())
+    def copy(self, path: Path, *, degraded: bool = False) -> str:
+        """Writes a picture, or a degraded copy of it, as PNG without metadata, unless it is written already. Returns its name."""
+        key = path / "degraded" if degraded else path  # no source file has this key
+        if key not in self.pictures:
+            source = path.read_bytes()
+            pixels = Photo.open(source).srgb_8bit()
+            if degraded:
+                pixels = degrade(pixels, self.rng.getrandbits(32))
+            photo, name = Photo.from_array(pixels, encoding="srgb"), f"{self.rng.getrandbits(64):016x}.png"
+            data = photo.encode("png")
+            write_atomically(self.folder / name, data)
+            digests = (hashlib.sha256(file).hexdigest() for file in (data, source))
+            self.pictures[key] = StudyPicture(name, *photo.size, *digests)
             self.on_progress(len(self.pictures))
-        return self.pictures[path].name
-
-    def copy_degraded(self, path: Path) -> str:
-        """Write a degraded copy of a picture. Returns its new name."""
-        key = path / "degraded"  # a key that no source file has
-        data = path.read_bytes()
-        degraded = Photo.from_array(
-            degrade(Photo.open(data).srgb_8bit(), self.rng.getrandbits(32)), encoding="srgb"
-        )
-        self.pictures[key] = self.write(degraded, hashlib.sha256(data).hexdigest())
-        self.on_progress(len(self.pictures))
         return self.pictures[key].name
 
-    def write(self, photo: Photo, source_sha256: str) -> StudyPicture:
-        """Write a picture as PNG without metadata. Returns its description."""
-        name = f"{self.rng.getrandbits(64):016x}.png"
-        data = Photo.from_array(photo.srgb_8bit(), encoding="srgb").encode("png")
-        write_atomically(self.folder / name, data)
-        return StudyPicture(name, *photo.size, hashlib.sha256(data).hexdigest(), source_sha256)
 
-
-def _comparisons(
-    files: _StudyFiles, pairs: Sequence[tuple[str, str]], copier: _Copier
-) -> Iterator[PairedComparison]:
-    for key, photo in files.inputs.items():
-        for first, second in pairs:
-            outputs = (copier.copy(files.outputs[first][key]), copier.copy(files.outputs[second][key]))
-            yield PairedComparison(*key, (first, second), copier.copy(photo), outputs)
-
-
-def _catch_pool(files: _StudyFiles, copier: _Copier, rng: Random) -> Iterator[CatchTrial]:
+def _catch_pool(
+    photos: Mapping[Key, Path], outputs: _Outputs, copier: _Copier, rng: Random
+) -> Iterator[CatchTrial]:
     """Photos for catch trials, at most CATCH_POOL_SIZE, each with the output of a random method and a degraded copy of this output."""
-    for key in rng.sample(list(files.inputs), min(CATCH_POOL_SIZE, len(files.inputs))):
-        output = files.outputs[rng.choice(list(files.outputs))][key]
+    for key in rng.sample(list(photos), min(CATCH_POOL_SIZE, len(photos))):
+        output = outputs[rng.choice(list(outputs))][key]
         yield CatchTrial(
-            *key, copier.copy(files.inputs[key]), copier.copy(output), copier.copy_degraded(output)
+            *key, copier.copy(photos[key]), copier.copy(output), copier.copy(output, degraded=True)
         )

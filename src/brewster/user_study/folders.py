@@ -55,7 +55,13 @@ def find_pictures(folder: Path, datasets: Sequence[str] = ()) -> dict[Key, Path]
             "check the name",
         )
     if not datasets and (top_level := _list_pictures(folder)):
-        _require_one_layout(folder, list(stems_by_dataset), list(top_level))
+        if stems_by_dataset:
+            names = shorten_list([path.name for path in top_level])
+            raise BrewsterError(
+                f"{folder} contains pictures ({names}) and subfolders with pictures ({', '.join(stems_by_dataset)})",
+                "expected pictures either in the folder or in subfolders, one for each dataset",
+                "move the pictures into a subfolder, or choose subfolders: --dataset NAME",
+            )
         stems_by_dataset = {UNNAMED_DATASET: top_level}
     found: defaultdict[Key, list[Path]] = defaultdict(list)
     for name in dict.fromkeys(datasets or stems_by_dataset):
@@ -110,15 +116,6 @@ def _require_unique_names(folder: Path, found: dict[Key, list[Path]]) -> None:
             f"{shorten_list(duplicates)} have the same name",
             "expected different names without the suffix, because pictures are paired by name",
             "keep one file of each name",
-        )
-
-
-def _require_one_layout(folder: Path, subfolders: Sequence[str], top_level: Sequence[Path]) -> None:
-    if subfolders:
-        raise BrewsterError(
-            f"{folder} contains pictures ({shorten_list([path.name for path in top_level])}) and subfolders with pictures ({', '.join(subfolders)})",
-            "expected pictures either in the folder or in subfolders, one for each dataset",
-            "move the pictures into a subfolder, or choose subfolders: --dataset NAME",
         )
 
 

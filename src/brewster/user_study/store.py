@@ -119,7 +119,7 @@ class AnswerStore:
 
     def count_participants(self) -> int:
         """The number of admitted participants."""
-        with self._reading() as database:
+        with self._transaction() as database:
             (number,) = database.execute("SELECT count(*) FROM participants").fetchone()
         return int(number)
 
@@ -158,7 +158,7 @@ class AnswerStore:
         A participant of a static bundle whose answers are not imported is returned only with `exported`, because the study does
         not have the consent yet.
         """
-        with self._reading() as database:
+        with self._transaction() as database:
             row = database.execute(
                 "SELECT number, trials, practice FROM participants WHERE token = ? AND (consented_on != ? OR ?)",
                 (token, _NO_CONSENT, exported),
@@ -177,7 +177,7 @@ class AnswerStore:
         return max(self._answered(participant), default=None)
 
     def _answered(self, participant: Participant) -> set[int]:
-        with self._reading() as database:
+        with self._transaction() as database:
             rows = database.execute("SELECT trial FROM answers WHERE participant = ?", (participant.number,))
             return {trial for (trial,) in rows}
 
@@ -192,9 +192,9 @@ class AnswerStore:
         """
         key = (participant.number, trial)
         with self._transaction("IMMEDIATE") as database:
-            (last,) = database.execute(
+            last = database.execute(
                 "SELECT max(trial) FROM answers WHERE participant = ?", key[:1]
-            ).fetchone()
+            ).fetchone()[0]
             if last is not None and last > trial:
                 raise BrewsterError(
                     f"the answer to pair {trial + 1} cannot be withdrawn",
@@ -294,7 +294,7 @@ class AnswerStore:
 
     def all_answers(self) -> Iterator[tuple[Participant, dict[int, StoredAnswer]]]:
         """Yield every participant, in order of number, and a dict of the answers by trial, which may be empty."""
-        with self._transaction("DEFERRED") as database:
+        with self._transaction() as database:
             answer_rows = database.execute("SELECT * FROM answers").fetchall()
             withdrawn_rows = database.execute(
                 "SELECT participant, trial, choice FROM withdrawn ORDER BY rowid"
@@ -314,18 +314,16 @@ class AnswerStore:
             yield Participant(number, _parse_trials(trials)), dict(sorted(answers[number].items()))
 
     @contextmanager
-    def _reading(self) -> Iterator[sqlite3.Connection]:
-        with self._database_errors(), self._lock:
-            yield self._database
-
-    @contextmanager
-    def _transaction(self, kind: Literal["DEFERRED", "IMMEDIATE"]) -> Iterator[sqlite3.Connection]:
+    def _transaction(
+        self, kind: Literal["DEFERRED", "IMMEDIATE"] = "DEFERRED"
+    ) -> Iterator[sqlite3.Connection]:
         """A transaction. All statements of the block read the same state of the database.
 
         DEFERRED is for a block that only reads. IMMEDIATE is for a block that writes: it waits for other writers, and the changes
         are synced to the disk at the end of the block.
         """
-        with self._reading() as database:
+        with self._database_errors(), self._lock:
+            database = self._database
             database.execute(f"BEGIN {kind}")
             try:
                 yield database

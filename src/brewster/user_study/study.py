@@ -139,8 +139,7 @@ class Study:
         Raises:
             BrewsterError: a picture is missing, or its digest differs from the description.
         """
-        changed = list(self.changed_pictures())
-        if changed:
+        if changed := list(self.changed_pictures()):
             raise BrewsterError(
                 f"pictures of the study are missing or changed: {len(changed)}, such as {self.picture_file(changed[0])}",
                 "expected all pictures as `brewster study create` wrote them",

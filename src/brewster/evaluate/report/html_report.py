@@ -45,7 +45,7 @@ def write_report(results: Results, cases: Iterable[CaseThumbnails], path: Path) 
     scores: list[Any] = []
 
     def entry_of(case: CaseThumbnails) -> Mapping[str, Any]:
-        entry: Mapping[str, Any] = entries.get((case.benchmark, case.name), {"scores": {}, "errors": {}})
+        entry: Mapping[str, Any] = entries[case.benchmark, case.name]
         scores.append(entry["scores"])
         return entry
 
@@ -114,12 +114,10 @@ def _notes(results: Results) -> list[tuple[str, list[str]]]:
         for kind in ("excluded", "remarks")
     )
     all_remarks += remarks(results)
+    cure = "Metrics that were not computed. Correct the cause, then run the evaluation again to add them."
     return [
         (f"Failed: {counted}", [f"{name}, {method}: {error}" for name, method, error in errors]),
-        (
-            "Metrics that were not computed. Correct the cause, then run the evaluation again to add them.",
-            unavailable_metrics(results),
-        ),
+        (cure, unavailable_metrics(results)),
         (_count(len(excluded), "file excluded"), excluded),
         (_count(len(all_remarks), "remark"), all_remarks),
     ]

@@ -31,16 +31,12 @@ def to_latex(results: Results, *, intervals: bool = False) -> str:
     if not metrics or not keys:
         return "% there are no scores\n"
     columns = "|".join("c" * len(metrics) for _ in keys)
-    titles = [_title(results, name) for name in metrics]
-    rows = [
-        _line(
-            [
-                escape_latex(method),
-                *(cell for key in keys for cell in _cells(results, key, method, metrics, intervals)),
-            ]
-        )
-        for method in results["methods"]
-    ]
+    arrows = {True: "$\\uparrow$", False: "$\\downarrow$"}
+    titles = [row["title"] + arrows[row["higher_is_better"]] for row in map(results["metrics"].get, metrics)]
+    rows = []
+    for method in results["methods"]:
+        cells = [cell for key in keys for cell in _cells(results, key, method, metrics, intervals)]
+        rows.append(_line([escape_latex(method), *cells]))
     note = f"{_DAGGER} mean over fewer images than in the other rows; do not compare"
     is_noted = any(_DAGGER in row for row in rows)
     lines = [
@@ -90,11 +86,8 @@ def _header_rows(results: Results, keys: Sequence[str], width: int) -> list[str]
     above, below = [_multirow("Method")], [""]
     for key in keys:
         if key == sir2[0]:
-            above.append(
-                _multicolumn(
-                    width * len(sir2), f"SIR$^2$ ({image_count})", is_last=keys[-len(sir2) :] == sir2
-                )
-            )
+            title, is_last = f"SIR$^2$ ({image_count})", keys[-len(sir2) :] == sir2
+            above.append(_multicolumn(width * len(sir2), title, is_last=is_last))
         elif key not in sir2:
             above.append(heading(key, 2))
         below.append(heading(key, 1) if key in sir2 else _multicolumn(width, "", is_last=key == keys[-1]))
@@ -112,11 +105,6 @@ def _multirow(text: str) -> str:
 
 def _multicolumn(columns: int, text: str, *, is_last: bool) -> str:
     return f"\\multicolumn{{{columns}}}{{{'c' if is_last else 'c|'}}}{{{text}}}"
-
-
-def _title(results: Results, metric: str) -> str:
-    metric_info = results["metrics"][metric]
-    return f"{metric_info['title']}$\\{'uparrow' if metric_info['higher_is_better'] else 'downarrow'}$"
 
 
 def _cells(results: Results, key: str, method: str, metrics: Iterable[str], intervals: bool) -> Iterator[str]:

@@ -7,19 +7,17 @@ for row in read_published():
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
-from typing import Final, TypeVar, final
+from typing import Final, final
 
 from brewster.tables import markdown_table
 
 _PUBLISHED_FILE: Final = Path(__file__).with_name("published.toml")
 _HEADING: Final = "Published scores of other methods (not measured here; the protocols differ)"
 _METRICS: Final = {"psnr": "PSNR (dB)", "ssim": "SSIM", "lpips": "LPIPS", "lpips_region": "regional LPIPS"}
-
-_Item = TypeVar("_Item")
 
 
 @final
@@ -74,37 +72,19 @@ def to_markdown(published: Sequence[PublishedScores]) -> str:
 
 
 def _table(protocol: str, rows: list[PublishedScores]) -> str:
-    benchmarks = _distinct(name for row in rows for name in row.scores)
-    metrics = _distinct(metric for row in rows for scores in row.scores.values() for metric in scores)
-    titles = " / ".join(_METRICS.get(metric, metric) for metric in metrics)
-    lines = [
-        f"**Protocol.** {protocol}",
-        "",
-        *_sources(rows),
-        "",
-        markdown_table(
-            [[f"published: {titles}", *benchmarks]]
-            + [[row.method, *(_cell(row, name, metrics) for name in benchmarks)] for row in rows]
-        ),
-    ]
-    return "\n".join(lines)
-
-
-def _sources(rows: list[PublishedScores]) -> list[str]:
+    benchmarks = dict.fromkeys(name for row in rows for name in row.scores)
+    metrics = dict.fromkeys(metric for row in rows for scores in row.scores.values() for metric in scores)
     methods: dict[tuple[str, str], list[str]] = {}
     for row in rows:
         methods.setdefault((row.source, row.copied_from), []).append(row.method)
-    return [
-        f"- {', '.join(names)}: {source}; copied from {location}"
-        for (source, location), names in methods.items()
+    sources = [
+        f"- {', '.join(names)}: {where[0]}; copied from {where[1]}" for where, names in methods.items()
     ]
-
-
-def _cell(row: PublishedScores, name: str, metrics: list[str]) -> str:
-    scores = row.scores.get(name)
-    return " / ".join(str(scores.get(metric, "-")) for metric in metrics) if scores else "-"
-
-
-def _distinct(items: Iterable[_Item]) -> list[_Item]:
-    """Returns the items without repetitions, in the order of their first occurrence."""
-    return list(dict.fromkeys(items))
+    titles = " / ".join(_METRICS.get(metric, metric) for metric in metrics)
+    table = [[f"published: {titles}", *benchmarks]]
+    for row in rows:
+        cells = (row.scores.get(name, {}) for name in benchmarks)
+        table.append(
+            [row.method, *(" / ".join(str(c.get(m, "-")) for m in metrics) if c else "-" for c in cells)]
+        )
+    return "\n".join([f"**Protocol.** {protocol}", "", *sources, "", markdown_table(table)])

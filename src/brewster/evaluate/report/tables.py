@@ -26,20 +26,33 @@ def main_metrics(results: Results) -> list[str]:
 
 def to_markdown(results: Results) -> str:
     """Returns all tables as Markdown: an overview, a table per benchmark with intervals and differences, notes, settings."""
-    parts = [
-        _overview(results),
-        *(_details(results, key) for key in results["selections"]),
-        _notes(results),
-        _settings(results),
+    benchmarks = results["benchmarks"].values()
+    notes = [f"{entry['title']}: {text}" for entry in benchmarks for text in _benchmark_notes(entry)]
+    notes += remarks(results)
+    notes += [f"not computed: {metrics}" for metrics in unavailable_metrics(results)]
+    notes += [
+        f"{name} is not scored: no image has the ground truth that it needs" for name in results["unmeasured"]
     ]
-    return "\n\n".join(part for part in parts if part) + "\n"
+    notes += failures(results)
+    metrics = (f"{entry['title']}: {entry['definition']}" for entry in results["metrics"].values())
+    settings = [*results["protocol"]["choices"], *metrics]
+    lists = {"Notes": notes, "Settings and definitions": settings}
+    parts = [
+        "\n".join([f"### {title}", "", *(f"- {line}" for line in lines)])
+        for title, lines in lists.items()
+        if lines
+    ]
+    return "\n\n".join([tables_to_markdown(results).strip("\n"), *parts]) + "\n"
+
+
+def _benchmark_notes(benchmark: Mapping[str, Any]) -> list[str]:
+    return [*benchmark["remarks"], *(f"excluded: {reason}" for reason in benchmark["excluded"])]
 
 
 def tables_to_markdown(results: Results) -> str:
     """Returns the tables as Markdown without notes and settings, for model cards."""
-    return (
-        "\n\n".join([_overview(results), *(_details(results, key) for key in results["selections"])]) + "\n"
-    )
+    details = [_details(results, key) for key in results["selections"]]
+    return "\n\n".join([part for part in (_overview(results), *details) if part]) + "\n"
 
 
 def to_terminal(results: Results, width: int = 100, *, intervals: bool = False) -> str:
@@ -61,11 +74,12 @@ def _terminal_table(results: Results, key: str, width: int, intervals: bool) -> 
     columns = []
     for metric in results["metrics"]:
         if any(metric in row for row in table.values()):
-            cells = [
-                _terminal_cell(results, metric, table[method].get(metric), image_count, intervals)
+            cells = (
+                _mean(results, metric, table[method].get(metric), image_count, intervals=intervals)
                 for method in results["methods"]
-            ]
-            columns.append([_heading(results, metric), *cells])
+            )
+            counted = [f"{mean} ({count})" if count else mean for mean, count in cells]
+            columns.append([_heading(results, metric), *counted])
     blocks, used = list[list[list[str]]](), width
     for column in columns:
         column_width = 2 + max(map(len, column))
@@ -75,16 +89,6 @@ def _terminal_table(results: Results, key: str, width: int, intervals: bool) -> 
         blocks[-1].append(column)
         used += column_width
     return "\n".join(plain_table(zip(*block, strict=True), align=">") for block in blocks)
-
-
-def _terminal_cell(
-    results: Results, metric: str, entry: Mapping[str, Any] | None, image_count: int, intervals: bool
-) -> str:
-    if entry is None:
-        return "-"
-    mean = _number(results, metric, entry["mean"])
-    count = f" ({entry['count']} of {image_count})" if entry["count"] != image_count else ""
-    return f"{mean}{_interval(results, metric, entry) if intervals else ''}{count}"
 
 
 def _shortened(names: list[str], width: int) -> list[str]:
@@ -100,27 +104,19 @@ def _overview(results: Results) -> str:
     if not metrics:
         return ""
     titles = " / ".join(_heading(results, name) for name in metrics)
-    rows = [
-        [
-            "",
-            *(f"{selection['title']} ({selection['cases']})" for selection in results["selections"].values()),
-        ]
-    ]
+    selections = results["selections"]
+    rows = [["", *(f"{selection['title']} ({selection['cases']})" for selection in selections.values())]]
     rows += [
-        [method, *(_cell(results, key, method, metrics) for key in results["selections"])]
+        [method, *(_cell(results, key, method, metrics) for key in selections)]
         for method in results["methods"]
     ]
-    return f"{titles}\n\n{markdown_table(rows)}{_UNEQUAL_COUNTS_NOTE if _has_unequal_counts(results, metrics) else ''}"
-
-
-def _has_unequal_counts(results: Results, metrics: Iterable[str]) -> bool:
-    """Returns whether a method has a mean over fewer images than another method."""
-    return any(
+    has_unequal_counts = any(
         metric in row and not is_complete(table, method, metric)
         for table in results["tables"].values()
         for method, row in table.items()
         for metric in metrics
     )
+    return f"{titles}\n\n{markdown_table(rows)}{_UNEQUAL_COUNTS_NOTE if has_unequal_counts else ''}"
 
 
 def _cell(results: Results, key: str, method: str, metrics: Iterable[str]) -> str:
@@ -142,31 +138,32 @@ def _details(results: Results, key: str) -> str:
         if not any(metric in table[method] for method in methods):
             continue
         by_pair = {(row["method"], row["reference"]): row for row in differences if row["metric"] == metric}
-        means = [_mean(results, metric, table[method].get(metric), selection["cases"]) for method in methods]
-        rows.append(
-            [
-                _heading(results, metric),
-                *means,
-                *(_difference_cell(results, metric, by_pair.get(pair)) for pair in pairs),
-            ]
+        cells = (
+            _mean(results, metric, table[method].get(metric), selection["cases"], intervals=True)
+            for method in methods
         )
+        means = [f"{mean}, {count}" if count else mean for mean, count in cells]
+        changes = [_difference_cell(results, metric, by_pair.get(pair)) for pair in pairs]
+        rows.append([_heading(results, metric), *means, *changes])
     return f"### {selection['title']} ({selection['cases']} images)\n\n{markdown_table(rows)}"
 
 
-def _mean(results: Results, metric: str, entry: Mapping[str, Any] | None, image_count: int) -> str:
+def _mean(
+    results: Results, metric: str, entry: Mapping[str, Any] | None, image_count: int, *, intervals: bool
+) -> tuple[str, str]:
+    """Returns the text of a mean, and that of the number of images, which is empty if it is `image_count`."""
     if entry is None:
-        return "-"
-    count = f", {entry['count']} of {image_count}" if entry["count"] != image_count else ""
-    return f"{_number(results, metric, entry['mean'])}{_interval(results, metric, entry)}{count}"
+        return "-", ""
+    count = f"{entry['count']} of {image_count}" if entry["count"] != image_count else ""
+    interval = _interval(results, metric, entry) if intervals else ""
+    return f"{_number(results, metric, entry['mean'])}{interval}", count
 
 
 def _difference_cell(results: Results, metric: str, row: Mapping[str, Any] | None) -> str:
     if row is None:
         return "-"
-    mean, interval = (
-        _number(results, metric, row["mean"], sign="+"),
-        _interval(results, metric, row, sign="+"),
-    )
+    mean = _number(results, metric, row["mean"], sign="+")
+    interval = _interval(results, metric, row, sign="+")
     return f"{mean}{interval}, better on {row['improved_count']} of {row['count']}"
 
 
@@ -175,23 +172,6 @@ def _interval(results: Results, metric: str, entry: Mapping[str, Any], *, sign: 
         return ""
     low, high = (_number(results, metric, entry[end], sign=sign) for end in ("low", "high"))
     return f" ({low} to {high})"
-
-
-def _notes(results: Results) -> str:
-    """Returns the notes: remarks, excluded files, metrics without a score, and errors."""
-    lines = [
-        f"- {benchmark['title']}: {text}"
-        for benchmark in results["benchmarks"].values()
-        for text in (*benchmark["remarks"], *(f"excluded: {reason}" for reason in benchmark["excluded"]))
-    ]
-    lines += [f"- {remark}" for remark in remarks(results)]
-    lines += [f"- not computed: {metrics}" for metrics in unavailable_metrics(results)]
-    lines += [
-        f"- {name} is not scored: no image has the ground truth that it needs"
-        for name in results["unmeasured"]
-    ]
-    lines += [f"- {error}" for error in failures(results)]
-    return "\n".join(["### Notes", "", *lines]) if lines else ""
 
 
 def remarks(results: Mapping[str, Any]) -> list[str]:
@@ -211,12 +191,6 @@ def failures(results: Results) -> list[str]:
     """Returns the errors of methods, without repetitions."""
     errors = (error for picture in results["cases"] for error in picture["errors"].values())
     return list(dict.fromkeys(errors))
-
-
-def _settings(results: Results) -> str:
-    metrics = (f"{entry['title']}: {entry['definition']}" for entry in results["metrics"].values())
-    lines = [*results["protocol"]["choices"], *metrics]
-    return "\n".join(["### Settings and definitions", "", *(f"- {line}" for line in lines)])
 
 
 def _heading(results: Results, metric: str) -> str:

@@ -10,7 +10,6 @@ from brewster.tables import csv_table
 from brewster.user_study.answer_file import ViewingConditions
 from brewster.user_study.assignment import Trial
 from brewster.user_study.report.participants import OUTCOMES, ParticipantAnswers, outcome
-from brewster.user_study.store import StoredAnswer
 from brewster.user_study.study import StudyDescription
 
 _CONDITIONS: Final = tuple(field.name for field in fields(ViewingConditions))
@@ -35,10 +34,17 @@ def answers_csv(
     for participant in participants:
         for position, trial, answer in participant.trials:
             shown = _comparison(description, trial) if trial.expected is None else _catch(description, trial)
-            row = shown | _answer(answer)
-            row |= {"participant": participant.number, "position": position + 1}
-            row["outcome"] = None if trial.expected else OUTCOMES[outcome(trial, answer.choice)]
-            row["left_out"] = left_out.get(str(participant.number))
+            row = shown | (asdict(answer.conditions) if answer.conditions else {})
+            row |= {
+                "participant": participant.number,
+                "position": position + 1,
+                "choice": answer.choice,
+                "outcome": None if trial.expected else OUTCOMES[outcome(trial, answer.choice)],
+                "seconds": round(answer.seconds, 3),
+                "answered_at": answer.answered_at,
+                "withdrawn": " ".join(answer.withdrawn),
+                "left_out": left_out.get(str(participant.number)),
+            }
             rows.append([row.get(name) for name in COLUMNS])
     return csv_table(rows)
 
@@ -63,13 +69,3 @@ def _catch(description: StudyDescription, trial: Trial) -> dict[str, object]:
         "kind": "catch", "dataset": catch.dataset, "name": catch.name,
         "left": left, "right": right, "expected": trial.expected,
     }  # fmt: skip
-
-
-def _answer(answer: StoredAnswer) -> dict[str, object]:
-    conditions = asdict(answer.conditions) if answer.conditions else {}
-    return conditions | {
-        "choice": answer.choice,
-        "seconds": round(answer.seconds, 3),
-        "answered_at": answer.answered_at,
-        "withdrawn": " ".join(answer.withdrawn),
-    }

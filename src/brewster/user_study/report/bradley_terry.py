@@ -40,7 +40,9 @@ def strengths(wins: Float64[Floats, "... m m"]) -> Float64[Floats, "... m"]:
         probability = 1 / (1 + np.exp(strength[..., None, :] - strength[..., :, None]))
         gradient = (wins - total * probability).sum(axis=-1)
         curvature = total * probability * (1 - probability)
-        hessian = _laplacian(np.where(is_bounded[..., None, None], curvature, 1.0))
+        weights = np.where(is_bounded[..., None, None], curvature, 1.0)
+        # the graph Laplacian; plus 1 in every entry, which makes it invertible and keeps the sum of each step at 0
+        hessian = np.eye(wins.shape[-1]) * weights.sum(axis=-1)[..., None] - weights + 1.0
         step = np.linalg.solve(hessian, gradient[..., None])[..., 0]
         length = np.abs(step).max(axis=-1, keepdims=True)
         strength = strength + np.where(is_bounded[..., None], step / (1 + length), 0.0)
@@ -48,12 +50,6 @@ def strengths(wins: Float64[Floats, "... m m"]) -> Float64[Floats, "... m"]:
             break
     strength -= strength.mean(axis=-1, keepdims=True)
     return np.where(is_bounded[..., None], strength, np.nan)
-
-
-def _laplacian(weights: Floats) -> Floats:
-    """The graph Laplacian plus 1 in every entry, which makes it invertible and keeps the sum of each step at 0."""
-    laplacian: Floats = np.eye(weights.shape[-1]) * weights.sum(axis=-1)[..., None] - weights + 1.0
-    return laplacian
 
 
 def all_connected(wins: Float64[Floats, "... m m"]) -> NDArray[np.bool_]:

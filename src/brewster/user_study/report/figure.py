@@ -57,15 +57,8 @@ def _bars(ax: Any, table: Mapping[str, Any], rows: Sequence[Mapping[str, Any]]) 
         ax.barh(positions, widths, left=starts, color=colour, height=0.72, edgecolor="white", linewidth=0.8)
         for i, (start, width) in enumerate(zip(starts, widths, strict=True)):
             if width >= _MIN_LABELLED_RATE:
-                ax.text(
-                    start + width / 2,
-                    i,
-                    f"{100 * width:.0f} %",
-                    color=_LABEL_COLOURS[name],
-                    ha="center",
-                    va="center",
-                    fontsize=8,
-                )
+                style = {"color": _LABEL_COLOURS[name], "ha": "center", "va": "center", "fontsize": 8}
+                ax.text(start + width / 2, i, f"{100 * width:.0f} %", **style)
         starts = [start + width for start, width in zip(starts, widths, strict=True)]
     ax.invert_yaxis()
     ax.set(xlim=(0, 1), xticks=[])
@@ -78,14 +71,5 @@ def _bars(ax: Any, table: Mapping[str, Any], rows: Sequence[Mapping[str, Any]]) 
         (1.0, "right", f"{table['second']} better", _HEADING_COLOURS["lose"]),
     )
     for x, alignment, text, colour in headings:
-        ax.text(
-            x,
-            1.02,
-            text,
-            transform=ax.transAxes,
-            ha=alignment,
-            color=colour,
-            fontsize=9,
-            weight="bold",
-            parse_math=False,
-        )
+        style = {"ha": alignment, "color": colour, "fontsize": 9, "weight": "bold", "parse_math": False}
+        ax.text(x, 1.02, text, transform=ax.transAxes, **style)

@@ -60,21 +60,28 @@ def collect_answers(
     records: Iterable[tuple[Participant, Mapping[int, StoredAnswer]]],
 ) -> list[ParticipantAnswers]:
     """The answers of each participant with at least one answer; incomplete participants are included."""
-    return [_participant_answers(participant, answers) for participant, answers in records if answers]
-
-
-def _participant_answers(participant: Participant, answers: Mapping[int, StoredAnswer]) -> ParticipantAnswers:
-    shown = [(participant.trials[trial], answer.choice) for trial, answer in answers.items()]
-    passed = [trial.expected == choice for trial, choice in shown if trial.expected]
-    return ParticipantAnswers(
-        participant.number,
-        {trial.comparison: outcome(trial, choice) for trial, choice in shown if trial.comparison is not None},
-        len(passed),
-        passed.count(False),
-        median(answer.seconds for answer in answers.values()),
-        len(answers) == len(participant.trials),
-        [(trial, participant.trials[trial], answer) for trial, answer in answers.items()],
-    )
+    collected = []
+    for participant, answers in records:
+        if not answers:
+            continue
+        trials = [(i, participant.trials[i], answer) for i, answer in answers.items()]
+        passed = [trial.expected == answer.choice for _, trial, answer in trials if trial.expected]
+        collected.append(
+            ParticipantAnswers(
+                participant.number,
+                {
+                    trial.comparison: outcome(trial, answer.choice)
+                    for _, trial, answer in trials
+                    if trial.comparison is not None
+                },
+                len(passed),
+                passed.count(False),
+                median(answer.seconds for answer in answers.values()),
+                len(answers) == len(participant.trials),
+                trials,
+            )
+        )
+    return collected
 
 
 def outcome(trial: Trial, choice: Choice) -> int:

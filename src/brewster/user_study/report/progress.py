@@ -34,6 +34,7 @@ def summarise_progress(
     for participant, answers in records:
         answered = by_number.get(participant.number)
         last = answers[max(answers)] if answers else None
+        shown = last.conditions if last else None
         rows.append(
             {
                 "participant": participant.number,
@@ -43,9 +44,7 @@ def summarise_progress(
                 "failed": answered.failed if answered else 0,
                 "median_seconds": round(answered.seconds, 2) if answered else None,
                 "last_answer": last.answered_at if last else None,
-                "window": f"{last.conditions.viewport_width}x{last.conditions.viewport_height}"
-                if last and last.conditions
-                else None,
+                "window": f"{shown.viewport_width}x{shown.viewport_height}" if shown else None,
                 "excluded": rule.reason(answered) if answered else None,
             }
         )

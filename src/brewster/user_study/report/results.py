@@ -77,11 +77,9 @@ def summarise(study: Study, participants: Sequence[ParticipantAnswers], rule: Ex
             "expected at least one answer to a comparison",
             "send participants the address that `brewster study serve` prints",
         )
-    reasons = [rule.reason(participant) for participant in participants]
-    included = [
-        participant for participant, reason in zip(participants, reasons, strict=True) if reason is None
-    ]
-    description = study.description
+    left_out = {str(one.number): reason for one in participants if (reason := rule.reason(one))}
+    included = [participant for participant in participants if str(participant.number) not in left_out]
+    description, reasons = study.description, list(left_out.values())
     return {
         "brewster": brewster.__version__,
         "study": {
@@ -94,11 +92,7 @@ def summarise(study: Study, participants: Sequence[ParticipantAnswers], rule: Ex
         },
         "rule": str(rule),
         "excluded": {reason: reasons.count(reason) for reason in ("failed", "fast")},
-        "left_out": {
-            str(participant.number): reason
-            for participant, reason in zip(participants, reasons, strict=True)
-            if reason is not None
-        },
+        "left_out": left_out,
         "included": _group(study, included),
         "everyone": _group(study, participants),
     }

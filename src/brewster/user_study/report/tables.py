@@ -31,18 +31,10 @@ Results = Mapping[str, Any]
 
 def to_markdown(results: Results) -> str:
     """The whole report: participants, tables with and without the exclusion rule, strengths, agreement, definitions."""
-    parts = [
-        f"# {' · '.join(results['study']['methods'])}",
-        *(_group(results, key, heading) for key, heading in _GROUPS.items()),
-        "\n".join(
-            [
-                "## Methods",
-                "",
-                *(f"- {line}" for line in (_rule(results), *_DEFINITIONS.splitlines())),
-            ]
-        ),
-    ]
-    return "\n\n".join(parts) + "\n"
+    groups = [_group(results, key, heading) for key, heading in _GROUPS.items()]
+    definitions = [f"- {line}" for line in (_rule(results), *_DEFINITIONS.splitlines())]
+    title = f"# {' · '.join(results['study']['methods'])}"
+    return "\n\n".join([title, *groups, "## Methods", "\n".join(definitions)]) + "\n"
 
 
 def overview(results: Results) -> str:
@@ -61,23 +53,17 @@ def _rule(results: Results) -> str:
 
 def _group(results: Results, key: str, heading: str) -> str:
     group = results[key]
-    parts = [f"## {heading}", _counts_line(group)]
-    parts += [_table(table) for table in group["tables"]]
-    if group["strengths"]:
-        rows = [
-            ["Method", "Strength"],
-            *([name, _strength_text(row)] for name, row in group["strengths"].items()),
-        ]
-        agreement = "has no value" if group["agreement"] is None else f"is {group['agreement']:.3f}"
-        parts += [markdown_table(rows), f"Krippendorff's alpha {agreement}."]
-    return "\n\n".join(parts)
-
-
-def _counts_line(group: Mapping[str, Any]) -> str:
-    return (
+    counts = (
         f"{counted(group['participants'], 'participant')} ({group['complete']} complete), {counted(group['answers'], 'answer')}; "
         f"{group['failed']} of {group['catch_trials']} catch trials failed."
     )
+    parts = [f"## {heading}", counts, *map(_table, group["tables"])]
+    if group["strengths"]:
+        strengths = ([name, _strength_text(row)] for name, row in group["strengths"].items())
+        rows = [["Method", "Strength"], *strengths]
+        agreement = "has no value" if group["agreement"] is None else f"is {group['agreement']:.3f}"
+        parts += [markdown_table(rows), f"Krippendorff's alpha {agreement}."]
+    return "\n\n".join(parts)
 
 
 def _table(table: Mapping[str, Any]) -> str:
@@ -92,12 +78,9 @@ def _table(table: Mapping[str, Any]) -> str:
         ]
         for row in filled
     ]  # fmt: skip
-    correlation = (
-        ""
-        if table["intraclass_correlation"] is None
-        else f"\n\nCorrelation: {table['intraclass_correlation']:.3f}"
-    )
-    return f"### {table['first']} and {table['second']}\n\n{markdown_table(rows)}{correlation}"
+    correlation = table["intraclass_correlation"]
+    text = f"### {table['first']} and {table['second']}\n\n{markdown_table(rows)}"
+    return text if correlation is None else f"{text}\n\nCorrelation: {correlation:.3f}"
 
 
 def _filled(rows: Iterable[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
@@ -166,12 +149,8 @@ def _latex_row(tables: Iterable[Mapping[str, Any]], key: str) -> str:
         "" if entry["low"] is None else f"\\scriptsize {_interval_text(entry, join='--')}"
         for entry in entries
     ]
-    return (
-        " & ".join([escape_latex(rows[0]["title"]), *rates])
-        + " \\\\\n"
-        + " & ".join(["", *intervals])
-        + r" \\"
-    )
+    lines = [escape_latex(rows[0]["title"]), *rates], ["", *intervals]
+    return "\n".join(f"{' & '.join(line)} \\\\" for line in lines)
 
 
 # --- CSV
