@@ -170,7 +170,8 @@ def test_every_case_and_method_appears_with_scores_and_differences(page):
 
 
 def test_every_image_has_a_button_and_an_alternative_text(page):
-    made = page(cases=[make_thumbnails("a", reflection_ground_truth=np.zeros((40, 60, 3), np.uint8))])
+    black = np.zeros((40, 60, 3), np.uint8)
+    made = page(cases=[make_thumbnails("a", reflections={"": black, "compact": black})])
     kinds = [has["data-kind"] for has in made.all("button", type="button") if "data-kind" in has]
     assert len(kinds) == len(made.all("img")) == 8
     assert [has["alt"] for has in made.all("img")] == [

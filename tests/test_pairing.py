@@ -48,7 +48,7 @@ def test_roles_are_recognised_by_the_names_of_their_folders(tmp_path, roles):
     repacked(tmp_path, ["1", "2"], roles)
     found = read_folders(tmp_path)
     assert names(found) == ["1", "2"]
-    assert found == FolderListing(found.groups)
+    assert found == FolderListing(tmp_path, found.groups)
     for group in found.groups:
         pictures = (group.photo, group.transmission, group.reflection)
         assert pictures == tuple(tmp_path / role / f"{group.name}.png" for role in roles)
@@ -112,7 +112,7 @@ def test_system_files_are_ignored_silently_and_other_files_with_a_remark(tmp_pat
         "__MACOSX/a.png",
     )
     write(tmp_path, *system_files[:2], *system_files[3:])
-    assert read_folders(tmp_path).remarks == ()
+    assert read_folders(tmp_path).remarks == []
     write(tmp_path, "blended/README.txt", "transmission_layer/old/a.png", "licence.md")
     (remark,) = read_folders(tmp_path).remarks
     assert remark == "ignored blended/README.txt, transmission_layer/old and licence.md"
@@ -219,7 +219,7 @@ def test_the_letter_of_a_role_is_a_separate_word_in_either_case(tmp_path):
     )
     found = read_tree(tmp_path, "wildscene")
     assert names(found) == ["1", "2"]
-    assert found.remarks == ("ignored 2/big.png", "ignored 3/grm.png and 3/m-g.png")
+    assert found.remarks == ["ignored 2/big.png", "ignored 3/grm.png and 3/m-g.png"]
     assert len(found.excluded) == 1
 
 
@@ -230,7 +230,7 @@ def test_shots_with_the_same_name_in_two_folders_are_both_excluded(tmp_path):
     if len(list_folder(tmp_path)[0]) < 2:
         pytest.skip("this file system is not case-sensitive")
     found = read_tree(tmp_path, "postcard")
-    assert found.groups == ()
+    assert found.groups == []
     assert len(found.excluded) == 2
     assert all("ambiguous" in line for line in found.excluded)
 
@@ -238,7 +238,7 @@ def test_shots_with_the_same_name_in_two_folders_are_both_excluded(tmp_path):
 def test_other_files_in_a_tree_are_ignored_with_a_remark(tmp_path):
     wildscene(tmp_path, 2)
     write(tmp_path, "README.txt", "1s/notes.txt", "1s/.DS_Store")
-    assert read_tree(tmp_path, "wildscene").remarks == ("ignored 1s/notes.txt", "ignored README.txt")
+    assert read_tree(tmp_path, "wildscene").remarks == ["ignored 1s/notes.txt", "ignored README.txt"]
 
 
 @pytest.mark.parametrize("subset", ["postcard", "solidobject", "wildscene"])

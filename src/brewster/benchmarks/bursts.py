@@ -66,7 +66,7 @@ def find_bursts(folder: Path) -> tuple[list[BurstFiles], FolderListing]:
             "expected folders with frame1.jpg, frame2.jpg ... and transmission2.jpg, or a dataset of brewster render --burst",
             "give the path of the parent folder of the bursts",
         )
-    return bursts, FolderListing(remarks=tuple(remarks), excluded=tuple(excluded))
+    return bursts, FolderListing(folder, remarks=remarks, excluded=excluded)
 
 
 _Roles = Mapping[str, Mapping[int, list[Path]]]
@@ -91,11 +91,8 @@ def _exclusion_reason(roles: _Roles) -> str:
     if len(roles["frame"]) < 2:
         return "expected two or more frames, but there is one"
     middle = _middle(roles)
-    return (
-        ""
-        if middle in roles["transmission"]
-        else f"there is no transmission of the middle frame, frame {middle}"
-    )
+    missing = f"there is no transmission of the middle frame, frame {middle}"
+    return "" if middle in roles["transmission"] else missing
 
 
 def _middle(roles: _Roles) -> int:
@@ -134,4 +131,4 @@ def _rendered_bursts(folder: Path) -> tuple[list[BurstFiles], FolderListing]:
         path = f"{reference.name}/photo"
         bursts.append(BurstFiles(f"burst-{burst.index:06d}", path, tuple(frames), transmission, reflection))
     excluded += [f"{name} is a frame of an incomplete burst" for name in samples.values()]
-    return bursts, FolderListing(excluded=tuple(excluded))
+    return bursts, FolderListing(folder, excluded=excluded)

@@ -15,8 +15,8 @@ from __future__ import annotations
 import re
 import unicodedata
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final, final
 
@@ -69,16 +69,55 @@ class ImageGroup:
 
 
 @final
-@dataclass(frozen=True)
+@dataclass
 class FolderListing:
     """The content of a folder. The groups are in natural order of their names (2 before 10).
 
     `remarks` lists the ignored files. `excluded` lists the images without a unique partner, with the reason.
     """
 
-    groups: tuple[ImageGroup, ...] = ()
-    remarks: tuple[str, ...] = ()
-    excluded: tuple[str, ...] = ()
+    root: Path
+    """The folder. Remarks and reasons name the files relative to it."""
+    groups: list[ImageGroup] = field(default_factory=list)
+    remarks: list[str] = field(default_factory=list)
+    excluded: list[str] = field(default_factory=list)
+
+    def add(self, name: str, scene: str, files: _FilesByRole) -> None:
+        """Adds a group, or the reason why its files are excluded."""
+        for role, paths in files.items():
+            if len(paths) > 1:
+                self.excluded.append(
+                    f"{self._names(paths)} are ambiguous: expected one {role} with this name"
+                )
+                return
+        paths = [path for paths in files.values() for path in paths]
+        for role in ("photo", "transmission"):
+            if not files.get(role):
+                verb = "has" if len(paths) == 1 else "have"
+                self.excluded.append(
+                    f"{self._names(paths)} {verb} no partner: there is no {role} with this name"
+                )
+                return
+        reflection = files["reflection"][0] if files.get("reflection") else None
+        self.groups.append(ImageGroup(name, scene, files["photo"][0], files["transmission"][0], reflection))
+
+    def ignore(self, paths: Sequence[Path]) -> None:
+        """Adds a remark on files that belong to no group."""
+        if paths:
+            self.remarks.append(f"ignored {self._names(paths)}")
+
+    def exclude_duplicates(self) -> None:
+        """Excludes all groups whose name is not unique. For example, the folders Focus and focus give equal names."""
+        counts = Counter(group.name for group in self.groups)
+        self.excluded += [
+            f"{self._names([group.photo])} is ambiguous: another photo has the same name, {group.name}"
+            for group in self.groups
+            if counts[group.name] > 1
+        ]
+        self.groups = [group for group in self.groups if counts[group.name] == 1]
+
+    def _names(self, paths: Sequence[Path]) -> str:
+        return join_names([path.relative_to(self.root).as_posix() for path in paths])
 
 
 def list_folder(folder: Path) -> tuple[list[Path], list[Path]]:
@@ -176,8 +215,11 @@ def read_folders(folder: Path, roles: Mapping[str, Path] | None = None) -> Folde
         ignored += others
         for image in images:
             by_name[unicodedata.normalize("NFC", image.stem)][role].append(image)
-    listings = [_make_group(folder, stem, "", by_name[stem]) for stem in sorted(by_name, key=natural_key)]
-    return _merge([*listings, _ignored_remark(folder, [*ignored, *list_folder(folder)[1]])])
+    listing = FolderListing(folder)
+    for stem in sorted(by_name, key=natural_key):
+        listing.add(stem, "", by_name[stem])
+    listing.ignore([*ignored, *list_folder(folder)[1]])
+    return listing
 
 
 def _role_files(folder: Path, role: str, roles: Mapping[str, Path]) -> tuple[list[Path], list[Path]]:
@@ -220,7 +262,10 @@ def read_tree(folder: Path, subset: str) -> FolderListing:
     Raises:
         PhotoError: a folder cannot be read, or there is no shot.
     """
-    listing = _exclude_duplicates(folder, _merge(_read_branches(folder, folder, SIR2_TREES[subset], {})))
+    listing = FolderListing(folder)
+    _read_branches(listing, folder, SIR2_TREES[subset], {})
+    listing.groups.sort(key=lambda group: natural_key(group.name))
+    listing.exclude_duplicates()
     if not listing.groups and not listing.excluded:
         raise PhotoError(
             f"{folder} contains no shot of SIR2 {subset}",
@@ -236,24 +281,24 @@ def _subset_of(name: str) -> str:
 
 
 def _read_branches(
-    root: Path, folder: Path, levels: Sequence[str], labels: Mapping[str, str]
-) -> Iterator[FolderListing]:
-    """Yields a listing of each shot below `folder`, and remarks about the other files.
+    listing: FolderListing, folder: Path, levels: Sequence[str], labels: Mapping[str, str]
+) -> None:
+    """Adds the shots below `folder`, and remarks about the other files.
 
     `levels` are the folder levels below `folder`. `labels` has the folder name of each level above.
     """
     if not levels:
-        yield _read_shot(root, folder, labels)
+        _read_shot(listing, folder, labels)
         return
     folders, files = list_folder(folder)
     branches = [path for path in folders if levels[0] != "kind" or path.name.lower() in _KINDS]
     for path in branches:
         label = path.name.capitalize() if levels[0] == "kind" else path.name
-        yield from _read_branches(root, path, levels[1:], {**labels, levels[0]: label})
-    yield _ignored_remark(root, [*files, *(path for path in folders if path not in branches)])
+        _read_branches(listing, path, levels[1:], {**labels, levels[0]: label})
+    listing.ignore([*files, *(path for path in folders if path not in branches)])
 
 
-def _read_shot(root: Path, folder: Path, labels: Mapping[str, str]) -> FolderListing:
+def _read_shot(listing: FolderListing, folder: Path, labels: Mapping[str, str]) -> None:
     by_name: dict[str, dict[str, list[Path]]] = defaultdict(lambda: defaultdict(list))
     images, others = image_files(folder)
     for image in images:
@@ -263,50 +308,17 @@ def _read_shot(root: Path, folder: Path, labels: Mapping[str, str]) -> FolderLis
         else:
             others.append(image)
     shot = "-".join(labels[level] for level in ("scene", "kind", "variant") if level in labels)
-    names = {stem: shot if len(by_name) == 1 else f"{shot}-{stem}".rstrip("-") for stem in by_name}
-    listings = [_make_group(root, names[stem], labels["scene"], by_name[stem]) for stem in by_name]
-    return _merge([*listings, _ignored_remark(root, others)])
+    for stem, files in by_name.items():
+        name = shot if len(by_name) == 1 else f"{shot}-{stem}".rstrip("-")
+        listing.add(name, labels["scene"], files)
+    listing.ignore(others)
 
 
 def _without_letter(stem: str) -> str:
     return "-".join(word for word in re.split(r"[-_ ]+", _ROLE_LETTER.sub("", stem)) if word)
 
 
-def _exclude_duplicates(root: Path, listing: FolderListing) -> FolderListing:
-    """Excludes all groups whose name is not unique. For example, the folders Focus and focus give equal names."""
-    counts = Counter(group.name for group in listing.groups)
-    duplicates = tuple(
-        f"{_relative(root, group.photo)} is ambiguous: another photo has the same name, {group.name}"
-        for group in listing.groups
-        if counts[group.name] > 1
-    )
-    unique = tuple(group for group in listing.groups if counts[group.name] == 1)
-    return FolderListing(unique, listing.remarks, (*listing.excluded, *duplicates))
-
-
 # --- both layouts
-
-
-def _make_group(root: Path, name: str, scene: str, files: _FilesByRole) -> FolderListing:
-    """Returns a listing with one group, or with the reason why the files are excluded."""
-    reason = _exclusion_reason(root, files)
-    if reason:
-        return FolderListing(excluded=(reason,))
-    reflection = files["reflection"][0] if files.get("reflection") else None
-    return FolderListing((ImageGroup(name, scene, files["photo"][0], files["transmission"][0], reflection),))
-
-
-def _exclusion_reason(root: Path, files: _FilesByRole) -> str:
-    for role, paths in files.items():
-        if len(paths) > 1:
-            names = [_relative(root, path) for path in paths]
-            return f"{join_names(names)} are ambiguous: expected one {role} with this name"
-    names = [_relative(root, path) for paths in files.values() for path in paths]
-    for role in ("photo", "transmission"):
-        if not files.get(role):
-            verb = "has" if len(names) == 1 else "have"
-            return f"{join_names(names)} {verb} no partner: there is no {role} with this name"
-    return ""
 
 
 def image_files(folder: Path) -> tuple[list[Path], list[Path]]:
@@ -328,29 +340,6 @@ def _find_subfolders(folder: Path, key_of: Callable[[str], str]) -> dict[str, Pa
                 "move or rename one of the two",
             )
     return found
-
-
-def _ignored_remark(root: Path, others: Iterable[Path]) -> FolderListing:
-    names = [_relative(root, path) for path in others]
-    return FolderListing(remarks=(f"ignored {join_names(names)}",) if names else ())
-
-
-def _merge(parts: Iterable[FolderListing]) -> FolderListing:
-    listings = list(parts)
-    return FolderListing(
-        tuple(
-            sorted(
-                (group for listing in listings for group in listing.groups),
-                key=lambda group: natural_key(group.name),
-            )
-        ),
-        tuple(line for listing in listings for line in listing.remarks),
-        tuple(line for listing in listings for line in listing.excluded),
-    )
-
-
-def _relative(root: Path, path: Path) -> str:
-    return path.relative_to(root).as_posix()
 
 
 def join_names(names: Sequence[str], last: str = " and ") -> str:

@@ -12,7 +12,7 @@ from __future__ import annotations
 import difflib
 import os
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final, final
@@ -32,7 +32,7 @@ from brewster.benchmarks.pairing import (
     read_folders,
     read_tree,
 )
-from brewster.errors import PhotoError
+from brewster.errors import PhotoError, counted
 from brewster.files import natural_key
 from brewster.photo import read_size
 
@@ -170,7 +170,7 @@ def _read_rendered(name: str, folder: Path) -> list[Benchmark]:
         cases.append(
             Case(benchmark_name, key, key, f"{key}/photo", photo, background, reflection, rendered=True)
         )
-    return [_make_benchmark(name, folder, cases, FolderListing(excluded=tuple(excluded)))]
+    return [_make_benchmark(name, folder, cases, FolderListing(folder, excluded=excluded))]
 
 
 def _read_bursts(name: str, folder: Path) -> list[Benchmark]:
@@ -197,24 +197,21 @@ def _read_bursts(name: str, folder: Path) -> list[Benchmark]:
 
 def _from_listing(name: str, folder: Path, listing: FolderListing) -> Benchmark:
     scenes, remarks = _find_scenes(BENCHMARKS[name], listing.groups)
+    listing.remarks += remarks
     benchmark_name = _benchmark_name(name, folder)
     cases = [
-        _to_case(benchmark_name, scene, group, folder)
+        Case(
+            benchmark_name,
+            group.name,
+            scene,
+            group.photo.relative_to(folder).with_suffix("").as_posix(),
+            ImageFile(group.photo),
+            ImageFile(group.transmission),
+            ImageFile(group.reflection) if group.reflection else None,
+        )
         for scene, group in zip(scenes, listing.groups, strict=True)
     ]
-    return _make_benchmark(name, folder, cases, replace(listing, remarks=(*listing.remarks, *remarks)))
-
-
-def _to_case(benchmark_name: str, scene: str, group: ImageGroup, root: Path) -> Case:
-    return Case(
-        benchmark_name,
-        group.name,
-        scene,
-        group.photo.relative_to(root).with_suffix("").as_posix(),
-        ImageFile(group.photo),
-        ImageFile(group.transmission),
-        ImageFile(group.reflection) if group.reflection else None,
-    )
+    return _make_benchmark(name, folder, cases, listing)
 
 
 def _find_scenes(layout: BenchmarkLayout, groups: Sequence[ImageGroup]) -> tuple[list[str], list[str]]:
@@ -234,39 +231,25 @@ def _find_scenes(layout: BenchmarkLayout, groups: Sequence[ImageGroup]) -> tuple
 
 def _make_benchmark(name: str, folder: Path, cases: Sequence[Case], listing: FolderListing) -> Benchmark:
     """Returns the benchmark without the cases whose images cannot be read or differ in size."""
-    layout = BENCHMARKS[name]
+    layout, expected = BENCHMARKS[name], BENCHMARKS[name].expected_counts
     unusable = {case.name: reason for case in cases if (reason := _unusable_reason(case))}
-    valid = tuple(
+    valid = [
         case for case in sorted(cases, key=lambda case: natural_key(case.name)) if case.name not in unusable
-    )
-    title = layout.title or folder_name(folder)
+    ]
+    remarks = []
+    if expected and len(valid) not in expected:
+        remarks.append(f"found {counted(len(valid), 'image')}, expected {' or '.join(map(str, expected))}")
+    missing = [case.name for case in valid if case.reflection is None]
+    if 0 < len(missing) < len(valid):
+        remarks.append(f"there is no ground truth of the reflection for {join_names(missing)}")
     return Benchmark(
         _benchmark_name(name, folder),
-        title,
-        valid,
-        layout.expected_counts,
-        (
-            *_count_remark(len(valid), layout.expected_counts),
-            *_missing_reflections(valid),
-            *listing.remarks,
-        ),
+        layout.title or folder_name(folder),
+        tuple(valid),
+        expected,
+        (*remarks, *listing.remarks),
         (*listing.excluded, *unusable.values()),
     )
-
-
-def _count_remark(count: int, expected_counts: Sequence[int]) -> list[str]:
-    if not expected_counts or count in expected_counts:
-        return []
-    return [
-        f"found {count} {'image' if count == 1 else 'images'}, expected {' or '.join(map(str, expected_counts))}"
-    ]
-
-
-def _missing_reflections(cases: Sequence[Case]) -> list[str]:
-    missing = [case.name for case in cases if case.reflection is None]
-    if not missing or len(missing) == len(cases):
-        return []
-    return [f"there is no ground truth of the reflection for {join_names(missing)}"]
 
 
 def _benchmark_name(name: str, folder: Path) -> str:
@@ -302,19 +285,16 @@ def _unusable_reason(case: Case) -> str:
             sizes |= {role: read_size(file.read())} if file else {}
         except PhotoError as error:
             return f"{case.relative_path}: the {role} cannot be read: {error}"
-    different = (
-        _size_mismatch(case.relative_path, role, sizes) for role in sizes if sizes[role] != sizes["photo"]
-    )
-    return next(different, "")
-
-
-def _size_mismatch(path: str, role: str, sizes: Mapping[str, tuple[int, int]]) -> str:
-    photo, layer = sizes["photo"], sizes[role]
-    scale_x, scale_y = layer[0] / photo[0], layer[1] / photo[1]
-    sizes_text = f"{path}: the photo is {photo[0]}x{photo[1]}, the {role} is {layer[0]}x{layer[1]}"
-    if abs(scale_x / scale_y - 1) <= 0.01 < abs(scale_x - 1):
-        return f"{sizes_text}: the {role} is resized by the factor {scale_x:.3g}"
-    return f"{sizes_text}: {'one of them is rotated' if layer == photo[::-1] else 'expected equal sizes'}"
+    for role, (width, height) in sizes.items():
+        photo = sizes["photo"]
+        if (width, height) != photo:
+            scale_x, scale_y = width / photo[0], height / photo[1]
+            if abs(scale_x / scale_y - 1) <= 0.01 < abs(scale_x - 1):
+                why = f"the {role} is resized by the factor {scale_x:.3g}"
+            else:
+                why = "one of them is rotated" if photo == (height, width) else "expected equal sizes"
+            return f"{case.relative_path}: the photo is {photo[0]}x{photo[1]}, the {role} is {width}x{height}: {why}"
+    return ""
 
 
 # --- the table

@@ -36,8 +36,6 @@ from brewster.evaluate.report.html_report import write_report
 from brewster.evaluate.report.images import (
     CaseImages,
     CaseThumbnails,
-    method_thumbnails,
-    photo_thumbnails,
     to_thumbnails,
 )
 from brewster.evaluate.report.latex import to_latex
@@ -239,30 +237,23 @@ class _ThumbnailCache:
             truth.photo.save(_input_path(self.out / INPUTS_FOLDER, case), overwrite=True)
         if case.benchmark not in self.benchmarks:
             return
-        images = self.images(truth, predictions)
-        width, height = truth.photo.size
-        thumbnails = {BASELINE: photo_thumbnails(images)}
-        thumbnails |= {name: method_thumbnails(images, name) for name in predictions if name != BASELINE}
-        for method, html in thumbnails.items():
-            data = json.dumps([width, height, html], ensure_ascii=True).encode()
-            self._path(case, method).write_bytes(data)
+        thumbnails = to_thumbnails(self.images(truth, predictions))
+        for method, html in thumbnails.methods.items():
+            self._path(case, method).write_text(json.dumps([thumbnails.size, html]))
 
     def read(self, case: Case, methods: Sequence[str]) -> CaseThumbnails | None:
         """Returns the stored thumbnails of a case and the methods, or None if a file is missing."""
-        thumbnails = {}
-        width = height = 0
-        for method in (BASELINE, *methods):
-            path = self._path(case, method)
-            if not path.exists():
-                return None
-            width, height, thumbnails[method] = json.loads(path.read_bytes())
-        return CaseThumbnails(
-            case.benchmark, case.name, (width, height), thumbnails.pop(BASELINE), thumbnails
-        )
+        paths = {method: self._path(case, method) for method in (BASELINE, *methods)}
+        if not all(path.exists() for path in paths.values()):
+            return None
+        stored = {method: json.loads(path.read_text()) for method, path in paths.items()}
+        thumbnails = {method: html for method, (_, html) in stored.items()}
+        return CaseThumbnails(case.benchmark, case.name, stored[BASELINE][0], thumbnails)
 
     def images(self, truth: GroundTruth, predictions: Mapping[str, MethodOutput]) -> CaseImages:
         """Returns the images of a case for the report, with links to files at full size."""
         others = {name: output for name, output in predictions.items() if name != BASELINE}
+        true_reflection = {"": truth.images["reflection"]} if "reflection" in truth.images else {}
         return CaseImages(
             benchmark=truth.case.benchmark,
             name=truth.case.name,
@@ -270,10 +261,8 @@ class _ThumbnailCache:
             ground_truth=truth.images["transmission"],
             region=truth.region(self.config.thresholds[0]),
             predictions={name: output.transmission.srgb_8bit() for name, output in others.items()},
-            reflections={
-                name: output.reflection.srgb_8bit() for name, output in others.items() if output.reflection
-            },
-            reflection_ground_truth=truth.images.get("reflection"),
+            reflections=true_reflection
+            | {name: output.reflection.srgb_8bit() for name, output in others.items() if output.reflection},
             links=dict(self._links(truth, others)),
         )
 

@@ -13,7 +13,7 @@ import unicodedata
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cache, cached_property
+from functools import cached_property
 from pathlib import Path
 from typing import Final, Protocol, final
 
@@ -100,25 +100,21 @@ class Method(Protocol):
 @final
 @dataclass(frozen=True)
 class IdentityBaseline:
-    """The baseline: the transmission is the photo itself, the reflection is black."""
+    """The baseline: the transmission is the photo itself, the reflection is black. It is not stored."""
 
     name: str = BASELINE
     exclusive: Final = False
 
-    def about(self) -> dict[str, str]:
-        """Returns the kind of method."""
+    def about(self) -> dict[str, str]:  # noqa: D102  (see Method)
         return {"kind": "baseline"}
 
-    def key(self, case: Case) -> str:  # noqa: ARG002  (the same for all cases)
-        """Returns a constant."""
+    def key(self, case: Case) -> str:  # noqa: ARG002, D102
         return "identity"
 
-    def predict(self, case: Case, photo: Photo) -> MethodOutput:  # noqa: ARG002
-        """Returns the photo and a black reflection."""
+    def predict(self, case: Case, photo: Photo) -> MethodOutput:  # noqa: ARG002, D102
         return MethodOutput(photo, photo.with_pixels(np.zeros_like(photo.pixels)))
 
-    def cached(self, case: Case) -> MethodOutput | None:  # noqa: ARG002
-        """Returns None: the baseline is not stored."""
+    def cached(self, case: Case) -> MethodOutput | None:  # noqa: ARG002, D102
         return None
 
 
@@ -141,26 +137,19 @@ class ModelMethod:
         """True for diffusion models, because a GPU has memory for only one of them."""
         return is_diffusion_model(self.model)
 
-    def about(self) -> dict[str, str]:
-        """Returns the kind of method, the digest of the model file, and the quality."""
+    def about(self) -> dict[str, str]:  # noqa: D102
         return {"kind": "model", "sha256": self._sha256, "quality": self.quality}
 
-    def key(self, case: Case) -> str:  # noqa: ARG002  (the same for all cases)
-        """Returns the digest of the model, the quality, and the version of predictions."""
+    def key(self, case: Case) -> str:  # noqa: ARG002, D102
         return f"{self._sha256} {self.quality} {PREDICTION_FORMAT_VERSION}"
 
     def predict(self, case: Case, photo: Photo) -> MethodOutput:
-        """Separates the photo and stores both layers.
+        """Separates the photo and stores both layers. Raises BrewsterError.
 
         Returns:
             The layers, decoded from the stored bytes. So new and stored predictions have the same scores.
-
-        Raises:
-            BrewsterError: the model cannot be loaded, the separation failed, or the layers cannot be written.
         """
-        separator = (_load_exclusive_separator if self.exclusive else _load_separator)(
-            self.model, self.device
-        )
+        separator = _load_separator(self.model, self.device, self.exclusive)
         started = time.perf_counter()
         separation = separator(photo, quality=self.quality)
         seconds = time.perf_counter() - started
@@ -171,11 +160,7 @@ class ModelMethod:
         return replace(MethodOutput.decode(data), seconds=seconds)
 
     def cached(self, case: Case) -> MethodOutput | None:
-        """Returns the stored layers, or None if there are none.
-
-        Raises:
-            PhotoError: a stored layer cannot be read.
-        """
+        """Returns the stored layers, or None if there are none. Raises PhotoError if one cannot be read."""
         files = self.files(case)
         if not all(path.is_file() for path in files.values()):
             return None
@@ -195,22 +180,17 @@ class ModelMethod:
         return {layer: folder / f"{case.name}.{layer}.png" for layer in ("transmission", "reflection")}
 
 
-@cache
-def _load_separator(model: str, device: Device) -> Separator:
-    """Loads a model. The cache keeps it, so that each process loads it once."""
-    return Separator.load(model, device=device)
+_separators: dict[tuple[str, Device], Separator] = {}
+"""The models that this process has loaded. Each is loaded once, but a diffusion model replaces the one before it."""
 
 
-_exclusive_separators: dict[tuple[str, Device], Separator] = {}
-
-
-def _load_exclusive_separator(model: str, device: Device) -> Separator:
-    """Loads a diffusion model if it is not loaded. Frees the previous model first, because memory is limited."""
-    if (model, device) not in _exclusive_separators:
-        _exclusive_separators.clear()
-        gc.collect()
-        _exclusive_separators[model, device] = Separator.load(model, device=device)
-    return _exclusive_separators[model, device]
+def _load_separator(model: str, device: Device, exclusive: bool) -> Separator:
+    if (model, device) not in _separators:
+        if exclusive:  # memory is limited: the previous model is freed first
+            _separators.clear()
+            gc.collect()
+        _separators[model, device] = Separator.load(model, device=device)
+    return _separators[model, device]
 
 
 @final
@@ -226,8 +206,7 @@ class PredictionFolder:
     )
     """The files that `key` read last, by case. `predict` decodes these bytes, so that each file is read once."""
 
-    def about(self) -> dict[str, str]:
-        """Returns the kind of method."""
+    def about(self) -> dict[str, str]:  # noqa: D102
         return {"kind": "predictions"}
 
     def key(self, case: Case) -> str:
@@ -240,11 +219,7 @@ class PredictionFolder:
         return _digest(data.values())
 
     def predict(self, case: Case, photo: Photo) -> MethodOutput:  # noqa: ARG002  (the predictions exist already)
-        """Reads and decodes the prediction for a case.
-
-        Raises:
-            PhotoError: a layer has no file or several, or a file cannot be read.
-        """
+        """Returns the stored prediction. Raises PhotoError if a layer has no file, several, or one that cannot be read."""
         return self.cached(case)
 
     def cached(self, case: Case) -> MethodOutput:
@@ -321,14 +296,12 @@ class PredictionFolder:
         root = root if root.is_dir() else self.folder
         paths = [root / f"{stem}.{layer}" for stem in (case.name, case.relative_path)]
         paths += [root / folder / case.name for folder in (layer, f"{layer}_layer")]
-        paths += [root / case.name / name for name in self._suffixed_stems(root / case.name, layer)]
+        # some methods write one folder for each photo, with files such as rdnet_t or dsrnet_l
+        stems = self._stems.get(root / case.name, ())
+        paths += [root / case.name / stem for stem in stems if stem.endswith(_STEM_SUFFIXES[layer])]
         if layer == "transmission":
             paths += [root / case.name]
         return {file for path in paths for file in self._images.get(_normalised(path), ())}
-
-    def _suffixed_stems(self, folder: Path, layer: str) -> list[str]:
-        """Returns the stems such as rdnet_t or dsrnet_l in a folder. Some methods write one folder for each photo."""
-        return [stem for stem in self._stems.get(folder, ()) if stem.endswith(_STEM_SUFFIXES[layer])]
 
     @cached_property
     def _images(self) -> dict[Path, list[Path]]:

@@ -13,7 +13,7 @@ from __future__ import annotations
 import hashlib
 import json
 import signal
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import asdict, dataclass, replace
@@ -42,16 +42,6 @@ ScoreCallback = Callable[[int, int, "ScoreRow"], None]
 
 CaseCallback = Callable[[GroundTruth, Mapping[str, MethodOutput]], None]
 """Called with (case, method -> new prediction) after a case is scored, in the process that scored it."""
-
-
-@final
-@dataclass(frozen=True)
-class _ScoringTask:
-    """A case, the names of the methods to score on it, and the rows of earlier runs by method."""
-
-    case: Case
-    methods: tuple[str, ...]
-    logged: Mapping[str, ScoreRow]
 
 
 def score(
@@ -109,23 +99,12 @@ def score(
                 on_progress(len(rows), len(ids), row)
 
     columns = tuple(column for column in config.columns() if column not in unavailable)
-    state = _WorkerState({method.name: method for method in methods}, config, columns, on_case_scored)
-    parallel_methods = [method.name for method in methods if not method.exclusive]
-    _run_tasks(_tasks(cases.values(), parallel_methods, logged), state, log_rows, workers)
-    for method in methods:
-        if method.exclusive:
-            _run_tasks(_tasks(cases.values(), [method.name], logged), state, log_rows, 1)
+    state = _WorkerState({method.name: method for method in methods}, config, columns, logged, on_case_scored)
+    together = [method.name for method in methods if not method.exclusive]
+    for names in filter(None, (together, *([method.name] for method in methods if method.exclusive))):
+        tasks = [(case, names) for case in cases.values()]
+        _run_tasks(tasks, state, log_rows, workers if names == together else 1)
     return [rows[row_id] for row_id in ids]
-
-
-def _tasks(
-    cases: Iterable[Case], methods: Sequence[str], logged: Mapping[RowId, ScoreRow]
-) -> list[_ScoringTask]:
-    def logged_rows(case: Case) -> dict[str, ScoreRow]:
-        ids = ((case.benchmark, case.name, method) for method in methods)
-        return {row_id[2]: logged[row_id] for row_id in ids if row_id in logged}
-
-    return [_ScoringTask(case, tuple(methods), logged_rows(case)) for case in cases] if methods else []
 
 
 def find_unavailable(
@@ -183,11 +162,15 @@ def _has_outdated_row(
         files = CaseFiles.read(case)
     except BrewsterError:  # the case fails without a score
         return False
-    rows = (_empty_row(files, method, config, {}) for method in methods)
+    rows = (_empty_row(files, method, config, logged) for method in methods)
     return any(logged[row.id].score_key != row.score_key for row in rows)
 
 
 # --- one case
+
+
+_Task = tuple[Case, Sequence[str]]
+"""A case, and the names of the methods to score on it."""
 
 
 @final
@@ -198,60 +181,81 @@ class _WorkerState:
     methods: Mapping[str, Method]
     config: EvaluationConfig
     columns: tuple[str, ...]
+    logged: Mapping[RowId, ScoreRow]
     on_case_scored: CaseCallback | None
 
+    def missing_columns(self, row: ScoreRow) -> list[str]:
+        """Returns the columns that a row of an earlier run does not have, or all if its inputs have changed."""
+        old = self.logged.get(row.id)
+        known = old.columns if old and old.score_key == row.score_key else ()
+        return [column for column in self.columns if column not in known]
 
-def _score_case(task: _ScoringTask, state: _WorkerState) -> list[ScoreRow]:
+    def reusable(self, row: ScoreRow) -> ScoreRow | None:
+        """Returns the row of an earlier run if its inputs have not changed and it has all columns."""
+        old = self.logged.get(row.id)
+        return old if old and old.score_key == row.score_key and not self.missing_columns(row) else None
+
+
+def _score_case(task: _Task, state: _WorkerState) -> list[ScoreRow]:
     """Returns the rows of a case. Decodes its images only if a row of an earlier run cannot be reused."""
-    case = task.case
+    case, names = task
+    rows = [ScoreRow(case.benchmark, case.name, name, "", "") for name in names]
     try:
         files = CaseFiles.read(case)
-    except BrewsterError as error:
-        rows = [ScoreRow(case.benchmark, case.name, name, "", "") for name in task.methods]
-        return [_case_failed(row, error) for row in rows]
-    rows = [_empty_row(files, state.methods[name], state.config, task.logged) for name in task.methods]
-    if not any(_missing_columns(row, state, task.logged) for row in rows):
-        return [task.logged[row.method] for row in rows]
-    try:
+        rows = [_empty_row(files, state.methods[name], state.config, state.logged) for name in names]
+        reused = [old for row in rows if (old := state.reusable(row))]
+        if len(reused) == len(rows):
+            return reused
         truth = GroundTruth.decode(files, state.config)
     except BrewsterError as error:
-        return [
-            _case_failed(row, error) if _missing_columns(row, state, task.logged) else task.logged[row.method]
-            for row in rows
-        ]
-    return _score_rows(rows, truth, task, state)
-
-
-def _score_rows(
-    rows: Sequence[ScoreRow], truth: GroundTruth, task: _ScoringTask, state: _WorkerState
-) -> list[ScoreRow]:
+        reason = f"{case.benchmark}/{case.name}: {error}"
+        return [state.reusable(row) or replace(row, error=reason) for row in rows]
     scorer, predictions = Scorer(truth, state.config), dict[str, MethodOutput]()
-    scored = []
-    for row in rows:
-        columns = _missing_columns(row, state, task.logged)
-        if not columns:
-            scored.append(task.logged[row.method])
-            continue
-        try:
-            prediction = get_prediction(truth, state.methods[row.method], row)
-            truth.check(prediction, row.method)
-        except BrewsterError as error:
-            scored.append(_method_failed(row, str(error)))
-        except Exception as error:  # noqa: BLE001  (a crash on one image must not stop the evaluation)
-            scored.append(_method_failed(row, f"{type(error).__name__}: {error}"))
-        else:
-            predictions[row.method] = prediction
-            is_stored = isinstance(state.methods[row.method], PredictionFolder)
-            registration = scorer.registration(prediction) if is_stored else ""
-            new = _scored_row(replace(row, registration=registration), truth, scorer, prediction, columns)
-            scored.append(_merged(task.logged.get(row.method), new))
+    scored = [_score_method(row, scorer, truth, predictions, state) for row in rows]
     if state.on_case_scored:
         state.on_case_scored(truth, predictions)
     return scored
 
 
+def _score_method(
+    row: ScoreRow,
+    scorer: Scorer,
+    truth: GroundTruth,
+    predictions: dict[str, MethodOutput],
+    state: _WorkerState,
+) -> ScoreRow:
+    """Returns the row of a method with all its scores. A new prediction is added to `predictions`."""
+    if reused := state.reusable(row):
+        return reused
+    columns, old = state.missing_columns(row), state.logged.get(row.id)
+    try:
+        prediction = get_prediction(truth, state.methods[row.method], row)
+        truth.check(prediction, row.method)
+    except Exception as error:  # noqa: BLE001  (a crash on one image must not stop the evaluation)
+        reason = str(error) if isinstance(error, BrewsterError) else f"{type(error).__name__}: {error}"
+        return replace(row, error=f"{row.method} failed on {row.benchmark}/{row.case}: {reason}")
+    predictions[row.method] = prediction
+    is_stored = isinstance(state.methods[row.method], PredictionFolder)
+    width, height = truth.photo.size
+    new = replace(
+        row,
+        scores=scorer.score(prediction, columns),
+        columns=tuple(columns),
+        seconds=prediction.seconds,
+        digest=prediction.digest,
+        width=width,
+        height=height,
+        region_share=scorer.region_share,
+        registration=scorer.registration(prediction) if is_stored else "",
+    )
+    if old is None or old.score_key != new.score_key:
+        return new
+    seconds = old.seconds if new.seconds is None else new.seconds
+    return replace(new, scores=old.scores | new.scores, columns=(*old.columns, *new.columns), seconds=seconds)
+
+
 def _empty_row(
-    files: CaseFiles, method: Method, config: EvaluationConfig, logged: Mapping[str, ScoreRow]
+    files: CaseFiles, method: Method, config: EvaluationConfig, logged: Mapping[RowId, ScoreRow]
 ) -> ScoreRow:
     """Returns a row without scores, with the keys that show whether a row of an earlier run can be reused."""
     case = files.case
@@ -262,41 +266,8 @@ def _empty_row(
     prediction_key = _digest(photo, config.short_side_px, config.size_divisor, method.key(case))
     score_key = _digest(prediction_key, ground_truths, settings, case.rendered, SCORE_FORMAT_VERSION)
     row = ScoreRow(case.benchmark, case.name, method.name, prediction_key, score_key)
-    logged_row = logged.get(method.name)
-    if logged_row and logged_row.prediction_key == prediction_key:
-        return replace(row, digest=logged_row.digest)
-    return row
-
-
-def _missing_columns(row: ScoreRow, state: _WorkerState, logged: Mapping[str, ScoreRow]) -> list[str]:
-    """Returns the columns that a row of an earlier run does not have, or all columns if its inputs have changed."""
-    old = logged.get(row.method)
-    known = old.columns if old and old.score_key == row.score_key else ()
-    return [column for column in state.columns if column not in known]
-
-
-def _scored_row(
-    row: ScoreRow, truth: GroundTruth, scorer: Scorer, prediction: MethodOutput, columns: Sequence[str]
-) -> ScoreRow:
-    width, height = truth.photo.size
-    return replace(
-        row,
-        scores=scorer.score(prediction, columns),
-        columns=tuple(columns),
-        seconds=prediction.seconds,
-        digest=prediction.digest,
-        width=width,
-        height=height,
-        region_share=scorer.region_share,
-    )
-
-
-def _merged(old: ScoreRow | None, new: ScoreRow) -> ScoreRow:
-    """Returns the new row with the scores of an earlier run, if the inputs have not changed."""
-    if old is None or old.score_key != new.score_key:
-        return new
-    seconds = old.seconds if new.seconds is None else new.seconds
-    return replace(new, scores=old.scores | new.scores, columns=(*old.columns, *new.columns), seconds=seconds)
+    old = logged.get(row.id)
+    return replace(row, digest=old.digest) if old and old.prediction_key == prediction_key else row
 
 
 def get_prediction(truth: GroundTruth, method: Method, row: ScoreRow) -> MethodOutput:
@@ -309,25 +280,18 @@ def get_prediction(truth: GroundTruth, method: Method, row: ScoreRow) -> MethodO
     return cached if cached and cached.digest == row.digest else method.predict(truth.case, truth.photo)
 
 
-def _case_failed(row: ScoreRow, error: BrewsterError) -> ScoreRow:
-    return replace(row, error=f"{row.benchmark}/{row.case}: {error}")
-
-
-def _method_failed(row: ScoreRow, error: str) -> ScoreRow:
-    return replace(row, error=f"{row.method} failed on {row.benchmark}/{row.case}: {error}")
-
-
 def _digest(*parts: object) -> str:
     return hashlib.sha256(json.dumps(parts).encode()).hexdigest()[:32]
 
 
 # --- all cases
 
-RowsCallback = Callable[[Sequence[ScoreRow]], None]
-
 
 def _run_tasks(
-    tasks: Sequence[_ScoringTask], state: _WorkerState, on_rows: RowsCallback, workers: int
+    tasks: Sequence[_Task],
+    state: _WorkerState,
+    on_rows: Callable[[Sequence[ScoreRow]], None],
+    workers: int,
 ) -> None:
     """Runs the tasks in this process or in several worker processes. Calls `on_rows` after each task.
 
@@ -370,6 +334,6 @@ def _initialize_worker(state: _WorkerState) -> None:
     _worker_state.append(state)
 
 
-def _score_case_in_worker(task: _ScoringTask) -> list[ScoreRow]:
+def _score_case_in_worker(task: _Task) -> list[ScoreRow]:
     with single_torch_thread():
         return _score_case(task, _worker_state[0])

@@ -79,17 +79,8 @@ __all__ = [
 def _psnr(comparison: Comparison) -> float:
     if comparison.region is None:
         return min(psnr_of_counts(comparison.shared(_pair_counts)), IDENTICAL_DB)
-    return min(
-        psnr(comparison.prediction.pixels, comparison.truth.pixels, region=comparison.region), IDENTICAL_DB
-    )
-
-
-def _psnr_of_channels(comparison: Comparison) -> float:
-    return min(psnr_of_channels(comparison.prediction.pixels, comparison.truth.pixels), IDENTICAL_DB)
-
-
-def _linear_rmse(comparison: Comparison) -> float:
-    return linear_rmse_of_counts(comparison.shared(_pair_counts))
+    prediction, truth = comparison.prediction.pixels, comparison.truth.pixels
+    return min(psnr(prediction, truth, region=comparison.region), IDENTICAL_DB)
 
 
 def _pair_counts(comparison: Comparison) -> PairCounts:
@@ -102,22 +93,6 @@ def _uniform_map(comparison: Comparison) -> NDArray[np.float64]:
 
 def _gaussian_map(comparison: Comparison) -> NDArray[np.float64]:
     return ssim_map(comparison.prediction.pixels, comparison.truth.pixels, window="gaussian")
-
-
-def _ssim(comparison: Comparison) -> float:
-    return mean_ssim(comparison.shared(_uniform_map), region=comparison.region)
-
-
-def _ssim_gaussian(comparison: Comparison) -> float:
-    return mean_ssim(comparison.shared(_gaussian_map), region=comparison.region)
-
-
-def _ssim_clipped(comparison: Comparison) -> float:
-    return mean_ssim(np.maximum(comparison.shared(_gaussian_map), 0), region=comparison.region)
-
-
-def _lpips(comparison: Comparison) -> float:
-    return comparison.shared(_lpips_difference).mean(region=comparison.region)
 
 
 def _lpips_difference(comparison: Comparison) -> DifferenceMaps:
@@ -135,29 +110,6 @@ def _lpips_features(image: Image) -> Features:
 @functools.lru_cache(maxsize=4)
 def _lpips_features_of_black(shape: tuple[int, ...]) -> Features:
     return Lpips.load().features(np.zeros(shape, np.uint8))
-
-
-def _niqe(comparison: Comparison) -> float:
-    return niqe(comparison.prediction.pixels)
-
-
-def _bright_score(score: Callable[[Image, Image, Image], float]) -> Callable[[Comparison], float]:
-    """Converts a function of prediction, truth and photo to the `score` function of a metric."""
-    return lambda comparison: score(comparison.prediction.pixels, comparison.truth.pixels, comparison.photo)
-
-
-def _rendered_score(
-    score: Callable[[Image, Image, Image, Image], float],
-) -> Callable[[Comparison], float]:
-    """Converts a function of prediction, background, photo and reflection to the `score` function of a metric."""
-
-    def score_comparison(comparison: Comparison) -> float:
-        assert comparison.reflection is not None
-        return score(
-            comparison.prediction.pixels, comparison.truth.pixels, comparison.photo, comparison.reflection
-        )
-
-    return score_comparison
 
 
 IDENTICAL_DB: Final = 100.0
@@ -180,22 +132,31 @@ _GAIN: Final = (
     " is no reflection."
 )
 
-_PSNR_ROW: Final = Metric("psnr", "PSNR", "dB", True, 2, f"{_PSNR} of all pixels.", "transmission", _psnr)
-_SSIM_ROW: Final = Metric("ssim", "SSIM", "", True, 3, f"Mean local SSIM, {_UNIFORM}.", "transmission", _ssim)
-_LPIPS_ROW: Final = Metric(
-    "lpips",
-    "LPIPS",
-    "",
-    False,
-    3,
-    f"{_LPIPS}, each layer averaged over its map.",
-    "transmission",
-    _lpips,
-    prepare=Lpips.load,
+_NEAR_WHITE: Final = "of the pixels above 200 in all channels of photo and ground truth, in 8-bit levels"
+_GAUSSIAN: Final = (
+    f"Gaussian 11x11 window of sigma 1.5, population covariance, {_SSIM}, without the outermost 5 pixels"
 )
-_RMSE_ROW: Final = Metric(
-    "linear_rmse", "RMSE (linear light)", "", False, 4, f"{_LINEAR}.", "transmission", _linear_rmse
+_WHITE: Final = "the background is white (encoded channels above 0.75 and less than 0.12 apart)"
+_LOST: Final = "Fraction of the background's light that the prediction lacks where the reflection is below 2 % of the photo"
+_KEPT: Final = (
+    "Fraction of the reflection's light that the prediction still has above the background, where the reflection is at"
+    " least 10 % of the photo and the photo is not clipped."
 )
+_NIQE: Final = (
+    "NIQE (Mittal 2013): distance between the local statistics of the prediction and of undistorted photographs, in"
+    " blocks of 96x96 pixels of the luma 0.299 R + 0.587 G + 0.114 B; the ground truth is not used."
+)
+_CHANNELS: Final = (
+    "The mean of 10 log10(255^2 / MSE) of red, green and blue of 8-bit sRGB, over all pixels, as in the code of ERRNet"
+    " and XReflection."
+)
+_CLIPPED: Final = "Share of the 8-bit channel values of at least 250 in photo and ground truth that are below 240 in the prediction."
+
+
+def _row(name: str, title: str, digits: int, definition: str, score: Callable[[Comparison], float]) -> Metric:
+    """Returns a metric of the transmission, over the whole image. Only PSNR has a unit; PSNR and SSIM rise with the quality."""
+    unit, is_higher_better = "dB" if name.startswith("psnr") else "", name.startswith(("psnr", "ssim"))
+    return Metric(name, title, unit, is_higher_better, digits, definition, "transmission", score)
 
 
 def _in_region(metric: Metric, definition: str) -> Metric:
@@ -207,97 +168,61 @@ def _of_reflection(metric: Metric, title: str) -> Metric:
     return replace(metric, name=f"{metric.name}_reflection", title=title, ground_truth="reflection")
 
 
-def _on_rendered(name: str, title: str, definition: str, score: Callable[..., float]) -> Metric:
-    return Metric(name, title, "", False, 3, f"{definition} {_GAIN}", "rendered", _rendered_score(score))
+def _of_photo(
+    name: str, title: str, digits: int, definition: str, score: Callable[[Image, Image, Image], float]
+) -> Metric:
+    """Returns a metric whose function takes prediction, truth and photo."""
+    return _row(
+        name, title, digits, definition, lambda c: score(c.prediction.pixels, c.truth.pixels, c.photo)
+    )
 
 
-_NEAR_WHITE: Final = "of the pixels above 200 in all channels of photo and ground truth, in 8-bit levels"
-_BRIGHT_ROWS: Final = (
-    ("lost_clipped", "Lost clipped light", 3, "Share of the 8-bit channel values of at least 250 in photo and ground truth that are below 240 in the prediction.", lost_clipped),
-    ("lost_near_white", "Lost near white", 1, f"Mean of truth - prediction {_NEAR_WHITE}.", lost_near_white),
-    ("near_white_cast", "Cast of near white", 1, f"Largest - smallest channel of the mean truth - prediction {_NEAR_WHITE}.", near_white_cast),
-)  # fmt: skip
+def _on_rendered(
+    name: str, title: str, definition: str, score: Callable[[Image, Image, Image, Image], float]
+) -> Metric:
+    """Returns a metric whose function takes prediction, background, photo and reflection."""
+
+    def score_comparison(c: Comparison) -> float:
+        assert c.reflection is not None
+        return score(c.prediction.pixels, c.truth.pixels, c.photo, c.reflection)
+
+    return replace(_row(name, title, 3, f"{definition} {_GAIN}", score_comparison), ground_truth="rendered")
+
+
+_PSNR_ROW: Final = _row("psnr", "PSNR", 2, f"{_PSNR} of all pixels.", _psnr)
+_SSIM_ROW: Final = _row("ssim", "SSIM", 3, f"Mean local SSIM, {_UNIFORM}.",
+    lambda c: mean_ssim(c.shared(_uniform_map), region=c.region))  # fmt: skip
+_LPIPS_ROW: Final = replace(_row("lpips", "LPIPS", 3, f"{_LPIPS}, each layer averaged over its map.",
+    lambda c: c.shared(_lpips_difference).mean(region=c.region)), prepare=Lpips.load)  # fmt: skip
+_RMSE_ROW: Final = _row("linear_rmse", "RMSE (linear light)", 4, f"{_LINEAR}.",
+    lambda c: linear_rmse_of_counts(c.shared(_pair_counts)))  # fmt: skip
 
 _ROWS: Final = (
     _PSNR_ROW,
     _SSIM_ROW,
-    Metric(
-        "ssim_gaussian",
-        "SSIM (Gaussian)",
-        "",
-        True,
-        3,
-        f"Mean local SSIM, Gaussian 11x11 window of sigma 1.5, population covariance, {_SSIM},"
-        " without the outermost 5 pixels.",
-        "transmission",
-        _ssim_gaussian,
-    ),
+    _row("ssim_gaussian", "SSIM (Gaussian)", 3, f"Mean local SSIM, {_GAUSSIAN}.",
+        lambda c: mean_ssim(c.shared(_gaussian_map))),
     _LPIPS_ROW,
     _in_region(_PSNR_ROW, f"{_PSNR} of"),
     _in_region(_SSIM_ROW, f"Mean local SSIM, {_UNIFORM}, over"),
     _in_region(_LPIPS_ROW, f"{_LPIPS}, each layer's map enlarged to the image (bilinear), averaged over"),
     _RMSE_ROW,
-    Metric(
-        "niqe",
-        "NIQE",
-        "",
-        False,
-        2,
-        "NIQE (Mittal 2013): distance between the local statistics of the prediction and of undistorted photographs, in"
-        " blocks of 96x96 pixels of the luma 0.299 R + 0.587 G + 0.114 B; the ground truth is not used.",
-        "transmission",
-        _niqe,
-    ),
-    Metric(
-        "psnr_channels",
-        "PSNR (channel mean)",
-        "dB",
-        True,
-        2,
-        "The mean of 10 log10(255^2 / MSE) of red, green and blue of 8-bit sRGB, over all pixels, as in the code of ERRNet"
-        " and XReflection.",
-        "transmission",
-        _psnr_of_channels,
-    ),
-    Metric(
-        "ssim_clipped",
-        "SSIM (clipped)",
-        "",
-        True,
-        3,
-        "As SSIM (Gaussian), but negative local values count as 0, as in the package pyiqa.",
-        "transmission",
-        _ssim_clipped,
-    ),
-    *(
-        Metric(name, title, "", False, digits, definition, "transmission", _bright_score(score))
-        for name, title, digits, definition, score in _BRIGHT_ROWS
-    ),
+    _row("niqe", "NIQE", 2, _NIQE, lambda c: niqe(c.prediction.pixels)),
+    _row("psnr_channels", "PSNR (channel mean)", 2, _CHANNELS,
+        lambda c: min(psnr_of_channels(c.prediction.pixels, c.truth.pixels), IDENTICAL_DB)),
+    _row("ssim_clipped", "SSIM (clipped)", 3, "As SSIM (Gaussian), but negative local values count as 0, as in the package pyiqa.",
+        lambda c: mean_ssim(np.maximum(c.shared(_gaussian_map), 0))),
+    _of_photo("lost_clipped", "Lost clipped light", 3, _CLIPPED, lost_clipped),
+    _of_photo("lost_near_white", "Lost near white", 1, f"Mean of truth - prediction {_NEAR_WHITE}.", lost_near_white),
+    _of_photo("near_white_cast", "Cast of near white", 1, f"Largest - smallest channel of the mean truth - prediction {_NEAR_WHITE}.", near_white_cast),
     _of_reflection(_PSNR_ROW, "PSNR of R"),
     _of_reflection(_SSIM_ROW, "SSIM of R"),
     _of_reflection(_LPIPS_ROW, "LPIPS of R"),
     _of_reflection(_RMSE_ROW, "RMSE of R (linear light)"),
-    _on_rendered(
-        "removed_content",
-        "Removed content",
-        "Fraction of the background's light that the prediction lacks where the reflection is below 2 % of the photo.",
-        removed_content,
-    ),
-    _on_rendered(
-        "removed_white",
-        "Removed white",
-        "Fraction of the background's light that the prediction lacks where the reflection is below 2 % of the photo and"
-        " the background is white (encoded channels above 0.75 and less than 0.12 apart).",
-        removed_white,
-    ),
-    _on_rendered(
-        "kept_reflection",
-        "Kept reflection",
-        "Fraction of the reflection's light that the prediction still has above the background, where the reflection is at"
-        " least 10 % of the photo and the photo is not clipped.",
-        kept_reflection,
-    ),
-)
+    _on_rendered("removed_content", "Removed content", f"{_LOST}.", removed_content),
+    _on_rendered("removed_white", "Removed white", f"{_LOST} and {_WHITE}.", removed_white),
+    _on_rendered("kept_reflection", "Kept reflection", _KEPT, kept_reflection),
+)  # fmt: skip
 
 METRICS: Final = {metric.name: metric for metric in _ROWS}
 """All metrics by name, in the order in which reports list them."""

@@ -11,6 +11,7 @@ from typing import Any, Final, final
 import numpy as np
 from numpy.typing import NDArray
 
+from brewster.evaluate.methods import BASELINE
 from brewster.photo import FileInfo, Photo
 
 Pixels = NDArray[np.uint8]
@@ -25,31 +26,12 @@ MAX_ERROR: Final = 96
 """Errors from this value up, of 255, have the last colour of the map."""
 
 _INFERNO: Final = (
-    0x000004,
-    0x1B0C41,
-    0x4A0C6B,
-    0x781C6D,
-    0xA52C60,
-    0xCF4446,
-    0xED6925,
-    0xFB9B06,
-    0xF7D13D,
-    0xFCFFA4,
+    0x000004, 0x100729, 0x240C49, 0x410C63, 0x5C126C, 0x781C6D, 0x932665, 0xAD315B,
+    0xC73F4B, 0xDB5339, 0xED6925, 0xF58712, 0xFAA611, 0xF8C632, 0xF9E366, 0xFCFFA4,
+)  # fmt: skip
+COLOUR_MAP: Final = np.array(
+    [[colour >> shift & 255 for shift in (16, 8, 0)] for colour in _INFERNO], np.uint8
 )
-_COLOUR_COUNT: Final = 16
-
-
-def _colour_map() -> Pixels:
-    anchors = np.array([[colour >> shift & 255 for shift in (16, 8, 0)] for colour in _INFERNO])
-    positions = np.linspace(0, 1, _COLOUR_COUNT)
-    channels = [
-        np.interp(positions, np.linspace(0, 1, len(anchors)), anchors[:, channel]) for channel in range(3)
-    ]
-    colours: Pixels = np.rint(np.stack(channels, axis=1)).astype(np.uint8)
-    return colours
-
-
-COLOUR_MAP: Final = _colour_map()
 """Colours of error maps, sRGB uint8 (16, 3), from "inferno" of matplotlib (CC0). The lightness increases evenly, so that a
 grey print is readable. Each colour covers MAX_ERROR / 16. Images with only 16 colours give small lossless files."""
 
@@ -63,7 +45,7 @@ class CaseImages:
     """The images of a case at full size, uint8 sRGB (H, W, 3), and the reflection region, bool (H, W).
 
     `predictions` is method -> transmission, without the baseline. `reflections` is method -> reflection, for the methods
-    that predict it. `links` is (layer, method) -> URL of the image at full size, relative to the page; the method is "" for
+    that predict it; the method "" has the ground truth. `links` is (layer, method) -> URL of the image at full size, relative to the page; the method is "" for
     the layers "photo", "transmission" and "reflection" of the benchmark.
     """
 
@@ -74,77 +56,48 @@ class CaseImages:
     region: NDArray[np.bool_]
     predictions: Mapping[str, Pixels]
     reflections: Mapping[str, Pixels] = field(default_factory=dict)
-    reflection_ground_truth: Pixels | None = None
     links: Mapping[tuple[str, str], str] = field(default_factory=dict)
 
 
 @final
 @dataclass(frozen=True)
 class CaseThumbnails:
-    """The images of a case as HTML with embedded files. `size` is that of the photo, (width, height) in px."""
+    """The images of a case as HTML with embedded files, by method; the photo and the ground truth are those of the baseline.
+
+    `size` is that of the photo, (width, height) in px.
+    """
 
     benchmark: str
     name: str
     size: tuple[int, int]
-    photo: str
     methods: Mapping[str, str]
 
 
 def to_thumbnails(case: CaseImages) -> CaseThumbnails:
     """Downscales and encodes all images of a case."""
     height, width = case.photo.shape[:2]
-    names = dict.fromkeys((*case.predictions, *case.reflections))
-    methods = {name: method_thumbnails(case, name) for name in names}
-    return CaseThumbnails(case.benchmark, case.name, (width, height), photo_thumbnails(case), methods)
-
-
-def photo_thumbnails(case: CaseImages) -> str:
-    """Returns HTML with the photo, its error map, the ground truth, the region and, if known, the true reflection."""
-    thumbnails = [
-        _thumbnail(case, "picture", "photo", encode_photo(case.photo), ("photo", "")),
-        _thumbnail(
-            case, "error", "error of the photo", encode_lossless(error_map(case.photo, case.ground_truth))
-        ),
+    figures = {BASELINE: _layer(case, "photo", ("photo", ""), case.photo)}
+    figures[BASELINE] += [
         _thumbnail(case, "picture", "ground truth", encode_photo(case.ground_truth), ("transmission", "")),
         _thumbnail(case, "region", "reflection region", overlay(case.region)),
     ]
-    if case.reflection_ground_truth is not None:
-        thumbnails.append(
-            _thumbnail(
-                case,
-                "reflection",
-                "ground truth of the reflection",
-                encode_photo(case.reflection_ground_truth),
-                ("reflection", ""),
-            )
-        )
-    return "".join(thumbnails)
+    figures |= {
+        name: _layer(case, name, ("transmission", name), image) for name, image in case.predictions.items()
+    }
+    for name, reflection in case.reflections.items():
+        caption = f"reflection by {name}" if name else "ground truth of the reflection"
+        data = encode_photo(reflection)
+        figures[name or BASELINE].append(_thumbnail(case, "reflection", caption, data, ("reflection", name)))
+    methods = {name: "".join(parts) for name, parts in figures.items()}
+    return CaseThumbnails(case.benchmark, case.name, (width, height), methods)
 
 
-def method_thumbnails(case: CaseImages, method: str) -> str:
-    """Returns HTML with the transmission of a method, its error map and its reflection; "" if the method failed."""
-    thumbnails = []
-    if method in case.predictions:
-        prediction = case.predictions[method]
-        thumbnails.append(
-            _thumbnail(case, "picture", method, encode_photo(prediction), ("transmission", method))
-        )
-        thumbnails.append(
-            _thumbnail(
-                case, "error", f"error of {method}", encode_lossless(error_map(prediction, case.ground_truth))
-            )
-        )
-    if method in case.reflections:
-        thumbnails.append(
-            _thumbnail(
-                case,
-                "reflection",
-                f"reflection by {method}",
-                encode_photo(case.reflections[method]),
-                ("reflection", method),
-            )
-        )
-    return "".join(thumbnails)
+def _layer(case: CaseImages, name: str, source: tuple[str, str], image: Pixels) -> list[str]:
+    error = encode_lossless(error_map(image, case.ground_truth))
+    return [
+        _thumbnail(case, "picture", name, encode_photo(image), source),
+        _thumbnail(case, "error", f"error of {'the photo' if source[0] == 'photo' else name}", error),
+    ]
 
 
 def _thumbnail(
@@ -187,7 +140,9 @@ def error_map(prediction: Pixels, truth: Pixels) -> Pixels:
     """
     red, green, blue = np.moveaxis(np.abs(prediction.astype(np.int16) - truth), 2, 0)
     means = _area_means(np.maximum(np.maximum(red, green), blue))  # much faster than max(axis=2)
-    colours: Pixels = COLOUR_MAP[(means / MAX_ERROR * _COLOUR_COUNT).astype(int).clip(0, _COLOUR_COUNT - 1)]
+    colours: Pixels = COLOUR_MAP[
+        (means / MAX_ERROR * len(COLOUR_MAP)).astype(int).clip(0, len(COLOUR_MAP) - 1)
+    ]
     return colours
 
 
