@@ -95,7 +95,7 @@ def test_the_reflection_of_a_locked_candidate_moves_with_the_transmission():
     assert torch.equal(positions[0, 0], positions[1, 0])
     assert not torch.equal(positions[0, 1], positions[1, 1])
     assert torch.allclose(positions[:, :, 1], pixel_grid(8, 12))  # the reference frame does not move
-    assert model.relative_motion(8, 12).tolist() == pytest.approx([0, 0.15], abs=1e-3)
+    assert model.motions(8, 12)[1].tolist() == pytest.approx([0, 0.15], abs=1e-3)
 
 
 @pytest.mark.parametrize("end", [(6.0, 0.0), (-9.0, 2.0)])
