@@ -135,6 +135,8 @@ class ModelMethod:
     folder: Path
     quality: Quality = "standard"
     device: Device = "auto"
+    burst: bool = False
+    """Whether all photos of a burst are used. Single photos are separated as before."""
 
     @property
     def exclusive(self) -> bool:
@@ -143,11 +145,12 @@ class ModelMethod:
 
     def about(self) -> dict[str, str]:
         """Returns the kind of method, the digest of the model file, and the quality."""
-        return {"kind": "model", "sha256": self._sha256, "quality": self.quality}
+        return {"kind": "burst" if self.burst else "model", "sha256": self._sha256, "quality": self.quality}
 
-    def key(self, case: Case) -> str:  # noqa: ARG002  (the same for all cases)
-        """Returns the digest of the model, the quality, and the version of predictions."""
-        return f"{self._sha256} {self.quality} {PREDICTION_FORMAT_VERSION}"
+    def key(self, case: Case) -> str:
+        """Returns the digest of the model, the quality, the version of predictions, and the digest of the frames of a burst."""
+        frames = f" {_digest(frame.read() for frame in case.frames)}" if self.burst and case.frames else ""
+        return f"{self._sha256} {self.quality} {PREDICTION_FORMAT_VERSION}{frames}"
 
     def predict(self, case: Case, photo: Photo) -> MethodOutput:
         """Separates the photo and stores both layers.
@@ -162,7 +165,19 @@ class ModelMethod:
             self.model, self.device
         )
         started = time.perf_counter()
-        separation = separator(photo, quality=self.quality)
+        if self.burst and case.frames:
+            from brewster.burst import separate_burst  # noqa: PLC0415  (imports torch)
+
+            # The photo may have been resized
+            frames = [
+                frame
+                if frame.size == photo.size
+                else Photo.from_array(frame.resized(*photo.size), encoding="linear")
+                for frame in (Photo.open(file.read()) for file in case.frames)
+            ]
+            separation = separate_burst(frames, separator=separator, quality=self.quality)
+        else:
+            separation = separator(photo, quality=self.quality)
         seconds = time.perf_counter() - started
         data = {}
         for layer, path in self.files(case).items():
