@@ -1,16 +1,18 @@
 """Measures bursts with ground truth: the gain over the single photo, and how often the choice between the two was right.
 
-    .venv/bin/python bench/burst.py FOLDER    # a dataset of `brewster render --burst`, or folders as docs/evaluation.md describes
-    .venv/bin/python bench/burst.py           # time and memory for five photos of 12 megapixels
+    .venv/bin/python bench/burst.py FOLDER              # a dataset of `brewster render --burst`, or folders as docs/evaluation.md says
+    .venv/bin/python bench/burst.py FOLDER 320 0 5      # at most 320 px; only the first and the sixth burst
+    .venv/bin/python bench/burst.py                     # time and memory for five photos of 12 megapixels
 
 Prints one row for each burst. "gain" is the PSNR of the layers by motion minus that of the single photo, after a gain for each
-channel; the choice is right if the better one of the two was chosen, or if they differ by less than 0.1 dB.
+channel; "result" is the same for the method that was chosen. The second table counts results that are worse by more than 0.1 dB.
 """
 
 import resource
 import sys
 import tempfile
 import time
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 
@@ -18,8 +20,8 @@ import numpy as np
 
 from brewster import Photo, Separator, separate_burst
 from brewster.benchmarks.registry import read_benchmark
-from brewster.burst.separate import burst_report, measure_layers
-from brewster.burst.solver import resized
+from brewster.burst import separate
+from brewster.burst.solver import LEVELS, resized, solve
 from brewster.srgb import to_encoded
 
 BORDER_PX = 8
@@ -37,57 +39,59 @@ def psnr_db(image, truth):
     return float(-10 * np.log10(np.maximum(np.mean(error**2), 1e-6)))
 
 
-def quality(folder):
+def quality(folder, long_side_px, numbers):
+    separate.solve = partial(solve, levels=[level for level in LEVELS if level.long_side_px <= long_side_px])
     separator = Separator.load()
     rows = []
     print(
-        "| burst | motion, px | explained | method | input T | single T | gain T | gain R | right |\n|---|"
-        + "---|" * 8
+        "| burst | motion, px | explained | naming | verdict | method | input T | single T | gain T | gain R | result T |"
     )
-    for case in (case for benchmark in read_benchmark("bursts", folder) for case in benchmark.cases):
+    print("|---|" + "---|" * 10)
+    cases = [case for benchmark in read_benchmark("bursts", folder) for case in benchmark.cases]
+    for case in [cases[number] for number in numbers] or cases:
         photos = [Photo.open(frame.read()) for frame in case.frames]
         reference = len(photos) // 2
         frames = [resized(photo.linear(), min(1000, max(photo.size))).clip(0, 1) for photo in photos]
         upsampler, _, single = separator.fit(photos[reference])
         frame = frames[reference]
         prior = upsampler.apply(frame, 0, len(frame))[0].clip(0, frame)
-        solution, left_out = measure_layers(frames, reference, prior)
-        report = burst_report(solution, single.verdict == "little found", len(photos), left_out, reference)
+        solution, left_out = separate.measure_layers(frames, reference, prior)
+        report = separate.burst_report(solution, single.verdict, len(photos), left_out, reference)
         if solution is None:
-            print(f"| {case.name} | | | {report.method} | | | | | |")
+            print(f"| {case.name} | | | | {single.verdict} | {report.method} | | | | | |")
             continue
         long_side = max(solution.transmission.shape)
         truth = [
             resized(Photo.open(file.read()).linear(), long_side)
             for file in (case.ground_truth, case.reflection)
         ]
-        singles = [resized(image, long_side) for image in (prior, frame - prior)]
-        scores = [psnr_db(image, layer) for image, layer in zip(singles, truth, strict=True)]
-        gains = [
-            psnr_db(image, layer) - score
-            for image, layer, score in zip(
-                (solution.transmission, solution.reflection), truth, scores, strict=True
-            )
-        ]
-        right = abs(gains[0]) < EQUAL_DB or (gains[0] > 0) == (report.method == "burst")
-        rows.append((report.relative_motion_px, report.method == "burst", *gains, right))
+        small, prior = resized(frame, long_side), resized(prior, long_side)
+        layers = {
+            "unchanged": (small, 0 * small),
+            "single photo": (prior, small - prior),
+            "burst": (solution.transmission, solution.reflection),
+        }
+        scores = {method: np.array([*map(psnr_db, pair, truth)]) for method, pair in layers.items()}
+        gain, result = (scores[method] - scores["single photo"] for method in ("burst", report.method))
+        rows.append((report.relative_motion_px, report.method, result))
         print(
-            f"| {case.name} | {report.relative_motion_px:.1f} | {report.explained:.2f} | {report.method}"
-            f" | {psnr_db(resized(frame, long_side), truth[0]):.2f} | {scores[0]:.2f} | {gains[0]:+.2f} | {gains[1]:+.2f}"
-            f" | {'yes' if right else 'no'} |",
+            f"| {case.name} | {report.relative_motion_px:.1f} | {report.explained:.2f} | {solution.naming:+.2f}"
+            f" | {single.verdict} | {report.method} | {scores['unchanged'][0]:.2f} | {scores['single photo'][0]:.2f}"
+            f" | {gain[0]:+.2f} | {gain[1]:+.2f} | {result[0]:+.2f} |",
             flush=True,
         )
     print(
-        "\n| measured motion, px | bursts | by motion | median gain T of these | R | choice right |\n|---|---|---|---|---|---|"
+        "\n| measured motion, px | bursts | burst / single / unchanged | median gain T | R | worse |\n|---|---|---|---|---|---|"
     )
     for low, high in pairwise(BINS_PX):
         found = [row for row in rows if low <= row[0] < high]
-        chosen = np.array([row[2:4] for row in found if row[1]]).reshape(-1, 2)
-        medians = [f"{value:+.2f}" for value in np.median(chosen, axis=0)] if len(chosen) else ["", ""]
-        right = f"{np.mean([row[4] for row in found]):.0%}" if found else ""
-        print(
-            f"| {low:g} to {high:g} | {len(found)} | {len(chosen)} | {medians[0]} | {medians[1]} | {right} |"
+        counts = " / ".join(
+            str(sum(row[1] == method for row in found)) for method in ("burst", "single photo", "unchanged")
         )
+        chosen = np.array([row[2] for row in found if row[1] == "burst"]).reshape(-1, 2)
+        medians = [f"{value:+.2f}" for value in np.median(chosen, axis=0)] if len(chosen) else ["", ""]
+        worse = sum(row[2][0] < -EQUAL_DB for row in found)
+        print(f"| {low:g} to {high:g} | {len(found)} | {counts} | {medians[0]} | {medians[1]} | {worse} |")
 
 
 def speed():
@@ -112,4 +116,8 @@ def speed():
 
 
 if __name__ == "__main__":
-    quality(Path(sys.argv[1])) if len(sys.argv) > 1 else speed()
+    if len(sys.argv) > 1:
+        folder, long_side_px, *numbers = [*sys.argv[1:], "640"] if len(sys.argv) == 2 else sys.argv[1:]
+        quality(Path(folder), int(long_side_px), [*map(int, numbers)])
+    else:
+        speed()

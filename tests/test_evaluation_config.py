@@ -4,6 +4,7 @@ import pytest
 
 from brewster.errors import BrewsterError
 from brewster.evaluate.config import EvaluationConfig
+from brewster.metrics import METRICS
 
 
 @pytest.mark.parametrize(

@@ -2,6 +2,7 @@
 
 import pickle
 import unicodedata
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -171,3 +172,19 @@ def test_folders_and_broken_links_with_names_of_images_are_ignored(cases, tmp_pa
     (tmp_path / "theirs" / "3.png").symlink_to("nowhere")
     assert theirs.count_unmatched(cases) == 0
     assert "no prediction" in theirs.key(cases[0])
+
+
+def test_a_burst_method_keys_on_the_frames_and_passes_them_on(case, model, tmp_path, monkeypatch):
+    burst = ModelMethod("pane burst", str(model), tmp_path, burst=True)
+    frames = (case.photo, case.ground_truth)
+    assert burst.key(case) == ModelMethod("pane", str(model), tmp_path).key(case)
+    assert burst.key(replace(case, frames=frames)) != burst.key(replace(case, frames=frames[:1]))
+    photo, passed = Photo.open(case.photo.read()), []
+
+    def record(photos, *, separator, quality):
+        passed.extend(photos)
+        return separator(photos[0], quality=quality)
+
+    monkeypatch.setattr("brewster.burst.separate_burst", record)
+    burst.predict(replace(case, frames=frames), photo)
+    assert [frame.size for frame in passed] == [photo.size] * 2

@@ -5,6 +5,7 @@ from functools import partial
 from pathlib import Path
 
 import av
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -17,12 +18,13 @@ from brewster.batch.plan import plan_bursts
 from brewster.burst import read_video, separate_burst
 from brewster.burst.fourier_search import find_translations
 from brewster.burst.joint_model import DEFAULT_WEIGHTS, JointModel, Rates, optimise, pixel_grid
-from brewster.burst.registration import frame_motions, motion_candidates
-from brewster.burst.solver import Level, solve
+from brewster.burst.registration import frame_motions, motion_candidates, path_order
+from brewster.burst.separate import burst_report, measure_layers
+from brewster.burst.solver import LEVELS, Level, Solution, solve
 from brewster.burst.video import choose_frames
 from brewster.cli import main
 from brewster.errors import PhotoError, PhotoTooLarge, UnreadablePhoto
-from brewster.srgb import to_encoded
+from brewster.srgb import to_encoded, to_linear
 from simulated_bursts import read_photo, simulate_burst
 
 PICTURES = sorted((Path(__file__).parent / "pictures").glob("*.jpg"))
@@ -95,7 +97,7 @@ def test_the_reflection_of_a_locked_candidate_moves_with_the_transmission():
     assert torch.equal(positions[0, 0], positions[1, 0])
     assert not torch.equal(positions[0, 1], positions[1, 1])
     assert torch.allclose(positions[:, :, 1], pixel_grid(8, 12))  # the reference frame does not move
-    assert model.relative_motion(8, 12).tolist() == pytest.approx([0, 0.15], abs=1e-3)
+    assert model.motions(8, 12)[1].tolist() == pytest.approx([0, 0.15], abs=1e-3)
 
 
 @pytest.mark.parametrize("end", [(6.0, 0.0), (-9.0, 2.0)])
@@ -125,6 +127,69 @@ def test_a_burst_is_separated_by_its_motion(small_burst, burst_files):
     scores = [psnr_db(layers.transmission.linear(), small_burst.transmission) for layers in (result, single)]
     assert scores[0] > scores[1]
     assert result.transmission.size == result.reflection.size == result.photo.size
+
+
+def test_the_order_of_the_photos_does_not_matter():
+    burst = simulate_burst(*linear_pictures((110, 84)), relative_px=10, frames=3, size=(96, 72))
+    frames = [to_linear(frame / 255).astype(np.float32) for frame in burst.frames]
+    motions = frame_motions(frames, 1, frames[1] * np.float32(0.8))
+    order = path_order(frames, motions)
+    assert order in ([0, 1, 2], [2, 1, 0])
+    solve_few = partial(solve, levels=(Level(48, 5, None),))
+    results = []
+    for shuffled in ([0, 1, 2], [2, 0, 1]):
+        chosen, reference = [frames[k] for k in shuffled], shuffled.index(1)
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr("brewster.burst.separate.solve", solve_few)
+            solution, _ = measure_layers(chosen, reference, frames[1] * np.float32(0.8))
+        results.append(solution)
+    assert np.allclose(results[0].transmission, results[1].transmission, atol=1e-5)
+    assert results[0].losses == pytest.approx(results[1].losses, rel=1e-4)
+
+
+def test_a_burst_without_reflection_stays_as_it_is():
+    burst = simulate_burst(
+        *linear_pictures((140, 106)), frames=3, parallax_px=2, common_px=8, strength=0, size=(120, 90)
+    )
+    photos = [brewster.Photo.from_array(frame, encoding="srgb") for frame in burst.frames]
+    result = separate_burst(photos)
+    assert result.burst.method == "unchanged"
+    assert (result.transmission.pixels == photos[1].pixels).all()
+
+
+def test_the_single_photo_names_the_layers(small_burst):
+    """A reflection that is brighter than the transmission takes its place, unless the single photo removes it."""
+    frames = [to_linear(frame / 255).astype(np.float32) for frame in small_burst.frames]
+    priors = [layer.astype(np.float32) for layer in (small_burst.transmission, small_burst.reflection)]
+    first, second = (solve_at_80(frames, prior) for prior in priors)
+    assert first.naming > 0.15
+    assert second.naming > 0.15
+    truth = [cv2.resize(layer, first.transmission.shape[1::-1]) for layer in priors]
+    for solution, (transmission, reflection) in ((first, truth), (second, truth[::-1])):
+        assert psnr_db(solution.transmission, transmission) > psnr_db(solution.transmission, reflection) + 3
+
+
+def solve_at_80(frames, prior):
+    motions = frame_motions(frames, 2, frames[2] / 2)
+    candidates = motion_candidates(frames, 2, motions)
+    return solve(frames, 2, prior, candidates, levels=LEVELS[:1])
+
+
+@pytest.mark.parametrize(
+    ("explained", "camera", "verdict", "method"),
+    [
+        (0.0, 0.03, "reflection remains", "unchanged"),  # one layer explains all photos
+        (0.0, 0.001, "reflection remains", "single photo"),  # a still camera tells nothing
+        (0.0, 0.03, "removed", "single photo"),
+        (0.0, 0.0, "little found", "unchanged"),
+        (0.5, 0.03, "little found", "burst"),
+        (0.15, 0.03, "reflection remains", "single photo"),
+    ],
+)
+def test_the_self_check_chooses_the_method(explained, camera, verdict, method):
+    layer = np.ones((2, 2, 3), np.float32)
+    solution = Solution(layer, layer, layer[..., :1], 0.02, camera, 0.5, 0.01, 0.01 * (1 - explained), {})
+    assert burst_report(solution, verdict, 5, (), 2).method == method
 
 
 def test_a_burst_keeps_depth_and_respects_strength_and_reference(small_burst, few_steps):

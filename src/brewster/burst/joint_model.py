@@ -120,6 +120,13 @@ class JointModel:
             self.is_locked[chosen], self.reference, self.losses[chosen], self.data_losses[chosen],
         )  # fmt: skip
 
+    def exchanged(self) -> JointModel:
+        """Returns a model with T and R exchanged."""
+        layers, homographies, splines = (
+            tensor.flip(0) for tensor in (self.layers, self.homographies, self.splines)
+        )
+        return replace(self, layers=layers, homographies=homographies, splines=splines)
+
     def resized(self, frames: Tensor, spline_size: tuple[int, int] | None) -> JointModel:
         """Returns the model for larger frames (K, 3, h, w) and finer splines."""
         layers = _resize(self.layers, _canvas_size(frames), align_corners=False)
@@ -156,11 +163,12 @@ class JointModel:
         rendered, _ = self.render(height, width, slice(self.reference, self.reference + 1))
         return rendered[:, :, 0]
 
-    def relative_motion(self, height: int, width: int) -> Tensor:
-        """Returns the largest mean motion of R relative to T between two frames, as a share of the width, (C,)."""
+    def motions(self, height: int, width: int) -> Tensor:
+        """Returns the largest mean motion between two frames, of T and of R relative to T, as shares of the width, (2, C)."""
         transmission, reflection = self.positions(height, width)
-        offsets = (reflection - transmission).mean((2, 3)) * torch.tensor([0.5, 0.5 * height / width])
-        return torch.cdist(offsets, offsets).amax((1, 2))
+        offsets = torch.stack([transmission, reflection - transmission]).mean((3, 4))
+        offsets = offsets * torch.tensor([0.5, 0.5 * height / width])
+        return torch.cdist(offsets, offsets).amax((2, 3))
 
     def confidence(self, frames: Tensor) -> Tensor:
         """Returns how well the frames agree with their prediction at each pixel of the reference frame, (C, 1, h, w) in 0..1.

@@ -32,6 +32,8 @@ _MIN_DIFFERENCE: Final = 0.007
 """Two motions of a frame are different if they differ by this share of the frame's width."""
 _SHIFTS: Final = (0.015, 0.045, 0.08)
 """Sideways shifts of the reflection at the end of the path, as shares of the width: a safety net for the other candidates."""
+_ORDER_PX: Final = 40
+"""The width at which frames are compared to order them: moved edges must still overlap."""
 _MIN_FRAMES_FOR_LARGE_SHIFTS: Final = 4
 """With fewer frames, a large shift leaves parts of the reflection in one frame only, where it explains everything."""
 
@@ -76,18 +78,42 @@ def frame_motions(frames: Sequence[Floats], reference: int, prior: Floats) -> li
     ]
 
 
+def path_order(frames: Sequence[Floats], motions: Sequence[Motions]) -> list[int]:
+    """Returns the indices of the frames that show the scene, in their order along the path of the camera.
+
+    After the alignment with T, only R moves: the further apart two frames were taken, the more they differ. The first coordinate of
+    classical multidimensional scaling puts them on a line. The result does not depend on the order of the frames.
+
+    Args:
+        frames: (h, w, 3) linear light.
+        motions: the motions of each frame, from `frame_motions`; none for a frame of another scene.
+    """
+    used = [k for k, found in enumerate(motions) if found]
+    height, width = frames[0].shape[:2]
+    size = _ORDER_PX, max(8, _ORDER_PX * height // width)
+    inner = slice(height // 12, -height // 12), slice(width // 12, -width // 12)
+    aligned = [_aligned(frames[k], _likeliest(motions[k]))[inner] for k in used]
+    small = [np.sqrt(cv2.resize(frame, size, interpolation=cv2.INTER_AREA)) for frame in aligned]
+    details = np.stack([image - cv2.GaussianBlur(image, (0, 0), _ORDER_PX / 10) for image in small])
+    centred = (details - details.mean(0)).reshape(len(used), -1).astype(np.float64)
+    line = np.linalg.eigh(centred @ centred.T)[1][:, -1]
+    if small[line.argmin()].mean() > small[line.argmax()].mean():  # the direction is that of the light
+        line = -line
+    return [used[i] for i in line.argsort()]
+
+
 def motion_candidates(
     frames: Sequence[Floats], reference: int, motions: Sequence[Motions]
 ) -> list[MotionCandidate]:
     """Returns candidates for the motion of both layers. The first one is locked: both layers are one.
 
     Args:
-        frames: (h, w, 3) linear light.
+        frames: (h, w, 3) linear light, in the order of `path_order`.
         reference: the index of the reference frame.
         motions: the motions of each frame, from `frame_motions`; each frame has at least one.
     """
     height, width = frames[0].shape[:2]
-    transmission = np.stack([max(found, key=lambda motion: motion[1])[0] for found in motions])
+    transmission = np.stack([_likeliest(found) for found in motions])
     times = np.arange(len(frames)) - reference
     times = times / np.abs(times).max()
 
@@ -98,10 +124,7 @@ def motion_candidates(
         )
 
     candidates = {ONE_LAYER: transmission}
-    aligned = [
-        cv2.warpPerspective(frame, matrix, (width, height), flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP, borderMode=cv2.BORDER_REPLICATE)
-        for frame, matrix in zip(frames, transmission, strict=True)
-    ]  # fmt: skip
+    aligned = [_aligned(frame, matrix) for frame, matrix in zip(frames, transmission, strict=True)]
     for rank, offsets in enumerate(find_translations(aligned, reference)):
         candidates[f"Fourier {rank + 1}"] = np.stack(
             [matrix @ _translation(*offset) for matrix, offset in zip(transmission, offsets, strict=True)]
@@ -136,6 +159,18 @@ def motion_candidates(
         )
         for name, reflection in candidates.items()
     ]
+
+
+def _likeliest(motions: Motions) -> Matrices:
+    """Returns the motion that is most likely that of T."""
+    return max(motions, key=lambda motion: motion[1])[0]
+
+
+def _aligned(frame: Floats, matrix: Matrices) -> Floats:
+    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    size = frame.shape[1::-1]
+    aligned: Floats = cv2.warpPerspective(frame, matrix, size, flags=flags, borderMode=cv2.BORDER_REPLICATE)
+    return aligned
 
 
 def _fitted_motions(matches: Floats, share: Floats) -> Motions:

@@ -19,9 +19,10 @@ from typing import Final, Literal, final
 import cv2
 import numpy as np
 
-from brewster.burst.registration import frame_motions, motion_candidates
+from brewster.burst.registration import frame_motions, motion_candidates, path_order
 from brewster.burst.solver import Floats, Solution, solve
 from brewster.errors import PhotoError
+from brewster.inference.assessment import Verdict
 from brewster.inference.burst_report import BurstReport
 from brewster.inference.guided_upsampling import GeneratedOverride
 from brewster.inference.predictor import Prediction, Predictor, ProgressCallback
@@ -40,8 +41,11 @@ _MIN_MOTION_PX: Final = 10.0
 _MIN_EXPLAINED: Final = 0.2
 """The smallest share of the errors of one layer that a second motion must explain."""
 _LARGE_MOTION_PX: Final = 60.0
-_MIN_EXPLAINED_IF_LARGE: Final = 0.4
-"""A larger motion must explain more: the parts of a layer that only one frame shows explain everything there."""
+_MIN_EXPLAINED_IF_DOUBTED: Final = 0.4
+"""A larger motion must explain more, because the parts of a layer that only one frame shows explain everything there; and so must
+any motion if the single photo shows little reflection."""
+_MAX_EXPLAINED_UNCHANGED: Final = 0.1
+"""If the camera moved and a second motion explains less than this share, one layer explains the photos."""
 _USEFUL_MOTION_PX: Final = 16
 _DETAIL_LIMITS: Final = (0.5, 2.0)
 """The detail of the reference photo changes the sum of the layers by no more than these factors."""
@@ -90,7 +94,7 @@ def separate_burst(
         frames, reference, prior, on_progress=lambda done: on_progress(0.9 * done)
     )
     seconds["motion"] = time.perf_counter() - started
-    report = burst_report(solution, single.verdict == "little found", len(photos), left_out, reference)
+    report = burst_report(solution, single.verdict, len(photos), left_out, reference)
     chosen_separator = separator
     if solution and report.method == "burst":
         name = f"burst with {separator.name}"
@@ -131,7 +135,7 @@ def measure_layers(
     """
     with single_torch_thread(), _single_opencv_thread():
         motions = frame_motions(frames, reference, prior)
-        used = [k for k, found in enumerate(motions) if found]
+        used = path_order(frames, motions)
         left_out = tuple(k for k, found in enumerate(motions) if not found)
         if len(used) < 2:
             return None, left_out
@@ -192,23 +196,31 @@ def _applied(apply: Callable[[Floats, int, int], tuple[Floats, Floats]], frame: 
 
 
 def burst_report(
-    solution: Solution | None, is_clear: bool, count: int, left_out: tuple[int, ...], reference: int
+    solution: Solution | None, verdict: Verdict, count: int, left_out: tuple[int, ...], reference: int
 ) -> BurstReport:
-    """Decides whether the motion separates the layers. `is_clear`: the model found little reflection in the reference photo."""
+    """Decides whether the motion separates the layers. `verdict` is that of the single photo.
+
+    If the camera moved and one layer explains all photos, there is no reflection: only a model that is sure of one is believed more.
+    """
     motion = 1000 * solution.relative_motion if solution else 0.0
     explained = (
         max(0.0, 1 - solution.two_layer_error / (solution.one_layer_error + 1e-9)) if solution else 0.0
     )
-    needed = _MIN_EXPLAINED if motion < _LARGE_MOTION_PX else _MIN_EXPLAINED_IF_LARGE
+    is_doubted = motion >= _LARGE_MOTION_PX or verdict == "little found"
+    needed = _MIN_EXPLAINED_IF_DOUBTED if is_doubted else _MIN_EXPLAINED
     method: Literal["burst", "single photo", "unchanged"] = "single photo"
     advice = "Move the camera 5 to 10 cm sideways between the photos."
     if solution is None:
         message = "No other photo shows the same scene as the reference photo."
     elif explained >= needed and motion >= _MIN_MOTION_PX:
         method, message = "burst", f"The layers moved {motion:.0f} px apart in a photo of 1,000 px."
-    elif is_clear:
+    elif verdict == "little found" or (
+        verdict != "removed"
+        and explained < _MAX_EXPLAINED_UNCHANGED
+        and 1000 * solution.camera_motion >= _MIN_MOTION_PX
+    ):
         method = "unchanged"
-        message = "One layer explains all photos, and no reflection was found in the reference photo."
+        message = "One layer explains all photos: no reflection was found. If there is one, separate the reference photo alone."
     elif explained < needed:
         message = f"No relative motion of two layers was found. {advice}"
     else:

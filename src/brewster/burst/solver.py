@@ -11,8 +11,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
+from torch.nn import functional
 
-from brewster.burst.joint_model import DEFAULT_WEIGHTS, JointModel, Rates, Weights, optimise
+from brewster.burst.joint_model import DEFAULT_WEIGHTS, OFFSET, JointModel, Rates, Weights, optimise
 from brewster.burst.registration import MotionCandidate
 
 Floats = NDArray[np.float32]
@@ -34,6 +35,9 @@ COMPARED_PX: Final = 160
 _MAX_RELATIVE_MOTION: Final = 0.2
 """As a share of the width. With a larger motion, the reflection becomes an offset of each frame, and explains all but edges."""
 _MOTION_SAMPLES: Final = (9, 12)
+_DETAIL_PX: Final = 9
+_MIN_NAMING: Final = 0.15
+"""If the single photo keeps this much more detail of R than of T, the layers are exchanged."""
 _MAX_ENLARGEMENT: Final = 1.3
 """Levels that would enlarge the frames by more than this factor are left out."""
 LEVELS: Final = (
@@ -56,6 +60,10 @@ class Solution:
     """(h, w, 1) in 0..1: how well the frames agree with their prediction at each pixel of the transmission."""
     relative_motion: float
     """The largest motion of R relative to T between two frames, as a share of the width of a frame."""
+    camera_motion: float
+    """The largest motion of T between two frames, as a share of the width of a frame."""
+    naming: float
+    """The share of the detail of T that the prior keeps, minus that of R: 0 if the single photo does not tell the layers apart."""
     one_layer_error: float
     """The mean error of the frames if both layers move together: the data term of the loss at `COMPARED_PX`."""
     two_layer_error: float
@@ -118,14 +126,33 @@ def solve(
         losses |= dict(zip(names, model.losses.tolist(), strict=True))
         if level.long_side_px <= COMPARED_PX:
             errors = _errors(model)
+        if level.long_side_px >= COMPARED_PX or level is levels[-1]:
+            kept = _best(model, with_locked=False)
+            best = model.selected(kept)
+            layers, naming = _named(best, small, small_prior)
+            if naming < -_MIN_NAMING:  # the next level corrects the brightness of large areas
+                model, names = best.exchanged(), [names[i] for i in kept]
+                layers, naming = layers.flip(0), -naming
     assert model
     model = model.selected(_best(model, with_locked=False))
     with torch.no_grad():
-        layers = model.reference_layers(*small.shape[-2:])[:, 0]
         confidence = model.confidence(small)[0]
-        motion = float(model.relative_motion(*small.shape[-2:]))
+        camera, motion = model.motions(*small.shape[-2:])[:, 0].tolist()
     transmission, reflection, confidence = (layer.movedim(0, -1).numpy() for layer in (*layers, confidence))
-    return Solution(transmission, reflection, confidence, motion, *errors, losses)
+    return Solution(transmission, reflection, confidence, motion, camera, naming, *errors, losses)
+
+
+def _named(model: JointModel, frames: Tensor, prior: Tensor) -> tuple[Tensor, float]:
+    """Returns the layers of the reference frame, (2, 3, h, w), and the share of T in the prior's detail minus that of R."""
+    with torch.no_grad():
+        layers = model.reference_layers(*frames.shape[-2:])[:, 0]
+    images = torch.cat([layers, prior[None]])
+    blurred = functional.avg_pool2d(images, _DETAIL_PX, 1, _DETAIL_PX // 2, count_include_pad=False)
+    # The noise of light is proportional to its square root
+    details = ((images - blurred) / (frames[model.reference] + OFFSET).sqrt()).flatten(1)
+    gram = details @ details.T
+    transmission, reflection = torch.linalg.lstsq(gram[:2, :2] + 1e-6 * torch.eye(2), gram[:2, 2]).solution
+    return layers, float(transmission - reflection)
 
 
 def _best_of_families(model: JointModel, candidates: Sequence[MotionCandidate]) -> list[int]:
@@ -150,7 +177,7 @@ def _best(model: JointModel, *, with_locked: bool) -> list[int]:
 def _selection_losses(model: JointModel) -> list[float]:
     """Returns the losses, larger by 1 for implausible motions."""
     with torch.no_grad():
-        is_implausible = model.relative_motion(*_MOTION_SAMPLES) > _MAX_RELATIVE_MOTION
+        is_implausible = model.motions(*_MOTION_SAMPLES)[1] > _MAX_RELATIVE_MOTION
     losses: list[float] = (model.losses + is_implausible).tolist()
     return losses
 

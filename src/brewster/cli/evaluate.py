@@ -118,6 +118,11 @@ class _Size(click.ParamType["int | str"]):
     help="A model to run, given in the same way as for `brewster --model`; NAME is its name in the tables; repeatable.",
 )
 @click.option(
+    "--burst",
+    is_flag=True,
+    help="Runs each model a second time, on all photos of each burst (the method NAME burst).",
+)
+@click.option(
     "--predictions",
     metavar="NAME=FOLDER",
     type=NamedValue("RDNet=out/rdnet"),
@@ -232,6 +237,7 @@ class _EvaluateCommand:
 
     benchmarks: tuple[tuple[str, str], ...]
     models: tuple[tuple[str, str], ...]
+    burst: bool
     predictions: tuple[tuple[str, str], ...]
     out: Path
     metrics: str | None
@@ -352,6 +358,18 @@ class _EvaluateCommand:
             *(
                 ModelMethod(name, model, predictions / name, self.quality, self.device)
                 for name, model in models
+            ),
+            *(
+                ModelMethod(
+                    f"{name} burst",
+                    model,
+                    predictions / f"{name} burst",
+                    self.quality,
+                    self.device,
+                    burst=True,
+                )
+                for name, model in models
+                if self.burst
             ),
             *(PredictionFolder(name, Path(folder)) for name, folder in self.predictions),
         ]

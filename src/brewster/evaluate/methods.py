@@ -105,16 +105,20 @@ class IdentityBaseline:
     name: str = BASELINE
     exclusive: Final = False
 
-    def about(self) -> dict[str, str]:  # noqa: D102  (see Method)
+    def about(self) -> dict[str, str]:
+        """See `Method.about`."""
         return {"kind": "baseline"}
 
-    def key(self, case: Case) -> str:  # noqa: ARG002, D102
+    def key(self, case: Case) -> str:  # noqa: ARG002
+        """See `Method.key`."""
         return "identity"
 
-    def predict(self, case: Case, photo: Photo) -> MethodOutput:  # noqa: ARG002, D102
+    def predict(self, case: Case, photo: Photo) -> MethodOutput:  # noqa: ARG002
+        """See `Method.predict`."""
         return MethodOutput(photo, photo.with_pixels(np.zeros_like(photo.pixels)))
 
-    def cached(self, case: Case) -> MethodOutput | None:  # noqa: ARG002, D102
+    def cached(self, case: Case) -> MethodOutput | None:  # noqa: ARG002
+        """See `Method.cached`."""
         return None
 
 
@@ -131,17 +135,22 @@ class ModelMethod:
     folder: Path
     quality: Quality = "standard"
     device: Device = "auto"
+    burst: bool = False
+    """Whether all photos of a burst are used. Single photos are separated as before."""
 
     @property
     def exclusive(self) -> bool:
         """True for diffusion models, because a GPU has memory for only one of them."""
         return is_diffusion_model(self.model)
 
-    def about(self) -> dict[str, str]:  # noqa: D102
-        return {"kind": "model", "sha256": self._sha256, "quality": self.quality}
+    def about(self) -> dict[str, str]:
+        """Returns the kind of method, the digest of the model file, and the quality."""
+        return {"kind": "burst" if self.burst else "model", "sha256": self._sha256, "quality": self.quality}
 
-    def key(self, case: Case) -> str:  # noqa: ARG002, D102
-        return f"{self._sha256} {self.quality} {PREDICTION_FORMAT_VERSION}"
+    def key(self, case: Case) -> str:
+        """Returns the digest of the model, the quality, the version of predictions, and the digest of the frames of a burst."""
+        frames = f" {_digest(frame.read() for frame in case.frames)}" if self.burst and case.frames else ""
+        return f"{self._sha256} {self.quality} {PREDICTION_FORMAT_VERSION}{frames}"
 
     def predict(self, case: Case, photo: Photo) -> MethodOutput:
         """Separates the photo and stores both layers. Raises BrewsterError.
@@ -151,7 +160,19 @@ class ModelMethod:
         """
         separator = _load_separator(self.model, self.device, self.exclusive)
         started = time.perf_counter()
-        separation = separator(photo, quality=self.quality)
+        if self.burst and case.frames:
+            from brewster.burst import separate_burst  # noqa: PLC0415  (imports torch)
+
+            # The photo may have been resized
+            frames = [
+                frame
+                if frame.size == photo.size
+                else Photo.from_array(frame.resized(*photo.size), encoding="linear")
+                for frame in (Photo.open(file.read()) for file in case.frames)
+            ]
+            separation = separate_burst(frames, separator=separator, quality=self.quality)
+        else:
+            separation = separator(photo, quality=self.quality)
         seconds = time.perf_counter() - started
         data = {}
         for layer, path in self.files(case).items():
@@ -206,7 +227,8 @@ class PredictionFolder:
     )
     """The files that `key` read last, by case. `predict` decodes these bytes, so that each file is read once."""
 
-    def about(self) -> dict[str, str]:  # noqa: D102
+    def about(self) -> dict[str, str]:
+        """See `Method.about`."""
         return {"kind": "predictions"}
 
     def key(self, case: Case) -> str:
