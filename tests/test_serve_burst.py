@@ -42,7 +42,7 @@ def photos():
 @pytest.fixture
 def few_steps(monkeypatch):
     """For tests that do not measure the separation."""
-    monkeypatch.setattr("brewster.burst.separate.solve", partial(solve, levels=(Level(48, 6, None),)))
+    monkeypatch.setattr("brewster.burst.separate.solve", partial(solve, levels=(Level(48, 20, None),)))
 
 
 def send(path, photos, app=None, mask=None, **fields):
