@@ -11,7 +11,7 @@ export function createThumbnail(photo, { onSelect, onRemove }, next = null) {
   const thumbnail = document.createElement("li");
   thumbnail.innerHTML = `<button type="button" class="pick"><img alt="" width="56" height="56"><span class="name"></span>
     <span class="state"></span></button><button type="button" class="remove"><span aria-hidden="true">×</span></button>`;
-  const name = photo.burst ? `${photo.file.name} (burst of ${photo.burst.length})` : photo.file.name;
+  const name = photo.burst ? `${photo.burst.length} × ${photo.file.name}` : photo.file.name;
   thumbnail.querySelector(".name").textContent = name;
   thumbnail.querySelector(".pick").title = name;
   thumbnail.querySelector(".remove").setAttribute("aria-label", `Remove ${photo.file.name}`);
