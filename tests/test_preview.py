@@ -211,4 +211,4 @@ def test_the_preview_route_returns_the_maps_and_refuses_invalid_files():
     assert Maps(gzip.decompress(response.content)).head["full"] == [60, 40]
     refused = request(make_app(), "POST", "/preview", **form(b"no picture"))
     assert refused.status_code == 422
-    assert "text" in refused.json()["error"]
+    assert "no known image format" in refused.json()["error"]

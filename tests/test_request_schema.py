@@ -161,7 +161,9 @@ def test_contradicting_options_raise_the_error_of_options():
         (body(("strength", b"1")), 422),
         (body(("photo", b"not a file")), 422),
         (body(("picture", b"bytes", "a.jpg")), 422),
-        (body(("photo", b"one", "a.jpg"), ("photo", b"two", "b.jpg")), 400),
+        (body(("photo", b"one", "a.jpg"), ("photo", b"not a file")), 422),
+        (body(("photo", b"one", "a.jpg"), ("mask", b"1", "m.png"), ("mask", b"2", "n.png")), 400),
+        (body(*[("photo", b"", "a.jpg")] * 40), 400),
         (body(("photo", b"", "a.jpg"), *[("strength", b"1")] * 40), 400),
         (body(("photo", b"", "a.jpg"), ("model", b"x" * 2_000_000)), 400),
         (b"", 422),
@@ -180,9 +182,32 @@ def test_a_body_that_is_not_a_form_is_refused(kind):
     assert refused(body(("photo", b"", "a.jpg")), kind=kind)[0] in (400, 415)
 
 
+def test_several_photos_are_a_burst_and_the_layers_are_named_after_the_reference_photo():
+    photos = [("photo", name.encode(), f"{name}.jpg") for name in "abc"]
+    request = read(body(*photos, ("strength", b"0.5")))
+    assert (request.burst, request.reference) == ((b"a", b"b", b"c"), 1)
+    assert (request.photo, request.name, request.options.strength) == (b"b", "b.jpg", 0.5)
+    request = read(body(*photos, ("reference", b"3"), ("mask", b"mask", "m.png")))
+    assert (request.photo, request.target("reflection", "jpeg"), request.mask) == (
+        b"c",
+        "c.reflection.jpg",
+        b"mask",
+    )
+    assert parse().burst == ()
+
+
+@pytest.mark.parametrize("number", ["0", "3", "-1", "1.5", "²", "9" * 5000, "first"])
+def test_the_reference_is_the_number_of_a_photo(number):
+    status, message = refused(
+        body(("photo", b"", "a.jpg"), ("photo", b"", "b.jpg"), ("reference", number.encode()))
+    )
+    assert status == 422
+    assert "expected the number of a photo, 1 to 2" in message
+
+
 def test_the_schema_has_the_descriptions_and_limits_of_options():
     fields = form_schema(MODELS)["properties"]
-    assert set(fields) == {"photo", "mask", "hints", *FIELDS}
+    assert set(fields) == {"photo", "reference", "mask", "hints", *FIELDS}
     assert (fields["strength"]["minimum"], fields["strength"]["maximum"]) == (0, 1)
     assert fields["model"]["enum"] == ["compact", "mine"]
     about = Options.__dataclass_fields__

@@ -13,7 +13,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Final, Literal, final
 
 import cv2
@@ -51,6 +51,18 @@ _DETAIL_LIMITS: Final = (0.5, 2.0)
 """The detail of the reference photo changes the sum of the layers by no more than these factors."""
 
 
+@final
+@dataclass(frozen=True)
+class FittedBurst:
+    """The reference photo of a burst, and the separator that separates it with the measured layers."""
+
+    photo: Photo
+    separator: Separator
+    report: BurstReport
+    seconds: dict[str, float]
+    """The time of each step."""
+
+
 def separate_burst(
     photos: Sequence[Source],
     *,
@@ -81,6 +93,38 @@ def separate_burst(
         PhotoError: there are fewer than 2 or more than 15 photos, their sizes differ, or one of them cannot be read.
         BrewsterError: see the call of a `Separator`.
     """
+    fitted = fit_burst(
+        photos,
+        reference=reference,
+        separator=separator,
+        quality=quality,
+        hints=hints,
+        max_pixels=max_pixels,
+        on_progress=lambda done: on_progress(0.9 * done),
+    )
+    separation = fitted.separator(
+        fitted.photo,
+        strength=strength,
+        quality=quality,
+        mask=mask,
+        hints=hints if fitted.report.method == "single photo" else None,
+        additive=additive,
+        on_progress=lambda done: on_progress(0.9 + 0.1 * done),
+    )
+    return replace(separation, burst=fitted.report, seconds=fitted.seconds | separation.seconds)
+
+
+def fit_burst(
+    photos: Sequence[Source],
+    *,
+    reference: int | None = None,
+    separator: Separator | None = None,
+    quality: Quality = Options.quality,
+    hints: Source | None = Options.hints,
+    max_pixels: int = Options.max_pixels,
+    on_progress: ProgressCallback = lambda _fraction: None,
+) -> FittedBurst:
+    """Measures the layers of a burst, but does not compute them at full size. See `separate_burst`."""
     reference = _checked_reference(len(photos), reference)
     started = time.perf_counter()
     photo = _open(photos, reference, max_pixels)
@@ -90,29 +134,17 @@ def separate_burst(
     started = time.perf_counter()
     upsampler, _, single = separator.fit(photo, quality=quality, hints=hints)
     prior = _applied(upsampler.apply, frames[reference])
-    solution, left_out = measure_layers(
-        frames, reference, prior, on_progress=lambda done: on_progress(0.9 * done)
-    )
+    solution, left_out = measure_layers(frames, reference, prior, on_progress=on_progress)
     seconds["motion"] = time.perf_counter() - started
     report = burst_report(solution, single.verdict, len(photos), left_out, reference)
-    chosen_separator = separator
     if solution and report.method == "burst":
         name = f"burst with {separator.name}"
-        chosen_separator = Separator(
+        separator = Separator(
             _FixedPredictor(solution), name=name, sha256=separator.sha256, device=separator.device
         )
     elif report.method == "unchanged":
-        chosen_separator = Separator(lambda tile: (tile, np.zeros_like(tile)), name="unchanged")
-    separation = chosen_separator(
-        photo,
-        strength=strength,
-        quality=quality,
-        mask=mask,
-        hints=hints if report.method == "single photo" else None,
-        additive=additive,
-        on_progress=lambda done: on_progress(0.9 + 0.1 * done),
-    )
-    return replace(separation, burst=report, seconds=seconds | separation.seconds)
+        separator = Separator(lambda tile: (tile, np.zeros_like(tile)), name="unchanged")
+    return FittedBurst(photo, separator, report, seconds)
 
 
 def measure_layers(

@@ -24,6 +24,9 @@ from brewster.remote_path import check_not_video
 FIELDS: Final = ("layers", "strength", "quality", "format", "additive", "model")
 """The options that a client may set as text. The server sets the other options."""
 _FILES: Final = ("photo", "mask", "hints")
+_REFERENCE: Final = "reference"
+_MAX_FILES: Final = 32
+"""Larger than the number of photos of a burst, which `brewster.burst` checks with a better message."""
 _OPTIONS: Final = TypeAdapter(Options)
 _REQUEST_PARTS: Final = ("query", "path", "body")
 _MAX_NAME_BYTES: Final = 255 - len(".transmission.jpeg")
@@ -35,19 +38,37 @@ _PHOTO_SCHEMA: Final = {
     "contentMediaType": "application/octet-stream",
     "description": "The photo as an image file.",
 }
+_PHOTOS_SCHEMA: Final = {
+    "type": "array",
+    "items": _PHOTO_SCHEMA,
+    "minItems": 1,
+    "maxItems": 15,
+    "description": "The photo, or 2 to 15 photos of one window (a burst), in the order in which they were taken.",
+}
+_REFERENCE_SCHEMA: Final = {
+    "type": "integer",
+    "minimum": 1,
+    "maximum": 15,
+    "description": "The photo of a burst to separate: 1 is the first one; by default, the middle one.",
+}
 
 
 @final
 @dataclass(frozen=True)
 class SeparationRequest:
-    """The uploaded photo and its options."""
+    """The uploaded photo, or the photos of a burst, and the options."""
 
     photo: bytes
+    """The photo to separate: the reference photo of a burst."""
     name: str
     """The file name of the photo, as returned by `safe_name`."""
     options: Options
     mask: bytes | None = None
     hints: bytes | None = None
+    burst: tuple[bytes, ...] = ()
+    """All photos of a burst, in the order of the form; empty for a single photo."""
+    reference: int = 0
+    """The index of `photo` in the burst."""
 
     def target(self, layer: str, format_name: str) -> str:
         """Returns the file name of a layer, the same as on the command line. `format_name` is the format of the photo."""
@@ -81,7 +102,7 @@ async def read_form(request: Request, models: Sequence[str], max_pixels: int) ->
         )
     try:
         form = await _InMemoryParser(
-            request.headers, request.stream(), max_fields=32, max_files=len(_FILES)
+            request.headers, request.stream(), max_fields=32, max_files=_MAX_FILES
         ).parse()
     except MultiPartException as error:
         raise HTTPException(
@@ -99,13 +120,13 @@ async def read_form(request: Request, models: Sequence[str], max_pixels: int) ->
 
 
 async def _build_request(form: FormData, options: Options) -> SeparationRequest:
-    for name in _FILES:
+    for name in _FILES[1:]:
         if len(form.getlist(name)) > 1:
             raise HTTPException(
                 400, f"the form contains several files {name}; expected one; send only one file"
             )
-    photo = form.get("photo")
-    if not isinstance(photo, UploadFile):
+    photos = [photo for photo in form.getlist("photo") if isinstance(photo, UploadFile)]
+    if not photos or len(photos) < len(form.getlist("photo")):
         raise HTTPException(
             422, "the form contains no photo; expected an image file; send it in the field photo"
         )
@@ -117,9 +138,26 @@ async def _build_request(form: FormData, options: Options) -> SeparationRequest:
                 422, f"the field {field} contains no file; expected an image file; send the {field} as a file"
             )
         painted[field] = await upload.read() if upload else None
-    name = safe_name(photo.filename or "")
-    check_not_video(Path(name))
-    return SeparationRequest(await photo.read(), name, options, **painted)
+    names = [safe_name(photo.filename or "") for photo in photos]
+    for name in names:
+        check_not_video(Path(name))
+    contents = [await photo.read() for photo in photos]
+    reference = _reference(form, len(photos))
+    burst = tuple(contents) if len(contents) > 1 else ()
+    return SeparationRequest(
+        contents[reference], names[reference], options, **painted, burst=burst, reference=reference
+    )
+
+
+def _reference(form: FormData, count: int) -> int:
+    """Returns the index of the photo to separate, by default the middle one."""
+    text = str(form.get(_REFERENCE) or count // 2 + 1)
+    if not (text.isascii() and text.isdecimal() and len(text) < 3 and 1 <= int(text) <= count):
+        raise HTTPException(
+            422,
+            f"{_REFERENCE} is {text[:40]!r}; expected the number of a photo, 1 to {count}; correct {_REFERENCE}",
+        )
+    return int(text) - 1
 
 
 @final
@@ -133,7 +171,12 @@ def form_schema(models: Sequence[str]) -> dict[str, Any]:
     """Returns the JSON schema of the form, for the OpenAPI document."""
     known = _OPTIONS.json_schema()["properties"]
     painted = {name: {**_PHOTO_SCHEMA, "description": known[name]["description"]} for name in _FILES[1:]}
-    fields = {"photo": _PHOTO_SCHEMA, **painted, **{name: _as_field(known[name]) for name in FIELDS}}
+    fields = {
+        "photo": _PHOTOS_SCHEMA,
+        _REFERENCE: _REFERENCE_SCHEMA,
+        **painted,
+        **{name: _as_field(known[name]) for name in FIELDS},
+    }
     description = "The model to use, one of `GET /models`."
     fields["model"] = known["model"] | {
         "default": models[0],
@@ -184,12 +227,16 @@ def _sent_name(location: Sequence[str | int]) -> tuple[str, ...]:
 
 
 def _options(form: FormData, models: Sequence[str], max_pixels: int) -> Options:
-    texts = {name: [str(value) for value in form.getlist(name)] for name in form if name not in _FILES}
+    texts = {
+        name: [str(value) for value in form.getlist(name)]
+        for name in form
+        if name not in (*_FILES, _REFERENCE)
+    }
     unknown = [name for name in texts if name not in FIELDS]
     if unknown:
         raise HTTPException(
             422,
-            f"there is no field {unknown[0][:40]!r}; expected {', '.join((*_FILES, *FIELDS))}; correct the name",
+            f"there is no field {unknown[0][:40]!r}; expected {', '.join((*_FILES, _REFERENCE, *FIELDS))}; correct the name",
         )
     values_by_name: dict[str, Any] = {name: values[-1] for name, values in texts.items() if values[-1]}
     if "format" in values_by_name:

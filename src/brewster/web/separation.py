@@ -24,6 +24,7 @@ from starlette.responses import Response
 
 import brewster
 from brewster.image_formats import SUFFIXES
+from brewster.inference.burst_report import BurstReport
 from brewster.inference.predictor import ProgressCallback
 from brewster.photo import Photo
 from brewster.photo.open_raster import zip_images
@@ -96,8 +97,8 @@ def separation_router(model_cache: ModelCache, job_queue: JobQueue, *, max_pixel
 
     @router.post("/separate", responses=_RESPONSES, response_class=Response, openapi_extra=body)
     async def separate(request: Request, job: JobName = None) -> Response:
-        """Separates a photo. A single layer is returned as an image in the format and colour space of the photo, several layers
-        as a zip.
+        """Separates a photo, or a burst: several photos of one window. A single layer is returned as an image in the format and
+        colour space of the photo, several layers as a zip.
 
         The names of the files are those of the command line. The separation stops if the client disconnects.
         """
@@ -158,14 +159,23 @@ def _add_page_routes(
 
 
 def _separate(model_cache: ModelCache, form: SeparationRequest, on_progress: ProgressCallback) -> Response:
-    """Separates a photo. Returns one layer as an image file, or several layers as a zip."""
+    """Separates a photo or a burst. Returns one layer as an image file, or several layers as a zip."""
     started = time.perf_counter()
     options = form.options
-    separation = model_cache.separator(options.model)(
-        form.photo,
-        on_progress=on_progress,
-        **options.call_options() | {"mask": form.mask, "hints": form.hints},
-    )
+    separator = model_cache.separator(options.model)
+    call_options = options.call_options() | {"mask": form.mask, "hints": form.hints}
+    if form.burst:
+        from brewster.burst import separate_burst  # noqa: PLC0415  (imports torch)
+
+        separation = separate_burst(
+            form.burst,
+            reference=form.reference,
+            separator=separator,
+            on_progress=on_progress,
+            **call_options,
+        )
+    else:
+        separation = separator(form.photo, on_progress=on_progress, **call_options)
     files = {}
     for layer in options.layers:
         on_progress(1)  # raises JobCancelled if the job is cancelled, because encoding also takes time
@@ -181,6 +191,8 @@ def _separate(model_cache: ModelCache, form: SeparationRequest, on_progress: Pro
         "Brewster-Verdict": separation.assessment.verdict,
         "Brewster-Seconds": f"{time.perf_counter() - started:.4f}",
     }
+    if separation.burst:
+        headers |= _burst_headers(separation.burst)
     if separation.reflection_is_derived:
         headers["Brewster-Reflection"] = "derived"
     if separation.reconstruction_error is not None:
@@ -192,11 +204,32 @@ def _preview(
     photos: PhotoCache, model_cache: ModelCache, form: SeparationRequest, on_progress: ProgressCallback
 ) -> Response:
     photo, headers = _open_photo(photos, form)
-    separator = model_cache.separator(form.options.model)
-    maps = preview(separator, photo, form.options, on_progress, form.hints)
+    separator, hints = model_cache.separator(form.options.model), form.hints
     if separator.takes_hints:
         headers["Brewster-Takes-Hints"] = "yes"
+    if form.burst:
+        from brewster.burst import fit_burst  # noqa: PLC0415  (imports torch)
+
+        fitted = fit_burst(
+            [*form.burst[: form.reference], photo, *form.burst[form.reference + 1 :]],
+            reference=form.reference,
+            separator=separator,
+            quality=form.options.quality,
+            hints=hints,
+            max_pixels=form.options.max_pixels,
+            on_progress=lambda done: on_progress(0.9 * done),
+        )
+        headers |= _burst_headers(fitted.report)
+        separator, hints = fitted.separator, hints if fitted.separator is separator else None
+    start = 0.9 if form.burst else 0.0
+    maps = preview(
+        separator, photo, form.options, lambda done: on_progress(start + (1 - start) * done), hints
+    )
     return Response(gzip.compress(maps, _GZIP_LEVEL, mtime=0), headers=headers, media_type="application/gzip")
+
+
+def _burst_headers(report: BurstReport) -> dict[str, str]:
+    return {"Brewster-Burst": report.method, "Brewster-Burst-Message": report.message}
 
 
 def _keep_photo(

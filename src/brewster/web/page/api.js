@@ -1,5 +1,5 @@
 // The client of the HTTP API. A failed request throws an Error whose message can be shown to the user; `details` is the
-// message of the server.
+// message of the server, and `isFinal` whether the same request would fail again.
 
 const POLL_MS = 300;
 const MAX_RETRIES = 60; // maximum number of repetitions of a request while the queue of the server is full
@@ -9,10 +9,10 @@ const MEANINGS = {
   UnreadablePhoto: "This file is not a photo, or it is damaged.",
   UnsupportedPhoto: "This kind of image cannot be separated.",
   PhotoTooLarge: "This photo has more pixels than the server accepts.",
-  MissingExtra: "The server cannot read this format, because a part of brewster is not installed.",
+  MissingExtra: "The server cannot do this, because a part of brewster is not installed.",
 };
 
-// Sends a photo with options to a path. Returns {blob, fileName, header(name)}. Before it returns, it calls `onProgress` repeatedly
+// Sends a photo, or an array with the photos of a burst, with options to a path. Returns {blob, fileName, header(name)}. Before it returns, it calls `onProgress` repeatedly
 // with {phase: "upload" | "download", loaded, total} in bytes, {phase: "waiting", ahead} or {phase: "working", share}, where `ahead`
 // is the number of photos before this photo, and `share` is the completed fraction.
 export async function send(path, file, options, { signal, onProgress }) {
@@ -21,7 +21,8 @@ export async function send(path, file, options, { signal, onProgress }) {
     if (value instanceof Blob) form.append(name, value, `${name}.png`);
     else if (value !== null) form.append(name, value);
   }
-  form.append("photo", file, file.name);
+  const files = [file].flat();
+  for (const one of files) form.append("photo", one, one.name);
   for (let tries = 0; ; tries++) {
     const job = randomJobName();
     const request = await post(`${path}?job=${job}`, job, form, signal, onProgress);
@@ -29,7 +30,7 @@ export async function send(path, file, options, { signal, onProgress }) {
       return { blob: request.response, fileName: fileNameOf(request), header: (name) => request.getResponseHeader(name) };
     }
     if (request.status === 0) throw await connectionError();
-    if (request.status !== 503 || tries === MAX_RETRIES) throw await serverError(request, file);
+    if (request.status !== 503 || tries === MAX_RETRIES) throw await serverError(request, files[0]);
     onProgress({ phase: "waiting", ahead: 0 });
     await sleep(1000 * Number(request.getResponseHeader("Retry-After") ?? 5), signal);
   }
@@ -100,7 +101,7 @@ async function serverError(request, file) {
   const message = sentence(body.error ?? `the server returned status ${request.status}`);
   const isVideo = ["UnreadablePhoto", "UnsupportedPhoto"].includes(body.kind) && file.type.startsWith("video/");
   const meaning = isVideo ? "This is a video. Only photos can be separated." : MEANINGS[body.kind];
-  return Object.assign(new Error(meaning ?? message), { details: meaning ? message : "" });
+  return Object.assign(new Error(meaning ?? message), { details: meaning ? message : "", isFinal: body.kind in MEANINGS });
 }
 
 const sentence = (text) => `${text[0].toUpperCase()}${text.slice(1).replace(/\.?$/, ".")}`;

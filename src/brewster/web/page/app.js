@@ -7,7 +7,7 @@ import { exportAll, exportLayer, save } from "./export.js";
 import { Layers, draw, readPreview } from "./light.js";
 import { SeparationQueue } from "./queue.js";
 import { maskCodes, maskFile } from "./regions.js";
-import { createThumbnail, fraction, progressText, setBar, showFile, statusText, summarise, updateThumbnail, watchScrolling } from "./filmstrip.js";
+import { createThumbnail, fraction, haveOneSize, progressText, setBar, showDecoded, showFile, statusText, summarise, updateThumbnail, watchScrolling } from "./filmstrip.js";
 import { TileSet } from "./tiles.js";
 import { createTools } from "./tools.js";
 
@@ -18,12 +18,14 @@ const LAYER_DESCRIPTIONS = {
 };
 const EXAMPLE = "page/example.jpg";
 const RETRY_MODELS_MS = 3000;
+const MAX_BURST_PHOTOS = 15;
 
 const byId = (id) => document.getElementById(id);
 const compare = byId("compare");
 let shown = null; // the current photo: {photo, preview, layers, mask: {list, codes}}
 let removed = null; // {photo, index} of the photo that was removed last
 let isPaintScheduled = false;
+let candidates = []; // the photos that were added last, if they can be a burst
 let exporting = null; // the AbortController of the running download
 
 // --- settings
@@ -83,7 +85,9 @@ const isImage = (name) => suffixes.some((suffix) => name.toLowerCase().endsWith(
 const room = () => Math.max(0, MAX_PHOTOS - queue.photos.length);
 
 function add(found) {
-  for (const file of found.files) insert(queue.add(file));
+  const photos = found.files.map((file) => queue.add(file));
+  for (const photo of photos) insert(photo);
+  askForBurst(photos);
   if (!found.files.length && !found.others && !found.surplus) return;
   announce(describeAdded(found));
   if (found.others || found.surplus) showNote(describeAdded(found));
@@ -96,6 +100,39 @@ function add(found) {
   queue.startNext();
 }
 
+// Asks whether the photos are a burst, if they have one size.
+async function askForBurst(photos) {
+  candidates = photos;
+  byId("burst").hidden = true;
+  const isPossible = photos.length > 1 && photos.length <= MAX_BURST_PHOTOS && (await haveOneSize(photos));
+  if (!isPossible || candidates !== photos || !photos.every((photo) => queue.photos.includes(photo))) return;
+  byId("burst").hidden = false;
+  announce(byId("burst-question").textContent);
+}
+
+// Replaces photos in the list by others, and selects the first of these.
+function replace(old, added) {
+  byId("burst").hidden = true;
+  for (const photo of old) {
+    queue.remove(photo);
+    photo.thumbnail.remove();
+  }
+  for (const photo of added) insert(photo);
+  select(added[0]);
+  added[0].thumbnail.querySelector("button").focus();
+}
+
+function joinBurst() {
+  const photos = candidates.filter((photo) => queue.photos.includes(photo));
+  const files = photos.map(({ file }) => file);
+  replace(photos, [queue.add(files[files.length >> 1], files)]); // the middle photo is the reference photo of the server
+}
+
+function splitBurst() {
+  const { current } = queue;
+  replace([current], current.burst.map((file) => queue.add(file)));
+}
+
 function insert(photo, next = null) {
   photo.thumbnail = createThumbnail(photo, { onSelect: () => select(photo), onRemove: () => remove(photo) }, next);
 }
@@ -103,6 +140,7 @@ function insert(photo, next = null) {
 function remove(photo) {
   const hadFocus = photo.thumbnail.contains(document.activeElement) || byId("stage").contains(document.activeElement);
   const index = queue.remove(photo);
+  if (candidates.includes(photo)) byId("burst").hidden = true;
   removed = { photo, index };
   photo.thumbnail.remove();
   if (photo === queue.current) select(queue.photos[Math.min(index, queue.photos.length - 1)] ?? null);
@@ -143,6 +181,7 @@ async function addExample() {
 // --- the current photo
 
 function finish(photo) {
+  if (photo.state === "done") showDecoded(photo);
   if (photo.state === "done") announceResult(`${photo.file.name} is separated`);
   if (photo.error) announceResult(`${photo.file.name} failed`);
   if (photo === queue.current) show();
@@ -243,7 +282,7 @@ function paint() {
 function refresh(photo = null) {
   for (const one of photo ? [photo] : queue.photos) if (one.thumbnail) updateThumbnail(one);
   const { current } = queue;
-  enable("all", exporting === null && queue.count("done") > 0);
+  enable("all", exporting === null && queue.count("done") > 0 && zipLayers().length > 0);
   byId("summary").textContent = queue.photos.length ? summarise(queue) : "";
   if (photo && photo !== current) return;
   const hasPhoto = current !== null;
@@ -256,16 +295,19 @@ function refresh(photo = null) {
   compare.hidden = byId("modes").hidden = !isReady;
   byId("error").hidden = current.state !== "failed";
   byId("waiting").hidden = isReady || current.state === "failed";
-  if (focusedPart?.hidden) (isReady ? compare : byId(current.state === "failed" ? "retry" : "cancel")).focus();
+  if (focusedPart?.hidden) (isReady ? compare : byId(current.state !== "failed" ? "cancel" : current.error?.isFinal ? "discard" : "retry")).focus();
   enable("download", isReady && !current.isUpdating && exporting === null);
   enable("copy", queue.photos.length > 1);
   byId("status").textContent = statusText(current);
   setBar(byId("bar"), fraction(current.progress));
   byId("error-title").textContent = current.error ? `${current.file.name} could not be separated` : "Cancelled";
   byId("error-text").textContent = current.error?.message ?? "";
+  byId("retry").className = current.error?.isFinal ? "quiet" : "main";
+  byId("discard").className = current.error?.isFinal ? "main" : "quiet";
   byId("error-details").hidden = !current.error?.details;
   byId("error-message").textContent = current.error?.details ?? "";
-  byId("facts").textContent = current.isUpdating ? statusText(current) : isReady ? describePreview(shown.preview) : "";
+  byId("facts").textContent = current.isUpdating ? statusText(current) : isReady ? `${describePreview(shown.preview)} ${current.message}` : "";
+  byId("split").hidden = !current.burst;
 }
 
 // Uses aria-disabled, because a button with the attribute `disabled` loses the focus.
@@ -324,11 +366,13 @@ function showExportProgress(progress, which = "") {
 const downloadLayer = (signal) =>
   exportLayer(queue.current, chosen("view"), exportSettings(), { signal, onProgress: (progress) => showExportProgress(progress) });
 
+const zipLayers = () => [...document.querySelectorAll("input[name=zip]:checked")].map(({ value }) => value);
+
 function downloadAll(signal) {
   let which = "";
   const onPhoto = (index, count) => (which = count > 1 ? `Photo ${index + 1} of ${count}: ` : "");
   const onProgress = (progress) => showExportProgress(progress, which);
-  return exportAll([...queue.photos], exportSettings(), { signal, onPhoto, onProgress });
+  return exportAll([...queue.photos], zipLayers(), exportSettings(), { signal, onPhoto, onProgress });
 }
 
 // --- event handlers
@@ -378,6 +422,10 @@ byId("cancel").addEventListener("click", () => queue.cancel(queue.current));
 byId("retry").addEventListener("click", () => queue.retry(queue.current));
 byId("discard").addEventListener("click", () => remove(queue.current));
 byId("undo-remove").addEventListener("click", undoRemove);
+byId("burst-yes").addEventListener("click", joinBurst);
+byId("burst-no").addEventListener("click", () => (byId("burst").hidden = true));
+byId("split").addEventListener("click", splitBurst);
+for (const input of document.querySelectorAll("input[name=zip]")) input.addEventListener("change", () => refresh());
 byId("download").addEventListener("click", (event) => runExport(event.currentTarget, downloadLayer));
 byId("all").addEventListener("click", (event) => runExport(event.currentTarget, downloadAll));
 byId("stop-export").addEventListener("click", () => exporting?.abort());

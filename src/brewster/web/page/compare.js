@@ -81,16 +81,17 @@ class GlassCompare extends HTMLElement {
     const { x, y } = point ?? { x: viewWidth / 2, y: viewHeight / 2 };
     const before = this.#placement();
     const maxZoom = Math.max(1, MAX_PIXEL_SIZE * this.#fullZoom());
-    this.#zoom = factor === 0 ? 1 : Math.min(maxZoom, Math.max(1, this.#zoom * factor));
+    const minZoom = Math.min(1, this.#fullZoom()); // a small photo is enlarged, so that 1:1 is smaller than the whole view
+    this.#zoom = factor === 0 ? 1 : Math.min(maxZoom, Math.max(minZoom, this.#zoom * factor));
     const at = { x: (x - before.left) / before.width, y: (y - before.top) / before.height };
     const { width, height } = this.#placement();
     this.#centre = { x: at.x - (x - viewWidth / 2) / width, y: at.y - (y - viewHeight / 2) / height };
     this.paint();
   }
 
-  // Zooms around a point of a pane until one photo pixel is one screen pixel. The zoom is never less than that of the whole image.
+  // Zooms around a point of a pane until one photo pixel is one screen pixel.
   zoomToFull(point = null) {
-    this.zoomBy(Math.max(1, this.#fullZoom()) / this.#zoom, point);
+    this.zoomBy(this.#fullZoom() / this.#zoom, point);
   }
 
   // Returns the zoom at which one photo pixel is one screen pixel.
@@ -254,7 +255,7 @@ class GlassCompare extends HTMLElement {
     if (this.editor?.isActive) {
       return target === this.line && Math.abs(point.y - this.clientHeight / 2) < GRAB_DISTANCE_PX ? "line" : "region";
     }
-    return hasLine && (this.#zoom === 1 || isNear) ? "line" : "image";
+    return hasLine && (this.#zoom <= 1 || isNear) ? "line" : "image";
   }
 
   _pointerdown(event) {

@@ -4,14 +4,13 @@ import { send } from "./api.js";
 import { hintsFile, maskFile } from "./regions.js";
 import { createZip, crc32, readZip, withUniqueNames } from "./zip.js";
 
-const ZIP_LAYERS = "transmission,reflection"; // the layers in the zip of all photos
 const REPORT_NAME = "brewster-report.txt";
 
 // Requests layers of a photo at full size. Returns the result of `send`.
 async function requestLayers(photo, layers, { takesHints, ...settings }, context) {
   const mask = await maskFile(photo.regions.list, ...photo.size);
   const hints = takesHints ? await hintsFile(photo.regions.list, ...photo.size) : null;
-  return send("separate", photo.file, { layers, strength: photo.strength, mask, hints, ...settings }, context);
+  return send("separate", photo.burst ?? photo.file, { layers, strength: photo.strength, mask, hints, ...settings }, context);
 }
 
 // Creates one layer of a photo. Returns {name, blob, problem, saved}, where `saved` are the photos whose results the file contains.
@@ -20,18 +19,19 @@ export async function exportLayer(photo, layer, settings, context) {
   return { name: fileName, blob, problem: "", saved: [photo] };
 }
 
-// Creates a zip of the layers of all photos that are done, with a report that also lists the photos that failed. A photo that
+// Creates a zip of these layers of all photos that are done, with a report that also lists the photos that failed. A photo that
 // fails during the export is left out, and `problem` describes the error. `onPhoto(index, count)` is called before each photo.
 //
 // Throws an Error if all photos fail.
-export async function exportAll(photos, settings, { onPhoto, ...context }) {
+export async function exportAll(photos, layers, settings, { onPhoto, ...context }) {
   const results = photos.map((photo) => ({ photo, files: [], error: photo.state === "failed" ? problemOf(photo) : null }));
   const separated = results.filter(({ photo }) => photo.state === "done");
   for (const [index, result] of separated.entries()) {
     onPhoto(index, separated.length);
     try {
-      const { blob } = await requestLayers(result.photo, ZIP_LAYERS, settings, context);
-      result.files = readZip(await blob.arrayBuffer());
+      const { blob, fileName } = await requestLayers(result.photo, layers.join(), settings, context);
+      const data = await blob.arrayBuffer();
+      result.files = layers.length > 1 ? readZip(data) : [{ name: fileName, crc: crc32(new Uint8Array(data)), data }];
     } catch (error) {
       if (error.name === "AbortError") throw error;
       result.error = `${error.message} ${error.details ?? ""}`.trim();

@@ -1,6 +1,7 @@
 // The list of photos below the current photo: a thumbnail for each photo with its state, the summary, and the buttons that scroll the list.
 
 const TRANSPARENT_PIXEL = "data:image/gif;base64,R0lGODlhAQABAAAAACH5BAEKAAEALAAAAAABAAEAAAICTAEAOw==";
+const TILE_PX = 512; // see tiles.js
 const byId = (id) => document.getElementById(id);
 
 export const megabytes = (bytes) => (bytes / 1e6).toFixed(bytes < 9.95e6 ? 1 : 0);
@@ -10,8 +11,9 @@ export function createThumbnail(photo, { onSelect, onRemove }, next = null) {
   const thumbnail = document.createElement("li");
   thumbnail.innerHTML = `<button type="button" class="pick"><img alt="" width="56" height="56"><span class="name"></span>
     <span class="state"></span></button><button type="button" class="remove"><span aria-hidden="true">×</span></button>`;
-  thumbnail.querySelector(".name").textContent = photo.file.name;
-  thumbnail.querySelector(".pick").title = photo.file.name;
+  const name = photo.burst ? `${photo.burst.length} × ${photo.file.name}` : photo.file.name;
+  thumbnail.querySelector(".name").textContent = name;
+  thumbnail.querySelector(".pick").title = name;
   thumbnail.querySelector(".remove").setAttribute("aria-label", `Remove ${photo.file.name}`);
   thumbnail.querySelector(".pick").addEventListener("click", onSelect);
   thumbnail.querySelector(".remove").addEventListener("click", onRemove);
@@ -27,6 +29,23 @@ export function showFile(image, file) {
   image.onload = done;
   image.onerror = () => (done(), (image.src = TRANSPARENT_PIXEL), (image.onload = null));
   image.src = url;
+}
+
+// Shows the photo as decoded by the server, if the browser cannot decode its file, such as HEIC.
+export function showDecoded({ thumbnail, key, size }) {
+  const image = thumbnail.querySelector("img");
+  if (image.src !== TRANSPARENT_PIXEL) return;
+  const level = Math.max(0, Math.ceil(Math.log2(Math.max(...size) / TILE_PX)));
+  image.onerror = () => ((image.src = TRANSPARENT_PIXEL), (image.onerror = null));
+  image.src = `tile/${key}/${level}/0/0`;
+}
+
+// Returns whether all photos have one size, as far as the browser can decode them.
+export async function haveOneSize(photos) {
+  const images = photos.map(({ thumbnail }) => thumbnail.querySelector("img"));
+  await Promise.allSettled(images.map((image) => image.decode()));
+  const sizes = images.map((image) => (image.src === TRANSPARENT_PIXEL ? null : `${image.naturalWidth} ${image.naturalHeight}`));
+  return sizes[0] !== null && new Set(sizes).size === 1;
 }
 
 export function updateThumbnail(photo) {

@@ -17,8 +17,9 @@ export class SeparationQueue {
     Object.assign(this, { settings, onChange, onEnd });
   }
 
-  add(file) {
-    const photo = { file, state: "waiting", progress: null, error: null, strength: 1, regions: new Regions(), controller: null, isSaved: false };
+  // Adds a photo. `burst` are the files of all photos of one window, if `file` is the middle one of a burst.
+  add(file, burst = null) {
+    const photo = { file, burst, state: "waiting", progress: null, error: null, strength: 1, regions: new Regions(), controller: null, isSaved: false };
     this.photos.push(photo);
     return photo;
   }
@@ -43,7 +44,7 @@ export class SeparationQueue {
   }
 
   takesHints(photo) {
-    return photo.size !== undefined && this.hintModels.has(this.settings().model);
+    return photo.size !== undefined && !photo.burst && this.hintModels.has(this.settings().model);
   }
 
   // Separates a photo again after a change of its hints. The old result is shown until then.
@@ -107,9 +108,10 @@ export class SeparationQueue {
     };
     try {
       const hints = this.takesHints(photo) ? await hintsFile(photo.regions.list, ...photo.size) : null;
-      const { blob, header } = await send("preview", photo.file, { ...requestSettings, hints }, { signal, onProgress });
+      const { blob, header } = await send("preview", photo.burst ?? photo.file, { ...requestSettings, hints }, { signal, onProgress });
       if (header("Brewster-Takes-Hints")) this.hintModels.add(requestSettings.model);
       photo.preview = blob;
+      photo.message = header("Brewster-Burst-Message") ?? "";
       photo.key = header("Brewster-Photo"); // the key of the photo on the server, for its tiles
       photo.size = header("Brewster-Size").split("x").map(Number);
       Object.assign(photo, { state: "done", mapSettings, isSaved: false });

@@ -1,0 +1,110 @@
+"""Bursts by HTTP: several photos of one window in one request."""
+
+import gzip
+import io
+import sys
+import zipfile
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from brewster import Photo
+from brewster.burst import separate_burst
+from brewster.burst.solver import Level, solve
+from brewster.inference import Separator
+from cli_helpers import image_bytes
+from simulated_bursts import read_photo, simulate_burst
+from test_preview import Maps
+from web_servers import make_app, pane, request
+
+PICTURES = sorted((Path(__file__).parent / "pictures").glob("*.jpg"))
+
+
+def png(pixels):
+    file = io.BytesIO()
+    Image.fromarray(pixels).save(file, "PNG")
+    return file.getvalue()
+
+
+@pytest.fixture(scope="module")
+def photos():
+    """Three photos of 120 x 90 pixels, in which the reflection moves by 12 pixels."""
+    layers = [np.clip(read_photo(path, (160, 120)), 0, 1) for path in (PICTURES[2], PICTURES[1])]
+    burst = simulate_burst(
+        *layers, frames=3, relative_px=12, common_px=3, strength=0.4, noise=0, size=(120, 90)
+    )
+    return [png(frame) for frame in burst.frames]
+
+
+@pytest.fixture
+def few_steps(monkeypatch):
+    """For tests that do not measure the separation."""
+    monkeypatch.setattr("brewster.burst.separate.solve", partial(solve, levels=(Level(48, 20, None),)))
+
+
+def send(path, photos, app=None, mask=None, **fields):
+    files = [("photo", (f"{number}.png", photo)) for number, photo in enumerate(photos, 1)]
+    if mask:
+        files.append(("mask", ("mask.png", mask)))
+    return request(app or make_app(), "POST", path, files=files, data=fields)
+
+
+@pytest.mark.usefixtures("few_steps")
+def test_a_burst_with_a_mask_returns_the_layers_of_the_python_function(photos):
+    mask = np.zeros((90, 120), np.uint8)
+    mask[:, 60:] = 255
+    response = send("/separate", photos, mask=png(mask), reference="3", strength="0.7")
+    assert response.status_code == 200, response.text
+    expected = separate_burst(
+        photos, reference=2, separator=Separator(pane, name="pane"), strength=0.7, mask=png(mask)
+    )
+    with zipfile.ZipFile(io.BytesIO(response.content)) as archive:
+        made = {name: Photo.open(archive.read(name)).pixels for name in archive.namelist()}
+    assert list(made) == ["3.transmission.png", "3.reflection.png"]
+    assert (made["3.transmission.png"] == expected.transmission.pixels).all()
+    assert (made["3.transmission.png"][:, :60] == Photo.open(photos[2]).pixels[:, :60]).all()
+    headers = response.headers
+    assert headers["Brewster-Burst"] == expected.burst.method
+    assert headers["Brewster-Burst-Message"] == expected.burst.message
+    assert headers["Brewster-Model"].startswith("burst")
+
+
+@pytest.mark.usefixtures("few_steps")
+def test_the_preview_of_a_burst_shows_the_layers_of_the_download(photos):
+    app = make_app()
+    response = send("/preview", photos, app)
+    assert response.status_code == 200, response.text
+    shown = Maps(gzip.decompress(response.content)).at(0.7)[0]
+    made = Photo.open(send("/separate", photos, app, layers="transmission", strength="0.7").content).pixels
+    assert np.quantile(np.abs(made.astype(int) - shown), 0.99) <= 2
+    tile = request(app, "GET", f"/tile/{response.headers['Brewster-Photo']}/0/0/0")
+    assert (Photo.open(tile.content).pixels == Photo.open(photos[1]).pixels).all()
+
+
+@pytest.mark.parametrize(
+    ("sizes", "status", "part"),
+    [
+        ([(30, 20), (20, 30)], 422, "photo 1 of the burst has 30 x 20 pixels"),
+        ([(30, 20)] * 16, 422, "expected 2 to 15 photos"),
+        ([(30, 20), (300, 200)], 413, "photo 2 of the burst"),
+    ],
+)
+def test_the_limits_hold_for_each_photo(sizes, status, part):
+    response = send(
+        "/separate", [image_bytes(*size, "png") for size in sizes], make_app(max_pixels=10_000), reference="2"
+    )
+    assert response.status_code == status
+    assert part in response.json()["error"]
+
+
+def test_a_server_without_the_extra_names_it(monkeypatch):
+    for name in [name for name in sys.modules if name.startswith("brewster.burst")]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, "cv2", None)
+    response = send("/separate", [image_bytes(30, 20, "png")] * 2)
+    assert response.status_code == 501
+    assert response.json()["kind"] == "MissingExtra"
+    assert "[burst]" in response.json()["error"]
