@@ -115,7 +115,7 @@ def test_every_command_of_the_paper_experiment_is_valid(tmp_path):
     studies = {f"recipes/ablations/{name}.toml" for name in ("lora-blend-space", "lora-size", "prompt")}
     assert recipes == {"recipes/train/kontext.toml", "recipes/train/kontext-real.toml"} | studies
     assert all((ROOT / name).is_file() for name in recipes)
-    check, final = commands[5], commands[10]
+    check, final = commands[6], commands[11]
     assert (
         final[: len(check)] == check
     )  # with the same benchmarks, metrics and folder, so its scores are kept
