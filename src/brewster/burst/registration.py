@@ -186,7 +186,8 @@ def _likeliest(motions: Motions) -> Matrices:
 def _aligned(frame: Floats, matrix: Matrices) -> Floats:
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
     size = frame.shape[1::-1]
-    return cv2.warpPerspective(frame, matrix, size, flags=flags, borderMode=cv2.BORDER_REPLICATE)
+    warped: Floats = cv2.warpPerspective(frame, matrix, size, flags=flags, borderMode=cv2.BORDER_REPLICATE)
+    return warped
 
 
 def _fitted_motions(matches: Floats, share: Floats) -> Motions:
