@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import combinations
 from typing import Final, final
 
 import cv2
@@ -32,8 +33,8 @@ _MIN_DIFFERENCE: Final = 0.007
 """Two motions of a frame are different if they differ by this share of the frame's width."""
 _SHIFTS: Final = (0.015, 0.045, 0.08)
 """Sideways shifts of the reflection at the end of the path, as shares of the width: a safety net for the other candidates."""
-_ORDER_PX: Final = 40
-"""The width at which frames are compared to order them: moved edges must still overlap."""
+_ORDER_PX: Final = 80
+"""The width at which frames are compared to order them."""
 _MIN_FRAMES_FOR_LARGE_SHIFTS: Final = 4
 """With fewer frames, a large shift leaves parts of the reflection in one frame only, where it explains everything."""
 
@@ -82,7 +83,7 @@ def path_order(frames: Sequence[Floats], motions: Sequence[Motions]) -> list[int
     """Returns the indices of the frames that show the scene, in their order along the path of the camera.
 
     After the alignment with T, only R moves: the further apart two frames were taken, the more they differ. The first coordinate of
-    classical multidimensional scaling puts them on a line. The result does not depend on the order of the frames.
+    classical multidimensional scaling puts them on a line, whose order is improved to the shortest path. The result does not depend on the order of the frames.
 
     Args:
         frames: (h, w, 3) linear light.
@@ -93,13 +94,29 @@ def path_order(frames: Sequence[Floats], motions: Sequence[Motions]) -> list[int
     size = _ORDER_PX, max(8, _ORDER_PX * height // width)
     inner = slice(height // 12, -height // 12), slice(width // 12, -width // 12)
     aligned = [_aligned(frames[k], _likeliest(motions[k]))[inner] for k in used]
-    small = [np.sqrt(cv2.resize(frame, size, interpolation=cv2.INTER_AREA)) for frame in aligned]
+    small = [np.sqrt(cv2.resize(frame, size, interpolation=cv2.INTER_AREA) + 0.01) for frame in aligned]
     details = np.stack([image - cv2.GaussianBlur(image, (0, 0), _ORDER_PX / 10) for image in small])
     centred = (details - details.mean(0)).reshape(len(used), -1).astype(np.float64)
     line = np.linalg.eigh(centred @ centred.T)[1][:, -1]
-    if small[line.argmin()].mean() > small[line.argmax()].mean():  # the direction is that of the light
-        line = -line
-    return [used[i] for i in line.argsort()]
+    distances = np.linalg.norm(centred[:, None] - centred, axis=-1)
+    order = _shortened(line.argsort().tolist(), distances)
+    if small[order[0]].mean() > small[order[-1]].mean():  # the direction is that of the light
+        order.reverse()
+    return [used[i] for i in order]
+
+
+def _shortened(path: list[int], distances: Matrices) -> list[int]:
+    """Returns the path, with parts of it reversed as long as this makes it shorter."""
+
+    def length(path: list[int]) -> float:
+        return float(distances[path[:-1], path[1:]].sum())
+
+    while True:
+        ends = combinations(range(len(path) + 1), 2)
+        shorter = min((path[:i] + path[i:j][::-1] + path[j:] for i, j in ends), key=length)
+        if length(shorter) > length(path) - 1e-9:
+            return path
+        path = shorter
 
 
 def motion_candidates(
@@ -169,8 +186,8 @@ def _likeliest(motions: Motions) -> Matrices:
 def _aligned(frame: Floats, matrix: Matrices) -> Floats:
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
     size = frame.shape[1::-1]
-    aligned: Floats = cv2.warpPerspective(frame, matrix, size, flags=flags, borderMode=cv2.BORDER_REPLICATE)
-    return aligned
+    warped: Floats = cv2.warpPerspective(frame, matrix, size, flags=flags, borderMode=cv2.BORDER_REPLICATE)
+    return warped
 
 
 def _fitted_motions(matches: Floats, share: Floats) -> Motions:
