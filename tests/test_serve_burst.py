@@ -6,6 +6,7 @@ import sys
 import zipfile
 from functools import partial
 from pathlib import Path
+from urllib.parse import quote
 
 import numpy as np
 import pytest
@@ -69,7 +70,7 @@ def test_a_burst_with_a_mask_returns_the_layers_of_the_python_function(photos):
     headers = response.headers
     assert headers["Brewster-Burst"] == expected.burst.method
     assert headers["Brewster-Burst-Message"] == expected.burst.message
-    assert headers["Brewster-Model"].startswith("burst")
+    assert headers["Brewster-Model"] == quote(expected.model)
 
 
 @pytest.mark.usefixtures("few_steps")
