@@ -42,8 +42,7 @@ _MIN_EXPLAINED: Final = 0.2
 """The smallest share of the errors of one layer that a second motion must explain."""
 _LARGE_MOTION_PX: Final = 60.0
 _MIN_EXPLAINED_IF_DOUBTED: Final = 0.4
-"""A larger motion must explain more, because the parts of a layer that only one frame shows explain everything there; and so must
-any motion if the single photo shows little reflection."""
+"""A larger motion must explain more, because the parts of a layer that only one frame shows explain everything there."""
 _MAX_EXPLAINED_UNCHANGED: Final = 0.1
 """If the camera moved and a second motion explains less than this share, one layer explains the photos."""
 _USEFUL_MOTION_PX: Final = 16
@@ -238,8 +237,7 @@ def burst_report(
     explained = (
         max(0.0, 1 - solution.two_layer_error / (solution.one_layer_error + 1e-9)) if solution else 0.0
     )
-    is_doubted = motion >= _LARGE_MOTION_PX or verdict == "little found"
-    needed = _MIN_EXPLAINED_IF_DOUBTED if is_doubted else _MIN_EXPLAINED
+    needed = _MIN_EXPLAINED_IF_DOUBTED if motion >= _LARGE_MOTION_PX else _MIN_EXPLAINED
     method: Literal["burst", "single photo", "unchanged"] = "single photo"
     advice = "Move the camera 5 to 10 cm sideways between the photos."
     if solution is None:
