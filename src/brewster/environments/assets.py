@@ -1,8 +1,4 @@
-"""Loads the environment maps and pictures of scenes: files by name and sha256.
-
-assets = Assets([Path("hdri"), Path("photos")])
-assets.map_radiance(EnvironmentMap(source=AssetSource(file="spree_bank.exr")))  # (H, 2 H, 3) float32
-"""
+"""Loads the environment maps and pictures of scenes: files by name and sha256."""
 
 from __future__ import annotations
 
@@ -66,7 +62,7 @@ class Assets:
             RecipeError: the file is missing, or has another sha256 than in the scene.
             PhotoError: the file cannot be decoded.
         """
-        picture = self._cached("picture", plane.source, self._read_picture)
+        picture = self._cached("picture", plane.source, lambda source: self._open(source).linear().clip(0, 1))
         highlight = ((picture.max(axis=2, keepdims=True) - 0.8) / 0.2).clip(0, 1)
         mean = (picture @ _LUMINANCE).mean() + np.float32(1e-4)
         light: Float32 = (
@@ -93,9 +89,6 @@ class Assets:
         light: Float32 = np.maximum(texels, np.float32(0))
         light /= _mean_luminance(texels)
         return light
-
-    def _read_picture(self, source: AssetSource) -> Float32:
-        return self._open(source).linear().clip(0, 1)
 
     def _open(self, source: AssetSource) -> Photo:
         with add_file_name_to_errors(source.file):
@@ -133,11 +126,7 @@ def add_file_name_to_errors(name: str) -> Iterator[None]:
 
 
 def read_bytes(path: Path) -> bytes:
-    """Returns the bytes of a file.
-
-    Raises:
-        RecipeError: the file cannot be read.
-    """
+    """Returns the bytes of a file. Raises RecipeError if the file cannot be read."""
     try:
         return path.read_bytes()
     except OSError as error:

@@ -1,8 +1,5 @@
 """Downloads CC0 environment maps from Poly Haven and verifies their MD5 sums.
 
-    for result in pull(DownloadRequest(indoor=2, outdoor=1), maps_folder()):
-        print(result.status, result.file)
-
 Files are downloaded one at a time. The next call resumes a partial download (see brewster.download).
 """
 
@@ -22,6 +19,7 @@ from brewster.download import Downloader, RemoteFile, file_digest, output_errors
 from brewster.errors import DownloadError, OutputError
 from brewster.files import cache_folder, write_atomically
 
+SERVER = "https://api.polyhaven.com"
 _COLUMNS = ("file", "asset", "category", "resolution", "md5", "authors", "licence")  # of manifest.csv
 _SAFE_NAME = re.compile(r"[A-Za-z0-9][\w.-]{0,200}", re.ASCII)
 _RETRY_DELAYS_S = (1.0, 2.0, 4.0, 8.0)  # between five attempts
@@ -38,7 +36,7 @@ class DownloadRequest:
     outdoor: int = 30
     resolution: str = "4k"
     format: str = "hdr"
-    server: str = "https://api.polyhaven.com"
+    server: str = SERVER
     dry_run: bool = False
 
 
@@ -105,7 +103,11 @@ def pull(request: DownloadRequest, out: Path) -> Iterator[DownloadResult]:
 def _download_asset(asset: _Asset, request: DownloadRequest, out: Path) -> DownloadResult:
     result = DownloadResult(asset.id, asset.category)
     try:
-        target = out / _file_name(asset, request)
+        name = f"{asset.id}_{request.resolution}.{request.format}"
+        if not _SAFE_NAME.fullmatch(name):
+            expected, cure = "expected letters, digits, '_', '-' and '.' only", "try another --server"
+            raise DownloadError(f"{name!r} is not a safe file name", expected, cure)  # noqa: TRY301
+        target = out / name
         remote = _find_remote_file(asset, request)
         if remote is None:
             return result
@@ -129,27 +131,21 @@ def _download_asset(asset: _Asset, request: DownloadRequest, out: Path) -> Downl
 
 def _list_assets(request: DownloadRequest) -> list[_Asset]:
     listed = _fetch_json(f"{request.server.rstrip('/')}/assets?type=hdris")
-    return [
-        _Asset(name, category, _authors(record))
-        for name, record in sorted(listed.items())
-        if (category := _category(record))
-    ]
+    assets = []
+    for name, record in sorted(listed.items()):
+        authors = _nested(record, "authors")
+        names = "; ".join(authors)[:1000] if isinstance(authors, dict) else ""
+        if category := _category(record):
+            assets.append(_Asset(name, category, names))
+    return assets
 
 
 def _category(record: object) -> str | None:
-    """Returns "indoor", "outdoor" or None. For a map with both categories, the result is "indoor".
-
-    Both `categories` and `attributes` are read, because the API will replace the first by the second.
-    """
+    """Returns "indoor" (also for both categories), "outdoor" or None. The API will replace `categories` by `attributes`."""
     categories = _nested(record, "categories")
     words = [*categories] if isinstance(categories, list) else []
     words.append(_nested(record, "attributes", "environment"))
     return next((category for category in ("indoor", "outdoor") if category in words), None)
-
-
-def _authors(record: object) -> str:
-    authors = _nested(record, "authors")
-    return "; ".join(authors)[:1000] if isinstance(authors, dict) else ""
 
 
 def _find_remote_file(asset: _Asset, request: DownloadRequest) -> RemoteFile | None:
@@ -164,14 +160,6 @@ def _find_remote_file(asset: _Asset, request: DownloadRequest) -> RemoteFile | N
         "expected url, size and MD5 sum of a file",
         "try another --server",
     )
-
-
-def _file_name(asset: _Asset, request: DownloadRequest) -> str:
-    name = f"{asset.id}_{request.resolution}.{request.format}"
-    if not _SAFE_NAME.fullmatch(name):
-        expected, cure = "expected letters, digits, '_', '-' and '.' only", "try another --server"
-        raise DownloadError(f"{name!r} is not a safe file name", expected, cure)
-    return name
 
 
 def _fetch_json(url: str) -> dict[str, object]:
