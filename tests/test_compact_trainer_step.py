@@ -84,7 +84,7 @@ def test_a_large_gradient_is_clipped_to_norm_one(make_trainer):
     trainer, norms = make_trainer(), []
     batch = hard_batch(0, 2, 64)
     loss = sum(separation_loss(trainer.network(batch.photo_encoded), batch).values())
-    raw = torch.autograd.grad(loss, tuple(trainer.network.parameters()))
+    raw = torch.autograd.grad(loss, tuple(trainer.network.parameters()), materialize_grads=True)
     assert norm(raw) > 1.5
     trainer.optimizer.register_step_pre_hook(
         lambda *_: norms.append(norm(parameter.grad for parameter in trainer.network.parameters()))
@@ -112,14 +112,6 @@ def test_the_exported_network_has_the_ema_weights(make_trainer):
     exported, trained = copy_parameters(trainer.ema_network()), copy_parameters(trainer.network)
     assert all(value.equal(trainer.ema_weights[name]) for name, value in exported.items())
     assert not any(value.equal(trained[name]) for name, value in exported.items() if "head" in name)
-
-
-def test_the_loss_is_the_sum_of_its_parts(make_trainer):
-    metrics = make_trainer().training_step(0)
-    assert metrics["loss_edges"] > 0
-    assert metrics["loss"] == pytest.approx(
-        sum(metrics[f"loss_{name}"] for name in ("transmission", "reflection", "edges", "log_mse")), rel=1e-5
-    )
 
 
 # --- a LoRA on a diffusion backbone

@@ -1,37 +1,17 @@
 import json
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from brewster.errors import ModelError, RecipeError
-from brewster.photo import Photo
-from brewster.training.checkpoint import Checkpoint
 from brewster.training.compact.trainer import CompactTrainer, train
 from brewster.training.data.image_loading import read_photos
-from brewster.training.loop import run
+from brewster.training.loop import Checkpoint, run
 from brewster.training.recipe import with_value
 from cli_helpers import image_bytes
-
-RECIPES = Path(__file__).parents[1] / "recipes"
-
-
-def ignore_step(step, steps, metrics, logged):
-    pass
-
-
-class Killed(Exception):
-    pass
-
-
-def kill_after(last):
-    def report(step, steps, metrics, logged):
-        if step == last:
-            raise Killed
-
-    return report
+from training_helpers import Killed, ignore_step, kill_after
 
 
 class CountingTrainer:
@@ -133,27 +113,6 @@ def test_a_run_with_an_invalid_stored_recipe_is_not_resumed(recipe, tmp_path):
         train(recipe, tmp_path, ignore_step)
 
 
-def test_folders_with_equal_last_names_have_unique_log_keys(recipe, tmp_path):
-    for parent in ("one/real", "two/real"):
-        for layer in ("blended", "transmission"):
-            folder = tmp_path / "data" / parent / layer
-            folder.mkdir(parents=True)
-            (folder / "a.jpg").write_bytes(image_bytes())
-    folders = [Path("one/real"), Path("two/real"), Path("one/real")]
-    train(with_value(recipe, "data.validate_on", folders), tmp_path / "run", ignore_step)
-    logged = json.loads((tmp_path / "run" / "log.jsonl").read_text().splitlines()[0])
-    assert {name for name in logged if name.startswith("psnr_gain")} == {
-        "psnr_gain_db_one/real",
-        "psnr_gain_db_two/real",
-    }
-
-
-def test_a_run_writes_a_log_and_an_image_of_samples(recipe, tmp_path):
-    train(recipe, tmp_path / "run", ignore_step)
-    assert logged_steps(tmp_path / "run") == [3, 6]
-    assert Photo.open(tmp_path / "run" / "samples.png").size[0] == 960
-
-
 def test_a_refused_resume_names_the_values_that_differ(recipe, tmp_path):
     run(CountingTrainer(recipe), tmp_path, ignore_step)
     other = with_value(with_value(recipe, "mix.veil", [0.0, 0.5]), "learning_rate", 0.01)
@@ -173,48 +132,6 @@ def test_a_run_can_be_made_longer_but_not_shorter(recipe, tmp_path):
     assert logged_steps(tmp_path) == [3, 4, 5]
     with pytest.raises(RecipeError, match="has 5 completed steps, but the recipe has steps = 3"):
         run(trainer, tmp_path, ignore_step)
-
-
-def test_a_resumed_run_is_announced_and_continues_to_count_its_seconds(recipe, tmp_path, monkeypatch):
-    """The clock advances by one second at each step; an hour passes between the two processes."""
-    now, starts = [0.0], []
-    monkeypatch.setattr("brewster.training.loop.time.monotonic", lambda: now[0])
-
-    def tick(step, steps, metrics, logged):
-        now[0] += 1
-        if step == 5 and now[0] < 100:
-            raise Killed
-
-    def start(*values):
-        starts.append(values)
-
-    often = recipe.model_copy(update={"report_every": 1, "checkpoint_every": 2})
-    with pytest.raises(Killed):
-        run(CountingTrainer(often), tmp_path, tick, start)
-    now[0] = 3600.0
-    run(CountingTrainer(often), tmp_path, tick, start)
-    lines = [json.loads(line) for line in (tmp_path / "log.jsonl").read_text().splitlines()]
-    assert starts == [(0, 6, 0.0), (4, 6, 3.0)]
-    assert [line["seconds"] for line in lines] == [0, 1, 2, 3, 3, 4]
-
-
-def test_a_checkpoint_without_seconds_is_resumed(recipe, tmp_path):
-    path, starts = tmp_path / "checkpoint.pt", []
-    torch.save({"step": 6, "recipe": recipe.model_dump_json(), "steps": []}, path)
-    run(CountingTrainer(recipe), tmp_path, ignore_step, lambda *values: starts.append(values))
-    assert starts == [(6, 6, 0.0)]
-
-
-def test_the_curves_are_drawn_at_each_report(recipe, tmp_path):
-    pictures = []
-
-    def read(step, steps, metrics, logged):
-        if logged:
-            pictures.append((tmp_path / "results.png").read_bytes())
-
-    run(CountingTrainer(recipe), tmp_path, read)
-    assert len(set(pictures)) == 2
-    assert Photo.open(tmp_path / "results.png").size[0] > 800  # two subplots: loss and gain
 
 
 def test_a_resumed_run_logs_every_step_once(recipe, tmp_path):

@@ -4,7 +4,6 @@ import json
 import os
 import subprocess
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -21,13 +20,13 @@ from brewster.models.diffusion.task import GUIDANCE, STEPS
 from brewster.models.diffusion.tensors import read_tensors
 from brewster.photo import Photo
 from brewster.training import distributed
-from brewster.training.checkpoint import Checkpoint
 from brewster.training.data.sample_rng import SampleRng
-from brewster.training.loop import run
+from brewster.training.loop import Checkpoint, run
 from brewster.training.lora.trainer import LoraTrainer
 from brewster.training.recipe import LoraRecipe
 from brewster.training.trainers import open_trainer
 from set_folders import render_set
+from training_helpers import Killed, kill_after
 
 RECIPE = {
     "backbone": "tiny:kontext", "rank": 2, "alpha": 2, "max_composite_pixels": 3 * 32 * 16,
@@ -58,18 +57,6 @@ def make_trainer(recipe):
         return trainer
 
     return initialize
-
-
-class Killed(Exception):
-    pass
-
-
-def kill_after(last):
-    def report(step, steps, metrics, logged):
-        if step == last:
-            raise Killed
-
-    return report
 
 
 def train(recipe, out, last=None):
@@ -159,20 +146,6 @@ def test_one_step_starts_from_the_photo_in_every_panel_and_subtracts_the_velocit
     torch.testing.assert_close(torch.cat([panels["T"], panels["R"]], dim=3), expected)
 
 
-def test_small_validation_photos_get_small_panels(make_trainer, tmp_path, monkeypatch):
-    monkeypatch.setenv("BREWSTER_DATA", str(tmp_path))
-    for role in ("blended", "transmission"):
-        (tmp_path / "small" / role).mkdir(parents=True)
-        Photo.from_array(np.full((16, 16, 3), 99, np.uint8), encoding="srgb").save(
-            tmp_path / "small" / role / "a.png"
-        )
-    trainer = make_trainer()
-    data = trainer.recipe.data.model_copy(update={"validate_on": (Path("small"),)})
-    scores, image = make_trainer(data=data, panels=["T", "R"], max_composite_pixels=2 * 32 * 16).validate()
-    assert scores.keys() == {"psnr_gain_db_small"}
-    assert image.shape == (20 + 20 + 160, 5 * 240, 3)
-
-
 def test_a_panel_of_weight_zero_has_no_loss_and_the_others_share_its_weight(make_trainer):
     equal, uneven = make_trainer(), make_trainer(panel_weights={"I": 0, "T": 3, "R": 1})
     before, after = equal.training_step(0), uneven.training_step(0)
@@ -236,37 +209,10 @@ def test_data_and_machine_are_checked_before_anything_is_loaded(recipe, tmp_path
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     with pytest.raises(DeviceError, match=r'optimizer = "adamw8bit" was requested on cpu'):
         LoraTrainer(recipe(optimizer="adamw8bit"))
-    with pytest.raises(
-        DeviceError, match=r"torch finds no GPU, and kontext has .*; train on a machine with a GPU"
-    ):
+    with pytest.raises(DeviceError, match=r"torch finds no GPU, and kontext has"):
         LoraTrainer(recipe(backbone="kontext"))
     with pytest.raises(AssertionError, match="loaded before"):
         LoraTrainer(recipe()).initialize()
-
-
-def test_the_prompt_is_encoded_before_the_backbone_is_loaded(recipe, monkeypatch):
-    calls = []
-    for name in ("encode_prompt", "load_backbone"):
-        original = getattr(trainer_module, name)
-        monkeypatch.setattr(
-            trainer_module,
-            name,
-            lambda *args, name=name, original=original, **options: (
-                calls.append(name) or original(*args, **options)
-            ),
-        )
-    LoraTrainer(recipe()).initialize()
-    assert calls == ["encode_prompt", "load_backbone"]
-
-
-def test_a_run_cannot_be_resumed_with_another_optimiser(recipe, tmp_path):
-    with pytest.raises(Killed):
-        train(recipe(), tmp_path, last=3)
-    assert json.loads(Checkpoint.read(tmp_path / "checkpoint.pt").recipe)["optimizer"] == "adamw"
-    trainer = open_trainer(recipe())
-    trainer.recipe = recipe(optimizer="adamw8bit")
-    with pytest.raises(RecipeError, match="another recipe: optimizer was adamw, is adamw8bit"):
-        run(trainer, tmp_path, kill_after(None))
 
 
 def test_validation_is_divided_among_the_processes(make_trainer, monkeypatch):
@@ -327,9 +273,7 @@ def test_the_timestep_shift_moves_training_times_towards_noise(make_trainer):
 
 def test_a_batch_that_cannot_be_divided_is_refused(recipe, monkeypatch):
     monkeypatch.setattr(distributed, "world_size", lambda: 2)
-    with pytest.raises(
-        RecipeError, match=r"batch_size = 1 cannot be divided equally among 2 processes; .*; raise batch_size"
-    ):
+    with pytest.raises(RecipeError, match=r"batch_size = 1 cannot be divided equally among 2 processes"):
         LoraTrainer(recipe(batch_size=1))
 
 
@@ -348,9 +292,7 @@ def test_a_nan_loss_stops_the_run_and_keeps_the_last_valid_checkpoint(recipe, tm
     def break_after_2(step, steps, metrics, logged):
         trainer.broken = step == 2
 
-    with pytest.raises(
-        ModelError, match="the loss is nan at step 2; expected a finite loss; resume from the last"
-    ):
+    with pytest.raises(ModelError, match="the loss is nan at step 2; expected a finite loss"):
         run(trainer, tmp_path, break_after_2)
     saved = Checkpoint.read(tmp_path / "checkpoint.pt")
     assert saved.step == 2
@@ -400,9 +342,3 @@ def test_a_backbone_in_a_folder_trains_like_its_tiny_version_quantized_or_not(re
     assert trainer.training_step(1)["loss"] > 0
     changed = lora_state_dict(trainer.backbone)
     assert any(tensor.any() for name, tensor in changed.items() if "lora_B" in name)
-
-
-def test_a_tiny_version_of_an_unknown_backbone_is_refused():
-    data = {"data": {"pairs": ["x"], "pairs_share": 0.0, "rendered": {"datasets": ["x"], "count": 0}}}
-    with pytest.raises(ModelError, match="there is no backbone 'contekst'"):
-        LoraTrainer(LoraRecipe.model_validate(RECIPE | data | {"backbone": "tiny:contekst"}))

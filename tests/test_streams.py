@@ -11,12 +11,12 @@ from brewster.photo import Photo
 from brewster.scene.recipe import read_scene_recipe
 from brewster.training.data.data_recipe import DataRecipe
 from brewster.training.data.image_loading import source_weights
-from brewster.training.data.online import OnlineRendered
-from brewster.training.data.rendered import RenderedDatasets
+from brewster.training.data.rendered import OnlineRendered, RenderedDatasets
 from brewster.training.recipe import read_recipe, with_value
 from brewster.training.streams import open_stream, validation_pairs
 from cli_helpers import image_bytes
 from set_folders import render_set
+from training_helpers import same
 
 TINY = Path(__file__).parents[1] / "recipes/ablations/tiny.toml"
 
@@ -52,10 +52,6 @@ def root(tmp_path, monkeypatch):
 
 def with_data(recipe, **data):
     return recipe.model_copy(update={"data": DataRecipe.model_validate(data)})
-
-
-def same(one, other):
-    return all(torch.equal(getattr(one, name), getattr(other, name)) for name in one.__dataclass_fields__)
 
 
 @pytest.mark.parametrize("kind", ["photos", "maps", "pairs"])
@@ -117,11 +113,6 @@ def test_each_batch_is_divided_by_the_shares(recipe, root):
     assert torch.equal(batch.photo_encoded[4:5], rendered.photo_encoded)
     mixtures = open_stream(with_data(recipe, photos=["photos"]))(0, 3, 32)
     assert torch.equal(batch.photo_encoded[5:], mixtures.photo_encoded)
-
-
-def test_pairs_alone_may_fill_a_batch(recipe, root):
-    batch = open_stream(with_data(recipe, pairs=["real"], pairs_share=1.0))(0, 4, 32)
-    assert (batch.reflection_weight < 1).all()
 
 
 def test_data_without_a_share_is_not_read(recipe, root):

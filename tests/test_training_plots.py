@@ -17,13 +17,6 @@ def test_a_sheet_has_the_images_unchanged_below_their_captions():
         assert caption.amin() < 0.5 < caption.amax() == 1  # dark letters on white
 
 
-def test_captions_with_special_characters_are_drawn_literally():
-    plain, dollar = (
-        sample_sheet(["a"], [(text, torch.zeros(3, 8, 200))]) for text in ("x^2 gain", "$x^2$ gain")
-    )
-    assert not torch.equal(plain, dollar)
-
-
 def test_metrics_of_one_kind_share_a_subplot():
     """Three subplots: the loss, its terms, and the gains of both folders."""
     lines = [
@@ -37,8 +30,3 @@ def test_metrics_of_one_kind_share_a_subplot():
     assert widths[0][0] == 3 * widths[2][0]
     assert widths[0][1] == widths[2][1]
     assert widths[1] == (widths[0][0], 2 * widths[0][1])  # a fourth subplot starts a second row
-
-
-def test_a_metric_that_was_added_later_is_plotted_from_its_first_step():
-    before, after = {"step": 1, "loss": 0.5}, {"step": 2, "loss": 0.4, "psnr_gain_db_x": 1.0}
-    assert plot_log([before, after]) != plot_log([before | {"psnr_gain_db_x": 0.0}, after])

@@ -1,5 +1,4 @@
 import shutil
-from pathlib import Path
 
 import pytest
 import torch
@@ -9,19 +8,15 @@ from brewster.errors import PhotoError, RecipeError
 from brewster.photo import Photo
 from brewster.render.camera_response import encode_jpeg
 from brewster.rendered.store import read_dataset, read_scene_of
-from brewster.training.data.alpha_blend import blended_layers
-from brewster.training.data.rendered import CachedRendered, RenderedDatasets
+from brewster.training.data.rendered import CachedRendered, RenderedDatasets, blended_layers
 from set_folders import render_set
+from training_helpers import same
 
 
 @pytest.fixture
 def folder(tmp_path):
     render_set(tmp_path / "set", count=3)
     return tmp_path / "set"
-
-
-def same(one, other):
-    return all(torch.equal(getattr(one, name), getattr(other, name)) for name in one.__dataclass_fields__)
 
 
 def pixels(data):
@@ -179,8 +174,3 @@ def test_a_full_cache_does_not_change_the_samples():
     large = CachedRendered(FakeOnline(), 4, seed=1)
     assert all(same(small(step, 4, 8), large(step, 4, 8)) for step in range(10))
     assert len(source.rendered) > 4
-
-
-def test_a_dataset_can_have_a_relative_path(folder, monkeypatch):
-    monkeypatch.chdir(folder.parent)
-    assert len(RenderedDatasets([Path(folder.name)], seed=1)) == 3

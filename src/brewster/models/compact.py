@@ -31,10 +31,8 @@ _SKIP_STAGES: Final = (0, 1, 2, 4, 6)
 """The indices of the stages whose output is a feature map of the encoder, at strides 2, 4, 8, 16 and 32."""
 _SKIP_WIDTHS: Final = tuple(_STAGES[stage][3] for stage in _SKIP_STAGES)
 _DECODER_WIDTHS: Final = (32, 64, 128, 224)
-FEATURE_WIDTHS: Final = (*_DECODER_WIDTHS[1:], _SKIP_WIDTHS[-1])
-"""Channels of the features at strides 4, 8, 16 and 32 that `CompactNetwork.maps` returns."""
-MAP_COUNT: Final = 12
-"""Channels of the head: four maps of three colours (see `layers_from_maps`)."""
+_FEATURE_WIDTHS: Final = (*_DECODER_WIDTHS, _SKIP_WIDTHS[-1])
+"""Channels of the features at strides 2, 4, 8, 16 and 32, to which the hints are added."""
 _BATCH_NORM_EPSILON: Final = 1e-3
 _FULL_WIDTH: Final = 16
 _LARGEST_GAIN: Final = 1.5
@@ -55,7 +53,7 @@ class _Convolution(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         padded = functional.pad(x, self._pad) if self._pad else x
-        return in_float32(self.conv, padded) if self.conv.groups > 1 else self.conv(padded)
+        return _in_float32(self.conv, padded) if self.conv.groups > 1 else self.conv(padded)
 
 
 @final
@@ -110,7 +108,7 @@ def _leaky(x: Tensor) -> Tensor:
     return functional.leaky_relu(x, 0.1)
 
 
-def in_float32(convolution: nn.Conv2d, x: Tensor) -> Tensor:
+def _in_float32(convolution: nn.Conv2d, x: Tensor) -> Tensor:
     """Applies the convolution in float32, even under bfloat16 autocast.
 
     The output layers need the precision. The gradient of depthwise convolutions is three times slower in bfloat16
@@ -152,44 +150,52 @@ class CompactNetwork(nn.Module):
     `added` is the light that the pane adds, and exp(gain) compensates for the light that it absorbs. Both vary more
     slowly than the photo. `transmission_correction` corrects overexposed pixels. `reflection_correction` corrects R where the
     added light is not reflection.
+
+    `hints` are two soft masks in 0..1, (N, 2, H, W): where a person sees reflection, and where only the scene. Zero is no hint:
+    the layers are the same as without hints.
     """
 
     def __init__(self) -> None:
         super().__init__()
         self.encoder = _Encoder()
-        below = FEATURE_WIDTHS
         self.decoders = nn.ModuleList(
-            _Decoder(*sizes) for sizes in zip(below, _SKIP_WIDTHS[:-1], _DECODER_WIDTHS, strict=True)
+            _Decoder(*sizes)
+            for sizes in zip(_FEATURE_WIDTHS[1:], _SKIP_WIDTHS[:-1], _DECODER_WIDTHS, strict=True)
         )
+        self.hints = nn.ModuleList(nn.Conv2d(width, 2 * width, 1) for width in _FEATURE_WIDTHS)
         self.squeeze = nn.Conv2d(_DECODER_WIDTHS[0], _FULL_WIDTH, 1)
         self.join = nn.Conv2d(_FULL_WIDTH + 3, _FULL_WIDTH, 3, padding=1)
-        self.head = nn.Conv2d(_FULL_WIDTH, MAP_COUNT, 3, padding=1)
+        self.head = nn.Conv2d(_FULL_WIDTH, 4 * 3, 3, padding=1)
         nn.init.zeros_(self.head.weight)  # an untrained network returns the photo and no reflection
         nn.init.zeros_(self.head.bias)  # type: ignore[arg-type]
+        for convolution in self.hints:
+            nn.init.zeros_(convolution.weight)  # type: ignore[arg-type]
+            nn.init.zeros_(convolution.bias)  # type: ignore[arg-type]
 
-    def forward(self, photo_encoded: Float[Tensor, "n 3 h w"]) -> Float[Tensor, "n 6 h w"]:
+    def forward(
+        self, photo_encoded: Float[Tensor, "n 3 h w"], hints: Float[Tensor, "n 2 h w"] | None = None
+    ) -> Float[Tensor, "n 6 h w"]:
         """Returns the encoded transmission and reflection of encoded photos, concatenated along the channels."""
-        return layers_from_maps(photo_encoded, self.maps(photo_encoded)[0])
-
-    def maps(self, photo_encoded: Float[Tensor, "n 3 h w"]) -> tuple[Tensor, list[Tensor]]:
-        """Returns the four maps, (N, 12, H, W), and the features at strides 4, 8, 16 and 32."""
         normal = photo_encoded * (255 / 128) - 127 / 128  # what the ImageNet weights expect
         *skips, x = self.encoder(normal)
-        features: list[Tensor] = []
-        for decoder, skip in zip(reversed(self.decoders), reversed(skips), strict=True):
-            features.insert(0, x)
-            x = decoder(x, skip)
-        x = functional.interpolate(self.squeeze(x), scale_factor=2.0, mode="bilinear")
-        x = in_float32(self.head, _leaky(in_float32(self.join, torch.cat([x, normal], dim=1))))
-        return x, features
+        levels = list(enumerate(self.decoders))
+        for level, decoder in reversed(levels):
+            x = decoder(self._with_hints(x, hints, level + 1), skips[level])
+        x = self.squeeze(self._with_hints(x, hints, 0))
+        x = functional.interpolate(x, scale_factor=2.0, mode="bilinear")
+        maps = _in_float32(self.head, _leaky(_in_float32(self.join, torch.cat([x, normal], dim=1))))
+        added, gain, transmission_correction, reflection_correction = maps.chunk(4, dim=1)
+        gain = (_LARGEST_GAIN * torch.tanh(gain / _LARGEST_GAIN)).exp()
+        transmission = to_encoded((to_linear(photo_encoded) - added) * gain) + transmission_correction
+        return torch.cat([transmission, to_encoded(added + reflection_correction)], dim=1)
 
-
-def layers_from_maps(photo_encoded: Tensor, maps: Tensor) -> Tensor:
-    """Returns the encoded layers (N, 6, H, W) of the image formation in the docstring of `CompactNetwork`."""
-    added, gain, transmission_correction, reflection_correction = maps.chunk(4, dim=1)
-    gain = (_LARGEST_GAIN * torch.tanh(gain / _LARGEST_GAIN)).exp()
-    transmission = to_encoded((to_linear(photo_encoded) - added) * gain) + transmission_correction
-    return torch.cat([transmission, to_encoded(added + reflection_correction)], dim=1)
+    def _with_hints(self, features: Tensor, hints: Tensor | None, level: int) -> Tensor:
+        """Changes the features at stride 2^(level + 1) where there are hints. A constant offset per hint gained only 0.1 dB."""
+        if hints is None:
+            return features
+        reflection, scene = functional.avg_pool2d(hints, 2 ** (level + 1)).chunk(2, dim=1)
+        if_reflection, if_scene = self.hints[level](features).chunk(2, dim=1)
+        return features + reflection * if_reflection + scene * if_scene  # type: ignore[no-any-return]
 
 
 @final

@@ -56,11 +56,6 @@ NETWORKS: Final[dict[str, NetworkEntry]] = {
         _imported("brewster.models.compact:CompactNetwork"),
         _imported("brewster.models.compact:with_imagenet_features"),
         stride=32,
-    ),
-    "lite2-dense": NetworkEntry(
-        _imported("brewster.models.dense:DenseNetwork"),
-        _imported("brewster.models.dense:with_imagenet_encoder"),
-        stride=32,
         takes_hints=True,
     ),
 }

@@ -7,25 +7,33 @@ with more steps: from then on, its learning rates and image sizes are those of t
 
 from __future__ import annotations
 
+import importlib.util
+import io
 import json
+import pickle
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing
+from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
-from typing import Any, Final, Protocol
+from typing import TYPE_CHECKING, Any, Final, Protocol, final
 
+import torch
 from pydantic import ValidationError
 from torch import Tensor
 
-from brewster.errors import RecipeError
+from brewster.errors import ModelError, RecipeError
 from brewster.files import write_atomically
 from brewster.photo import Photo
 from brewster.srgb import to_linear
-from brewster.training.checkpoint import START_FRESH, Checkpoint, mismatch_as_model_error
 from brewster.training.distributed import is_main_process
 from brewster.training.plots import plot_log
 from brewster.training.recipe import TrainingRecipe
-from brewster.training.tensorboard import TensorBoardLog
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+    from torch.utils.tensorboard import SummaryWriter
 
 StepCallback = Callable[[int, int, Mapping[str, float], bool], None]
 """Called after every step with (step, steps, metrics, logged); `logged` is true if the metrics were written to the log."""
@@ -37,8 +45,86 @@ CHECKPOINT_FILE: Final = "checkpoint.pt"
 LOG_FILE: Final = "log.jsonl"
 SAMPLES_FILE: Final = "samples.png"
 CURVES_FILE: Final = "results.png"
-_NOT_COMPARED: Final = ("steps", "report_every", "checkpoint_every", "init")
+IMAGE_TAG: Final = "samples"
+"""The name of the images in TensorBoard."""
+_START_FRESH: Final = "delete it to start again, or choose another folder with -o"
+_CHECKPOINT_ERRORS: Final = (
+    OSError, RuntimeError, TypeError, ValueError, LookupError, EOFError, pickle.UnpicklingError,
+)  # fmt: skip
+_NOT_COMPARED: Final = ("steps", "report_every", "checkpoint_every", "init", "init_share")
 """Recipe values that may change when a run is resumed."""
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    """The state of a trainer after `step` steps and `seconds` of training, and its recipe as JSON.
+
+    Batches and learning rates need no state, because they are functions of step and recipe. In the file, the keys of
+    `state` are at the same level as `step`, `recipe` and `seconds`.
+    """
+
+    step: int
+    recipe: str
+    state: Mapping[str, Any]
+    seconds: float = 0.0
+
+    def write(self, path: Path) -> None:
+        """Writes or replaces the file atomically: a killed process leaves either the old or the new checkpoint. Raises
+        OutputError if the file cannot be written."""
+        stream = io.BytesIO()
+        torch.save({"step": self.step, "recipe": self.recipe, "seconds": self.seconds, **self.state}, stream)
+        write_atomically(path, stream.getvalue(), overwrite=True)
+
+    @classmethod
+    def read(cls, path: Path) -> Checkpoint:
+        """Reads a checkpoint without running code from it (`weights_only`). Raises ModelError if the file is missing, damaged,
+        or not a checkpoint of brewster."""
+        try:
+            state = dict(torch.load(path, map_location="cpu", weights_only=True))
+            # Checkpoints of brewster 0.1.0 have no seconds.
+            step, recipe, seconds = state.pop("step"), state.pop("recipe"), state.pop("seconds", 0.0)
+            return cls(step, recipe, state, seconds)
+        except _CHECKPOINT_ERRORS as error:
+            raise ModelError(
+                f"{path} cannot be read ({type(error).__name__})",
+                "expected a checkpoint written by brewster train",
+                _START_FRESH,
+            ) from error
+
+
+@final
+class TensorBoardLog:
+    """Writes TensorBoard events, in addition to the log: `tensorboard --logdir OUT`. A no-op without tensorboard.
+
+    Events of an interrupted run after `completed_steps` are discarded.
+    """
+
+    def __init__(self, folder: Path, completed_steps: int) -> None:
+        self._folder, self._completed_steps = folder, completed_steps
+
+    def log(self, step: int, metrics: Mapping[str, float], image_encoded: Float[Tensor, "h w 3"]) -> None:
+        """Writes each metric as a scalar, and the image, sRGB-encoded in 0..1."""
+        if self._writer:
+            for name, value in metrics.items():
+                self._writer.add_scalar(name, value, step)
+            self._writer.add_image(IMAGE_TAG, image_encoded.clamp(0, 1), step, dataformats="HWC")
+            self._writer.flush()
+
+    def close(self) -> None:
+        """Closes the event file, if one was opened."""
+        if "_writer" in vars(self) and self._writer:
+            self._writer.close()
+
+    @cached_property
+    def _writer(self) -> SummaryWriter | None:
+        """The writer of the event file, or None without tensorboard. The file is created at the first event, so that a completed
+        run that is resumed gets no empty file.
+        """
+        if not importlib.util.find_spec("tensorboard"):
+            return None
+        from torch.utils.tensorboard import SummaryWriter  # noqa: PLC0415  (imports tensorboard)
+
+        return SummaryWriter(self._folder, purge_step=self._completed_steps + 1)
 
 
 class Trainer(Protocol):
@@ -96,8 +182,13 @@ def run(
     out.mkdir(parents=True, exist_ok=True)
     recipe = trainer.recipe
     completed_steps, seconds_before = _resume_or_initialize(trainer, out / CHECKPOINT_FILE)
-    if is_main_process():
-        _truncate_log(completed_steps, out / LOG_FILE)
+    log = out / LOG_FILE
+    if is_main_process() and log.exists():
+        # A killed run may have written lines after its last checkpoint, and an incomplete last line.
+        lines = log.read_text().splitlines()
+        valid = [line for line in lines if line.endswith("}") and json.loads(line)["step"] <= completed_steps]
+        if valid != lines:
+            write_atomically(log, "".join(f"{line}\n" for line in valid).encode(), overwrite=True)
     on_start(completed_steps, recipe.steps, seconds_before)
     started, steps = time.monotonic() - seconds_before, 0 if recipe.data.is_empty else recipe.steps
     with closing(TensorBoardLog(out, completed_steps)) as event_log:
@@ -108,8 +199,13 @@ def run(
             scores, image = trainer.validate() if reports else ({}, None)
             if logged and image is not None:
                 metrics |= scores | {"seconds": time.monotonic() - started}
-                _append_log(out / LOG_FILE, {"step": step, **metrics})
-                _write_image(out / SAMPLES_FILE, image)
+                line = json.dumps(
+                    {name: round(value, 5) for name, value in {"step": step, **metrics}.items()}
+                )
+                with log.open("a") as stream:
+                    stream.write(f"{line}\n")
+                linear = to_linear(image.clamp(0, 1)).numpy()
+                Photo.from_array(linear, encoding="linear").save(out / SAMPLES_FILE, depth=8, overwrite=True)
                 write_atomically(out / CURVES_FILE, plot_log(read_log(out)), overwrite=True)
                 event_log.log(step, metrics, image)
             if is_main_process() and (is_last or step % recipe.checkpoint_every == 0):
@@ -134,14 +230,7 @@ def _resume_or_initialize(trainer: Trainer, path: Path) -> tuple[int, float]:
     if not path.exists():
         trainer.initialize()
         return 0, 0.0
-    checkpoint = _check_recipe(Checkpoint.read(path), trainer.recipe, path)
-    with mismatch_as_model_error(path, START_FRESH):
-        trainer.load_state_dict(checkpoint.state)
-    return checkpoint.step, checkpoint.seconds
-
-
-def _check_recipe(checkpoint: Checkpoint, recipe: TrainingRecipe, path: Path) -> Checkpoint:
-    """Returns the checkpoint if its run can be resumed with the recipe."""
+    checkpoint, recipe = Checkpoint.read(path), trainer.recipe
     before = _compared_values(checkpoint.recipe, recipe)
     now = _compared_values(recipe.model_dump_json(), recipe)
     if before != now:
@@ -159,7 +248,15 @@ def _check_recipe(checkpoint: Checkpoint, recipe: TrainingRecipe, path: Path) ->
             f"expected steps of at least {checkpoint.step}: a run can be made longer, but not shorter",
             "raise steps, or choose another folder with -o",
         )
-    return checkpoint
+    try:
+        trainer.load_state_dict(checkpoint.state)
+    except (RuntimeError, ValueError, KeyError) as error:
+        raise ModelError(
+            f"{path} contains another network",
+            "expected a checkpoint of the network that the recipe trains",
+            _START_FRESH,
+        ) from error
+    return checkpoint.step, checkpoint.seconds
 
 
 def _compared_values(text: str, recipe: TrainingRecipe) -> dict[str, object]:
@@ -182,21 +279,3 @@ def _flatten(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str,
             yield from _flatten(value, f"{prefix}{name}.")
         else:
             yield prefix + name, value
-
-
-def _append_log(path: Path, metrics: Mapping[str, float]) -> None:
-    with path.open("a") as stream:
-        stream.write(json.dumps({name: round(value, 5) for name, value in metrics.items()}) + "\n")
-
-
-def _truncate_log(step: int, log: Path) -> None:
-    """Removes the lines that a killed run wrote after its last checkpoint, also if the last line is incomplete."""
-    lines = log.read_text().splitlines() if log.exists() else []
-    valid = [line for line in lines if line.endswith("}") and json.loads(line)["step"] <= step]
-    if valid != lines:
-        write_atomically(log, "".join(f"{line}\n" for line in valid).encode(), overwrite=True)
-
-
-def _write_image(path: Path, encoded: Tensor) -> None:
-    linear = to_linear(encoded.clamp(0, 1)).numpy()
-    Photo.from_array(linear, encoding="linear").save(path, depth=8, overwrite=True)

@@ -108,11 +108,8 @@ def exposure_ratio(prediction: Tensor, photo: Tensor, ground_truth: Tensor) -> f
 
 
 def check_finite(value: Tensor, step: int, name: str = "loss") -> Tensor:
-    """Returns `value`, a scalar, if it is finite.
-
-    Raises:
-        ModelError: the value is NaN or infinite. The last checkpoint is still valid.
-    """
+    """Returns `value`, a scalar, if it is finite. Raises ModelError if the value is NaN or infinite. The last checkpoint is
+    still valid."""
     if value.isfinite():
         return value
     raise ModelError(

@@ -49,6 +49,8 @@ TEMPLATES: Final = tuple(sorted(path.stem for path in _TEMPLATE_FOLDER.glob("*.t
 
 Optimizer = Literal["adamw", "adamw8bit"]
 
+SQUARE_PHOTO_PX: Final = (4096, 4096)
+"""A large square photo, for estimates: its panels fill the pixel budget best."""
 ENCODED_SUFFIX: Final = ".safetensors"
 """The file name suffix of an encoded prompt."""
 
@@ -139,7 +141,12 @@ class CompactRecipe(TrainingRecipe):
     """Probability of a sample with simulated hints of a person: where there is reflection, and where only the scene."""
     init: str | None = None
     """The model from which training starts: a name from `brewster models list`, or an .onnx file, relative to this recipe. It
-    contains this network or its encoder. Not set: ImageNet features."""
+    contains this network, with or without hints. Not set: ImageNet features."""
+    init_share: Share = 0.0
+    """Share of the weights of `init` in the exported weights, which are a mean of the two (Wortsman et al., CVPR 2022)."""
+    trained_part: Literal["", "hints."] = ""
+    """The part of the network that is trained. hints.: only the weights of the hints, so that photos without hints give the same layers
+    as before. Empty: all weights."""
     mix: MixRecipe = MixRecipe()
 
     @model_validator(mode="after")
@@ -150,6 +157,8 @@ class CompactRecipe(TrainingRecipe):
             raise ValueError(
                 f"expected hint_probability 0, because the network {self.network} takes no hints"
             )
+        if self.init_share and self.init is None:
+            raise ValueError("expected init_share 0, because init is not set")
         return self
 
     def size_at(self, step: int) -> int:
@@ -267,11 +276,8 @@ AnyRecipe = TypeVar("AnyRecipe", bound=TrainingRecipe)
 
 
 def _sample_count(batch_size: int, name: str, share: float) -> int:
-    """Returns the number of samples of a source in a batch: round(batch_size * share).
-
-    Raises:
-        ValueError: a share between 0 and 1 gives no sample or all samples.
-    """
+    """Returns the number of samples of a source in a batch: round(batch_size * share). Raises ValueError if a share between 0
+    and 1 gives no sample or all samples."""
     count = round(batch_size * share)
     if batch_size and 0 < share < 1 and count in (0, batch_size):
         raise ValueError(
@@ -304,11 +310,8 @@ def read_recipe(path: Path) -> CompactRecipe | LoraRecipe:
 
 
 def read_template(name: str) -> CompactRecipe | LoraRecipe:
-    """Reads a packaged recipe (a name of TEMPLATES) or a recipe file. Relative paths are not resolved.
-
-    Raises:
-        RecipeError: the name is unknown, or the file is not a valid recipe (see `read_recipe`).
-    """
+    """Reads a packaged recipe (a name of TEMPLATES) or a recipe file. Relative paths are not resolved. Raises RecipeError if
+    the name is unknown, or the file is not a valid recipe (see `read_recipe`)."""
     if name in TEMPLATES:
         return _read_unresolved(_TEMPLATE_FOLDER / f"{name}.toml")
     if not name.endswith(".toml"):
@@ -321,26 +324,18 @@ def read_template(name: str) -> CompactRecipe | LoraRecipe:
 
 
 def _read_unresolved(path: Path) -> CompactRecipe | LoraRecipe:
-    return read_toml(_recipe_class(path), path, reference=_REFERENCE)
-
-
-def _recipe_class(path: Path) -> type[CompactRecipe] | type[LoraRecipe]:
+    recipe_class: type[CompactRecipe] | type[LoraRecipe] = CompactRecipe
     with suppress(OSError, ValueError):  # read_toml raises an error for such a file
         if "backbone" in tomllib.loads(path.read_text("utf-8")):
-            return LoraRecipe
-    return CompactRecipe
+            recipe_class = LoraRecipe
+    return read_toml(recipe_class, path, reference=_REFERENCE)
 
 
 def with_value(recipe: AnyRecipe, key_path: str, value: object) -> AnyRecipe:
     """Returns a copy of the recipe with one changed value. All values of the copy are validated.
 
-    Args:
-        recipe: the recipe to change.
-        key_path: the key with its tables, such as "data.rendered.blend_space".
-        value: the new value.
-
-    Raises:
-        RecipeError: the recipe has no such key, or the value is not allowed for it.
+    `key_path` is the key with its tables, such as "data.rendered.blend_space". Raises RecipeError if the recipe has no such key,
+    or the value is not allowed for it.
     """
     if key_path not in _key_paths(recipe):
         suggestion = similar_key(type(recipe), key_path.split("."))
@@ -368,11 +363,8 @@ def _key_paths(values: FrozenModel, prefix: str = "") -> Iterator[str]:
 
 
 def data_folder() -> Path:
-    """Returns the folder in the environment variable BREWSTER_DATA.
-
-    Raises:
-        RecipeError: the variable is not set, or the folder does not exist.
-    """
+    """Returns the folder in the environment variable BREWSTER_DATA. Raises RecipeError if the variable is not set, or the
+    folder does not exist."""
     folder = os.environ.get("BREWSTER_DATA", "")
     if not Path(folder or "/nowhere").is_dir():
         raise RecipeError(

@@ -8,7 +8,6 @@ batch = stream(step=0, count=2, size=64)
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from functools import partial
 from pathlib import Path
 from typing import Final
 
@@ -18,8 +17,8 @@ from torch import Tensor
 from brewster.environments.assets import Assets
 from brewster.environments.catalog import read_catalog
 from brewster.errors import RecipeError
-from brewster.scene.recipe import SceneRecipe, read_scene_recipe
-from brewster.training.data.data_recipe import DataRecipe, MixRecipe, RenderedRecipe
+from brewster.scene.recipe import read_scene_recipe
+from brewster.training.data.data_recipe import DataRecipe, MixRecipe
 from brewster.training.data.image_loading import read_maps, read_pairs, read_photos, source_weights
 from brewster.training.data.mixtures import (
     InterleavedStream,
@@ -28,8 +27,7 @@ from brewster.training.data.mixtures import (
     Stream,
     TrainingBatch,
 )
-from brewster.training.data.online import OnlineRendered
-from brewster.training.data.rendered import CachedRendered, RenderedDatasets
+from brewster.training.data.rendered import CachedRendered, OnlineRendered, RenderedDatasets
 from brewster.training.recipe import CompactRecipe, data_folder
 
 _HELD_OUT_SEED: Final = 1811
@@ -42,8 +40,13 @@ def open_stream(recipe: CompactRecipe, device: torch.device | str = "cpu") -> St
         RecipeError: a folder is missing or empty, pairs do not match, or there are too few rendered samples.
         PhotoError: an image cannot be read, or a map cannot light a scene.
     """
+    data = recipe.data
     return _interleave(
-        recipe.data.pairs_share, partial(_open_pairs, recipe), partial(_open_unpaired, recipe, device)
+        data.pairs_share,
+        lambda: Pairs(read_pairs(resolve_folders(data.pairs)), recipe.mix.crop, seed=recipe.seed + 1),
+        lambda: _interleave(
+            data.rendered_share, lambda: _open_rendered(recipe, device), lambda: _open_mixtures(recipe)
+        ),
     )
 
 
@@ -95,12 +98,6 @@ def _unique_names(folders: Sequence[Path]) -> list[str]:
     return list(map(str, folders))
 
 
-def _open_unpaired(recipe: CompactRecipe, device: torch.device | str) -> Stream:
-    return _interleave(
-        recipe.data.rendered_share, partial(_open_rendered, recipe, device), partial(_open_mixtures, recipe)
-    )
-
-
 def _interleave(share: float, first: Callable[[], Stream], second: Callable[[], Stream]) -> Stream:
     """Interleaves two streams; `share` is the share of the first. If one stream has a share of 0, only the other is opened."""
     if share in (0, 1):
@@ -122,10 +119,6 @@ def _open_mixtures(recipe: CompactRecipe) -> Stream:
     )
 
 
-def _open_pairs(recipe: CompactRecipe) -> Stream:
-    return Pairs(read_pairs(resolve_folders(recipe.data.pairs)), recipe.mix.crop, seed=recipe.seed + 1)
-
-
 def _open_rendered(recipe: CompactRecipe, device: torch.device | str) -> Stream:
     rendered, seed = recipe.data.rendered, recipe.seed + 2
     assert rendered
@@ -138,20 +131,16 @@ def _open_rendered(recipe: CompactRecipe, device: torch.device | str) -> Stream:
             target=rendered.target,
             blend_space=rendered.blend_space,
         )
-    online = _open_online(recipe, rendered, device)
-    return online if rendered.count is None else CachedRendered(online, rendered.count, seed=seed)
-
-
-def _open_online(
-    recipe: CompactRecipe, rendered: RenderedRecipe, device: torch.device | str
-) -> OnlineRendered:
     maps, photos = resolve_folders(rendered.maps), resolve_folders(rendered.photos)
     catalog, refused = read_catalog(maps, photos, recipe.data.excluded_files)
     if refused:
         # This is an error, because a warning in the log of a long run is easy to overlook.
         raise refused[0]
-    return OnlineRendered(
-        _scene_recipe(rendered),
+    scenes = read_scene_recipe(rendered.recipe or "")
+    if rendered.orders:
+        scenes = scenes.model_copy(update={"orders": rendered.orders})
+    online = OnlineRendered(
+        scenes,
         catalog,
         Assets([*maps, *photos]),
         seed=recipe.seed if rendered.seed is None else rendered.seed,
@@ -159,11 +148,7 @@ def _open_online(
         target=rendered.target,
         blend_space=rendered.blend_space,
     )
-
-
-def _scene_recipe(rendered: RenderedRecipe) -> SceneRecipe:
-    scenes = read_scene_recipe(rendered.recipe or "")
-    return scenes.model_copy(update={"orders": rendered.orders}) if rendered.orders else scenes
+    return online if rendered.count is None else CachedRendered(online, rendered.count, seed=seed)
 
 
 def _empty_stream(step: int, count: int, size: int) -> TrainingBatch:  # noqa: ARG001  (a Stream)
@@ -175,9 +160,6 @@ def _empty_stream(step: int, count: int, size: int) -> TrainingBatch:  # noqa: A
 
 
 def resolve_folders(folders: Sequence[Path]) -> list[Path]:
-    """Returns the folders of a recipe as paths. Relative folders are in the folder BREWSTER_DATA.
-
-    Raises:
-        RecipeError: a path is relative, and BREWSTER_DATA is unset or not a folder.
-    """
+    """Returns the folders of a recipe as paths. Relative folders are in the folder BREWSTER_DATA. Raises RecipeError if a path
+    is relative, and BREWSTER_DATA is unset or not a folder."""
     return [folder if folder.is_absolute() else data_folder() / folder for folder in folders]

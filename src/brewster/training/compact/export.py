@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import logging
 import warnings
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -31,17 +29,20 @@ _MIN_HALF_SIZE = 16
 def export_onnx(network: nn.Module, path: Path, entry: NetworkEntry) -> None:
     """Writes the network as an ONNX file: input `photo`, outputs `transmission` and `reflection`.
 
-    Input and outputs are linear light, (1, 3, H, W), with H and W multiples of the stride. Networks that take hints have a second
-    input `hints`, (1, 2, H, W). The weights are stored in half
-    precision, which halves the size of the file. The network still computes in float32.
-
-    Raises:
-        OutputError: the file cannot be written.
+    Input and outputs are linear light, (1, 3, H, W), with H and W multiples of the stride. Networks that take hints have a
+    second input `hints`, (1, 2, H, W). The weights are stored in half precision, which halves the size of the file. The network
+    still computes in float32. Raises OutputError if the file cannot be written.
     """
     height, width = (torch.export.Dim(name, min=1, max=256) for name in ("rows", "columns"))
     stride, names = entry.stride, ["photo", "hints"][: 1 + entry.takes_hints]
     examples = [torch.rand(1, channels, 4 * stride, 5 * stride) for channels in (3, 2)]
-    with _without_warnings():
+    logger = logging.getLogger("torch.onnx")
+    level = logger.level
+    # torchvision is missing (it is not needed), the exporter calls deprecated functions, and photo and hints have the same size.
+    logger.setLevel(logging.ERROR)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", FutureWarning)
+        warnings.filterwarnings("ignore", message=".*axis name", category=UserWarning)
         program = torch.onnx.export(
             LinearSeparator(network).eval(),
             tuple(examples[: len(names)]),
@@ -52,6 +53,7 @@ def export_onnx(network: nn.Module, path: Path, entry: NetworkEntry) -> None:
             dynamo=True,
             verbose=False,
         )
+    logger.setLevel(level)
     assert program is not None
     model = with_half_weights(program.model_proto)
     for node in model.graph.node:
@@ -79,11 +81,8 @@ def with_half_weights(model: ModelProto) -> ModelProto:
 
 
 def read_weights(path: Path) -> dict[str, Tensor]:
-    """Returns the weights of a network in a file of `export_onnx`, in the half precision of the file, by name.
-
-    Raises:
-        ModelError: the file cannot be read.
-    """
+    """Returns the weights of a network in a file of `export_onnx`, in the half precision of the file, by name. Raises
+    ModelError if the file cannot be read."""
     try:
         graph = onnx.load(path).graph
     except Exception as error:
@@ -99,19 +98,3 @@ def read_weights(path: Path) -> dict[str, Tensor]:
         for tensor in graph.initializer
         if tensor.name.startswith(_PREFIX)
     }
-
-
-@contextmanager
-def _without_warnings() -> Iterator[None]:
-    """Hides warnings of the exporter: torchvision is missing (it is not needed), the exporter calls deprecated functions, and photo
-    and hints have the same size."""
-    logger = logging.getLogger("torch.onnx")
-    before = logger.level
-    logger.setLevel(logging.ERROR)
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", FutureWarning)
-            warnings.filterwarnings("ignore", message=".*axis name", category=UserWarning)
-            yield
-    finally:
-        logger.setLevel(before)

@@ -34,7 +34,11 @@ def blur(image: Image, sigma_px: float, *, disc: bool) -> Image:
         blurred = blur(small, sigma_px / reduction, disc=disc)
         return functional.interpolate(blurred[None], image.shape[1:], mode="bilinear")[0]
     if disc:
-        return _filter(image, _disc(2 * sigma_px))
+        radius_px = 2 * sigma_px
+        reach = max(1, math.ceil(radius_px))
+        y, x = torch.meshgrid(*[torch.arange(-reach, reach + 1.0)] * 2, indexing="ij")
+        kernel = (radius_px + 0.5 - torch.hypot(x, y)).clamp(0, 1)
+        return _filter(image, kernel / kernel.sum())
     reach = max(1, round(3 * sigma_px))
     line = torch.exp(-((torch.arange(-reach, reach + 1) / max(sigma_px, 0.1)) ** 2) / 2)
     line = line / line.sum()
@@ -185,13 +189,6 @@ def _line(rng: SampleRng, size: int) -> Mask:
 def _noise(rng: SampleRng, size: int, cells: int) -> Mask:
     """Returns normal noise on a grid of `cells` x `cells` nodes, bicubically interpolated."""
     return functional.interpolate(rng.normal(1, 1, cells, cells), (size, size), mode="bicubic")[0]
-
-
-def _disc(radius_px: float) -> Tensor:
-    reach = max(1, math.ceil(radius_px))
-    y, x = torch.meshgrid(*[torch.arange(-reach, reach + 1.0)] * 2, indexing="ij")
-    disc = (radius_px + 0.5 - torch.hypot(x, y)).clamp(0, 1)
-    return disc / disc.sum()
 
 
 def _filter(image: Image, kernel: Tensor) -> Image:

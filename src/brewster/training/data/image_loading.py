@@ -39,17 +39,19 @@ def read_photos(
         RecipeError: a folder cannot be read, or none of the folders contains a photo.
         PhotoError: a photo cannot be decoded.
     """
-    return [_read_photo(path, _PHOTO_SIDE_PX) for path in _list_images(folders, _PHOTOS, exclude, only)]
+    photos = []
+    for path in _list_images(folders, _PHOTOS, exclude, only):
+        encoded = to_encoded(np.clip(_downscaled(Photo.open(path), _PHOTO_SIDE_PX), 0, 1))
+        photos.append(torch.from_numpy(np.rint(encoded * 255).astype(np.uint8)))
+    return photos
 
 
 def source_weights(folders: Sequence[Path], exclude: Sequence[str] = ()) -> list[float]:
     """Returns sampling weights for the photos of `read_photos`, so that no single source dominates.
 
-    Photos whose file names start with the same word (letters and digits) belong to one source. The n photos of a source
-    have the total weight n^(2/3): a large source counts more, but does not dominate.
-
-    Raises:
-        RecipeError: a folder cannot be read, or none of the folders contains a photo.
+    Photos whose file names start with the same word (letters and digits) belong to one source. The n photos of a source have
+    the total weight n^(2/3): a large source counts more, but does not dominate. Raises RecipeError if a folder cannot be read,
+    or none of the folders contains a photo.
     """
     sources = [_WORD_END.split(path.name)[0] for path in _list_images(folders, _PHOTOS, exclude)]
     counts = Counter(sources)
@@ -67,7 +69,11 @@ def read_maps(
         RecipeError: a folder cannot be read, or none of the folders contains a map.
         PhotoError: a map cannot be decoded.
     """
-    return [_read_map(path) for path in _list_images(folders, _MAPS, exclude, only)]
+    maps = []
+    for path in _list_images(folders, _MAPS, exclude, only):
+        linear = np.clip(_downscaled(Photo.open(path), 2 * _MAP_HEIGHT_PX), 0, _MAX_FLOAT16)
+        maps.append(torch.from_numpy(linear.astype(np.float16)).permute(2, 0, 1).contiguous())
+    return maps
 
 
 def read_pairs(folders: Sequence[Path], max_pairs: int | None = None) -> list[tuple[Tensor, Tensor]]:
@@ -79,14 +85,12 @@ def read_pairs(folders: Sequence[Path], max_pairs: int | None = None) -> list[tu
         RecipeError: a folder cannot be read or is empty, or a photo has no transmission with its name and size.
         PhotoError: an image cannot be decoded.
     """
-    return [
-        _read_pair(group) for folder in folders for group in _evenly_spaced(_image_groups(folder), max_pairs)
-    ]
-
-
-def _evenly_spaced(groups: list[ImageGroup], max_pairs: int | None) -> list[ImageGroup]:
-    count = min(len(groups), max_pairs or len(groups))
-    return [groups[number * len(groups) // count] for number in range(count)]
+    pairs = []
+    for folder in folders:
+        groups = _image_groups(folder)
+        count = min(len(groups), max_pairs or len(groups))
+        pairs += [_read_pair(groups[number * len(groups) // count]) for number in range(count)]
+    return pairs
 
 
 def _image_groups(folder: Path) -> list[ImageGroup]:
@@ -120,16 +124,6 @@ def _read_pair(group: ImageGroup) -> tuple[Tensor, Tensor]:
     return photo, transmission
 
 
-def _read_map(path: Path) -> Tensor:
-    linear = np.clip(_downscaled(Photo.open(path), 2 * _MAP_HEIGHT_PX), 0, _MAX_FLOAT16)
-    return torch.from_numpy(linear.astype(np.float16)).permute(2, 0, 1).contiguous()
-
-
-def _read_photo(path: Path, max_side_px: int) -> Tensor:
-    encoded = to_encoded(np.clip(_downscaled(Photo.open(path), max_side_px), 0, 1))
-    return torch.from_numpy(np.rint(encoded * 255).astype(np.uint8))
-
-
 def _downscaled(photo: Photo, max_side_px: int) -> NDArray[np.float32]:
     scale = min(1.0, max_side_px / max(photo.size))
     width, height = (max(1, round(side * scale)) for side in photo.size)
@@ -139,10 +133,19 @@ def _downscaled(photo: Photo, max_side_px: int) -> NDArray[np.float32]:
 def _list_images(
     folders: Iterable[Path], suffixes: set[str], exclude: Sequence[str] = (), only: Sequence[str] = ("*",)
 ) -> list[Path]:
+    paths: list[Path] = []
+    for folder in folders:
+        try:
+            paths += folder.iterdir()
+        except OSError as error:
+            raise RecipeError(
+                f"{folder} cannot be read ({error.strerror})",
+                "expected a folder with images",
+                _FOLDER_CURE,
+            ) from error
     found = sorted(
         path
-        for folder in folders
-        for path in _list_folder(folder)
+        for path in paths
         if path.suffix.lower() in suffixes and _matches(path, only) and not _matches(path, exclude)
     )
     if folders and not found:
@@ -156,14 +159,3 @@ def _list_images(
 
 def _matches(path: Path, patterns: Sequence[str]) -> bool:
     return any(fnmatch(path.name, pattern) for pattern in patterns)
-
-
-def _list_folder(folder: Path) -> list[Path]:
-    try:
-        return list(folder.iterdir())
-    except OSError as error:
-        raise RecipeError(
-            f"{folder} cannot be read ({error.strerror})",
-            "expected a folder with images",
-            _FOLDER_CURE,
-        ) from error

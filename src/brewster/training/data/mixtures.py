@@ -35,12 +35,13 @@ _REFERENCE_SIDE_PX: Final = 256
 
 @dataclass(frozen=True)
 class TrainingBatch:
-    """Encoded images, each (N, 3, S, S) in 0..1, and the weights of the reflections in the loss, (N,)."""
+    """Encoded images, each (N, 3, S, S) in 0..1, the weights of the reflections in the loss, (N,), and hints (N, 2, S, S)."""
 
     photo_encoded: Tensor
     transmission_encoded: Tensor
     reflection_encoded: Tensor
     reflection_weight: Tensor
+    hints: Tensor | None = None
 
     @classmethod
     def from_layers(cls, layers: Tensor) -> TrainingBatch:
@@ -50,12 +51,17 @@ class TrainingBatch:
 
     def to(self, device: torch.device) -> TrainingBatch:
         """Returns the batch on another device."""
-        return TrainingBatch(*(getattr(self, name).to(device) for name in self.__dataclass_fields__))
+        return TrainingBatch(**{name: tensor.to(device) for name, tensor in self.tensors().items()})
 
     def split(self, max_size: int) -> list[TrainingBatch]:
         """Splits the batch into batches of at most `max_size` samples."""
-        parts = zip(*(getattr(self, name).split(max_size) for name in self.__dataclass_fields__), strict=True)
-        return [TrainingBatch(*tensors) for tensors in parts]
+        names = self.tensors()
+        splits = zip(*(torch.split(tensor, max_size) for tensor in names.values()), strict=True)
+        return [TrainingBatch(**dict(zip(names, parts, strict=True))) for parts in splits]
+
+    def tensors(self) -> dict[str, Tensor]:
+        """Returns the tensors by name, with hints only if the batch has some."""
+        return {name: tensor for name, tensor in vars(self).items() if tensor is not None}
 
 
 class Stream(Protocol):
@@ -210,10 +216,8 @@ class InterleavedStream:
         counts = (self._first, first_count), (self._second, count - first_count)
         parts = [stream(step, part_count, size) for stream, part_count in counts if part_count]
         device = max((part.photo_encoded.device for part in parts), key=lambda device: device.type != "cpu")
-        names = TrainingBatch.__dataclass_fields__
-        return TrainingBatch(
-            *(torch.cat([getattr(part.to(device), name) for part in parts]) for name in names)
-        )
+        tensors = [part.to(device).tensors() for part in parts]
+        return TrainingBatch(**{name: torch.cat([part[name] for part in tensors]) for name in tensors[0]})
 
 
 def _expose_and_develop(rng: SampleRng, recipe: MixRecipe, *layers: Image) -> tuple[Image, Image, Image]:

@@ -1,9 +1,13 @@
-"""Streams of a finite number of rendered samples: crops of datasets on disk, or a cache of samples rendered online.
+"""Streams of rendered samples: crops of datasets on disk, samples that are rendered during training, or a cache of these.
 
     stream = RenderedDatasets([Path("out/window")], seed=7, count=300)
-    stream = CachedRendered(OnlineRendered(...), 300, seed=7)
+    stream = OnlineRendered(read_scene_recipe("window"), catalog, Assets(folders), seed=7, device="cuda")
+    stream = CachedRendered(stream, 300, seed=7)
 
-The sample in a slot, its crop and whether it is mirrored depend on (seed, step, slot) only.
+The sample in a slot, its crop and whether it is mirrored depend on (seed, step, slot) only. With the blend space "srgb", the
+photo is an 8-bit mixture of the layers: the baseline of the paper's ablation (Table 4, Figure 7). RDNet blends two tone-mapped
+images, I = alpha T + beta R - T o R, where o is the element-wise product. In this formula, T is the background and R the mirror
+image of a rendered sample, so that the mixture shows the same two scenes as the rendered photo.
 """
 
 from __future__ import annotations
@@ -11,39 +15,44 @@ from __future__ import annotations
 import tarfile
 from collections.abc import Callable, Hashable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
+from random import Random
 from threading import Lock
 from typing import Final
 
 import torch
 from torch import Tensor
 
-from brewster.environments.assets import add_file_name_to_errors
+from brewster.environments.assets import Assets, add_file_name_to_errors
 from brewster.errors import RecipeError
 from brewster.photo import Photo
-from brewster.render.camera_response import encode_jpeg, to_uint8
+from brewster.render.analytic import render
+from brewster.render.camera_response import DevelopedSample, develop, encode_jpeg, to_uint8, with_jpeg
 from brewster.rendered.store import SCENE_FILE, StoredSample, key, read_dataset, read_scene_of
+from brewster.scene.recipe import SceneRecipe
+from brewster.scene.sampler import Catalog, draw
+from brewster.scene.scene import Scene
 from brewster.scene.values import Range
 from brewster.srgb import to_encoded
-from brewster.training.data.alpha_blend import blended_layers
 from brewster.training.data.data_recipe import BlendSpace, Target
 from brewster.training.data.mixtures import TrainingBatch, random_crop
-from brewster.training.data.online import OnlineRendered
 from brewster.training.data.sample_rng import SampleRng
 
 CACHE_BYTES: Final = 1 << 30
 """Memory for cached samples, 9 bytes per pixel: 600 samples of 512x384, 1,800 of 256x256 or 7,200 of 128x128. When it is full,
 the oldest samples are dropped. When such a sample is drawn again, it is read or rendered again, with the same result."""
+ALPHA: Final = (0.8, 1.0)
+BETA: Final = (0.4, 1.0)
 
 
 class RenderedDatasets:
     """A `Stream` of random crops of the first `count` samples of rendered datasets, mirrored at random. It is thread-safe.
 
-    With `blend_space` "srgb", the photo is a blend of the sample's background and mirror image. The blend is compressed
-    as JPEG with the same quality as the photo of the sample.
-
-    Raises:
-        RecipeError: a dataset cannot be read, or all datasets together have fewer than `count` samples.
+    With `blend_space` "srgb", the photo is a blend of the sample's background and mirror image. The blend is compressed as JPEG
+    with the same quality as the photo of the sample. Raises RecipeError if a dataset cannot be read, or all datasets together
+    have fewer than `count` samples.
     """
 
     def __init__(
@@ -56,7 +65,14 @@ class RenderedDatasets:
         target: Target = "background",
         blend_space: BlendSpace = "linear",
     ) -> None:
-        self._entries = _first_entries(folders, count)
+        entries = [entry for folder in folders for entry in _entries(folder)]
+        if len(entries) < (count or 1):
+            raise RecipeError(
+                f"{', '.join(map(str, folders))}: {len(entries)} rendered samples",
+                f"expected at least {count or 1}, the count of the recipe",
+                "render more with a larger --count, or lower data.rendered.count",
+            )
+        self._entries = entries[:count]
         self._seed, self._crop, self._target, self._blend_space = seed, crop, target, blend_space
         self._cache = _TensorCache(CACHE_BYTES)
 
@@ -64,27 +80,67 @@ class RenderedDatasets:
         return len(self._entries)
 
     def __call__(self, step: int, count: int, size: int) -> TrainingBatch:
-        """Returns the batch of this step: `count` samples with sides of `size` px.
-
-        Raises:
-            RecipeError, PhotoError: a file of a sample is missing or damaged.
-        """
+        """Returns the batch of this step: `count` samples with sides of `size` px. Raises RecipeError or PhotoError if a file
+        of a sample is missing or damaged."""
         rngs = (SampleRng(self._seed, step, slot) for slot in range(count))
         crops = [random_crop(each, self.sample(each.randint(len(self))), self._crop, size) for each in rngs]
         return TrainingBatch.from_layers(to_encoded(torch.stack(crops)))
 
     def sample(self, number: int) -> Tensor:
-        """Returns photo, target and reflection of a whole sample as channels: (H, W, 9) sRGB uint8.
+        """Returns photo, target and reflection of a whole sample as channels: (H, W, 9) sRGB uint8. Raises RecipeError or
+        PhotoError if a file of the sample is missing or damaged."""
+        entry = self._entries[number]
+        if self._blend_space == "srgb":
+            return self._cache.get_or_create(number, partial(_blended_sample, entry))
+        names = ("photo", self._target, "reflection")
+        return self._cache.get_or_create(
+            number, lambda: torch.cat([_read_image(entry, name) for name in names], dim=2)
+        )
+
+
+class OnlineRendered:
+    """A `Stream` of samples of the analytic renderer. It is thread-safe.
+
+    Only one thread renders at a time, because `Assets` is not thread-safe. Several threads can compute camera response and JPEG
+    at the same time.
+    """
+
+    def __init__(
+        self,
+        recipe: SceneRecipe,
+        catalog: Catalog,
+        assets: Assets,
+        *,
+        seed: int,
+        device: torch.device | str = "cpu",
+        target: Target = "background",
+        blend_space: BlendSpace = "linear",
+    ) -> None:
+        self._recipe, self._catalog, self._assets = recipe, catalog, assets
+        self._seed, self._device, self._target, self._blend_space = seed, device, target, blend_space
+        self._render_lock = Lock()
+
+    def __call__(self, step: int, count: int, size: int) -> TrainingBatch:
+        """Returns the batch of this step: `count` new samples with sides of `size` px."""
+        return TrainingBatch.from_layers(
+            torch.stack([self.layers(step * count + slot, size) for slot in range(count)])
+        )
+
+    def layers(self, index: int, size: int) -> Tensor:
+        """Renders the sample of this index as a square. Returns photo, `target` and reflection as channels, (9, size, size),
+        encoded, in 0..1. The photo has JPEG artefacts.
 
         Raises:
-            RecipeError, PhotoError: a file of the sample is missing or damaged.
+            RecipeError: no valid scene can be drawn from the recipe, or a file is missing.
+            PhotoError: a file cannot be decoded.
         """
-        return self._cache.get_or_create(number, lambda: self._read(self._entries[number]))
-
-    def _read(self, entry: StoredSample) -> Tensor:
-        if self._blend_space == "srgb":
-            return _blended_sample(entry)
-        return torch.cat([_read_image(entry, name) for name in ("photo", self._target, "reflection")], dim=2)
+        camera = self._recipe.camera.model_copy(update={"width": size, "height": size})
+        scene = draw(self._recipe.model_copy(update={"camera": camera}), self._catalog, self._seed, index)
+        with self._render_lock:
+            sample = render(scene, self._assets, self._device)
+        developed = develop(sample)
+        images = with_jpeg(developed if self._blend_space == "linear" else blended(developed)).images()
+        return torch.cat([images[name] for name in ("photo", self._target, "reflection")])
 
 
 class CachedRendered:
@@ -99,22 +155,18 @@ class CachedRendered:
         self._source, self._count, self._seed, self._cache = source, count, seed, _TensorCache(max_bytes)
 
     def __call__(self, step: int, count: int, size: int) -> TrainingBatch:
-        """Returns the batch of this step: `count` samples with sides of `size` px.
-
-        Raises:
-            RecipeError: no valid scene can be drawn from the recipe, or a file is missing.
-            PhotoError: a file cannot be decoded.
-        """
-        rngs = (SampleRng(self._seed, step, slot) for slot in range(count))
-        return TrainingBatch.from_layers(torch.stack([self._sample(each, size) for each in rngs]) / 255)
-
-    def _sample(self, rng: SampleRng, size: int) -> Tensor:
-        index = rng.randint(self._count)
-        layers = self._cache.get_or_create((index, size), lambda: self._render(index, size))
-        return layers.flip(2) if rng.bernoulli(0.5) else layers
+        """Returns the batch of this step: `count` samples with sides of `size` px. Raises RecipeError if no valid scene can be
+        drawn from the recipe, or a file is missing, and PhotoError if a file cannot be decoded."""
+        samples = []
+        for slot in range(count):
+            rng = SampleRng(self._seed, step, slot)
+            index = rng.randint(self._count)
+            # A sample has the 8-bit values of the cache also when it is first used.
+            layers = self._cache.get_or_create((index, size), partial(self._render, index, size))
+            samples.append(layers.flip(2) if rng.bernoulli(0.5) else layers)
+        return TrainingBatch.from_layers(torch.stack(samples) / 255)
 
     def _render(self, index: int, size: int) -> Tensor:
-        """Renders a sample as (9, size, size) uint8. The sample has these 8-bit values also when it is first used."""
         return (self._source.layers(index, size).clamp(0, 1) * 255).round().to(torch.uint8)
 
 
@@ -127,29 +179,16 @@ class _TensorCache:
 
     def get_or_create(self, name: Hashable, create: Callable[[], Tensor]) -> Tensor:
         found = self._tensors.get(name)
-        if found is None:
-            found = create()
-            self._insert(name, found)
-        return found
-
-    def _insert(self, name: Hashable, tensor: Tensor) -> None:
+        if found is not None:
+            return found
+        created = create()
         with self._lock:
             if name not in self._tensors:  # another thread may have inserted it
-                self._tensors[name] = tensor
-                self._bytes += tensor.nbytes
+                self._tensors[name] = created
+                self._bytes += created.nbytes
             while self._bytes > self._max_bytes:
                 self._bytes -= self._tensors.pop(next(iter(self._tensors))).nbytes
-
-
-def _first_entries(folders: Sequence[Path], count: int | None) -> list[StoredSample]:
-    entries = [entry for folder in folders for entry in _entries(folder)]
-    if len(entries) < (count or 1):
-        raise RecipeError(
-            f"{', '.join(map(str, folders))}: {len(entries)} rendered samples",
-            f"expected at least {count or 1}, the count of the recipe",
-            "render more with a larger --count, or lower data.rendered.count",
-        )
-    return entries[:count]
+        return created
 
 
 def _entries(folder: Path) -> list[StoredSample]:
@@ -194,3 +233,37 @@ def _file_errors(entry: StoredSample, name: str) -> Iterator[None]:
             "expected a sample with five images and a scene",
             "delete the sample and render the dataset again",
         ) from error
+
+
+def blend(transmission_encoded: Tensor, reflection_encoded: Tensor, alpha: float, beta: float) -> Tensor:
+    """Returns I = alpha T + beta R - T o R (RDNet) of encoded images of one shape, rounded to 8 bits, in 0..1."""
+    t, r = (_eight_bits(layer) for layer in (transmission_encoded, reflection_encoded))
+    return _eight_bits(alpha * t + beta * r - t * r)
+
+
+def blended(developed: DevelopedSample) -> DevelopedSample:
+    """Returns the sample as an 8-bit mixture: T is the background, R is beta times the mirror image, and I is their blend."""
+    photo, transmission, reflection = blended_layers(
+        developed.background_encoded, developed.mirror_encoded, developed.scene
+    )
+    return replace(
+        developed, photo_encoded=photo, transmission_encoded=transmission, reflection_encoded=reflection
+    )
+
+
+def blended_layers(
+    background_encoded: Tensor, mirror_encoded: Tensor, scene: Scene
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Returns I, T and R of an 8-bit mixture, each (3, H, W) in 0..1, from encoded background and mirror image.
+
+    T is the background. R is the mirror image times beta. alpha is uniform in 0.8..1, beta is uniform in 0.4..1. Both depend on
+    the seed and the index of the scene only.
+    """
+    rng = Random(f"blend/{scene.seed}/{scene.index}")  # noqa: S311  (not for secrets)
+    alpha, beta = rng.uniform(*ALPHA), rng.uniform(*BETA)
+    background, mirror = _eight_bits(background_encoded), _eight_bits(mirror_encoded)
+    return blend(background, mirror, alpha, beta), background, _eight_bits(beta * mirror)
+
+
+def _eight_bits(encoded: Tensor) -> Tensor:
+    return (encoded.clamp(0, 1) * 255).round() / 255

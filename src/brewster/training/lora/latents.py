@@ -12,10 +12,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-import numpy as np
 import torch
 from torch import Tensor
 from torch.nn import functional
@@ -83,11 +81,9 @@ class SampleSequence:
         return self._pairs[number - self._first_pair]
 
     def check_sizes(self, recipe: LoraRecipe, size_divisor: int) -> list[PanelFit]:
-        """Returns the panel sizes for the first rendered sample and for every pair. Training calls this first, so that an unusable
-        sample stops it before any step.
-
-        Raises:
-            RecipeError, PhotoError: a file is damaged or missing, or a sample is too small, see `fit_sample`.
+        """Returns the panel sizes for the first rendered sample and for every pair. Training calls this first, so that an
+        unusable sample stops it before any step. Raises RecipeError or PhotoError if a file is damaged or missing, or a sample
+        is too small, see `fit_sample`.
         """
         first = [self._rendered.sample(0)] if self._rendered else []
         return [
@@ -114,11 +110,8 @@ class EncodedSampleLoader:
         self._encoded = lru_cache(CACHE_SIZE)(self._encode)
 
     def __call__(self, rng: SampleRng) -> EncodedSample:
-        """Draws the index of a sample, its crop and whether it is mirrored. Returns the encoded sample.
-
-        Raises:
-            RecipeError, PhotoError: a file of the sample is missing or damaged, or the sample is too small, see `fit_sample`.
-        """
+        """Draws the index of a sample, its crop and whether it is mirrored. Returns the encoded sample. Raises RecipeError or
+        PhotoError if a file of the sample is missing or damaged, or the sample is too small, see `fit_sample`."""
         number = self._samples.draw_index(rng)
         mirrored = self._recipe.flip and rng.bernoulli(0.5)
         crops = self._recipe.crops
@@ -172,10 +165,8 @@ def make_panels(layers: UInt8[Tensor, "h w 9"], fit: PanelFit) -> dict[str, Floa
 def fit_sample(layers: Tensor, recipe: LoraRecipe, size_divisor: int) -> PanelFit:
     """Returns the size of the panels of a sample, and the position of the sample in them, as for photos at inference.
 
-    A sample is never enlarged: a small sample gets small panels.
-
-    Raises:
-        PhotoError: a side of the sample is smaller than `size_divisor`, or its aspect ratio is too extreme.
+    A sample is never enlarged: a small sample gets small panels. Raises PhotoError if a side of the sample is smaller than
+    `size_divisor`, or its aspect ratio is too extreme.
     """
     height, width, _ = layers.shape
     return recipe.task.fit((width, height), size_divisor)
@@ -197,28 +188,20 @@ def open_samples(recipe: LoraRecipe) -> SampleSequence:
             target=rendered.target,
             blend_space=rendered.blend_space,
         )
-    folders = resolve_folders(data.pairs) if data.pairs_share else []
-    pairs = [sample for folder in folders for sample in _read_pairs(folder, recipe)]
-    return SampleSequence(datasets, pairs, data.pairs_share)
-
-
-def _read_pairs(folder: Path, recipe: LoraRecipe) -> list[TrainingSample]:
-    pairs = read_pairs([folder])
-    groups = sorted(read_folders(folder).groups, key=lambda group: group.photo)
-    if "R" in recipe.panels and recipe.reflections == "given":
-        _check_reflections(folder, groups)
-    weight = recipe.derived_reflection_weight
-    return [_read_sample(group, *pair, weight) for group, pair in zip(groups, pairs, strict=True)]
-
-
-def _check_reflections(folder: Path, groups: Sequence[ImageGroup]) -> None:
-    missing = [group.name for group in groups if group.reflection is None]
-    if missing:
-        raise RecipeError(
-            f"{folder} has no reflection for {missing[0]} (photos without one: {len(missing)})",
-            "expected a reflection for each photo, because R is a panel",
-            'add a folder reflection_layer, set reflections = "difference", or leave R out of panels',
-        )
+    samples = []
+    for folder in resolve_folders(data.pairs) if data.pairs_share else []:
+        pairs = read_pairs([folder])
+        groups = sorted(read_folders(folder).groups, key=lambda group: group.photo)
+        missing = [group.name for group in groups if group.reflection is None]
+        if missing and "R" in recipe.panels and recipe.reflections == "given":
+            raise RecipeError(
+                f"{folder} has no reflection for {missing[0]} (photos without one: {len(missing)})",
+                "expected a reflection for each photo, because R is a panel",
+                'add a folder reflection_layer, set reflections = "difference", or leave R out of panels',
+            )
+        weight = recipe.derived_reflection_weight
+        samples += [_read_sample(group, *pair, weight) for group, pair in zip(groups, pairs, strict=True)]
+    return SampleSequence(datasets, samples, data.pairs_share)
 
 
 def _read_sample(
@@ -226,7 +209,7 @@ def _read_sample(
 ) -> TrainingSample:
     if group.reflection is None:
         return TrainingSample(layers_from_pair(photo, transmission), derived_weight)
-    reflection = _read_image(group.reflection)
+    reflection = torch.from_numpy(Photo.open(group.reflection).srgb_8bit().copy())
     if reflection.shape != photo.shape:
         raise RecipeError(
             f"{group.photo} and {group.reflection} differ in size",
@@ -244,9 +227,3 @@ def layers_from_pair(photo: Tensor, transmission: Tensor) -> Tensor:
     difference = to_linear(photo / 255) - to_linear(transmission / 255)
     reflection = (to_encoded(difference.clamp(0, 1)) * 255).round().to(torch.uint8)
     return torch.cat([photo, transmission, reflection], dim=2)
-
-
-def _read_image(path: Path) -> Tensor:
-    photo = Photo.open(path)
-    encoded = to_encoded(np.clip(photo.resized(*photo.size), 0, 1))
-    return torch.from_numpy(np.rint(encoded * 255).astype(np.uint8))

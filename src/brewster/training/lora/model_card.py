@@ -21,12 +21,11 @@ from brewster.files import write_atomically
 from brewster.models.diffusion.adapter.hub import CARD_FILE
 from brewster.models.diffusion.backbones.backbone import APACHE_2, Backbone
 from brewster.models.diffusion.backbones.registry import BACKBONES
-from brewster.models.diffusion.panels import fit_panel
 from brewster.models.diffusion.prompt import PROMPT, PROMPT_FILE, load_prompt
 from brewster.models.zoo import TINY_PREFIX
 from brewster.rendered.generation.job import RECORD_FILE
 from brewster.rendered.store import read_dataset
-from brewster.training.recipe import LoraRecipe
+from brewster.training.recipe import SQUARE_PHOTO_PX, LoraRecipe
 from brewster.training.streams import resolve_folders
 
 _TEMPLATE: Final = "model_card.md.jinja"
@@ -36,8 +35,6 @@ _PANELS: Final = {
     "T": "the scene behind the glass (T, the transmission)",
     "R": "the mirrored scene (R, the reflection)",
 }
-_SQUARE_PHOTO_PX: Final = (4096, 4096)
-"""A large square photo: its panels fill the pixel budget best."""
 _BENCHMARK_HEADING: Final = "## Benchmark scores"
 _SCORE_TITLES: Final = {
     "psnr_gain_db_": "PSNR gain over the input, {}, dB",
@@ -68,14 +65,12 @@ def card_text(
     """Returns the model card, Markdown, of a LoRA trained with this recipe; `scores` is the last line of the run's log."""
     import jinja2  # noqa: PLC0415  (an extra)
 
-    is_tiny, base = recipe.backbone.startswith(TINY_PREFIX), _base_id(recipe, backbone_class)
-    fit = fit_panel(
-        _SQUARE_PHOTO_PX,
-        recipe.layout,
-        max_composite_pixels=recipe.max_composite_pixels,
-        size_divisor=backbone_class.size_divisor,
-    )
-    width, height = fit.panel
+    is_tiny, base = recipe.backbone.startswith(TINY_PREFIX), backbone_class.hub_id
+    # A local folder counts as a copy of its backbone on the hub.
+    is_hub_id = re.fullmatch(r"[\w.-]+/[\w.-]+", recipe.backbone) and not Path(recipe.backbone).exists()
+    if is_hub_id and recipe.backbone not in BACKBONES:
+        base = recipe.backbone
+    width, height = panel_size = recipe.task.fit(SQUARE_PHOTO_PX, backbone_class.size_divisor).panel
     environment = jinja2.Environment(  # noqa: S701  (Markdown, not HTML)
         loader=jinja2.FileSystemLoader(Path(__file__).parent),
         undefined=jinja2.StrictUndefined,
@@ -105,13 +100,22 @@ def card_text(
         base=base,
         prompt=prompt,
         prompt_file=PROMPT_FILE,
-        panel=fit.panel,
+        panel=panel_size,
         corners={
             panel: (index * width, 0) if recipe.layout.axis == -1 else (0, index * height)
             for index, panel in enumerate(recipe.panels)
         },
         scores={
-            _score_title(name): value for name, value in scores.items() if name not in {"step", "seconds"}
+            next(
+                (
+                    title.format(name.removeprefix(prefix))
+                    for prefix, title in _SCORE_TITLES.items()
+                    if name.startswith(prefix)
+                ),
+                name.replace("_", " "),
+            ): value
+            for name, value in scores.items()
+            if name not in {"step", "seconds"}
         },
         benchmark_heading=_BENCHMARK_HEADING,
         licence=licence.title,
@@ -119,11 +123,8 @@ def card_text(
 
 
 def with_benchmark_tables(card: str, tables: str) -> str:
-    """Returns the card with these Markdown tables under the heading for benchmarks, in place of earlier tables.
-
-    Raises:
-        ModelError: the card has no heading for benchmarks.
-    """
+    """Returns the card with these Markdown tables under the heading for benchmarks, in place of earlier tables. Raises
+    ModelError if the card has no heading for benchmarks."""
     before, heading, rest = card.partition(f"\n{_BENCHMARK_HEADING}\n")
     after = re.search(r"^## ", rest, re.MULTILINE)
     if not (heading and after):
@@ -133,20 +134,6 @@ def with_benchmark_tables(card: str, tables: str) -> str:
             "train again to write a new card",
         )
     return f"{before}{heading}\n{tables.strip()}\n\n{rest[after.start() :]}"
-
-
-def _score_title(name: str) -> str:
-    for prefix, title in _SCORE_TITLES.items():
-        if name.startswith(prefix):
-            return title.format(name.removeprefix(prefix))
-    return name.replace("_", " ")
-
-
-def _base_id(recipe: LoraRecipe, backbone_class: type[Backbone]) -> str:
-    """Returns the hub id of the backbone. A local folder counts as a copy of its backbone on the hub."""
-    name = recipe.backbone
-    is_hub_id = re.fullmatch(r"[\w.-]+/[\w.-]+", name) and not Path(name).exists()
-    return name if is_hub_id and name not in BACKBONES else backbone_class.hub_id
 
 
 def _dataset_description(folder: Path) -> str:

@@ -16,10 +16,9 @@ from typing import Final, final
 import torch
 
 from brewster.models.diffusion.adapter.lora import select_target_modules
-from brewster.models.diffusion.backbones.backbone import Backbone
 from brewster.models.diffusion.backbones.registry import build_on_meta
 from brewster.models.diffusion.memory import backbone_cost
-from brewster.models.diffusion.panels import count_tokens, fit_panel
+from brewster.models.diffusion.panels import count_tokens
 from brewster.models.diffusion_resources import (
     EFFICIENCY,
     GIB,
@@ -32,10 +31,8 @@ from brewster.models.diffusion_resources import (
     weights_gib,
 )
 from brewster.models.zoo import TINY_PREFIX
-from brewster.training.recipe import ENCODED_SUFFIX, LoraRecipe
+from brewster.training.recipe import ENCODED_SUFFIX, SQUARE_PHOTO_PX, LoraRecipe
 
-_SQUARE_PHOTO_PX: Final = (4096, 4096)
-"""A large square photo: its panels fill the pixel budget best."""
 _BYTES_PER_LORA_WEIGHT: Final = {"adamw": 16, "adamw8bit": 10}
 """Weight, gradient and two moments of AdamW; the moments are float32 or have 8 bits."""
 _OVERHEAD_GIB: Final = 1.5
@@ -106,19 +103,14 @@ class ResourceEstimate:
         )
 
     def check_fits(self) -> None:
-        """Checks that the recipe fits into the memory of the GPU.
-
-        Raises:
-            DeviceError: the recipe does not fit. The message says which values to change.
-        """
-        check_gpu_memory(self.recipe.backbone, self.total_gib, self.card, self._cure())
-
-    def _cure(self) -> str:
+        """Checks that the recipe fits into the memory of the GPU. Raises DeviceError if the recipe does not fit. The message
+        says which values to change."""
+        cure = "lower max_composite_pixels or rank, or choose a smaller backbone (klein) or a GPU with more memory"
         others = self.total_gib - self.memory_gib["backbone"]
         if fitting := fitting_quantizations(self.cost.parameters, self.card.memory_gib - others):
             total = others + weights_gib(self.cost.parameters, fitting[0])
-            return f'set quantization = "{fitting[0]}", which needs {total:.1f} GiB'
-        return "lower max_composite_pixels or rank, or choose a smaller backbone (klein) or a GPU with more memory"
+            cure = f'set quantization = "{fitting[0]}", which needs {total:.1f} GiB'
+        check_gpu_memory(self.recipe.backbone, self.total_gib, self.card, cure)
 
 
 def estimate_resources(recipe: LoraRecipe, card: GraphicsCard) -> ResourceEstimate:
@@ -131,17 +123,11 @@ def estimate_resources(recipe: LoraRecipe, card: GraphicsCard) -> ResourceEstima
         MissingExtra: diffusers is not installed.
     """
     backbone = build_on_meta(recipe.backbone, dtype=torch.bfloat16)
-    fit = fit_panel(
-        _SQUARE_PHOTO_PX,
-        recipe.layout,
-        max_composite_pixels=recipe.max_composite_pixels,
-        size_divisor=backbone.size_divisor,
-    )
-    generated_tokens, condition_tokens = count_tokens(fit.panel, recipe.layout, backbone.size_divisor)
-    cost, lora_parameters = (
-        backbone_cost(recipe.backbone, type(backbone)),
-        _count_lora_parameters(backbone, recipe),
-    )
+    panel = recipe.task.fit(SQUARE_PHOTO_PX, backbone.size_divisor).panel
+    generated_tokens, condition_tokens = count_tokens(panel, recipe.layout, backbone.size_divisor)
+    cost = backbone_cost(recipe.backbone, type(backbone))
+    layers = map(backbone.transformer.get_submodule, select_target_modules(backbone, recipe.target_modules))
+    lora_parameters = sum(recipe.rank * (layer.in_features + layer.out_features) for layer in layers)
     tokens = generated_tokens + condition_tokens
     # The inputs of all blocks are kept, and the activations of one block while it computes.
     activations = cost.blocks * cost.hidden_state_bytes(tokens) + cost.block_bytes(tokens)
@@ -154,18 +140,5 @@ def estimate_resources(recipe: LoraRecipe, card: GraphicsCard) -> ResourceEstima
     }
     tflop = _FORWARD_PASSES_PER_STEP * recipe.batch_size * cost.forward_tflop(tokens)
     return ResourceEstimate(
-        recipe,
-        card,
-        fit.panel,
-        generated_tokens,
-        condition_tokens,
-        cost,
-        lora_parameters,
-        memory,
-        tflop,
+        recipe, card, panel, generated_tokens, condition_tokens, cost, lora_parameters, memory, tflop
     )
-
-
-def _count_lora_parameters(backbone: Backbone, recipe: LoraRecipe) -> int:
-    layers = map(backbone.transformer.get_submodule, select_target_modules(backbone, recipe.target_modules))
-    return sum(recipe.rank * (layer.in_features + layer.out_features) for layer in layers)

@@ -15,7 +15,7 @@ import importlib
 import importlib.util
 import itertools
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Final
@@ -37,8 +37,8 @@ from brewster.models.diffusion.backbones.backbone import Backbone
 from brewster.models.diffusion.backbones.loading import encode_prompt, load_backbone
 from brewster.models.diffusion.backbones.registry import backbone_class_of
 from brewster.models.diffusion.memory import check_machine
-from brewster.models.diffusion.out_of_memory import explain_out_of_memory
-from brewster.models.diffusion.panels import PanelFit, split
+from brewster.models.diffusion.offloading import explain_out_of_memory
+from brewster.models.diffusion.panels import split
 from brewster.models.diffusion.pipeline import DecompositionPipeline
 from brewster.models.diffusion.prompt import PROMPTS, PromptEmbedding, load_prompt
 from brewster.models.diffusion_resources import Placement
@@ -48,7 +48,6 @@ from brewster.training.loop import read_log
 from brewster.training.lora.latents import (
     EncodedSample,
     EncodedSampleLoader,
-    SampleSequence,
     fit_sample,
     layers_from_pair,
     make_panels,
@@ -88,13 +87,30 @@ class LoraTrainer:
     """
 
     def __init__(self, recipe: LoraRecipe, device: str = "auto") -> None:
-        _check_batch(recipe)
+        if recipe.batch_size % distributed.world_size():
+            raise RecipeError(
+                f"batch_size = {recipe.batch_size} cannot be divided equally among {distributed.world_size()} processes",
+                "expected a batch size that is a multiple of the number of processes",
+                "raise batch_size to a multiple, or start fewer processes",
+            )
         self.recipe, self._device = recipe, str(distributed.best_device(device))
         self._backbone_class = backbone_class_of(recipe.backbone)
-        self._samples = open_samples(recipe)
-        self._samples.check_sizes(recipe, self._backbone_class.size_divisor)
-        self._validation_samples = _read_validation_samples(recipe, self._samples)
-        _check_optimizer(recipe, self._device)
+        samples = self._samples = open_samples(recipe)
+        samples.check_sizes(recipe, self._backbone_class.size_divisor)
+        # Up to four validation pairs of each folder, (H, W, 9), or training samples if the recipe names no such folder.
+        self._validation_samples = {
+            name: [layers_from_pair(*pair) for pair in pairs[:_MAX_VALIDATION_SAMPLES]]
+            for name, pairs in validation_pairs(recipe.data).items()
+        } or {
+            "training": [samples[index].layers for index in range(min(_MAX_VALIDATION_SAMPLES, len(samples)))]
+        }
+        has_8_bits = self._device.startswith("cuda") and importlib.util.find_spec("bitsandbytes")
+        if recipe.optimizer == "adamw8bit" and not has_8_bits:
+            raise DeviceError(
+                f'optimizer = "adamw8bit" was requested on {self._device}',
+                "expected an NVIDIA GPU and the package bitsandbytes, which contains this optimizer",
+                'set optimizer = "adamw", or run: pip install bitsandbytes',
+            )
         try:
             check_machine(
                 recipe.backbone,
@@ -115,11 +131,8 @@ class LoraTrainer:
 
     @cached_property
     def backbone(self) -> Backbone:
-        """The frozen backbone with the LoRA. The first use loads it.
-
-        Raises:
-            DownloadError, ModelError, DeviceError, MissingExtra: the backbone cannot be loaded.
-        """
+        """The frozen backbone with the LoRA. The first use loads it. Raises DownloadError, ModelError, DeviceError or
+        MissingExtra if the backbone cannot be loaded."""
         recipe = self.recipe
         backbone = load_backbone(recipe.backbone, device=self._device, quantization=recipe.quantization)
         add_lora(
@@ -142,7 +155,13 @@ class LoraTrainer:
 
     @cached_property
     def _optimizer(self) -> torch.optim.Optimizer:
-        return _create_optimizer(self._parameters, self.recipe)
+        is_8_bit = self.recipe.optimizer == "adamw8bit"
+        create = importlib.import_module("bitsandbytes.optim").AdamW8bit if is_8_bit else torch.optim.AdamW
+        optimizer = create(
+            self._parameters, lr=self.recipe.learning_rate, weight_decay=self.recipe.weight_decay
+        )
+        assert isinstance(optimizer, torch.optim.Optimizer)
+        return optimizer
 
     @property
     def prompt(self) -> PromptEmbedding:
@@ -153,14 +172,16 @@ class LoraTrainer:
     def initialize(self) -> None:
         """Loads or encodes the prompt of the recipe, then loads the backbone.
 
-        Only rank 0 loads the text encoders. It releases them before the backbone is loaded.
-
-        Raises:
-            DownloadError, ModelError, DeviceError, MissingExtra: a text encoder, the prompt or the backbone cannot be loaded.
+        Only rank 0 loads the text encoders. It releases them before the backbone is loaded. Raises DownloadError, ModelError,
+        DeviceError or MissingExtra if a text encoder, the prompt or the backbone cannot be loaded.
         """
-        self._prompt = distributed.from_main_process(
-            lambda: _load_prompt(self.recipe, self._backbone_class, self._device)
-        )
+
+        def load_prompt_of_recipe() -> PromptEmbedding:
+            if self.recipe.prompt.endswith(ENCODED_SUFFIX):
+                return load_prompt(Path(self.recipe.prompt), self._backbone_class.name)
+            return encode_prompt(self.recipe.backbone, PROMPTS[self.recipe.prompt], device=self._device)
+
+        self._prompt = distributed.from_main_process(load_prompt_of_recipe)
         _ = self.backbone
 
     def state_dict(self) -> dict[str, Any]:
@@ -185,8 +206,13 @@ class LoraTrainer:
             RecipeError, PhotoError: a sample is missing, damaged or too small.
         """
         self._optimizer.zero_grad()
+        parts: dict[str, Tensor] = {}
         with explain_out_of_memory(_MEMORY_CURE):
-            parts = self._compute_gradients(step)
+            for slot in range(distributed.rank(), self.recipe.batch_size, distributed.world_size()):
+                losses = self._losses(SampleRng(self.recipe.seed, step, slot))
+                scaled = {name: loss / self.recipe.batch_size for name, loss in losses.items()}
+                torch.stack(list(scaled.values())).sum().backward()  # type: ignore[no-untyped-call]
+                parts = {name: parts.get(name, 0) + loss.detach() for name, loss in scaled.items()}
         distributed.all_reduce_sum(
             [parameter.grad for parameter in self._parameters if parameter.grad is not None]
         )
@@ -232,24 +258,20 @@ class LoraTrainer:
 
     def export(self, folder: Path) -> Path:
         """Writes LoRA, prompt, recipe and model card to the folder `lora` in `folder`, and returns its path. diffusers can load
-        the LoRA.
-
-        Raises:
-            OutputError: the folder cannot be written.
+        the LoRA. Raises OutputError if the folder cannot be written.
         """
         lora_folder = folder / LORA_FOLDER
-        base_model, quantization = self.recipe.backbone, self.recipe.quantization
+        base_model = self.recipe.backbone
         if Path(base_model).is_dir():
             base_model = str(Path(base_model).resolve())
-        target_modules = self.recipe.target_modules
         save_lora(
             lora_folder,
             self.backbone,
             self.prompt,
             self.recipe.task,
             base_model=base_model,
-            quantization=quantization,
-            target_modules=target_modules,
+            quantization=self.recipe.quantization,
+            target_modules=self.recipe.target_modules,
         )
         text = json.dumps(self.recipe.model_dump(mode="json"), indent=2)
         write_atomically(lora_folder / RECIPE_FILE, f"{text}\n".encode(), overwrite=True)
@@ -258,23 +280,10 @@ class LoraTrainer:
         return lora_folder
 
     def separate(self, photo: Tensor, *, seed: int = 0) -> Mapping[str, Tensor]:
-        """Generates the panels of a photo, (1, 3, h, w) in [-1, 1], in the same way as at inference. The photo has the size of a
-        panel.
-
-        Raises:
-            DeviceError: the GPU is out of memory. The message lists the values to lower.
+        """Generates the panels of a photo, (1, 3, h, w) in [-1, 1], in the same way as at inference. The photo has the size of
+        a panel. Raises DeviceError if the GPU is out of memory. The message lists the values to lower.
         """
         return DecompositionPipeline(self.backbone, self.prompt, self.recipe.task)(photo, seeds=[seed])
-
-    def _compute_gradients(self, step: int) -> dict[str, Tensor]:
-        """Accumulates the gradients of the slots that this process computes. Returns the parts of the loss."""
-        totals: dict[str, Tensor] = {}
-        for slot in range(distributed.rank(), self.recipe.batch_size, distributed.world_size()):
-            parts = self._losses(SampleRng(self.recipe.seed, step, slot))
-            scaled = {name: part / self.recipe.batch_size for name, part in parts.items()}
-            torch.stack(list(scaled.values())).sum().backward()  # type: ignore[no-untyped-call]
-            totals = {name: totals.get(name, 0) + part.detach() for name, part in scaled.items()}
-        return totals
 
     def _losses(self, rng: SampleRng) -> dict[str, Tensor]:
         """Returns the weighted mean squared error of the predicted velocity for each panel. The loss is the sum of these errors.
@@ -292,10 +301,12 @@ class LoraTrainer:
             self.recipe.guidance,
         )
         errors = (velocity - (start - encoded.composite).to(device)).square()
-        weights = self._panel_weights()
-        reliability = {"R": encoded.reflection_weight}
+        weights: dict[str, float] = {
+            panel: self.recipe.panel_weights.get(panel, 1.0) for panel in self.recipe.panels
+        }
+        total, reliability = sum(weights.values()), {"R": encoded.reflection_weight}
         return {
-            f"panel_{name}": weights[name] * reliability.get(name, 1.0) * panel.mean()
+            f"panel_{name}": weights[name] / total * reliability.get(name, 1.0) * panel.mean()
             for name, panel in split(errors, self.recipe.layout).items()
         }
 
@@ -313,19 +324,10 @@ class LoraTrainer:
         )
         return rng.normal(*grid.shape), sigma
 
-    def _panel_weights(self) -> dict[str, float]:
-        """Returns the weights of the panels in the loss. Their sum is 1."""
-        named = {panel: self.recipe.panel_weights.get(panel, 1.0) for panel in self.recipe.panels}
-        return {panel: weight / sum(named.values()) for panel, weight in named.items()}
-
-    def _validation_panels(self, layers: Tensor) -> tuple[dict[str, Tensor], PanelFit]:
-        """Returns the panels of a validation sample, and the position of the sample in them."""
-        fit = fit_sample(layers, self.recipe, self.backbone.size_divisor)
-        return make_panels(layers, fit), fit
-
     def _validate_sample(self, layers: Tensor) -> tuple[float, Tensor]:
         """Returns the PSNR gain on a sample in dB, and a row of photo, ground truth and generated panels."""
-        ground_truth, fit = self._validation_panels(layers)
+        fit = fit_sample(layers, self.recipe, self.backbone.size_divisor)
+        ground_truth = make_panels(layers, fit)
         predicted = self.separate(ground_truth["I"])
         photo, transmission, prediction = (
             (fit.crop(panel) + 1) / 2 for panel in (ground_truth["I"], ground_truth["T"], predicted["T"])
@@ -335,52 +337,3 @@ class LoraTrainer:
             for panel in (*ground_truth.values(), *predicted.values())
         ]
         return psnr_gain_db(prediction, photo, transmission), torch.cat(panels, dim=3)[0]
-
-
-def _check_batch(recipe: LoraRecipe) -> None:
-    if recipe.batch_size % distributed.world_size():
-        raise RecipeError(
-            f"batch_size = {recipe.batch_size} cannot be divided equally among {distributed.world_size()} processes",
-            "expected a batch size that is a multiple of the number of processes",
-            "raise batch_size to a multiple, or start fewer processes",
-        )
-
-
-def _check_optimizer(recipe: LoraRecipe, device: str) -> None:
-    if recipe.optimizer == "adamw8bit" and not (
-        device.startswith("cuda") and importlib.util.find_spec("bitsandbytes")
-    ):
-        raise DeviceError(
-            f'optimizer = "adamw8bit" was requested on {device}',
-            "expected an NVIDIA GPU and the package bitsandbytes, which contains this optimizer",
-            'set optimizer = "adamw", or run: pip install bitsandbytes',
-        )
-
-
-def _load_prompt(recipe: LoraRecipe, backbone_class: type[Backbone], device: str) -> PromptEmbedding:
-    if recipe.prompt.endswith(ENCODED_SUFFIX):
-        return load_prompt(Path(recipe.prompt), backbone_class.name)
-    return encode_prompt(recipe.backbone, PROMPTS[recipe.prompt], device=device)
-
-
-def _create_optimizer(parameters: Sequence[nn.Parameter], recipe: LoraRecipe) -> torch.optim.Optimizer:
-    """Returns the optimiser of the recipe."""
-    options: dict[str, Any] = {"lr": recipe.learning_rate, "weight_decay": recipe.weight_decay}
-    if recipe.optimizer == "adamw8bit":
-        optimizer = importlib.import_module("bitsandbytes.optim").AdamW8bit(parameters, **options)
-        assert isinstance(optimizer, torch.optim.Optimizer)
-        return optimizer
-    return torch.optim.AdamW(parameters, **options)
-
-
-def _read_validation_samples(recipe: LoraRecipe, samples: SampleSequence) -> dict[str, list[Tensor]]:
-    """Returns up to four validation pairs of each folder, (H, W, 9), or training samples if the recipe names no such folder."""
-    folders = validation_pairs(recipe.data)
-    if folders:
-        return {
-            name: [layers_from_pair(*pair) for pair in pairs[:_MAX_VALIDATION_SAMPLES]]
-            for name, pairs in folders.items()
-        }
-    return {
-        "training": [samples[number].layers for number in range(min(_MAX_VALIDATION_SAMPLES, len(samples)))]
-    }

@@ -3,30 +3,15 @@
 import sys
 import time
 
-import pytest
 import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from brewster.training.tensorboard import IMAGE_TAG, TensorBoardLog
+from brewster.training.loop import IMAGE_TAG, TensorBoardLog
 
 
 def read(folder):
     events = EventAccumulator(str(folder), size_guidance={"scalars": 0, "images": 0})
     return events.Reload()
-
-
-def test_metrics_and_the_image_are_read_back_at_their_steps(tmp_path):
-    event_log = TensorBoardLog(tmp_path, 0)
-    for step in (3, 6):
-        event_log.log(step, {"loss": 1 / step, "psnr_gain_db_real/dev": -2.5}, torch.full((4, 6, 3), 0.5))
-    events = read(tmp_path)
-    assert [(event.step, event.value) for event in events.Scalars("loss")] == [
-        (3, pytest.approx(1 / 3)),
-        (6, pytest.approx(1 / 6)),
-    ]
-    assert events.Scalars("psnr_gain_db_real/dev")[0].value == -2.5
-    shown = events.Images(IMAGE_TAG)
-    assert [(event.step, event.width, event.height) for event in shown] == [(3, 6, 4), (6, 6, 4)]
 
 
 def test_a_resumed_run_discards_events_of_later_steps(tmp_path):
@@ -43,11 +28,6 @@ def test_a_resumed_run_discards_events_of_later_steps(tmp_path):
         (1, 10.0), (2, 5.0), (3, 5.0), (4, 5.0),
     ]  # fmt: skip
     assert [event.step for event in events.Images(IMAGE_TAG)] == [1, 2, 3, 4]
-
-
-def test_a_run_without_events_writes_no_file(tmp_path):
-    TensorBoardLog(tmp_path, 7)
-    assert not list(tmp_path.iterdir())
 
 
 def test_without_tensorboard_nothing_is_written(tmp_path, monkeypatch):

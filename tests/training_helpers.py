@@ -1,0 +1,26 @@
+"""Helpers for tests of training: interrupted runs, and the comparison of batches."""
+
+import torch
+
+
+class Killed(Exception):
+    """Simulates the end of a process in the middle of a run."""
+
+
+def kill_after(last):
+    """A report of steps that ends the run after this step."""
+
+    def report(step, steps, metrics, logged):
+        if step == last:
+            raise Killed
+
+    return report
+
+
+def ignore_step(step, steps, metrics, logged):
+    pass
+
+
+def same(one, other):
+    """Whether two batches have the same tensors."""
+    return all(torch.equal(tensor, other.tensors()[name]) for name, tensor in one.tensors().items())
