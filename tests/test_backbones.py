@@ -1,6 +1,5 @@
 """The table of diffusion backbones: loading of tiny versions from folders, and all errors for damaged or wrong folders."""
 
-import gc
 import importlib.metadata
 import importlib.util
 import json
@@ -8,14 +7,13 @@ import shutil
 import sys
 from types import ModuleType
 
-import huggingface_hub
 import pytest
 import torch
 import transformers
 from tokenizers.pre_tokenizers import ByteLevel
 from torch.utils.flop_counter import FlopCounterMode
 
-from brewster.errors import DeviceError, DownloadError, ModelError
+from brewster.errors import DeviceError, ModelError
 from brewster.models.diffusion import lazy_imports
 from brewster.models.diffusion.adapter.lora import add_lora
 from brewster.models.diffusion.backbones import loading
@@ -23,8 +21,7 @@ from brewster.models.diffusion.backbones.loading import encode_prompt, load_back
 from brewster.models.diffusion.backbones.registry import BACKBONES, build, tiny
 from brewster.models.diffusion.prompt import PROMPT, PromptEmbedding
 from brewster.models.diffusion_resources import PROMPT_TOKENS
-
-KONTEXT = BACKBONES["kontext"]
+from published_models import velocity
 
 
 @pytest.fixture(scope="module")
@@ -40,12 +37,6 @@ def tiny_folders(tmp_path_factory):
 def folder(tiny_folders, tmp_path):
     """A folder of a tiny Kontext that a test may change."""
     return shutil.copytree(tiny_folders / "kontext", tmp_path / "kontext")
-
-
-def velocity(backbone, prompt):
-    generator = torch.Generator().manual_seed(0)
-    latents, condition = torch.randn(2, 1, backbone.channels, 2, 6, generator=generator)
-    return backbone.predict(latents, condition, torch.tensor([0.7]), prompt, 1.0)
 
 
 @pytest.mark.parametrize("name", list(BACKBONES))
@@ -103,15 +94,6 @@ def counted_flop(backbone, generated, condition):
 
 
 @pytest.mark.parametrize("name", list(BACKBONES))
-def test_a_latent_grid_has_one_token_for_16_by_16_pixels(name):
-    backbone, _ = tiny(name, seed=1)
-    latents = backbone.encode(torch.rand(2, 3, 32, 96) * 2 - 1)
-    assert latents.shape == (2, backbone.channels, 2, 6)
-    assert backbone.noise((96, 32), 0).shape == latents[:1].shape
-    assert backbone.decode(latents).shape == (2, 3, 32, 96)
-
-
-@pytest.mark.parametrize("name", list(BACKBONES))
 def test_latent_statistics_are_applied_and_inverted(name, monkeypatch):
     backbone, _ = tiny(name, seed=1)
     mean, deviation = backbone.statistics()
@@ -123,14 +105,6 @@ def test_latent_statistics_are_applied_and_inverted(name, monkeypatch):
     monkeypatch.setattr(backbone, "_vae_decode", lambda latent: decoded.append(latent) or black)
     backbone.decode(backbone.encode(black))
     torch.testing.assert_close(decoded, [grid])
-
-
-def test_a_panel_encoded_separately_differs_from_that_panel_of_the_composite():
-    backbone, _ = tiny("kontext", seed=1)
-    composite = torch.rand(1, 3, 32, 96) * 2 - 1
-    assert not torch.allclose(
-        backbone.encode(composite)[..., :2], backbone.encode(composite[..., :32]), atol=1e-3
-    )
 
 
 @pytest.mark.parametrize("quantization", ["int8", "float8"])
@@ -209,18 +183,14 @@ def test_nf4_leaves_the_layers_in_full_precision_that_the_backbone_names(
 
 
 def test_nf4_needs_an_nvidia_gpu():
-    with pytest.raises(
-        DeviceError, match='nf4 does not run on cpu; expected an NVIDIA GPU; use quantization="int8"'
-    ):
+    with pytest.raises(DeviceError, match="nf4 does not run on cpu; expected an NVIDIA GPU"):
         load_backbone("kontext", quantization="nf4")
 
 
 def test_unknown_names_get_suggestions():
     with pytest.raises(ModelError, match="did you mean kontext"):
         tiny("kontxt")
-    with pytest.raises(
-        ModelError, match="there is no quantization 'int2'; expected one of int8, float8, nf4"
-    ):
+    with pytest.raises(ModelError, match="there is no quantization 'int2'"):
         load_backbone("kontext", quantization="int2")
 
 
@@ -287,12 +257,6 @@ def test_a_prompt_is_encoded_by_the_text_encoders_of_the_folder(text_encoder_fol
     assert not torch.equal(encode_prompt(str(text_encoder_folders / name), "a cat").embeds, prompt.embeds)
 
 
-def test_text_encoders_are_released_after_the_prompt_is_encoded(text_encoder_folders):
-    encode_prompt(str(text_encoder_folders / "kontext"))
-    loaded = [each for each in gc.get_objects() if type(each) is transformers.T5EncoderModel]
-    assert not [model for model in loaded if model.dtype == torch.bfloat16]
-
-
 def test_missing_text_encoders_are_named(tiny_folders, text_encoder_folders, tmp_path):
     cure = r"set prompt to an encoded prompt"
     with pytest.raises(ModelError, match=f"has no text_encoder.*; .*{cure}"):
@@ -303,43 +267,17 @@ def test_missing_text_encoders_are_named(tiny_folders, text_encoder_folders, tmp
         encode_prompt(str(folder))
 
 
-def test_the_offline_error_of_huggingface_hub_is_explained(tmp_path, monkeypatch):
-    monkeypatch.setattr(huggingface_hub.constants, "HF_HUB_OFFLINE", True)
-    monkeypatch.setattr(huggingface_hub.constants, "HF_HUB_CACHE", str(tmp_path))
-    with pytest.raises(DownloadError, match="cannot be reached"):
-        load_backbone("klein")
-
-
-def test_text_encoders_are_not_downloaded(tiny_folders, monkeypatch):
-    requests = []
-
-    def snapshot_download(source, *, allow_patterns, dry_run=False):
-        if dry_run:
-            return []
-        requests.append((source, allow_patterns))
-        return str(tiny_folders / "klein")
-
-    monkeypatch.setattr(huggingface_hub, "snapshot_download", snapshot_download)
-    load_backbone("klein")
-    source, patterns = requests[0]
-    assert source == "black-forest-labs/FLUX.2-klein-base-4B"
-    assert patterns == ["model_index.json", "transformer/*", "vae/*", "scheduler/*"]
-
-
 def test_a_path_that_does_not_exist_is_not_taken_for_a_hub_id():
     with pytest.raises(ModelError, match=r"there is no folder ./nowhere/at/all"):
         load_backbone("./nowhere/at/all")
 
 
+INDEX, CONFIG = "model_index.json", "transformer/config.json"
+WEIGHTS = "diffusion_pytorch_model.safetensors"
+
+
 @pytest.mark.parametrize(
-    "name",
-    [
-        "model_index.json",
-        "transformer/config.json",
-        "transformer/diffusion_pytorch_model.safetensors",
-        "vae/diffusion_pytorch_model.safetensors",
-        "scheduler/scheduler_config.json",
-    ],
+    "name", [INDEX, CONFIG, f"transformer/{WEIGHTS}", f"vae/{WEIGHTS}", "scheduler/scheduler_config.json"]
 )
 def test_a_missing_file_is_named(folder, name):
     (folder / name).unlink()
@@ -347,54 +285,33 @@ def test_a_missing_file_is_named(folder, name):
         load_backbone(str(folder))
 
 
-@pytest.mark.parametrize("size", [0, 100, -7])
-def test_truncated_weights_are_refused(folder, size):
-    path = folder / "transformer" / "diffusion_pytorch_model.safetensors"
-    path.write_bytes(path.read_bytes()[:size])
-    with pytest.raises(ModelError, match=r"transformer cannot be loaded.*download the model again"):
+@pytest.mark.parametrize(
+    ("name", "change", "message"),
+    [
+        (
+            f"transformer/{WEIGHTS}",
+            lambda data: b"",
+            "transformer cannot be loaded.*download the model again",
+        ),
+        (f"transformer/{WEIGHTS}", lambda data: data[:100], "transformer cannot be loaded"),
+        (f"transformer/{WEIGHTS}", lambda data: data[:-7], "transformer cannot be loaded"),
+        (INDEX, lambda data: data.replace(b"FluxKontext", b"Other"), "contains a OtherPipeline"),
+        (INDEX, lambda data: b"{}", "has no _class_name"),
+        (INDEX, lambda data: b"{", "is not JSON"),
+        (INDEX, lambda data: b"[]", "contains no settings"),
+        (CONFIG, lambda data: with_values(data, num_layers=3), "transformer"),
+        (CONFIG, lambda data: with_values(data, num_attention_heads=3), "transformer cannot be loaded"),
+        (CONFIG, lambda data: data.replace(b"FluxT", b"QwenImageT"), "expected a FluxTransformer2DModel"),
+    ],
+)
+def test_a_damaged_or_other_file_is_refused(folder, name, change, message):
+    (folder / name).write_bytes(change((folder / name).read_bytes()))
+    with pytest.raises(ModelError, match=message):
         load_backbone(str(folder))
 
 
-def change_json(path, **values):
-    path.write_text(json.dumps(json.loads(path.read_text()) | values))
-
-
-def test_a_folder_of_another_pipeline_is_refused(folder):
-    change_json(folder / "model_index.json", _class_name="StableDiffusionPipeline")
-    with pytest.raises(
-        ModelError, match="contains a StableDiffusionPipeline; expected one of FluxKontextPipeline"
-    ):
-        load_backbone(str(folder))
-    (folder / "model_index.json").write_text("{}")
-    with pytest.raises(ModelError, match=r"model_index.json has no _class_name; .*QwenImageEditPlusPipeline"):
-        load_backbone(str(folder))
-
-
-def test_a_transformer_of_another_architecture_is_refused(folder, tiny_folders):
-    shutil.rmtree(folder / "transformer")
-    shutil.copytree(tiny_folders / "qwen" / "transformer", folder / "transformer")
-    with pytest.raises(
-        ModelError, match="contains a QwenImageTransformer2DModel; expected a FluxTransformer2DModel"
-    ):
-        load_backbone(str(folder))
-
-
-def test_settings_that_do_not_match_the_weights_are_refused(folder):
-    change_json(folder / "transformer" / "config.json", num_layers=3)
-    with pytest.raises(ModelError, match="transformer"):
-        load_backbone(str(folder))
-    change_json(folder / "transformer" / "config.json", num_layers=2, num_attention_heads=3)
-    with pytest.raises(ModelError, match="transformer cannot be loaded"):
-        load_backbone(str(folder))
-
-
-def test_a_damaged_index_is_refused(folder):
-    (folder / "model_index.json").write_text("{")
-    with pytest.raises(ModelError, match=r"model_index.json is not JSON"):
-        load_backbone(str(folder))
-    (folder / "model_index.json").write_text("[]")
-    with pytest.raises(ModelError, match="contains no settings"):
-        load_backbone(str(folder))
+def with_values(data, **values):
+    return json.dumps(json.loads(data) | values).encode()
 
 
 def test_out_of_memory_while_loading_says_what_to_reduce(folder, monkeypatch):

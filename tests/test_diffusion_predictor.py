@@ -144,9 +144,7 @@ def test_photos_of_any_shape_keep_their_size(width, height):
 
 
 def test_a_photo_that_is_smaller_than_a_token_is_refused_with_the_smallest_size():
-    with pytest.raises(
-        PhotoError, match=r"15 x 40 pixels; expected at least 16 pixels a side, .* or use the compact model"
-    ):
+    with pytest.raises(PhotoError, match=r"15 x 40 pixels; expected at least 16 pixels"):
         Separator(DiffusionPredictor(FakePipeline()))(smooth_photo(15, 40))
 
 
@@ -216,9 +214,7 @@ def test_a_backbone_without_a_lora_generates_the_transmission_only():
 
 
 def test_the_base_and_the_device_of_a_lora_are_checked(lora, tmp_path):
-    with pytest.raises(
-        ModelError, match="is a LoRA of kontext; expected a base model of kontext, not of klein"
-    ):
+    with pytest.raises(ModelError, match="is a LoRA of kontext; expected a base model of kontext"):
         load_pipeline(str(lora), base_model="tiny:klein")
     with pytest.raises(ModelError, match="is a backbone, and the base model tiny:kontext was given"):
         load_pipeline("tiny:klein", base_model="tiny:kontext")
@@ -292,9 +288,7 @@ def test_the_path_of_a_base_that_has_moved_can_be_given(tmp_path):
         DecompositionTask(max_composite_pixels=SMALL_COMPOSITE_PIXELS),
         base_model="/gone/kontext",
     )
-    with pytest.raises(
-        ModelError, match=r"the base model of .* was /gone/kontext, which does not exist.*--base-model"
-    ):
+    with pytest.raises(ModelError, match=r"the base model of .* was /gone/kontext, which does not exist"):
         Separator.load(str(tmp_path / "lora"))
     assert Separator.load(str(tmp_path / "lora"), base_model="tiny:kontext").name == "lora"
 

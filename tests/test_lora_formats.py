@@ -16,7 +16,7 @@ from brewster.models.diffusion.adapter.lora_formats import LowRankLayer, read_lo
 from brewster.models.diffusion.backbones.registry import tiny
 from brewster.models.diffusion.pipeline import load_pipeline
 from brewster.models.diffusion.tensors import read_tensors
-from published_models import linear_layers, random_pair
+from published_models import linear_layers, random_pair, velocity
 
 # Layers in diffusers, and the layer of the original code that contains them one after the other.
 BLOCK = "transformer_blocks.0."
@@ -36,12 +36,6 @@ KLEIN = {
 }
 QWEN = {name: [name] for name in (f"{BLOCK}attn.to_q", f"{BLOCK}attn.to_add_out", f"{BLOCK}img_mlp.net.2")}
 ORIGINAL = {"kontext": KONTEXT, "klein": KLEIN, "qwen": QWEN}
-
-
-def velocity(backbone, prompt):
-    generator = torch.Generator().manual_seed(0)
-    latents, condition = torch.randn(2, 1, backbone.channels, 2, 4, generator=generator)
-    return backbone.predict(latents, condition, torch.tensor([0.7]), prompt, 1.0)
 
 
 class Fused:
@@ -195,12 +189,6 @@ def test_a_layer_of_several_is_split_by_rows_and_the_top_level_layer_is_not_mist
     } == set(merged)
 
 
-def test_weights_in_bf16_are_read_as_float32(tmp_path):
-    tensors = {key: value.bfloat16() for key, value in STYLES["diffusers"]("qwen").items()}
-    layers = read_lora_layers(tensors, tiny("qwen", seed=1)[0].transformer, "qwen")
-    assert {matrix.dtype for layer in layers.values() for matrix in (layer.down, layer.up)} == {torch.float32}
-
-
 def test_alphas_come_from_the_metadata_of_diffusers_and_the_settings_of_peft(tmp_path):
     pairs = weights("qwen", original=False)
     layers = []
@@ -233,9 +221,7 @@ def test_a_lora_of_peft_without_its_settings_needs_its_alpha(prefix, tmp_path):
     name, path = f"{BLOCK}attn.to_q", tmp_path / "adapter_model.safetensors"
     pair, (backbone, _) = weights("qwen", original=False)[name], tiny("qwen", seed=1)
     save_file({key: value.bfloat16() for key, value in peft({name: pair}, prefix).items()}, path)
-    with pytest.raises(
-        ModelError, match=r"no alpha for .*to_q; expected adapter_config\.json .*--alpha NUMBER"
-    ):
+    with pytest.raises(ModelError, match=r"no alpha for .*to_q; expected adapter_config\.json"):
         read_layers(path, backbone)
     expected = 8 / len(pair[0]) * pair[1].bfloat16().float()
     torch.testing.assert_close(read_layers(path, backbone, alpha=8)[name].up, expected)
@@ -340,24 +326,10 @@ def test_only_the_file_in_the_root_of_a_repository_is_downloaded(tmp_path, monke
     assert {tuple(patterns) for _, patterns in requests} == {("lora.safetensors", "adapter_config.json")}
     assert {source for source, _ in requests} == {"someone/glass"}
     files.append("other.safetensors")
-    with pytest.raises(
-        ModelError, match=r"contains lora\.safetensors, other\.safetensors; .*OWNER/NAME/FILE"
-    ):
+    with pytest.raises(ModelError, match=r"contains lora\.safetensors, other\.safetensors;"):
         importer.find_lora_file("someone/glass")
     with pytest.raises(ModelError, match=r"there is no file absent\.safetensors"):
         importer.find_lora_file("absent.safetensors")
-
-
-def test_the_base_may_be_a_folder(tmp_path, monkeypatch):
-    backbone, prompt = tiny("qwen", seed=1)
-    backbone.save(tmp_path / "base")
-    monkeypatch.setattr(importer, "encode_prompt", lambda *_, **__: prompt)
-    save_file(STYLES["diffusers"]("qwen"), tmp_path / "lora.safetensors")
-    base_model = str(tmp_path / "base")
-    metadata = import_lora(
-        str(tmp_path / "lora.safetensors"), tmp_path / "out", base_model=base_model, prompt="x", panels=("T",)
-    )
-    assert (metadata.backbone, metadata.base_model) == ("qwen", base_model)
 
 
 def test_a_lora_and_a_checkpoint_are_imported(run_without_model, tmp_path):
@@ -381,13 +353,3 @@ def test_a_lora_and_a_checkpoint_are_imported(run_without_model, tmp_path):
     (tmp_path / "model.pt").write_bytes(b"nothing")
     code, _, err = run_without_model("models", "import", "model.pt", "out")
     assert (code, err.startswith("error: model.pt cannot be read")) == (1, True)
-
-
-def test_the_alphas_of_a_file_have_precedence_over_its_settings():
-    name = f"{BLOCK}attn.to_q"
-    tensors, transformer = kohya({name: weights("qwen", original=False)[name]}), tiny("qwen")[0].transformer
-    layers = [
-        read_lora_layers(tensors, transformer, "qwen", scale)
-        for scale in (None, scaling_from_config({"lora_alpha": 100}))
-    ]
-    assert torch.equal(*(each[name].up for each in layers))

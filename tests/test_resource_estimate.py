@@ -13,7 +13,6 @@ from brewster.models.diffusion_resources import CARDS, GraphicsCard, find_gpu, l
 from brewster.training.lora.resource_estimate import estimate_resources
 from brewster.training.recipe import read_recipe, with_value
 from published_models import KLEIN_9B, write_klein_9b
-from set_folders import render_set
 
 RECIPES = Path(__file__).parents[1] / "recipes" / "train"
 CARD = CARDS["RTX 4090"]
@@ -33,19 +32,6 @@ def test_klein_fits_the_papers_gpu_with_the_known_sizes(klein):
     assert klein.total_gib < 16
 
 
-def test_the_table_lists_tokens_memory_and_time(klein):
-    table = klein.table()
-    for text in (
-        "3.88 billion",
-        "rank 16",
-        "3072 generated, 3072 condition, 512 text",
-        "RTX 4090",
-        "4000 steps",
-        "estimate",
-    ):
-        assert text in table
-
-
 def test_the_estimate_for_kontext_agrees_with_the_counts_for_the_paper():
     estimate = estimate_resources(read_recipe(RECIPES / "kontext.toml"), CARD)
     assert estimate.cost.parameters == pytest.approx(11.9e9, rel=0.01)
@@ -56,14 +42,6 @@ def test_the_estimate_for_kontext_agrees_with_the_counts_for_the_paper():
     assert 17 <= estimate.total_gib <= 19
 
 
-def test_without_panel_i_the_condition_is_the_photo_alone():
-    recipe = with_value(read_recipe(RECIPES / "lora-tiny.toml"), "panels", ["T", "R"])
-    estimate = estimate_resources(recipe, CARD)
-    assert estimate.generated_tokens == 2 * estimate.condition_tokens
-    both = estimate_resources(with_value(recipe, "panels", ["I", "T", "R"]), CARD)
-    assert both.generated_tokens == both.condition_tokens
-
-
 def test_a_recipe_that_does_not_fit_is_refused_with_a_change_that_fits(klein):
     recipe = with_value(read_recipe(RECIPES / "klein.toml"), "max_composite_pixels", 768 * 256)
     for memory, cure in (
@@ -72,9 +50,7 @@ def test_a_recipe_that_does_not_fit_is_refused_with_a_change_that_fits(klein):
         (2, "lower max_composite_pixels"),
     ):
         estimate = estimate_resources(recipe, GraphicsCard("toy card", memory, 100))
-        with pytest.raises(
-            DeviceError, match=f"klein needs about .* GiB; .* {memory} GiB of toy card; {cure}"
-        ):
+        with pytest.raises(DeviceError, match=f"{memory} GiB of toy card; {cure}"):
             estimate.check_fits()
 
 
@@ -125,26 +101,6 @@ def test_the_command_prints_the_estimate_and_trains_nothing(run_without_model, t
     code, _, err = run_without_model("train", RECIPES / "tiny.toml", "--plan")
     assert code != 0
     assert "train it without --plan" in err
-
-
-def test_the_plan_reads_the_data(run_without_model, tmp_path, monkeypatch):
-    monkeypatch.setenv("BREWSTER_DATA", str(tmp_path))
-    code, _, err = run_without_model("train", RECIPES / "lora-tiny.toml", "--plan")
-    assert code == 1
-    assert "sets/tiny" in err
-    render_set(tmp_path / "sets" / "tiny", count=4)
-    code, out, _ = run_without_model("train", RECIPES / "lora-tiny.toml", "--plan")
-    assert code == 0
-    assert re.search(rb"^data +4 rendered samples; panels of 32 x 16$", out, re.MULTILINE)
-    assert re.search(rb"^download +0 GB, of which 0 GB", out, re.MULTILINE)
-    assert re.search(rb"^host memory +4\.0 GiB \(estimate\)$", out, re.MULTILINE)
-
-
-def test_the_plan_lists_download_and_host_memory(klein):
-    assert re.search(r"host memory +11\.5 GiB, while the text encoders encode the prompt", klein.table())
-    assert re.search(r"download +16 GB, of which 8 GB are text encoders", klein.table())
-    encoded = estimate_resources(with_value(klein.recipe, "prompt", "prompt.safetensors"), CARD)
-    assert re.search(r"download +8 GB, of which 0 GB are text encoders", encoded.table())
 
 
 def test_white_space_and_the_optimiser_change_the_estimate():

@@ -163,39 +163,11 @@ def test_the_name_is_opened_from_the_hub_and_only_its_subfolders_are_fetched(
     assert not any("*" in pattern for pattern in asked)
 
 
-def test_weights_in_bf16_are_read(base, tmp_path):
-    image = random_image(SIDE, SIDE)
-    model = write_windowseat(tmp_path / "bf16", base, dtype=torch.bfloat16)
-    panels = load_pipeline(str(model))(image)
-    torch.testing.assert_close(panels["T"], load_pipeline(str(model))(image)["T"], atol=0, rtol=0)
-    assert panels["T"].isfinite().all()
-
-
-def test_an_unexpected_key_is_an_error(folder):
-    weights = load_file(folder / WEIGHTS_FILE)
-    extra = {"transformer_blocks.9.attn.to_q.lora_A.default.weight": torch.zeros(4, 32)}
-    save_file(weights | extra, folder / WEIGHTS_FILE)
-    with pytest.raises(ModelError, match=r"style of peft, belongs to no layer of qwen"):
-        load_pipeline(str(folder))
-
-
-def test_a_matrix_of_another_size_is_an_error(folder):
-    weights = load_file(folder / WEIGHTS_FILE)
-    name = next(name for name in weights if "to_q.lora_A" in name)
-    save_file(weights | {name: torch.zeros(2, 31)}, folder / WEIGHTS_FILE)
-    with pytest.raises(ModelError, match=r"expected a layer with 32 x 32 weights"):
-        load_pipeline(str(folder))
-
-
 @pytest.mark.parametrize(
     ("file", "change", "message"),
     [
-        (INDEX_FILE, {"base_model": None}, "base_model .* is None; expected a hub id"),
-        (
-            INDEX_FILE,
-            {"processing_resolution": 70},
-            "processing_resolution .* is 70; expected a multiple of 16",
-        ),
+        (INDEX_FILE, {"base_model": None}, "base_model is None"),
+        (INDEX_FILE, {"processing_resolution": 70}, "processing_resolution is 70"),
         (CONFIG_FILE, {"r": "many"}, "lacks a setting of WindowSeat"),
     ],
 )

@@ -67,11 +67,8 @@ DIFFUSION_MODELS: Final = {
 
 
 def check_is_converted(model: str) -> None:
-    """Checks that this is not the name or hub id of a published model that must be converted first.
-
-    Raises:
-        ModelError: it is. The message says how to get and convert the model.
-    """
+    """Checks that this is not the name or hub id of a published model that must be converted first. Raises ModelError if it is.
+    The message says how to get and convert the model."""
     for row in DIFFUSION_MODELS.values():
         if model in (row.name, row.hub_id) and not row.is_opened_by_name:
             raise ModelError(
@@ -83,10 +80,8 @@ def check_is_converted(model: str) -> None:
 
 def licence_of(hub_id: str) -> str:
     """The licence of a repository on the hub, for a message before its download."""
-    licences = {model.hub_id: model.licence for model in DIFFUSION_MODELS.values()}
-    licences |= {
-        model.base_model: model.licence
-        for model in DIFFUSION_MODELS.values()
-        if model.base_model and model.base_model not in licences
-    }
-    return licences.get(hub_id, "see its page on the hub")
+    models = DIFFUSION_MODELS.values()
+    owners = [model for model in models if model.hub_id == hub_id] or [
+        model for model in models if model.base_model == hub_id
+    ]
+    return owners[0].licence if owners else "see its page on the hub"

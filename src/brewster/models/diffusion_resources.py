@@ -142,11 +142,8 @@ def _model_number(name: str) -> str:
 
 
 def find_gpu(name: str) -> GraphicsCard:
-    """Returns the GPU of this name, such as `RTX 4090`, `nvidia geforce rtx 4090` or `AMD Radeon RX 7900 XTX`.
-
-    Raises:
-        DeviceError: the name is not in `CARDS`.
-    """
+    """Returns the GPU of this name, such as `RTX 4090`, `nvidia geforce rtx 4090` or `AMD Radeon RX 7900 XTX`. Raises
+    DeviceError if the name is not in `CARDS`."""
     known = {_model_number(other): card for other, card in CARDS.items()}
     if (number := _model_number(name)) in known:
         return known[number]
@@ -267,13 +264,11 @@ def place_on_gpu(
 ) -> Placement:
     """The placement on a GPU with this memory.
 
-    If no quantization is given, it is the first of (`preferred`, int8, nf4) with which the weights fit into the GPU. The
-    total memory decides, not the free one: the same machine always gives the same result. If none fits, or the weights
-    are offloaded on request, it is `preferred`. Int8 replaces nf4 without `has_nf4` (by default, if bitsandbytes is not
-    installed), or if the weights are offloaded. With `offload` "auto", they are offloaded if they do not fit into the free memory.
-
-    Raises:
-        DeviceError: offloading was requested with nf4, which cannot be offloaded.
+    If no quantization is given, it is the first of (`preferred`, int8, nf4) with which the weights fit into the GPU. The total
+    memory decides, not the free one: the same machine always gives the same result. If none fits, or the weights are offloaded
+    on request, it is `preferred`. Int8 replaces nf4 without `has_nf4` (by default, if bitsandbytes is not installed), or if the
+    weights are offloaded. With `offload` "auto", they are offloaded if they do not fit into the free memory. Raises DeviceError
+    if offloading was requested with nf4, which cannot be offloaded.
     """
     quantization, preferred, offload = choice.quantization, choice.preferred, choice.offload
     if offload == "layers" and quantization == "nf4":
@@ -299,11 +294,8 @@ def place_on_gpu(
 
 
 def check_gpu_memory(name: str, needed_gib: float, card: GraphicsCard, cure: str) -> None:
-    """Checks that an estimate for the model `name` fits into the memory of a GPU; `cure` says what to do if it does not.
-
-    Raises:
-        DeviceError: it does not fit.
-    """
+    """Checks that an estimate for the model `name` fits into the memory of a GPU; `cure` says what to do if it does not. Raises
+    DeviceError if it does not fit."""
     if needed_gib > card.memory_gib:
         raise DeviceError(
             f"{name} needs about {needed_gib:.1f} GiB",

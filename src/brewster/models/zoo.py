@@ -25,21 +25,14 @@ class ModelFile:
     sha256: str | None
     licence: str
 
-    def digest(self) -> str:
-        """The SHA-256 of the file's current bytes, in hexadecimal."""
-        return hashlib.sha256(self.path.read_bytes()).hexdigest()
-
     def verify(self) -> str:
-        """Checks the file and returns its SHA-256.
-
-        Raises:
-            ModelError: the file is missing, or its digest is not the expected one.
-        """
+        """Checks the file and returns its SHA-256. Raises ModelError if the file is missing, or its digest is not the expected
+        one."""
         if not self.path.is_file():
             raise ModelError(
                 f"{self.path} is missing", f"expected the file of model {self.name}", "reinstall brewster"
             )
-        digest = self.digest()
+        digest = hashlib.sha256(self.path.read_bytes()).hexdigest()
         if self.sha256 not in (None, digest):
             raise ModelError(
                 f"{self.path} has SHA-256 {digest[:12]}...",
@@ -49,11 +42,8 @@ class ModelFile:
         return digest
 
     def card(self) -> str:
-        """The text of the model card, Markdown. It is the file next to the model file with the suffix .md.
-
-        Raises:
-            ModelError: the model has no card.
-        """
+        """The text of the model card, Markdown. It is the file next to the model file with the suffix .md. Raises ModelError if
+        the model has no card."""
         path = self.path.with_suffix(".md")
         if not path.is_file():
             raise ModelError(f"{self.name} has no model card", f"expected a file {path}", "write this file")
@@ -93,15 +83,16 @@ def is_diffusion_model(name: str) -> bool:
     """Whether `name` is that of a diffusion model or LoRA: a registered name, "tiny:" and a name, a folder, or a hub id."""
     if name in MODELS or Path(name).is_file() or _run_model(name):
         return False
-    return name in DIFFUSION_NAMES or name.startswith(TINY_PREFIX) or Path(name).is_dir() or _is_hub_id(name)
+    if name in DIFFUSION_NAMES or name.startswith(TINY_PREFIX) or Path(name).is_dir():
+        return True
+    # OWNER/NAME is a hub id. If a folder OWNER exists, it is a local path, and the hub is not queried.
+    has_form = re.fullmatch(r"[\w-][\w.-]*/[\w-][\w.-]*", name) is not None
+    return has_form and not name.endswith(".onnx") and not Path(name).parent.is_dir()
 
 
 def check_diffusion_model(name: str) -> None:
-    """Checks that `name` is that of a diffusion model, because only these need a plan. Needs no torch.
-
-    Raises:
-        ModelError: it is not, or it is unknown.
-    """
+    """Checks that `name` is that of a diffusion model, because only these need a plan. Needs no torch. Raises ModelError if it
+    is not, or it is unknown."""
     if name in DIFFUSION_MODELS:  # also one that must be imported first
         return
     model_name(name)
@@ -114,11 +105,8 @@ def check_diffusion_model(name: str) -> None:
 
 
 def model_name(model: str) -> str:
-    """The short name of a model for reports: a registered name, the stem of a file, or the name of a folder.
-
-    Raises:
-        ModelError: `model` is neither a diffusion model, a name in the registry, nor a file.
-    """
+    """The short name of a model for reports: a registered name, the stem of a file, or the name of a folder. Raises ModelError
+    if `model` is neither a diffusion model, a name in the registry, nor a file."""
     if is_diffusion_model(model):
         return Path(model).resolve().name.replace(":", "-")
     return find_model(model).name
@@ -130,18 +118,9 @@ def _run_model(name: str) -> Path | None:
     return path if path.is_file() else None
 
 
-def _is_hub_id(name: str) -> bool:
-    """Whether this is OWNER/NAME. If a folder OWNER exists, it is a local path, and the hub is not queried."""
-    has_form = re.fullmatch(r"[\w-][\w.-]*/[\w-][\w.-]*", name) is not None
-    return has_form and not name.endswith(".onnx") and not Path(name).parent.is_dir()
-
-
 def find_model(name: str) -> ModelFile:
-    """The model file with this registered name or path.
-
-    Raises:
-        ModelError: there is no such model or file, or it is a diffusion model, which has no single file.
-    """
+    """The model file with this registered name or path. Raises ModelError if there is no such model or file, or it is a
+    diffusion model, which has no single file."""
     if name in MODELS:
         return MODELS[name]
     if is_diffusion_model(name):

@@ -18,7 +18,6 @@ import torch
 from torch import Tensor, nn
 
 from brewster.errors import ModelError
-from brewster.models.diffusion.backbones.backbone import Backbone
 from brewster.models.diffusion.backbones.kontext import Kontext
 from brewster.models.diffusion.backbones.registry import build_on_meta
 from brewster.models.diffusion.prompt import PROMPT_FILE, PromptEmbedding
@@ -34,11 +33,7 @@ _IGNORED: Final = ("text_encoder.",)
 def convert(checkpoint: Path, folder: Path, *, base_model: str = "kontext", short_side_px: int = 768) -> None:
     """Reads the checkpoint and writes the folder. The weights keep their precision.
 
-    Args:
-        checkpoint: the file GenSIRR.pt.
-        folder: the folder to write.
-        base_model: "kontext", or "tiny:kontext" for tests.
-        short_side_px: the short side of the input: 768 or 512.
+    `base_model` is "kontext", or "tiny:kontext" for tests. `short_side_px`, that of the input, is 768 or 512.
 
     Raises:
         ModelError: the file is not such a checkpoint, or its weights do not match the architecture of the base model.
@@ -53,7 +48,24 @@ def convert(checkpoint: Path, folder: Path, *, base_model: str = "kontext", shor
     state = _read_checkpoint(checkpoint)
     prompt = _prompt(checkpoint, state)
     backbone = build_on_meta(base_model)
-    _load(checkpoint, backbone, state)
+    parts: dict[str, nn.Module] = {"transformer.": backbone.transformer, "vae.": backbone.vae}
+    unknown = [key for key in state if not key.startswith((*parts, *_IGNORED))]
+    if unknown:
+        raise ModelError(
+            f"{checkpoint} contains {unknown[0]}",
+            f"expected only {', '.join(parts)}",
+            "use the file GenSIRR.pt",
+        )
+    for prefix, part in parts.items():
+        weights = {key.removeprefix(prefix): value for key, value in state.items() if key.startswith(prefix)}
+        try:
+            part.load_state_dict(weights, strict=True, assign=True)
+        except RuntimeError as error:
+            raise ModelError(
+                f"{checkpoint} does not match the {prefix[:-1]} of {backbone.name}: {' '.join(str(error).split())[:200]}",
+                f"expected the weights of a {type(part).__name__}",
+                "use the file GenSIRR.pt",
+            ) from error
     backbone.save(folder)
     prompt.save(folder / PROMPT_FILE)
     save_task(gensirr_task(short_side_px), folder / TASK_FILE)
@@ -99,22 +111,3 @@ def _prompt(path: Path, state: dict[str, Tensor]) -> PromptEmbedding:
             "use another checkpoint",
         )
     return PromptEmbedding(Kontext.name, _PROMPT_TEXT, embeds.detach().clone(), pooled.detach().clone())
-
-
-def _load(path: Path, backbone: Backbone, state: Mapping[str, Tensor]) -> None:
-    parts: dict[str, nn.Module] = {"transformer.": backbone.transformer, "vae.": backbone.vae}
-    unknown = [key for key in state if not key.startswith((*parts, *_IGNORED))]
-    if unknown:
-        raise ModelError(
-            f"{path} contains {unknown[0]}", f"expected only {', '.join(parts)}", "use the file GenSIRR.pt"
-        )
-    for prefix, part in parts.items():
-        weights = {key.removeprefix(prefix): value for key, value in state.items() if key.startswith(prefix)}
-        try:
-            part.load_state_dict(weights, strict=True, assign=True)
-        except RuntimeError as error:
-            raise ModelError(
-                f"{path} does not match the {prefix[:-1]} of {backbone.name}: {' '.join(str(error).split())[:200]}",
-                f"expected the weights of a {type(part).__name__}",
-                "use the file GenSIRR.pt",
-            ) from error

@@ -10,7 +10,7 @@ import shutil
 import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path, PurePosixPath
-from typing import Any, Final, Literal
+from typing import Final, Literal
 
 from brewster.errors import DownloadError, ModelError
 from brewster.models.diffusion.lazy_imports import import_library
@@ -42,17 +42,13 @@ def resolve_model_folder(source: str, patterns: list[str]) -> Path:
     hub, errors = import_library("huggingface_hub"), import_library("huggingface_hub.errors")
     # If this request fails, the download reports the reason, or finds the files in the cache.
     with contextlib.suppress(errors.HTTPError, errors.HFValidationError, errors.DryRunError, OSError):
-        _announce_download(hub, source, patterns)
+        _announce_download(source, patterns)
     with translate_hub_errors(source):
         return Path(hub.snapshot_download(source, allow_patterns=patterns))
 
 
 def cached_model_folder(source: str, patterns: list[str]) -> Path | None:
-    """Returns the local folder of a model, or None if it is not in the cache. Downloads nothing.
-
-    Raises:
-        MissingExtra: huggingface_hub is not installed.
-    """
+    """Returns the local folder of a model, or None if it is not in the cache. Downloads nothing."""
     if Path(source).is_dir():
         return Path(source)
     hub = import_library("huggingface_hub")
@@ -64,10 +60,8 @@ def cached_model_folder(source: str, patterns: list[str]) -> Path | None:
 def list_root_files(source: str) -> list[str]:
     """The names of the files of a folder or a repository on the hub, without those in subfolders.
 
-    Without a network connection, these are the files in the cache.
-
-    Raises:
-        DownloadError, ModelError, MissingExtra: see `resolve_model_folder`.
+    Without a network connection, these are the files in the cache. Raises DownloadError, ModelError or MissingExtra, see
+    `resolve_model_folder`.
     """
     if folder := Path(source) if Path(source).is_dir() else None:
         return sorted(path.name for path in folder.iterdir() if path.is_file())
@@ -85,11 +79,9 @@ def list_root_files(source: str) -> list[str]:
 def find_weights_file(source: str, suffixes: tuple[str, ...], companions: Sequence[str] = ()) -> Path:
     """The file with the weights of a LoRA or a transformer, downloaded if it is on the hub.
 
-    Args:
-        source: a file, a folder or hub id with one file that has such a suffix, or OWNER/NAME/FILE on the hub, where FILE may
-            contain folders. Subfolders are not searched.
-        suffixes: the possible suffixes.
-        companions: other files of the same folder that are downloaded with it, if they exist.
+    `source` is a file, a folder or hub id with one file that has such a suffix, or OWNER/NAME/FILE on the hub, where FILE may
+    contain folders. Subfolders are not searched. `companions` are other files of the same folder that are downloaded with it, if
+    they exist.
 
     Raises:
         ModelError: the file does not exist, the folder or repository does not have exactly one such file, or `source` is none
@@ -128,7 +120,13 @@ def translate_hub_errors(source: str, access: Literal["read", "write"] = "read")
     try:
         yield
     except errors.GatedRepoError as error:
-        raise _gated_error(error, source, page) from error
+        # The hub returns 401 without a token, and 403 if the account has no access.
+        reason = "your account has no access" if _status(error) == 403 else "no valid token was sent"
+        raise DownloadError(
+            f"{source} is gated and {reason}",
+            f"expected that the owner of the token has accepted the licence at {page}",
+            "open that page, agree to the licence, then run `hf auth login` or set HF_TOKEN to a token with read access",
+        ) from error
     except errors.RepositoryNotFoundError as error:
         raise DownloadError(
             f"the hub has no model {source}, or your token has no access to it",
@@ -167,32 +165,14 @@ def translate_hub_errors(source: str, access: Literal["read", "write"] = "read")
 
 
 def is_transformer_cached(hub_id: str) -> bool:
-    """Whether the transformer of a model on the hub is in the cache, so that loading it downloads at most a few files.
-
-    Raises:
-        MissingExtra: huggingface_hub is not installed.
-    """
+    """Whether the transformer of a model on the hub is in the cache, so that loading it downloads at most a few files."""
     folder = cached_model_folder(hub_id, ["transformer/*"])
     return folder is not None and any(folder.glob("transformer/*.safetensors"))
 
 
 def has_hub_token() -> bool:
-    """Whether huggingface_hub finds a token: in HF_TOKEN, or in the file that `hf auth login` writes.
-
-    Raises:
-        MissingExtra: huggingface_hub is not installed.
-    """
+    """Whether huggingface_hub finds a token: in HF_TOKEN, or in the file that `hf auth login` writes."""
     return import_library("huggingface_hub").get_token() is not None
-
-
-def _gated_error(error: Exception, source: str, page: str) -> DownloadError:
-    """The error for a gated model. The hub returns 401 without a token, and 403 if the account has no access."""
-    is_authenticated = _status(error) == 403
-    return DownloadError(
-        f"{source} is gated and {'your account has no access' if is_authenticated else 'no valid token was sent'}",
-        f"expected that the owner of the token has accepted the licence at {page}",
-        "open that page, agree to the licence, then run `hf auth login` or set HF_TOKEN to a token with read access",
-    )
 
 
 def _http_error(error: Exception, source: str, access: str) -> DownloadError:
@@ -214,18 +194,12 @@ def _status(error: Exception) -> int | None:
     return getattr(getattr(error, "response", None), "status_code", None)
 
 
-def _announce_download(hub: Any, source: str, patterns: list[str]) -> None:  # noqa: ANN401 - huggingface_hub
+def _announce_download(source: str, patterns: list[str]) -> None:
     """Prints the size and the licence on stderr if files that match the patterns are not in the cache yet.
 
-    Args:
-        hub: the library huggingface_hub.
-        source: the hub id of the model.
-        patterns: the names of the files.
-
-    Raises:
-        DownloadError: the files do not fit on the disk of the cache.
-        Exception: an exception of huggingface_hub, if the request fails.
+    Raises DownloadError if the files do not fit on the disk, or an exception of huggingface_hub if the request fails.
     """
+    hub = import_library("huggingface_hub")
     planned = hub.snapshot_download(source, allow_patterns=patterns, dry_run=True)
     size = sum(file.file_size or 0 for file in planned if file.will_download)
     if size < _MIN_ANNOUNCED_BYTES:

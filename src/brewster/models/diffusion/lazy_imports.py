@@ -13,11 +13,7 @@ from brewster.errors import MissingExtra
 
 
 def import_library(name: str) -> Any:  # noqa: ANN401 - a module of a library that may be missing
-    """Imports a module of a third-party library and returns it.
-
-    Raises:
-        MissingExtra: the library is not installed.
-    """
+    """Imports a module of a third-party library and returns it. Raises MissingExtra if the library is not installed."""
     try:
         with suppress_log_messages():
             return importlib.import_module(name)
@@ -30,11 +26,8 @@ def import_library(name: str) -> Any:  # noqa: ANN401 - a module of a library th
 
 
 def import_bitsandbytes() -> None:
-    """Imports bitsandbytes, which stores weights in nf4. The extra `diffusion` does not install it.
-
-    Raises:
-        MissingExtra: it is not installed, or cannot be imported.
-    """
+    """Imports bitsandbytes, which stores weights in nf4. The extra `diffusion` does not install it. Raises MissingExtra if it
+    is not installed, or cannot be imported."""
     try:
         import_library("bitsandbytes")
     except MissingExtra as error:

@@ -48,11 +48,8 @@ _DEVICES: Final = {"auto": "", "cuda": "cuda", "rocm": "cuda", "cpu": "cpu"}
 
 
 def torch_device(device: str) -> str:
-    """torch's name, "cuda" or "cpu", for a value of the option --device.
-
-    Raises:
-        DeviceError: diffusion models do not run on this device.
-    """
+    """torch's name, "cuda" or "cpu", for a value of the option --device. Raises DeviceError if diffusion models do not run on
+    this device."""
     if device not in _DEVICES:
         raise DeviceError(
             f"diffusion models do not run on {device}",
@@ -63,13 +60,8 @@ def torch_device(device: str) -> str:
 
 
 def backbone_cost(source: str, backbone_class: type[Backbone]) -> BackboneCost:
-    """The cost of a backbone. A folder, or a hub id in the cache, is counted by its configuration.
-
-    For another source it is the cost of its class.
-
-    Raises:
-        ModelError: the configuration is damaged.
-    """
+    """The cost of a backbone. A folder, or a hub id in the cache, is counted by its configuration; another source by its class.
+    Raises ModelError if the configuration is damaged."""
     cost = backbone_class.cost
     if source.startswith(TINY_PREFIX):
         return cost.tiny()
@@ -90,10 +82,8 @@ def backbone_cost(source: str, backbone_class: type[Backbone]) -> BackboneCost:
 def count_weights(source: str, backbone_class: type[Backbone], transformer_file: Path | None = None) -> int:
     """The number of parameters of the transformer; 0 for a tiny version.
 
-    For a `transformer_file`, it is the number of bf16 weights that need the same memory.
-
-    Raises:
-        ModelError: the configuration is damaged.
+    For a `transformer_file`, it is the number of bf16 weights that need the same memory. Raises ModelError if the configuration
+    is damaged.
     """
     if transformer_file:
         return transformer_file.stat().st_size // _FILE_BYTES_PER_WEIGHT
@@ -103,10 +93,8 @@ def count_weights(source: str, backbone_class: type[Backbone], transformer_file:
 def choose_placement(weights: int, choice: WeightChoice, device: str) -> Placement:
     """The placement of a transformer with this number of weights on this machine. `device` is what the user chose, or "auto".
 
-    On a CPU the default is no quantization, because int8 is slower there.
-
-    Raises:
-        DeviceError: diffusion models do not run on this device, or cannot be offloaded in this way.
+    On a CPU the default is no quantization, because int8 is slower there. Raises DeviceError if diffusion models do not run on
+    this device, or cannot be offloaded in this way.
     """
     device = torch_device(device)
     if device == "cpu":
@@ -132,14 +120,9 @@ def check_machine(
 ) -> None:
     """Checks that a backbone can run on this machine: device, free memory, and free disk for the download.
 
-    Args:
-        source: see `load_backbone`.
-        backbone_class: the class of the backbone.
-        placement: where its weights will be.
-        requested: the device that the user chose, or "auto".
-        with_text_encoders: whether the prompt must be encoded, so that the text encoders are downloaded too. They are
-            loaded in host memory, also if they compute on the GPU, and released before the transformer is loaded.
-        transformer_file: see `load_backbone`.
+    For `source` and `transformer_file`, see `load_backbone`. `requested` is the device that the user chose, or "auto".
+    `with_text_encoders` is whether the prompt must be encoded, so that the text encoders are downloaded too. They are loaded in
+    host memory, also if they compute on the GPU, and released before the transformer is loaded.
 
     Raises:
         DeviceError: there is no GPU and the CPU was not chosen explicitly, or the free memory is too small.
@@ -153,42 +136,40 @@ def check_machine(
     if with_text_encoders:
         encoders = weights_gib(backbone_class.cost.text_encoder_parameters, None)
         _check_host_memory(source, encoders, "of host memory, because its text encoders are loaded there")
-    _check_memory(source, weights, placement)
-    if placement.quantization == "nf4" and placement.device != "cpu":
+    is_cpu = placement.device == "cpu"
+    if host := placement.host_gib(weights):
+        where = "of memory on cpu" if is_cpu else "of host memory, because it is offloaded"
+        _check_host_memory(source, host, where)
+    if not is_cpu:
+        free = torch.cuda.mem_get_info(placement.device)[0] / GIB
+        fitting = fitting_quantizations(weights, free - INFERENCE_OVERHEAD_GIB)
+        cure = f"choose quantization {fitting[0]}" if fitting else _SMALLER_MODEL
+        _check_fits(source, placement.gpu_gib(weights), free, f"of memory on {placement.device}", cure)
+    if placement.quantization == "nf4" and not is_cpu:
         import_bitsandbytes()
     hub_id = hub_id_of(source)
     if not transformer_file and not Path(source).is_dir() and not is_transformer_cached(hub_id):
         cost = backbone_class.cost
         encoders = with_text_encoders * cost.text_encoder_parameters
-        _check_disk(hub_id, weights + cost.vae_parameters + encoders)
+        cache = Path(import_library("huggingface_hub.constants").HF_HUB_CACHE)
+        needed = (weights + cost.vae_parameters + encoders) * _FILE_BYTES_PER_WEIGHT
+        if needed > (free := free_disk_bytes(cache)):
+            raise DownloadError(
+                f"{hub_id} needs about {needed / 1e9:.0f} GB on the disk, and {cache} has {free / 1e9:.0f} GB free",
+                "expected enough free disk for the download",
+                "free disk space, or set HF_HOME to a folder on a larger disk",
+            )
 
 
 def check_device(source: str, weights: int, device: str, *, requested: str) -> None:
-    """Checks that a transformer with this number of weights does not run on the CPU, unless the user chose the CPU.
-
-    Raises:
-        DeviceError: there is no GPU, and the CPU was not chosen explicitly.
-    """
+    """Checks that a transformer with this number of weights does not run on the CPU, unless the user chose the CPU. Raises
+    DeviceError if it would."""
     if weights >= _MIN_LARGE and device == "cpu" and requested != "cpu":
         raise DeviceError(
             f"torch finds no GPU, and {source} has {weights / 1e9:.1f} billion parameters",
             "expected an NVIDIA or AMD GPU, because one photo takes hours on a CPU",
             f"use the model compact, or choose --device cpu explicitly{_WINDOWS_HINT if sys.platform == 'win32' else ''}",
         )
-
-
-def _check_memory(source: str, weights: int, placement: Placement) -> None:
-    if host := placement.host_gib(weights):
-        is_cpu = placement.device == "cpu"
-        _check_host_memory(
-            source, host, "of memory on cpu" if is_cpu else "of host memory, because it is offloaded"
-        )
-    if placement.device == "cpu":
-        return
-    free = torch.cuda.mem_get_info(placement.device)[0] / GIB
-    fitting = fitting_quantizations(weights, free - INFERENCE_OVERHEAD_GIB)
-    cure = f"choose quantization {fitting[0]}" if fitting else _SMALLER_MODEL
-    _check_fits(source, placement.gpu_gib(weights), free, f"of memory on {placement.device}", cure)
 
 
 def _check_host_memory(source: str, needed_gib: float, where: str) -> None:
@@ -202,15 +183,4 @@ def _check_fits(source: str, needed_gib: float, free_gib: float, where: str, cur
             f"{source} needs about {needed_gib:.1f} GiB {where}, and {free_gib:.1f} GiB are free",
             "expected enough memory for the weights and one prediction",
             cure,
-        )
-
-
-def _check_disk(hub_id: str, parameters: int) -> None:
-    cache = Path(import_library("huggingface_hub.constants").HF_HUB_CACHE)
-    free, needed = free_disk_bytes(cache), parameters * _FILE_BYTES_PER_WEIGHT
-    if needed > free:
-        raise DownloadError(
-            f"{hub_id} needs about {needed / 1e9:.0f} GB on the disk, and {cache} has {free / 1e9:.0f} GB free",
-            "expected enough free disk for the download",
-            "free disk space, or set HF_HOME to a folder on a larger disk",
         )

@@ -65,11 +65,6 @@ LAYOUTS: Final = (
 """The layouts of LoRA folders. To support another published layout, write a module and add a row."""
 
 
-def layout_of(folder: Path) -> LoraLayout | None:
-    """The layout of a folder, or None if it contains no LoRA."""
-    return next((layout for layout in LAYOUTS if (folder / layout.weights).is_file()), None)
-
-
 _FINGERPRINT_BYTES: Final = 1 << 20
 """The number of bytes at the start and at the end of a file that a digest reads."""
 _FILES: Final = [
@@ -111,7 +106,13 @@ class ModelSource:
         A base on the hub is identified by its name. A base in a folder is identified by the names, sizes, and first and
         last MiB of its files, because reading them completely takes a minute.
         """
-        base = _digest_folder(Path(self.base)) if self._is_base_folder else self.base
+        base, folder = self.base, Path(self.base)
+        if not is_registered(base) and folder.is_dir():
+            digest = hashlib.sha256()
+            for path in sorted(path for path in folder.rglob("*") if path.is_file()):
+                digest.update(f"{path.relative_to(folder)} {path.stat().st_size}\0".encode())
+                digest.update(_ends(path))
+            base = digest.hexdigest()
         if not (self.layout and self.folder and self.metadata):
             return [base]
         # The task and the scale of the LoRA are in the file of the weights, or in the JSON files of the layout.
@@ -119,25 +120,18 @@ class ModelSource:
         digests = [hashlib.sha256((self.folder / name).read_bytes()).hexdigest() for name in files]
         return [*digests, self.metadata.prompt_sha256, base]
 
-    @property
-    def _is_base_folder(self) -> bool:
-        return not is_registered(self.base) and Path(self.base).is_dir()
-
 
 def find_model_source(
     model: str, base_model: str | None = None, *, allow_download: bool = True
 ) -> ModelSource:
     """Looks up a model. Downloads the files of a LoRA. For a backbone it downloads the index, the task and the prompt.
 
-    Args:
-        model: a LoRA by its folder or hub id, or a backbone by its name, folder or hub id.
-        base_model: the folder or hub id of the LoRA's base; by default the one used in training. Only for a LoRA.
-        allow_download: whether files that are not in the cache are downloaded. If false, and the base is not in the cache, its
-            class is read from the LoRA's metadata. A WindowSeat that is not in the cache gets its published task.
+    `model` and `base_model` are those of `load_pipeline`. Without `allow_download`, files that are not in the cache are not
+    downloaded. If the base is not in the cache then, its class is read from the LoRA's metadata. A WindowSeat that is not in the
+    cache gets its published task.
 
     Raises:
-        DownloadError: no access to a gated model, an invalid token, no network connection, or a download that is not
-            allowed.
+        DownloadError: see `resolve_model_folder`; or a download is not allowed.
         ModelError: a file is missing or damaged, the LoRA belongs to another backbone, or the name is unknown.
     """
     if is_registered(model):
@@ -150,19 +144,11 @@ def find_model_source(
     folder = resolve_model_folder(source, _FILES) if allow_download else cached_model_folder(source, _FILES)
     if folder is None:
         return _published_source(model, base_model)
-    if layout := layout_of(folder):
+    if layout := next((each for each in LAYOUTS if (folder / each.weights).is_file()), None):
         metadata = layout.read_metadata(folder)
         base, backbone_class = _find_base(model, metadata, base_model, allow_download=allow_download)
-        return ModelSource(
-            base,
-            backbone_class,
-            metadata.task,
-            metadata.quantization,
-            has_prompt=True,
-            folder=folder,
-            layout=layout,
-            metadata=metadata,
-        )
+        quantization = metadata.quantization
+        return ModelSource(base, backbone_class, metadata.task, quantization, True, folder, layout, metadata)
     if not (folder / INDEX_FILE).is_file():
         raise _unknown_layout(model, list_root_files(source if allow_download else str(folder)))
     _check_no_base(model, base_model)
@@ -198,20 +184,16 @@ def _published_source(model: str, base_model: str | None) -> ModelSource:
             f"expected a folder, a model in the cache, or one of {', '.join(names)}",
             "download it first, or plan with its base",
         )
-    return ModelSource(
-        base_model or row.base_model,
-        windowseat.BACKBONE,
-        named_task(model),
-        row.quantization,
-        has_prompt=True,
-    )
+    base, task = base_model or row.base_model, named_task(model)
+    return ModelSource(base, windowseat.BACKBONE, task, row.quantization, has_prompt=True)
 
 
 def _find_base(
     model: str, metadata: LoraMetadata, base_model: str | None, *, allow_download: bool
 ) -> tuple[str, type[Backbone]]:
     base = base_model or metadata.base_model
-    if base_model is None and _is_path(base) and not Path(base).is_dir():
+    is_path = Path(base).is_absolute() or base.startswith((".", "~"))
+    if base_model is None and is_path and not Path(base).is_dir():
         raise ModelError(
             f"the base model of {model} was {base}, which does not exist",
             f"expected a {metadata.backbone} in diffusers' layout",
@@ -236,18 +218,6 @@ def _check_no_base(model: str, base_model: str | None) -> None:
             f"expected a base model only for a LoRA, which is a folder with {LORA_FILE}",
             "leave the base model out",
         )
-
-
-def _is_path(source: str) -> bool:
-    return Path(source).is_absolute() or source.startswith((".", "~"))
-
-
-def _digest_folder(folder: Path) -> str:
-    digest = hashlib.sha256()
-    for path in sorted(path for path in folder.rglob("*") if path.is_file()):
-        digest.update(f"{path.relative_to(folder)} {path.stat().st_size}\0".encode())
-        digest.update(_ends(path))
-    return digest.hexdigest()
 
 
 def digest_file(path: Path) -> str:

@@ -1,19 +1,24 @@
 """Reduces the GPU memory of a prediction: the transformer is offloaded by layers, and large images are decoded in tiles.
+Converts out-of-memory errors to a DeviceError.
 
-Both are methods of diffusers. Offloading does not change the result. Tiling changes it, because the VAE of
+Offloading and tiling are methods of diffusers. Offloading does not change the result. Tiling changes it, because the VAE of
 FLUX normalises each tile by its own statistics. So tiling is used only if the decoding would not fit.
 """
 
 from __future__ import annotations
 
 import contextlib
+import re
 from collections.abc import Iterator
-from typing import Any
+from typing import Any, Final
 
 import torch
 
+from brewster.errors import DeviceError
 from brewster.models.diffusion.lazy_imports import import_library
 from brewster.models.diffusion_resources import DECODING_BYTES_PER_PIXEL
+
+_CPU_MEMORY_ERROR: Final = re.compile(r"out of memory|not enough memory|can't allocate memory", re.IGNORECASE)
 
 
 def offload_layers(transformer: Any, vae: Any, device: str) -> None:  # noqa: ANN401 - modules of diffusers
@@ -51,3 +56,17 @@ def free_gpu_bytes(device: torch.device) -> int | None:
         return None
     reserved = torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)
     return torch.cuda.mem_get_info(device)[0] + reserved
+
+
+@contextlib.contextmanager
+def explain_out_of_memory(hint: str) -> Iterator[None]:
+    """Converts out-of-memory errors of any device to a DeviceError; `hint` says what to reduce."""
+    try:
+        yield
+    except (MemoryError, RuntimeError) as error:
+        if isinstance(error, MemoryError | torch.OutOfMemoryError) or _CPU_MEMORY_ERROR.search(str(error)):
+            first = str(error).splitlines()[0] if str(error) else "out of memory"
+            raise DeviceError(
+                f"the device ran out of memory ({first})", "expected enough memory for the model", hint
+            ) from error
+        raise

@@ -9,7 +9,7 @@ Therefore the list of panels is a setting.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, Literal, final, get_args
 
@@ -31,11 +31,8 @@ WHITE: Final = 1.0
 class PanelLayout:
     """The panels of the composite in their order, and the direction in which they are concatenated.
 
-    `white_space` is whether the conditioning image has the size of the composite, with white space for the panels that
-    are to be generated. Otherwise it is the photo alone.
-
-    Raises:
-        RecipeError: there is no panel, a panel is unknown or repeated, or the direction is unknown.
+    `white_space` is whether the conditioning image has the size of the composite, with white space for the panels that are to
+    be generated. Otherwise it is the photo alone. Raises RecipeError if there is no panel, or a panel is unknown or repeated.
     """
 
     panels: tuple[Panel, ...] = ("I", "T", "R")
@@ -49,12 +46,6 @@ class PanelLayout:
                 f"the panels are {list(self.panels)}",
                 "expected one or more of I, T and R, each once",
                 'write panels = ["I", "T", "R"] or ["T", "R"]',
-            )
-        if self.direction not in get_args(Direction):
-            raise RecipeError(
-                f"the direction is {self.direction!r}",
-                f"expected {' or '.join(map(repr, get_args(Direction)))}",
-                "choose one of them",
             )
 
     @property
@@ -75,40 +66,15 @@ class PanelLayout:
 
 
 def compose(panels: Mapping[str, Tensor], layout: PanelLayout) -> Float[Tensor, "n 3 h w"]:
-    """Concatenates the panels of the layout into one image; other panels are ignored.
-
-    Raises:
-        PhotoError: a panel is missing, or the panels differ in shape.
-    """
-    missing = [name for name in layout.panels if name not in panels]
-    if missing:
-        raise PhotoError(
-            f"there is no panel {', '.join(missing)} among {', '.join(panels) or 'none'}",
-            f"expected all panels of the layout: {', '.join(layout.panels)}",
-            "pass the missing panels or change the layout",
-        )
-    shapes = {name: tuple(panels[name].shape) for name in layout.panels}
-    if len(set(shapes.values())) > 1:
-        raise PhotoError(f"the panels have the shapes {shapes}", "expected equal shapes", "resize them first")
+    """Concatenates the panels of the layout, which have equal shapes, into one image; other panels are ignored."""
     import torch  # noqa: PLC0415 - recipes are read without torch
 
     return torch.cat([panels[name] for name in layout.panels], dim=layout.axis)
 
 
 def split(composite: Float[Tensor, "n c h w"], layout: PanelLayout) -> dict[str, Tensor]:
-    """Splits a composite, or its latents, into its panels by name: the exact inverse of `compose`.
-
-    Raises:
-        PhotoError: the size of the composite is not divisible by the number of panels.
-    """
-    length, count = composite.shape[layout.axis], len(layout.panels)
-    if length % count:
-        raise PhotoError(
-            f"a composite of {length} pixels is not divisible by {count}",
-            f"expected {count} equal panels {layout.direction}",
-            "pass the result of compose",
-        )
-    return dict(zip(layout.panels, composite.chunk(count, dim=layout.axis), strict=True))
+    """Splits a composite, or its latents, into its panels by name: the exact inverse of `compose`."""
+    return dict(zip(layout.panels, composite.chunk(len(layout.panels), dim=layout.axis), strict=True))
 
 
 def count_tokens(panel: tuple[int, int], layout: PanelLayout, size_divisor: int) -> tuple[int, int]:
@@ -148,12 +114,7 @@ class PanelFit:
     panel: tuple[int, int]
 
     def pad(self, content: Float[Tensor, "n c h w"]) -> Float[Tensor, "n c H W"]:
-        """Pads an image of the content's size to the panel's size with a mirrored copy of its border.
-
-        Raises:
-            PhotoError: the image has another size.
-        """
-        _check_size(content, self.content)
+        """Pads an image of the content's size to the panel's size with a mirrored copy of its border."""
         right, below = (panel - content for panel, content in zip(self.panel, self.content, strict=True))
         if not right and not below:
             return content
@@ -162,12 +123,7 @@ class PanelFit:
         return functional.pad(content, (0, right, 0, below), mode="reflect")
 
     def crop(self, panel: Float[Tensor, "n c H W"]) -> Float[Tensor, "n c h w"]:
-        """Crops a panel to its content: the exact inverse of `pad`.
-
-        Raises:
-            PhotoError: the panel has another size.
-        """
-        _check_size(panel, self.panel)
+        """Crops a panel to its content: the exact inverse of `pad`."""
         width, height = self.content
         return panel[..., :height, :width]
 
@@ -177,84 +133,22 @@ def fit_panel(
 ) -> PanelFit:
     """The largest panel for a photo of this (width, height) whose composite has at most `max_composite_pixels` pixels.
 
-    Both sides are multiples of `size_divisor`. The short side is the largest that fits. The long side is the
-    multiple that is nearest to the photo's aspect ratio. The difference of at most half a multiple becomes padding, so
-    the photo is not stretched.
-
-    Raises:
-        PhotoError: the photo is smaller than its panel and would have to be enlarged, or its aspect ratio is so
-            extreme that no panel fits the budget.
+    Both sides are multiples of `size_divisor`. The short side is the largest that fits without enlarging the photo. The long
+    side is the multiple that is nearest to the photo's aspect ratio. The difference of at most half a multiple becomes padding,
+    so the photo is not stretched. Raises PhotoError if the photo has fewer than `size_divisor` pixels on a side, or its aspect
+    ratio is too extreme.
     """
-    area = max_composite_pixels // len(layout.panels)
-    fit = next(_panel_fits(size, area, size_divisor), None)
-    if fit is None:
-        raise PhotoError(
-            f"no panel with the aspect ratio of {size[0]} x {size[1]} pixels fits into {area} pixels",
-            f"expected that both sides of the panel have at least {size_divisor} pixels",
-            "crop the photo or raise max_composite_pixels",
-        )
-    if not _enlarges(fit, size):
-        return fit
-    max_allowed_pixels = math.prod(side // size_divisor * size_divisor for side in size) * len(layout.panels)
-    raise PhotoError(
-        f"the photo has {size[0]} x {size[1]} pixels",
-        f"expected at least {fit.content[0]} x {fit.content[1]}, the size of a panel",
-        f"lower max_composite_pixels to {max_allowed_pixels}"
-        if max_allowed_pixels
-        else f"use a photo with sides of at least {size_divisor} pixels",
-    )
-
-
-def fit_smaller_panel(
-    size: tuple[int, int], layout: PanelLayout, *, max_composite_pixels: int, size_divisor: int
-) -> PanelFit:
-    """As `fit_panel`, but a photo that is smaller than its panel gets a smaller panel.
-
-    Raises:
-        PhotoError: the photo has fewer than `size_divisor` pixels on a side, or its aspect ratio is too extreme.
-    """
-    fits = _panel_fits(size, max_composite_pixels // len(layout.panels), size_divisor)
-    if fit := next((fit for fit in fits if not _enlarges(fit, size)), None):
-        return fit
+    area, (short, long) = max_composite_pixels // len(layout.panels), sorted(size)
+    upper_bound = math.isqrt(area * short // long + 1) + size_divisor
+    for short_side in range(upper_bound // size_divisor * size_divisor, 0, -size_divisor):
+        long_side = max(size_divisor, round(short_side * long / short / size_divisor) * size_divisor)
+        panel = (short_side, long_side) if size[0] <= size[1] else (long_side, short_side)
+        scale = min(panel[0] / size[0], panel[1] / size[1])
+        width, height = (min(side, round(scale * whole)) for whole, side in zip(size, panel, strict=True))
+        if short_side * long_side <= area and width <= size[0] and height <= size[1]:
+            return PanelFit((width, height), panel)
     raise PhotoError(
         f"the photo has {size[0]} x {size[1]} pixels",
         f"expected at least {size_divisor} pixels a side, and a less extreme aspect ratio",
         "crop it, or use the compact model",
     )
-
-
-def _panel_fits(size: tuple[int, int], area: int, size_divisor: int) -> Iterator[PanelFit]:
-    """The fits of a photo into panels of at most `area` pixels, largest first."""
-    short, long = min(size), max(size)
-    if short < 1:
-        raise PhotoError(
-            f"the photo has {size[0]} x {size[1]} pixels",
-            "expected at least one pixel a side",
-            "check the file",
-        )
-    upper_bound = math.isqrt(area * short // long + 1) + size_divisor
-    for short_side in range(upper_bound // size_divisor * size_divisor, 0, -size_divisor):
-        long_side = max(size_divisor, round(short_side * long / short / size_divisor) * size_divisor)
-        if short_side * long_side <= area:
-            yield _fit(size, (short_side, long_side) if size[0] <= size[1] else (long_side, short_side))
-
-
-def _fit(size: tuple[int, int], panel: tuple[int, int]) -> PanelFit:
-    """The fit with the largest content that is inside the panel."""
-    scale = min(panel[0] / size[0], panel[1] / size[1])
-    width, height = (
-        min(side, round(scale * photo_side)) for photo_side, side in zip(size, panel, strict=True)
-    )
-    return PanelFit((width, height), panel)
-
-
-def _enlarges(fit: PanelFit, size: tuple[int, int]) -> bool:
-    return fit.content[0] > size[0] or fit.content[1] > size[1]
-
-
-def _check_size(image: Tensor, size: tuple[int, int]) -> None:
-    height, width = image.shape[-2:]
-    if (width, height) != size:
-        raise PhotoError(
-            f"the image has {width} x {height} pixels", f"expected {size[0]} x {size[1]}", "resize it first"
-        )

@@ -32,8 +32,7 @@ from brewster.models.diffusion.memory import (
     torch_device,
 )
 from brewster.models.diffusion.model_source import ModelSource, digest_file, find_model_source
-from brewster.models.diffusion.offloading import offload_layers
-from brewster.models.diffusion.out_of_memory import explain_out_of_memory
+from brewster.models.diffusion.offloading import explain_out_of_memory, offload_layers
 from brewster.models.diffusion.panels import PanelLayout, compose, conditioning_image, split
 from brewster.models.diffusion.prompt import PROMPT_FILE, PROMPTS, PromptEmbedding, load_prompt
 from brewster.models.diffusion.sampling import euler, sample
@@ -78,14 +77,17 @@ class DecompositionPipeline:
             The panels by name, (seeds, 3, H, W) in [-1, 1], float32, on the CPU.
 
         Raises:
-            ModelError: a side is not a multiple of 16, or there is no step or no seed.
+            ModelError: there is no step or no seed.
             DeviceError: out of memory; the message says what to reduce.
         """
         layout = self.task.layout
         if self.task.objective == "direct":
             return self._direct(photo, on_progress)
         if self.task.objective == "one_step":
-            return split(self._one_step(photo, on_progress), layout)
+            images = self._one_step(photo)
+            if on_progress:
+                on_progress(1, 1)
+            return split(images, layout)
         height, width = photo.shape[-2:]
         images = sample(
             self.backbone,
@@ -102,7 +104,7 @@ class DecompositionPipeline:
         return split(images, layout)
 
     @torch.no_grad()
-    def _one_step(self, photo: Tensor, on_progress: Callable[[int, int], None] | None) -> Tensor:
+    def _one_step(self, photo: Tensor) -> Tensor:
         backbone, layout = self.backbone, self.task.layout
         with explain_out_of_memory(_MEMORY_HINT):
             latents = euler(
@@ -113,10 +115,7 @@ class DecompositionPipeline:
                 sigmas=torch.tensor([1.0, 0.0]),
                 guidance=self.task.guidance,
             )
-            image = backbone.decode(latents).clamp(-1, 1).cpu()
-        if on_progress:
-            on_progress(1, 1)
-        return image
+            return backbone.decode(latents).clamp(-1, 1).cpu()
 
     @torch.no_grad()
     def _direct(self, photo: Tensor, on_progress: Callable[[int, int], None] | None) -> dict[str, Tensor]:
@@ -157,32 +156,22 @@ def load_pipeline(
 ) -> DecompositionPipeline:
     """Loads a LoRA with its base model, or a backbone without a LoRA.
 
+    For the other options, see `brewster.options.Options`.
+
     Args:
         model: a LoRA by its folder or hub id, or a backbone by its name, folder or hub id.
         device: "auto" uses an NVIDIA or AMD GPU if torch finds one, otherwise the CPU.
-        base_model: the folder or hub id of the LoRA's base model; by default the one used in training. Only for a LoRA.
-        quantization: the quantization of the base model. On a GPU, the default is that of the training; if it does not fit, int8,
-            then nf4. On a CPU, the default is none.
-        offload: "layers" keeps the weights of the transformer in host memory and copies each block to the GPU while it
-            computes; "auto" does this only if they do not fit into the free GPU memory.
-        transformer: a single file (.gguf or .safetensors) whose weights replace those of the base's transformer; see
-            `find_weights_file`.
-        fast_lora: a few-step LoRA, which is added to that of the model; see `find_weights_file`. A few-step LoRA (Lightning,
-            turbo) is trained for sampling in few steps, such as 4 or 8.
-        guidance: the guidance scale, by default that of the task. With a few-step LoRA and classifier-free guidance, the
-            default is 1, which saves the second prediction.
-        timestep_shift: the factor by which the sampling times are shifted towards noise, by default that of the task. With
-            a few-step LoRA for qwen, the default is 3. See `Backbone.schedule`.
-        prompt: for a backbone without a LoRA: a name in `PROMPTS`, or the text itself. A finetuned backbone with a
-            stored prompt uses that one.
+        quantization: on a GPU, the default is that of the training; if it does not fit, int8, then nf4. On a CPU: none.
+        transformer, fast_lora: see `find_weights_file`.
+        guidance: with a few-step LoRA and classifier-free guidance, the default is 1, which saves the second prediction.
+        prompt: for a backbone without a LoRA: a name in `PROMPTS`, or the text itself. A finetuned backbone with a stored
+            prompt uses that one.
 
     Raises:
-        DownloadError: no access to a gated model, an invalid token, or no network connection.
+        DownloadError, MissingExtra: see `load_backbone`.
         ModelError: a file is missing or damaged, a LoRA belongs to another backbone, the name is unknown, or a few-step
             LoRA or a timestep shift is given for a model that takes one step.
-        DeviceError: there is no such device, it is out of memory, or the weights cannot be offloaded; the message says
-            what to change.
-        MissingExtra: diffusers, torchao or bitsandbytes is not installed.
+        DeviceError: there is no such device, it is out of memory, or the weights cannot be offloaded.
     """
     _check_before_download(
         model,
@@ -194,8 +183,12 @@ def load_pipeline(
     )
     source = find_model_source(model, base_model)
     for option, value in {"few-step LoRA": fast_lora, "timestep shift": timestep_shift}.items():
-        if value is not None:
-            _check_takes_steps(model, source.task, option)
+        if value is not None and source.task.objective != "flow":
+            raise ModelError(
+                f"a {option} was given for {model}, which takes one step",
+                "expected a model that samples in several steps",
+                f"leave the {option} out",
+            )
     transformer_file = find_weights_file(transformer, TRANSFORMER_SUFFIXES) if transformer else None
     placement = _choose_placement(source, device, quantization, offload, transformer_file)
     check_machine(
@@ -209,8 +202,19 @@ def load_pipeline(
     fast_lora_file = find_lora_file(fast_lora) if fast_lora else None
     text = PROMPTS.get(prompt, prompt)
     # The prompt is encoded before the backbone is loaded, because memory may be too small for both.
-    embedding = None if source.layout else _embed(source, text, placement.device)
-    backbone = _load_base(source.base, placement, transformer_file)
+    if source.layout:
+        embedding = None
+    elif source.has_prompt and source.folder:  # a finetuned backbone, which has no text encoder
+        embedding = load_prompt(source.folder / PROMPT_FILE, source.backbone_class.name)
+    else:
+        embedding = encode_prompt(source.base, text, device=placement.device)
+    backbone = load_backbone(
+        source.base,
+        device="cpu" if placement.is_offloaded else placement.device,
+        dtype=torch.float32 if placement.device == "cpu" else torch.bfloat16,
+        quantization=placement.quantization,
+        transformer_file=transformer_file,
+    )
     few_step_layers = read_layers(fast_lora_file, backbone) if fast_lora_file else {}
     if source.layout and source.folder:
         _, embedding = source.layout.load(source.folder, backbone)
@@ -242,11 +246,8 @@ def fingerprint(
 ) -> str:
     """The SHA-256 of what `load_pipeline` would load: LoRA, prompt, base model, and the quantization of the base model.
 
-    See `ModelSource.digest_parts` for how a base model is identified.
-
-    Raises:
-        ModelError, DownloadError: the LoRA does not exist or is damaged.
-        DeviceError: diffusion models do not run on this device.
+    See `ModelSource.digest_parts` for how a base model is identified. Raises ModelError, DownloadError or DeviceError, see
+    `load_pipeline`.
     """
     source = find_model_source(model, base_model)
     placement = _choose_placement(source, device, quantization)
@@ -275,9 +276,6 @@ def _check_before_download(
 
     The memory for the text encoders is checked later, because the files of the model show whether its prompt is stored. If
     the transformer is in a file, only the device is checked, because the size of a file on the hub is not known.
-
-    Raises:
-        DeviceError, DownloadError, MissingExtra: see `check_machine`.
     """
     chosen_device = torch_device(device)
     try:
@@ -302,35 +300,6 @@ def _choose_placement(
     weights = count_weights(source.base, source.backbone_class, transformer_file)
     choice = WeightChoice(quantization, source.trained_quantization, offload, transformer_file is not None)
     return choose_placement(weights, choice, device)
-
-
-def _embed(source: ModelSource, text: str, device: str) -> PromptEmbedding:
-    """The prompt that is stored with a finetuned backbone, which has no text encoder; otherwise the encoded text."""
-    if source.has_prompt and source.folder:
-        return load_prompt(source.folder / PROMPT_FILE, source.backbone_class.name)
-    return encode_prompt(source.base, text, device=device)
-
-
-def _load_base(base: str, placement: Placement, transformer_file: Path | None) -> Backbone:
-    """Loads the base to its device, or to host memory in the precision of the device."""
-    device = "cpu" if placement.is_offloaded else placement.device
-    dtype = torch.float32 if placement.device == "cpu" else torch.bfloat16
-    return load_backbone(
-        base,
-        device=device,
-        dtype=dtype,
-        quantization=placement.quantization,
-        transformer_file=transformer_file,
-    )
-
-
-def _check_takes_steps(model: str, task: DecompositionTask, option: str) -> None:
-    if task.objective != "flow":
-        raise ModelError(
-            f"a {option} was given for {model}, which takes one step",
-            "expected a model that samples in several steps",
-            f"leave the {option} out",
-        )
 
 
 def task_with_options(

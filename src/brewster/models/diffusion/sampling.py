@@ -17,7 +17,7 @@ from torch import Tensor
 
 from brewster.errors import ModelError
 from brewster.models.diffusion.backbones.backbone import Backbone
-from brewster.models.diffusion.out_of_memory import explain_out_of_memory
+from brewster.models.diffusion.offloading import explain_out_of_memory
 from brewster.models.diffusion.prompt import PromptEmbedding
 from brewster.models.diffusion.task import GUIDANCE, STEPS
 
@@ -41,38 +41,38 @@ def sample(
     timestep_shift: float | None = None,
     last_sigma: float | None = None,
     seeds: Sequence[int] = (0,),
-    batch: int = 1,
     on_progress: Callable[[int, int], None] | None = None,
 ) -> Float[Tensor, "seeds 3 h w"]:
     """Generates one composite per seed, of this (width, height) in pixels.
 
-    The noise is drawn on the CPU, so a seed gives the same noise on every device. `batch` is the number of seeds that
-    are computed at once; the result depends on it only by rounding. For `timestep_shift` and `last_sigma`, see
+    The noise is drawn on the CPU, so a seed gives the same noise on every device. For `timestep_shift` and `last_sigma`, see
     `Backbone.schedule`. `on_progress(done, total)` is called after each step.
 
     Returns:
         The composites in [-1, 1], float32, on the CPU. `.mean(0, keepdim=True)` averages them.
 
     Raises:
-        ModelError: a side is not a multiple of 16; the prompt lacks the embedding that guidance needs; `steps`, `batch`
-            or the number of seeds is less than one.
+        ModelError: the prompt lacks the embedding that guidance needs, or `steps` or the number of seeds is less than one.
         DeviceError: out of memory; the message says what to reduce.
     """
-    _check_positive(f"{steps} steps", steps, default=STEPS)
-    _check_positive(f"{len(seeds)} seeds", len(seeds), default=1)
-    _check_positive(f"a batch of {batch}", batch, default=1)
-    chunks = [seeds[start : start + batch] for start in range(0, len(seeds), batch)]
+    for noun, number, default in (("steps", steps, STEPS), ("seeds", len(seeds), 1)):
+        if number < 1:
+            raise ModelError(
+                f"sampling was requested with {number} {noun}",
+                "expected at least 1",
+                f"use {default}, the default",
+            )
     done = itertools.count(1)
 
     def report_step() -> None:
         if on_progress:
-            on_progress(next(done), steps * len(chunks))
+            on_progress(next(done), steps * len(seeds))
 
     images = []
     with explain_out_of_memory(_MEMORY_HINT):
         condition_latents = backbone.encode(condition)
-        for chunk in chunks:
-            noise = torch.cat([backbone.noise(size, seed) for seed in chunk])
+        for seed in seeds:
+            noise = backbone.noise(size, seed)
             sigmas = backbone.schedule(
                 noise.shape[2] * noise.shape[3], steps, timestep_shift=timestep_shift, last_sigma=last_sigma
             )
@@ -113,10 +113,3 @@ def euler(
         if on_progress:
             on_progress()
     return latents
-
-
-def _check_positive(request: str, count: int, *, default: int) -> None:
-    if count < 1:
-        raise ModelError(
-            f"sampling was requested with {request}", "expected at least 1", f"use {default}, the default"
-        )

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from dataclasses import asdict, dataclass, field
-from functools import cache
 from pathlib import Path
 from typing import Annotated, Final, Literal, final
 
@@ -12,7 +11,7 @@ from pydantic import Field, TypeAdapter
 
 from brewster.errors import ModelError, RecipeError
 from brewster.files import write_atomically
-from brewster.models.diffusion.panels import PanelFit, PanelLayout, fit_smaller_panel
+from brewster.models.diffusion.panels import PanelFit, PanelLayout, fit_panel
 
 Objective = Literal["flow", "one_step"]
 """The objectives that brewster trains."""
@@ -64,28 +63,18 @@ class DecompositionTask:
             )
 
     def input_size(self, size: tuple[int, int], size_divisor: int) -> tuple[int, int]:
-        """The (width, height) of the copy of a photo that is the input, never larger than the photo.
-
-        Raises:
-            PhotoError: see `fit`. With `short_side_px` every photo has an input size.
-        """
+        """The (width, height) of the copy of a photo that is the input, never larger than the photo. Raises PhotoError, see
+        `fit`. With `short_side_px` every photo has an input size."""
         if self.short_side_px is None:
             return self.fit(size, size_divisor).content
         scale = min(1.0, self.short_side_px / min(size))
         return round(scale * size[0]), round(scale * size[1])
 
     def fit(self, size: tuple[int, int], size_divisor: int) -> PanelFit:
-        """The largest panel within the budget for a photo of this (width, height). A photo is never enlarged.
-
-        Raises:
-            PhotoError: the photo has fewer than `size_divisor` pixels on a side, or its aspect ratio is too extreme.
-        """
-        return fit_smaller_panel(
-            size,
-            self.layout,
-            max_composite_pixels=self.max_composite_pixels,
-            size_divisor=size_divisor,
-        )
+        """The largest panel within the budget for a photo of this (width, height). A photo is never enlarged. Raises PhotoError
+        if the photo has fewer than `size_divisor` pixels on a side, or its aspect ratio is too extreme."""
+        budget = self.max_composite_pixels
+        return fit_panel(size, self.layout, max_composite_pixels=budget, size_divisor=size_divisor)
 
 
 def windowseat_task(side_px: int = 768) -> DecompositionTask:
@@ -125,30 +114,17 @@ def named_task(model: str) -> DecompositionTask:
 
 
 def save_task(task: DecompositionTask, path: Path) -> None:
-    """Writes a JSON file, and replaces an existing one.
-
-    Raises:
-        OutputError: the file cannot be written.
-    """
+    """Writes a JSON file, and replaces an existing one. Raises OutputError if the file cannot be written."""
     write_atomically(path, f"{json.dumps(asdict(task), indent=2)}\n".encode(), overwrite=True)
 
 
 def load_task(path: Path) -> DecompositionTask:
-    """Reads a file that `save_task` wrote.
-
-    Raises:
-        ModelError: the file cannot be read, or is not a valid task.
-    """
+    """Reads a file that `save_task` wrote. Raises ModelError if the file cannot be read, or is not a valid task."""
     try:
-        return _validator().validate_json(path.read_bytes(), strict=True, extra="forbid")
+        return TypeAdapter(DecompositionTask).validate_json(path.read_bytes(), strict=True, extra="forbid")
     except (OSError, ValueError, RecipeError) as error:
         raise ModelError(
             f"{path} cannot be read: {error}",
             "expected the task of a model",
             "copy or convert the model again",
         ) from error
-
-
-@cache
-def _validator() -> TypeAdapter[DecompositionTask]:
-    return TypeAdapter(DecompositionTask)

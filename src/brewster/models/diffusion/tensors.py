@@ -16,12 +16,8 @@ if TYPE_CHECKING:
 
 
 def write_tensors(path: Path, tensors: Mapping[str, Tensor], metadata: Mapping[str, str]) -> None:
-    """Writes the tensors and their metadata atomically, and replaces an existing file.
-
-    Raises:
-        OutputError: the file cannot be written.
-        MissingExtra: safetensors is not installed.
-    """
+    """Writes the tensors and their metadata atomically, and replaces an existing file. Raises OutputError if the file cannot be
+    written, and MissingExtra if safetensors is not installed."""
     cpu_tensors = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
     metadata = {"format": "pt", **metadata}
     # safetensors writes metadata in an order that differs between runs, so the header is written again in sorted order.
@@ -31,12 +27,8 @@ def write_tensors(path: Path, tensors: Mapping[str, Tensor], metadata: Mapping[s
 
 
 def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
-    """The tensors of a file by name, on the CPU, and its metadata.
-
-    Raises:
-        ModelError: the file is missing or damaged.
-        MissingExtra: safetensors is not installed.
-    """
+    """The tensors of a file by name, on the CPU, and its metadata. Raises ModelError if the file is missing or damaged, and
+    MissingExtra if safetensors is not installed."""
     safetensors = import_library("safetensors")
     try:
         # Not memory-mapped: mapped tensors would change if another process rewrote the file.
@@ -56,11 +48,7 @@ def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
 
 
 def read_json(path: Path) -> dict[str, Any]:
-    """The JSON object in a file of a model.
-
-    Raises:
-        ModelError: the file is missing or damaged, or contains no object.
-    """
+    """The JSON object in a file of a model. Raises ModelError if the file is missing or damaged, or contains no object."""
     try:
         value = json.loads(path.read_text("utf-8"))
     except FileNotFoundError as error:
@@ -78,25 +66,21 @@ def read_json(path: Path) -> dict[str, Any]:
     return value
 
 
-def _header(data: bytes) -> dict[str, Any]:
-    return json.loads(data[8 : _header_end(data)])  # type: ignore[no-any-return]
-
-
-def _header_end(data: bytes) -> int:
-    """The offset of the header's end; the first eight bytes of the file hold its length."""
-    return 8 + int.from_bytes(data[:8], "little")
+def _header(data: bytes) -> tuple[dict[str, Any], int]:
+    """The header, and the offset of its end. The first eight bytes of the file hold its length."""
+    end = 8 + int.from_bytes(data[:8], "little")
+    return json.loads(data[8:end]), end
 
 
 def read_metadata(data: bytes) -> dict[str, str]:
     """The metadata in the bytes of a safetensors file."""
-    metadata: dict[str, str] = _header(data).get("__metadata__", {})
-    return metadata
+    return dict(_header(data)[0].get("__metadata__", {}))
 
 
 def with_metadata(data: bytes, metadata: Mapping[str, str]) -> bytes:
     """Replaces the metadata in the bytes of a safetensors file, and returns the new bytes."""
-    header = _header(data)
+    header, end = _header(data)
     header["__metadata__"] = dict(sorted(metadata.items()))
     text = json.dumps(header, separators=(",", ":"), ensure_ascii=False).encode()
     text += b" " * (-len(text) % 8)
-    return len(text).to_bytes(8, "little") + text + data[_header_end(data) :]
+    return len(text).to_bytes(8, "little") + text + data[end:]

@@ -57,10 +57,7 @@ def export_merged(folder: Path, target: Path, base_model: str | None = None) -> 
     The sums are computed in float32 on the CPU. The folder also gets the encoded prompt and the task, but no text encoders.
     It is for programs that cannot load a LoRA; `load_pipeline` opens it, too.
 
-    Args:
-        folder: the folder of the LoRA.
-        target: the folder to write.
-        base_model: the folder or hub id of the base, if it has moved since training.
+    `base_model` is the folder or hub id of the base, if it has moved since training.
 
     Raises:
         ModelError: the LoRA or its base is missing or damaged, or they do not match.
@@ -79,38 +76,7 @@ def export_merged(folder: Path, target: Path, base_model: str | None = None) -> 
             f"expected a base of {metadata.backbone}, not of {backbone_class.name}",
             "choose another base",
         )
-    _check_space(base, count_weights(base, backbone_class) + backbone_class.cost.vae_parameters, target)
-    backbone = load_backbone(base, dtype=torch.bfloat16)
-    merge(backbone, state, 1.0 if metadata.imported else metadata.alpha / metadata.rank)
-    backbone.save(target)
-    prompt.save(target / PROMPT_FILE)
-    save_task(metadata.task, target / TASK_FILE)
-
-
-@torch.no_grad()
-def merge(backbone: Backbone, state: Mapping[str, Tensor], scale: float) -> None:
-    """Replaces the weight W of each adapted layer by W + scale B A (Hu et al. 2021). `state` is that of `lora_state_dict`.
-
-    Raises:
-        ModelError: the backbone has no such layer.
-    """
-    modules = backbone.transformer.named_modules()
-    layers = {name for name, module in modules if isinstance(module, nn.Linear)}
-    for layer in adapted_layers(state):
-        if layer not in layers:
-            raise ModelError(
-                f"the base has no layer {layer}",
-                "expected the base with which the LoRA was trained",
-                "choose another base",
-            )
-        weight = backbone.transformer.get_submodule(layer).weight
-        change = scale * state[layer + UP_SUFFIX].float() @ state[layer + DOWN_SUFFIX].float()
-        weight.copy_(weight.float() + change.to(weight.device))
-
-
-def _check_space(base: str, parameters: int, target: Path) -> None:
-    """Checks the host memory and the disk of `target` for this number of parameters in bfloat16."""
-    needed = weights_gib(parameters, None)
+    needed = weights_gib(count_weights(base, backbone_class) + backbone_class.cost.vae_parameters, None)
     memory = import_library("psutil").virtual_memory().available / GIB
     if needed > memory:
         raise DeviceError(
@@ -125,6 +91,29 @@ def _check_space(base: str, parameters: int, target: Path) -> None:
             "expected enough free disk for all weights in bfloat16",
             "free disk space, or choose a folder on a larger disk",
         )
+    backbone = load_backbone(base, dtype=torch.bfloat16)
+    merge(backbone, state, 1.0 if metadata.imported else metadata.alpha / metadata.rank)
+    backbone.save(target)
+    prompt.save(target / PROMPT_FILE)
+    save_task(metadata.task, target / TASK_FILE)
+
+
+@torch.no_grad()
+def merge(backbone: Backbone, state: Mapping[str, Tensor], scale: float) -> None:
+    """Replaces the weight W of each adapted layer by W + scale B A (Hu et al. 2021). `state` is that of `lora_state_dict`.
+    Raises ModelError if the backbone has no such layer."""
+    modules = backbone.transformer.named_modules()
+    layers = {name for name, module in modules if isinstance(module, nn.Linear)}
+    for layer in adapted_layers(state):
+        if layer not in layers:
+            raise ModelError(
+                f"the base has no layer {layer}",
+                "expected the base with which the LoRA was trained",
+                "choose another base",
+            )
+        weight = backbone.transformer.get_submodule(layer).weight
+        change = scale * state[layer + UP_SUFFIX].float() @ state[layer + DOWN_SUFFIX].float()
+        weight.copy_(weight.float() + change.to(weight.device))
 
 
 def _check_target(target: Path) -> None:

@@ -15,13 +15,13 @@ import hashlib
 import json
 import re
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import Any, Final, final
 
 from brewster.errors import DownloadError, ModelError
-from brewster.models.diffusion.adapter.lora import LORA_FILE, LoraMetadata, read_lora_metadata, read_prompt
+from brewster.models.diffusion.adapter.lora import LORA_FILE, read_lora_metadata, read_prompt
 from brewster.models.diffusion.backbones.registry import BACKBONES, find_backbone_class
 from brewster.models.diffusion.hub_download import LOGIN_HINT, translate_hub_errors
 from brewster.models.diffusion.lazy_imports import import_library
@@ -40,39 +40,29 @@ _CARD_HINT: Final = "correct the model card, or train again to write a new one"
 
 @final
 @dataclass(frozen=True)
-class UploadFile:
-    """A file of the upload: its name in the repository and its bytes."""
-
-    name: str
-    data: bytes = field(repr=False)
-
-    @property
-    def sha256(self) -> str:
-        """SHA-256 of the bytes, in hexadecimal."""
-        return hashlib.sha256(self.data).hexdigest()
-
-
-@final
-@dataclass(frozen=True)
 class UploadPlan:
-    """A checked upload: repository, files, commit message, visibility, and remarks for the user."""
+    """A checked upload: repository, files by name, commit message, visibility, and remarks for the user."""
 
     repo_id: str
-    files: tuple[UploadFile, ...]
+    files: Mapping[str, bytes] = field(repr=False)
     message: str
     is_private: bool
-    remarks: tuple[str, ...]
+    remarks: Sequence[str]
 
     def table(self) -> str:
         """The plan as text: one line per file (name, bytes, SHA-256), then the total."""
-        lines = [f"{file.name:36}{len(file.data):>13,}  {file.sha256[:12]}" for file in self.files]
-        total = sum(len(file.data) for file in self.files)
+        rows = self.to_dict()["files"]
+        lines = [f"{row['name']:36}{row['bytes']:>13,}  {row['sha256'][:12]}" for row in rows]
+        total = sum(row["bytes"] for row in rows)
         visibility = "private" if self.is_private else "public"
         return "\n".join([*lines, f"{total / 1e6:.1f} MB to {self.repo_id} ({visibility}): {self.message}"])
 
     def to_dict(self) -> dict[str, Any]:
         """The plan as JSON values, without the contents of the files."""
-        files = [{"name": file.name, "bytes": len(file.data), "sha256": file.sha256} for file in self.files]
+        files = [
+            {"name": name, "bytes": len(data), "sha256": hashlib.sha256(data).hexdigest()}
+            for name, data in self.files.items()
+        ]
         return {
             "repo": self.repo_id, "private": self.is_private, "message": self.message,
             "files": files, "remarks": list(self.remarks),
@@ -87,27 +77,52 @@ def plan_push(folder: Path, repo_id: str, *, message: str = "", public: bool = F
             matter, a file or the message contains the path of a home folder, or `repo_id` is not OWNER/NAME.
         MissingExtra: huggingface_hub is not installed.
     """
-    _check_repo_id(repo_id)
-    data = {name: _read_bytes(folder / name) for name in FILES}
-    metadata, recipe = read_lora_metadata(folder), _parse_recipe(folder, data[RECIPE_FILE])
+    reason = "" if "/" in repo_id else "it has no owner"
+    try:
+        import_library("huggingface_hub.utils").validate_repo_id(repo_id)
+    except import_library("huggingface_hub.errors").HFValidationError as error:
+        reason = str(error).rstrip(".")
+    if reason:
+        raise ModelError(
+            f"{repo_id!r} is not a valid hub id ({reason})",
+            "expected OWNER/NAME",
+            "pass your user name and a repository name",
+        )
+    data, recipe = _read_files(folder)
+    metadata = read_lora_metadata(folder)
     read_prompt(folder, metadata)
-    _check_front_matter(folder, data[CARD_FILE], is_tiny=_is_tiny(metadata))
-    replacements = {path: PureWindowsPath(path).name for path in _local_paths(recipe)}
-    replacements |= _base_replacement(metadata)
+    is_tiny, base = metadata.base_model.startswith(TINY_PREFIX), metadata.base_model
+    _check_front_matter(folder, data[CARD_FILE], is_tiny=is_tiny)
+    backbone_class = find_backbone_class(metadata.backbone)
+    replacements: dict[str, str] = {}
+    if base not in BACKBONES and (_is_local_path(base) or Path(base).is_dir()):
+        replacements[base] = backbone_class.hub_id
+    recipe = _replace_paths(recipe, replacements)
+    base = replacements.get(base, base)
     if replacements:
-        data[RECIPE_FILE] = f"{json.dumps(_replace_strings(recipe, replacements), indent=2)}\n".encode()
-        data[LORA_FILE] = _replace_base(data[LORA_FILE], metadata, replacements)
+        data[RECIPE_FILE] = f"{json.dumps(recipe, indent=2)}\n".encode()
+        new_text = dataclasses.replace(metadata, base_model=base).to_json()
+        entries = read_metadata(data[LORA_FILE])
+        entries = {name: new_text if text == metadata.to_json() else text for name, text in entries.items()}
+        data[LORA_FILE] = with_metadata(data[LORA_FILE], entries)
     for name, content in data.items():
-        _refuse_home_folders(str(folder / name), _readable_text(name, content))
+        is_weights = name.endswith(".safetensors")
+        text = json.dumps(read_metadata(content)) if is_weights else content.decode(errors="replace")
+        _refuse_home_folders(str(folder / name), text)
     _refuse_home_folders("the commit message", message)
-    return UploadPlan(
-        repo_id,
-        tuple(UploadFile(name, content) for name, content in data.items()),
-        message
-        or f"LoRA of {replacements.get(metadata.base_model, metadata.base_model)}, rank {metadata.rank}",
-        not public,
-        tuple(_remarks(folder, metadata, replacements)),
-    )
+    remarks = [f"{path} is replaced by {name} in the uploaded files" for path, name in replacements.items()]
+    licence = backbone_class.licence
+    if is_tiny:
+        remarks.insert(0, f"the base of the LoRA is {base}, a tiny version: the LoRA cannot separate photos")
+    elif not licence.allows_commercial_use:
+        remarks.insert(
+            0,
+            f"the base of the LoRA has the licence {licence.title}, which also applies to the LoRA: not for commercial use",
+        )
+    if other_files := sorted(path.name for path in folder.iterdir() if path.name not in FILES):
+        remarks.append(f"not sent: {', '.join(other_files)}")
+    message = message or f"LoRA of {base}, rank {metadata.rank}"
+    return UploadPlan(repo_id, data, message, not public, remarks)
 
 
 def push(plan: UploadPlan, token: str | None = None) -> str:
@@ -131,7 +146,7 @@ def push(plan: UploadPlan, token: str | None = None) -> str:
     if not sys.stderr.isatty():
         import_library("huggingface_hub.utils").disable_progress_bars()
     api = hub.HfApi(token=token, library_name="brewster")
-    added = [hub.CommitOperationAdd(file.name, file.data) for file in plan.files]
+    added = [hub.CommitOperationAdd(name, data) for name, data in plan.files.items()]
     with _translate_push_errors(plan.repo_id):
         api.create_repo(plan.repo_id, private=plan.is_private, exist_ok=True)
         is_private = bool(api.model_info(plan.repo_id).private)
@@ -145,40 +160,25 @@ def push(plan: UploadPlan, token: str | None = None) -> str:
     return str(commit.commit_url)
 
 
-def _check_repo_id(repo_id: str) -> None:
-    reason = "" if "/" in repo_id else "it has no owner"
+def _read_files(folder: Path) -> tuple[dict[str, bytes], Any]:
+    """The content of each file by name, and the recipe."""
     try:
-        import_library("huggingface_hub.utils").validate_repo_id(repo_id)
-    except import_library("huggingface_hub.errors").HFValidationError as error:
-        reason = str(error).rstrip(".")
-    if reason:
-        raise ModelError(
-            f"{repo_id!r} is not a valid hub id ({reason})",
-            "expected OWNER/NAME",
-            "pass your user name and a repository name",
-        )
-
-
-def _read_bytes(path: Path) -> bytes:
-    try:
-        return path.read_bytes()
+        data = {name: (folder / name).read_bytes() for name in FILES}
     except OSError as error:
         raise ModelError(
-            f"{path} cannot be read ({error.strerror})",
+            f"{error.filename} cannot be read ({error.strerror})",
             f"expected a LoRA's folder, with {', '.join(FILES)}",
             "pass the folder named `lora` in the output folder of brewster train, or train again to write it",
         ) from error
-
-
-def _parse_recipe(folder: Path, data: bytes) -> Any:  # noqa: ANN401 - JSON
     try:
-        return json.loads(data)
+        recipe = json.loads(data[RECIPE_FILE])
     except ValueError as error:
         raise ModelError(
             f"{folder / RECIPE_FILE} is not JSON: {error}",
             "expected the recipe of the LoRA",
             "train again to write it",
         ) from error
+    return data, recipe
 
 
 def _check_front_matter(folder: Path, card: bytes, *, is_tiny: bool) -> None:
@@ -205,52 +205,19 @@ def _check_front_matter(folder: Path, card: bytes, *, is_tiny: bool) -> None:
         )
 
 
-def _local_paths(value: object) -> Iterator[str]:
-    """Yields all strings in a JSON value that are paths of this machine."""
-    if isinstance(value, str) and _is_local_path(value):
-        yield value
-    for item in value.values() if isinstance(value, dict) else value if isinstance(value, list) else ():
-        yield from _local_paths(item)
-
-
 def _is_local_path(text: str) -> bool:
     return PurePosixPath(text).is_absolute() or PureWindowsPath(text).is_absolute() or text.startswith("~")
 
 
-def _replace_strings(value: Any, replacements: Mapping[str, str]) -> Any:  # noqa: ANN401 - JSON
-    """Replaces strings in a JSON value, and returns the new value."""
+def _replace_paths(value: Any, replacements: dict[str, str]) -> Any:  # noqa: ANN401 - JSON
+    """Replaces the paths of this machine in a JSON value by their last part, and adds them to `replacements`."""
     if isinstance(value, dict):
-        return {name: _replace_strings(item, replacements) for name, item in value.items()}
+        return {name: _replace_paths(item, replacements) for name, item in value.items()}
     if isinstance(value, list):
-        return [_replace_strings(item, replacements) for item in value]
+        return [_replace_paths(item, replacements) for item in value]
+    if isinstance(value, str) and _is_local_path(value):
+        replacements.setdefault(value, PureWindowsPath(value).name)
     return replacements.get(value, value) if isinstance(value, str) else value
-
-
-def _base_replacement(metadata: LoraMetadata) -> dict[str, str]:
-    """{local folder: hub id} if the base is a local folder; otherwise empty."""
-    is_local = metadata.base_model not in BACKBONES and (
-        _is_local_path(metadata.base_model) or Path(metadata.base_model).is_dir()
-    )
-    return {metadata.base_model: find_backbone_class(metadata.backbone).hub_id} if is_local else {}
-
-
-def _replace_base(data: bytes, metadata: LoraMetadata, replacements: Mapping[str, str]) -> bytes:
-    """Replaces the base in the metadata of the LoRA file, and returns the new bytes."""
-    new_text = dataclasses.replace(
-        metadata, base_model=replacements.get(metadata.base_model, metadata.base_model)
-    ).to_json()
-    return with_metadata(
-        data,
-        {
-            name: new_text if text == metadata.to_json() else text
-            for name, text in read_metadata(data).items()
-        },
-    )
-
-
-def _readable_text(name: str, data: bytes) -> str:
-    """Returns the text of a file, or the metadata of a .safetensors file."""
-    return json.dumps(read_metadata(data)) if name.endswith(".safetensors") else data.decode(errors="replace")
 
 
 def _refuse_home_folders(source: str, text: str) -> None:
@@ -266,22 +233,6 @@ def _refuse_home_folders(source: str, text: str) -> None:
             "expected no path of a home folder, because it is published",
             f"remove it from {source}",
         )
-
-
-def _is_tiny(metadata: LoraMetadata) -> bool:
-    return metadata.base_model.startswith(TINY_PREFIX)
-
-
-def _remarks(folder: Path, metadata: LoraMetadata, replacements: Mapping[str, str]) -> Iterator[str]:
-    licence = find_backbone_class(metadata.backbone).licence
-    if _is_tiny(metadata):
-        yield f"the base of the LoRA is {metadata.base_model}, a tiny version: the LoRA cannot separate photos"
-    elif not licence.allows_commercial_use:
-        yield f"the base of the LoRA has the licence {licence.title}, which also applies to the LoRA: not for commercial use"
-    yield from (f"{path} is replaced by {name} in the uploaded files" for path, name in replacements.items())
-    other_files = sorted(path.name for path in folder.iterdir() if path.name not in FILES)
-    if other_files:
-        yield f"not sent: {', '.join(other_files)}"
 
 
 @contextlib.contextmanager

@@ -3,8 +3,8 @@
     import_lora("someone/glass-lora", Path("glass"), base_model="kontext", prompt="remove the reflection", panels=("T",))
 
 The file of a LoRA contains neither its base model nor its prompt nor its panels, so the user states them. peft stores alpha in
-another file; without it, the user also states alpha. The prompt is encoded once, during the import. The names and shapes of the layers are compared with the configuration of the base model; its weights are not
-loaded.
+another file; without it, the user also states alpha. The prompt is encoded once, during the import. The names and shapes of the
+layers are compared with the configuration of the base model; its weights are not loaded.
 """
 
 from __future__ import annotations
@@ -15,14 +15,14 @@ from pathlib import Path
 from typing import Final
 
 from brewster.errors import ModelError
-from brewster.models.diffusion.adapter.lora import LoraMetadata, save_layers
+from brewster.models.diffusion.adapter.lora import LoraMetadata, layer_settings, write_lora
 from brewster.models.diffusion.adapter.lora_formats import (
     LowRankLayer,
     ScalingFunction,
-    has_alphas,
     lora_format,
     read_lora_layers,
     scaling_from_config,
+    to_state_dict,
 )
 from brewster.models.diffusion.backbones.backbone import Backbone
 from brewster.models.diffusion.backbones.loading import encode_prompt
@@ -51,14 +51,8 @@ def import_lora(
 ) -> LoraMetadata:
     """Reads the LoRA, encodes the prompt, and writes the folder.
 
-    Args:
-        source: see `find_weights_file`.
-        folder: the folder to write.
-        base_model: the base model of the LoRA: a name in `BACKBONES`, a folder or a hub id.
-        prompt: a name in `PROMPTS`, or the text itself.
-        panels: the panels that the LoRA generates from the photo.
-        alpha: see `read_layers`.
-        device: the device that encodes the prompt.
+    For `source`, see `find_weights_file`; for `base_model`, see `load_backbone`; for `alpha`, see `read_layers`. `prompt` is a
+    name in `PROMPTS`, or the text itself, which `device` encodes. `panels` are those that the LoRA generates from the photo.
 
     Returns:
         The metadata of the written LoRA.
@@ -76,7 +70,7 @@ def import_lora(
     embedding = encode_prompt(base_model, PROMPTS.get(prompt, prompt), device=device)
     rank = max(layer.rank for layer in layers.values())
     written = LoraMetadata(base.name, base_model, None, rank, rank, task, embedding.sha256, imported=True)
-    save_layers(folder, layers, embedding, written)
+    write_lora(folder, to_state_dict(layers), layer_settings(layers), embedding, written)
     return written
 
 
@@ -88,16 +82,14 @@ def find_lora_file(source: str) -> Path:
 def read_layers(path: Path, base: Backbone, alpha: int | None = None) -> dict[str, LowRankLayer]:
     """The layers of the LoRA in a file, see `read_lora_layers`. The base must have no LoRA; it may be on the device "meta".
 
-    `alpha` is that of all layers, for a LoRA of peft without its adapter_config.json.
-
-    Raises:
-        ModelError: the file is missing or damaged, a key or shape does not belong to the base, a LoRA of peft has no alpha,
-            or alpha is given for a LoRA that has its own.
+    `alpha` is that of all layers, for a LoRA of peft without its adapter_config.json. Raises ModelError if the file is missing
+    or damaged, a key or shape does not belong to the base, a LoRA of peft has no alpha, or alpha is given for a LoRA that has
+    its own.
     """
     tensors, metadata = read_tensors(path)
     scale = _scale(path, metadata)
     if alpha is not None:
-        if scale or has_alphas(tensors):
+        if scale or any(key.endswith(".alpha") for key in tensors):
             raise ModelError(
                 f"alpha = {alpha} was given for {path}, which has its own alpha",
                 "expected alpha only for a LoRA without one",
@@ -118,10 +110,7 @@ def _refuse_unknown_alpha(name: str, rank: int) -> float:  # noqa: ARG001  (a Sc
 
 
 def _scale(path: Path, metadata: Mapping[str, str]) -> ScalingFunction | None:
-    """Returns the function that gives alpha / rank of a layer, from the settings in the file (diffusers) or next to it (peft).
-
-    Returns None if there are no settings.
-    """
+    """The scale of the layers by the settings in the file (diffusers) or next to it (peft), or None without settings."""
     config = path.with_name(PEFT_CONFIG_FILE)
     if _DIFFUSERS_KEY not in metadata:
         return scaling_from_config(read_json(config)) if config.is_file() else None

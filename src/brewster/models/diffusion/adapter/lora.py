@@ -17,7 +17,6 @@ import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from fnmatch import fnmatchcase
-from functools import cache
 from pathlib import Path
 from typing import Annotated, Any, Final, final
 
@@ -25,7 +24,7 @@ import torch
 from pydantic import Field, TypeAdapter, ValidationError
 from torch import Tensor, nn
 
-from brewster.errors import ModelError, RecipeError, invalid_value
+from brewster.errors import BrewsterError, ModelError, RecipeError, invalid_value
 from brewster.models.diffusion.adapter import lora_formats
 from brewster.models.diffusion.adapter.lora_formats import LowRankLayer
 from brewster.models.diffusion.backbones.backbone import Backbone
@@ -68,47 +67,34 @@ class LoraMetadata:
 
     @classmethod
     def from_json(cls, text: str) -> LoraMetadata:
-        """Parses the result of `to_json`.
-
-        Raises:
-            ModelError: the text is not valid metadata.
-        """
+        """Parses the result of `to_json`. Raises ModelError if the text is not valid metadata."""
+        problem: BrewsterError
+        cause: Exception
         try:
-            return _metadata_validator().validate_json(text, strict=True, extra="forbid")
+            return TypeAdapter(LoraMetadata).validate_json(text, strict=True, extra="forbid")
         except ValidationError as error:
-            details = error.errors()[0]
-            problem = invalid_value(details)
+            cause, details = error, error.errors()[0]
             if details["type"] in {"extra_forbidden", "unexpected_keyword_argument"}:
                 raise ModelError(
                     f"the metadata of the LoRA has the unknown key {'.'.join(map(str, details['loc']))}",
                     "expected only keys of the metadata format of this version",
                     "update brewster: a newer version wrote the LoRA",
                 ) from error
-            raise ModelError(
-                f"the metadata of the LoRA cannot be read: {problem.happened}",
-                f"{problem.expected}, as in the metadata that brewster writes",
-                "copy the folder again, or save the LoRA again",
-            ) from error
+            problem = invalid_value(details)
         except RecipeError as error:
-            raise ModelError(
-                f"the metadata of the LoRA cannot be read: {error}",
-                "expected metadata that brewster wrote",
-                "copy the folder again, or save the LoRA again",
-            ) from error
-
-
-@cache
-def _metadata_validator() -> TypeAdapter[LoraMetadata]:
-    return TypeAdapter(LoraMetadata)
+            cause = problem = error
+        raise ModelError(
+            f"the metadata of the LoRA cannot be read: {problem.happened}",
+            f"{problem.expected}, as in the metadata that brewster writes",
+            "copy the folder again, or save the LoRA again",
+        ) from cause
 
 
 def select_target_modules(backbone: Backbone, patterns: Sequence[str] = ()) -> list[str]:
     """The full names of the linear layers of the blocks that match a pattern; without patterns, of all of them.
 
-    In a pattern, * and ? are wildcards as in a shell: "*.attn.*" selects the layers of the attention.
-
-    Raises:
-        ModelError: a pattern matches no layer.
+    In a pattern, * and ? are wildcards as in a shell: "*.attn.*" selects the layers of the attention. Raises ModelError if a
+    pattern matches no layer.
     """
     names = backbone.lora_targets()
     for pattern in patterns:
@@ -132,17 +118,12 @@ def add_lora(
         The parameters to train.
 
     Raises:
-        ModelError: the backbone already has a LoRA, the rank is less than 1, or a target matches no layer.
+        ModelError: a target matches no layer.
         MissingExtra: peft is not installed.
     """
-    if rank < 1:
-        raise ModelError(f"the rank is {rank}", "expected at least 1", "use 16 as in the paper")
-    _check_no_lora(backbone)
-    peft = import_library("peft")
-    config = peft.LoraConfig(
-        r=rank, lora_alpha=alpha, target_modules=select_target_modules(backbone, target_modules)
-    )
-    with torch.random.fork_rng(devices=_cuda_devices(backbone)):
+    names = select_target_modules(backbone, target_modules)
+    config = import_library("peft").LoraConfig(r=rank, lora_alpha=alpha, target_modules=names)
+    with torch.random.fork_rng(devices=[backbone.device] if backbone.device.type == "cuda" else []):
         torch.manual_seed(seed)
         _add_adapter(backbone, config)
     return lora_parameters(backbone)
@@ -157,17 +138,15 @@ def attach_layers(
     added. The weights are in the dtype in which the backbone computes, see `load_lora`.
 
     Raises:
-        ModelError: the backbone already has a LoRA of this name, or a layer is not in it or has another shape.
+        ModelError: a layer is not in the backbone, or has another shape.
         MissingExtra: peft is not installed.
     """
     others = [*(getattr(backbone.transformer, "peft_config", None) or ())]
-    if adapter in others:
-        _check_no_lora(backbone)
     modules = dict(backbone.transformer.named_modules())
     for name, layer in layers.items():
         lora_formats.check_shape(name, layer, modules.get(name))
     peft = import_library("peft")
-    _add_adapter(backbone, peft.LoraConfig(**_layer_settings(layers)), adapter)
+    _add_adapter(backbone, peft.LoraConfig(**layer_settings(layers)), adapter)
     _convert_for_inference(backbone)
     peft.set_peft_model_state_dict(
         backbone.transformer, lora_formats.to_state_dict(layers), adapter_name=adapter
@@ -176,44 +155,35 @@ def attach_layers(
         backbone.transformer.set_adapters([*others, adapter])
 
 
-def _check_no_lora(backbone: Backbone) -> None:
-    if has_lora(backbone):
-        raise ModelError(
-            "the backbone already has a LoRA", "expected a backbone without a LoRA", "call remove_lora first"
-        )
-
-
-def remove_lora(backbone: Backbone) -> None:
-    """Removes the LoRA and so restores the base's predictions. Does nothing if there is no LoRA."""
-    if has_lora(backbone):
-        backbone.transformer.unload_lora()
-
-
-def has_lora(backbone: Backbone) -> bool:
-    """Whether the backbone has a LoRA."""
-    return bool(getattr(backbone.transformer, "peft_config", None))
-
-
 def lora_parameters(backbone: Backbone) -> list[nn.Parameter]:
     """The LoRA's parameters, the only ones that require gradients, always in the same order."""
     return [parameter for parameter in backbone.transformer.parameters() if parameter.requires_grad]
 
 
 def lora_state_dict(backbone: Backbone) -> dict[str, Tensor]:
-    """The LoRA's weights by name, such as transformer_blocks.0.attn.to_q.lora_A.weight; empty without a LoRA."""
-    if not has_lora(backbone):
-        return {}
+    """The LoRA's weights by name, such as transformer_blocks.0.attn.to_q.lora_A.weight."""
     state = import_library("peft").get_peft_model_state_dict(backbone.transformer, adapter_name=ADAPTER_NAME)
     return dict(sorted(state.items()))
 
 
 def load_lora_state(backbone: Backbone, state: Mapping[str, Tensor]) -> None:
-    """Loads weights from `lora_state_dict` into a backbone with a LoRA of the same shapes.
-
-    Raises:
-        ModelError: the backbone has no LoRA, or the weights are those of another backbone or rank.
-    """
-    _check_weights(lora_state_dict(backbone), state)
+    """Loads weights from `lora_state_dict` into a backbone with a LoRA of the same shapes. Raises ModelError if the weights are
+    those of another backbone or rank."""
+    expected = lora_state_dict(backbone)
+    mismatched = sorted(set(expected) ^ set(state))
+    if mismatched:
+        raise ModelError(
+            f"{len(mismatched)} weights of the LoRA are missing or unexpected, for example {mismatched[0]}",
+            "expected one pair of matrices for each adapted layer",
+            "use the backbone with which it was trained",
+        )
+    for name, tensor in sorted(state.items()):
+        if tensor.shape != expected[name].shape:
+            raise ModelError(
+                f"{name} has the shape {tuple(tensor.shape)}",
+                f"expected {tuple(expected[name].shape)}",
+                "use the rank and the backbone with which it was trained",
+            )
     import_library("peft").set_peft_model_state_dict(
         backbone.transformer, dict(state), adapter_name=ADAPTER_NAME
     )
@@ -237,17 +207,8 @@ def save_lora(
         The metadata that is stored in the file.
 
     Raises:
-        ModelError: the backbone has no LoRA, or the prompt belongs to another backbone.
         OutputError: the folder cannot be written.
     """
-    if not has_lora(backbone):
-        raise ModelError("the backbone has no LoRA", "expected a backbone with a LoRA", "call add_lora first")
-    if prompt.backbone != backbone.name:
-        raise ModelError(
-            f"the prompt was encoded for {prompt.backbone}",
-            f"expected a prompt for {backbone.name}",
-            "encode it for this backbone",
-        )
     config = backbone.transformer.peft_config[ADAPTER_NAME]
     source, rank, alpha = base_model or backbone.hub_id, config.r, config.lora_alpha
     metadata = LoraMetadata(
@@ -255,29 +216,18 @@ def save_lora(
     )
     # Without lora_alpha, diffusers assumes that alpha equals the rank.
     settings = {"r": rank, "lora_alpha": alpha, "target_modules": sorted(config.target_modules)}
-    _write(folder, lora_state_dict(backbone), settings, prompt, metadata)
+    write_lora(folder, lora_state_dict(backbone), settings, prompt, metadata)
     return metadata
 
 
-def save_layers(
-    folder: Path, layers: Mapping[str, LowRankLayer], prompt: PromptEmbedding, metadata: LoraMetadata
-) -> None:
-    """Writes a LoRA of another program as `save_lora` writes those of brewster.
-
-    Raises:
-        OutputError: the folder cannot be written.
-    """
-    _write(folder, lora_formats.to_state_dict(layers), _layer_settings(layers), prompt, metadata)
-
-
-def _write(
+def write_lora(
     folder: Path,
     state: Mapping[str, Tensor],
     settings: Mapping[str, Any],
     prompt: PromptEmbedding,
     metadata: LoraMetadata,
 ) -> None:
-    """Writes prompt and weights. `settings` are those that diffusers reads from the file."""
+    """Writes prompt and weights. `settings` are those that diffusers reads from the file. May raise OutputError."""
     tensors = {_PREFIX + name: tensor for name, tensor in state.items()}
     prefixed = {_PREFIX + name: value for name, value in settings.items()}
     prompt.save(folder / PROMPT_FILE)
@@ -286,20 +236,14 @@ def _write(
 
 
 def read_lora_metadata(folder: Path) -> LoraMetadata:
-    """The metadata of the LoRA in this folder. It names the backbone to load.
-
-    Raises:
-        ModelError: the LoRA is missing or damaged, or was not written by brewster.
-    """
+    """The metadata of the LoRA in this folder. It names the backbone to load. Raises ModelError if the LoRA is missing or
+    damaged, or was not written by brewster."""
     return read_lora(folder)[1]
 
 
 def read_prompt(folder: Path, metadata: LoraMetadata) -> PromptEmbedding:
-    """The prompt of the LoRA in this folder.
-
-    Raises:
-        ModelError: the prompt is missing or damaged, or is not the one with which the LoRA was trained.
-    """
+    """The prompt of the LoRA in this folder. Raises ModelError if the prompt is missing or damaged, or is not the one with
+    which the LoRA was trained."""
     prompt = load_prompt(folder / PROMPT_FILE, metadata.backbone)
     if prompt.sha256 != metadata.prompt_sha256:
         raise ModelError(
@@ -320,26 +264,16 @@ def load_lora(folder: Path, backbone: Backbone) -> tuple[LoraMetadata, PromptEmb
         The metadata of the LoRA, and its prompt.
 
     Raises:
-        ModelError: the LoRA belongs to another backbone, its weights do not match the rank in its metadata, a file is
-            damaged, the prompt does not belong to it, or the backbone already has a LoRA.
+        ModelError: its weights do not match the rank in its metadata or the backbone, a file is damaged, or the prompt does
+            not belong to it.
     """
     state, metadata = read_lora(folder)
-    if metadata.backbone != backbone.name:
-        raise ModelError(
-            f"{folder} is a LoRA of {metadata.backbone}",
-            f"expected a LoRA of {backbone.name}",
-            f"load the backbone {metadata.backbone} for it",
-        )
     prompt = read_prompt(folder, metadata)
     if metadata.imported:
         attach_layers(backbone, lora_formats.read_lora_layers(state, backbone.transformer, backbone.name))
         return metadata, prompt
     add_lora(backbone, rank=metadata.rank, alpha=metadata.alpha, target_modules=metadata.target_modules)
-    try:
-        load_lora_state(backbone, state)
-    except ModelError:
-        remove_lora(backbone)
-        raise
+    load_lora_state(backbone, state)
     _convert_for_inference(backbone)
     return metadata, prompt
 
@@ -350,11 +284,8 @@ def _convert_for_inference(backbone: Backbone) -> None:
 
 
 def read_lora(folder: Path) -> tuple[dict[str, Tensor], LoraMetadata]:
-    """The weights of the LoRA in this folder, as `lora_state_dict` names them, and its metadata.
-
-    Raises:
-        ModelError: the LoRA is missing or damaged, or was not written by brewster.
-    """
+    """The weights of the LoRA in this folder, as `lora_state_dict` names them, and its metadata. Raises ModelError if the LoRA
+    is missing or damaged, or was not written by brewster."""
     tensors, entries = read_tensors(folder / LORA_FILE)
     if _METADATA_KEY not in entries:
         raise ModelError(
@@ -366,23 +297,6 @@ def read_lora(folder: Path) -> tuple[dict[str, Tensor], LoraMetadata]:
     return {name.removeprefix(_PREFIX): tensor for name, tensor in tensors.items()}, metadata
 
 
-def _check_weights(expected: Mapping[str, Tensor], actual: Mapping[str, Tensor]) -> None:
-    mismatched = sorted(set(expected) ^ set(actual))
-    if mismatched:
-        raise ModelError(
-            f"{len(mismatched)} weights of the LoRA are missing or unexpected, for example {mismatched[0]}",
-            "expected one pair of matrices for each adapted layer",
-            "use the backbone with which it was trained",
-        )
-    for name, tensor in sorted(actual.items()):
-        if tensor.shape != expected[name].shape:
-            raise ModelError(
-                f"{name} has the shape {tuple(tensor.shape)}",
-                f"expected {tuple(expected[name].shape)}",
-                "use the rank and the backbone with which it was trained",
-            )
-
-
 def _add_adapter(backbone: Backbone, config: Any, name: str = ADAPTER_NAME) -> None:  # noqa: ANN401 - peft's configuration
     """Adds a LoRA with random A matrices, float32. peft creates it in the dtype of the base, which may be bf16."""
     with warnings.catch_warnings():
@@ -391,7 +305,7 @@ def _add_adapter(backbone: Backbone, config: Any, name: str = ADAPTER_NAME) -> N
     import_library("diffusers.training_utils").cast_training_params(backbone.transformer, torch.float32)
 
 
-def _layer_settings(layers: Mapping[str, LowRankLayer]) -> dict[str, Any]:
+def layer_settings(layers: Mapping[str, LowRankLayer]) -> dict[str, Any]:
     """The settings of peft for layers of any rank. The names are regular expressions that match only the full name."""
     ranks = {re.escape(name): layer.rank for name, layer in sorted(layers.items())}
     rank = max(ranks.values())
@@ -403,7 +317,3 @@ def _layer_settings(layers: Mapping[str, LowRankLayer]) -> dict[str, Any]:
         "rank_pattern": pattern,
         "alpha_pattern": pattern,
     }
-
-
-def _cuda_devices(backbone: Backbone) -> list[torch.device]:
-    return [backbone.device] if backbone.device.type == "cuda" else []

@@ -128,15 +128,10 @@ def read_lora_layers(
 ) -> dict[str, LowRankLayer]:
     """The LoRA of each layer by the layer's name in the transformer, float32, with the scale multiplied in.
 
-    Args:
-        tensors: the content of the file. Its alphas have precedence over `scale`.
-        transformer: the transformer of the base; only names and shapes are read, so it may be on the device "meta".
-        backbone: the name of the backbone.
-        scale: alpha / rank, for files without alphas; by default 1, as in diffusers, sd-scripts and ComfyUI.
-
-    Raises:
-        ModelError: a key is not understood, a matrix is missing, a layer occurs twice, or a layer or shape is not that of the
-            transformer. The message names the style of the keys.
+    Only names and shapes of the transformer are read, so it may be on the device "meta". The scale alpha / rank is for files
+    without alphas; by default 1, as in diffusers, sd-scripts and ComfyUI. Raises ModelError if a key is not understood, a
+    matrix is missing, a layer occurs twice, or a layer or shape is not that of the transformer. The message names the style of
+    the keys.
     """
     matrices, alphas = _parse(tensors, backbone)
     targets = _layer_names(transformer, backbone)
@@ -171,11 +166,6 @@ def to_state_dict(layers: Mapping[str, LowRankLayer]) -> dict[str, Tensor]:
     return state
 
 
-def has_alphas(tensors: Mapping[str, Tensor]) -> bool:
-    """Whether a LoRA file has the alpha of a layer, as those of sd-scripts do."""
-    return any(key.endswith(".alpha") for key in tensors)
-
-
 def lora_format(tensors: Mapping[str, Tensor]) -> str:
     """The program whose key style a LoRA file has: peft, diffusers, kohya, ComfyUI, or unknown."""
     styles = {style for key in tensors for prefix, style in _PREFIXES.items() if key.startswith(prefix)}
@@ -195,7 +185,9 @@ def _parse(
         match = _KEY.fullmatch(key)
         if not match:
             raise _unknown(key, tensors, backbone)
-        name, part = _without_prefix(match["module"]), "down" if match["matrix"] in _DOWN else "up"
+        name, part = match["module"], "down" if match["matrix"] in _DOWN else "up"
+        while prefix := next((prefix for prefix in _PREFIXES if name.startswith(prefix)), ""):
+            name = name.removeprefix(prefix)
         if name in alphas if match["alpha"] else part in matrices.get(name, {}):
             raise _repeated(name)
         if match["alpha"]:
@@ -211,12 +203,6 @@ def _parse(
             "check the file",
         )
     return matrices, alphas
-
-
-def _without_prefix(name: str) -> str:
-    while prefix := next((prefix for prefix in _PREFIXES if name.startswith(prefix)), ""):
-        name = name.removeprefix(prefix)
-    return name
 
 
 def _layer_names(transformer: nn.Module, backbone: str) -> dict[str, tuple[str, ...]]:
@@ -259,11 +245,7 @@ def _split(
 
 
 def check_shape(name: str, layer: LowRankLayer, module: Any) -> None:  # noqa: ANN401 - quantized layers differ in type
-    """Checks that the LoRA fits a linear layer.
-
-    Raises:
-        ModelError: the module is not a linear layer, or has another shape.
-    """
+    """Checks that the LoRA fits a linear layer. Raises ModelError if the module is not a linear layer, or has another shape."""
     expected = (module.out_features, module.in_features) if hasattr(module, "out_features") else None
     up, down = tuple(layer.up.shape), tuple(layer.down.shape)
     if expected is None or up != (expected[0], layer.rank) or down != (layer.rank, expected[1]):

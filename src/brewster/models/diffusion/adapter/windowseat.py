@@ -12,11 +12,11 @@ For its task, see `windowseat_task`.
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Final
+from typing import Annotated, Final
 
-from torch import Tensor
+from pydantic import BaseModel, Field, ValidationError
 
-from brewster.errors import ModelError
+from brewster.errors import ModelError, invalid_value
 from brewster.models.diffusion.adapter.lora import LoraMetadata, attach_layers
 from brewster.models.diffusion.adapter.lora_formats import read_lora_layers, scaling_from_config
 from brewster.models.diffusion.backbones.backbone import Backbone
@@ -36,41 +36,36 @@ BACKBONE: Final = Qwen
 _PROMPT_TEXT: Final = "WindowSeat's trained embedding"
 
 
-def read_metadata(folder: Path) -> LoraMetadata:
-    """The base, rank, task and prompt digest of the model in this folder. The quantization is that of the published inference code.
+class _Index(BaseModel):
+    base_model: str
+    processing_resolution: Annotated[int, Field(ge=Qwen.size_divisor, multiple_of=Qwen.size_divisor)]
 
-    Raises:
-        ModelError: a file is missing or damaged, or lacks a value.
-    """
-    index, config = read_json(folder / INDEX_FILE), read_json(folder / CONFIG_FILE)
+
+class _Config(BaseModel):
+    r: int
+    lora_alpha: int
+
+
+def read_metadata(folder: Path) -> LoraMetadata:
+    """The base, rank, task and prompt digest of the model in this folder. The quantization is that of the published inference
+    code. Raises ModelError if a file is missing or damaged, or lacks a value."""
     try:
-        base, side = index["base_model"], int(index["processing_resolution"])
-        rank, alpha = int(config["r"]), int(config["lora_alpha"])
-    except (KeyError, TypeError, ValueError) as error:
+        index = _Index.model_validate(read_json(folder / INDEX_FILE))
+        config = _Config.model_validate(read_json(folder / CONFIG_FILE))
+    except ValidationError as error:
+        problem = invalid_value(error.errors()[0])
         raise ModelError(
-            f"{folder} lacks a setting of WindowSeat ({error!r})",
-            f"expected base_model and processing_resolution in {INDEX_FILE}, and r and lora_alpha in {CONFIG_FILE}",
+            f"{folder} lacks a setting of WindowSeat ({problem.happened})",
+            problem.expected,
             "download the model again",
         ) from error
-    if not isinstance(base, str):
-        raise ModelError(
-            f"base_model in {folder / INDEX_FILE} is {base!r}",
-            "expected a hub id",
-            "download the model again",
-        )
-    if side < Qwen.size_divisor or side % Qwen.size_divisor:
-        raise ModelError(
-            f"processing_resolution in {folder / INDEX_FILE} is {side}",
-            f"expected a multiple of {Qwen.size_divisor}",
-            "download the model again",
-        )
     return LoraMetadata(
         BACKBONE.name,
-        base,
+        index.base_model,
         DIFFUSION_MODELS["windowseat"].quantization,
-        rank,
-        alpha,
-        windowseat_task(side),
+        config.r,
+        config.lora_alpha,
+        windowseat_task(index.processing_resolution),
         _read_prompt(folder).sha256,
     )
 
@@ -87,9 +82,8 @@ def load(folder: Path, backbone: Backbone) -> tuple[LoraMetadata, PromptEmbeddin
     metadata, prompt = read_metadata(folder), _read_prompt(folder)
     tensors, _ = read_tensors(folder / WEIGHTS_FILE)
     config = read_json(folder / CONFIG_FILE)
-    attach_layers(
-        backbone, read_lora_layers(tensors, backbone.transformer, backbone.name, scaling_from_config(config))
-    )
+    scale = scaling_from_config(config)
+    attach_layers(backbone, read_lora_layers(tensors, backbone.transformer, backbone.name, scale))
     return metadata, prompt
 
 
@@ -106,17 +100,13 @@ def _read_prompt(folder: Path) -> PromptEmbedding:
             "expected prompt_embeds (n, tokens, width) and prompt_mask (n, tokens), with n of at least 1",
             "download the model again",
         )
-    tokens = _count_tokens(path, tensors["prompt_mask"][0] > 0)
-    return PromptEmbedding(Qwen.name, _PROMPT_TEXT, tensors["prompt_embeds"][:1, :tokens].contiguous())
-
-
-def _count_tokens(path: Path, mask: Tensor) -> int:
-    """The number of tokens that are not masked. They come first, so the position of each stays the same."""
+    mask = tensors["prompt_mask"][0] > 0
     count = int(mask.sum())
+    # The tokens that are not masked come first, so the position of each stays the same.
     if count == 0 or not mask[:count].all():
         raise ModelError(
             f"prompt_mask in {path} masks tokens before the end, or all of them",
             "expected padding at the end only",
             "download the model again",
         )
-    return count
+    return PromptEmbedding(Qwen.name, _PROMPT_TEXT, tensors["prompt_embeds"][:1, :count].contiguous())

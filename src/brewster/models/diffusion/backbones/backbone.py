@@ -132,12 +132,8 @@ class Backbone(ABC):
         """Encodes images in [-1, 1] to normalised latent grids, float32: the mode of the VAE's distribution.
 
         Encode the whole composite at once. Panels that are encoded separately differ at the seams and, because of
-        GroupNorm, everywhere.
-
-        Raises:
-            ModelError: a side is not a multiple of 16.
+        GroupNorm, everywhere. The sides must be multiples of `size_divisor`.
         """
-        self._check_grid(image.shape[-1], image.shape[-2])
         mean, deviation = self.statistics()
         cells = self._vae_encode(image.to(self.vae.device, self.vae.dtype))
         return (functional.pixel_unshuffle(cells, PATCH).float() - mean) / deviation
@@ -166,10 +162,7 @@ class Backbone(ABC):
     ) -> Float[Tensor, "n c h w"]:
         """The velocity (noise - latents of the image) at time sigma, float32; differentiable.
 
-        `condition` may be `no_condition()`.
-
-        Raises:
-            ModelError: the prompt lacks an embedding that this guidance needs.
+        `condition` may be `no_condition()`. Raises ModelError if the prompt lacks an embedding that this guidance needs.
         """
 
     @abstractmethod
@@ -193,12 +186,8 @@ class Backbone(ABC):
     def noise(self, size: tuple[int, int], seed: int) -> Float[Tensor, "1 c h w"]:
         """The noise from which the diffusers pipeline starts for a composite of this (width, height) and seed.
 
-        It is drawn on the CPU, so it is the same for every device.
-
-        Raises:
-            ModelError: a side is not a multiple of 16.
+        It is drawn on the CPU, so it is the same for every device. The sides must be multiples of `size_divisor`.
         """
-        self._check_grid(*size)
         width, height = (side // self.size_divisor * PATCH for side in size)
         shape = (1, self.channels // PATCH**2, height, width)
         return functional.pixel_unshuffle(_seeded_noise(shape, seed), PATCH)
@@ -272,11 +261,8 @@ class Backbone(ABC):
         ]
 
     def pipeline(self) -> Any:  # noqa: ANN401 - a pipeline of diffusers
-        """The pipeline of diffusers with the same transformer, VAE and scheduler, without text encoders.
-
-        Raises:
-            MissingExtra: diffusers is not installed.
-        """
+        """The pipeline of diffusers with the same transformer, VAE and scheduler, without text encoders. Raises MissingExtra if
+        diffusers is not installed."""
         pipeline_class = diffusers_class(self.classes["pipeline"])
         parts = {"transformer": self.transformer, "vae": self.vae, "scheduler": self.scheduler}
         parameters = inspect.signature(pipeline_class.__init__).parameters
@@ -293,14 +279,6 @@ class Backbone(ABC):
         pipeline = self.pipeline()
         with suppress_log_messages():  # diffusers warns about missing text encoders
             pipeline.save_pretrained(folder)
-
-    def _check_grid(self, width: int, height: int) -> None:
-        if width % self.size_divisor or height % self.size_divisor:
-            raise ModelError(
-                f"the image has {width} x {height} pixels",
-                f"expected sides that are multiples of {self.size_divisor}",
-                "pad it with PanelFit.pad",
-            )
 
     def _vae_encode(self, image: Tensor) -> Tensor:
         return self.vae.encode(image).latent_dist.mode()  # type: ignore[no-any-return]
@@ -322,15 +300,18 @@ class ClassifierFreeBackbone(Backbone):
     def predict(
         self, latents: Tensor, condition: Tensor, sigma: Tensor, prompt: PromptEmbedding, guidance: float
     ) -> Tensor:
-        """See `Backbone.predict`. A distilled model ignores the guidance.
-
-        Raises:
-            ModelError: the guidance is above 1, and the prompt has no embedding of the empty prompt.
-        """
+        """See `Backbone.predict`. A distilled model ignores the guidance. Raises ModelError if the guidance is above 1, and the
+        prompt has no embedding of the empty prompt."""
         conditional = self._velocity(latents, condition, sigma, prompt.embeds)
         if guidance <= 1 or self.distilled:
             return conditional
-        unconditional = self._velocity(latents, condition, sigma, _negative_embeds(prompt))
+        if prompt.negative is None:
+            raise ModelError(
+                f"the prompt for {prompt.backbone} has no embedding of the empty prompt",
+                "expected this embedding for a guidance above 1",
+                "encode the prompt again or set the guidance to 1",
+            )
+        unconditional = self._velocity(latents, condition, sigma, prompt.negative)
         return self._guided(conditional, unconditional, guidance)
 
     @abstractmethod
@@ -356,16 +337,6 @@ def random_prompt(backbone: str, seed: int, **shapes: tuple[int, ...]) -> Prompt
         name: _seeded_noise(shape, seed + index) for index, (name, shape) in enumerate(sorted(shapes.items()))
     }
     return PromptEmbedding(backbone, PROMPT, **tensors)
-
-
-def _negative_embeds(prompt: PromptEmbedding) -> Tensor:
-    if prompt.negative is None:
-        raise ModelError(
-            f"the prompt for {prompt.backbone} has no embedding of the empty prompt",
-            "expected this embedding for a guidance above 1",
-            "encode the prompt again or set the guidance to 1",
-        )
-    return prompt.negative
 
 
 def _seeded_noise(shape: tuple[int, ...], seed: int) -> Tensor:

@@ -71,12 +71,7 @@ class Klein(ClassifierFreeBackbone):
         return norm.running_mean.float().view(1, -1, 1, 1), deviation.view(1, -1, 1, 1)
 
     def noise(self, size: tuple[int, int], seed: int) -> Tensor:
-        """See `Backbone.noise`. For klein, diffusers draws the noise on the packed grid.
-
-        Raises:
-            ModelError: a side is not a multiple of 16.
-        """
-        self._check_grid(*size)
+        """See `Backbone.noise`. For klein, diffusers draws the noise on the packed grid."""
         width, height = (side // self.size_divisor for side in size)
         return torch.randn(1, self.channels, height, width, generator=torch.Generator().manual_seed(seed))
 
@@ -112,12 +107,13 @@ class Klein(ClassifierFreeBackbone):
 
     def _velocity(self, latents: Tensor, condition: Tensor, sigma: Tensor, embeds: Tensor) -> Tensor:
         embeds = embeds.to(self.device, self.dtype).expand(len(latents), -1, -1)
+        zero = torch.arange(1)
         tokens = self.transformer(
             hidden_states=self._tokens(latents, condition),
             encoder_hidden_states=embeds,
             timestep=sigma.to(self.device, self.dtype),
             guidance=None,
-            txt_ids=_text_position_ids(embeds).to(self.device),
+            txt_ids=torch.cartesian_prod(zero, zero, zero, torch.arange(embeds.shape[1])).to(self.device),
             img_ids=self.positions(latents, condition),
             return_dict=False,
         )[0]
@@ -127,8 +123,3 @@ class Klein(ClassifierFreeBackbone):
 def _position_ids(grid: Tensor, time: int) -> Tensor:
     rows, columns = (torch.arange(side) for side in grid.shape[2:])
     return torch.cartesian_prod(torch.tensor([time]), rows, columns, torch.arange(1))
-
-
-def _text_position_ids(embeds: Tensor) -> Tensor:
-    zero = torch.arange(1)
-    return torch.cartesian_prod(zero, zero, zero, torch.arange(embeds.shape[1]))

@@ -7,7 +7,6 @@ from typing import Any, ClassVar, Final, final
 import torch
 from torch import Tensor
 
-from brewster.errors import ModelError
 from brewster.models.diffusion.backbones.backbone import (
     Backbone,
     DiffusersUsage,
@@ -84,17 +83,7 @@ class Kontext(Backbone):
     def predict(
         self, latents: Tensor, condition: Tensor, sigma: Tensor, prompt: PromptEmbedding, guidance: float
     ) -> Tensor:
-        """See `Backbone.predict`. The guidance scale is an input of the transformer.
-
-        Raises:
-            ModelError: the prompt has no pooled vector.
-        """
-        if prompt.pooled is None:
-            raise ModelError(
-                "the prompt has no pooled vector",
-                "expected the pooled vector of CLIP",
-                "encode the prompt again",
-            )
+        """See `Backbone.predict`. The guidance scale is an input of the transformer."""
         count, embedding = len(latents), prompt.to(self.device, self.dtype)
         assert embedding.pooled is not None
         takes_guidance = self.transformer.config.guidance_embeds

@@ -38,15 +38,21 @@ from brewster.models.diffusion.lazy_imports import (
     import_bitsandbytes,
     import_library,
 )
-from brewster.models.diffusion.out_of_memory import explain_out_of_memory
+from brewster.models.diffusion.offloading import explain_out_of_memory
 from brewster.models.diffusion.prompt import PROMPT, PromptEmbedding
 from brewster.models.diffusion.tensors import read_json
-from brewster.models.diffusion.text_encoders import check_text_encoders, text_encoder_device
 from brewster.models.zoo import TINY_PREFIX
 from brewster.options import Quantization
 
 _BACKBONE_PATTERNS: Final = [INDEX_FILE, *(f"{part}/*" for part in CONFIG_FILES)]
 _SINGLE_FILE_PATTERNS: Final = [INDEX_FILE, "transformer/config.json", "vae/*", "scheduler/*"]
+_ENCODING_BYTES: Final = 2 << 30
+"""GPU memory for the activations of the text encoders and the CUDA context."""
+_FEWER_BITS: Final = {
+    None: 'use quantization="int8"', "int8": 'use quantization="nf4"', "float8": 'use quantization="nf4"',
+}  # fmt: skip
+"""Quantization -> what to do if the GPU is out of memory."""
+_CLOSE_OTHERS: Final = "close other programs that use the GPU"
 _TEXT_ENCODER_PATTERNS: Final = [INDEX_FILE, "scheduler/*", "text_encoder*/*", "tokenizer*/*", "processor/*"]
 
 
@@ -66,8 +72,7 @@ def load_backbone(
     weights replace those of the transformer, which are then not downloaded. It cannot be quantized again.
 
     Raises:
-        DownloadError: no access to a gated model (the message says how to get it), an invalid token, or no network
-            connection.
+        DownloadError: see `resolve_model_folder`.
         ModelError: a file is missing or damaged, the architecture is not supported, or a name or quantization is unknown.
         DeviceError: there is no such device, or it is out of memory; the message says what to reduce.
         MissingExtra: diffusers, torchao or bitsandbytes is not installed.
@@ -80,7 +85,16 @@ def load_backbone(
             "leave quantization out",
         )
     if source.startswith(TINY_PREFIX):
-        return _load_tiny(source, device, quantization)
+        if quantization:
+            raise ModelError(
+                f"{source} was requested with quantization={quantization}",
+                "expected a tiny version without quantization",
+                "leave quantization out",
+            )
+        backbone, _ = tiny(source.removeprefix(TINY_PREFIX))
+        backbone.transformer.to(device)
+        backbone.vae.to(device)
+        return backbone
     options = _quantization_options(quantization, device) if quantization else {}
     dtype = dtype or (torch.float32 if device == "cpu" else torch.bfloat16)
     disable_progress_bars_in_pipes()
@@ -89,7 +103,7 @@ def load_backbone(
     backbone_class, index = read_index(folder)
     if quantization == "nf4" and backbone_class.unquantized:
         options["quantization_config"].llm_int8_skip_modules = list(backbone_class.unquantized)
-    with explain_out_of_memory(_memory_hint(quantization)):
+    with explain_out_of_memory(f"{_FEWER_BITS.get(quantization, _CLOSE_OTHERS)}, or {MEMORY_HINT}"):
         vae = _load_part(folder, backbone_class, "vae", dtype=dtype, **_device_map(device))
         if transformer_file:
             transformer = _load_single_file(
@@ -103,9 +117,23 @@ def load_backbone(
     backbone = backbone_class(
         transformer, vae, scheduler, distilled=bool(index.get("is_distilled")), dtype=dtype
     )
-    _check_channels(backbone, folder)
+    packed = backbone.statistics()[0].shape[1]
+    if packed not in {1, backbone.channels}:
+        raise ModelError(
+            f"the VAE in {folder} has {packed} values per token",
+            f"expected {backbone.channels}, the input channels of its transformer",
+            "copy both from the same model",
+        )
     if quantization:
-        _check_quantized(backbone, quantization)
+        # diffusers silently leaves parts on the CPU unquantized.
+        name = next(name for name in backbone.lora_targets() if not name.startswith(backbone.unquantized))
+        weight = backbone.transformer.get_submodule(name).weight
+        if type(weight) in {Tensor, nn.Parameter}:
+            raise ModelError(
+                f"the weights were loaded as {weight.dtype}",
+                f"expected weights stored as {quantization}",
+                "update diffusers and torchao (constraints.txt lists versions that work)",
+            )
     return backbone
 
 
@@ -138,8 +166,18 @@ def encode_prompt(source: str, text: str = PROMPT, *, device: str = "cpu") -> Pr
     disable_progress_bars_in_pipes()
     folder = resolve_model_folder(hub_id_of(source), _TEXT_ENCODER_PATTERNS)
     backbone_class, index = read_index(folder)
-    check_text_encoders(folder, index)
-    dtype, device = torch.bfloat16, text_encoder_device(folder, device)
+    names = [name for name in index if name.startswith(("text_encoder", "tokenizer", "processor"))]
+    missing = [name for name in names if not (folder / name).is_dir()]
+    if missing or not names:
+        raise ModelError(
+            f"{folder} has no {', '.join(missing) or 'text_encoder'}",
+            "expected the text encoders of the model, because the prompt must be encoded",
+            "copy the complete model, or, in a training recipe, set prompt to an encoded prompt, such as the prompt.safetensors of a LoRA",
+        )
+    size = sum(path.stat().st_size for path in folder.glob("text_encoder*/*.safetensors"))
+    if device != "cpu" and size + _ENCODING_BYTES >= torch.cuda.mem_get_info(device)[0]:
+        device = "cpu"
+    dtype = torch.bfloat16
     pipeline_class = diffusers_class(index["_class_name"])
     with (
         explain_out_of_memory("close other programs, or pass an encoded prompt"),
@@ -157,21 +195,8 @@ def encode_prompt(source: str, text: str = PROMPT, *, device: str = "cpu") -> Pr
     return embedding
 
 
-def _load_tiny(source: str, device: str, quantization: str | None) -> Backbone:
-    if quantization:
-        raise ModelError(
-            f"{source} was requested with quantization={quantization}",
-            "expected a tiny version without quantization",
-            "leave quantization out",
-        )
-    backbone, _ = tiny(source.removeprefix(TINY_PREFIX))
-    backbone.transformer.to(device)
-    backbone.vae.to(device)
-    return backbone
-
-
 def _load_part(folder: Path, backbone_class: type[Backbone], part: str, **options: Any) -> Any:  # noqa: ANN401 - passed on
-    """Loads the transformer, VAE or scheduler of a folder. Checks its class, and that its weights are complete."""
+    """Loads a part in CONFIG_FILES. Checks its class, and that its weights are complete."""
     part_folder, expected = folder / part, backbone_class.classes[part]
     found = read_json(part_folder / CONFIG_FILES[part]).get("_class_name")
     if found != expected:
@@ -271,48 +296,14 @@ def _quantization_options(quantization: str, device: str) -> dict[str, Any]:
 
 
 def _device_map(device: str) -> dict[str, Any]:
-    """The keyword argument of from_pretrained that loads weights directly to an accelerator, not through host memory."""
+    """The keyword argument of from_pretrained that loads weights directly to a GPU, not through host memory."""
     return {} if device == "cpu" else {"device_map": {"": device}}
 
 
-def _memory_hint(quantization: str | None) -> str:
-    hints = {
-        None: 'use quantization="int8"',
-        "int8": 'use quantization="nf4"',
-        "float8": 'use quantization="nf4"',
-    }
-    return f"{hints.get(quantization, 'close other programs that use the GPU')}, or {MEMORY_HINT}"
-
-
 def _check_device(device: str) -> None:
-    device_type = torch.device(device).type
-    if device_type == "cuda" and not torch.cuda.is_available():
+    if device.startswith("cuda") and not torch.cuda.is_available():
         raise DeviceError(
             "there is no CUDA device",
             "expected an NVIDIA or AMD GPU and a torch built for it",
             "use device cpu, or install torch with CUDA (on Windows, pip alone installs it without: see pytorch.org)",
-        )
-    if device_type == "mps" and not torch.backends.mps.is_available():
-        raise DeviceError("there is no MPS device", "expected an Apple GPU", "use device cpu")
-
-
-def _check_channels(backbone: Backbone, folder: Path) -> None:
-    packed = backbone.statistics()[0].shape[1]
-    if packed not in {1, backbone.channels}:
-        raise ModelError(
-            f"the VAE in {folder} has {packed} values per token",
-            f"expected {backbone.channels}, the input channels of its transformer",
-            "copy both from the same model",
-        )
-
-
-def _check_quantized(backbone: Backbone, quantization: str) -> None:
-    """Checks that the weights are quantized: diffusers silently leaves parts on the CPU unquantized."""
-    name = next(name for name in backbone.lora_targets() if not name.startswith(backbone.unquantized))
-    weight = backbone.transformer.get_submodule(name).weight
-    if type(weight) in {Tensor, nn.Parameter}:
-        raise ModelError(
-            f"the weights were loaded as {weight.dtype}",
-            f"expected weights stored as {quantization}",
-            "update diffusers and torchao (constraints.txt lists versions that work)",
         )

@@ -100,15 +100,14 @@ class Qwen(ClassifierFreeBackbone):
     def _guided(self, conditional: Tensor, unconditional: Tensor, guidance: float) -> Tensor:
         """The guided prediction, rescaled per token to the norm of the conditional one."""
         combined = super()._guided(conditional, unconditional, guidance)
-        return combined * (_token_norm(conditional) / _token_norm(combined))
+        norm, new_norm = (
+            torch.linalg.vector_norm(each, dim=1, keepdim=True) for each in (conditional, combined)
+        )
+        guided: Tensor = combined * (norm / new_norm)
+        return guided
 
     def _vae_encode(self, image: Tensor) -> Tensor:
         return self.vae.encode(image[:, :, None]).latent_dist.mode()[:, :, 0]  # type: ignore[no-any-return]
 
     def _vae_decode(self, latent: Tensor) -> Tensor:
         return self.vae.decode(latent[:, :, None], return_dict=False)[0][:, :, 0]  # type: ignore[no-any-return]
-
-
-def _token_norm(grid: Tensor) -> Tensor:
-    norm: Tensor = torch.linalg.vector_norm(grid, dim=1, keepdim=True)
-    return norm

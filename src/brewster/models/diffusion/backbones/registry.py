@@ -22,7 +22,7 @@ from brewster.errors import ModelError
 from brewster.models.diffusion.backbones.backbone import Architecture, Backbone
 from brewster.models.diffusion.hub_download import cached_model_folder, resolve_model_folder
 from brewster.models.diffusion.lazy_imports import diffusers_class, suppress_log_messages
-from brewster.models.diffusion.out_of_memory import explain_out_of_memory
+from brewster.models.diffusion.offloading import explain_out_of_memory
 from brewster.models.diffusion.prompt import PromptEmbedding
 from brewster.models.diffusion.tensors import read_json
 from brewster.models.zoo import BACKBONE_CLASSES, TINY_PREFIX
@@ -48,11 +48,8 @@ normalisation."""
 
 
 def tiny(name: str, seed: int = 0) -> tuple[Backbone, PromptEmbedding]:
-    """Builds a tiny version of a backbone, with the same classes and seeded random weights, and a random prompt for it.
-
-    Raises:
-        ModelError: the name is not in the table.
-    """
+    """Builds a tiny version of a backbone, with the same classes and seeded random weights, and a random prompt for it. Raises
+    ModelError if the name is not in the table."""
     backbone_class = find_backbone_class(name)
     backbone = build(name, backbone_class.tiny, seed=seed)
     return backbone, backbone_class.random_prompt(backbone.transformer, seed)
@@ -69,8 +66,7 @@ def build(
     """Builds a backbone with seeded random weights, by default in full size. Device "meta" needs no memory.
 
     Raises:
-        ModelError: the name is not in the table.
-        DeviceError: out of memory.
+        ModelError, DeviceError: the name is not in the table; out of memory.
     """
     backbone_class = find_backbone_class(name)
     architecture = architecture or backbone_class.full_size
@@ -84,17 +80,19 @@ def build(
         torch.manual_seed(seed)
         transformer = part_classes["transformer"](**architecture["transformer"])
         vae = part_classes["vae"](**architecture["vae"])
-        _randomise_batch_norms(vae)
+        for module in vae.modules():
+            if isinstance(module, nn.BatchNorm2d) and module.running_mean is not None:
+                assert module.running_var is not None
+                module.running_mean.normal_(0, _STATISTICS_SPREAD)
+                module.running_var.uniform_(1 - _STATISTICS_SPREAD, 1 + _STATISTICS_SPREAD)
     return backbone_class(transformer, vae, part_classes["scheduler"](**architecture["scheduler"]))
 
 
 def build_on_meta(source: str, *, dtype: torch.dtype = torch.float32) -> Backbone:
     """The backbone on the device "meta": the names and shapes of its weights, which need no memory.
 
-    For `source`, see `load_backbone`. For a hub id, only configuration files are downloaded.
-
-    Raises:
-        DownloadError, ModelError, MissingExtra: see `load_backbone`.
+    For `source`, see `load_backbone`. For a hub id, only configuration files are downloaded. Raises DownloadError, ModelError
+    or MissingExtra, see `load_backbone`.
     """
     if is_registered(source):
         backbone_class = find_backbone_class(source.removeprefix(TINY_PREFIX))
@@ -103,11 +101,20 @@ def build_on_meta(source: str, *, dtype: torch.dtype = torch.float32) -> Backbon
         return build(backbone_class.name, architecture, device="meta", dtype=dtype)
     folder = resolve_model_folder(source, list(DESCRIPTION_FILES))
     backbone_class, index = read_index(folder)
-    with torch.device("meta"), _default_dtype(dtype):
-        parts = {
-            part: _build_part(folder / part / file, backbone_class.classes[part])
-            for part, file in CONFIG_FILES.items()
-        }
+    parts = {}
+    for part, file in CONFIG_FILES.items():
+        class_name, config_file = backbone_class.classes[part], folder / part / file
+        part_class, config = diffusers_class(class_name), read_json(config_file)
+        try:
+            # diffusers warns about settings that the class does not have
+            with torch.device("meta"), _default_dtype(dtype), suppress_log_messages():
+                parts[part] = part_class.from_config(config)
+        except (ArithmeticError, LookupError, RuntimeError, TypeError, ValueError) as error:
+            raise ModelError(
+                f"{config_file} has invalid settings ({' '.join(str(error).split())[:200]})",
+                f"expected the settings of a {class_name}",
+                "copy the model again",
+            ) from error
     return backbone_class(**parts, distilled=bool(index.get("is_distilled")))
 
 
@@ -139,11 +146,8 @@ def find_backbone_class(name: str) -> type[Backbone]:
 
 
 def backbone_class_of(source: str) -> type[Backbone]:
-    """The Backbone class that `load_backbone` would use for this source. The files of its description are downloaded, but no weights.
-
-    Raises:
-        DownloadError, ModelError, MissingExtra: see `load_backbone`.
-    """
+    """The Backbone class that `load_backbone` would use for this source. The files of its description are downloaded, but no
+    weights. Raises DownloadError, ModelError or MissingExtra, see `load_backbone`."""
     if is_registered(source):
         return find_backbone_class(source.removeprefix(TINY_PREFIX))
     return read_index(resolve_model_folder(source, list(DESCRIPTION_FILES)))[0]
@@ -160,40 +164,22 @@ def hub_id_of(source: str) -> str:
 
 
 def read_index(folder: Path) -> tuple[type[Backbone], dict[str, Any]]:
-    """The Backbone class of a folder in diffusers' layout, and the content of its index.
-
-    Raises:
-        ModelError: the index is missing or damaged, or names a pipeline of another model.
-    """
+    """The Backbone class of a folder in diffusers' layout, and the content of its index. Raises ModelError if the index is
+    missing or damaged, or names a pipeline of another model."""
     index = read_json(folder / INDEX_FILE)
     class_name = index.get("_class_name")
-    for backbone_class in BACKBONES.values():
-        if class_name in (backbone_class.classes["pipeline"], *backbone_class.other_pipelines):
-            return backbone_class, index
-    names = [
-        name
+    by_pipeline = {
+        name: backbone_class
         for backbone_class in BACKBONES.values()
         for name in (backbone_class.classes["pipeline"], *backbone_class.other_pipelines)
-    ]
+    }
+    if class_name in by_pipeline:
+        return by_pipeline[class_name], index
     raise ModelError(
         f"{folder} contains a {class_name}" if class_name else f"{folder / INDEX_FILE} has no _class_name",
-        f"expected one of {', '.join(names)}",
+        f"expected one of {', '.join(by_pipeline)}",
         f"use {', '.join(backbone_class.hub_id for backbone_class in BACKBONES.values())} or a finetune of one",
     )
-
-
-def _build_part(config_file: Path, class_name: str) -> Any:  # noqa: ANN401 - a class of diffusers
-    """Builds the transformer, VAE or scheduler of a configuration, on the default device."""
-    part_class, config = diffusers_class(class_name), read_json(config_file)
-    try:
-        with suppress_log_messages():  # diffusers warns about settings that the class does not have
-            return part_class.from_config(config)
-    except (ArithmeticError, LookupError, RuntimeError, TypeError, ValueError) as error:
-        raise ModelError(
-            f"{config_file} has invalid settings ({' '.join(str(error).split())[:200]})",
-            f"expected the settings of a {class_name}",
-            "copy the model again",
-        ) from error
 
 
 @contextlib.contextmanager
@@ -204,12 +190,3 @@ def _default_dtype(dtype: torch.dtype) -> Iterator[None]:
         yield
     finally:
         torch.set_default_dtype(previous_dtype)
-
-
-def _randomise_batch_norms(vae: nn.Module) -> None:
-    """Sets random running statistics. Their default is exactly 0 and 1; see _STATISTICS_SPREAD."""
-    for module in vae.modules():
-        if isinstance(module, nn.BatchNorm2d) and module.running_mean is not None:
-            assert module.running_var is not None
-            module.running_mean.normal_(0, _STATISTICS_SPREAD)
-            module.running_var.uniform_(1 - _STATISTICS_SPREAD, 1 + _STATISTICS_SPREAD)
