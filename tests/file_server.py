@@ -3,25 +3,46 @@
 import contextlib
 import socket
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
-from threading import Thread
+from threading import Event, Thread
+from urllib.parse import urlsplit
 
 
-class _Handler(BaseHTTPRequestHandler):
+class FileHandler(BaseHTTPRequestHandler):
     def do_GET(self):
-        files = self.server.content
-        files.requests.append((self.path, self.headers["Range"]))
-        body, fault = files.bodies.get(self.path), files.faults.pop(0) if files.faults else None
-        if body is None or isinstance(fault, int):
-            return self.head(fault or 404)
-        start = int((self.headers["Range"] or "bytes=0-")[6:-1])
+        files, path = self.server.content, urlsplit(self.path).path
+        files.requests.append((path, self.headers["Range"]))
+        files.agents.append(self.headers["User-Agent"])
+        faults = files.faults.get(path)
+        match faults.pop(0) if faults else None:
+            case None:
+                self.send(files.body(path))
+            case "cut":
+                self.send(files.body(path), is_cut=True)
+            case "stall":
+                self.send(files.body(path), is_cut=True)
+                files.stop.wait(5)
+            case "no range":
+                self.send(files.body(path), ranged=False)
+            case bytes(body):
+                self.send(body, ranged=False)
+            case str(location):
+                self.head(302, Location=location)
+            case code:
+                self.head(code, **({"Retry-After": "7"} if code == 429 else {}))
+
+    def send(self, body, *, ranged=True, is_cut=False):
+        if body is None:
+            self.head(404)
+            return
+        start = int((self.headers["Range"] or "bytes=0-")[6:-1]) if ranged else 0
         rest = body[start:]
         self.head(206 if start else 200, len(rest))
-        self.wfile.write(rest[: len(rest) // 2] if fault == "cut" else rest)
-        return None
+        self.wfile.write(rest[: len(rest) // 2] if is_cut else rest)
 
-    def head(self, code, length=0):
+    def head(self, code, length=0, **headers):
         self.send_response(code)
-        self.send_header("Content-Length", str(length))
+        for name, value in ({"Content-Length": length} | headers).items():
+            self.send_header(name, str(value))
         self.end_headers()
 
     def log_message(self, *_):
@@ -29,14 +50,21 @@ class _Handler(BaseHTTPRequestHandler):
 
 
 class Files:
-    """The bodies of a server by path, the requests it has received, and its next faults: "cut" or a status code."""
+    """The bodies of a server by path, the requests it has received, and its next faults by path.
+
+    A fault is "cut", "stall", "no range", another body, a location, or a status code.
+    """
 
     def __init__(self, url):
-        self.url, self.bodies, self.requests, self.faults = url, {}, [], []
+        self.url, self.bodies, self.requests, self.agents = url, {}, [], []
+        self.faults, self.stop = {}, Event()
+
+    def body(self, path):
+        return self.bodies.get(path)
 
 
 def loopback_only(monkeypatch):
-    """Allows connections to this machine only. Test files with a server use it instead of `_network_off`."""
+    """Allows connections to this machine only. Tests with the marker `loopback` use it."""
     connect = socket.socket.connect
 
     def loopback(self, address):
@@ -60,7 +88,7 @@ def on_loopback(handler, content):
 
 def served():
     """Runs a file server and yields its `Files`."""
-    return on_loopback(_Handler, Files)
+    return on_loopback(FileHandler, Files)
 
 
 def unused_address():

@@ -213,13 +213,6 @@ def test_a_burst_without_motion_has_the_light_of_the_single_photo_in_every_frame
         assert not torch.equal(photos[0], photos[2])  # each frame has its own noise
 
 
-def test_frames_are_numbered_through():
-    recipe = burst_recipe(frames=3)
-    assert [draw(recipe, builtin_catalog(), 7, index) for index in range(6, 9)] == draw_frames(
-        recipe, builtin_catalog(), 7, 2
-    )
-
-
 def test_the_frames_of_a_burst_differ_in_camera_exposure_and_number_only():
     frames = frames_of(4, frames=4)
     varying = {"camera", "camera_response", "burst"}
@@ -262,17 +255,6 @@ def test_the_tremble_has_the_requested_size_on_all_axes():
     np.testing.assert_allclose(np.std(turns, axis=0), 0.5, rtol=0.25)
 
 
-def test_the_packaged_recipe_covers_relative_motions_up_to_60_px():
-    """In px at a width of 1,000 px, between the first and the last frame."""
-    found = []
-    for index in range(80):
-        frames = frames_of(index, size=(32, 24))
-        found.append(layer_motion(frames[0], frames[-1]).relative_px() * 1000 / 32)
-    assert 14 < np.median(found) < 28
-    assert min(found) < 5
-    assert 45 < max(found) < 100
-
-
 def test_a_still_camera_does_not_move_the_layers_apart():
     for index in range(10):
         frames = frames_of(index, still_probability=1.0, tremble_mm=0.0)
@@ -301,14 +283,6 @@ def test_without_glass_the_photo_is_the_background():
         sample = render(draw(recipe, builtin_catalog(), 7, index), ANY_ASSETS)
         assert float(sample.reflection.abs().max()) < 1e-6
         torch.testing.assert_close(sample.photo, sample.background, rtol=1e-4, atol=1e-5)
-
-
-def test_every_frame_is_the_sum_of_its_layers():
-    for scene in frames_of(2, frames=3):
-        sample = render(scene, ANY_ASSETS)
-        torch.testing.assert_close(
-            sample.photo, sample.transmission + sample.reflection, rtol=1e-5, atol=1e-6
-        )
 
 
 @pytest.mark.parametrize(

@@ -4,7 +4,6 @@ import shutil
 
 import numpy as np
 import pytest
-from pyarrow import parquet
 
 from benchmark_folders import picture, write
 from brewster.benchmarks.registry import read_benchmark
@@ -16,9 +15,8 @@ from brewster.rendered import store
 from brewster.rendered.bursts import read_bursts
 from brewster.rendered.generation import workers
 from brewster.scene.burst import layer_motion
-from brewster.scene.scene import read_scene
 from cli_helpers import error_lines, json_lines
-from set_folders import hashes, names, render_set
+from set_folders import hashes, render_set
 
 ROLES = ("frame", "transmission", "reflection")
 
@@ -62,16 +60,6 @@ def test_a_burst_with_a_missing_frame_is_left_out_until_it_is_rendered(two_burst
     assert hashes(tmp_path / "set") == hashes(two_bursts)
 
 
-def test_bursts_in_shards_are_the_same(two_bursts, tmp_path):
-    render_set(tmp_path / "set", count=10, recipe="burst", shards=True)
-    assert "shard-000000.tar" in names(tmp_path / "set")
-    pairs = zip(read_bursts(two_bursts), read_bursts(tmp_path / "set"), strict=True)
-    for one, other in pairs:
-        assert one.scenes == other.scenes
-        for frame, same in zip(one.frames, other.frames, strict=True):
-            assert all(frame.read(name) == same.read(name) for name in store.SAMPLE_FILES)
-
-
 def test_single_photos_are_not_read_as_bursts(tmp_path):
     render_set(tmp_path / "set", count=1)
     for read in (
@@ -80,12 +68,6 @@ def test_single_photos_are_not_read_as_bursts(tmp_path):
     ):
         with pytest.raises(RecipeError, match=r"sample 0 .* is a single photo"):
             read()
-
-
-def test_the_index_has_the_number_of_each_frame(two_bursts):
-    table = parquet.read_table(two_bursts / "index.parquet")
-    assert table["burst_frame"].to_pylist() == [*range(5)] * 2
-    assert set(table["burst_frames"].to_pylist()) == {5}
 
 
 # --- the command
@@ -129,13 +111,6 @@ def test_the_baseline_of_the_recipe_is_replaced(run_without_model, fake_renderer
     code, _, err = run_without_model("render", "set", "--recipe", "burst", "--count", 1, "--workers", 0)
     assert code == 1
     assert "baseline_mm" in error_lines(err)[0]
-
-
-def test_a_frame_can_be_rendered_again(run_without_model, fake_renderer, tmp_path, two_bursts):
-    scene = two_bursts / "000004" / "scene.toml"
-    code, _, err = run_without_model("render", "--scene", scene, "-o", "again", "--renderer", "analytic")
-    assert code == 0, err
-    assert read_scene(tmp_path / "again" / "scene.toml") == read_scene(scene)
 
 
 # --- the benchmark

@@ -304,10 +304,3 @@ def test_the_command_reports_bursts_that_cannot_be_separated(tmp_path, burst_fil
     assert (code, [report["status"] for report in reports]) == (1, ["failed", "failed"])
     assert "1 photo" in reports[0]["error"]
     assert "window.mp4" in reports[1]["error"]
-
-
-def test_a_dry_run_writes_nothing(tmp_path, burst_files, capfd):
-    code, out = run_burst(capfd, *burst_files, "-o", tmp_path / "clear.png", "--dry-run")
-    assert code == 0
-    assert "clear.png" in out
-    assert not list(tmp_path.iterdir())

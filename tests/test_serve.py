@@ -1,25 +1,29 @@
 """The command `brewster serve`."""
 
+import ipaddress
 import json
 import re
+import socket
 import urllib.error
 import urllib.request
 
+import cv2
 import httpx
+import numpy as np
 import pytest
 
-from brewster.cli import serve as command
-from brewster.cli.serve import serve
+from brewster import Photo
+from brewster.errors import OutputError
+from brewster.web.application import lan_address
 from cli_helpers import image_bytes
 from file_server import loopback_only
+from page_helpers import canvas, upload
 from web_servers import form, serve_process
 
 
 @pytest.fixture
 def reachable(monkeypatch):
     """Allows connections to this machine, for the address that the server prints."""
-    import socket  # noqa: PLC0415
-
     monkeypatch.undo()
     loopback_only(monkeypatch)
     return socket
@@ -48,11 +52,8 @@ def test_the_message_of_a_library_is_only_in_the_log(reachable, model, tmp_path,
     half = image_bytes(600, 400)[:20_000]
     with (tmp_path / "log").open("w") as log, serve_process("--model", model, *options, stderr=log) as link:
         response = httpx.post(f"{link}separate", **form(half))
-    assert response.json() == {
-        "error": "the jpeg cannot be read completely; expected a complete file in a common variant of the format; "
-        "copy the file again from its source, or convert it.",
-        "kind": "UnreadablePhoto",
-    }
+    assert response.json()["kind"] == "UnreadablePhoto"
+    assert "Vips" not in response.text
     text = (tmp_path / "log").read_text()
     assert ("POST /separate failed" in text, "VipsJpeg" in text) == (bool(options), bool(options))
 
@@ -121,11 +122,76 @@ def test_a_port_in_use_is_an_error_without_a_traceback(run_without_model, reacha
     assert err.startswith("error: 127.0.0.1 port")
 
 
-def test_the_page_opens_in_the_browser_only_if_requested(monkeypatch, capsys):
-    opened = []
-    monkeypatch.setattr(command.webbrowser, "open", opened.append)
-    command.print_link("http://127.0.0.1:1/", None, open_browser=False)
-    command.print_link("http://127.0.0.1:1/", "token", open_browser=True)
-    assert opened == ["http://127.0.0.1:1/?token=token"]
-    assert capsys.readouterr().out.splitlines() == ["http://127.0.0.1:1/", "http://127.0.0.1:1/?token=token"]
-    assert serve.name == "serve"
+@pytest.fixture
+def lan(monkeypatch, model, tmp_path):
+    """A server for phones: its link, and the log with the QR code."""
+    monkeypatch.undo()  # allow connections to the address of this machine in its network
+    try:
+        lan_address()
+    except OutputError as error:
+        pytest.skip(str(error))
+    log = tmp_path / "log"
+    with log.open("w") as stderr, serve_process("--lan", "--model", model, stderr=stderr) as link:
+        yield link, log
+
+
+def test_a_server_for_phones_admits_only_its_private_address_and_only_with_the_token(lan):
+    link, log = lan
+    host, port, token = re.fullmatch(r"http://([\d.]+):(\d+)/\?token=([\w-]{16,})", link).groups()
+    address = ipaddress.ip_address(host)
+    assert address.is_private
+    assert not address.is_loopback
+    url, bearer = f"http://{host}:{port}/health", {"Authorization": f"Bearer {token}"}
+    assert get(url)[0] == 401
+    assert get(url, Authorization="Bearer " + "x" * len(token))[0] == 401
+    assert get(url, **bearer)[0] == 200
+    for other in ("evil.com", "192.168.255.254", socket.gethostname()):
+        assert get(url, Host=other, **bearer)[0] == 421
+    with socket.socket() as loopback:  # the server is bound to one address
+        assert loopback.connect_ex(("127.0.0.1", int(port))) != 0
+    assert f"warning: everybody who can reach {host}" in log.read_text()
+
+
+def test_a_phone_reads_the_link_from_the_qr_code(lan):
+    link, log = lan
+    assert get(link)[0] == 200  # the server has printed everything
+    rows = [line for line in log.read_text().splitlines() if set(line) <= set(" ▀▄█") and line]
+    halves = {" ": (0, 0), "▀": (1, 0), "▄": (0, 1), "█": (1, 1)}  # a module is light where a block is
+    modules = [[halves[block][half] for block in row] for row in rows for half in (0, 1)]
+    image = np.kron(np.array(modules, np.uint8) * 255, np.ones((8, 8), np.uint8))
+    assert cv2.QRCodeDetector().detectAndDecode(image)[0] == link
+
+
+def test_a_phone_opens_the_link_once_and_separates_a_photo(lan, chromium):
+    link, _ = lan
+    context = chromium.new_context(viewport={"width": 390, "height": 844}, has_touch=True, is_mobile=True)
+    page = context.new_page()
+    page.goto(link)
+    page.wait_for_selector("#model option", state="attached")
+    assert page.evaluate("[isSecureContext, document.cookie, location.search]") == [False, "", ""]
+    page.reload()  # without the token in the address
+    photo = image_bytes(60, 40, "png")
+    upload(page, ("window.png", photo))
+    (cookie,) = context.cookies()
+    assert (cookie["httpOnly"], cookie["sameSite"]) == (True, "Strict")
+    assert (canvas(page, "left") == Photo.open(photo).pixels).all()
+    assert page.locator("li.done").count() == 1
+    context.close()
+
+
+@pytest.mark.parametrize(
+    ("own", "message"),
+    [(None, "no network"), ("127.0.0.1", "no network"), ("8.8.8.8", r"8\.8\.8\.8 is public")],
+)
+def test_a_machine_without_a_private_address_cannot_serve_phones(monkeypatch, own, message):
+    class Network(socket.socket):
+        def connect(self, address):
+            if not own:
+                raise OSError(101, "Network is unreachable")
+
+        def getsockname(self):
+            return own, 1
+
+    monkeypatch.setattr(socket, "socket", Network)
+    with pytest.raises(OutputError, match=message):
+        lan_address()

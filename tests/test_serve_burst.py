@@ -14,6 +14,7 @@ from PIL import Image
 
 from brewster import Photo
 from brewster.burst import separate_burst
+from brewster.burst.separate import measure_layers
 from brewster.burst.solver import Level, solve
 from brewster.inference import Separator
 from cli_helpers import image_bytes
@@ -83,6 +84,29 @@ def test_the_preview_of_a_burst_shows_the_layers_of_the_download(photos):
     assert np.quantile(np.abs(made.astype(int) - shown), 0.99) <= 2
     tile = request(app, "GET", f"/tile/{response.headers['Brewster-Photo']}/0/0/0")
     assert (Photo.open(tile.content).pixels == Photo.open(photos[1]).pixels).all()
+
+
+@pytest.mark.usefixtures("few_steps")
+def test_a_download_after_a_preview_measures_the_motion_only_for_other_photos_or_another_reference(
+    photos, monkeypatch
+):
+    measured = []
+
+    def count(frames, reference, prior, **keywords):
+        measured.append(reference)
+        return measure_layers(frames, reference, prior, **keywords)
+
+    monkeypatch.setattr("brewster.burst.separate.measure_layers", count)
+    app = make_app()
+    send("/preview", photos, app)
+    one, other, same = (
+        send("/separate", photos, app, layers="transmission", strength="0.5", reference=number).content
+        for number in ("2", "1", "1")
+    )
+    assert measured == [1, 0]
+    assert one != other == same
+    send("/separate", photos[:2], app, layers="transmission", reference="1")
+    assert measured == [1, 0, 0]
 
 
 @pytest.mark.parametrize(

@@ -8,11 +8,8 @@ import numpy as np
 import pytest
 
 from brewster import Photo
-from brewster.photo.file_info import FileInfo
-from brewster.srgb import to_encoded, to_linear
 from cli_helpers import image_bytes
 from page_helpers import canvas, difference, downloaded, settle, share, upload
-from picture_files import exif_block, file_of, smooth
 
 MIXTURE = Path(__file__).parent / "pictures" / "mixture-coffee-rocket.jpg"
 
@@ -62,24 +59,6 @@ def test_the_layers_on_the_page_are_those_of_the_server_to_two_code_values(open_
             settle(page)
             _, made, _ = run("-", "--strength", strength, "--layers", layer, stdin=data)
             assert difference(canvas(page, "right"), Photo.open(made).pixels).max() <= 2
-
-
-def test_wide_gamut_and_rotated_photos_have_the_right_colours_and_orientation(open_page):
-    import pyvips  # noqa: PLC0415
-
-    colours = np.kron(np.array([[[230, 60, 60], [60, 200, 60]]], np.uint8), np.ones((30, 30, 1), np.uint8))
-    wide = Photo(colours, None, FileInfo(icc=pyvips.Image.profile_load("p3")))
-    page = open_page()
-    upload(page, ("p3.png", wide.encode("png")))
-    assert difference(canvas(page, "left"), wide.srgb_8bit()).max() <= 1
-    assert canvas(page, "left")[0, 0, 0] > 240
-    expected = 255 * to_encoded(to_linear(wide.srgb_8bit() / 255) * 0.8)
-    # The red half is clipped in sRGB and stays as it is. The red of the green half is outside sRGB, so only green and blue are compared.
-    inside = np.s_[5:25, 40:55]
-    assert np.abs(canvas(page, "right")[inside] - expected[inside])[..., 1:].max() <= 2
-    page.get_by_role("button", name="Remove p3.png").click()
-    upload(page, ("turned.png", file_of(smooth(), "png", exif=exif_block(6))))
-    assert (canvas(page, "left") == np.rot90(smooth(), -1)).all()
 
 
 def test_the_page_works_with_the_keyboard_only(open_page, run):
@@ -170,29 +149,6 @@ def test_the_confidence_is_shown_as_colours_over_the_grey_photo_with_a_legend(op
     assert middle @ [2, 7, 1] > unknown @ [2, 7, 1] + 100  # the order is visible without colours
 
 
-def test_zoom_and_pan_move_both_sides_together(open_page):
-    """At strength 0, both sides show the same ramp. An offset between the sides is therefore visible as a step."""
-    page = open_page()
-    ramp = np.repeat(np.linspace(20, 220, 240).astype(np.uint8)[None, :, None], 120, axis=0)
-    upload(page, ("a.png", file_of(ramp, "png")))
-    page.get_by_label("Strength", exact=True).fill("0")
-    page.get_by_role("button", name="Zoom in").click()
-    before = row(page)
-    stage = page.locator("glass-compare").bounding_box()
-    page.mouse.move(stage["x"] + 200, stage["y"] + 200)
-    page.mouse.down()
-    page.mouse.move(stage["x"] + 100, stage["y"] + 150)
-    page.mouse.up()
-    after = row(page)
-    for line in (before, after):
-        assert line.all()  # the image is larger than the view
-        assert set(np.diff(line)) <= {0, 1}
-    assert after[0] > before[0]
-    page.mouse.wheel(0, -200)
-    settle(page)
-    assert np.ptp(row(page)) < np.ptp(after)  # a smaller part of the ramp is visible
-
-
 def row(page):
     """The pixels of the middle row of the view, without the line and its handle."""
     settle(page)
@@ -222,15 +178,6 @@ def test_a_file_that_is_not_a_photo_shows_an_error_and_can_be_retried_or_removed
     assert page.get_by_role("listitem").count() == 1
     page.get_by_role("button", name="Remove window.png").click()
     assert page.evaluate("document.activeElement.id") == "undo-remove"
-
-
-@pytest.mark.parametrize("content", [b"\0\0\0\x18ftypisom", b"damaged"])
-def test_a_video_is_called_a_video(open_page, content):
-    page = open_page()
-    video = {"name": "clip.mp4", "mimeType": "video/mp4", "buffer": content + bytes(100)}
-    page.set_input_files("#files", [video])
-    page.wait_for_selector("#error:not([hidden])")
-    assert "This is a video. Only photos can be separated." in page.get_by_role("alert").inner_text()
 
 
 def test_many_photos_are_downloaded_as_one_zip_with_unique_names(open_page, run):
@@ -272,85 +219,6 @@ def test_photos_can_be_pasted_and_dropped(open_page):
         page.get_by_role("button", name=f"{kind}.png").first.wait_for()
     page.wait_for_selector("li.done >> nth=1")
     assert "2 of 2 are done" in page.locator("#announcement").inner_text()
-
-
-def test_a_change_of_quality_repeats_the_preview(open_page):
-    page = open_page()
-    upload(page, ("a.png", image_bytes(90, 60, "png")))
-    with page.expect_request("**/preview?*") as request:
-        page.get_by_label("Draft", exact=True).check()
-    assert request.value.method == "POST"
-    for quality in ("Standard", "Draft", "Standard"):  # each before the previous preview is done
-        page.get_by_label(quality, exact=True).check()
-    page.wait_for_selector("li.done")
-    page.wait_for_selector("glass-compare:not([hidden])")
-
-
-def hold_requests(page, path):
-    """Gives no response to requests for this path, until `page.unroute(path)`."""
-    page.route(path, lambda route: None)
-
-
-def focused(page):
-    settle(page)
-    return page.evaluate("document.activeElement.id")
-
-
-def test_the_previous_quality_shows_the_previous_maps_again(open_page):
-    page = open_page()
-    upload(page, ("a.png", image_bytes(90, 60, "png")), ("b.png", image_bytes(80, 60, "png")))
-    hold_requests(page, "**/preview?*")
-    page.get_by_label("Draft", exact=True).check()
-    page.get_by_role("button", name="Cancel").click()
-    page.get_by_role("heading", name="Cancelled").wait_for()
-    page.get_by_label("Standard", exact=True).check()
-    page.wait_for_selector("glass-compare:not([hidden])")
-    page.wait_for_selector("li.done >> nth=1")  # the running request for b.png is cancelled, too
-    assert page.get_by_role("button", name="Download transmission").is_enabled()
-    page.get_by_label("Draft", exact=True).check()
-    page.get_by_role("button", name="Cancel").wait_for()
-    page.unroute("**/preview?*")
-    page.get_by_label("Draft", exact=True).check()
-    page.wait_for_selector("li.done >> nth=1")
-
-
-def test_the_focus_moves_to_the_next_button_when_its_button_disappears(open_page):
-    page = open_page()
-    hold_requests(page, "**/preview?*")
-    page.set_input_files("#files", [{"name": "a.png", "mimeType": "", "buffer": image_bytes(90, 60, "png")}])
-    page.get_by_role("button", name="Cancel").focus()
-    for successor in ("retry", "cancel", "retry"):
-        page.keyboard.press("Enter")
-        page.wait_for_selector(f"#{successor}:visible")
-        assert focused(page) == successor
-    page.unroute("**/preview?*")
-    page.keyboard.press("Enter")
-    page.wait_for_selector("glass-compare:not([hidden])")
-    assert focused(page) == "compare"
-
-    page.get_by_role("button", name="Download transmission").focus()
-    downloaded(page, lambda: page.keyboard.press("Enter"))
-    page.wait_for_selector("#export", state="hidden")
-    assert focused(page) == "download"
-    hold_requests(page, "**/separate?*")
-    with page.expect_request("**/separate?*"):
-        page.keyboard.press("Enter")
-    assert page.get_by_role("button", name="Download transmission").is_disabled()
-    page.keyboard.press("Enter")  # ignored while the download runs
-    page.get_by_role("button", name="Stop").focus()
-    page.keyboard.press("Enter")
-    page.wait_for_selector("#export", state="hidden")
-    assert focused(page) == "download"
-
-
-def test_a_photo_that_is_not_done_shows_its_own_strength(open_page):
-    page = open_page()
-    upload(page, ("a.png", image_bytes(90, 60, "png")))
-    page.get_by_label("Strength", exact=True).fill("0.3")
-    hold_requests(page, "**/preview?*")
-    page.set_input_files("#files", [{"name": "b.png", "mimeType": "", "buffer": image_bytes(90, 60, "png")}])
-    page.locator(".pick").nth(1).click()
-    assert page.locator("#amount").inner_text() == "100 %"
 
 
 def test_a_photo_that_fails_is_left_out_of_the_zip_and_its_error_is_shown(open_page):

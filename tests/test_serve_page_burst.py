@@ -7,7 +7,7 @@ import pytest
 
 from brewster import Photo
 from cli_helpers import image_bytes
-from page_helpers import downloaded, settle, upload
+from page_helpers import downloaded, upload
 
 PHOTOS = [(f"{number}.png", image_bytes(90, 60, "png", number)) for number in (1, 2, 3)]
 
@@ -60,20 +60,6 @@ def test_one_to_one_is_always_100_percent_and_fit_shows_the_whole_photo_again(op
     page.locator("glass-compare").focus()
     page.keyboard.press("1")
     assert size.inner_text() == "100 %"
-
-
-def test_on_a_phone_the_photo_stays_visible_while_the_settings_are_changed(open_page):
-    page = open_page(viewport={"width": 390, "height": 844}, has_touch=True)
-    upload(page, *PHOTOS)
-    assert page.evaluate("document.documentElement.scrollWidth") == 390
-    strength = page.get_by_label("Strength", exact=True)
-    strength.scroll_into_view_if_needed()
-    assert strength.bounding_box()["height"] >= 44
-    page.evaluate("scrollTo(0, document.documentElement.scrollHeight)")
-    settle(page)
-    stage = page.locator("#stage").bounding_box()
-    assert stage["y"] >= 0
-    assert page.get_by_role("button", name="Download all").bounding_box()["y"] >= stage["y"] + stage["height"]
 
 
 def test_a_text_file_and_a_tiff_have_the_right_button_and_thumbnail(open_page):

@@ -1,19 +1,9 @@
 """The page never loses files or results, and reports what happens to them; tested in a real browser with a real server."""
 
-import io
-import zipfile
-
 import pytest
 
 from cli_helpers import image_bytes
 from page_helpers import downloaded, upload
-
-
-def add(page, *names, **kwargs):
-    data = image_bytes(90, 60, "png")
-    page.set_input_files(
-        "#files", [{"name": name, "mimeType": "", "buffer": data} for name in names], **kwargs
-    )
 
 
 def names_in_list(page):
@@ -72,22 +62,6 @@ def test_a_folder_with_more_photos_than_the_list_can_contain_reports_how_many_ar
     assert "99000 more photos were left out" in found[3]
 
 
-def test_a_photo_that_is_added_before_the_models_are_known_is_separated_once(open_page):
-    page = open_page()
-    requests = []
-    page.on("request", lambda request: requests.append(request.url) if "/preview" in request.url else None)
-    held = []
-    page.route("**/models", lambda route: held.append(route))  # noqa: PLW0108  (Playwright wraps functions only)
-    page.reload()
-    page.wait_for_selector("#choose")
-    add(page, "a.png")
-    page.get_by_text("Waiting", exact=True).wait_for()
-    assert requests == []
-    held[0].continue_()
-    page.wait_for_selector("li.done")
-    assert len(requests) == 1
-
-
 def test_a_removed_photo_comes_back_to_its_place_with_its_result_and_strength(open_page):
     page = open_page()
     upload(page, *((name, image_bytes(90, 60, "png")) for name in ("a.png", "b.png", "c.png")))
@@ -128,31 +102,6 @@ def test_leaving_with_results_that_were_not_downloaded_asks(open_page):
     assert names_in_list(page) == []
 
 
-def test_the_bytes_of_the_upload_and_of_the_download_are_shown(open_page):
-    page = open_page()
-    phases = page.evaluate(
-        """async (bytes) => {
-        const { send } = await import("/page/api.js");
-        const phases = [];
-        const file = new File([new Uint8Array(bytes)], "a.png");
-        const context = { signal: new AbortController().signal, onProgress: (progress) => phases.push(progress) };
-        await send("separate", file, { layers: "transmission" }, context);
-        return phases;
-    }""",
-        list(image_bytes(300, 200, "png")),
-    )
-    for phase in ("upload", "download"):
-        ends = [progress for progress in phases if progress["phase"] == phase]
-        assert ends, phase
-        assert ends[-1]["loaded"] == ends[-1]["total"] > 500
-    texts = page.evaluate("""async () => {
-        const { progressText } = await import("/page/filmstrip.js");
-        return [{ phase: "upload", loaded: 1_200_000, total: 5_000_000 }, { phase: "working", share: 0.351 },
-                { phase: "download", loaded: 12_000_000, total: 36_500_000 }].map(progressText);
-    }""")
-    assert texts == ["Sending 1.2 of 5.0 MB", "Separating, 35 %", "Receiving 12 of 37 MB"]
-
-
 def test_a_file_that_was_deleted_after_it_was_added_is_named_as_the_cause(open_page, tmp_path):
     page = open_page()
     path = tmp_path / "a.png"
@@ -164,35 +113,3 @@ def test_a_file_that_was_deleted_after_it_was_added_is_named_as_the_cause(open_p
     page.unroute("**/preview?*")
     page.get_by_role("button", name="Try again").click()
     page.get_by_text("The photo was not sent. The file was moved, changed or deleted").wait_for()
-
-
-def test_the_settings_of_one_photo_are_copied_to_all_and_reset(open_page):
-    page = open_page()
-    upload(page, *((name, image_bytes(90, 60, "png")) for name in ("a.png", "b.png")))
-    page.get_by_label("Strength", exact=True).fill("0.3")
-    page.get_by_role("button", name="Copy to all photos").click()
-    page.locator(".pick").nth(1).click()
-    assert page.locator("#amount").inner_text() == "30 %"
-    page.get_by_role("button", name="Reset").click()
-    assert page.locator("#amount").inner_text() == "100 %"
-    _, data = downloaded(page, page.get_by_role("button", name="Download all").click)
-    report = zipfile.ZipFile(io.BytesIO(data)).read("brewster-report.txt").decode()
-    assert "(strength 30 %)" in report
-    assert "(strength 100 %)" in report
-
-
-def test_the_example_on_the_empty_page_is_separated(open_page):
-    page = open_page()
-    page.get_by_role("button", name="Try an example").click()
-    page.wait_for_selector("li.done")
-    assert names_in_list(page) == ["example.jpg"]
-    assert page.locator("#model-field").is_visible()  # the server has two models
-
-
-def test_a_long_list_of_photos_is_scrolled_with_buttons(open_page):
-    page = open_page()
-    upload(page, *((f"{number}.png", image_bytes(20, 20, "png")) for number in range(9)))
-    assert page.get_by_role("button", name="Earlier photos").is_disabled()
-    page.get_by_role("button", name="Later photos").click()
-    page.get_by_role("button", name="Earlier photos", disabled=False).wait_for()
-    assert page.evaluate("document.getElementById('photos').scrollLeft") > 0

@@ -66,19 +66,6 @@ def test_the_key_b_shows_the_photo_in_place_of_the_result(large_page):
     assert difference(before, after).max() > 10
 
 
-def test_side_by_side_shows_the_same_part_of_both(large_page, run):
-    page, data = large_page
-    page.get_by_label("Side by side").check()
-    page.get_by_role("button", name="Fit").click()
-    page.get_by_role("button", name="1:1").click()
-    both = view(page)
-    half = both.shape[1] // 2
-    shape = (both.shape[0], half)
-    made = Photo.open(run("-", stdin=data)[1]).pixels
-    assert (both[:, :half] == middle(Photo.open(data).pixels, shape)).all()
-    assert difference(both[:, -half:], middle(made, shape)).max() <= 2
-
-
 def test_beyond_one_to_one_a_photo_pixel_is_a_square(large_page):
     page, data = large_page
     page.get_by_label("Result", exact=True).check()

@@ -224,7 +224,3 @@ def test_a_hint_on_the_page_separates_again_and_reaches_the_file_together_with_a
         assert pixels[80:120, 80:120].mean() < 0.85 * photo[80:120, 80:120].mean()  # hint: half of the light
         assert (pixels[80:120, 150:190] == photo[80:120, 150:190]).all()  # hint, but protected by the mask
         assert (pixels[170:, :] == photo[170:, :]).all()
-
-
-def test_a_model_without_hints_has_no_tools_for_them(page):
-    assert page.get_by_label("Reflection is here").is_hidden()

@@ -70,16 +70,6 @@ def test_a_participant_who_agrees_gets_a_link_and_all_trials(app, store):
     assert [answer.seconds for answer in answers.values()] == [2.5] * 8
 
 
-def test_the_pictures_of_a_trial_are_those_that_were_drawn(app, store, study):
-    link = admit_participant(app)
-    participant = store.participant(link.removeprefix("/s/"))
-    for number, trial in enumerate(participant.trials):
-        for side in ("photo", "left", "right"):
-            response = request(app, "GET", f"{link}/pictures/{number}/{side}")
-            assert response.content == study.picture_file(getattr(trial, side)).read_bytes()
-            assert response.headers["content-type"] == "image/png"
-
-
 def test_no_response_contains_a_method_a_dataset_or_a_file_name(app, store, study):
     link = admit_participant(app)
     paths = ["/", link, f"{link}/trial", "/invitation", "/privacy", "/openapi.json"]
@@ -100,15 +90,6 @@ def test_no_response_contains_a_method_a_dataset_or_a_file_name(app, store, stud
             assert word.encode() not in sent
         if response.headers["content-type"] == "image/png":  # no header reveals the age of the file
             assert not {"etag", "last-modified", "content-disposition"} & set(response.headers)
-
-
-def test_an_answer_sent_twice_is_stored_once(app, store):
-    link = admit_participant(app)
-    assert post_answer(app, link, 0, "left").json()["kept"] == "left"
-    again = post_answer(app, link, 0, "right").json()
-    assert (again["kept"], again["next"]["trial"]) == ("left", 1)
-    ((_, answers),) = store.all_answers()
-    assert len(answers) == 1
 
 
 def test_the_practice_pair_has_a_known_answer_and_its_pictures(app, store, study):
@@ -182,18 +163,6 @@ def test_an_unknown_link_is_an_error(app):
     assert post_answer(app, "/s/nobody", 0).status_code == 404
     whole = request(app, "GET", "/s/nobody")
     assert (whole.status_code, "<title>Compare pictures" in whole.text) == (404, True)
-
-
-def test_trials_beyond_the_last_are_an_error(app):
-    link = admit_participant(app)
-    for trial in (-1, 8):
-        response = request(app, "GET", f"{link}/pictures/{trial}/left")
-        assert response.status_code == 404
-        assert response.json()["error"].startswith(
-            f"there is no pair {trial + 1}; expected a pair from 1 to 8; "
-        )
-    assert request(app, "GET", f"{link}/pictures/0/middle").status_code == 422
-    assert post_answer(app, link, 8).status_code == 404
 
 
 def test_a_full_study_admits_no_one_else_and_its_participants_can_continue(study, store):

@@ -12,12 +12,11 @@ from threading import Event, Thread
 import httpx
 
 from brewster.inference import Separator
-from brewster.web.application import create_app, listen
+from brewster.web.application import create_app, create_server, listen
 from brewster.web.job_queue import JobQueue
 from brewster.web.middleware import AccessPolicy
 from brewster.web.model_cache import ModelRow
 from brewster.web.separation import separation_router
-from brewster.web.server import create_server
 from other_processes import started
 
 

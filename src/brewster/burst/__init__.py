@@ -3,7 +3,7 @@
 from brewster.errors import MissingExtra
 
 try:
-    from brewster.burst.separate import MAX_FRAMES, fit_burst, separate_burst
+    from brewster.burst.separate import fit_burst, separate_burst
     from brewster.burst.video import read_video
 except ImportError as error:
     raise MissingExtra.for_extra(
@@ -11,4 +11,4 @@ except ImportError as error:
     ) from error
 from brewster.inference.burst_report import BurstReport
 
-__all__ = ["MAX_FRAMES", "BurstReport", "fit_burst", "read_video", "separate_burst"]
+__all__ = ["BurstReport", "fit_burst", "read_video", "separate_burst"]

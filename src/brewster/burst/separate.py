@@ -14,26 +14,24 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from typing import Final, Literal, final
+from typing import Any, Final, Literal, final
 
 import cv2
 import numpy as np
 
 from brewster.burst.registration import frame_motions, motion_candidates, path_order
 from brewster.burst.solver import Floats, Solution, solve
-from brewster.errors import PhotoError
+from brewster.errors import PhotoError, counted
 from brewster.inference.assessment import Verdict
 from brewster.inference.burst_report import BurstReport
 from brewster.inference.guided_upsampling import GeneratedOverride
 from brewster.inference.predictor import Prediction, Predictor, ProgressCallback
 from brewster.inference.separation import Separation
-from brewster.inference.separator import Separator
-from brewster.options import Options, Quality
+from brewster.inference.separator import Separator, white_level
+from brewster.options import MAX_BURST_PHOTOS, Options, Quality
 from brewster.photo import Photo, Source
 from brewster.worker_setup import single_torch_thread
 
-MAX_FRAMES: Final = 15
-"""Larger bursts take longer and are hardly better."""
 _WORKING_PX: Final = 1000
 """The long side of the frames from which the motion is estimated."""
 _MIN_MOTION_PX: Final = 10.0
@@ -57,9 +55,16 @@ class FittedBurst:
 
     photo: Photo
     separator: Separator
+    hints: Source | None
+    """The hints of the person, if the separator is that of the single photo."""
     report: BurstReport
     seconds: dict[str, float]
     """The time of each step."""
+
+    def separate(self, on_progress: ProgressCallback, **options: Any) -> Separation:  # noqa: ANN401
+        """Computes the layers at full size. `options` are those of the call of a `Separator`, without hints."""
+        separation = self.separator(self.photo, hints=self.hints, on_progress=on_progress, **options)
+        return replace(separation, burst=self.report, seconds=self.seconds | separation.seconds)
 
 
 def separate_burst(
@@ -101,16 +106,13 @@ def separate_burst(
         max_pixels=max_pixels,
         on_progress=lambda done: on_progress(0.9 * done),
     )
-    separation = fitted.separator(
-        fitted.photo,
+    return fitted.separate(
+        lambda done: on_progress(0.9 + 0.1 * done),
         strength=strength,
         quality=quality,
         mask=mask,
-        hints=hints if fitted.report.method == "single photo" else None,
         additive=additive,
-        on_progress=lambda done: on_progress(0.9 + 0.1 * done),
     )
-    return replace(separation, burst=fitted.report, seconds=fitted.seconds | separation.seconds)
 
 
 def fit_burst(
@@ -136,6 +138,8 @@ def fit_burst(
     solution, left_out = measure_layers(frames, reference, prior, on_progress=on_progress)
     seconds["motion"] = time.perf_counter() - started
     report = burst_report(solution, single.verdict, len(photos), left_out, reference)
+    if report.method != "single photo":
+        hints = None
     if solution and report.method == "burst":
         name = f"burst with {separator.name}"
         separator = Separator(
@@ -143,7 +147,7 @@ def fit_burst(
         )
     elif report.method == "unchanged":
         separator = Separator(lambda tile: (tile, np.zeros_like(tile)), name="unchanged")
-    return FittedBurst(photo, separator, report, seconds)
+    return FittedBurst(photo, separator, hints, report, seconds)
 
 
 def measure_layers(
@@ -176,10 +180,10 @@ def measure_layers(
 
 
 def _checked_reference(count: int, reference: int | None) -> int:
-    if not 2 <= count <= MAX_FRAMES:
+    if not 2 <= count <= MAX_BURST_PHOTOS:
         raise PhotoError(
-            f"a burst has {count} photo{'' if count == 1 else 's'}",
-            f"expected 2 to {MAX_FRAMES} photos of one window",
+            f"a burst has {counted(count, 'photo')}",
+            f"expected 2 to {MAX_BURST_PHOTOS} photos of one window",
             "separate a single photo with brewster.separate, or select some of the photos",
         )
     reference = count // 2 if reference is None else reference
@@ -215,8 +219,8 @@ def _working_frames(photos: Sequence[Source], reference: int, photo: Photo, max_
                 "leave it out, or pass photos that were taken with the same camera, orientation and zoom",
             )
         frames.append(frame.resized(width, height))
-    white = max(1.0, float(np.percentile(frames[reference], 99)))  # as in Separator
-    return [np.clip(frame / np.float32(white), 0, 1) for frame in frames]
+    white = white_level(frames[reference])
+    return [np.clip(frame / white, 0, 1) for frame in frames]
 
 
 def _applied(apply: Callable[[Floats, int, int], tuple[Floats, Floats]], frame: Floats) -> Floats:

@@ -2,11 +2,15 @@
 
     serve(create_app(router, policy=AccessPolicy.for_host("127.0.0.1")), host="127.0.0.1", port=8417)
 
-All files of the pages are part of this package, so that the pages work offline.
+All files of the pages are part of this package, so that the pages work offline. The server closes idle connections, and shuts
+down without log messages. The idle time limit applies while the server waits for the client to send a request or to receive a
+response.
 """
 
 from __future__ import annotations
 
+import asyncio
+import ipaddress
 import logging
 import signal
 import socket
@@ -14,13 +18,15 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from http import HTTPStatus
 from pathlib import Path
-from typing import Final
+from typing import Any, Final, final
 
+import uvicorn
 from fastapi import APIRouter, FastAPI, Request
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import FileResponse, JSONResponse, Response
 from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect
+from uvicorn.protocols.http.h11_impl import H11Protocol
 
 import brewster
 from brewster.errors import (
@@ -34,12 +40,12 @@ from brewster.errors import (
     UnreadablePhoto,
     UnsupportedPhoto,
 )
-from brewster.web.middleware import SECURITY_HEADERS, AccessMiddleware, AccessPolicy
+from brewster.web.middleware import SECURITY_HEADERS, AccessMiddleware, AccessPolicy, is_loopback
 from brewster.web.request_schema import validation_message
-from brewster.web.server import create_server
 
 _LOGGER: Final = logging.getLogger(__name__)
 PAGE_FOLDER: Final = Path(__file__).parent / "page"
+_ANY_ROUTED_ADDRESS: Final = ("192.0.2.1", 9)  # reserved for documentation, see RFC 5737
 _STATUS_CODES: Final[dict[type[BrewsterError], int]] = {
     PhotoTooLarge: 413,
     UnreadablePhoto: 422,
@@ -52,15 +58,19 @@ _STATUS_CODES: Final[dict[type[BrewsterError], int]] = {
 }
 """HTTP status by error class. Other BrewsterErrors are caused by the request and get the status 422."""
 
+IDLE_CHECK_SECONDS: Final = 10.0
+"""Interval of the idle check. A connection is closed at the second check if the client neither completes the head of a
+request nor receives a byte between the checks."""
+GRACE_SECONDS: Final = 2.0
+"""The time for which running requests may continue after the shutdown begins."""
+_BACKLOG: Final = 128
+_SEND_BUFFER_BYTES: Final = (
+    1 << 17
+)  # with a larger kernel buffer, the server cannot see whether a slow client still receives
+
 
 def create_app(*routers: APIRouter, policy: AccessPolicy, index: str = "index.html") -> FastAPI:
-    """Creates an application.
-
-    Args:
-        routers: the routes of the API.
-        policy: the access policy for every request.
-        index: the file in web/page/ that is served at `/`.
-    """
+    """Creates an application with these routes. `index` is the file in web/page/ that is served at `/`."""
     app = FastAPI(title="brewster", version=brewster.__version__, docs_url=None, redoc_url=None)
     app.add_middleware(AccessMiddleware, policy=policy)
     for error_class in (ClientDisconnect, HTTPException, RequestValidationError, BrewsterError, Exception):
@@ -84,11 +94,7 @@ def _add_page(app: FastAPI, path: str, name: str) -> None:
 
 
 def listen(host: str, port: int) -> socket.socket:
-    """Opens a listening socket; port 0 chooses a free port.
-
-    Raises:
-        OutputError: the address or the port cannot be used.
-    """
+    """Opens a listening socket; port 0 chooses a free port. Raises OutputError if the address or the port cannot be used."""
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     try:
         return socket.create_server((host, port), family=family, backlog=128)
@@ -100,6 +106,27 @@ def listen(host: str, port: int) -> socket.socket:
         ) from error
 
 
+def lan_address() -> str:
+    """Returns the IPv4 address of this machine in its local network.
+
+    Raises:
+        OutputError: this machine is in no network, or its address is public.
+    """
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        try:
+            probe.connect(_ANY_ROUTED_ADDRESS)  # chooses the address of this machine, and sends no packet
+            address = str(probe.getsockname()[0])
+        except OSError:  # no route
+            address = "127.0.0.1"
+    if is_loopback(address) or not ipaddress.ip_address(address).is_private:
+        raise OutputError(
+            "this machine has no network" if is_loopback(address) else f"its address {address} is public",
+            "expected an address in a private network, such as 192.168.1.5",
+            "connect this machine and the phone to the same network, or choose an address with --host",
+        )
+    return address
+
+
 def server_url(listening: socket.socket) -> str:
     """Returns the URL of a listening socket for a browser; a wildcard address becomes a loopback address."""
     host, port = listening.getsockname()[:2]
@@ -107,20 +134,10 @@ def server_url(listening: socket.socket) -> str:
     return f"http://[{host}]:{port}/" if ":" in host else f"http://{host}:{port}/"
 
 
-def serve(
-    app: FastAPI,
-    *,
-    host: str,
-    port: int,
-    on_ready: Callable[[str], None] = print,
-) -> None:
+def serve(app: FastAPI, *, host: str, port: int, on_ready: Callable[[str], None] = print) -> None:
     """Serves the application until it is interrupted. Call this in the main thread, because it handles signals.
 
-    Args:
-        app: the application.
-        host: the address to bind to.
-        port: the port; 0 chooses a free port.
-        on_ready: called with the URL when the socket is open.
+    Port 0 chooses a free port. `on_ready` is called with the URL when the socket is open.
 
     Raises:
         KeyboardInterrupt: Ctrl-C or SIGTERM has ended the server.
@@ -149,7 +166,13 @@ async def _error_response(request: Request, error: Exception) -> Response:
     if isinstance(error, ClientDisconnect):
         return Response(status_code=499)  # the client has disconnected and does not read the response
     if isinstance(error, HTTPException):
-        return JSONResponse({"error": _http_error_message(request, error)}, error.status_code, error.headers)
+        message, path = error.detail, request.url.path
+        if message == HTTPStatus(error.status_code).phrase:
+            message = f"{request.method} {path} does not exist; expected an existing route; choose one from GET /openapi.json"
+            if error.status_code == HTTPStatus.METHOD_NOT_ALLOWED:
+                allowed = (error.headers or {}).get("Allow", "another method")
+                message = f"{path} does not accept {request.method}; expected {allowed}; repeat the request with this method"
+        return JSONResponse({"error": message}, error.status_code, error.headers)
     if isinstance(error, RequestValidationError):
         return JSONResponse({"error": validation_message(error.errors())}, 422)
     if isinstance(error, BrewsterError):
@@ -162,10 +185,87 @@ async def _error_response(request: Request, error: Exception) -> Response:
     return JSONResponse(body, 500, SECURITY_HEADERS)  # Starlette sends this response outside AccessMiddleware
 
 
-def _http_error_message(request: Request, error: HTTPException) -> str:
-    if error.detail != HTTPStatus(error.status_code).phrase:
-        return error.detail
-    if error.status_code == HTTPStatus.METHOD_NOT_ALLOWED:
-        allowed = (error.headers or {}).get("Allow", "another method")
-        return f"{request.url.path} does not accept {request.method}; expected {allowed}; repeat the request with this method"
-    return f"{request.method} {request.url.path} does not exist; expected an existing route; choose one from GET /openapi.json"
+def create_server(app: FastAPI) -> uvicorn.Server:
+    """Creates a server for an application. At shutdown, the server waits up to GRACE_SECONDS for running requests."""
+    config = uvicorn.Config(
+        app,
+        http=TimeoutProtocol,
+        ws="none",
+        backlog=_BACKLOG,
+        log_config=None,
+        log_level="error",
+        access_log=False,
+        server_header=False,
+        timeout_graceful_shutdown=int(GRACE_SECONDS) + 3,  # only for tasks that ignore cancellation
+    )
+    return QuietServer(config)
+
+
+@final
+class QuietServer(uvicorn.Server):
+    """A uvicorn server that logs nothing at shutdown.
+
+    It cancels requests that run longer than GRACE_SECONDS; AccessMiddleware then sends an error message for each of them.
+    """
+
+    async def startup(self, sockets: list[socket.socket] | None = None) -> None:
+        """Starts serving."""
+        for listening in sockets or []:  # connections inherit the option
+            listening.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _SEND_BUFFER_BYTES)
+        asyncio.get_running_loop().set_exception_handler(_handle_loop_error)
+        await super().startup(sockets)
+
+    async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
+        """Stops serving, and cancels requests that run longer than GRACE_SECONDS."""
+        grace_timer = asyncio.get_running_loop().call_later(GRACE_SECONDS, self._cancel)
+        try:
+            await super().shutdown(sockets)
+        finally:
+            grace_timer.cancel()
+
+    def _cancel(self) -> None:
+        for connection in list(self.server_state.connections):
+            if isinstance(connection, TimeoutProtocol) and not connection.is_unanswered:
+                connection.transport.abort()  # a response has begun, so no error message can be sent
+        for task in list(self.server_state.tasks):
+            task.cancel()
+
+
+@final
+class TimeoutProtocol(H11Protocol):
+    """A connection that is closed if its state does not change between two idle checks."""
+
+    _previous_state: tuple[object, int] | None = None
+    _idle_timer: asyncio.TimerHandle | None = None
+
+    @property
+    def is_unanswered(self) -> bool:
+        """Whether there is a request whose response has not begun."""
+        return self.cycle is not None and not self.cycle.response_started
+
+    def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
+        """Starts the idle check."""
+        super().connection_made(transport)
+        self._idle_timer = self.loop.call_later(IDLE_CHECK_SECONDS, self._check_idle)
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        """Stops the idle check."""
+        super().connection_lost(exc)
+        if self._idle_timer:
+            self._idle_timer.cancel()
+
+    def _check_idle(self) -> None:
+        unsent_bytes = self.transport.get_write_buffer_size()
+        is_responding = self.cycle is not None and not self.cycle.response_complete
+        state = self.cycle, unsent_bytes
+        if state == self._previous_state and (unsent_bytes or not is_responding):
+            self.transport.abort()
+            return
+        self._previous_state = state
+        self._idle_timer = self.loop.call_later(IDLE_CHECK_SECONDS, self._check_idle)
+
+
+def _handle_loop_error(loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
+    """Ignores errors of accept(). With too many connections, asyncio logs one error per second for each connection."""
+    if not any(ignored in context["message"] for ignored in ("socket.accept()", "_start_serving")):
+        loop.default_exception_handler(context)

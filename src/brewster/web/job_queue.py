@@ -55,11 +55,7 @@ class SeparationJob:
     cancelled: Event = field(default_factory=Event)
 
     def on_progress(self, share: float) -> None:
-        """Records the completed fraction.
-
-        Raises:
-            JobCancelled: the job is cancelled.
-        """
+        """Records the completed fraction. Raises JobCancelled if the job is cancelled."""
         if self.cancelled.is_set():
             raise JobCancelled
         self.share = share
@@ -124,34 +120,30 @@ class JobQueue:
             yield job
         finally:
             job.cancelled.set()
-            self._release(key, job.future)
-
-    def _release(self, key: object, future: Future[Any] | None) -> None:
-        if future is None or future.cancel():
-            del self._jobs[key]
-        else:
-            future.add_done_callback(lambda _: self._jobs.pop(key))
+            if job.future is None or job.future.cancel():
+                del self._jobs[key]
+            else:
+                job.future.add_done_callback(lambda _: self._jobs.pop(key))
 
     async def run_job(
         self, job: SeparationJob, work: Callable[[ProgressCallback], Result], receive: Receive
     ) -> Result:
-        """Runs a work function in a worker thread.
+        """Runs a work function in a worker thread, and returns its result.
 
-        Args:
-            job: the reserved job.
-            work: the function to run.
-            receive: the ASGI receive channel of the request; it reports when the client disconnects.
-
-        Returns:
-            The result of `work`.
+        `receive` is the ASGI receive channel of the request; it reports when the client disconnects.
 
         Raises:
             HTTPException: 504 if the time limit is exceeded.
             ClientDisconnect: the client has disconnected.
         """
+
+        async def wait_for_disconnect() -> None:
+            while (await receive())["type"] != "http.disconnect":
+                pass
+
         future: Future[Result] = self._pool.submit(job.run, work)
         job.future, result = future, asyncio.wrap_future(future)
-        disconnected = asyncio.ensure_future(_wait_for_disconnect(receive))
+        disconnected = asyncio.ensure_future(wait_for_disconnect())
         try:
             done, _ = await asyncio.wait(
                 (result, disconnected), timeout=self.timeout_seconds, return_when=asyncio.FIRST_COMPLETED
@@ -169,8 +161,3 @@ class JobQueue:
             job.cancelled.set()
             result.cancel()
             disconnected.cancel()
-
-
-async def _wait_for_disconnect(receive: Receive) -> None:
-    while (await receive())["type"] != "http.disconnect":
-        pass

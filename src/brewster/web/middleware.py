@@ -9,6 +9,7 @@ a foreign Host header (DNS rebinding) and a POST request from a foreign origin. 
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import hashlib
 import ipaddress
 import re
@@ -141,7 +142,9 @@ class AccessMiddleware:
         query_token = parse_qs(scope["query_string"].decode("latin-1")).get("token", [None])[0]
         if policy.token and query_token and method == "GET" and policy.accepts_token(query_token):
             return _redirect_with_cookie(scope["path"], policy)
-        if not policy.accepts_token(_request_token(headers, policy.cookie_name)):
+        scheme, _, bearer = headers.get("authorization", "").partition(" ")
+        cookie = cookie_parser(headers.get("cookie", "")).get(policy.cookie_name)
+        if not policy.accepts_token(bearer.strip() if scheme.lower() == "bearer" else cookie):
             return _error_response(
                 401,
                 "the token is missing or wrong; expected the token of this server; "
@@ -197,7 +200,11 @@ class _Exchange:
             await self.forward(message)
             return
         await self._send({**message, "more_body": True})
-        await self._drain()
+        self._is_draining = True
+        self._deadline = asyncio.get_running_loop().time() + _DRAIN_SECONDS
+        with contextlib.suppress(HTTPException):
+            while not self._is_complete:
+                await self.receive()
         await self._send({"type": "http.response.body", "body": b""})
 
     async def forward(self, message: Message) -> None:
@@ -208,15 +215,6 @@ class _Exchange:
             for name, value in SECURITY_HEADERS.items():
                 headers.setdefault(name, value)
         await self._send(message)
-
-    async def _drain(self) -> None:
-        self._is_draining = True
-        self._deadline = asyncio.get_running_loop().time() + _DRAIN_SECONDS
-        try:
-            while not self._is_complete:
-                await self.receive()
-        except HTTPException:
-            return
 
 
 def _error_response(status: int, message: str) -> Response:
@@ -240,27 +238,15 @@ def _redirect_with_cookie(path: str, policy: AccessPolicy) -> Response:
     return response
 
 
-def _request_token(headers: Headers, cookie_name: str) -> str | None:
-    """Returns the token of the Authorization header or the cookie, or None."""
-    scheme, _, token = headers.get("authorization", "").partition(" ")
-    if scheme.lower() == "bearer":
-        return token.strip()
-    return cookie_parser(headers.get("cookie", "")).get(cookie_name)
-
-
 def _is_same_origin(headers: Headers) -> bool:
     """Whether a POST comes from a page of this server, or from a client that is not a browser and sends no origin."""
     origin = headers.get("origin")
-    if origin is not None:
-        return _netloc(origin) == headers["host"]
-    return headers.get("sec-fetch-site", "none") in ("same-origin", "none")
-
-
-def _netloc(origin: str) -> str | None:
+    if origin is None:
+        return headers.get("sec-fetch-site", "none") in ("same-origin", "none")
     try:
-        return urlsplit(origin).netloc
+        return urlsplit(origin).netloc == headers["host"]
     except ValueError:  # for example "[" without "]"
-        return None
+        return False
 
 
 def _is_ip_address(name: str) -> bool:

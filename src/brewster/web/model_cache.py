@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Sequence
 from pathlib import Path
 from threading import Lock
@@ -41,19 +42,16 @@ class ModelCache:
     def __init__(self, models: Sequence[str] = (), *, device: Device = "auto") -> None:
         self._sources: dict[str, str] = {}
         for source in dict.fromkeys((*models, *zoo.MODELS)):
-            self._add(source)
+            name = Path(source).name if zoo.is_diffusion_model(source) else zoo.find_model(source).name
+            if name in self._sources:
+                raise ModelError(
+                    f"{source} and {self._sources[name]} have the same name {name}",
+                    "expected different names, because clients choose models by name",
+                    "rename one of the files",
+                )
+            self._sources[name] = source
         self._device, self._lock = device, Lock()
         self._loaded: dict[str, Separator] = {}
-
-    def _add(self, source: str) -> None:
-        name = Path(source).name if zoo.is_diffusion_model(source) else zoo.find_model(source).name
-        if name in self._sources:
-            raise ModelError(
-                f"{source} and {self._sources[name]} have the same name {name}",
-                "expected different names, because clients choose models by name",
-                "rename one of the files",
-            )
-        self._sources[name] = source
 
     @property
     def names(self) -> list[str]:
@@ -62,27 +60,21 @@ class ModelCache:
 
     def rows(self) -> list[ModelRow]:
         """Returns the name, licence, digest and card of each model."""
-        return [_model_row(name, source) for name, source in self._sources.items()]
+        rows = []
+        for name, source in self._sources.items():
+            licence, sha256, card = "the licence of its base model", None, None
+            if not zoo.is_diffusion_model(source):
+                model = zoo.find_model(source)
+                licence, sha256 = model.licence, model.sha256
+                with contextlib.suppress(ModelError):  # a model file that is not in the zoo has no card
+                    card = model.card()
+            rows.append(ModelRow(name=name, licence=licence, sha256=sha256, card=card))
+        return rows
 
     def separator(self, name: str) -> Separator:
-        """Returns the separator of a model. The model is loaded on first use. This method is thread-safe.
-
-        Raises:
-            ModelError: the model file is damaged.
-            DeviceError: the device is not available.
-        """
+        """Returns the separator of a model. The model is loaded on first use. This method is thread-safe. Raises ModelError if
+        the model file is damaged, and DeviceError if the device is not available."""
         with self._lock:
             if name not in self._loaded:
                 self._loaded[name] = Separator.load(self._sources[name], device=self._device)
             return self._loaded[name]
-
-
-def _model_row(name: str, source: str) -> ModelRow:
-    if zoo.is_diffusion_model(source):
-        return ModelRow(name=name, licence="the licence of its base model", sha256=None, card=None)
-    model = zoo.find_model(source)
-    try:
-        card = model.card()
-    except ModelError:  # a model file that is not in the zoo has no card
-        card = None
-    return ModelRow(name=name, licence=model.licence, sha256=model.sha256, card=card)

@@ -27,14 +27,14 @@ import math
 from collections import OrderedDict
 from collections.abc import Callable
 from threading import Lock
-from typing import Any, Final, final
+from typing import Final, final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from brewster.inference import Separator
 from brewster.options import Options
-from brewster.photo import Photo
+from brewster.photo import Photo, Source
 from brewster.srgb import REC709_LUMINANCE, to_encoded
 
 MAX_PREVIEW_PIXELS: Final = 1_400_000
@@ -48,16 +48,12 @@ def preview(
     photo: Photo,
     options: Options,
     on_progress: Callable[[float], None],
-    hints: bytes | None = None,
+    hints: Source | None = None,
 ) -> bytes:
     """Separates a photo for the page.
 
-    Args:
-        separator: the model.
-        photo: the photo at full size.
-        options: the options of the request; only `quality` is used.
-        on_progress: called with the completed fraction, 0 to 1.
-        hints: an image file with hints for the model, see the call of a `Separator`.
+    Of the options, only `quality` is used. `on_progress` is called with the completed fraction, 0 to 1. `hints` is an image file
+    with hints for the model, see the call of a `Separator`.
 
     Returns:
         One line of JSON, then the reduced photo (3 bytes for each pixel, sRGB), and then maps of little-endian 16-bit
@@ -70,7 +66,8 @@ def preview(
     upsampler, prediction, assessment = separator.fit(
         photo, quality=options.quality, hints=hints, on_progress=on_progress
     )
-    width, height = _preview_size(photo.size)
+    scale = min(1.0, math.sqrt(MAX_PREVIEW_PIXELS / math.prod(photo.size)))
+    width, height = (max(1, round(side * scale)) for side in photo.size)
     maps = {
         "change_slope": upsampler.change.slope,
         "change_offset": upsampler.change.offset,
@@ -84,16 +81,34 @@ def preview(
     if upsampler.override:
         maps |= {"generated": upsampler.override.transmission, "weight": upsampler.override.weight}
     if photo.pixels.shape[2] == 1:  # the layers of a grey photo are grey
-        maps = {name: _luminance(map_) for name, map_ in maps.items()}
+        weights = np.array(REC709_LUMINANCE, np.float32)
+        maps = {
+            name: map_ if map_.shape[2] == 1 else (map_ @ weights)[..., None] for name, map_ in maps.items()
+        }
+    # The range is at least 1: smaller steps between the stored values are not visible, and increase the size of the compressed map.
+    lows = {name: float(map_.min()) for name, map_ in maps.items()}
+    highs = {name: max(float(map_.max()), lows[name] + 1) for name, map_ in maps.items()}
     head = {
         "width": width,
         "height": height,
         "full": photo.size,
         "verdict": assessment.verdict,
-        "maps": [_describe(name, map_) for name, map_ in maps.items()],
+        "maps": [
+            {
+                "name": name,
+                "width": map_.shape[1],
+                "height": map_.shape[0],
+                "channels": map_.shape[2],
+                "range": (lows[name], highs[name]),
+            }
+            for name, map_ in maps.items()
+        ],
     }
     codes = _to_srgb_bytes(photo.resized(width, height))
-    coefficients = (_to_uint16(map_).tobytes() for map_ in maps.values())
+    coefficients = []
+    for name, map_ in maps.items():
+        scaled = (map_ - np.float32(lows[name])) / np.float32(highs[name] - lows[name])
+        coefficients.append(np.rint(65535 * scaled).astype(np.dtype("<u2"), copy=False).tobytes())
     on_progress(1.0)
     return b"".join((json.dumps(head).encode(), b"\n", codes.tobytes(), *coefficients))
 
@@ -111,8 +126,11 @@ def photo_tile(photo: Photo, level: int, column: int, row: int) -> Photo | None:
         return None
     stored = photo.pixels[top : top + TILE_PX * step, left : left + TILE_PX * step]
     linear = photo.colour_space().to_linear(stored)
-    if step > 1:
-        linear = _block_means(linear, step)
+    for axis in (0, 1) if step > 1 else ():  # blocks at the edges have fewer pixels
+        starts = np.arange(0, linear.shape[axis], step)
+        counts = np.minimum(starts + step, linear.shape[axis]) - starts
+        sums = np.add.reduceat(linear, starts, axis=axis)
+        linear = np.divide(sums, counts.reshape((-1, 1, 1) if axis == 0 else (1, -1, 1)), dtype=np.float32)
     return Photo(_to_srgb_bytes(linear))
 
 
@@ -132,7 +150,10 @@ class PhotoCache:
         with self._lock:
             self._photos[key] = photo
             self._photos.move_to_end(key)
-            while len(self._photos) > 1 and self._bytes() > self.max_bytes:
+            while (
+                len(self._photos) > 1
+                and sum(each.pixels.nbytes for each in self._photos.values()) > self.max_bytes
+            ):
                 self._photos.popitem(last=False)
 
     def get(self, key: str) -> Photo | None:
@@ -142,50 +163,6 @@ class PhotoCache:
                 self._photos.move_to_end(key)
             return self._photos.get(key)
 
-    def _bytes(self) -> int:
-        return sum(photo.pixels.nbytes for photo in self._photos.values())
-
-
-def _preview_size(size: tuple[int, int]) -> tuple[int, int]:
-    scale = min(1.0, math.sqrt(MAX_PREVIEW_PIXELS / math.prod(size)))
-    return max(1, round(size[0] * scale)), max(1, round(size[1] * scale))
-
-
-def _block_means(linear: NDArray[np.float32], step: int) -> NDArray[np.float32]:
-    """Returns the means of blocks of step x step pixels. Blocks at the edges have fewer pixels."""
-    for axis in (0, 1):
-        starts = np.arange(0, linear.shape[axis], step)
-        counts = np.minimum(starts + step, linear.shape[axis]) - starts
-        sums = np.add.reduceat(linear, starts, axis=axis)
-        linear = np.divide(sums, counts.reshape((-1, 1, 1) if axis == 0 else (1, -1, 1)), dtype=np.float32)
-    return linear
-
-
-def _luminance(map_: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Returns the luminance of a map in linear Rec.709 light, or the map itself if it has one channel."""
-    if map_.shape[2] == 1:
-        return map_
-    return (map_ @ np.array(REC709_LUMINANCE, np.float32))[..., None]
-
-
-def _describe(name: str, map_: NDArray[np.float32]) -> dict[str, Any]:
-    height, width, channels = map_.shape
-    return {"name": name, "width": width, "height": height, "channels": channels, "range": _range(map_)}
-
-
-def _range(map_: NDArray[np.float32]) -> tuple[float, float]:
-    """Returns the values that 0 and 65535 stand for. They differ by at least 1, because smaller steps between the stored values
-    are not visible, and increase the size of the compressed map.
-    """
-    low = float(map_.min())
-    return low, max(float(map_.max()), low + 1)
-
 
 def _to_srgb_bytes(linear: NDArray[np.float32]) -> NDArray[np.uint8]:
     return np.rint(255 * to_encoded(np.clip(linear, 0, 1))).astype(np.uint8)
-
-
-def _to_uint16(map_: NDArray[np.float32]) -> NDArray[np.uint16]:
-    low, high = _range(map_)
-    scaled: NDArray[np.float32] = (map_ - np.float32(low)) / np.float32(high - low)
-    return np.rint(65535 * scaled).astype(np.dtype("<u2"), copy=False)

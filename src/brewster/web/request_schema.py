@@ -18,7 +18,7 @@ from starlette.requests import Request
 from brewster.errors import invalid_value
 from brewster.files import OUTPUT_LAYERS, SeparationPaths
 from brewster.image_formats import FORMATS, canonical_format, format_of
-from brewster.options import Options
+from brewster.options import MAX_BURST_PHOTOS, Options
 from brewster.remote_path import check_not_video
 
 FIELDS: Final = ("layers", "strength", "quality", "format", "additive", "model")
@@ -42,13 +42,13 @@ _PHOTOS_SCHEMA: Final = {
     "type": "array",
     "items": _PHOTO_SCHEMA,
     "minItems": 1,
-    "maxItems": 15,
-    "description": "The photo, or 2 to 15 photos of one window (a burst), in the order in which they were taken.",
+    "maxItems": MAX_BURST_PHOTOS,
+    "description": f"The photo, or 2 to {MAX_BURST_PHOTOS} photos of one window (a burst), in the order in which they were taken.",
 }
 _REFERENCE_SCHEMA: Final = {
     "type": "integer",
     "minimum": 1,
-    "maximum": 15,
+    "maximum": MAX_BURST_PHOTOS,
     "description": "The photo of a burst to separate: 1 is the first one; by default, the middle one.",
 }
 
@@ -82,12 +82,7 @@ class SeparationRequest:
 
 
 async def read_form(request: Request, models: Sequence[str], max_pixels: int) -> SeparationRequest:
-    """Parses and validates the form of a request, in memory.
-
-    Args:
-        request: the request.
-        models: the names of the models, the default first.
-        max_pixels: the maximum number of pixels of the photo.
+    """Parses and validates the form of a request, in memory. `models` has the names of the models, the default first.
 
     Raises:
         HTTPException: 415 if the body is not a form; 400 if the form is damaged; 422 if a field or a value is invalid.
@@ -175,23 +170,15 @@ def form_schema(models: Sequence[str]) -> dict[str, Any]:
         "photo": _PHOTOS_SCHEMA,
         _REFERENCE: _REFERENCE_SCHEMA,
         **painted,
-        **{name: _as_field(known[name]) for name in FIELDS},
+        **{name: known[name] for name in FIELDS},
     }
+    for name in FIELDS:
+        if "anyOf" in known[name]:  # a form has no null: an optional field is left out instead
+            (not_null,) = (choice for choice in known[name]["anyOf"] if choice["type"] != "null")
+            fields[name] = {"description": known[name]["description"], **not_null}
     description = "The model to use, one of `GET /models`."
-    fields["model"] = known["model"] | {
-        "default": models[0],
-        "enum": list(models),
-        "description": description,
-    }
+    fields["model"] |= {"default": models[0], "enum": list(models), "description": description}
     return {"type": "object", "required": ["photo"], "properties": fields}
-
-
-def _as_field(schema: dict[str, Any]) -> dict[str, Any]:
-    """Returns the schema without the type null. A form has no null: an optional field is left out instead."""
-    if "anyOf" not in schema:
-        return schema
-    (not_null,) = (choice for choice in schema["anyOf"] if choice["type"] != "null")
-    return {"description": schema["description"], **not_null}
 
 
 def safe_name(name: str) -> str:
@@ -200,30 +187,30 @@ def safe_name(name: str) -> str:
     The name stays unchanged wherever possible, because the command line names the layers after the unchanged name. Only characters
     that Windows forbids, control characters and marks that change the direction of text are replaced by underscores.
     """
-    last = re.split(r"[/\\]", name)[-1]
-    plain = "".join("_" if _is_unsafe(letter) else letter for letter in last)
+    plain = "".join(
+        "_"
+        if unicodedata.category(letter) in ("Cc", "Cs", "Zl", "Zp")
+        or letter in '<>:"|?*'
+        or unicodedata.bidirectional(letter) in _DIRECTION_MARKS
+        else letter
+        for letter in re.split(r"[/\\]", name)[-1]
+    )
     path = Path(plain if plain.strip(". ") else "photo")
     suffix = path.suffix if format_of(path) else ""
     return path.name.removesuffix(suffix).encode()[:_MAX_NAME_BYTES].decode(errors="ignore") + suffix
 
 
-def _is_unsafe(letter: str) -> bool:
-    is_control = unicodedata.category(letter) in ("Cc", "Cs", "Zl", "Zp")
-    return is_control or letter in '<>:"|?*' or unicodedata.bidirectional(letter) in _DIRECTION_MARKS
-
-
 def validation_message(errors: Iterable[Any]) -> str:
-    """Returns the validation errors of pydantic as one message, with three parts for each error."""
-    return " ".join(str(invalid_value({**error, "loc": _sent_name(error["loc"])})) for error in errors)
+    """Returns the validation errors of pydantic as one message, with three parts for each error.
 
-
-def _sent_name(location: Sequence[str | int]) -> tuple[str, ...]:
-    """Returns the location of a value with the names that the client has sent: `job` for `("query", "job")`.
-
-    The part of the request is kept only if it is the whole location. The index in a list is left out.
+    The location of a value has the names that the client has sent: `job` for `("query", "job")`, without the index in a list.
     """
-    names = tuple(part for part in location if isinstance(part, str))
-    return names[1:] if len(names) > 1 and names[0] in _REQUEST_PARTS else names
+    messages = []
+    for error in errors:
+        names = tuple(part for part in error["loc"] if isinstance(part, str))
+        sent = names[1:] if len(names) > 1 and names[0] in _REQUEST_PARTS else names
+        messages.append(str(invalid_value({**error, "loc": sent})))
+    return " ".join(messages)
 
 
 def _options(form: FormData, models: Sequence[str], max_pixels: int) -> Options:
@@ -242,7 +229,11 @@ def _options(form: FormData, models: Sequence[str], max_pixels: int) -> Options:
     if "format" in values_by_name:
         values_by_name["format"] = canonical_format(values_by_name["format"])
     if "layers" in texts:
-        values_by_name["layers"] = _ordered_layers(",".join(texts["layers"]).split(","))
+        # Each layer once, in the order of the command line. Unknown names come last, and the validation refuses them.
+        layers = ",".join(texts["layers"]).split(",")
+        values_by_name["layers"] = [
+            layer for layer in dict.fromkeys((*OUTPUT_LAYERS, *layers)) if layer in layers
+        ]
     if values_by_name.setdefault("model", models[0]) not in models:
         raise HTTPException(
             422,
@@ -252,8 +243,3 @@ def _options(form: FormData, models: Sequence[str], max_pixels: int) -> Options:
         return _OPTIONS.validate_python(values_by_name | {"max_pixels": max_pixels})
     except ValidationError as error:
         raise HTTPException(422, validation_message(error.errors())) from error
-
-
-def _ordered_layers(layers: Sequence[str]) -> list[str]:
-    """Returns each layer once, in the order of the command line. Unknown names come last, and the validation refuses them."""
-    return [layer for layer in dict.fromkeys((*OUTPUT_LAYERS, *layers)) if layer in layers]

@@ -14,7 +14,7 @@ import time
 from collections.abc import Awaitable, Callable
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, Final, Literal, final
+from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, final
 from urllib.parse import quote
 
 from fastapi import APIRouter, Query, Request
@@ -24,14 +24,18 @@ from starlette.responses import Response
 
 import brewster
 from brewster.image_formats import SUFFIXES
+from brewster.inference import Separator
 from brewster.inference.burst_report import BurstReport
 from brewster.inference.predictor import ProgressCallback
-from brewster.photo import Photo
+from brewster.photo import Photo, Source
 from brewster.photo.open_raster import zip_images
 from brewster.web.job_queue import JobProgress, JobQueue
 from brewster.web.model_cache import ModelCache, ModelRow
 from brewster.web.preview import PhotoCache, photo_tile, preview
 from brewster.web.request_schema import SeparationRequest, form_schema, read_form
+
+if TYPE_CHECKING:
+    from brewster.burst.separate import FittedBurst
 
 _GZIP_LEVEL: Final = 1  # higher levels save little more and take several times longer
 _TILE_HEADERS: Final = {"Cache-Control": "private, max-age=3600"}
@@ -57,6 +61,36 @@ class HealthResponse(BaseModel):
     """Number of photos that are waiting or being separated."""
     places: int
     """Maximum value of `jobs`."""
+
+
+@final
+class BurstCache:
+    """The layers of the last burst, so that a download after a preview does not measure the motion again. Thread-safe."""
+
+    _last: tuple[object, FittedBurst] | None = None
+
+    def fit(
+        self, form: SeparationRequest, separator: Separator, on_progress: ProgressCallback
+    ) -> FittedBurst:
+        """Measures the layers of the burst in the form, or returns those of the last request with the same photos and model."""
+        from brewster.burst import fit_burst  # noqa: PLC0415  (imports torch)
+
+        quality, max_pixels = form.options.quality, form.options.max_pixels
+        digests = tuple(hashlib.sha256(file).digest() for file in (*form.burst, form.hints or b""))
+        key, last = (digests, form.reference, quality, separator), self._last
+        if last and last[0] == key:
+            return last[1]
+        fitted = fit_burst(
+            form.burst,
+            reference=form.reference,
+            separator=separator,
+            quality=quality,
+            hints=form.hints,
+            max_pixels=max_pixels,
+            on_progress=on_progress,
+        )
+        self._last = key, fitted
+        return fitted
 
 
 Handler = Callable[[ModelCache, SeparationRequest, ProgressCallback], Response]
@@ -95,6 +129,8 @@ def separation_router(model_cache: ModelCache, job_queue: JobQueue, *, max_pixel
             form = await read_form(request, model_cache.names, max_pixels)
             return await job_queue.run_job(reserved_job, partial(handler, model_cache, form), request.receive)
 
+    bursts = BurstCache()
+
     @router.post("/separate", responses=_RESPONSES, response_class=Response, openapi_extra=body)
     async def separate(request: Request, job: JobName = None) -> Response:
         """Separates a photo, or a burst: several photos of one window. A single layer is returned as an image in the format and
@@ -102,7 +138,7 @@ def separation_router(model_cache: ModelCache, job_queue: JobQueue, *, max_pixel
 
         The names of the files are those of the command line. The separation stops if the client disconnects.
         """
-        return await run(request, job, _separate)
+        return await run(request, job, partial(_separate, bursts))
 
     @router.get("/progress/{job}", responses={404: _ERROR})
     async def progress(job: str) -> JobProgress:
@@ -127,19 +163,19 @@ def separation_router(model_cache: ModelCache, job_queue: JobQueue, *, max_pixel
         """Returns the version of the server and the number of its jobs."""
         return HealthResponse(jobs=job_queue.job_count, places=job_queue.workers + job_queue.max_waiting)
 
-    _add_page_routes(router, run)
+    _add_page_routes(router, run, bursts)
     return router
 
 
 def _add_page_routes(
-    router: APIRouter, run: Callable[[Request, str | None, Handler], Awaitable[Response]]
+    router: APIRouter, run: Callable[[Request, str | None, Handler], Awaitable[Response]], bursts: BurstCache
 ) -> None:
     """Adds the routes that only the page uses: the preview of a photo, and its tiles."""
     photos = PhotoCache()
 
     @router.post("/preview", include_in_schema=False)
     async def preview_maps(request: Request, job: JobName = None) -> Response:
-        return await run(request, job, partial(_preview, photos))
+        return await run(request, job, partial(_preview, photos, bursts))
 
     @router.post("/photo", include_in_schema=False)
     async def keep_photo(request: Request, job: JobName = None) -> Response:
@@ -158,23 +194,24 @@ def _add_page_routes(
         return Response(found.encode("png"), media_type="image/png", headers=_TILE_HEADERS)
 
 
-def _separate(model_cache: ModelCache, form: SeparationRequest, on_progress: ProgressCallback) -> Response:
+def _separate(
+    bursts: BurstCache, model_cache: ModelCache, form: SeparationRequest, on_progress: ProgressCallback
+) -> Response:
     """Separates a photo or a burst. Returns one layer as an image file, or several layers as a zip."""
     started = time.perf_counter()
     options = form.options
     separator = model_cache.separator(options.model)
-    call_options = options.call_options() | {"mask": form.mask, "hints": form.hints}
     if form.burst:
-        from brewster.burst import separate_burst  # noqa: PLC0415  (imports torch)
-
-        separation = separate_burst(
-            form.burst,
-            reference=form.reference,
-            separator=separator,
-            on_progress=on_progress,
-            **call_options,
+        fitted = bursts.fit(form, separator, lambda done: on_progress(0.9 * done))
+        separation = fitted.separate(
+            lambda done: on_progress(0.9 + 0.1 * done),
+            strength=options.strength,
+            quality=options.quality,
+            mask=form.mask,
+            additive=options.additive,
         )
     else:
+        call_options = options.call_options() | {"mask": form.mask, "hints": form.hints}
         separation = separator(form.photo, on_progress=on_progress, **call_options)
     files = {}
     for layer in options.layers:
@@ -201,26 +238,21 @@ def _separate(model_cache: ModelCache, form: SeparationRequest, on_progress: Pro
 
 
 def _preview(
-    photos: PhotoCache, model_cache: ModelCache, form: SeparationRequest, on_progress: ProgressCallback
+    photos: PhotoCache,
+    bursts: BurstCache,
+    model_cache: ModelCache,
+    form: SeparationRequest,
+    on_progress: ProgressCallback,
 ) -> Response:
     photo, headers = _open_photo(photos, form)
-    separator, hints = model_cache.separator(form.options.model), form.hints
+    separator = model_cache.separator(form.options.model)
+    hints: Source | None = form.hints
     if separator.takes_hints:
         headers["Brewster-Takes-Hints"] = "yes"
     if form.burst:
-        from brewster.burst import fit_burst  # noqa: PLC0415  (imports torch)
-
-        fitted = fit_burst(
-            [*form.burst[: form.reference], photo, *form.burst[form.reference + 1 :]],
-            reference=form.reference,
-            separator=separator,
-            quality=form.options.quality,
-            hints=hints,
-            max_pixels=form.options.max_pixels,
-            on_progress=lambda done: on_progress(0.9 * done),
-        )
+        fitted = bursts.fit(form, separator, lambda done: on_progress(0.9 * done))
         headers |= _burst_headers(fitted.report)
-        separator, hints = fitted.separator, hints if fitted.separator is separator else None
+        separator, hints = fitted.separator, fitted.hints
     start = 0.9 if form.burst else 0.0
     maps = preview(
         separator, photo, form.options, lambda done: on_progress(start + (1 - start) * done), hints

@@ -105,14 +105,7 @@ _CAPTIONS: Final = {"photo": "the photo", "left": "result A", "right": "result B
 def study_router(
     study: Study, store: AnswerStore, *, max_participants: int | None = None, token: str | None = None
 ) -> APIRouter:
-    """Returns the routes of a study.
-
-    Args:
-        study: the study.
-        store: the answers of the study.
-        max_participants: maximum number of participants; None means no limit.
-        token: the token of the server, which is added to personal links.
-    """
+    """Returns the routes of a study. The token of the server is added to personal links."""
     routes, router = _StudyRoutes(study, store, max_participants, token), APIRouter(tags=["study"])
     router.get("/invitation")(routes.invitation)
     router.post("/participants", status_code=201)(routes.admit)
@@ -236,21 +229,21 @@ class _StudyRoutes:
         last = self.store.last_trial(participant)
         if trial is None:
             return TrialResponse(trial=None, trials=count, last=last)
+        practice_trial = None
+        if last is None:
+            practice = _practice(participant)
+            assert practice.expected
+            photo = self.study.picture(practice.photo)
+            practice_trial = PracticeTrial(width=photo.width, height=photo.height, expected=practice.expected)
         photo = self.study.picture(participant.trials[trial].photo)
         return TrialResponse(
             trial=trial,
             trials=count,
             width=photo.width,
             height=photo.height,
-            practice=self._practice_trial(participant) if last is None else None,
+            practice=practice_trial,
             last=last,
         )
-
-    def _practice_trial(self, participant: Participant) -> PracticeTrial:
-        practice = _practice(participant)
-        photo = self.study.picture(practice.photo)
-        assert practice.expected
-        return PracticeTrial(width=photo.width, height=photo.height, expected=practice.expected)
 
 
 def _practice(participant: Participant) -> assignment.Trial:

@@ -11,14 +11,13 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, Final
 
 from brewster.files import atomic_path
 from brewster.user_study.assignment import Trial
 from brewster.user_study.create import require_empty
-from brewster.user_study.store import AnswerStore, Participant
+from brewster.user_study.store import AnswerStore
 from brewster.user_study.study import PICTURES_FOLDER, Study
 
 PARTICIPANTS_FOLDER: Final = "participants"
@@ -35,10 +34,8 @@ _PRIVACY: Final = """<p>Your browser keeps your answers until you download them 
 def export_bundle(study: Study, store: AnswerStore, out: Path, *, participants: int) -> list[str]:
     """Writes the page, the pictures and the trials of new participants into the folder `out`.
 
-    The participants take the next places in the assignment of the study, as participants of the server do.
-
-    Returns:
-        The token of each participant. The personal link is the address of the folder, followed by `?p=TOKEN`.
+    The participants take the next places in the assignment of the study, as participants of the server do. Returns the token of
+    each. The personal link is the address of the folder, followed by `?p=TOKEN`.
 
     Raises:
         OutputError: `out` is not empty or cannot be written, or the answers cannot be written.
@@ -55,8 +52,20 @@ def export_bundle(study: Study, store: AnswerStore, out: Path, *, participants: 
         for token in tokens:
             participant = store.participant(token, exported=True)
             assert participant
-            _copy_pictures(study, folder, [*participant.trials, *_practice(participant)])
-            text = json.dumps(_describe(study, participant))
+            practice = [participant.practice] if participant.practice else []
+            trials = [*participant.trials, *practice]
+            for name in {name for trial in trials for name in (trial.photo, trial.left, trial.right)}:
+                target = folder / PICTURES_FOLDER / Path(name).name
+                if not target.exists():
+                    shutil.copyfile(study.picture_file(name), target)
+            described = [_describe_trial(study, trial) | {"expected": trial.expected} for trial in practice]
+            text = json.dumps(
+                {  # without the correct choices of catch trials
+                    "consent": study.description.consent,
+                    "trials": [_describe_trial(study, trial) for trial in participant.trials],
+                    "practice": described[0] if described else None,
+                }
+            )
             (folder / PARTICIPANTS_FOLDER / f"{token}.json").write_text(text, "utf-8")
     return tokens
 
@@ -71,30 +80,7 @@ def _write_page(folder: Path) -> None:
         (folder / target).write_text(text, "utf-8")
 
 
-def _copy_pictures(study: Study, folder: Path, trials: Iterable[Trial]) -> None:
-    for name in {name for trial in trials for name in (trial.photo, trial.left, trial.right)}:
-        target = folder / PICTURES_FOLDER / Path(name).name
-        if not target.exists():
-            shutil.copyfile(study.picture_file(name), target)
-
-
-def _describe(study: Study, participant: Participant) -> dict[str, Any]:
-    """Returns what the page needs. The correct choices of catch trials are left out."""
-    practice = [
-        _describe_trial(study, trial) | {"expected": trial.expected} for trial in _practice(participant)
-    ]
-    return {
-        "consent": study.description.consent,
-        "trials": [_describe_trial(study, trial) for trial in participant.trials],
-        "practice": practice[0] if practice else None,
-    }
-
-
 def _describe_trial(study: Study, trial: Trial) -> dict[str, Any]:
     photo = study.picture(trial.photo)
     names = {side: Path(getattr(trial, side)).name for side in ("photo", "left", "right")}
     return names | {"width": photo.width, "height": photo.height}
-
-
-def _practice(participant: Participant) -> list[Trial]:
-    return [participant.practice] if participant.practice else []
