@@ -24,7 +24,7 @@ from brewster.render.analytic import render
 from brewster.render.camera_response import develop, to_uint8
 from brewster.scene.recipe import RECIPES, read_scene_recipe
 from brewster.scene.sampler import draw
-from brewster.training.data.alpha_blend import blended
+from brewster.training.data.rendered import blended
 
 DATA = os.environ.get("BREWSTER_DATA")
 MAPS = [Path(DATA) / "hdri"] if DATA else []
@@ -55,7 +55,7 @@ def save(rows, name):
 def save_scenes():
     save(
         [
-            list(render_sample(name, 3, i).layers().values())
+            list(render_sample(name, 3, i).images().values())
             for name in RECIPES
             if name != "tiny"
             for i in (0, 1)

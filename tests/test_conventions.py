@@ -19,6 +19,7 @@ import brewster
 import brewster.errors
 import brewster.inference
 import brewster.photo
+from brewster.cli import cli
 from brewster.inference.tiles import run_tiled
 from brewster.options import Options, SeparateOptions
 
@@ -77,9 +78,21 @@ def test_libraries_of_large_models_are_loaded_in_one_package_only():
     assert other_libraries == {"accelerate"}  # training/distributed
 
 
-def test_inference_imports_no_torch():
-    code = "import brewster.inference, sys; assert not {'torch', 'scipy', 'PIL'} & set(sys.modules)"
-    subprocess.run([sys.executable, "-c", code], check=True)
+@pytest.mark.parametrize(
+    ("code", "libraries"),
+    [
+        ("import brewster.inference", {"torch", "scipy", "PIL", "OpenEXR", "pillow_heif"}),
+        ("import brewster.download", {"torch", "numpy", "click"}),
+        ("import brewster.metrics", {"torch", "scipy", "PIL"}),
+        ("import brewster.executors.ray_cluster", {"ray"}),
+        ("import brewster.render.mitsuba.renderer", {"mitsuba", "drjit"}),
+        ("from brewster.options import Options; Options()", {"pydantic"}),
+        ("from brewster.cli import main; main(['render', '--help'])", {"torch", "pyarrow", "ray", "pyvips"}),
+    ],
+)
+def test_a_module_imports_no_library_that_it_may_not_need(code, libraries):
+    check = f"import sys; {code}; assert not {libraries} & set(sys.modules)"
+    subprocess.run([sys.executable, "-c", check], check=True, capture_output=True)
 
 
 def test_the_signature_of_separate_shows_the_source_and_every_option():
@@ -162,6 +175,36 @@ def test_every_error_is_in_the_tree_of_the_docstring():
             assert name in tree
 
 
+FOREIGN_OPTIONS = {"--head", "--multi_gpu"}  # of Ray and of accelerate
+
+
+def subcommands(command):
+    yield command
+    for child in getattr(command, "commands", {}).values():
+        yield from subcommands(child)
+
+
+def test_every_message_has_three_parts_and_names_options_that_exist():
+    """What happened, what was expected, and what to do. Tests of single errors assert the class and a key part."""
+    errors = {name for name, value in vars(brewster.errors).items() if inspect.isclass(value)}
+    options = {
+        name for command in subcommands(cli) for option in command.params for name in option.opts
+    } | FOREIGN_OPTIONS
+    raised = [
+        (f"{path.name}:{node.lineno}", node.args)
+        for path in FILES
+        for node in ast.walk(ast.parse(path.read_text()))
+        if isinstance(node, ast.Call) and getattr(node.func, "id", "") in errors
+    ]
+    assert len(raised) > 300
+    for place, parts in raised:
+        if isinstance(parts[0], ast.Starred):
+            continue
+        assert len(parts) >= 3, place
+        for option in re.findall(r"(?<![\w-])--[a-z]\w[\w-]*", ast.unparse(parts[1]) + ast.unparse(parts[2])):
+            assert option in options, f"{place}: {option}"
+
+
 def test_signatures_stay_small():
     for path, node in all_functions():
         positional = [argument.arg for argument in node.args.args if argument.arg not in {"self", "cls"}]
@@ -208,7 +251,7 @@ def test_the_python_examples_in_the_readme_run(tmp_path, monkeypatch):
 
 
 def test_every_link_in_the_documents_has_a_target():
-    for document in [ROOT / "README.md", *ROOT.glob("docs/*.md")]:
+    for document in [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *ROOT.glob("docs/*.md")]:
         links = re.findall(r"\]\(([^)#]+)", document.read_text())
         for link in (link for link in links if "://" not in link):
             assert (document.parent / link).exists(), f"{document.name}: {link}"

@@ -14,7 +14,7 @@ import pytest
 from onnx import TensorProto, helper
 
 from brewster import Photo
-from brewster.benchmarks.registry import Case
+from brewster.benchmarks.image_files import Case
 from brewster.environments.catalog import builtin_catalog
 from brewster.evaluate.config import EvaluationConfig
 from brewster.evaluate.methods import PREDICTION_FORMAT_VERSION, MethodOutput, ModelMethod

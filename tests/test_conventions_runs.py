@@ -144,6 +144,70 @@ def test_the_tiny_paper_experiment_trains_evaluates_and_ablates(tmp_path):
     assert output.splitlines()[-1] == "nothing was sent"
 
 
+@pytest.mark.slow
+def test_the_first_gpu_day_runs_completely_on_tiny_models(tmp_path):
+    run_script("first_gpu_day.sh", "--tiny", tmp_path)
+    report = (tmp_path / "report.html").read_text()
+    assert "All steps finished" in report
+    assert report.count("none: a tiny model") == 2  # no verdict on WindowSeat
+    assert (
+        report.count("data:image/jpeg") == 2 * 2 * 6
+    )  # photo, four predictions and ground truth of each photo
+    assert report.count("data:image/png") == 2
+    scores = json.loads((tmp_path / "evaluate" / "results.json").read_text())["tables"]
+    for name in ("real20", "nature20"):
+        means = {method: columns["psnr"]["mean"] for method, columns in scores[name].items()}
+        assert means.keys() == {"input (unprocessed)", "WindowSeat", "WindowSeat-guided", "LoRA", "compact"}
+        assert all(mean > 5 for mean in means.values())
+        assert len(set(means.values())) == 5
+        assert f"<td>{means['LoRA']:.2f} dB" in report
+    assert json.loads((tmp_path / "evaluate-rendered" / "results.json").read_text())["tables"]["test"]["LoRA"]
+    assert (tmp_path / "lora-run" / "lora" / FILES[1]).is_file()
+
+
+def test_the_first_gpu_day_lists_all_that_is_missing_and_starts_nothing(tmp_path):
+    blended = tmp_path / "real20" / "blended"
+    blended.mkdir(parents=True)
+    for number in range(19):
+        (blended / f"{number}.jpg").touch()
+    process = subprocess.run(
+        [RUNS / "first_gpu_day.sh", tmp_path / "out"],
+        env=os.environ
+        | {"PATH": f"{BIN}:/usr/bin:/bin", "BREWSTER_DATA": str(tmp_path), "HF_HUB_OFFLINE": "1", "HF_HOME": str(tmp_path)},
+        capture_output=True,
+        text=True,
+        check=False,
+    )  # fmt: skip
+    assert process.returncode == 1
+    assert f"20 photos in {blended} (found 19;" in process.stderr
+    assert f"20 photos in {tmp_path / 'nature20' / 'blended'} (found 0;" in process.stderr
+    assert "access to https://huggingface.co/black-forest-labs/FLUX.1-Kontext-dev" in process.stderr
+    assert "needs are not met; nothing was started" in process.stderr
+    assert not (tmp_path / "out").exists()
+
+
+def test_the_first_gpu_day_reports_also_after_a_failure(tmp_path, capsys, monkeypatch):
+    (tmp_path / "log.txt").write_text("error: <WindowSeat> failed\n")
+    monkeypatch.setattr(sys, "argv", ["first_gpu_day.py", "report", str(tmp_path), "1", "full"])
+    runpy.run_path(str(RUNS / "first_gpu_day.py"), run_name="__main__")
+    report = (tmp_path / "report.html").read_text()
+    assert "A step failed with exit code 1" in report
+    assert "error: &lt;WindowSeat&gt; failed" in report
+    assert report.count("not measured") == 2
+    assert str(tmp_path / "report.html") in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("measured", "verdict"),
+    [(26.7, "reproduced"), (26.31, "reproduced"), (26.2, "NOT reproduced"), (27.2, "NOT reproduced")],
+)
+def test_windowseat_is_reproduced_if_its_score_is_close_to_the_published_one(measured, verdict):
+    first_gpu_day = runpy.run_path(str(RUNS / "first_gpu_day.py"))
+    scores = {"tables": {"real20": {"WindowSeat": {"psnr": {"mean": measured}}}}}
+    (table,) = first_gpu_day["verdicts"](scores, is_tiny=False)
+    assert f"<td>26.60 dB<td>{measured:.2f} dB<td>{measured - 26.6:+.2f} dB<td>{verdict}<td>" in table
+
+
 def parse(arguments):
     """Parses the arguments of a command line, including those of subcommands, without running the command."""
     command, context = cli, cli.make_context("brewster", list(arguments))

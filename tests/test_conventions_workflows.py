@@ -42,8 +42,3 @@ def test_ci_runs_the_checks_and_the_tests():
 def test_citation_and_changelog_have_the_version_of_the_package():
     assert yaml.safe_load((ROOT / "CITATION.cff").read_text())["version"] == PROJECT["version"]
     assert f"\n## [{PROJECT['version']}] - 20" in (ROOT / "CHANGELOG.md").read_text()
-
-
-def test_every_link_for_contributors_has_a_target():
-    for link in re.findall(r"\]\(([^)#:]+)\)", (ROOT / "CONTRIBUTING.md").read_text()):
-        assert (ROOT / link).exists(), link
