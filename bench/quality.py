@@ -15,7 +15,8 @@ from pathlib import Path
 import numpy as np
 
 from brewster import Photo
-from brewster.benchmarks.registry import Case, read_benchmark
+from brewster.benchmarks.image_files import Case
+from brewster.benchmarks.registry import read_benchmark
 from brewster.evaluate.config import EvaluationConfig
 from brewster.evaluate.evaluation import evaluate
 from brewster.evaluate.methods import IdentityBaseline, ModelMethod, PredictionFolder

@@ -25,7 +25,7 @@ from torch.nn.functional import avg_pool2d
 
 from brewster.environments.assets import Assets
 from brewster.environments.catalog import builtin_catalog, read_catalog
-from brewster.executors import SerialExecutor
+from brewster.executors.local import SerialExecutor
 from brewster.render.analytic import needs_monte_carlo, render
 from brewster.render.mitsuba.renderer import trace
 from brewster.render.sample import SAMPLE_IMAGES, LinearSample

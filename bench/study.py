@@ -22,7 +22,7 @@ import httpx
 import numpy as np
 
 from brewster import Photo
-from brewster.user_study.create import StudyOptions, create_study
+from brewster.user_study.create import create_study
 from brewster.user_study.report.participants import ExclusionRule, collect_answers
 from brewster.user_study.report.results import summarise
 from brewster.user_study.store import AnswerStore
@@ -102,7 +102,7 @@ def create_large_study(folder):
                 blocks = np.kron(rng.integers(0, 256, (6, 8, 3)), np.ones((20, 20, 1))).astype(np.uint8)
                 Photo.from_array(blocks, encoding="srgb").save(folder / part / name / f"{i}.png")
     methods = {name: folder / name for name in ("ours", "RDNet", "DSIT")}
-    return create_study(folder / "study", folder / "inputs", methods, StudyOptions(seed=1))
+    return create_study(folder / "study", folder / "inputs", methods, seed=1)
 
 
 async def run(study):
