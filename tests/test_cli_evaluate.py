@@ -1,15 +1,8 @@
 """The command `brewster evaluate`."""
 
 import json
-import signal
-import subprocess
-import sys
-import time
 
-import numpy as np
 import pytest
-from PIL import Image
-from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
 from benchmark_folders import paint, picture, write
 from cli_helpers import error_lines
@@ -49,10 +42,6 @@ def test_tables_go_to_standard_output_and_all_results_into_a_folder(
     assert "found 3 images, expected 20" in err
     assert (tmp_path / "out" / "report.html").is_file()
     assert (tmp_path / "out" / "predictions" / "pane" / "real20" / "3.reflection.png").is_file()
-
-
-def test_quiet_prints_nothing(run_without_model, benchmark):
-    assert run_without_model("evaluate", "--benchmark", benchmark, "--quiet", *QUICK_OPTIONS) == (0, b"", "")
 
 
 def test_a_dry_run_scores_nothing(run_without_model, benchmark, tmp_path):
@@ -144,53 +133,12 @@ def test_several_thresholds_and_a_smaller_size_are_evaluated(run_without_model, 
     assert {(row["width"], row["height"]) for row in results["cases"]} == {(18, 12)}
 
 
-def test_scores_of_the_development_pairs_equal_those_of_scikit_image(run_without_model, data, tmp_path):
-    """The unprocessed input on the ten Nature pairs, compared with scikit-image and PIL, and with the published value."""
+def test_the_development_pairs_have_their_published_psnr(run_without_model, data, tmp_path):
+    """The unprocessed input on the ten Nature pairs."""
     folder = data / "real/dev/nature"
     code, out, _ = run_without_model(
         "evaluate", "--benchmark", f"nature20={folder}", "--json", *QUICK_OPTIONS
     )
     assert code == 0
     table = json.loads(out)["tables"]["nature20"]["input (unprocessed)"]
-    pairs = [
-        [
-            np.asarray(Image.open(folder / role / path.name).convert("RGB"))
-            for role in ("blended", "transmission")
-        ]
-        for path in (folder / "blended").iterdir()
-    ]
-    psnr = np.mean([peak_signal_noise_ratio(truth, photo) for photo, truth in pairs])
-    ssim = np.mean([structural_similarity(truth, photo, channel_axis=2) for photo, truth in pairs])
-    assert table["psnr"]["mean"] == pytest.approx(psnr, abs=1e-5)
-    assert table["ssim"]["mean"] == pytest.approx(ssim, abs=1e-5)
-    assert psnr == pytest.approx(22.09, abs=0.005)
-
-
-@pytest.mark.slow
-def test_ctrl_c_with_two_workers_stops_soon_and_keeps_finished_scores(tmp_path, model):
-    for i in range(60):
-        paint(tmp_path / "real20" / "blended" / f"{i}.png", i, size=(400, 300), noise=20)
-        paint(tmp_path / "real20" / "transmission" / f"{i}.png", i, size=(400, 300))
-    options = [
-        "evaluate",
-        "--benchmark",
-        "real20=real20",
-        "--model",
-        f"pane={model}",
-        "--workers",
-        "2",
-        *QUICK_OPTIONS,
-    ]
-    command = [sys.executable, "-m", "brewster", *options]
-    run = subprocess.Popen(command, cwd=tmp_path, stderr=subprocess.PIPE, stdout=subprocess.PIPE)
-    log = tmp_path / "out" / "scores.jsonl"
-    while not log.exists():
-        time.sleep(0.05)
-    run.send_signal(signal.SIGINT)
-    _, err = run.communicate(timeout=120)
-    assert run.returncode == 130, err
-    assert b"Traceback" not in err
-    scored = len(log.read_text().splitlines())
-    predicted = len(list((tmp_path / "out" / "predictions").rglob("*.transmission.png")))
-    assert predicted <= scored / 2 + 1
-    assert scored < 120
+    assert table["psnr"]["mean"] == pytest.approx(22.09, abs=0.005)

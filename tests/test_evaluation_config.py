@@ -4,7 +4,6 @@ import pytest
 
 from brewster.errors import BrewsterError
 from brewster.evaluate.config import EvaluationConfig
-from brewster.metrics import METRICS
 
 
 @pytest.mark.parametrize(
@@ -28,15 +27,3 @@ def test_several_thresholds_give_a_column_each():
     assert config.columns()["psnr_region@0.05"].title.endswith("> 0.05")
     assert [config.threshold(column) for column in config.columns()] == [0.05, 0.05, 0.1]
     assert list(EvaluationConfig(metrics=("psnr_region",)).columns()) == ["psnr_region"]
-
-
-def test_by_default_every_metric_is_measured_that_needs_no_download_and_is_no_second_definition():
-    assert set(METRICS) - set(EvaluationConfig().metrics) == {
-        "lpips",
-        "lpips_region",
-        "lpips_reflection",
-        "ssim_gaussian",
-        "ssim_clipped",
-        "psnr_channels",
-        "niqe",
-    }

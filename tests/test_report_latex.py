@@ -27,26 +27,6 @@ def test_the_table_has_the_papers_layout(results):
     assert widths == [12] * 5
 
 
-def test_intervals_are_printed_on_demand(results):
-    assert "18.50" not in to_latex(results)
-    text = to_latex(results, intervals=True)
-    assert r"20.00 {\scriptsize [18.50, 21.25]}" in text
-    assert r"0.200 &" in text  # LPIPS has no interval here
-
-
-def test_only_the_packages_that_the_table_uses_are_named(results):
-    assert to_latex(results).startswith("% brewster evaluate; needs \\usepackage{multirow}\n")
-    for part in ("selections", "tables", "differences"):
-        results[part] = {key: results[part][key] for key in ("real20", "average")}
-    assert to_latex(results).startswith("% brewster evaluate\n")
-    means = {"A": 21.5, "B": 20.0, "C": 19.0, "D": 18.0}
-    results["methods"] = {key: {} for key in means}
-    results["tables"] = {
-        key: {name: {"psnr": entry(mean)} for name, mean in means.items()} for key in results["tables"]
-    }
-    assert to_latex(results).startswith("% brewster evaluate; needs \\usepackage[normalem]{ulem}\n")
-
-
 def test_the_best_three_are_marked_but_not_the_worst(results):
     means = {"A_b|c": 21.5, "input (unprocessed)": 20.0, "third": 19.0, "fourth": 18.0, "equal": 18.0}
     results["methods"] = {key: {} for key in means}
@@ -72,24 +52,9 @@ def test_a_mean_over_fewer_images_has_a_dagger_and_no_mark(results):
     assert r"\multicolumn{13}{l}{$^\dagger$ mean over fewer images" in text
 
 
-def test_the_papers_draw_replaces_the_whole_benchmark(results):
-    for part in ("selections", "tables", "differences"):
-        results[part]["postcard:paper"] = results[part]["postcard"]
-    results["selections"]["postcard:paper"] = {"title": "Postcard, subset of the paper", "cases": 7}
-    text = to_latex(results)
-    assert "Postcard (7)" in text
-    assert "Postcard (20)" not in text
-
-
 @pytest.mark.parametrize("names", [["psnr_channels", "ssim"], ["psnr", "ssim_clipped", "lpips", "niqe"]])
 def test_requested_metrics_are_in_the_table_and_in_the_overview(results, names):
     results["metrics"] = {name: results["metrics"]["psnr"] | {"title": name.upper()} for name in names}
     titles = [name.upper() for name in names[:3]]
     assert " & ".join(f"{title}$\\uparrow$" for title in titles) in to_latex(results)
     assert to_markdown(results).startswith(" / ".join(f"{title}, dB ↑" for title in titles) + "\n")
-
-
-def test_psnr_ssim_and_lpips_come_first_if_the_results_have_all_of_them(results):
-    psnr = results["metrics"]["psnr"]
-    results["metrics"] = {name: psnr | {"title": name} for name in ("psnr", "ssim", "psnr_region", "lpips")}
-    assert "psnr_region" not in to_latex(results)

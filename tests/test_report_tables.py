@@ -76,13 +76,3 @@ def test_a_method_with_errors_is_not_in_the_ranking(results):
     assert ranking(table, "psnr", METRICS["psnr"]) == []
     table["third"] = {"psnr": entry(19.0)}
     assert ranking(table, "psnr", METRICS["psnr"]) == ["20.00", "19.00"]
-
-
-def test_a_note_warns_of_means_over_fewer_images(results):
-    note = "Do not compare a mean over fewer images"
-    assert note not in tables_to_markdown(results)
-    results["tables"]["real20"] = {
-        "input (unprocessed)": {"psnr": entry(20.0)},
-        "A_b|c": {"psnr": entry(21.5, count=19)},
-    }
-    assert note in tables_to_markdown(results)

@@ -11,9 +11,10 @@ from brewster.user_study.store import AnswerStore
 from brewster.web.application import create_app
 from brewster.web.middleware import AccessPolicy
 from brewster.web.study import study_router
-from file_server import loopback_only
 from small_studies import copy_without_answers, make_study
 from web_servers import served_port
+
+pytestmark = pytest.mark.loopback
 
 expect.set_options(timeout=60_000)  # for slow machines
 READY = "#trial:not(.waiting):not([hidden])"
@@ -24,11 +25,6 @@ ACCESSIBLE_NAMES = {
     "progressbar": ["Pair 1 of 4"],
 }
 """Accessible names by role."""
-
-
-@pytest.fixture(autouse=True)
-def _network_off(monkeypatch):
-    loopback_only(monkeypatch)
 
 
 @pytest.fixture(scope="module")
@@ -139,90 +135,6 @@ def test_the_pictures_of_the_trial_are_shown_on_their_sides_and_have_names(open_
     assert page.get_by_role("heading", level=1).all_inner_texts() == ["Which result looks better?"]
 
 
-def test_zoom_and_pan_apply_to_all_three_pictures_and_are_reset_for_new_ones(open_page, url):
-    page = open_page(url)
-    begin(page)
-
-    def transforms():
-        return page.eval_on_selector_all(".frame img", "all => all.map(one => one.style.transform)")
-
-    whole = transforms()
-    page.keyboard.press("+")
-    page.keyboard.press("+")
-    page.keyboard.press("Shift+ArrowRight")
-    closer = transforms()
-    assert len(set(closer)) == 1
-    assert closer != whole
-    box = page.locator(".left .frame").bounding_box()
-    page.mouse.move(box["x"] + 50, box["y"] + 50)
-    page.mouse.down()
-    page.mouse.move(box["x"] + 80, box["y"] + 70)
-    page.mouse.up()
-    dragged = transforms()
-    assert len(set(dragged)) == 1
-    assert dragged != closer
-    page.mouse.wheel(0, -400)
-    page.wait_for_function(
-        "before => document.querySelector('.frame img').style.transform !== before", arg=dragged[0]
-    )
-    page.keyboard.press("0")
-    assert transforms() == whole
-    page.get_by_role("button", name="Zoom in").click()
-    press(page, "3")
-    expect(page.get_by_text("Pair 2 of 4").first).to_be_visible()
-    page.wait_for_selector(READY)
-    assert transforms() == whole
-
-
-def test_full_size_shows_the_pixels_of_the_picture_and_is_kept_for_the_next_pair(open_page, url, store):
-    page = open_page(url, viewport={"width": 500, "height": 500})  # the pictures have 240 px
-    begin(page)
-    full = page.locator("[data-zoom=full]")
-
-    def picture_width():
-        return page.locator(".left img").bounding_box()["width"]
-
-    page.keyboard.press("f")
-    assert picture_width() == 240
-    ((participant, _),) = store.all_answers()
-    expected = Photo.open(store.study.picture_file(participant.trials[0].left)).pixels
-    screen = Photo.open(page.screenshot()).pixels
-    picture, frame = (page.locator(f".left {part}").bounding_box() for part in ("img", ".frame"))
-    left, top, x, y = (round(value) for value in (frame["x"] + 2, frame["y"] + 2, picture["x"], picture["y"]))
-    rows, columns = int(frame["height"]) - 4, int(frame["width"]) - 4
-    shown = screen[top : top + rows, left : left + columns].astype(int)
-    assert np.abs(shown - expected[top - y :, left - x :][:rows, :columns]).max() <= 1
-    press(page, "2")
-    expect(page.get_by_text("Pair 2 of 4").first).to_be_visible()
-    page.wait_for_selector(READY)
-    assert picture_width() == 240
-    expect(full).to_have_attribute("aria-pressed", "true")
-    page.keyboard.press("+")
-    expect(full).to_have_attribute("aria-pressed", "false")
-
-
-def test_results_can_be_swapped_in_place_at_a_larger_size(open_page, url, store):
-    page = open_page(url, viewport={"width": 1280, "height": 800})
-    begin(page)
-
-    def visible():
-        return [side for side in ("left", "photo", "right") if page.locator(f".{side} .frame").is_visible()]
-
-    width = page.locator(".left .frame").bounding_box()["width"]
-    page.keyboard.press("d")
-    assert visible() == ["left", "right"]
-    assert page.locator(".left .frame").bounding_box()["width"] > 1.4 * width
-    for key, side in (("x", "left"), ("x", "right"), ("x", "left"), ("p", "photo"), ("b", "right")):
-        page.keyboard.press(key)
-        assert visible() == [side]
-    assert page.locator(".right .frame").bounding_box()["width"] > 1.7 * width
-    assert page.evaluate("document.querySelector('main').scrollHeight <= innerHeight")
-    press(page, "3")
-    expect(page.get_by_text("Pair 2 of 4").first).to_be_visible()
-    ((_, answers),) = store.all_answers()
-    assert (answers[0].conditions.view, answers[0].conditions.switches) == ("single", 4)
-
-
 def test_the_last_answer_can_be_undone_also_after_the_last_trial(open_page, url, store):
     page = open_page(url)
     begin(page)
@@ -244,17 +156,6 @@ def test_the_last_answer_can_be_undone_also_after_the_last_trial(open_page, url,
     ((_, answers),) = store.all_answers()
     assert sorted(answers) == [0, 1, 2]
     assert (answers[0].choice, answers[0].withdrawn) == ("right", ("left",))
-
-
-def test_the_surround_is_the_same_grey_in_both_themes_and_a_narrow_window_is_warned(open_page, url):
-    colours = []
-    for theme, width in (("light", 1280), ("dark", 800)):
-        page = open_page(url, color_scheme=theme, viewport={"width": width, "height": 800})
-        page.wait_for_selector("#invitation:not([hidden])")
-        colours.append(page.evaluate("getComputedStyle(document.body).backgroundColor"))
-        warning = page.get_by_text(f"This window is {width} pixels wide").first
-        expect(warning).to_be_visible() if width < 900 else expect(warning).to_be_hidden()
-    assert colours == ["rgb(107, 107, 107)"] * 2
 
 
 def test_an_answer_without_acknowledgement_is_sent_again(open_page, url, store):
@@ -300,58 +201,6 @@ def test_a_phone_shows_everything_without_horizontal_scrolling_and_accepts_touch
     expect(page.get_by_text("Pair 2 of 4").first).to_be_visible()
     ((_, answers),) = store.all_answers()
     assert answers[0].choice == "right"
-
-
-def test_arrows_up_and_down_scroll_and_the_focus_stays(open_page, url, store):
-    page = open_page(url, viewport={"width": 390, "height": 500})
-    begin(page)
-    similar = page.get_by_role("button", name="Similar", exact=True)
-    press(page, "ArrowDown")
-    page.wait_for_function("() => document.querySelector('main').scrollTop + scrollY > 0")
-    similar.focus()
-    for trial in range(2, 4):
-        press(page, "Enter")
-        expect(page.get_by_text(f"Pair {trial} of 4", exact=True).first).to_be_visible()
-        page.wait_for_selector(READY)
-        expect(similar).to_be_focused()
-        expect(similar).to_be_enabled()
-    page.wait_for_timeout(320)
-    page.keyboard.down("ArrowUp")
-    page.keyboard.up("ArrowUp")
-    page.keyboard.down("Enter")
-    expect(page.get_by_text("Pair 4 of 4").first).to_be_visible()
-    page.wait_for_selector(READY)
-    page.wait_for_timeout(320)
-    page.keyboard.down("Enter")  # a repeat of the held key
-    page.wait_for_timeout(200)
-    ((_, answers),) = store.all_answers()
-    assert [answer.choice for answer in answers.values()] == ["similar"] * 3
-
-
-def test_the_explanation_of_the_practice_pair_stays_while_the_next_pictures_are_loaded(open_page, url):
-    page = open_page(url)
-    begin(page)
-    page.wait_for_load_state("networkidle")
-    page.wait_for_timeout(300)
-    expect(page.locator("#notice")).to_contain_text("The study begins now.")
-
-
-def test_a_notice_is_not_removed_by_the_timer_of_an_earlier_notice(open_page, url):
-    page = open_page(url)
-    begin(page)
-    page.clock.install()
-    notice, copy = page.locator("#notice"), page.get_by_role("button", name="Copy your personal link")
-    page.evaluate("() => { navigator.clipboard.writeText = async () => {} }")
-    copy.click()
-    expect(notice).to_contain_text("Your link is copied.")
-    page.clock.fast_forward(6000)
-    page.evaluate("() => { navigator.clipboard.writeText = async () => { throw new Error() } }")
-    copy.click()
-    expect(notice).to_contain_text("Your link: http")
-    page.clock.fast_forward(6000)
-    expect(notice).to_contain_text("Your link: http")
-    page.clock.fast_forward(6000)
-    expect(notice).to_be_hidden()
 
 
 def test_a_missing_picture_is_reported_when_its_trial_is_shown(open_page, url, store):

@@ -8,12 +8,13 @@ from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 
 import pytest
 
-from brewster.errors import BrewsterError, OutputError
+from brewster.errors import BrewsterError
 from brewster.user_study.answer_file import MAX_ANSWER_FILE_BYTES, read_answer_file
 from brewster.user_study.store import AnswerStore
 from brewster.web.study_bundle import export_bundle
-from file_server import loopback_only
 from small_studies import make_study
+
+pytestmark = pytest.mark.loopback
 
 ANSWERED_AT = "2026-11-22T12:00:00.250Z"
 CONDITIONS = {
@@ -27,11 +28,6 @@ CONDITIONS = {
     "switches": 2,
     "zoomed": False,
 }
-
-
-@pytest.fixture(autouse=True)
-def _network_off(monkeypatch):
-    loopback_only(monkeypatch)
 
 
 @pytest.fixture
@@ -99,12 +95,6 @@ def test_participants_of_a_bundle_and_of_the_server_share_one_assignment(study, 
     assert store.participant(token, exported=True).number == 1
     assert store.participant(token) is None  # the server does not accept the link without consent
     assert store.participant(store.admit()).number == 2
-
-
-def test_a_bundle_is_not_written_into_a_folder_with_files(study, store, tmp_path):
-    with pytest.raises(OutputError, match="is not empty"):
-        export_bundle(study, store, study.folder, participants=1)
-    assert store.count_participants() == 0
 
 
 def test_imported_answers_are_stored_once(study, store, answers, tmp_path):

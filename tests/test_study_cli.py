@@ -1,10 +1,8 @@
 """The commands `brewster study create, plan, serve, report`."""
 
-import contextlib
 import json
 import os
 import re
-import shutil
 import signal
 import subprocess
 import sys
@@ -15,16 +13,12 @@ import pytest
 
 from brewster.user_study.store import AnswerStore
 from brewster.user_study.study import read_study
-from file_server import loopback_only
 from other_processes import started
 from small_studies import choice_for, write_pictures
 
+pytestmark = pytest.mark.loopback
+
 get, post = (partial(ask, timeout=None) for ask in (httpx.get, httpx.post))  # the test has its own time limit
-
-
-@pytest.fixture(autouse=True)
-def _network_off(monkeypatch):
-    loopback_only(monkeypatch)
 
 
 @pytest.fixture
@@ -48,28 +42,6 @@ def add_answers(study, participants, rng):
             choice = trial.expected or choice_for(trial, rng.choice(3, p=[0.6, 0.2, 0.2]))
             store.record_answer(participant, number, choice, seconds=4)
     store.close()
-
-
-@pytest.mark.parametrize("names", [("inputs", "ours", "rdnet"), ("inputs", "ours", "inputs")])
-def test_the_progress_of_create_ends_at_its_total(run_without_model, folders, names, monkeypatch):
-    totals, counts = [], []
-
-    @contextlib.contextmanager
-    def progress(total, *, shown):
-        totals.append(total)
-        yield lambda done, _text: counts.append(done)
-
-    monkeypatch.setattr("brewster.cli.study.progress", progress)
-    inputs, first, second = names
-    options = ["--inputs", inputs, "--method", f"a={first}", "--method", f"b={second}"]
-    assert run_without_model("study", "create", "study", *options)[0] == 0
-    assert counts == list(range(1, totals[0] + 1))
-
-
-def test_create_accepts_a_consent_text(run_without_model, folders, tmp_path):
-    (tmp_path / "consent.txt").write_text("A consent text.\n")
-    run_without_model("study", "create", "study", *folders, "--consent", "consent.txt")
-    assert read_study(tmp_path / "study").description.consent == "A consent text."
 
 
 def test_create_exits_with_1_for_wrong_files_and_with_2_for_wrong_arguments(
@@ -179,15 +151,6 @@ def test_serving_a_study_whose_pictures_changed_is_refused(run_without_model, st
     assert (code, "missing or changed" in err) == (1, True)
 
 
-def test_serving_on_another_address_prints_a_warning(study):
-    with serve_study(study.folder, "--host", "0.0.0.0", "--token", "auto") as server:
-        link = server.stdout.readline().strip()
-        # the server responds only after it has installed its signal handlers
-        assert get(link).status_code < 400
-        assert "the connection is not encrypted" in stop_server(server)
-    assert re.fullmatch(r"http://127\.0\.0\.1:\d+/\?token=[\w-]{22}", link)
-
-
 def test_an_automatic_token_is_stored_for_its_owner_only_and_links_survive_a_restart(study):
     with serve_study(study.folder, "--token", "auto") as first:
         url, _, token = first.stdout.readline().strip().partition("?token=")
@@ -213,21 +176,3 @@ def test_a_name_that_cannot_be_in_a_host_header_is_a_wrong_argument(run_without_
 def test_report_without_answers_creates_no_database(run_without_model, study):
     run_without_model("study", "report", "study")
     assert sorted(path.name for path in study.folder.iterdir()) == ["pictures", "study.json"]
-
-
-@pytest.mark.skipif(
-    os.geteuid() == 0 and not shutil.which("setpriv"), reason="root writes to read-only folders"
-)
-def test_a_read_only_study_is_reported_into_another_folder(study, rng, tmp_path):
-    add_answers(study, 3, rng)
-    study.folder.chmod(0o555)
-    without_root_rights = ["setpriv", "--inh-caps=-all", "--bounding-set=-all"] if os.geteuid() == 0 else []
-    command = [*without_root_rights, sys.executable, "-m", "brewster", "study", "report", str(study.folder)]
-    done = subprocess.run(
-        [*command, "-o", str(tmp_path / "out")], capture_output=True, text=True, check=False
-    )
-    refused = subprocess.run(command, capture_output=True, text=True, check=False)
-    study.folder.chmod(0o755)
-    assert done.returncode == 0, done.stderr
-    assert "3 participants" in done.stdout
-    assert refused.returncode == 1  # checks that the folder was read-only

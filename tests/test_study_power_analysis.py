@@ -39,27 +39,12 @@ def test_a_study_of_the_computed_size_detects_the_difference_with_the_given_powe
     assert power == pytest.approx(0.8, abs=3 * np.sqrt(0.8 * 0.2 / 400))
 
 
-def test_without_a_difference_five_percent_of_studies_detect_one():
-    same = (1 - 0.25) / 2
-    assert detection_rate(np.random.default_rng(7), 100, 40, (same, 0.25, same), 0.05, 400) == pytest.approx(
-        0.05, abs=0.03
-    )
-
-
 def test_the_number_of_participants_equals_a_manual_calculation():
     """(1.95996 + 0.84162)^2 x 0.74 x 2.95 / (40 x 0.01) + 1.95996^2 / 2 = 42.84 + 1.92."""
     analysis = required_participants(difference=0.1, tie=0.25)
     assert (analysis.participants, analysis.answers) == (45, 1800)
     assert analysis.design_effect == pytest.approx(2.95)
     assert (analysis.win, analysis.lose) == pytest.approx((0.425, 0.325))
-
-
-def test_smaller_differences_and_higher_correlations_need_more_participants():
-    base = required_participants(difference=0.1, tie=0.25).participants
-    assert required_participants(difference=0.05, tie=0.25).participants > 3 * base
-    assert required_participants(difference=0.1, tie=0.25, correlation=0.2).participants > 2 * base
-    assert required_participants(difference=0.1, tie=0.25, power=0.9).participants > base
-    assert required_participants(difference=0.1, tie=0.6).participants < base
 
 
 @pytest.mark.parametrize(("difference", "tie"), [(0, 0.2), (-0.1, 0.2), (0.9, 0.2), (0.1, 1)])

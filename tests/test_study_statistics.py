@@ -44,20 +44,6 @@ def test_an_outcome_without_answers_gets_the_bound_and_the_others_the_bootstrap_
     assert 0 < low[0] < 0.625 < high[0] <= 1
 
 
-def test_the_bound_of_an_average_is_the_average_of_the_bounds():
-    both, first = [[2, 0, 0], [1, 0, 0]], [[2, 0, 0], [0, 0, 0]]
-    _, low, _ = estimate(both, both, first, first, pictures=(3.0, 1))
-    assert low[:, 0] == pytest.approx(
-        [
-            0.025**0.25,
-            0.025**0.5,
-            (3 * 0.025**0.25 + 0.025**0.5) / 4,
-            (0.025**0.25 + 0.025**0.5) / 2,
-            0.025**0.25,
-        ]
-    )
-
-
 def test_a_dataset_with_different_answers_of_one_participant_has_no_interval():
     one, none = [[1, 1, 0], [2, 1, 1]], [[5, 0, 1], [0, 0, 0]]
     _, low, high = estimate(one, none, none, pictures=(1.0, 1))

@@ -41,14 +41,6 @@ def test_a_participant_gets_the_assigned_trials_and_continues_where_they_stopped
     assert store.next_trial(participant) is None
 
 
-def test_a_skipped_trial_comes_next(store):
-    participant = store.participant(store.admit())
-    store.record_answer(participant, 1, "left", seconds=2)
-    assert store.next_trial(participant) == 0
-    store.record_answer(participant, 0, "left", seconds=2)
-    assert store.next_trial(participant) == 2
-
-
 def test_the_first_answer_is_final(store):
     participant = store.participant(store.admit())
     assert store.record_answer(participant, 0, "left", seconds=2) == "left"
@@ -171,13 +163,6 @@ def test_a_copy_after_kill_9_has_all_answers_and_the_file_alone_has_them_after_r
     store.close()
 
 
-def open_without_log(study, folder):
-    """The answers of a copy of answers.sqlite without its log."""
-    folder.mkdir()
-    shutil.copy(study.answers_file, folder)
-    return AnswerStore(replace(study, folder=folder))
-
-
 def test_closing_a_store_moves_all_answers_into_the_file(store, tmp_path):
     other = AnswerStore(store.study)
     participant = store.participant(store.admit())
@@ -185,6 +170,13 @@ def test_closing_a_store_moves_all_answers_into_the_file(store, tmp_path):
     store.close()
     assert len(answers_by_participant(open_without_log(store.study, tmp_path / "alone"))[0]) == 1
     other.close()
+
+
+def open_without_log(study, folder):
+    """The answers of a copy of answers.sqlite without its log."""
+    folder.mkdir()
+    shutil.copy(study.answers_file, folder)
+    return AnswerStore(replace(study, folder=folder))
 
 
 def test_a_reader_creates_no_database_and_sees_new_answers(store):

@@ -12,11 +12,10 @@ from __future__ import annotations
 import re
 from collections import defaultdict
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Final, final
+from typing import Final
 
-from brewster.benchmarks.image_files import ImageFile, files_of, read_samples
+from brewster.benchmarks.image_files import Case, ImageFile, files_of, read_samples
 from brewster.benchmarks.pairing import FolderListing, image_files, list_folder
 from brewster.errors import PhotoError
 
@@ -25,23 +24,8 @@ _RENDERED: Final = re.compile(r"[0-9]{6,}|shard-[0-9]{6,}\.tar|set\.toml")
 _LAYER_FILES: Final = ("photo.jpg", "transmission.jpg", "reflection.jpg")
 
 
-@final
-@dataclass(frozen=True)
-class BurstFiles:
-    """The files of a burst. `transmission` and `reflection` (None if unknown) are the ground truth of the middle frame.
-
-    `relative_path` is the path of the middle frame relative to the benchmark folder, without the suffix.
-    """
-
-    name: str
-    relative_path: str
-    frames: tuple[ImageFile, ...]
-    transmission: ImageFile
-    reflection: ImageFile | None
-
-
-def find_bursts(folder: Path) -> tuple[list[BurstFiles], FolderListing]:
-    """Returns the bursts in a folder, and a listing without groups: what is ignored and excluded.
+def find_bursts(folder: Path, benchmark: str) -> tuple[list[Case], FolderListing]:
+    """Returns a case for each burst in a folder, and a listing without groups: what is ignored and excluded.
 
     Raises:
         PhotoError: the folder cannot be read, or contains no burst.
@@ -50,7 +34,7 @@ def find_bursts(folder: Path) -> tuple[list[BurstFiles], FolderListing]:
     """
     folders, files = list_folder(folder)
     if any(_RENDERED.fullmatch(path.name) for path in (*folders, *files)):
-        return _rendered_bursts(folder)
+        return _rendered_bursts(folder, benchmark)
     bursts, remarks, excluded = [], [], []
     for path in [folder, *folders]:
         roles = _read_roles(path)
@@ -59,7 +43,7 @@ def find_bursts(folder: Path) -> tuple[list[BurstFiles], FolderListing]:
         elif reason := _exclusion_reason(roles):
             excluded.append(f"{path.name}: {reason}")
         else:
-            bursts.append(_burst(folder, path, roles))
+            bursts.append(_burst(benchmark, folder, path, roles))
     if not bursts and not excluded:
         raise PhotoError(
             f"{folder} contains no burst",
@@ -95,20 +79,24 @@ def _exclusion_reason(roles: _Roles) -> str:
     return "" if middle in roles["transmission"] else missing
 
 
-def _burst(root: Path, folder: Path, roles: _Roles) -> BurstFiles:
+def _burst(benchmark: str, root: Path, folder: Path, roles: _Roles) -> Case:
     frames, numbers = roles["frame"], sorted(roles["frame"])
     middle = numbers[len(numbers) // 2]
     reflection = roles["reflection"].get(middle)
-    return BurstFiles(
-        folder.absolute().name,
-        frames[middle][0].relative_to(root).with_suffix("").as_posix(),
-        tuple(ImageFile(frames[number][0]) for number in numbers),
+    name, photo = folder.absolute().name, frames[middle][0]
+    return Case(
+        benchmark,
+        name,
+        name,
+        photo.relative_to(root).with_suffix("").as_posix(),
+        ImageFile(photo),
         ImageFile(roles["transmission"][middle][0]),
         ImageFile(reflection[0]) if reflection else None,
+        frames=tuple(ImageFile(frames[number][0]) for number in numbers),
     )
 
 
-def _rendered_bursts(folder: Path) -> tuple[list[BurstFiles], FolderListing]:
+def _rendered_bursts(folder: Path, benchmark: str) -> tuple[list[Case], FolderListing]:
     samples = {sample.index: sample.name for sample in read_samples(folder)}
     from brewster.rendered.bursts import read_bursts  # noqa: PLC0415  (needs torch, which read_samples has checked)
 
@@ -123,7 +111,9 @@ def _rendered_bursts(folder: Path) -> tuple[list[BurstFiles], FolderListing]:
             excluded.append(f"burst {burst.index} is incomplete: expected {', '.join(_LAYER_FILES)}")
             continue
         _, transmission, reflection = layers
-        path = f"{reference.name}/photo"
-        bursts.append(BurstFiles(f"burst-{burst.index:06d}", path, tuple(frames), transmission, reflection))
+        name, path, photo = f"burst-{burst.index:06d}", f"{reference.name}/photo", frames[len(frames) // 2]
+        bursts.append(
+            Case(benchmark, name, name, path, photo, transmission, reflection, frames=tuple(frames))
+        )
     excluded += [f"{name} is a frame of an incomplete burst" for name in samples.values()]
     return bursts, FolderListing(folder, excluded=excluded)

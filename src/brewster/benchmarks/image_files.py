@@ -1,4 +1,4 @@
-"""Locations of encoded images: whole files, and the images of rendered samples in folders and shards."""
+"""Locations of encoded images (whole files, and the images of rendered samples in folders and shards), and cases of images."""
 
 from __future__ import annotations
 
@@ -50,6 +50,31 @@ class ImageFile:
         return f"{self.path}" if self.span is None else f"{self.path} from byte {self.span[0]}"
 
 
+@final
+@dataclass(frozen=True)
+class Case:
+    """A photo to separate, with its ground truth.
+
+    `name` is unique within the benchmark. It is used in reports and in folders of predictions. Cases with the same `scene`
+    show the same objects, so they are not statistically independent. `scene` equals `name` if the scene is unknown.
+    `relative_path` is the photo's path relative to the benchmark folder, without the suffix and with forward slashes.
+    `ground_truth` is the ground truth of the transmission, and `reflection` is the ground truth of the reflection. If
+    `rendered` is True, both are exact: `ground_truth` is the background without the glass, and `reflection` is the light
+    that the glass adds. `frames` are the photos of a burst in order, of which `photo` is the middle one; they are empty for a
+    single photo. The ground truth of a burst is that of `photo`.
+    """
+
+    benchmark: str
+    name: str
+    scene: str
+    relative_path: str
+    photo: ImageFile
+    ground_truth: ImageFile
+    reflection: ImageFile | None = None
+    rendered: bool = False
+    frames: tuple[ImageFile, ...] = ()
+
+
 def read_samples(folder: Path) -> list[StoredSample]:
     """Returns the samples of a rendered dataset.
 
@@ -61,6 +86,8 @@ def read_samples(folder: Path) -> list[StoredSample]:
         from brewster.rendered.store import read_dataset  # noqa: PLC0415  (needs torch, an optional dependency)
 
         entries = list(read_dataset(folder))
+        if not entries:
+            raise ValueError("it has no samples")  # noqa: TRY301
     except ImportError as error:
         raise MissingExtra.for_extra(
             "render",
@@ -68,9 +95,11 @@ def read_samples(folder: Path) -> list[StoredSample]:
             "expected torch, which brewster needs to read rendered datasets",
         ) from error
     except (OSError, tarfile.TarError, ValueError) as error:
-        raise _not_a_rendered_dataset(folder, str(error)) from error
-    if not entries:
-        raise _not_a_rendered_dataset(folder, "it has no samples")
+        raise PhotoError(
+            f"{folder} is not a rendered dataset ({error})",
+            "expected the folders 000000, 000001 ... or files such as shard-000000.tar",
+            "give the path of an output folder of `brewster render`",
+        ) from error
     return entries
 
 
@@ -79,11 +108,3 @@ def files_of(entry: StoredSample, names: Sequence[str]) -> list[ImageFile]:
     if entry.spans:
         return [ImageFile(entry.path, entry.spans[name]) for name in names if name in entry.spans]
     return [ImageFile(entry.path / name) for name in names if (entry.path / name).exists()]
-
-
-def _not_a_rendered_dataset(folder: Path, reason: str) -> PhotoError:
-    return PhotoError(
-        f"{folder} is not a rendered dataset ({reason})",
-        "expected the folders 000000, 000001 ... or files such as shard-000000.tar",
-        "give the path of an output folder of `brewster render`",
-    )

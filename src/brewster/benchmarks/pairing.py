@@ -173,11 +173,7 @@ def _role_of(name: str) -> str:
 
 
 def find_sets(folder: Path) -> list[Path]:
-    """Returns the subfolders that contain pairs, in natural order.
-
-    Raises:
-        PhotoError: a folder cannot be read.
-    """
+    """Returns the subfolders that contain pairs, in natural order. Raises PhotoError if a folder cannot be read."""
     return [path for path in list_folder(folder)[0] if {"photo", "transmission"} <= find_roles(path).keys()]
 
 
@@ -283,10 +279,7 @@ def _subset_of(name: str) -> str:
 def _read_branches(
     listing: FolderListing, folder: Path, levels: Sequence[str], labels: Mapping[str, str]
 ) -> None:
-    """Adds the shots below `folder`, and remarks about the other files.
-
-    `levels` are the folder levels below `folder`. `labels` has the folder name of each level above.
-    """
+    """Adds the shots below `folder`, whose folder `levels` are to come, and whose `labels` are the names of the levels above."""
     if not levels:
         _read_shot(listing, folder, labels)
         return
@@ -304,7 +297,8 @@ def _read_shot(listing: FolderListing, folder: Path, labels: Mapping[str, str]) 
     for image in images:
         letters = _ROLE_LETTER.findall(image.stem)
         if len(letters) == 1:
-            by_name[_without_letter(image.stem)][_ROLE_LETTERS[letters[0].lower()]].append(image)
+            words = re.split(r"[-_ ]+", _ROLE_LETTER.sub("", image.stem))
+            by_name["-".join(filter(None, words))][_ROLE_LETTERS[letters[0].lower()]].append(image)
         else:
             others.append(image)
     shot = "-".join(labels[level] for level in ("scene", "kind", "variant") if level in labels)
@@ -312,10 +306,6 @@ def _read_shot(listing: FolderListing, folder: Path, labels: Mapping[str, str]) 
         name = shot if len(by_name) == 1 else f"{shot}-{stem}".rstrip("-")
         listing.add(name, labels["scene"], files)
     listing.ignore(others)
-
-
-def _without_letter(stem: str) -> str:
-    return "-".join(word for word in re.split(r"[-_ ]+", _ROLE_LETTER.sub("", stem)) if word)
 
 
 # --- both layouts

@@ -1,8 +1,5 @@
 """Reads public benchmarks from folders that the user has downloaded. Pairs each photo with its ground truth by file name.
 
-    for benchmark in read_benchmark("sir2", Path("SIR2")):
-        print(benchmark.title, len(benchmark.cases), *benchmark.remarks, *benchmark.excluded)
-
 The module `pairing` groups the files by name. This module creates a `Case` for each group, compares the image sizes in the
 file headers, and checks the number of cases. `excluded` lists the files that cannot be used.
 """
@@ -18,7 +15,7 @@ from pathlib import Path
 from typing import Final, final
 
 from brewster.benchmarks.bursts import find_bursts
-from brewster.benchmarks.image_files import ImageFile, files_of, read_samples
+from brewster.benchmarks.image_files import Case, ImageFile, files_of, read_samples
 from brewster.benchmarks.pairing import (
     SIR2_TREES,
     FolderListing,
@@ -39,31 +36,6 @@ from brewster.photo import read_size
 _RENDERED_FILES: Final = ("photo.jpg", "background.jpg", "reflection.jpg")
 _MAX_SCENES: Final = 20
 """Postcard and SolidObject have 20 scenes each. If a pattern finds more scenes, the names do not identify the scenes."""
-
-
-@final
-@dataclass(frozen=True)
-class Case:
-    """A photo to separate, with its ground truth.
-
-    `name` is unique within the benchmark. It is used in reports and in folders of predictions. Cases with the same `scene`
-    show the same objects, so they are not statistically independent. `scene` equals `name` if the scene is unknown.
-    `relative_path` is the photo's path relative to the benchmark folder, without the suffix and with forward slashes.
-    `ground_truth` is the ground truth of the transmission, and `reflection` is the ground truth of the reflection. If
-    `rendered` is True, both are exact: `ground_truth` is the background without the glass, and `reflection` is the light
-    that the glass adds. `frames` are the photos of a burst in order, of which `photo` is the middle one; they are empty for a
-    single photo. The ground truth of a burst is that of `photo`.
-    """
-
-    benchmark: str
-    name: str
-    scene: str
-    relative_path: str
-    photo: ImageFile
-    ground_truth: ImageFile
-    reflection: ImageFile | None = None
-    rendered: bool = False
-    frames: tuple[ImageFile, ...] = ()
 
 
 @final
@@ -129,14 +101,14 @@ def _read_pairs(name: str, folder: Path) -> list[Benchmark]:
 def _read_sets(name: str, folder: Path) -> list[Benchmark]:
     """Reads a folder of pairs, or one benchmark for each subfolder with pairs."""
     sets = [] if "photo" in find_roles(folder) else find_sets(folder)
-    return [benchmark for path in sets or [folder] for benchmark in _read_pairs(name, path)]
+    return [_from_listing(name, path, read_folders(path)) for path in sets or [folder]]
 
 
 def _read_split(name: str, folder: Path) -> list[Benchmark]:
     complete = [roles for roles in find_numbered_splits(folder).values() if "transmission" in roles]
-    if len(complete) == 1:
-        return [_from_listing(name, folder, read_folders(folder, complete[0]))]
-    return [_from_listing(name, folder, read_folders(find_split(folder)))]
+    is_complete = len(complete) == 1
+    listing = read_folders(folder, complete[0]) if is_complete else read_folders(find_split(folder))
+    return [_from_listing(name, folder, listing)]
 
 
 def _read_subset(name: str, folder: Path) -> list[Benchmark]:
@@ -174,22 +146,7 @@ def _read_rendered(name: str, folder: Path) -> list[Benchmark]:
 
 
 def _read_bursts(name: str, folder: Path) -> list[Benchmark]:
-    bursts, listing = find_bursts(folder)
-    benchmark_name = _benchmark_name(name, folder)
-    cases = [
-        Case(
-            benchmark_name,
-            burst.name,
-            burst.name,
-            burst.relative_path,
-            burst.frames[len(burst.frames) // 2],
-            burst.transmission,
-            burst.reflection,
-            frames=burst.frames,
-        )
-        for burst in bursts
-    ]
-    return [_make_benchmark(name, folder, cases, listing)]
+    return [_make_benchmark(name, folder, *find_bursts(folder, _benchmark_name(name, folder)))]
 
 
 # --- from groups of files to cases
@@ -215,10 +172,7 @@ def _from_listing(name: str, folder: Path, listing: FolderListing) -> Benchmark:
 
 
 def _find_scenes(layout: BenchmarkLayout, groups: Sequence[ImageGroup]) -> tuple[list[str], list[str]]:
-    """Returns the scene of each group, and remarks.
-
-    If the scene of one name is unknown, the name of each group is used as its scene.
-    """
+    """Returns the scene of each group, and remarks. If one scene is unknown, the name of each group is its scene."""
     if not layout.scene_pattern or any(group.scene for group in groups):
         return [group.scene or group.name for group in groups], []
     matched = [match[0] for group in groups if (match := re.match(layout.scene_pattern, group.name))]

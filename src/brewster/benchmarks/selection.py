@@ -10,7 +10,8 @@ from pathlib import Path
 from random import Random
 from typing import Final
 
-from brewster.benchmarks.registry import BENCHMARKS, Benchmark, Case, safe_name
+from brewster.benchmarks.image_files import Case
+from brewster.benchmarks.registry import BENCHMARKS, Benchmark, safe_name
 from brewster.errors import PhotoError
 from brewster.files import natural_key
 
@@ -21,12 +22,9 @@ PAPER_SEED: Final = 181
 def paper_subset(benchmark: Benchmark, seed: int = PAPER_SEED) -> tuple[Case, ...]:
     """Draws a random subset like that of the paper, which does not say which cases it uses.
 
-    This function draws one case of each scene with
-    `Random(f"{seed}/{benchmark}/{scene}").choice(...)` from the cases in natural order of their names. The case of a scene
-    therefore does not depend on the other scenes.
-
-    Returns:
-        One random case of each scene for Postcard and SolidObject, and all cases for any other benchmark.
+    This function draws one case of each scene with `Random(f"{seed}/{benchmark}/{scene}").choice(...)` from the cases in
+    natural order of their names. The case of a scene therefore does not depend on the other scenes. Other benchmarks than
+    Postcard and SolidObject keep all cases.
 
     Raises:
         PhotoError: the file names do not identify the scenes.
@@ -66,10 +64,6 @@ def with_unique_names(benchmarks: Sequence[Benchmark], folders: Sequence[Path]) 
 
     As many parent folders are added as are needed: x/a/test and y/a/test become x-a-test and y-a-test. Only equal folders
     keep equal names.
-
-    Args:
-        benchmarks: the benchmarks of a run.
-        folders: the folder of each benchmark.
     """
     names = [benchmark.name for benchmark in benchmarks]
     unique_names = list(names)

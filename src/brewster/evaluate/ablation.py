@@ -1,8 +1,5 @@
 """Ablation studies: trains a model for each of several values of one key of a training recipe, and compares their scores.
 
-    study = read_study(Path("recipes/ablations/blend-space.toml"))
-    ablate(study, study.open_benchmarks(), Path("out/ablations/blend-space"))
-
 A study is a TOML file with a base recipe, the key, its values and the benchmarks. The first value is the reference
 of the comparisons. A stopped study resumes both training and evaluation.
 """
@@ -102,17 +99,8 @@ def ablate(
 ) -> Results:
     """Trains and evaluates a model for every value. `out` gets one folder per value and the files that `evaluate` writes.
 
-    If all values are numbers and any metric has a score, plot.png shows the metrics against the values.
-
-    Args:
-        study: the definition of the study.
-        benchmarks: the benchmarks to score on, such as `study.open_benchmarks()`.
-        out: a folder for this study only.
-        workers: the number of processes that score in parallel.
-        on_progress: called after each training step.
-
-    Returns:
-        The results of `evaluate`; the model of each value is a method.
+    If all values are numbers and any metric has a score, plot.png shows the metrics against the values. The results are
+    those of `evaluate`; the model of each value is a method.
 
     Raises:
         RecipeError: the base recipe, the key or a value is invalid, or data is missing.

@@ -102,43 +102,32 @@ class EvaluationConfig:
             else f"If the shorter side is longer than {self.short_side_px} px, photo and ground truth are downscaled to it before any "
             "method runs, by area means in linear light. Smaller images keep their size."
         )
-        region = _REGION.format(" or ".join(f"{threshold:g}" for threshold in self.thresholds))
-        quality = f'Models run as in the command "brewster PHOTO", at quality "{self.quality}".'
+        rounded = f"Photo and ground truth are resized to sides that are multiples of {self.size_divisor} px, by bicubic interpolation of the 8-bit values."
+        border = f"The outermost {self.border} pixels of all images are not scored."
+        thresholds = " or ".join(f"{threshold:g}" for threshold in self.thresholds)
+        subset = (
+            "The paper uses one image of each scene of Postcard and SolidObject, and does not say which. These subsets are drawn with the "
+            f"seed {PAPER_SEED} and listed in results.json. The average is over the paper's five benchmarks, with these subsets."
+        )
         return [
             size,
-            *([_ROUNDED.format(self.size_divisor)] if self.size_divisor > 1 else []),
-            *([_BORDER.format(self.border)] if self.border else []),
-            _VALUES,
-            _PAIRS,
-            _BASELINE,
-            quality,
-            _IDENTICAL,
-            region,
-            _INTERVALS,
-            *([_SUBSET] if self.paper_subset else []),
+            *([rounded] if self.size_divisor > 1 else []),
+            *([border] if self.border else []),
+            (
+                "Metrics are computed on 8-bit sRGB values with three channels. Grey images are repeated in all channels, alpha is "
+                "dropped, and embedded profiles are converted. The border is included unless the definition of the metric says otherwise."
+            ),
+            "Images are paired by name. A prediction is never resized: it fails if its size differs from that of the ground truth.",
+            '"input (unprocessed)" is the baseline: its transmission is the photo itself, its reflection is black.',
+            f'Models run as in the command "brewster PHOTO", at quality "{self.quality}".',
+            f"The PSNR of identical images, which is infinite, counts as {IDENTICAL_DB:g} dB.",
+            (
+                f"The reflection region contains the pixels where photo and ground truth differ by more than {thresholds} of full scale (the largest "
+                "difference of the channels, averaged over 7x7 px). Images without such pixels have no score in the region."
+            ),
+            (
+                f"Confidence intervals are 95 %, from {RESAMPLES:,} bootstrap resamples of whole scenes within each benchmark. Differences "
+                "are paired by image. The mean of a method is over the images on which it did not fail. The tables show their number."
+            ),
+            *([subset] if self.paper_subset else []),
         ]
-
-
-_ROUNDED: Final = "Photo and ground truth are resized to sides that are multiples of {} px, by bicubic interpolation of the 8-bit values."
-_BORDER: Final = "The outermost {} pixels of all images are not scored."
-_VALUES: Final = (
-    "Metrics are computed on 8-bit sRGB values with three channels. Grey images are repeated in all channels, alpha is "
-    "dropped, and embedded profiles are converted. The border is included unless the definition of the metric says otherwise."
-)
-_PAIRS: Final = "Images are paired by name. A prediction is never resized: it fails if its size differs from that of the ground truth."
-_BASELINE: Final = (
-    '"input (unprocessed)" is the baseline: its transmission is the photo itself, its reflection is black.'
-)
-_IDENTICAL: Final = f"The PSNR of identical images, which is infinite, counts as {IDENTICAL_DB:g} dB."
-_REGION: Final = (
-    "The reflection region contains the pixels where photo and ground truth differ by more than {} of full scale (the largest "
-    "difference of the channels, averaged over 7x7 px). Images without such pixels have no score in the region."
-)
-_INTERVALS: Final = (
-    f"Confidence intervals are 95 %, from {RESAMPLES:,} bootstrap resamples of whole scenes within each benchmark. Differences "
-    "are paired by image. The mean of a method is over the images on which it did not fail. The tables show their number."
-)
-_SUBSET: Final = (
-    "The paper uses one image of each scene of Postcard and SolidObject, and does not say which. These subsets are drawn with the "
-    f"seed {PAPER_SEED} and listed in results.json. The average is over the paper's five benchmarks, with these subsets."
-)

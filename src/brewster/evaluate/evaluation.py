@@ -1,9 +1,4 @@
-"""Runs an evaluation: scores every method on every benchmark, and writes results, tables and an HTML report.
-
-benchmarks = read_benchmark("nature20", Path("nature20"))
-methods = [IdentityBaseline(), PredictionFolder("RDNet", Path("rdnet"))]
-evaluate(benchmarks, methods, EvaluationConfig(), Path("out/evaluate"))
-"""
+"""Runs an evaluation: scores every method on every benchmark, and writes results, tables and an HTML report."""
 
 from __future__ import annotations
 
@@ -20,9 +15,9 @@ from tempfile import TemporaryDirectory
 from typing import Final, final
 from urllib.parse import quote
 
-from brewster.benchmarks.image_files import ImageFile
+from brewster.benchmarks.image_files import Case, ImageFile
 from brewster.benchmarks.pairing import join_names
-from brewster.benchmarks.registry import Benchmark, Case
+from brewster.benchmarks.registry import Benchmark
 from brewster.errors import BrewsterError, PhotoError, counted
 from brewster.evaluate.config import EvaluationConfig
 from brewster.evaluate.methods import (
@@ -34,19 +29,15 @@ from brewster.evaluate.methods import (
     check_names,
 )
 from brewster.evaluate.report.html_report import write_report
-from brewster.evaluate.report.images import (
-    CaseImages,
-    CaseThumbnails,
-    to_thumbnails,
-)
+from brewster.evaluate.report.images import CaseThumbnails, to_thumbnails
 from brewster.evaluate.report.latex import to_latex
 from brewster.evaluate.report.published import read_published
 from brewster.evaluate.report.published import to_markdown as published_to_markdown
 from brewster.evaluate.report.tables import scores_to_csv, to_csv, to_markdown
 from brewster.evaluate.resizing import resize
 from brewster.evaluate.results import Results, paper_subsets, summarise
-from brewster.evaluate.runner import ScoreCallback, find_unavailable, get_prediction, score
-from brewster.evaluate.score_log import SCORES_FILE, RowId, ScoreRow, read_score_rows
+from brewster.evaluate.runner import ScoreCallback, get_prediction, score
+from brewster.evaluate.score_log import RowId, ScoreRow
 from brewster.evaluate.scoring import GroundTruth
 from brewster.files import write_atomically
 from brewster.metrics import IDENTICAL_DB
@@ -74,24 +65,18 @@ def evaluate(
 ) -> Results:
     """Scores the methods. Writes results.json, scores.csv, tables.md, table.tex, table.csv and report.html into `out`.
 
-    A metric whose weights are missing is left out, and "unavailable" in the results says why; the next run adds it. If photos
-    are resized, it also writes them into `out`/inputs. Each image is read and decoded once, with four exceptions. The files are
-    read twice if an earlier run has all scores. Exclusive methods read the cases again. The report reads the images of a case
-    again if the benchmark has more than `max_report_cases` cases, or if an earlier run scored the case.
+    A metric whose weights are missing is left out, and "unavailable" in the results says why; the next run adds it. If
+    photos are resized, it also writes them into `out`/inputs. Each image is read and decoded once, with four exceptions.
+    The files are read twice if an earlier run has all scores. Exclusive methods read the cases again. The report reads the
+    images of a case again if the benchmark has more than `max_report_cases` cases, or if an earlier run scored the case.
+    The result is the content of results.json.
 
     Args:
-        benchmarks: the benchmarks, as `read_benchmark` returns them.
         methods: the methods, in the order of the tables. The first one should be the baseline.
-        config: the settings of the evaluation.
         out: a folder for this evaluation only. A stopped run is resumed from its files.
-        workers: the number of processes that score in parallel.
         max_report_cases: the maximum of cases of each benchmark in the report. They are the cases with the worst scores of
             the first method that is not the baseline.
         intervals: whether table.tex has the confidence intervals.
-        on_progress: called after each new row.
-
-    Returns:
-        The content of results.json.
 
     Raises:
         BrewsterError: there is no case or no method, names are not unique, an image matches two cases, the file names do
@@ -107,16 +92,12 @@ def evaluate(
         thumbnails = _ThumbnailCache(
             Path(folder), complete, config, out, {method.name: method for method in methods}
         )
-        logged = read_score_rows(out / SCORES_FILE)
-        unavailable = find_unavailable(benchmarks, methods, config, logged)
-        rows = score(
+        rows, unavailable = score(
             benchmarks,
             methods,
             config,
             out,
             workers=workers,
-            logged=logged,
-            unavailable=unavailable,
             on_progress=on_progress,
             on_case_scored=thumbnails,
         )
@@ -146,12 +127,7 @@ def evaluate(
 
 
 def check(benchmarks: Sequence[Benchmark], methods: Sequence[Method], config: EvaluationConfig) -> None:
-    """Checks everything that can be checked before the evaluation starts.
-
-    Raises:
-        BrewsterError: there is no case or no method, names are not unique, an image matches two cases, or the file names
-            do not identify the scenes, which the subsets of the paper need.
-    """
+    """Checks everything that can be checked before the evaluation starts; see `evaluate` for the errors."""
     check_names(methods)
     names = [benchmark.name for benchmark in benchmarks]
     for name, count in Counter(names).items():
@@ -222,9 +198,10 @@ class _ThumbnailCache:
             truth.photo.save(_input_path(self.out / INPUTS_FOLDER, case), overwrite=True)
         if case.benchmark not in self.benchmarks:
             return
-        thumbnails = to_thumbnails(self.images(truth, predictions))
-        for method, html in thumbnails.methods.items():
-            self._path(case, method).write_text(json.dumps([thumbnails.size, html]))
+        thumbnails = self.create(truth, predictions)
+        for method, images in thumbnails.methods.items():
+            path = self._path(case, method)
+            path.write_text(json.dumps([thumbnails.size, thumbnails.embedded_size, images]))
 
     def read(self, case: Case, methods: Sequence[str]) -> CaseThumbnails | None:
         """Returns the stored thumbnails of a case and the methods, or None if a file is missing."""
@@ -232,24 +209,15 @@ class _ThumbnailCache:
         if not all(path.exists() for path in paths.values()):
             return None
         stored = {method: json.loads(path.read_text()) for method, path in paths.items()}
-        thumbnails = {method: html for method, (_, html) in stored.items()}
-        return CaseThumbnails(case.benchmark, case.name, stored[BASELINE][0], thumbnails)
+        thumbnails = {method: images for method, (*_, images) in stored.items()}
+        size, embedded_size, _ = stored[BASELINE]
+        return CaseThumbnails(case.benchmark, case.name, size, embedded_size, thumbnails)
 
-    def images(self, truth: GroundTruth, predictions: Mapping[str, MethodOutput]) -> CaseImages:
-        """Returns the images of a case for the report, with links to files at full size."""
+    def create(self, truth: GroundTruth, predictions: Mapping[str, MethodOutput]) -> CaseThumbnails:
+        """Returns the thumbnails of a case, with links to files at full size."""
         others = {name: output for name, output in predictions.items() if name != BASELINE}
-        true_reflection = {"": truth.images["reflection"]} if "reflection" in truth.images else {}
-        return CaseImages(
-            benchmark=truth.case.benchmark,
-            name=truth.case.name,
-            photo=truth.images["photo"],
-            ground_truth=truth.images["transmission"],
-            region=truth.region(self.config.thresholds[0]),
-            predictions={name: output.transmission.srgb_8bit() for name, output in others.items()},
-            reflections=true_reflection
-            | {name: output.reflection.srgb_8bit() for name, output in others.items() if output.reflection},
-            links=dict(self._links(truth, others)),
-        )
+        region = truth.region(self.config.thresholds[0])
+        return to_thumbnails(truth, others, region, dict(self._links(truth, others)))
 
     def _links(
         self, truth: GroundTruth, predictions: Mapping[str, MethodOutput]
@@ -310,7 +278,7 @@ def _report_cases(
         except PhotoError:
             continue  # the row of the case has this error, and the tables show it
         predictions = {method.name: get_prediction(truth, method, row) for method, row in method_rows.items()}
-        yield to_thumbnails(thumbnails.images(truth, predictions))
+        yield thumbnails.create(truth, predictions)
 
 
 def _worst_cases(
@@ -320,11 +288,7 @@ def _worst_cases(
     rows: Mapping[RowId, ScoreRow],
     limit: int,
 ) -> list[Case]:
-    """Returns up to `limit` cases of each benchmark: first those with an error, then those with the worst scores.
-
-    Errors and scores are those of the first method that is not the baseline, in the first metric. Cases that no method
-    could score come last.
-    """
+    """Returns up to `limit` cases of each benchmark: errors of the first method after the baseline first, then its worst scores."""
     method = next((method.name for method in methods if method.name != BASELINE), BASELINE)
     column, metric = next(iter(config.columns().items()))
 

@@ -19,7 +19,7 @@ from typing import Final, Protocol, final
 
 import numpy as np
 
-from brewster.benchmarks.registry import Case
+from brewster.benchmarks.image_files import Case
 from brewster.errors import BrewsterError, PhotoError
 from brewster.files import walk, write_atomically
 from brewster.image_formats import SUFFIXES
@@ -43,8 +43,7 @@ _STEM_SUFFIXES: Final = {"transmission": ("_t", "_l"), "reflection": ("_r",)}
 class MethodOutput:
     """The layers that a method predicts for a photo.
 
-    `seconds` is the wall time of the prediction, if it was measured. `digest` is the SHA-256 of the files of the layers, if
-    they are stored.
+    `seconds` is the wall time of the prediction, if it was measured. `digest` is that of the files of the layers, if stored.
     """
 
     transmission: Photo
@@ -54,11 +53,7 @@ class MethodOutput:
 
     @classmethod
     def decode(cls, data: Mapping[str, bytes]) -> MethodOutput:
-        """Decodes a prediction from layer -> encoded bytes.
-
-        Raises:
-            PhotoError: a layer cannot be decoded.
-        """
+        """Decodes a prediction from layer -> encoded bytes. Raises PhotoError if a layer cannot be decoded."""
         photos = {layer: Photo.open(encoded) for layer, encoded in data.items()}
         return cls(photos["transmission"], photos.get("reflection"), digest=_digest(data.values()))
 
@@ -357,11 +352,7 @@ def _digest(data: Iterable[bytes]) -> str:
 
 
 def check_names(methods: Sequence[Method]) -> None:
-    """Checks that there is a method, and that the names are unique and valid as folder names.
-
-    Raises:
-        BrewsterError: there is no method, two methods have the same name, or a name is not valid for a folder.
-    """
+    """Raises BrewsterError unless there is a method, and the names are unique and valid as folder names."""
     if not methods:
         raise BrewsterError(
             "there is no method", "expected at least one method", "add a method such as IdentityBaseline()"

@@ -1,7 +1,5 @@
 """Protocols by name: the choices of papers and contests that change the scores, each with its source.
 
-    config = protocol_config("xreflection", quality="draft")
-
 A published score can be compared with a measured score only if both use the same protocol. Reports list the choices.
 """
 

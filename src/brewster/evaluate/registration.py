@@ -1,7 +1,5 @@
 """Finds predictions that are mirrored or shifted against their photo, which ruins all scores of a good method.
 
-    find_misregistration(prediction, photo)  # "", "mirrored left to right" or "shifted by about 9 px to the right"
-
 The comparison is with the photo, not with the ground truth: refraction can shift the ground truth by some pixels.
 """
 

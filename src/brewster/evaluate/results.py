@@ -9,7 +9,8 @@ from typing import Any, Final, final
 import numpy as np
 
 import brewster
-from brewster.benchmarks.registry import Benchmark, Case
+from brewster.benchmarks.image_files import Case
+from brewster.benchmarks.registry import Benchmark
 from brewster.benchmarks.selection import PAPER_SEED, paper_subset
 from brewster.evaluate.config import DEFAULT_METRICS, PAPER_METRICS, EvaluationConfig
 from brewster.evaluate.methods import Method
@@ -61,17 +62,24 @@ def summarise(
         if benchmark.cases
     ]
     subsets = paper_subsets(benchmarks) if config.paper_subset else []
-    tables = [[selection] for selection in (*full, *subsets)]
     # the average is over the subset of each benchmark, or over the whole benchmark if it has no subset
     subset_of = {subset.key.partition(":")[0]: subset for subset in subsets}
     whole = [selection for selection in full if not config.paper_subset or selection.key in PAPER_COUNTS]
     averaged = [subset_of.get(selection.key, selection) for selection in whole] if len(whole) > 1 else []
-    selections = {group[0].key: group for group in tables} | ({AVERAGE: averaged} if averaged else {})
+    selections = {selection.key: [selection] for selection in (*full, *subsets)}
+    selections |= {AVERAGE: averaged} if averaged else {}
     series = [(method, column) for method in method_names for column in columns]
     directions = {name: metric.higher_is_better for name, metric in columns.items()}
     strata = {
         key: [_stratum(selection, series, by_id) for selection in group] for key, group in selections.items()
     }
+    tables: dict[str, dict[str, dict[str, Any]]] = {
+        key: {method: {} for method, _ in series} for key in selections
+    }
+    for key, table in tables.items():
+        for (method, column), mean in zip(series, estimate(strata[key]), strict=True):
+            if mean:
+                table[method][column] = _rounded(asdict(mean))
     return {
         "brewster": brewster.__version__,
         "protocol": {
@@ -116,7 +124,7 @@ def summarise(
             for benchmark in benchmarks
             for case in benchmark.cases
         ],
-        "tables": {key: _table(strata[key], series) for key in selections},
+        "tables": tables,
         "differences": {
             key: [
                 _rounded(row.pop("estimate") | row)
@@ -166,14 +174,6 @@ def _stratum(
     shape = len(selection.cases), len(series)
     scenes = [case.scene for case in selection.cases]
     return Stratum(selection.key, scenes, np.array(values, float).reshape(shape))  # None becomes NaN
-
-
-def _table(strata: Sequence[Stratum], series: Sequence[tuple[str, str]]) -> dict[str, dict[str, Any]]:
-    table: dict[str, dict[str, Any]] = {method: {} for method, _ in series}
-    for (method, column), mean in zip(series, estimate(strata), strict=True):
-        if mean:
-            table[method][column] = _rounded(asdict(mean))
-    return table
 
 
 def _rounded(row: dict[str, Any]) -> dict[str, Any]:

@@ -1,7 +1,5 @@
 """Scores every method on every case, in one or several processes. A stopped run can be resumed.
 
-    rows = score(read_benchmark("nature20", folder), [IdentityBaseline(), model], EvaluationConfig(), Path("out/evaluate"))
-
 The file `scores.jsonl` in the output folder has one line for each new result, scored or failed. A later run reuses a line if its inputs
 have not changed, and adds the columns that it does not have, such as LPIPS after its weights were missing. Each file of a
 case is read once: its bytes are hashed and, if a score is missing, decoded. If an earlier run has all scores of a metric that needs
@@ -21,7 +19,8 @@ from multiprocessing import get_context
 from pathlib import Path
 from typing import final
 
-from brewster.benchmarks.registry import Benchmark, Case
+from brewster.benchmarks.image_files import Case
+from brewster.benchmarks.registry import Benchmark
 from brewster.errors import BrewsterError
 from brewster.evaluate.config import EvaluationConfig
 from brewster.evaluate.methods import Method, MethodOutput, PredictionFolder, check_names
@@ -34,7 +33,7 @@ from brewster.evaluate.score_log import (
     read_score_rows,
 )
 from brewster.evaluate.scoring import CaseFiles, GroundTruth, Scorer
-from brewster.executors import exit_with_parent
+from brewster.executors.local import exit_with_parent
 from brewster.worker_setup import single_torch_thread
 
 ScoreCallback = Callable[[int, int, "ScoreRow"], None]
@@ -51,44 +50,30 @@ def score(
     out: Path,
     *,
     workers: int = 1,
-    logged: Mapping[RowId, ScoreRow] | None = None,
-    unavailable: Collection[str] | None = None,
     on_progress: ScoreCallback = lambda _done, _total, _row: None,
     on_case_scored: CaseCallback | None = None,
-) -> list[ScoreRow]:
+) -> tuple[list[ScoreRow], dict[str, str]]:
     """Runs every method on every case and scores the predictions. Reuses the rows of an earlier run if nothing changed.
 
-    Exclusive methods run last, one after another, in this process. Each of them reads the cases again.
+    Exclusive methods run last, one after another, in this process. Each of them reads the cases again. A column is left out if
+    it cannot be computed on this machine, for example without weights.
 
     Args:
-        benchmarks: the benchmarks, as `read_benchmark` returns them.
-        methods: the methods. Their names must be unique.
-        config: the settings of the evaluation.
-        out: the folder of scores.jsonl.
-        workers: the number of processes that score in parallel.
-        logged: the rows of an earlier run; by default, those of scores.jsonl.
-        unavailable: columns that are not computed now, from `find_unavailable`. By default, a metric whose weights are missing
-            is an error.
-        on_progress: called after each new row.
         on_case_scored: called once for each case with new rows. With several workers, it must be picklable.
 
     Returns:
         One row for each case and method, in the order of benchmarks, cases and methods. The number of workers does not
-        change the order. If a method failed on a case, its row has an `error`.
+        change the order. If a method failed on a case, its row has an `error`. And column -> reason, for the columns left out.
 
     Raises:
-        BrewsterError: two methods have the same name, a name is not valid for a folder, a metric is not available, or
-            a worker process died.
+        BrewsterError: two methods have the same name, a name is not valid for a folder, or a worker process died.
         OutputError: `out` cannot be written.
     """
     check_names(methods)
-    logged = read_score_rows(out / SCORES_FILE) if logged is None else logged
+    logged = read_score_rows(out / SCORES_FILE)
     cases = {(case.benchmark, case.name): case for benchmark in benchmarks for case in benchmark.cases}
     ids = [(*case, method.name) for case in cases for method in methods]
-    if unavailable is None:
-        unavailable = ()
-        for prepare, _ in _missing_metrics(cases.values(), methods, config, logged):
-            prepare()
+    unavailable = _find_unavailable(cases.values(), methods, config, logged)
     rows = dict[RowId, ScoreRow]()
 
     def log_rows(case_rows: Sequence[ScoreRow]) -> None:
@@ -104,40 +89,19 @@ def score(
     for names in filter(None, (together, *([method.name] for method in methods if method.exclusive))):
         tasks = [(case, names) for case in cases.values()]
         _run_tasks(tasks, state, log_rows, workers if names == together else 1)
-    return [rows[row_id] for row_id in ids]
+    return [rows[row_id] for row_id in ids], unavailable
 
 
-def find_unavailable(
-    benchmarks: Sequence[Benchmark],
-    methods: Sequence[Method],
-    config: EvaluationConfig,
-    logged: Mapping[RowId, ScoreRow],
-) -> dict[str, str]:
-    """Returns column -> reason, for the columns that cannot be computed on this machine, for example without weights.
-
-    The weights of all other metrics are loaded. A metric is not tried if `logged`, the rows of an earlier run, has it for all
-    cases and methods, and their inputs have not changed.
-    """
-    cases = [case for benchmark in benchmarks for case in benchmark.cases]
-    unavailable: dict[str, str] = {}
-    for prepare, columns in _missing_metrics(cases, methods, config, logged):
-        try:
-            prepare()
-        except BrewsterError as error:
-            unavailable |= dict.fromkeys(columns, str(error))
-    return {column: unavailable[column] for column in config.columns() if column in unavailable}
-
-
-def _missing_metrics(
+def _find_unavailable(
     cases: Collection[Case],
     methods: Sequence[Method],
     config: EvaluationConfig,
     logged: Mapping[RowId, ScoreRow],
-) -> list[tuple[Callable[[], object], list[str]]]:
-    """Returns (prepare, columns) for the metrics with missing scores.
+) -> dict[str, str]:
+    """Loads the weights of all metrics before the workers start. Returns column -> reason, for the columns without weights.
 
-    `prepare` loads weights, for example of LPIPS. Call each `prepare` once, before the workers start. A metric is left out if
-    every row of an earlier run has it and no row is outdated. The files of the cases are read only if every row has it.
+    A metric is not tried if every row of an earlier run has it and no row is outdated. The files of the cases are read only if
+    every row has it.
     """
     columns: dict[Callable[[], object], list[str]] = {}
     for column, metric in config.columns().items():
@@ -151,7 +115,13 @@ def _missing_metrics(
     }
     if complete and any(_has_outdated_row(case, methods, config, logged) for case in cases):
         complete = set()
-    return [(prepare, names) for prepare, names in columns.items() if prepare not in complete]
+    unavailable: dict[str, str] = {}
+    for prepare in [prepare for prepare in columns if prepare not in complete]:
+        try:
+            prepare()
+        except BrewsterError as error:
+            unavailable |= dict.fromkeys(columns[prepare], str(error))
+    return {column: unavailable[column] for column in config.columns() if column in unavailable}
 
 
 def _has_outdated_row(

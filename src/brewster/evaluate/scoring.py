@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brewster import metrics
-from brewster.benchmarks.registry import Case
+from brewster.benchmarks.image_files import Case
 from brewster.errors import PhotoError
 from brewster.evaluate.config import EvaluationConfig
 from brewster.evaluate.methods import MethodOutput
@@ -36,18 +36,14 @@ class CaseFiles:
 
     @classmethod
     def read(cls, case: Case) -> CaseFiles:
-        """Reads the files of a case.
-
-        Raises:
-            PhotoError: a file cannot be read.
-        """
+        """Reads the files of a case. Raises PhotoError if a file cannot be read."""
         files = {"photo": case.photo, "transmission": case.ground_truth, "reflection": case.reflection}
         return cls(case, {role: file.read() for role, file in files.items() if file})
 
     def digests(self) -> list[str]:
         """Returns the SHA-256 of photo, transmission and reflection; "" if there is no reflection."""
-        roles = ("photo", "transmission", "reflection")
-        return [hashlib.sha256(self.data[role]).hexdigest() if role in self.data else "" for role in roles]
+        data = (self.data.get(role) for role in ("photo", "transmission", "reflection"))
+        return [hashlib.sha256(content).hexdigest() if content else "" for content in data]
 
 
 @final
@@ -64,11 +60,7 @@ class GroundTruth:
 
     @classmethod
     def open(cls, case: Case, config: EvaluationConfig) -> GroundTruth:
-        """Reads and decodes a case.
-
-        Raises:
-            PhotoError: an image cannot be read, or the images differ in size.
-        """
+        """Reads and decodes a case. Raises PhotoError if an image cannot be read, or the images differ in size."""
         return cls.decode(CaseFiles.read(case), config)
 
     @classmethod
@@ -96,16 +88,9 @@ class GroundTruth:
         )
 
     def check(self, prediction: MethodOutput, name: str) -> None:
-        """Checks the size of a prediction.
-
-        Raises:
-            PhotoError: a layer differs from the photo in size.
-        """
-        for layer, photo in (
-            ("transmission", prediction.transmission),
-            ("reflection", prediction.reflection),
-        ):
-            if photo:
+        """Checks the size of a prediction. Raises PhotoError if a layer differs from the photo in size."""
+        for layer in ("transmission", "reflection"):
+            if photo := getattr(prediction, layer):
                 _check_size(
                     f"{name}'s {layer} of {self.case.benchmark}/{self.case.name}",
                     photo,

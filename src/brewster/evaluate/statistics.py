@@ -52,25 +52,23 @@ def estimate(strata: Sequence[Stratum]) -> list[Estimate | None]:
     """Computes the mean of each series over all images of all strata, and its 95 % interval.
 
     Stratified cluster bootstrap with percentile intervals (Efron and Tibshirani 1993, chapter 13), 10,000 resamples and a
-    fixed seed. For a stratum of k scenes, each resample draws k scenes with replacement, and all images of these scenes.
-
-    Returns:
-        One estimate for each series; None for a series without values.
+    fixed seed. For a stratum of k scenes, each resample draws k scenes with replacement, and all images of these scenes. A
+    series without values has no estimate.
     """
     resampled = [_resample(stratum) for stratum in strata]
     sums, counts = (np.sum([part[i] for part in resampled], axis=0) for i in range(2))
     values = np.concatenate([stratum.values for stratum in strata])
-    has_interval = np.any([_scene_counts(stratum) > 1 for stratum in strata], axis=0)
+    has_interval = np.any([_has_two_scenes(stratum) for stratum in strata], axis=0)
     return [
         _estimate(values[:, i], sums[:, i], counts[:, i], has_interval=bool(has_interval[i]))
         for i in range(values.shape[1])
     ]
 
 
-def _scene_counts(stratum: Stratum) -> NDArray[np.int64]:
-    """Returns the number of scenes with a value, for each series, (s,)."""
+def _has_two_scenes(stratum: Stratum) -> list[bool]:
+    """Returns whether two scenes or more have a value, for each series."""
     names = np.array(stratum.scenes)
-    return np.array([len(set(names[is_valid])) for is_valid in np.isfinite(stratum.values).T])
+    return [len(set(names[is_valid])) > 1 for is_valid in np.isfinite(stratum.values).T]
 
 
 def _resample(stratum: Stratum) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -117,13 +115,12 @@ def differences(
 ) -> list[Difference]:
     """Compares each method with all methods before it, in every metric, paired by image.
 
+    There is a difference for each pair of methods and metric, if an image has both scores.
+
     Args:
         strata: the scores. Column i of `values` is `series[i]`.
         series: (method, metric) of each column.
         directions: metric -> whether higher is better.
-
-    Returns:
-        One difference for each pair of methods and metric, if an image has both scores.
     """
     column_of = {name: i for i, name in enumerate(series)}
     methods = list(dict.fromkeys(method for method, _ in series))

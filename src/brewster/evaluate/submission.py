@@ -1,7 +1,4 @@
-"""Packs predictions in the form that a contest takes.
-
-export_ntire2026(Path("OpenRR-5k"), method, Path("out/ntire2026"))  # [.../val_300_output.zip, .../test_100_output.zip]
-"""
+"""Packs predictions in the form that a contest takes."""
 
 from __future__ import annotations
 
@@ -10,9 +7,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
-from brewster.benchmarks.image_files import ImageFile
+from brewster.benchmarks.image_files import Case, ImageFile
 from brewster.benchmarks.pairing import find_numbered_splits, image_files
-from brewster.benchmarks.registry import Case
 from brewster.errors import BrewsterError, PhotoError
 from brewster.evaluate.methods import Method
 from brewster.files import write_atomically
@@ -53,15 +49,7 @@ def export_ntire2026(
 
     The README of OpenRR-5k asks for val_300_output.zip and test_100_output.zip with images only, and its evaluate.py reads
     files "*.jpg" with the names of the photos. The predictions of "val" that an evaluation has stored are used again.
-
-    Args:
-        folder: the folder of OpenRR-5k.
-        method: the method. It must not fail on any photo.
-        out: the folder for the zip files.
-        on_progress: called with the name of each photo, before it is predicted.
-
-    Returns:
-        The paths of the zip files.
+    Returns the paths of the zip files. The method must not fail on any photo.
 
     Raises:
         PhotoError: the folder has no photos in the layout of OpenRR-5k, or a photo cannot be read.

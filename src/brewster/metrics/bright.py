@@ -22,12 +22,9 @@ MIN_COUNT: Final = 64
 
 
 def lost_clipped(prediction: Image, truth: Image, photo: Image) -> float:
-    """Returns the share of the clipped channel values that the prediction loses.
+    """Returns the share of the channel values of at least 250 in photo and truth that are below 240 in the prediction, 0..1.
 
-    The channels of a pixel are counted apart, because a coloured lamp clips in one or two of them.
-
-    Returns:
-        The share of the values of at least 250 in photo and truth that are below 240 in the prediction, 0..1; lower is better.
+    The channels of a pixel are counted apart, because a coloured lamp clips in one or two of them. Lower is better.
 
     Raises:
         ValueError: the images are not uint8 (H, W, 3) or differ in shape, or fewer than 64 values are clipped.
@@ -39,10 +36,9 @@ def lost_clipped(prediction: Image, truth: Image, photo: Image) -> float:
 
 
 def lost_near_white(prediction: Image, truth: Image, photo: Image) -> float:
-    """Returns the mean of truth - prediction over the near-white pixels, in 8-bit levels.
+    """Returns the mean of truth - prediction over the channels of the near-white pixels, in 8-bit levels.
 
-    Returns:
-        The mean over pixels and channels; 0 is best, and a negative value is a brighter prediction.
+    0 is best, and a negative value is a brighter prediction.
 
     Raises:
         ValueError: the images are not uint8 (H, W, 3) or differ in shape, or fewer than 64 pixels are above 200 in all channels
@@ -54,17 +50,12 @@ def lost_near_white(prediction: Image, truth: Image, photo: Image) -> float:
 def near_white_cast(prediction: Image, truth: Image, photo: Image) -> float:
     """Returns the colour cast of the near-white pixels, in 8-bit levels: the largest minus the smallest channel of their mean loss.
 
-    Returns:
-        A number of at least 0, which is best.
-
-    Raises:
-        ValueError: see `lost_near_white`.
+    0 is best. The errors are those of `lost_near_white`.
     """
     return float(np.ptp(_near_white_losses(prediction, truth, photo)))
 
 
 def _near_white_losses(prediction: Image, truth: Image, photo: Image) -> NDArray[np.float64]:
-    """Returns the mean of truth - prediction of each channel."""
     check_images(prediction, truth, photo)
     is_near_white = (np.minimum(photo, truth) > MIN_NEAR_WHITE).all(axis=2)
     _check_count(int(is_near_white.sum()), f"pixels are above {MIN_NEAR_WHITE} in all channels")

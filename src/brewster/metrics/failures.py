@@ -26,9 +26,8 @@ if TYPE_CHECKING:
     from jaxtyping import Float
 
     Light = Float[NDArray[np.float64], "h w"]
-    LightOfPixels = Float[NDArray[np.float64], " pixels"]
 else:
-    Light = LightOfPixels = NDArray
+    Light = NDArray
 
 NEGLIGIBLE_FRACTION: Final = 0.02
 """A pixel with R below this fraction of I is a pixel without reflection."""
@@ -58,9 +57,6 @@ def removed_content(prediction: Image, background: Image, photo: Image, reflecti
     The score is sum max(B - g prediction, 0) / sum B over the pixels with R < 2 % of I and B > 0. The module docstring
     defines the gain g.
 
-    Returns:
-        A fraction in 0..1; lower is better.
-
     Raises:
         ValueError: the images are not uint8 (H, W, 3) or differ in shape, or the score or the background has fewer
             than 64 valid pixels.
@@ -74,13 +70,7 @@ def removed_white(prediction: Image, background: Image, photo: Image, reflection
 
     The formula is that of `removed_content`, over the pixels that are also white in B: every encoded channel is above
     0.75, and the largest is less than 0.12 above the smallest. The score is high if a method removes white objects
-    because it mistakes them for reflections.
-
-    Returns:
-        A fraction in 0..1; lower is better.
-
-    Raises:
-        ValueError: see `removed_content`.
+    because it mistakes them for reflections. The errors are those of `removed_content`.
     """
     luminance = _Luminances.of(prediction, background, photo, reflection)
     return luminance.removed_fraction(
@@ -92,13 +82,7 @@ def kept_reflection(prediction: Image, background: Image, photo: Image, reflecti
     """Returns the fraction of the reflection's light that the prediction still contains.
 
     The score is sum min(max(g prediction - B, 0), R) / sum R over the pixels with R >= 10 % of I and I not clipped. The
-    module docstring defines the gain g.
-
-    Returns:
-        A fraction in 0..1; lower is better.
-
-    Raises:
-        ValueError: see `removed_content`.
+    module docstring defines the gain g. The errors are those of `removed_content`.
     """
     luminance = _Luminances.of(prediction, background, photo, reflection)
     reflective = (
@@ -134,16 +118,13 @@ class _Luminances:
             comparable_background, f"R < {NEGLIGIBLE_FRACTION:.0%} of I and B neither black nor clipped"
         )
         comparable = comparable_background & (p >= BLACK_LUMINANCE) & ~_is_clipped(prediction)
-        return cls(p * _gain(p[comparable], b[comparable]), b, i, r, unreflected)
+        # The median is used, because content that is missing in less than half of the pixels must not change the gain.
+        gain = np.median(b[comparable] / p[comparable]) if comparable.sum() >= MIN_PIXELS else 1.0
+        return cls(p * float(gain), b, i, r, unreflected)
 
     def removed_fraction(self, mask: Region, condition: str) -> float:
         missing = np.maximum(self.background - self.prediction, 0)
         return _fraction(missing, self.background, mask & (self.background > 0), condition)
-
-
-def _gain(prediction: LightOfPixels, background: LightOfPixels) -> float:
-    # The median is used, because content that is missing in less than half of the pixels must not change the gain.
-    return float(np.median(background / prediction)) if prediction.size >= MIN_PIXELS else 1.0
 
 
 def _fraction(part: Light, whole: Light, mask: Region, condition: str) -> float:

@@ -44,12 +44,9 @@ _WINDOW_SIDES: Final[dict[Window, int]] = {"uniform": BOX_SIDE, "gaussian": 2 * 
 
 
 def psnr(prediction: Image, truth: Image, *, region: Region | None = None) -> float:
-    """Returns the peak signal-to-noise ratio, 10 log10(255^2 / MSE).
+    """Returns the peak signal-to-noise ratio in dB, 10 log10(255^2 / MSE); infinity for equal images. Higher is better.
 
     The mean squared error is over the three channels of all pixels, or of the pixels in `region`, bool (H, W).
-
-    Returns:
-        The PSNR in dB; infinity for equal images. Higher is better.
 
     Raises:
         ValueError: the images are not uint8 (H, W, 3) or differ in shape; the region is empty or of another shape.
@@ -74,9 +71,7 @@ def count_pairs(prediction: Image, truth: Image) -> PairCounts:
     """Counts the pairs of 8-bit values at the same position: the joint histogram of two images, over all channels.
 
     Every mean over all pixels of a function of two values follows from it, and it is faster than the function of each pixel.
-
-    Returns:
-        The counts, int64 (65536,). The index is 256 times the value of the prediction, plus that of the ground truth.
+    The counts are int64 (65536,). The index is 256 times the value of the prediction, plus that of the ground truth.
 
     Raises:
         ValueError: the images are not uint8 (H, W, 3) or differ in shape.
@@ -91,10 +86,8 @@ def count_pairs(prediction: Image, truth: Image) -> PairCounts:
 def psnr_of_channels(prediction: Image, truth: Image) -> float:
     """Returns the mean of the PSNR of red, green and blue, as the code of ERRNet (util/index.py) and XReflection computes it.
 
-    The value is never below that of `psnr`, which uses one mean squared error over all channels.
-
-    Returns:
-        The mean in dB; infinity if a channel is equal in both images. Higher is better.
+    The value is never below that of `psnr`, which uses one mean squared error over all channels. It is in dB, and infinity if a
+    channel is equal in both images. Higher is better.
 
     Raises:
         ValueError: the images are not uint8 (H, W, 3) or differ in shape.
@@ -110,9 +103,7 @@ def linear_rmse(prediction: Image, truth: Image, *, region: Region | None = None
 
     L is the inverse of the sRGB curve (IEC 61966-2-1). The mean is over the three channels of all pixels, or of the
     pixels in `region`, bool (H, W). This error is proportional to the light that is wrong; errors of encoded values are not.
-
-    Returns:
-        The error, 0 for equal images. Lower is better.
+    Lower is better.
 
     Raises:
         ValueError: the images are not uint8 (H, W, 3) or differ in shape; the region is empty or of another shape.
@@ -135,10 +126,7 @@ def ssim(
     """Returns the mean structural similarity (Wang et al. 2004), with one of the two windows of this module.
 
     The SSIM map is averaged over all its pixels, or over those in `region`, bool (H, W). The map has no values within
-    3 pixels of the image's border, or 5 pixels with the Gaussian window.
-
-    Returns:
-        The mean, at most 1; 1 for equal images. Higher is better.
+    3 pixels of the image's border, or 5 pixels with the Gaussian window. The mean is 1 for equal images. Higher is better.
 
     Raises:
         ValueError: the images are not uint8 (H, W, 3), differ in shape, or are smaller than the window; the
@@ -177,18 +165,15 @@ def ssim_map(prediction: Image, truth: Image, *, window: Window = "uniform") -> 
     if min(height, width) < side:
         raise ValueError(f"SSIM needs at least {side}x{side} pixels, not {height}x{width}")
     # Strips of 32 rows fit into the processor's cache.
-    windowed_ssim, strip_height = _WINDOWED_SSIM[window], _STRIP_ROWS + _WINDOW_SIDES[window] - 1
-    tops = range(0, len(prediction) - _WINDOW_SIDES[window] + 1, _STRIP_ROWS)
+    windowed_ssim, strip_height = _WINDOWED_SSIM[window], _STRIP_ROWS + side - 1
+    tops = range(0, height - side + 1, _STRIP_ROWS)
     return np.concatenate(
         [windowed_ssim(prediction[top : top + strip_height], truth[top : top + strip_height]) for top in tops]
     )
 
 
 def _ssim_uniform(prediction: Image, truth: Image) -> NDArray[np.float64]:
-    """Returns the SSIM map with the uniform window.
-
-    int16 holds the sums of 8-bit values exactly, and int32 those of their products.
-    """
+    """Returns the SSIM map with the uniform window. int16 holds sums of 8-bit values exactly, and int32 those of products."""
     x, y = prediction.astype(np.int32), truth.astype(np.int32)
     sums = [box_sums(image.astype(np.int16)).astype(np.int32) for image in (prediction, truth)]
     sums += [box_sums(x * x + y * y), box_sums(x * y)]

@@ -11,7 +11,7 @@ from __future__ import annotations
 import functools
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,10 +43,8 @@ Blocks = NDArray[np.float64]
 def niqe(image: Image) -> float:
     """Returns the NIQE of an image, uint8 sRGB (H, W, 3) (equation 10 of the paper).
 
-    The image is cropped to whole blocks of 96x96 pixels, from the upper left corner.
-
-    Returns:
-        A distance between two Gaussians, at least 0; lower is better. Undistorted photographs have values of 2 to 5.
+    The image is cropped to whole blocks of 96x96 pixels, from the upper left corner. The NIQE is a distance between two
+    Gaussians, at least 0; lower is better. Undistorted photographs have values of 2 to 5.
 
     Raises:
         ValueError: the image is not uint8 (H, W, 3), or fewer than two blocks have features.
@@ -57,7 +55,8 @@ def niqe(image: Image) -> float:
     features = np.empty((0, 0))
     if rows * columns > 1:
         luma = luma[: rows * BLOCK_SIDE, : columns * BLOCK_SIDE]
-        scales = [_features(level, rows, columns) for level in (luma, _halved(luma))]
+        halved = _filtered(luma, _HALVING_TAPS, 2, "symmetric")
+        scales = [_features(level, rows, columns) for level in (luma, halved)]
         features = np.concatenate(scales, axis=1)
         features = features[np.isfinite(features).all(axis=1)]
     if len(features) < 2:
@@ -100,27 +99,23 @@ def _normalised(luma: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def _blurred(values: NDArray[np.float64]) -> NDArray[np.float64]:
     """Returns Gaussian 7x7 means. Edge pixels are repeated beyond the border."""
-    for axis in (0, 1):
-        padded = np.pad(values, [(_RADIUS, _RADIUS) if i == axis else (0, 0) for i in range(2)], mode="edge")
-        values = _filtered(padded, _TAPS, axis, 1)
-    return values
-
-
-def _halved(luma: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Returns the image at half the resolution. The image is mirrored beyond the border."""
-    for axis in (0, 1):
-        padded = np.pad(luma, [(_RADIUS, _RADIUS) if i == axis else (0, 0) for i in range(2)], "symmetric")
-        luma = _filtered(padded, _HALVING_TAPS, axis, 2)
-    return luma
+    return _filtered(values, _TAPS, 1, "edge")
 
 
 def _filtered(
-    values: NDArray[np.float64], taps: NDArray[np.float64], axis: int, step: int
+    values: NDArray[np.float64],
+    taps: NDArray[np.float64],
+    step: int,
+    beyond_border: Literal["edge", "symmetric"],
 ) -> NDArray[np.float64]:
-    along_axis = np.moveaxis(values, axis, 0)
-    count = (len(along_axis) - len(taps)) // step + 1
-    total = sum(tap * along_axis[i : i + step * (count - 1) + 1 : step] for i, tap in enumerate(taps))
-    return np.moveaxis(np.asarray(total), 0, axis)
+    """Filters rows and columns, and keeps every `step`-th value."""
+    for axis in (0, 1):
+        padding = [(_RADIUS, _RADIUS) if i == axis else (0, 0) for i in range(2)]
+        along_axis = np.moveaxis(np.pad(values, padding, beyond_border), axis, 0)
+        count = (len(along_axis) - len(taps)) // step + 1
+        total = sum(tap * along_axis[i : i + step * (count - 1) + 1 : step] for i, tap in enumerate(taps))
+        values = np.moveaxis(np.asarray(total), 0, axis)
+    return values
 
 
 def _fit_asymmetric_gaussian(
@@ -128,9 +123,8 @@ def _fit_asymmetric_gaussian(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """Fits an asymmetric generalised Gaussian to each block (N. Lasmar et al., ICIP 2009).
 
-    Returns:
-        The shape, and the scales of the left and the right half, (blocks,) each. The scales are NaN for a block without
-        negative or without positive values.
+    Returns the shape, and the scales of the left and the right half, (blocks,) each. The scales are NaN for a block without
+    negative or without positive values.
     """
     flat = blocks.reshape(len(blocks), -1)
     squares = flat * flat

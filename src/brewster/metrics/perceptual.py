@@ -2,7 +2,7 @@
 
     metric = Lpips.load()
     truth = metric.features(image)  # once for many predictions
-    print([metric.distance(metric.features(prediction), truth) for prediction in predictions])
+    print([metric.difference(metric.features(prediction), truth).mean() for prediction in predictions])
 
 R. Zhang et al., "The Unreasonable Effectiveness of Deep Features as a Perceptual Metric", CVPR 2018. The
 definition and the weights are those of version 0.1 of the `lpips` package. Functions import torch when they are called; the
@@ -67,7 +67,7 @@ class DifferenceMaps:
     shape: tuple[int, int]
 
     def mean(self, *, region: Region | None = None) -> float:
-        """Returns the distance, averaged over the whole maps or over a region; see `Lpips.distance`.
+        """Returns the distance, averaged over the whole maps or over a region; see `Lpips.difference`.
 
         Raises:
             ValueError: the region is empty or of another shape.
@@ -128,25 +128,14 @@ class Lpips:
                 maps.append(activations[0] / (torch.linalg.vector_norm(activations[0], dim=0) + 1e-10))
         return Features(tuple(maps), shape)
 
-    def distance(self, one: Features, other: Features, *, region: Region | None = None) -> float:
-        """Returns the LPIPS distance between two images, given by their features.
-
-        The squared differences of the features are weighted by channel, averaged over each map, and summed over the
-        five maps. With a `region`, bool (H, W), each map of differences is first upsampled to the size of the image
-        (bilinear, align_corners=False; `spatial=True` in `lpips`), and the sum of the maps is averaged over the region.
-        A region that is the whole image gives a slightly different value than no region, because upsampling changes the
-        weight of the pixels at the border of a map.
-
-        Returns:
-            The distance, 0 for equal images; lower is better.
-
-        Raises:
-            ValueError: the images differ in size, or the region is empty or of another shape.
-        """
-        return self.difference(one, other).mean(region=region)
-
     def difference(self, one: Features, other: Features) -> DifferenceMaps:
-        """Returns the five maps of `distance` before they are averaged, so that several means need them only once.
+        """Returns the five maps of the LPIPS distance between two images, given by their features. Its `mean` is the distance.
+
+        The squared differences of the features are weighted by channel. Without a region, they are averaged over each map, and
+        summed over the five maps. With a `region`, bool (H, W), each map of differences is first upsampled to the size of the
+        image (bilinear, align_corners=False; `spatial=True` in `lpips`), and the sum of the maps is averaged over the region. A
+        region that is the whole image gives a slightly different value than no region, because upsampling changes the weight of
+        the pixels at the border of a map. The distance is 0 for equal images; lower is better.
 
         Raises:
             ValueError: the images differ in size.
@@ -164,10 +153,7 @@ class Lpips:
 
 
 def lpips(prediction: Image, truth: Image, *, region: Region | None = None) -> float:
-    """Returns the LPIPS 0.1 (AlexNet) distance between two images, with weights from `Lpips.load`; see `Lpips.distance`.
-
-    Returns:
-        The distance, 0 for equal images; lower is better.
+    """Returns the LPIPS 0.1 (AlexNet) distance between two images, with weights from `Lpips.load`; see `Lpips.difference`.
 
     Raises:
         ValueError: the images are not uint8 (H, W, 3), differ in shape, or are smaller than 31x31 pixels; the
@@ -176,7 +162,7 @@ def lpips(prediction: Image, truth: Image, *, region: Region | None = None) -> f
     """
     check_images(prediction, truth)
     metric = Lpips.load()
-    return metric.distance(metric.features(prediction), metric.features(truth), region=region)
+    return metric.difference(metric.features(prediction), metric.features(truth)).mean(region=region)
 
 
 @functools.cache

@@ -54,14 +54,8 @@ def check_region(region: Region, shape: tuple[int, int]) -> None:
         raise ValueError("the region is empty; a metric needs at least one pixel")
 
 
-def mean_inside(values: NDArray[Any], region: Region | None = None) -> float:
-    """Returns the mean of values (H, W, 3), or of the values in a region, bool (H, W).
-
-    Raises:
-        ValueError: the region is empty or of another shape.
-    """
-    if region is None:
-        return float(np.mean(values))
+def mean_inside(values: NDArray[Any], region: Region) -> float:
+    """Returns the mean of the values (H, W, 3) in a region, bool (H, W). Raises ValueError as `check_region` does."""
     check_region(region, values.shape[:2])
     # Sum over the channels first, because indexing (H, W, 3) with a mask of pixels takes ten times as long.
     sums = values[..., 0] + values[..., 1] + values[..., 2]

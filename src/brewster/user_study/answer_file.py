@@ -1,8 +1,4 @@
-"""The file of answers that a participant of a static bundle downloads and sends back.
-
-answer_file = read_answer_file(Path("answers-3f9a.json"))
-store.import_answers(answer_file)    # the number of new answers
-"""
+"""The file of answers that a participant of a static bundle downloads and sends back."""
 
 from __future__ import annotations
 

@@ -46,9 +46,13 @@ def draw_trials(description: StudyDescription, number: int) -> tuple[Trial, ...]
     sequence = comparison_sequence(count, pairs, description.seed)
     assigned = list(itertools.islice(sequence, number * pairs, (number + 1) * pairs))
     rng = Random(f"{description.seed}/participant/{number}")  # noqa: S311  (not a secret: the seed is published)
-    trials = [_comparison_trial(description, comparison, flipped) for comparison, flipped in assigned]
+    trials = []
+    for index, flipped in assigned:
+        comparison = description.comparisons[index]
+        left, right = comparison.outputs[::-1] if flipped else comparison.outputs
+        trials.append(Trial(comparison.photo, left, right, index, flipped))
     # catch trials in random order; those of photos that the participant does not see otherwise come first
-    photos = {description.comparisons[comparison].photo for comparison, _ in assigned}
+    photos = {trial.photo for trial in trials}
     pool = rng.sample(description.catch_pool, len(description.catch_pool))
     pool.sort(key=lambda catch: catch.photo in photos)
     trials += [_catch_trial(catch, i, rng) for i, catch in enumerate(pool[: description.catch_trials])]
@@ -73,11 +77,6 @@ def comparison_sequence(count: int, pairs: int, seed: int) -> Iterator[tuple[int
     Items `n * pairs` to `(n + 1) * pairs - 1` belong to participant n and contain no comparison twice. For each
     comparison, the numbers of items with and without swapped sides differ by at most 1 at any time; for each participant
     they are nearly equal.
-
-    Args:
-        count: number of comparisons.
-        pairs: comparisons for each participant, at most `count`.
-        seed: the study's seed.
     """
     flips: dict[int, bool] = {}
     order: list[int] = []
@@ -92,7 +91,9 @@ def comparison_sequence(count: int, pairs: int, seed: int) -> Iterator[tuple[int
                 _unseen_first([c for c in order if flips[c] is flip], seen, needed // 2)
                 for flip in (False, True)
             ]
-            order = _unseen_first(_interleave(*sides), seen, needed)
+            longer, shorter = sorted(sides, key=len, reverse=True)
+            interleaved = itertools.chain.from_iterable(itertools.zip_longest(longer, shorter))
+            order = _unseen_first([c for c in interleaved if c is not None], seen, needed)
             flips = {comparison: not flip for comparison, flip in flips.items()}
         else:
             start = rng.random() < 0.5
@@ -101,24 +102,9 @@ def comparison_sequence(count: int, pairs: int, seed: int) -> Iterator[tuple[int
 
 
 def _unseen_first(order: Sequence[int], seen: Collection[int], count: int) -> list[int]:
-    """Move the first `count` comparisons that are not in `seen` to the front.
-
-    Then a participant whose items belong to two rounds gets no comparison twice.
-    """
+    """Move the first `count` comparisons that are not in `seen` to the front, so that no participant gets a comparison twice."""
     front = dict.fromkeys([comparison for comparison in order if comparison not in seen][:count])
     return [*front, *(comparison for comparison in order if comparison not in front)]
-
-
-def _interleave(first: Sequence[int], second: Sequence[int]) -> list[int]:
-    longer, shorter = (first, second) if len(first) >= len(second) else (second, first)
-    interleaved = itertools.chain.from_iterable(itertools.zip_longest(longer, shorter))
-    return [comparison for comparison in interleaved if comparison is not None]
-
-
-def _comparison_trial(description: StudyDescription, number: int, flipped: bool) -> Trial:
-    comparison = description.comparisons[number]
-    left, right = comparison.outputs[::-1] if flipped else comparison.outputs
-    return Trial(comparison.photo, left, right, number, flipped)
 
 
 def _catch_trial(catch: CatchTrial, i: int, rng: Random) -> Trial:

@@ -1,7 +1,5 @@
 """Create a study from folders of outputs: pair pictures by name and copy them under random names.
 
-    create_study(Path("out/study"), Path("inputs"), {"ours": Path("out/ours"), "RDNet": Path("out/rdnet")})
-
 All files are checked before anything is written, and one error lists all problems. Pictures are stored as upright 8-bit
 sRGB PNG without metadata, so every browser shows the same pixels, and neither format nor EXIF reveals the method.
 """
@@ -47,30 +45,6 @@ We store your choices with their times, the size and kind of your screen, and th
 store no name and no address."""
 
 
-@final
-@dataclass(frozen=True)
-class StudyOptions:
-    """Options of a new study.
-
-    Attributes:
-        datasets: the datasets to use; all if empty.
-        names: the inputs to use, as "dataset/stem", or "stem" if there are no datasets; all if empty.
-        pairs: number of comparisons for each participant. None means DEFAULT_PAIRS, or all if there are fewer.
-        catch_trials: number of catch trials for each participant. None means DEFAULT_CATCHES, or all if there are fewer.
-        all_pairs: whether each method is compared with each other method, instead of the first method only.
-        seed: the seed of the assignment; None chooses a random one.
-        consent: the text that participants agree to.
-    """
-
-    datasets: Sequence[str] = ()
-    names: Sequence[str] = ()
-    pairs: int | None = None
-    catch_trials: int | None = None
-    all_pairs: bool = False
-    seed: int | None = None
-    consent: str = DEFAULT_CONSENT
-
-
 _Outputs = Mapping[str, Mapping[Key, Path]]
 """The outputs of each method, by (dataset, stem)."""
 
@@ -79,34 +53,41 @@ def create_study(
     out: Path,
     inputs: Path,
     methods: Mapping[str, Path],
-    options: StudyOptions = StudyOptions(),
+    *,
+    datasets: Sequence[str] = (),
+    names: Sequence[str] = (),
+    pairs: int | None = None,
+    catch_trials: int | None = None,
+    all_pairs: bool = False,
+    seed: int | None = None,
+    consent: str = DEFAULT_CONSENT,
     on_progress: Callable[[int], None] = lambda _done: None,
 ) -> Study:
     """Create a study of all pictures in the folder `inputs`.
 
     Args:
         out: the folder of the new study. It must be empty, or not exist yet.
-        inputs: the folder of photos with reflections.
         methods: the folder of outputs by method name. The first method is compared with each of the others.
-        options: sizes, seed and consent text.
-        on_progress: called after each written picture with the number of pictures written so far, including degraded copies.
-
-    Returns:
-        The study in the folder `out`.
+        datasets: the datasets to use; all if empty.
+        names: the inputs to use, as "dataset/stem", or "stem" if there are no datasets; all if empty.
+        pairs: number of comparisons for each participant. None means DEFAULT_PAIRS, or all if there are fewer.
+        catch_trials: number of catch trials for each participant. None means DEFAULT_CATCHES, or all if there are fewer.
+        all_pairs: whether each method is compared with each other method, instead of the first method only.
+        seed: the seed of the assignment; None chooses a random one.
 
     Raises:
-        BrewsterError: there are fewer than two methods; files are missing, unreadable or of different sizes; or `options`
-            requests more pairs or catch trials than exist.
+        BrewsterError: there are fewer than two methods; files are missing, unreadable or of different sizes; or more pairs
+            or catch trials are requested than exist.
         OutputError: `out` is not empty or cannot be written.
     """
     require_empty(out)
-    photos, outputs = _pair_pictures(inputs, methods, options)
-    all_pairs = list(combinations(methods, 2))
-    pairs = all_pairs if options.all_pairs else all_pairs[: len(methods) - 1]
-    seed = secrets.randbelow(1 << 32) if options.seed is None else options.seed
-    pairs_each = _limited(options.pairs, DEFAULT_PAIRS, len(pairs) * len(photos), "pairs")
+    photos, outputs = _pair_pictures(inputs, methods, datasets, names)
+    compared = list(combinations(methods, 2))
+    compared = compared if all_pairs else compared[: len(methods) - 1]
+    seed = secrets.randbelow(1 << 32) if seed is None else seed
+    pairs_each = _limited(pairs, DEFAULT_PAIRS, len(compared) * len(photos), "pairs")
     pool_size = min(CATCH_POOL_SIZE, len(photos))
-    catch_trials = _limited(options.catch_trials, DEFAULT_CATCHES, pool_size, "catch trials")
+    catch_trials = _limited(catch_trials, DEFAULT_CATCHES, pool_size, "catch trials")
     with atomic_path(out) as folder:
         copier = _Copier(folder / PICTURES_FOLDER, Random(f"{seed}/names"), on_progress)  # noqa: S311  (the seed is published)
         comparisons = tuple(
@@ -117,20 +98,24 @@ def create_study(
                 photo=copier.copy(photo),
             )
             for key, photo in photos.items()
-            for first, second in pairs
+            for first, second in compared
         )
-        pool = tuple(_catch_pool(photos, outputs, copier, Random(f"{seed}/catch_trials")))  # noqa: S311
+        rng, pool = Random(f"{seed}/catch_trials"), []  # noqa: S311
+        for key in rng.sample(list(photos), pool_size):
+            output = outputs[rng.choice(list(outputs))][key]
+            photo, good = copier.copy(photos[key]), copier.copy(output)
+            pool.append(CatchTrial(*key, photo, good, copier.copy(output, degraded=True)))
         description = StudyDescription(
             brewster=brewster.__version__,
             seed=seed,
             pairs=pairs_each,
             catch_trials=catch_trials,
-            consent=options.consent,
+            consent=consent,
             methods=tuple(methods),
             datasets=tuple(dict.fromkeys(dataset for dataset, _ in photos)),
             pictures=tuple(sorted(copier.pictures.values(), key=lambda picture: picture.name)),
             comparisons=comparisons,
-            catch_pool=pool,
+            catch_pool=tuple(pool),
         )
         write_study(folder, description)
     return Study(out, description)
@@ -140,7 +125,7 @@ def create_study(
 
 
 def _pair_pictures(
-    inputs: Path, methods: Mapping[str, Path], options: StudyOptions
+    inputs: Path, methods: Mapping[str, Path], datasets: Sequence[str], names: Sequence[str]
 ) -> tuple[Mapping[Key, Path], _Outputs]:
     """Returns the inputs and the outputs, after checking them. One error lists all problems."""
     if len(methods) < 2:
@@ -150,8 +135,7 @@ def _pair_pictures(
             "add another --method NAME=FOLDER",
         )
     photos, *found = (
-        select_pictures(find_pictures(path, options.datasets), options.names, path)
-        for path in (inputs, *methods.values())
+        select_pictures(find_pictures(path, datasets), names, path) for path in (inputs, *methods.values())
     )
     outputs = dict(zip(methods, found, strict=True))
     problems = []
@@ -228,14 +212,3 @@ class _Copier:
             self.pictures[key] = StudyPicture(name, *photo.size, *digests)
             self.on_progress(len(self.pictures))
         return self.pictures[key].name
-
-
-def _catch_pool(
-    photos: Mapping[Key, Path], outputs: _Outputs, copier: _Copier, rng: Random
-) -> Iterator[CatchTrial]:
-    """Photos for catch trials, at most CATCH_POOL_SIZE, each with the output of a random method and a degraded copy of this output."""
-    for key in rng.sample(list(photos), min(CATCH_POOL_SIZE, len(photos))):
-        output = outputs[rng.choice(list(outputs))][key]
-        yield CatchTrial(
-            *key, copier.copy(photos[key]), copier.copy(output), copier.copy(output, degraded=True)
-        )

@@ -24,14 +24,8 @@ def find_pictures(folder: Path, datasets: Sequence[str] = ()) -> dict[Key, Path]
     """Find pictures in the subfolders, one for each dataset, or in the folder itself if no subfolder has pictures.
 
     Outputs may be named as `brewster -o` names them: `name.transmission.png` counts as `name`, and the files
-    `name.reflection.png` and `name.confidence.png` of the same photo are ignored.
-
-    Args:
-        folder: the folder to search; subfolders are searched one level deep.
-        datasets: the datasets to use, in this order; all of them if empty.
-
-    Returns:
-        Paths by (dataset, stem), in natural order (2 before 10).
+    `name.reflection.png` and `name.confidence.png` of the same photo are ignored. The keys are (dataset, stem), in natural
+    order (2 before 10). With `datasets`, only these are used, in this order.
 
     Raises:
         BrewsterError: the folder contains no picture; a dataset is missing; two files have the same name; or pictures are both
@@ -67,7 +61,18 @@ def find_pictures(folder: Path, datasets: Sequence[str] = ()) -> dict[Key, Path]
     for name in dict.fromkeys(datasets or stems_by_dataset):
         for path, stem in stems_by_dataset[name].items():
             found[name, stem].append(path)
-    _require_unique_names(folder, found)
+    if not found:
+        raise BrewsterError(
+            f"{folder} contains no picture",
+            "expected pictures, or subfolders with pictures",
+            "check the path",
+        )
+    if duplicates := [" and ".join(sorted(map(str, paths))) for paths in found.values() if len(paths) > 1]:
+        raise BrewsterError(
+            f"{shorten_list(duplicates)} have the same name",
+            "expected different names without the suffix, because pictures are paired by name",
+            "keep one file of each name",
+        )
     return {key: paths[0] for key, paths in found.items()}
 
 
@@ -75,9 +80,7 @@ def select_pictures(pictures: Mapping[Key, Path], names: Sequence[str], folder: 
     """The pictures with these names, in the order of `pictures`; all of them if `names` is empty.
 
     Args:
-        pictures: the result of `find_pictures`.
         names: "dataset/stem" for each picture, or "stem" if there are no datasets. A suffix is allowed.
-        folder: the folder of the pictures, for the error message.
 
     Raises:
         BrewsterError: a name has no picture.
@@ -103,27 +106,8 @@ def shorten_list(items: Sequence[str]) -> str:
     return "; ".join(items[:_MAX_LISTED]) + (f"; and {remaining} more" if remaining > 0 else "")
 
 
-def _require_unique_names(folder: Path, found: dict[Key, list[Path]]) -> None:
-    if not found:
-        raise BrewsterError(
-            f"{folder} contains no picture",
-            "expected pictures, or subfolders with pictures",
-            "check the path",
-        )
-    duplicates = [" and ".join(sorted(map(str, paths))) for paths in found.values() if len(paths) > 1]
-    if duplicates:
-        raise BrewsterError(
-            f"{shorten_list(duplicates)} have the same name",
-            "expected different names without the suffix, because pictures are paired by name",
-            "keep one file of each name",
-        )
-
-
 def _list_pictures(folder: Path) -> dict[Path, str]:
-    """The stems of the pictures in a folder, by path and in natural order.
-
-    Reflections and confidence maps are left out if the folder contains the transmission of the same photo.
-    """
+    """The stems of the pictures in a folder, by path in natural order, without other layers of a photo with a transmission."""
     pictures = {
         path: _normalised(path.stem)
         for path in folder.iterdir()

@@ -1,7 +1,4 @@
-"""Power analysis: the number of participants that a study needs.
-
-required_participants(difference=0.1, tie=0.25).participants    # 45
-"""
+"""Power analysis: the number of participants that a study needs."""
 
 from __future__ import annotations
 

@@ -126,8 +126,7 @@ class AnswerStore:
     def admit(self, *, max_participants: int | None = None) -> str | None:
         """Add a participant who has given consent.
 
-        Returns:
-            The token of the participant's link, or None if `max_participants` are admitted already.
+        Returns the token of their link, or None if `max_participants` are admitted already.
         """
         with self._transaction("IMMEDIATE") as database:
             (number,) = database.execute("SELECT count(*) FROM participants").fetchone()
@@ -217,15 +216,8 @@ class AnswerStore:
     ) -> Choice:
         """Store an answer, unless the trial already has one. The answer is synced to the disk on return.
 
-        Args:
-            participant: the participant.
-            trial: the index of the trial, from 0.
-            choice: the participant's choice.
-            seconds: for how long the pictures were shown, clipped to 0..MAX_SECONDS.
-            conditions: how the pictures were shown; None if it is unknown.
-
-        Returns:
-            The stored choice, which is that of the first answer.
+        `trial` is the index of the trial, from 0. `seconds` is how long the pictures were shown, clipped to 0..MAX_SECONDS.
+        Returns the stored choice, which is that of the first answer.
 
         Raises:
             BrewsterError: the trial or the choice does not exist.
@@ -254,8 +246,7 @@ class AnswerStore:
     def import_answers(self, answer_file: AnswerFile) -> int:
         """Store the answers of a participant of a static bundle in one transaction. An answer that is stored already is kept.
 
-        Returns:
-            The number of answers that were not stored before.
+        Returns the number of answers that were not stored before.
 
         Raises:
             BrewsterError: the participant or a trial does not exist in this study.

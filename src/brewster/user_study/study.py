@@ -1,8 +1,5 @@
 """The description of a study: its pictures, its comparisons, and the number of trials of a participant.
 
-    study = read_study(Path("out/study"))
-    study.picture(study.comparisons[0].photo)    # digest and size of that picture
-
 `create` writes the description once; it never changes. No other file says which method made which picture.
 """
 
@@ -10,7 +7,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from pathlib import Path
@@ -126,20 +122,18 @@ class Study:
         """The pairs of methods that are compared, in the order of the tables."""
         return tuple(dict.fromkeys(comparison.methods for comparison in self.description.comparisons))
 
-    def changed_pictures(self) -> Iterator[str]:
-        """Yield the names of pictures that are missing or whose digest differs from the description."""
-        for picture in self.description.pictures:
-            path = self.picture_file(picture.name)
-            if not path.is_file() or hashlib.sha256(path.read_bytes()).hexdigest() != picture.sha256:
-                yield picture.name
-
     def verify_pictures(self) -> None:
         """Check that all pictures exist and are unchanged.
 
         Raises:
             BrewsterError: a picture is missing, or its digest differs from the description.
         """
-        if changed := list(self.changed_pictures()):
+        changed = []
+        for picture in self.description.pictures:
+            path = self.picture_file(picture.name)
+            if not path.is_file() or hashlib.sha256(path.read_bytes()).hexdigest() != picture.sha256:
+                changed.append(picture.name)
+        if changed:
             raise BrewsterError(
                 f"pictures of the study are missing or changed: {len(changed)}, such as {self.picture_file(changed[0])}",
                 "expected all pictures as `brewster study create` wrote them",
@@ -152,11 +146,7 @@ class Study:
 
 
 def write_study(folder: Path, description: StudyDescription) -> None:
-    """Write the description into a folder.
-
-    Raises:
-        OutputError: the file exists already or cannot be written.
-    """
+    """Write the description into a folder. Raises OutputError if the file exists already or cannot be written."""
     text = json.dumps(asdict(description), indent=1, ensure_ascii=False)
     write_atomically(folder / DESCRIPTION_FILE, f"{text}\n".encode())
 

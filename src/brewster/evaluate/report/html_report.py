@@ -1,8 +1,6 @@
 """Writes the HTML report: one self-contained page with all scores, the images and their error maps.
 
-    write_report(json.loads(Path("results.json").read_text()), cases, Path("report.html"))
-
-The Jinja2 template page.html has the whole page, which is readable without JavaScript; page.js sorts it and opens images.
+The Jinja2 template page.html has the whole page, which is readable without JavaScript; page.js sorts it and compares images.
 Cases are written one at a time, so that memory does not grow with their number.
 """
 
@@ -26,10 +24,7 @@ _FOLDER: Final = Path(__file__).parent
 def write_report(results: Results, cases: Iterable[CaseThumbnails], path: Path) -> None:
     """Writes the page atomically and replaces an older one. Equal arguments give equal bytes.
 
-    Args:
-        results: the content of results.json.
-        cases: the cases to show, in this order. The function reads one at a time.
-        path: the HTML file.
+    `results` is the content of results.json. The cases are read one at a time.
 
     Raises:
         OutputError: the file cannot be written.
@@ -40,14 +35,7 @@ def write_report(results: Results, cases: Iterable[CaseThumbnails], path: Path) 
         loader=jinja2.FileSystemLoader(_FOLDER), autoescape=True, trim_blocks=True, lstrip_blocks=True
     )
     environment.filters |= {"has": _has, "number": _number, "count": _count, "verdict": _verdict}
-    environment.policies["json.dumps_kwargs"] = {"separators": (",", ":")}
     entries = {(entry["benchmark"], entry["name"]): entry for entry in results["cases"]}
-    scores: list[Any] = []
-
-    def entry_of(case: CaseThumbnails) -> Mapping[str, Any]:
-        entry: Mapping[str, Any] = entries[case.benchmark, case.name]
-        scores.append(entry["scores"])
-        return entry
 
     def best_mean(table: Mapping[str, Any], method: str, key: str) -> str | None:
         """Returns the best printed mean of a column, if the mean of this method may be compared with it."""
@@ -66,13 +54,10 @@ def write_report(results: Results, cases: Iterable[CaseThumbnails], path: Path) 
         best_mean=best_mean,
         to_baseline=_differences(results, is_baseline=True),
         between_methods=_differences(results, is_baseline=False),
-        cases=cases,
-        entry_of=entry_of,
-        scores=scores,
+        cases=((case, entries[case.benchmark, case.name]) for case in cases),
         colours=COLOUR_MAP.tolist(),
         max_error=MAX_ERROR,
         max_side_px=MAX_SIDE_PX,
-        data=lambda: _data(results, scores),
         script=(_FOLDER / "page.js").read_text("utf-8"),
     )
     with (
@@ -80,21 +65,6 @@ def write_report(results: Results, cases: Iterable[CaseThumbnails], path: Path) 
         part.open("x", encoding="utf-8", errors="replace", newline="\n") as file,
     ):
         file.writelines(parts)
-
-
-def _data(results: Results, scores: list[Any]) -> dict[str, Any]:
-    """Returns the data for sorting. It is complete after the last case."""
-    keys = {"title": "title", "unit": "unit", "higher": "higher_is_better", "digits": "digits"}
-    return {
-        "metrics": {
-            name: {key: metric[field] for key, field in keys.items()}
-            for name, metric in results["metrics"].items()
-        },
-        "methods": [*results["methods"]],
-        "benchmarks": {name: benchmark["title"] for name, benchmark in results["benchmarks"].items()},
-        "baseline": BASELINE,
-        "scores": scores,
-    }
 
 
 def _notes(results: Results) -> list[tuple[str, list[str]]]:

@@ -59,10 +59,7 @@ def to_latex(results: Results, *, intervals: bool = False) -> str:
 
 
 def _table_selections(results: Results) -> list[str]:
-    """Returns the selections of the table. The subsets of SIR2 are adjacent, and the average is last.
-
-    If a benchmark has a paper subset, the subset replaces the whole benchmark.
-    """
+    """Returns the selections of the table: subsets of the paper replace their benchmark, SIR2 is adjacent, the average is last."""
     keys = [
         key for key in results["selections"] if f"{key}:paper" not in results["selections"] and key != AVERAGE
     ]

@@ -1,8 +1,4 @@
-"""Reads published scores of other methods from published.toml. Reports show them in a section of their own.
-
-for row in read_published():
-    print(row.method, row.scores["real20"]["psnr"], row.protocol)
-"""
+"""Reads published scores of other methods from published.toml. Reports show them in a section of their own."""
 
 from __future__ import annotations
 
@@ -26,34 +22,20 @@ class PublishedScores:
     """The scores of a method as a paper printed them.
 
     `source` is the paper, `copied_from` the table that the numbers were copied from. `protocol` describes the images, their
-    number and size, and says what is unknown. `scores` is benchmark -> metric -> value: PSNR in dB, SSIM and LPIPS without
-    a unit. str(value) has the printed digits.
+    number and size, and says what is unknown. `scores` is benchmark -> metric -> the printed number: PSNR in dB, SSIM and
+    LPIPS without a unit.
     """
 
     method: str
     source: str
     copied_from: str
     protocol: str
-    scores: dict[str, dict[str, float]]
-
-
-class _PrintedNumber(float):
-    """A number that keeps its printed digits: 26.60, not 26.6."""
-
-    def __new__(cls, printed: str) -> _PrintedNumber:
-        number = super().__new__(cls, printed)
-        number._printed = printed
-        return number
-
-    _printed: str
-
-    def __str__(self) -> str:
-        return self._printed
+    scores: dict[str, dict[str, str]]
 
 
 def read_published() -> list[PublishedScores]:
     """Returns the rows of published.toml, in the order of the file."""
-    tables = tomllib.loads(_PUBLISHED_FILE.read_text("utf-8"), parse_float=_PrintedNumber)["table"]
+    tables = tomllib.loads(_PUBLISHED_FILE.read_text("utf-8"), parse_float=str)["table"]
     return [
         PublishedScores(method, table["source"], table["copied_from"], table["protocol"].strip(), scores)
         for table in tables
@@ -84,7 +66,5 @@ def _table(protocol: str, rows: list[PublishedScores]) -> str:
     table = [[f"published: {titles}", *benchmarks]]
     for row in rows:
         cells = (row.scores.get(name, {}) for name in benchmarks)
-        table.append(
-            [row.method, *(" / ".join(str(c.get(m, "-")) for m in metrics) if c else "-" for c in cells)]
-        )
+        table.append([row.method, *(" / ".join(c.get(m, "-") for m in metrics) if c else "-" for c in cells)])
     return "\n".join([f"**Protocol.** {protocol}", "", *sources, "", markdown_table(table)])

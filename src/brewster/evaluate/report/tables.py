@@ -27,7 +27,11 @@ def main_metrics(results: Results) -> list[str]:
 def to_markdown(results: Results) -> str:
     """Returns all tables as Markdown: an overview, a table per benchmark with intervals and differences, notes, settings."""
     benchmarks = results["benchmarks"].values()
-    notes = [f"{entry['title']}: {text}" for entry in benchmarks for text in _benchmark_notes(entry)]
+    notes = [
+        f"{entry['title']}: {text}"
+        for entry in benchmarks
+        for text in (*entry["remarks"], *(f"excluded: {reason}" for reason in entry["excluded"]))
+    ]
     notes += remarks(results)
     notes += [f"not computed: {metrics}" for metrics in unavailable_metrics(results)]
     notes += [
@@ -43,10 +47,6 @@ def to_markdown(results: Results) -> str:
         if lines
     ]
     return "\n\n".join([tables_to_markdown(results).strip("\n"), *parts]) + "\n"
-
-
-def _benchmark_notes(benchmark: Mapping[str, Any]) -> list[str]:
-    return [*benchmark["remarks"], *(f"excluded: {reason}" for reason in benchmark["excluded"])]
 
 
 def tables_to_markdown(results: Results) -> str:
@@ -70,7 +70,12 @@ def to_terminal(results: Results, width: int = 100, *, intervals: bool = False) 
 
 def _terminal_table(results: Results, key: str, width: int, intervals: bool) -> str:
     table, image_count = results["tables"][key], results["selections"][key]["cases"]
-    names = _shortened(list(results["methods"]), max(12, width // 3))
+    # "…" replaces the middle of longer names, because names often differ at the end
+    kept = max(12, width // 3) - 1
+    names = [
+        name if len(name) <= kept + 1 else f"{name[: kept - kept // 2]}…{name[-(kept // 2) :]}"
+        for name in results["methods"]
+    ]
     columns = []
     for metric in results["metrics"]:
         if any(metric in row for row in table.values()):
@@ -89,13 +94,6 @@ def _terminal_table(results: Results, key: str, width: int, intervals: bool) -> 
         blocks[-1].append(column)
         used += column_width
     return "\n".join(plain_table(zip(*block, strict=True), align=">") for block in blocks)
-
-
-def _shortened(names: list[str], width: int) -> list[str]:
-    """Returns the names with at most `width` characters. In longer names, "…" replaces the middle, because names often
-    differ at the end."""
-    left, right = (width - 1) - (width - 1) // 2, (width - 1) // 2
-    return [name if len(name) <= width else f"{name[:left]}…{name[-right:]}" for name in names]
 
 
 def _overview(results: Results) -> str:

@@ -23,13 +23,7 @@ COLUMNS: Final = (
 def answers_csv(
     description: StudyDescription, participants: Sequence[ParticipantAnswers], left_out: Mapping[str, str]
 ) -> str:
-    """The answers of all participants, in the order of presentation.
-
-    Args:
-        description: the description of the study.
-        participants: the participants with their answers.
-        left_out: number of a participant -> reason of the exclusion. A participant who is not in it is included.
-    """
+    """The answers of all participants, in the order of presentation. `left_out` is the number of a participant -> why excluded."""
     rows: list[Sequence[object]] = [COLUMNS]
     for participant in participants:
         for position, trial, answer in participant.trials:

@@ -19,8 +19,7 @@ _EVERYONE_TITLE: Final = "All participants: the rule excludes everyone"
 def plot(results: Mapping[str, Any]) -> bytes:
     """Plots the results after the exclusion rule, or those of all participants if the rule excludes everyone.
 
-    Returns:
-        The plot as the bytes of a PNG file.
+    The plot is a PNG file.
     """
     from matplotlib.figure import Figure  # noqa: PLC0415  (an optional dependency, and slow to import)
 

@@ -18,12 +18,7 @@ def summarise_progress(
     records: Iterable[tuple[Participant, Mapping[int, StoredAnswer]]],
     rule: ExclusionRule,
 ) -> dict[str, Any]:
-    """Summarise the progress of all admitted participants.
-
-    Args:
-        description: the description of the study.
-        records: every participant with their answers, such as `AnswerStore.all_answers()`.
-        rule: the rule that excludes participants.
+    """Summarise the progress of all admitted participants, whose `records` are those of `AnswerStore.all_answers()`.
 
     Returns:
         Plain JSON values: totals, the smallest and the largest number of answers to a comparison, and a row for each participant.

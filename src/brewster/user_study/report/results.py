@@ -1,9 +1,5 @@
 """Compute the results of a study from its answers, as plain JSON values, and write the files of the report.
 
-    participants = collect_answers(store.all_answers())
-    results = summarise(study, participants, ExclusionRule())
-    write(results, study, participants, Path("report"))
-
 All results are given twice: for the participants after the exclusion rule, and for all participants.
 """
 
@@ -22,19 +18,19 @@ import brewster
 from brewster.errors import BrewsterError
 from brewster.files import write_atomically
 from brewster.user_study.report.answers import answers_csv
-from brewster.user_study.report.bradley_terry import strengths
 from brewster.user_study.report.figure import plot
-from brewster.user_study.report.krippendorff import alpha
 from brewster.user_study.report.participants import OUTCOMES, ExclusionRule, ParticipantAnswers
 from brewster.user_study.report.statistics import (
     MIN_PARTICIPANTS,
     agreement_bounds,
+    alpha,
     bootstrap_interval,
     bootstrap_weights,
     intraclass_correlation,
     rates,
     resampled_counts,
     sign_flip_test,
+    strengths,
     with_agreement_bounds,
 )
 from brewster.user_study.report.tables import to_csv, to_latex, to_markdown
@@ -58,15 +54,7 @@ Floats = NDArray[np.float64]
 
 
 def summarise(study: Study, participants: Sequence[ParticipantAnswers], rule: ExclusionRule) -> Results:
-    """Compute the results of a study.
-
-    Args:
-        study: the study.
-        participants: the answers of all participants.
-        rule: the rule that excludes participants.
-
-    Returns:
-        The content of report.json.
+    """Compute the results of a study from the answers of all participants: the content of report.json.
 
     Raises:
         BrewsterError: there is no answer yet.
@@ -163,7 +151,11 @@ def _tables(study: Study, counts: Floats, pictures: Floats, weights: Floats) -> 
     means = rates(counts.sum(axis=0), pictures)
     ends = bootstrap_interval(rates(resampled_counts(weights, counts), pictures), len(counts))
     lows, highs = with_agreement_bounds(means, ends, agreement_bounds(counts, pictures))
-    p_values, sizes = sign_flip_test(counts, pictures), _participant_counts(counts)
+    answered = counts.sum(axis=-1) > 0
+    pooled = answered.any(axis=-1).sum(axis=0)[:, None]
+    # numbers of participants with an answer, for each row of a table: (pairs of methods, datasets + 3)
+    sizes = np.concatenate([answered.sum(axis=0), np.repeat(pooled, len(AVERAGES), axis=1)], axis=1)
+    p_values = sign_flip_test(counts, pictures)
     titles = {name: _dataset_title(name) for name in study.description.datasets} | AVERAGES
     answers = counts.sum(axis=(0, 3))
     return [
@@ -191,20 +183,20 @@ def _tables(study: Study, counts: Floats, pictures: Floats, weights: Floats) -> 
     ]
 
 
-def _participant_counts(counts: Floats) -> Floats:
-    """Numbers of participants with an answer, for each row of a table: (pairs of methods, datasets + 3)."""
-    answered = counts.sum(axis=-1) > 0
-    pooled = answered.any(axis=-1).sum(axis=0)[:, None]
-    return np.concatenate([answered.sum(axis=0), np.repeat(pooled, len(AVERAGES), axis=1)], axis=1)
-
-
 def _strengths(study: Study, counts: Floats, weights: Floats) -> dict[str, Any]:
     """The strength of each method, with its interval.
 
     There is no interval if the likelihood of a resample has no maximum, because a method only won or only lost. There is
     also none if all resamples are equal.
     """
-    wins = _wins(study, counts)
+    methods = study.description.methods
+    # wins of each method against each other method, (participants, methods, methods); a tie is half a win
+    wins = np.zeros((len(counts), len(methods), len(methods)))
+    for i, (first, second) in enumerate(study.pairs_of_methods):
+        won, tied, lost = np.moveaxis(counts[:, i].sum(axis=1), -1, 0)
+        a, b = methods.index(first), methods.index(second)
+        wins[:, a, b] += won + tied / 2
+        wins[:, b, a] += lost + tied / 2
     means = strengths(wins.sum(axis=0))
     resamples = strengths(resampled_counts(weights, wins))
     lows, highs = (
@@ -213,21 +205,8 @@ def _strengths(study: Study, counts: Floats, weights: Floats) -> dict[str, Any]:
         else np.full((2, len(means)), math.nan)
     )
     return {
-        method: _estimate(*(part[i] for part in (means, lows, highs)))
-        for i, method in enumerate(study.description.methods)
+        method: _estimate(*(part[i] for part in (means, lows, highs))) for i, method in enumerate(methods)
     }
-
-
-def _wins(study: Study, counts: Floats) -> Floats:
-    """Number of wins of each method against each other method: (participants, methods, methods). A tie is half a win."""
-    methods = study.description.methods
-    wins = np.zeros((len(counts), len(methods), len(methods)))
-    for i, (first, second) in enumerate(study.pairs_of_methods):
-        won, tied, lost = np.moveaxis(counts[:, i].sum(axis=1), -1, 0)
-        a, b = methods.index(first), methods.index(second)
-        wins[:, a, b] += won + tied / 2
-        wins[:, b, a] += lost + tied / 2
-    return wins
 
 
 def _estimate(mean: float, low: float, high: float) -> dict[str, float | None]:
@@ -243,11 +222,7 @@ def _round(value: float | None) -> float | None:
 
 
 def write(results: Results, study: Study, participants: Sequence[ParticipantAnswers], out: Path) -> None:
-    """Write all files of a report into the folder `out`; files of an earlier report are replaced.
-
-    Raises:
-        OutputError: a file cannot be written.
-    """
+    """Write all files of a report into the folder `out`, and replace older ones. Raises OutputError if one cannot be written."""
     files = {
         "report.json": f"{json.dumps(results, indent=1, ensure_ascii=False)}\n".encode(),
         "report.md": to_markdown(results).encode(),

@@ -22,6 +22,8 @@ SEED: Final = 20_261_121
 MIN_PARTICIPANTS: Final = 6
 """With fewer participants, `sign_flip_test` cannot reach the 5 % level: its smallest p-value with n participants is 2 / 2^n."""
 _TOLERANCE: Final = 1e-9
+_MAX_NEWTON_STEPS: Final = 200
+_MIN_NEWTON_STEP: Final = 1e-10
 
 Floats = NDArray[np.float64]
 
@@ -42,11 +44,7 @@ def resampled_counts(
 def rates(
     counts: Float64[Floats, "... d 3"], pictures: Float64[Floats, "... d"]
 ) -> Float64[Floats, "... d+3 4"]:
-    """Rates of win, tie and lose, and the difference win - lose.
-
-    Args:
-        counts: wins, ties and losses.
-        pictures: number of pictures of each dataset.
+    """Rates of win, tie and lose, and the difference win - lose. `pictures` is the number of pictures of each dataset.
 
     Returns:
         A row for each dataset, then three averages: the mean weighted by the number of pictures (as in the paper), the
@@ -75,14 +73,10 @@ def bootstrap_interval(draws: Float64[Floats, "r ..."], participants: int) -> Fl
     """The 95 % expanded percentile interval (Hesterberg 2015, section 4.3.2).
 
     Its percentiles are slightly wider than 2.5 and 97.5, because the plain percentile interval is too narrow for few
-    participants.
+    participants. The ends are NaN for a single participant.
 
     Args:
         draws: the values of a statistic, one for each resample; values that are not finite are ignored.
-        participants: number of participants in each resample.
-
-    Returns:
-        The lower and the upper ends; NaN for a single participant.
     """
     if participants < 2:
         return np.full((2, *draws.shape[1:]), np.nan)
@@ -138,14 +132,8 @@ def with_agreement_bounds(
 ) -> Float64[Floats, "2 ... n 4"]:
     """The intervals of `rates`, with those of width 0 replaced by intervals from `agreement_bounds`.
 
-    Args:
-        rows: the rates.
-        ends: their bootstrap intervals.
-        bounds: the result of `agreement_bounds`.
-
-    Returns:
-        The intervals; NaN if the width is 0 although answers differ, for example if only one participant has answered
-        comparisons of a dataset.
+    An interval is NaN if its width is 0 although answers differ, for example if only one participant has answered
+    comparisons of a dataset.
     """
     bound, shares = bounds[..., None], rows[..., :3]
     is_one, is_zero = shares > 1 - _TOLERANCE, shares < _TOLERANCE
@@ -173,10 +161,8 @@ def _expanded_percentiles(participants: int) -> tuple[float, float]:
 def intraclass_correlation(counts: Float64[Floats, "p 3"]) -> float | None:
     """The intraclass correlation of the scores 1, 0, -1 for win, tie, lose, with participants as classes.
 
-    The estimator from the analysis of variance (Donner 1986, equation 2.1). It can be below 0 by chance.
-
-    Returns:
-        The correlation; None with fewer than two participants, one answer for each participant, or no variance.
+    The estimator from the analysis of variance (Donner 1986, equation 2.1). It can be below 0 by chance. It is None with
+    fewer than two participants, one answer for each participant, or no variance.
     """
     counts = counts[counts.sum(axis=1) > 0]
     sizes, sums, squares = counts.sum(axis=1), counts[:, 0] - counts[:, 2], counts[:, 0] + counts[:, 2]
@@ -189,3 +175,70 @@ def intraclass_correlation(counts: Float64[Floats, "p 3"]) -> float | None:
     size = (answers - (sizes**2).sum() / answers) / (participants - 1)
     spread = between + (size - 1) * within
     return float((between - within) / spread) if spread > 0 else None
+
+
+# --- strengths and agreement
+
+
+def strengths(wins: Float64[Floats, "... m m"]) -> Float64[Floats, "... m"]:
+    """The maximum-likelihood strengths of methods in the model of Bradley and Terry (1952), for each table of wins.
+
+    P(a beats b) = 1 / (1 + exp(strength_b - strength_a)). A tie counts as half a win for each of the two methods.
+
+    Damped Newton's method: each step is divided by 1 + its length, so the likelihood always increases (Nesterov 2004,
+    section 4.1.5).
+
+    Args:
+        wins: `wins[a, b]` is the number of wins of method a against method b; a tie adds 0.5 to both orders.
+
+    Returns:
+        The strengths, with mean 0; NaN for a table without a maximum, where some methods never lose to the others
+        (Ford 1957).
+    """
+    wins = wins * (1 - np.eye(wins.shape[-1]))
+    total = wins + np.swapaxes(wins, -1, -2)
+    is_bounded = all_connected(wins)
+    strength = np.zeros(wins.shape[:-1])
+    for _ in range(_MAX_NEWTON_STEPS):
+        probability = 1 / (1 + np.exp(strength[..., None, :] - strength[..., :, None]))
+        gradient = (wins - total * probability).sum(axis=-1)
+        curvature = total * probability * (1 - probability)
+        weights = np.where(is_bounded[..., None, None], curvature, 1.0)
+        # the graph Laplacian; plus 1 in every entry, which makes it invertible and keeps the sum of each step at 0
+        hessian = np.eye(wins.shape[-1]) * weights.sum(axis=-1)[..., None] - weights + 1.0
+        step = np.linalg.solve(hessian, gradient[..., None])[..., 0]
+        length = np.abs(step).max(axis=-1, keepdims=True)
+        strength = strength + np.where(is_bounded[..., None], step / (1 + length), 0.0)
+        if length[is_bounded].max(initial=0.0) < _MIN_NEWTON_STEP:
+            break
+    strength -= strength.mean(axis=-1, keepdims=True)
+    return np.where(is_bounded[..., None], strength, np.nan)
+
+
+def all_connected(wins: Float64[Floats, "... m m"]) -> NDArray[np.bool_]:
+    """Whether each method has beaten each other one, directly or through a chain of wins; one value for each table."""
+    reach = (wins > 0) | np.eye(wins.shape[-1], dtype=bool)
+    for _ in range(wins.shape[-1].bit_length()):
+        reach = (reach.astype(np.int64) @ reach.astype(np.int64)) > 0
+    return np.asarray(reach.all(axis=(-1, -2)))
+
+
+def alpha(ratings: Float64[NDArray[np.float64], "u c"]) -> float | None:
+    """Krippendorff's alpha, the agreement of raters on nominal categories: 1 - observed / expected disagreement.
+
+    Krippendorff 2011, "Computing Krippendorff's alpha-reliability", part D. Ratings may be missing.
+
+    Args:
+        ratings: number of ratings by unit and category. Units with fewer than two ratings are ignored.
+
+    Returns:
+        1 for perfect agreement, 0 for agreement by chance; None if no unit has two ratings, or all ratings are equal.
+    """
+    paired = ratings[ratings.sum(axis=1) >= 2]
+    sizes, totals = paired.sum(axis=1), paired.sum(axis=0)
+    count = sizes.sum()
+    expected = count**2 - (totals**2).sum()
+    if expected == 0:
+        return None
+    observed = ((sizes**2 - (paired**2).sum(axis=1)) / (sizes - 1)).sum()
+    return float(1 - (count - 1) * observed / expected)
