@@ -86,7 +86,14 @@ class IndexWriter:
             )
         tables = [self._read(path) for path in [*([self._index] if exists(self._index) else []), *parts]]
         table = self._arrow.concat_tables(tables, promote_options="default").select(list(COLUMNS))
-        self._write(self._index, table.take(self._arrow.array(_last_rows(table), "int64")).sort_by("path"))
+        # the last row of each path; for a photo that was separated and later skipped, that of the run that separated it
+        last: dict[str, int] = {}
+        statuses = table.column("status").to_pylist()
+        for row, path in enumerate(table.column("path").to_pylist()):
+            if not (statuses[row] == "skipped" and path in last and statuses[last[path]] == "separated"):
+                last[path] = row
+        last_rows = table.take(self._arrow.array(list(last.values()), "int64"))
+        self._write(self._index, last_rows.sort_by("path"))
         for part in parts:
             part.unlink()
         with contextlib.suppress(OSError):  # the folder contains parts of another run
@@ -100,18 +107,14 @@ class IndexWriter:
 
     def _write_part(self) -> None:
         self._written_at = time.monotonic()
-        columns = {
-            name: self._arrow.array([value(row) for row in self._rows], self._type(kind))
-            for name, (kind, value) in COLUMNS.items()
-        }
+        arrow, columns = self._arrow, {}
+        for name, (kind, value) in COLUMNS.items():
+            type_ = arrow.list_(arrow.string()) if kind == "strings" else getattr(arrow, kind)()
+            columns[name] = arrow.array([value(row) for row in self._rows], type_)
         name = f"{self._run}-{self._part_count:06d}.parquet"
-        self._write(self._parts_folder / name, self._arrow.table(columns))
+        self._write(self._parts_folder / name, arrow.table(columns))
         self._part_count += 1
         self._rows.clear()
-
-    def _type(self, kind: str) -> Any:  # noqa: ANN401  (pyarrow has no types)
-        arrow = self._arrow
-        return arrow.list_(arrow.string()) if kind == "strings" else getattr(arrow, kind)()
 
     def _write(self, path: Location, table: Any) -> None:  # noqa: ANN401
         buffer = io.BytesIO()
@@ -131,15 +134,3 @@ class IndexWriter:
                 "expected no such file, or the index of an earlier run",
                 "move it to another folder, or choose another output folder",
             ) from error
-
-
-def _last_rows(table: Any) -> list[int]:  # noqa: ANN401  (pyarrow has no types)
-    """Returns the index of the last row of each path. For a photo that was separated and later skipped, this is the row of
-    the run that separated it.
-    """
-    last: dict[str, int] = {}
-    statuses = table.column("status").to_pylist()
-    for row, path in enumerate(table.column("path").to_pylist()):
-        if not (statuses[row] == "skipped" and path in last and statuses[last[path]] == "separated"):
-            last[path] = row
-    return list(last.values())

@@ -32,7 +32,6 @@ def name_layers(
 
     Args:
         images: pairs of an image and the folder of its layers, as `images_in` yields them.
-        options: the options of the batch, which contain the layers and their format.
 
     Raises:
         OutputError: a layer of two images of different folders would have the same path.

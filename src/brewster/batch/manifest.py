@@ -64,9 +64,7 @@ def read_manifest(
 ) -> Iterator[tuple[ManifestRow, Location, Location]]:
     """Yields each row of a manifest with its photo and the folder for its layers. Files that do not exist are included.
 
-    Args:
-        manifest: the path of the table.
-        output_folder: the folder below which the layers are written. By default, they are written next to their photo.
+    Layers are written below `output_folder`, by default next to their photo.
 
     Raises:
         ManifestError: the manifest cannot be read, is not a table, or has no rows; or a row has no path, a relative path outside the
@@ -74,8 +72,14 @@ def read_manifest(
         BrewsterError: a row has a URL that cannot be read; see `location`.
         MissingExtra: the package is not installed that a Parquet table (pyarrow) or a URL needs.
     """
+    try:
+        data = manifest.read_bytes()
+    except (OSError, UnreadablePhoto) as error:
+        reason = str(error) if isinstance(error, UnreadablePhoto) else error.strerror
+        raise ManifestError(f"{manifest} cannot be read ({reason})", _EXPECTED, "check its name") from error
     row = None
-    for number, text in _paths(manifest):
+    paths = _csv_paths(manifest, data) if _is_csv(manifest) else _parquet_paths(manifest, data)
+    for number, text in paths:
         row = ManifestRow(manifest, number)
         photo, mirrored = _photo(row, text)
         yield row, photo, photo.parent if output_folder is None else output_folder.joinpath(*mirrored)
@@ -90,11 +94,7 @@ def read_manifest(
 def _photo(row: ManifestRow, text: object) -> tuple[Location, tuple[str, ...]]:
     """Returns the photo of a row, and the parts of the folder for its layers below the output folder."""
     if not isinstance(text, str) or not text.strip():
-        raise ManifestError(
-            f"{row} has the path {text!r}",
-            "expected the path of a photo",
-            "correct the row",
-        )
+        raise ManifestError(f"{row} has the path {text!r}", "expected the path of a photo", "correct the row")
     with row_in_errors(row):
         photo = location(text)
     if isinstance(photo, RemotePath) or photo.is_absolute():
@@ -113,17 +113,8 @@ def _is_csv(manifest: Location) -> bool:
     return manifest.suffix.lower() == ".csv"
 
 
-def _paths(manifest: Location) -> Iterator[tuple[int, object]]:
-    """Yields the number of each row, as in `ManifestRow`, and the value of its column `path`."""
-    try:
-        data = manifest.read_bytes()
-    except (OSError, UnreadablePhoto) as error:
-        reason = str(error) if isinstance(error, UnreadablePhoto) else error.strerror
-        raise ManifestError(f"{manifest} cannot be read ({reason})", _EXPECTED, "check its name") from error
-    return _csv_paths(manifest, data) if _is_csv(manifest) else _parquet_paths(manifest, data)
-
-
 def _csv_paths(manifest: Location, data: bytes) -> Iterator[tuple[int, object]]:
+    """Yields the number of each row, as in `ManifestRow`, and the value of its column `path`."""
     try:
         file = io.StringIO(data.decode("utf-8-sig"), newline="")
         delimiter = _delimiter(file.readline())
@@ -182,11 +173,7 @@ def _not_a_table(manifest: Location, error: Exception, cure: str = "check the fi
 
 
 def import_parquet(purpose: str) -> Any:  # noqa: ANN401  (pyarrow has no types)
-    """Imports `pyarrow.parquet`.
-
-    Raises:
-        MissingExtra: pyarrow is not installed.
-    """
+    """Imports `pyarrow.parquet`. Raises MissingExtra if pyarrow is not installed."""
     try:
         return importlib.import_module("pyarrow.parquet")
     except ImportError as error:

@@ -22,7 +22,7 @@ from typing import final
 from brewster.batch.plan import FileResult, SeparationTask
 from brewster.batch.runner import check_outputs, real_paths, separate_tasks, skipped_result
 from brewster.errors import OutputError
-from brewster.executors import Executor, run_tasks
+from brewster.executors.local import Executor, run_tasks
 from brewster.files import exists
 from brewster.inference.separator import Separator
 from brewster.options import Options
@@ -35,7 +35,6 @@ def separate_in_parallel(
     """Separates the photos of the tasks, and yields the results in the order in which workers finish them.
 
     Args:
-        tasks: the photos and the paths of their layers, from `plan_files`.
         executor: runs a `SeparationRunner` in its workers. The caller enters its context.
         overwrite: whether tasks whose layers exist are given to a worker. The runner needs the same value.
 
@@ -69,9 +68,7 @@ class SeparationRunner:
     """Separates photos in a worker. The model is loaded when the first photo is separated.
 
     Args:
-        options: the options of the batch.
         shared_folder: the output folder on a cluster. If it is not an object store, all nodes must share it.
-        overwrite: whether layers that exist are replaced.
 
     Raises:
         OutputError: the folder does not exist on this node.

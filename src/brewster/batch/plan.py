@@ -1,8 +1,4 @@
-"""Finds the photos of a batch, and plans a task for each photo with the paths of its layers.
-
-for task in plan_files("holiday", "clear"):
-    print(task.source, task.outputs)
-"""
+"""Finds the photos of a batch, and plans a task for each photo with the paths of its layers."""
 
 from __future__ import annotations
 
@@ -18,11 +14,9 @@ from brewster.files import check_output_folder, images_in
 from brewster.image_formats import SUFFIXES, is_video
 from brewster.inference.assessment import Assessment
 from brewster.inference.burst_report import BurstReport
-from brewster.options import Options
+from brewster.options import DEFAULT_FRAMES, Options
 from brewster.remote_path import Location, location
 
-DEFAULT_FRAMES: Final = 7
-"""The number of frames that are chosen from a video."""
 _STREAM_NAME: Final = "-"
 _DEFAULT_OPTIONS: Final = Options()
 
@@ -49,7 +43,7 @@ class Burst:
     photos: tuple[Location, ...]
     """The photos in the order in which they were taken, or one video."""
     reference: int | None
-    """The index of the photo that is separated, or None for the middle one."""
+    """The index of the photo that is separated; None for the middle frame of a video."""
     frames: int
     """The number of frames that are chosen from a video."""
 
@@ -102,16 +96,12 @@ class FileResult:
     device: str | None = None
     seconds: dict[str, float] = field(default_factory=dict)
     """Wall time of the steps `decode`, `network`, `upsampling` and `encode`."""
+    # see the fields of `Separation` with the same names
     residual: float | None = None
-    """See `Separation.residual`."""
     reconstruction_error: float | None = None
-    """See `Separation.reconstruction_error`."""
     assessment: Assessment | None = None
-    """See `Separation.assessment`."""
     reflection_is_derived: bool = False
-    """See `Separation.reflection_is_derived`."""
     burst: BurstReport | None = None
-    """See `Separation.burst`."""
     note: str | None = None
     """What changed when the photo was read, such as a conversion of CMYK colours, or None."""
     error: str | None = None
@@ -207,14 +197,15 @@ def plan_bursts(
     bursts = []
     for tasks in groups.values():
         photos = tuple(task.source for task in tasks if isinstance(task.source, Location))
-        index = len(photos) // 2 if reference is None or is_video(photos[0]) else reference
+        shows_video = is_video(photos[0])
+        index = len(photos) // 2 if reference is None or shows_video else reference
         if not 0 <= index < len(photos):
             raise PhotoError(
                 f"photo {index + 1} is the reference of a burst of {counted(len(photos), 'photo')} ({photos[0]})",
                 f"expected a number from 1 to {len(photos)}",
                 "correct --reference (in Python reference, which begins at 0), or leave it out for the middle photo",
             )
-        bursts.append(replace(tasks[index], burst=Burst(photos, reference, frames)))
+        bursts.append(replace(tasks[index], burst=Burst(photos, reference if shows_video else index, frames)))
     return bursts
 
 

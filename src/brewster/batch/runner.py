@@ -1,11 +1,7 @@
 """Separates many files. A file that cannot be separated does not stop the batch.
 
-The tree of an input folder is mirrored in the output folder, and layers that exist already are skipped.
-
-    for result in separate_files("holiday", "clear"):
-        print(result.source, result.status, result.error)
-
-Only one photo is in memory at a time. The model is loaded when the first photo needs it.
+The tree of an input folder is mirrored in the output folder, and layers that exist already are skipped. Only one photo is in
+memory at a time. The model is loaded when the first photo needs it.
 """
 
 from __future__ import annotations
@@ -167,11 +163,11 @@ def separate_task(
         BrewsterError: the photo cannot be read or separated, or a layer cannot be written.
     """
     result.model, result.model_sha256, result.device = separator.name, separator.sha256, separator.device
+    with row_in_errors(task.row):
+        photo = read_content(task.source)
     if task.burst:
-        photo, separation = _separate_burst(task.burst, separator, options, on_progress)
+        separation = _separate_burst(task.burst, separator, options, on_progress)
     else:
-        with row_in_errors(task.row):
-            photo = read_content(task.source)
         separation = separator(photo, on_progress=on_progress, **options.call_options())
     result.photo_sha256, result.burst = _sha256(photo), separation.burst
     result.seconds, result.residual = dict(separation.seconds), separation.residual
@@ -194,11 +190,7 @@ def separate_task(
 
 
 def _check_sources(task: SeparationTask) -> None:
-    """Checks that the files of a task can be read. The frames of a video are not read.
-
-    Raises:
-        BrewsterError: a file cannot be read.
-    """
+    """Checks that the files of a task can be read. The frames of a video are not read."""
     for source in task.burst.photos if task.burst else (task.source,):
         if isinstance(source, Location) and not (task.burst and is_video(source)):
             with row_in_errors(task.row):
@@ -206,11 +198,7 @@ def _check_sources(task: SeparationTask) -> None:
 
 
 def _missing_outputs(task: SeparationTask, *, overwrite: bool) -> dict[str, Location | OutputStream]:
-    """Returns the layers that must be written, with their outputs.
-
-    Raises:
-        OutputError: an existing layer was made from another photo.
-    """
+    """Returns the layers that must be written, with their outputs. The others must have been made from this photo."""
     missing = {
         layer: target
         for layer, target in task.outputs.items()
@@ -222,25 +210,22 @@ def _missing_outputs(task: SeparationTask, *, overwrite: bool) -> dict[str, Loca
 
 def _separate_burst(
     burst: Burst, separator: Separator, options: Options, on_progress: Callable[[float], None]
-) -> tuple[Path | bytes, Separation]:
-    """Returns the content of the reference photo, or of the video, and its separation."""
+) -> Separation:
     from brewster.burst import read_video, separate_burst  # noqa: PLC0415  (imports torch)
 
-    content: Path | bytes
-    if is_video(burst.photos[0]):
-        content = Path(burst.photos[0])
-        photos: list[Source] = [*read_video(content, burst.frames, max_pixels=options.max_pixels)]
-    else:
-        photos = [read_content(photo) for photo in burst.photos]
-        content = read_content(burst.photos[len(photos) // 2 if burst.reference is None else burst.reference])
-    separation = separate_burst(
+    first, *_ = burst.photos
+    photos: list[Source] = (
+        [*read_video(Path(first), burst.frames, max_pixels=options.max_pixels)]
+        if is_video(first)
+        else [read_content(photo) for photo in burst.photos]
+    )
+    return separate_burst(
         photos,
         reference=burst.reference,
         separator=separator,
         on_progress=on_progress,
         **options.call_options(),
     )
-    return content, separation
 
 
 def check_outputs(task: SeparationTask, photos: Set[str]) -> None:

@@ -17,10 +17,8 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import AbstractContextManager, contextmanager
-from functools import partial
 from multiprocessing import active_children, get_context, parent_process, resource_tracker
 from multiprocessing.process import BaseProcess
-from types import TracebackType
 from typing import Any, Final, Generic, Protocol, Self, TypeVar, final
 
 ResultT = TypeVar("ResultT")
@@ -78,7 +76,6 @@ def run_tasks(
 
     Args:
         next_task: returns the next task, or None if there is no task before the next result.
-        executor: starts the tasks; its context is entered by the caller.
 
     Raises:
         BrewsterError: raised by the runner.
@@ -174,13 +171,15 @@ class ProcessExecutor(Generic[ResultT]):
         for process in active_children():
             if process not in others:
                 self._processes[pool] = process
-        future.add_done_callback(partial(self._release, pool))
-        return future
 
-    def _release(self, pool: ProcessPoolExecutor, future: Future[list[ResultT]]) -> None:
-        """Called in a thread of the pool when its task ends."""
-        is_broken = isinstance(future.exception(), BrokenProcessPool)
-        (self._broken if is_broken else self._idle).append(pool)
+        def release(
+            future: Future[list[ResultT]],
+        ) -> None:  # called in a thread of the pool when its task ends
+            is_broken = isinstance(future.exception(), BrokenProcessPool)
+            (self._broken if is_broken else self._idle).append(pool)
+
+        future.add_done_callback(release)
+        return future
 
     def lost_reason(self, error: Exception) -> str:
         """Returns the exit code of the worker that died."""
@@ -193,9 +192,7 @@ class ProcessExecutor(Generic[ResultT]):
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, _kind: object, error: object, _trace: object) -> None:
         """Waits until the workers exit: at once if they are idle, otherwise after their task.
 
         After an error, all workers are killed.
@@ -210,10 +207,7 @@ class ProcessExecutor(Generic[ResultT]):
 
 @contextmanager
 def _interrupts_blocked() -> Iterator[None]:
-    """Blocks SIGINT in processes started within this block.
-
-    A terminal sends Ctrl-C to all processes of a group, but only the parent process may stop its workers.
-    """
+    """Blocks Ctrl-C in processes that start within this block, because only the parent process may stop its workers."""
     if sys.platform == "win32":  # Windows has no signal masks; _start_worker ignores Ctrl-C
         yield
         return
@@ -245,11 +239,10 @@ def _run_task(create_runner: Callable[[], Runner[Any]], task: Task[Any]) -> list
 
 def exit_with_parent() -> None:
     """Makes this process exit when its parent process ends, even if the parent is killed."""
-    threading.Thread(target=_wait_for_parent, daemon=True).start()
 
+    def wait() -> None:
+        if parent := parent_process():
+            parent.join()
+            os._exit(1)
 
-def _wait_for_parent() -> None:
-    parent = parent_process()
-    if parent:
-        parent.join()
-        os._exit(1)
+    threading.Thread(target=wait, daemon=True).start()

@@ -8,7 +8,7 @@ import secrets
 import socket
 from collections.abc import Callable
 from concurrent.futures import Future
-from types import ModuleType, TracebackType
+from types import ModuleType
 from typing import Any, Final, Generic, Self, final
 
 from brewster.errors import DeviceError, MissingExtra
@@ -79,7 +79,10 @@ class RayExecutor(Generic[ResultT]):
             {"num_cpus": self._worker_count, "include_dashboard": False} if self._address == LOCAL else {}
         )
         try:
-            _check_reachable(self._address)
+            # OSError if no program listens at HOST:PORT: Ray itself retries for many minutes
+            host, _, port = self._address.rpartition(":")
+            if host and port.isdigit() and "/" not in host:
+                socket.create_connection((host, int(port)), timeout=_CONNECT_TIMEOUT_S).close()
             self._ray.init(self._address, log_to_driver=False, logging_level="error", **local_options)
         except (OSError, RuntimeError, ValueError) as error:
             raise DeviceError(
@@ -92,9 +95,7 @@ class RayExecutor(Generic[ResultT]):
         self._create_runner_ref = self._ray.put(self._create_runner)
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         """Disconnects from the cluster, which ends the running tasks."""
         self._ray.shutdown()
 
@@ -112,13 +113,6 @@ def _ray() -> ModuleType:
     # Ray prints lost processes on standard output, which is reserved for --json. There is no option to prevent this.
     importlib.import_module("ray._private.worker")._worker_logs_enabled = False  # type: ignore[attr-defined]
     return ray
-
-
-def _check_reachable(address: str) -> None:
-    """Raises OSError if no program listens at HOST:PORT. Ray itself retries for many minutes."""
-    host, _, port = address.rpartition(":")
-    if host and port.isdigit() and "/" not in host:
-        socket.create_connection((host, int(port)), timeout=_CONNECT_TIMEOUT_S).close()
 
 
 _runners: dict[str, Runner[Any]] = {}

@@ -3,20 +3,26 @@
 A `ColourSpace` has a tone curve for each channel, and a matrix from linear RGB to linear Rec.709. It is read from an ICC
 matrix profile (ICC.1:2022) or from the chromaticities of an EXR file. Without a profile and chromaticities, integers are
 sRGB and floats are linear Rec.709. Colours outside the Rec.709 gamut have values below 0 or above 1, which are not clipped.
+
+A photo with a LUT-based profile, which scanners and some cameras write, or with CMYK colours is converted to Display P3 when it
+is opened, by littleCMS in libvips. Display P3 is the largest colour space whose profile libvips includes. Colours outside
+Display P3 are clipped.
 """
 
 from __future__ import annotations
 
 import struct
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
 
 import numpy as np
+import pyvips
 from numpy.typing import NDArray
 
 from brewster import srgb
 from brewster.errors import UnsupportedPhoto
+from brewster.photo.file_info import FileInfo
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
@@ -93,7 +99,12 @@ class ColourSpace:
         curves = self._curves(original)
         channels = [linear[..., i] for i in range(3)]
         if len(curves) == 1:
-            channels = [_grey(linear)]
+            red, green, blue = channels
+            weights = np.array(srgb.REC709_LUMINANCE, np.float32)
+            luminance = weights[0] * red + weights[1] * green + weights[2] * blue
+            channels = [
+                np.where((red == green) & (green == blue), green, luminance)
+            ]  # equal channels stay exact
         elif self.matrix:
             channels = _apply_matrix(_inverse(self.matrix), channels)
         for i, curve in enumerate(curves):
@@ -122,10 +133,8 @@ LINEAR_REC709 = ColourSpace((ToneCurve(),) * 3)
 def colour_space_of(icc: bytes | None, primaries: tuple[float, ...] | None, is_float: bool) -> ColourSpace:
     """Returns the colour space of stored pixels from their ICC profile or chromaticities.
 
-    Without a profile and chromaticities, integers are sRGB and floats are linear Rec.709.
-
-    Raises:
-        UnsupportedPhoto: the profile is neither a grey profile with a curve nor an RGB profile with curves and a matrix.
+    Without a profile and chromaticities, integers are sRGB and floats are linear Rec.709. Raises UnsupportedPhoto if the
+    profile is neither a grey profile with a curve nor an RGB profile with curves and a matrix.
     """
     if icc is not None:
         return _profile_space(icc)
@@ -177,14 +186,6 @@ def _apply_matrix(matrix: Matrix, channels: list[Float32]) -> list[Float32]:
     return [row[0] * red + row[1] * green + row[2] * blue for row in rows]
 
 
-def _grey(linear: Float32) -> Float32:
-    """Returns the luminance (H, W). For pixels with equal channels, the luminance is exactly the value of the channels."""
-    red, green, blue = (linear[..., i] for i in range(3))
-    weights = np.array(srgb.REC709_LUMINANCE, np.float32)
-    neutral = (red == green) & (green == blue)
-    return np.where(neutral, green, weights[0] * red + weights[1] * green + weights[2] * blue)
-
-
 def _inverse(matrix: Matrix) -> Matrix:
     return _as_matrix(np.linalg.inv(np.array(matrix)))
 
@@ -216,7 +217,8 @@ def _profile_space(icc: bytes) -> ColourSpace:
         tags = icc_tags(icc)
         if icc[16:20] == b"GRAY":
             return _snap_to_srgb(ColourSpace((_parse_curve(tags[b"kTRC"]),) * 3))
-        to_d50 = np.array([_parse_xyz(tags[name]) for name in (b"rXYZ", b"gXYZ", b"bXYZ")]).T
+        points = [struct.unpack_from(">3i", tags[name], 8) for name in (b"rXYZ", b"gXYZ", b"bXYZ")]
+        to_d50 = np.array(points).T / 65536
         red, green, blue = (_parse_curve(tags[name]) for name in (b"rTRC", b"gTRC", b"bTRC"))
         space = _snap_to_srgb(ColourSpace((red, green, blue), _to_rec709(to_d50)))
         _inverse(space.matrix or _as_matrix(np.eye(3)))
@@ -248,11 +250,6 @@ def icc_tags(icc: bytes) -> dict[bytes, bytes]:
     return {name: icc[start : start + size] for name, start, size in rows}
 
 
-def _parse_xyz(tag: bytes) -> tuple[float, float, float]:
-    x, y, z = struct.unpack_from(">3i", tag, 8)
-    return x / 65536, y / 65536, z / 65536
-
-
 _PARAMETRIC_NAMES = ("g", "gab", "gabc", "gabcd", "gabcdef")  # parameters of ICC function types 0 to 4
 
 
@@ -260,7 +257,15 @@ def _parse_curve(tag: bytes) -> ToneCurve:
     """Parses a tag of curveType or parametricCurveType (ICC.1:2022 10.6 and 10.18)."""
     kind, count = struct.unpack_from(">4s4xI", tag)
     if kind == b"para":
-        return _parse_parametric(count >> 16, tag)
+        function = count >> 16
+        names = _PARAMETRIC_NAMES[function] if function < len(_PARAMETRIC_NAMES) else ""
+        values = dict(zip(names, struct.unpack_from(f">{len(names)}i", tag, 12), strict=True))
+        g, a, b, c, d, e, f = (values.get(name, 65536 * (name == "a")) / 65536 for name in "gabcdef")
+        if g <= 0 or a <= 0:
+            raise ValueError(names)
+        if function in (1, 2):  # types 1 and 2 are constant for x < -b/a
+            c, d, e, f = 0.0, -b / a, c, c
+        return ToneCurve(parameters=(g, a, b, c, d, e, f))
     if kind != b"curv":
         raise ValueError(kind)
     if count == 0:
@@ -273,12 +278,81 @@ def _parse_curve(tag: bytes) -> ToneCurve:
     return ToneCurve(samples=tuple(number / 65535 for number in numbers))
 
 
-def _parse_parametric(function: int, tag: bytes) -> ToneCurve:
-    names = _PARAMETRIC_NAMES[function] if function < len(_PARAMETRIC_NAMES) else ""
-    values = dict(zip(names, struct.unpack_from(f">{len(names)}i", tag, 12), strict=True))
-    g, a, b, c, d, e, f = (values.get(name, 65536 * (name == "a")) / 65536 for name in "gabcdef")
-    if g <= 0 or a <= 0:
-        raise ValueError(names)
-    if function in (1, 2):  # types 1 and 2 are constant for x < -b/a
-        c, d, e, f = 0.0, -b / a, c, c
-    return ToneCurve(parameters=(g, a, b, c, d, e, f))
+# --- LUT-based and CMYK profiles
+
+_MATRIX_TAGS = {b"rXYZ", b"gXYZ", b"bXYZ", b"rTRC", b"gTRC", b"bTRC"}
+_TABLE_TAGS = {b"A2B0", b"A2B1"}
+_VIPS_FORMATS = {"uint8": ("uchar", "rgb", 8), "uint16": ("ushort", "rgb16", 16)}
+
+
+def has_only_tables(icc: bytes | None) -> bool:
+    """Returns whether an ICC profile is an RGB profile with lookup tables, but without curves and a matrix."""
+    if icc is None or icc[16:20] != b"RGB ":
+        return False
+    try:
+        tags = icc_tags(icc).keys()
+    except struct.error:
+        return False
+    return bool(tags & _TABLE_TAGS) and not tags >= _MATRIX_TAGS
+
+
+def convert_to_display_p3(pixels: NDArray[Any], file_info: FileInfo) -> tuple[NDArray[Any], FileInfo]:
+    """Returns pixels (H, W, 3) of 8 or 16 bits in Display P3 (relative colorimetric), and `file_info` with its profile. Raises
+    UnsupportedPhoto if the profile is damaged, or the pixels are grey or floats."""
+    channels = pixels.shape[2]
+    if channels != 3 or pixels.dtype.name not in _VIPS_FORMATS:
+        raise UnsupportedPhoto(
+            f"{channels} channels of {pixels.dtype} have a LUT-based colour profile",
+            "expected RGB of 8 or 16 bits for such a profile",
+            "convert the photo to sRGB or Display P3 first",
+        )
+    icc = file_info.icc or b""
+    try:
+        profile_is_ignored = np.array_equal(
+            _convert(_PROBE_COLOURS, icc), _convert(_PROBE_COLOURS, pyvips.Image.profile_load("srgb"))
+        )
+        array = _convert(pixels, icc)
+    except pyvips.Error as error:
+        raise _damaged_profile(icc) from error
+    if profile_is_ignored:
+        raise _damaged_profile(icc)
+    return array, replace(file_info, icc=bytes(pyvips.Image.profile_load("p3")))
+
+
+def convert_cmyk(image: pyvips.Image, file_info: FileInfo) -> tuple[pyvips.Image, FileInfo]:
+    """Returns a CMYK image in Display P3 (relative colorimetric), and `file_info` with its profile and a note.
+
+    Without a usable CMYK profile, the default profile of libvips is used.
+    """
+    is_cmyk = file_info.icc is not None and file_info.icc[16:20] == b"CMYK"
+    profile = "its profile" if is_cmyk else "a default profile, because it has none"
+    depth = 16 if image.format == "ushort" else 8
+    converted = image.icc_transform(
+        "p3", embedded=is_cmyk, input_profile="cmyk", intent="relative", depth=depth
+    )
+    note = f"its CMYK colours were converted to RGB (Display P3) with {profile}"
+    return converted, replace(file_info, icc=bytes(pyvips.Image.profile_load("p3")), note=note)
+
+
+_PROBE_LEVELS = np.arange(0, 256, 51).astype(np.uint8)
+_PROBE_COLOURS = np.stack(np.meshgrid(_PROBE_LEVELS, _PROBE_LEVELS, _PROBE_LEVELS), axis=-1).reshape(-1, 6, 3)
+"""Test colours. If a profile converts them exactly as sRGB does, libvips could not use the profile and used sRGB."""
+
+
+def _convert(pixels: NDArray[Any], icc: bytes) -> NDArray[Any]:
+    height, width, channels = pixels.shape
+    band_format, interpretation, depth = _VIPS_FORMATS[pixels.dtype.name]
+    contiguous = np.ascontiguousarray(pixels)
+    image = pyvips.Image.new_from_memory(contiguous.data, width, height, channels, band_format)
+    image = image.copy(interpretation=interpretation)
+    image.set_type(pyvips.GValue.blob_type, "icc-profile-data", icc)
+    converted = image.icc_transform("p3", embedded=True, intent="relative", depth=depth)
+    return np.frombuffer(converted.write_to_memory(), pixels.dtype).reshape(pixels.shape)
+
+
+def _damaged_profile(icc: bytes) -> UnsupportedPhoto:
+    return UnsupportedPhoto(
+        f"the LUT-based colour profile ({len(icc)} bytes) cannot be used",
+        "expected a complete ICC profile",
+        "convert the photo to sRGB or Display P3 first",
+    )

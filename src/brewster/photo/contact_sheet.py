@@ -41,13 +41,9 @@ def write_contact_sheets(
 ) -> Iterator[Path]:
     """Writes the rows to `path`. Yields the path of each sheet.
 
-    A sheet has at most 200 rows. Further sheets have a number: `sheet.jpg`, `sheet-2.jpg` and so on.
-
-    Args:
-        path: the image file. A contact sheet of an earlier run is replaced.
-        rows: the file of each photo, and the files of its layers. The label of a row is the path of the photo.
-        max_pixels: files with more pixels are refused.
-        overwrite: whether other existing files are replaced, too.
+    A sheet has at most 200 rows. Further sheets have a number: `sheet.jpg`, `sheet-2.jpg` and so on. A contact sheet of an
+    earlier run is replaced; with `overwrite`, other files are, too. A row has the file of a photo, whose path is its label, and
+    the files of its layers. Files with more than `max_pixels` pixels are refused.
 
     Raises:
         PhotoError: an image file cannot be read.

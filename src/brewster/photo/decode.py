@@ -12,7 +12,7 @@ import lzma
 import re
 import zipfile
 import zlib
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -30,25 +30,15 @@ from brewster.errors import (
 from brewster.files import DEFAULT_MAX_PIXELS
 from brewster.image_formats import FORMATS, VIDEO_SIGNATURE, format_of_content
 from brewster.photo import metadata
-from brewster.photo.colour import colour_space_of
-from brewster.photo.file_info import FileInfo, check_pixel_count, library_of
+from brewster.photo.colour import colour_space_of, convert_cmyk, has_only_tables
+from brewster.photo.file_info import Decoded, FileInfo, check_pixel_count, library_of
 from brewster.photo.hdr_formats import read_exr, read_hdr
-from brewster.photo.lut_profiles import convert_cmyk, has_only_tables
 from brewster.photo.raw import is_raw, read_raw, read_raw_size
 
 pyvips.cache_set_max(0)  # each image is read once, so the operation cache of libvips has no use
 logging.getLogger("pyvips").addHandler(logging.NullHandler())  # warnings of libvips become brewster errors
 
 Stored = NDArray[Any]
-
-
-@dataclass(frozen=True)
-class Decoded:
-    """Stored pixels (H, W, 1|3) and alpha (H, W) or None: uint8, uint16 or float32, with the EXIF orientation applied."""
-
-    pixels: Stored
-    alpha: Stored | None
-    file_info: FileInfo
 
 
 def decode(data: bytes, max_pixels: int) -> Decoded:
@@ -64,8 +54,7 @@ def decode(data: bytes, max_pixels: int) -> Decoded:
     if format_name == "raw":
         return split_alpha(*read_raw(data, max_pixels))
     if format_name in _FLOAT_READERS:
-        floats = _FLOAT_READERS[format_name](data, max_pixels)
-        decoded = Decoded(floats.pixels, floats.alpha, floats.file_info)
+        decoded = _FLOAT_READERS[format_name](data, max_pixels)
     elif format_name == "heic":
         decoded = _decode_heic(data, max_pixels)
     else:
@@ -156,7 +145,7 @@ def _decode_vips(data: bytes, format_name: str, max_pixels: int) -> Decoded:
 
 def _open_vips(data: bytes, format_name: str, max_pixels: int) -> pyvips.Image:
     """Opens an image and checks its header. libvips decodes the pixels later."""
-    load = getattr(pyvips.Image, FORMATS[format_name].vips_loader or "")
+    load = getattr(pyvips.Image, f"{FORMATS[format_name].vips_name}load_buffer")
     try:
         image = load(data, access="sequential", fail_on=_FAIL_ON.get(format_name, "truncated"))
         _check_supported(image, data, format_name, max_pixels)
@@ -227,7 +216,21 @@ def _file_info(image: pyvips.Image, data: bytes, format_name: str) -> FileInfo:
         iptc=iptc,
         resolution_px_per_mm=(image.xres, image.yres) if has_resolution else None,
     )
-    return replace(file_info, **_EXTRA_INFO[format_name](data)) if format_name in _EXTRA_INFO else file_info
+    match format_name:
+        case "jpeg":
+            subsampling = metadata.jpeg_subsampling(data)
+            quality = _jpeg_quality(data, bands=3 if subsampling else 1)
+            return replace(file_info, subsampling=subsampling, jpeg_quality=quality)
+        case "tiff":
+            tags = metadata.read_tags(data)
+            compression = _COMPRESSIONS.get(metadata.number_of(tags, 259, 1), "deflate")
+            return replace(file_info, compression=compression, exif=metadata.tiff_exif(tags))
+        case "webp":
+            return replace(file_info, lossless=b"VP8L" in metadata.webp_chunks(data))
+        case "avif":
+            codes = metadata.cicp(data)  # only a lossless AVIF stores RGB: matrix code 0, the identity
+            return replace(file_info, lossless=codes is not None and codes[2] == 0)
+    return file_info
 
 
 _SRGB_TRANSFERS = (1, 2, 6, 13, 14, 15)  # BT.709, unspecified, BT.601, sRGB, BT.2020 of 10 and 12 bits
@@ -253,11 +256,6 @@ def _profile_of(data: bytes, format_name: str) -> bytes | None:
     return bytes(pyvips.Image.profile_load("p3")) if primaries == 12 else None
 
 
-def _jpeg_info(data: bytes) -> dict[str, Any]:
-    subsampling = metadata.jpeg_subsampling(data)
-    return {"subsampling": subsampling, "jpeg_quality": _jpeg_quality(data, bands=3 if subsampling else 1)}
-
-
 def _jpeg_quality(data: bytes, bands: int) -> int:
     """Returns the lowest libvips quality whose quantization, for luma and chroma, is at least as fine as that of the file."""
     source = metadata.jpeg_quantization_sums(data)
@@ -275,25 +273,6 @@ _COMPRESSIONS = {
 }  # fmt: skip
 
 
-def _tiff_info(data: bytes) -> dict[str, Any]:
-    tags = metadata.read_tags(data)
-    compression = _COMPRESSIONS.get(metadata.number_of(tags, 259, 1), "deflate")
-    return {"compression": compression, "exif": metadata.tiff_exif(tags)}
-
-
-def _webp_info(data: bytes) -> dict[str, Any]:
-    return {"lossless": b"VP8L" in metadata.webp_chunks(data)}
-
-
-def _avif_info(data: bytes) -> dict[str, Any]:
-    """Returns whether the AVIF is lossless. Only a lossless AVIF stores RGB (matrix code 0, the identity)."""
-    codes = metadata.cicp(data)
-    return {"lossless": codes is not None and codes[2] == 0}
-
-
-_EXTRA_INFO = {"jpeg": _jpeg_info, "tiff": _tiff_info, "webp": _webp_info, "avif": _avif_info}
-
-
 # --- OpenRaster
 
 _ZIP_ERRORS = (
@@ -302,12 +281,8 @@ _ZIP_ERRORS = (
 
 
 def _merged_image(data: bytes, max_pixels: int) -> bytes:
-    """Returns the PNG of the merged image in an OpenRaster file (baseline 0.0.6).
-
-    Raises:
-        PhotoError: the archive is damaged or has no merged image, or the merged image is larger than any PNG of
-            `max_pixels` pixels.
-    """
+    """Returns the PNG of the merged image in an OpenRaster file (baseline 0.0.6). Raises PhotoError if the archive is damaged
+    or has no merged image, or the merged image is larger than any PNG of `max_pixels` pixels."""
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
             if archive.getinfo("mergedimage.png").file_size > (1 << 20) + 16 * max_pixels:

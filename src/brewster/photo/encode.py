@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from brewster.errors import UnsupportedPhoto
 from brewster.image_formats import FORMATS, WRITABLE
 from brewster.photo import metadata
-from brewster.photo.file_info import FileInfo, library_of
-from brewster.photo.hdr_formats import HdrPixels, write_exr, write_hdr
+from brewster.photo.file_info import Decoded, FileInfo, library_of
+from brewster.photo.hdr_formats import write_exr, write_hdr
 
 Stored = NDArray[Any]
 
@@ -50,10 +50,9 @@ def encode(pixels: Stored, alpha: Stored | None, file_info: FileInfo, quality: i
             f"expected 1..100 for {', '.join(_DEFAULT_QUALITIES)}, and no quality for other formats",
             "correct the quality, or choose one of these formats",
         )
-    if file_info.format_name == "exr":
-        return write_exr(HdrPixels(pixels, alpha, file_info))
-    if file_info.format_name == "hdr":
-        return write_hdr(HdrPixels(pixels, alpha, file_info))
+    if file_info.format_name in ("exr", "hdr"):
+        write = write_exr if file_info.format_name == "exr" else write_hdr
+        return write(Decoded(pixels, alpha, file_info))
     array = pixels if alpha is None else np.concatenate([pixels, alpha[..., None]], axis=2)
     if file_info.format_name == "heic":
         return _encode_heic(array, file_info, quality)
@@ -66,7 +65,11 @@ def _encode_vips(array: Stored, file_info: FileInfo, quality: int) -> bytes:
     contiguous = np.ascontiguousarray(array)
     band_format = {"uint8": "uchar", "uint16": "ushort", "float32": "float"}[array.dtype.name]
     image = pyvips.Image.new_from_memory(contiguous.data, width, height, channels, band_format)
-    image = image.copy(interpretation=_interpretation(array), xres=across, yres=down)
+    is_grey = channels < 3
+    grey, colour = {"uint8": ("b-w", "srgb"), "uint16": ("grey16", "rgb16")}.get(
+        array.dtype.name, ("b-w", "scrgb")
+    )
+    image = image.copy(interpretation=grey if is_grey else colour, xres=across, yres=down)
     image.set_type(pyvips.GValue.gstr_type, "resolution-unit", "in")
     blobs = {"icc-profile-data": file_info.icc, "xmp-data": file_info.xmp, "iptc-data": file_info.iptc}
     if file_info.format_name == "avif":
@@ -75,7 +78,7 @@ def _encode_vips(array: Stored, file_info: FileInfo, quality: int) -> bytes:
         if blob is not None:
             image.set_type(pyvips.GValue.blob_type, name, blob)
     keep = _KEPT_AVIF_METADATA if file_info.format_name == "avif" else _KEPT_METADATA
-    save = getattr(image, FORMATS[file_info.format_name].vips_saver or "")
+    save = getattr(image, f"{FORMATS[file_info.format_name].vips_name}save_buffer")
     try:
         return bytes(save(keep=keep, **_save_options(file_info, array.dtype, quality)))
     except pyvips.Error as error:
@@ -84,15 +87,6 @@ def _encode_vips(array: Stored, file_info: FileInfo, quality: int) -> bytes:
             "expected a size that the format can store",
             "write PNG or TIFF",
         ) from error
-
-
-def _interpretation(array: Stored) -> str:
-    is_grey, is_16bit = array.shape[2] < 3, array.dtype == np.uint16
-    if array.dtype.kind == "f":
-        return "b-w" if is_grey else "scrgb"
-    return {(True, True): "grey16", (True, False): "b-w", (False, True): "rgb16"}.get(
-        (is_grey, is_16bit), "srgb"
-    )
 
 
 def _save_options(file_info: FileInfo, dtype: np.dtype[Any], quality: int) -> dict[str, Any]:

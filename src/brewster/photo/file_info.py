@@ -8,6 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from numpy.typing import NDArray
+
 from brewster.errors import MissingExtra, PhotoTooLarge, UnsupportedPhoto
 from brewster.image_formats import FORMATS, WRITABLE, format_of
 
@@ -47,12 +49,18 @@ class FileInfo:
     """See `brewster.photo.history.sampled_digest`; None if the photo was not read from a file."""
 
 
-def library_of(format_name: str) -> Any:  # noqa: ANN401  (these libraries have no types)
-    """Imports and returns the library that reads and writes a format. An extra of brewster installs it.
+@dataclass(frozen=True)
+class Decoded:
+    """Stored pixels (H, W, 1|3) and alpha (H, W) or None: uint8, uint16 or float32, with the EXIF orientation applied."""
 
-    Raises:
-        MissingExtra: the library is not installed.
-    """
+    pixels: NDArray[Any]
+    alpha: NDArray[Any] | None
+    file_info: FileInfo
+
+
+def library_of(format_name: str) -> Any:  # noqa: ANN401  (these libraries have no types)
+    """Imports and returns the library that reads and writes a format. An extra of brewster installs it. Raises MissingExtra if
+    the library is not installed."""
     row = FORMATS[format_name]
     try:
         return importlib.import_module(row.library.replace("-", "_"))
@@ -65,11 +73,8 @@ def library_of(format_name: str) -> Any:  # noqa: ANN401  (these libraries have 
 
 
 def check_pixel_count(width: int, height: int, max_pixels: int) -> None:
-    """Checks the size of an image in pixels, before the image is decoded.
-
-    Raises:
-        PhotoTooLarge: the image has more pixels than `max_pixels`.
-    """
+    """Checks the size of an image in pixels, before the image is decoded. Raises PhotoTooLarge if the image has more pixels
+    than `max_pixels`."""
     if width * height > max_pixels:
         raise PhotoTooLarge(
             f"the image has {width} x {height} pixels ({width * height / 1e6:.3g} million)",
@@ -79,11 +84,8 @@ def check_pixel_count(width: int, height: int, max_pixels: int) -> None:
 
 
 def format_name_of(path: Path) -> str:
-    """Returns the name of the format for the suffix of a file name.
-
-    Raises:
-        UnsupportedPhoto: brewster does not write files with this suffix.
-    """
+    """Returns the name of the format for the suffix of a file name. Raises UnsupportedPhoto if brewster does not write files
+    with this suffix."""
     image_format = format_of(path)
     if image_format is None or not image_format.is_writable:
         raise UnsupportedPhoto(
@@ -97,11 +99,9 @@ def format_name_of(path: Path) -> str:
 def depth_for(file_info: FileInfo, format_name: str, bit_depth: int | None) -> int:
     """Returns the bits per channel to write.
 
-    The result is `bit_depth` if it is not None. Otherwise it is the largest depth of the format that is not larger than
-    the depth of the file, or the smallest depth of the format if all its depths are larger.
-
-    Raises:
-        UnsupportedPhoto: brewster does not write this format, or does not write it at this bit depth.
+    The result is `bit_depth` if it is not None. Otherwise it is the largest depth of the format that is not larger than the
+    depth of the file, or the smallest depth of the format if all its depths are larger. Raises UnsupportedPhoto if brewster
+    does not write this format, or does not write it at this bit depth.
     """
     depths = WRITABLE[format_name].bit_depths if format_name in WRITABLE else ()
     if not depths or (bit_depth is not None and bit_depth not in depths):

@@ -8,25 +8,15 @@ from __future__ import annotations
 import io
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from brewster.errors import UnreadablePhoto, UnsupportedPhoto
-from brewster.photo.file_info import FileInfo, check_pixel_count, library_of
+from brewster.photo.file_info import Decoded, FileInfo, check_pixel_count, library_of
 
 Float32 = NDArray[np.float32]
-
-
-@dataclass(frozen=True)
-class HdrPixels:
-    """Pixels (H, W, 1|3) in linear light and alpha (H, W) or None, both float32, with the metadata of their file."""
-
-    pixels: Float32
-    alpha: Float32 | None
-    file_info: FileInfo
 
 
 def _valid_chromaticities(chromaticities: Sequence[float | str]) -> tuple[float, ...] | None:
@@ -47,7 +37,7 @@ def _valid_chromaticities(chromaticities: Sequence[float | str]) -> tuple[float,
 # --- OpenEXR
 
 
-def read_exr(data: bytes, max_pixels: int) -> HdrPixels:
+def read_exr(data: bytes, max_pixels: int) -> Decoded:
     """Reads the first part of an EXR: the channels R, G and B, or Y alone, and the channel A if there is one.
 
     Other channels, such as Z, are ignored.
@@ -79,7 +69,7 @@ def _exr_part(data: bytes, *, header_only: bool) -> Any:  # noqa: ANN401  (OpenE
         ) from error
 
 
-def _exr_pixels(channels: dict[str, NDArray[Any]], header: dict[str, Any]) -> HdrPixels:
+def _exr_pixels(channels: dict[str, NDArray[Any]], header: dict[str, Any]) -> Decoded:
     names = ["R", "G", "B"] if {"R", "G", "B"} <= channels.keys() else ["Y"]
     if not set(names) <= channels.keys() or "RY" in channels:
         raise UnsupportedPhoto(
@@ -89,19 +79,15 @@ def _exr_pixels(channels: dict[str, NDArray[Any]], header: dict[str, Any]) -> Hd
         )
     is_half = all(channels[name].dtype == np.float16 for name in names)
     attributes = {key: value for key, value in header.items() if key not in ("channels", "tiles", "type")}
-    return HdrPixels(
+    primaries = _valid_chromaticities(header.get("chromaticities", ()))
+    return Decoded(
         np.stack([channels[name].astype(np.float32) for name in names], axis=2),
         channels["A"].astype(np.float32) if "A" in channels else None,
-        FileInfo(
-            format_name="exr",
-            bits=16 if is_half else 32,
-            primaries=_valid_chromaticities(header.get("chromaticities", ())),
-            header=attributes,
-        ),
+        FileInfo("exr", 16 if is_half else 32, primaries=primaries, header=attributes),
     )
 
 
-def write_exr(image: HdrPixels) -> bytes:
+def write_exr(image: Decoded) -> bytes:
     """Encodes an EXR in half (16 `bits`) or single precision (32 `bits`), with the attributes of the source."""
     exr = library_of("exr")
     names = "RGB" if image.pixels.shape[2] == 3 else "Y"
@@ -200,7 +186,7 @@ _FACTORS = ("EXPOSURE", "COLORCORR", "PIXASPECT")
 """Attributes that are factors. If a header has one of them several times, its value is the product ("Radiance File Formats")."""
 
 
-def read_hdr(data: bytes, max_pixels: int) -> HdrPixels:
+def read_hdr(data: bytes, max_pixels: int) -> Decoded:
     """Reads a Radiance HDR image: red, green and blue with a shared exponent (RGBE).
 
     Raises:
@@ -232,21 +218,17 @@ def read_hdr(data: bytes, max_pixels: int) -> HdrPixels:
             "export the image again",
         )
     check_pixel_count(width, height, max_pixels)
-    return HdrPixels(_from_rgbe(_scan_lines(body, width, height)), None, _hdr_file_info(lines))
-
-
-def _hdr_file_info(lines: list[str]) -> FileInfo:
     header: dict[str, str] = {}
     for line in lines:
-        key, separator, value = line.partition("=")
-        if separator and not line.startswith("FORMAT"):
+        key, equals_sign, value = line.partition("=")
+        if equals_sign and not line.startswith("FORMAT"):
             header[key] = _product(header[key], value) if key in _FACTORS and key in header else value
-    return FileInfo(
-        format_name="hdr",
-        bits=32,
-        header=header,
-        primaries=_valid_chromaticities(header.get("PRIMARIES", "").split()),
-    )
+    primaries = _valid_chromaticities(header.get("PRIMARIES", "").split())
+    file_info = FileInfo("hdr", bits=32, header=header, primaries=primaries)
+    rgbe = _scan_lines(body, width, height)
+    exponent = rgbe[..., 3].astype(np.int32)
+    scale = np.where(exponent > 0, np.ldexp(np.float32(1), exponent - 136), np.float32(0)).astype(np.float32)
+    return Decoded(rgbe[..., :3].astype(np.float32) * scale[..., None], None, file_info)
 
 
 def _product(first: str, second: str) -> str:
@@ -301,10 +283,7 @@ def _decode_old_runs(body: bytes, count: int) -> bytes:
     """Decodes the run-length encoding of Radiance 1.4 and earlier to `count` pixels.
 
     The pixel (1, 1, 1, n) repeats the pixel before it n times. If k such pixels follow each other, the last one has the weight
-    256**(k-1).
-
-    Raises:
-        ValueError: the runs do not have `count` pixels together.
+    256**(k-1). Raises ValueError if the runs do not have `count` pixels together.
     """
     pixels = np.frombuffer(body, np.uint8, len(body) // 4 * 4).reshape(-1, 4)
     is_run = (pixels[:, :3] == 1).all(axis=1)
@@ -318,26 +297,11 @@ def _decode_old_runs(body: bytes, count: int) -> bytes:
     return np.repeat(pixels[last_literal], repeats, axis=0).tobytes()
 
 
-def _from_rgbe(rgbe: NDArray[np.uint8]) -> Float32:
-    exponent = rgbe[..., 3].astype(np.int32)
-    scale = np.where(exponent > 0, np.ldexp(np.float32(1), exponent - 136), np.float32(0))
-    pixels: Float32 = rgbe[..., :3].astype(np.float32) * scale[..., None].astype(np.float32)
-    return pixels
+def write_hdr(image: Decoded) -> bytes:
+    """Encodes a Radiance HDR image with flat lines, which all readers support. Grey becomes three equal channels.
 
-
-def _to_rgbe(pixels: Float32) -> NDArray[np.uint8]:
-    """Converts light to RGBE bytes. For light from `_from_rgbe`, this is the exact inverse. Negative light becomes black."""
-    light = np.fmax(pixels, 0)
-    _, exponent = np.frexp(light.max(axis=2))
-    exponent = np.clip(exponent, -127, 127)
-    mantissa = np.floor(np.ldexp(light, (8 - exponent)[..., None]) + 0.5).clip(0, 255)
-    rgbe = np.concatenate([mantissa, (exponent + 128)[..., None]], axis=2).astype(np.uint8)
-    rgbe[mantissa.max(axis=2) == 0] = 0
-    return rgbe
-
-
-def write_hdr(image: HdrPixels) -> bytes:
-    """Encodes a Radiance HDR image with flat lines, which all readers support. Grey becomes three equal channels."""
+    For light from `read_hdr`, the values are exactly those that were read. Negative light becomes black.
+    """
     height, width = image.pixels.shape[:2]
     header = dict(image.file_info.header or {})
     if image.file_info.software:
@@ -345,5 +309,10 @@ def write_hdr(image: HdrPixels) -> bytes:
     attributes = [f"{key}={value}" for key, value in header.items()]
     lines = ["#?RADIANCE", "FORMAT=32-bit_rle_rgbe", *attributes]
     head = "\n".join(lines) + f"\n\n-Y {height} +X {width}\n"
-    pixels = np.broadcast_to(image.pixels, (height, width, 3))
-    return head.encode("latin-1") + _to_rgbe(pixels).tobytes()
+    light = np.fmax(np.broadcast_to(image.pixels, (height, width, 3)), 0)
+    _, exponent = np.frexp(light.max(axis=2))
+    exponent = np.clip(exponent, -127, 127)
+    mantissa = np.floor(np.ldexp(light, (8 - exponent)[..., None]) + 0.5).clip(0, 255)
+    rgbe = np.concatenate([mantissa, (exponent + 128)[..., None]], axis=2).astype(np.uint8)
+    rgbe[mantissa.max(axis=2) == 0] = 0
+    return head.encode("latin-1") + rgbe.tobytes()

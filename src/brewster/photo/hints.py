@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from brewster.errors import MaskError
 from brewster.photo.in_memory import WHITE_LEVELS
-from brewster.photo.mask import open_painted
+from brewster.photo.mask import open_painted, sampled
 from brewster.photo.photo import Float32, Source
 
 
@@ -57,8 +57,4 @@ class Hints:
 
     def sampled(self, width: int, height: int) -> Float32:
         """Returns the hints in a grid of `width` x `height` cells that covers the photo: (height, width, 2) in 0..1."""
-        rows, columns = (
-            (2 * np.arange(cells) + 1) * side // (2 * cells)
-            for cells, side in zip((height, width), self.values.shape[:2], strict=True)
-        )
-        return self.values[np.ix_(rows, columns)].astype(np.float32) / np.float32(255)
+        return sampled(self.values, width, height).astype(np.float32) / np.float32(255)

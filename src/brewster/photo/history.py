@@ -21,7 +21,7 @@ from xml.sax.saxutils import quoteattr
 
 import brewster
 from brewster.photo.file_info import FileInfo
-from brewster.photo.metadata import png_chunks
+from brewster.photo.metadata import first_directory, png_chunks
 
 PROGRAM: Final = "brewster"
 """The name under which the metadata of images record this program."""
@@ -44,18 +44,22 @@ _ENTRY = (
 
 
 def with_history(file_info: FileInfo, software: str, parameters: Mapping[str, str]) -> FileInfo:
-    """Returns the metadata with an entry about a processing step.
-
-    Args:
-        file_info: the metadata of the input.
-        software: the program with its version.
-        parameters: the options of the step by name. Names and values contain neither "; " nor "=".
+    """Returns the metadata of an input with an entry about a processing step: the program with its version, and the options by
+    name. Names and values contain neither "; " nor "=".
     """
     text = "; ".join(f"{name}={value}" for name, value in parameters.items())
     entry = _ENTRY.format(software=quoteattr(software), parameters=quoteattr(text)).encode()
     packet = file_info.xmp or _PACKET.format(software=quoteattr(software)).encode()
     exif = file_info.exif and _with_exif_software(file_info.exif, software)
-    return replace(file_info, xmp=_with_entry(packet, entry), exif=exif, software=software)
+    if history := re.search(rb"<xmpMM:History>.*?(?=</rdf:Seq>)", packet, re.DOTALL):
+        packet = packet[: history.end()] + entry + packet[history.end() :]
+    elif (end := packet.rfind(b"</rdf:RDF>")) >= 0:  # a block without an RDF element stays unchanged
+        about = re.search(
+            rb"""rdf:about=("[^"]*"|'[^']*')""", packet
+        )  # all descriptions are of the same resource
+        block = _HISTORY.encode().replace(b"{about}", about[1] if about else b'""').replace(b"{entry}", entry)
+        packet = packet[:end] + block + packet[end:]
+    return replace(file_info, xmp=packet, exif=exif, software=software)
 
 
 def with_layer_history(file_info: FileInfo, layer: str, parameters: Mapping[str, str]) -> FileInfo:
@@ -96,40 +100,19 @@ def recorded_parameters(path: Path, program: str) -> dict[str, str] | None:
 
 def _last_parameters(data: bytes, program: str) -> dict[str, str] | None:
     if data.startswith(b"\x89PNG"):
-        data += _compressed_png_xmp(data)
+        # libvips writes the XMP block as compressed text (PNG 11.3.3.3, zTXt). Other programs write it uncompressed (iTXt), as
+        # the XMP specification, part 3, requires.
+        for kind, chunk in png_chunks(data):
+            keyword, _, text = chunk.partition(b"\0")
+            if kind == b"zTXt" and keyword == b"XML:com.adobe.xmp":
+                with contextlib.suppress(zlib.error):
+                    data += zlib.decompress(text[1:])
     agent = re.escape(program.encode())
     found = re.findall(rb'stEvt:softwareAgent="' + agent + rb' [^"]*" stEvt:parameters="([^"]*)"', data)
     if not found:
         return None
-    text = html.unescape(found[-1].decode("utf-8", "replace"))
-    return dict(part.split("=", 1) for part in text.split("; ") if "=" in part)
-
-
-def _compressed_png_xmp(data: bytes) -> bytes:
-    """Returns the XMP block of a PNG if it is compressed, or no bytes.
-
-    libvips writes the block as compressed text (PNG 11.3.3.3, zTXt). Other programs write it uncompressed (iTXt), as the XMP
-    specification, part 3, requires.
-    """
-    for kind, chunk in png_chunks(data):
-        keyword, _, text = chunk.partition(b"\0")
-        if kind == b"zTXt" and keyword == b"XML:com.adobe.xmp":
-            with contextlib.suppress(zlib.error):
-                return zlib.decompress(text[1:])
-    return b""
-
-
-def _with_entry(xmp: bytes, entry: bytes) -> bytes:
-    """Appends an entry to the history of an XMP block. A block without an RDF element is returned unchanged."""
-    history = re.search(rb"<xmpMM:History>.*?(?=</rdf:Seq>)", xmp, re.DOTALL)
-    if history:
-        return xmp[: history.end()] + entry + xmp[history.end() :]
-    end = xmp.rfind(b"</rdf:RDF>")
-    if end < 0:
-        return xmp
-    about = re.search(rb"""rdf:about=("[^"]*"|'[^']*')""", xmp)  # all descriptions are of the same resource
-    block = _HISTORY.encode().replace(b"{about}", about[1] if about else b'""').replace(b"{entry}", entry)
-    return xmp[:end] + block + xmp[end:]
+    parameters = html.unescape(found[-1].decode("utf-8", "replace")).split("; ")
+    return dict(part.split("=", 1) for part in parameters if "=" in part)
 
 
 def _with_exif_software(exif: bytes, software: str) -> bytes:
@@ -138,15 +121,10 @@ def _with_exif_software(exif: bytes, software: str) -> bytes:
     The directory with the new tag is appended, and the offset of the first directory is set to it. Therefore the offsets in
     maker notes stay valid. A damaged block is returned unchanged, and so is a block that becomes too large for a JPEG.
     """
-    byte_order = {b"II*\0": "<", b"MM\0*": ">"}.get(exif[:4])
-    if byte_order is None or len(exif) < 10:
+    byte_order, first_row, end = first_directory(exif)
+    if end == first_row or end + 4 > len(exif):
         return exif
-    (position,) = struct.unpack_from(byte_order + "I", exif, 4)
-    (count,) = struct.unpack_from(byte_order + "H", exif, position) if position + 2 <= len(exif) else (0,)
-    end = position + 2 + 12 * count
-    if count == 0 or end + 4 > len(exif):
-        return exif
-    rows = [exif[row : row + 12] for row in range(position + 2, end, 12)]
+    rows = [exif[row : row + 12] for row in range(first_row, end, 12)]
     value = software.encode("ascii", "replace") + b"\0"
     start = len(exif) + len(exif) % 2
     rows = [row for row in rows if struct.unpack_from(byte_order + "H", row) != (_EXIF_SOFTWARE,)]

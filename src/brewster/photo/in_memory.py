@@ -11,8 +11,8 @@ from brewster import srgb
 from brewster.errors import MissingExtra, PhotoError, UnsupportedPhoto
 from brewster.image_formats import WRITABLE
 from brewster.photo import metadata
-from brewster.photo.decode import Decoded, apply_orientation, split_alpha
-from brewster.photo.file_info import FileInfo
+from brewster.photo.decode import apply_orientation, split_alpha
+from brewster.photo.file_info import Decoded, FileInfo
 
 Stored = NDArray[Any]
 Encoding = Literal["srgb", "linear"]
@@ -157,11 +157,8 @@ def decode_pil(image: Any) -> Decoded:  # noqa: ANN401  (Pillow is optional, so 
 
 
 def pil_image(pixels: Stored, alpha: Stored | None, file_info: FileInfo) -> Any:  # noqa: ANN401
-    """Returns a PIL image of stored pixels (H, W, 1|3), uint8, or uint16 for grey without alpha.
-
-    Raises:
-        MissingExtra: Pillow is not installed.
-    """
+    """Returns a PIL image of stored pixels (H, W, 1|3), uint8, or uint16 for grey without alpha. Raises MissingExtra if Pillow
+    is not installed."""
     try:
         from PIL import Image  # noqa: PLC0415  (optional: only for users of Pillow)
     except ImportError as error:

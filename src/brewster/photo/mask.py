@@ -66,16 +66,21 @@ class Mask:
 
     def sampled(self, width: int, height: int) -> Float32:
         """Returns the weights at the centres of a grid of `width` x `height` cells that covers the mask: (height, width, 1)."""
-        rows, columns = (
-            (2 * np.arange(cells) + 1) * side // (2 * cells)
-            for cells, side in zip((height, width), self.values.shape, strict=True)
-        )
-        return _weights(self.values[np.ix_(rows, columns)])
+        return _weights(sampled(self.values, width, height))
 
 
 def _weights(values: Stored) -> Float32:
     weights: NDArray[Any] = values[..., None] / np.float32(WHITE_LEVELS[values.dtype.name])
     return weights.astype(np.float32, copy=False)
+
+
+def sampled(values: Stored, width: int, height: int) -> Stored:
+    """Returns the values (H, W, ...) at the centres of a grid of `width` x `height` cells: (height, width, ...)."""
+    rows, columns = (
+        (2 * np.arange(cells) + 1) * side // (2 * cells)
+        for cells, side in zip((height, width), values.shape[:2], strict=True)
+    )
+    return values[np.ix_(rows, columns)]
 
 
 def open_painted(source: Source, size: tuple[int, int], name: str) -> Photo:

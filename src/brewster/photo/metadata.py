@@ -66,11 +66,8 @@ def jpeg_subsampling(data: bytes) -> str | None:
 
 
 def with_jpeg_head(data: bytes, exif: bytes | None, dots_per_inch: tuple[float, float] | None) -> bytes:
-    """Inserts a JFIF segment with the resolution, and an EXIF segment, into a JPEG without these segments.
-
-    Raises:
-        UnsupportedPhoto: the EXIF block is larger than a segment, 64 KiB.
-    """
+    """Inserts a JFIF segment with the resolution, and an EXIF segment, into a JPEG without these segments. Raises
+    UnsupportedPhoto if the EXIF block is larger than a segment, 64 KiB."""
     head = b""
     if dots_per_inch is not None:
         across, down = (min(max(round(dots), 1), 65535) for dots in dots_per_inch)
@@ -230,14 +227,11 @@ def _directory(data: bytes, byte_order: str, position: int, pointers: tuple[int,
         if tag in pointers:
             tags[tag] = _directory(data, byte_order, offset, tuple(p for p in pointers if p != tag))
         elif width and start + size <= len(data):
-            tags[tag] = (kind, number, _to_little_endian(data[start : start + size], width, byte_order))
+            value = data[start : start + size]
+            if byte_order == ">":
+                value = b"".join(value[i : i + width][::-1] for i in range(0, size, width))
+            tags[tag] = (kind, number, value)
     return tags
-
-
-def _to_little_endian(value: bytes, width: int, byte_order: str) -> bytes:
-    if byte_order == "<" or width == 1:
-        return value
-    return b"".join(value[i : i + width][::-1] for i in range(0, len(value), width))
 
 
 def number_of(tags: Tags, tag: int, default: int) -> int:
@@ -306,6 +300,19 @@ def with_tiff_exif(data: bytes, exif: bytes) -> bytes:
     return b"".join((data[:4], struct.pack("<I", first), data[8:], bytes(len(data) % 2), body))
 
 
+def first_directory(exif: bytes) -> tuple[str, int, int]:
+    """Returns the byte order of an EXIF block for `struct`, and the start and the end of the rows of its first directory.
+
+    Without a directory, all values are empty or 0.
+    """
+    byte_order = {b"II*\0": "<", b"MM\0*": ">"}.get(exif[:4])
+    if byte_order is None or len(exif) < 10:
+        return "", 0, 0
+    (position,) = struct.unpack_from(byte_order + "I", exif, 4)
+    (count,) = struct.unpack_from(byte_order + "H", exif, position) if position + 2 <= len(exif) else (0,)
+    return byte_order, position + 2, position + 2 + 12 * count
+
+
 def upright_exif(exif: bytes) -> bytes:
     """Returns an EXIF block with orientation 1 and without the thumbnail. The result begins at the TIFF header.
 
@@ -313,20 +320,15 @@ def upright_exif(exif: bytes) -> bytes:
     bytes are unchanged.
     """
     exif = exif.removeprefix(_EXIF_NAME)
-    byte_order = {b"II*\0": "<", b"MM\0*": ">"}.get(exif[:4])
-    if byte_order is None or len(exif) < 10:
-        return exif
     block = bytearray(exif)
-    (position,) = struct.unpack_from(byte_order + "I", block, 4)
-    (count,) = struct.unpack_from(byte_order + "H", block, position) if position + 2 <= len(block) else (0,)
-    next_directory = position + 2 + 12 * count
-    for row in range(position + 2, min(next_directory, len(block) - 11), 12):
+    byte_order, first_row, next_directory = first_directory(exif)
+    for row in range(first_row, min(next_directory, len(block) - 11), 12):
         tag, kind = struct.unpack_from(byte_order + "HH", block, row)
         if tag == _ORIENTATION:
             struct.pack_into(
                 byte_order + ("I" if kind == 4 else "HH"), block, row + 8, *((1,) if kind == 4 else (1, 0))
             )
-    if next_directory + 4 <= len(block):
+    if first_row and next_directory + 4 <= len(block):
         struct.pack_into(byte_order + "I", block, next_directory, 0)
     return bytes(block)
 

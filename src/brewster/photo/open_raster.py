@@ -71,10 +71,8 @@ class LayeredImage:
         """Returns the bytes of an OpenRaster file with the profile of the photo, in 8 or 16 bits.
 
         The stored values of both layers sum to those of the photo exactly. The reflection is never negative, because the
-        transmission is clipped to the photo where it is brighter. The composite has the alpha of the photo.
-
-        Raises:
-            UnsupportedPhoto: `format_name` is not "ora".
+        transmission is clipped to the photo where it is brighter. The composite has the alpha of the photo. Raises
+        UnsupportedPhoto if `format_name` is not "ora".
         """
         if format_name != _FORMAT:
             raise UnsupportedPhoto(
@@ -83,7 +81,12 @@ class LayeredImage:
                 f"choose the suffix .{_FORMAT}",
             )
         bits = 8 if self.photo.pixels.dtype == np.uint8 else 16
-        photo, transmission = (layer.stored_as("png", bits) for layer in (self.photo, self._like_photo()))
+        like_photo = self.transmission
+        if (
+            like_photo.pixels.dtype != self.photo.pixels.dtype
+        ):  # an additive transmission is stored as linear floats
+            like_photo = self.photo.with_linear(like_photo.linear())
+        photo, transmission = (layer.stored_as("png", bits) for layer in (self.photo, like_photo))
         behind = np.minimum(photo.pixels, transmission.pixels)
         info = replace(photo.file_info, format_name="png", bits=bits, xmp=self.transmission.file_info.xmp)
         width, height = photo.size
@@ -102,8 +105,3 @@ class LayeredImage:
             "Thumbnails/thumbnail.png": photo.thumbnail(_THUMBNAIL_PX).encode("png", depth=8),
         }
         return zip_images(files.items())
-
-    def _like_photo(self) -> Photo:
-        """Returns the transmission in the colour space of the photo. An additive transmission is stored as linear floats."""
-        is_like = self.transmission.pixels.dtype == self.photo.pixels.dtype
-        return self.transmission if is_like else self.photo.with_linear(self.transmission.linear())

@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 from brewster.errors import PhotoError, UnreadablePhoto, UnsupportedPhoto
 from brewster.files import DEFAULT_MAX_PIXELS, write_atomically
 from brewster.image_formats import FORMATS, canonical_format, format_of
-from brewster.photo.colour import SRGB, ColourSpace, colour_space_of
-from brewster.photo.decode import Decoded, decode
+from brewster.photo.colour import SRGB, ColourSpace, colour_space_of, convert_to_display_p3, has_only_tables
+from brewster.photo.decode import decode
 from brewster.photo.encode import encode
-from brewster.photo.file_info import FileInfo, check_pixel_count, depth_for, format_name_of
+from brewster.photo.file_info import Decoded, FileInfo, check_pixel_count, depth_for, format_name_of
 from brewster.photo.history import sampled_digest
 from brewster.photo.in_memory import (
     WHITE_LEVELS,
@@ -31,7 +31,6 @@ from brewster.photo.in_memory import (
     decode_pil,
     pil_image,
 )
-from brewster.photo.lut_profiles import convert_to_display_p3, has_only_tables
 from brewster.photo.raw import with_raw_suffix
 from brewster.remote_path import location, read_image
 
@@ -60,10 +59,18 @@ class Photo:
 
     def __post_init__(self) -> None:
         """Makes the arrays read-only, so that several photos can use the same arrays."""
-        _check_arrays(self.pixels, self.alpha)
-        self.pixels.flags.writeable = False
-        if self.alpha is not None:
-            self.alpha.flags.writeable = False
+        pixels, alpha = self.pixels, self.alpha
+        is_image = pixels.ndim == 3 and pixels.shape[2] in (1, 3) and pixels.size > 0
+        alpha_fits = alpha is None or (alpha.shape == pixels.shape[:2] and alpha.dtype == pixels.dtype)
+        if not (is_image and alpha_fits and pixels.dtype.name in ("uint8", "uint16", "float32")):
+            raise UnsupportedPhoto(
+                f"pixels are {pixels.shape} of {pixels.dtype}, and alpha is {None if alpha is None else alpha.shape}",
+                "expected (H, W, 1|3) pixels of uint8, uint16 or float32, and alpha (H, W) of the same dtype or None",
+                "use Photo.from_array",
+            )
+        pixels.flags.writeable = False
+        if alpha is not None:
+            alpha.flags.writeable = False
 
     @classmethod
     def open(
@@ -272,7 +279,11 @@ class Photo:
             weights = np.minimum(rows + 1, bottom) - np.maximum(rows, top)
             strip = self.linear_rows(int(rows[0]), int(rows[-1]) + 1)
             mean_row = np.tensordot((weights / weights.sum()).astype(np.float32), strip, 1)
-            out[row] = _area_means(mean_row, width)
+            # The means over `width` equal parts are differences of the cumulative sum.
+            sums = np.vstack([np.zeros((1, 3)), np.cumsum(mean_row, axis=0, dtype=np.float64)])
+            positions, edges = np.arange(len(sums)), np.linspace(0, len(mean_row), width + 1)
+            sums_at_edges = np.column_stack([np.interp(edges, positions, sums[:, i]) for i in range(3)])
+            out[row] = np.diff(sums_at_edges, axis=0) * (width / len(mean_row))
         return out
 
     def encode(
@@ -355,25 +366,6 @@ def _rescaled(values: Stored, dtype: np.dtype[Any]) -> Stored:
     if values.dtype.kind == "f":
         return np.rint(values.clip(0, 1) * np.float32(new_white)).astype(dtype)
     return ((values.astype(np.uint32) * new_white + white // 2) // white).astype(dtype)
-
-
-def _area_means(row: Float32, width: int) -> Float32:
-    """Returns the means of a row (W, 3) over `width` equal parts, as differences of its cumulative sum."""
-    sums = np.vstack([np.zeros((1, 3)), np.cumsum(row, axis=0, dtype=np.float64)])
-    edges = np.linspace(0, len(row), width + 1)
-    sums_at_edges = np.column_stack([np.interp(edges, np.arange(len(sums)), sums[:, i]) for i in range(3)])
-    return (np.diff(sums_at_edges, axis=0) * (width / len(row))).astype(np.float32)
-
-
-def _check_arrays(pixels: Stored, alpha: Stored | None) -> None:
-    is_image = pixels.ndim == 3 and pixels.shape[2] in (1, 3) and pixels.size > 0
-    alpha_fits = alpha is None or (alpha.shape == pixels.shape[:2] and alpha.dtype == pixels.dtype)
-    if not (is_image and alpha_fits and pixels.dtype.name in ("uint8", "uint16", "float32")):
-        raise UnsupportedPhoto(
-            f"pixels are {pixels.shape} of {pixels.dtype}, and alpha is {None if alpha is None else alpha.shape}",
-            "expected (H, W, 1|3) pixels of uint8, uint16 or float32, and alpha (H, W) of the same dtype or None",
-            "use Photo.from_array",
-        )
 
 
 def _read_source(source: object) -> bytes:

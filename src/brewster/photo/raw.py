@@ -118,24 +118,20 @@ def _upright_size(raw: Any, max_pixels: int) -> tuple[int, int]:  # noqa: ANN401
 
 def _exif(data: bytes) -> bytes | None:
     """Returns the camera tags of a RAW file as an EXIF block, without the maker note, because its offsets become invalid."""
-    tags = _camera_tags(data)
-    exif = tags.get(_EXIF_TAG)
-    if isinstance(exif, dict):
-        exif.pop(_MAKER_NOTE, None)
-    return metadata.tiff_exif(tags)
-
-
-def _camera_tags(data: bytes) -> metadata.Tags:
     if data[4:8] == b"ftyp":  # CR3: one TIFF block for each directory, each in a separate box
         blocks = {name: _box(data, name) for name in (b"CMT1", b"CMT2", b"CMT4")}
         tags = metadata.read_tags(blocks[b"CMT1"])
         subdirectories = {_EXIF_TAG: blocks[b"CMT2"], _GPS_TAG: blocks[b"CMT4"]}
-        return tags | {tag: metadata.read_tags(block) for tag, block in subdirectories.items() if block}
-    if data.startswith(b"FUJIFILM"):  # RAF: the position of a JPEG with EXIF is in the header
+        tags |= {tag: metadata.read_tags(block) for tag, block in subdirectories.items() if block}
+    elif data.startswith(b"FUJIFILM"):  # RAF: the position of a JPEG with EXIF is in the header
         start, size = (int.from_bytes(data[at : at + 4], "big") for at in (84, 88))
-        return metadata.read_tags(metadata.jpeg_exif(data[start : start + size]))
-    byte_order = data[:2] + (b"*\0" if data[:2] == b"II" else b"\0*")
-    return metadata.read_tags(byte_order + data[4:])  # ORF and RW2 have another number than 42 at this place
+        tags = metadata.read_tags(metadata.jpeg_exif(data[start : start + size]))
+    else:  # ORF and RW2 have another number than 42 after the byte order
+        tags = metadata.read_tags(data[:2] + (b"*\0" if data[:2] == b"II" else b"\0*") + data[4:])
+    exif = tags.get(_EXIF_TAG)
+    if isinstance(exif, dict):
+        exif.pop(_MAKER_NOTE, None)
+    return metadata.tiff_exif(tags)
 
 
 def _box(data: bytes, name: bytes) -> bytes:

@@ -1,7 +1,5 @@
 """The analytic renderer: each camera ray is split into transmission and reflection orders with exact weights.
 
-    sample = render(scene, Assets([Path("hdri")]), device="cuda")
-
 Smooth parallel panes need no Monte Carlo integration. All orders leave such a glazing in the same direction, so light
 from infinity needs one lookup behind the glass and one in front of it. Near content needs one lookup per group of orders,
 because each order shifts the ray along the glass by its own distance. Defocus of light from infinity is a convolution,
@@ -38,6 +36,7 @@ from brewster.render.rays.vectors import normalize
 from brewster.render.sample import SAMPLE_IMAGES, LinearSample
 from brewster.scene.camera import axes, dot
 from brewster.scene.scene import Scene
+from brewster.scene.world import Side
 
 _MERGE_DISTANCE_PX = 0.1  # orders whose images are closer than this share one lookup
 _MAX_TABLE_REFLECTANCE = 0.08
@@ -52,10 +51,7 @@ _GPU_BATCH_RAYS = 1 << 20
 
 @dataclass(frozen=True)
 class _PreparedSide:
-    """One side of the glass: its emitters, the depth of the surface where light exits, and its orders.
-
-    The images of the orders in a group coincide; each group needs one lookup.
-    """
+    """One side of the glass: its emitters, the depth of the surface where light exits, and groups of orders that coincide."""
 
     emitters: SideEmitters
     depth_mm: float
@@ -123,20 +119,14 @@ def _prepare(scene: Scene, assets: Assets, device: Device) -> _PreparedScene:
         scene.camera.aperture_mm if needs_monte_carlo(scene) else 0.0,
         scene.camera.focus_mm,
     )
-    behind, front = (
-        _prepare_side(scene, assets, view, to_glass.T, is_behind=is_behind, device=device)
-        for is_behind in (True, False)
-    )
-    return _PreparedScene(scene, behind, front, origin, right, up, back)
 
+    def prepare(side: Side, *, is_behind: bool) -> _PreparedSide:
+        emitters = SideEmitters(side, assets, view, is_behind=is_behind, to_world=to_glass.T, device=device)
+        groups = _group_orders(scene, emitters, is_behind=is_behind)
+        return _PreparedSide(emitters, scene.glass.depth_mm if is_behind else 0.0, groups)
 
-def _prepare_side(
-    scene: Scene, assets: Assets, view: CameraView, to_world: Tensor, *, is_behind: bool, device: Device
-) -> _PreparedSide:
-    side = scene.behind if is_behind else scene.front
-    emitters = SideEmitters(side, assets, view, is_behind=is_behind, to_world=to_world, device=device)
-    groups = _group_orders(scene, emitters, is_behind=is_behind)
-    return _PreparedSide(emitters, scene.glass.depth_mm if is_behind else 0.0, groups)
+    sides = prepare(scene.behind, is_behind=True), prepare(scene.front, is_behind=False)
+    return _PreparedScene(scene, *sides, origin, right, up, back)
 
 
 def needs_monte_carlo(scene: Scene) -> bool:
@@ -146,11 +136,7 @@ def needs_monte_carlo(scene: Scene) -> bool:
 
 
 def _render_deterministic(prepared: _PreparedScene) -> list[Tensor]:
-    """Traces a regular grid of rays in each pixel, then applies the defocus blur of the lens.
-
-    Returns:
-        I, T, B, R and MR, (3, H, W) each.
-    """
+    """Traces a regular grid of rays in each pixel, then applies the defocus blur of the lens: I, T, B, R and MR, (3, H, W) each."""
     camera = prepared.scene.camera
     margin = margin_px(camera)
     width, height = camera.width + 2 * margin, camera.height + 2 * margin
@@ -201,11 +187,7 @@ def _pinhole_rays(
 
 
 def _render_monte_carlo(prepared: _PreparedScene, device: Device) -> list[Tensor]:
-    """Traces `samples_per_pixel` random rays per pixel, over the pixel, the lens and the microfacets of rough glass.
-
-    Returns:
-        I, T, B, R and MR, (3, H, W) each.
-    """
+    """Traces `samples_per_pixel` random rays per pixel, over pixel, lens and microfacets: I, T, B, R and MR, (3, H, W) each."""
     scene, camera = prepared.scene, prepared.scene.camera
     count = camera.width * camera.height
     sobol = SobolPoints(scene.seed, scene.index, count, scene.samples_per_pixel, device)
@@ -275,9 +257,7 @@ def _shifted_orders(
     """Looks up the light of a side with near content: once per group, at the exit point of the group's first order.
 
     `exiting` holds the rays after the glass, with origins on the first surface; `far` is the light from infinity along them.
-
-    Returns:
-        The sum of all orders, and the sum of the orders in T or R, (3, N) each.
+    The results are the sum of all orders, and the sum of the orders in T or R, (3, N) each.
     """
     glass, direction = prepared.scene.glass, exiting.direction
     cosine = direction[2].abs()
@@ -307,14 +287,15 @@ def _in_plane_shift(order: ReflectionOrder, shifts: list[Tensor]) -> Tensor:
 def _group_orders(scene: Scene, emitters: SideEmitters, *, is_behind: bool) -> list[list[ReflectionOrder]]:
     """Groups the orders of one side whose images are less than `_MERGE_DISTANCE_PX` apart.
 
-    Distances are measured in the corner of the view with the largest angle of incidence, where they are greatest.
-
-    Returns:
-        The groups, each with its brightest order first. The list is empty if the side has only light from infinity.
+    Distances are measured in the corner of the view with the largest angle of incidence, where they are greatest. Each group
+    has its brightest order first. The list is empty if the side has only light from infinity.
     """
     if not emitters.has_near_light:
         return []
-    cosine = _min_cosine(scene)
+    _, _, normal = axes(scene.glass.heading_deg, scene.glass.pitch_deg)
+    cosine = torch.tensor(
+        min(-dot(corner, normal) / math.hypot(*corner) for corner in scene.camera.corners())
+    )
     reflectances = (float(sum(fresnel(cosine, pane.refractive_index))) / 2 for pane in scene.glass.panes)
     table = enumerate_orders(tuple(round(min(r, _MAX_TABLE_REFLECTANCE), 3) for r in reflectances))
     shifts = in_plane_shifts_mm(scene.glass, cosine)
@@ -331,12 +312,6 @@ def _group_orders(scene: Scene, emitters: SideEmitters, *, is_behind: bool) -> l
         else:
             groups.append((shift_px, [order]))
     return [group for _, group in groups]
-
-
-def _min_cosine(scene: Scene) -> Tensor:
-    """Returns the cosine of the largest angle of incidence in the view."""
-    _, _, normal = axes(scene.glass.heading_deg, scene.glass.pitch_deg)
-    return torch.tensor(min(-dot(corner, normal) / math.hypot(*corner) for corner in scene.camera.corners()))
 
 
 def _trace_rough(prepared: _PreparedScene, rays: Rays, sobol: SobolPoints) -> list[Tensor]:

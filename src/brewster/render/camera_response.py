@@ -1,8 +1,5 @@
 """Simulates a camera: converts the five linear images of a sample into sRGB photographs.
 
-    developed = develop(sample)
-    encode_jpeg(developed.photo_encoded, 90)
-
 Exposure and white balance are computed from I. They are applied to I, T, B and R with the same tone curve, so equal light
 has equal values in these four images. MR is often far brighter and has its own exposure. Only I has noise.
 """
@@ -84,7 +81,7 @@ def develop(sample: LinearSample) -> DevelopedSample:
     gains = sample.photo.new_tensor(white_balance_gains).view(3, 1, 1)
     ev = _exposure_ev(sample.photo * gains, response.target_luminance)
     mirror_ev = _exposure_ev(sample.mirror * gains, response.target_luminance)
-    exposed = sample.map(lambda light: light * (gains * math.exp2(ev))).images()
+    exposed = {name: light * (gains * math.exp2(ev)) for name, light in sample.images().items()}
     exposed["photo"] = _add_noise(exposed["photo"], sample.scene)
     exposed["mirror"] = sample.mirror * (gains * math.exp2(mirror_ev))
     return DevelopedSample(
@@ -190,10 +187,7 @@ def _gains(colour: Tensor, strength: float) -> tuple[float, float, float]:
 
 
 def _grey_world(image: Tensor, valid: Tensor) -> Tensor:
-    """Returns the mean of the valid pixels. Grey-world assumes that the average of a scene is grey.
-
-    Source: G. Buchsbaum, J. Franklin Institute 310, 1980.
-    """
+    """Returns the mean of the valid pixels: the average of a scene is grey (G. Buchsbaum, J. Franklin Institute 310, 1980)."""
     return image[:, valid].mean(1)
 
 

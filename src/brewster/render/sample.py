@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final
 
@@ -32,7 +31,3 @@ class LinearSample:
     def images(self) -> dict[str, Tensor]:
         """Returns the five images by name."""
         return {name: getattr(self, name) for name in SAMPLE_IMAGES}
-
-    def map(self, function: Callable[[Tensor], Tensor]) -> LinearSample:
-        """Returns a sample with the function applied to each image."""
-        return LinearSample(self.scene, **{name: function(layer) for name, layer in self.images().items()})

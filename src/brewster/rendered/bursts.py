@@ -1,9 +1,5 @@
 """Reads rendered bursts: the frames of each scene, and the exact motion of both layers between them.
 
-    for burst in read_bursts(Path("out/burst")):
-        light, _ = open_sample(burst.frames[burst.reference])
-        motion = burst.motion(4)
-
 A dataset of `brewster render --burst` has one sample for each frame. The frames of a burst follow each other.
 """
 
@@ -11,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import cached_property
 from itertools import groupby
 from pathlib import Path
 
@@ -27,26 +22,19 @@ class StoredBurst:
 
     index: int
     frames: tuple[StoredSample, ...]
+    scenes: tuple[Scene, ...]
+    """The scenes of the frames."""
 
     @property
     def reference(self) -> int:
         """The position of the reference frame in `frames`: the middle."""
         return len(self.frames) // 2
 
-    @cached_property
-    def scenes(self) -> tuple[Scene, ...]:
-        """The scenes of the frames.
-
-        Raises:
-            RecipeError: a scene file is damaged.
-        """
-        return tuple(read_scene_of(frame) for frame in self.frames)
-
     def motion(self, frame: int) -> LayerMotion:
         """Computes the motion of both layers from the reference frame to another frame.
 
         Raises:
-            RecipeError: a scene file is damaged, or the motion cannot be computed (see `layer_motion`).
+            RecipeError: the motion cannot be computed (see `layer_motion`).
         """
         return layer_motion(self.scenes[self.reference], self.scenes[frame])
 
@@ -57,19 +45,19 @@ def read_bursts(out: Path) -> Iterator[StoredBurst]:
     Raises:
         RecipeError: the dataset has a sample that is not a frame of a burst, or a scene file is damaged.
     """
-    frames = ((_frames_of(entry), entry) for entry in read_dataset(out))
-    for (index, count), group in groupby(frames, key=lambda item: (item[1].index // item[0], item[0])):
-        entries = tuple(entry for _, entry in group)
+    frames = ((entry, read_scene_of(entry)) for entry in read_dataset(out))
+    for (index, count), group in groupby(frames, key=lambda frame: _burst_of(*frame)):
+        entries, scenes = zip(*group, strict=True)
         if len(entries) == count:
-            yield StoredBurst(index, entries)
+            yield StoredBurst(index, entries, scenes)
 
 
-def _frames_of(entry: StoredSample) -> int:
-    burst = read_scene_of(entry).burst
-    if burst is None:
+def _burst_of(entry: StoredSample, scene: Scene) -> tuple[int, int]:
+    """Returns the number of the burst of a frame, and the number of its frames."""
+    if scene.burst is None:
         raise RecipeError(
             f"sample {entry.index} of {entry.path.parent} is a single photo",
             "expected the frames of bursts",
             "choose a dataset of `brewster render --burst`",
         )
-    return burst.frames
+    return entry.index // scene.burst.frames, scene.burst.frames

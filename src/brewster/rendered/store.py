@@ -1,8 +1,5 @@
 """Stores rendered samples: one folder per sample, or shards (tar files) of a hundred samples, and an index.
 
-    for entry in read_dataset(Path("out/window")):
-        layers, scene = open_sample(entry)
-
 Writing is atomic: a file or folder is written with a hidden name, flushed to disk, and then renamed.
 """
 
@@ -16,6 +13,7 @@ import tomllib
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from io import BytesIO
+from itertools import product
 from pathlib import Path
 from typing import Final
 
@@ -48,10 +46,8 @@ _CURE: Final = "delete this sample, and render the dataset again"
 
 
 def _reflection_to_transmission(sample: LinearSample, _: DevelopedSample) -> float:
-    reflected, transmitted = (
-        luminance(layer.double().mean((1, 2))) for layer in (sample.reflection, sample.transmission)
-    )
-    return reflected / max(transmitted, 1e-12)
+    means = [luminance(layer.double().mean((1, 2))) for layer in (sample.reflection, sample.transmission)]
+    return means[0] / max(means[1], 1e-12)
 
 
 STATISTICS: Final[dict[str, Callable[[LinearSample, DevelopedSample], float]]] = {
@@ -77,11 +73,7 @@ two versions (tests/test_conventions_formats.py). Version 3 renamed keys of scen
 
 
 def encode_sample(sample: LinearSample, renderer: str) -> dict[str, bytes]:
-    """Encodes a sample. Returns the bytes of each of its files by name.
-
-    Raises:
-        MissingExtra: OpenEXR is not installed.
-    """
+    """Encodes a sample. Returns the bytes of each of its files by name. Raises MissingExtra if OpenEXR is not installed."""
     developed = develop(sample)
     origin = {"version": brewster.__version__, "renderer": renderer}
     outcome = {**origin, **developed.camera_settings(), **statistics(sample, developed)}
@@ -144,30 +136,22 @@ def pack(out: Path, block: int) -> None:
             atomic_path(out / shard_name(block)) as part,
             tarfile.open(part, "w", format=tarfile.USTAR_FORMAT) as tar,
         ):
-            for entry in entries:
-                _add(tar, entry)
+            for entry, name in product(entries, SAMPLE_FILES):
+                data, member = entry.read(name), tarfile.TarInfo(f"{entry.name}.{name}")
+                member.size = len(data)
+                tar.addfile(member, BytesIO(data))
     for folder in _folders(out, block):
-        _remove(folder)
+        hidden = temporary_path(
+            folder
+        )  # the folder is renamed first, so that no reader finds a partial sample
+        with contextlib.suppress(OSError):  # another process has removed it
+            folder.replace(hidden)
+            discard(hidden)
 
 
 def has_folders(out: Path, block: int) -> bool:
     """Whether there are folders with samples of this block. If packing was interrupted, the shard may have them, too."""
     return next(_folders(out, block), None) is not None
-
-
-def _add(tar: tarfile.TarFile, entry: StoredSample) -> None:
-    for name in SAMPLE_FILES:
-        data, member = entry.read(name), tarfile.TarInfo(f"{key(entry.index)}.{name}")
-        member.size = len(data)
-        tar.addfile(member, BytesIO(data))
-
-
-def _remove(folder: Path) -> None:
-    """Removes the folder of a sample. The folder is renamed first, so that no reader finds a partial sample."""
-    hidden = temporary_path(folder)
-    with contextlib.suppress(OSError):  # another process has removed it
-        folder.replace(hidden)
-        discard(hidden)
 
 
 # --- reading
@@ -198,7 +182,10 @@ class StoredSample:
 
 def read_dataset(out: Path) -> Iterator[StoredSample]:
     """Yields the finished samples of a dataset from folders and shards, in the order of their indices."""
-    for block in _blocks(out):
+    with os.scandir(out) as found:
+        names = (re.fullmatch(r"(?:shard-(\d{6,})\.tar|(\d{6,}))", item.name) for item in found)
+        blocks = {int(name[1]) if name[1] else int(name[2]) // SHARD_SIZE for name in names if name}
+    for block in sorted(blocks):
         yield from read_block(out, block)
 
 
@@ -227,24 +214,13 @@ def open_sample(entry: StoredSample) -> tuple[dict[str, Float32], Scene]:
 
 
 def read_scene_of(entry: StoredSample) -> Scene:
-    """Reads the scene of a sample.
-
-    Raises:
-        RecipeError: the scene file is damaged.
-    """
+    """Reads the scene of a sample. Raises RecipeError if the scene file is damaged."""
     try:
         table = tomllib.loads(entry.read(SCENE_FILE).decode())
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise RecipeError(f"the scene of {entry.path} is not TOML", "expected a scene file", _CURE) from error
     values = {name: table[name] for name in table if name != "outcome"}
     return validated(Scene, values, source=f"the scene of {entry.path}", reference="brewster render --help")
-
-
-def _blocks(out: Path) -> list[int]:
-    """Returns the numbers of the blocks with at least one finished sample, in ascending order."""
-    with os.scandir(out) as found:
-        names = (re.fullmatch(r"(?:shard-(\d{6,})\.tar|(\d{6,}))", item.name) for item in found)
-        return sorted({int(name[1]) if name[1] else int(name[2]) // SHARD_SIZE for name in names if name})
 
 
 def _folders(out: Path, block: int) -> Iterator[Path]:

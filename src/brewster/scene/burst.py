@@ -1,8 +1,5 @@
 """The exact motion of both layers between two frames of a burst, computed from their scenes.
 
-    motion = layer_motion(scenes[2], scenes[4])
-    motion.transmission[y, x]  # where the point of T at pixel (x, y) of frame 2 is in frame 4, minus (x, y)
-
 The motion of T is that of the path that passes the panes without a reflection, and the motion of R that of the
 reflection at the first surface. These paths carry nearly all light of their layers.
 """
@@ -61,20 +58,15 @@ def layer_motion(reference: Scene, frame: Scene) -> LayerMotion:
     """
     _check_same_burst(reference, frame)
     glass = reference.glass
-    layers = (
-        _Content(reference.behind, glass, is_behind=True),
-        _Content(reference.front, glass, is_behind=False),
-    )
-    return LayerMotion(*(_motion(content, reference.camera, frame.camera) for content in layers))
-
-
-def _motion(content: _Content, camera: Camera, moved: Camera) -> Float32:
-    rays = _pixel_rays(camera, content.to_glass)
-    points = content.intersect(content.origin(camera), rays)
-    positions = _project(content, moved, points)
+    camera = reference.camera
     y, x = np.mgrid[: camera.height, : camera.width]
-    motion = positions.reshape(camera.height, camera.width, 2) - np.stack([x, y], -1)
-    return np.asarray(motion, np.float32)
+    motions = []
+    for side, is_behind in ((reference.behind, True), (reference.front, False)):
+        content = _Content(side, glass, is_behind=is_behind)
+        points = content.intersect(content.origin(camera), _pixel_rays(camera, content.to_glass))
+        positions = _project(content, frame.camera, points).reshape(camera.height, camera.width, 2)
+        motions.append(np.asarray(positions - np.stack([x, y], -1), np.float32))
+    return LayerMotion(*motions)
 
 
 class _Content:

@@ -1,15 +1,11 @@
-"""Reads recipes from TOML files and reports all problems at once; writes recipes with all defaults.
-
-recipe = read_toml(SceneRecipe, Path("mine.toml"), reference="docs/recipes.md")
-print(commented_toml(recipe))
-"""
+"""Reads recipes from TOML files and reports all problems at once; writes recipes with all defaults."""
 
 from __future__ import annotations
 
 import re
 import textwrap
 import tomllib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Any, Final, TypeVar
@@ -88,7 +84,7 @@ def _problem(
     if kind == "missing":
         missing = [*path, str(location[-1])]
         return RecipeError(
-            f"{source}: {_dotted(missing)} is missing", _expected(model, missing), "add this key"
+            f"{source}: {_dotted(missing)} is missing", f"expected {describe(model, missing)}", "add this key"
         )
     if kind == "extra_forbidden" or location[-1:] == ("[key]",):
         return _unknown_key(model, path, value, source)
@@ -100,17 +96,16 @@ def _problem(
         return RecipeError(happened, expected_value(details), cure)
     allowed = [name for name in literal_values(model, path) if isinstance(name, str)]
     close = get_close_matches(str(value), allowed, n=1)
-    return RecipeError(happened, _expected(model, path), f'did you mean "{close[0]}"?' if close else cure)
+    return RecipeError(
+        happened, f"expected {describe(model, path)}", f'did you mean "{close[0]}"?' if close else cure
+    )
 
 
 def _look_up(
     values: Any,  # noqa: ANN401  (any value of TOML)
     location: Sequence[str | int],
 ) -> tuple[list[str | int], Any]:
-    """Returns the part of pydantic's location that exists in the values, and the value at this location.
-
-    The rest of the location may be the name of a member of a union, or "[key]".
-    """
+    """Returns the part of pydantic's location that exists in the values, and the value there. The rest may be "[key]"."""
     path: list[str | int] = []
     for part in location:
         is_key = isinstance(values, Mapping) and part in values
@@ -149,10 +144,6 @@ def similar_key(model: type[FrozenModel], path: Sequence[str | int]) -> str | No
     return next((known for known in paths if known.rpartition(".")[2] == name), None)
 
 
-def _expected(model: type[FrozenModel], path: Sequence[str | int]) -> str:
-    return f"expected {describe(model, path)}"
-
-
 def _dotted(path: Sequence[str | int]) -> str:
     return ".".join(map(str, path))
 
@@ -179,26 +170,11 @@ def commented_toml(recipe: FrozenModel) -> str:
         for key in table.keys:
             default = None if key.default is REQUIRED else key.default
             value = _value_at(values, key.path) if is_set else default
-            lines += _key_lines(key, value, is_set=is_set)
+            facts = (key.kind, key.allowed, key.unit and f"in {key.unit}", describe_default(key))
+            lines += _comment(f"{key.meaning} ({', '.join(filter(None, facts))})")
+            name, text = key.path.rpartition(".")[2], "" if value is None else _toml(value)
+            lines.append(_line(f"{name} = {text}".rstrip(), is_set=is_set and value is not None))
     return "\n".join(lines) + "\n"
-
-
-def _key_lines(key: RecipeKey, value: object, *, is_set: bool) -> Iterator[str]:
-    """Yields the description of a key as comment lines, then the line with its value."""
-    yield from _comment(f"{key.meaning} ({', '.join(_facts(key))})")
-    name = key.path.rpartition(".")[2]
-    has_value = is_set and value is not None
-    yield _line(f"{name} = {'' if value is None else _toml(value)}".rstrip(), is_set=has_value)
-
-
-def _facts(key: RecipeKey) -> Iterator[str]:
-    """Yields the type, the allowed values, the unit and the default of a key in words."""
-    yield key.kind
-    if key.allowed:
-        yield key.allowed
-    if key.unit:
-        yield f"in {key.unit}"
-    yield describe_default(key)
 
 
 def describe_default(key: RecipeKey) -> str:
@@ -228,7 +204,10 @@ def _toml(value: object) -> str:
         case bool():
             return str(value).lower()
         case Mapping():
-            pairs = [f"{_toml_key(name)} = {_toml(inner)}" for name, inner in value.items()]
+            names = [
+                name if re.fullmatch(r"[A-Za-z0-9_-]+", name) else _toml(name) for name in map(str, value)
+            ]
+            pairs = [f"{name} = {_toml(inner)}" for name, inner in zip(names, value.values(), strict=True)]
             return f"{{ {', '.join(pairs)} }}" if pairs else "{}"
         case list() | tuple():
             return f"[{', '.join(map(_toml, value))}]"
@@ -236,8 +215,3 @@ def _toml(value: object) -> str:
             return f'"{value.translate(_ESCAPES)}"'
         case _:
             return str(value)
-
-
-def _toml_key(name: object) -> str:
-    text = str(name)
-    return text if re.fullmatch(r"[A-Za-z0-9_-]+", text) else _toml(text)

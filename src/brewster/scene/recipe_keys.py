@@ -1,8 +1,5 @@
 """Describes the keys of a recipe from the JSON schema of its pydantic model: type, unit, allowed values, default and meaning.
 
-    for key in recipe_keys(SceneRecipe):
-        print(key.path, key.kind, key.allowed)
-
 docs/recipes.md, `--show-recipe` and the error messages of recipes contain these descriptions.
 """
 
@@ -68,12 +65,7 @@ def recipe_keys(model: type[FrozenModel]) -> Iterator[RecipeKey]:
 
 
 def describe(model: type[FrozenModel], path: Sequence[str | int]) -> str:
-    """Describes the values that are allowed at a path of a recipe: "an integer, above 0".
-
-    Args:
-        model: the model of the recipe.
-        path: names of keys and indices of list items.
-    """
+    """Describes the values that are allowed at a path of a recipe: "an integer, above 0"."""
     kind, allowed = _in_words(_schema_at(model, path))
     return f"{'an' if kind[:1] in 'aeiou' else 'a'} {kind}{', ' if allowed else ''}{allowed}"
 
@@ -101,18 +93,18 @@ def _tables(schema: Schema, path: str, meaning: str) -> Iterator[RecipeTable]:
         unit = units[0] if units else _UNITS[suffix[1]] if suffix else ""
         keys.append(
             RecipeKey(
-                prefix + name, *_in_words(field), unit, default, _one_paragraph(field.get("description", ""))
+                prefix + name,
+                *_in_words(field),
+                unit,
+                default,
+                " ".join(field.get("description", "").split()),
             )
         )
     yield RecipeTable(
-        path, schema["title"], tuple(keys), _one_paragraph(meaning or schema.get("description", ""))
+        path, schema["title"], tuple(keys), " ".join((meaning or schema.get("description", "")).split())
     )
     for table in tables:
         yield from _tables(*table)
-
-
-def _one_paragraph(text: str) -> str:
-    return " ".join(text.split())
 
 
 # --- schemas in words

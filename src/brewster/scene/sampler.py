@@ -1,7 +1,4 @@
-"""Draws random scenes. The same recipe, catalog, seed and index give the same scene on every machine.
-
-scene = draw(read_scene_recipe("window"), catalog, seed=7, index=12)
-"""
+"""Draws random scenes. The same recipe, catalog, seed and index give the same scene on every machine."""
 
 from __future__ import annotations
 
@@ -165,10 +162,7 @@ def _draw_glazing(recipe: GlassRecipe, rng: _SceneRng) -> Glazing:
 
 
 def _choose_map(recipe: SideRecipe, camera: CameraRecipe, catalog: Catalog, rng: _SceneRng) -> Asset | None:
-    """Draws a map whose resolution is sufficient for the widest view of the recipe.
-
-    Returns None for a side without a map, and if no map is suitable but the recipe also allows pictures.
-    """
+    """Draws a map that is sharp enough for the widest view; None for a side without one, or if pictures replace it."""
     candidates = [
         asset
         for asset in catalog.maps
@@ -284,10 +278,8 @@ def _focus_camera(recipe: CameraRecipe, partial: _PartialScene, behind: Side, fr
     """Returns the camera, focused on the content of one side."""
     rng, camera = partial.rng, partial.camera
     focused_side = front if rng.bernoulli(recipe.focus_on_front_probability) else behind
-    is_pinhole, aperture = (
-        rng.bernoulli(recipe.pinhole_probability),
-        rng.from_log_range(recipe.aperture_mm),
-    )
+    is_pinhole = rng.bernoulli(recipe.pinhole_probability)
+    aperture = rng.from_log_range(recipe.aperture_mm)
     distance_mm = _camera_in_glass_frame(camera, partial.glass)[2] + focused_side.distance_mm
     cosine = _to_glass_frame(camera.axes[2], partial.glass)[2]
     return camera.model_copy(
@@ -315,10 +307,7 @@ def _draw_camera_response(recipe: CameraResponseRecipe, rng: _SceneRng) -> Camer
 
 @dataclass(frozen=True)
 class _CameraMove:
-    """A frame relative to the reference frame: the move in mm to the right, up and back, the turn, and the exposure.
-
-    `turn_deg` is added to heading, pitch and roll.
-    """
+    """A frame relative to the reference frame: mm to the right, up and back; what is added to heading, pitch and roll; exposure."""
 
     offset_mm: Point = (0.0, 0.0, 0.0)
     turn_deg: Point = (0.0, 0.0, 0.0)
@@ -335,10 +324,8 @@ class _BurstMotion:
 
 
 def _draw_motion(recipe: BurstRecipe, rng: _SceneRng) -> _BurstMotion:
-    at_equal_distance, without_glass = (
-        rng.bernoulli(recipe.equal_distance_probability),
-        rng.bernoulli(recipe.without_glass_probability),
-    )
+    is_at_equal_distance = rng.bernoulli(recipe.equal_distance_probability)
+    without_glass = rng.bernoulli(recipe.without_glass_probability)
     is_still = rng.bernoulli(recipe.still_probability)
     baseline_mm = 0.0 if is_still else rng.from_range(recipe.baseline_mm) * rng.choice((-1, 1))
     direction = math.radians(rng.from_range(recipe.direction_deg))
@@ -352,7 +339,7 @@ def _draw_motion(recipe: BurstRecipe, rng: _SceneRng) -> _BurstMotion:
         exposure_ev = rng.gauss(0, recipe.exposure_jitter_ev)
         moves.append(_CameraMove((x, y, z), (heading, pitch, roll), exposure_ev))
     moves[reference] = _CameraMove()
-    return _BurstMotion(tuple(moves), at_equal_distance, without_glass)
+    return _BurstMotion(tuple(moves), is_at_equal_distance, without_glass)
 
 
 def _frames(scene: Scene, motion: _BurstMotion, catalog: Catalog) -> list[Scene]:
@@ -362,23 +349,20 @@ def _frames(scene: Scene, motion: _BurstMotion, catalog: Catalog) -> list[Scene]
         behind, front = at_equal_distance(behind, front)
     glass = scene.glass.without_effect() if motion.without_glass else scene.glass
     values = dict(scene) | {"behind": behind, "front": front, "glass": glass}
+    target = scene.camera_response.target_luminance
     return [
         Scene(
             **values
             | {
                 "camera": scene.camera.moved(move.offset_mm, move.turn_deg),
-                "camera_response": _exposed(scene.camera_response, move.exposure_ev),
+                "camera_response": scene.camera_response.model_copy(
+                    update={"target_luminance": min(1.0, _six_digits(target * 2**move.exposure_ev))}
+                ),
                 "burst": BurstFrame(frame=frame, frames=len(motion.moves)),
             }
         )
         for frame, move in enumerate(motion.moves)
     ]
-
-
-def _exposed(response: CameraResponse, exposure_ev: float) -> CameraResponse:
-    """Returns the camera response with another target of the automatic exposure."""
-    target = min(1.0, _six_digits(response.target_luminance * 2**exposure_ev))
-    return response.model_copy(update={"target_luminance": target})
 
 
 def _with_height(side: Side, catalog: Catalog) -> Side:

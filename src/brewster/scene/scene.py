@@ -1,8 +1,4 @@
-"""A scene: glass, camera, content on both sides, and camera response. Scenes are read from and written to TOML.
-
-scene = read_scene(Path("scene.toml"))
-print(scene.to_toml())
-"""
+"""A scene: glass, camera, content on both sides, and camera response. Scenes are read from and written to TOML."""
 
 from __future__ import annotations
 
@@ -96,9 +92,19 @@ class Scene(FrozenModel):
             raise ValueError(
                 f"expected the camera in front of the glass, but it is {-above_glass_mm:g} mm behind it"
             )
-        if self.glass.is_flat:
-            self._check_incidence(normal)
-        self._check_focus(normal, above_glass_mm)
+        for corner in self.camera.corners() if self.glass.is_flat else ():
+            cosine = -dot(corner, normal) / math.sqrt(dot(corner, corner))
+            if cosine <= math.cos(math.radians(MAX_INCIDENCE_DEG)):
+                raise ValueError(
+                    f"expected angles of incidence up to {MAX_INCIDENCE_DEG:g} degrees, but a corner of the view exceeds this limit:"
+                    " turn the camera to the glass, or reduce fov_deg"
+                )
+        _, _, back = self.camera.axes
+        focus_depth_mm = self.camera.focus_mm * dot(back, normal) - above_glass_mm
+        if self.camera.aperture_mm > 0 and 0 <= focus_depth_mm <= self.glass.depth_mm:
+            raise ValueError(
+                f"expected a focus_mm in front of the glass or behind it, but the focus is {focus_depth_mm:g} mm inside the glass"
+            )
         self._check_distances()
         return self
 
@@ -114,23 +120,6 @@ class Scene(FrozenModel):
         """The seeds of the noise in I. The reference frame of a burst has the noise of the single photo."""
         seeds = self.seed, self.index
         return seeds if self.burst is None or self.burst.is_reference else (*seeds, self.burst.frame + 1)
-
-    def _check_incidence(self, normal: tuple[float, float, float]) -> None:
-        for corner in self.camera.corners():
-            cosine = -dot(corner, normal) / math.sqrt(dot(corner, corner))
-            if cosine <= math.cos(math.radians(MAX_INCIDENCE_DEG)):
-                raise ValueError(
-                    f"expected angles of incidence up to {MAX_INCIDENCE_DEG:g} degrees, but a corner of the view exceeds this limit:"
-                    " turn the camera to the glass, or reduce fov_deg"
-                )
-
-    def _check_focus(self, normal: tuple[float, float, float], above_glass_mm: float) -> None:
-        _, _, back = self.camera.axes
-        focus_depth_mm = self.camera.focus_mm * dot(back, normal) - above_glass_mm
-        if self.camera.aperture_mm > 0 and 0 <= focus_depth_mm <= self.glass.depth_mm:
-            raise ValueError(
-                f"expected a focus_mm in front of the glass or behind it, but the focus is {focus_depth_mm:g} mm inside the glass"
-            )
 
     def _check_distances(self) -> None:
         """Checks that glass and camera are inside every dome, and that no plane touches the glass."""

@@ -85,10 +85,8 @@ class Side(FrozenModel):
 def at_equal_distance(behind: Side, front: Side) -> tuple[Side, Side]:
     """Moves the content behind the glass to the mirror image of the content in front, so that both layers move alike.
 
-    What only one side has, a map or a picture, is removed. The sides keep their textures and luminances.
-
-    Returns:
-        The new sides behind and in front of the glass.
+    What only one side has, a map or a picture, is removed. The sides keep their textures and luminances. Returns the new
+    sides behind and in front of the glass.
 
     Raises:
         ValueError: one side has only a map, and the other has only a picture.
@@ -98,13 +96,9 @@ def at_equal_distance(behind: Side, front: Side) -> tuple[Side, Side]:
     if behind.map and front.map:
         near["map"], far["map"] = front.map, behind.map.model_copy(update={"radius_mm": front.map.radius_mm})
     if behind.plane and front.plane:
-        near["plane"], far["plane"] = front.plane, _mirrored(front.plane, behind.plane)
+        picture = behind.plane.model_dump(include={"source", "luminance", "highlight_boost"})
+        mirrored = front.plane.model_dump() | picture | {"heading_deg": -front.plane.heading_deg}
+        near["plane"], far["plane"] = front.plane, Plane(**mirrored)
     if not near:
         raise ValueError("expected a map on both sides of the glass, or a picture on both sides")
     return Side.model_validate(far), Side.model_validate(near)
-
-
-def _mirrored(plane: Plane, texture: Plane) -> Plane:
-    """Returns a plane with the picture of `texture` where the glass mirrors `plane`."""
-    picture = texture.model_dump(include={"source", "luminance", "highlight_boost"})
-    return Plane(**plane.model_dump() | picture | {"heading_deg": -plane.heading_deg})

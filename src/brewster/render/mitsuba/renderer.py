@@ -1,7 +1,5 @@
 """The reference renderer: path-traces the five images of any scene with an unmodified Mitsuba 3.
 
-    sample = trace(scene, Assets([Path("hdri")]), noise_threshold=0.01)
-
 The two renderers share no code for the optics, so that each validates the other. Each image is lit from one side of the
 glass only; objects on the other side are black. Light is additive, so I is the sum of the image lit from behind and the
 image lit from the front.
@@ -59,12 +57,7 @@ def trace(
     unpolarised after a rough surface.
 
     Args:
-        scene: the scene to render.
-        assets: the source of the scene's maps and pictures.
-        noise_threshold: the relative error at which an image is finished.
-        max_samples: the maximum number of samples per pixel of an image.
         denoise: whether to filter the result with Intel Open Image Denoise.
-        polarised: whether to trace polarisation.
 
     Returns:
         Linear light, float32 (3, H, W) each.
@@ -135,19 +128,16 @@ def _render_layers(
 def _to_tensor(light: NDArray[np.float64], denoise: bool) -> Tensor:
     image = np.ascontiguousarray(light, np.float32)
     if denoise:
-        image = np.array(_denoiser().denoise(image, hdr=True), np.float32)
+        try:
+            denoiser = importlib.import_module("mitsuba_oidn")
+        except ImportError as error:
+            happened, expected = (
+                "mitsuba_oidn is not installed",
+                "expected the package mitsuba-oidn for denoising",
+            )
+            raise MissingExtra.for_extra("render", happened, expected) from error
+        image = np.array(denoiser.denoise(image, hdr=True), np.float32)
     return torch.from_numpy(image).permute(2, 0, 1).contiguous()
-
-
-def _denoiser() -> ModuleType:
-    try:
-        return importlib.import_module("mitsuba_oidn")
-    except ImportError as error:
-        raise MissingExtra.for_extra(
-            "render",
-            "mitsuba_oidn is not installed",
-            "expected the package mitsuba-oidn for denoising",
-        ) from error
 
 
 class _RunningEstimate:
@@ -198,19 +188,13 @@ class _RunningEstimate:
 
 
 def _samples_per_pass(pixel_count: int, max_samples: int) -> int:
-    """Returns the number of samples per pixel in a pass: 64, 16, 4 or 1, as many as the memory and `_MIN_PASSES` passes allow.
-
-    These are square numbers, which the sampler stratifies evenly.
-    """
+    """Returns 64, 16, 4 or 1 samples per pixel, as memory and `_MIN_PASSES` allow: square numbers are stratified evenly."""
     limit = min(max_samples // _MIN_PASSES, _MAX_RAYS_PER_PASS // pixel_count)
     return next((samples for samples in (64, 16, 4) if samples <= limit), 1)
 
 
 def _converge(estimates: Sequence[_RunningEstimate], noise_threshold: float, max_samples: int) -> None:
-    """Adds passes until the error of the images' sum is at most `noise_threshold`, or all images have `max_samples` samples per pixel.
-
-    Each pass is for the image with the largest error.
-    """
+    """Adds a pass to the image with the largest error, until their sum is good enough, or all have `max_samples`."""
     for estimate in estimates:
         for _ in range(_MIN_PASSES):
             estimate.add_pass()

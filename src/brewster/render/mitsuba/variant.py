@@ -77,9 +77,6 @@ def load() -> ModuleType:
 
     The first call takes a second or two.
 
-    Returns:
-        The module `mitsuba`.
-
     Raises:
         MissingExtra: mitsuba is not installed, or a system library that it needs is missing.
     """

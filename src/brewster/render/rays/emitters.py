@@ -51,22 +51,16 @@ class MipmappedTexture:
         `footprint` is in texels of the image at full resolution.
         """
         level = min(math.ceil(math.log2(max(footprint / _MAX_TEXELS_PER_LOOKUP, 1.0))), len(self._levels) - 1)
-        texels = self._level(level)
-        if self.wraps:
-            width = self._levels[level].shape[3]
-            u = (u * width + 1) / (width + 2)  # the level has one more column on either side
+        texels = self._levels[level]
+        if self.wraps:  # each side has an additional column from the opposite side
+            u = (u * texels.shape[3] + 1) / (texels.shape[3] + 2)
+            if level not in self._padded:
+                self._padded[level] = functional.pad(texels, (1, 1, 0, 0), mode="circular")
+            texels = self._padded[level]
         grid = torch.stack([u, v], dim=-1)[None, None] * 2 - 1
         return functional.grid_sample(
             texels, grid, mode="bilinear", padding_mode="border", align_corners=False
         )[0, :, 0]
-
-    def _level(self, level: int) -> Tensor:
-        """Returns the texels of a level. If the texture wraps, each side has an additional column from the opposite side."""
-        if not self.wraps:
-            return self._levels[level]
-        if level not in self._padded:
-            self._padded[level] = functional.pad(self._levels[level], (1, 1, 0, 0), mode="circular")
-        return self._padded[level]
 
 
 @dataclass(frozen=True)
@@ -253,10 +247,8 @@ class SideEmitters:
         return LightSamples(self._to_world.T @ direction, radiance, distribution.pdf(u, v))
 
     def towards(self, samples: LightSamples, rays: Rays) -> tuple[Tensor, Tensor, Tensor]:
-        """Returns the unit directions from the origins of `rays` to points of the map, and the light from there.
-
-        Returns:
-            Directions (3, N), light (3, N) and the densities of the directions per steradian (N,).
+        """Returns the unit directions (3, N) from the origins of `rays` to points of the map, the light from there (3, N), and
+        the densities of the directions per steradian (N,).
         """
         direction, pdf = samples.point, samples.pdf
         if self.has_dome:
@@ -288,11 +280,7 @@ class SideEmitters:
         return (distance / self.radius_mm) ** 2 / dot(point, direction).clamp(min=1e-6)
 
     def _intersect_dome(self, origin: Tensor, direction: Tensor) -> tuple[Tensor, Tensor]:
-        """Intersects rays with the dome.
-
-        Returns:
-            Unit directions from the dome's centre to the intersections, (3, N), and distances along the rays in mm, (N,).
-        """
+        """Returns unit directions (3, N) from the dome's centre to the intersections of rays, and distances along the rays in mm."""
         along = dot(origin, direction)
         distance = torch.sqrt((along**2 - dot(origin, origin) + self.radius_mm**2).clamp(min=0)) - along
         return (origin + distance * direction) / self.radius_mm, distance

@@ -1,8 +1,5 @@
 """Renders datasets: the job, the schedule of its tasks, and the lock. The executors are in `brewster.executors`.
 
-    job = RenderJob(Path("out/window"), read_scene_recipe("window"), read_catalog([], [])[0], seed=7)
-    build(job, range(1000), ProcessExecutor(partial(TaskRunner, job), 8))
-
 A sample depends only on the job and its index. The process that renders a sample writes it atomically. Therefore every
 existing sample is complete, and a killed run needs no other state to resume. Memory and time per sample do not depend on
 the number of samples.
@@ -23,7 +20,7 @@ import filelock
 import tomli_w
 
 from brewster.errors import DeviceError, MissingExtra, OutputError
-from brewster.executors import Executor, run_tasks
+from brewster.executors.local import Executor, run_tasks
 from brewster.files import write_atomically
 from brewster.rendered import store
 from brewster.rendered.generation.preview import write_index
@@ -117,14 +114,8 @@ def build(
 ) -> None:
     """Renders the missing samples of a dataset, packs them into shards if `shards` is True, and writes the index.
 
-    A sample that fails is reported and skipped. The next call renders it again.
-
-    Args:
-        job: the dataset to render.
-        indices: the indices of the samples.
-        executor: the executor that runs the tasks.
-        shards: whether to pack every hundred samples into a tar file.
-        report: a function that is called with the result of every sample.
+    A sample that fails is reported and skipped. The next call renders it again. `report` is called with the result of every
+    sample.
 
     Raises:
         OutputError: the folder has other content, another run writes to it, or the disk is full or read-only.
@@ -210,14 +201,6 @@ def _exclusive_lock(out: Path) -> Iterator[None]:
             "choose another folder",
         ) from error
     lock = filelock.FileLock(out / _LOCK_FILE, blocking=False, fallback_to_soft=False)
-    _acquire(lock, out)
-    try:
-        yield
-    finally:
-        lock.release()
-
-
-def _acquire(lock: filelock.BaseFileLock, out: Path) -> None:
     try:
         lock.acquire()
     except filelock.Timeout as error:
@@ -232,16 +215,31 @@ def _acquire(lock: filelock.BaseFileLock, out: Path) -> None:
             "expected a file system with locks, so that only one run writes to a dataset",
             "choose a folder on another file system",
         ) from error
+    try:
+        yield
+    finally:
+        lock.release()
 
 
 def _check_record(job: RenderJob) -> None:
     """Writes the record of the job into a new dataset, or compares it with the record of an existing dataset."""
     path, text = job.out / RECORD_FILE, tomli_w.dumps(job.record())
     if not path.exists():
-        _check_is_set(job.out)
+        if foreign := next((entry for entry in job.out.iterdir() if not entry.name.startswith(".")), None):
+            raise OutputError(
+                f"{job.out} contains {foreign.name}, but no rendered dataset",
+                "expected an empty folder or a rendered dataset",
+                "choose a new folder",
+            )
         write_atomically(path, text.encode())
         return
-    existing, requested = dict(_flatten(_read_record(path))), dict(_flatten(tomllib.loads(text)))
+    try:
+        existing = dict(_flatten(tomllib.loads(path.read_text("utf-8"))))
+    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        raise OutputError(
+            f"{path} cannot be read ({error})", "expected the record of a dataset", "choose another folder"
+        ) from error
+    requested = dict(_flatten(tomllib.loads(text)))
     for name in {**existing, **requested}:
         old, new = existing.get(name, "not set"), requested.get(name, "not set")
         if old != new:
@@ -250,25 +248,6 @@ def _check_record(job: RenderJob) -> None:
                 "expected the settings of that dataset, or a new folder",
                 "choose another folder, or use the same settings",
             )
-
-
-def _read_record(path: Path) -> dict[str, Any]:
-    try:
-        return tomllib.loads(path.read_text("utf-8"))
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-        raise OutputError(
-            f"{path} cannot be read ({error})", "expected the record of a dataset", "choose another folder"
-        ) from error
-
-
-def _check_is_set(out: Path) -> None:
-    foreign = next((path for path in out.iterdir() if not path.name.startswith(".")), None)
-    if foreign:
-        raise OutputError(
-            f"{out} contains {foreign.name}, but no rendered dataset",
-            "expected an empty folder or a rendered dataset",
-            "choose a new folder",
-        )
 
 
 def _flatten(table: dict[str, Any], before: str = "") -> Iterator[tuple[str, object]]:

@@ -113,7 +113,10 @@ def write_preview(out: Path) -> None:
     Raises:
         OutputError: the file cannot be written.
     """
-    rows = [_contact_sheet_row(entry) for entry in islice(read_dataset(out), _SHEET_ROWS * _SHEET_COLUMNS)]
+    rows = [
+        np.concatenate([_cell(entry.read(f"{layer}.jpg")) for layer in SAMPLE_IMAGES], axis=1)
+        for entry in islice(read_dataset(out), _SHEET_ROWS * _SHEET_COLUMNS)
+    ]
     columns = [
         np.concatenate(rows[first : first + _SHEET_ROWS]) for first in range(0, len(rows), _SHEET_ROWS)
     ]
@@ -125,10 +128,6 @@ def write_preview(out: Path) -> None:
         ]
         sheet = Photo.from_array(np.concatenate(padded, axis=1), encoding="srgb")
         write_atomically(out / PREVIEW_FILE, sheet.encode("png"), overwrite=True)
-
-
-def _contact_sheet_row(entry: StoredSample) -> NDArray[np.uint8]:
-    return np.concatenate([_cell(entry.read(f"{layer}.jpg")) for layer in SAMPLE_IMAGES], axis=1)
 
 
 def _cell(data: bytes) -> NDArray[np.uint8]:
