@@ -24,6 +24,7 @@ from brewster import Photo  # noqa: E402
 from brewster.cli import main  # noqa: E402
 from brewster.errors import MissingExtra  # noqa: E402
 from cli_helpers import write_pane  # noqa: E402
+from file_server import loopback_only  # noqa: E402
 
 RECIPES = Path(__file__).parents[1] / "recipes"
 
@@ -33,6 +34,10 @@ hypothesis.settings.load_profile("shared machine")
 BROWSER_TIMEOUT_MS = 120_000  # long, because the machine may be slow
 SLOW_SECONDS = 1800
 """The time limit of a test marked as slow; the time limit of other tests is in pyproject.toml."""
+
+
+def pytest_configure(config):
+    config.addinivalue_line("markers", "loopback: connects to a server on this machine")
 
 
 def pytest_collection_modifyitems(items):
@@ -53,7 +58,12 @@ def pytest_terminal_summary(terminalreporter):
 
 
 @pytest.fixture(autouse=True)
-def _network_off(monkeypatch: pytest.MonkeyPatch) -> None:
+def _network_off(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Refuses every connection, or with the marker `loopback` every connection to another machine."""
+    if request.node.get_closest_marker("loopback"):
+        loopback_only(monkeypatch)
+        return
+
     def refuse(self: socket.socket, address: object) -> None:
         raise AssertionError(f"a test tried to reach {address}")
 

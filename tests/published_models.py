@@ -7,6 +7,7 @@ import torch
 from safetensors.torch import save_file
 from torch import nn
 
+from brewster.models.diffusion.adapter.lora import add_lora, lora_parameters
 from brewster.models.diffusion.backbones.registry import tiny
 
 KLEIN_9B = "black-forest-labs/FLUX.2-klein-9B"
@@ -23,6 +24,23 @@ def random_pair(module, rank, generator):
     """The matrices lora_A (rank, in) and lora_B (out, rank) of a layer, of similar size as its weights."""
     down = torch.randn(rank, module.in_features, generator=generator) / module.in_features**0.5
     return down, 0.3 * torch.randn(module.out_features, rank, generator=generator)
+
+
+def velocity(backbone, prompt):
+    """The prediction for fixed random latents, without guidance."""
+    generator = torch.Generator().manual_seed(0)
+    latents, condition = torch.randn(2, 1, backbone.channels, 2, 4, generator=generator)
+    return backbone.predict(latents, condition, torch.tensor([0.7]), prompt, 1.0)
+
+
+def with_random_lora(name):
+    """A tiny version with a LoRA whose matrices are random, as after training."""
+    backbone, prompt = tiny(name)
+    add_lora(backbone, rank=2, alpha=4, target_modules=["*.attn.*"])
+    with torch.no_grad():
+        for parameter in lora_parameters(backbone):
+            parameter.normal_(0, 0.1, generator=torch.Generator().manual_seed(3))
+    return backbone, prompt
 
 
 def write_json(path, value):

@@ -4,7 +4,7 @@ import hashlib
 from functools import partial
 
 from brewster.environments.catalog import builtin_catalog
-from brewster.executors import SerialExecutor
+from brewster.executors.local import SerialExecutor
 from brewster.rendered.generation.job import RenderJob, build
 from brewster.rendered.generation.workers import TaskRunner
 from brewster.scene.recipe import read_scene_recipe

@@ -3,7 +3,7 @@
 import numpy as np
 
 from brewster import Photo
-from brewster.user_study.create import StudyOptions, create_study
+from brewster.user_study.create import create_study
 from brewster.user_study.study import (
     PICTURES_FOLDER,
     CatchTrial,
@@ -78,7 +78,7 @@ def make_study(
         method: write_pictures(folder / method, names, size=size, seed=i + 1)
         for i, method in enumerate(methods)
     }
-    return create_study(folder / "study", inputs, outputs, StudyOptions(**{"seed": 3} | options))
+    return create_study(folder / "study", inputs, outputs, **{"seed": 3} | options)
 
 
 def choice_for(trial, outcome):

@@ -1,7 +1,6 @@
 """Ablation studies: one model for each value of a key, all trained and scored in the same way."""
 
 import io
-import os
 import shutil
 import tomllib
 from dataclasses import replace
@@ -18,7 +17,6 @@ from brewster.evaluate import ablation as module
 from brewster.evaluate.ablation import ablate, read_study
 from brewster.metrics import METRICS
 from brewster.training.recipe import read_recipe, with_value
-from cli_helpers import run_process
 
 RECIPES = Path(__file__).parents[1] / "recipes" / "ablations"
 STUDIES = [
@@ -32,20 +30,7 @@ def names(paths):
     return [path.stem for path in paths]
 
 
-SMALL_STUDIES = [path for path in STUDIES if not path.with_stem(f"{path.stem}-tiny").is_file()]
 """The studies of the compact model. runs/paper.sh --tiny runs the tiny variants of those of the diffusion model."""
-
-
-def test_every_ablation_of_the_paper_has_a_study():
-    assert names(STUDIES) == [
-        "blend-space",
-        "lora-blend-space",
-        "lora-size",
-        "orders",
-        "pairs",
-        "prompt",
-        "size",
-    ]
 
 
 @pytest.mark.parametrize("path", STUDIES, ids=names(STUDIES))
@@ -59,18 +44,6 @@ def test_a_study_changes_one_value_of_both_the_full_and_the_tiny_recipe(path):
         recipes = [with_value(base, study.key, value) for value in study.values]
         assert base in recipes
         assert len({recipe.model_dump_json() for recipe in recipes}) == len(study.values)
-
-
-@pytest.mark.parametrize("name", ["lora-blend-space", "lora-size", "prompt"])
-def test_every_ablation_of_the_large_model_has_a_tiny_variant(name):
-    full, tiny = (read_study(RECIPES / f"{stem}.toml") for stem in (name, f"{name}-tiny"))
-    assert tiny.key == full.key
-    base = read_recipe(tiny.base)
-    assert base.backbone == "tiny:kontext"
-    assert len({with_value(base, tiny.key, value).model_dump_json() for value in tiny.values}) >= 2
-    assert read_recipe(full.base).backbone == "kontext"
-    assert "lpips" in full.metrics
-    assert "lpips" not in tiny.metrics
 
 
 @pytest.mark.parametrize(
@@ -135,27 +108,6 @@ def test_values_are_compared_with_the_first_and_numbers_are_plotted(
     assert 0.005 < (plot < 128).mean() < 0.5
 
 
-def test_metrics_without_scores_are_left_out_of_the_plot():
-    study = read_study(RECIPES / "size.toml")
-    estimate = {"mean": 0.5, "low": None, "high": None}
-    scored = {study.label(value): {"niqe": estimate} for value in study.values}
-    results = {
-        "metrics": {"niqe": {"title": "NIQE", "unit": ""}},
-        "selections": {
-            "real20": {"title": "Real20"},
-            "nature20": {"title": "Nature20"},
-            "postcard": {"title": "P"},
-        },
-        "tables": {
-            "real20": scored,
-            "nature20": scored | {"count 50": {}},  # a model that failed on every image of a benchmark
-            "postcard": {label: {} for label in scored},
-        },
-    }
-    plot = Image.open(io.BytesIO(module._plot(study, study.values, results)))
-    assert min(plot.size) > 300
-
-
 def test_missing_weights_of_a_metric_are_reported_before_training(pairs, data, tmp_path, monkeypatch):
     def refuse():
         raise DownloadError("LPIPS has no weights", "expected a network connection", "connect")
@@ -187,32 +139,3 @@ def test_prompts_are_compared_on_a_backbone_without_training(pairs, data, tmp_pa
     assert not (tmp_path / "out" / "prompt-generic" / "checkpoint.pt").exists()
     means = [row["psnr"]["mean"] for row in results["tables"]["real20"].values()]
     assert len(set(means)) == 4
-
-
-@pytest.fixture
-def few_pairs(data, tmp_path):
-    """A data folder with four training pairs and two pairs of each benchmark."""
-    for place, count in (("real/train", 4), ("real/dev/nature", 2), ("real/dev/real", 2)):
-        for photo in sorted((data / place / "blended").iterdir())[:count]:
-            for role in ("blended", "transmission"):
-                link = tmp_path / "data" / place / role / photo.name
-                link.parent.mkdir(parents=True, exist_ok=True)
-                link.symlink_to(data / place / role / photo.name)
-    (tmp_path / "data" / "weights").symlink_to(data / "weights")
-    return tmp_path / "data"
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("path", SMALL_STUDIES, ids=names(SMALL_STUDIES))
-def test_every_study_runs_end_to_end_at_tiny_size(path, few_pairs, tmp_path):
-    """Nothing is replaced: the study renders, trains on four real pairs, and evaluates."""
-    environment = {**os.environ, "BREWSTER_DATA": str(few_pairs)}
-    result = run_process(
-        "ablate", path, "--base", RECIPES / "tiny.toml", "-o", tmp_path / "out", env=environment
-    )
-    assert result.returncode == 0, result.stderr.decode()
-    text = result.stdout.decode()
-    for value in read_study(path).values:
-        assert f" {value} " in text
-    assert (tmp_path / "out" / "report.html").is_file()
-    assert (tmp_path / "out" / "plot.png").is_file() == (path.stem in {"size", "pairs"})

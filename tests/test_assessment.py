@@ -138,9 +138,3 @@ def test_with_a_black_mask_nothing_is_removed_and_the_verdict_says_so():
 def test_a_separation_of_strength_0_is_not_doubtful():
     assert assess(grey(0.4), grey(0.2), certain(), 1.0, 0.0).verdict == "little found"
     assert assess(grey(0.4), grey(0.2), certain(), 1.0, 0.1).verdict == "doubtful"
-
-
-def test_a_separation_of_strength_0_removes_nothing_and_its_verdict_says_so():
-    photo = Photo.from_array(np.full((40, 60, 3), 0.5, np.float32), encoding="linear")
-    found = Separator(lambda tile: (0.5 * tile, 0.5 * tile))(photo, strength=0).assessment
-    assert (found.verdict, found.removed_light, found.changed_area) == ("little found", 0, 0)

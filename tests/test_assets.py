@@ -152,37 +152,37 @@ def test_the_folder_with_the_right_file_is_found(tmp_path, folder, rng):
     assert np.array_equal(lights[0], lights[2])
 
 
-def test_a_file_that_cannot_be_read_is_named(folder, rng, monkeypatch):
-    def refuse(_path):
-        raise PermissionError(13, "Permission denied")
-
-    monkeypatch.setattr(type(folder), "read_bytes", refuse)
-    (folder / "sky.hdr").write_text("")
-    with pytest.raises(RecipeError, match="Permission denied") as error:
-        Assets([folder]).map_radiance(EnvironmentMap(source=AssetSource(file="sky.hdr")))
-    check_message(error, "sky.hdr")
-
-
-@pytest.mark.parametrize("kind", [hdr_of, exr_of])
-def test_a_map_that_is_not_twice_as_wide_as_high_is_refused(folder, rng, kind):
-    with pytest.raises(UnsupportedPhoto, match="60 x 32") as error:
-        map_radiance(folder, "narrow.hdr", kind(sky(rng)[:, :60]))
-    check_message(error, "narrow.hdr", "twice as wide")
-
-
-@pytest.mark.parametrize("value", [np.nan, np.inf])
-def test_texels_that_are_not_finite_are_refused(folder, rng, value):
-    texels = sky(rng)
+def with_texel(texels, value):
     texels[5, 6, 1] = value
-    with pytest.raises(UnsupportedPhoto, match="infinite or NaN") as error:
-        map_radiance(folder, "broken.exr", exr_of(texels))
-    check_message(error, "broken.exr")
+    return texels
 
 
-def test_a_black_map_is_refused(folder):
-    with pytest.raises(UnsupportedPhoto, match="black") as error:
-        map_radiance(folder, "night.hdr", hdr_of(np.zeros((HEIGHT, WIDTH, 3), np.float32)))
-    check_message(error, "night.hdr")
+BAD_MAPS = {
+    "narrow.hdr": lambda texels: hdr_of(texels[:, :60]),
+    "narrow.exr": lambda texels: exr_of(texels[:, :60]),
+    "nan.exr": lambda texels: exr_of(with_texel(texels, np.nan)),
+    "infinite.exr": lambda texels: exr_of(with_texel(texels, np.inf)),
+    "black.hdr": lambda texels: hdr_of(0 * texels),
+    "empty.hdr": lambda texels: b"",
+    "cut.hdr": lambda texels: hdr_of(texels)[:-900],
+    "cut.exr": lambda texels: exr_of(texels)[:-900],
+    "header.hdr": lambda texels: hdr_of(texels).replace(b"-Y", b"?Y"),
+    "other.hdr": lambda texels: b"<html>",
+}
+
+
+@pytest.mark.parametrize("name", BAD_MAPS)
+def test_a_map_that_cannot_light_a_scene_is_refused_by_name(folder, rng, name):
+    with pytest.raises(PhotoError) as error:
+        map_radiance(folder, name, BAD_MAPS[name](sky(rng)))
+    check_message(error, name)
+
+
+@pytest.mark.parametrize("data", [b"", b"<html>", file_of(smooth(), "JPEG")[:500]])
+def test_a_picture_that_cannot_be_read_is_refused_by_name(folder, data):
+    with pytest.raises(UnreadablePhoto) as error:
+        plane_radiance(folder, "photo.jpg", data)
+    check_message(error, "photo.jpg")
 
 
 def test_an_ordinary_photo_saved_as_a_map_is_refused(folder, rng):
@@ -198,21 +198,6 @@ def test_a_map_with_one_sun_is_not_clipped(folder, rng):
     texels = sky(rng)
     texels[10, 10:12] = 5000
     assert map_radiance(folder, "sun.hdr", hdr_of(texels)).max() > 1000
-
-
-@pytest.mark.parametrize("damage", ["empty", "cut", "header", "other"])
-def test_a_corrupt_map_is_refused_by_name(folder, rng, damage):
-    data = hdr_of(sky(rng))
-    bad = {"empty": b"", "cut": data[:-900], "header": data.replace(b"-Y", b"?Y"), "other": b"<html>"}[damage]
-    with pytest.raises(PhotoError) as error:
-        map_radiance(folder, "bad.hdr", bad)
-    check_message(error, "bad.hdr")
-
-
-def test_an_exr_that_ends_early_is_refused_by_name(folder, rng):
-    with pytest.raises(UnreadablePhoto) as error:
-        map_radiance(folder, "bad.exr", exr_of(sky(rng))[:-900])
-    check_message(error, "bad.exr")
 
 
 # --- pictures
@@ -255,20 +240,6 @@ def test_a_black_picture_is_dark_and_finite(folder):
     assert not light.any()
 
 
-@pytest.mark.parametrize(("data", "error"), [(b"", UnreadablePhoto), (b"<html>", UnreadablePhoto)])
-def test_a_file_that_is_no_picture_is_refused_by_name(folder, data, error):
-    with pytest.raises(error) as caught:
-        plane_radiance(folder, "photo.jpg", data)
-    check_message(caught, "photo.jpg")
-
-
-def test_a_picture_whose_pixels_are_missing_is_refused_by_name(folder):
-    data = file_of(smooth(), "JPEG")
-    with pytest.raises(UnreadablePhoto) as caught:
-        plane_radiance(folder, "photo.jpg", data[: len(data) // 2])
-    check_message(caught, "photo.jpg")
-
-
 # --- memory
 
 
@@ -287,15 +258,6 @@ def test_the_cache_has_a_maximum_size_and_keeps_the_most_recently_used_maps(fold
         return len(opened) - before
 
     assert [read(name) for name in "ababacacb"] == [1, 1, 0, 0, 0, 1, 0, 0, 1]
-
-
-def test_a_map_larger_than_the_cache_is_cached_alone(folder, rng, monkeypatch):
-    monkeypatch.setattr(assets_module, "_MAX_CACHE_BYTES", 10)
-    (folder / "a.hdr").write_bytes(hdr_of(sky(rng)))
-    assets = Assets([folder])
-    first = assets.map_radiance(EnvironmentMap(source=AssetSource(file="a.hdr")))
-    (folder / "a.hdr").unlink()
-    assert np.array_equal(assets.map_radiance(EnvironmentMap(source=AssetSource(file="a.hdr"))), first)
 
 
 def test_the_luminance_of_the_scene_does_not_change_the_cached_map(folder, rng):

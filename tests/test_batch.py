@@ -44,13 +44,6 @@ def test_a_folder_is_mirrored_and_a_damaged_photo_does_not_stop_the_batch(photo_
     assert first.residual == pytest.approx(0, abs=0.01)
 
 
-def test_layers_are_written_next_to_their_photo_by_default(tmp_path, separator):
-    (tmp_path / "a.jpg").write_bytes(image_bytes())
-    (result,) = separate_files(str(tmp_path / "a.jpg"), separator=separator)
-    assert result.status == "separated"
-    assert list_files(tmp_path) == ["a.jpg", *layer_files("a")]
-
-
 def test_the_options_choose_layers_and_formats(tmp_path, separator):
     (tmp_path / "a.jpg").write_bytes(image_bytes())
     options = Options(layers=("transmission", "confidence"), format="tiff", strength=0)
@@ -75,15 +68,6 @@ def test_finished_photos_are_skipped_without_a_model_and_missing_layers_are_adde
     assert Photo.open(tmp_path / "a.transmission.jpg").size == (60, 40)
 
 
-def test_a_dry_run_returns_the_paths_and_writes_nothing(photo_folder, tmp_path):
-    planned = list(
-        separate_files(photo_folder, tmp_path / "out", Options(model="no-such-model"), dry_run=True)
-    )
-    assert [result.status for result in planned] == ["planned"] * 3
-    assert planned[2].outputs["reflection"] == str(tmp_path / "out/c/d.reflection.jpg")
-    assert not (tmp_path / "out").exists()
-
-
 def test_a_photo_of_the_batch_is_never_overwritten(tmp_path, separator):
     for name in ("a.jpg", "a.transmission.jpg"):
         (tmp_path / name).write_bytes(image_bytes())
@@ -103,14 +87,6 @@ def test_names_and_sources_are_checked_before_the_first_photo_is_separated(tmp_p
         separate_files([tmp_path / "x/a.jpg", tmp_path / "y/a.jpg"], tmp_path / "out")
     with pytest.raises(PhotoError, match="there is no photo in"):
         plan_files(tmp_path / "empty")
-
-
-@pytest.mark.parametrize("dry_run", [False, True])
-def test_an_output_folder_that_cannot_be_created_is_one_error_before_the_first_photo(photo_folder, dry_run):
-    before = list_files(photo_folder)
-    with pytest.raises(OutputError, match=r"a\.jpg/out was not written \(.*expected a folder"):
-        separate_files(photo_folder, photo_folder / "a.jpg/out", dry_run=dry_run)
-    assert list_files(photo_folder) == before
 
 
 def test_a_photo_is_separated_when_its_result_is_requested(photo_folder, tmp_path, separator):

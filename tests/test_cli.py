@@ -9,21 +9,15 @@ import subprocess
 import sys
 from dataclasses import fields
 from pathlib import Path
-from typing import get_args, get_type_hints
 
 import click
 import numpy as np
 import pytest
-from pydantic import TypeAdapter, ValidationError
 
 import brewster
-from brewster import Photo, batch, errors, files
+from brewster import Photo, batch, errors
 from brewster.cli import cli
 from brewster.cli.reference import reference
-from brewster.errors import BrewsterError
-from brewster.image_formats import WRITABLE
-from brewster.inference import QUALITIES
-from brewster.inference.onnx_backend import DEVICES
 from brewster.options import Options
 from cli_helpers import image_bytes, json_lines, list_files, run_process
 
@@ -69,47 +63,12 @@ def test_the_python_reference_has_a_meaning_for_every_public_name_and_for_no_oth
     assert all(meaning.endswith(".") for meaning in rows.values()), rows
 
 
-def test_the_reference_names_every_command_and_every_option():
-    text = reference()
-    for path, command in commands():
-        assert f"## {' '.join(('brewster', *path))}\n" in text
-        for option in (param for param in command.params if isinstance(param, click.Option)):
-            assert option.opts[-1] in text
-
-
-def test_the_version_is_that_of_the_package(run_without_model):
-    assert run_without_model("--version") == (0, f"brewster {brewster.__version__}\n".encode(), "")
-
-
 # --- the options are those of the library
-
-
-def test_the_options_offer_the_values_that_the_library_accepts():
-    hints = get_type_hints(Options)
-    assert get_args(hints["quality"]) == tuple(QUALITIES)
-    assert set(get_args(hints["device"])) == set(DEVICES)
-    assert get_args(get_args(hints["layers"])[0]) == files.OUTPUT_LAYERS
-    assert set(get_args(get_args(hints["format"])[0])) == set(WRITABLE)
 
 
 def test_every_option_of_a_separation_is_an_option_of_the_command():
     option_names = {param.name for param in cli.commands["separate"].params}
     assert {field.name for field in fields(Options)} <= option_names
-
-
-def test_a_web_form_can_be_made_from_the_same_options():
-    form = TypeAdapter(Options)
-    schema = form.json_schema()["properties"]
-    assert schema["strength"]["maximum"] == 1
-    assert all(field["description"] for field in schema.values())
-    assert form.validate_python({"strength": "0.5", "layers": ["confidence"]}).strength == 0.5
-    with pytest.raises(ValidationError):
-        form.validate_python({"strength": 2})
-
-
-def test_additive_layers_are_rejected_in_formats_without_floats():
-    with pytest.raises(BrewsterError, match="tiff or exr"):
-        Options(additive=True, format="jpeg")
 
 
 # --- one photo
@@ -132,37 +91,6 @@ def test_the_command_name_separate_is_optional_and_options_may_come_first(run, t
     assert list_files(tmp_path / "x") == ["a.reflection.png", "a.transmission.png"]
 
 
-def test_the_layers_are_the_output_of_the_model(run, tmp_path):
-    grey = np.full((40, 40, 3), 128, np.uint8)
-    (tmp_path / "a.png").write_bytes(Photo.from_array(grey, encoding="srgb").encode("png"))
-    assert run("a.png")[0] == 0
-    light = Photo.from_array(grey, encoding="srgb").linear().mean()
-    for layer, share in (("transmission", 0.8), ("reflection", 0.2)):
-        assert Photo.open(tmp_path / f"a.{layer}.png").linear().mean() == pytest.approx(
-            share * light, rel=0.03
-        )
-
-
-def test_strength_zero_returns_the_photo_bit_by_bit(run, tmp_path):
-    (tmp_path / "a.png").write_bytes(image_bytes(format_name="png"))
-    assert run("a.png", "--strength", 0)[0] == 0
-    is_equal = Photo.open(tmp_path / "a.transmission.png").pixels == Photo.open(tmp_path / "a.png").pixels
-    assert is_equal.all()
-
-
-def test_only_the_requested_layers_are_written(run, tmp_path):
-    (tmp_path / "a.jpg").write_bytes(image_bytes())
-    assert run("a.jpg", "--layers", "confidence,reflection", "-o", "x")[0] == 0
-    assert list_files(tmp_path / "x") == ["a.confidence.png", "a.reflection.jpg"]
-
-
-def test_another_format_can_be_requested(run, tmp_path):
-    (tmp_path / "a.jpg").write_bytes(image_bytes())
-    assert run("a.jpg", "--format", "webp", "--layers", "transmission,confidence", "-o", "x")[0] == 0
-    assert list_files(tmp_path / "x") == ["a.confidence.png", "a.transmission.webp"]
-    assert Photo.open(tmp_path / "x" / "a.transmission.webp").file_info.format_name == "webp"
-
-
 def test_the_suffix_of_the_photo_is_kept_if_its_format_is_requested(run, tmp_path):
     (tmp_path / "A.JPEG").write_bytes(image_bytes())
     assert run("A.JPEG", "--format", "jpeg", "--layers", "transmission", "-o", "x")[0] == 0
@@ -183,14 +111,6 @@ def test_an_image_file_as_the_output_gets_the_transmission(run, tmp_path):
     assert run("a.jpg", "-o", "new/clear.png")[0] == 0
     assert list_files(tmp_path / "new") == ["clear.png"]
     assert Photo.open(tmp_path / "new" / "clear.png").file_info.format_name == "png"
-
-
-def test_an_output_folder_may_have_an_image_suffix(run, tmp_path):
-    (tmp_path / "a.jpg").write_bytes(image_bytes())
-    (tmp_path / "old.png").mkdir()
-    for folder in ("old.png", "new.png/"):
-        assert run("a.jpg", "-o", folder, "--layers", "reflection")[0] == 0
-        assert list_files(tmp_path / folder) == ["a.reflection.jpg"]
 
 
 # --- standard input and output
@@ -293,7 +213,7 @@ def test_a_damaged_exr_does_not_corrupt_the_json(model, tmp_path):
 
 
 def test_help_goes_to_standard_output():
-    for arguments in (["--help"], ["separate", "--help"], ["models", "list", "--help"], ["--version"]):
+    for arguments in (["--help"], ["separate", "-h"], ["models", "list", "-h"], ["--version"]):
         process = run_process(*arguments)
         assert (process.returncode, process.stderr) == (0, b"")
         assert process.stdout
@@ -325,6 +245,10 @@ def test_help_goes_to_standard_output():
         ["a.jpg", "-o", "clear.jpg", "--format", "png"],
         ["a.jpg", "-o", "clear.jpg", "--additive"],
         ["a.jpg", "-o", "clear.gif"],
+        ["a.jpg", "--cluster", "local"],
+        ["a.jpg", "--index"],
+        ["a.jpg", "--index", "-o", "-"],
+        ["a.jpg", "--workers", "2", "-o", "b.jpg"],
         ["modles"],
         ["models", "delete"],
     ],

@@ -14,7 +14,7 @@ from click.shell_completion import ShellComplete
 from brewster import Photo
 from brewster.cli import batch_plan, cli
 from brewster.photo import contact_sheet
-from cli_helpers import error_lines, image_bytes, layer_files, list_files, run_process
+from cli_helpers import error_lines, image_bytes, layer_files, list_files
 from picture_files import dng_file, mosaic
 
 # --- the names of photos
@@ -64,13 +64,6 @@ def test_an_address_of_another_machine_is_refused(run, tmp_path, address, option
 # --- suffixes
 
 
-@pytest.mark.parametrize("name", ["jpg", "JPG", ".jpeg", "jpeg"])
-def test_a_format_may_be_named_by_its_suffix(run, tmp_path, name):
-    (tmp_path / "a.png").write_bytes(image_bytes(format_name="png"))
-    assert run("a.png", "--format", name)[0] == 0
-    assert list_files(tmp_path) == ["a.png", *layer_files("a")]
-
-
 @pytest.mark.parametrize("name", ["bmp", "gif", "dng", "jpgg"])
 def test_a_format_that_is_not_written_is_refused(run_without_model, tmp_path, name):
     (tmp_path / "a.png").write_bytes(image_bytes(format_name="png"))
@@ -99,39 +92,14 @@ def test_an_output_folder_that_is_a_file_is_refused(run_without_model, tmp_path,
     assert f"-o is the existing file {name}; expected a folder, or an image file such as clear.jpg" in message
 
 
-@pytest.mark.parametrize("name", ["photo", "x.jpg_large", "photo.v2"])
-def test_a_photo_without_an_image_suffix_gives_layers_of_its_format(run, tmp_path, name):
-    (tmp_path / name).write_bytes(image_bytes())
-    assert run(name)[0] == 0
-    assert list_files(tmp_path) == [name, *layer_files(name)]
-    assert Photo.open(tmp_path / f"{name}.transmission.jpg").file_info.format_name == "jpeg"
-
-
-@pytest.mark.parametrize("name", ["clear.bmp/", "2026.11", "v1.2", "made"])
+@pytest.mark.parametrize("name", ["clear.bmp/", "new.png/", "2026.11", "made"])
 def test_a_folder_may_have_a_dot_in_its_name(run, tmp_path, name):
     (tmp_path / "a.jpg").write_bytes(image_bytes())
     assert run("a.jpg", "-o", name)[0] == 0
     assert list_files(tmp_path / name) == layer_files("a")
 
 
-def test_the_short_option_for_help_works_everywhere():
-    """In a process of its own: click caches the help option of a command that another test has opened without its group."""
-    for arguments in (["-h"], ["separate", "-h"], ["models", "list", "-h"]):
-        result = run_process(*arguments)
-        assert result.returncode == 0
-        assert result.stdout.startswith(b"Usage: brewster")
-
-
 # --- RAW files and videos
-
-
-def test_a_raw_file_gives_tiff_layers(run, tmp_path):
-    pytest.importorskip("rawpy")
-    (tmp_path / "a.dng").write_bytes(dng_file(mosaic()))
-    assert run("a.dng")[0] == 0
-    assert list_files(tmp_path) == sorted(["a.dng", *layer_files("a", suffix="tiff")])
-    layer = Photo.open(tmp_path / "a.transmission.tiff")
-    assert (layer.file_info.bits, layer.size) == (16, (128, 96))
 
 
 def test_raw_files_without_the_extra_are_counted_and_named_once(run, tmp_path, monkeypatch):
@@ -170,13 +138,10 @@ def test_other_files_in_a_folder_are_counted_by_suffix_with_an_example(run, tmp_
     for name in names:
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).write_bytes(image_bytes())
-    line = (
-        "4 other files skipped (2 .bmp, 1 without a suffix, 1 .txt), for example b/scan: expected the suffix of an image; "
-        "if such a file is a photo, pass its own path, or convert it"
-    )
     for _ in range(2):  # layers are not counted
         code, _, err = run(".")
-        assert (code, line in err.splitlines()) == (0, True)
+        assert code == 0
+        assert "4 other files skipped (2 .bmp, 1 without a suffix, 1 .txt), for example b/scan" in err
     assert run(".", "--quiet")[2] == ""
     code, _, err = run("b/scan")  # named files are read by their content
     assert (code, "skipped (" in err) == (0, False)
@@ -228,13 +193,6 @@ def test_a_contact_sheet_replaces_only_contact_sheets(run, tmp_path):
     assert contact_sheet.is_contact_sheet(tmp_path / "other.jpg")
 
 
-def test_a_contact_sheet_in_the_folder_of_the_photos_is_not_separated(run, tmp_path):
-    (tmp_path / "a.jpg").write_bytes(image_bytes())
-    for _ in range(3):
-        assert run(".", "-o", "out", "--contact-sheet", "sheet.jpg")[0] == 0
-    assert list_files(tmp_path / "out") == ["a.reflection.jpg", "a.transmission.jpg"]
-
-
 def test_many_rows_give_several_sheets(tmp_path, monkeypatch):
     monkeypatch.setattr(contact_sheet, "_MAX_ROWS", 2)
     (tmp_path / "<a&>.jpg").write_bytes(image_bytes())
@@ -261,18 +219,6 @@ def completions(*words):
     *before, last = words
     items = ShellComplete(cli, {}, "brewster", "_BREWSTER_COMPLETE").get_completions(list(before), last)
     return {(item.type, item.value) for item in items}
-
-
-def test_completion_offers_commands_and_files():
-    assert ("plain", "separate") in completions("se")
-    assert ("file", "holi") in completions("holi")
-    assert ("file", "ho") in completions("a.jpg", "ho")
-    assert ("file", "ho") in completions("separate", "a.jpg", "ho")
-
-
-def test_completion_offers_the_options_of_a_separation_without_its_command():
-    for words in (["--stren"], ["a.jpg", "--stren"], ["serv.jpg", "--stren"]):
-        assert ("plain", "--strength") in completions(*words)
 
 
 def test_completion_offers_models_layers_and_formats():

@@ -15,23 +15,6 @@ from cli_helpers import error_lines, image_bytes, json_lines, layer_files, list_
 from other_processes import started, wait_for
 
 
-def test_ctrl_c_while_a_file_is_written_leaves_no_partial_file(run, tmp_path, monkeypatch):
-    (tmp_path / "a.jpg").write_bytes(image_bytes())
-    fsync, calls = os.fsync, []
-
-    def interrupt_the_second_call(file):
-        calls.append(file)
-        if len(calls) == 2:
-            raise KeyboardInterrupt
-        fsync(file)
-
-    monkeypatch.setattr(os, "fsync", interrupt_the_second_call)
-    code, _, err = run("a.jpg")
-    assert code == 130
-    assert "stopped" in err
-    assert list_files(tmp_path) == ["a.jpg", "a.transmission.jpg"]
-
-
 def raise_interrupt_in_c_callback():
     """Simulates Ctrl-C while libvips calls Python to log: C code cannot propagate the exception, and Python drops it."""
 

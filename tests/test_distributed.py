@@ -81,9 +81,7 @@ def test_missing_processes_are_reported(monkeypatch):
     accelerate.PartialState(cpu=True)  # as a library may do before initialize
     for name, value in (LAUNCHER_VARIABLES | {"WORLD_SIZE": "2"}).items():
         monkeypatch.setenv(name, value)
-    with pytest.raises(
-        DeviceError, match=r"1 processes have joined; expected 2 processes, .* WORLD_SIZE; .*torchrun"
-    ):
+    with pytest.raises(DeviceError, match=r"1 processes have joined; expected 2 processes, .* WORLD_SIZE;"):
         distributed.initialize()
     accelerate.PartialState._reset_state()
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import errno
 import os
 from pathlib import Path
-from types import SimpleNamespace
 
 import platformdirs
 import pytest
@@ -17,11 +16,11 @@ from brewster import files
 from brewster.batch.layer_names import name_layers
 from brewster.errors import OutputError
 from brewster.files import cache_folder, check_output_folder, images_in, write_atomically
-from brewster.image_formats import SUFFIXES, FormatName
+from brewster.image_formats import SUFFIXES
 from brewster.options import Options
 
 
-def touch(folder: Path, *names: str) -> Path:
+def touch(folder, *names):
     for name in names:
         path = folder / name
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -32,9 +31,7 @@ def touch(folder: Path, *names: str) -> Path:
 LAYERS = ("transmission", "reflection", "confidence")
 
 
-def find(
-    *sources: Path, output: Path | None = None, format_name: FormatName | None = None
-) -> dict[str, dict[str, str]]:
+def find(*sources, output=None, format_name=None):
     """Returns the names of the images, in their order, with the paths of their layers, relative to the first source or output."""
     images = (pair for source in sources for pair in images_in(source, output))
     return {
@@ -45,13 +42,13 @@ def find(
     }
 
 
-def transmissions(*sources: Path, format_name: FormatName | None = None) -> dict[str, str]:
+def transmissions(*sources, format_name=None):
     return {
         name: targets["transmission"] for name, targets in find(*sources, format_name=format_name).items()
     }
 
 
-def test_layers_are_next_to_their_image_and_keep_its_suffix(tmp_path: Path) -> None:
+def test_layers_are_next_to_their_image_and_keep_its_suffix(tmp_path):
     path = touch(tmp_path, "view.jpg") / "view.jpg"
     assert find(path)["view.jpg"] == {
         "transmission": "view.transmission.jpg",
@@ -62,7 +59,7 @@ def test_layers_are_next_to_their_image_and_keep_its_suffix(tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize(("name", "suffix"), [("view.gif", "png"), ("view.ora", "png"), ("view.DNG", "tiff")])
-def test_if_a_format_is_not_written_another_one_replaces_it(tmp_path: Path, name: str, suffix: str) -> None:
+def test_if_a_format_is_not_written_another_one_replaces_it(tmp_path, name, suffix):
     assert transmissions(touch(tmp_path, name) / name) == {name: f"view.transmission.{suffix}"}
 
 
@@ -82,9 +79,7 @@ BEGINNINGS = {
 @pytest.mark.parametrize("suffix", BEGINNINGS)
 @pytest.mark.parametrize("name", ["photo", "x.jpg_large", "a.b", "2026.11", ".jpg"])
 @pytest.mark.parametrize("options", [Options(), Options(format="avif"), Options(additive=True)])
-def test_without_an_image_suffix_the_format_of_the_content_names_the_layers(
-    tmp_path: Path, name: str, suffix: str, options: Options
-) -> None:
+def test_without_an_image_suffix_the_format_of_the_content_names_the_layers(tmp_path, name, suffix, options):
     """The layers are those of the same file with the suffix of its format."""
     for path in (tmp_path / name, tmp_path / f"{name}{suffix}"):
         path.write_bytes(BEGINNINGS[suffix])
@@ -95,17 +90,17 @@ def test_without_an_image_suffix_the_format_of_the_content_names_the_layers(
 
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="Windows has no named pipes in folders")
-def test_a_pipe_is_not_read_to_name_its_layers(tmp_path: Path) -> None:
+def test_a_pipe_is_not_read_to_name_its_layers(tmp_path):
     os.mkfifo(tmp_path / "photo")  # reading a pipe without a writer would wait forever
     assert transmissions(tmp_path / "photo") == {"photo": "photo.transmission.png"}
 
 
-def test_a_known_suffix_names_the_layers_whatever_the_content(tmp_path: Path) -> None:
+def test_a_known_suffix_names_the_layers_whatever_the_content(tmp_path):
     (tmp_path / "a.tif").write_bytes(BEGINNINGS[".jpg"])
     assert transmissions(tmp_path / "a.tif") == {"a.tif": "a.transmission.tif"}
 
 
-def test_a_photo_without_an_image_suffix_has_only_one_name(tmp_path: Path) -> None:
+def test_a_photo_without_an_image_suffix_has_only_one_name(tmp_path):
     for name in ("photo", "photo.jpg"):
         (tmp_path / name).write_bytes(BEGINNINGS[".jpg"])
     assert transmissions(tmp_path / "photo.jpg", tmp_path / "photo") == {
@@ -114,20 +109,14 @@ def test_a_photo_without_an_image_suffix_has_only_one_name(tmp_path: Path) -> No
     }
 
 
-def test_a_folder_is_searched_in_order_and_its_tree_is_mirrored(tmp_path: Path) -> None:
+def test_a_folder_is_searched_in_order_and_its_tree_is_mirrored(tmp_path):
     touch(tmp_path / "in", "b.jpg", "a.PNG", "deep/er/c.webp", "notes.txt")
     found = find(tmp_path / "in", output=tmp_path / "out")
     assert list(found) == ["a.PNG", "b.jpg", "c.webp"]
     assert found["c.webp"]["transmission"] == "deep/er/c.transmission.webp"
 
 
-def test_hidden_files_and_results_are_skipped(tmp_path: Path) -> None:
-    results = [f"a.{layer}.png" for layer in LAYERS]
-    touch(tmp_path, "a.jpg", ".hidden.jpg", ".thumbnails/b.jpg", *results)
-    assert list(find(tmp_path)) == ["a.jpg"]
-
-
-def test_every_visible_file_of_a_folder_is_an_image_or_skipped(tmp_path: Path) -> None:
+def test_every_visible_file_of_a_folder_is_an_image_or_skipped(tmp_path):
     touch(tmp_path, "a.jpg", "b.mp4", "c.bmp", "d", ".e", "x/f.txt", ".y/g.txt", "a.transmission.jpg")
     (tmp_path / "h.jp2").symlink_to("nothing")
     skipped: list[files.Location] = []
@@ -136,7 +125,7 @@ def test_every_visible_file_of_a_folder_is_an_image_or_skipped(tmp_path: Path) -
     assert [path.name for path in skipped] == ["b.mp4", "c.bmp", "d", "h.jp2", "f.txt"]
 
 
-def test_masks_are_skipped_if_their_photo_is_in_the_same_folder(tmp_path: Path) -> None:
+def test_masks_are_skipped_if_their_photo_is_in_the_same_folder(tmp_path):
     touch(
         tmp_path, "a.jpg", "a.mask.png", "b.mask.png", "x/a.mask.png", "x/c.mask.png", "x/c.tif", "mask.png"
     )
@@ -146,28 +135,16 @@ def test_masks_are_skipped_if_their_photo_is_in_the_same_folder(tmp_path: Path) 
     assert list(find(tmp_path / "a.mask.png")) == ["a.mask.png"]
 
 
-def test_a_file_given_by_name_is_always_listed(tmp_path: Path) -> None:
+def test_a_file_given_by_name_is_always_listed(tmp_path):
     file_names = ["a.transmission.jpg", ".hidden.jpg", "missing.jpg"]
     touch(tmp_path, *file_names[:2])
     assert list(find(*(tmp_path / name for name in file_names))) == file_names
 
 
 @pytest.mark.parametrize("format_name", [None, "tiff", "png", "jpeg"])
-def test_an_image_that_is_added_to_a_folder_does_not_change_the_layers_of_the_others(
-    tmp_path: Path, format_name: FormatName | None
-) -> None:
+def test_an_image_that_is_added_to_a_folder_does_not_change_the_layers_of_the_others(tmp_path, format_name):
     before = find(touch(tmp_path, "a.jpg"), format_name=format_name)["a.jpg"]
-    touch(
-        tmp_path,
-        "a.CR2",
-        "a.dng",
-        "a.jpg.png",
-        "a.tif",
-        "a.tiff",
-        "a.png",
-        "a.avif",
-        "a.jpg.transmission.jpg",
-    )
+    touch(tmp_path, "a.CR2", "a.dng", "a.jpg.png", "a.tif", "a.tiff", "a.png", "a.jpg.transmission.jpg")
     assert (
         find(tmp_path / "a.jpg", format_name=format_name)["a.jpg"]
         == find(tmp_path, format_name=format_name)["a.jpg"]
@@ -176,27 +153,18 @@ def test_an_image_that_is_added_to_a_folder_does_not_change_the_layers_of_the_ot
     assert before["confidence"] == "a.confidence.png"
 
 
-def test_images_of_one_stem_use_their_full_name_only_if_they_would_write_the_same_file(
-    tmp_path: Path,
-) -> None:
+def test_images_of_one_stem_use_their_full_name_only_if_they_would_write_the_same_file(tmp_path):
     touch(tmp_path, "a.gif", "a.jpg", "a.png")
-    assert find(tmp_path) == {
-        "a.gif": dict(zip(LAYERS, [f"a.gif.{layer}.png" for layer in LAYERS], strict=True)),
-        "a.jpg": {
-            "transmission": "a.transmission.jpg",
-            "reflection": "a.reflection.jpg",
-            "confidence": "a.confidence.png",
-        },
-        "a.png": {
-            "transmission": "a.transmission.png",
-            "reflection": "a.reflection.png",
-            "confidence": "a.png.confidence.png",
-        },
+    names = {image: list(layers.values()) for image, layers in find(tmp_path).items()}
+    assert names == {
+        "a.gif": ["a.gif.transmission.png", "a.gif.reflection.png", "a.gif.confidence.png"],
+        "a.jpg": ["a.transmission.jpg", "a.reflection.jpg", "a.confidence.png"],
+        "a.png": ["a.transmission.png", "a.reflection.png", "a.png.confidence.png"],
     }
     assert transmissions(tmp_path / "a.gif") == {"a.gif": "a.transmission.png"}
 
 
-def test_the_case_of_a_suffix_does_not_separate_two_files(tmp_path: Path) -> None:
+def test_the_case_of_a_suffix_does_not_separate_two_files(tmp_path):
     touch(tmp_path, "a.JPG", "a.dng")
     assert transmissions(tmp_path, format_name="jpeg")["a.dng"] == "a.dng.transmission.jpg"
     assert transmissions(tmp_path / "a.JPG") == {"a.JPG": "a.transmission.JPG"}
@@ -213,9 +181,7 @@ def test_the_case_of_a_suffix_does_not_separate_two_files(tmp_path: Path) -> Non
     ),
     st.sampled_from([None, "png"]),
 )
-def test_no_two_images_of_a_folder_share_a_target(
-    tmp_path_factory: pytest.TempPathFactory, files: set[str], format_name: FormatName | None
-) -> None:
+def test_no_two_images_of_a_folder_share_a_target(tmp_path_factory, files, format_name):
     folder = touch(tmp_path_factory.mktemp("images"), *files)
     found = find(*(folder / name for name in files), format_name=format_name)
     targets = {target for row in found.values() for target in row.values()}
@@ -223,32 +189,32 @@ def test_no_two_images_of_a_folder_share_a_target(
     assert len(targets) == len(LAYERS) * len(files)
 
 
-def test_link_loops_end_and_linked_folders_are_searched_once(tmp_path: Path) -> None:
+def test_link_loops_end_and_linked_folders_are_searched_once(tmp_path):
     touch(tmp_path, "deep/a.jpg")
     (tmp_path / "deep" / "loop").symlink_to(tmp_path)
     (tmp_path / "self.jpg").symlink_to(tmp_path / "self.jpg")
-    assert list(find(tmp_path)) == ["a.jpg", "self.jpg"]
+    (tmp_path / "also").symlink_to(tmp_path / "deep")
+    found = [image.relative_to(tmp_path).as_posix() for image, _ in images_in(tmp_path)]
+    assert found == ["also/a.jpg", "self.jpg"]
 
 
-def test_an_image_given_twice_is_listed_once(tmp_path: Path) -> None:
+def test_an_image_given_twice_is_listed_once(tmp_path):
     touch(tmp_path, "a.jpg")
     images = (pair for name in (".", "a.jpg", "./a.jpg") for pair in images_in(tmp_path / name))
     assert len(name_layers(images, Options())) == 1
 
 
-def test_images_of_two_folders_with_one_target_are_refused_before_any_work(tmp_path: Path) -> None:
+def test_images_of_two_folders_with_one_target_are_refused_before_any_work(tmp_path):
     touch(tmp_path, "x/a.jpg", "y/a.jpg")
     with pytest.raises(OutputError, match="would both be written"):
         find(tmp_path / "x/a.jpg", tmp_path / "y/a.jpg", output=tmp_path / "out")
 
 
-def test_an_unreadable_folder_is_listed_so_that_opening_it_reports_the_error(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_unreadable_folder_is_listed_so_that_opening_it_reports_the_error(tmp_path, monkeypatch):
     touch(tmp_path, "locked/a.jpg", "z.jpg")
     listing = Path.iterdir
 
-    def iterdir(path: Path) -> object:
+    def iterdir(path):
         if path.name == "locked":
             raise PermissionError(errno.EACCES, "Permission denied")
         return listing(path)
@@ -257,21 +223,7 @@ def test_an_unreadable_folder_is_listed_so_that_opening_it_reports_the_error(
     assert list(find(tmp_path)) == ["locked", "z.jpg"]
 
 
-@pytest.mark.parametrize("name", ["two words.jpg", "Kühlhaus été 窓.jpg", "line\nbreak.jpg", "-dash.jpg"])
-def test_names_with_spaces_accents_and_newlines_work(tmp_path: Path, name: str) -> None:
-    target = tmp_path / transmissions(touch(tmp_path, name))[name]
-    write_atomically(target, b"layer")
-    assert target.read_bytes() == b"layer"
-    assert target.name == name.replace(".jpg", ".transmission.jpg")
-
-
-def test_writing_creates_the_folder_and_leaves_only_the_file(tmp_path: Path) -> None:
-    write_atomically(tmp_path / "new" / "deep" / "a.png", b"whole")
-    assert [path.name for path in (tmp_path / "new" / "deep").iterdir()] == ["a.png"]
-    assert (tmp_path / "new" / "deep" / "a.png").read_bytes() == b"whole"
-
-
-def test_nothing_is_overwritten_by_default(tmp_path: Path) -> None:
+def test_nothing_is_overwritten_by_default(tmp_path):
     path = tmp_path / "a.png"
     path.write_bytes(b"old")
     with pytest.raises(OutputError, match="overwrite"):
@@ -281,12 +233,10 @@ def test_nothing_is_overwritten_by_default(tmp_path: Path) -> None:
     assert path.read_bytes() == b"new"
 
 
-def test_a_file_that_appears_during_writing_is_not_replaced(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_file_that_appears_during_writing_is_not_replaced(tmp_path, monkeypatch):
     path, fsync = tmp_path / "a.png", os.fsync
 
-    def write_other_file(descriptor: int) -> None:
+    def write_other_file(descriptor):
         path.write_bytes(b"other")
         fsync(descriptor)
 
@@ -300,10 +250,8 @@ def test_a_file_that_appears_during_writing_is_not_replaced(
     ("code", "word"),
     [(errno.ENOSPC, "free some space"), (errno.EROFS, "writable"), (errno.EIO, "was not written")],
 )
-def test_a_full_or_failing_disk_is_an_error_and_leaves_nothing(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, code: int, word: str
-) -> None:
-    def fail(descriptor: int) -> None:
+def test_a_full_or_failing_disk_is_an_error_and_leaves_nothing(tmp_path, monkeypatch, code, word):
+    def fail(descriptor):
         raise OSError(code, os.strerror(code))
 
     monkeypatch.setattr(os, "fsync", fail)
@@ -312,10 +260,8 @@ def test_a_full_or_failing_disk_is_an_error_and_leaves_nothing(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_ctrl_c_leaves_the_old_file_and_no_partial_one(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def interrupt(descriptor: int) -> None:
+def test_ctrl_c_leaves_the_old_file_and_no_partial_one(tmp_path, monkeypatch):
+    def interrupt(descriptor):
         raise KeyboardInterrupt
 
     (tmp_path / "a.png").write_bytes(b"old")
@@ -325,17 +271,7 @@ def test_ctrl_c_leaves_the_old_file_and_no_partial_one(
     assert [(path.name, path.read_bytes()) for path in tmp_path.iterdir()] == [("a.png", b"old")]
 
 
-@pytest.mark.skipif(os.geteuid() == 0, reason="root may write anywhere")
-def test_a_read_only_folder_is_an_error(tmp_path: Path) -> None:
-    tmp_path.chmod(0o500)
-    with pytest.raises(OutputError, match="writable"):
-        write_atomically(tmp_path / "a.png", b"layer")
-    tmp_path.chmod(0o700)
-
-
-def test_a_read_only_target_is_kept_even_with_overwrite(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_read_only_target_is_kept_even_with_overwrite(tmp_path, monkeypatch):
     (tmp_path / "a.png").write_bytes(b"old")
     monkeypatch.setattr(os, "access", lambda path, mode: False)  # root ignores the permission bits
     with pytest.raises(OutputError, match="writable"):
@@ -343,10 +279,8 @@ def test_a_read_only_target_is_kept_even_with_overwrite(
     assert (tmp_path / "a.png").read_bytes() == b"old"
 
 
-def test_files_are_written_on_file_systems_without_hard_links(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def refuse(*_: object) -> None:
+def test_files_are_written_on_file_systems_without_hard_links(tmp_path, monkeypatch):
+    def refuse(*_):
         raise PermissionError(errno.EPERM, "Operation not permitted")
 
     monkeypatch.setattr(os, "link", refuse)
@@ -366,7 +300,7 @@ def test_files_are_written_on_file_systems_without_hard_links(
         ("n" * 300, "shorter"),
     ],
 )
-def test_impossible_targets_are_errors(tmp_path: Path, target: str, word: str) -> None:
+def test_impossible_targets_are_errors(tmp_path, target, word):
     (tmp_path / "folder").mkdir()
     (tmp_path / "file").write_bytes(b"")
     with pytest.raises(OutputError, match=word) as raised:
@@ -383,9 +317,7 @@ def test_impossible_targets_are_errors(tmp_path: Path, target: str, word: str) -
         (macos.MacOS, {"HOME": "/Users/ann"}, "/Users/ann/Library/Caches/brewster"),
     ],
 )
-def test_downloads_are_in_the_cache_folder_of_the_system(
-    monkeypatch: pytest.MonkeyPatch, system: type, variables: dict[str, str], folder: str
-) -> None:
+def test_downloads_are_in_the_cache_folder_of_the_system(monkeypatch, system, variables, folder):
     monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
     for name, value in variables.items():
         monkeypatch.setenv(name, value)
@@ -409,7 +341,7 @@ def test_ctrl_c_just_after_the_rename_leaves_nothing_else(tmp_path, monkeypatch)
     assert [path.name for path in tmp_path.iterdir()] == ["a"]
 
 
-def test_the_check_of_an_output_folder_creates_nothing(tmp_path: Path) -> None:
+def test_the_check_of_an_output_folder_creates_nothing(tmp_path):
     touch(tmp_path, "file")
     (tmp_path / "link").symlink_to("nowhere")
     before = sorted(tmp_path.iterdir())
@@ -424,18 +356,3 @@ def test_the_check_of_an_output_folder_creates_nothing(tmp_path: Path) -> None:
         with pytest.raises(OutputError, match=rf"{bad} was not written \(.*; expected .*{reason}"):
             check_output_folder(tmp_path / bad)
     assert sorted(tmp_path.iterdir()) == before
-
-
-def test_a_path_too_long_for_windows_is_named_as_such(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def refuse(path: Path, data: bytes) -> None:
-        raise FileNotFoundError(errno.ENOENT, "No such file or directory")  # what Windows reports
-
-    monkeypatch.setattr(files, "_write_synced", refuse)
-    monkeypatch.setattr(files, "sys", SimpleNamespace(platform="win32"))
-    with pytest.raises(OutputError, match=r"fewer than 260 characters.* enable long paths"):
-        write_atomically(tmp_path / ("a" * 240) / "b.jpg", b"layer")
-    with pytest.raises(OutputError, match=r"b\.jpg was not written \(No such file") as raised:
-        write_atomically(tmp_path / "b.jpg", b"layer")
-    assert "260" not in str(raised.value)

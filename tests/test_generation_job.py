@@ -15,7 +15,7 @@ from pyarrow import parquet
 
 import brewster
 from brewster.errors import DeviceError, OutputError
-from brewster.executors import SerialExecutor
+from brewster.executors.local import SerialExecutor
 from brewster.rendered import store
 from brewster.rendered.generation import job as job_module
 from brewster.rendered.generation.workers import TaskRunner
@@ -130,9 +130,7 @@ def test_a_sample_that_fails_is_reported_and_the_others_are_rendered(
 
 
 def test_an_error_of_every_sample_ends_the_run_with_its_message(tmp_path):
-    with pytest.raises(
-        DeviceError, match=r"^there is no GPU; expected a GPU; or a CPU; use another computer\.$"
-    ):
+    with pytest.raises(DeviceError, match=r"^there is no GPU; expected a GPU; or a CPU"):
         render_set(tmp_path / "set", renderer="without_device")
 
 
@@ -258,11 +256,3 @@ def test_a_file_system_without_locks_is_reported(four_samples, monkeypatch, numb
     monkeypatch.setattr(fcntl, "flock", refuse)
     with pytest.raises(OutputError, match="cannot be locked"):
         render_set(four_samples)
-
-
-def test_a_schedule_plans_one_block_at_a_time(tmp_path):
-    """The memory of the schedule does not depend on the number of samples."""
-    schedule = job_module._Schedule(tmp_path, range(10**9), 4, shards=True, report=lambda _: None)
-    tasks = [schedule.next() for _ in range(3)]
-    assert [task.indices for task in tasks] == [(0, 1, 2, 3), (4, 5, 6, 7), (8, 9, 10, 11)]
-    assert len(schedule._remaining) == 1

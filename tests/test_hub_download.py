@@ -7,10 +7,7 @@ import huggingface_hub
 import pytest
 
 from brewster.errors import DownloadError, ModelError
-from brewster.models.diffusion import hub_download
-from brewster.models.diffusion.backbones.registry import BACKBONES
 from brewster.models.diffusion.hub_download import find_weights_file, resolve_model_folder
-from brewster.models.diffusion_models import DIFFUSION_MODELS, licence_of
 
 
 @pytest.fixture
@@ -48,14 +45,6 @@ def test_a_download_that_does_not_fit_on_the_disk_is_refused(hub):
     with pytest.raises(DownloadError, match=r"has 40\.2 GB to download, and 41\.0 GB are free in .*HF_HOME"):
         resolve_model_folder("Qwen/Qwen-Image-Edit-2509", ["*"])
     assert hub.calls == ["dry run"]
-
-
-def test_small_and_cached_files_are_not_announced(hub, capsys):
-    hub.files[:2] = [SimpleNamespace(file_size=None, will_download=True)]
-    hub.free(0)
-    resolve_model_folder("someone/model", ["*"])
-    assert hub.calls == ["dry run", "download"]
-    assert capsys.readouterr().err == ""
 
 
 def test_the_hub_that_cannot_be_asked_does_not_prevent_the_use_of_the_cache(monkeypatch, tmp_path):
@@ -108,17 +97,3 @@ def test_a_file_in_a_subfolder_of_a_repository_is_found_with_its_companion(tmp_p
     )
     assert found == tmp_path / "steps" / "4" / "lora.safetensors"
     assert set(requests) == {("someone/fast", "steps/4/lora.safetensors", "steps/4/adapter_config.json")}
-
-
-@pytest.mark.parametrize("name", list(BACKBONES))
-def test_the_table_agrees_with_the_backbones(name):
-    model, family = DIFFUSION_MODELS[name], BACKBONES[name]
-    assert (model.hub_id, model.licence) == (family.hub_id, family.licence.title)
-    assert model.allows_commercial_use == family.licence.allows_commercial_use
-
-
-def test_the_licence_of_a_base_is_that_of_its_owner():
-    assert licence_of("black-forest-labs/FLUX.1-Kontext-dev") == "FLUX.1 [dev] Non-Commercial License"
-    assert licence_of("Qwen/Qwen-Image-Edit-2509") == "Apache-2.0"
-    assert licence_of("someone/model") == "see its page on the hub"
-    assert hub_download.licence_of is licence_of

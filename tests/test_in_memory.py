@@ -1,7 +1,6 @@
 """The Python API: arrays, PIL images, open files, notebooks, many photos, and custom models."""
 
 import io
-import sys
 import threading
 
 import numpy as np
@@ -12,7 +11,6 @@ import brewster
 from brewster import Photo, Separation, Separator
 from brewster.errors import (
     BrewsterError,
-    MissingExtra,
     ModelError,
     PhotoError,
     UnreadablePhoto,
@@ -90,12 +88,6 @@ def test_colours_of_more_than_eight_bits_become_a_pil_image_of_eight(dtype):
     assert np.unique(np.asarray(Photo.from_array(array, encoding="srgb").to_pil())).tolist() in ([127], [128])
 
 
-def test_to_pil_without_pillow_names_the_command_that_installs_it(monkeypatch):
-    monkeypatch.setitem(sys.modules, "PIL", None)
-    with pytest.raises(MissingExtra, match="pip install pillow"):
-        Photo.from_array(smooth(), encoding="srgb").to_pil()
-
-
 def test_a_notebook_shows_a_photo_and_a_separation_as_small_png():
     photo = Photo.from_array(np.tile(smooth(64, 64), (30, 40, 1)), encoding="srgb")
     shown = pil(photo._repr_png_())
@@ -103,15 +95,6 @@ def test_a_notebook_shows_a_photo_and_a_separation_as_small_png():
     small = Photo.from_array(smooth(), encoding="srgb")
     assert np.abs(np.asarray(pil(small._repr_png_())).astype(int) - smooth()).max() <= 1
     assert pil(SEPARATOR(small)._repr_png_()).size == (3 * 64 + 2 * 8, 240)
-
-
-def test_the_text_of_a_photo_names_size_kind_and_metadata():
-    photo = Photo.open(file_of(smooth(), "JPEG", exif=exif_block(1)))
-    assert repr(photo) == "Photo(64 x 48, RGB, uint8, jpeg, EXIF)"
-    grey = Photo.from_array(np.zeros((2, 3), np.uint16), encoding="srgb")
-    assert repr(grey) == "Photo(3 x 2, grey, uint16, png)"
-    assert repr(SEPARATOR(photo)) == f"Separation(64 x 48, custom, {SEPARATOR(photo).assessment.verdict})"
-    assert repr(SEPARATOR) == "Separator(custom, cpu)"
 
 
 def test_integers_are_srgb_encoded_by_default_and_floats_need_an_encoding():
@@ -252,16 +235,6 @@ def test_many_photos_need_a_thread_and_a_wrong_type_is_raised():
 def test_an_invalid_output_of_a_model_is_an_error_that_says_what_is_wrong(model, message):
     with pytest.raises(ModelError, match=message):
         Separator(model)(smooth(), encoding="srgb")
-
-
-def test_a_model_may_return_other_floats_and_a_list():
-    result = Separator(lambda tile: [0.8 * tile.astype(np.float64), (0.2 * tile).astype(np.float16)])(
-        smooth(), encoding="srgb"
-    )
-    assert (
-        np.abs(result.transmission.pixels.astype(int) - SEPARATOR(result.photo).transmission.pixels).max()
-        <= 1
-    )
 
 
 def test_the_folder_of_a_training_run_is_a_model(tmp_path):

@@ -51,15 +51,6 @@ async def wait_until(condition):
         await asyncio.sleep(0.001)
 
 
-def test_a_job_returns_its_result_and_releases_its_place():
-    async def scenario(job_queue, work):
-        work.proceed.set()
-        assert await submit(job_queue, work) == "result"
-        await wait_until(lambda: not job_queue.job_count)
-
-    asyncio.run(scenario(JobQueue(), BlockingWork()))
-
-
 def test_an_exception_of_the_work_is_raised():
     def raise_error(on_progress):
         raise KeyError("the error")

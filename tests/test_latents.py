@@ -166,9 +166,7 @@ def test_data_without_a_share_is_not_read(recipe):
 
 def test_pairs_without_reflections_are_refused_where_r_is_a_panel(recipe):
     pairs = {"pairs": ["pairs"], "pairs_share": 1.0}
-    with pytest.raises(
-        RecipeError, match=r"pairs has no reflection for a \(photos without one: 1\); .*difference"
-    ):
+    with pytest.raises(RecipeError, match=r"pairs has no reflection for a \(photos without one: 1"):
         open_samples(recipe(pairs))
     assert len(open_samples(recipe(pairs, panels=["I", "T"]))) == 1
     (sample,) = open_samples(recipe(pairs, reflections="difference"))
@@ -197,16 +195,6 @@ def test_a_small_sample_gets_the_panels_that_it_gets_at_inference(recipe, backbo
     shapes = {latents(SampleRng(1, step, 0)).composite.shape[2:] for step in range(20)}
     assert shapes == {(1, 6), (2, 9)}
     assert samples.description() == "3 rendered samples, 3 real pairs"
-
-
-def test_a_sample_with_a_side_of_fewer_than_16_pixels_is_refused(recipe, root):
-    for role in ("blended", "transmission"):
-        (root / "narrow" / role).mkdir(parents=True)
-        pixels = np.full((15, 60, 3), 99, np.uint8)
-        Photo.from_array(pixels, encoding="srgb").save(root / "narrow" / role / "a.png")
-    narrow = recipe({"pairs": ["narrow"], "pairs_share": 1.0}, reflections="difference")
-    with pytest.raises(PhotoError, match="60 x 15 pixels; expected at least 16 pixels a side"):
-        open_samples(narrow).check_sizes(narrow, 16)
 
 
 def test_too_few_rendered_samples_are_refused(recipe):

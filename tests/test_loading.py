@@ -16,7 +16,7 @@ from brewster.models.diffusion.backbones.loading import load_backbone
 from brewster.models.diffusion.backbones.registry import BACKBONES, tiny
 from brewster.models.diffusion.pipeline import load_pipeline
 from brewster.models.diffusion.prompt import PROMPT_FILE
-from published_models import linear_layers, random_pair
+from published_models import linear_layers, random_pair, velocity
 
 Q8 = gguf.GGMLQuantizationType.Q8_0
 
@@ -48,13 +48,6 @@ def bases(tmp_path_factory):
         tiny(name)[0].save(folder / name)
         (folder / name / "transformer" / "diffusion_pytorch_model.safetensors").unlink()
     return folder
-
-
-def velocity(backbone, prompt):
-    latents, condition = torch.randn(
-        2, 1, backbone.channels, 2, 3, generator=torch.Generator().manual_seed(0)
-    )
-    return backbone.predict(latents, condition, torch.tensor([0.7]), prompt, 1.0)
 
 
 @pytest.mark.parametrize("name", list(BACKBONES))

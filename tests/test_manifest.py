@@ -63,9 +63,7 @@ def test_a_photo_that_is_listed_twice_has_the_first_of_its_rows(tmp_path):
 @pytest.mark.parametrize("suffix", [".csv", ".parquet"])
 def test_a_manifest_without_rows_is_refused(tmp_path, suffix):
     manifest = write_manifest(tmp_path / f"empty{suffix}")
-    with pytest.raises(
-        ManifestError, match="has only the names of its columns, and no rows; expected a row for"
-    ):
+    with pytest.raises(ManifestError, match="has only the names of its columns, and no rows"):
         plan_files(manifest)
 
 
@@ -87,9 +85,7 @@ def test_the_column_path_decides_which_character_separates_the_values(tmp_path):
     with pytest.raises(ManifestError, match="has the columns 'file', 'year'; expected"):
         plan_files(manifest)
     manifest.write_text("path\na,b.jpg\n")
-    with pytest.raises(
-        ManifestError, match=r"line 2 of .* has more values .*; write a path that contains ','"
-    ):
+    with pytest.raises(ManifestError, match=r"line 2 of .* has more values"):
         plan_files(manifest)
     manifest.write_text("")
     with pytest.raises(ManifestError, match="has no columns; expected"):
@@ -119,9 +115,7 @@ def test_rows_that_are_not_paths_below_the_manifest_are_refused(tmp_path):
     ]:
         with pytest.raises(ManifestError, match=message):
             plan_files(write_manifest(tmp_path / "list.parquet", *rows))
-    with pytest.raises(
-        BrewsterError, match=r"line 3 of .*: https://x\.org/a\.jpg is a web address; .*; download"
-    ):
+    with pytest.raises(BrewsterError, match=r"line 3 of .*: https://x\.org/a\.jpg is a web address"):
         plan_files(write_manifest(tmp_path / "list.csv", "a.jpg", "https://x.org/a.jpg"))
     short = tmp_path / "short.csv"
     short.write_text("year,path\n1987\n")

@@ -147,19 +147,6 @@ def test_the_command_line_and_the_server_return_the_bytes_of_python(run, tmp_pat
     assert (text.status_code, "no file" in text.json()["error"]) == (422, True)
 
 
-def test_a_photo_whose_size_differs_from_the_mask_fails_and_the_others_are_separated(run, tmp_path):
-    for name, size in (("a.png", SIZE), ("b.png", (50, 50))):
-        (tmp_path / name).write_bytes(image_bytes(*size, "png"))
-    (tmp_path / "m").mkdir()
-    (tmp_path / "m/mask.png").write_bytes(file_of(left_half(), "png"))
-    code, _, err = run("a.png", "b.png", "--mask", "m/mask.png")
-    assert code == 1
-    assert "b.png: the size of the mask m/mask.png is 60 x 40 pixels; expected 50 x 50" in err
-    assert (tmp_path / "a.transmission.png").exists()
-    assert not (tmp_path / "b.transmission.png").exists()
-    assert run("a.png", "--mask", "missing.png")[0] == 2
-
-
 @pytest.mark.parametrize("size", [(6, 4), (3, 2), (4, 3), (1, 1)])
 def test_a_sampled_mask_has_the_weights_at_the_centres_of_its_cells(size):
     values = np.arange(24, dtype=np.uint8).reshape(4, 6)

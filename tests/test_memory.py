@@ -39,9 +39,7 @@ def test_the_weights_of_a_hub_id_are_counted_by_its_configuration(tmp_path, monk
     assert count_weights("someone/not-in-the-cache", klein) == klein.cost.parameters
     config = next(tmp_path.rglob("transformer/config.json"))
     config.write_text('{"num_layers": "many"}')
-    with pytest.raises(
-        ModelError, match=r"config.json has invalid settings .*; expected the settings of a Flux2"
-    ):
+    with pytest.raises(ModelError, match=r"config.json has invalid settings"):
         count_weights(KLEIN_9B, klein)
 
 

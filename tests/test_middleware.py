@@ -252,11 +252,7 @@ def test_a_body_up_to_the_limit_is_accepted(app):
 
 @pytest.mark.parametrize("content", [lambda: b"x" * 101, lambda: chunks(4), lambda: chunks(1000)])
 def test_a_larger_body_is_refused_with_and_without_content_length(app, content):
-    response = post(app, content=content())
-    assert response.status_code == 413
-    assert (
-        response.json()["error"] == "the upload is too large; expected at most 0.0001 MB; send a smaller file"
-    )
+    assert post(app, content=content()).status_code == 413
 
 
 @pytest.mark.parametrize("length", ["-1", "1e3", "\u00b2", "9" * 20, "9" * 5000])

@@ -3,6 +3,7 @@ import math
 import numpy as np
 import pytest
 
+import synthetic_scenes
 from brewster.errors import RecipeError
 from brewster.render.mitsuba import renderer, variant
 from brewster.render.mitsuba.renderer import trace
@@ -10,7 +11,8 @@ from brewster.render.mitsuba.scene_builder import MitsubaSceneBuilder, sample_bi
 from brewster.scene.camera import Camera, axes
 from brewster.scene.glass import Glazing, Pane
 from brewster.scene.scene import Scene
-from brewster.scene.world import AssetSource, EnvironmentMap, Plane, Side
+from brewster.scene.world import Side
+from synthetic_scenes import SyntheticAssets, map_side
 
 pytestmark = [
     pytest.mark.usefixtures("mitsuba"),
@@ -27,22 +29,11 @@ MOTTLED = np.random.default_rng(3).random((8, 16, 3), np.float32)
 IMAGES = {"white": WHITE, "red right": RED_RIGHT, "red top": RED_TOP, "ramp": RAMP, "mottled": MOTTLED}
 
 
-class SyntheticAssets:
-    """Assets without files: the entry of `IMAGES` with the source's name."""
-
-    def map_radiance(self, lit):
-        return IMAGES[lit.source.file] * np.float32(lit.luminance)
-
-    def plane_radiance(self, plane):
-        return IMAGES[plane.source.file] * np.float32(plane.luminance)
-
-
-def map_side(name="white", **more):
-    return Side(map=EnvironmentMap(source=AssetSource(file=name), **more))
+ASSETS = SyntheticAssets(**IMAGES)
 
 
 def plane_side(name, **more):
-    return Side(plane=Plane(source=AssetSource(file=name), **{"distance_mm": 1000, "width_mm": 1200, **more}))
+    return synthetic_scenes.plane_side(name, **{"distance_mm": 1000, "width_mm": 1200, **more})
 
 
 def a_scene(**more):
@@ -51,14 +42,14 @@ def a_scene(**more):
 
 
 def traced(scene, **more):
-    return trace(scene, SyntheticAssets(), **{"noise_threshold": 0.01, "max_samples": 512, **more})
+    return trace(scene, ASSETS, **{"noise_threshold": 0.01, "max_samples": 512, **more})
 
 
 def render_image(scene, side, glass_mode, samples=64):
     """Renders one image (H, W, 3)."""
     mitsuba = variant.load()
     with renderer._active_variant(mitsuba, variant.probe().variant):
-        mi_scene = MitsubaSceneBuilder(mitsuba, scene, SyntheticAssets()).scene_dict(
+        mi_scene = MitsubaSceneBuilder(mitsuba, scene, ASSETS).scene_dict(
             lit_from_behind=side == "behind", glass_mode=glass_mode
         )
         return np.array(mitsuba.render(mitsuba.load_dict(mi_scene), spp=samples))
@@ -123,9 +114,9 @@ def test_polarised_light_follows_the_closed_form_at_brewsters_angle(requires_llv
 def test_s_and_p_light_each_follow_the_closed_form(requires_llvm, mitsuba):
     camera = {**at(56.31), "width": 16, "height": 16}
     with renderer._active_variant(mitsuba, renderer._variant(polarised=True)):
-        mi_scene = MitsubaSceneBuilder(
-            mitsuba, a_scene(camera=camera), SyntheticAssets(), channel=0
-        ).scene_dict(lit_from_behind=False, glass_mode="full")
+        mi_scene = MitsubaSceneBuilder(mitsuba, a_scene(camera=camera), ASSETS, channel=0).scene_dict(
+            lit_from_behind=False, glass_mode="full"
+        )
         mi_scene["integrator"] = {"type": "stokes", "nested": mi_scene["integrator"]}
         stokes = np.array(mitsuba.render(mitsuba.load_dict(mi_scene), spp=4096)).mean((0, 1))
     intensity, difference = stokes[1], abs(stokes[4])
@@ -188,9 +179,7 @@ def test_a_map_emits_the_light_of_its_texels_on_its_own_side_only(
     to_glass = np.array(axes(glass.heading_deg, glass.pitch_deg))
     with renderer._active_variant(mitsuba, variant.COMPILED):
         mi_scene = mitsuba.load_dict(
-            MitsubaSceneBuilder(mitsuba, scene, SyntheticAssets()).scene_dict(
-                lit_from_behind=behind, glass_mode="none"
-            )
+            MitsubaSceneBuilder(mitsuba, scene, ASSETS).scene_dict(lit_from_behind=behind, glass_mode="none")
         )
         intersection = mi_scene.ray_intersect(
             mitsuba.Ray3f(mitsuba.Point3f(0), mitsuba.Vector3f((to_glass @ directions).astype("f4")))

@@ -8,9 +8,10 @@ from brewster.errors import RecipeError
 from brewster.inference.onnx_backend import OnnxBackend
 from brewster.models.compact import CompactNetwork
 from brewster.models.networks import DEFAULT_NETWORK, MAX_STRIDE, NETWORKS, NetworkEntry
-from brewster.training.checkpoint import Checkpoint
 from brewster.training.compact.trainer import CompactTrainer, train
+from brewster.training.loop import Checkpoint
 from brewster.training.recipe import with_value
+from training_helpers import ignore_step
 
 
 class SmallNetwork(nn.Module):
@@ -29,10 +30,6 @@ class SmallNetwork(nn.Module):
 def small_network(monkeypatch):
     monkeypatch.setitem(NETWORKS, "small", NetworkEntry(SmallNetwork, SmallNetwork, stride=4))
     return "small"
-
-
-def ignore_progress(step, steps, metrics, logged):
-    pass
 
 
 @pytest.mark.parametrize("name", list(NETWORKS))
@@ -57,7 +54,7 @@ def test_a_recipe_without_a_network_trains_the_default_one(recipe):
 
 def test_a_recipe_trains_and_exports_the_network_that_it_names(recipe, small_network, tmp_path):
     recipe = with_value(recipe, "network", small_network)
-    assert isinstance(train(recipe, tmp_path, ignore_progress), SmallNetwork)
+    assert isinstance(train(recipe, tmp_path, ignore_step), SmallNetwork)
     trainer = CompactTrainer(recipe)
     trainer.load_state_dict(Checkpoint.read(tmp_path / "checkpoint.pt").state)
     backend = OnnxBackend(trainer.export(tmp_path), "cpu")
@@ -67,6 +64,6 @@ def test_a_recipe_trains_and_exports_the_network_that_it_names(recipe, small_net
 
 
 def test_a_run_of_one_network_is_not_resumed_with_another(recipe, small_network, tmp_path):
-    train(recipe, tmp_path, ignore_progress)
+    train(recipe, tmp_path, ignore_step)
     with pytest.raises(RecipeError, match=r"belongs to a run of another recipe: network was"):
-        train(with_value(recipe, "network", small_network), tmp_path, ignore_progress)
+        train(with_value(recipe, "network", small_network), tmp_path, ignore_step)

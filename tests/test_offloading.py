@@ -5,13 +5,14 @@ import torch
 from diffusers.hooks import group_offloading
 
 from brewster.models.diffusion import offloading, pipeline
-from brewster.models.diffusion.adapter.lora import add_lora, lora_parameters, save_lora
+from brewster.models.diffusion.adapter.lora import add_lora, save_lora
 from brewster.models.diffusion.backbones.loading import load_backbone
 from brewster.models.diffusion.backbones.registry import BACKBONES, tiny
 from brewster.models.diffusion.offloading import DECODING_BYTES_PER_PIXEL, offload_layers
 from brewster.models.diffusion.pipeline import load_pipeline
 from brewster.models.diffusion.task import DecompositionTask
 from brewster.models.diffusion_resources import Placement
+from published_models import velocity, with_random_lora
 
 PHOTO = torch.linspace(-1, 1, 3 * 32 * 48).reshape(1, 3, 32, 48)
 
@@ -26,25 +27,12 @@ def copies(monkeypatch):
     return copied
 
 
-def with_random_lora(name):
-    backbone, prompt = tiny(name, seed=1)
-    add_lora(backbone, rank=2, alpha=4)
-    with torch.no_grad():
-        for parameter in lora_parameters(backbone):
-            parameter.normal_(0, 0.1, generator=torch.Generator().manual_seed(3))
-    return backbone, prompt
-
-
 @pytest.mark.parametrize("name", list(BACKBONES))
 def test_an_offloaded_transformer_with_a_lora_predicts_the_same_bits(name, copies):
     backbone, prompt = with_random_lora(name)
-    latents, condition = torch.randn(
-        2, 1, backbone.channels, 2, 3, generator=torch.Generator().manual_seed(0)
-    )
-    call = (latents, condition, torch.tensor([0.7]), prompt, 1.0)
-    expected = backbone.predict(*call)
+    expected = velocity(backbone, prompt)
     offload_layers(backbone.transformer, backbone.vae, "cpu")
-    assert torch.equal(backbone.predict(*call), expected)
+    assert torch.equal(velocity(backbone, prompt), expected)
     transformer = backbone.transformer
     blocks = [*transformer.transformer_blocks, *getattr(transformer, "single_transformer_blocks", [])]
     copied = {id(module) for group in copies for module in group.modules}
@@ -57,20 +45,17 @@ def test_quantized_weights_are_offloaded_with_their_lora(tmp_path, copies):
     backbone = load_backbone(str(tmp_path), quantization="int8", dtype=torch.bfloat16)
     _, prompt = tiny("kontext", seed=1)
     add_lora(backbone, rank=2)
-    latents, condition = torch.randn(
-        2, 1, backbone.channels, 2, 3, generator=torch.Generator().manual_seed(0)
-    )
-    call = (latents, condition, torch.tensor([0.7]), prompt, 1.0)
     with torch.no_grad():
-        expected = backbone.predict(*call)
+        expected = velocity(backbone, prompt)
         offload_layers(backbone.transformer, backbone.vae, "cpu")
-        assert torch.equal(backbone.predict(*call), expected)
+        assert torch.equal(velocity(backbone, prompt), expected)
     assert copies
 
 
 def test_an_offloaded_lora_separates_as_a_resident_one(tmp_path, monkeypatch, copies):
     backbone, prompt = with_random_lora("kontext")
-    save_lora(tmp_path, backbone, prompt, DecompositionTask(steps=2), base_model="tiny:kontext")
+    task, targets = DecompositionTask(steps=2), ["*.attn.*"]
+    save_lora(tmp_path, backbone, prompt, task, base_model="tiny:kontext", target_modules=targets)
     expected = load_pipeline(str(tmp_path))(PHOTO)
     assert not copies
     monkeypatch.setattr(pipeline, "choose_placement", lambda *_, **__: Placement("cpu", is_offloaded=True))

@@ -8,7 +8,6 @@ from brewster.errors import DeviceError, ModelError
 from brewster.inference import onnx_backend
 from brewster.inference.onnx_backend import OnnxBackend, available_devices
 from brewster.models.compact import LinearSeparator, with_imagenet_features
-from brewster.models.dense import DenseNetwork
 from brewster.models.networks import DEFAULT_NETWORK, NETWORKS
 from brewster.training.compact.export import export_onnx
 
@@ -17,7 +16,8 @@ from brewster.training.compact.export import export_onnx
 def network():
     torch.manual_seed(1)
     network = with_imagenet_features().eval()
-    torch.nn.init.normal_(network.head.weight, std=0.1)
+    for convolution in (network.head, *network.hints):
+        torch.nn.init.normal_(convolution.weight, std=0.1)
     with torch.no_grad():
         for parameter in network.parameters():
             parameter.copy_(parameter.half())  # the precision of the file
@@ -31,23 +31,6 @@ def model_file(network, tmp_path_factory):
     return path
 
 
-@pytest.fixture(scope="module")
-def dense_network():
-    torch.manual_seed(2)
-    network = DenseNetwork().eval()
-    with torch.no_grad():
-        for parameter in network.parameters():
-            parameter.add_(0.02 * torch.randn_like(parameter)).copy_(parameter.half())
-    return network
-
-
-@pytest.fixture(scope="module")
-def dense_model_file(dense_network, tmp_path_factory):
-    path = tmp_path_factory.mktemp("dense") / "model.onnx"
-    export_onnx(dense_network, path, NETWORKS["lite2-dense"])
-    return path
-
-
 @pytest.mark.parametrize("size", [(64, 96), (160, 32), (320, 448)])
 def test_the_exported_model_equals_the_network_at_any_size(network, model_file, size):
     tile = np.random.default_rng(1).random((*size, 3), np.float32)
@@ -58,13 +41,13 @@ def test_the_exported_model_equals_the_network_at_any_size(network, model_file, 
 
 
 @pytest.mark.parametrize("has_hints", [True, False])
-def test_an_exported_model_with_hints_equals_its_network(dense_network, dense_model_file, has_hints):
+def test_an_exported_model_with_hints_equals_its_network(network, model_file, has_hints):
     rng = np.random.default_rng(3)
     tile, hints = rng.random((64, 96, 3), np.float32), rng.random((64, 96, 2), np.float32)
     hints_tensor = torch.from_numpy(hints * has_hints).permute(2, 0, 1)[None]
     with torch.no_grad():
-        expected = LinearSeparator(dense_network)(torch.from_numpy(tile).permute(2, 0, 1)[None], hints_tensor)
-    layers = OnnxBackend(dense_model_file, "cpu")(tile, hints if has_hints else None)
+        expected = LinearSeparator(network)(torch.from_numpy(tile).permute(2, 0, 1)[None], hints_tensor)
+    layers = OnnxBackend(model_file, "cpu")(tile, hints if has_hints else None)
     for layer, expected_layer in zip(layers, expected, strict=True):
         np.testing.assert_allclose(layer, expected_layer[0].permute(1, 2, 0).numpy(), atol=5e-4)
 
@@ -72,11 +55,6 @@ def test_an_exported_model_with_hints_equals_its_network(dense_network, dense_mo
 def test_the_file_contains_no_paths_of_the_machine_that_wrote_it(model_file):
     assert b"site-packages" not in model_file.read_bytes()
     assert b"/src/brewster" not in model_file.read_bytes()
-
-
-def test_the_file_has_two_bytes_for_each_weight(network, model_file):
-    weights = sum(parameter.numel() for parameter in network.parameters())
-    assert 2 * weights < model_file.stat().st_size < 2 * weights + 5e5
 
 
 @pytest.mark.parametrize("size", [(1, 1), (33, 31), (5, 200)])
@@ -108,10 +86,6 @@ def test_an_unavailable_device_is_an_error_with_the_command_that_installs_it(mod
         OnnxBackend(model_file, unavailable)
     with pytest.raises(DeviceError, match="one of auto"):
         OnnxBackend(model_file, "unknown")
-
-
-def test_auto_finds_a_device(model_file):
-    assert OnnxBackend(model_file).device == available_devices()[0]
 
 
 def test_a_device_that_does_not_start_is_an_error_and_auto_skips_it(model_file, monkeypatch):

@@ -129,15 +129,6 @@ def test_a_missing_or_empty_folder_of_a_role_is_an_error(tmp_path):
         read_folders(tmp_path)
 
 
-def test_links_are_followed(tmp_path):
-    repacked(tmp_path / "elsewhere", ["a"])
-    here = tmp_path / "here"
-    here.mkdir()
-    for role in ("blended", "transmission_layer"):
-        (here / role).symlink_to(tmp_path / "elsewhere" / role)
-    assert names(read_folders(here)) == ["a"]
-
-
 def test_a_split_is_the_folder_itself_or_the_only_one_in_it(tmp_path):
     repacked(tmp_path / "val", ["a"])
     (tmp_path / "other").mkdir()
@@ -267,9 +258,7 @@ def test_training_pairs_are_grouped_in_the_same_way(tmp_path):
         repacked(tmp_path, [name], ("blended", "transmission"), size=size)
     assert [tuple(photo.shape) for photo, _ in read_pairs([tmp_path])] == [(8, 6, 3), (6, 8, 3)]
     write(tmp_path, "transmission/10.jpg")
-    with pytest.raises(
-        RecipeError, match=r"transmission/10.jpg and transmission/10.png are ambiguous.*; .*; "
-    ):
+    with pytest.raises(RecipeError, match=r"transmission/10.jpg and transmission/10.png are ambiguous.*"):
         read_pairs([tmp_path])
 
 
@@ -278,9 +267,3 @@ def test_a_training_pair_of_two_sizes_is_an_error_that_names_both(tmp_path):
     write(tmp_path, "gt/a.png", size=(4, 3))
     with pytest.raises(RecipeError, match=r"blended/a.png and .*gt/a.png differ in size; "):
         read_pairs([tmp_path])
-
-
-def test_a_folder_with_a_semicolon_in_its_name_is_named_in_full(tmp_path):
-    with pytest.raises(RecipeError) as raised:
-        read_pairs([tmp_path / "window; north"])
-    assert raised.value.happened == f"{tmp_path}/window; north cannot be read (No such file or directory)"

@@ -3,8 +3,6 @@
 import hashlib
 import os
 import re
-import subprocess
-import sys
 from functools import partial
 from pathlib import Path
 
@@ -16,14 +14,12 @@ from pyarrow import parquet
 from brewster.batch import FileResult, plan_files, separate_files
 from brewster.batch.index import COLUMNS, INDEX_FILE, PARTS_FOLDER, IndexWriter
 from brewster.batch.parallel import SeparationRunner, separate_in_parallel
-from brewster.errors import ModelError, OutputError
-from brewster.executors import ProcessExecutor, SerialExecutor
+from brewster.errors import OutputError
+from brewster.executors.local import SerialExecutor
 from brewster.files import discard
 from brewster.options import Options
-from brewster.photo import Photo
 from brewster.remote_path import location
 from cli_helpers import image_bytes, json_lines, layer_files, list_files, run_process
-from set_folders import hashes
 
 TESTS = Path(__file__).parent
 NAMES = ("a.jpg", "b/c.jpg", "b/d.jpg")
@@ -181,14 +177,6 @@ def test_a_store_that_cannot_be_written_to_ends_the_run_before_the_first_photo(s
         run_archive(root, Options(model="no-such-model"))
 
 
-def test_a_folder_that_cannot_be_written_to_ends_the_run_before_the_first_photo(tmp_path):
-    (tmp_path / "in").mkdir()
-    (tmp_path / "in/a.jpg").write_bytes(image_bytes())
-    (tmp_path / "out").write_bytes(b"a file")
-    with pytest.raises(OutputError, match="was not written"):
-        run_archive(tmp_path, Options(model="no-such-model"))
-
-
 def test_rows_survive_a_killed_run_and_a_store_that_fails_for_a_while(store, monkeypatch):
     folder = location("memory://bucket/out")
     killed = IndexWriter(folder)
@@ -260,32 +248,9 @@ def test_layers_that_another_worker_has_written_in_the_meantime_are_kept(tmp_pat
     }
 
 
-def test_a_photo_of_the_archive_is_never_replaced(tmp_path, options):
-    (tmp_path / "out").mkdir()
-    for name in ("a.jpg", "a.transmission.jpg"):
-        (tmp_path / "out" / name).write_bytes(image_bytes())
-    manifest = tmp_path / "out/list.csv"
-    manifest.write_text("path\na.jpg\na.transmission.jpg\n")
-    with pytest.raises(OutputError, match="is itself a photo of the batch"):
-        run_archive(tmp_path, options, source=manifest, overwrite=True)
-
-
 def test_a_node_without_the_output_folder_ends_the_run(tmp_path, options):
     with pytest.raises(OutputError, match="does not exist on the node"):
         SeparationRunner(options, tmp_path / "not mounted")
-
-
-def test_two_processes_write_the_files_of_one_and_a_missing_model_ends_the_run(tmp_path, options):
-    (tmp_path / "in").mkdir()
-    for number in range(4):
-        (tmp_path / f"in/{number}.jpg").write_bytes(image_bytes(seed=number))
-    two = partial(ProcessExecutor, worker_count=2)
-    assert set(run_archive(tmp_path, options, executor=two, index=False).values()) == {"separated"}
-    list(separate_files(tmp_path / "in", tmp_path / "plain", options))
-    assert hashes(tmp_path / "out") == hashes(tmp_path / "plain")
-    discard(tmp_path / "out")
-    with pytest.raises(ModelError, match="no-such-model"):
-        run_archive(tmp_path, Options(model="no-such-model"), executor=two)
 
 
 def test_the_command_writes_the_index_and_separates_urls(run, tmp_path, store):
@@ -311,17 +276,6 @@ def test_the_command_writes_the_index_and_separates_urls(run, tmp_path, store):
     for target in ("clear.jpg", "memory://bucket/clear.jpg"):
         code, _, err = run("memory://bucket/in/a.jpg", "-o", target)
         assert (code, location(target).read_bytes()) == (0, layer), err
-
-
-@pytest.mark.parametrize(
-    "arguments",
-    [["--cluster", "local"], ["--index"], ["--workers", "2", "-o", "a.jpg"], ["--index", "-o", "-"]],
-)
-def test_the_command_needs_a_folder_for_the_layers_of_an_archive(run, tmp_path, arguments):
-    (tmp_path / "in.jpg").write_bytes(image_bytes())
-    code, _, err = run("in.jpg", *arguments)
-    assert code == 2
-    assert "give a folder with -o" in err
 
 
 def write_archive(folder):
@@ -380,95 +334,24 @@ def test_the_index_of_a_cluster_has_the_paths_of_that_of_one_process(run, tmp_pa
     assert index_rows(tmp_path) == rows
 
 
-LOSES_A_NODE = """
-import os, sys
-from functools import partial
-from pathlib import Path
-os.environ["RAY_USAGE_STATS_ENABLED"] = "0"
-from ray.cluster_utils import Cluster
-from brewster.executors.ray_cluster import RayExecutor
-from brewster.batch import plan_files
-from brewster.batch.parallel import SeparationRunner, separate_in_parallel
-from brewster.batch.index import IndexWriter
-from brewster.options import Options
-from brewster.photo import Photo
-root, options, done = Path(sys.argv[1]), Options(model=sys.argv[2]), []
-nodes = Cluster(initialize_head=True, head_node_args={"num_cpus": 1, "include_dashboard": False})
-lost_node = nodes.add_node(num_cpus=1)
-nodes.wait_for_nodes()
-with IndexWriter(root / "out") as index, RayExecutor(partial(SeparationRunner, options, root / "out"), nodes.address) as executor:
-
-    def report(result):
-        index.append(result)
-        done.append(result.status)
-        if len(done) == 10:
-            nodes.remove_node(lost_node, allow_graceful=False)
-
-    for result in separate_in_parallel(plan_files(root / "in", root / "out", options), executor):
-        report(result)
-nodes.shutdown()
-print(len(done), sorted(set(done) - {"skipped"}))
-"""
-
-
-@pytest.mark.slow
-def test_an_archive_is_complete_and_has_the_same_bytes_if_a_node_is_lost(tmp_path, model):
-    pytest.importorskip("ray")
-    (tmp_path / "in").mkdir()
-    for number in range(60):
-        (tmp_path / f"in/{number:02}.jpg").write_bytes(image_bytes(600, 400, seed=number))
-    paths = os.pathsep.join([str(TESTS), os.environ.get("PYTHONPATH", "")])
-    done = subprocess.run(
-        [sys.executable, "-c", LOSES_A_NODE, str(tmp_path), str(model)],
-        env={**os.environ, "PYTHONPATH": paths, "RAY_USAGE_STATS_ENABLED": "0"},
-        capture_output=True,
-        text=True,
-        check=False,
-        timeout=900,
-    )
-    assert done.stdout.strip().endswith("60 ['separated']"), done.stderr
-    rows = read_index(tmp_path)
-    assert len(rows) == 60
-    (tmp_path / "out" / INDEX_FILE).unlink()
-    list(separate_files(tmp_path / "in", tmp_path / "plain", Options(model=str(model))))
-    assert hashes(tmp_path / "out") == hashes(tmp_path / "plain")
-
-
-def test_several_processes_have_the_summary_grouped_errors_and_contact_sheet_of_a_batch(run, tmp_path):
-    for name in ("a.jpg", "b.jpg"):
-        (tmp_path / name).write_bytes(image_bytes())
-    (tmp_path / "c.jpg").write_bytes(b"not an image")
-    code, _, err = run(
-        "a.jpg", "b.jpg", "c.jpg", "-o", "out", "--workers", "2", "--contact-sheet", "sheet.png"
-    )
-    assert code == 1
-    assert re.search(r"2 separated, 1 failed in [\d.]+ s; the layers are in .*out", err)
-    assert err.count("error: ") == 1, err
-    assert Photo.open(tmp_path / "sheet.png").size[1] > 2 * 240
-
-
-def test_a_layer_that_is_its_own_photo_through_a_hard_link_is_refused(options, tmp_path):
-    photo = tmp_path / "a.jpg"
-    photo.write_bytes(image_bytes())
-    (tmp_path / "a.reflection.jpg").hardlink_to(photo)
-    with (
-        SerialExecutor(partial(SeparationRunner, options, overwrite=True)) as executor,
-        pytest.raises(OutputError, match=r"a\.reflection\.jpg is itself a photo of the batch"),
-    ):
-        list(separate_in_parallel(plan_files(photo, None, options), executor, overwrite=True))
-    assert photo.read_bytes() == image_bytes()
-
-
-def test_a_layer_that_is_another_photo_through_a_link_is_refused(options, tmp_path):
-    """Otherwise --overwrite replaces the photo."""
+@pytest.mark.parametrize("link", ["same name", "hard link", "linked folder"])
+def test_a_photo_of_the_archive_is_never_replaced(tmp_path, options, link):
+    """Also if --overwrite is set and the layer reaches the photo through a link."""
     folder = tmp_path / "photos"
     folder.mkdir()
-    (folder / "a.jpg").write_bytes(image_bytes())
-    (folder / "a.transmission.jpg").write_bytes(image_bytes(seed=1))
-    (tmp_path / "linked").symlink_to(folder)
-    tasks = plan_files([folder / "a.jpg", folder / "a.transmission.jpg"], tmp_path / "linked", options)
+    photos = [folder / "a.jpg", folder / "a.transmission.jpg"]
+    photos[0].write_bytes(image_bytes())
+    out = folder
+    if link == "hard link":
+        photos.pop().hardlink_to(photos[0])
+    else:
+        photos[1].write_bytes(image_bytes())
+    if link == "linked folder":
+        out = tmp_path / "linked"
+        out.symlink_to(folder)
     with (
         SerialExecutor(partial(SeparationRunner, options, overwrite=True)) as executor,
         pytest.raises(OutputError, match="is itself a photo of the batch"),
     ):
-        list(separate_in_parallel(tasks, executor, overwrite=True))
+        list(separate_in_parallel(plan_files(photos, out, options), executor, overwrite=True))
+    assert (folder / "a.transmission.jpg").read_bytes() == image_bytes()

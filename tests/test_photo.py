@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import io
-import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -27,7 +25,7 @@ P3 = bytes(pyvips.Image.profile_load("p3"))
 LOSSLESS = ("png", "tiff")
 
 
-def random_image(height: int = 24, width: int = 40, channels: int = 3, dtype: type = np.uint8) -> np.ndarray:
+def random_image(height=24, width=40, channels=3, dtype=np.uint8):
     white = np.iinfo(dtype).max
     return np.random.default_rng(0).integers(0, white, (height, width, channels), dtype, endpoint=True)
 
@@ -41,7 +39,7 @@ def random_image(height: int = 24, width: int = 40, channels: int = 3, dtype: ty
         st.sampled_from([np.uint8, np.uint16]), st.tuples(*[st.integers(1, 9)] * 2, st.sampled_from([1, 3]))
     )
 )
-def test_pixels_survive_lossless_files_bit_for_bit(pixels: np.ndarray) -> None:
+def test_pixels_survive_lossless_files_bit_for_bit(pixels):
     photo = Photo.from_array(pixels, encoding="srgb")
     for format_name in LOSSLESS:
         again = Photo.open(photo.encode(format_name))
@@ -51,7 +49,7 @@ def test_pixels_survive_lossless_files_bit_for_bit(pixels: np.ndarray) -> None:
 
 @quick
 @given(arrays.arrays(np.float32, (3, 4, 3), elements=st.floats(0, 1e6, width=32)))
-def test_floats_survive_tiff_and_exr_bit_for_bit(pixels: np.ndarray) -> None:
+def test_floats_survive_tiff_and_exr_bit_for_bit(pixels):
     photo = Photo.from_array(pixels, encoding="linear")
     for format_name in ("tiff", "exr"):
         assert np.array_equal(Photo.open(photo.encode(format_name)).pixels, pixels)
@@ -59,7 +57,7 @@ def test_floats_survive_tiff_and_exr_bit_for_bit(pixels: np.ndarray) -> None:
 
 @pytest.mark.parametrize(("mode", "channels"), [("L", 1), ("LA", 2), ("RGB", 3), ("RGBA", 4)])
 @pytest.mark.parametrize("format_name", ["png", "tiff", "webp"])
-def test_grey_stays_grey_and_alpha_is_kept(format_name: str, mode: str, channels: int) -> None:
+def test_grey_stays_grey_and_alpha_is_kept(format_name, mode, channels):
     array = random_image(channels=channels)
     data = (
         file_of(array, format_name, lossless=True) if format_name == "webp" else file_of(array, format_name)
@@ -70,7 +68,7 @@ def test_grey_stays_grey_and_alpha_is_kept(format_name: str, mode: str, channels
     assert np.array_equal(np.asarray(again.convert("RGBA")), np.asarray(pil(data).convert("RGBA")))
 
 
-def test_sixteen_bit_alpha_survives() -> None:
+def test_sixteen_bit_alpha_survives():
     pixels = random_image(channels=4, dtype=np.uint16)
     again = Photo.open(Photo.from_array(pixels, encoding="srgb").encode())
     assert np.array_equal(again.alpha, pixels[..., 3])
@@ -78,7 +76,7 @@ def test_sixteen_bit_alpha_survives() -> None:
 
 
 @pytest.mark.parametrize("mode", ["1", "P"])
-def test_bilevel_and_palette_images_become_grey_and_rgb(mode: str) -> None:
+def test_bilevel_and_palette_images_become_grey_and_rgb(mode):
     image = Image.fromarray(smooth()).convert(mode)
     file = io.BytesIO()
     image.save(file, "PNG")
@@ -87,7 +85,7 @@ def test_bilevel_and_palette_images_become_grey_and_rgb(mode: str) -> None:
     )
 
 
-def test_a_gif_of_one_frame_is_read_and_written_as_png() -> None:
+def test_a_gif_of_one_frame_is_read_and_written_as_png():
     image = Image.fromarray(smooth()).convert("P")
     file = io.BytesIO()
     image.save(file, "GIF")
@@ -97,24 +95,17 @@ def test_a_gif_of_one_frame_is_read_and_written_as_png() -> None:
 
 
 @pytest.mark.parametrize("format_name", ["jpeg", "png", "tiff", "webp", "avif", "exr", "hdr"])
-def test_one_pixel_works_in_every_format(format_name: str) -> None:
+def test_one_pixel_works_in_every_format(format_name):
     photo = Photo.from_array(np.full((1, 1, 3), 128, np.uint8), encoding="srgb")
     again = Photo.open(photo.encode(format_name))
     assert again.size == (1, 1)
     np.testing.assert_allclose(again.linear(), photo.linear(), atol=0.01)
 
 
-def test_a_panorama_of_20000_by_300_works() -> None:
-    photo = Photo.from_array(np.zeros((300, 20000, 1), np.uint8), encoding="srgb")
-    again = Photo.open(photo.encode("jpeg"))
-    assert again.size == (20000, 300)
-    assert again.resized(500, 8).shape == (8, 500, 3)
-
-
 # --- floats
 
 
-def test_exr_keeps_its_half_floats_alpha_and_attributes() -> None:
+def test_exr_keeps_its_half_floats_alpha_and_attributes():
     exr = pytest.importorskip("OpenEXR")
     planes = {name: np.random.default_rng(1).random((5, 7)).astype(np.float16) for name in "RGBA"}
     file = io.BytesIO()
@@ -130,7 +121,7 @@ def test_exr_keeps_its_half_floats_alpha_and_attributes() -> None:
         assert np.array_equal(part.channels[name].pixels, planes[name])
 
 
-def test_radiance_images_round_trip_bit_equal_and_run_lengths_are_decoded() -> None:
+def test_radiance_images_round_trip_bit_equal_and_run_lengths_are_decoded():
     rgbe = random_image(height=6, width=16, channels=4)
     rgbe[..., 0] |= 128
     rgbe[..., 3] = 120 + rgbe[..., 3] % 20
@@ -152,7 +143,7 @@ def test_radiance_images_round_trip_bit_equal_and_run_lengths_are_decoded() -> N
         assert again.file_info.header == {"EXPOSURE": "2"}
 
 
-def test_run_lengths_of_old_radiance_images_are_decoded() -> None:
+def test_run_lengths_of_old_radiance_images_are_decoded():
     """The pixel (1, 1, 1, n) repeats the pixel before it n times; the next such pixel counts 256 times as much."""
     first, second, third = (bytes((128, 2, level, 129)) for level in (3, 4, 5))
     body = first + bytes((1, 1, 1, 43, 1, 1, 1, 1)) + second + third + bytes((1, 1, 1, 42, 1, 1, 1, 1))
@@ -164,7 +155,7 @@ def test_run_lengths_of_old_radiance_images_are_decoded() -> None:
             Photo.open(head + damaged)
 
 
-def test_repeated_factors_of_a_radiance_header_are_multiplied() -> None:
+def test_repeated_factors_of_a_radiance_header_are_multiplied():
     """The exposure of an image is the product of all EXPOSURE lines."""
     head = b"#?RADIANCE\nEXPOSURE=2\nVIEW=a\nEXPOSURE= 0.25\nCOLORCORR=1 2 3\nCOLORCORR=2 2 0.5\nVIEW=b\n"
     photo = Photo.open(head + b"\n-Y 1 +X 1\n" + bytes((128, 64, 32, 129)))
@@ -173,26 +164,19 @@ def test_repeated_factors_of_a_radiance_header_are_multiplied() -> None:
 
 
 @pytest.mark.parametrize("width", [1 << 15, 1 << 16])
-def test_a_radiance_image_too_wide_for_run_lengths_is_flat(width: int) -> None:
+def test_a_radiance_image_too_wide_for_run_lengths_is_flat(width):
     photo = Photo.from_array(np.full((1, width, 3), 0.5, np.float32), encoding="linear")
     assert np.array_equal(Photo.open(photo.encode("hdr")).pixels, photo.pixels)
 
 
 @pytest.mark.parametrize("primaries", ["0 0 0 0 0 0 0 0", "none", "0.3 0.3"])
-def test_primaries_that_span_no_gamut_are_ignored(primaries: str) -> None:
+def test_primaries_that_span_no_gamut_are_ignored(primaries):
     data = f"#?RADIANCE\nPRIMARIES={primaries}\n\n-Y 1 +X 1\n".encode() + bytes((128, 64, 32, 129))
     np.testing.assert_allclose(Photo.open(data).linear()[0, 0], (1, 0.5, 0.25))
 
 
-@pytest.mark.parametrize("format_name", ["png", "tiff", "exr", "hdr"])
-def test_light_is_the_same_in_every_format(format_name: str) -> None:
-    photo = Photo(smooth(), None, FileInfo(icc=P3))
-    again = Photo.open(photo.encode(format_name)).linear()
-    np.testing.assert_allclose(again, photo.linear().clip(0 if format_name == "hdr" else -1), atol=5e-3)
-
-
 @pytest.mark.parametrize(("depth", "dtype"), [(8, np.uint8), (16, np.uint16), (32, np.float32)])
-def test_bit_depth_is_changed_only_on_request(depth: int, dtype: type) -> None:
+def test_bit_depth_is_changed_only_on_request(depth, dtype):
     for photo in (Photo(smooth(), None, FileInfo(icc=P3)), Photo.from_array(smooth() / 255, encoding="srgb")):
         again = Photo.open(photo.encode("tiff", depth=depth))
         assert again.pixels.dtype == dtype
@@ -203,7 +187,7 @@ def test_bit_depth_is_changed_only_on_request(depth: int, dtype: type) -> None:
 # --- HEIC
 
 
-def test_heic_keeps_profile_exif_and_pixels() -> None:
+def test_heic_keeps_profile_exif_and_pixels():
     pytest.importorskip("pillow_heif")
     photo = Photo(smooth(), None, FileInfo(icc=P3, exif=exif_block(1).removeprefix(b"Exif\0\0")))
     for depth in FORMATS["heic"].bit_depths:
@@ -215,7 +199,7 @@ def test_heic_keeps_profile_exif_and_pixels() -> None:
 
 @pytest.mark.parametrize("brand", [b"mif1", b"miaf"])
 @pytest.mark.parametrize("format_name", ["avif", "heic"])
-def test_a_file_with_a_general_brand_is_recognised_by_its_content(format_name: str, brand: bytes) -> None:
+def test_a_file_with_a_general_brand_is_recognised_by_its_content(format_name, brand):
     pytest.importorskip("pillow_heif")
     data = Photo(smooth(), None, FileInfo()).encode(format_name)
     again = Photo.open(data[:8] + brand + data[12:])
@@ -224,9 +208,7 @@ def test_a_file_with_a_general_brand_is_recognised_by_its_content(format_name: s
 
 
 @pytest.mark.parametrize(("format_name", "module"), [("heic", "pillow_heif"), ("exr", "OpenEXR")])
-def test_a_missing_extra_names_the_command_that_installs_it(
-    format_name: str, module: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_missing_extra_names_the_command_that_installs_it(format_name, module, monkeypatch):
     monkeypatch.setitem(sys.modules, module, None)
     with pytest.raises(MissingExtra, match=rf"pip install -c constraints.txt -e '\.\[{format_name}\]'"):
         Photo.from_array(smooth(), encoding="srgb").encode(format_name)
@@ -236,13 +218,13 @@ def test_a_missing_extra_names_the_command_that_installs_it(
 
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.float32])
-def test_an_unknown_encoding_is_refused(dtype: type) -> None:
+def test_an_unknown_encoding_is_refused(dtype):
     for create in (Photo.open, Photo.from_array):
         with pytest.raises(PhotoError, match=r"'sRGB'; .*; pass encoding"):
             create(smooth().astype(dtype), encoding="sRGB")
 
 
-def test_an_encoding_is_refused_for_sources_other_than_arrays() -> None:
+def test_an_encoding_is_refused_for_sources_other_than_arrays():
     data = file_of(smooth(), "PNG")
     for source in (data, "a.png", pil(data), Photo.open(data)):
         with pytest.raises(PhotoError, match="expected no encoding"):
@@ -250,7 +232,7 @@ def test_an_encoding_is_refused_for_sources_other_than_arrays() -> None:
 
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.float64])
-def test_arrays_are_read_by_their_encoding(dtype: type) -> None:
+def test_arrays_are_read_by_their_encoding(dtype):
     white = np.iinfo(dtype).max if dtype != np.float64 else 1
     half = np.full((2, 2), white * 0.5).astype(dtype)
     encoded = Photo.from_array(half, encoding="srgb").linear()
@@ -259,7 +241,7 @@ def test_arrays_are_read_by_their_encoding(dtype: type) -> None:
     np.testing.assert_allclose(linear, 0.5, atol=2e-3)
 
 
-def test_a_photo_does_not_change_with_the_array_it_came_from() -> None:
+def test_a_photo_does_not_change_with_the_array_it_came_from():
     array = smooth()
     photo = Photo.from_array(array, encoding="srgb")
     array[:] = 0
@@ -268,18 +250,7 @@ def test_a_photo_does_not_change_with_the_array_it_came_from() -> None:
         photo.pixels[0] = 1
 
 
-@pytest.mark.parametrize("mode", ["1", "L", "LA", "P", "RGB", "RGBA", "I;16"])
-def test_pil_images_are_read_unchanged(mode: str) -> None:
-    wide = Image.fromarray(random_image(channels=1, dtype=np.uint16)[..., 0])
-    image = wide if mode == "I;16" else Image.fromarray(smooth()).convert(mode)
-    again = pil(Photo.open(image).encode())
-    if mode == "I;16":
-        assert np.array_equal(np.asarray(again), np.asarray(wide))
-    else:
-        assert np.array_equal(np.asarray(again.convert("RGBA")), np.asarray(image.convert("RGBA")))
-
-
-def test_profile_exif_and_orientation_of_a_pil_image_are_read() -> None:
+def test_profile_exif_and_orientation_of_a_pil_image_are_read():
     image = pil(file_of(smooth(), "JPEG", exif=exif_block(), icc_profile=P3))
     photo = Photo.open(image)
     assert photo.file_info.icc == P3
@@ -287,13 +258,13 @@ def test_profile_exif_and_orientation_of_a_pil_image_are_read() -> None:
     assert np.array_equal(photo.pixels, np.asarray(ImageOps.exif_transpose(image)))
 
 
-def test_a_pil_jpeg_followed_by_previews_is_one_image() -> None:
+def test_a_pil_jpeg_followed_by_previews_is_one_image():
     image = Image.fromarray(smooth())
     data = file_of(smooth(), "MPO", save_all=True, append_images=[image.resize((8, 8))])
     assert Photo.open(pil(data)).size == Photo.open(data).size == image.size
 
 
-def test_a_cmyk_or_lab_pil_image_is_refused() -> None:
+def test_a_cmyk_or_lab_pil_image_is_refused():
     for mode in ("CMYK", "LAB"):
         image = Image.new(mode, (4, 4))
         with pytest.raises(UnsupportedPhoto, match=mode):
@@ -302,9 +273,7 @@ def test_a_cmyk_or_lab_pil_image_is_refused() -> None:
 
 @quick
 @given(st.integers(1, 12), st.integers(1, 12), st.integers(1, 30), st.integers(1, 30))
-def test_a_resized_photo_has_the_mean_light_of_each_area(
-    width: int, height: int, across: int, down: int
-) -> None:
+def test_a_resized_photo_has_the_mean_light_of_each_area(width, height, across, down):
     pixels = random_image(down, across)
     photo = Photo.from_array(pixels, encoding="srgb")
     repeated = photo.linear().repeat(height, axis=0).repeat(width, axis=1)
@@ -312,20 +281,20 @@ def test_a_resized_photo_has_the_mean_light_of_each_area(
     np.testing.assert_allclose(photo.resized(width, height), means, atol=1e-5)
 
 
-def test_strips_cover_every_row_once() -> None:
+def test_strips_cover_every_row_once():
     photo = Photo.from_array(np.zeros((700, 900, 1), np.uint8), encoding="srgb")
     rows = [row for strip in photo.strips() for row in range(700)[strip]]
     assert rows == list(range(700))
 
 
-def test_a_photo_may_be_used_by_many_threads() -> None:
+def test_a_photo_may_be_used_by_many_threads():
     photo = Photo(random_image(200, 200), None, FileInfo(icc=P3))
     with ThreadPoolExecutor(4) as pool:
         linears = list(pool.map(lambda _: photo.with_linear(photo.linear()).encode(), range(8)))
     assert len(set(linears)) == 1
 
 
-def test_the_suffix_of_a_saved_file_sets_its_format_and_no_file_is_overwritten(tmp_path: Path) -> None:
+def test_the_suffix_of_a_saved_file_sets_its_format_and_no_file_is_overwritten(tmp_path):
     photo = Photo.from_array(smooth(), encoding="srgb")
     for suffix, pil_format in (
         (".jpg", "JPEG"),
@@ -342,12 +311,12 @@ def test_the_suffix_of_a_saved_file_sets_its_format_and_no_file_is_overwritten(t
 
 
 @pytest.mark.parametrize("name", ["a.gif", "a", "a.bmp"])
-def test_saving_to_a_format_that_is_not_written_is_refused(tmp_path: Path, name: str) -> None:
+def test_saving_to_a_format_that_is_not_written_is_refused(tmp_path, name):
     with pytest.raises(UnsupportedPhoto, match=r"expected one of the suffixes \.jpg \.jpeg .*\.hdr; choose"):
         Photo.from_array(smooth(), encoding="srgb").save(tmp_path / name)
 
 
-def test_alpha_is_not_dropped_silently_and_impossible_depths_are_refused() -> None:
+def test_alpha_is_not_dropped_silently_and_impossible_depths_are_refused():
     photo = Photo.from_array(random_image(channels=4), encoding="srgb")
     for format_name in ("jpeg", "hdr"):
         with pytest.raises(UnsupportedPhoto, match="alpha"):
@@ -356,20 +325,15 @@ def test_alpha_is_not_dropped_silently_and_impossible_depths_are_refused() -> No
         photo.encode("webp", depth=16)
 
 
-def test_a_photo_too_large_for_the_format_is_refused() -> None:
+def test_a_photo_too_large_for_the_format_is_refused():
     with pytest.raises(UnsupportedPhoto, match="write PNG"):
         Photo.from_array(np.zeros((1, 17000, 3), np.uint8), encoding="srgb").encode("webp")
 
 
-def test_the_same_photo_gives_the_same_bytes() -> None:
+def test_the_same_photo_gives_the_same_bytes():
     for format_name in ("jpeg", "png", "tiff", "webp", "avif", "exr", "hdr"):
         photo = Photo.from_array(smooth(), encoding="srgb")
         assert photo.encode(format_name) == photo.encode(format_name)
-
-
-def test_optional_libraries_are_imported_on_demand() -> None:
-    code = "import brewster.photo, sys; assert not {'PIL', 'OpenEXR', 'pillow_heif'} & set(sys.modules)"
-    subprocess.run([sys.executable, "-c", code], check=True)
 
 
 def test_sixteen_bits_are_rounded_to_eight():

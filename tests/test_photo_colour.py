@@ -16,9 +16,8 @@ from PIL import Image, ImageCms
 from brewster import srgb
 from brewster.errors import UnsupportedPhoto
 from brewster.photo import FileInfo, Photo
-from brewster.photo.colour import SRGB, ToneCurve, colour_space_of
+from brewster.photo.colour import SRGB, ToneCurve, colour_space_of, convert_to_display_p3
 from brewster.photo.decode import read_size
-from brewster.photo.lut_profiles import convert_to_display_p3
 
 quick = settings(max_examples=25, deadline=None, database=None)
 
@@ -35,7 +34,7 @@ ADOBE = ((0.60974, 0.31111, 0.01947), (0.20528, 0.62567, 0.06087), (0.14919, 0.0
 PRO = ((0.79767, 0.28804, 0.0), (0.13519, 0.71188, 0.0), (0.03134, 0.00009, 0.82491))
 
 
-def profile(curve: bytes, colourants: tuple[tuple[float, ...], ...] | None) -> bytes:
+def profile(curve, colourants):
     """Returns a small ICC profile: RGB with a matrix, or grey if `colourants` is None."""
     curve += bytes(-len(curve) % 4)
     xyz = {
@@ -58,7 +57,7 @@ def profile(curve: bytes, colourants: tuple[tuple[float, ...], ...] | None) -> b
     return head.ljust(68, b"\0") + struct.pack(">3i", 63190, 65536, 54061) + bytes(48) + body
 
 
-def lut_profile(points: int = 33) -> bytes:
+def lut_profile(points=33):
     """Returns an ICC profile with a table (lut16Type) from RGB to Lab and without a matrix.
 
     Its tone curve has the exponent 1.8, and its primaries are `LUT_PRIMARIES`.
@@ -105,11 +104,11 @@ PROFILES = {
 }
 
 
-def photo_of(pixels: np.ndarray, icc: bytes | None) -> Photo:
+def photo_of(pixels, icc):
     return Photo(pixels, None, FileInfo(bits=8 * pixels.dtype.itemsize, icc=icc))
 
 
-def all_code_values(dtype: type, channels: int = 3) -> np.ndarray:
+def all_code_values(dtype, channels=3):
     """Returns every value of the dtype, in another order in each channel."""
     count = np.iinfo(dtype).max + 1
     order = np.random.default_rng(1)
@@ -117,7 +116,7 @@ def all_code_values(dtype: type, channels: int = 3) -> np.ndarray:
 
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
-def test_srgb_is_decoded_by_its_curve_and_every_value_round_trips(dtype: type) -> None:
+def test_srgb_is_decoded_by_its_curve_and_every_value_round_trips(dtype):
     photo = photo_of(all_code_values(dtype), None)
     formula = srgb.to_linear(photo.pixels / np.iinfo(dtype).max)
     np.testing.assert_allclose(photo.linear(), formula, atol=1e-7)
@@ -125,7 +124,7 @@ def test_srgb_is_decoded_by_its_curve_and_every_value_round_trips(dtype: type) -
 
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
-def test_new_light_is_rounded_to_the_nearest_value(dtype: type) -> None:
+def test_new_light_is_rounded_to_the_nearest_value(dtype):
     linear = np.linspace(-0.1, 1.1, 30_000, dtype=np.float32).reshape(10, 1000, 3)
     white = np.iinfo(dtype).max
     found = photo_of(np.zeros((10, 1000, 3), dtype), None).with_linear(linear).pixels
@@ -135,41 +134,35 @@ def test_new_light_is_rounded_to_the_nearest_value(dtype: type) -> None:
 
 @pytest.mark.parametrize("name", PROFILES)
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
-def test_unchanged_light_is_bit_equal_with_every_profile(name: str, dtype: type) -> None:
+def test_unchanged_light_is_bit_equal_with_every_profile(name, dtype):
     photo = photo_of(all_code_values(dtype), PROFILES[name])
     assert np.array_equal(photo.with_linear(photo.linear()).pixels, photo.pixels)
 
 
+def littlecms(pixels, source, target):
+    """Converts pixels between two profiles with littleCMS."""
+    return np.asarray(
+        ImageCms.profileToProfile(
+            Image.fromarray(pixels),
+            source,
+            target,
+            renderingIntent=ImageCms.Intent.RELATIVE_COLORIMETRIC,
+            flags=ImageCms.Flags.NOOPTIMIZE,
+        )
+    )
+
+
 @pytest.mark.parametrize("name", PROFILES)
-def test_a_profile_agrees_with_littlecms_when_it_is_decoded(name: str) -> None:
+def test_a_profile_agrees_with_littlecms_in_both_directions(name):
     pixels = np.random.default_rng(2).integers(0, 256, (32, 32, 3), np.uint8)
-    expected = ImageCms.profileToProfile(
-        Image.fromarray(pixels),
-        ImageCms.ImageCmsProfile(io.BytesIO(PROFILES[name])),
-        ImageCms.createProfile("sRGB"),
-        renderingIntent=ImageCms.Intent.RELATIVE_COLORIMETRIC,
-        flags=ImageCms.Flags.NOOPTIMIZE,
-    )
-    ours = srgb.to_encoded(photo_of(pixels, PROFILES[name]).linear().clip(0, 1)) * 255
-    assert np.abs(ours - np.asarray(expected)).max() <= 1
+    icc, standard = ImageCms.ImageCmsProfile(io.BytesIO(PROFILES[name])), ImageCms.createProfile("sRGB")
+    decoded = srgb.to_encoded(photo_of(pixels, PROFILES[name]).linear().clip(0, 1)) * 255
+    assert np.abs(decoded - littlecms(pixels, icc, standard)).max() <= 1
+    ours = photo_of(np.zeros_like(pixels), PROFILES[name]).with_linear(srgb.to_linear(pixels / 255)).pixels
+    assert np.abs(ours.astype(int) - littlecms(pixels, standard, icc)).max() <= 1
 
 
-@pytest.mark.parametrize("name", PROFILES)
-def test_a_profile_agrees_with_littlecms_when_it_is_encoded(name: str) -> None:
-    linear = np.random.default_rng(3).random((32, 32, 3), dtype=np.float32)
-    encoded = np.rint(srgb.to_encoded(linear) * 255).astype(np.uint8)
-    expected = ImageCms.profileToProfile(
-        Image.fromarray(encoded),
-        ImageCms.createProfile("sRGB"),
-        ImageCms.ImageCmsProfile(io.BytesIO(PROFILES[name])),
-        renderingIntent=ImageCms.Intent.RELATIVE_COLORIMETRIC,
-        flags=ImageCms.Flags.NOOPTIMIZE,
-    )
-    ours = photo_of(np.zeros_like(encoded), PROFILES[name]).with_linear(srgb.to_linear(encoded / 255)).pixels
-    assert np.abs(ours.astype(int) - np.asarray(expected)).max() <= 1
-
-
-def test_wide_gamut_is_not_clipped_and_white_stays_white() -> None:
+def test_wide_gamut_is_not_clipped_and_white_stays_white():
     green_and_white = np.array([[[0, 255, 0], [255, 255, 255]]], np.uint8)
     green, white = photo_of(green_and_white, PROFILES["Display P3"]).linear()[0]
     assert green[0] < -0.1
@@ -178,7 +171,7 @@ def test_wide_gamut_is_not_clipped_and_white_stays_white() -> None:
 
 @quick
 @given(arrays.arrays(np.float32, (4, 5, 3), elements=st.floats(0, 1, width=32)))
-def test_a_second_round_trip_through_16_bits_changes_light_by_less_than_1e_4(linear: np.ndarray) -> None:
+def test_a_second_round_trip_through_16_bits_changes_light_by_less_than_1e_4(linear):
     for icc in (None, *PROFILES.values()):
         space = colour_space_of(icc, None, is_float=False)
         inside = space.to_linear(space.to_stored(linear, np.zeros(linear.shape, np.uint16)))
@@ -186,7 +179,7 @@ def test_a_second_round_trip_through_16_bits_changes_light_by_less_than_1e_4(lin
         np.testing.assert_allclose(again, inside, atol=1e-4)
 
 
-def test_the_light_of_a_row_does_not_depend_on_its_strip() -> None:
+def test_the_light_of_a_row_does_not_depend_on_its_strip():
     pixels = np.random.default_rng(4).integers(0, 256, (50, 33, 3), np.uint8)
     photo = photo_of(pixels, PROFILES["Adobe RGB"])
     whole = photo.linear()
@@ -195,14 +188,14 @@ def test_the_light_of_a_row_does_not_depend_on_its_strip() -> None:
         assert np.array_equal(photo.stored_rows(whole[top:bottom], top), pixels[top:bottom])
 
 
-def test_only_changed_pixels_change() -> None:
+def test_only_changed_pixels_change():
     pixels = np.random.default_rng(5).integers(0, 256, (20, 20, 3), np.uint8)
     photo = photo_of(pixels, PROFILES["ProPhoto, sampled"])
     linear = photo.linear()
-    linear[3, 4] = 0.5
-    changed = (photo.with_linear(linear).pixels != pixels).any(axis=2)
-    assert changed.sum() == 1
-    assert changed[3, 4]
+    linear[3, 4, 0] = 0.9 - linear[3, 4, 0]
+    changed = photo.with_linear(linear)
+    assert np.argwhere((changed.pixels != pixels).any(axis=2)).tolist() == [[3, 4]]
+    np.testing.assert_allclose(changed.linear()[3, 4], linear[3, 4], atol=1e-2)
 
 
 @pytest.mark.parametrize(
@@ -215,37 +208,32 @@ def test_only_changed_pixels_change() -> None:
         ),
     ],
 )
-def test_a_profile_that_equals_srgb_is_recognised(icc: bytes) -> None:
+def test_a_profile_that_equals_srgb_is_recognised(icc):
     assert colour_space_of(icc, None, is_float=False) == SRGB
 
 
-@pytest.mark.parametrize("icc", [PROFILES["Display P3"], PROFILES["linear"]])
-def test_other_profiles_are_not_recognised_as_srgb(icc: bytes) -> None:
-    assert colour_space_of(icc, None, is_float=False) != SRGB
-
-
-def test_the_tone_curve_of_a_grey_profile_is_applied() -> None:
+def test_the_tone_curve_of_a_grey_profile_is_applied():
     photo = photo_of(all_code_values(np.uint8, channels=1), profile(GAMMA, None))
     formula = (photo.pixels[..., 0] / 255) ** (round(2.2 * 256) / 256)
     np.testing.assert_allclose(photo.linear()[..., 1], formula, atol=1e-6)
     assert np.array_equal(photo.with_linear(photo.linear()).pixels, photo.pixels)
 
 
-def test_grey_takes_the_luminance_of_coloured_light() -> None:
+def test_grey_takes_the_luminance_of_coloured_light():
     linear = np.zeros((1, 1, 3), np.float32)
     linear[..., 1] = 1
     grey = Photo.from_array(np.zeros((1, 1), np.float32), encoding="linear").with_linear(linear)
     np.testing.assert_allclose(grey.pixels, 0.7152, atol=1e-6)
 
 
-def test_floats_are_stored_as_they_are_beyond_white_and_below_black() -> None:
+def test_floats_are_stored_as_they_are_beyond_white_and_below_black():
     linear = np.array([[[-0.5, 0.25, 7.0]]], np.float32)
     photo = Photo.from_array(linear, encoding="linear")
     assert np.array_equal(photo.linear(), linear)
     assert np.array_equal(photo.with_linear(linear * 2).pixels, linear * 2)
 
 
-def test_floats_with_a_profile_are_decoded_and_encoded_with_it() -> None:
+def test_floats_with_a_profile_are_decoded_and_encoded_with_it():
     pixels = np.random.default_rng(6).random((8, 8, 3), dtype=np.float32)
     photo = photo_of(pixels, PROFILES["Adobe RGB"])
     assert np.array_equal(photo.with_linear(photo.linear()).pixels, pixels)
@@ -254,14 +242,14 @@ def test_floats_with_a_profile_are_decoded_and_encoded_with_it() -> None:
 
 
 @pytest.mark.parametrize("channels", [1, 3])
-def test_unchanged_floats_with_the_srgb_profile_are_bit_equal(channels: int) -> None:
+def test_unchanged_floats_with_the_srgb_profile_are_bit_equal(channels):
     pixels = np.random.default_rng(7).uniform(-0.5, 2, (64, 64, channels)).astype(np.float32)
     photo = photo_of(pixels, bytes(pyvips.Image.profile_load("srgb")))
     assert photo.colour_space() == SRGB
     assert np.array_equal(photo.with_linear(photo.linear()).pixels, pixels)
 
 
-def test_chromaticities_are_converted_to_rec709_and_white_stays_white() -> None:
+def test_chromaticities_are_converted_to_rec709_and_white_stays_white():
     aces = (0.7347, 0.2653, 0.0, 1.0, 0.0001, -0.077, 0.32168, 0.33767)
     to_linear = colour_space_of(None, aces, is_float=True).to_linear
     np.testing.assert_allclose(to_linear(np.ones((1, 1, 3), np.float32)), 1, atol=1e-4)
@@ -274,31 +262,27 @@ def test_chromaticities_are_converted_to_rec709_and_white_stays_white() -> None:
 @pytest.mark.parametrize(
     "parameters", [(2.4, 1 / 1.055, 0.055 / 1.055, 1 / 12.92, 0.04045, 0, 0), (1.8, 1, 0, 0, 0, 0, 0)]
 )
-def test_a_parametric_curve_and_its_inverse_agree(parameters: tuple[float, ...]) -> None:
+def test_a_parametric_curve_and_its_inverse_agree(parameters):
     values = np.linspace(0, 1.5, 1000)
     curve = ToneCurve(parameters=parameters)
     np.testing.assert_allclose(curve.encode(curve.decode(values)), values, atol=1e-4)
 
 
 @pytest.mark.parametrize(("function", "count"), [(0, 1), (1, 3), (2, 4), (3, 5), (4, 7)])
-def test_all_parametric_functions_of_icc_agree_with_littlecms(function: int, count: int) -> None:
+def test_all_parametric_functions_of_icc_agree_with_littlecms(function, count):
     numbers = (2.2, 0.9, 0.1, 0.0 if function == 2 else 0.08, 0.05, 0.0, 0.0)[:count]
     curve = struct.pack(">4s4xHH", b"para", function, 0)
     curve += struct.pack(f">{count}i", *(round(65536 * number) for number in numbers))
     test_profile = profile(curve, ADOBE)
     pixels = np.repeat(np.arange(256, dtype=np.uint8)[None, :, None], 3, axis=2)
-    expected = ImageCms.profileToProfile(
-        Image.fromarray(pixels),
-        ImageCms.ImageCmsProfile(io.BytesIO(test_profile)),
-        ImageCms.createProfile("sRGB"),
-        renderingIntent=ImageCms.Intent.RELATIVE_COLORIMETRIC,
-        flags=ImageCms.Flags.NOOPTIMIZE,
+    expected = littlecms(
+        pixels, ImageCms.ImageCmsProfile(io.BytesIO(test_profile)), ImageCms.createProfile("sRGB")
     )
     ours = srgb.to_encoded(photo_of(pixels, test_profile).linear().clip(0, 1)) * 255
-    assert np.abs(ours - np.asarray(expected)).max() <= 1.5
+    assert np.abs(ours - expected).max() <= 1.5
 
 
-def light_by_lut(pixels: np.ndarray) -> np.ndarray:
+def light_by_lut(pixels):
     """Returns the linear Rec.709 light of pixels with the LUT profile, by its formula."""
     rec709 = np.array(((0.43607, 0.22249, 0.01392), (0.38515, 0.71687, 0.09708), (0.14307, 0.06061, 0.71410)))
     return (pixels / np.iinfo(pixels.dtype).max) ** 1.8 @ np.array(LUT_PRIMARIES) @ np.linalg.inv(rec709)
@@ -307,7 +291,7 @@ def light_by_lut(pixels: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize(
     ("format_name", "dtype", "tolerance"), [("png", np.uint8, 0.01), ("tiff", np.uint16, 0.006)]
 )
-def test_a_lut_profile_is_converted_and_its_colours_are_written(format_name, dtype, tolerance) -> None:
+def test_a_lut_profile_is_converted_and_its_colours_are_written(format_name, dtype, tolerance):
     noise = np.random.default_rng(8).integers(0, np.iinfo(dtype).max + 1, (24, 24, 3)).astype(dtype)
     data = photo_of(noise, lut_profile()).encode(format_name)
     photo = Photo.open(data)
@@ -320,13 +304,13 @@ def test_a_lut_profile_is_converted_and_its_colours_are_written(format_name, dty
     assert read_size(data) == (24, 24)
 
 
-def test_a_pil_image_with_a_lut_profile_is_read_as_its_file_is() -> None:
+def test_a_pil_image_with_a_lut_profile_is_read_as_its_file_is():
     noise = np.random.default_rng(9).integers(0, 256, (16, 16, 3), np.uint8)
     data = photo_of(noise, lut_profile()).encode("png")
     assert np.array_equal(Photo.open(Image.open(io.BytesIO(data))).pixels, Photo.open(data).pixels)
 
 
-def test_white_in_a_lut_profile_stays_white() -> None:
+def test_white_in_a_lut_profile_stays_white():
     white = Photo.open(photo_of(np.full((4, 4, 3), 255, np.uint8), lut_profile()).encode("png"))
     assert white.srgb_8bit().min() >= 254
 
@@ -336,14 +320,14 @@ def test_white_in_a_lut_profile_stays_white() -> None:
     [lut_profile()[:100_000], lut_profile().replace(b"mft2", b"mftX")],
     ids=["truncated", "unknown"],
 )
-def test_a_damaged_lut_profile_is_refused(icc: bytes) -> None:
+def test_a_damaged_lut_profile_is_refused(icc):
     """libvips uses sRGB instead, without an error."""
     with pytest.raises(UnsupportedPhoto, match=r"LUT-based colour profile \(\d+ bytes\) cannot be used;"):
         Photo.open(photo_of(NOISE_8BIT, icc).encode("tiff"))
 
 
 @pytest.mark.parametrize(("dtype", "channels"), [(np.uint8, 1), (np.float32, 3)])
-def test_a_lut_profile_is_refused_for_grey_and_for_floats(dtype: type, channels: int) -> None:
+def test_a_lut_profile_is_refused_for_grey_and_for_floats(dtype, channels):
     with pytest.raises(UnsupportedPhoto, match="RGB of 8 or 16 bits"):
         convert_to_display_p3(np.ones((4, 4, channels), dtype), FileInfo(icc=lut_profile()))
 
@@ -353,12 +337,12 @@ def test_a_lut_profile_is_refused_for_grey_and_for_floats(dtype: type, channels:
     [b"no profile at all" * 20, bytes(pyvips.Image.profile_load("cmyk")), profile(GAMMA, ADOBE)[:200], b""],
     ids=["garbage", "tables", "truncated", "empty"],
 )
-def test_profiles_without_curves_and_matrix_are_refused(icc: bytes) -> None:
+def test_profiles_without_curves_and_matrix_are_refused(icc):
     with pytest.raises(UnsupportedPhoto, match="curves and a matrix"):
         colour_space_of(icc, None, is_float=False)
 
 
-def parametric(function: int, *parameters: float) -> bytes:
+def parametric(function, *parameters):
     """Returns a tone curve as a tag of parametricCurveType."""
     numbers = [round(65536 * value) for value in parameters]
     return struct.pack(f">4s4xHH{len(numbers)}i", b"para", function, 0, *numbers)
@@ -376,16 +360,14 @@ def parametric(function: int, *parameters: float) -> bytes:
     ids=["curve, g = 0", "g = 0", "type 1, a = 0", "type 2, a = 0", "type 3, a = 0"],
 )
 @pytest.mark.parametrize("colourants", [None, ADOBE], ids=["grey", "rgb"])
-def test_curves_without_an_inverse_are_refused(
-    curve: bytes, colourants: tuple[tuple[float, ...], ...] | None
-) -> None:
+def test_curves_without_an_inverse_are_refused(curve, colourants):
     with pytest.raises(UnsupportedPhoto, match="curves and a matrix"):
         colour_space_of(profile(curve, colourants), None, is_float=False)
 
 
 @pytest.mark.parametrize("format_name", ["jpeg", "tiff"])
 @pytest.mark.parametrize("has_profile", [True, False])
-def test_cmyk_is_converted_by_its_profile_or_a_default_one_with_a_note(format_name, has_profile) -> None:
+def test_cmyk_is_converted_by_its_profile_or_a_default_one_with_a_note(format_name, has_profile):
     """Paper white and the grey of black ink stay neutral; the colours come back by the inverse of the separation."""
     pixels = np.kron(
         np.uint8([[[255] * 3, [180, 90, 60]], [[90, 120, 80], [128] * 3]]), np.ones((16, 16, 1))
@@ -401,13 +383,3 @@ def test_cmyk_is_converted_by_its_profile_or_a_default_one_with_a_note(format_na
     assert ("default" in str(photo.file_info.note)) != has_profile
     assert np.abs(photo.srgb_8bit().astype(int) - pixels).max() < 12
     assert Photo.open(photo.encode()).file_info.icc == photo.file_info.icc
-
-
-def test_a_pixel_whose_light_changes_in_one_channel_is_stored_anew() -> None:
-    icc = bytes(pyvips.Image.profile_load("p3"))
-    photo = Photo(np.full((2, 2, 3), 100, np.uint8), file_info=FileInfo(icc=icc))
-    light = photo.linear()
-    light[0, 0, 0] += 0.2
-    changed = photo.with_linear(light)
-    np.testing.assert_allclose(changed.linear()[0, 0], light[0, 0], atol=5e-3)
-    assert (changed.pixels.reshape(4, 3)[1:] == 100).all()

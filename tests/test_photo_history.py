@@ -5,7 +5,6 @@ import struct
 import xml.etree.ElementTree as ET
 import zlib
 
-import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -52,15 +51,6 @@ def test_a_layer_records_the_program_and_the_options(format_name, tmp_path):
     assert exif[305].startswith("brewster ")
     assert (exif[271], exif.get_ifd(34665)[37500]) == ("Sextant", b"maker\0note\xff")
     assert recorded_parameters(path, "another program") is None
-
-
-@pytest.mark.parametrize("format_name", ["exr", "hdr"])
-def test_an_image_without_xmp_records_the_program(format_name):
-    if format_name == "exr":
-        pytest.importorskip("OpenEXR")
-    layer = SEPARATOR(np.full((8, 8, 3), 0.5, np.float32), encoding="linear").transmission
-    header = Photo.open(layer.encode(format_name)).file_info.header
-    assert next(value for key, value in header.items() if key.lower() == "software").startswith("brewster ")
 
 
 def test_the_history_of_a_photo_is_continued():

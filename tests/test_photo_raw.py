@@ -2,14 +2,13 @@
 
 import io
 import struct
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 from PIL import Image
 
-from brewster.errors import MissingExtra, PhotoTooLarge, UnreadablePhoto
+from brewster.errors import PhotoTooLarge, UnreadablePhoto
 from brewster.image_formats import FORMATS, format_of
 from brewster.photo import Photo, decode, metadata, raw, read_size
 from brewster.photo.colour import colour_space_of
@@ -105,15 +104,6 @@ def test_the_size_of_a_raw_file_above_the_limit_is_refused(monkeypatch):
         read_size(dng_file(mosaic(96, 128)))
 
 
-def test_the_missing_extra_names_the_command_that_installs_it(monkeypatch):
-    monkeypatch.setitem(sys.modules, "rawpy", None)
-    for read in (Photo.open, read_size):
-        with pytest.raises(
-            MissingExtra, match=r"RAW files need it; run in .*: pip install -c constraints.txt -e '\.\[raw\]'"
-        ):
-            read(dng_file(mosaic()))
-
-
 def test_a_tiff_of_a_photo_is_not_raw():
     assert Photo.open(file_of(smooth(), "TIFF")).file_info.format_name == "tiff"
     assert format_of(Path("a.NEF")) == FORMATS["raw"]
@@ -135,7 +125,8 @@ def box(name, content):
 
 def test_the_tags_of_a_cr3_are_those_of_its_boxes():
     boxes = box(b"CMT1", tiff_block({271: "Sextant"})) + box(b"CMT2", tiff_block({33434: 0.5}))
-    tags = raw._camera_tags(box(b"ftyp", b"crx \0\0\0\1") + box(b"moov", box(b"uuid", bytes(16) + boxes)))
+    data = box(b"ftyp", b"crx \0\0\0\1") + box(b"moov", box(b"uuid", bytes(16) + boxes))
+    tags = metadata.read_tags(raw._exif(data))
     assert tags[271][2] == b"Sextant\0"
     assert 33434 in tags[34665]
 
@@ -162,18 +153,10 @@ def test_a_damaged_file_with_the_suffix_of_a_raw_file_is_called_a_raw_file(
     if not is_installed:
         monkeypatch.setattr(raw.importlib.util, "find_spec", lambda _name: None)
     (tmp_path / "a.NEF").write_bytes(data)
-    with pytest.raises(
-        UnreadablePhoto, match=r"suffix \.NEF is that of a RAW file; expected a complete RAW"
-    ) as raised:
+    with pytest.raises(UnreadablePhoto, match=r"suffix \.NEF is that of a RAW file") as raised:
         Photo.open(tmp_path / "a.NEF")
     assert ("install the extra raw" in raised.value.cure) != is_installed
     (tmp_path / "a.tif").write_bytes(data)
     with pytest.raises(UnreadablePhoto) as raised:
         Photo.open(tmp_path / "a.tif")
     assert "RAW" not in str(raised.value).replace("raw", "")
-
-
-def test_a_truncated_raw_file_has_the_error_of_libraw(tmp_path):
-    (tmp_path / "a.dng").write_bytes(dng_file(mosaic())[:-2000])
-    with pytest.raises(UnreadablePhoto, match=r"^the RAW file cannot be read completely; .* LibRaw \d"):
-        Photo.open(tmp_path / "a.dng")

@@ -21,20 +21,20 @@ from brewster.photo import Photo, metadata
 NOISE = np.random.default_rng(0).integers(0, 256, (40, 64, 3), np.uint8)
 
 
-def file_of(kind: str, array: np.ndarray = NOISE, **options: object) -> bytes:
+def file_of(kind, array=NOISE, **options):
     file = io.BytesIO()
     Image.fromarray(array).save(file, kind, **options)
     return file.getvalue()
 
 
-def tiff_of(array: np.ndarray, **options: object) -> bytes:
+def tiff_of(array, **options):
     height, width, bands = array.shape
     kind = {"uint8": "uchar", "uint32": "uint", "float64": "double"}[array.dtype.name]
     image = pyvips.Image.new_from_memory(np.ascontiguousarray(array).data, width, height, bands, kind)
     return bytes(image.tiffsave_buffer(**options))
 
 
-def assert_refused(source: object, error: type[PhotoError], message: str, **options: object) -> None:
+def assert_refused(source, error, message, **options):
     with pytest.raises(error, match=message) as raised:
         Photo.open(source, **options)
     assert str(raised.value).count("; ") >= 2  # what happened, what was expected, what to do
@@ -59,17 +59,17 @@ OWN_MESSAGE = r"^the \w+ cannot be read completely( \(pixels are missing\))?; ex
         ("GIF", {}),
     ],
 )
-def test_a_truncated_image_is_refused(kind: str, options: dict[str, object], fraction: float) -> None:
+def test_a_truncated_image_is_refused(kind, options, fraction):
     data = file_of(kind, **options)
     assert_refused(data[: int(len(data) * fraction)], UnreadablePhoto, OWN_MESSAGE)
 
 
 @pytest.mark.parametrize("size", [4, 7])
-def test_a_tiff_shorter_than_its_header_is_refused(size: int) -> None:
+def test_a_tiff_shorter_than_its_header_is_refused(size):
     assert_refused(b"II*\0\x08\0\0"[:size], UnreadablePhoto, "read completely")
 
 
-def test_a_tiff_with_missing_tiles_is_refused() -> None:
+def test_a_tiff_with_missing_tiles_is_refused():
     data = tiff_of(NOISE, tile=True, tile_width=16, tile_height=16)
     assert np.array_equal(Photo.open(data).pixels, NOISE)
     last = metadata.numbers(metadata.read_tags(data), 324)[-1]
@@ -79,40 +79,40 @@ def test_a_tiff_with_missing_tiles_is_refused() -> None:
 
 @pytest.mark.parametrize("fraction", [0.02, 0.5, 0.99])
 @pytest.mark.parametrize("format_name", ["exr", "hdr"])
-def test_truncated_floats_are_refused(format_name: str, fraction: float) -> None:
+def test_truncated_floats_are_refused(format_name, fraction):
     data = Photo.from_array(NOISE, encoding="srgb").encode(format_name)
     message = {"exr": OWN_MESSAGE, "hdr": "; "}[format_name]
     assert_refused(data[: int(len(data) * fraction)], PhotoError, message)
 
 
-def test_a_heic_without_an_image_is_refused() -> None:
+def test_a_heic_without_an_image_is_refused():
     data = Photo.from_array(NOISE, encoding="srgb").encode("heic")
     assert_refused(data.replace(b"hvcC", b"hvcX"), UnreadablePhoto, "no image in the file can be decoded")
 
 
-def test_a_heic_whose_image_is_longer_than_the_file_is_refused() -> None:
+def test_a_heic_whose_image_is_longer_than_the_file_is_refused():
     data = bytearray(Photo.from_array(NOISE, encoding="srgb").encode("heic"))
     data[data.index(b"mdat") + 4] = 0xFF  # the length of the first unit
     assert_refused(bytes(data), UnreadablePhoto, OWN_MESSAGE)
 
 
-def test_an_empty_file_is_refused(tmp_path: Path) -> None:
+def test_an_empty_file_is_refused(tmp_path):
     (tmp_path / "a.jpg").write_bytes(b"")
     assert_refused(tmp_path / "a.jpg", UnreadablePhoto, "empty")
 
 
-def test_a_text_file_with_the_suffix_jpg_is_refused(tmp_path: Path) -> None:
+def test_a_text_file_with_the_suffix_jpg_is_refused(tmp_path):
     (tmp_path / "a.jpg").write_text("a text file, not an image")
     assert_refused(str(tmp_path / "a.jpg"), UnreadablePhoto, "the file is text")
 
 
-def test_a_missing_file_and_a_folder_are_refused(tmp_path: Path) -> None:
+def test_a_missing_file_and_a_folder_are_refused(tmp_path):
     assert_refused(tmp_path / "none.jpg", UnreadablePhoto, "No such file")
     assert_refused(tmp_path, UnreadablePhoto, "folder")
 
 
-def test_a_file_without_read_permission_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def deny(path: Path, mode: str) -> io.BytesIO:
+def test_a_file_without_read_permission_is_refused(tmp_path, monkeypatch):
+    def deny(path, mode):
         raise PermissionError(13, "Permission denied")
 
     monkeypatch.setattr(Path, "open", deny)
@@ -131,31 +131,31 @@ VIDEO_HEADS = [
 
 
 @pytest.mark.parametrize("head", VIDEO_HEADS)
-def test_a_video_is_refused_by_its_content(head: bytes) -> None:
+def test_a_video_is_refused_by_its_content(head):
     assert_refused(head + bytes(100), UnsupportedPhoto, "^the file is a video; expected a photo; ")
 
 
 @pytest.mark.parametrize("content", [b"", b"damaged", file_of("JPEG")[:100]])
 @pytest.mark.parametrize("name", ["a.mp4", "a.MOV", "a.wmv"])
-def test_a_damaged_video_is_refused_by_its_suffix(tmp_path: Path, name: str, content: bytes) -> None:
+def test_a_damaged_video_is_refused_by_its_suffix(tmp_path, name, content):
     (tmp_path / name).write_bytes(content)
     assert_refused(tmp_path / name, UnsupportedPhoto, f"{name} is a video; expected a photo; ")
     assert_refused(tmp_path / f"no-{name}", UnreadablePhoto, "No such file")
 
 
 @pytest.mark.parametrize("kind", ["BMP", "JPEG2000", "PPM", "ICO"])
-def test_unknown_formats_are_refused(kind: str) -> None:
+def test_unknown_formats_are_refused(kind):
     assert_refused(file_of(kind), UnreadablePhoto, "no known image format")
 
 
 @pytest.mark.parametrize("kind", ["GIF", "WEBP", "PNG", "AVIF", "TIFF"])
-def test_animations_and_pages_are_refused(kind: str) -> None:
+def test_animations_and_pages_are_refused(kind):
     frames = [Image.fromarray(255 - NOISE)]
     assert_refused(file_of(kind, save_all=True, append_images=frames), UnsupportedPhoto, "extract the frames")
 
 
 @pytest.mark.parametrize("kind", ["GIF", "WEBP", "PNG", "AVIF", "TIFF"])
-def test_a_pil_image_of_several_frames_is_refused_and_its_copy_is_not(kind: str) -> None:
+def test_a_pil_image_of_several_frames_is_refused_and_its_copy_is_not(kind):
     data = file_of(kind, save_all=True, append_images=[Image.fromarray(255 - NOISE)])
     image = Image.open(io.BytesIO(data))
     assert_refused(image, UnsupportedPhoto, "2 frames")
@@ -163,16 +163,16 @@ def test_a_pil_image_of_several_frames_is_refused_and_its_copy_is_not(kind: str)
 
 
 @pytest.mark.parametrize("bands", [5, 6])
-def test_five_channels_and_more_are_refused(bands: int) -> None:
+def test_five_channels_and_more_are_refused(bands):
     assert_refused(tiff_of(np.zeros((4, 4, bands), np.uint8)), UnsupportedPhoto, f"{bands} channels")
 
 
 @pytest.mark.parametrize("kind", [np.uint32, np.float64])
-def test_unsupported_dtypes_are_refused(kind: type) -> None:
+def test_unsupported_dtypes_are_refused(kind):
     assert_refused(tiff_of(np.zeros((4, 4, 3), kind)), PhotoError, "3 channels of|common variant")
 
 
-def test_a_raw_file_is_never_read_as_its_preview() -> None:
+def test_a_raw_file_is_never_read_as_its_preview():
     pytest.importorskip("rawpy")
     image = Image.fromarray(NOISE)
     for tags in ({50706: b"\1\4\0\0"}, {254: 1}):
@@ -181,7 +181,7 @@ def test_a_raw_file_is_never_read_as_its_preview() -> None:
         assert_refused(file.getvalue(), UnreadablePhoto, "the RAW file")  # LibRaw finds only the preview
 
 
-def png_with_cicp(primaries: int, transfer: int) -> bytes:
+def png_with_cicp(primaries, transfer):
     data, chunk = file_of("PNG"), b"cICP" + bytes((primaries, transfer, 0, 1))
     return data[:33] + struct.pack(">I", 4) + chunk + struct.pack(">I", zlib.crc32(chunk)) + data[33:]
 
@@ -191,13 +191,13 @@ def png_with_cicp(primaries: int, transfer: int) -> bytes:
     [(9, 16), (9, 18), (9, 13), (1, 16), (1, 18), (1, 8), (1, 4), (12, 8)],
     ids=str,
 )
-def test_other_primaries_and_transfer_functions_are_refused(primaries: int, transfer: int) -> None:
+def test_other_primaries_and_transfer_functions_are_refused(primaries, transfer):
     message = f"the png has the primaries {primaries} and the transfer function {transfer}"
     assert_refused(png_with_cicp(primaries, transfer), UnsupportedPhoto, message)
 
 
 @pytest.mark.parametrize("transfer", [1, 2, 6, 13, 14, 15])
-def test_transfer_functions_like_that_of_srgb_are_read_as_srgb(transfer: int) -> None:
+def test_transfer_functions_like_that_of_srgb_are_read_as_srgb(transfer):
     photo = Photo.open(png_with_cicp(1, transfer))
     assert photo.file_info.icc is None
     assert np.array_equal(photo.pixels, NOISE)
@@ -205,7 +205,7 @@ def test_transfer_functions_like_that_of_srgb_are_read_as_srgb(transfer: int) ->
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
 @pytest.mark.parametrize("format_name", ["exr", "tiff"])
-def test_floats_that_are_not_finite_are_refused(format_name: str, value: float) -> None:
+def test_floats_that_are_not_finite_are_refused(format_name, value):
     pixels = np.zeros((4, 4, 3), np.float32)
     whole = Photo.from_array(pixels, encoding="linear")
     broken = pixels.copy()
@@ -217,7 +217,7 @@ def test_floats_that_are_not_finite_are_refused(format_name: str, value: float) 
         Photo.from_array(broken, encoding="linear")
 
 
-def test_an_exr_without_colour_channels_is_refused() -> None:
+def test_an_exr_without_colour_channels_is_refused():
     exr = pytest.importorskip("OpenEXR")
     file = io.BytesIO()
     header = {"compression": exr.ZIP_COMPRESSION, "type": exr.scanlineimage}
@@ -230,7 +230,7 @@ def test_an_exr_without_colour_channels_is_refused() -> None:
     )
 
 
-def test_a_radiance_image_with_xyz_or_rotated_lines_is_refused() -> None:
+def test_a_radiance_image_with_xyz_or_rotated_lines_is_refused():
     for head, message in (
         (
             b"FORMAT=32-bit_rle_xyze\n\n-Y 1 +X 1\n",
@@ -245,7 +245,7 @@ def test_a_radiance_image_with_xyz_or_rotated_lines_is_refused() -> None:
 
 
 @pytest.mark.parametrize(("height", "width"), [(0, 8), (8, 0), (0, 0)])
-def test_a_radiance_image_without_pixels_is_refused(height: int, width: int) -> None:
+def test_a_radiance_image_without_pixels_is_refused(height, width):
     head = f"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y {height} +X {width}\n".encode()
     assert_refused(head, UnreadablePhoto, f"{width} x {height} pixels; expected at least one pixel; ")
 
@@ -254,7 +254,7 @@ def test_a_radiance_image_without_pixels_is_refused(height: int, width: int) -> 
     ("width", "message"),
     [("70000", "is truncated"), ("999999999", "at most 200 million"), ("9" * 5000, "RGBE")],
 )
-def test_a_radiance_image_with_a_wrong_size_is_refused(width: str, message: str) -> None:
+def test_a_radiance_image_with_a_wrong_size_is_refused(width, message):
     assert_refused(f"#?RADIANCE\n\n-Y 1 +X {width}\n".encode(), PhotoError, message)
 
 
@@ -263,7 +263,7 @@ def test_a_radiance_image_with_a_wrong_size_is_refused(width: str, message: str)
     st.sampled_from(["JPEG", "PNG", "TIFF", "WEBP", "AVIF", "GIF"]),
     st.lists(st.tuples(st.integers(0, 400), st.integers(0, 255)), min_size=1, max_size=5),
 )
-def test_damaged_files_give_a_photo_or_a_photo_error(kind: str, damage: list[tuple[int, int]]) -> None:
+def test_damaged_files_give_a_photo_or_a_photo_error(kind, damage):
     data = bytearray(file_of(kind, NOISE[:16, :16]))
     for position, value in damage:
         data[position % len(data)] = value
@@ -271,26 +271,18 @@ def test_damaged_files_give_a_photo_or_a_photo_error(kind: str, damage: list[tup
         Photo.open(bytes(data), max_pixels=10_000).encode("png")
 
 
-@pytest.mark.parametrize("kind", ["JPEG", "PNG", "TIFF", "WEBP", "AVIF", "GIF"])
-def test_more_pixels_than_the_limit_are_refused(kind: str) -> None:
-    data = file_of(kind)
-    assert_refused(data, PhotoTooLarge, "64 x 40", max_pixels=64 * 40 - 1)
-    assert Photo.open(data, max_pixels=64 * 40).size == (64, 40)
+@pytest.mark.parametrize("kind", ["JPEG", "PNG", "TIFF", "WEBP", "AVIF", "GIF", "exr", "hdr", "array", "PIL"])
+def test_more_pixels_than_the_limit_are_refused(kind):
+    options = {"encoding": "srgb"} if kind == "array" else {}
+    if kind in ("array", "PIL"):
+        source = NOISE if kind == "array" else Image.fromarray(NOISE)
+    else:
+        source = Photo.from_array(NOISE, encoding="srgb").encode(kind) if kind.islower() else file_of(kind)
+    assert_refused(source, PhotoTooLarge, "64 x 40", max_pixels=64 * 40 - 1, **options)
+    assert Photo.open(source, max_pixels=64 * 40, **options).size == (64, 40)
 
 
-@pytest.mark.parametrize("format_name", ["exr", "hdr"])
-def test_more_floats_than_the_limit_are_refused(format_name: str) -> None:
-    data = Photo.from_array(NOISE, encoding="srgb").encode(format_name)
-    assert_refused(data, PhotoTooLarge, "64 x 40", max_pixels=64 * 40 - 1)
-
-
-def test_more_pixels_than_the_limit_are_refused_in_memory_too() -> None:
-    for source, options in ((NOISE, {"encoding": "srgb"}), (Image.fromarray(NOISE), {})):
-        assert_refused(source, PhotoTooLarge, "64 x 40", max_pixels=64 * 40 - 1, **options)
-        assert Photo.open(source, max_pixels=64 * 40, **options).size == (64, 40)
-
-
-def test_a_decompression_bomb_is_refused_from_its_header() -> None:
+def test_a_decompression_bomb_is_refused_from_its_header():
     header = struct.pack(">2I5B", 60_000, 60_000, 8, 2, 0, 0, 0)
     chunk = struct.pack(">I", 13) + b"IHDR" + header + struct.pack(">I", zlib.crc32(b"IHDR" + header))
     body = struct.pack(">I", 2) + b"IDAT" + b"\x78\x9c" + struct.pack(">I", zlib.crc32(b"IDAT\x78\x9c"))
@@ -298,18 +290,18 @@ def test_a_decompression_bomb_is_refused_from_its_header() -> None:
 
 
 @pytest.mark.parametrize("shape", [(4,), (4, 4, 2), (4, 4, 5), (0, 4, 3), (1, 4, 4, 3)])
-def test_arrays_of_other_shapes_are_refused(shape: tuple[int, ...]) -> None:
+def test_arrays_of_other_shapes_are_refused(shape):
     with pytest.raises(UnsupportedPhoto):
         Photo.from_array(np.zeros(shape, np.uint8), encoding="srgb")
 
 
 @pytest.mark.parametrize("kind", [np.int8, np.int64, np.complex64, bool])
-def test_arrays_of_other_dtypes_are_refused(kind: type) -> None:
+def test_arrays_of_other_dtypes_are_refused(kind):
     with pytest.raises(UnsupportedPhoto):
         Photo.from_array(np.zeros((4, 4, 3), kind), encoding="srgb")
 
 
-def test_new_pixels_must_fit_the_photo() -> None:
+def test_new_pixels_must_fit_the_photo():
     photo = Photo.from_array(NOISE, encoding="srgb")
     for other in (NOISE[:-1], NOISE.astype(np.uint16)):
         with pytest.raises(PhotoError, match="with_linear"):

@@ -1,6 +1,5 @@
 """Multi-scale prediction: input scales of each quality, flips, mean and confidence."""
 
-import itertools
 import math
 import re
 from pathlib import Path
@@ -33,18 +32,6 @@ def input_pixels(quality, height=1000, width=1000):
 def test_every_listed_input_scale_is_used_with_and_without_flip(quality):
     expected = [pixels for pixels in QUALITIES[quality] for _ in range(2)]
     assert input_pixels(quality) == pytest.approx(expected, rel=0.01)
-
-
-def test_each_quality_uses_more_pixels_than_the_one_below():
-    levels = [(len(scales), sum(scales)) for scales in QUALITIES.values()]
-    for (count, pixels), (next_count, next_pixels) in itertools.pairwise(levels):
-        assert next_count >= count
-        assert (next_count, next_pixels) > (count, pixels)
-
-
-def test_input_scales_rise_and_none_is_listed_twice():
-    for scales in QUALITIES.values():
-        assert list(scales) == sorted(set(scales))
 
 
 def test_the_documentation_states_the_input_scales_of_every_quality_in_megapixels():

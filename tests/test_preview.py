@@ -199,13 +199,6 @@ def test_tiles_are_served_until_the_photo_is_dropped_and_again_after_it_was_sent
     assert request(app, "GET", f"/tile/{sent.headers['Brewster-Photo']}/0/1/0").status_code == 404
 
 
-def test_progress_reaches_the_end():
-    progress = []
-    preview(Separator(pane), Photo.open(image_bytes(60, 40, "png")), Options(), progress.append)
-    assert progress == sorted(progress)
-    assert progress[-1] == 1
-
-
 def test_the_preview_route_returns_the_maps_and_refuses_invalid_files():
     response = request(make_app(), "POST", "/preview", **form(image_bytes(60, 40, "png"), quality="draft"))
     assert Maps(gzip.decompress(response.content)).head["full"] == [60, 40]

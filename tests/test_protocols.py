@@ -1,17 +1,7 @@
 """The named protocols: their settings, their sources, and what a report says about them."""
 
-import pytest
-
 from brewster.cli.evaluate import evaluate
 from brewster.evaluate.protocols import PROTOCOLS, describe_protocol, protocol_config
-
-
-@pytest.mark.parametrize("name", PROTOCOLS)
-def test_each_choice_of_a_protocol_has_a_source(name):
-    lines = describe_protocol(protocol_config(name))
-    assert lines[0].startswith(f"Protocol {name}: ")
-    assert len(lines) == 1 + len(PROTOCOLS[name].choices) > 1
-    assert all(choice and source for choice, source in PROTOCOLS[name].choices)
 
 
 def test_the_contest_crops_the_border_and_scores_its_metrics():

@@ -13,10 +13,11 @@ from types import SimpleNamespace
 import pytest
 
 from brewster.errors import DeviceError, MissingExtra
-from brewster.executors import ray_cluster, run_tasks
+from brewster.executors import ray_cluster
+from brewster.executors.local import run_tasks
 from brewster.rendered.generation.job import RenderTask
 from brewster.rendered.generation.workers import TaskRunner
-from set_folders import hashes, render_set, statuses
+from set_folders import hashes, render_set
 
 TESTS = Path(__file__).parent
 
@@ -76,11 +77,6 @@ def test_without_ray_the_error_has_the_command_that_installs_it(tmp_path, monkey
         render_set(tmp_path / "set", executor=ray_cluster.RayExecutor)
 
 
-def test_an_executor_does_not_import_ray_before_it_is_used():
-    code = "import sys, brewster.executors.ray_cluster; assert 'ray' not in sys.modules"
-    subprocess.run([sys.executable, "-c", code], check=True)
-
-
 class UnpicklableError(Exception):
     def __init__(self):
         super().__init__()
@@ -137,15 +133,6 @@ def test_the_items_of_a_lost_task_are_tried_again_one_by_one(are_arguments_lost)
 
 
 @pytest.mark.slow
-def test_a_cluster_on_this_machine_renders_the_set_of_one_process(tmp_path):
-    pytest.importorskip("ray")
-    done = run_in_process(LOCAL, tmp_path / "set", "rejecting")
-    plain = render_set(tmp_path / "plain", count=9, renderer="rejecting")
-    assert done.stdout.strip() == str(sorted(statuses(plain).items())), done.stderr
-    assert hashes(tmp_path / "set") == hashes(tmp_path / "plain")
-
-
-@pytest.mark.slow
 def test_a_sample_that_kills_its_process_on_every_node_fails(tmp_path):
     pytest.importorskip("ray")
     done = run_in_process(LOCAL, tmp_path / "set", "crashing")
@@ -172,16 +159,3 @@ def test_an_address_that_refuses_connections_is_reported(tmp_path, monkeypatch, 
     monkeypatch.setattr(socket, "create_connection", refuse)
     with pytest.raises(DeviceError, match=f"no cluster at {address}"):
         render_set(tmp_path / "set", executor=partial(ray_cluster.RayExecutor, address=address))
-
-
-def test_ray_tries_a_task_as_often_as_several_processes_do(monkeypatch):
-    options = {}
-    ray = SimpleNamespace(
-        init=lambda *_, **__: None,
-        remote=lambda **given: options.update(given) or (lambda function: function),
-        put=lambda value: value,
-        shutdown=lambda: None,
-    )
-    monkeypatch.setattr(ray_cluster, "_ray", lambda: ray)
-    with ray_cluster.RayExecutor(partial(TaskRunner, None)):
-        assert 1 + options["max_retries"] == ray_cluster.MAX_ATTEMPTS

@@ -55,8 +55,8 @@ def test_only_the_photo_has_the_quality_of_the_scene(scene):
 
 
 def test_statistics_compare_the_luminance_of_the_layers(scene):
-    grey = render(scene, None).map(lambda layer: torch.full_like(layer, 0.5))
-    mirrored = LinearSample(**{**vars(grey), "reflection": grey.reflection * 0.1})
+    layers = {name: torch.full_like(layer, 0.5) for name, layer in render(scene, None).images().items()}
+    mirrored = LinearSample(scene, **(layers | {"reflection": layers["reflection"] * 0.1}))
     found = store.statistics(mirrored, store.develop(mirrored))
     assert found["reflection_to_transmission"] == pytest.approx(0.1)
     assert found["overexposed_fraction"] == 0
@@ -158,18 +158,6 @@ def test_the_index_has_a_row_with_the_parameters_of_each_sample(four_samples, mo
         assert (row["seed"], row["recipe"], row["renderer"]) == (7, "tiny", "fake_renderer:render")
         assert row["path"] == entry.path.name
         assert row["reflection_to_transmission"] == pytest.approx(1, abs=0.2)
-
-
-def test_the_index_is_written_in_batches_and_the_same_each_time(four_samples, tmp_path, monkeypatch):
-    shutil.copytree(four_samples, tmp_path / "set")
-    preview.write_index(tmp_path / "set")
-    assert hashes(tmp_path / "set") == hashes(four_samples)
-    monkeypatch.setattr(preview, "_BATCH_ROWS", 3)
-    preview.write_index(tmp_path / "set")
-    assert parquet.ParquetFile(tmp_path / "set" / preview.INDEX_FILE).num_row_groups == 2
-    assert parquet.read_table(tmp_path / "set" / preview.INDEX_FILE) == parquet.read_table(
-        four_samples / preview.INDEX_FILE
-    )
 
 
 def test_the_contact_sheet_has_a_row_for_each_sample_in_two_columns(four_samples, tmp_path):

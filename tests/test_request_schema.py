@@ -96,13 +96,6 @@ def test_a_format_may_be_named_by_its_suffix_as_on_the_command_line(text, name):
     assert option.type.convert(text, option, None) == name
 
 
-@pytest.mark.parametrize("layers", ["confidence,transmission", "transmission,confidence,transmission"])
-def test_layers_are_unique_and_in_the_standard_order(layers):
-    assert parse(layers=layers).options.layers == ("transmission", "confidence")
-    repeated = [("layers", layer.encode()) for layer in layers.split(",")]
-    assert read(body(("photo", b"", "a.jpg"), *repeated)).options.layers == ("transmission", "confidence")
-
-
 def test_an_empty_field_counts_as_omitted():
     assert parse(format="", strength="", model="").options == Options(max_pixels=1000)
 
@@ -135,19 +128,6 @@ def test_a_wrong_value_is_named_in_the_message(fields, part):
     assert len(message) < 300
     assert re.fullmatch(r"[^;]+; (expected|choose) [^;]+; [^;]+", message), message
     assert "Input should" not in message
-
-
-def test_every_wrong_value_is_in_the_message():
-    data = body(
-        ("photo", b"bytes", "a.jpg"), ("strength", b"1.5"), ("quality", b"best"), ("additive", b"perhaps")
-    )
-    status, message = refused(data)
-    assert status == 422
-    assert message == (
-        "strength is '1.5'; expected a number of at most 1; correct strength. "
-        "quality is 'best'; expected 'draft' or 'standard'; correct quality. "
-        "additive is 'perhaps'; expected true or false; correct additive."
-    )
 
 
 def test_contradicting_options_raise_the_error_of_options():
@@ -262,22 +242,3 @@ def test_layers_have_the_same_names_as_in_a_batch(stem, suffix, layer):
 )
 def test_unsafe_names_are_replaced(name, safe):
     assert safe_name(name) == safe
-
-
-@pytest.mark.parametrize(
-    ("name", "options", "target"),
-    [
-        ("a.JPG", Options(), "a.transmission.JPG"),
-        ("a.png", Options(format="jpeg"), "a.transmission.jpg"),
-        ("a.gif", Options(), "a.transmission.png"),
-        ("a.jpg", Options(additive=True), "a.transmission.tiff"),
-        ("blob", Options(), "blob.transmission.webp"),
-        ("a.b", Options(), "a.b.transmission.webp"),
-        ("x.jpg_large", Options(format="png"), "x.jpg_large.transmission.png"),
-        ("IMG 1 ü.JPG", Options(), "IMG 1 ü.transmission.JPG"),
-        (".jpg", Options(), ".jpg.transmission.webp"),
-    ],
-)
-def test_layers_have_the_file_names_of_the_command_line(name, options, target):
-    assert SeparationRequest(b"", name, options).target("transmission", "webp") == target
-    assert Path(SeparationRequest(b"", name, options).target("confidence", "webp")).suffix == ".png"

@@ -5,8 +5,8 @@ import json
 import pytest
 
 from benchmark_folders import repacked, sir2
-from brewster.benchmarks.image_files import ImageFile
-from brewster.benchmarks.registry import Benchmark, Case, read_benchmark
+from brewster.benchmarks.image_files import Case, ImageFile
+from brewster.benchmarks.registry import Benchmark, read_benchmark
 from brewster.errors import BrewsterError
 from brewster.evaluate.config import EvaluationConfig
 from brewster.evaluate.methods import IdentityBaseline, PredictionFolder
@@ -90,14 +90,6 @@ def test_a_failed_case_is_not_counted_and_is_named(methods):
     }
     assert results["cases"][0]["errors"] == {"theirs": "theirs failed"}
     assert results["benchmarks"]["a"]["excluded"] == ["x.png has no partner"]
-
-
-def test_metrics_without_any_score_are_left_out(methods):
-    parts = [make_benchmark("a", 2)]
-    config = EvaluationConfig(metrics=("psnr", "kept_reflection"))
-    results = summarise(parts, methods, config, make_rows(parts, methods, lambda *_: 1.0))
-    assert list(results["metrics"]) == ["psnr"]
-    assert results["metrics"]["psnr"]["unit"] == "dB"
 
 
 def test_a_benchmark_without_pairs_is_listed_and_has_no_table(methods):

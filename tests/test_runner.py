@@ -12,18 +12,23 @@ from typing import final
 import numpy as np
 import pytest
 
-from benchmark_folders import paint, repacked, write
+from benchmark_folders import paint
 from brewster import Photo
 from brewster.benchmarks.registry import read_benchmark
-from brewster.errors import BrewsterError, OutputError, PhotoError
+from brewster.errors import BrewsterError
+from brewster.evaluate import runner
 from brewster.evaluate.config import EvaluationConfig
-from brewster.evaluate.methods import IdentityBaseline, MethodOutput, ModelMethod, PredictionFolder
-from brewster.evaluate.runner import score
+from brewster.evaluate.methods import IdentityBaseline, MethodOutput, ModelMethod
 from brewster.evaluate.score_log import SCORES_FILE
 from other_processes import children, is_alive, wait_for
 
 QUICK = EvaluationConfig(metrics=("psnr", "ssim"))
 NAMES = ["1", "2", "3"]
+
+
+def score(*args, **kwargs):
+    """Returns the rows of `runner.score`."""
+    return runner.score(*args, **kwargs)[0]
 
 
 class FakeMethod:
@@ -224,30 +229,12 @@ if __name__ == "__main__":
     assert len(workers) >= 2
 
 
-def test_stored_layers_have_the_same_scores_as_new_ones(real20, model, tmp_path):
-    method = ModelMethod("pane", str(model), tmp_path / "predictions")
-    fresh = score(real20, [method], QUICK, tmp_path / "out")
-    stored = score(real20, [PredictionFolder("pane", tmp_path / "predictions")], QUICK, tmp_path / "out")
-    assert [row.scores for row in fresh] == [row.scores for row in stored]
-
-
 def test_two_workers_give_the_same_rows_as_one(real20, model, tmp_path):
     methods = [IdentityBaseline(), ModelMethod("pane", str(model), tmp_path / "predictions")]
     config = EvaluationConfig(metrics=("psnr", "ssim", "psnr_region"))
     one = score(real20, methods, config, tmp_path / "one")
     two = score(real20, methods, config, tmp_path / "two", workers=2)
     assert comparable(one) == comparable(two)
-
-
-def test_if_a_method_fails_on_one_photo_the_others_are_scored(real20, tmp_path):
-    fake = FakeMethod(
-        predictions={
-            "2": PhotoError("the photo is damaged", "expected another photo", "choose another photo")
-        }
-    )
-    rows = score(real20, [IdentityBaseline(), fake], QUICK, tmp_path / "out")
-    assert [bool(row.error) for row in rows] == [False, False, False, True, False, False]
-    assert rows[3].error.startswith("fake failed on real20/2: the photo is damaged")
 
 
 def test_a_crash_is_reported_with_its_case_and_the_next_run_tries_again(real20, tmp_path):
@@ -295,27 +282,6 @@ def test_grey_images_alpha_and_sixteen_bits_are_compared_by_their_8_bit_colours(
         read_benchmark("real20", tmp_path / "real20"), [IdentityBaseline()], QUICK, tmp_path / "out"
     )
     assert row.scores == {"psnr": 100.0, "ssim": 1.0}
-
-
-def test_photos_are_downscaled_before_any_method_runs(tmp_path):
-    repacked(tmp_path / "real20", ["1"], size=(80, 40))
-    fake = FakeMethod()
-    sizes = []
-    fake.predict = lambda case, photo: sizes.append(photo.size) or MethodOutput(photo)
-    (row,) = score(
-        read_benchmark("real20", tmp_path / "real20"),
-        [fake],
-        replace(QUICK, short_side_px=20),
-        tmp_path / "out",
-    )
-    assert sizes == [(40, 20)]
-    assert (row.width, row.height) == (40, 20)
-
-
-def test_an_output_folder_that_cannot_be_written_is_an_error(real20, tmp_path):
-    write(tmp_path, "out", data=b"a file")
-    with pytest.raises(OutputError, match="was not written"):
-        score(real20, [FakeMethod()], QUICK, tmp_path / "out")
 
 
 def test_lines_of_another_version_are_ignored(real20, tmp_path):

@@ -148,9 +148,7 @@ def test_a_recipe_of_maps_needs_maps_that_are_sharp_enough():
         Catalog(pictures=BUILTIN.pictures),
         Catalog(maps=(Asset(source=AssetSource(file="a.hdr"), width=64, height=32),)),
     ):
-        with pytest.raises(
-            RecipeError, match=rf"none of {len(catalog.maps)} maps is suitable for the recipe"
-        ):
+        with pytest.raises(RecipeError, match=rf"none of {len(catalog.maps)} maps is suitable"):
             drawn(asked, 0, catalog=catalog)
 
 
@@ -158,10 +156,7 @@ def test_a_recipe_of_maps_needs_maps_that_are_sharp_enough():
     ("camera", "says"),
     [
         ({"incidence_deg": (88.0, 89.0)}, "gave no possible scene in 100 attempts; .* a corner of the view"),
-        (
-            {"incidence_deg": (180.0, 180.0)},
-            "gave no possible scene in 100 attempts; expected the camera .* behind",
-        ),
+        ({"incidence_deg": (180.0, 180.0)}, "gave no possible scene in 100 attempts; expected the camera"),
         ({"fov_deg": (155.0, 160.0)}, "gave no possible scene in 100 attempts; expected a number below 150;"),
     ],
 )

@@ -68,52 +68,11 @@ def test_the_loop_gives_the_image_of_the_diffusers_pipeline(
     assert expected.std() > 0.01
 
 
-def test_the_transformer_gets_the_same_input_as_in_the_diffusers_pipeline(tiny_model, monkeypatch):
-    """Tokens and their order, position ids, times and guidance, at every step."""
-    calls = []
-    backbone, _ = tiny_model
-    hook = backbone.transformer.register_forward_pre_hook(
-        lambda module, args, kwargs: calls.append(kwargs), with_kwargs=True
-    )
-    condition = image_8bit(64, 96)
-    sample_with_diffusers(tiny_model, condition, monkeypatch)
-    sample_with_brewster(tiny_model, condition)
-    hook.remove()
-    half = len(calls) // 2
-    assert half == STEPS * (1 if backbone.guided_by_embedding else 2)
-    names = ("hidden_states", "img_ids", "txt_ids", "timestep", "guidance", "encoder_hidden_states")
-    for expected_call, actual_call in zip(calls[:half], calls[half:], strict=True):
-        for name in names:
-            if expected_call.get(name) is not None:
-                same_shape = actual_call[name].reshape(expected_call[name].shape)
-                torch.testing.assert_close(
-                    same_shape, expected_call[name], atol=2e-5, rtol=0, check_dtype=False
-                )
-        assert actual_call.get("img_shapes") == expected_call.get("img_shapes")
-
-
-def test_every_argument_changes_the_image(tiny_model):
-    backbone, _ = tiny_model
+def test_a_seed_gives_the_same_image_alone_and_with_others(tiny_model):
     condition = image_8bit(*SIZE)
-    reference = sample_with_brewster(tiny_model, condition)
-    others = {
-        "condition": sample_with_brewster(tiny_model, -condition),
-        "guidance": sample_with_brewster(tiny_model, condition, guidance=2.0),
-        "seed": sample_with_brewster(tiny_model, condition, seeds=[4]),
-        "prompt": sample_with_brewster(
-            (backbone, backbone.random_prompt(backbone.transformer, 9)), condition
-        ),
-    }
-    assert not [name for name, other in others.items() if (other - reference).abs().max() < 1e-4]
-
-
-def test_a_seed_gives_the_same_image_alone_and_in_a_batch(tiny_model):
-    condition = image_8bit(*SIZE)
-    alone = sample_with_brewster(tiny_model, condition, seeds=[3, 4, 5])
-    batched = sample_with_brewster(tiny_model, condition, seeds=[3, 4, 5], batch=2)
-    torch.testing.assert_close(alone, batched, atol=5e-5, rtol=0)
-    assert torch.equal(sample_with_brewster(tiny_model, condition, seeds=[4]), alone[1:2])
-    assert (alone[0] - alone[1]).abs().max() > 0.01
+    several = sample_with_brewster(tiny_model, condition, seeds=[3, 4, 5])
+    assert torch.equal(sample_with_brewster(tiny_model, condition, seeds=[4]), several[1:2])
+    assert (several[0] - several[1]).abs().max() > 0.01
 
 
 def test_the_schedule_counts_generated_tokens_and_ends_at_sigma_0(tiny_model):
@@ -171,27 +130,6 @@ def test_guidance_without_an_empty_prompt_is_refused_with_a_hint(tiny_model):
     assert (
         sample_with_brewster((backbone, without_negative), image_8bit(*SIZE), guidance=1.0).isfinite().all()
     )
-
-
-def test_an_image_with_sides_that_are_not_multiples_of_16_is_refused(tiny_model):
-    with pytest.raises(ModelError, match="has 100 x 64 pixels; expected sides that are multiples of 16"):
-        sample_with_brewster(tiny_model, torch.zeros(1, 3, 64, 100))
-    with pytest.raises(ModelError, match="has 100 x 64 pixels"):
-        sample_with_brewster(tiny_model, torch.zeros(1, 3, 64, 64), size=(100, 64))
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"steps": 0}, "0 steps; expected at least 1; use 20"),
-        ({"steps": -3}, "-3 steps; expected at least 1; use 20"),
-        ({"seeds": []}, "0 seeds; expected at least 1; use 1,"),
-        ({"batch": 0}, "a batch of 0; expected at least 1; use 1,"),
-    ],
-)
-def test_counts_less_than_one_are_refused(tiny_model, options, message):
-    with pytest.raises(ModelError, match=message):
-        sample_with_brewster(tiny_model, image_8bit(*SIZE), **options)
 
 
 @pytest.mark.parametrize(

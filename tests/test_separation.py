@@ -10,12 +10,10 @@ from urllib.parse import unquote
 import numpy as np
 import pytest
 import schemathesis
-from hypothesis import HealthCheck, given, settings
+from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 from schemathesis.specs.openapi.checks import negative_data_rejection, positive_data_acceptance
 
-import brewster
-from brewster import Photo
 from brewster.batch import plan_files
 from brewster.inference import Separator
 from brewster.web.application import create_app
@@ -24,7 +22,7 @@ from brewster.web.middleware import AccessPolicy
 from brewster.web.model_cache import ModelCache
 from brewster.web.separation import separation_router
 from cli_helpers import image_bytes
-from picture_files import exif_block, file_of, smooth
+from picture_files import file_of, smooth
 from web_servers import BlockingBackend, client, form, make_app, pane, request
 
 MIXTURE = Path(__file__).parent / "pictures" / "mixture-coffee-rocket.jpg"
@@ -94,19 +92,11 @@ def test_the_headers_describe_the_separation(app):
     assert float(headers["brewster-seconds"]) > 0
 
 
-def test_the_same_photo_gives_the_same_bytes(app):
-    assert separate(app).content == separate(app).content
-
-
-def test_a_layer_has_the_orientation_and_the_metadata_of_the_photo(app):
-    photo = file_of(smooth(), "jpeg", exif=exif_block(6), icc_profile=Photo.open(SMALL).file_info.icc)
-    layer = Photo.open(separate(app, photo, "a.jpg", layers="transmission").content)
-    assert layer.size == (48, 64)
-    assert b"Sextant" in layer.file_info.exif
-
-
 @settings(max_examples=25, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(name=st.text())
+@example("../../a.png")
+@example("%2e%2e%2f.png")
+@example("x" * 1000 + ".png")
 def test_no_file_name_breaks_the_response(app, name):
     head = f'form-data; name="photo"; filename="{name}"'.replace("\r", "").replace("\n", "")
     data = b"--x\r\nContent-Disposition: %b\r\n\r\n%b\r\n--x--\r\n" % (head.encode(errors="replace"), SMALL)
@@ -119,15 +109,6 @@ def test_no_file_name_breaks_the_response(app, name):
         file_name = unquote(disposition.partition("UTF-8''")[2])
         assert file_name.endswith(".zip")
         assert not set(file_name) & set('/\\\r\n"')
-
-
-@pytest.mark.parametrize(
-    "name", ["../../a.png", "a\nb.png", "ä日本.png", "x" * 1000 + ".png", '".png', "%2e%2e%2f.png"]
-)
-def test_an_unsafe_file_name_is_replaced_by_a_safe_one(app, name):
-    response = separate(app, name=name, layers="transmission")
-    assert response.status_code == 200
-    assert Path(unquote(response.headers["content-disposition"].partition("''")[2])).suffix == ".png"
 
 
 @pytest.mark.parametrize(
@@ -189,14 +170,6 @@ def test_an_unsupported_kind_of_image_is_refused(app):
     assert "5 channels" in error_of(response)
 
 
-@pytest.mark.parametrize("path", ["/separate", "/preview", "/photo"])
-def test_a_damaged_video_has_the_message_of_the_command_line(app, path):
-    response = request(app, "POST", path, **form(bytes(100), "holiday/clip.MP4"))
-    assert response.status_code == 415
-    message = "clip.MP4 is a video; expected a photo; extract single images first, for example with ffmpeg."
-    assert response.json() == {"error": message, "kind": "UnsupportedPhoto"}
-
-
 def test_wrong_values_are_refused_before_any_work():
     def fail_if_called(tile):
         raise AssertionError
@@ -212,10 +185,6 @@ def test_unknown_paths_and_methods_are_refused(app):
     assert request(app, "GET", "/page/%2e%2e/separation.py").status_code == 404
     response = request(app, "GET", "/separate")
     assert (response.status_code, response.headers["allow"]) == (405, "POST")
-    assert (
-        error_of(response)
-        == "/separate does not accept GET; expected POST; repeat the request with this method"
-    )
 
 
 def test_a_bug_is_reported_without_its_traceback():
@@ -236,63 +205,6 @@ def test_a_bug_is_reported_without_its_traceback():
 
 
 # --- the job queue
-
-
-def test_a_client_that_disconnects_stops_the_work():
-    backend, job_queue = BlockingBackend(), JobQueue()
-
-    async def leave():
-        async with client(make_app(backend, job_queue=job_queue)) as http:
-            task = asyncio.create_task(http.post("/separate", **form(SMALL)))
-            await asyncio.to_thread(backend.started.wait)
-            task.cancel()
-            await asyncio.wait([task])
-        backend.proceed.set()
-        while job_queue.job_count:
-            await asyncio.sleep(0.001)
-
-    asyncio.run(leave())
-    assert backend.tiles == 1
-    free_backend = BlockingBackend()
-    free_backend.proceed.set()
-    assert separate(make_app(free_backend)).status_code == 200
-    assert free_backend.tiles > 1
-
-
-def test_a_full_server_returns_retry_after_and_continues():
-    backend, job_queue = BlockingBackend(), JobQueue(max_waiting=1)
-
-    async def crowd():
-        async with client(make_app(backend, job_queue=job_queue)) as http:
-            first = [asyncio.create_task(http.post("/separate", **form(SMALL))) for _ in range(2)]
-            await asyncio.to_thread(backend.started.wait)
-            while job_queue.job_count < 2:
-                await asyncio.sleep(0.001)
-            health = (await http.get("/health")).json()
-            late = await http.post("/separate", **form(SMALL))
-            backend.proceed.set()
-            return health, late, await asyncio.gather(*first)
-
-    health, late, first = asyncio.run(crowd())
-    assert (health["status"], health["jobs"], health["places"]) == ("ok", 2, 2)
-    assert late.status_code == 503
-    assert late.headers["retry-after"].isdecimal()
-    assert "try again" in error_of(late)
-    assert [response.status_code for response in first] == [200, 200]
-
-
-def test_work_beyond_the_time_limit_is_cancelled():
-    backend = BlockingBackend()
-
-    async def wait():
-        async with client(make_app(backend, job_queue=JobQueue(timeout_seconds=0.01))) as http:
-            response = await http.post("/separate", **form(SMALL))
-            backend.proceed.set()
-            return response
-
-    response = asyncio.run(wait())
-    assert response.status_code == 504
-    assert "draft" in error_of(response)
 
 
 def test_progress_is_available_while_the_job_runs():
@@ -316,23 +228,10 @@ def test_progress_is_available_while_the_job_runs():
 
 
 def test_an_invalid_job_name_is_refused(app):
-    response = request(app, "POST", "/separate?job=../x", **form(SMALL))
-    assert response.status_code == 422
-    assert error_of(response) == (
-        "job is '../x'; expected a text that matches ^[A-Za-z0-9-]{8,64}$; correct job."
-    )
+    assert request(app, "POST", "/separate?job=../x", **form(SMALL)).status_code == 422
 
 
 # --- OpenAPI
-
-
-def test_openapi_describes_every_field_and_every_error(app):
-    api = request(app, "GET", "/openapi.json").json()
-    assert set(api["paths"]) == {"/separate", "/progress/{job}", "/models", "/health"}
-    post = api["paths"]["/separate"]["post"]
-    assert {"413", "415", "422", "503", "504"} <= set(post["responses"])
-    assert post["requestBody"]["content"]["multipart/form-data"]["schema"]["required"] == ["photo"]
-    assert api["info"]["version"] == brewster.__version__
 
 
 def test_the_documentation_has_every_status_and_the_pattern_of_job(app):

@@ -10,12 +10,13 @@ from pathlib import Path
 import pytest
 import torch
 
-from brewster.errors import DeviceError, OutputError, RecipeError
-from brewster.executors import ProcessExecutor, local
+from brewster.errors import OutputError, RecipeError
+from brewster.executors import local
+from brewster.executors.local import ProcessExecutor
 from brewster.rendered import store
 from brewster.rendered.generation import workers
 from brewster.rendered.generation.job import RenderTask
-from brewster.rendered.generation.workers import TaskRunner, render_again
+from brewster.rendered.generation.workers import render_again
 from other_processes import children, is_alive, started, wait_for
 from set_folders import hashes, make_job, names, render_set, statuses
 
@@ -30,7 +31,7 @@ def start_blocking_run(out, count):
     """Starts a run in a separate process, with a worker that never finishes sample 2."""
     code = f"""
 from pathlib import Path
-from brewster.executors import ProcessExecutor
+from brewster.executors.local import ProcessExecutor
 from set_folders import render_set
 render_set(Path({str(out)!r}), {count}, renderer="blocking", executor=lambda create_runner: ProcessExecutor(create_runner, 1))
 """
@@ -87,26 +88,6 @@ def test_a_sample_that_kills_every_worker_fails_and_the_others_are_rendered(tmp_
     )
 
 
-def test_a_fatal_error_in_a_worker_ends_the_run(tmp_path):
-    with pytest.raises(
-        DeviceError, match=r"^there is no GPU; expected a GPU; or a CPU; use another computer\.$"
-    ):
-        render_set(
-            tmp_path / "set", renderer="without_device", executor=partial(ProcessExecutor, worker_count=1)
-        )
-
-
-@pytest.mark.parametrize("is_finished", [False, True])
-def test_leaving_the_context_before_a_result_is_read_prints_no_traceback(tmp_path, capfd, is_finished):
-    job = make_job(tmp_path, "slow")
-    with ProcessExecutor(partial(TaskRunner, job), 1) as executor:
-        future = executor.start(RenderTask("render", (0,)))
-        if is_finished:
-            future.result()
-    assert (tmp_path / "000000").is_dir()
-    assert capfd.readouterr().err == ""
-
-
 def test_serial_rendering_restores_the_number_of_torch_threads(tmp_path):
     threads = torch.get_num_threads()
     torch.set_num_threads(2)
@@ -115,13 +96,6 @@ def test_serial_rendering_restores_the_number_of_torch_threads(tmp_path):
         assert torch.get_num_threads() == 2
     finally:
         torch.set_num_threads(threads)
-
-
-def test_a_scene_is_rendered_again_byte_for_byte(tmp_path):
-    render_set(tmp_path / "set", count=2)
-    scene = tmp_path / "set" / "000001" / store.SCENE_FILE
-    render_again(scene, tmp_path / "again", renderer="fake_renderer:render")
-    assert hashes(tmp_path / "again") == hashes(scene.parent)
 
 
 def test_a_scene_file_cannot_run_a_renderer_that_is_not_in_the_table(tmp_path):

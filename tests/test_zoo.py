@@ -3,8 +3,7 @@ from dataclasses import replace
 import pytest
 
 from brewster.errors import ModelError
-from brewster.models.diffusion.backbones.registry import BACKBONES
-from brewster.models.zoo import BACKBONE_CLASSES, MODELS, find_model
+from brewster.models.zoo import MODELS, find_model
 
 
 def test_every_shipped_model_is_intact_small_enough_and_has_a_card():
@@ -27,9 +26,7 @@ def test_a_file_of_weights_is_refused_with_the_folder_to_pass_and_the_command_th
     with pytest.raises(ModelError, match=r"there is no model .*glass"):
         find_model(str(file))
     file.touch()
-    with pytest.raises(
-        ModelError, match=f"is a file of weights; .*--model {tmp_path}; .*models import {file} "
-    ):
+    with pytest.raises(ModelError, match=f"is a file of weights; .*--model {tmp_path};"):
         find_model(str(file))
 
 
@@ -38,7 +35,3 @@ def test_a_damaged_file_is_refused(tmp_path):
     broken.write_bytes(MODELS["compact"].path.read_bytes()[:-1])
     with pytest.raises(ModelError, match="SHA-256"):
         replace(MODELS["compact"], path=broken).verify()
-
-
-def test_the_large_models_of_the_registry_are_the_backbones():
-    assert list(BACKBONE_CLASSES) == list(BACKBONES) == [backbone.name for backbone in BACKBONES.values()]

@@ -15,16 +15,18 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from http.client import HTTPException, HTTPResponse, InvalidURL
-from importlib import metadata
 from pathlib import Path
 from typing import Literal, NamedTuple, TypeVar, cast, final
 from urllib import request
 from urllib.error import HTTPError
 
+import brewster
 from brewster.errors import DownloadError, OutputError
 
 _RETRYABLE_STATUS = (408, 425, 429, 500, 502, 503, 504)
 _MAX_RETRY_AFTER_S = 120.0
+_USER_AGENT = "brewster/{} (+separates reflections in photographs; one download at a time)"
+"""Poly Haven requires that programs identify themselves."""
 _BLOCK_BYTES = 1 << 18
 _EXPECTED_URL = "expected a URL that starts with http:// or https://"
 
@@ -65,11 +67,8 @@ class Downloader:
     sleep: Callable[[float], object] = time.sleep
 
     def read(self, url: str) -> bytes:
-        """Requests a URL and returns the body of the response.
-
-        Raises:
-            DownloadError: the URL is invalid, the server refuses it, or all attempts fail.
-        """
+        """Requests a URL and returns the body of the response. Raises DownloadError if the URL is invalid, the server refuses
+        it, or all attempts fail."""
 
         def attempt() -> bytes:
             with self._open(url) as response:
@@ -116,7 +115,9 @@ class Downloader:
 
     def _open(self, url: str, start: int = 0) -> HTTPResponse:
         """Returns the open response. It starts at byte `start` if the server supports range requests."""
-        headers = {"User-Agent": _user_agent()} | ({"Range": f"bytes={start}-"} if start else {})
+        headers = {"User-Agent": _USER_AGENT.format(brewster.__version__)} | (
+            {"Range": f"bytes={start}-"} if start else {}
+        )
         try:
             query = request.Request(url, headers=headers)  # noqa: S310  (the opener supports http and https only)
             response = _opener().open(query, timeout=self.timeout_s)
@@ -202,13 +203,3 @@ def _opener() -> request.OpenerDirector:
     ):
         opener.add_handler(handler())
     return opener
-
-
-@functools.cache
-def _user_agent() -> str:
-    """Returns the User-Agent header. Poly Haven requires that programs identify themselves."""
-    try:
-        version = metadata.version("brewster")
-    except metadata.PackageNotFoundError:
-        version = "source"
-    return f"brewster/{version} (+separates reflections in photographs; one download at a time)"

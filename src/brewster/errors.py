@@ -187,11 +187,7 @@ class MissingExtra(BrewsterError):
 
 
 def invalid_value(details: Mapping[str, Any]) -> BrewsterError:
-    """Returns an error about one invalid value.
-
-    Args:
-        details: an item of `errors()` of pydantic's ValidationError: the type of the error, its location `loc`, and the value.
-    """
+    """Returns an error about one invalid value, from an item of `errors()` of pydantic's ValidationError."""
     name = ".".join(map(str, details["loc"])) or "the whole value"
     kind, value = details["type"], details["input"]
     if kind.startswith("missing"):

@@ -79,33 +79,30 @@ def images_in(
     is not an image, opening it raises the error.
     """
     for image in _image_files(source, [] if skipped is None else skipped):
-        yield image, _output_folder(image, source, output_folder)
-
-
-def _output_folder(image: Location, source: Location, output_folder: Location | None) -> Location:
-    """Returns the folder for the layers of an image that was found in `source`."""
-    if output_folder is None:
-        return image.parent
-    return (
-        output_folder if image == source else output_folder.joinpath(*image.parent.relative_to(source).parts)
-    )
+        if output_folder is None or image == source:
+            yield image, output_folder or image.parent
+        else:
+            yield image, output_folder.joinpath(*image.parent.relative_to(source).parts)
 
 
 def write_atomically(path: Location, data: bytes, *, overwrite: bool = False) -> None:
     """Writes a file atomically and creates its folder where needed.
 
-    The bytes are written to a hidden file in the same folder and flushed to the disk. Then the file is renamed.
-    Therefore a full disk or Ctrl-C leaves no partial file. In an object store, the file is written with one upload.
-
-    Raises:
-        OutputError: the file exists and `overwrite` is False, or it cannot be written.
+    The bytes are written to a hidden file in the same folder and flushed to the disk. Then the file is renamed. Therefore a
+    full disk or Ctrl-C leaves no partial file. In an object store, the file is written with one upload. Raises OutputError if
+    the file exists and `overwrite` is False, or it cannot be written.
     """
     try:
         if isinstance(path, RemotePath):
             path.write_bytes(data, overwrite=overwrite)
             return
         with _temporary(path) as part:
-            _create_folder(path.parent)
+            try:
+                path.parent.mkdir(parents=True, exist_ok=True)
+            except (
+                FileExistsError
+            ) as error:  # has another cure: --overwrite does not replace a file by a folder
+                raise NotADirectoryError(errno.ENOTDIR, os.strerror(errno.ENOTDIR)) from error
             _check_writable(path, overwrite)
             _write_synced(part, data)
             _publish(part, path, overwrite)
@@ -116,11 +113,9 @@ def write_atomically(path: Location, data: bytes, *, overwrite: bool = False) ->
 def check_output_folder(folder: Location) -> None:
     """Checks that the output folder of a batch can be created and written to, so that an error is found before the first photo.
 
-    The permissions of a folder do not show all errors. Therefore a hidden folder is created in the output folder, or in its nearest
-    parent that exists, and is deleted at once. A folder in an object store is not checked.
-
-    Raises:
-        OutputError: the folder cannot be created, or cannot be written to.
+    The permissions of a folder do not show all errors. Therefore a hidden folder is created in the output folder, or in its
+    nearest parent that exists, and is deleted at once. A folder in an object store is not checked. Raises OutputError if the
+    folder cannot be created, or cannot be written to.
     """
     if isinstance(folder, RemotePath):
         return
@@ -141,17 +136,19 @@ def check_output_folder(folder: Location) -> None:
 def atomic_path(path: Path) -> Iterator[Path]:
     """Yields a hidden path for a new file or folder. At the end of the block, the file or folder is renamed to `path`.
 
-    An existing file is replaced. If another process has created the folder in the meantime, that folder stays.
-
-    Raises:
-        OutputError: the file or folder cannot be written, for example because the disk is full.
+    An existing file is replaced. If another process has created the folder in the meantime, that folder stays. Raises
+    OutputError if the file or folder cannot be written, for example because the disk is full.
     """
     try:
         with _temporary(path) as part:
             path.parent.mkdir(parents=True, exist_ok=True)
             yield part
             _sync(part)
-            _replace(path, part)
+            try:
+                part.replace(path)
+            except OSError as error:
+                if error.errno not in (errno.ENOTEMPTY, errno.EEXIST):
+                    raise
             _sync(path.parent)
     except OSError as error:
         raise OutputError(
@@ -189,14 +186,6 @@ def discard(path: Path) -> None:
             path.unlink()
 
 
-def _replace(path: Path, part: Path) -> None:
-    try:
-        part.replace(path)
-    except OSError as error:
-        if error.errno not in (errno.ENOTEMPTY, errno.EEXIST):
-            raise
-
-
 def _sync(path: Path) -> None:
     is_folder = path.is_dir()
     if is_folder and sys.platform == "win32":  # Windows cannot open a folder
@@ -217,30 +206,26 @@ def _image_files(source: Location, skipped: list[Location]) -> Iterator[Location
         return _is_input(path)
 
     if isinstance(source, RemotePath):
-        found = [source] if format_of(source) else filter(is_included, _visible_remote_files(source))
-        yield from _without_masks(found)
+        found = [source] if format_of(source) else source.walk_files()
+        visible = (
+            path for path in found if not any(part.startswith(".") for part in path.relative_to(source).parts)
+        )
+        yield from _without_masks(path for path in visible if path == source or is_included(path))
     elif _is_folder(source):
         yield from _without_masks(walk(source, is_included))
     else:
         yield source
 
 
-def _visible_remote_files(folder: RemotePath) -> Iterator[RemotePath]:
-    for path in folder.walk_files():
-        if not any(part.startswith(".") for part in path.relative_to(folder).parts):
-            yield path
-
-
-def walk(folder: Path, is_included: Callable[[Path], bool]) -> Iterator[Path]:
+def walk(
+    folder: Path, is_included: Callable[[Path], bool], visited: set[tuple[int, int]] | None = None
+) -> Iterator[Path]:
     """Yields the files below a folder for which `is_included` is True, in a stable order. Hidden folders are skipped.
 
-    Links are followed. Each folder is visited once, so that link loops end. If a folder cannot be read, its path is
-    yielded.
+    Links are followed. Each folder is visited once, so that link loops end: `visited` contains the device and the number of
+    those that were visited before. If a folder cannot be read, its path is yielded.
     """
-    return _walk(folder, is_included, set())
-
-
-def _walk(folder: Path, is_included: Callable[[Path], bool], visited: set[tuple[int, int]]) -> Iterator[Path]:
+    visited = set() if visited is None else visited
     try:
         entries = sorted(folder.iterdir())
         status = folder.stat()
@@ -253,7 +238,7 @@ def _walk(folder: Path, is_included: Callable[[Path], bool], visited: set[tuple[
     for entry in entries:
         if _is_folder(entry):
             if not entry.name.startswith("."):
-                yield from _walk(entry, is_included, visited)
+                yield from walk(entry, is_included, visited)
         elif is_included(entry):
             yield entry
 
@@ -297,19 +282,6 @@ def is_same_file(path: Location, other: Location) -> bool:
 def exists(path: Location) -> bool:
     """Whether a file, a folder or a link exists at the path."""
     return path.exists() if isinstance(path, RemotePath) else os.path.lexists(path)
-
-
-def _create_folder(folder: Path) -> None:
-    """Creates a folder and its parents where needed.
-
-    Raises:
-        NotADirectoryError: the folder or one of its parents is a file.
-        OSError: the folder cannot be created.
-    """
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except FileExistsError as error:  # has another cure: --overwrite does not replace a file by a folder
-        raise NotADirectoryError(errno.ENOTDIR, os.strerror(errno.ENOTDIR)) from error
 
 
 def _check_writable(path: Path, overwrite: bool) -> None:

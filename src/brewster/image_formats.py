@@ -26,8 +26,8 @@ class ImageFormat:
     signature: bytes
     """A regular expression for the first bytes of a file. Most RAW files begin like a TIFF file; their tags identify them."""
     library: Literal["libvips", "OpenEXR", "pillow-heif", "rawpy", "built-in"] = "libvips"
-    vips_loader: str | None = None
-    vips_saver: str | None = None
+    vips_name: str | None = None
+    """The name of the format in the functions of libvips."""
     extra: str | None = None
     """The extra of brewster that installs the library, or None if the library is installed without an extra."""
     bit_depths: tuple[int, ...] = ()
@@ -62,8 +62,7 @@ _ROWS: Final = (
         suffixes=(".jpg", ".jpeg", ".jpe", ".jfif"),
         mime_type="image/jpeg",
         signature=rb"\xff\xd8\xff",
-        vips_loader="jpegload_buffer",
-        vips_saver="jpegsave_buffer",
+        vips_name="jpeg",
         bit_depths=(8,),
         has_alpha=False,
         is_stored_rotated=True,
@@ -73,8 +72,7 @@ _ROWS: Final = (
         suffixes=(".png",),
         mime_type="image/png",
         signature=rb"\x89PNG\r\n\x1a\n",
-        vips_loader="pngload_buffer",
-        vips_saver="pngsave_buffer",
+        vips_name="png",
         bit_depths=(8, 16),
         has_cicp=True,
         is_stored_rotated=True,
@@ -93,8 +91,7 @@ _ROWS: Final = (
         suffixes=(".tiff", ".tif"),
         mime_type="image/tiff",
         signature=rb"II[*+]\0|MM\0[*+]",
-        vips_loader="tiffload_buffer",
-        vips_saver="tiffsave_buffer",
+        vips_name="tiff",
         bit_depths=(8, 16, 32),
         has_float32=True,
         is_stored_rotated=True,
@@ -104,8 +101,7 @@ _ROWS: Final = (
         suffixes=(".webp",),
         mime_type="image/webp",
         signature=rb"RIFF....WEBP",
-        vips_loader="webpload_buffer",
-        vips_saver="webpsave_buffer",
+        vips_name="webp",
         bit_depths=(8,),
         is_stored_rotated=True,
     ),
@@ -114,8 +110,7 @@ _ROWS: Final = (
         suffixes=(".avif",),
         mime_type="image/avif",
         signature=rb"....ftyp(avif|avis)",
-        vips_loader="heifload_buffer",
-        vips_saver="heifsave_buffer",
+        vips_name="heif",
         bit_depths=(8, 10, 12),
         has_cicp=True,
     ),
@@ -162,7 +157,7 @@ _ROWS: Final = (
         suffixes=(".gif",),
         mime_type="image/gif",
         signature=rb"GIF8[79]a",
-        vips_loader="gifload_buffer",
+        vips_name="gif",
     ),
 )
 

@@ -56,11 +56,16 @@ class SeparateOptions(LoadOptions, total=False):
     max_pixels: int
 
 
+MAX_BURST_PHOTOS: Final = 15
+"""Larger bursts take longer and are hardly better."""
+DEFAULT_FRAMES: Final = 7
+"""The number of frames that are chosen from a video."""
+
 _CALL_OPTIONS: Final = ("strength", "quality", "mask", "hints", "additive", "max_pixels")
 
 
-def _field_metadata(description: str, **limits: int) -> dict[str, Any]:
-    return {"description": description, **limits}
+def _option(default: Any, description: str, **limits: int) -> Any:  # noqa: ANN401  (a field of any type)
+    return field(default=default, metadata={"description": description, **limits})
 
 
 @final
@@ -75,133 +80,94 @@ class Options:
         BrewsterError: a value is invalid; or `additive` is set, and the format does not store 32-bit floats.
     """
 
-    layers: tuple[Layer, ...] = field(
-        default=("transmission", "reflection"),
-        metadata=_field_metadata(
-            "The layers to write, separated by commas: transmission, reflection, confidence; "
-            "layered is one OpenRaster file (.ora) with both layers, for image editors."
-        ),
+    layers: tuple[Layer, ...] = _option(
+        ("transmission", "reflection"),
+        "The layers to write, separated by commas: transmission, reflection, confidence; "
+        "layered is one OpenRaster file (.ora) with both layers, for image editors.",
     )
-    strength: float = field(
-        default=1.0,
-        metadata=_field_metadata(
-            "How much of the separation to apply, from 0 (the unchanged photo) to 1 (the full separation).",
-            ge=0,
-            le=1,
-            allow_inf_nan=False,
-        ),
+    strength: float = _option(
+        1.0,
+        "How much of the separation to apply, from 0 (the unchanged photo) to 1 (the full separation).",
+        ge=0,
+        le=1,
+        allow_inf_nan=False,
     )
-    quality: Quality = field(
-        default="standard",
-        metadata=_field_metadata("Number and size of the input scales: draft is faster than standard."),
+    quality: Quality = _option(
+        "standard", "Number and size of the input scales: draft is faster than standard."
     )
-    mask: Path | None = field(
-        default=None,
-        metadata=_field_metadata(
-            "A grey image of the size of the photo that scales the strength: white is separated, black stays unchanged."
-        ),
+    mask: Path | None = _option(
+        None,
+        "A grey image of the size of the photo that scales the strength: white is separated, black stays unchanged.",
     )
-    hints: Path | None = field(
-        default=None,
-        metadata=_field_metadata(
-            "An image of the size of the photo that helps the model: red where there is reflection, green where there is only the "
-            "scene, rough strokes on black or transparent."
-        ),
+    hints: Path | None = _option(
+        None,
+        "An image of the size of the photo that helps the model: red where there is reflection, green where there is only the "
+        "scene, rough strokes on black or transparent.",
     )
-    additive: bool = field(
-        default=False,
-        metadata=_field_metadata(
-            "Write layers that sum to the photo exactly: 32-bit floats in linear light, TIFF or EXR."
-        ),
+    additive: bool = _option(
+        False, "Write layers that sum to the photo exactly: 32-bit floats in linear light, TIFF or EXR."
     )
-    format: FormatName | None = field(
-        default=None,
-        metadata=_field_metadata(
-            "The file format of the transmission and the reflection; by default, the format of the photo."
-        ),
+    format: FormatName | None = _option(
+        None, "The file format of the transmission and the reflection; by default, the format of the photo."
     )
-    model: str = field(
-        default="compact",
-        metadata=_field_metadata(
-            "The model to use: a name from `brewster models list` (gensirr must be imported first), an .onnx file, the folder "
-            "of a training run, or a LoRA's folder or hub id."
-        ),
+    model: str = _option(
+        "compact",
+        "The model to use: a name from `brewster models list` (gensirr must be imported first), an .onnx file, the folder "
+        "of a training run, or a LoRA's folder or hub id.",
     )
-    device: Device = field(
-        default="auto",
-        metadata=_field_metadata("The device that runs the model; auto selects the fastest one available."),
+    device: Device = _option(
+        "auto", "The device that runs the model; auto selects the fastest one available."
     )
-    base_model: str | None = field(
-        default=None,
-        metadata=_field_metadata(
-            "For a LoRA: the folder or hub id of its base model, if it has moved since training."
-        ),
+    base_model: str | None = _option(
+        None, "For a LoRA: the folder or hub id of its base model, if it has moved since training."
     )
-    quantization: Quantization | None = field(
-        default=None,
-        metadata=_field_metadata(
-            "For diffusion models: store the weights in 8 or 4 bits; the default is the setting of the training, "
-            "or fewer bits if the GPU has too little memory for it."
-        ),
+    quantization: Quantization | None = _option(
+        None,
+        "For diffusion models: store the weights in 8 or 4 bits; the default is the setting of the training, "
+        "or fewer bits if the GPU has too little memory for it.",
     )
-    offload: Offload = field(
-        default="auto",
-        metadata=_field_metadata(
-            "For diffusion models: layers keeps the weights in host memory and copies each block to the GPU while it computes, "
-            "which is slower; auto does this only if the weights do not fit into the free GPU memory."
-        ),
+    offload: Offload = _option(
+        "auto",
+        "For diffusion models: layers keeps the weights in host memory and copies each block to the GPU while it computes, "
+        "which is slower; auto does this only if the weights do not fit into the free GPU memory.",
     )
-    transformer: str | None = field(
-        default=None,
-        metadata=_field_metadata(
-            "For diffusion models: one file with the weights of the transformer, which replaces that of the base: a .gguf or .safetensors "
-            "file, a hub id or OWNER/NAME/FILE."
-        ),
+    transformer: str | None = _option(
+        None,
+        "For diffusion models: one file with the weights of the transformer, which replaces that of the base: a .gguf or .safetensors "
+        "file, a hub id or OWNER/NAME/FILE.",
     )
-    fast_lora: str | None = field(
-        default=None,
-        metadata=_field_metadata(
-            "For diffusion models: a few-step LoRA, which is added to the model. A few-step LoRA (Lightning, turbo) is trained for "
-            "sampling in few steps, such as 4 or 8. Pass a .safetensors file, a folder, a hub id or OWNER/NAME/FILE, and set the "
-            "option steps."
-        ),
+    fast_lora: str | None = _option(
+        None,
+        "For diffusion models: a few-step LoRA, which is added to the model. A few-step LoRA (Lightning, turbo) is trained for "
+        "sampling in few steps, such as 4 or 8. Pass a .safetensors file, a folder, a hub id or OWNER/NAME/FILE, and set the "
+        "option steps.",
     )
-    guidance: float | None = field(
-        default=None,
-        metadata=_field_metadata(
-            "For diffusion models: the guidance scale, by default that of the model; with a few-step LoRA, 1 for klein and qwen.",
-            ge=1,
-            allow_inf_nan=False,
-        ),
+    guidance: float | None = _option(
+        None,
+        "For diffusion models: the guidance scale, by default that of the model; with a few-step LoRA, 1 for klein and qwen.",
+        ge=1,
+        allow_inf_nan=False,
     )
-    timestep_shift: float | None = field(
-        default=None,
-        metadata=_field_metadata(
-            "For diffusion models: the factor by which the sampling times are shifted towards noise, by default that of the model; "
-            "with a few-step LoRA, 3 for qwen. 1 is no shift.",
-            ge=1,
-        ),
+    timestep_shift: float | None = _option(
+        None,
+        "For diffusion models: the factor by which the sampling times are shifted towards noise, by default that of the model; "
+        "with a few-step LoRA, 3 for qwen. 1 is no shift.",
+        ge=1,
     )
-    steps: int | None = field(
-        default=None,
-        metadata=_field_metadata(
-            "For diffusion models: sampling steps for each prediction; by default those of the model, usually 20; at most 4 for draft.",
-            ge=1,
-        ),
+    steps: int | None = _option(
+        None,
+        "For diffusion models: sampling steps for each prediction; by default those of the model, usually 20; at most 4 for draft.",
+        ge=1,
     )
-    ensemble_size: int = field(
-        default=1,
-        metadata=_field_metadata("For diffusion models: the number of predictions that are averaged.", ge=1),
+    ensemble_size: int = _option(
+        1, "For diffusion models: the number of predictions that are averaged.", ge=1
     )
-    no_guided_upsampling: bool = field(
-        default=False,
-        metadata=_field_metadata(
-            "For diffusion models: enlarge the generated transmission without adding fine detail from the photo."
-        ),
+    no_guided_upsampling: bool = _option(
+        False,
+        "For diffusion models: enlarge the generated transmission without adding fine detail from the photo.",
     )
-    max_pixels: int = field(
-        default=DEFAULT_MAX_PIXELS,
-        metadata=_field_metadata("Refuse photos with more pixels than this, before they are decoded.", ge=1),
+    max_pixels: int = _option(
+        DEFAULT_MAX_PIXELS, "Refuse photos with more pixels than this, before they are decoded.", ge=1
     )
 
     def __post_init__(self) -> None:
@@ -211,7 +177,13 @@ class Options:
         for option in fields(self):
             value = getattr(self, option.name)
             if type(value) is not type(option.default) or value != option.default:
-                object.__setattr__(self, option.name, _checked(option.name, value))
+                from pydantic import ValidationError  # noqa: PLC0415  (slow, and not needed for the default options)
+
+                try:
+                    checked = _validators()[option.name].validate_python(value)
+                except ValidationError as error:
+                    raise invalid_value({**error.errors()[0], "loc": (option.name,)}) from error
+                object.__setattr__(self, option.name, checked)
         if not self.layers:
             raise BrewsterError(
                 "layers is empty", "expected at least one layer", "add a layer, or leave layers out"
@@ -254,20 +226,6 @@ class Options:
         format_name = self.format_name(layer, source_format.written_as)
         is_same = layer not in LAYER_FORMATS and format_name == source_format.name
         return photo_suffix if is_same else FORMATS[format_name].suffixes[0]
-
-
-def _checked(name: str, value: object) -> object:
-    """Returns the value of an option, converted to the type of its field.
-
-    Raises:
-        BrewsterError: the value is invalid.
-    """
-    from pydantic import ValidationError  # noqa: PLC0415  (slow to import, and not needed for the default options)
-
-    try:
-        return _validators()[name].validate_python(value)
-    except ValidationError as error:
-        raise invalid_value({**error.errors()[0], "loc": (name,)}) from error
 
 
 @cache

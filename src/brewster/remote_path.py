@@ -45,14 +45,9 @@ class RemotePath(PurePosixPath):
         return super().__str__().replace(":/", "://", 1)
 
     def read_bytes(self) -> bytes:
-        """Returns the content of the file.
-
-        Raises:
-            UnreadablePhoto: the file does not exist, or the store fails.
-            MissingExtra: the package of the store is not installed.
-        """
-        store = self._store()
-        with self._read_errors():
+        """Returns the content of the file. Raises UnreadablePhoto if the file does not exist, or the store fails, and
+        MissingExtra if the package of the store is not installed."""
+        with self._read_errors() as store:
             return bytes(store.cat_file(str(self)))
 
     def check_readable(self) -> None:
@@ -62,8 +57,7 @@ class RemotePath(PurePosixPath):
             UnreadablePhoto: the file does not exist, is empty or is a folder, or the store fails.
             MissingExtra: the package of the store is not installed.
         """
-        store = self._store()
-        with self._read_errors():
+        with self._read_errors() as store:
             info = store.info(str(self))
         if info["type"] == "directory":
             raise UnreadablePhoto(
@@ -73,10 +67,11 @@ class RemotePath(PurePosixPath):
             raise empty_file_error()
 
     @contextlib.contextmanager
-    def _read_errors(self) -> Iterator[None]:
-        """Translates errors of the store within this block into `UnreadablePhoto`."""
+    def _read_errors(self) -> Iterator[Any]:
+        """Yields the store. Translates its errors within this block into `UnreadablePhoto`."""
+        store = _store(self)
         try:
-            yield
+            yield store
         except FileNotFoundError as error:
             raise UnreadablePhoto(
                 f"{self} cannot be read (it does not exist)", "expected an image file", "check the URL"
@@ -94,7 +89,7 @@ class RemotePath(PurePosixPath):
             OutputError: the store fails, or refuses the upload.
             MissingExtra: the package of the store is not installed.
         """
-        store = self._store()
+        store = _store(self)
         try:
             store.pipe_file(str(self), data, mode="overwrite" if overwrite else "create")
         except FileExistsError as error:
@@ -108,7 +103,7 @@ class RemotePath(PurePosixPath):
 
     def exists(self) -> bool:
         """Whether the file exists. False if the store fails: reading or writing the file then raises the error."""
-        store = self._store()
+        store = _store(self)
         try:
             return bool(store.exists(str(self)))
         except Exception:  # noqa: BLE001  (each store has its own errors)
@@ -117,14 +112,14 @@ class RemotePath(PurePosixPath):
     def unlink(self) -> None:
         """Deletes the file. Ignores errors, because only temporary files are deleted."""
         with contextlib.suppress(Exception):  # each store has its own errors
-            self._store().rm_file(str(self))
+            _store(self).rm_file(str(self))
 
     def rmdir(self) -> None:
         """Does nothing, because a folder in a store exists only as long as it has files."""
 
     def iterdir(self) -> Iterator[RemotePath]:
         """Yields the files and folders in this folder. Yields nothing if the store fails."""
-        store = self._store()
+        store = _store(self)
         try:
             names = store.ls(str(self), detail=False)
         except Exception:  # noqa: BLE001  (each store has its own errors)
@@ -132,12 +127,8 @@ class RemotePath(PurePosixPath):
         yield from (self / PurePosixPath(name).name for name in names)
 
     def walk_files(self) -> list[RemotePath]:
-        """Returns all files below this folder, sorted.
-
-        Raises:
-            UnreadablePhoto: the store fails.
-        """
-        store = self._store()
+        """Returns all files below this folder, sorted. Raises UnreadablePhoto if the store fails."""
+        store = _store(self)
         try:
             found = store.find(str(self))
             root = store._strip_protocol(str(self))  # the prefix of all names that `find` returns
@@ -146,9 +137,6 @@ class RemotePath(PurePosixPath):
                 f"{self} cannot be listed ({_reason(error)})", "expected a store that responds", _RETRY
             ) from error
         return sorted(self / str(name)[len(root) :].lstrip("/") for name in found)
-
-    def _store(self) -> Any:  # noqa: ANN401  (fsspec has no types)
-        return _store(self.parts[0].rstrip(":"))
 
 
 Location: TypeAlias = Path | RemotePath
@@ -173,16 +161,13 @@ def location(text: str | os.PathLike[str]) -> Location:
             "download the photo, and pass the path of the file",
         )
     path = RemotePath(url)
-    path._store()  # raises the errors here once, instead of for every photo
+    _store(path)  # raises the errors here once, instead of for every photo
     return path
 
 
 def path_of_file_url(url: str) -> str:
     """Returns the local path of a file:// URL (RFC 8089). Its host is empty or localhost, or on Windows the name of a server.
-
-    Raises:
-        BrewsterError: the URL names another machine, and this machine does not run Windows.
-    """
+    Raises BrewsterError if the URL names another machine, and this machine does not run Windows."""
     from urllib.request import url2pathname  # noqa: PLC0415  (imports http.client: slow, and every command imports this module)
 
     host, _, path = url.removeprefix("file://").partition("/")
@@ -244,42 +229,34 @@ def _opened(path: Path) -> Iterator[BinaryIO]:
 
 def check_not_video(path: Location) -> None:
     """Checks that the name of a photo does not have the suffix of a video. A damaged video cannot be recognised by its content.
-
-    Raises:
-        UnsupportedPhoto: the name has such a suffix.
-    """
+    Raises UnsupportedPhoto if the name has such a suffix."""
     if is_video(path):
         raise video_error(str(path))
 
 
-def _store(protocol: str) -> Any:  # noqa: ANN401  (fsspec has no types)
-    """Returns the file system of a protocol. Listings are not cached, because other nodes write files, too."""
+def _store(path: RemotePath) -> Any:  # noqa: ANN401  (fsspec has no types)
+    """Returns the file system of a URL. Listings are not cached, because other nodes write files, too."""
+    protocol = path.parts[0].rstrip(":")
     try:
         return importlib.import_module("fsspec").filesystem(protocol, use_listings_cache=False)
-    except ModuleNotFoundError as error:
+    except ImportError as error:
         if error.name == "fsspec":
             raise MissingExtra.for_extra(
                 "cluster",
                 "the package fsspec is not installed",
                 f"expected it to be installed, because it reads {protocol}:// URLs",
             ) from error
-        raise _missing_package(protocol, error) from error
-    except ImportError as error:
-        raise _missing_package(protocol, error) from error
+        raise MissingExtra(
+            f"{protocol}:// needs a package that is not installed ({error})",
+            "expected the package of this store: s3fs for s3://, gcsfs for gs://, adlfs for az://",
+            "install it with pip",
+        ) from error
     except ValueError as error:
         raise BrewsterError(
             f"the protocol {protocol}:// is unknown",
             "expected the path of a file or folder, or a URL such as s3://bucket/folder",
             "correct the URL",
         ) from error
-
-
-def _missing_package(protocol: str, error: ImportError) -> MissingExtra:
-    return MissingExtra(
-        f"{protocol}:// needs a package that is not installed ({error})",
-        "expected the package of this store: s3fs for s3://, gcsfs for gs://, adlfs for az://",
-        "install it with pip",
-    )
 
 
 def _reason(error: Exception) -> str:

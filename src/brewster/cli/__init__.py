@@ -40,8 +40,10 @@ class _DefaultCommandGroup(click.Group):
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
         """Inserts `separate` in front of the arguments if the first argument is not a command."""
         if args and args[0] not in self.commands and args[0] not in _GROUP_OPTIONS:
-            if not ctx.resilient_parsing:  # shell completion
-                self._reject_misspelled_command(ctx, args[0])
+            close = difflib.get_close_matches(args[0], self.commands, n=1, cutoff=0.7)
+            is_misspelled = close and args[0].isalpha() and not Path(args[0]).exists()
+            if is_misspelled and not ctx.resilient_parsing:  # shell completion
+                ctx.fail(f"{args[0]!r} is neither a photo nor a command. Did you mean {close[0]}?")
             args = ["separate", *args]
         return super().parse_args(ctx, args)
 
@@ -52,31 +54,13 @@ class _DefaultCommandGroup(click.Group):
         files = [] if incomplete.startswith("-") else [CompletionItem(incomplete, type="file")]
         return [*{item.value: item for item in items}.values(), *files]
 
-    def _reject_misspelled_command(self, ctx: click.Context, argument: str) -> None:
-        close = difflib.get_close_matches(argument, self.commands, n=1, cutoff=0.7)
-        if close and argument.isalpha() and not Path(argument).exists():
-            ctx.fail(f"{argument!r} is neither a photo nor a command. Did you mean {close[0]}?")
-
-
-def _print_version(context: click.Context, _parameter: click.Parameter, requested: bool) -> None:
-    if requested and not context.resilient_parsing:
-        click.echo(f"brewster {brewster.__version__}")
-        context.exit()
-
 
 @click.group(
     cls=_DefaultCommandGroup,
     subcommand_metavar="PHOTO... | COMMAND [ARGS]...",
-    context_settings={"help_option_names": _HELP_OPTIONS},
+    context_settings={"help_option_names": _HELP_OPTIONS, "show_default": True},
 )
-@click.option(
-    "--version",
-    is_flag=True,
-    is_eager=True,
-    expose_value=False,
-    callback=_print_version,
-    help="Print the version.",
-)
+@click.version_option(brewster.__version__, message="brewster %(version)s", help="Print the version.")
 def cli() -> None:
     """Separate photos taken through glass into transmission and reflection.
 

@@ -9,32 +9,26 @@ import click
 
 from brewster.cli.evaluate import print_failures, print_remarks, print_tables
 from brewster.cli.extras import require_extra
+from brewster.cli.parameters import FILE, FOLDER, Number
 from brewster.cli.terminal import interrupts, print_status
 
 
 @click.command
-@click.argument("path", metavar="ABLATION", type=click.Path(path_type=Path))
+@click.argument("path", metavar="ABLATION", type=FILE)
 @click.option(
     "-o",
     "--output",
     "out",
-    metavar="FOLDER",
-    type=click.Path(path_type=Path, file_okay=False),
+    type=FOLDER,
     help="The folder for models, tables and the report; by default out/ablations/NAME for NAME.toml, and with --base BASE.toml, out/ablations/NAME-BASE.",
 )
 @click.option(
     "--base",
     metavar="RECIPE",
-    type=click.Path(path_type=Path),
+    type=FILE,
     help="A training recipe that replaces the base recipe of ABLATION, such as a tiny one for a test run.",
 )
-@click.option(
-    "--workers",
-    type=click.IntRange(min=1),
-    default=1,
-    show_default=True,
-    help="The number of processes that compute scores.",
-)
+@click.option("--workers", type=Number(1), default=1, help="The number of processes that compute scores.")
 @click.option("--quiet", is_flag=True, help="Print only errors, and no tables.")
 @click.pass_context
 def ablate(

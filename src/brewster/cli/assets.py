@@ -1,22 +1,21 @@
-"""`brewster assets`: download data that brewster does not include, such as environment maps."""
+"""`brewster assets`: download data that brewster does not include: environment maps, and photographs for training."""
 
 from __future__ import annotations
 
 import json
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
+from brewster.cli.parameters import FILE, QUIET, Number
 from brewster.cli.terminal import one_line, print_error, print_status, progress, standard_output, write_out
 
 if TYPE_CHECKING:
     from brewster.environments.polyhaven import DownloadRequest, DownloadResult
-
-_COUNT = click.IntRange(min=0)
 
 
 @click.group
@@ -25,73 +24,68 @@ def assets() -> None:
 
 
 @assets.command
-@click.argument("source", type=click.Choice(["polyhaven"]))
-@click.argument("out", required=False, type=click.Path(path_type=Path))
-@click.option(
-    "--indoor",
-    type=_COUNT,
-    default=140,
-    show_default=True,
-    metavar="NUMBER",
-    help="The number of indoor maps.",
-)
-@click.option(
-    "--outdoor",
-    type=_COUNT,
-    default=30,
-    show_default=True,
-    metavar="NUMBER",
-    help="The number of outdoor maps.",
-)
+@click.argument("source", type=click.Choice(["polyhaven", "photos"]))
+@click.argument("out", required=False, type=FILE)
+@click.option("--indoor", type=Number(0), default=140, help="The number of indoor maps.")
+@click.option("--outdoor", type=Number(0), default=30, help="The number of outdoor maps.")
 @click.option(
     "--resolution",
     type=click.Choice(["1k", "2k", "4k", "8k", "16k"]),
     default="4k",
-    show_default=True,
     help="The width of the maps, in units of 1024 pixels.",
 )
 @click.option(
     "--format",
     type=click.Choice(["hdr", "exr"]),
     default="hdr",
-    show_default=True,
     help="The file format of the maps; exr files need the extra exr.",
 )
 @click.option(
     "--server",
     metavar="URL",
-    default="https://api.polyhaven.com",
-    show_default=True,
-    help="The server: Poly Haven, or a mirror with the same API.",
+    help="The server: a mirror of https://api.polyhaven.com with the same API, or of https://github.com.",
 )
 @click.option(
-    "--json", "as_json", is_flag=True, help="Print one line of JSON for each map on standard output."
+    "--json", "as_json", is_flag=True, help="Print one line of JSON for each file on standard output."
 )
-@click.option("--quiet", is_flag=True, help="Print only errors.")
+@QUIET
 @click.option("--dry-run", is_flag=True, help="Print the planned downloads, and write nothing.")
 @click.pass_context
 def pull(
     context: click.Context,
     /,
     *,
-    source: str,  # noqa: ARG001  (polyhaven is the only choice)
+    source: str,
     out: Path | None,
+    server: str | None,
     as_json: bool,
     quiet: bool,
+    dry_run: bool,
     **options: Any,  # noqa: ANN401  (the fields of DownloadRequest)
 ) -> None:
-    """Download CC0 environment maps (360-degree HDR images) from Poly Haven into the folder OUT.
+    """Download data into the folder OUT: environment maps, or photographs for training.
 
-    OUT is brewster/maps in the user's cache folder by default. The maps are chosen in the order of their ids.
-    manifest.csv lists the maps, their authors and their MD5 checksums.
+    polyhaven: CC0 environment maps (360-degree HDR images) from Poly Haven, in the order of their ids. OUT is brewster/maps in
+    the user's cache folder by default. manifest.csv lists the maps, their authors and their MD5 checksums. Interrupted
+    downloads are resumed.
 
-    Existing maps are skipped, and interrupted downloads are resumed. If the download of a map fails, the other maps are
-    still downloaded, the failed map is listed at the end, and the exit code is 1.
+    photos: the photographs on which the default model is trained, from public repositories, reduced to at most 1,024 pixels.
+    OUT is brewster/photos in the cache folder by default. manifest.csv lists their licences and authors. The origin of half
+    of the photographs is not known, and these are left out.
+
+    Existing files are skipped. If a download fails, the other files are still downloaded, the failed file is listed at the
+    end, and the exit code is 1.
     """
-    from brewster.environments.polyhaven import DownloadRequest, maps_folder  # noqa: PLC0415  (imports urllib)
+    if source == "photos":
+        _check_no_map_options(context)
+        results = _pull_photos(out, server, dry_run=dry_run, as_json=as_json, quiet=quiet)
+        context.exit(1 if any(result.error for result in results) else 0)
+    from brewster.environments.polyhaven import SERVER, DownloadRequest, maps_folder  # noqa: PLC0415  (imports urllib)
+    from brewster.environments.polyhaven import pull as fetch  # noqa: PLC0415
 
-    request = DownloadRequest(**options)
-    results = _fetch(request, out or maps_folder(), as_json=as_json, quiet=quiet)
+    request = DownloadRequest(**options, dry_run=dry_run, server=server or SERVER)
+    total = request.indoor + request.outdoor
+    results = _print_results(fetch(request, out or maps_folder()), total, as_json=as_json, quiet=quiet)
     if not quiet:
         _print_missing_counts(request, results)
         # The terms of service of Poly Haven require these words.
@@ -99,17 +93,38 @@ def pull(
     context.exit(1 if any(result.error for result in results) else 0)
 
 
-def _fetch(request: DownloadRequest, folder: Path, *, as_json: bool, quiet: bool) -> list[DownloadResult]:
-    """Downloads the maps, and prints each result and a summary. After an interruption, the summary is printed too."""
-    from brewster.environments.polyhaven import pull as fetch  # noqa: PLC0415
+def _check_no_map_options(context: click.Context) -> None:
+    for name in ("indoor", "outdoor", "resolution", "format"):
+        if context.get_parameter_source(name) is click.core.ParameterSource.COMMANDLINE:
+            raise click.UsageError(f"--{name} is for maps; photos have none.")
 
+
+def _pull_photos(
+    out: Path | None, server: str | None, *, dry_run: bool, as_json: bool, quiet: bool
+) -> list[DownloadResult]:
+    from brewster.environments import training_photos  # noqa: PLC0415  (imports pyvips)
+
+    table = training_photos.read_table()
+    known = sum(bool(photo.origin) for photo in table)
+    folder = out or training_photos.photos_folder()
+    fetched = training_photos.pull(folder, server=server or training_photos.SERVER, dry_run=dry_run)
+    results = _print_results(fetched, known, as_json=as_json, quiet=quiet)
+    if not quiet:
+        print_status(
+            f"{len(table) - known} of the {len(table)} photos are left out, because their origin is not known"
+        )
+    return results
+
+
+def _print_results(
+    fetched: Iterator[DownloadResult], total: int, *, as_json: bool, quiet: bool
+) -> list[DownloadResult]:
+    """Downloads the files, and prints each result and a summary. After an interruption, the summary is printed too."""
     results: list[DownloadResult] = []
     shares_terminal = as_json and standard_output.stream.isatty()
     try:
-        with progress(
-            request.indoor + request.outdoor, shown=not quiet and not shares_terminal
-        ) as update_progress:
-            for result in fetch(request, folder):
+        with progress(total, shown=not quiet and not shares_terminal) as update_progress:
+            for result in fetched:
                 results.append(result)
                 _print_result(result, as_json=as_json, quiet=quiet)
                 update_progress(sum(result.status != "missing" for result in results), result.asset)

@@ -7,11 +7,10 @@ import time
 from collections import Counter, defaultdict
 from collections.abc import Sequence
 from contextlib import ExitStack
-from dataclasses import asdict
+from dataclasses import KW_ONLY, asdict, dataclass, field
 from functools import partial
 from pathlib import Path
-from types import TracebackType
-from typing import TYPE_CHECKING, Self, final
+from typing import TYPE_CHECKING, final
 
 from brewster.cli.batch_plan import listed
 from brewster.cli.terminal import interrupts, one_line, print_error, print_status, progress, write_out
@@ -23,7 +22,7 @@ from brewster.remote_path import location
 if TYPE_CHECKING:
     from brewster.batch import FileResult, SeparationTask
     from brewster.batch.index import IndexWriter
-    from brewster.executors import Executor
+    from brewster.executors.local import Executor
 
 
 def open_executor(
@@ -31,7 +30,7 @@ def open_executor(
 ) -> Executor[FileResult]:
     """Returns the executor of a batch in several processes, or on a cluster. The caller enters its context."""
     from brewster.batch.parallel import SeparationRunner  # noqa: PLC0415
-    from brewster.executors import ProcessExecutor  # noqa: PLC0415
+    from brewster.executors.local import ProcessExecutor  # noqa: PLC0415
 
     shared_folder = location(output) if cluster and output else None
     create_runner = partial(SeparationRunner, options, shared_folder, overwrite=overwrite)
@@ -43,44 +42,32 @@ def open_executor(
 
 
 @final
+@dataclass
 class BatchReport:
     """Prints a line for each result, and at the end a summary, and writes the contact sheet and the index.
 
-    A context manager: its exit prints the summary if all `count` photos have a result, also after an error. The results are not
-    kept in memory, because an archive can have millions of photos.
+    The summary is printed if all `count` photos have a result, also after an error. The results are not kept in memory, because
+    an archive can have millions of photos.
     """
 
-    def __init__(
-        self,
-        options: Options,
-        output: str | None,
-        count: int,
-        *,
-        dry_run: bool,
-        as_json: bool,
-        quiet: bool,
-        is_parallel: bool,
-        contact_sheet: Path | None,
-        overwrite: bool,
-    ) -> None:
-        self.options, self.output, self.count, self.dry_run = options, output, count, dry_run
-        self.as_json, self.quiet, self.is_parallel = as_json, quiet, is_parallel
-        self.contact_sheet, self.overwrite = None if dry_run else contact_sheet, overwrite
-        self.counts: Counter[str] = Counter()
-        self._contact_sheet_rows: list[tuple[Path, list[Path]]] = []
-        self._errors: list[str] = []
-        self._sources_by_missing_extra: defaultdict[str, list[str]] = defaultdict(list)
-        self._skipped: dict[str, tuple[int, str]] = {}
-        """The number of skipped photos, and the last one, by the options of their layers that differ from those of this batch."""
-        self._index: IndexWriter | None = None
-        self._started = time.perf_counter()
-
-    def open_index(self, stack: ExitStack) -> None:
-        """Opens the index of the output folder, which `stack` closes. A dry run has none."""
-        from brewster.batch.index import IndexWriter  # noqa: PLC0415
-
-        if self.output and not self.dry_run:
-            self._index = stack.enter_context(IndexWriter(location(self.output)))
+    options: Options
+    output: str | None
+    count: int
+    _: KW_ONLY
+    dry_run: bool
+    as_json: bool
+    quiet: bool
+    overwrite: bool
+    is_parallel: bool = False
+    contact_sheet: Path | None = None
+    counts: Counter[str] = field(default_factory=Counter)
+    _contact_sheet_rows: list[tuple[Path, list[Path]]] = field(default_factory=list)
+    _errors: list[str] = field(default_factory=list)
+    _sources_by_missing_extra: dict[str, list[str]] = field(default_factory=lambda: defaultdict(list))
+    _skipped: dict[str, tuple[int, str]] = field(default_factory=dict)
+    """The number of skipped photos, and the last one, by the options of their layers that differ from those of this batch."""
+    _index: IndexWriter | None = None
+    _started: float = field(default_factory=time.perf_counter)
 
     def run(
         self,
@@ -94,9 +81,12 @@ class BatchReport:
         from brewster.batch import separate_tasks  # noqa: PLC0415  (imports ONNX Runtime and pyvips)
         from brewster.batch.parallel import separate_in_parallel  # noqa: PLC0415
 
-        with self, ExitStack() as stack:
-            if has_index:
-                self.open_index(stack)
+        with ExitStack() as stack:
+            stack.push(self._finish)
+            if has_index and self.output and not self.dry_run:
+                from brewster.batch.index import IndexWriter  # noqa: PLC0415
+
+                self._index = stack.enter_context(IndexWriter(location(self.output)))
             is_shown = not (self.quiet or self.as_json)
             update_progress = stack.enter_context(progress(self.count, shown=is_shown))
 
@@ -123,15 +113,10 @@ class BatchReport:
                 interrupts.raise_pending()
         return 1 if self.counts["failed"] else 0
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def _finish(self, kind: type[BaseException] | None, *_: object) -> None:
         """Writes the contact sheet if there was no error, and prints the summary."""
         try:
-            if kind is None and self.contact_sheet:
+            if kind is None and self.contact_sheet and not self.dry_run:
                 self._write_contact_sheet(self.contact_sheet)
         finally:
             if self.counts.total() == self.count:
@@ -147,7 +132,8 @@ class BatchReport:
         if result.error and INSTALL_COMMAND in result.error:
             self._sources_by_missing_extra[result.error].append(result.source)
         elif result.error:
-            self._errors.append(_error_text(result))
+            has_source = result.error.startswith(f"{result.source} ") or f": {result.source} " in result.error
+            self._errors.append(result.error if has_source else f"{result.source}: {result.error}")
         elif self.contact_sheet and "-" not in (result.source, *result.outputs.values()):
             self._contact_sheet_rows.append((Path(result.source), [*map(Path, result.outputs.values())]))
         self._print(result)
@@ -155,7 +141,8 @@ class BatchReport:
     def _print(self, result: FileResult) -> None:
         outputs = ", ".join(result.outputs.values())
         if self.as_json:
-            write_out(_json_line(result))
+            seconds = {name: round(duration, 4) for name, duration in result.seconds.items()}
+            write_out(f"{json.dumps(asdict(result) | {'seconds': seconds})}\n".encode())
         elif result.status == "planned":
             write_out(f"{one_line(result.source)} -> {one_line(outputs)}\n".encode())
         if self.quiet or result.error:
@@ -169,8 +156,9 @@ class BatchReport:
         elif result.status == "separated":
             verdict = result.assessment.verdict if result.assessment else ""
             hint = ": check the layers" if verdict == "doubtful" else ""
-            seconds = sum(result.seconds.values())
-            print_status(f"{result.source} -> {outputs} ({seconds:.1f} s, {verdict}{hint})")
+            print_status(
+                f"{result.source} -> {outputs} ({sum(result.seconds.values()):.1f} s, {verdict}{hint})"
+            )
             if result.note:
                 print_status(f"  {result.note}")
             if result.burst:
@@ -222,10 +210,7 @@ class BatchReport:
 
 
 def _model_name(model: str) -> str | None:
-    """Returns the name under which the metadata of layers record this model.
-
-    Returns None if the model is unknown, or if its name is known only after loading.
-    """
+    """Returns the name of the model in the metadata of layers; None if it is unknown, or known only after loading."""
     try:
         return None if zoo.is_diffusion_model(model) else zoo.find_model(model).name
     except ModelError:
@@ -238,16 +223,3 @@ def _duration(seconds: float) -> str:
         return f"{seconds:.1f} s"
     minutes, rest = divmod(round(seconds), 60)
     return f"{minutes} min {rest} s" if minutes < 60 else f"{minutes // 60} h {minutes % 60} min"
-
-
-def _error_text(result: FileResult) -> str:
-    """Returns the error message of a photo, with its path in front if the message does not begin with it or with its row."""
-    error = str(result.error)
-    has_source = error.startswith(f"{result.source} ") or f": {result.source} " in error
-    return error if has_source else f"{result.source}: {error}"
-
-
-def _json_line(result: FileResult) -> bytes:
-    values = asdict(result)
-    values["seconds"] = {name: round(seconds, 4) for name, seconds in result.seconds.items()}
-    return f"{json.dumps(values)}\n".encode()

@@ -73,7 +73,8 @@ def _shortened(names: Sequence[object]) -> str:
 
 def is_single_output(photos: Sequence[str], output: str | None) -> bool:
     """Whether only one layer can be written, because it is written to standard output or to an image file (-o)."""
-    return "-" in photos or output == "-" or _is_image_file(output)
+    is_folder = output is None or output.endswith(("/", os.sep)) or Path(output).is_dir()
+    return "-" in photos or output == "-" or (not is_folder and format_of(Path(output or "")) is not None)
 
 
 def plan(
@@ -117,11 +118,7 @@ def _plan_single_output(photos: Sequence[str], output: str | None, options: Opti
 
 
 def _check_format(image_format: ImageFormat | None, options: Options) -> None:
-    """Checks that the format of the image file given with -o can be written, and that --format and --additive match it.
-
-    Raises:
-        click.UsageError: the format is unknown or cannot be written, or the options require another format.
-    """
+    """Checks that the format of the image file given with -o can be written, and that --format and --additive match it."""
     if image_format is None:
         raise click.UsageError(
             "If the photo is standard input, -o must be an image file such as clear.jpg, or be left out."
@@ -142,50 +139,23 @@ def check_output(photos: Sequence[str], output: str | None) -> None:
     Raises:
         click.UsageError: it is or does.
     """
-    _check_not_a_file(output)
-    _check_output_suffix(photos, output)
-
-
-def _check_not_a_file(output: str | None) -> None:
-    """Checks that the output folder (-o) is not an existing file. --overwrite does not replace a file by a folder.
-
-    Raises:
-        click.UsageError: -o is an existing file.
-    """
-    if output and "://" not in output and os.path.isfile(Path(output)):  # noqa: PTH113  (Path.is_file raises for names that are too long)
+    # os.path and not pathlib, which raises for names that are too long
+    if output is None or "://" in output:
+        return
+    if os.path.isfile(Path(output)):  # noqa: PTH113
         raise click.UsageError(
             f"-o is the existing file {output}; expected a folder, or an image file such as clear.jpg for a single layer; "
             "choose another name."
         )
-
-
-def _check_output_suffix(photos: Sequence[str], output: str | None) -> None:
-    """Checks that -o for a single photo is not an image file of an unknown format.
-
-    Raises:
-        click.UsageError: -o ends in an unknown suffix, and is not an existing folder.
-    """
-    if output is None or output.endswith(("/", os.sep)) or "://" in output or len(photos) > 1:
+    if output.endswith(("/", os.sep)) or len(photos) > 1:
         return
     suffix = Path(output).suffix
-    if (
-        re.fullmatch(r"\.[A-Za-z][A-Za-z0-9]{1,4}", suffix)
-        and not os.path.isdir(output)  # noqa: PTH112  (Path.is_dir raises for names that are too long)
-        and not os.path.isdir(photos[0])  # noqa: PTH112
-    ):
+    is_folder = os.path.isdir(output) or os.path.isdir(photos[0])  # noqa: PTH112
+    if re.fullmatch(r"\.[A-Za-z][A-Za-z0-9]{1,4}", suffix) and not is_folder:
         raise click.UsageError(
             f"-o ends in {suffix}, but brewster writes no format with this suffix. Choose one of "
             f"{', '.join(row.suffixes[0] for row in WRITABLE.values())}. If -o is a folder, add {os.sep} at its end."
         )
-
-
-def _is_image_file(output: str | None) -> bool:
-    return (
-        output is not None
-        and not output.endswith(("/", os.sep))
-        and format_of(Path(output)) is not None
-        and not Path(output).is_dir()
-    )
 
 
 def gpu_for_plan(name: str | None) -> GraphicsCard:
@@ -207,13 +177,7 @@ class _StandardStream:
     """Reads a photo from standard input, or writes a layer to standard output."""
 
     def read(self) -> bytes:
-        """Returns the bytes of the photo."""
         return sys.stdin.buffer.read()
 
     def write(self, data: bytes) -> None:
-        """Writes the encoded layer.
-
-        Raises:
-            OutputError: standard output cannot be written.
-        """
         write_out(data)

@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any
 
 import click
-from click.core import ParameterSource
 
 from brewster.cli.batch import BatchReport
 from brewster.cli.batch_plan import check_output, is_single_output, local_path, plan
 from brewster.cli.extras import require_extra
-from brewster.cli.separate import with_options
-from brewster.errors import BrewsterError
+from brewster.cli.parameters import OVERWRITE, QUIET, Number
+from brewster.cli.separate import parse_options, with_options
 from brewster.models import zoo
-from brewster.options import Options
+from brewster.options import DEFAULT_FRAMES, MAX_BURST_PHOTOS, Options
 
 if TYPE_CHECKING:
     from brewster.batch import SeparationTask
@@ -31,23 +30,22 @@ if TYPE_CHECKING:
 )
 @click.option(
     "--reference",
-    type=click.IntRange(min=1),
+    type=Number(1),
     help="The photo to separate: 1 is the first one; by default, the middle one.",
 )
 @click.option(
     "--frames",
-    type=click.IntRange(2, 15),
-    default=7,
-    show_default=True,
+    type=Number(2, MAX_BURST_PHOTOS),
+    default=DEFAULT_FRAMES,
     help="The number of frames to choose from a video.",
 )
 @with_options
 @click.option(
     "--json", "as_json", is_flag=True, help="Print one line of JSON for each burst on standard output."
 )
-@click.option("--quiet", is_flag=True, help="Print only errors.")
+@QUIET
 @click.option("--dry-run", is_flag=True, help="Print the planned files. Write nothing.")
-@click.option("--overwrite", is_flag=True, help="Replace existing layers.")
+@OVERWRITE
 @click.pass_context
 def burst(
     context: click.Context,
@@ -61,7 +59,7 @@ def burst(
     quiet: bool,
     dry_run: bool,
     overwrite: bool,
-    **values: object,
+    **values: Any,  # noqa: ANN401  (those of Options)
 ) -> None:
     """Separate several photos of one window by the motion of the layers.
 
@@ -73,18 +71,10 @@ def burst(
     it, are one burst. The layers are named after the reference photo, or the video.
     """
     photos = tuple(map(local_path, photos))
-    single_output = is_single_output((), output)
-    if single_output and context.get_parameter_source("layers") is ParameterSource.DEFAULT:
-        values["layers"] = ("transmission",)
-    try:
-        options = Options(**cast("dict[str, Any]", values))
-    except BrewsterError as error:
-        raise click.UsageError(str(error)) from error
+    options = parse_options(context, values, single_output=is_single_output((), output))
     zoo.model_name(options.model)
     require_extra("burst", "a burst")
-    tasks = _plan(
-        photos, output, options, reference=None if reference is None else reference - 1, frames=frames
-    )
+    tasks = _plan(photos, output, options, reference=reference and reference - 1, frames=frames)
     report = BatchReport(
         options,
         output,
@@ -92,8 +82,6 @@ def burst(
         dry_run=dry_run,
         as_json=as_json,
         quiet=quiet,
-        is_parallel=False,
-        contact_sheet=None,
         overwrite=overwrite,
     )
     context.exit(report.run(tasks))
@@ -102,12 +90,6 @@ def burst(
 def _plan(
     photos: tuple[str, ...], output: str | None, options: Options, *, reference: int | None, frames: int
 ) -> list[SeparationTask]:
-    """Returns a task for each burst.
-
-    Raises:
-        click.UsageError: -o is standard output, or an image file for several bursts or layers.
-        BrewsterError: see `plan_bursts`.
-    """
     from brewster.batch.plan import plan_bursts  # noqa: PLC0415  (imports ONNX Runtime and pyvips)
 
     if "-" in (*photos, output):

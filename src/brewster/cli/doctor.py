@@ -2,20 +2,21 @@
 
 from __future__ import annotations
 
-import importlib.util
+import importlib
 import json
 import platform
 import shutil
 import sys
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from typing import Final, Literal, final
 
 import click
 
-from brewster.cli.extras import CORE, EXTRAS
+from brewster.cli.extras import CORE, EXTRAS, missing_packages, module_of
 from brewster.cli.models import describe
+from brewster.cli.parameters import JSON
 from brewster.cli.terminal import print_out
 from brewster.errors import INSTALL_COMMAND, BrewsterError, MissingExtra, install_command
 from brewster.image_formats import FORMATS, WRITABLE
@@ -47,7 +48,7 @@ class Check:
 
 
 @click.command
-@click.option("--json", "as_json", is_flag=True, help="Print JSON.")
+@JSON
 @click.option(
     "--needs",
     metavar="EXTRA,...",
@@ -68,7 +69,13 @@ def doctor(context: click.Context, *, as_json: bool, needs: str | None) -> None:
     if as_json:
         print_out(json.dumps({"ok": is_healthy, "checks": [asdict(check) for check in checks]}))
     else:
-        _print(checks)
+        area = None
+        for check in checks:
+            if check.area != area:
+                print_out(check.area)
+            area = check.area
+            cure = f"\n{'':8}{check.cure}" if check.cure else ""
+            print_out(f"  {_SYMBOLS[check.status]}  {check.name:16} {check.detail}{cure}")
         print_out(
             "All required parts work."
             if is_healthy
@@ -80,8 +87,7 @@ def doctor(context: click.Context, *, as_json: bool, needs: str | None) -> None:
 def _require_extras(names: list[str]) -> None:
     if unknown := [name for name in names if name not in EXTRAS]:
         raise click.BadParameter(f"there is no extra {unknown[0]!r}; expected some of {', '.join(EXTRAS)}.")
-    packages = {package: module for name in names for package, module in EXTRAS[name].items()}
-    if missing := [package for package, module in packages.items() if not importlib.util.find_spec(module)]:
+    if missing := missing_packages(dict.fromkeys(package for name in names for package in EXTRAS[name])):
         raise MissingExtra.for_extra(
             ",".join(names), f"not installed: {', '.join(missing)}", f"expected the extras {', '.join(names)}"
         )
@@ -103,8 +109,7 @@ def run_checks() -> Iterator[Check]:
 
 
 def _packages() -> Iterator[Check]:
-    for package, module in CORE.items():
-        yield _package(package, module)
+    yield from map(_package, CORE)
     for extra, packages in EXTRAS.items():
         versions = {package: _version(package) for package in packages}
         missing = [package for package, version in versions.items() if version is None]
@@ -114,13 +119,13 @@ def _packages() -> Iterator[Check]:
         yield Check("extras", extra, "missing" if missing else "ok", detail, cure, needed=False)
 
 
-def _package(package: str, module: str) -> Check:
+def _package(package: str) -> Check:
     installed = [name for name in (*_ALTERNATIVES.get(package, ()), package) if _version(name)]
     if not installed:
         return Check("packages", package, "missing", "not installed", f"pip install {package}")
     version = f"{_version(installed[0])}" + ("" if installed[0] == package else f" ({installed[0]})")
     try:
-        importlib.import_module(module)
+        importlib.import_module(module_of(package))
     except (ImportError, OSError) as error:  # a shared library is missing, or was built for another machine
         cure = f"pip install {installed[0]} --force-reinstall"
         return Check("packages", package, "broken", f"{version}: {error}", cure)
@@ -145,15 +150,8 @@ def _devices() -> Iterator[Check]:
         yield Check("devices", "devices", "broken", str(error), "repair the packages above")
         return
     if "cuda" not in devices and shutil.which("nvidia-smi"):
-        cure = "pip install onnxruntime-gpu"
-        yield Check(
-            "devices",
-            "cuda",
-            "missing",
-            "an NVIDIA driver is installed, but the package onnxruntime does not support CUDA",
-            cure,
-            needed=False,
-        )
+        detail = "an NVIDIA driver is installed, but the package onnxruntime does not support CUDA"
+        yield Check("devices", "cuda", "missing", detail, "pip install onnxruntime-gpu", needed=False)
     for device in devices:
         yield Check("devices", device, "ok", "used by --device auto" if device == devices[0] else "")
 
@@ -165,35 +163,25 @@ def _formats() -> Iterator[Check]:
     except (ImportError, OSError) as error:
         yield Check("formats", "formats", "broken", str(error), "repair the packages above")
         return
-    for format_name in WRITABLE:
-        yield _try_format(format_name, "reads and writes", lambda name=format_name: _encode_sample(name))  # type: ignore[misc]
-    yield _try_format("gif", "reads", lambda: _GIF)
+    yield from map(_try_format, (*WRITABLE, "gif"))
 
 
-def _encode_sample(format_name: str) -> bytes:
-    """Returns a grey image of 64x64 pixels as a file of this format."""
+def _try_format(format_name: str) -> Check:
     import numpy as np  # noqa: PLC0415  (slow to import)
 
     from brewster.photo import Photo  # noqa: PLC0415  (imports pyvips)
 
-    grey = np.full((64, 64, 3), 128, np.uint8)
-    return Photo.from_array(grey, encoding="srgb").encode(format_name)
-
-
-def _try_format(format_name: str, detail: str, encode_sample: Callable[[], bytes]) -> Check:
-    """Decodes a sample file. `detail` is the detail of the check if this succeeds."""
-    from brewster.photo import Photo  # noqa: PLC0415  (imports pyvips)
-
-    extra = FORMATS[format_name].extra
+    extra, grey = FORMATS[format_name].extra, np.full((64, 64, 3), 128, np.uint8)
     try:
-        Photo.open(encode_sample())
+        sample = Photo.from_array(grey, encoding="srgb")
+        Photo.open(_GIF if format_name == "gif" else sample.encode(format_name))
     except MissingExtra as error:
         cure = install_command(extra) if extra else None
         return Check("formats", format_name, "missing", str(error), cure, needed=False)
     except BrewsterError as error:
         cure = "pip install --force-reinstall pyvips-binary"
         return Check("formats", format_name, "broken", str(error), cure, needed=extra is None)
-    return Check("formats", format_name, "ok", detail)
+    return Check("formats", format_name, "ok", "reads" if format_name == "gif" else "reads and writes")
 
 
 def _models() -> Iterator[Check]:
@@ -244,13 +232,3 @@ def _diffusion() -> Iterator[Check]:
     detail = "found" if token_found else "not found; gated models such as FLUX.1 Kontext need a token"
     cure = None if token_found else "hf auth login"
     yield Check("diffusion", "hub token", "ok" if token_found else "missing", detail, cure, needed=False)
-
-
-def _print(checks: list[Check]) -> None:
-    area = None
-    for check in checks:
-        if check.area != area:
-            print_out(check.area)
-        area = check.area
-        cure = f"\n{'':8}{check.cure}" if check.cure else ""
-        print_out(f"  {_SYMBOLS[check.status]}  {check.name:16} {check.detail}{cure}")

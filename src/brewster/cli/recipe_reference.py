@@ -13,7 +13,7 @@ import click
 from brewster.evaluate.ablation import AblationStudy
 from brewster.scene.recipe import SceneRecipe
 from brewster.scene.recipe_file import describe_default
-from brewster.scene.recipe_keys import RecipeKey, RecipeTable, recipe_tables
+from brewster.scene.recipe_keys import RecipeKey, recipe_tables
 from brewster.scene.values import FrozenModel
 from brewster.training.recipe import CompactRecipe, LoraRecipe
 
@@ -54,24 +54,20 @@ def _sections() -> Iterator[str]:
             if table.name in seen:
                 yield f"The keys are those of {seen[table.name]}."
             else:
-                yield _rows(table)
+                head = [
+                    "| key | type | allowed values | unit | default | meaning |",
+                    "|---|---|---|---|---|---|",
+                ]
+                yield "\n".join([*head, *map(_row, table.keys)])
             seen.setdefault(table.name, f'`[{table.path}]` in "{title}"')
 
 
-def _rows(table: RecipeTable) -> str:
-    head = ["| key | type | allowed values | unit | default | meaning |", "|---|---|---|---|---|---|"]
-    return "\n".join([*head, *map(_row, table.keys)])
-
-
 def _row(key: RecipeKey) -> str:
-    cells = (f"`{key.path}`", key.kind, key.allowed, key.unit, _default(key), key.meaning)
-    return f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in cells)} |"
-
-
-def _default(key: RecipeKey) -> str:
     text = describe_default(key)
     value = text.removeprefix("default ")
-    return text if value == text else f"`{value}`"
+    default = text if value == text else f"`{value}`"
+    cells = (f"`{key.path}`", key.kind, key.allowed, key.unit, default, key.meaning)
+    return f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in cells)} |"
 
 
 if __name__ == "__main__":

@@ -22,14 +22,19 @@ by Ctrl-C."""
 
 def reference() -> str:
     """Returns the page in Markdown, with a section for each command and its options."""
-    return "\n\n".join([_BEGINNING, *_sections(cli, click.Context(cli, info_name="brewster"))]) + "\n"
+    return (
+        "\n\n".join(
+            [_BEGINNING, *_sections(cli, click.Context(cli, info_name="brewster", show_default=True))]
+        )
+        + "\n"
+    )
 
 
 def _sections(command: click.Command, context: click.Context) -> Iterator[str]:
     yield f"## {context.command_path}"
     yield f"    {context.command_path} {' '.join(command.collect_usage_pieces(context))}"
     yield inspect.cleandoc(command.help or "")
-    rows = [_row(param) for param in command.params if isinstance(param, click.Option)]
+    rows = [_row(param, context) for param in command.params if isinstance(param, click.Option)]
     if rows:
         yield "\n".join(["| option | meaning |", "|---|---|", *rows])
     if isinstance(command, click.Group):
@@ -37,12 +42,11 @@ def _sections(command: click.Command, context: click.Context) -> Iterator[str]:
             yield from _sections(child, click.Context(child, info_name=name, parent=context))
 
 
-def _row(option: click.Option) -> str:
-    context = click.Context(cli)
+def _row(option: click.Option, context: click.Context) -> str:
     value = "" if option.is_flag else f" {option.make_metavar(context)}"
-    default = f" Default: `{option.default}`." if option.show_default else ""
+    default = option.get_help_extra(context).get("default")
     usage = f"{', '.join(option.opts)}{value}".replace("|", "\\|")
-    return f"| `{usage}` | {option.help}{default} |"
+    return f"| `{usage}` | {option.help}{f' Default: `{default}`.' if default else ''} |"
 
 
 if __name__ == "__main__":

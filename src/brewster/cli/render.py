@@ -15,6 +15,7 @@ import click
 from click.core import ParameterSource
 
 from brewster.cli.extras import require_extra
+from brewster.cli.parameters import EXISTING_FOLDER, FILE, QUIET, Number
 from brewster.cli.terminal import (
     interrupts,
     print_error,
@@ -26,7 +27,7 @@ from brewster.cli.terminal import (
 )
 
 if TYPE_CHECKING:
-    from brewster.executors import Executor
+    from brewster.executors.local import Executor
     from brewster.rendered.generation.job import RenderJob, RenderResult
     from brewster.scene.recipe import BurstRecipe, SceneRecipe
 
@@ -34,49 +35,26 @@ _MITSUBA_PACKAGES: Final = frozenset({"mitsuba", "mitsuba-oidn"})
 _SCENE_OPTIONS: Final = {"out", "output", "scene", "renderer", "maps", "photos", "quiet"}
 _MAX_WORKERS: Final = 8
 _SIZE: Final = re.compile(r"0*([0-9]{1,5})[xX]0*([0-9]{1,5})")
-_FOLDER: Final = click.Path(path_type=Path, file_okay=False, exists=True)
 
 
-@final
-class _Size(click.ParamType[tuple[int, int]]):
-    """Width and height in pixels, such as 512x384."""
-
-    name = "WxH"
-
-    def convert(
-        self, value: object, param: click.Parameter | None, ctx: click.Context | None
-    ) -> tuple[int, int]:
-        """Returns the width and the height in pixels.
-
-        Raises:
-            click.BadParameter: the value is not two integers from 16 to 16384 with an x between them.
-        """
-        if isinstance(value, tuple):
-            return value
-        match = _SIZE.fullmatch(str(value))
-        size = (int(match[1]), int(match[2])) if match else (0, 0)
-        if not all(16 <= side <= 16384 for side in size):
-            self.fail(
-                f"{value!r} is not a size. Give width and height in pixels, from 16 to 16384, such as 512x384.",
-                param,
-                ctx,
-            )
-        return size
+def _size(text: str) -> tuple[int, int]:
+    match = _SIZE.fullmatch(text)
+    size = (int(match[1]), int(match[2])) if match else (0, 0)
+    if not all(16 <= side <= 16384 for side in size):
+        raise click.BadParameter(
+            f"{text!r} is not a size. Give width and height in pixels, from 16 to 16384, such as 512x384."
+        )
+    return size
 
 
 @click.command
-@click.argument("out", required=False, type=click.Path(path_type=Path))
+@click.argument("out", required=False, type=FILE)
 @click.option(
-    "-o",
-    "--output",
-    metavar="FOLDER",
-    type=click.Path(path_type=Path),
-    help="The folder of the dataset, as an alternative to OUT.",
+    "-o", "--output", metavar="FOLDER", type=FILE, help="The folder of the dataset, as an alternative to OUT."
 )
 @click.option(
     "--recipe",
     default="window",
-    show_default=True,
     metavar="NAME|FILE",
     help="The distribution of scenes: window, shopfront, vitrine, office, burst, tiny, or a TOML file.",
 )
@@ -85,27 +63,23 @@ class _Size(click.ParamType[tuple[int, int]]):
     metavar="NAME|FILE",
     help="Do not render; print this recipe as TOML with all defaults and a comment for each key.",
 )
-@click.option(
-    "--count", type=click.IntRange(min=0), default=10, show_default=True, help="The number of samples."
-)
-@click.option(
-    "--first", type=click.IntRange(min=0), default=0, show_default=True, help="The index of the first sample."
-)
+@click.option("--count", type=Number(0), default=10, help="The number of samples.")
+@click.option("--first", type=Number(0), default=0, help="The index of the first sample.")
 @click.option(
     "--seed",
-    type=click.IntRange(0, 2**32 - 1),
+    type=Number(0, 2**32 - 1),
     default=0,
-    show_default=True,
     help="The random seed. The same recipe, seed, maps and photos give the same dataset.",
 )
 @click.option(
     "--size",
-    type=_Size(),
+    type=_size,
+    metavar="WxH",
     help="The size of the images in pixels, such as 512x384; by default, the size in the recipe.",
 )
 @click.option(
     "--burst",
-    type=click.IntRange(2, 99),
+    type=Number(2, 99),
     metavar="N",
     help="Render N photos of each scene, by a camera that moves sideways; --count and --first then count bursts. By default, the number in the recipe.",
 )
@@ -127,15 +101,13 @@ class _Size(click.ParamType[tuple[int, int]]):
 )
 @click.option(
     "--maps",
-    metavar="FOLDER",
-    type=_FOLDER,
+    type=EXISTING_FOLDER,
     multiple=True,
     help="A folder of HDR environment maps; repeatable. By default, the built-in environments are used.",
 )
 @click.option(
     "--photos",
-    metavar="FOLDER",
-    type=_FOLDER,
+    type=EXISTING_FOLDER,
     multiple=True,
     help="A folder of photos that are placed in front of the environment maps; repeatable.",
 )
@@ -145,7 +117,7 @@ class _Size(click.ParamType[tuple[int, int]]):
 @click.option("--preview", is_flag=True, help="Also write preview.png, which shows the first 40 samples.")
 @click.option(
     "--workers",
-    type=click.IntRange(min=0),
+    type=Number(0),
     help="The number of worker processes; 0 renders in the main process. By default, one per CPU core, but at most 8.",
 )
 @click.option(
@@ -153,13 +125,13 @@ class _Size(click.ParamType[tuple[int, int]]):
 )
 @click.option(
     "--scene",
-    type=click.Path(path_type=Path),
+    type=FILE,
     help="Render only the sample that this scene.toml describes, and write the files of the sample directly into OUT.",
 )
 @click.option(
     "--json", "as_json", is_flag=True, help="Print one line of JSON for each sample on standard output."
 )
-@click.option("--quiet", is_flag=True, help="Print only errors.")
+@QUIET
 @click.pass_context
 def render(
     context: click.Context,
@@ -185,14 +157,23 @@ def render(
     --count. If a sample fails, the other samples are still rendered, the failed sample is listed, and the exit code is 1.
     """
     if show_recipe:
-        _show_recipe(show_recipe)
+        from brewster.scene.recipe import read_scene_recipe  # noqa: PLC0415
+        from brewster.scene.recipe_file import commented_toml  # noqa: PLC0415
+
+        print_out(commented_toml(read_scene_recipe(show_recipe)).rstrip())
         return
     if (out is None) == (output is None):
         raise click.UsageError("Give one output folder, either as OUT or with -o: brewster render OUT.")
     require_extra("render", "rendering", without=_MITSUBA_PACKAGES)
     command = _RenderCommand(out or output or Path(), **options)
     if scene:
-        _reject_dataset_options(context)
+        for parameter in context.command.params:  # scene.toml defines the whole sample
+            name, option = parameter.name or "", parameter.opts[0]
+            is_given = context.get_parameter_source(name) is ParameterSource.COMMANDLINE
+            if is_given and name not in _SCENE_OPTIONS:
+                raise click.UsageError(
+                    f"--scene renders one sample, but {option} is an option for datasets: leave out {option}."
+                )
         command.render_again(scene)
     else:
         context.exit(0 if command.render_dataset() else 1)
@@ -235,22 +216,30 @@ class _RenderCommand:
         from brewster.rendered.generation.job import build  # noqa: PLC0415
         from brewster.rendered.generation.preview import write_preview  # noqa: PLC0415
 
-        job, printer = self._job(), _RenderPrinter(self.as_json, self.quiet)
+        job, counts = self._job(), Counter[str]()
         shares_terminal = self.as_json and standard_output.stream.isatty()
         frames = job.recipe.frames
         with progress(self.count * frames, shown=not self.quiet and not shares_terminal) as update_progress:
 
             def on_result(result: RenderResult) -> None:
-                printer.print_result(result)
-                update_progress(printer.counts.total(), f"sample {result.index}")
+                counts[result.status] += 1  # the results are not stored, so that memory stays constant
+                if self.as_json:
+                    write_out(f"{json.dumps(asdict(result))}\n".encode())
+                if result.error:
+                    print_error(f"sample {result.index}: {result.error}")
+                elif result.status == "rendered" and not self.quiet:
+                    print_status(f"sample {result.index} ({result.seconds:.1f} s)")
+                update_progress(counts.total(), f"sample {result.index}")
                 interrupts.raise_pending()
 
             indices = range(self.first * frames, (self.first + self.count) * frames)
             build(job, indices, self._executor(job), shards=self.shards, report=on_result)
         if self.preview:
             write_preview(self.out)
-        printer.print_summary(self.out)
-        return not printer.counts["failed"]
+        if not self.quiet:
+            totals = ", ".join(f"{count} {status}" for status, count in sorted(counts.items()))
+            print_status(f"{self.out}: {totals}")
+        return not counts["failed"]
 
     def _job(self) -> RenderJob:
         from brewster.environments.catalog import read_catalog  # noqa: PLC0415
@@ -292,7 +281,7 @@ class _RenderCommand:
         return (recipe.burst or BurstRecipe()).model_copy(update=changes)
 
     def _executor(self, job: RenderJob) -> Executor[RenderResult]:
-        from brewster.executors import ProcessExecutor, SerialExecutor  # noqa: PLC0415
+        from brewster.executors.local import ProcessExecutor, SerialExecutor  # noqa: PLC0415
         from brewster.rendered.generation.workers import TaskRunner  # noqa: PLC0415
 
         create_runner = partial(TaskRunner, job)
@@ -302,51 +291,3 @@ class _RenderCommand:
             return RayExecutor(create_runner, self.cluster, self.workers)
         workers = min(_MAX_WORKERS, os.cpu_count() or 1) if self.workers is None else self.workers
         return ProcessExecutor(create_runner, workers) if workers else SerialExecutor(create_runner)
-
-
-@final
-class _RenderPrinter:
-    """Prints each result and counts the results by status. Results are not stored, so that memory stays constant."""
-
-    def __init__(self, as_json: bool, quiet: bool) -> None:
-        self._as_json, self._quiet = as_json, quiet
-        self.counts: Counter[str] = Counter()
-
-    def print_result(self, result: RenderResult) -> None:
-        """Prints one line for a sample that was rendered or failed, and with `as_json` for every sample."""
-        self.counts[result.status] += 1
-        if self._as_json:
-            write_out(f"{json.dumps(asdict(result))}\n".encode())
-        if result.error:
-            print_error(f"sample {result.index}: {result.error}")
-        elif result.status == "rendered" and not self._quiet:
-            print_status(f"sample {result.index} ({result.seconds:.1f} s)")
-
-    def print_summary(self, out: Path) -> None:
-        """Prints the number of samples of each status."""
-        if not self._quiet:
-            print_status(
-                f"{out}: " + ", ".join(f"{count} {status}" for status, count in sorted(self.counts.items()))
-            )
-
-
-def _show_recipe(name: str) -> None:
-    from brewster.scene.recipe import read_scene_recipe  # noqa: PLC0415
-    from brewster.scene.recipe_file import commented_toml  # noqa: PLC0415
-
-    print_out(commented_toml(read_scene_recipe(name)).rstrip())
-
-
-def _reject_dataset_options(context: click.Context) -> None:
-    """Checks that no option of a dataset is given together with --scene, which defines the whole sample.
-
-    Raises:
-        click.UsageError: such an option is given on the command line.
-    """
-    for parameter in context.command.params:
-        name = parameter.name or ""
-        if name not in _SCENE_OPTIONS and context.get_parameter_source(name) is ParameterSource.COMMANDLINE:
-            option = parameter.opts[0]
-            raise click.UsageError(
-                f"--scene renders one sample, but {option} is an option for datasets: leave out {option}."
-            )

@@ -7,7 +7,7 @@ import os
 from collections.abc import Callable
 from pathlib import Path
 from types import NoneType
-from typing import TYPE_CHECKING, Any, Final, Literal, TypeVar, get_args, get_origin, get_type_hints
+from typing import TYPE_CHECKING, Any, Literal, TypeVar, get_args, get_origin, get_type_hints
 
 import click
 from click.core import ParameterSource
@@ -23,6 +23,7 @@ from brewster.cli.batch_plan import (
     skipped_files,
 )
 from brewster.cli.extras import require_extra
+from brewster.cli.parameters import FILE, OVERWRITE, QUIET, Number
 from brewster.cli.terminal import print_out, print_status, standard_output
 from brewster.errors import BrewsterError
 from brewster.image_formats import FormatName, canonical_format, format_of
@@ -33,31 +34,20 @@ from brewster.remote_path import Location
 if TYPE_CHECKING:
     from brewster.batch import SeparationTask
 
-_METAVARS: Final[dict[object, str]] = {int: "NUMBER", float: "NUMBER", Path | None: "FILE"}
-
 _Command = TypeVar("_Command", bound=Callable[..., Any])
 
 
 class _ChoiceList(click.ParamType[tuple[str, ...]]):
-    """One or more of a fixed list of choices, separated by commas."""
+    """One or more of a fixed list of choices, separated by commas, without duplicates and in the order of the list."""
 
-    name = "choices"
+    name = "LAYER,..."
 
     def __init__(self, choices: tuple[str, ...]) -> None:
         self.choices = choices
 
-    def get_metavar(self, param: click.Parameter, ctx: click.Context) -> str:  # noqa: ARG002
-        """Returns the placeholder for the value in the help text."""
-        return "LAYER,..."
-
     def convert(
         self, value: object, param: click.Parameter | None, ctx: click.Context | None
     ) -> tuple[str, ...]:
-        """Returns the given choices without duplicates, in the order of `choices`.
-
-        Raises:
-            click.BadParameter: a part of the value is not in `choices`.
-        """
         given = str(value).split(",")
         unknown = [choice for choice in given if choice not in self.choices]
         if unknown:
@@ -70,7 +60,6 @@ class _ChoiceList(click.ParamType[tuple[str, ...]]):
         param: click.Parameter,  # noqa: ARG002
         incomplete: str,
     ) -> list[CompletionItem]:
-        """Completes the last choice in the text."""
         *given, last = incomplete.split(",")
         return [
             CompletionItem(",".join((*given, choice)))
@@ -83,28 +72,15 @@ class _FormatChoice(click.Choice[str]):
     """The name of a file format such as jpeg, or one of its suffixes such as jpg."""
 
     def convert(self, value: object, param: click.Parameter | None, ctx: click.Context | None) -> str:
-        """Returns the name of the format.
-
-        Raises:
-            click.BadParameter: brewster does not write this format.
-        """
         return super().convert(canonical_format(str(value)), param, ctx)
 
 
-class _ModelName(click.ParamType[str]):
-    """The name of a model, or the path of a file or folder."""
-
-    name = "text"
-
-    def shell_complete(
-        self,
-        ctx: click.Context,  # noqa: ARG002
-        param: click.Parameter,  # noqa: ARG002
-        incomplete: str,
-    ) -> list[CompletionItem]:
-        """Completes the names of the registered models, and file names."""
-        names = [name for name in (*zoo.MODELS, *zoo.DIFFUSION_NAMES) if name.startswith(incomplete)]
-        return [*map(CompletionItem, names), CompletionItem(incomplete, type="file")]
+def _complete_model(
+    _context: click.Context, _param: click.Parameter, incomplete: str
+) -> list[CompletionItem]:
+    """Completes the names of the registered models, and file names."""
+    names = [name for name in (*zoo.MODELS, *zoo.DIFFUSION_NAMES) if name.startswith(incomplete)]
+    return [*map(CompletionItem, names), CompletionItem(incomplete, type="file")]
 
 
 def with_options(command: _Command) -> _Command:
@@ -124,8 +100,8 @@ def _option(field: dataclasses.Field[Any], hint: object) -> Callable[[_Command],
         name,
         type=_param_type(hint, field),
         default=default,
-        show_default=default is not None,
-        metavar=_METAVARS.get(hint),
+        metavar="NUMBER" if "ge" in field.metadata else None,
+        shell_complete=_complete_model if field.name == "model" else None,
         help=description,
     )
 
@@ -142,7 +118,7 @@ def _param_type(hint: object, field: dataclasses.Field[Any]) -> click.ParamType[
         return _ChoiceList(get_args(get_args(hint)[0]))
     if get_origin(hint) is Literal:
         return (_FormatChoice if hint == FormatName else click.Choice)(get_args(hint))
-    return _ModelName() if field.name == "model" else click.STRING
+    return click.STRING
 
 
 @click.command
@@ -158,22 +134,22 @@ def _param_type(hint: object, field: dataclasses.Field[Any]) -> click.ParamType[
 @click.option(
     "--json", "as_json", is_flag=True, help="Print one line of JSON for each photo on standard output."
 )
-@click.option("--quiet", is_flag=True, help="Print only errors.")
+@QUIET
 @click.option(
     "--dry-run",
     is_flag=True,
     help="Print the planned files, and the photos that cannot be opened. Write nothing.",
 )
-@click.option("--overwrite", is_flag=True, help="Replace existing layers.")
+@OVERWRITE
 @click.option(
     "--contact-sheet",
     metavar="IMAGE",
-    type=click.Path(path_type=Path),
+    type=FILE,
     help="Also write an overview of all photos and their layers to this image file. An overview of an earlier run is replaced.",
 )
 @click.option(
     "--workers",
-    type=click.IntRange(min=1),
+    type=Number(1),
     help="The number of processes that separate photos, each with one thread; with --cluster local, the number of processors.",
 )
 @click.option(
@@ -229,16 +205,24 @@ def separate(
     """
 
     photos, output = tuple(map(local_path, photos)), output and local_path(output)
-    options = _options(context, values, single_output=is_single_output(photos, output))
+    options = parse_options(context, values, single_output=is_single_output(photos, output))
     if is_plan or gpu_name:
         _print_plan(photos, output, options, gpu_name)
         return
     if workers or cluster or index:
         # All paths become absolute: other nodes have other working folders, and the index is read from any folder.
-        _check_archive_output(photos, output, needs_folder=bool(cluster or index))
+        if is_single_output(photos, output) or ((cluster or index) and not output):
+            raise click.UsageError(
+                "With --cluster, --workers and --index, layers are written to files: give a folder with -o."
+            )
         photos, output = tuple(map(absolute_path, photos)), output and absolute_path(output)
         contact_sheet = contact_sheet and contact_sheet.absolute()
-    tasks = _plan_batch(photos, output, options, quiet=quiet)
+    # An unknown name is an error, even if no photo needs the model. Nothing is loaded.
+    zoo.model_name(options.model)
+    skipped: list[Location] = []
+    tasks = plan(photos, output, options, skipped)
+    for line in skipped_files(skipped) if not quiet else ():
+        print_status(line)
     if not dry_run:
         _reject_shared_output(photos, output, as_json=as_json)
     if contact_sheet:
@@ -258,7 +242,7 @@ def separate(
     context.exit(report.run(tasks, workers=workers, cluster=cluster, has_index=bool(index or cluster)))
 
 
-def _options(context: click.Context, values: dict[str, Any], *, single_output: bool) -> Options:
+def parse_options(context: click.Context, values: dict[str, Any], *, single_output: bool) -> Options:
     """Returns the options; the only layer of a single output is the transmission by default.
 
     Raises:
@@ -270,19 +254,6 @@ def _options(context: click.Context, values: dict[str, Any], *, single_output: b
         return Options(**values)
     except BrewsterError as error:
         raise click.UsageError(str(error)) from error
-
-
-def _plan_batch(
-    photos: tuple[str, ...], output: str | None, options: Options, *, quiet: bool
-) -> list[SeparationTask]:
-    """Returns the tasks, and prints which files of the folders are skipped. See `plan` for the errors."""
-    # An unknown name is an error, even if no photo needs the model. Nothing is loaded.
-    zoo.model_name(options.model)
-    skipped: list[Location] = []
-    tasks = plan(photos, output, options, skipped)
-    for line in skipped_files(skipped) if not quiet else ():
-        print_status(line)
-    return tasks
 
 
 def _print_plan(photos: tuple[str, ...], output: str | None, options: Options, gpu_name: str | None) -> None:
@@ -308,11 +279,7 @@ def _print_plan(photos: tuple[str, ...], output: str | None, options: Options, g
 def _check_contact_sheet(
     path: Path, photos: tuple[str, ...], output: str | None, cluster: str | None
 ) -> None:
-    """Checks that the contact sheet can be written before any photo is separated.
-
-    Raises:
-        click.UsageError: the photos or the layers are not files, or the format of the sheet cannot be written.
-    """
+    """Checks that the contact sheet can be written before any photo is separated."""
     if cluster:
         raise click.UsageError("--contact-sheet cannot be combined with --cluster.")
     row = format_of(path)
@@ -327,11 +294,7 @@ def _check_contact_sheet(
 def _without_contact_sheet(
     tasks: list[SeparationTask], path: Path, *, overwrite: bool
 ) -> list[SeparationTask]:
-    """Returns the tasks without the contact sheets of earlier runs, which may be in the folder of the photos.
-
-    Raises:
-        click.UsageError: the sheet would replace a photo or a layer of the batch, or, without `overwrite`, another file.
-    """
+    """Returns the tasks without the contact sheets of earlier runs, which may be in the folder of the photos."""
     from brewster.batch.runner import real_paths  # noqa: PLC0415
     from brewster.photo.contact_sheet import is_contact_sheet  # noqa: PLC0415
 
@@ -351,24 +314,7 @@ def _without_contact_sheet(
     return tasks
 
 
-def _check_archive_output(photos: tuple[str, ...], output: str | None, *, needs_folder: bool) -> None:
-    """Checks that the layers are written to files, and to a folder if `needs_folder` is true.
-
-    Raises:
-        click.UsageError: -o is standard output or an image file, or -o is missing but needed.
-    """
-    if is_single_output(photos, output) or (needs_folder and not output):
-        raise click.UsageError(
-            "With --cluster, --workers and --index, layers are written to files: give a folder with -o."
-        )
-
-
 def _reject_shared_output(photos: tuple[str, ...], output: str | None, *, as_json: bool) -> None:
-    """Checks that standard output is not a terminal, and --json is off, if an image is written to it.
-
-    Raises:
-        click.UsageError: standard output is also used for JSON or is a terminal.
-    """
     if not is_single_output(photos, output) or output not in (None, "-"):
         return
     if as_json:

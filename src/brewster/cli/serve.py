@@ -4,17 +4,20 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
+import dataclasses
+import io
 import logging
 import re
 import secrets
 import sys
 import webbrowser
 from collections.abc import Callable
-from typing import Any, Final, get_args
+from typing import Any, Final
 
 import click
 
 from brewster.cli.extras import require_extra
+from brewster.cli.parameters import DEVICE, Number, options
 from brewster.cli.terminal import print_out, print_status
 from brewster.files import DEFAULT_MAX_PIXELS
 from brewster.options import Device
@@ -25,45 +28,43 @@ _MAX_BYTES: Final = 100_000_000
 _TOKEN: Final = re.compile(r"[A-Za-z0-9_-]{16,200}")
 _WARNING: Final = (
     "warning: everybody who can reach {host} can send requests to this machine, and the connection is not encrypted; "
-    "the server accepts only requests with the token in the link"
+    "the server accepts only requests with the token in the link; do not share the link, and stop the server after use"
 )
 
 
 def address_options(port: int, token_help: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
     """Returns a decorator that adds the options --host, --port and --token to a command."""
-
-    def add_options(command: Callable[..., Any]) -> Callable[..., Any]:
-        for option in (
-            click.option("--token", callback=_read_token, metavar="TOKEN|auto", help=token_help),
-            click.option(
-                "--port",
-                type=click.IntRange(0, 65535),
-                default=port,
-                show_default=True,
-                metavar="NUMBER",
-                help="The port; 0 chooses a free port.",
-            ),
-            click.option(
-                "--host",
-                default="127.0.0.1",
-                show_default=True,
-                metavar="ADDRESS",
-                help="The address to bind to.",
-            ),
-        ):
-            command = option(command)
-        return command
-
-    return add_options
+    return options(
+        click.option("--host", default="127.0.0.1", metavar="ADDRESS", help="The address to bind to."),
+        click.option("--port", type=Number(0, 65535), default=port, help="The port; 0 chooses a free port."),
+        click.option("--token", callback=_read_token, metavar="TOKEN|auto", help=token_help),
+    )
 
 
-def print_link(url: str, token: str | None, *, open_browser: bool = False) -> None:
-    """Prints the link to the server, including the token, on standard output. `open_browser` also opens the link."""
+def print_link(url: str, token: str | None, *, open_browser: bool = False, qr_code: bool = False) -> None:
+    """Prints the link to the server, including the token, on standard output.
+
+    `open_browser` also opens the link, and `qr_code` prints it as a QR code on standard error.
+    """
     link = f"{url}?token={token}" if token else url
     print_out(link)
+    if qr_code:
+        _print_qr_code(link)
     print_status("press Ctrl-C to stop the server")
     if open_browser:
         webbrowser.open(link)
+
+
+def _print_qr_code(link: str) -> None:
+    import segno  # noqa: PLC0415  (part of the extra web)
+    from rich.console import Console  # noqa: PLC0415  (slow to import)
+
+    blocks = io.StringIO()
+    segno.make_qr(link, error="L").terminal(blocks, compact=True)
+    # The colours are fixed, because some phones cannot read the inverted code that a light terminal would show.
+    Console(stderr=True, highlight=False).print(
+        blocks.getvalue(), style="bright_white on black", soft_wrap=True, end=""
+    )
 
 
 def _limit_arenas() -> None:
@@ -77,11 +78,7 @@ def _limit_arenas() -> None:
 
 
 def _read_token(_context: click.Context, _parameter: click.Parameter, token: str | None) -> str | None:
-    """Checks that the token can be part of a link and of a cookie, and is too long to be guessed.
-
-    Raises:
-        click.BadParameter: the token has other characters, or fewer than 16, or more than 200.
-    """
+    """Checks that the token can be part of a link and of a cookie, and is too long to be guessed."""
     if token not in (None, AUTO) and not _TOKEN.fullmatch(token):
         raise click.BadParameter(
             "expected 16 to 200 characters, each one of A-Z a-z 0-9 _ -; auto generates a token."
@@ -95,47 +92,34 @@ def _read_token(_context: click.Context, _parameter: click.Parameter, token: str
     "The token that each request must contain; auto generates a token. By default, no token is required if --host is a loopback address such as 127.0.0.1; for any other address, the default is auto.",
 )
 @click.option(
+    "--lan",
+    is_flag=True,
+    help="Serve phones in the same network: bind to the address of this machine in it, require a token, and print the link as a QR code.",
+)
+@click.option(
     "--model",
     "models",
     multiple=True,
     help="A model to offer in addition to those of `brewster models list`; repeatable. The first model is the default.",
 )
-@click.option(
-    "--device",
-    type=click.Choice(get_args(Device)),
-    default="auto",
-    show_default=True,
-    help="The device that runs the models.",
-)
-@click.option(
-    "--max-bytes",
-    type=click.IntRange(1),
-    default=_MAX_BYTES,
-    show_default=True,
-    metavar="NUMBER",
-    help="Reject uploads with more bytes.",
-)
+@DEVICE
+@click.option("--max-bytes", type=Number(1), default=_MAX_BYTES, help="Reject uploads with more bytes.")
 @click.option(
     "--max-pixels",
-    type=click.IntRange(1),
+    type=Number(1),
     default=DEFAULT_MAX_PIXELS,
-    show_default=True,
-    metavar="NUMBER",
     help="Reject photos with more pixels, before they are decoded.",
 )
 @click.option(
     "--queue",
-    type=click.IntRange(0),
+    type=Number(0),
     default=16,
-    show_default=True,
-    metavar="NUMBER",
     help="The maximum number of waiting photos; further requests are rejected with status 503.",
 )
 @click.option(
     "--timeout",
     type=click.FloatRange(0, min_open=True),
     default=300.0,
-    show_default=True,
     metavar="SECONDS",
     help="The maximum time for one photo, including the time in the queue.",
 )
@@ -150,6 +134,7 @@ def serve(
     host: str,
     port: int,
     token: str | None,
+    lan: bool,
     models: tuple[str, ...],
     device: Device,
     max_bytes: int,
@@ -168,10 +153,12 @@ def serve(
     require_extra("web", "serving", without=frozenset({"matplotlib"}))
     from brewster.web import application as web  # noqa: PLC0415  (imports FastAPI)
     from brewster.web.job_queue import JobQueue  # noqa: PLC0415
-    from brewster.web.middleware import AccessPolicy, is_loopback  # noqa: PLC0415
+    from brewster.web.middleware import LOOPBACK, AccessPolicy, is_loopback  # noqa: PLC0415
     from brewster.web.model_cache import ModelCache  # noqa: PLC0415
     from brewster.web.separation import separation_router  # noqa: PLC0415
 
+    if lan and is_loopback(host):
+        host = web.lan_address()
     _limit_arenas()
     if verbose:
         logging.basicConfig(format="%(asctime)s %(message)s")
@@ -186,9 +173,15 @@ def serve(
     router = separation_router(
         model_cache, JobQueue(max_waiting=queue, timeout_seconds=timeout), max_pixels=max_pixels
     )
-    app = web.create_app(router, policy=AccessPolicy.for_host(host, token=token, max_bytes=max_bytes))
+    policy = AccessPolicy.for_host(host, token=token, max_bytes=max_bytes)
+    if lan:  # without the name of this machine
+        policy = dataclasses.replace(policy, hosts=LOOPBACK | {host})
+    app = web.create_app(router, policy=policy)
     with contextlib.suppress(KeyboardInterrupt):  # Ctrl-C is the usual way to stop the server
         web.serve(
-            app, host=host, port=port, on_ready=lambda url: print_link(url, token, open_browser=open_browser)
+            app,
+            host=host,
+            port=port,
+            on_ready=lambda url: print_link(url, token, open_browser=open_browser, qr_code=lan),
         )
     print_status("stopped")

@@ -6,48 +6,45 @@ import contextlib
 import ipaddress
 import json
 import re
-from collections.abc import Callable
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 import click
 
-from brewster.cli.evaluate import NamedValue
 from brewster.cli.extras import require_extra
+from brewster.cli.parameters import FOLDER, JSON, Fraction, Number, named_value, options
 from brewster.cli.serve import AUTO, address_options, print_link
-from brewster.cli.study_bundle import export_study, import_answers
-from brewster.cli.terminal import print_out, print_status, progress, write_out
+from brewster.cli.terminal import print_error, print_out, print_status, progress, write_out
 from brewster.errors import BrewsterError, counted
+
+if TYPE_CHECKING:
+    from brewster.user_study.store import Participant, StoredAnswer
+    from brewster.user_study.study import Study
 
 _HOST_NAME: Final = re.compile(r"[a-z0-9_-]+(\.[a-z0-9_-]+)*", re.IGNORECASE)
 _MAX_BYTES: Final = 10_000  # an answer has about 80 bytes
-_FOLDER: Final = click.Path(path_type=Path, file_okay=False)
 _WARNING: Final = (
     "warning: {visitors} can take part, and the connection is not encrypted; "
     "for an encrypted connection, keep --host 127.0.0.1, run an HTTPS proxy in front, and give its name with --host-name"
 )
 
 
-def rule_options(command: Callable[..., None]) -> Callable[..., None]:
-    """Adds the options of the exclusion rule to a command."""
-    seconds = click.option(
+_RULE_OPTIONS: Final = options(
+    click.option(
+        "--max-failed",
+        type=Fraction(0, 1),
+        default=0.25,
+        help="The maximum fraction of failed catch trials; participants who fail more are excluded.",
+    ),
+    click.option(
         "--min-seconds",
         type=click.FloatRange(0),
         default=1.5,
-        show_default=True,
         metavar="SECONDS",
         help="The minimum median time per trial; participants with a shorter one are excluded.",
-    )
-    failed = click.option(
-        "--max-failed",
-        type=click.FloatRange(0, 1),
-        default=0.25,
-        show_default=True,
-        metavar="FRACTION",
-        help="The maximum fraction of failed catch trials; participants who fail more are excluded.",
-    )
-    return failed(seconds(command))
+    ),
+)
 
 
 @click.group
@@ -60,23 +57,18 @@ def study() -> None:
     """
 
 
-study.add_command(export_study)
-study.add_command(import_answers)
-
-
 @study.command
-@click.argument("out", type=_FOLDER)
+@click.argument("out", type=FOLDER)
 @click.option(
     "--inputs",
-    type=_FOLDER,
+    type=FOLDER,
     required=True,
-    metavar="FOLDER",
     help="The folder of the photos. It has either photos or one subfolder of photos for each dataset.",
 )
 @click.option(
     "--method",
     "methods",
-    type=NamedValue("RDNet=out/rdnet"),
+    type=named_value("RDNet=out/rdnet"),
     multiple=True,
     required=True,
     metavar="NAME=FOLDER",
@@ -100,20 +92,17 @@ study.add_command(import_answers)
 @click.option(
     "--comparisons",
     "comparisons_per_participant",
-    type=click.IntRange(1),
-    metavar="NUMBER",
+    type=Number(1),
     help="The number of pairs per participant; by default 40, or all pairs if the study has fewer.",
 )
 @click.option(
     "--catch-trials",
-    type=click.IntRange(0),
-    metavar="NUMBER",
+    type=Number(0),
     help="The number of catch trials per participant, by default 4. They alternate between two kinds: an output next to itself, and an output next to a degraded copy of it.",
 )
 @click.option(
     "--seed",
-    type=click.IntRange(0),
-    metavar="NUMBER",
+    type=Number(0),
     help="The random seed of the assignment; by default a random number. The study stores the seed.",
 )
 @click.option(
@@ -142,7 +131,7 @@ def create(
     dataset without a name. If an image is missing, duplicate, unreadable or of another size, the error lists it, and
     nothing is written. The study folder contains copies of all images and can be moved.
     """
-    from brewster.user_study.create import CATCH_POOL_SIZE, DEFAULT_CONSENT, StudyOptions, create_study  # noqa: PLC0415  (imports pyvips)
+    from brewster.user_study.create import CATCH_POOL_SIZE, DEFAULT_CONSENT, create_study  # noqa: PLC0415  (imports pyvips)
     from brewster.user_study.folders import find_pictures, select_pictures  # noqa: PLC0415
 
     folders = {name: Path(folder) for name, folder in methods}
@@ -152,36 +141,32 @@ def create(
             "expected a different name for each method",
             "rename one of the methods",
         )
-    text = DEFAULT_CONSENT if consent is None else _read_text(consent)
-    names = [] if list_file is None else _read_list(list_file)
-    options = StudyOptions(
-        datasets=datasets,
-        names=names,
-        pairs=comparisons_per_participant,
-        catch_trials=catch_trials,
-        all_pairs=all_pairs,
-        seed=seed,
-        consent=text,
-    )
-    pictures = select_pictures(find_pictures(inputs, datasets), options.names, inputs)
+    names = [line.strip() for line in _read_text(list_file).splitlines()] if list_file else []
+    names = [name for name in names if name]
+    if list_file and not names:
+        raise BrewsterError(f"{list_file} is empty", "expected one input per line", "add inputs to the list")
+    pictures = select_pictures(find_pictures(inputs, datasets), names, inputs)
     sources = {inputs, *folders.values()}  # a picture that is both input and output is copied once
     total = len(pictures) * len(sources) + min(CATCH_POOL_SIZE, len(pictures))
     with progress(total, shown=True) as update_progress:
         description = create_study(
-            out, inputs, folders, options, lambda done: update_progress(done, "copying")
+            out,
+            inputs,
+            folders,
+            datasets=datasets,
+            names=names,
+            pairs=comparisons_per_participant,
+            catch_trials=catch_trials,
+            all_pairs=all_pairs,
+            seed=seed,
+            consent=DEFAULT_CONSENT if consent is None else _read_text(consent),
+            on_progress=lambda done: update_progress(done, "copying"),
         ).description
     print_status(
         f"{out}: {counted(len(description.comparisons), 'comparison')} of {counted(len(description.methods), 'method')}; "
         f"a participant sees {description.pairs} of them and {counted(description.catch_trials, 'catch trial')} (seed {description.seed})"
     )
     print_status(f"next: brewster study serve {out}")
-
-
-def _read_list(path: Path) -> list[str]:
-    names = [line.strip() for line in _read_text(path).splitlines() if line.strip()]
-    if not names:
-        raise BrewsterError(f"{path} is empty", "expected one input per line", "add inputs to the list")
-    return names
 
 
 def _read_text(path: Path) -> str:
@@ -196,11 +181,7 @@ def _read_text(path: Path) -> str:
 def _read_host_names(
     _context: click.Context, _parameter: click.Parameter, names: tuple[str, ...]
 ) -> list[str]:
-    """Checks the host names, and returns them in lower case. The middleware compares them with the Host header.
-
-    Raises:
-        click.BadParameter: a name is neither a host name nor an IP address.
-    """
+    """Checks the host names, and returns them in lower case. The middleware compares them with the Host header."""
     for name in names:
         if not _HOST_NAME.fullmatch(name):
             try:
@@ -214,7 +195,7 @@ def _read_host_names(
 
 
 @study.command
-@click.argument("folder", metavar="STUDY", type=_FOLDER)
+@click.argument("folder", metavar="STUDY", type=FOLDER)
 @address_options(
     8420, "The token that each request must contain; auto generates one and stores it in STUDY/token."
 )
@@ -226,12 +207,7 @@ def _read_host_names(
     metavar="NAME",
     help="Another host name of this server, such as study.example.org, the name of a proxy in front of it; repeatable.",
 )
-@click.option(
-    "--max-participants",
-    type=click.IntRange(1),
-    metavar="NUMBER",
-    help="The maximum number of participants.",
-)
+@click.option("--max-participants", type=Number(1), help="The maximum number of participants.")
 def serve(
     folder: Path,
     *,
@@ -246,7 +222,7 @@ def serve(
     Each answer is stored on the disk before it is acknowledged. After the server was stopped or killed, run the same
     command again to continue the study.
     """
-    require_extra("web", "serving", without=frozenset({"matplotlib"}))
+    require_extra("web", "serving", without=frozenset({"matplotlib", "segno"}))
     from brewster.user_study.access_token import load_or_create_token  # noqa: PLC0415
     from brewster.user_study.store import AnswerStore  # noqa: PLC0415
     from brewster.user_study.study import read_study  # noqa: PLC0415
@@ -273,17 +249,21 @@ def serve(
     print_status("stopped; all answers are stored")
 
 
+def _read_answers(folder: Path) -> tuple[Study, list[tuple[Participant, dict[int, StoredAnswer]]]]:
+    from brewster.user_study.store import AnswerStore  # noqa: PLC0415  (imports pydantic)
+    from brewster.user_study.study import read_study  # noqa: PLC0415
+
+    opened = read_study(folder)
+    with contextlib.closing(AnswerStore(opened, read_only=True)) as store:
+        return opened, list(store.all_answers())
+
+
 @study.command
-@click.argument("folder", metavar="STUDY", type=_FOLDER)
+@click.argument("folder", metavar="STUDY", type=FOLDER)
 @click.option(
-    "-o",
-    "--output",
-    "out",
-    type=_FOLDER,
-    metavar="FOLDER",
-    help="The folder for the report; by default STUDY/report.",
+    "-o", "--output", "out", type=FOLDER, help="The folder for the report; by default STUDY/report."
 )
-@rule_options
+@_RULE_OPTIONS
 @click.option("--json", "as_json", is_flag=True, help="Print the results as JSON instead of the tables.")
 def report(folder: Path, *, out: Path | None, max_failed: float, min_seconds: float, as_json: bool) -> None:
     """Evaluate the answers, both without the excluded participants and with all participants.
@@ -291,16 +271,13 @@ def report(folder: Path, *, out: Path | None, max_failed: float, min_seconds: fl
     The tables are printed on standard output. The output folder gets report.md, report.json, table.tex
     (in the layout of the paper's Table 3), table.csv, answers.csv and plot.png. The server may run at the same time.
     """
-    require_extra("web", "the report", without=frozenset({"fastapi", "python-multipart", "uvicorn"}))
+    require_extra("web", "the report", without=frozenset({"fastapi", "python-multipart", "segno", "uvicorn"}))
     from brewster.user_study.report.participants import ExclusionRule, collect_answers  # noqa: PLC0415
     from brewster.user_study.report.results import summarise, write  # noqa: PLC0415
     from brewster.user_study.report.tables import overview  # noqa: PLC0415
-    from brewster.user_study.store import AnswerStore  # noqa: PLC0415
-    from brewster.user_study.study import read_study  # noqa: PLC0415
 
-    opened_study = read_study(folder)
-    with contextlib.closing(AnswerStore(opened_study, read_only=True)) as store:
-        answers = collect_answers(store.all_answers())
+    opened_study, records = _read_answers(folder)
+    answers = collect_answers(records)
     results = summarise(opened_study, answers, ExclusionRule(max_failed, min_seconds))
     out = folder / "report" if out is None else out
     write(results, opened_study, answers, out)
@@ -309,19 +286,15 @@ def report(folder: Path, *, out: Path | None, max_failed: float, min_seconds: fl
 
 
 @study.command("progress")
-@click.argument("folder", metavar="STUDY", type=_FOLDER)
-@rule_options
-@click.option("--json", "as_json", is_flag=True, help="Print JSON.")
+@click.argument("folder", metavar="STUDY", type=FOLDER)
+@_RULE_OPTIONS
+@JSON
 def show_progress(folder: Path, *, max_failed: float, min_seconds: float, as_json: bool) -> None:
     """Print how many trials each participant has answered, without any result. The server may run at the same time."""
     from brewster.user_study.report.participants import ExclusionRule  # noqa: PLC0415
     from brewster.user_study.report.progress import progress_text, summarise_progress  # noqa: PLC0415
-    from brewster.user_study.store import AnswerStore  # noqa: PLC0415
-    from brewster.user_study.study import read_study  # noqa: PLC0415
 
-    opened_study = read_study(folder)
-    with contextlib.closing(AnswerStore(opened_study, read_only=True)) as store:
-        records = list(store.all_answers())
+    opened_study, records = _read_answers(folder)
     found = summarise_progress(opened_study.description, records, ExclusionRule(max_failed, min_seconds))
     write_out((json.dumps(found) + "\n" if as_json else progress_text(found)).encode())
 
@@ -329,31 +302,26 @@ def show_progress(folder: Path, *, max_failed: float, min_seconds: float, as_jso
 @study.command
 @click.option(
     "--difference",
-    type=click.FloatRange(0, 1, min_open=True),
+    type=Fraction(0, 1, min_open=True),
     required=True,
-    metavar="FRACTION",
     help="The difference between win rate and loss rate to detect, such as 0.1.",
 )
-@click.option("--tie", type=click.FloatRange(0, 1, max_open=True), default=0.25, show_default=True, metavar="FRACTION", help='The expected fraction of the answer "similar".')  # fmt: skip
+@click.option("--tie", type=Fraction(0, 1, max_open=True), default=0.25, help='The expected fraction of the answer "similar".')  # fmt: skip
 @click.option(
     "--comparisons",
     "comparisons_per_participant",
-    type=click.IntRange(1),
+    type=Number(1),
     default=40,
-    show_default=True,
-    metavar="NUMBER",
     help="The number of pairs of these two methods per participant.",
 )
 @click.option(
     "--correlation",
-    type=click.FloatRange(0, 1),
+    type=Fraction(0, 1),
     default=0.05,
-    show_default=True,
-    metavar="NUMBER",
     help="The intraclass correlation of the answers of one participant; `brewster study report` estimates it.",
 )
-@click.option("--power", type=click.FloatRange(0.5, 1, max_open=True), default=0.8, show_default=True, metavar="FRACTION", help="The probability of detecting the difference if it exists.")  # fmt: skip
-@click.option("--json", "as_json", is_flag=True, help="Print JSON.")
+@click.option("--power", type=Fraction(0.5, 1, max_open=True), default=0.8, help="The probability of detecting the difference if it exists.")  # fmt: skip
+@JSON
 def plan(
     *,
     difference: float,
@@ -385,3 +353,71 @@ def plan(
         f"answers carries as much information as one independent answer. The difference between win rate and loss rate varies "
         f"between participants, with a standard deviation of {estimate.deviation:.0%}."
     )
+
+
+# --- participants who cannot reach the machine of the study
+
+
+@study.command("export")
+@click.argument("folder", metavar="STUDY", type=FOLDER)
+@click.option(
+    "-o", "--output", "out", type=FOLDER, required=True, help="The new folder for the static files."
+)
+@click.option(
+    "--participants",
+    type=Number(1, 10_000),
+    required=True,
+    help="The number of participants, who get one personal link each.",
+)
+@click.option(
+    "--url",
+    metavar="URL",
+    help="The address at which you publish the folder, such as https://example.org/study/. It is put before each link.",
+)
+def export_study(folder: Path, *, out: Path, participants: int, url: str | None) -> None:
+    """Write the page of the study as static files, and print one personal link for each participant.
+
+    Copy the folder to any web server that serves files. Participants download their answers as a file and send it to you;
+    `brewster study import` adds it to the study.
+    """
+    from brewster.user_study.store import AnswerStore  # noqa: PLC0415  (imports pydantic)
+    from brewster.user_study.study import read_study  # noqa: PLC0415
+    from brewster.web.study_bundle import export_bundle  # noqa: PLC0415
+
+    opened_study = read_study(folder)
+    with contextlib.closing(AnswerStore(opened_study)) as store:
+        tokens = export_bundle(opened_study, store, out, participants=participants)
+    root = f"{url.rstrip('/')}/" if url else ""
+    for token in tokens:
+        print_out(f"{root}?p={token}")
+    print_status(f"the page is in {out}; send one of the links above to each participant")
+
+
+@study.command("import")
+@click.argument("folder", metavar="STUDY", type=FOLDER)
+@click.argument(
+    "files", metavar="FILE...", nargs=-1, required=True, type=click.Path(path_type=Path, dir_okay=False)
+)
+@click.pass_context
+def import_answers(context: click.Context, folder: Path, files: tuple[Path, ...]) -> None:
+    """Add the answers in files that participants of `brewster study export` have sent.
+
+    A file can be imported again: answers that the study already has are kept. An invalid file is reported, the others are imported,
+    and the exit code is 1.
+    """
+    from brewster.user_study.answer_file import read_answer_file  # noqa: PLC0415  (imports pydantic)
+    from brewster.user_study.store import AnswerStore  # noqa: PLC0415
+    from brewster.user_study.study import read_study  # noqa: PLC0415
+
+    failed = False
+    with contextlib.closing(AnswerStore(read_study(folder))) as store:
+        for path in files:
+            try:
+                answer_file = read_answer_file(path)
+                count = store.import_answers(answer_file)
+            except BrewsterError as error:
+                failed = True
+                print_error(str(error))
+            else:
+                print_status(f"{path}: {count} new answers of {len(answer_file.answers)}")
+    context.exit(1 if failed else 0)

@@ -13,6 +13,7 @@ import click
 
 from brewster.cli.batch_plan import gpu_for_plan
 from brewster.cli.extras import require_extra
+from brewster.cli.parameters import FILE, QUIET
 from brewster.cli.terminal import interrupts, print_out, print_status, progress, standard_output
 from brewster.errors import OutputError, RecipeError
 
@@ -21,13 +22,13 @@ if TYPE_CHECKING:
 
 
 @click.command
-@click.argument("recipe", required=False, type=click.Path(path_type=Path))
+@click.argument("recipe", required=False, type=FILE)
 @click.option(
     "-o",
     "--output",
     "out",
     metavar="FOLDER",
-    type=click.Path(path_type=Path),
+    type=FILE,
     help="The folder for the checkpoint, the log, its curves, sample images and the trained model (model.onnx or the folder lora); by default out/NAME for NAME.toml.",
 )
 @click.option(
@@ -50,7 +51,6 @@ if TYPE_CHECKING:
     "--device",
     type=click.Choice(["auto", "cpu"]),
     default="auto",
-    show_default=True,
     help="The device to train on. auto is the GPU, or the CPU if there is no GPU. A diffusion backbone is trained on a CPU only with --device cpu, because this takes weeks.",
 )
 @click.option(
@@ -59,7 +59,7 @@ if TYPE_CHECKING:
     is_flag=True,
     help="Print one line of JSON for each event on standard output: start, report (the metrics of a line of the log), end.",
 )
-@click.option("--quiet", is_flag=True, help="Print only errors.")
+@QUIET
 def train(
     *,
     recipe: Path | None,
@@ -79,7 +79,10 @@ def train(
     start the command with torchrun.
     """
     if show_recipe:
-        _show_recipe(show_recipe)
+        from brewster.scene.recipe_file import commented_toml  # noqa: PLC0415
+        from brewster.training.recipe import read_template  # noqa: PLC0415
+
+        print_out(commented_toml(read_template(show_recipe)).rstrip())
         return
     require_extra("train", "training")
     if recipe is None:
@@ -92,7 +95,14 @@ def train(
     if plan or gpu_name:
         _print_plan(parsed, gpu_name)
         return
-    _make_folder(out)
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OutputError(
+            f"{out} cannot be created ({error.strerror})",
+            "expected a writable folder for the run",
+            "choose another folder with -o",
+        ) from error
     from brewster.training.distributed import is_main_process  # noqa: PLC0415
     from brewster.training.loop import run  # noqa: PLC0415
     from brewster.training.trainers import open_trainer  # noqa: PLC0415
@@ -158,13 +168,6 @@ class _TrainingPrinter:
             print_status(text)
 
 
-def _show_recipe(name: str) -> None:
-    from brewster.scene.recipe_file import commented_toml  # noqa: PLC0415
-    from brewster.training.recipe import read_template  # noqa: PLC0415
-
-    print_out(commented_toml(read_template(name)).rstrip())
-
-
 def _print_plan(recipe: CompactRecipe | LoraRecipe, gpu_name: str | None) -> None:
     from brewster.training.lora.resource_estimate import estimate_resources  # noqa: PLC0415
     from brewster.training.recipe import LoraRecipe  # noqa: PLC0415
@@ -196,14 +199,3 @@ def _print_data(recipe: LoraRecipe) -> None:
     sizes = sorted(set(panels), key=lambda size: size[0] * size[1])
     span = " to ".join(f"{width} x {height}" for width, height in dict.fromkeys((*sizes[:1], *sizes[-1:])))
     print_out(f"{'data':24}{samples.description()}{f'; panels of {span}' if span else ''}")
-
-
-def _make_folder(folder: Path) -> None:
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise OutputError(
-            f"{folder} cannot be created ({error.strerror})",
-            "expected a writable folder for the run",
-            "choose another folder with -o",
-        ) from error

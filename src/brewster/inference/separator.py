@@ -41,8 +41,6 @@ from brewster.models.zoo import find_model, is_diffusion_model
 from brewster.options import LoadOptions, Options, Quality, SeparateOptions
 from brewster.photo import Encoding, Hints, Mask, Photo, Source
 
-_WHITE_PERCENTILE: Final = 99.0
-"""If this percentile of the photo is above 1, as in an EXR file, the input of the network is divided by the percentile."""
 _CALL_OPTIONS: Final = SeparateOptions.__annotations__.keys() - LoadOptions.__annotations__.keys()
 _PREDICTOR_OPTIONS: Final = ("steps", "ensemble_size", "no_guided_upsampling")
 _NETWORK_SHARE: Final = 0.6
@@ -319,7 +317,7 @@ class Separator:
     def _inputs(self, photo: Photo, quality: Quality) -> tuple[list[Floats], np.float32]:
         """Returns the inputs of the model in 0..1, smallest first, and the white level by which they are divided."""
         inputs = [photo.resized(*size) for size in self._predictor.input_sizes(photo.size, quality)]
-        white = np.float32(max(1.0, float(np.percentile(inputs[-1], _WHITE_PERCENTILE))))
+        white = white_level(inputs[-1])
         return [np.clip(scaled_input / white, 0, 1) for scaled_input in inputs], white
 
     def _with_hints(self, inputs: list[Floats], photo: Photo, hints: Source | None) -> list[Floats]:
@@ -383,3 +381,8 @@ def _timed(seconds: dict[str, float], name: str) -> Iterator[None]:
     started = time.perf_counter()
     yield
     seconds[name] = time.perf_counter() - started
+
+
+def white_level(light: Floats) -> np.float32:
+    """Returns the level by which linear light is divided before the network: 1, or the 99th percentile if it is larger, as in an EXR file."""
+    return np.float32(max(1.0, float(np.percentile(light, 99))))
