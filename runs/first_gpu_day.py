@@ -175,8 +175,8 @@ def verdicts(scores, *, is_tiny):
             for method, columns in scores.get("tables", {}).get(name, {}).items()
             if "psnr" in columns
         }
-        expected, measured = published[name]["psnr"], means.get("WindowSeat")
-        rows.append((title, f"{expected} dB", *compared(measured, expected, is_tiny=is_tiny), *(
+        expected, measured = float(published[name]["psnr"]), means.get("WindowSeat")
+        rows.append((title, f"{expected:.2f} dB", *compared(measured, expected, is_tiny=is_tiny), *(
             f"{means[method]:.2f} dB" if method in means else "-"
             for method in ("WindowSeat-guided", "LoRA", "compact", "input (unprocessed)"))))  # fmt: skip
     yield f"<h2>Verdict</h2><p>reproduced: at most {AGREEMENT_DB} dB from the published PSNR</p>{table(rows)}"

@@ -43,8 +43,7 @@ def test_the_photo_has_jpeg_artefacts_and_the_ground_truth_has_none(assets, blen
         decoded = Photo.open(encode_jpeg(encoded, scene.camera_response.jpeg_quality)).pixels.copy()
         return (torch.from_numpy(decoded).permute(2, 0, 1) / 255 - encoded).abs().mean()
 
-    assert change(photo) < 1e-3
-    assert change(background) > 5e-3
+    assert change(photo) < change(background) / 10
 
 
 def test_the_target_is_the_background_or_the_transmission(assets):
