@@ -5,7 +5,8 @@
     .venv/bin/python bench/burst.py                     # time and memory for five photos of 12 megapixels
 
 Prints one row for each burst. "gain" is the PSNR of the layers by motion minus that of the single photo, after a gain for each
-channel; "result" is the same for the method that was chosen. The second table counts results that are worse by more than 0.1 dB.
+channel; "exchanged" is that of the two layers with each other's names, "result" that of the method that was chosen. The second
+table counts results that are worse by more than 0.1 dB.
 """
 
 import resource
@@ -44,9 +45,9 @@ def quality(folder, long_side_px, numbers):
     separator = Separator.load()
     rows = []
     print(
-        "| burst | motion, px | explained | naming | verdict | method | input T | single T | gain T | gain R | result T |"
+        "| burst | motion, px | explained | naming | verdict | method | input T | single T | gain T | gain R | exchanged T | result T |"
     )
-    print("|---|" + "---|" * 10)
+    print("|---|" + "---|" * 11)
     cases = [case for benchmark in read_benchmark("bursts", folder) for case in benchmark.cases]
     for case in [cases[number] for number in numbers] or cases:
         photos = [Photo.open(frame.read()) for frame in case.frames]
@@ -70,14 +71,17 @@ def quality(folder, long_side_px, numbers):
             "unchanged": (small, 0 * small),
             "single photo": (prior, small - prior),
             "burst": (solution.transmission, solution.reflection),
+            "exchanged": (solution.reflection, solution.transmission),
         }
         scores = {method: np.array([*map(psnr_db, pair, truth)]) for method, pair in layers.items()}
-        gain, result = (scores[method] - scores["single photo"] for method in ("burst", report.method))
+        gain, exchanged, result = (
+            scores[method] - scores["single photo"] for method in ("burst", "exchanged", report.method)
+        )
         rows.append((report.relative_motion_px, report.method, result))
         print(
             f"| {case.name} | {report.relative_motion_px:.1f} | {report.explained:.2f} | {solution.naming:+.2f}"
             f" | {single.verdict} | {report.method} | {scores['unchanged'][0]:.2f} | {scores['single photo'][0]:.2f}"
-            f" | {gain[0]:+.2f} | {gain[1]:+.2f} | {result[0]:+.2f} |",
+            f" | {gain[0]:+.2f} | {gain[1]:+.2f} | {exchanged[0]:+.2f} | {result[0]:+.2f} |",
             flush=True,
         )
     print(

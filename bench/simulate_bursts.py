@@ -1,0 +1,124 @@
+"""Makes bursts with ground truth from pairs of photos, for quantity: what motion the calibration of `brewster burst` needs.
+
+    .venv/bin/python bench/simulate_bursts.py out/simulated 60        # photos of $BREWSTER_DATA that no network was trained on
+    .venv/bin/python bench/burst.py out/simulated 320
+
+Each burst has five photos of 640 x 480 pixels: photo = T + R in linear light, with noise, exposure and JPEG of its own. The camera moves
+along a line with a tremble. T moves by a homography and, with the parallax of a smooth depth, differently in each place; R moves by
+another distance. One burst in eight has no reflection, one in eight the same motion for both layers, one in eight a still camera.
+The folder has the layout `bursts` (docs/evaluation.md), and motions.csv has the true motions in pixels of a photo 1,000 pixels wide.
+"""
+
+import csv
+import os
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from brewster import Photo
+from brewster.srgb import to_encoded, to_linear
+
+HELD_OUT = ("kodak24__*", "gianni-rosato-gb82*")
+WIDTH, HEIGHT, FRAMES = 640, 480, 5
+MARGIN = 1.3
+"""The layers are larger than the photos, so that a moved camera sees no border."""
+
+
+def read_layer(rng, paths):
+    """A linear photo of MARGIN times the frame."""
+    image = to_linear(Photo.open(paths[rng.integers(len(paths))]).pixels.astype(np.float32) / 255)
+    if image.shape[0] > image.shape[1]:
+        image = np.rot90(image)
+    scale = MARGIN * max(WIDTH / image.shape[1], HEIGHT / image.shape[0])
+    image = cv2.resize(np.ascontiguousarray(image), None, fx=scale, fy=scale, interpolation=cv2.INTER_CUBIC)
+    image = image[:, ::-1] if rng.random() < 0.5 else image
+    return np.clip(image, 0, 1)
+
+
+def view(layer, shift, rotation, depth, parallax):
+    """The frame that sees the layer moved by `shift` px and turned, with `parallax` px times the depth along the shift."""
+    rows, columns = np.mgrid[:HEIGHT, :WIDTH].astype(np.float32)
+    x, y = columns - WIDTH / 2, rows - HEIGHT / 2
+    moved = np.asarray(shift)[:, None, None] + np.asarray(parallax)[:, None, None] * depth
+    across = np.cos(rotation) * x - np.sin(rotation) * y + layer.shape[1] / 2 + moved[0]
+    down = np.sin(rotation) * x + np.cos(rotation) * y + layer.shape[0] / 2 + moved[1]
+    return cv2.remap(
+        layer,
+        across.astype(np.float32),
+        down.astype(np.float32),
+        cv2.INTER_LINEAR,
+        borderMode=cv2.BORDER_REFLECT,
+    )
+
+
+def simulate(rng, paths):
+    """The photos, the layers of the middle one, and the true motions."""
+    transmission, reflection = read_layer(rng, paths), read_layer(rng, paths)
+    case = rng.choice(
+        ["moved", "no reflection", "equal distances", "still camera"], p=[5 / 8, 1 / 8, 1 / 8, 1 / 8]
+    )
+    if rng.random() < 0.3:  # the mirrored scene is out of focus
+        reflection = cv2.GaussianBlur(reflection, (0, 0), rng.uniform(1, 4))
+    brightness = np.exp(rng.uniform(np.log(0.15), np.log(1.2)))
+    reflection = reflection * min(brightness * transmission.mean() / (reflection.mean() + 1e-3), 1)
+    reflection *= case != "no reflection"
+    small = rng.normal(size=(4, 5)).astype(np.float32)
+    depth = cv2.resize(small, (WIDTH, HEIGHT), interpolation=cv2.INTER_CUBIC)
+    depth = (depth - depth.mean()) / np.ptp(depth)
+    pixel = WIDTH / 1000
+    relative = np.exp(rng.uniform(np.log(4), np.log(70))) * pixel * (case in ("moved", "no reflection"))
+    camera = rng.uniform(8, 60) * pixel * rng.choice([-1, 1]) * (case != "still camera")
+    parallax = rng.uniform(0, 8) * pixel * (case != "still camera")
+    angle = rng.normal(0, 0.15)
+    direction = np.array([np.cos(angle), np.sin(angle)])
+    positions = np.linspace(-0.5, 0.5, FRAMES) + rng.normal(0, 0.04, FRAMES)
+    light = 0.8 / max(np.quantile(transmission, 0.98), 0.2)
+    photos, middle = [], None
+    for position in positions:
+        tremble, rotation = rng.normal(0, 1.5, 2) * pixel, rng.normal(0, 0.003)
+        layers = [
+            light * view(transmission, camera * position * direction + tremble, rotation, depth, parallax * position * direction),
+            light * view(reflection, (camera + relative) * position * direction + tremble, rotation, depth, (0, 0)),
+        ]  # fmt: skip
+        middle = layers if len(photos) == FRAMES // 2 else middle
+        total = sum(layers) * np.exp(rng.normal(0, 0.03))
+        total = total + rng.normal(0, 1, total.shape) * np.sqrt(1e-5 + 2e-4 * total)
+        photos.append(np.clip(total, 0, 1))
+    truth = (
+        case,
+        relative / pixel * np.ptp(positions),
+        camera / pixel * np.ptp(positions),
+        parallax / pixel * np.ptp(positions),
+    )
+    return photos, middle, truth
+
+
+def save(image, path, quality=None):
+    pixels = np.rint(255 * to_encoded(image.clip(0, 1))).astype(np.uint8)
+    Photo.from_array(pixels, encoding="srgb").save(path, quality=quality)
+
+
+def main(folder, count):
+    photos_folder = Path(os.environ["BREWSTER_DATA"], "photos/permissive")
+    paths = sorted(path for pattern in HELD_OUT for path in photos_folder.glob(pattern))
+    folder.mkdir(parents=True, exist_ok=True)
+    with (folder / "motions.csv").open("w") as file:
+        table = csv.writer(file)
+        table.writerow(("burst", "case", "relative_motion_px", "camera_motion_px", "parallax_px"))
+        for number in range(count):
+            rng = np.random.default_rng((31, number))
+            photos, (transmission, reflection), (case, *motions) = simulate(rng, paths)
+            burst = folder / f"{number:03}"
+            burst.mkdir()
+            for k, photo in enumerate(photos, 1):
+                save(photo, burst / f"frame{k}.jpg", int(rng.integers(85, 97)))
+            middle = FRAMES // 2 + 1
+            save(transmission, burst / f"transmission{middle}.png")
+            save(reflection, burst / f"reflection{middle}.png")
+            table.writerow((burst.name, case, *(f"{motion:.1f}" for motion in motions)))
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]), int(sys.argv[2]))
