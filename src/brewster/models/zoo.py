@@ -56,7 +56,7 @@ MODELS: Final = {
         ModelFile(
             "compact",
             _WEIGHTS / "compact.onnx",
-            "339dee6c35a1838068966bb9dbfde42f53f6371bab24ccb00f1eff50143d9ae6",
+            "4d6f9ba60f811c26ce7fb7b034c3a6b45a20be9283574887d5debe00abf983a7",
             "Apache-2.0",
         ),
     )

@@ -141,12 +141,12 @@ class CompactRecipe(TrainingRecipe):
     """Probability of a sample with simulated hints of a person: where there is reflection, and where only the scene."""
     init: str | None = None
     """The model from which training starts: a name from `brewster models list`, or an .onnx file, relative to this recipe. It
-    contains this network, with or without hints. Not set: ImageNet features."""
+    contains this network. Not set: ImageNet features."""
     init_share: Share = 0.0
     """Share of the weights of `init` in the exported weights, which are a mean of the two (Wortsman et al., CVPR 2022)."""
     trained_part: Literal["", "hints."] = ""
-    """The part of the network that is trained. hints.: only the weights of the hints, so that photos without hints give the same layers
-    as before. Empty: all weights."""
+    """The part of the network that is trained, from zero if `init` is set. hints.: only the weights of the hints, so that photos without
+    hints give the same layers as before. Empty: all weights."""
     mix: MixRecipe = MixRecipe()
 
     @model_validator(mode="after")

@@ -108,18 +108,21 @@ class CompactTrainer:
         )
 
     def initialize(self) -> None:
-        """Loads the weights of `init`. A model without hints, such as version 2, has no weights for them: these stay zero.
+        """Loads the weights of `init`, except those of `trained_part`, which start from zero.
 
         Raises:
             ModelError: the model is unknown or damaged, or contains another network.
         """
         if self.recipe.init is None:
             return
-        weights = read_weights(find_model(self.recipe.init).path)
-        expected = {name: value.shape for name, value in self.network.state_dict().items()}
-        without_hints = {name: shape for name, shape in expected.items() if not name.startswith("hints.")}
-        if {name: value.shape for name, value in weights.items()} in (expected, without_hints):
-            self.network.load_state_dict(weights, strict=False)
+        weights, new = read_weights(find_model(self.recipe.init).path), self.recipe.trained_part
+        shapes = [
+            {name: value.shape for name, value in state.items()}
+            for state in (weights, self.network.state_dict())
+        ]
+        if shapes[0] == shapes[1]:
+            kept = {name: value for name, value in weights.items() if not (new and name.startswith(new))}
+            self.network.load_state_dict(kept, strict=False)
             self._reset_ema()
             return
         raise ModelError(
