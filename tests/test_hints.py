@@ -114,3 +114,15 @@ def test_simulated_hints_lie_mostly_where_they_are_true_and_half_of_the_samples_
     assert reflection_hint[:, :64].sum() > 5 * reflection_hint[:, 64:].sum()
     assert scene_hint[:, 64:].sum() > 5 * scene_hint[:, :64].sum()
     assert to_linear(batch.reflection_encoded).max() > 0
+
+
+def test_the_shipped_model_removes_more_under_a_hint_and_nothing_far_from_it():
+    photo = np.asarray(Image.open("tests/pictures/mixture-coffee-rocket.jpg").convert("RGB"))
+    image = np.zeros_like(photo)
+    rows, columns = slice(0, photo.shape[0] // 2), slice(0, photo.shape[1] // 4)
+    image[rows, columns] = RED
+    separator = Separator.load()
+    plain, hinted = (separator(photo, hints=hints).transmission.linear() for hints in (None, image))
+    assert hinted[rows, columns].mean() < 0.95 * plain[rows, columns].mean()
+    far = slice(photo.shape[1] // 2, None)
+    np.testing.assert_allclose(hinted[:, far], plain[:, far], atol=0.02)
