@@ -97,7 +97,7 @@ def test_the_reflection_of_a_locked_candidate_moves_with_the_transmission():
     assert torch.equal(positions[0, 0], positions[1, 0])
     assert not torch.equal(positions[0, 1], positions[1, 1])
     assert torch.allclose(positions[:, :, 1], pixel_grid(8, 12))  # the reference frame does not move
-    assert model.motions(8, 12)[1].tolist() == pytest.approx([0, 0.15], abs=1e-3)
+    assert model.relative_motion(8, 12).tolist() == pytest.approx([0, 0.15], abs=1e-3)
 
 
 @pytest.mark.parametrize("end", [(6.0, 0.0), (-9.0, 2.0)])
@@ -173,19 +173,19 @@ def solve_at_80(frames, prior):
 
 
 @pytest.mark.parametrize(
-    ("explained", "camera", "verdict", "method"),
+    ("explained", "motion", "verdict", "method"),
     [
-        (0.0, 0.03, "reflection remains", "unchanged"),  # one layer explains all photos
-        (0.0, 0.001, "reflection remains", "single photo"),  # a still camera tells nothing
-        (0.0, 0.03, "removed", "single photo"),
-        (0.0, 0.0, "little found", "unchanged"),
-        (0.5, 0.03, "little found", "burst"),
-        (0.15, 0.03, "reflection remains", "single photo"),
+        (0.0, 0.02, "reflection remains", "single photo"),
+        (0.0, 0.02, "little found", "unchanged"),
+        (0.5, 0.02, "little found", "burst"),
+        (0.15, 0.02, "reflection remains", "single photo"),
+        (0.5, 0.004, "removed", "single photo"),  # too small a motion
+        (0.3, 0.2, "removed", "single photo"),  # a large motion must explain more
     ],
 )
-def test_the_self_check_chooses_the_method(explained, camera, verdict, method):
+def test_the_self_check_chooses_the_method(explained, motion, verdict, method):
     layer = np.ones((2, 2, 3), np.float32)
-    solution = Solution(layer, layer, layer[..., :1], 0.02, camera, 0.5, 0.01, 0.01 * (1 - explained), {})
+    solution = Solution(layer, layer, layer[..., :1], motion, 0.5, 0.01, 0.01 * (1 - explained), {})
     assert burst_report(solution, verdict, 5, (), 2).method == method
 
 

@@ -163,12 +163,11 @@ class JointModel:
         rendered, _ = self.render(height, width, slice(self.reference, self.reference + 1))
         return rendered[:, :, 0]
 
-    def motions(self, height: int, width: int) -> Tensor:
-        """Returns the largest mean motion between two frames, of T and of R relative to T, as shares of the width, (2, C)."""
+    def relative_motion(self, height: int, width: int) -> Tensor:
+        """Returns the largest mean motion of R relative to T between two frames, as a share of the width, (C,)."""
         transmission, reflection = self.positions(height, width)
-        offsets = torch.stack([transmission, reflection - transmission]).mean((3, 4))
-        offsets = offsets * torch.tensor([0.5, 0.5 * height / width])
-        return torch.cdist(offsets, offsets).amax((2, 3))
+        offsets = (reflection - transmission).mean((2, 3)) * torch.tensor([0.5, 0.5 * height / width])
+        return torch.cdist(offsets, offsets).amax((1, 2))
 
     def confidence(self, frames: Tensor) -> Tensor:
         """Returns how well the frames agree with their prediction at each pixel of the reference frame, (C, 1, h, w) in 0..1.

@@ -41,8 +41,6 @@ _MIN_EXPLAINED: Final = 0.2
 _LARGE_MOTION_PX: Final = 60.0
 _MIN_EXPLAINED_IF_DOUBTED: Final = 0.4
 """A larger motion must explain more, because the parts of a layer that only one frame shows explain everything there."""
-_MAX_EXPLAINED_UNCHANGED: Final = 0.1
-"""If the camera moved and a second motion explains less than this share, one layer explains the photos."""
 _USEFUL_MOTION_PX: Final = 16
 _DETAIL_LIMITS: Final = (0.5, 2.0)
 """The detail of the reference photo changes the sum of the layers by no more than these factors."""
@@ -235,7 +233,7 @@ def burst_report(
 ) -> BurstReport:
     """Decides whether the motion separates the layers. `verdict` is that of the single photo.
 
-    If the camera moved and one layer explains all photos, there is no reflection: only a model that is sure of one is believed more.
+    That one layer explains all photos is no sign that there is no reflection: it was so for two weak ones, and at equal distances.
     """
     motion = 1000 * solution.relative_motion if solution else 0.0
     explained = (
@@ -248,13 +246,9 @@ def burst_report(
         message = "No other photo shows the same scene as the reference photo."
     elif explained >= needed and motion >= _MIN_MOTION_PX:
         method, message = "burst", f"The layers moved {motion:.0f} px apart in a photo of 1,000 px."
-    elif verdict == "little found" or (
-        verdict != "removed"
-        and explained < _MAX_EXPLAINED_UNCHANGED
-        and 1000 * solution.camera_motion >= _MIN_MOTION_PX
-    ):
+    elif verdict == "little found":
         method = "unchanged"
-        message = "One layer explains all photos: no reflection was found. If there is one, separate the reference photo alone."
+        message = "Little reflection was found, in the motion and in the reference photo. If there is one, separate this photo alone."
     elif explained < needed:
         message = f"No relative motion of two layers was found. {advice}"
     else:

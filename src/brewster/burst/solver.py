@@ -60,8 +60,6 @@ class Solution:
     """(h, w, 1) in 0..1: how well the frames agree with their prediction at each pixel of the transmission."""
     relative_motion: float
     """The largest motion of R relative to T between two frames, as a share of the width of a frame."""
-    camera_motion: float
-    """The largest motion of T between two frames, as a share of the width of a frame."""
     naming: float
     """The share of the detail of T that the prior keeps, minus that of R: 0 if the single photo does not tell the layers apart."""
     one_layer_error: float
@@ -137,9 +135,9 @@ def solve(
     model = model.selected(_best(model, with_locked=False))
     with torch.no_grad():
         confidence = model.confidence(small)[0]
-        camera, motion = model.motions(*small.shape[-2:])[:, 0].tolist()
+        motion = model.relative_motion(*small.shape[-2:])[0].item()
     transmission, reflection, confidence = (layer.movedim(0, -1).numpy() for layer in (*layers, confidence))
-    return Solution(transmission, reflection, confidence, motion, camera, naming, *errors, losses)
+    return Solution(transmission, reflection, confidence, motion, naming, *errors, losses)
 
 
 def _named(model: JointModel, frames: Tensor, prior: Tensor) -> tuple[Tensor, float]:
@@ -177,7 +175,7 @@ def _best(model: JointModel, *, with_locked: bool) -> list[int]:
 def _selection_losses(model: JointModel) -> list[float]:
     """Returns the losses, larger by 1 for implausible motions."""
     with torch.no_grad():
-        is_implausible = model.motions(*_MOTION_SAMPLES)[1] > _MAX_RELATIVE_MOTION
+        is_implausible = model.relative_motion(*_MOTION_SAMPLES) > _MAX_RELATIVE_MOTION
     losses: list[float] = (model.losses + is_implausible).tolist()
     return losses
 
