@@ -189,6 +189,13 @@ def test_the_self_check_chooses_the_method(explained, motion, verdict, method):
     assert burst_report(solution, verdict, 5, (), 2).method == method
 
 
+@pytest.mark.parametrize(("naming", "is_certain"), [(0.3, True), (0.01, False)])
+def test_the_message_says_if_the_layers_may_be_exchanged(naming, is_certain):
+    layer = np.ones((2, 2, 3), np.float32)
+    solution = Solution(layer, layer, layer[..., :1], 0.03, naming, 0.02, 0.01, {})
+    assert ("each other's names" in burst_report(solution, "removed", 5, (), 2).message) is not is_certain
+
+
 def test_a_burst_keeps_depth_and_respects_strength_and_reference(small_burst, few_steps):
     frames = [frame.astype(np.uint16) * 257 for frame in small_burst.frames]
     photos = [brewster.Photo.from_array(frame, encoding="srgb") for frame in frames]

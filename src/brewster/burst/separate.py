@@ -42,6 +42,8 @@ _LARGE_MOTION_PX: Final = 60.0
 _MIN_EXPLAINED_IF_DOUBTED: Final = 0.4
 """A larger motion must explain more, because the parts of a layer that only one frame shows explain everything there."""
 _USEFUL_MOTION_PX: Final = 16
+_MIN_CERTAIN_NAMING: Final = 0.08
+"""Of six simulated bursts below, two had exchanged layers; of four above, none."""
 _DETAIL_LIMITS: Final = (0.5, 2.0)
 """The detail of the reference photo changes the sum of the layers by no more than these factors."""
 
@@ -246,6 +248,8 @@ def burst_report(
         message = "No other photo shows the same scene as the reference photo."
     elif explained >= needed and motion >= _MIN_MOTION_PX:
         method, message = "burst", f"The layers moved {motion:.0f} px apart in a photo of 1,000 px."
+        if solution.naming < _MIN_CERTAIN_NAMING:
+            message += " They may have each other's names, because the reference photo alone does not tell them apart."
     elif verdict == "little found":
         method = "unchanged"
         message = "Little reflection was found, in the motion and in the reference photo. If there is one, separate this photo alone."
