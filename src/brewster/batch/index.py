@@ -46,11 +46,8 @@ COLUMNS: Final[dict[str, tuple[str, Callable[[FileResult], object]]]] = {
 @final
 class IndexWriter:
     """Writes the index of an output folder. A context manager: all rows are merged into index.parquet when it exits.
-
-    Raises:
-        OutputError: the folder cannot be written to, or has another file named index.parquet.
-        MissingExtra: pyarrow is not installed.
-    """
+    Raises OutputError if the folder cannot be written to, or has another file named index.parquet, and MissingExtra
+    if pyarrow is not installed."""
 
     def __init__(self, folder: Location) -> None:
         self._index, self._parts_folder = folder / INDEX_FILE, folder / PARTS_FOLDER
@@ -70,12 +67,8 @@ class IndexWriter:
                 self._write_part()
 
     def close(self) -> None:
-        """Merges the parts of this run and of killed runs into index.parquet, and deletes them.
-
-        Raises:
-            OutputError: the index cannot be written. The parts are kept, and the next run merges them.
-            UnreadablePhoto: the object store of the folder cannot be read.
-        """
+        """Merges the parts of this run and of killed runs into index.parquet, and deletes them. Raises OutputError if
+        the index cannot be written (the next run then merges the parts), and UnreadablePhoto if they cannot be read."""
         self._write_part()
         parts = sorted(path for path in self._parts_folder.iterdir() if path.suffix == ".parquet")
         if not parts:

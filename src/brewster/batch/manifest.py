@@ -64,13 +64,10 @@ def read_manifest(
 ) -> Iterator[tuple[ManifestRow, Location, Location]]:
     """Yields each row of a manifest with its photo and the folder for its layers. Files that do not exist are included.
 
-    Layers are written below `output_folder`, by default next to their photo.
-
-    Raises:
-        ManifestError: the manifest cannot be read, is not a table, or has no rows; or a row has no path, a relative path outside the
-            folder of the manifest, or more values than the header.
-        BrewsterError: a row has a URL that cannot be read; see `location`.
-        MissingExtra: the package is not installed that a Parquet table (pyarrow) or a URL needs.
+    Layers are written below `output_folder`, by default next to their photo. Raises ManifestError if the manifest
+    cannot be read, is not a table, or has no rows, or if a row has no path, a relative path outside the folder of the
+    manifest, or more values than the header; BrewsterError if a row has a URL that `location` refuses; MissingExtra if
+    the package is not installed that a Parquet table (pyarrow) or a URL needs.
     """
     try:
         data = manifest.read_bytes()

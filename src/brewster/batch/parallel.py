@@ -34,14 +34,12 @@ def separate_in_parallel(
 ) -> Iterator[FileResult]:
     """Separates the photos of the tasks, and yields the results in the order in which workers finish them.
 
+    Raises OutputError if a layer would replace a photo of the archive, or a node cannot reach the output folder;
+    ModelError if the model does not exist or is damaged; DeviceError if the requested device is not available.
+
     Args:
         executor: runs a `SeparationRunner` in its workers. The caller enters its context.
         overwrite: whether tasks whose layers exist are given to a worker. The runner needs the same value.
-
-    Raises:
-        OutputError: a layer would replace a photo of the archive, or a node cannot reach the output folder.
-        ModelError: the model does not exist or is damaged.
-        DeviceError: the requested device is not available.
     """
     photos, cache = real_paths(task.source for task in tasks), _FileNameCache()
     for task in tasks:  # a worker cannot check this, because it does not get the paths of all photos
@@ -67,11 +65,10 @@ def separate_in_parallel(
 class SeparationRunner:
     """Separates photos in a worker. The model is loaded when the first photo is separated.
 
+    Raises OutputError if the folder does not exist on this node.
+
     Args:
         shared_folder: the output folder on a cluster. If it is not an object store, all nodes must share it.
-
-    Raises:
-        OutputError: the folder does not exist on this node.
     """
 
     def __init__(
@@ -87,11 +84,8 @@ class SeparationRunner:
         self._separator: Separator | None = None
 
     def __call__(self, task: SeparationTask) -> list[FileResult]:
-        """Separates one photo. If the photo fails, its result has the status "failed".
-
-        Raises:
-            ModelError, DeviceError, MissingExtra: the model cannot be loaded.
-        """
+        """Separates one photo. If the photo fails, its result has the status "failed". Raises ModelError, DeviceError
+        or MissingExtra if the model cannot be loaded."""
         self._separator = self._separator or Separator.load(**self._options.load_options())
         result = next(separate_tasks([task], self._options, self._separator, overwrite=self._overwrite))
         if result.error and not self._overwrite and _is_finished(task, exists):

@@ -174,18 +174,15 @@ def plan_bursts(
 ) -> list[SeparationTask]:
     """Groups photos into bursts, and returns a task for each burst with the paths of the layers of its reference photo.
 
-    The photos that are given by name are one burst, in their order. The photos of each folder are one burst, in the order of their
-    names. Each video that is given by name is one burst.
+    The photos that are given by name are one burst, in their order. The photos of each folder are one burst, in the
+    order of their names. Each video that is given by name is one burst. Raises PhotoError if the sources contain no
+    photo, or a burst has no photo with the index `reference`, and OutputError as `plan_files`.
 
     Args:
         sources: photos, folders and videos.
         output, options: see `separate_files`.
         reference: the index of the reference photo in each burst, by default the middle one.
         frames: the number of frames that are chosen from a video.
-
-    Raises:
-        PhotoError: the sources contain no photo, or a burst has no photo with the index `reference`.
-        OutputError: see `plan_files`.
     """
     given = [location(source) for source in sources]
     groups: dict[object, list[SeparationTask]] = {}

@@ -157,11 +157,8 @@ def separate_task(
     overwrite: bool,
     on_progress: ProgressCallback,
 ) -> None:
-    """Separates one photo, writes its layers, and enters both into the result.
-
-    Raises:
-        BrewsterError: the photo cannot be read or separated, or a layer cannot be written.
-    """
+    """Separates one photo, writes its layers, and enters both into the result. Raises BrewsterError if the photo cannot
+    be read or separated, or a layer cannot be written."""
     result.model, result.model_sha256, result.device = separator.name, separator.sha256, separator.device
     with row_in_errors(task.row):
         photo = read_content(task.source)
@@ -229,11 +226,8 @@ def _separate_burst(
 
 
 def check_outputs(task: SeparationTask, photos: Set[str]) -> None:
-    """Checks that no layer would replace a photo of the batch. `photos` are their paths, from `real_paths`.
-
-    Raises:
-        OutputError: a layer has the path of a photo, or is a hard link to the photo of the task.
-    """
+    """Checks that no layer would replace a photo of the batch. `photos` are their paths, from `real_paths`. Raises
+    OutputError if a layer has the path of a photo, or is a hard link to the photo of the task."""
     for target in task.outputs.values():
         if not isinstance(target, Location):
             continue
@@ -262,11 +256,9 @@ def _names(outputs: Mapping[str, Location | OutputStream]) -> dict[str, str]:
 def check_layers(source: Location | InputStream, layers: Iterable[Location | OutputStream]) -> None:
     """Checks that existing layers were made from this photo. See `find_layer_of_another_photo`.
 
-    Streams are not checked, because they can be read only once. Files in an object store are not checked either: two more
-    requests for each photo of an archive would take hours.
-
-    Raises:
-        OutputError: a layer was made from another photo, or from another version of this photo.
+    Streams are not checked, because they can be read only once. Files in an object store are not checked either: two
+    more requests for each photo of an archive would take hours. Raises OutputError if a layer was made from another
+    photo, or from another version of this photo.
     """
     if not isinstance(source, Path):
         return
@@ -281,11 +273,8 @@ def check_layers(source: Location | InputStream, layers: Iterable[Location | Out
 
 def read_content(source: Location | InputStream) -> Path | bytes:
     """Returns what a `Separator` reads: the path of a local file that can be opened, or the bytes of a URL or stream.
-
-    Raises:
-        UnreadablePhoto: the file does not exist, is a folder, or cannot be opened or read.
-        UnsupportedPhoto: the file has the suffix of a video.
-    """
+    Raises UnreadablePhoto if the file does not exist, is a folder, or cannot be opened or read, and UnsupportedPhoto
+    if the file has the suffix of a video."""
     if isinstance(source, Path):
         check_readable(source)
         return source

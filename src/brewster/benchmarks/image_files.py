@@ -26,11 +26,8 @@ class ImageFile:
     span: tuple[int, int] | None = None
 
     def read(self) -> bytes:
-        """Returns the encoded bytes of the image.
-
-        Raises:
-            UnreadablePhoto: the file is missing, cannot be read, or ends before the end of the span.
-        """
+        """Returns the encoded bytes of the image. Raises UnreadablePhoto if the file is missing, cannot be read, or
+        ends before the end of the span."""
         offset, length = self.span or (0, -1)
         try:
             with self.path.open("rb") as file:
@@ -76,12 +73,8 @@ class Case:
 
 
 def read_samples(folder: Path) -> list[StoredSample]:
-    """Returns the samples of a rendered dataset.
-
-    Raises:
-        PhotoError: the folder is not a rendered dataset.
-        MissingExtra: torch is not installed.
-    """
+    """Returns the samples of a rendered dataset. Raises PhotoError if the folder is not a rendered dataset, and
+    MissingExtra if torch is not installed."""
     try:
         from brewster.rendered.store import read_dataset  # noqa: PLC0415  (needs torch, an optional dependency)
 

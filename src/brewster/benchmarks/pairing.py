@@ -121,11 +121,8 @@ class FolderListing:
 
 
 def list_folder(folder: Path) -> tuple[list[Path], list[Path]]:
-    """Returns the folders and the files in a folder, in natural order, without hidden files and system files.
-
-    Raises:
-        PhotoError: the folder cannot be read.
-    """
+    """Returns the folders and the files in a folder, in natural order, without hidden files and system files. Raises
+    PhotoError if the folder cannot be read."""
     kinds: tuple[list[Path], list[Path]] = ([], [])
     try:
         for path in sorted(folder.iterdir(), key=lambda path: natural_key(path.name)):
@@ -144,20 +141,14 @@ def list_folder(folder: Path) -> tuple[list[Path], list[Path]]:
 
 
 def find_roles(folder: Path) -> dict[str, Path]:
-    """Returns the subfolder of each role. A subfolder has a role if its name is in ROLES.
-
-    Raises:
-        PhotoError: the folder cannot be read, or has two subfolders for one role.
-    """
+    """Returns the subfolder of each role. A subfolder has a role if its name is in ROLES. Raises PhotoError if the
+    folder cannot be read, or has two subfolders for one role."""
     return _find_subfolders(folder, _role_of)
 
 
 def find_numbered_splits(folder: Path) -> dict[str, dict[str, Path]]:
     """Returns the subfolders by split and role, for names such as val_300_blended. The split of this name is "val_300".
-
-    Raises:
-        PhotoError: the folder cannot be read.
-    """
+    Raises PhotoError if the folder cannot be read."""
     splits: dict[str, dict[str, Path]] = defaultdict(dict)
     for path in list_folder(folder)[0]:
         prefix = _SPLIT_PREFIX.match(path.name)
@@ -179,10 +170,7 @@ def find_sets(folder: Path) -> list[Path]:
 
 def find_split(folder: Path) -> Path:
     """Returns the folder itself if it contains pairs, else its only subfolder with pairs, such as train, val or test.
-
-    Raises:
-        PhotoError: several subfolders contain pairs, or a folder cannot be read.
-    """
+    Raises PhotoError if several subfolders contain pairs, or a folder cannot be read."""
     if "photo" in find_roles(folder):
         return folder
     splits = [path for path in list_folder(folder)[0] if "photo" in find_roles(path)]
@@ -198,10 +186,8 @@ def find_split(folder: Path) -> Path:
 def read_folders(folder: Path, roles: Mapping[str, Path] | None = None) -> FolderListing:
     """Returns the groups of a folder with one subfolder per role. The file stems must be equal; suffixes may differ.
 
-    `roles` has the subfolder of each role; by default, it is the result of `find_roles`.
-
-    Raises:
-        PhotoError: a folder is missing, empty or unreadable, or two folders have the same role.
+    `roles` has the subfolder of each role; by default, it is the result of `find_roles`. Raises PhotoError if a folder
+    is missing, empty or unreadable, or two folders have the same role.
     """
     roles = find_roles(folder) if roles is None else roles
     by_name: dict[str, dict[str, list[Path]]] = defaultdict(lambda: defaultdict(list))
@@ -242,21 +228,16 @@ def _role_files(folder: Path, role: str, roles: Mapping[str, Path]) -> tuple[lis
 
 
 def find_subsets(folder: Path) -> dict[str, Path]:
-    """Returns the subfolder of each subset of SIR2. Only the start of the name is compared: "Postcard Dataset" is "postcard".
-
-    Raises:
-        PhotoError: the folder cannot be read, or has two subfolders for one subset.
-    """
+    """Returns the subfolder of each subset of SIR2. Only the start of the name is compared: "Postcard Dataset" is
+    "postcard". Raises PhotoError if the folder cannot be read, or has two subfolders for one subset."""
     return _find_subfolders(folder, _subset_of)
 
 
 def read_tree(folder: Path, subset: str) -> FolderListing:
     """Returns the groups of a subset of SIR2. Its folders have one subfolder per shot.
 
-    Files of a shot are grouped if their names, without the letter of the role, are equal.
-
-    Raises:
-        PhotoError: a folder cannot be read, or there is no shot.
+    Files of a shot are grouped if their names, without the letter of the role, are equal. Raises PhotoError if a folder
+    cannot be read, or there is no shot.
     """
     listing = FolderListing(folder)
     _read_branches(listing, folder, SIR2_TREES[subset], {})

@@ -73,13 +73,12 @@ class BenchmarkLayout:
 def read_benchmark(name: str, folder: Path) -> list[Benchmark]:
     """Reads a benchmark from a folder. Decodes only the file headers.
 
+    Raises PhotoError if the name is not in BENCHMARKS, or the folder is missing or empty, or its layout is not
+    supported, and MissingExtra if the extra for rendered datasets or for the image format is not installed.
+
     Returns:
         A list with one benchmark. For "sir2", a list with one benchmark for each of the three subsets in the folder.
         If the copy is incomplete, `remarks` and `excluded` list the missing files.
-
-    Raises:
-        PhotoError: the name is not in BENCHMARKS, or the folder is missing or empty, or its layout is not supported.
-        MissingExtra: the extra for rendered datasets or for the image format is not installed.
     """
     if name not in BENCHMARKS:
         close = difflib.get_close_matches(name.lower(), BENCHMARKS, 1)

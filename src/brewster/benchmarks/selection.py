@@ -22,12 +22,9 @@ PAPER_SEED: Final = 181
 def paper_subset(benchmark: Benchmark, seed: int = PAPER_SEED) -> tuple[Case, ...]:
     """Draws a random subset like that of the paper, which does not say which cases it uses.
 
-    This function draws one case of each scene with `Random(f"{seed}/{benchmark}/{scene}").choice(...)` from the cases in
-    natural order of their names. The case of a scene therefore does not depend on the other scenes. Other benchmarks than
-    Postcard and SolidObject keep all cases.
-
-    Raises:
-        PhotoError: the file names do not identify the scenes.
+    This function draws one case of each scene with `Random(f"{seed}/{benchmark}/{scene}").choice(...)` from the cases
+    in natural order of their names. The case of a scene therefore does not depend on the other scenes. Other benchmarks
+    than Postcard and SolidObject keep all cases. Raises PhotoError if the file names do not identify the scenes.
     """
     if benchmark.name not in BENCHMARKS or not BENCHMARKS[benchmark.name].scene_pattern:
         return benchmark.cases

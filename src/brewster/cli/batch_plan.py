@@ -159,11 +159,8 @@ def check_output(photos: Sequence[str], output: str | None) -> None:
 
 
 def gpu_for_plan(name: str | None) -> GraphicsCard:
-    """Returns the GPU of this name, or that of this machine, or else that of the paper, with a message.
-
-    Raises:
-        DeviceError: the name is unknown.
-    """
+    """Returns the GPU of this name, or that of this machine, or else that of the paper, with a message. Raises
+    DeviceError if the name is unknown."""
     from brewster.models.diffusion_resources import PAPER_GPU, find_gpu, local_gpu  # noqa: PLC0415
 
     gpu = find_gpu(name) if name else local_gpu()

@@ -124,21 +124,15 @@ _STDERR: Final = 2
 
 
 def print_out(text: object) -> None:
-    """Prints one line on standard output, and flushes it.
-
-    Raises:
-        OutputError: standard output cannot be written, for example because the disk is full.
-    """
+    """Prints one line on standard output, and flushes it. Raises OutputError if standard output cannot be written, for
+    example because the disk is full."""
     stream = standard_output.stream
     write_out(f"{text}\n".encode(stream.encoding or "utf-8", stream.errors or "strict"))
 
 
 def write_out(data: bytes) -> None:
-    """Writes bytes to standard output, and flushes them.
-
-    Raises:
-        OutputError: standard output cannot be written, for example because the disk is full.
-    """
+    """Writes bytes to standard output, and flushes them. Raises OutputError if standard output cannot be written, for
+    example because the disk is full."""
     stream = standard_output.stream
     try:
         stream.buffer.write(data)

@@ -67,12 +67,8 @@ class AblationStudy(FrozenModel):
         return f"{self.key.rpartition('.')[2]} {str(value).replace('/', ' ')}"
 
     def open_benchmarks(self) -> list[Benchmark]:
-        """Reads the benchmarks of the study.
-
-        Raises:
-            RecipeError: BREWSTER_DATA is not a folder.
-            PhotoError: a benchmark cannot be read.
-        """
+        """Reads the benchmarks of the study. Raises RecipeError if BREWSTER_DATA is not a folder, and PhotoError if a
+        benchmark cannot be read."""
         root = data_folder()
         return [
             part for name, folder in self.benchmarks.items() for part in read_benchmark(name, root / folder)
@@ -80,11 +76,8 @@ class AblationStudy(FrozenModel):
 
 
 def read_study(path: Path) -> AblationStudy:
-    """Reads and validates a study. The path `base` is resolved relative to the folder of the file.
-
-    Raises:
-        RecipeError: the file is missing or not TOML, or its values are missing, unknown or invalid.
-    """
+    """Reads and validates a study. The path `base` is resolved relative to the folder of the file. Raises RecipeError
+    if the file is missing or not TOML, or its values are missing, unknown or invalid."""
     study = read_toml(AblationStudy, path, reference="docs/recipes.md")
     return study.model_copy(update={"base": path.parent / study.base})
 
@@ -100,11 +93,8 @@ def ablate(
     """Trains and evaluates a model for every value. `out` gets one folder per value and the files that `evaluate` writes.
 
     If all values are numbers and any metric has a score, plot.png shows the metrics against the values. The results are
-    those of `evaluate`; the model of each value is a method.
-
-    Raises:
-        RecipeError: the base recipe, the key or a value is invalid, or data is missing.
-        BrewsterError: as raised by training and `evaluate`.
+    those of `evaluate`; the model of each value is a method. Raises RecipeError if the base recipe, the key or a value
+    is invalid, or data is missing, and BrewsterError as training and `evaluate` do.
     """
     config = EvaluationConfig(metrics=study.metrics)
     for metric in config.columns().values():

@@ -66,10 +66,12 @@ def evaluate(
     """Scores the methods. Writes results.json, scores.csv, tables.md, table.tex, table.csv and report.html into `out`.
 
     A metric whose weights are missing is left out, and "unavailable" in the results says why; the next run adds it. If
-    photos are resized, it also writes them into `out`/inputs. Each image is read and decoded once, with four exceptions.
-    The files are read twice if an earlier run has all scores. Exclusive methods read the cases again. The report reads the
-    images of a case again if the benchmark has more than `max_report_cases` cases, or if an earlier run scored the case.
-    The result is the content of results.json.
+    photos are resized, it also writes them into `out`/inputs. Each image is read and decoded once, with four
+    exceptions. The files are read twice if an earlier run has all scores. Exclusive methods read the cases again. The
+    report reads the images of a case again if the benchmark has more than `max_report_cases` cases, or if an earlier
+    run scored the case. The result is the content of results.json. Raises BrewsterError if there is no case or no
+    method, names are not unique, an image matches two cases, the file names do not identify the scenes, which the
+    subsets of the paper need, or an optional dependency is missing, and OutputError if `out` cannot be written.
 
     Args:
         methods: the methods, in the order of the tables. The first one should be the baseline.
@@ -77,11 +79,6 @@ def evaluate(
         max_report_cases: the maximum of cases of each benchmark in the report. They are the cases with the worst scores of
             the first method that is not the baseline.
         intervals: whether table.tex has the confidence intervals.
-
-    Raises:
-        BrewsterError: there is no case or no method, names are not unique, an image matches two cases, the file names do
-            not identify the scenes, which the subsets of the paper need, or an optional dependency is missing.
-        OutputError: `out` cannot be written.
     """
     check(benchmarks, methods, config)
     cases = [case for benchmark in benchmarks for case in benchmark.cases]

@@ -80,11 +80,8 @@ class Method(Protocol):
         ...
 
     def predict(self, case: Case, photo: Photo) -> MethodOutput:
-        """Returns the predicted layers for the photo of a case.
-
-        Raises:
-            BrewsterError: the method failed. Any other exception counts as a failure too.
-        """
+        """Returns the predicted layers for the photo of a case. Raises BrewsterError if the method failed. Any other
+        exception counts as a failure too."""
         ...
 
     def cached(self, case: Case) -> MethodOutput | None:
@@ -247,11 +244,8 @@ class PredictionFolder:
         return {layer: read_image(path) for layer, path in self.files(case).items()}
 
     def files(self, case: Case) -> dict[str, Path]:
-        """Returns layer -> file for a case: the transmission and, if there is one, the reflection.
-
-        Raises:
-            PhotoError: there is no transmission, or there are several files for a layer.
-        """
+        """Returns layer -> file for a case: the transmission and, if there is one, the reflection. Raises PhotoError if
+        there is no transmission, or there are several files for a layer."""
         found = {layer: self._candidates(case, layer) for layer in ("transmission", "reflection")}
         for layer, paths in found.items():
             if len(paths) > 1:
@@ -276,11 +270,8 @@ class PredictionFolder:
         return sum(map(len, self._images.values())) - len(used)
 
     def check_pairing(self, cases: Sequence[Case]) -> None:
-        """Checks that the folder can be paired with the cases by name.
-
-        Raises:
-            PhotoError: the folder is missing, one image matches two cases, or no image matches a case.
-        """
+        """Checks that the folder can be paired with the cases by name. Raises PhotoError if the folder is missing, one
+        image matches two cases, or no image matches a case."""
         if not self.folder.is_dir():
             raise PhotoError(
                 f"{self.folder} is not a folder",

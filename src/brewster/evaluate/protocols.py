@@ -24,10 +24,7 @@ class ProtocolPreset:
 
 def protocol_config(name: str, **changes: Any) -> EvaluationConfig:  # noqa: ANN401  (the fields of EvaluationConfig)
     """Returns the settings of a protocol. `changes` are fields of `EvaluationConfig` that replace or complete them.
-
-    Raises:
-        BrewsterError: there is no protocol of this name, or a value is invalid.
-    """
+    Raises BrewsterError if there is no protocol of this name, or a value is invalid."""
     if name not in PROTOCOLS:
         raise BrewsterError(
             f"there is no protocol {name!r}", f"expected one of {', '.join(PROTOCOLS)}", "choose one of them"

@@ -47,10 +47,8 @@ def summarise(
 ) -> Results:
     """Returns the content of results.json. The order of the rows does not matter.
 
-    `unavailable` is column -> reason, for the columns that could not be computed.
-
-    Raises:
-        BrewsterError: the subsets of the paper are requested, but the file names of a benchmark do not identify its scenes.
+    `unavailable` is column -> reason, for the columns that could not be computed. Raises BrewsterError if the subsets
+    of the paper are requested, but the file names of a benchmark do not identify its scenes.
     """
     by_id = {row.id: row for row in rows}
     method_names = [method.name for method in methods]
@@ -136,11 +134,8 @@ def summarise(
 
 
 def paper_subsets(benchmarks: Sequence[Benchmark]) -> list[Selection]:
-    """Returns the subset that the paper uses of each benchmark, without the benchmarks that it uses as a whole.
-
-    Raises:
-        BrewsterError: the file names of a benchmark do not identify its scenes.
-    """
+    """Returns the subset that the paper uses of each benchmark, without the benchmarks that it uses as a whole. Raises
+    BrewsterError if the file names of a benchmark do not identify its scenes."""
     subsets = [(benchmark, paper_subset(benchmark)) for benchmark in benchmarks if benchmark.cases]
     return [
         Selection(f"{benchmark.name}:paper", f"{benchmark.title}, subset of the paper", cases)

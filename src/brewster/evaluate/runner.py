@@ -55,8 +55,10 @@ def score(
 ) -> tuple[list[ScoreRow], dict[str, str]]:
     """Runs every method on every case and scores the predictions. Reuses the rows of an earlier run if nothing changed.
 
-    Exclusive methods run last, one after another, in this process. Each of them reads the cases again. A column is left out if
-    it cannot be computed on this machine, for example without weights.
+    Exclusive methods run last, one after another, in this process. Each of them reads the cases again. A column is left
+    out if it cannot be computed on this machine, for example without weights. Raises BrewsterError if two methods have
+    the same name, a name is not valid for a folder, or a worker process died, and OutputError if `out` cannot be
+    written.
 
     Args:
         on_case_scored: called once for each case with new rows. With several workers, it must be picklable.
@@ -64,10 +66,6 @@ def score(
     Returns:
         One row for each case and method, in the order of benchmarks, cases and methods. The number of workers does not
         change the order. If a method failed on a case, its row has an `error`. And column -> reason, for the columns left out.
-
-    Raises:
-        BrewsterError: two methods have the same name, a name is not valid for a folder, or a worker process died.
-        OutputError: `out` cannot be written.
     """
     check_names(methods)
     logged = read_score_rows(out / SCORES_FILE)
@@ -241,11 +239,8 @@ def _empty_row(
 
 
 def get_prediction(truth: GroundTruth, method: Method, row: ScoreRow) -> MethodOutput:
-    """Returns the stored prediction if it has the digest of the row, else a new prediction.
-
-    Raises:
-        BrewsterError: the method failed.
-    """
+    """Returns the stored prediction if it has the digest of the row, else a new prediction. Raises BrewsterError if the
+    method failed."""
     cached = method.cached(truth.case) if row.digest else None
     return cached if cached and cached.digest == row.digest else method.predict(truth.case, truth.photo)
 

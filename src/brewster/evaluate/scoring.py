@@ -65,11 +65,8 @@ class GroundTruth:
 
     @classmethod
     def decode(cls, files: CaseFiles, config: EvaluationConfig) -> GroundTruth:
-        """Decodes the images of a case and resizes them as `config` says.
-
-        Raises:
-            PhotoError: an image cannot be decoded, or the images differ in size.
-        """
+        """Decodes the images of a case and resizes them as `config` says. Raises PhotoError if an image cannot be
+        decoded, or the images differ in size."""
         case = files.case
         photos = {role: resize(Photo.open(data), config) for role, data in files.data.items()}
         for role, photo in photos.items():

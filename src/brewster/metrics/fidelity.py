@@ -70,11 +70,9 @@ def _to_decibels(mse: float) -> float:
 def count_pairs(prediction: Image, truth: Image) -> PairCounts:
     """Counts the pairs of 8-bit values at the same position: the joint histogram of two images, over all channels.
 
-    Every mean over all pixels of a function of two values follows from it, and it is faster than the function of each pixel.
-    The counts are int64 (65536,). The index is 256 times the value of the prediction, plus that of the ground truth.
-
-    Raises:
-        ValueError: the images are not uint8 (H, W, 3) or differ in shape.
+    Every mean over all pixels of a function of two values follows from it, and it is faster than the function of each
+    pixel. The counts are int64 (65536,). The index is 256 times the value of the prediction, plus that of the ground
+    truth. Raises ValueError if the images are not uint8 (H, W, 3) or differ in shape.
     """
     check_images(prediction, truth)
     pairs = prediction.astype(np.intp)
@@ -136,11 +134,8 @@ def ssim(
 
 
 def mean_ssim(values: NDArray[np.float64], *, region: Region | None = None) -> float:
-    """Returns the mean of a map of `ssim_map`, over all its pixels or over those in `region`, bool (H, W).
-
-    Raises:
-        ValueError: the region is empty, of another shape, or has only pixels without a value.
-    """
+    """Returns the mean of a map of `ssim_map`, over all its pixels or over those in `region`, bool (H, W). Raises
+    ValueError if the region is empty, of another shape, or has only pixels without a value."""
     if region is None:
         return float(np.mean(values))
     border = (region.shape[0] - values.shape[0]) // 2
@@ -154,11 +149,8 @@ def mean_ssim(values: NDArray[np.float64], *, region: Region | None = None) -> f
 
 
 def ssim_map(prediction: Image, truth: Image, *, window: Window = "uniform") -> NDArray[np.float64]:
-    """Returns the local SSIM, (H - side + 1, W - side + 1, 3) for a window with sides of `side` pixels.
-
-    Raises:
-        ValueError: the images are not uint8 (H, W, 3), differ in shape, or are smaller than the window.
-    """
+    """Returns the local SSIM, (H - side + 1, W - side + 1, 3) for a window with sides of `side` pixels. Raises
+    ValueError if the images are not uint8 (H, W, 3), differ in shape, or are smaller than the window."""
     check_images(prediction, truth)
     side = _WINDOW_SIDES[window]
     height, width = prediction.shape[:2]

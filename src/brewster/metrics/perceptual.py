@@ -67,11 +67,8 @@ class DifferenceMaps:
     shape: tuple[int, int]
 
     def mean(self, *, region: Region | None = None) -> float:
-        """Returns the distance, averaged over the whole maps or over a region; see `Lpips.difference`.
-
-        Raises:
-            ValueError: the region is empty or of another shape.
-        """
+        """Returns the distance, averaged over the whole maps or over a region; see `Lpips.difference`. Raises
+        ValueError if the region is empty or of another shape."""
         import torch  # noqa: PLC0415 - an extra
 
         if region is None:
@@ -93,22 +90,15 @@ class Lpips:
 
     @classmethod
     def load(cls) -> Lpips:
-        """Returns LPIPS with its published weights. All calls return the same object.
-
-        Raises:
-            MissingExtra: torch is not installed.
-            ModelError: the file of AlexNet's weights is damaged, or contains other weights.
-            DownloadError: AlexNet's weights are not on this machine, and the download fails.
-            OutputError: the downloaded weights cannot be written to the cache folder.
-        """
+        """Returns LPIPS with its published weights. All calls return the same object. Raises MissingExtra if torch is
+        not installed; ModelError if the file of AlexNet's weights is damaged, or contains other weights;
+        DownloadError if AlexNet's weights are not on this machine, and the download fails; OutputError if the
+        downloaded weights cannot be written to the cache folder."""
         return _load()
 
     def features(self, image: Image) -> Features:
-        """Returns the features of an image, uint8 (H, W, 3).
-
-        Raises:
-            ValueError: the image is not uint8 (H, W, 3), or has fewer than 31 pixels on a side.
-        """
+        """Returns the features of an image, uint8 (H, W, 3). Raises ValueError if the image is not uint8 (H, W, 3), or
+        has fewer than 31 pixels on a side."""
         import torch  # noqa: PLC0415 - an extra
         from torch.nn import functional  # noqa: PLC0415
 
@@ -131,14 +121,12 @@ class Lpips:
     def difference(self, one: Features, other: Features) -> DifferenceMaps:
         """Returns the five maps of the LPIPS distance between two images, given by their features. Its `mean` is the distance.
 
-        The squared differences of the features are weighted by channel. Without a region, they are averaged over each map, and
-        summed over the five maps. With a `region`, bool (H, W), each map of differences is first upsampled to the size of the
-        image (bilinear, align_corners=False; `spatial=True` in `lpips`), and the sum of the maps is averaged over the region. A
-        region that is the whole image gives a slightly different value than no region, because upsampling changes the weight of
-        the pixels at the border of a map. The distance is 0 for equal images; lower is better.
-
-        Raises:
-            ValueError: the images differ in size.
+        The squared differences of the features are weighted by channel. Without a region, they are averaged over each
+        map, and summed over the five maps. With a `region`, bool (H, W), each map of differences is first upsampled to
+        the size of the image (bilinear, align_corners=False; `spatial=True` in `lpips`), and the sum of the maps is
+        averaged over the region. A region that is the whole image gives a slightly different value than no region,
+        because upsampling changes the weight of the pixels at the border of a map. The distance is 0 for equal images;
+        lower is better. Raises ValueError if the images differ in size.
         """
         import torch  # noqa: PLC0415 - an extra
 

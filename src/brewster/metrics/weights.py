@@ -49,12 +49,8 @@ def load_alexnet(
     downloader: Downloader | None = None,
 ) -> dict[str, Tensor]:
     """Returns AlexNet's ten tensors by name, float32: from the cache, from BREWSTER_DATA, or downloaded into the cache.
-
-    Raises:
-        ModelError: the file is damaged, or contains other weights.
-        DownloadError: there is no file, and the download fails.
-        OutputError: the cache folder cannot be written.
-    """
+    Raises ModelError if the file is damaged, or contains other weights; DownloadError if there is no file, and the
+    download fails; OutputError if the cache folder cannot be written."""
     cached, data = cache_folder() / "weights" / ALEXNET_FILE, os.environ.get("BREWSTER_DATA")
     for path in (cached, *([Path(data) / "weights" / ALEXNET_FILE] if data else [])):
         if path.is_file():
@@ -63,11 +59,8 @@ def load_alexnet(
 
 
 def read_alexnet(path: Path, digest: str = ALEXNET_DIGEST) -> dict[str, Tensor]:
-    """Reads the ten tensors of a state dict and checks their digest. Other tensors in the file are ignored.
-
-    Raises:
-        ModelError: the file is damaged, or contains other weights.
-    """
+    """Reads the ten tensors of a state dict and checks their digest. Other tensors in the file are ignored. Raises
+    ModelError if the file is damaged, or contains other weights."""
     import torch  # noqa: PLC0415 - an extra
 
     try:

@@ -41,13 +41,10 @@ def write_contact_sheets(
 ) -> Iterator[Path]:
     """Writes the rows to `path`. Yields the path of each sheet.
 
-    A sheet has at most 200 rows. Further sheets have a number: `sheet.jpg`, `sheet-2.jpg` and so on. A contact sheet of an
-    earlier run is replaced; with `overwrite`, other files are, too. A row has the file of a photo, whose path is its label, and
-    the files of its layers. Files with more than `max_pixels` pixels are refused.
-
-    Raises:
-        PhotoError: an image file cannot be read.
-        OutputError: the sheet cannot be written, or another file has its name.
+    A sheet has at most 200 rows. Further sheets have a number: `sheet.jpg`, `sheet-2.jpg` and so on. A contact sheet of
+    an earlier run is replaced; with `overwrite`, other files are, too. A row has the file of a photo, whose path is its
+    label, and the files of its layers. Files with more than `max_pixels` pixels are refused. Raises PhotoError if an
+    image file cannot be read, and OutputError if the sheet cannot be written, or another file has its name.
     """
     if not _SYSTEM_FONTS.exists():
         os.environ.setdefault("FONTCONFIG_FILE", str(_PACKAGED_FONTS))  # ignored on Windows and macOS

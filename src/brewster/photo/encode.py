@@ -27,12 +27,9 @@ _DEFAULT_RESOLUTION = (72 / 25.4, 72 / 25.4)
 
 
 def encode(pixels: Stored, alpha: Stored | None, file_info: FileInfo, quality: int | None = None) -> bytes:
-    """Returns the bytes of a file. `pixels` (H, W, 1|3) and `alpha` (H, W) have the dtype for `file_info.bits`.
-
-    Raises:
-        UnsupportedPhoto: the format cannot store the image, or the quality is not 1..100 or the format has none.
-        MissingExtra: the writer of EXR or HEIC is not installed.
-    """
+    """Returns the bytes of a file. `pixels` (H, W, 1|3) and `alpha` (H, W) have the dtype for `file_info.bits`. Raises
+    UnsupportedPhoto if the format cannot store the image, or the quality is not 1..100 or the format has none, and
+    MissingExtra if the writer of EXR or HEIC is not installed."""
     if alpha is not None and not FORMATS[file_info.format_name].has_alpha:
         raise UnsupportedPhoto(
             f"the photo has an alpha channel, which {file_info.format_name} cannot store",

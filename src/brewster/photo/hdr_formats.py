@@ -40,14 +40,10 @@ def _valid_chromaticities(chromaticities: Sequence[float | str]) -> tuple[float,
 def read_exr(data: bytes, max_pixels: int) -> Decoded:
     """Reads the first part of an EXR: the channels R, G and B, or Y alone, and the channel A if there is one.
 
-    Other channels, such as Z, are ignored.
-
-    Raises:
-        MissingExtra: OpenEXR is not installed.
-        PhotoTooLarge: the image has more pixels than `max_pixels`.
-        UnreadablePhoto: the file is damaged or truncated.
-        UnsupportedPhoto: the file has neither the channels R, G and B nor the channel Y, or its colours are stored as luminance
-            and chroma (Y, RY, BY).
+    Other channels, such as Z, are ignored. Raises MissingExtra if OpenEXR is not installed; PhotoTooLarge if the image
+    has more pixels than `max_pixels`; UnreadablePhoto if the file is damaged or truncated; UnsupportedPhoto if the file
+    has neither the channels R, G and B nor the channel Y, or its colours are stored as luminance and chroma (Y, RY,
+    BY).
     """
     header = _exr_part(data, header_only=True).header
     low, high = header["dataWindow"]
@@ -187,13 +183,9 @@ _FACTORS = ("EXPOSURE", "COLORCORR", "PIXASPECT")
 
 
 def read_hdr(data: bytes, max_pixels: int) -> Decoded:
-    """Reads a Radiance HDR image: red, green and blue with a shared exponent (RGBE).
-
-    Raises:
-        PhotoTooLarge: the image has more pixels than `max_pixels`.
-        UnreadablePhoto: the image is empty or truncated.
-        UnsupportedPhoto: the image has XYZ colours, its scan lines are not ordered from top to bottom, or its header has no size.
-    """
+    """Reads a Radiance HDR image: red, green and blue with a shared exponent (RGBE). Raises PhotoTooLarge if the image
+    has more pixels than `max_pixels`; UnreadablePhoto if the image is empty or truncated; UnsupportedPhoto if the
+    image has XYZ colours, its scan lines are not ordered from top to bottom, or its header has no size."""
     header_text, separator, rest = data.partition(b"\n\n")
     resolution, _, body = rest.partition(b"\n")
     resolution_match = re.fullmatch(rb"-Y (\d{1,9}) \+X (\d{1,9})\s*", resolution)

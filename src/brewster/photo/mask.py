@@ -84,11 +84,8 @@ def sampled(values: Stored, width: int, height: int) -> Stored:
 
 
 def open_painted(source: Source, size: tuple[int, int], name: str) -> Photo:
-    """Opens an image that was painted for a photo of this (width, height). `name` is its name in messages.
-
-    Raises:
-        MaskError: the source cannot be read, or has another size.
-    """
+    """Opens an image that was painted for a photo of this (width, height). `name` is its name in messages. Raises
+    MaskError if the source cannot be read, or has another size."""
     try:
         if isinstance(source, np.ndarray):
             array = np.uint8(255) * source if source.dtype == np.bool_ else source

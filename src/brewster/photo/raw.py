@@ -39,13 +39,9 @@ def is_raw(tags: metadata.Tags) -> bool:
 
 
 def read_raw(data: bytes, max_pixels: int) -> tuple[NDArray[np.uint16], FileInfo]:
-    """Returns the pixels (H, W, 1|3) in Display P3, upright, and the metadata of a RAW file.
-
-    Raises:
-        MissingExtra: rawpy is not installed.
-        PhotoTooLarge: the image has more pixels than `max_pixels`.
-        UnreadablePhoto: the file is damaged or truncated, or LibRaw does not support the camera.
-    """
+    """Returns the pixels (H, W, 1|3) in Display P3, upright, and the metadata of a RAW file. Raises MissingExtra if
+    rawpy is not installed; PhotoTooLarge if the image has more pixels than `max_pixels`; UnreadablePhoto if the file
+    is damaged or truncated, or LibRaw does not support the camera."""
     with _opened(data) as raw:
         _upright_size(raw, max_pixels)  # checks the limit before the pixels are decoded
         linear = raw.postprocess(
@@ -64,13 +60,9 @@ def read_raw(data: bytes, max_pixels: int) -> tuple[NDArray[np.uint16], FileInfo
 
 
 def read_raw_size(data: bytes, max_pixels: int) -> tuple[int, int]:
-    """Returns (width, height) of the upright image of a RAW file.
-
-    Raises:
-        MissingExtra: rawpy is not installed.
-        PhotoTooLarge: the image has more pixels than `max_pixels`.
-        UnreadablePhoto: the file is damaged, or LibRaw does not support the camera.
-    """
+    """Returns (width, height) of the upright image of a RAW file. Raises MissingExtra if rawpy is not installed;
+    PhotoTooLarge if the image has more pixels than `max_pixels`; UnreadablePhoto if the file is damaged, or LibRaw
+    does not support the camera."""
     with _opened(data) as raw:
         return _upright_size(raw, max_pixels)
 

@@ -72,11 +72,8 @@ _ANSWER_FILE: Final = TypeAdapter(AnswerFile)
 
 
 def read_answer_file(path: Path) -> AnswerFile:
-    """Reads a file of answers. Nothing in it is trusted: types, ranges, names and size are checked.
-
-    Raises:
-        BrewsterError: the file cannot be read, is too large, or is not a valid file of answers.
-    """
+    """Reads a file of answers. Nothing in it is trusted: types, ranges, names and size are checked. Raises
+    BrewsterError if the file cannot be read, is too large, or is not a valid file of answers."""
     try:
         with path.open("rb") as file:
             data = file.read(MAX_ANSWER_FILE_BYTES + 1)

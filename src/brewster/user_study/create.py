@@ -65,6 +65,9 @@ def create_study(
 ) -> Study:
     """Create a study of all pictures in the folder `inputs`.
 
+    Raises BrewsterError if there are fewer than two methods, files are missing, unreadable or of different sizes, or more
+    pairs or catch trials are requested than exist, and OutputError if `out` is not empty or cannot be written.
+
     Args:
         out: the folder of the new study. It must be empty, or not exist yet.
         methods: the folder of outputs by method name. The first method is compared with each of the others.
@@ -74,11 +77,6 @@ def create_study(
         catch_trials: number of catch trials for each participant. None means DEFAULT_CATCHES, or all if there are fewer.
         all_pairs: whether each method is compared with each other method, instead of the first method only.
         seed: the seed of the assignment; None chooses a random one.
-
-    Raises:
-        BrewsterError: there are fewer than two methods; files are missing, unreadable or of different sizes; or more pairs
-            or catch trials are requested than exist.
-        OutputError: `out` is not empty or cannot be written.
     """
     require_empty(out)
     photos, outputs = _pair_pictures(inputs, methods, datasets, names)

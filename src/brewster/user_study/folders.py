@@ -24,12 +24,10 @@ def find_pictures(folder: Path, datasets: Sequence[str] = ()) -> dict[Key, Path]
     """Find pictures in the subfolders, one for each dataset, or in the folder itself if no subfolder has pictures.
 
     Outputs may be named as `brewster -o` names them: `name.transmission.png` counts as `name`, and the files
-    `name.reflection.png` and `name.confidence.png` of the same photo are ignored. The keys are (dataset, stem), in natural
-    order (2 before 10). With `datasets`, only these are used, in this order.
-
-    Raises:
-        BrewsterError: the folder contains no picture; a dataset is missing; two files have the same name; or pictures are both
-            in the folder and in its subfolders, and `datasets` is empty.
+    `name.reflection.png` and `name.confidence.png` of the same photo are ignored. The keys are (dataset, stem), in
+    natural order (2 before 10). With `datasets`, only these are used, in this order. Raises BrewsterError if the folder
+    contains no picture, a dataset is missing, two files have the same name, or pictures are both in the folder and in
+    its subfolders, and `datasets` is empty.
     """
     if not folder.is_dir():
         raise BrewsterError(f"{folder} is not a folder", "expected a folder with pictures", "check the path")
@@ -79,11 +77,10 @@ def find_pictures(folder: Path, datasets: Sequence[str] = ()) -> dict[Key, Path]
 def select_pictures(pictures: Mapping[Key, Path], names: Sequence[str], folder: Path) -> dict[Key, Path]:
     """The pictures with these names, in the order of `pictures`; all of them if `names` is empty.
 
+    Raises BrewsterError if a name has no picture.
+
     Args:
         names: "dataset/stem" for each picture, or "stem" if there are no datasets. A suffix is allowed.
-
-    Raises:
-        BrewsterError: a name has no picture.
     """
     by_name = {"/".join(filter(None, key)): key for key in pictures}
     stems = {

@@ -183,11 +183,8 @@ class AnswerStore:
     def withdraw_answer(self, participant: Participant, trial: int) -> None:
         """Withdraw the answer to the last answered trial, so that the trial can be answered again. The answer is kept.
 
-        Nothing is changed if the trial has no answer, for example because it was withdrawn already.
-
-        Raises:
-            BrewsterError: a later trial has an answer.
-            OutputError: the database cannot be written.
+        Nothing is changed if the trial has no answer, for example because it was withdrawn already. Raises
+        BrewsterError if a later trial has an answer, and OutputError if the database cannot be written.
         """
         key = (participant.number, trial)
         with self._transaction("IMMEDIATE") as database:
@@ -216,12 +213,9 @@ class AnswerStore:
     ) -> Choice:
         """Store an answer, unless the trial already has one. The answer is synced to the disk on return.
 
-        `trial` is the index of the trial, from 0. `seconds` is how long the pictures were shown, clipped to 0..MAX_SECONDS.
-        Returns the stored choice, which is that of the first answer.
-
-        Raises:
-            BrewsterError: the trial or the choice does not exist.
-            OutputError: the database cannot be written.
+        `trial` is the index of the trial, from 0. `seconds` is how long the pictures were shown, clipped to
+        0..MAX_SECONDS. Returns the stored choice, which is that of the first answer. Raises BrewsterError if the trial
+        or the choice does not exist, and OutputError if the database cannot be written.
         """
         if not 0 <= trial < len(participant.trials) or choice not in CHOICES:
             raise BrewsterError(
@@ -246,11 +240,8 @@ class AnswerStore:
     def import_answers(self, answer_file: AnswerFile) -> int:
         """Store the answers of a participant of a static bundle in one transaction. An answer that is stored already is kept.
 
-        Returns the number of answers that were not stored before.
-
-        Raises:
-            BrewsterError: the participant or a trial does not exist in this study.
-            OutputError: the database cannot be written.
+        Returns the number of answers that were not stored before. Raises BrewsterError if the participant or a trial
+        does not exist in this study, and OutputError if the database cannot be written.
         """
         participant = self.participant(answer_file.participant, exported=True)
         if participant is None:

@@ -123,11 +123,8 @@ class Study:
         return tuple(dict.fromkeys(comparison.methods for comparison in self.description.comparisons))
 
     def verify_pictures(self) -> None:
-        """Check that all pictures exist and are unchanged.
-
-        Raises:
-            BrewsterError: a picture is missing, or its digest differs from the description.
-        """
+        """Check that all pictures exist and are unchanged. Raises BrewsterError if a picture is missing, or its digest
+        differs from the description."""
         changed = []
         for picture in self.description.pictures:
             path = self.picture_file(picture.name)
@@ -152,11 +149,8 @@ def write_study(folder: Path, description: StudyDescription) -> None:
 
 
 def read_study(folder: Path) -> Study:
-    """Read the study in a folder.
-
-    Raises:
-        BrewsterError: the description cannot be read, is invalid, or has the format of another version.
-    """
+    """Read the study in a folder. Raises BrewsterError if the description cannot be read, is invalid, or has the format
+    of another version."""
     path = folder / DESCRIPTION_FILE
     try:
         description = _DESCRIPTION.validate_json(path.read_bytes(), extra="forbid")

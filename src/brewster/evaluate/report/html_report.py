@@ -24,10 +24,8 @@ _FOLDER: Final = Path(__file__).parent
 def write_report(results: Results, cases: Iterable[CaseThumbnails], path: Path) -> None:
     """Writes the page atomically and replaces an older one. Equal arguments give equal bytes.
 
-    `results` is the content of results.json. The cases are read one at a time.
-
-    Raises:
-        OutputError: the file cannot be written.
+    `results` is the content of results.json. The cases are read one at a time. Raises OutputError if the file cannot be
+    written.
     """
     import jinja2  # noqa: PLC0415 - an extra
 

@@ -54,11 +54,8 @@ Floats = NDArray[np.float64]
 
 
 def summarise(study: Study, participants: Sequence[ParticipantAnswers], rule: ExclusionRule) -> Results:
-    """Compute the results of a study from the answers of all participants: the content of report.json.
-
-    Raises:
-        BrewsterError: there is no answer yet.
-    """
+    """Compute the results of a study from the answers of all participants: the content of report.json. Raises
+    BrewsterError if there is no answer yet."""
     if not any(participant.votes for participant in participants):
         raise BrewsterError(
             f"{study.folder} has no answers yet",
