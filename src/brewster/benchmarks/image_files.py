@@ -17,10 +17,8 @@ if TYPE_CHECKING:
 @final
 @dataclass(frozen=True)
 class ImageFile:
-    """The location of an encoded image: a whole file, or a part of a tar shard.
-
-    `span` is the (offset, length) of the part in bytes, or None for a whole file.
-    """
+    """The location of an encoded image: a whole file, or a part of a tar shard. `span` is the (offset, length) of the
+    part in bytes, or None for a whole file."""
 
     path: Path
     span: tuple[int, int] | None = None

@@ -57,9 +57,7 @@ _FilesByRole = Mapping[str, list[Path]]
 @dataclass(frozen=True)
 class ImageGroup:
     """The files with one name: photo, transmission (ground truth) and reflection (None if there is no such file).
-
-    `scene` is "" if the scene is unknown.
-    """
+    `scene` is "" if the scene is unknown."""
 
     name: str
     scene: str
@@ -71,10 +69,8 @@ class ImageGroup:
 @final
 @dataclass
 class FolderListing:
-    """The content of a folder. The groups are in natural order of their names (2 before 10).
-
-    `remarks` lists the ignored files. `excluded` lists the images without a unique partner, with the reason.
-    """
+    """The content of a folder. The groups are in natural order of their names (2 before 10). `remarks` lists the
+    ignored files. `excluded` lists the images without a unique partner, with the reason."""
 
     root: Path
     """The folder. Remarks and reasons name the files relative to it."""
@@ -185,10 +181,8 @@ def find_split(folder: Path) -> Path:
 
 def read_folders(folder: Path, roles: Mapping[str, Path] | None = None) -> FolderListing:
     """Returns the groups of a folder with one subfolder per role. The file stems must be equal; suffixes may differ.
-
-    `roles` has the subfolder of each role; by default, it is the result of `find_roles`. Raises PhotoError if a folder
-    is missing, empty or unreadable, or two folders have the same role.
-    """
+    `roles` has the subfolder of each role; by default, it is the result of `find_roles`. Raises PhotoError if a
+    folder is missing, empty or unreadable, or two folders have the same role."""
     roles = find_roles(folder) if roles is None else roles
     by_name: dict[str, dict[str, list[Path]]] = defaultdict(lambda: defaultdict(list))
     ignored: list[Path] = []
@@ -234,11 +228,9 @@ def find_subsets(folder: Path) -> dict[str, Path]:
 
 
 def read_tree(folder: Path, subset: str) -> FolderListing:
-    """Returns the groups of a subset of SIR2. Its folders have one subfolder per shot.
-
-    Files of a shot are grouped if their names, without the letter of the role, are equal. Raises PhotoError if a folder
-    cannot be read, or there is no shot.
-    """
+    """Returns the groups of a subset of SIR2. Its folders have one subfolder per shot. Files of a shot are grouped if
+    their names, without the letter of the role, are equal. Raises PhotoError if a folder cannot be read, or there is
+    no shot."""
     listing = FolderListing(folder)
     _read_branches(listing, folder, SIR2_TREES[subset], {})
     listing.groups.sort(key=lambda group: natural_key(group.name))

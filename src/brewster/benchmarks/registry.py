@@ -41,11 +41,9 @@ _MAX_SCENES: Final = 20
 @final
 @dataclass(frozen=True)
 class Benchmark:
-    """The cases of a benchmark, in natural order of their names (2 before 10).
-
-    `expected_counts` are the numbers of images that papers report. `remarks` are notes for the user. `excluded` has one
-    line for each file or case that is not used, with the reason.
-    """
+    """The cases of a benchmark, in natural order of their names (2 before 10). `expected_counts` are the numbers of
+    images that papers report. `remarks` are notes for the user. `excluded` has one line for each file or case that
+    is not used, with the reason."""
 
     name: str
     title: str
@@ -59,10 +57,8 @@ class Benchmark:
 @dataclass(frozen=True)
 class BenchmarkLayout:
     """A row of BENCHMARKS: title ("" means the name of the folder), counts that papers report, and reader.
-
-    `scene_pattern` is a regular expression that matches the part of a file name that identifies the scene. It is set only
-    for the benchmarks from which the paper draws one case per scene.
-    """
+    `scene_pattern` is a regular expression that matches the part of a file name that identifies the scene. It is set
+    only for the benchmarks from which the paper draws one case per scene."""
 
     title: str
     expected_counts: tuple[int, ...]
@@ -206,11 +202,9 @@ def _make_benchmark(name: str, folder: Path, cases: Sequence[Case], listing: Fol
 
 
 def _benchmark_name(name: str, folder: Path) -> str:
-    """Returns the name of the benchmark in results: `name` if its row has a title, else the name of the folder.
-
-    If the folder has the name "average" or the name of a benchmark with a title, the result is "{name}-{folder}", which
-    is unique.
-    """
+    """Returns the name of the benchmark in results: `name` if its row has a title, else the name of the folder. If the
+    folder has the name "average" or the name of a benchmark with a title, the result is "{name}-{folder}", which is
+    unique."""
     if BENCHMARKS[name].title:
         return name
     safe = safe_name(folder_name(folder)) or name

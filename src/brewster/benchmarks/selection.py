@@ -58,10 +58,8 @@ def spread(benchmark: Benchmark, limit: int) -> Benchmark:
 
 def with_unique_names(benchmarks: Sequence[Benchmark], folders: Sequence[Path]) -> list[Benchmark]:
     """Adds names of parent folders to names that occur twice: the folders a/test and b/test become a-test and b-test.
-
-    As many parent folders are added as are needed: x/a/test and y/a/test become x-a-test and y-a-test. Only equal folders
-    keep equal names.
-    """
+    As many parent folders are added as are needed: x/a/test and y/a/test become x-a-test and y-a-test. Only equal
+    folders keep equal names."""
     names = [benchmark.name for benchmark in benchmarks]
     unique_names = list(names)
     # the names of all folders above each folder; links are not resolved

@@ -44,11 +44,9 @@ def open_executor(
 @final
 @dataclass
 class BatchReport:
-    """Prints a line for each result, and at the end a summary, and writes the contact sheet and the index.
-
-    The summary is printed if all `count` photos have a result, also after an error. The results are not kept in memory, because
-    an archive can have millions of photos.
-    """
+    """Prints a line for each result, and at the end a summary, and writes the contact sheet and the index. The summary
+    is printed if all `count` photos have a result, also after an error. The results are not kept in memory, because
+    an archive can have millions of photos."""
 
     options: Options
     output: str | None

@@ -29,10 +29,8 @@ _MAX_NAMES: Final = 10
 
 
 def local_path(text: str) -> str:
-    """Returns the path in an argument that is a file:// address or has quotes around it.
-
-    File managers and some terminals pass a dropped file in this form. The name of an existing file is never changed.
-    """
+    """Returns the path in an argument that is a file:// address or has quotes around it. File managers and some
+    terminals pass a dropped file in this form. The name of an existing file is never changed."""
     if os.path.lexists(text):
         return text
     if len(text) > 2 and text[0] == text[-1] and text[0] in "'\"":

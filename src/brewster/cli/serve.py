@@ -42,10 +42,8 @@ def address_options(port: int, token_help: str) -> Callable[[Callable[..., Any]]
 
 
 def print_link(url: str, token: str | None, *, open_browser: bool = False, qr_code: bool = False) -> None:
-    """Prints the link to the server, including the token, on standard output.
-
-    `open_browser` also opens the link, and `qr_code` prints it as a QR code on standard error.
-    """
+    """Prints the link to the server, including the token, on standard output. `open_browser` also opens the link, and
+    `qr_code` prints it as a QR code on standard error."""
     link = f"{url}?token={token}" if token else url
     print_out(link)
     if qr_code:
@@ -68,10 +66,9 @@ def _print_qr_code(link: str) -> None:
 
 
 def _limit_arenas() -> None:
-    """Limits the allocator of glibc to two arenas, because an arena per thread keeps memory that other threads cannot use.
-
-    Over 1,500 different photos, the server then needs 257 to 290 MB, instead of 302 to 359 MB (as with MALLOC_ARENA_MAX=2).
-    """
+    """Limits the allocator of glibc to two arenas, because an arena per thread keeps memory that other threads cannot
+    use. Over 1,500 different photos, the server then needs 257 to 290 MB, instead of 302 to 359 MB (as with
+    MALLOC_ARENA_MAX=2)."""
     if sys.platform == "linux":
         with contextlib.suppress(AttributeError):  # another C library, such as musl
             ctypes.CDLL(None).mallopt(_M_ARENA_MAX, 2)

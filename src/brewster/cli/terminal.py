@@ -22,11 +22,9 @@ ProgressUpdater = Callable[[float, str], None]
 
 @final
 class _DeferredInterrupts:
-    """Remembers a KeyboardInterrupt that Python has dropped, and raises it later.
-
-    libvips calls Python to write its log. If Ctrl-C is pressed during such a call, the KeyboardInterrupt cannot pass
-    through the C code, so that Python drops it. Without this class, the command continues after Ctrl-C.
-    """
+    """Remembers a KeyboardInterrupt that Python has dropped, and raises it later. libvips calls Python to write its
+    log. If Ctrl-C is pressed during such a call, the KeyboardInterrupt cannot pass through the C code, so that
+    Python drops it. Without this class, the command continues after Ctrl-C."""
 
     def __init__(self) -> None:
         self._pending = False
@@ -78,11 +76,9 @@ def print_error(text: object) -> None:
 
 @final
 class _Output:
-    """Standard output, reserved for the results of the command. The output of libraries is redirected to standard error.
-
-    Libraries print in two ways, and each needs its own redirection. C code and child processes write to file
-    descriptor 1. Python code writes to `sys.stdout`, as OpenEXR does for a damaged file.
-    """
+    """Standard output, reserved for the results of the command. The output of libraries is redirected to standard
+    error. Libraries print in two ways, and each needs its own redirection. C code and child processes write to file
+    descriptor 1. Python code writes to `sys.stdout`, as OpenEXR does for a damaged file."""
 
     def __init__(self) -> None:
         self._stream: TextIO | None = None
@@ -93,10 +89,8 @@ class _Output:
         return self._stream or sys.stdout
 
     def redirect_descriptor(self) -> None:
-        """Redirects file descriptor 1 to standard error. `sys.stdout` writes to a copy of the original descriptor.
-
-        The redirection lasts until the process ends, because C code may write its buffered output only then.
-        """
+        """Redirects file descriptor 1 to standard error. `sys.stdout` writes to a copy of the original descriptor. The
+        redirection lasts until the process ends, because C code may write its buffered output only then."""
         try:
             if sys.stdout.fileno() != _STDOUT:  # a test or a notebook has replaced it
                 return
@@ -149,10 +143,8 @@ def write_out(data: bytes) -> None:
 
 @contextmanager
 def progress(total: int, *, shown: bool) -> Iterator[ProgressUpdater]:
-    """Shows a progress bar if `shown` is true and standard error is a terminal. Yields the function that updates the bar.
-
-    A single item has a percentage instead of the number of finished items.
-    """
+    """Shows a progress bar if `shown` is true and standard error is a terminal. Yields the function that updates the
+    bar. A single item has a percentage instead of the number of finished items."""
     if not (shown and sys.stderr.isatty()):
         yield lambda _done, _text: None
         return

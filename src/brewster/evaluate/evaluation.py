@@ -176,11 +176,9 @@ def _input_path(folder: Path, case: Case) -> Path:
 @final
 @dataclass(frozen=True)
 class _ThumbnailCache:
-    """Writes the thumbnails of the report and the resized photos while a case is decoded.
-
-    It stores the thumbnails of `benchmarks`, of which the report shows all cases. They are stored in files, because worker
-    processes create them, and because memory must not grow with the number of cases.
-    """
+    """Writes the thumbnails of the report and the resized photos while a case is decoded. It stores the thumbnails of
+    `benchmarks`, of which the report shows all cases. They are stored in files, because worker processes create
+    them, and because memory must not grow with the number of cases."""
 
     folder: Path
     benchmarks: frozenset[str]

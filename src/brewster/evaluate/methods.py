@@ -41,10 +41,8 @@ _STEM_SUFFIXES: Final = {"transmission": ("_t", "_l"), "reflection": ("_r",)}
 @final
 @dataclass(frozen=True, eq=False)
 class MethodOutput:
-    """The layers that a method predicts for a photo.
-
-    `seconds` is the wall time of the prediction, if it was measured. `digest` is that of the files of the layers, if stored.
-    """
+    """The layers that a method predicts for a photo. `seconds` is the wall time of the prediction, if it was measured.
+    `digest` is that of the files of the layers, if stored."""
 
     transmission: Photo
     reflection: Photo | None = None
@@ -117,10 +115,8 @@ class IdentityBaseline:
 @final
 @dataclass(frozen=True)
 class ModelMethod:
-    """A model, run by `Separator`. Its predictions are stored as PNG files in `folder`.
-
-    `PredictionFolder` can read this folder.
-    """
+    """A model, run by `Separator`. Its predictions are stored as PNG files in `folder`. `PredictionFolder` can read
+    this folder."""
 
     name: str
     model: str

@@ -7,18 +7,14 @@ from brewster.photo import Photo
 
 
 def resize(photo: Photo, config: EvaluationConfig) -> Photo:
-    """Downscales a photo to `config.short_side_px`, then to sides that are multiples of `config.size_divisor`.
-
-    The result is 8-bit sRGB, or the photo itself if both settings leave it as it is.
-    """
+    """Downscales a photo to `config.short_side_px`, then to sides that are multiples of `config.size_divisor`. The
+    result is 8-bit sRGB, or the photo itself if both settings leave it as it is."""
     return round_sides(downscale(photo, config.short_side_px), config.size_divisor)
 
 
 def downscale(photo: Photo, shorter: int | None) -> Photo:
-    """Downscales a photo by area means in linear light, so that its shorter side has `shorter` px.
-
-    The result is 8-bit sRGB, or the photo itself if it is not larger, or if `shorter` is None.
-    """
+    """Downscales a photo by area means in linear light, so that its shorter side has `shorter` px. The result is 8-bit
+    sRGB, or the photo itself if it is not larger, or if `shorter` is None."""
     if shorter is None or min(photo.size) <= shorter:
         return photo
     width, height = (round(side * shorter / min(photo.size)) for side in photo.size)

@@ -45,11 +45,9 @@ def summarise(
     rows: Sequence[ScoreRow],
     unavailable: Mapping[str, str] | None = None,
 ) -> Results:
-    """Returns the content of results.json. The order of the rows does not matter.
-
-    `unavailable` is column -> reason, for the columns that could not be computed. Raises BrewsterError if the subsets
-    of the paper are requested, but the file names of a benchmark do not identify its scenes.
-    """
+    """Returns the content of results.json. The order of the rows does not matter. `unavailable` is column -> reason,
+    for the columns that could not be computed. Raises BrewsterError if the subsets of the paper are requested, but
+    the file names of a benchmark do not identify its scenes."""
     by_id = {row.id: row for row in rows}
     method_names = [method.name for method in methods]
     measured = {column for row in rows for column, score in row.scores.items() if score is not None}

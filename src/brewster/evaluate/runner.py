@@ -96,11 +96,9 @@ def _find_unavailable(
     config: EvaluationConfig,
     logged: Mapping[RowId, ScoreRow],
 ) -> dict[str, str]:
-    """Loads the weights of all metrics before the workers start. Returns column -> reason, for the columns without weights.
-
-    A metric is not tried if every row of an earlier run has it and no row is outdated. The files of the cases are read only if
-    every row has it.
-    """
+    """Loads the weights of all metrics before the workers start. Returns column -> reason, for the columns without
+    weights. A metric is not tried if every row of an earlier run has it and no row is outdated. The files of the
+    cases are read only if every row has it."""
     columns: dict[Callable[[], object], list[str]] = {}
     for column, metric in config.columns().items():
         if metric.prepare:
@@ -258,10 +256,8 @@ def _run_tasks(
     on_rows: Callable[[Sequence[ScoreRow]], None],
     workers: int,
 ) -> None:
-    """Runs the tasks in this process or in several worker processes. Calls `on_rows` after each task.
-
-    Each process computes metrics with one thread, so that the scores do not depend on the number of workers.
-    """
+    """Runs the tasks in this process or in several worker processes. Calls `on_rows` after each task. Each process
+    computes metrics with one thread, so that the scores do not depend on the number of workers."""
     if workers == 1:
         with single_torch_thread():
             for task in tasks:

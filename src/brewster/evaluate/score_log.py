@@ -68,9 +68,8 @@ def append_row(path: Path, row: ScoreRow) -> None:
 
 
 def read_score_rows(path: Path) -> dict[RowId, ScoreRow]:
-    """Returns the last row for each id. Skips rows with errors, incomplete lines and lines with other fields.
-
-    A row may be outdated: the caller compares its `score_key`."""
+    """Returns the last row for each id. Skips rows with errors, incomplete lines and lines with other fields. A row may
+    be outdated: the caller compares its `score_key`."""
     rows = {}
     for line in path.read_text(errors="replace").splitlines() if path.is_file() else ():
         try:

@@ -49,10 +49,8 @@ class CaseFiles:
 @final
 @dataclass(frozen=True, eq=False)
 class GroundTruth:
-    """A decoded case: the photo for the methods, and role -> image, 8-bit sRGB, uint8 (H, W, 3).
-
-    The roles are "photo", "transmission" and, if there is one, "reflection".
-    """
+    """A decoded case: the photo for the methods, and role -> image, 8-bit sRGB, uint8 (H, W, 3). The roles are "photo",
+    "transmission" and, if there is one, "reflection"."""
 
     case: Case
     photo: Photo
@@ -118,11 +116,9 @@ class Scorer:
     def score(
         self, prediction: MethodOutput, columns: Iterable[str] | None = None
     ) -> dict[str, float | None]:
-        """Returns column -> score, for all columns of the evaluation or for some of them.
-
-        A score is None if it is undefined, because the region is empty or the image is too small for the metric. There is
-        no column if the metric compares a layer that the prediction or the ground truth does not have.
-        """
+        """Returns column -> score, for all columns of the evaluation or for some of them. A score is None if it is
+        undefined, because the region is empty or the image is too small for the metric. There is no column if the
+        metric compares a layer that the prediction or the ground truth does not have."""
         layers = {"transmission": prediction.transmission, "reflection": prediction.reflection}
         comparisons = {
             layer: Comparison(

@@ -37,11 +37,9 @@ class Estimate:
 @final
 @dataclass(frozen=True, eq=False)
 class Stratum:
-    """The scores of a benchmark: `values` (n, s) for n images and s series, and the scene of each image.
-
-    A missing score is NaN. `name` seeds the bootstrap, so that the intervals of a benchmark do not depend on the other
-    benchmarks of the run.
-    """
+    """The scores of a benchmark: `values` (n, s) for n images and s series, and the scene of each image. A missing
+    score is NaN. `name` seeds the bootstrap, so that the intervals of a benchmark do not depend on the other
+    benchmarks of the run."""
 
     name: str
     scenes: Sequence[str]
@@ -99,9 +97,7 @@ def _estimate(
 @dataclass(frozen=True)
 class Difference:
     """The mean of score(method) - score(reference) in one metric, over the images with both scores, with its interval.
-
-    `improved_count` is the number of images on which `method` has a better score than `reference`.
-    """
+    `improved_count` is the number of images on which `method` has a better score than `reference`."""
 
     method: str
     reference: str

@@ -46,10 +46,8 @@ class Comparison:
     _shared: dict[Callable[[Comparison], Any], Any] = field(default_factory=dict, repr=False)
 
     def shared(self, compute: Callable[[Comparison], _Shared]) -> _Shared:
-        """Returns the result of `compute` for this pair of images. The result must not depend on the region.
-
-        It is computed once and reused by all metrics of the pair, with or without a region.
-        """
+        """Returns the result of `compute` for this pair of images. The result must not depend on the region. It is
+        computed once and reused by all metrics of the pair, with or without a region."""
         if compute not in self._shared:
             self._shared[compute] = compute(self)
         return cast("_Shared", self._shared[compute])

@@ -121,11 +121,9 @@ def _filtered(
 def _fit_asymmetric_gaussian(
     blocks: Blocks,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Fits an asymmetric generalised Gaussian to each block (N. Lasmar et al., ICIP 2009).
-
-    Returns the shape, and the scales of the left and the right half, (blocks,) each. The scales are NaN for a block without
-    negative or without positive values.
-    """
+    """Fits an asymmetric generalised Gaussian to each block (N. Lasmar et al., ICIP 2009). Returns the shape, and the
+    scales of the left and the right half, (blocks,) each. The scales are NaN for a block without negative or without
+    positive values."""
     flat = blocks.reshape(len(blocks), -1)
     squares = flat * flat
     with np.errstate(invalid="ignore", divide="ignore"):

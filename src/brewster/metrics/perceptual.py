@@ -46,10 +46,8 @@ _POOLED: Final = (1, 2)
 @final
 @dataclass(frozen=True, eq=False)
 class Features:
-    """AlexNet's features of an image: five float32 maps (C, h, w), normalised to unit length over C.
-
-    `shape` is the (height, width) of the image.
-    """
+    """AlexNet's features of an image: five float32 maps (C, h, w), normalised to unit length over C. `shape` is the
+    (height, width) of the image."""
 
     maps: tuple[Map, ...]
     shape: tuple[int, int]
@@ -58,10 +56,8 @@ class Features:
 @final
 @dataclass(frozen=True, eq=False)
 class DifferenceMaps:
-    """The weighted squared differences of the features of two images: five float32 maps (h, w).
-
-    `shape` is the (height, width) of the images.
-    """
+    """The weighted squared differences of the features of two images: five float32 maps (h, w). `shape` is the (height,
+    width) of the images."""
 
     maps: tuple[Tensor, ...]
     shape: tuple[int, int]
@@ -170,11 +166,9 @@ def _load() -> Lpips:
 
 
 def _normalised(image: Image) -> NDArray[np.float32]:
-    """Returns (value / 127.5 - 1 - shift) / scale, (H, W, 3).
-
-    The channels stay last in memory, because convolutions on a CPU are fastest in this layout. The arithmetic is done on
-    whole rows, because numpy is slow along an axis of length 3.
-    """
+    """Returns (value / 127.5 - 1 - shift) / scale, (H, W, 3). The channels stay last in memory, because convolutions on
+    a CPU are fastest in this layout. The arithmetic is done on whole rows, because numpy is slow along an axis of
+    length 3."""
     height, width, _ = image.shape
     values = image.reshape(height, -1).astype(np.float32, order="C")
     values *= np.tile(1 / (127.5 * _SCALE), width).astype(np.float32)

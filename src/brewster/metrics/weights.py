@@ -89,11 +89,9 @@ def alexnet_digest(tensors: dict[str, Tensor]) -> str:
 
 
 def _fetch(remote: RemoteFile, digest: str, cached: Path, downloader: Downloader) -> dict[str, Tensor]:
-    """Downloads the whole network, stores ten of its tensors in `cached`, and deletes the download.
-
-    The other tensors, 96 % of the file, are not needed. Before the download, its size and licence are printed on standard
-    error, and how to avoid it.
-    """
+    """Downloads the whole network, stores ten of its tensors in `cached`, and deletes the download. The other tensors,
+    96 % of the file, are not needed. Before the download, its size and licence are printed on standard error, and
+    how to avoid it."""
     import torch  # noqa: PLC0415 - an extra
 
     size = f"{remote.size / 2**20:.0f} MiB"

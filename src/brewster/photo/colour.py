@@ -36,11 +36,9 @@ _BRADFORD = np.array([[0.8951, 0.2664, -0.1614], [-0.7502, 1.7135, 0.0367], [0.0
 
 @dataclass(frozen=True)
 class ToneCurve:
-    """A tone curve from stored values 0..1 to linear light (ICC.1:2022 10.6 and 10.18).
-
-    If `samples` is not empty, the curve interpolates them linearly over 0..1. Otherwise it is parametric, with the
-    parameters g, a, b, c, d, e, f: (a x + b)^g + e for x >= d, and c x + f for x < d.
-    """
+    """A tone curve from stored values 0..1 to linear light (ICC.1:2022 10.6 and 10.18). If `samples` is not empty, the
+    curve interpolates them linearly over 0..1. Otherwise it is parametric, with the parameters g, a, b, c, d, e, f:
+    (a x + b)^g + e for x >= d, and c x + f for x < d."""
 
     samples: tuple[float, ...] = ()
     parameters: tuple[float, ...] = (1, 1, 0, 0, 0, 0, 0)
@@ -90,11 +88,9 @@ class ColourSpace:
         return np.stack(_apply_matrix(self.matrix, channels) if self.matrix else channels, axis=2)
 
     def to_stored(self, linear: Float32, original: Stored) -> Stored:
-        """Converts linear Rec.709 (H, W, 3) to stored pixels with the dtype and the channels of `original`.
-
-        `original` has the stored pixels before a change. Pixels with unchanged light keep exactly these stored values.
-        In integers, NaN becomes black; floats keep NaN.
-        """
+        """Converts linear Rec.709 (H, W, 3) to stored pixels with the dtype and the channels of `original`. `original`
+        has the stored pixels before a change. Pixels with unchanged light keep exactly these stored values. In
+        integers, NaN becomes black; floats keep NaN."""
         stored = np.empty_like(original)
         curves = self._curves(original)
         channels = [linear[..., i] for i in range(3)]
@@ -118,10 +114,8 @@ class ColourSpace:
         return stored
 
     def _curves(self, stored: Stored) -> tuple[ToneCurve, ...]:
-        """Returns the curve of each stored channel.
-
-        Grey pixels use the green curve. In a grey profile all three curves are the same. In an RGB profile they usually are.
-        """
+        """Returns the curve of each stored channel. Grey pixels use the green curve. In a grey profile all three curves
+        are the same. In an RGB profile they usually are."""
         return self.curves if stored.shape[-1] == 3 else (self.curves[1],)
 
 
@@ -131,11 +125,9 @@ LINEAR_REC709 = ColourSpace((ToneCurve(),) * 3)
 
 @lru_cache(maxsize=16)
 def colour_space_of(icc: bytes | None, primaries: tuple[float, ...] | None, is_float: bool) -> ColourSpace:
-    """Returns the colour space of stored pixels from their ICC profile or chromaticities.
-
-    Without a profile and chromaticities, integers are sRGB and floats are linear Rec.709. Raises UnsupportedPhoto if the
-    profile is neither a grey profile with a curve nor an RGB profile with curves and a matrix.
-    """
+    """Returns the colour space of stored pixels from their ICC profile or chromaticities. Without a profile and
+    chromaticities, integers are sRGB and floats are linear Rec.709. Raises UnsupportedPhoto if the profile is
+    neither a grey profile with a curve nor an RGB profile with curves and a matrix."""
     if icc is not None:
         return _profile_space(icc)
     if primaries is not None and not np.allclose(primaries, REC709_CHROMATICITIES, atol=1e-4):
@@ -166,21 +158,17 @@ def _decode_table(curve: ToneCurve, white: int) -> Float32:
 
 @lru_cache(maxsize=16)
 def _encode_table(curve: ToneCurve, white: int) -> NDArray[Any]:
-    """Returns a lookup table from the square root of linear light to stored integers.
-
-    With the square root, dark values have more entries, as in tone curves. With 2**16 entries, the rounding error is below
-    0.01 levels of 8 bits; with 2**20 entries, it is below 0.1 levels of 16 bits.
-    """
+    """Returns a lookup table from the square root of linear light to stored integers. With the square root, dark values
+    have more entries, as in tone curves. With 2**16 entries, the rounding error is below 0.01 levels of 8 bits; with
+    2**20 entries, it is below 0.1 levels of 16 bits."""
     sqrt_light = np.linspace(0, 1, 2**16 if white < 256 else 2**20)
     levels = np.rint(np.clip(curve.encode(sqrt_light**2), 0, 1) * white)
     return levels.astype(np.uint8 if white < 256 else np.uint16)
 
 
 def _apply_matrix(matrix: Matrix, channels: list[Float32]) -> list[Float32]:
-    """Multiplies the channels of each pixel by a matrix.
-
-    BLAS is not used, because its rounding depends on the position of a pixel in the strip.
-    """
+    """Multiplies the channels of each pixel by a matrix. BLAS is not used, because its rounding depends on the position
+    of a pixel in the strip."""
     red, green, blue = channels
     rows = np.array(matrix, np.float32)
     return [row[0] * red + row[1] * green + row[2] * blue for row in rows]
@@ -195,10 +183,8 @@ def _as_matrix(array: Float64) -> Matrix:
 
 
 def _to_d50(primaries: tuple[float, ...]) -> Float64:
-    """Returns the matrix from linear RGB with these chromaticities to XYZ under D50.
-
-    The white point is adapted by the Bradford transform (ICC.1:2022 annex E).
-    """
+    """Returns the matrix from linear RGB with these chromaticities to XYZ under D50. The white point is adapted by the
+    Bradford transform (ICC.1:2022 annex E)."""
     xyz = np.array(
         [[x / y, 1, (1 - x - y) / y] for x, y in zip(primaries[::2], primaries[1::2], strict=True)]
     ).T
@@ -320,10 +306,8 @@ def convert_to_display_p3(pixels: NDArray[Any], file_info: FileInfo) -> tuple[ND
 
 
 def convert_cmyk(image: pyvips.Image, file_info: FileInfo) -> tuple[pyvips.Image, FileInfo]:
-    """Returns a CMYK image in Display P3 (relative colorimetric), and `file_info` with its profile and a note.
-
-    Without a usable CMYK profile, the default profile of libvips is used.
-    """
+    """Returns a CMYK image in Display P3 (relative colorimetric), and `file_info` with its profile and a note. Without
+    a usable CMYK profile, the default profile of libvips is used."""
     is_cmyk = file_info.icc is not None and file_info.icc[16:20] == b"CMYK"
     profile = "its profile" if is_cmyk else "a default profile, because it has none"
     depth = 16 if image.format == "ushort" else 8

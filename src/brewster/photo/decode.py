@@ -229,12 +229,9 @@ _SRGB_TRANSFERS = (1, 2, 6, 13, 14, 15)  # BT.709, unspecified, BT.601, sRGB, BT
 
 
 def _profile_of(data: bytes, format_name: str) -> bytes | None:
-    """Returns the ICC profile for the code points (ITU-T H.273) of a file.
-
-    Returns Display P3 if the primaries are those of Display P3; otherwise None, which means sRGB. Raises
-    UnsupportedPhoto if the file has other primaries, or a transfer function unlike that of sRGB: for example linear
-    (8), or PQ (16) or HLG (18) of HDR video.
-    """
+    """Returns the ICC profile for the code points (ITU-T H.273) of a file. Returns Display P3 if the primaries are
+    those of Display P3; otherwise None, which means sRGB. Raises UnsupportedPhoto if the file has other primaries,
+    or a transfer function unlike that of sRGB: for example linear (8), or PQ (16) or HLG (18) of HDR video."""
     codes = metadata.cicp(data) if FORMATS[format_name].has_cicp else None
     primaries, transfer = codes[:2] if codes else (1, 13)
     if transfer not in _SRGB_TRANSFERS or primaries not in (1, 2, 5, 6, 12):
@@ -327,11 +324,8 @@ _TRANSPOSED = (5, 6, 7, 8)
 
 
 def _full_scale(array: Stored, bits: int) -> Stored:
-    """Scales 10- and 12-bit values to 16 bits, so that white is 65535.
-
-    The libraries return such values in the upper bits of 16-bit integers. The lower bits are filled with a copy of the
-    upper bits.
-    """
+    """Scales 10- and 12-bit values to 16 bits, so that white is 65535. The libraries return such values in the upper
+    bits of 16-bit integers. The lower bits are filled with a copy of the upper bits."""
     return array | array >> bits if bits in (10, 12) else array
 
 

@@ -20,10 +20,8 @@ Float32 = NDArray[np.float32]
 
 
 def _valid_chromaticities(chromaticities: Sequence[float | str]) -> tuple[float, ...] | None:
-    """Returns chromaticities if red, green and blue form a triangle, otherwise None.
-
-    Some programs write no chromaticities, or zeros.
-    """
+    """Returns chromaticities if red, green and blue form a triangle, otherwise None. Some programs write no
+    chromaticities, or zeros."""
     try:
         points = np.array(chromaticities, np.float64).reshape(4, 2)
     except ValueError:
@@ -252,10 +250,8 @@ def _scan_lines(body: bytes, width: int, height: int) -> NDArray[np.uint8]:
 
 
 def _decode_runs(body: bytes, width: int, height: int) -> bytes:
-    """Decodes run-length encoded lines.
-
-    Each line has a header of 4 bytes, followed by runs (128 + length, value) and literals (length, values...).
-    """
+    """Decodes run-length encoded lines. Each line has a header of 4 bytes, followed by runs (128 + length, value) and
+    literals (length, values...)."""
     planes, position = bytearray(), 0
     for line in range(height):
         position += 4
@@ -272,11 +268,9 @@ def _decode_runs(body: bytes, width: int, height: int) -> bytes:
 
 
 def _decode_old_runs(body: bytes, count: int) -> bytes:
-    """Decodes the run-length encoding of Radiance 1.4 and earlier to `count` pixels.
-
-    The pixel (1, 1, 1, n) repeats the pixel before it n times. If k such pixels follow each other, the last one has the weight
-    256**(k-1). Raises ValueError if the runs do not have `count` pixels together.
-    """
+    """Decodes the run-length encoding of Radiance 1.4 and earlier to `count` pixels. The pixel (1, 1, 1, n) repeats the
+    pixel before it n times. If k such pixels follow each other, the last one has the weight 256**(k-1). Raises
+    ValueError if the runs do not have `count` pixels together."""
     pixels = np.frombuffer(body, np.uint8, len(body) // 4 * 4).reshape(-1, 4)
     is_run = (pixels[:, :3] == 1).all(axis=1)
     positions = np.arange(len(pixels))
@@ -290,10 +284,8 @@ def _decode_old_runs(body: bytes, count: int) -> bytes:
 
 
 def write_hdr(image: Decoded) -> bytes:
-    """Encodes a Radiance HDR image with flat lines, which all readers support. Grey becomes three equal channels.
-
-    For light from `read_hdr`, the values are exactly those that were read. Negative light becomes black.
-    """
+    """Encodes a Radiance HDR image with flat lines, which all readers support. Grey becomes three equal channels. For
+    light from `read_hdr`, the values are exactly those that were read. Negative light becomes black."""
     height, width = image.pixels.shape[:2]
     header = dict(image.file_info.header or {})
     if image.file_info.software:

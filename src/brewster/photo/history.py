@@ -44,9 +44,8 @@ _ENTRY = (
 
 
 def with_history(file_info: FileInfo, software: str, parameters: Mapping[str, str]) -> FileInfo:
-    """Returns the metadata of an input with an entry about a processing step: the program with its version, and the options by
-    name. Names and values contain neither "; " nor "=".
-    """
+    """Returns the metadata of an input with an entry about a processing step: the program with its version, and the
+    options by name. Names and values contain neither "; " nor "="."""
     text = "; ".join(f"{name}={value}" for name, value in parameters.items())
     entry = _ENTRY.format(software=quoteattr(software), parameters=quoteattr(text)).encode()
     packet = file_info.xmp or _PACKET.format(software=quoteattr(software)).encode()
@@ -84,9 +83,8 @@ def sampled_digest(file: BinaryIO) -> str:
 
 def recorded_parameters(path: Path, program: str) -> dict[str, str] | None:
     """Returns the parameters of the last step of a program in the history of a file, or None if there is no such step.
-
-    Only the first 256 KiB are read, and the last 256 KiB if the first contain no such step: all writers put the metadata there.
-    """
+    Only the first 256 KiB are read, and the last 256 KiB if the first contain no such step: all writers put the
+    metadata there."""
     try:
         with path.open("rb") as file:
             head = file.read(_SEARCHED_BYTES)
@@ -116,11 +114,9 @@ def _last_parameters(data: bytes, program: str) -> dict[str, str] | None:
 
 
 def _with_exif_software(exif: bytes, software: str) -> bytes:
-    """Sets the tag Software of an EXIF block. All existing bytes keep their positions.
-
-    The directory with the new tag is appended, and the offset of the first directory is set to it. Therefore the offsets in
-    maker notes stay valid. A damaged block is returned unchanged, and so is a block that becomes too large for a JPEG.
-    """
+    """Sets the tag Software of an EXIF block. All existing bytes keep their positions. The directory with the new tag
+    is appended, and the offset of the first directory is set to it. Therefore the offsets in maker notes stay valid.
+    A damaged block is returned unchanged, and so is a block that becomes too large for a JPEG."""
     byte_order, first_row, end = first_directory(exif)
     if end == first_row or end + 4 > len(exif):
         return exif

@@ -135,9 +135,7 @@ def with_webp_exif(data: bytes, exif: bytes, size: tuple[int, int], has_alpha: b
 
 def cicp(data: bytes) -> tuple[int, int, int] | None:
     """Returns the code points (CICP, ITU-T H.273) of primaries, transfer function and matrix of an AVIF, HEIC or PNG.
-
-    Returns None for a file without code points.
-    """
+    Returns None for a file without code points."""
     if data.startswith(b"\x89PNG"):
         chunk = dict(png_chunks(data)).get(b"cICP", b"")
         return (chunk[0], chunk[1], chunk[2]) if len(chunk) >= 3 else None
@@ -149,10 +147,8 @@ def cicp(data: bytes) -> tuple[int, int, int] | None:
 
 
 def with_avif_exif(data: bytes, exif: bytes) -> bytes:
-    """Replaces the Exif item of an AVIF that libvips has written.
-
-    The new block is appended to the file, and the location of the item is set to this block.
-    """
+    """Replaces the Exif item of an AVIF that libvips has written. The new block is appended to the file, and the
+    location of the item is set to this block."""
     item = re.search(rb"infe\x02...(..)..Exif", data, re.DOTALL)
     row = _item_location(data, item[1]) if item else None
     if row is None:
@@ -164,10 +160,8 @@ def with_avif_exif(data: bytes, exif: bytes) -> bytes:
 
 
 def _item_location(data: bytes, item: bytes) -> int | None:
-    """Returns the position of the location of an item (base, count, offset, length) in an iloc box.
-
-    Returns None if the box does not have the layout that libheif writes.
-    """
+    """Returns the position of the location of an item (base, count, offset, length) in an iloc box. Returns None if the
+    box does not have the layout that libheif writes."""
     table = data.find(b"iloc")
     version, size_fields, index_fields = data[table + 4], data[table + 8], data[table + 9]
     if table < 0 or version > 1 or (size_fields, index_fields) != (0x44, 0x40):
@@ -301,10 +295,8 @@ def with_tiff_exif(data: bytes, exif: bytes) -> bytes:
 
 
 def first_directory(exif: bytes) -> tuple[str, int, int]:
-    """Returns the byte order of an EXIF block for `struct`, and the start and the end of the rows of its first directory.
-
-    Without a directory, all values are empty or 0.
-    """
+    """Returns the byte order of an EXIF block for `struct`, and the start and the end of the rows of its first
+    directory. Without a directory, all values are empty or 0."""
     byte_order = {b"II*\0": "<", b"MM\0*": ">"}.get(exif[:4])
     if byte_order is None or len(exif) < 10:
         return "", 0, 0
@@ -314,11 +306,9 @@ def first_directory(exif: bytes) -> tuple[str, int, int]:
 
 
 def upright_exif(exif: bytes) -> bytes:
-    """Returns an EXIF block with orientation 1 and without the thumbnail. The result begins at the TIFF header.
-
-    The thumbnail shows the input before rotation and separation, so the pointer to its directory is set to 0. All other
-    bytes are unchanged.
-    """
+    """Returns an EXIF block with orientation 1 and without the thumbnail. The result begins at the TIFF header. The
+    thumbnail shows the input before rotation and separation, so the pointer to its directory is set to 0. All other
+    bytes are unchanged."""
     exif = exif.removeprefix(_EXIF_NAME)
     block = bytearray(exif)
     byte_order, first_row, next_directory = first_directory(exif)

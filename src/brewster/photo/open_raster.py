@@ -48,10 +48,8 @@ _LAYERS_WITH_ALPHA: Final = f"""\
 
 
 def zip_images(files: Iterable[tuple[str, bytes]]) -> bytes:
-    """Returns a zip archive of (name, content) in this order. The same files always give the same bytes.
-
-    The archive is not compressed, because image files are already compressed.
-    """
+    """Returns a zip archive of (name, content) in this order. The same files always give the same bytes. The archive is
+    not compressed, because image files are already compressed."""
     archive_file = io.BytesIO()
     with zipfile.ZipFile(archive_file, "w", zipfile.ZIP_STORED) as archive:
         for name, data in files:

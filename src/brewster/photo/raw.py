@@ -29,11 +29,9 @@ _DAMAGED = "the RAW file cannot be read completely"
 
 
 def is_raw(tags: metadata.Tags) -> bool:
-    """Returns whether the first directory of a TIFF is that of a RAW file.
-
-    A DNG has the tag DNGVersion (50706). Other RAW files begin with a reduced image (NewSubfileType, bit 0), or with
-    colour filter array data (PhotometricInterpretation 32803).
-    """
+    """Returns whether the first directory of a TIFF is that of a RAW file. A DNG has the tag DNGVersion (50706). Other
+    RAW files begin with a reduced image (NewSubfileType, bit 0), or with colour filter array data
+    (PhotometricInterpretation 32803)."""
     is_reduced = metadata.number_of(tags, 254, 0) & 1 == 1
     return 50706 in tags or is_reduced or metadata.number_of(tags, 262, 0) == 32803
 

@@ -68,10 +68,8 @@ _CONDITIONS: Final = TypeAdapter(ViewingConditions | None)
 @final
 @dataclass(frozen=True)
 class StoredAnswer:
-    """A choice, and the seconds for which the pictures were shown before it.
-
-    `answered_at` is the time in UTC, ISO 8601. `withdrawn` has the choices that the participant withdrew before this one.
-    """
+    """A choice, and the seconds for which the pictures were shown before it. `answered_at` is the time in UTC, ISO
+    8601. `withdrawn` has the choices that the participant withdrew before this one."""
 
     choice: Choice
     seconds: float
@@ -82,10 +80,8 @@ class StoredAnswer:
 
 @final
 class AnswerStore:
-    """The answers of one study; safe to use from many threads and many processes at the same time.
-
-    With `read_only`, nothing can be written, and no database file is created for a study without answers.
-    """
+    """The answers of one study; safe to use from many threads and many processes at the same time. With `read_only`,
+    nothing can be written, and no database file is created for a study without answers."""
 
     def __init__(self, study: Study, *, read_only: bool = False) -> None:
         self.study = study
@@ -124,10 +120,8 @@ class AnswerStore:
         return int(number)
 
     def admit(self, *, max_participants: int | None = None) -> str | None:
-        """Add a participant who has given consent.
-
-        Returns the token of their link, or None if `max_participants` are admitted already.
-        """
+        """Add a participant who has given consent. Returns the token of their link, or None if `max_participants` are
+        admitted already."""
         with self._transaction("IMMEDIATE") as database:
             (number,) = database.execute("SELECT count(*) FROM participants").fetchone()
             if max_participants is not None and number >= max_participants:
@@ -152,11 +146,8 @@ class AnswerStore:
         return token
 
     def participant(self, token: str, *, exported: bool = False) -> Participant | None:
-        """The participant with this token, or None if the token is unknown.
-
-        A participant of a static bundle whose answers are not imported is returned only with `exported`, because the study does
-        not have the consent yet.
-        """
+        """The participant with this token, or None if the token is unknown. A participant of a static bundle whose
+        answers are not imported is returned only with `exported`, because the study does not have the consent yet."""
         with self._transaction() as database:
             row = database.execute(
                 "SELECT number, trials, practice FROM participants WHERE token = ? AND (consented_on != ? OR ?)",
@@ -182,10 +173,8 @@ class AnswerStore:
 
     def withdraw_answer(self, participant: Participant, trial: int) -> None:
         """Withdraw the answer to the last answered trial, so that the trial can be answered again. The answer is kept.
-
         Nothing is changed if the trial has no answer, for example because it was withdrawn already. Raises
-        BrewsterError if a later trial has an answer, and OutputError if the database cannot be written.
-        """
+        BrewsterError if a later trial has an answer, and OutputError if the database cannot be written."""
         key = (participant.number, trial)
         with self._transaction("IMMEDIATE") as database:
             last = database.execute(
@@ -238,11 +227,9 @@ class AnswerStore:
         return stored
 
     def import_answers(self, answer_file: AnswerFile) -> int:
-        """Store the answers of a participant of a static bundle in one transaction. An answer that is stored already is kept.
-
-        Returns the number of answers that were not stored before. Raises BrewsterError if the participant or a trial
-        does not exist in this study, and OutputError if the database cannot be written.
-        """
+        """Store the answers of a participant of a static bundle in one transaction. An answer that is stored already is
+        kept. Returns the number of answers that were not stored before. Raises BrewsterError if the participant or a
+        trial does not exist in this study, and OutputError if the database cannot be written."""
         participant = self.participant(answer_file.participant, exported=True)
         if participant is None:
             raise BrewsterError(
@@ -299,11 +286,9 @@ class AnswerStore:
     def _transaction(
         self, kind: Literal["DEFERRED", "IMMEDIATE"] = "DEFERRED"
     ) -> Iterator[sqlite3.Connection]:
-        """A transaction. All statements of the block read the same state of the database.
-
-        DEFERRED is for a block that only reads. IMMEDIATE is for a block that writes: it waits for other writers, and the changes
-        are synced to the disk at the end of the block.
-        """
+        """A transaction. All statements of the block read the same state of the database. DEFERRED is for a block that
+        only reads. IMMEDIATE is for a block that writes: it waits for other writers, and the changes are synced to
+        the disk at the end of the block."""
         with self._database_errors(), self._lock:
             database = self._database
             database.execute(f"BEGIN {kind}")
@@ -329,11 +314,9 @@ class AnswerStore:
 
 
 def _read_only_uri(file: Path) -> str:
-    """The SQLite URI that opens a file read-only, or an empty database in memory if the file does not exist.
-
-    A reader of a database in WAL mode creates a shared-memory file in the same folder. In a folder that is not writable,
-    `immutable=1` avoids that; it is correct only if the log is empty.
-    """
+    """The SQLite URI that opens a file read-only, or an empty database in memory if the file does not exist. A reader
+    of a database in WAL mode creates a shared-memory file in the same folder. In a folder that is not writable,
+    `immutable=1` avoids that; it is correct only if the log is empty."""
     if not file.exists():
         return "file::memory:"
     log = file.with_name(f"{file.name}-wal")

@@ -28,10 +28,8 @@ UNNAMED_DATASET: Final = ""
 @final
 @dataclass(frozen=True)
 class StudyPicture:
-    """A picture of the study: an 8-bit sRGB PNG with a random name.
-
-    `width` and `height` are in px; `sha256` is the digest of the PNG file, `source_sha256` that of its source file.
-    """
+    """A picture of the study: an 8-bit sRGB PNG with a random name. `width` and `height` are in px; `sha256` is the
+    digest of the PNG file, `source_sha256` that of its source file."""
 
     name: str
     width: int
@@ -43,11 +41,8 @@ class StudyPicture:
 @final
 @dataclass(frozen=True)
 class PairedComparison:
-    """A comparison of two methods on one photo.
-
-    `dataset` and `name` identify the source file. `photo` and `outputs` are names of pictures; `outputs` has the order of
-    `methods`.
-    """
+    """A comparison of two methods on one photo. `dataset` and `name` identify the source file. `photo` and `outputs`
+    are names of pictures; `outputs` has the order of `methods`."""
 
     dataset: str
     name: str
@@ -60,9 +55,7 @@ class PairedComparison:
 @dataclass(frozen=True)
 class CatchTrial:
     """Pictures for a catch trial, which tests attention: an output is compared with itself or with a degraded copy.
-
-    `photo`, `good` and `degraded` are names of pictures: the photo, the output, and the degraded copy of the output.
-    """
+    `photo`, `good` and `degraded` are names of pictures: the photo, the output, and the degraded copy of the output."""
 
     dataset: str
     name: str
@@ -74,11 +67,9 @@ class CatchTrial:
 @final
 @dataclass(frozen=True)
 class StudyDescription:
-    """Everything that is fixed before the first answer; the content of study.json.
-
-    `pairs` and `catch_trials` count the comparisons and catch trials of one participant. `consent` is the text that participants
-    agree to, with an empty line between paragraphs.
-    """
+    """Everything that is fixed before the first answer; the content of study.json. `pairs` and `catch_trials` count the
+    comparisons and catch trials of one participant. `consent` is the text that participants agree to, with an empty
+    line between paragraphs."""
 
     brewster: str
     seed: int

@@ -22,11 +22,8 @@ _FOLDER: Final = Path(__file__).parent
 
 
 def write_report(results: Results, cases: Iterable[CaseThumbnails], path: Path) -> None:
-    """Writes the page atomically and replaces an older one. Equal arguments give equal bytes.
-
-    `results` is the content of results.json. The cases are read one at a time. Raises OutputError if the file cannot be
-    written.
-    """
+    """Writes the page atomically and replaces an older one. Equal arguments give equal bytes. `results` is the content
+    of results.json. The cases are read one at a time. Raises OutputError if the file cannot be written."""
     import jinja2  # noqa: PLC0415 - an extra
 
     environment = jinja2.Environment(

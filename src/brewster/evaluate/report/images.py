@@ -45,10 +45,8 @@ Thumbnail = tuple[str, str, str]
 @final
 @dataclass(frozen=True)
 class CaseThumbnails:
-    """The embedded images of a case, by method; the photo and the ground truth are those of the baseline.
-
-    Sizes are (width, height) in px: that of the photo, and that of the embedded images.
-    """
+    """The embedded images of a case, by method; the photo and the ground truth are those of the baseline. Sizes are
+    (width, height) in px: that of the photo, and that of the embedded images."""
 
     benchmark: str
     name: str
@@ -112,10 +110,8 @@ def embedded_size(image: NDArray[Any]) -> tuple[int, int]:
 
 
 def encode_photo(image: Pixels) -> bytes:
-    """Downscales an sRGB image (H, W, 3) to its embedded size by area means in linear light; returns a JPEG file.
-
-    WebP files are 1/8 smaller, but their encoder takes seven times as long.
-    """
+    """Downscales an sRGB image (H, W, 3) to its embedded size by area means in linear light; returns a JPEG file. WebP
+    files are 1/8 smaller, but their encoder takes seven times as long."""
     if embedded_size(image) != image.shape[1::-1]:
         light = Photo.from_array(image, encoding="srgb").resized(*embedded_size(image))
         image = Photo.from_array(light, encoding="linear").srgb_8bit()
@@ -123,10 +119,8 @@ def encode_photo(image: Pixels) -> bytes:
 
 
 def error_map(prediction: Pixels, truth: Pixels) -> Pixels:
-    """Returns the error of a prediction (H, W, 3) in colours of COLOUR_MAP, uint8 (h, w, 3), at the embedded size.
-
-    The error is max over channels |prediction - truth|, averaged over the area of each new pixel.
-    """
+    """Returns the error of a prediction (H, W, 3) in colours of COLOUR_MAP, uint8 (h, w, 3), at the embedded size. The
+    error is max over channels |prediction - truth|, averaged over the area of each new pixel."""
     red, green, blue = np.moveaxis(np.abs(prediction.astype(np.int16) - truth), 2, 0)
     largest = np.maximum(np.maximum(red, green), blue).astype(np.float32)  # much faster than max(axis=2)
     photo = Photo.from_array(largest[..., None].repeat(3, axis=2), encoding="linear")

@@ -56,11 +56,9 @@ def tables_to_markdown(results: Results) -> str:
 
 
 def to_terminal(results: Results, width: int = 100, *, intervals: bool = False) -> str:
-    """Returns the means for a terminal with `width` columns: a table per selection, with one row per method.
-
-    A table that is too wide is continued below, and long names of methods are shortened. With `intervals`, each mean has its
-    95 % interval.
-    """
+    """Returns the means for a terminal with `width` columns: a table per selection, with one row per method. A table
+    that is too wide is continued below, and long names of methods are shortened. With `intervals`, each mean has its
+    95 % interval."""
     parts = [
         f"{selection['title']} ({selection['cases']} images)\n{_terminal_table(results, key, width, intervals)}"
         for key, selection in results["selections"].items()
@@ -202,11 +200,8 @@ def _number(results: Results, metric: str, value: float, *, sign: str = "") -> s
 
 
 def ranking(table: Mapping[str, Any], metric: str, metric_info: Mapping[str, Any]) -> list[str]:
-    """Returns the distinct means in descending order of quality, as they are printed.
-
-    The list has no means of methods with scores on fewer images than other methods. It is empty if fewer than two methods
-    remain.
-    """
+    """Returns the distinct means in descending order of quality, as they are printed. The list has no means of methods
+    with scores on fewer images than other methods. It is empty if fewer than two methods remain."""
     means = [row[metric]["mean"] for method, row in table.items() if is_complete(table, method, metric)]
     if len(means) < 2:
         return []

@@ -17,10 +17,8 @@ _EVERYONE_TITLE: Final = "All participants: the rule excludes everyone"
 
 
 def plot(results: Mapping[str, Any]) -> bytes:
-    """Plots the results after the exclusion rule, or those of all participants if the rule excludes everyone.
-
-    The plot is a PNG file.
-    """
+    """Plots the results after the exclusion rule, or those of all participants if the rule excludes everyone. The plot
+    is a PNG file."""
     from matplotlib.figure import Figure  # noqa: PLC0415  (an optional dependency, and slow to import)
 
     included = results["included"]["tables"]

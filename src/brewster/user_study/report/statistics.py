@@ -62,9 +62,7 @@ def averages(
     shares: Float64[Floats, "... d k"], pictures: Float64[Floats, "... d"]
 ) -> Float64[Floats, "... 2 k"]:
     """Two means over datasets: one weighted by the number of pictures, as in the paper's Table 3, and one unweighted.
-
-    The leading axes of the two arguments broadcast: `shares` may have an axis of resamples that `pictures` lacks.
-    """
+    The leading axes of the two arguments broadcast: `shares` may have an axis of resamples that `pictures` lacks."""
     weights = pictures / pictures.sum(axis=-1, keepdims=True)
     return np.stack([(shares * weights[..., None]).sum(axis=-2), shares.mean(axis=-2)], axis=-2)
 
@@ -130,11 +128,9 @@ def agreement_bounds(
 def with_agreement_bounds(
     rows: Float64[Floats, "... n 4"], ends: Float64[Floats, "2 ... n 4"], bounds: Float64[Floats, "... n"]
 ) -> Float64[Floats, "2 ... n 4"]:
-    """The intervals of `rates`, with those of width 0 replaced by intervals from `agreement_bounds`.
-
-    An interval is NaN if its width is 0 although answers differ, for example if only one participant has answered
-    comparisons of a dataset.
-    """
+    """The intervals of `rates`, with those of width 0 replaced by intervals from `agreement_bounds`. An interval is NaN
+    if its width is 0 although answers differ, for example if only one participant has answered comparisons of a
+    dataset."""
     bound, shares = bounds[..., None], rows[..., :3]
     is_one, is_zero = shares > 1 - _TOLERANCE, shares < _TOLERANCE
     lows = np.where(is_one, bound, np.where(is_zero, 0.0, np.nan))
@@ -147,11 +143,9 @@ def with_agreement_bounds(
 
 
 def _expanded_percentiles(participants: int) -> tuple[float, float]:
-    """The percentiles of a bootstrap that match the 95 % interval of Student's t with n - 1 degrees of freedom.
-
-    They also correct the bootstrap's spread, which is too small by the factor sqrt((n - 1) / n). The quantile of t is the
-    expansion 26.7.5 of Abramowitz and Stegun 1972.
-    """
+    """The percentiles of a bootstrap that match the 95 % interval of Student's t with n - 1 degrees of freedom. They
+    also correct the bootstrap's spread, which is too small by the factor sqrt((n - 1) / n). The quantile of t is the
+    expansion 26.7.5 of Abramowitz and Stegun 1972."""
     z, v = NormalDist().inv_cdf(0.975), participants - 1
     t = z + (z**3 + z) / (4 * v) + (5 * z**5 + 16 * z**3 + 3 * z) / (96 * v**2)
     tail = 100 * NormalDist().cdf(-t * math.sqrt(participants / v))
@@ -159,11 +153,9 @@ def _expanded_percentiles(participants: int) -> tuple[float, float]:
 
 
 def intraclass_correlation(counts: Float64[Floats, "p 3"]) -> float | None:
-    """The intraclass correlation of the scores 1, 0, -1 for win, tie, lose, with participants as classes.
-
-    The estimator from the analysis of variance (Donner 1986, equation 2.1). It can be below 0 by chance. It is None with
-    fewer than two participants, one answer for each participant, or no variance.
-    """
+    """The intraclass correlation of the scores 1, 0, -1 for win, tie, lose, with participants as classes. The estimator
+    from the analysis of variance (Donner 1986, equation 2.1). It can be below 0 by chance. It is None with fewer
+    than two participants, one answer for each participant, or no variance."""
     counts = counts[counts.sum(axis=1) > 0]
     sizes, sums, squares = counts.sum(axis=1), counts[:, 0] - counts[:, 2], counts[:, 0] + counts[:, 2]
     participants, answers = len(sizes), float(sizes.sum())

@@ -114,11 +114,9 @@ def _strength_text(entry: Mapping[str, Any]) -> str:
 
 
 def to_latex(results: Results) -> str:
-    """The results after the exclusion rule, in the layout of the paper's Table 3, with intervals below the rates.
-
-    One row for each dataset and one for the average; columns win, tie and lose for each pair of methods. Needs the LaTeX
-    package booktabs.
-    """
+    """The results after the exclusion rule, in the layout of the paper's Table 3, with intervals below the rates. One
+    row for each dataset and one for the average; columns win, tie and lose for each pair of methods. Needs the LaTeX
+    package booktabs."""
     tables = results["included"]["tables"]
     if not tables:
         return "% the rule excludes everyone\n"
@@ -157,10 +155,8 @@ def _latex_row(tables: Iterable[Mapping[str, Any]], key: str) -> str:
 
 
 def to_csv(results: Results) -> str:
-    """One line for each group, pair of methods, row (dataset or average) and rate. Rates are fractions, not percentages.
-
-    The key is the name of the dataset, or begins with a slash for an average.
-    """
+    """One line for each group, pair of methods, row (dataset or average) and rate. Rates are fractions, not
+    percentages. The key is the name of the dataset, or begins with a slash for an average."""
     header = ["group", "first", "second", "key", "dataset", "rate", "mean", "low", "high", "answers", "participants", "p"]  # fmt: skip
     rows: list[list[Any]] = [header]
     for key in _GROUPS:
