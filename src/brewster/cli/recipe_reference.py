@@ -54,11 +54,8 @@ def _sections() -> Iterator[str]:
             if table.name in seen:
                 yield f"The keys are those of {seen[table.name]}."
             else:
-                head = [
-                    "| key | type | allowed values | unit | default | meaning |",
-                    "|---|---|---|---|---|---|",
-                ]
-                yield "\n".join([*head, *map(_row, table.keys)])
+                head = "| key | type | allowed values | unit | default | meaning |\n|---|---|---|---|---|---|"
+                yield "\n".join([head, *map(_row, table.keys)])
             seen.setdefault(table.name, f'`[{table.path}]` in "{title}"')
 
 

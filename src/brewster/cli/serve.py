@@ -17,7 +17,7 @@ from typing import Any, Final
 import click
 
 from brewster.cli.extras import require_extra
-from brewster.cli.parameters import DEVICE, Number, options
+from brewster.cli.parameters import DEVICE, Number, flag, options
 from brewster.cli.terminal import print_out, print_status
 from brewster.files import DEFAULT_MAX_PIXELS
 from brewster.options import Device
@@ -88,9 +88,8 @@ def _read_token(_context: click.Context, _parameter: click.Parameter, token: str
     8417,
     "The token that each request must contain; auto generates a token. By default, no token is required if --host is a loopback address such as 127.0.0.1; for any other address, the default is auto.",
 )
-@click.option(
+@flag(
     "--lan",
-    is_flag=True,
     help="Serve phones in the same network: bind to the address of this machine in it, require a token, and print the link as a QR code.",
 )
 @click.option(
@@ -120,12 +119,11 @@ def _read_token(_context: click.Context, _parameter: click.Parameter, token: str
     metavar="SECONDS",
     help="The maximum time for one photo, including the time in the queue.",
 )
-@click.option(
+@flag(
     "--verbose",
-    is_flag=True,
     help="Log each photo that fails on standard error, with the messages of the libraries that read it.",
 )
-@click.option("--open", "open_browser", is_flag=True, help="Open the page in the web browser.")
+@flag("--open", "open_browser", help="Open the page in the web browser.")
 def serve(
     *,
     host: str,
