@@ -80,8 +80,13 @@ class BatchReport:
                 executor = stack.enter_context(self._executor(workers, cluster))
                 results = separate_in_parallel(tasks, executor, overwrite=self.overwrite)
             else:
-                given = {"overwrite": self.overwrite, "dry_run": self.dry_run}
-                results = separate_tasks(tasks, self.options, on_progress=on_progress, **given)
+                results = separate_tasks(
+                    tasks,
+                    self.options,
+                    overwrite=self.overwrite,
+                    dry_run=self.dry_run,
+                    on_progress=on_progress,
+                )
             for result in results:
                 self.add(result)
                 update_progress(self.counts.total(), result.source)

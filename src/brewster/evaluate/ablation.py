@@ -90,17 +90,13 @@ def ablate(
     workers: int = 1,
     on_progress: AblationCallback = lambda _label, _step, _steps, _numbers, _logged: None,
 ) -> Results:
-    """Trains and evaluates a model for every value. `out` gets one folder per value and the files that `evaluate` writes.
-
-    If all values are numbers and any metric has a score, plot.png shows the metrics against the values. The results are
-    those of `evaluate`; the model of each value is a method. Raises RecipeError if the base recipe, the key or a value
-    is invalid, or data is missing, and BrewsterError as training and `evaluate` do.
-    """
+    """Trains and evaluates a model for every value. `out` gets one folder per value and the files that `evaluate`
+    writes. If all values are numbers and any metric has a score, plot.png shows the metrics against the values. The
+    results are those of `evaluate`; the model of each value is a method. Raises RecipeError if the base recipe, the
+    key or a value is invalid, or data is missing, and BrewsterError as training and `evaluate` do."""
     config = EvaluationConfig(metrics=study.metrics)
     for metric in config.columns().values():
-        if (
-            metric.prepare
-        ):  # loads the weights of LPIPS: a download that fails must not fail after hours of training
+        if metric.prepare:  # loads weights: a download must not fail after hours of training
             metric.prepare()
     base = read_recipe(study.base)
     recipes = {study.label(value): with_value(base, study.key, value) for value in study.values}
@@ -111,9 +107,8 @@ def ablate(
         def on_step(*values: Any, label: str = label) -> None:  # noqa: ANN401  (the arguments of the training callback)
             on_progress(label, *values)
 
-        models.append(
-            ModelMethod(label, str(_train(recipe, folder, on_step)), out / "predictions" / folder.name)
-        )
+        model = _train(recipe, folder, on_step)
+        models.append(ModelMethod(label, str(model), out / "predictions" / folder.name))
     results = evaluate(benchmarks, [IdentityBaseline(), *models], config, out, workers=workers)
     numbers = [
         value for value in study.values if isinstance(value, int | float) and not isinstance(value, bool)

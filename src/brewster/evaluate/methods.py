@@ -112,6 +112,10 @@ class IdentityBaseline:
         return None
 
 
+_separators: dict[tuple[str, Device], Separator] = {}
+"""The models that this process has loaded. Each is loaded once, but a diffusion model replaces the one before it."""
+
+
 @final
 @dataclass(frozen=True)
 class ModelMethod:
@@ -146,17 +150,23 @@ class ModelMethod:
         Returns:
             The layers, decoded from the stored bytes. So new and stored predictions have the same scores.
         """
-        separator = _load_separator(self.model, self.device, self.exclusive)
+        if (key := (self.model, self.device)) not in _separators:
+            if self.exclusive:  # memory is limited: the previous model is freed first
+                _separators.clear()
+                gc.collect()
+            _separators[key] = Separator.load(self.model, device=self.device)
+        separator = _separators[key]
         started = time.perf_counter()
         if self.burst and case.frames:
             from brewster.burst import separate_burst  # noqa: PLC0415  (imports torch)
 
             # The photo may have been resized
+            frames = [Photo.open(file.read()) for file in case.frames]
             frames = [
                 frame
                 if frame.size == photo.size
                 else Photo.from_array(frame.resized(*photo.size), encoding="linear")
-                for frame in (Photo.open(file.read()) for file in case.frames)
+                for frame in frames
             ]
             separation = separate_burst(frames, separator=separator, quality=self.quality)
         else:
@@ -187,19 +197,6 @@ class ModelMethod:
         """Returns layer -> file in which the prediction for a case is stored."""
         folder = self.folder / case.benchmark
         return {layer: folder / f"{case.name}.{layer}.png" for layer in ("transmission", "reflection")}
-
-
-_separators: dict[tuple[str, Device], Separator] = {}
-"""The models that this process has loaded. Each is loaded once, but a diffusion model replaces the one before it."""
-
-
-def _load_separator(model: str, device: Device, exclusive: bool) -> Separator:
-    if (model, device) not in _separators:
-        if exclusive:  # memory is limited: the previous model is freed first
-            _separators.clear()
-            gc.collect()
-        _separators[model, device] = Separator.load(model, device=device)
-    return _separators[model, device]
 
 
 @final
@@ -346,11 +343,8 @@ def check_names(methods: Sequence[Method]) -> None:
         )
     (name, count), *_ = Counter(method.name for method in methods).most_common(1)
     if count > 1:
-        raise BrewsterError(
-            f"{count} methods have the name {name!r}",
-            "expected unique names",
-            "rename one method with NAME=...",
-        )
+        happened = f"{count} methods have the name {name!r}"
+        raise BrewsterError(happened, "expected unique names", "rename one method with NAME=...")
     for method in methods:
         if method.name in ("", ".", "..") or set("/\\") & set(method.name) or not method.name.isprintable():
             raise BrewsterError(

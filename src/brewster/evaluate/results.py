@@ -52,11 +52,7 @@ def summarise(
     method_names = [method.name for method in methods]
     measured = {column for row in rows for column, score in row.scores.items() if score is not None}
     columns = {name: metric for name, metric in config.columns().items() if name in measured}
-    full = [
-        Selection(benchmark.name, benchmark.title, benchmark.cases)
-        for benchmark in benchmarks
-        if benchmark.cases
-    ]
+    full = [Selection(part.name, part.title, part.cases) for part in benchmarks if part.cases]
     subsets = paper_subsets(benchmarks) if config.paper_subset else []
     # the average is over the subset of each benchmark, or over the whole benchmark if it has no subset
     subset_of = {subset.key.partition(":")[0]: subset for subset in subsets}
@@ -66,12 +62,8 @@ def summarise(
     selections |= {AVERAGE: averaged} if averaged else {}
     series = [(method, column) for method in method_names for column in columns]
     directions = {name: metric.higher_is_better for name, metric in columns.items()}
-    strata = {
-        key: [_stratum(selection, series, by_id) for selection in group] for key, group in selections.items()
-    }
-    tables: dict[str, dict[str, dict[str, Any]]] = {
-        key: {method: {} for method, _ in series} for key in selections
-    }
+    strata = {key: [_stratum(part, series, by_id) for part in group] for key, group in selections.items()}
+    tables: dict[str, dict[str, Any]] = {key: {method: {} for method, _ in series} for key in selections}
     for key, table in tables.items():
         for (method, column), mean in zip(series, estimate(strata[key]), strict=True):
             if mean:
@@ -114,9 +106,7 @@ def summarise(
         "draw": {"seed": PAPER_SEED}
         | {subset.key: [case.name for case in subset.cases] for subset in subsets},
         "cases": [
-            _describe_case(
-                [by_id[case.benchmark, case.name, method] for method in method_names], case, columns
-            )
+            _describe_case([by_id[case.benchmark, case.name, name] for name in method_names], case, columns)
             for benchmark in benchmarks
             for case in benchmark.cases
         ],
@@ -149,11 +139,8 @@ def _choices(config: EvaluationConfig, averaged: Sequence[Selection]) -> list[st
     if not config.paper_subset or counts == PAPER_COUNTS:
         return choices
     found = ", ".join(f"{count} of {name}" for name, count in counts.items())
-    difference = (
-        f"The average of this evaluation is over {found}."
-        if found
-        else "This evaluation has no average, because it has fewer than two of the paper's benchmarks."
-    )
+    missing = "This evaluation has no average, because it has fewer than two of the paper's benchmarks."
+    difference = f"The average of this evaluation is over {found}." if found else missing
     return [*choices, f"The paper's average is over {sum(PAPER_COUNTS.values())} images. {difference}"]
 
 
@@ -179,9 +166,7 @@ def _describe_case(rows: Sequence[ScoreRow], case: Case, columns: Collection[str
         "benchmark": case.benchmark,
         "name": case.name,
         "scene": case.scene,
-        "width": scored.width if scored else None,
-        "height": scored.height if scored else None,
-        "region_share": scored.region_share if scored else None,
+        **{name: getattr(scored, name, None) for name in ("width", "height", "region_share")},
         "scores": {
             row.method: {column: row.scores[column] for column in columns if column in row.scores}
             for row in rows

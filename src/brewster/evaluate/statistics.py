@@ -47,12 +47,10 @@ class Stratum:
 
 
 def estimate(strata: Sequence[Stratum]) -> list[Estimate | None]:
-    """Computes the mean of each series over all images of all strata, and its 95 % interval.
-
-    Stratified cluster bootstrap with percentile intervals (Efron and Tibshirani 1993, chapter 13), 10,000 resamples and a
-    fixed seed. For a stratum of k scenes, each resample draws k scenes with replacement, and all images of these scenes. A
-    series without values has no estimate.
-    """
+    """Computes the mean of each series over all images of all strata, and its 95 % interval. Stratified cluster
+    bootstrap with percentile intervals (Efron and Tibshirani 1993, chapter 13), 10,000 resamples and a fixed seed.
+    For a stratum of k scenes, each resample draws k scenes with replacement, and all images of these scenes. A
+    series without values has no estimate."""
     resampled = [_resample(stratum) for stratum in strata]
     sums, counts = (np.sum([part[i] for part in resampled], axis=0) for i in range(2))
     values = np.concatenate([stratum.values for stratum in strata])
@@ -109,15 +107,9 @@ class Difference:
 def differences(
     strata: Sequence[Stratum], series: Sequence[tuple[str, str]], directions: Mapping[str, bool]
 ) -> list[Difference]:
-    """Compares each method with all methods before it, in every metric, paired by image.
+    """Compares each method with all methods before it, in every metric, paired by image, if an image has both scores.
 
-    There is a difference for each pair of methods and metric, if an image has both scores.
-
-    Args:
-        strata: the scores. Column i of `values` is `series[i]`.
-        series: (method, metric) of each column.
-        directions: metric -> whether higher is better.
-    """
+    `series` has (method, metric) of each column of the values of `strata`; `directions` is metric -> whether higher is better."""
     column_of = {name: i for i, name in enumerate(series)}
     methods = list(dict.fromkeys(method for method, _ in series))
     comparisons = [

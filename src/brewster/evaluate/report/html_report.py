@@ -70,10 +70,8 @@ def _notes(results: Results) -> list[tuple[str, list[str]]]:
         for image in images
         for error in image["errors"].items()
     ]
-    counts = Counter(method for _, method, _ in errors)
-    counted = ", ".join(
-        f"{method} on {count} of {_count(len(images), 'image')}" for method, count in counts.items()
-    )
+    counts, total = Counter(method for _, method, _ in errors), _count(len(images), "image")
+    counted = ", ".join(f"{method} on {count} of {total}" for method, count in counts.items())
     excluded, all_remarks = (
         [f"{benchmark['title']}: {text}" for benchmark in benchmarks for text in benchmark[kind]]
         for kind in ("excluded", "remarks")

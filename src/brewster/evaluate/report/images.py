@@ -61,13 +61,8 @@ def to_thumbnails(
     region: Region,
     links: Mapping[tuple[str, str], str],
 ) -> CaseThumbnails:
-    """Downscales and encodes all images of a case.
-
-    Args:
-        predictions: method -> prediction, without the baseline.
-        links: (layer, method) -> URL of the image at full size, relative to the page; the method is "" for the layers
-            "photo", "transmission" and "reflection" of the benchmark.
-    """
+    """Downscales and encodes all images of a case. `predictions` has no baseline. `links` is (layer, method) -> URL of the image
+    at full size, relative to the page; the method is "" for the photo, transmission and reflection of the benchmark."""
     photo, ground_truth = truth.images["photo"], truth.images["transmission"]
 
     def thumbnail(caption: str, data: bytes, layer: str = "", method: str = "") -> Thumbnail:
@@ -125,7 +120,6 @@ def error_map(prediction: Pixels, truth: Pixels) -> Pixels:
     largest = np.maximum(np.maximum(red, green), blue).astype(np.float32)  # much faster than max(axis=2)
     photo = Photo.from_array(largest[..., None].repeat(3, axis=2), encoding="linear")
     means = photo.resized(*embedded_size(largest))[..., 0]
-    colours: Pixels = COLOUR_MAP[
-        (means / MAX_ERROR * len(COLOUR_MAP)).astype(int).clip(0, len(COLOUR_MAP) - 1)
-    ]
+    indices = (means / MAX_ERROR * len(COLOUR_MAP)).astype(int).clip(0, len(COLOUR_MAP) - 1)
+    colours: Pixels = COLOUR_MAP[indices]
     return colours
