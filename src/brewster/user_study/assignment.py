@@ -40,10 +40,9 @@ def draw_trials(description: StudyDescription, number: int) -> tuple[Trial, ...]
     computed from its start, which takes 0.3 s for participant 10,000."""
     count, pairs = len(description.comparisons), description.pairs
     sequence = comparison_sequence(count, pairs, description.seed)
-    assigned = list(itertools.islice(sequence, number * pairs, (number + 1) * pairs))
     rng = Random(f"{description.seed}/participant/{number}")  # noqa: S311  (not a secret: the seed is published)
     trials = []
-    for index, flipped in assigned:
+    for index, flipped in itertools.islice(sequence, number * pairs, (number + 1) * pairs):
         comparison = description.comparisons[index]
         left, right = comparison.outputs[::-1] if flipped else comparison.outputs
         trials.append(Trial(comparison.photo, left, right, index, flipped))

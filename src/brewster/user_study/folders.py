@@ -32,13 +32,12 @@ def find_pictures(folder: Path, datasets: Sequence[str] = ()) -> dict[Key, Path]
     if not folder.is_dir():
         raise BrewsterError(f"{folder} is not a folder", "expected a folder with pictures", "check the path")
     subfolders = {
-        _normalised(subfolder.name): subfolder
-        for subfolder in folder.iterdir()
-        if subfolder.is_dir() and subfolder.name[0] != "."
+        _normalised(path.name): path for path in folder.iterdir() if path.is_dir() and path.name[0] != "."
     }
-    subfolders = {name: subfolders[name] for name in sorted(subfolders, key=natural_key)}
     stems_by_dataset = {
-        name: stems for name, subfolder in subfolders.items() if (stems := _list_pictures(subfolder))
+        name: stems
+        for name in sorted(subfolders, key=natural_key)
+        if (stems := _list_pictures(subfolders[name]))
     }
     if missing := [name for name in datasets if name not in stems_by_dataset]:
         raise BrewsterError(
@@ -75,13 +74,8 @@ def find_pictures(folder: Path, datasets: Sequence[str] = ()) -> dict[Key, Path]
 
 
 def select_pictures(pictures: Mapping[Key, Path], names: Sequence[str], folder: Path) -> dict[Key, Path]:
-    """The pictures with these names, in the order of `pictures`; all of them if `names` is empty.
-
-    Raises BrewsterError if a name has no picture.
-
-    Args:
-        names: "dataset/stem" for each picture, or "stem" if there are no datasets. A suffix is allowed.
-    """
+    """The pictures with these names, in the order of `pictures`; all of them if `names` is empty. A name is "dataset/stem", or
+    "stem" if there are no datasets; a suffix is allowed. Raises BrewsterError if a name has no picture."""
     by_name = {"/".join(filter(None, key)): key for key in pictures}
     stems = {
         name: name.rpartition(".")[0] if f".{name.rpartition('.')[2]}".lower() in SUFFIXES else name
@@ -110,13 +104,11 @@ def _list_pictures(folder: Path) -> dict[Path, str]:
         for path in folder.iterdir()
         if path.suffix.lower() in SUFFIXES and not path.name.startswith(".") and path.is_file()
     }
-    separated = {
+    separated = [
         stem.removesuffix(_TRANSMISSION) for stem in pictures.values() if stem.endswith(_TRANSMISSION)
-    }
-    other_layers = {f"{stem}{layer}" for stem in separated for layer in (".reflection", ".confidence")}
-    stems = {
-        path: stem.removesuffix(_TRANSMISSION) for path, stem in pictures.items() if stem not in other_layers
-    }
+    ]
+    others = {f"{stem}{layer}" for stem in separated for layer in (".reflection", ".confidence")}
+    stems = {path: stem.removesuffix(_TRANSMISSION) for path, stem in pictures.items() if stem not in others}
     return dict(sorted(stems.items(), key=lambda pair: (natural_key(pair[1]), pair[0])))
 
 

@@ -13,12 +13,9 @@ from brewster.errors import BrewsterError
 @final
 @dataclass(frozen=True)
 class PowerAnalysis:
-    """The required number of participants, and the quantities that it is computed from.
-
-    `answers` is the number of participants times the number of pairs. `win` and `lose` are the assumed rates.
-    `design_effect` is the number of real answers that have the information of one independent answer. `deviation` is
-    the standard deviation, over participants, of the difference between win and lose rate.
-    """
+    """The required number of participants, and the quantities that it is computed from: `answers` of all participants, the
+    assumed `win` and `lose` rates, the `design_effect` (the number of real answers that are worth one independent answer), and the
+    standard `deviation`, over participants, of the difference between win and lose rate."""
 
     participants: int
     answers: int

@@ -1,14 +1,9 @@
 """Store the answers of a study in SQLite, with a write-ahead log and a disk sync after each commit.
 
-    store = AnswerStore(study)
-    participant = store.participant(store.admit())
-    store.record_answer(participant, 0, "left", seconds=4.2)
-
-For each participant, the database contains a number, the token of the personal link, the date of the consent and the
-trials; it contains no name and no address. The trials are drawn once, at admission, and stored, so a later version of
-brewster cannot change them. A second answer to a trial is ignored: a browser repeats an answer if the response was lost. To
-change their last answer, participants withdraw it first. Withdrawn answers are kept.
-"""
+A participant has a number, the token of the personal link, the date of the consent and the trials; no name and no address. The
+trials are drawn once, at admission, and stored, so a later version of brewster cannot change them. A second answer to a trial
+is ignored: a browser repeats an answer if the response was lost. To change their last answer, participants withdraw it first.
+Withdrawn answers are kept."""
 
 from __future__ import annotations
 
@@ -122,27 +117,22 @@ class AnswerStore:
     def admit(self, *, max_participants: int | None = None) -> str | None:
         """Add a participant who has given consent. Returns the token of their link, or None if `max_participants` are
         admitted already."""
+        return self._insert_participant(datetime.now(UTC).date().isoformat(), max_participants)
+
+    def admit_exported(self) -> str:
+        """Add a participant of a static bundle, who has not given consent yet. Returns the token."""
+        return self._insert_participant(_NO_CONSENT) or ""
+
+    def _insert_participant(self, consented_on: str, max_participants: int | None = None) -> str | None:
         with self._transaction("IMMEDIATE") as database:
             (number,) = database.execute("SELECT count(*) FROM participants").fetchone()
             if max_participants is not None and number >= max_participants:
                 return None
-            today = datetime.now(UTC).date().isoformat()
-            return self._insert_participant(database, consented_on=today)
-
-    def admit_exported(self) -> str:
-        """Add a participant of a static bundle, who has not given consent yet. Returns the token."""
-        with self._transaction("IMMEDIATE") as database:
-            return self._insert_participant(database, consented_on=_NO_CONSENT)
-
-    def _insert_participant(self, database: sqlite3.Connection, *, consented_on: str) -> str:
-        (number,) = database.execute("SELECT count(*) FROM participants").fetchone()
-        token = secrets.token_urlsafe(24)
-        drawn = draw_trials(self.study.description, number)
-        trials = json.dumps([asdict(trial) for trial in drawn])
-        practice = json.dumps(asdict(draw_practice(self.study.description, number, drawn)))
-        database.execute(
-            "INSERT INTO participants VALUES (?, ?, ?, ?, ?)", (number, token, consented_on, trials, practice)
-        )
+            drawn, token = draw_trials(self.study.description, number), secrets.token_urlsafe(24)
+            trials = json.dumps([asdict(trial) for trial in drawn])
+            practice = json.dumps(asdict(draw_practice(self.study.description, number, drawn)))
+            row = number, token, consented_on, trials, practice
+            database.execute("INSERT INTO participants VALUES (?, ?, ?, ?, ?)", row)
         return token
 
     def participant(self, token: str, *, exported: bool = False) -> Participant | None:
@@ -153,9 +143,7 @@ class AnswerStore:
                 "SELECT number, trials, practice FROM participants WHERE token = ? AND (consented_on != ? OR ?)",
                 (token, _NO_CONSENT, exported),
             ).fetchone()
-        return (
-            None if row is None else Participant(row[0], _parse_trials(row[1]), Trial(**json.loads(row[2])))
-        )
+        return row and Participant(row[0], _parse_trials(row[1]), Trial(**json.loads(row[2])))
 
     def next_trial(self, participant: Participant) -> int | None:
         """The index of the first trial without an answer, or None if all trials have one."""
@@ -177,9 +165,9 @@ class AnswerStore:
         BrewsterError if a later trial has an answer, and OutputError if the database cannot be written."""
         key = (participant.number, trial)
         with self._transaction("IMMEDIATE") as database:
-            last = database.execute(
+            (last,) = database.execute(
                 "SELECT max(trial) FROM answers WHERE participant = ?", key[:1]
-            ).fetchone()[0]
+            ).fetchone()
             if last is not None and last > trial:
                 raise BrewsterError(
                     f"the answer to pair {trial + 1} cannot be withdrawn",
@@ -200,12 +188,10 @@ class AnswerStore:
         seconds: float,
         conditions: ViewingConditions | None = None,
     ) -> Choice:
-        """Store an answer, unless the trial already has one. The answer is synced to the disk on return.
-
-        `trial` is the index of the trial, from 0. `seconds` is how long the pictures were shown, clipped to
-        0..MAX_SECONDS. Returns the stored choice, which is that of the first answer. Raises BrewsterError if the trial
-        or the choice does not exist, and OutputError if the database cannot be written.
-        """
+        """Store an answer, unless the trial already has one. The answer is synced to the disk on return. `trial` is the
+        index of the trial, from 0. `seconds` is how long the pictures were shown, clipped to 0..MAX_SECONDS. Returns
+        the stored choice, which is that of the first answer. Raises BrewsterError if the trial or the choice does
+        not exist, and OutputError if the database cannot be written."""
         if not 0 <= trial < len(participant.trials) or choice not in CHOICES:
             raise BrewsterError(
                 f"trial {trial} was answered with {choice!r}",
@@ -237,15 +223,14 @@ class AnswerStore:
                 "expected a participant of a bundle that `brewster study export` wrote from this study",
                 "choose the study that the bundle belongs to",
             )
-        count = len(participant.trials)
+        last, number = len(participant.trials) - 1, participant.number
         for answer in (*answer_file.answers, *answer_file.withdrawn):
-            if answer.trial >= count:
+            if answer.trial > last:
                 raise BrewsterError(
                     f"the file of answers has an answer to trial {answer.trial}",
-                    f"expected trials from 0 to {count - 1}",
+                    f"expected trials from 0 to {last}",
                     "ask the participant to download the answers again",
                 )
-        number = participant.number
         with self._transaction("IMMEDIATE") as database:
             database.execute(
                 "UPDATE participants SET consented_on = ? WHERE number = ? AND consented_on = ?",

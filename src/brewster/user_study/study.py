@@ -116,12 +116,12 @@ class Study:
     def verify_pictures(self) -> None:
         """Check that all pictures exist and are unchanged. Raises BrewsterError if a picture is missing, or its digest
         differs from the description."""
-        changed = []
-        for picture in self.description.pictures:
+
+        def is_unchanged(picture: StudyPicture) -> bool:
             path = self.picture_file(picture.name)
-            if not path.is_file() or hashlib.sha256(path.read_bytes()).hexdigest() != picture.sha256:
-                changed.append(picture.name)
-        if changed:
+            return path.is_file() and hashlib.sha256(path.read_bytes()).hexdigest() == picture.sha256
+
+        if changed := [picture.name for picture in self.description.pictures if not is_unchanged(picture)]:
             raise BrewsterError(
                 f"pictures of the study are missing or changed: {len(changed)}, such as {self.picture_file(changed[0])}",
                 "expected all pictures as `brewster study create` wrote them",

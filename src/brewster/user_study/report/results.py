@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 import brewster
 from brewster.errors import BrewsterError
 from brewster.files import write_atomically
-from brewster.user_study.report.answers import answers_csv
 from brewster.user_study.report.figure import plot
 from brewster.user_study.report.participants import OUTCOMES, ExclusionRule, ParticipantAnswers
 from brewster.user_study.report.statistics import (
@@ -33,7 +32,7 @@ from brewster.user_study.report.statistics import (
     strengths,
     with_agreement_bounds,
 )
-from brewster.user_study.report.tables import to_csv, to_latex, to_markdown
+from brewster.user_study.report.tables import answers_csv, to_csv, to_latex, to_markdown
 from brewster.user_study.study import Study
 
 AVERAGES: Final = {
@@ -84,9 +83,7 @@ def summarise(study: Study, participants: Sequence[ParticipantAnswers], rule: Ex
 
 
 def _dataset_title(dataset: str) -> str:
-    if dataset in AVERAGES.values():
-        return f"{dataset} (dataset)"
-    return dataset or "All pictures"
+    return f"{dataset} (dataset)" if dataset in AVERAGES.values() else dataset or "All pictures"
 
 
 def _group(study: Study, participants: Sequence[ParticipantAnswers]) -> dict[str, Any]:
@@ -94,10 +91,10 @@ def _group(study: Study, participants: Sequence[ParticipantAnswers]) -> dict[str
     participants = [participant for participant in participants if participant.votes]
     summary = {
         "participants": len(participants),
-        "complete": sum(participant.is_complete for participant in participants),
-        "answers": sum(len(participant.votes) for participant in participants),
-        "catch_trials": sum(participant.catch_trials for participant in participants),
-        "failed": sum(participant.failed for participant in participants),
+        "complete": sum(one.is_complete for one in participants),
+        "answers": sum(len(one.votes) for one in participants),
+        "catch_trials": sum(one.catch_trials for one in participants),
+        "failed": sum(one.failed for one in participants),
         "tables": [],
         "strengths": {},
         "agreement": None,
@@ -168,10 +165,13 @@ def _tables(study: Study, counts: Floats, pictures: Floats, weights: Floats) -> 
                     "answers": int(answers[i, j] if j < answers.shape[1] else answers[i].sum()),
                     "participants": int(sizes[i, j]),
                     "p": _round(p_values[i, j]) if sizes[i, j] >= MIN_PARTICIPANTS else None,
-                    **{
-                        name: _estimate(*(part[i, j, k] for part in (means, lows, highs)))
-                        for k, name in enumerate((*OUTCOMES, "difference"))
-                    },
+                    **dict(
+                        zip(
+                            (*OUTCOMES, "difference"),
+                            map(_estimate, means[i, j], lows[i, j], highs[i, j]),
+                            strict=True,
+                        )
+                    ),
                 }
                 for j, (key, title) in enumerate(titles.items())
             ],
@@ -198,9 +198,7 @@ def _strengths(study: Study, counts: Floats, weights: Floats) -> dict[str, Any]:
         if np.isfinite(resamples).all() and np.ptp(resamples, axis=0).min() > _MIN_SPREAD
         else np.full((2, len(means)), math.nan)
     )
-    return {
-        method: _estimate(*(part[i] for part in (means, lows, highs))) for i, method in enumerate(methods)
-    }
+    return dict(zip(methods, map(_estimate, means, lows, highs), strict=True))
 
 
 def _estimate(mean: float, low: float, high: float) -> dict[str, float | None]:

@@ -45,11 +45,8 @@ def rates(
     counts: Float64[Floats, "... d 3"], pictures: Float64[Floats, "... d"]
 ) -> Float64[Floats, "... d+3 4"]:
     """Rates of win, tie and lose, and the difference win - lose. `pictures` is the number of pictures of each dataset.
-
-    Returns:
-        A row for each dataset, then three averages: the mean weighted by the number of pictures (as in the paper), the
-        mean of the datasets, and the rates of all answers together. Rows without answers are NaN.
-    """
+    Returns a row for each dataset, then three averages: the mean weighted by the number of pictures (as in the
+    paper), the mean of the datasets, and the rates of all answers together. Rows without answers are NaN."""
     with np.errstate(invalid="ignore"):
         shares = counts / counts.sum(axis=-1, keepdims=True)
         pooled = counts.sum(axis=-2, keepdims=True)
@@ -68,14 +65,9 @@ def averages(
 
 
 def bootstrap_interval(draws: Float64[Floats, "r ..."], participants: int) -> Float64[Floats, "2 ..."]:
-    """The 95 % expanded percentile interval (Hesterberg 2015, section 4.3.2).
-
-    Its percentiles are slightly wider than 2.5 and 97.5, because the plain percentile interval is too narrow for few
-    participants. The ends are NaN for a single participant.
-
-    Args:
-        draws: the values of a statistic, one for each resample; values that are not finite are ignored.
-    """
+    """The 95 % expanded percentile interval (Hesterberg 2015, section 4.3.2) of a statistic with these values, one for each
+    resample; values that are not finite are ignored. Its percentiles are slightly wider than 2.5 and 97.5, because the plain
+    percentile interval is too narrow for few participants. The ends are NaN for a single participant."""
     if participants < 2:
         return np.full((2, *draws.shape[1:]), np.nan)
     ends = _expanded_percentiles(participants)
@@ -111,12 +103,10 @@ def sign_flip_test(
 def agreement_bounds(
     counts: Float64[Floats, "p ... d 3"], pictures: Float64[Floats, "... d"]
 ) -> Float64[Floats, "... d+3"]:
-    """The lower end of the 95 % interval for an observed rate of 1, for each row of `rates`; NaN without answers.
-
-    If all answers agree, the bootstrap has no spread. The bound is then that of Clopper and Pearson (1934) for n successes of
-    n trials, 0.025^(1 / n). Here n is the number of participants, not of answers, since answers of one participant are not
-    independent. The bound of an average of rates is the average of their bounds.
-    """
+    """The lower end of the 95 % interval for an observed rate of 1, for each row of `rates`; NaN without answers. If
+    all answers agree, the bootstrap has no spread. The bound is then that of Clopper and Pearson (1934) for n
+    successes of n trials, 0.025^(1 / n). Here n is the number of participants, not of answers, since answers of one
+    participant are not independent. The bound of an average of rates is the average of their bounds."""
     sizes = counts.sum(axis=-1)
     with np.errstate(divide="ignore"):
         bounds = 0.025 ** (1 / (sizes > 0).sum(axis=0))
@@ -173,20 +163,11 @@ def intraclass_correlation(counts: Float64[Floats, "p 3"]) -> float | None:
 
 
 def strengths(wins: Float64[Floats, "... m m"]) -> Float64[Floats, "... m"]:
-    """The maximum-likelihood strengths of methods in the model of Bradley and Terry (1952), for each table of wins.
+    """The maximum-likelihood strengths of methods in the model of Bradley and Terry (1952), for each table of wins, with mean 0.
 
-    P(a beats b) = 1 / (1 + exp(strength_b - strength_a)). A tie counts as half a win for each of the two methods.
-
-    Damped Newton's method: each step is divided by 1 + its length, so the likelihood always increases (Nesterov 2004,
-    section 4.1.5).
-
-    Args:
-        wins: `wins[a, b]` is the number of wins of method a against method b; a tie adds 0.5 to both orders.
-
-    Returns:
-        The strengths, with mean 0; NaN for a table without a maximum, where some methods never lose to the others
-        (Ford 1957).
-    """
+    P(a beats b) = 1 / (1 + exp(strength_b - strength_a)); `wins[a, b]` is the number of wins of method a against method b, and a
+    tie adds 0.5 to both orders. NaN for a table without a maximum, where some methods never lose to the others (Ford 1957).
+    Damped Newton's method: each step is divided by 1 + its length, so the likelihood always increases (Nesterov 2004, 4.1.5)."""
     wins = wins * (1 - np.eye(wins.shape[-1]))
     total = wins + np.swapaxes(wins, -1, -2)
     is_bounded = all_connected(wins)
@@ -216,16 +197,10 @@ def all_connected(wins: Float64[Floats, "... m m"]) -> NDArray[np.bool_]:
 
 
 def alpha(ratings: Float64[NDArray[np.float64], "u c"]) -> float | None:
-    """Krippendorff's alpha, the agreement of raters on nominal categories: 1 - observed / expected disagreement.
-
-    Krippendorff 2011, "Computing Krippendorff's alpha-reliability", part D. Ratings may be missing.
-
-    Args:
-        ratings: number of ratings by unit and category. Units with fewer than two ratings are ignored.
-
-    Returns:
-        1 for perfect agreement, 0 for agreement by chance; None if no unit has two ratings, or all ratings are equal.
-    """
+    """Krippendorff's alpha, the agreement of raters on nominal categories: 1 - observed / expected disagreement
+    (Krippendorff 2011, "Computing Krippendorff's alpha-reliability", part D), 1 for perfect agreement and 0 for
+    agreement by chance. `ratings` is the number of ratings by unit and category; units with fewer than two are
+    ignored. None if no unit has two ratings, or all ratings are equal."""
     paired = ratings[ratings.sum(axis=1) >= 2]
     sizes, totals = paired.sum(axis=1), paired.sum(axis=0)
     count = sizes.sum()
