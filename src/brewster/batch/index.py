@@ -1,11 +1,7 @@
-"""The index of an archive: a Parquet table with one row for each photo, in the output folder.
+"""The index of an archive: a Parquet table with one row for each photo, index.parquet in the output folder.
 
-    import pandas
-    index = pandas.read_parquet("out/index.parquet")
-
-During a run, rows are written to small tables in the folder .brewster-index, about every 30 seconds. At the end of the run, they
-are merged into index.parquet, together with the rows of earlier runs. A killed run loses only the rows after its last small table.
-"""
+About every 30 seconds, rows are written to small tables in the folder .brewster-index. At the end of the run, they are merged
+into index.parquet, together with the rows of earlier runs. A killed run loses only the rows after its last small table."""
 
 from __future__ import annotations
 
@@ -118,9 +114,8 @@ class IndexWriter:
         try:
             table = self._parquet.read_table(io.BytesIO(path.read_bytes()))
             # An index of an earlier version may have fewer columns.
-            return table.select(
-                ["path", "status", *(COLUMNS.keys() & {*table.column_names} - {"path", "status"})]
-            )
+            others = COLUMNS.keys() & {*table.column_names} - {"path", "status"}
+            return table.select(["path", "status", *others])
         except (OSError, ValueError, KeyError) as error:  # the errors of pyarrow are subclasses
             raise OutputError(
                 f"{path} is not an index ({str(error).partition(chr(10))[0]})",

@@ -4,10 +4,10 @@
     1987/box-04/0017.tif
     s3://scans/1987/box-04/0018.tif
 
-The values of a CSV table are separated by commas, semicolons or tabs, as its header shows. Blank lines are skipped. Messages name the
-line of a CSV file, or the row of a Parquet table. Row 1 is its first row. A relative path is relative to the folder of the manifest,
-and its layers are written to the same relative path below the output folder. The layers of an absolute path or a URL are written to
-this path below the output folder, without the root or the protocol: to `OUT/scans/1987/box-04` for the second row. The output folder of a photo therefore does not depend on the other rows.
+The values of a CSV table are separated by commas, semicolons or tabs, as its header shows. A relative path is relative to the
+folder of the manifest, and its layers are written to the same relative path below the output folder. The layers of an absolute
+path or a URL are written to this path below the output folder, without the root or the protocol: to `OUT/scans/1987/box-04`
+for the second row. The output folder of a photo therefore does not depend on the other rows.
 """
 
 from __future__ import annotations
@@ -174,8 +174,5 @@ def import_parquet(purpose: str) -> Any:  # noqa: ANN401  (pyarrow has no types)
     try:
         return importlib.import_module("pyarrow.parquet")
     except ImportError as error:
-        raise MissingExtra.for_extra(
-            "cluster",
-            "the package pyarrow is not installed",
-            f"expected pyarrow, because {purpose} is a Parquet table",
-        ) from error
+        expected = f"expected pyarrow, because {purpose} is a Parquet table"
+        raise MissingExtra.for_extra("cluster", "the package pyarrow is not installed", expected) from error

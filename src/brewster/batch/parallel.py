@@ -1,15 +1,8 @@
-"""Separates an archive: a batch in several processes or on a cluster, with an index of the results.
+"""Separates an archive: a batch in several processes or on a cluster.
 
-    tasks = plan_files("scans.parquet", "s3://bucket/clear", options)
-    create_runner = partial(SeparationRunner, options)
-    with RayExecutor(create_runner, "10.0.0.1:6379") as executor, IndexWriter(location("s3://bucket/clear")) as index:
-        for result in separate_in_parallel(tasks, executor):
-            index.append(result)
-
-A worker separates one photo at a time, with the same code as a batch in one process (`separate_tasks`). The worker itself reads the
-photo and writes the layers. Without `overwrite`, a layer that exists is never written again, even if two workers separate the same
-photo. If a node is lost, only the photos that it was separating are separated again. The same command resumes a stopped run.
-"""
+A worker separates one photo at a time, as a batch in one process does: it reads the photo and writes the layers. Without
+`overwrite`, a layer that exists is never written again, even if two workers separate the same photo. If a node is lost, only
+its photos are separated again. The same command resumes a stopped run."""
 
 from __future__ import annotations
 
@@ -32,15 +25,9 @@ from brewster.remote_path import Location
 def separate_in_parallel(
     tasks: Sequence[SeparationTask], executor: Executor[FileResult], *, overwrite: bool = False
 ) -> Iterator[FileResult]:
-    """Separates the photos of the tasks, and yields the results in the order in which workers finish them.
-
-    Raises OutputError if a layer would replace a photo of the archive, or a node cannot reach the output folder;
-    ModelError if the model does not exist or is damaged; DeviceError if the requested device is not available.
-
-    Args:
-        executor: runs a `SeparationRunner` in its workers. The caller enters its context.
-        overwrite: whether tasks whose layers exist are given to a worker. The runner needs the same value.
-    """
+    """Separates the photos of the tasks, and yields the results in the order in which workers finish them. The caller enters the
+    context of the executor, which runs a `SeparationRunner` in its workers; both need the same `overwrite`. Raises OutputError if
+    a layer would replace a photo of the archive, or a node cannot reach the output folder, and ModelError or DeviceError."""
     photos, cache = real_paths(task.source for task in tasks), _FileNameCache()
     for task in tasks:  # a worker cannot check this, because it does not get the paths of all photos
         check_outputs(task, photos)
@@ -63,13 +50,8 @@ def separate_in_parallel(
 
 @final
 class SeparationRunner:
-    """Separates photos in a worker. The model is loaded when the first photo is separated.
-
-    Raises OutputError if the folder does not exist on this node.
-
-    Args:
-        shared_folder: the output folder on a cluster. If it is not an object store, all nodes must share it.
-    """
+    """Separates photos in a worker. The model is loaded when the first photo is separated. Raises OutputError if the
+    `shared_folder`, the output folder on a cluster, is not an object store and does not exist on this node."""
 
     def __init__(
         self, options: Options, shared_folder: Location | None = None, *, overwrite: bool = False

@@ -123,14 +123,8 @@ def separate_tasks(
         # This is not in a try block, because no photo can be separated without a model: a model error ends the batch.
         separator = separator or Separator.load(**options.load_options())
         try:
-            separate_task(
-                replace(task, outputs=outputs),
-                options,
-                separator,
-                result,
-                overwrite=overwrite,
-                on_progress=partial(on_progress, done, task.name),
-            )
+            missing, progress = replace(task, outputs=outputs), partial(on_progress, done, task.name)
+            separate_task(missing, options, separator, result, overwrite=overwrite, on_progress=progress)
             result.outputs = _names(task.outputs)  # also the layers that existed before
         except BrewsterError as error:
             result.failed(error)
@@ -139,9 +133,8 @@ def separate_tasks(
                 "the photo does not fit into memory; expected more free memory; close other programs, or make the photo smaller.",
             )
         except Exception as error:  # noqa: BLE001  (raised again after the last photo)
-            unexpected = (
-                unexpected or error
-            )  # only the first, because each traceback keeps its photo in memory
+            # only the first, because each traceback keeps its photo in memory
+            unexpected = unexpected or error
             result.failed(f"internal error in brewster ({type(error).__name__}: {error}); please report it")
         yield result
     if unexpected:
@@ -254,16 +247,13 @@ def _names(outputs: Mapping[str, Location | OutputStream]) -> dict[str, str]:
 
 
 def check_layers(source: Location | InputStream, layers: Iterable[Location | OutputStream]) -> None:
-    """Checks that existing layers were made from this photo. See `find_layer_of_another_photo`.
-
-    Streams are not checked, because they can be read only once. Files in an object store are not checked either: two
-    more requests for each photo of an archive would take hours. Raises OutputError if a layer was made from another
-    photo, or from another version of this photo.
-    """
+    """Checks that existing layers were made from this photo. See `find_layer_of_another_photo`. Streams are not
+    checked, because they can be read only once. Files in an object store are not checked either: two more requests
+    for each photo of an archive would take hours. Raises OutputError if a layer was made from another photo, or from
+    another version of this photo."""
     if not isinstance(source, Path):
         return
-    layer = find_layer_of_another_photo(source, (path for path in layers if isinstance(path, Path)))
-    if layer:
+    if layer := find_layer_of_another_photo(source, (path for path in layers if isinstance(path, Path))):
         raise OutputError(
             f"{layer} was made from another photo, or from another version of {source}",
             "expected layers of this photo, or no files with their names",

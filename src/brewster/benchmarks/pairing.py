@@ -1,14 +1,10 @@
-"""Groups the images of a benchmark folder by file name: photo, transmission and, if there is one, reflection.
-
-Files are paired by name only, never by their position in a sorted list. Two layouts are supported:
+"""Groups the images of a benchmark folder by file name, never by position: photo, transmission and, if there is one, reflection.
 
 - Pairs: one folder per role with equal file names: blended/a.png, transmission_layer/a.png.
 - The original folders of SIR2: one folder per shot. A letter in the file name denotes the role: ab/3/ab-3-m-32.png,
   ab/3/ab-3-g-32.png.
 
-A name with one photo, one transmission and at most one reflection becomes an `ImageGroup`. Every other name is excluded,
-with a reason.
-"""
+A name with one photo, one transmission and at most one reflection becomes an `ImageGroup`; others are excluded, with a reason."""
 
 from __future__ import annotations
 
@@ -210,11 +206,8 @@ def _role_files(folder: Path, role: str, roles: Mapping[str, Path]) -> tuple[lis
         )
     images, others = image_files(roles[role])
     if not images:
-        raise PhotoError(
-            f"{roles[role]} contains no images",
-            f"expected files ending in {', '.join(SUFFIXES)}",
-            "choose another folder",
-        )
+        expected = f"expected files ending in {', '.join(SUFFIXES)}"
+        raise PhotoError(f"{roles[role]} contains no images", expected, "choose another folder")
     return images, others
 
 
@@ -224,7 +217,12 @@ def _role_files(folder: Path, role: str, roles: Mapping[str, Path]) -> tuple[lis
 def find_subsets(folder: Path) -> dict[str, Path]:
     """Returns the subfolder of each subset of SIR2. Only the start of the name is compared: "Postcard Dataset" is
     "postcard". Raises PhotoError if the folder cannot be read, or has two subfolders for one subset."""
-    return _find_subfolders(folder, _subset_of)
+
+    def subset_of(name: str) -> str:
+        letters = re.sub(r"[^a-z]", "", name.lower())
+        return next((subset for subset in SIR2_TREES if letters.startswith(subset)), "")
+
+    return _find_subfolders(folder, subset_of)
 
 
 def read_tree(folder: Path, subset: str) -> FolderListing:
@@ -242,11 +240,6 @@ def read_tree(folder: Path, subset: str) -> FolderListing:
             "give the path of the subset in your copy of SIR2",
         )
     return listing
-
-
-def _subset_of(name: str) -> str:
-    letters = re.sub(r"[^a-z]", "", name.lower())
-    return next((subset for subset in SIR2_TREES if letters.startswith(subset)), "")
 
 
 def _read_branches(

@@ -67,15 +67,9 @@ class BenchmarkLayout:
 
 
 def read_benchmark(name: str, folder: Path) -> list[Benchmark]:
-    """Reads a benchmark from a folder. Decodes only the file headers.
-
-    Raises PhotoError if the name is not in BENCHMARKS, or the folder is missing or empty, or its layout is not
-    supported, and MissingExtra if the extra for rendered datasets or for the image format is not installed.
-
-    Returns:
-        A list with one benchmark. For "sir2", a list with one benchmark for each of the three subsets in the folder.
-        If the copy is incomplete, `remarks` and `excluded` list the missing files.
-    """
+    """Reads a benchmark from a folder; decodes only the file headers. "sir2" gives one benchmark for each of its subsets in the
+    folder. If the copy is incomplete, `remarks` and `excluded` list the missing files. Raises PhotoError if the name is not in
+    BENCHMARKS, or the folder is missing, empty or of another layout, and MissingExtra if a reader is not installed."""
     if name not in BENCHMARKS:
         close = difflib.get_close_matches(name.lower(), BENCHMARKS, 1)
         raise PhotoError(
@@ -96,14 +90,13 @@ def _read_pairs(name: str, folder: Path) -> list[Benchmark]:
 def _read_sets(name: str, folder: Path) -> list[Benchmark]:
     """Reads a folder of pairs, or one benchmark for each subfolder with pairs."""
     sets = [] if "photo" in find_roles(folder) else find_sets(folder)
-    return [_from_listing(name, path, read_folders(path)) for path in sets or [folder]]
+    return [part for path in sets or [folder] for part in _read_pairs(name, path)]
 
 
 def _read_split(name: str, folder: Path) -> list[Benchmark]:
     complete = [roles for roles in find_numbered_splits(folder).values() if "transmission" in roles]
-    is_complete = len(complete) == 1
-    listing = read_folders(folder, complete[0]) if is_complete else read_folders(find_split(folder))
-    return [_from_listing(name, folder, listing)]
+    found = (folder, complete[0]) if len(complete) == 1 else (find_split(folder),)
+    return [_from_listing(name, folder, read_folders(*found))]
 
 
 def _read_subset(name: str, folder: Path) -> list[Benchmark]:
@@ -119,9 +112,7 @@ def _read_sir2(_: str, folder: Path) -> list[Benchmark]:
             "expected folders whose names begin with Postcard, SolidObject and Wildscene",
             "give the path of their parent folder, or use postcard=, solidobject= or wildscene= for one subset",
         )
-    first, *others = [
-        benchmark for name in SIR2_TREES if name in subsets for benchmark in _read_subset(name, folder)
-    ]
+    first, *others = [part for name in SIR2_TREES if name in subsets for part in _read_subset(name, folder)]
     missing = [f"{BENCHMARKS[name].title} is not in {folder}" for name in SIR2_TREES if name not in subsets]
     return [replace(first, remarks=(*missing, *first.remarks)), *others]
 
@@ -134,9 +125,8 @@ def _read_rendered(name: str, folder: Path) -> list[Benchmark]:
             excluded.append(f"{key} is incomplete: expected {', '.join(_RENDERED_FILES)}")
             continue
         photo, background, reflection = files
-        cases.append(
-            Case(benchmark_name, key, key, f"{key}/photo", photo, background, reflection, rendered=True)
-        )
+        path = f"{key}/photo"
+        cases.append(Case(benchmark_name, key, key, path, photo, background, reflection, rendered=True))
     return [_make_benchmark(name, folder, cases, FolderListing(folder, excluded=excluded))]
 
 
@@ -182,9 +172,8 @@ def _make_benchmark(name: str, folder: Path, cases: Sequence[Case], listing: Fol
     """Returns the benchmark without the cases whose images cannot be read or differ in size."""
     layout, expected = BENCHMARKS[name], BENCHMARKS[name].expected_counts
     unusable = {case.name: reason for case in cases if (reason := _unusable_reason(case))}
-    valid = [
-        case for case in sorted(cases, key=lambda case: natural_key(case.name)) if case.name not in unusable
-    ]
+    usable = (case for case in cases if case.name not in unusable)
+    valid = sorted(usable, key=lambda case: natural_key(case.name))
     remarks = []
     if expected and len(valid) not in expected:
         remarks.append(f"found {counted(len(valid), 'image')}, expected {' or '.join(map(str, expected))}")

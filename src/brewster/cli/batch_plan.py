@@ -45,7 +45,7 @@ def absolute_path(path: str) -> str:
 
 
 def skipped_files(files: Sequence[Location]) -> Iterator[str]:
-    """Yields a line about the videos, and a line about all other files, which do not have the suffix of an image either."""
+    """Yields a line about the videos, and a line about all other files without the suffix of an image."""
     others = [file for file in files if not is_video(file)]
     if videos := [file for file in files if is_video(file)]:
         yield f"{listed(videos, 'video')} skipped: brewster separates photos; extract single images first, for example with ffmpeg"

@@ -73,9 +73,8 @@ def removed_white(prediction: Image, background: Image, photo: Image, reflection
     because it mistakes them for reflections. The errors are those of `removed_content`.
     """
     luminance = _Luminances.of(prediction, background, photo, reflection)
-    return luminance.removed_fraction(
-        luminance.unreflected & _is_white(background), f"R < {NEGLIGIBLE_FRACTION:.0%} of I and white in B"
-    )
+    condition = f"R < {NEGLIGIBLE_FRACTION:.0%} of I and white in B"
+    return luminance.removed_fraction(luminance.unreflected & _is_white(background), condition)
 
 
 def kept_reflection(prediction: Image, background: Image, photo: Image, reflection: Image) -> float:
@@ -84,16 +83,12 @@ def kept_reflection(prediction: Image, background: Image, photo: Image, reflecti
     The score is sum min(max(g prediction - B, 0), R) / sum R over the pixels with R >= 10 % of I and I not clipped. The
     module docstring defines the gain g. The errors are those of `removed_content`.
     """
-    luminance = _Luminances.of(prediction, background, photo, reflection)
-    reflective = (
-        (luminance.reflection >= NOTICEABLE_FRACTION * luminance.photo)
-        & (luminance.reflection > 0)
-        & ~_is_clipped(photo)
-    )
-    remaining = np.clip(luminance.prediction - luminance.background, 0, luminance.reflection)
-    return _fraction(
-        remaining, luminance.reflection, reflective, f"R >= {NOTICEABLE_FRACTION:.0%} of I and I not clipped"
-    )
+    light = _Luminances.of(prediction, background, photo, reflection)
+    is_noticeable = light.reflection >= NOTICEABLE_FRACTION * light.photo
+    reflective = is_noticeable & (light.reflection > 0) & ~_is_clipped(photo)
+    remaining = np.clip(light.prediction - light.background, 0, light.reflection)
+    condition = f"R >= {NOTICEABLE_FRACTION:.0%} of I and I not clipped"
+    return _fraction(remaining, light.reflection, reflective, condition)
 
 
 @final
@@ -114,9 +109,8 @@ class _Luminances:
         p, b, i, r = map(_luminance, (prediction, background, photo, reflection))
         unreflected = r < NEGLIGIBLE_FRACTION * i
         comparable_background = unreflected & (b >= BLACK_LUMINANCE) & ~_is_clipped(background)
-        _require_pixels(
-            comparable_background, f"R < {NEGLIGIBLE_FRACTION:.0%} of I and B neither black nor clipped"
-        )
+        condition = f"R < {NEGLIGIBLE_FRACTION:.0%} of I and B neither black nor clipped"
+        _require_pixels(comparable_background, condition)
         comparable = comparable_background & (p >= BLACK_LUMINANCE) & ~_is_clipped(prediction)
         # The median is used, because content that is missing in less than half of the pixels must not change the gain.
         gain = np.median(b[comparable] / p[comparable]) if comparable.sum() >= MIN_PIXELS else 1.0

@@ -69,11 +69,9 @@ def _to_decibels(mse: float) -> float:
 
 def count_pairs(prediction: Image, truth: Image) -> PairCounts:
     """Counts the pairs of 8-bit values at the same position: the joint histogram of two images, over all channels.
-
-    Every mean over all pixels of a function of two values follows from it, and it is faster than the function of each
-    pixel. The counts are int64 (65536,). The index is 256 times the value of the prediction, plus that of the ground
-    truth. Raises ValueError if the images are not uint8 (H, W, 3) or differ in shape.
-    """
+    Every mean over all pixels of a function of two values follows from it, and it is faster than the function of
+    each pixel. The counts are int64 (65536,). The index is 256 times the value of the prediction, plus that of the
+    ground truth. Raises ValueError if the images are not uint8 (H, W, 3) or differ in shape."""
     check_images(prediction, truth)
     pairs = prediction.astype(np.intp)
     pairs *= 256
@@ -158,10 +156,8 @@ def ssim_map(prediction: Image, truth: Image, *, window: Window = "uniform") -> 
         raise ValueError(f"SSIM needs at least {side}x{side} pixels, not {height}x{width}")
     # Strips of 32 rows fit into the processor's cache.
     windowed_ssim, strip_height = _WINDOWED_SSIM[window], _STRIP_ROWS + side - 1
-    tops = range(0, height - side + 1, _STRIP_ROWS)
-    return np.concatenate(
-        [windowed_ssim(prediction[top : top + strip_height], truth[top : top + strip_height]) for top in tops]
-    )
+    strips = [np.s_[top : top + strip_height] for top in range(0, height - side + 1, _STRIP_ROWS)]
+    return np.concatenate([windowed_ssim(prediction[strip], truth[strip]) for strip in strips])
 
 
 def _ssim_uniform(prediction: Image, truth: Image) -> NDArray[np.float64]:

@@ -12,7 +12,6 @@ import of this module does not.
 from __future__ import annotations
 
 import functools
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, final
 
@@ -70,8 +69,12 @@ class DifferenceMaps:
         if region is None:
             return float(sum(_mean(map_.numpy()) for map_ in self.maps))
         check_region(region, self.shape)
+        upsample = functools.partial(
+            torch.nn.functional.interpolate, size=self.shape, mode="bilinear", align_corners=False
+        )
         with torch.inference_mode():
-            return _mean(_upsampled(self.maps, self.shape).numpy()[region])
+            full = [upsample(map_[None, None])[0, 0] for map_ in self.maps]
+            return _mean(sum(full[1:], start=full[0]).numpy()[region])
 
 
 @final
@@ -86,10 +89,9 @@ class Lpips:
 
     @classmethod
     def load(cls) -> Lpips:
-        """Returns LPIPS with its published weights. All calls return the same object. Raises MissingExtra if torch is
-        not installed; ModelError if the file of AlexNet's weights is damaged, or contains other weights;
-        DownloadError if AlexNet's weights are not on this machine, and the download fails; OutputError if the
-        downloaded weights cannot be written to the cache folder."""
+        """Returns LPIPS with its published weights, always the same object. Raises MissingExtra if torch is not installed, ModelError if
+        the file of AlexNet's weights is damaged, DownloadError if it is missing and the download fails, and OutputError if it cannot be
+        stored."""
         return _load()
 
     def features(self, image: Image) -> Features:
@@ -105,9 +107,8 @@ class Lpips:
         maps = []
         with torch.inference_mode():
             activations = torch.from_numpy(_normalised(image)).permute(2, 0, 1)[None]
-            for i, ((weight, bias), how) in enumerate(
-                zip(self.convolutions, _STRIDES_AND_PADDINGS, strict=True)
-            ):
+            layers = zip(self.convolutions, _STRIDES_AND_PADDINGS, strict=True)
+            for i, ((weight, bias), how) in enumerate(layers):
                 if i in _POOLED:
                     activations = functional.max_pool2d(activations, 3, 2)
                 activations = functional.conv2d(activations, weight, bias, *how).relu_()
@@ -115,15 +116,13 @@ class Lpips:
         return Features(tuple(maps), shape)
 
     def difference(self, one: Features, other: Features) -> DifferenceMaps:
-        """Returns the five maps of the LPIPS distance between two images, given by their features. Its `mean` is the distance.
+        """Returns the five maps of the LPIPS distance between two images of equal size, given by their features. Its `mean` is the
+        distance: 0 for equal images; lower is better.
 
-        The squared differences of the features are weighted by channel. Without a region, they are averaged over each
-        map, and summed over the five maps. With a `region`, bool (H, W), each map of differences is first upsampled to
-        the size of the image (bilinear, align_corners=False; `spatial=True` in `lpips`), and the sum of the maps is
-        averaged over the region. A region that is the whole image gives a slightly different value than no region,
-        because upsampling changes the weight of the pixels at the border of a map. The distance is 0 for equal images;
-        lower is better. Raises ValueError if the images differ in size.
-        """
+        The squared differences of the features are weighted by channel, averaged over each map, and summed over the five maps. With a
+        `region`, bool (H, W), each map is first upsampled to the size of the image (bilinear, align_corners=False; `spatial=True` in
+        `lpips`), and the sum of the maps is averaged over the region. A region that is the whole image gives a slightly different value
+        than no region, because upsampling changes the weight of the border. Raises ValueError if the images differ in size."""
         import torch  # noqa: PLC0415 - an extra
 
         if one.shape != other.shape:
@@ -154,11 +153,8 @@ def _load() -> Lpips:
     try:
         import torch  # noqa: PLC0415 - an extra
     except ImportError as error:
-        raise MissingExtra.for_extra(
-            "evaluate",
-            "torch is not installed",
-            "expected torch, which brewster needs for LPIPS",
-        ) from error
+        expected = "expected torch, which brewster needs for LPIPS"
+        raise MissingExtra.for_extra("evaluate", "torch is not installed", expected) from error
     tensors = [*load_alexnet().values()]
     weights = [weight.to(memory_format=torch.channels_last) for weight in tensors[::2]]  # faster on the CPU
     channel_weights = tuple(map(torch.from_numpy, read_lpips_channel_weights()))
@@ -179,10 +175,3 @@ def _normalised(image: Image) -> NDArray[np.float32]:
 def _mean(values: NDArray[np.float32]) -> float:
     """Returns the mean. It is computed by numpy, because the order of torch's sums depends on the number of threads."""
     return float(values.mean(dtype=np.float64))
-
-
-def _upsampled(maps: Sequence[Tensor], shape: tuple[int, int]) -> Tensor:
-    from torch.nn.functional import interpolate  # noqa: PLC0415 - an extra
-
-    full = [interpolate(map_[None, None], shape, mode="bilinear", align_corners=False)[0, 0] for map_ in maps]
-    return sum(full[1:], start=full[0])

@@ -1,10 +1,8 @@
 """Loads the AlexNet of LPIPS, which is downloaded once. The small file of channel weights is part of brewster.
 
-The network is that of torchvision (BSD-3-Clause): the layers `features.0`, 3, 6, 8 and 10 of alexnet-owt-7be5be79.pth,
-stored as a state dict of ten tensors, `lpips_alexnet_features.pth`. It is searched for in the folder `brewster/weights` of
-the user's cache folder, then in the folder `weights` of BREWSTER_DATA. The digest of the values is always checked, because
-other weights define a different metric.
-"""
+The network is that of torchvision (BSD-3-Clause): the layers `features.0`, 3, 6, 8 and 10 of alexnet-owt-7be5be79.pth, stored
+as a state dict of ten tensors in the folder `weights` of the cache or of BREWSTER_DATA. The digest of the values is always
+checked, because other weights define a different metric."""
 
 from __future__ import annotations
 
@@ -89,9 +87,8 @@ def alexnet_digest(tensors: dict[str, Tensor]) -> str:
 
 
 def _fetch(remote: RemoteFile, digest: str, cached: Path, downloader: Downloader) -> dict[str, Tensor]:
-    """Downloads the whole network, stores ten of its tensors in `cached`, and deletes the download. The other tensors,
-    96 % of the file, are not needed. Before the download, its size and licence are printed on standard error, and
-    how to avoid it."""
+    """Downloads the whole network, stores ten of its tensors, 4 % of the file, in `cached`, and deletes the download. Before, prints
+    its size and licence on standard error, and how to avoid it."""
     import torch  # noqa: PLC0415 - an extra
 
     size = f"{remote.size / 2**20:.0f} MiB"

@@ -98,17 +98,13 @@ class ColourSpace:
             red, green, blue = channels
             weights = np.array(srgb.REC709_LUMINANCE, np.float32)
             luminance = weights[0] * red + weights[1] * green + weights[2] * blue
-            channels = [
-                np.where((red == green) & (green == blue), green, luminance)
-            ]  # equal channels stay exact
+            channels = [np.where((red == green) & (green == blue), green, luminance)]  # equal ones stay exact
         elif self.matrix:
             channels = _apply_matrix(_inverse(self.matrix), channels)
         for i, curve in enumerate(curves):
             stored[..., i] = _encoded(channels[i], curve, original.dtype)
         is_exact = self == LINEAR_REC709 or (self == SRGB and original.dtype.kind == "u")
-        if (
-            not is_exact
-        ):  # in an exact space, decoding and encoding returns the same values; a test checks this
+        if not is_exact:  # in an exact space, encoding returns the decoded values; a test checks this
             same = np.all(linear == self.to_linear(original), axis=2)
             stored[same] = original[same]
         return stored
@@ -137,15 +133,13 @@ def colour_space_of(icc: bytes | None, primaries: tuple[float, ...] | None, is_f
 
 def _decoded(stored: Stored, curve: ToneCurve) -> Float32:
     if stored.dtype.kind == "f":
-        is_identity = curve == ToneCurve()
-        return stored if is_identity else curve.decode(stored.astype(np.float64)).astype(np.float32)
+        return stored if curve == ToneCurve() else curve.decode(stored.astype(np.float64)).astype(np.float32)
     return _decode_table(curve, np.iinfo(stored.dtype).max).take(stored)
 
 
 def _encoded(linear: Float32, curve: ToneCurve, dtype: np.dtype[Any]) -> Stored:
     if dtype.kind == "f":
-        is_identity = curve == ToneCurve()
-        return linear if is_identity else curve.encode(linear.astype(np.float64)).astype(np.float32)
+        return linear if curve == ToneCurve() else curve.encode(linear.astype(np.float64)).astype(np.float32)
     table = _encode_table(curve, np.iinfo(dtype).max)
     sqrt_light = np.sqrt(np.fmin(np.fmax(linear, np.float32(0)), np.float32(1)))
     return table.take((sqrt_light * np.float32(len(table) - 1) + np.float32(0.5)).astype(np.intp))
@@ -185,9 +179,8 @@ def _as_matrix(array: Float64) -> Matrix:
 def _to_d50(primaries: tuple[float, ...]) -> Float64:
     """Returns the matrix from linear RGB with these chromaticities to XYZ under D50. The white point is adapted by the
     Bradford transform (ICC.1:2022 annex E)."""
-    xyz = np.array(
-        [[x / y, 1, (1 - x - y) / y] for x, y in zip(primaries[::2], primaries[1::2], strict=True)]
-    ).T
+    points = zip(primaries[::2], primaries[1::2], strict=True)
+    xyz = np.array([[x / y, 1, (1 - x - y) / y] for x, y in points]).T
     white = xyz[:, 3]
     to_xyz = xyz[:, :3] * np.linalg.solve(xyz[:, :3], white)
     gains = np.diag((_BRADFORD @ _D50) / (_BRADFORD @ white))
@@ -226,11 +219,7 @@ def _snap_to_srgb(space: ColourSpace) -> ColourSpace:
 
 
 def icc_tags(icc: bytes) -> dict[bytes, bytes]:
-    """Returns the data of each tag of an ICC profile, by the signature of the tag.
-
-    Raises:
-        struct.error: the profile is truncated.
-    """
+    """Returns the data of each tag of an ICC profile by its signature. Raises struct.error if the profile is truncated."""
     (count,) = struct.unpack_from(">I", icc, 128)
     rows = (struct.unpack_from(">4sII", icc, 132 + 12 * i) for i in range(min(count, 100)))
     return {name: icc[start : start + size] for name, start, size in rows}
@@ -294,13 +283,13 @@ def convert_to_display_p3(pixels: NDArray[Any], file_info: FileInfo) -> tuple[ND
         )
     icc = file_info.icc or b""
     try:
-        profile_is_ignored = np.array_equal(
-            _convert(_PROBE_COLOURS, icc), _convert(_PROBE_COLOURS, pyvips.Image.profile_load("srgb"))
+        own, srgb_probe = (
+            _convert(_PROBE_COLOURS, used) for used in (icc, pyvips.Image.profile_load("srgb"))
         )
         array = _convert(pixels, icc)
     except pyvips.Error as error:
         raise _damaged_profile(icc) from error
-    if profile_is_ignored:
+    if np.array_equal(own, srgb_probe):
         raise _damaged_profile(icc)
     return array, replace(file_info, icc=bytes(pyvips.Image.profile_load("p3")))
 
@@ -311,9 +300,8 @@ def convert_cmyk(image: pyvips.Image, file_info: FileInfo) -> tuple[pyvips.Image
     is_cmyk = file_info.icc is not None and file_info.icc[16:20] == b"CMYK"
     profile = "its profile" if is_cmyk else "a default profile, because it has none"
     depth = 16 if image.format == "ushort" else 8
-    converted = image.icc_transform(
-        "p3", embedded=is_cmyk, input_profile="cmyk", intent="relative", depth=depth
-    )
+    given = {"embedded": is_cmyk, "input_profile": "cmyk", "intent": "relative", "depth": depth}
+    converted = image.icc_transform("p3", **given)
     note = f"its CMYK colours were converted to RGB (Display P3) with {profile}"
     return converted, replace(file_info, icc=bytes(pyvips.Image.profile_load("p3")), note=note)
 

@@ -56,11 +56,8 @@ def _exr_part(data: bytes, *, header_only: bool) -> Any:  # noqa: ANN401  (OpenE
     try:
         return exr.File(io.BytesIO(data), separate_channels=True, header_only=header_only).parts[0]
     except (RuntimeError, ValueError, TypeError, IndexError) as error:
-        raise UnreadablePhoto(
-            "the EXR cannot be read completely",
-            "expected a complete file",
-            "export the image again",
-        ) from error
+        happened = "the EXR cannot be read completely"
+        raise UnreadablePhoto(happened, "expected a complete file", "export the image again") from error
 
 
 def _exr_pixels(channels: dict[str, NDArray[Any]], header: dict[str, Any]) -> Decoded:
@@ -88,32 +85,20 @@ def write_exr(image: Decoded) -> bytes:
     planes = {name: image.pixels[..., i] for i, name in enumerate(names)}
     if image.alpha is not None:
         planes["A"] = image.alpha
-    dtype: type[np.floating[Any]] = np.float16 if image.file_info.bits == 16 else np.float32
-    max_value = float(np.finfo(dtype).max)
-    channels = {name: plane.clip(-max_value, max_value).astype(dtype) for name, plane in planes.items()}
     header = {
         "compression": exr.ZIP_COMPRESSION,
         **(image.file_info.header or {}),
         **({"software": image.file_info.software} if image.file_info.software else {}),
         "type": exr.scanlineimage,
     }
-    file = io.BytesIO()
-    exr.File(header, channels).write(file)
-    return file.getvalue()
+    return _exr_bytes(planes, np.float16 if image.file_info.bits == 16 else np.float32, header)
 
 
 # --- OpenEXR with several layers
 
 _LAYER_CHANNELS = ("R", "G", "B")
 _RESERVED_ATTRIBUTES = {
-    "channels",
-    "chunkCount",
-    "compression",
-    "dataWindow",
-    "lineOrder",
-    "tiles",
-    "type",
-    "version",
+    *["channels", "chunkCount", "compression", "dataWindow", "lineOrder", "tiles", "type", "version"]
 }
 """Attributes that OpenEXR defines. It drops text attributes with some of these names without an error."""
 
@@ -135,18 +120,22 @@ def write_exr_layers(layers: Mapping[str, Float32], header: Mapping[str, str]) -
             "expected other names, because these are reserved by OpenEXR",
             "choose other names",
         )
-    max_value = float(np.finfo(np.float16).max)
-    half_layers = {
-        name: layer.clip(-max_value, max_value).astype(np.float16) for name, layer in layers.items()
-    }
-    channels = {
-        f"{name}.{channel}": np.ascontiguousarray(half[..., i])
-        for name, half in half_layers.items()
+    planes = {
+        f"{name}.{channel}": layer[..., i]
+        for name, layer in layers.items()
         for i, channel in enumerate(_LAYER_CHANNELS)
     }
-    file = io.BytesIO()
     attributes = {**header, "compression": exr.ZIP_COMPRESSION, "type": exr.scanlineimage}
-    exr.File(attributes, channels).write(file)
+    return _exr_bytes(planes, np.float16, attributes)
+
+
+def _exr_bytes(planes: Mapping[str, Float32], dtype: type[np.floating[Any]], header: dict[str, Any]) -> bytes:
+    max_value, file = float(np.finfo(dtype).max), io.BytesIO()
+    channels = {
+        name: np.ascontiguousarray(plane.clip(-max_value, max_value).astype(dtype))
+        for name, plane in planes.items()
+    }
+    library_of("exr").File(header, channels).write(file)
     return file.getvalue()
 
 
@@ -189,11 +178,8 @@ def read_hdr(data: bytes, max_pixels: int) -> Decoded:
     resolution_match = re.fullmatch(rb"-Y (\d{1,9}) \+X (\d{1,9})\s*", resolution)
     lines = header_text.decode("latin-1").splitlines()[1:]
     if any(line.startswith("FORMAT=") and "xyze" in line for line in lines):
-        raise UnsupportedPhoto(
-            "the HDR image has XYZ colours (FORMAT=32-bit_rle_xyze)",
-            "expected RGBE colours",
-            "export the image as RGBE",
-        )
+        happened = "the HDR image has XYZ colours (FORMAT=32-bit_rle_xyze)"
+        raise UnsupportedPhoto(happened, "expected RGBE colours", "export the image as RGBE")
     if not separator or resolution_match is None:
         raise UnsupportedPhoto(
             f"the header of the HDR image ends in {resolution[:40]!r}",
@@ -202,11 +188,8 @@ def read_hdr(data: bytes, max_pixels: int) -> Decoded:
         )
     height, width = int(resolution_match[1]), int(resolution_match[2])
     if width * height == 0:
-        raise UnreadablePhoto(
-            f"the HDR image has {width} x {height} pixels",
-            "expected at least one pixel",
-            "export the image again",
-        )
+        happened = f"the HDR image has {width} x {height} pixels"
+        raise UnreadablePhoto(happened, "expected at least one pixel", "export the image again")
     check_pixel_count(width, height, max_pixels)
     header: dict[str, str] = {}
     for line in lines:
@@ -258,12 +241,9 @@ def _decode_runs(body: bytes, width: int, height: int) -> bytes:
         end = 4 * width * (line + 1)
         while len(planes) < end:
             run = body[position]
-            planes += (
-                body[position + 1 : position + 2] * (run - 128)
-                if run > 128
-                else body[position + 1 : position + 1 + run]
-            )
-            position += 2 if run > 128 else 1 + run
+            size = 1 if run > 128 else run
+            planes += body[position + 1 : position + 1 + size] * (run - 128 if run > 128 else 1)
+            position += 1 + size
     return bytes(planes)
 
 
@@ -275,9 +255,8 @@ def _decode_old_runs(body: bytes, count: int) -> bytes:
     is_run = (pixels[:, :3] == 1).all(axis=1)
     positions = np.arange(len(pixels))
     last_literal = np.maximum.accumulate(np.where(is_run, -1, positions))
-    repeats = np.where(
-        is_run, pixels[:, 3].astype(np.int64) << np.minimum(8 * (positions - last_literal - 1), 24), 1
-    )
+    shifts = np.minimum(8 * (positions - last_literal - 1), 24)
+    repeats = np.where(is_run, pixels[:, 3].astype(np.int64) << shifts, 1)
     if last_literal[:1].tolist() != [0] or repeats.sum() != count:
         raise ValueError
     return np.repeat(pixels[last_literal], repeats, axis=0).tobytes()

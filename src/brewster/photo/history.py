@@ -53,9 +53,8 @@ def with_history(file_info: FileInfo, software: str, parameters: Mapping[str, st
     if history := re.search(rb"<xmpMM:History>.*?(?=</rdf:Seq>)", packet, re.DOTALL):
         packet = packet[: history.end()] + entry + packet[history.end() :]
     elif (end := packet.rfind(b"</rdf:RDF>")) >= 0:  # a block without an RDF element stays unchanged
-        about = re.search(
-            rb"""rdf:about=("[^"]*"|'[^']*')""", packet
-        )  # all descriptions are of the same resource
+        # all descriptions are of the same resource
+        about = re.search(rb"""rdf:about=("[^"]*"|'[^']*')""", packet)
         block = _HISTORY.encode().replace(b"{about}", about[1] if about else b'""').replace(b"{entry}", entry)
         packet = packet[:end] + block + packet[end:]
     return replace(file_info, xmp=packet, exif=exif, software=software)
@@ -69,10 +68,9 @@ def with_layer_history(file_info: FileInfo, layer: str, parameters: Mapping[str,
 def sampled_digest(file: BinaryIO) -> str:
     """Returns 16 hexadecimal digits that identify the file of a photo: the start of the SHA-256 of at most 192 KiB of it.
 
-    The samples are 64 KiB long: at the end of the file, at a distance of d from the end, and at d/2, where d is the largest power
-    of two that is not larger than the file. Positions from the end do not change if metadata at the start of a JPEG are edited.
-    Samples suffice to distinguish photos: their pixels contain noise. For an archive, reading whole files would take hours.
-    """
+    The samples are 64 KiB long: at the end of the file, at a distance of d from the end, and at d/2, where d is the largest power of
+    two that is not larger than the file. So they do not change with metadata at the start of a JPEG. They suffice, because the
+    pixels of photos contain noise. For an archive, reading whole files would take hours."""
     size = file.seek(0, os.SEEK_END)
     distance, digest = 1 << max(size.bit_length() - 1, 0), hashlib.sha256()
     for position in (size - distance, size - distance // 2, size - _SAMPLE_BYTES):
@@ -127,16 +125,8 @@ def _with_exif_software(exif: bytes, software: str) -> bytes:
     rows.append(struct.pack(byte_order + "HHII", _EXIF_SOFTWARE, 2, len(value), start))
     rows.sort(key=lambda row: struct.unpack_from(byte_order + "H", row))
     directory = start + len(value) + len(value) % 2
-    changed = b"".join(
-        (
-            exif[:4],
-            struct.pack(byte_order + "I", directory),
-            exif[8:].ljust(start - 8, b"\0"),
-            value.ljust(directory - start, b"\0"),
-            struct.pack(byte_order + "H", len(rows)),
-            *rows,
-            exif[end : end + 4],
-        )
-    )
+    head = exif[:4] + struct.pack(byte_order + "I", directory) + exif[8:].ljust(start - 8, b"\0")
+    count = struct.pack(byte_order + "H", len(rows))
+    changed = b"".join((head, value.ljust(directory - start, b"\0"), count, *rows, exif[end : end + 4]))
     fits = len(changed) <= _MAX_EXIF_BYTES or len(exif) > _MAX_EXIF_BYTES
     return changed if fits else exif

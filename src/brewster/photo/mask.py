@@ -53,11 +53,8 @@ class Mask:
             )
         values = np.ascontiguousarray(pixels[..., 0])
         if values.dtype.kind == "f" and not (values.min() >= 0 and values.max() <= 1):
-            raise MaskError(
-                f"{mask} has values from {values.min():g} to {values.max():g}",
-                "expected values from 0 to 1",
-                "scale the mask",
-            )
+            happened = f"{mask} has values from {values.min():g} to {values.max():g}"
+            raise MaskError(happened, "expected values from 0 to 1", "scale the mask")
         return cls(values)
 
     def rows(self, top: int, bottom: int) -> Float32:

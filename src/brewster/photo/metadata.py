@@ -126,10 +126,8 @@ def with_webp_exif(data: bytes, exif: bytes, size: tuple[int, int], has_alpha: b
     ordered = {b"VP8X": bytes((flags, 0, 0, 0)) + canvas, **chunks, b"EXIF": exif}
     if xmp is not None:
         ordered[b"XMP "] = xmp
-    body = b"".join(
-        name + struct.pack("<I", len(chunk)) + chunk + bytes(len(chunk) % 2)
-        for name, chunk in ordered.items()
-    )
+    padded = ((name, len(chunk), chunk + bytes(len(chunk) % 2)) for name, chunk in ordered.items())
+    body = b"".join(name + struct.pack("<I", size) + chunk for name, size, chunk in padded)
     return b"RIFF" + struct.pack("<I", len(body) + 4) + b"WEBP" + body
 
 
@@ -182,18 +180,10 @@ Tags = dict[int, "tuple[int, int, bytes] | Tags"]
 """The tags of a directory by number. An entry is (type, count, little-endian value), or the directory for a pointer tag."""
 
 _POINTER_TAGS = (34665, 34853, 40965)  # Exif, GPS, interoperability
-_CAMERA_TAGS = (
-    270,
-    271,
-    272,
-    305,
-    306,
-    315,
-    33432,
-    34665,
-    34853,
-)  # camera, date, author, copyright, and the pointers to Exif and GPS
+_CAMERA_TAGS = (270, 271, 272, 305, 306, 315, 33432, 34665, 34853)
+"""Camera, date, author, copyright, and the pointers to Exif and GPS."""
 _ORIENTATION = 274
+_BYTE_ORDERS = {b"II*\0": "<", b"MM\0*": ">"}
 _TIFF_HEADER_BYTES = 8  # byte order, the number 42, and the position of the first directory
 _TYPE_BYTES = {1: 1, 2: 1, 3: 2, 4: 4, 5: 4, 6: 1, 7: 1, 8: 2, 9: 4, 10: 4, 11: 4, 12: 8, 13: 4}
 _RATIONAL_TYPES = (5, 10)  # two numbers: numerator and denominator
@@ -201,7 +191,7 @@ _RATIONAL_TYPES = (5, 10)  # two numbers: numerator and denominator
 
 def read_tags(data: bytes) -> Tags:
     """Returns the first directory of a TIFF or EXIF block with its subdirectories, or an empty dict for other data."""
-    byte_order = {b"II*\0": "<", b"MM\0*": ">"}.get(data[:4])
+    byte_order = _BYTE_ORDERS.get(data[:4])
     if byte_order is None or len(data) < _TIFF_HEADER_BYTES:
         return {}
     return _directory(data, byte_order, struct.unpack_from(byte_order + "I", data, 4)[0], _POINTER_TAGS)
@@ -235,12 +225,8 @@ def number_of(tags: Tags, tag: int, default: int) -> int:
 
 def pixel_data_end(tags: Tags) -> int:
     """Returns the end position of the last strip or tile of a TIFF, or 0 if its tags contain no positions."""
-    ends = [0]
-    for starts, sizes in ((273, 279), (324, 325)):
-        ends += [
-            start + size for start, size in zip(numbers(tags, starts), numbers(tags, sizes), strict=False)
-        ]
-    return max(ends)
+    parts = ((numbers(tags, starts), numbers(tags, sizes)) for starts, sizes in ((273, 279), (324, 325)))
+    return max((start + size for part in parts for start, size in zip(*part, strict=False)), default=0)
 
 
 def numbers(tags: Tags, tag: int) -> list[int]:
@@ -297,7 +283,7 @@ def with_tiff_exif(data: bytes, exif: bytes) -> bytes:
 def first_directory(exif: bytes) -> tuple[str, int, int]:
     """Returns the byte order of an EXIF block for `struct`, and the start and the end of the rows of its first
     directory. Without a directory, all values are empty or 0."""
-    byte_order = {b"II*\0": "<", b"MM\0*": ">"}.get(exif[:4])
+    byte_order = _BYTE_ORDERS.get(exif[:4])
     if byte_order is None or len(exif) < 10:
         return "", 0, 0
     (position,) = struct.unpack_from(byte_order + "I", exif, 4)
@@ -315,9 +301,8 @@ def upright_exif(exif: bytes) -> bytes:
     for row in range(first_row, min(next_directory, len(block) - 11), 12):
         tag, kind = struct.unpack_from(byte_order + "HH", block, row)
         if tag == _ORIENTATION:
-            struct.pack_into(
-                byte_order + ("I" if kind == 4 else "HH"), block, row + 8, *((1,) if kind == 4 else (1, 0))
-            )
+            kind_format, values = ("I", (1,)) if kind == 4 else ("HH", (1, 0))
+            struct.pack_into(byte_order + kind_format, block, row + 8, *values)
     if first_row and next_directory + 4 <= len(block):
         struct.pack_into(byte_order + "I", block, next_directory, 0)
     return bytes(block)

@@ -157,10 +157,8 @@ class Photo:
     def __repr__(self) -> str:
         """Returns a short description: `Photo(4000 x 3000, RGB, uint8, jpeg, ICC profile, EXIF)`."""
         width, height = self.size
-        mode = ("grey" if self.pixels.shape[2] == 1 else "RGB") + (
-            " with alpha" if self.alpha is not None else ""
-        )
-        info = self.file_info
+        mode, info = "grey" if self.pixels.shape[2] == 1 else "RGB", self.file_info
+        mode += "" if self.alpha is None else " with alpha"
         present = {"ICC profile": info.icc, "EXIF": info.exif, "XMP": info.xmp}
         parts = (f"{width} x {height}", mode, self.pixels.dtype.name, info.format_name)
         return f"Photo({', '.join((*parts, *(name for name, block in present.items() if block)))})"
@@ -221,9 +219,8 @@ class Photo:
         stored values exactly. Other pixels are clipped to the range of the dtype. To process a photo in strips, write the
         strips to an array with the shape and dtype of `pixels`, and call `with_pixels`.
         """
-        return self.colour_space().to_stored(
-            np.asarray(linear, np.float32), self.pixels[top : top + len(linear)]
-        )
+        original = self.pixels[top : top + len(linear)]
+        return self.colour_space().to_stored(np.asarray(linear, np.float32), original)
 
     def srgb_8bit(self) -> NDArray[np.uint8]:
         """Returns 8-bit sRGB values (H, W, 3), clipped to the sRGB gamut, without alpha. Benchmarks compare these values.

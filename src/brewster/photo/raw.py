@@ -42,19 +42,13 @@ def read_raw(data: bytes, max_pixels: int) -> tuple[NDArray[np.uint16], FileInfo
     is damaged or truncated, or LibRaw does not support the camera."""
     with _opened(data) as raw:
         _upright_size(raw, max_pixels)  # checks the limit before the pixels are decoded
-        linear = raw.postprocess(
-            use_camera_wb=True,
-            no_auto_bright=True,
-            gamma=(1, 1),
-            output_bps=16,
-            output_color=library_of("raw").ColorSpace.P3D65,
-        )
+        options = {"use_camera_wb": True, "no_auto_bright": True, "gamma": (1, 1), "output_bps": 16}
+        linear = raw.postprocess(**options, output_color=library_of("raw").ColorSpace.P3D65)
     icc = bytes(pyvips.Image.profile_load("p3"))
     curve = colour_space_of(icc, None, is_float=False).curves[1]
     encoded = np.rint(65535 * np.clip(curve.encode(np.arange(65536) / 65535), 0, 1)).astype(np.uint16)
-    return encoded[linear.reshape(*linear.shape[:2], -1)], FileInfo(
-        FORMATS["raw"].written_as, bits=16, icc=icc, exif=_exif(data)
-    )
+    file_info = FileInfo(FORMATS["raw"].written_as, bits=16, icc=icc, exif=_exif(data))
+    return encoded[linear.reshape(*linear.shape[:2], -1)], file_info
 
 
 def read_raw_size(data: bytes, max_pixels: int) -> tuple[int, int]:
@@ -69,10 +63,8 @@ def with_raw_suffix(error: UnreadablePhoto, suffix: str) -> UnreadablePhoto:
     """Returns the error for a file with the suffix of a RAW file. The content of a damaged RAW file may look like another format."""
     if error.happened == _DAMAGED:
         return error
-    is_installed = importlib.util.find_spec("rawpy") is not None
-    extra = (
-        "" if is_installed else f", and install the extra raw, which RAW files need: {install_command('raw')}"
-    )
+    extra = f", and install the extra raw, which RAW files need: {install_command('raw')}"
+    extra = "" if importlib.util.find_spec("rawpy") else extra
     return UnreadablePhoto(
         f"{error.happened}, and its suffix {suffix} is that of a RAW file",
         "expected a complete RAW file",
