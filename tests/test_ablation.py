@@ -26,14 +26,10 @@ STUDIES = [
 ]
 
 
-def names(paths):
-    return [path.stem for path in paths]
-
-
 """The studies of the compact model. runs/paper.sh --tiny runs the tiny variants of those of the diffusion model."""
 
 
-@pytest.mark.parametrize("path", STUDIES, ids=names(STUDIES))
+@pytest.mark.parametrize("path", STUDIES, ids=lambda path: path.stem)
 def test_a_study_changes_one_value_of_both_the_full_and_the_tiny_recipe(path):
     full, variant = read_study(path), path.with_stem(f"{path.stem}-tiny")
     tiny = (

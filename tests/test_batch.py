@@ -7,7 +7,7 @@ import pytest
 
 from brewster import Photo, Separator
 from brewster.batch import SeparationTask, plan_files, separate_files, separate_tasks
-from brewster.errors import ModelError, OutputError, PhotoError
+from brewster.errors import OutputError, PhotoError
 from brewster.options import Options
 from cli_helpers import LAYERS, image_bytes, layer_files, list_files
 
@@ -68,16 +68,6 @@ def test_finished_photos_are_skipped_without_a_model_and_missing_layers_are_adde
     assert Photo.open(tmp_path / "a.transmission.jpg").size == (60, 40)
 
 
-def test_a_photo_of_the_batch_is_never_overwritten(tmp_path, separator):
-    for name in ("a.jpg", "a.transmission.jpg"):
-        (tmp_path / name).write_bytes(image_bytes())
-    sources = [tmp_path / "a.jpg", tmp_path / "a.transmission.jpg"]
-    refused, separated = separate_files(sources, separator=separator, overwrite=True)
-    assert "is itself a photo of the batch" in refused.error
-    assert separated.status == "separated"
-    assert (tmp_path / "a.transmission.jpg").read_bytes() == image_bytes()
-
-
 def test_names_and_sources_are_checked_before_the_first_photo_is_separated(tmp_path):
     for name in ("x", "y", "empty"):
         (tmp_path / name).mkdir()
@@ -94,11 +84,6 @@ def test_a_photo_is_separated_when_its_result_is_requested(photo_folder, tmp_pat
     assert not (tmp_path / "out").exists()
     assert next(batch).status == "separated"
     assert list_files(tmp_path / "out") == layer_files("a")
-
-
-def test_a_model_that_does_not_exist_ends_the_batch(photo_folder, tmp_path):
-    with pytest.raises(ModelError):
-        next(separate_files(photo_folder, tmp_path / "out", Options(model="no-such-model")))
 
 
 def test_an_unexpected_exception_is_raised_again_after_the_last_photo(

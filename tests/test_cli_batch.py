@@ -113,12 +113,6 @@ def test_any_file_name_works_and_each_error_is_one_line(run, tmp_path):
     assert r"bad\nname.jpg" in error_lines(err)[0]
 
 
-def test_a_name_that_looks_like_an_option_comes_after_two_dashes(run, tmp_path, model):
-    (tmp_path / "-dash.jpg").write_bytes(image_bytes())
-    assert run("--quiet", "--model", model, "--", "-dash.jpg", with_model=False)[0] == 0
-    assert list_files(tmp_path) == ["-dash.jpg", *layer_files("-dash")]
-
-
 # --- outputs
 
 
@@ -209,13 +203,6 @@ def test_a_photo_that_has_changed_since_its_separation_is_an_error(run, tmp_path
     (tmp_path / "a.transmission.jpg").write_bytes(image_bytes())  # layers without a record are accepted
     (tmp_path / "a.reflection.jpg").write_bytes(image_bytes())
     assert "a.jpg: skipped" in run("a.jpg")[2]
-
-
-def test_a_folder_run_twice_does_not_separate_its_own_results(run, tmp_path):
-    (tmp_path / "a.jpg").write_bytes(image_bytes())
-    run(".")
-    assert run(".")[0] == 0
-    assert list_files(tmp_path) == ["a.jpg", *layer_files("a")]
 
 
 def test_the_same_photo_gives_the_same_bytes_twice(run, tmp_path):

@@ -322,19 +322,3 @@ def test_cases_are_read_and_freed_one_at_a_time(tmp_path):
 
     write_report(results([*"012345"]), cases(), tmp_path / "report.html")
     assert len(alive) == 6
-
-
-def test_a_report_replaces_an_older_one_atomically(tmp_path):
-    def broken():
-        yield make_thumbnails("a")
-        raise ValueError
-
-    path = tmp_path / "new" / "report.html"
-    write_report(results(), [make_thumbnails("a")], path)
-    before = path.read_bytes()
-    with pytest.raises(ValueError):  # noqa: PT011
-        write_report(results(), broken(), path)
-    assert path.read_bytes() == before
-    write_report(results(), [make_thumbnails("b")], path)
-    assert path.read_bytes() != before
-    assert [file.name for file in path.parent.iterdir()] == ["report.html"]

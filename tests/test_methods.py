@@ -11,7 +11,7 @@ from benchmark_folders import picture, repacked, write
 from brewster import Photo
 from brewster.benchmarks.registry import read_benchmark
 from brewster.errors import BrewsterError, PhotoError
-from brewster.evaluate.methods import IdentityBaseline, ModelMethod, PredictionFolder, check_names
+from brewster.evaluate.methods import ModelMethod, PredictionFolder, check_names
 from brewster.photo import FileInfo
 
 
@@ -99,13 +99,6 @@ def test_a_folder_without_a_matching_name_is_an_error_before_scoring(cases, tmp_
 
 def test_images_without_a_case_are_counted(cases, tmp_path):
     assert write_predictions(tmp_path, "1.png", "other.png", "another.png").count_unmatched(cases) == 2
-
-
-def test_the_baseline_predicts_the_photo_and_a_black_reflection(case):
-    photo = Photo.open(case.photo.read())
-    prediction = IdentityBaseline().predict(case, photo)
-    assert prediction.transmission is photo
-    assert not prediction.reflection.pixels.any()
 
 
 def test_a_model_stores_its_prediction(case, model, tmp_path):

@@ -281,12 +281,6 @@ def test_a_resized_photo_has_the_mean_light_of_each_area(width, height, across, 
     np.testing.assert_allclose(photo.resized(width, height), means, atol=1e-5)
 
 
-def test_strips_cover_every_row_once():
-    photo = Photo.from_array(np.zeros((700, 900, 1), np.uint8), encoding="srgb")
-    rows = [row for strip in photo.strips() for row in range(700)[strip]]
-    assert rows == list(range(700))
-
-
 def test_a_photo_may_be_used_by_many_threads():
     photo = Photo(random_image(200, 200), None, FileInfo(icc=P3))
     with ThreadPoolExecutor(4) as pool:

@@ -23,6 +23,7 @@ quick = settings(max_examples=25, deadline=None, database=None)
 
 GAMMA = struct.pack(">4s4xIH", b"curv", 1, round(2.2 * 256))
 LINEAR = struct.pack(">4s4xI", b"curv", 0)
+WHITE = struct.pack(">4s4x3i", b"XYZ ", 63190, 65536, 54061)
 SAMPLED = (
     struct.pack(">4s4xI", b"curv", 1024) + (np.linspace(0, 1, 1024) ** 1.8 * 65535).astype(">u2").tobytes()
 )
@@ -41,19 +42,20 @@ def profile(curve, colourants):
         name: struct.pack(">4s4x3i", b"XYZ ", *(round(65536 * value) for value in values))
         for name, values in zip((b"rXYZ", b"gXYZ", b"bXYZ"), colourants or (), strict=False)
     }
-    white = struct.pack(">4s4x3i", b"XYZ ", 63190, 65536, 54061)
     text = struct.pack(">4s4xI", b"desc", 5) + b"test\0" + bytes(78)
     curves = dict.fromkeys((b"rTRC", b"gTRC", b"bTRC") if colourants else (b"kTRC",), curve)
-    tags = {b"desc": text + bytes(-len(text) % 4), b"wtpt": white, **xyz, **curves}
+    tags = {b"desc": text + bytes(-len(text) % 4), b"wtpt": WHITE, **xyz, **curves}
+    return icc_file(tags, b"mntr", b"RGB " if colourants else b"GRAY", b"XYZ ")
+
+
+def icc_file(tags, device, space, connection_space):
     rows, body = b"", b""
     for name, tag in tags.items():
         rows += struct.pack(">4sII", name, 132 + 12 * len(tags) + len(body), len(tag))
         body += tag
     body = struct.pack(">I", len(tags)) + rows + body
-    space = b"RGB " if colourants else b"GRAY"
-    head = struct.pack(
-        ">I4sI4s4s4s12x4s", 128 + len(body), bytes(4), 0x02400000, b"mntr", space, b"XYZ ", b"acsp"
-    )
+    words = (bytes(4), 0x02400000, device, space, connection_space, b"acsp")
+    head = struct.pack(">I4sI4s4s4s12x4s", 128 + len(body), *words)
     return head.ljust(68, b"\0") + struct.pack(">3i", 63190, 65536, 54061) + bytes(48) + body
 
 
@@ -78,15 +80,7 @@ def lut_profile(points=33):
     lut = struct.pack(">4s4x4B", b"mft2", 3, 3, points, 0) + matrix + struct.pack(">2H", 2, 2)
     lut += linear_curve + table + linear_curve
     lut += bytes(-len(lut) % 4)
-    white = struct.pack(">4s4x3i", b"XYZ ", 63190, 65536, 54061)
-    body, rows, start = b"", b"", 132 + 2 * 12
-    for name, tag in ((b"wtpt", white), (b"A2B0", lut)):
-        rows += struct.pack(">4sII", name, start + len(body), len(tag))
-        body += tag
-    size = start + len(body)
-    head = struct.pack(">I4sI4s4s4s12x4s", size, bytes(4), 0x02400000, b"scnr", b"RGB ", b"Lab ", b"acsp")
-    head = head.ljust(68, b"\0") + struct.pack(">3i", 63190, 65536, 54061) + bytes(48)
-    return head + struct.pack(">I", 2) + rows + body
+    return icc_file({b"wtpt": WHITE, b"A2B0": lut}, b"scnr", b"RGB ", b"Lab ")
 
 
 LUT_PRIMARIES = (

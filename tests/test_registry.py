@@ -164,11 +164,6 @@ def test_as_many_parent_folders_are_added_as_are_needed(tmp_path, monkeypatch):
     assert len(equal) == 1
 
 
-def test_a_folder_has_its_name_also_as_the_current_folder(tmp_path, monkeypatch):
-    monkeypatch.chdir(repacked(tmp_path / "mine", ["a"]))
-    assert only("pairs", registry.Path()).name == "mine"
-
-
 @pytest.mark.parametrize("shards", [False, True])
 def test_a_rendered_set_gives_its_background_and_its_reflection(tmp_path, shards):
     render_set(tmp_path / "set", count=3, shards=shards)
@@ -304,12 +299,6 @@ def test_the_drawn_case_of_a_scene_depends_on_no_other_scene(subsets, tmp_path):
     full = {case.scene: case.name for case in paper_subset(subsets["postcard"])}
     few = paper_subset(only("postcard", postcard(tmp_path, POSTCARD_SCENES[3:6])))
     assert {case.scene: case.name for case in few} == {scene: full[scene] for scene in POSTCARD_SCENES[3:6]}
-
-
-def test_the_subset_does_not_depend_on_the_order_of_cases(subsets, original, monkeypatch):
-    listing = registry.Path.iterdir
-    monkeypatch.setattr(registry.Path, "iterdir", lambda path: iter(sorted(listing(path), reverse=True)))
-    assert paper_subset(only("solidobject", original)) == paper_subset(subsets["solidobject"])
 
 
 def test_a_repacked_set_whose_names_identify_the_scenes_has_a_subset(tmp_path):

@@ -6,7 +6,7 @@ import re
 
 import pytest
 
-from brewster.evaluate.report.tables import ranking, tables_to_markdown, to_csv, to_markdown, to_terminal
+from brewster.evaluate.report.tables import tables_to_markdown, to_csv, to_markdown, to_terminal
 from known_results import METRICS, entry, known_results
 
 
@@ -66,13 +66,3 @@ def test_the_tables_fit_the_terminal(results, width):
     assert "31.00 (18.00 to 21.00)" in to_terminal(results, width, intervals=True)
     shown = [line for line in text.splitlines() if line.startswith("a me")]
     assert len({re.split(" {2,}", line)[0] for line in shown}) == 2  # shortened names stay different
-
-
-def test_a_method_with_errors_is_not_in_the_ranking(results):
-    table = {
-        "input (unprocessed)": {"psnr": entry(20.0), "lpips": entry(0.2)},
-        "A_b|c": {"psnr": entry(21.5, count=10), "lpips": entry(0.1, count=10)},
-    }
-    assert ranking(table, "psnr", METRICS["psnr"]) == []
-    table["third"] = {"psnr": entry(19.0)}
-    assert ranking(table, "psnr", METRICS["psnr"]) == ["20.00", "19.00"]

@@ -7,7 +7,6 @@ import pytest
 from benchmark_folders import repacked, sir2
 from brewster.benchmarks.image_files import Case, ImageFile
 from brewster.benchmarks.registry import Benchmark, read_benchmark
-from brewster.errors import BrewsterError
 from brewster.evaluate.config import EvaluationConfig
 from brewster.evaluate.methods import IdentityBaseline, PredictionFolder
 from brewster.evaluate.results import summarise
@@ -60,21 +59,6 @@ def test_the_order_of_rows_does_not_matter(methods):
         parts, methods, lambda case, method: int(case.name) ** 2 + (method.name == "theirs")
     )
     assert summarise(parts, methods, PSNR, score_rows) == summarise(parts, methods, PSNR, score_rows[::-1])
-
-
-def test_each_method_is_compared_with_the_methods_before_it(methods):
-    parts = [make_benchmark("a", 4)]
-    score_rows = make_rows(
-        parts, methods, lambda case, method: int(case.name) + 0.5 * (method.name == "theirs")
-    )
-    (row,) = summarise(parts, methods, PSNR, score_rows)["differences"]["a"]
-    assert (row["method"], row["reference"], row["mean"], row["improved_count"]) == (
-        "theirs",
-        "input (unprocessed)",
-        0.5,
-        4,
-    )
-    assert (row["low"], row["high"]) == (0.5, 0.5)
 
 
 def test_a_failed_case_is_not_counted_and_is_named(methods):
@@ -132,15 +116,3 @@ def test_the_papers_average_uses_only_the_papers_benchmarks_and_reports_missing_
         "over 181 images. The average of this evaluation is over 20 of real20, 10 of nature20."
         in results["protocol"]["choices"][-1]
     )
-
-
-def test_the_subset_of_the_paper_is_an_error_if_names_do_not_identify_the_scenes(tmp_path, methods):
-    repacked(tmp_path / "postcard", ["001", "002"])
-    parts = read_benchmark("postcard", tmp_path / "postcard")
-    with pytest.raises(BrewsterError, match="scene"):
-        summarise(
-            parts,
-            methods,
-            EvaluationConfig(metrics=("psnr",), paper_subset=True),
-            make_rows(parts, methods, lambda *_: 1.0),
-        )

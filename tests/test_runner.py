@@ -229,14 +229,6 @@ if __name__ == "__main__":
     assert len(workers) >= 2
 
 
-def test_two_workers_give_the_same_rows_as_one(real20, model, tmp_path):
-    methods = [IdentityBaseline(), ModelMethod("pane", str(model), tmp_path / "predictions")]
-    config = EvaluationConfig(metrics=("psnr", "ssim", "psnr_region"))
-    one = score(real20, methods, config, tmp_path / "one")
-    two = score(real20, methods, config, tmp_path / "two", workers=2)
-    assert comparable(one) == comparable(two)
-
-
 def test_a_crash_is_reported_with_its_case_and_the_next_run_tries_again(real20, tmp_path):
     rows = score(real20, [FakeMethod(predictions={"2": RuntimeError("boom")})], QUICK, tmp_path / "out")
     assert rows[1].error == "fake failed on real20/2: RuntimeError: boom"

@@ -4,11 +4,8 @@ import re
 from contextlib import closing
 from dataclasses import asdict
 
-import numpy as np
 import pytest
 
-from brewster import Photo
-from brewster.user_study.create import create_study
 from brewster.user_study.store import AnswerStore
 from brewster.web.application import create_app
 from brewster.web.middleware import AccessPolicy
@@ -189,21 +186,6 @@ def test_a_personal_link_contains_the_token_of_the_server(study, store):
     assert request(app, "GET", f"{participant}/link", headers=bearer).json()["link"] == link
     assert request(app, "GET", participant).status_code == 401
     assert "Refresh" in request(app, "GET", link).headers
-
-
-def test_a_16_bit_picture_is_shown_as_8_bit_srgb(tmp_path):
-    """The page shows the pixels that `brewster evaluate` scores."""
-    make_study(tmp_path, names=("a",))
-    deep = Photo.from_array(np.full((18, 24, 3), 30_000, np.uint16), encoding="srgb")
-    for folder in ("inputs", "Secretlus", "Rivalino"):
-        deep.save(tmp_path / folder / "a.png", overwrite=True)
-    methods = {name: tmp_path / name for name in ("Secretlus", "Rivalino")}
-    study = create_study(tmp_path / "again", tmp_path / "inputs", methods)
-    with closing(AnswerStore(study)) as store:
-        app = create_app(study_router(study, store), policy=AccessPolicy(), index="study.html")
-        shown = Photo.open(request(app, "GET", f"{admit_participant(app)}/pictures/0/photo").content)
-    assert shown.pixels.dtype == np.uint8
-    assert np.array_equal(shown.pixels, deep.srgb_8bit())
 
 
 def test_all_assets_of_the_page_are_served_locally(app):
