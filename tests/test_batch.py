@@ -1,6 +1,7 @@
 """Batches from Python: names, folders, existing files, errors of single files, streams."""
 
 import io
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -28,16 +29,15 @@ def photo_folder(tmp_path):
 
 
 def test_a_folder_is_mirrored_and_a_damaged_photo_does_not_stop_the_batch(photo_folder, tmp_path, separator):
-    batch_results = list(separate_files(photo_folder, tmp_path / "out", separator=separator))
-    assert [result.status for result in batch_results] == ["separated", "failed", "separated"]
-    assert [result.source for result in batch_results] == [
+    results = list(separate_files(photo_folder, tmp_path / "out", separator=separator))
+    assert [(result.status, result.error is None) for result in results] == [
+        ("separated", True), ("failed", False), ("separated", True),
+    ]  # fmt: skip
+    assert [result.source for result in results] == [
         str(photo_folder / name) for name in ("a.jpg", "b.jpg", "c/d.jpg")
     ]
-    assert [result.error is None for result in batch_results] == [True, False, True]
-    assert list_files(tmp_path / "out") == sorted(
-        layer_files("a") + [f"c/{name}" for name in layer_files("d")]
-    )
-    first = batch_results[0]
+    assert list_files(tmp_path / "out") == [*layer_files("a"), *(f"c/{name}" for name in layer_files("d"))]
+    first = results[0]
     assert (first.model, first.model_sha256, first.device) == ("pane", "0" * 64, "cpu")
     assert first.outputs == {layer: str(tmp_path / f"out/a.{layer}.jpg") for layer in LAYERS}
     assert set(first.seconds) == {"decode", "network", "upsampling", "encode"}
@@ -103,12 +103,8 @@ def test_an_unexpected_exception_is_raised_again_after_the_last_photo(
 
 
 def test_progress_names_the_file_and_grows_and_keyboard_interrupt_stops(photo_folder, tmp_path, separator):
-    calls = []
-    list(
-        separate_files(
-            photo_folder, tmp_path / "out", separator=separator, on_progress=lambda *args: calls.append(args)
-        )
-    )
+    calls, separate = [], partial(separate_files, photo_folder, separator=separator)
+    list(separate(tmp_path / "out", on_progress=lambda *args: calls.append(args)))
     positions = [done + fraction for done, _, fraction in calls]
     assert positions == sorted(positions)
     assert {Path(name).name for _, name, _ in calls} == {"a.jpg", "b.jpg", "d.jpg"}
@@ -118,7 +114,7 @@ def test_progress_names_the_file_and_grows_and_keyboard_interrupt_stops(photo_fo
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        list(separate_files(photo_folder, tmp_path / "other", separator=separator, on_progress=stop))
+        list(separate(tmp_path / "other", on_progress=stop))
     assert not (tmp_path / "other").exists()
 
 

@@ -164,14 +164,8 @@ def test_a_model_that_does_not_exist_is_an_error_even_if_all_layers_exist(run, t
     code, out, err = run("a.jpg", "--model", "nonsuch", *options, with_model=False)
     assert (code, out) == (1, b"")
     assert err.startswith("error: there is no model 'nonsuch'; expected one of compact, ")
-    for model in (
-        "compact",
-        "owner/name",
-        "tiny:klein",
-        "windowseat",
-        "folder",
-    ):  # valid names; the models are not loaded
-        (tmp_path / "folder").mkdir(exist_ok=True)
+    (tmp_path / "folder").mkdir()
+    for model in ("compact", "owner/name", "tiny:klein", "windowseat", "folder"):  # valid, and not loaded
         assert run("a.jpg", "--model", model, *options, with_model=False)[0] == 0
 
 
@@ -223,10 +217,8 @@ def test_a_dry_run_prints_the_planned_files_and_writes_nothing(run, tmp_path):
     (tmp_path / "broken.onnx").write_bytes(b"")
     before = list_files(tmp_path)
     code, out, _ = run(".", "--dry-run", "--model", "broken.onnx", with_model=False)
-    assert (code, out) == (
-        0,
-        b"a.jpg -> a.transmission.jpg\nb.jpg -> b.transmission.jpg, b.reflection.jpg\n",
-    )
+    planned = b"a.jpg -> a.transmission.jpg\nb.jpg -> b.transmission.jpg, b.reflection.jpg\n"
+    assert (code, out) == (0, planned)
     planned = json_lines(run(".", "--dry-run", "--json")[1])
     assert [line["status"] for line in planned] == ["planned", "planned"]
     assert list_files(tmp_path) == before
@@ -278,9 +270,8 @@ def test_json_has_the_result_of_each_photo(run, tmp_path, model):
     assert len(err.splitlines()) == 1
     assert set(separated) == set(failed) == {field.name for field in fields(FileResult)} - {"exception"}
     assert separated["outputs"] == {layer: f"a.{layer}.jpg" for layer in LAYERS}
-    assert [separated[key] for key in ("source", "status", "model", "error")] == [
-        *("a.jpg", "separated", "pane", None)
-    ]
+    found = [separated[key] for key in ("source", "status", "model", "error")]
+    assert found == ["a.jpg", "separated", "pane", None]
     assert len(separated["model_sha256"]) == 64
     assert separated["device"]
     assert set(separated["seconds"]) == {"decode", "network", "upsampling", "encode"}

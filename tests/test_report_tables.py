@@ -41,13 +41,8 @@ def test_a_method_with_errors_shows_the_number_of_scored_images(results):
 def test_csv_has_a_line_for_every_mean_and_every_difference(results):
     rows = list(csv.DictReader(io.StringIO(to_csv(results))))
     assert len(rows) == 6 * (4 + 2)
-    first = rows[0]
-    assert (first["set"], first["method"], first["metric"], first["mean"]) == (
-        "real20",
-        "input (unprocessed)",
-        "psnr",
-        "20.0",
-    )
+    first = [rows[0][name] for name in ("set", "method", "metric", "mean")]
+    assert first == ["real20", "input (unprocessed)", "psnr", "20.0"]
     assert [row["reference"] for row in rows if row["set"] == "average"].count("input (unprocessed)") == 2
 
 

@@ -1,7 +1,7 @@
 """Chooses the paths of the layers of a batch, so that no two photos have a layer with the same path.
 
-The names of a photo that is separated alone depend only on this photo. The other files in its folder do not change them.
-"""
+The names of a photo that is separated alone depend only on this photo. The other files in its folder do not change
+them."""
 
 from __future__ import annotations
 
@@ -22,14 +22,15 @@ _SUFFIX_RANKS: Final = {suffix: rank for rank, suffix in enumerate(SUFFIXES)}
 def name_layers(
     images: Iterable[tuple[Location, Location]], options: Options
 ) -> list[tuple[Location, dict[str, Location]]]:
-    """Returns the images with the paths of their layers, from pairs of an image and the folder of its layers, as `images_in` yields
-    them. An image that occurs several times is included once.
+    """Returns the images with the paths of their layers, from pairs of an image and the folder of its layers, as
+    `images_in` yields them. An image that occurs several times is included once.
 
-    `a.jpg` gives `a.transmission.jpg`, and `a.png` gives `a.transmission.png`. If a layer of two images of a folder would have the
-    same path, as their confidence, the image whose suffix comes first in `SUFFIXES` keeps it, and the other one uses its full name:
-    `a.confidence.png` and `a.png.confidence.png`. Therefore `a.jpg` has the same names in all batches, whichever files are added to
-    its folder. Only an image whose name has no image suffix comes before: its full name is its short name. Raises OutputError if a
-    layer of two images of different folders would have the same path."""
+    `a.jpg` gives `a.transmission.jpg`, and `a.png` gives `a.transmission.png`. If a layer of two images of a folder
+    would have the same path, as their confidence, the image whose suffix comes first in `SUFFIXES` keeps it, and the
+    other one uses its full name: `a.confidence.png` and `a.png.confidence.png`. Therefore `a.jpg` has the same names in
+    all batches, whichever files are added to its folder. Only an image whose name has no image suffix comes before: its
+    full name is its short name. Raises OutputError if a layer of two images of different folders would have the same
+    path."""
     found: dict[str, SeparationPaths] = {}
     for image, folder in images:
         key = absolute(image)

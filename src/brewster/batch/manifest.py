@@ -4,11 +4,10 @@
     1987/box-04/0017.tif
     s3://scans/1987/box-04/0018.tif
 
-The values of a CSV table are separated by commas, semicolons or tabs, as its header shows. A relative path is relative to the
-folder of the manifest, and its layers are written to the same relative path below the output folder. The layers of an absolute
-path or a URL are written to this path below the output folder, without the root or the protocol: to `OUT/scans/1987/box-04`
-for the second row. The output folder of a photo therefore does not depend on the other rows.
-"""
+The values of a CSV table are separated by commas, semicolons or tabs, as its header shows. A relative path is relative
+to the folder of the manifest, and its layers are written to the same relative path below the output folder. The layers
+of an absolute path or a URL are written to this path below the output folder, without the root or the protocol: to
+`OUT/scans/1987/box-04` for the second row. The output folder of a photo therefore does not depend on the other rows."""
 
 from __future__ import annotations
 
@@ -67,8 +66,7 @@ def read_manifest(
     Layers are written below `output_folder`, by default next to their photo. Raises ManifestError if the manifest
     cannot be read, is not a table, or has no rows, or if a row has no path, a relative path outside the folder of the
     manifest, or more values than the header; BrewsterError if a row has a URL that `location` refuses; MissingExtra if
-    the package is not installed that a Parquet table (pyarrow) or a URL needs.
-    """
+    the package is not installed that a Parquet table (pyarrow) or a URL needs."""
     try:
         data = manifest.read_bytes()
     except (OSError, UnreadablePhoto) as error:

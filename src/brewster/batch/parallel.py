@@ -1,8 +1,8 @@
 """Separates an archive: a batch in several processes or on a cluster.
 
-A worker separates one photo at a time, as a batch in one process does: it reads the photo and writes the layers. Without
-`overwrite`, a layer that exists is never written again, even if two workers separate the same photo. If a node is lost, only
-its photos are separated again. The same command resumes a stopped run."""
+A worker separates one photo at a time, as a batch in one process does: it reads the photo and writes the layers.
+Without `overwrite`, a layer that exists is never written again, even if two workers separate the same photo. If a node
+is lost, only its photos are separated again. The same command resumes a stopped run."""
 
 from __future__ import annotations
 
@@ -25,9 +25,10 @@ from brewster.remote_path import Location
 def separate_in_parallel(
     tasks: Sequence[SeparationTask], executor: Executor[FileResult], *, overwrite: bool = False
 ) -> Iterator[FileResult]:
-    """Separates the photos of the tasks, and yields the results in the order in which workers finish them. The caller enters the
-    context of the executor, which runs a `SeparationRunner` in its workers; both need the same `overwrite`. Raises OutputError if
-    a layer would replace a photo of the archive, or a node cannot reach the output folder, and ModelError or DeviceError."""
+    """Separates the photos of the tasks, and yields the results in the order in which workers finish them. The caller
+    enters the context of the executor, which runs a `SeparationRunner` in its workers; both need the same `overwrite`.
+    Raises OutputError if a layer would replace a photo of the archive, or a node cannot reach the output folder, and
+    ModelError or DeviceError."""
     photos, cache = real_paths(task.source for task in tasks), _FileNameCache()
     for task in tasks:  # a worker cannot check this, because it does not get the paths of all photos
         check_outputs(task, photos)

@@ -174,10 +174,10 @@ def plan_bursts(
 ) -> list[SeparationTask]:
     """Groups photos into bursts, and returns a task for each burst with the paths of the layers of its reference photo.
 
-    The photos that are given by name are one burst, in their order, and so are the photos of each folder, in the order of their
-    names, and each video. `reference` is the index of the reference photo in each burst, by default the middle one; `frames` is
-    the number of frames that are chosen from a video. Raises PhotoError if there is no photo, or none with the index `reference`,
-    and OutputError as `plan_files`."""
+    The photos that are given by name are one burst, in their order, and so are the photos of each folder, in the order
+    of their names, and each video. `reference` is the index of the reference photo in each burst, by default the middle
+    one; `frames` is the number of frames that are chosen from a video. Raises PhotoError if there is no photo, or none
+    with the index `reference`, and OutputError as `plan_files`."""
     given = [location(source) for source in sources]
     groups: dict[object, list[SeparationTask]] = {}
     for task in plan_files(map(str, given), output, options):

@@ -1,8 +1,7 @@
 """Separates many files. A file that cannot be separated does not stop the batch.
 
-The tree of an input folder is mirrored in the output folder, and layers that exist already are skipped. Only one photo is in
-memory at a time. The model is loaded when the first photo needs it.
-"""
+The tree of an input folder is mirrored in the output folder, and layers that exist already are skipped. Only one photo
+is in memory at a time. The model is loaded when the first photo needs it."""
 
 from __future__ import annotations
 
@@ -59,8 +58,9 @@ def separate_files(
     """Separates files and folders of photos, and writes the layers as files.
 
     Layers are named after their photo (`a.transmission.jpg` for `a.jpg`). They never replace a photo of the batch. If
-    all layers of a photo exist, the photo is skipped. If some of its layers exist, only the missing layers are written. If an
-    existing layer was made from another photo, the photo fails. Each file is written atomically. If a photo fails, its result has the status `failed`, and the batch continues.
+    all layers of a photo exist, the photo is skipped. If some of its layers exist, only the missing layers are written.
+    If an existing layer was made from another photo, the photo fails. Each file is written atomically. If a photo
+    fails, its result has the status `failed`, and the batch continues.
 
     Args:
         sources: photos, folders that are searched recursively for photos, and manifests (CSV or Parquet tables with
@@ -85,8 +85,7 @@ def separate_files(
         ModelError: the model does not exist or is damaged (raised during iteration).
         DeviceError: the requested device is not available (raised during iteration).
         Exception: an unexpected exception, which is a bug in brewster. The result of its photo has the status `failed`, and
-            the first such exception is raised again after the last photo.
-    """
+            the first such exception is raised again after the last photo."""
     tasks = plan_files(sources, output, options)
     return separate_tasks(
         tasks, options, separator, overwrite=overwrite, dry_run=dry_run, on_progress=on_progress

@@ -50,10 +50,11 @@ class ImageFile:
 class Case:
     """A photo to separate, with its ground truth, whose `name` is unique within the benchmark.
 
-    Cases with the same `scene` show the same objects, so they are not statistically independent; it equals `name` if it is unknown.
-    `relative_path` is that of the photo below the benchmark folder, without the suffix and with forward slashes. `ground_truth` is
-    the transmission. If `rendered` is True, it is the background without the glass, and `reflection` is the light that the glass
-    adds. `frames` are the photos of a burst in order, of which `photo` is the middle one."""
+    Cases with the same `scene` show the same objects, so they are not statistically independent; it equals `name` if it
+    is unknown. `relative_path` is that of the photo below the benchmark folder, without the suffix and with forward
+    slashes. `ground_truth` is the transmission. If `rendered` is True, it is the background without the glass, and
+    `reflection` is the light that the glass adds. `frames` are the photos of a burst in order, of which `photo` is the
+    middle one."""
 
     benchmark: str
     name: str

@@ -1,10 +1,12 @@
-"""Groups the images of a benchmark folder by file name, never by position: photo, transmission and, if there is one, reflection.
+"""Groups the images of a benchmark folder by file name, never by position: photo, transmission and, if there is one,
+reflection.
 
 - Pairs: one folder per role with equal file names: blended/a.png, transmission_layer/a.png.
 - The original folders of SIR2: one folder per shot. A letter in the file name denotes the role: ab/3/ab-3-m-32.png,
   ab/3/ab-3-g-32.png.
 
-A name with one photo, one transmission and at most one reflection becomes an `ImageGroup`; others are excluded, with a reason."""
+A name with one photo, one transmission and at most one reflection becomes an `ImageGroup`; others are excluded, with a
+reason."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
-"""Reads public benchmarks from folders that the user has downloaded. Pairs each photo with its ground truth by file name.
+"""Reads public benchmarks from folders that the user has downloaded. Pairs each photo with its ground truth by file
+name.
 
-The module `pairing` groups the files by name. This module creates a `Case` for each group, compares the image sizes in the
-file headers, and checks the number of cases. `excluded` lists the files that cannot be used.
-"""
+The module `pairing` groups the files by name. This module creates a `Case` for each group, compares the image sizes in
+the file headers, and checks the number of cases. `excluded` lists the files that cannot be used."""
 
 from __future__ import annotations
 
@@ -67,9 +67,10 @@ class BenchmarkLayout:
 
 
 def read_benchmark(name: str, folder: Path) -> list[Benchmark]:
-    """Reads a benchmark from a folder; decodes only the file headers. "sir2" gives one benchmark for each of its subsets in the
-    folder. If the copy is incomplete, `remarks` and `excluded` list the missing files. Raises PhotoError if the name is not in
-    BENCHMARKS, or the folder is missing, empty or of another layout, and MissingExtra if a reader is not installed."""
+    """Reads a benchmark from a folder; decodes only the file headers. "sir2" gives one benchmark for each of its
+    subsets in the folder. If the copy is incomplete, `remarks` and `excluded` list the missing files. Raises PhotoError
+    if the name is not in BENCHMARKS, or the folder is missing, empty or of another layout, and MissingExtra if a reader
+    is not installed."""
     if name not in BENCHMARKS:
         close = difflib.get_close_matches(name.lower(), BENCHMARKS, 1)
         raise PhotoError(

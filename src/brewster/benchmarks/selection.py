@@ -20,9 +20,9 @@ PAPER_SEED: Final = 181
 
 
 def paper_subset(benchmark: Benchmark, seed: int = PAPER_SEED) -> tuple[Case, ...]:
-    """Draws one case of each scene, as the paper does, which does not say which ones. Other benchmarks than Postcard and
-    SolidObject keep all cases. The choice, from the cases in natural order of their names, does not depend on the other scenes.
-    Raises PhotoError if the file names do not identify the scenes."""
+    """Draws one case of each scene, as the paper does, which does not say which ones. Other benchmarks than Postcard
+    and SolidObject keep all cases. The choice, from the cases in natural order of their names, does not depend on the
+    other scenes. Raises PhotoError if the file names do not identify the scenes."""
     if benchmark.name not in BENCHMARKS or not BENCHMARKS[benchmark.name].scene_pattern:
         return benchmark.cases
     if any(case.scene == case.name for case in benchmark.cases):

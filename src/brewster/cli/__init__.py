@@ -1,7 +1,6 @@
 """The command `brewster`. No other package uses click or rich.
 
-Commands import slow modules when they run, so that `brewster --help` starts fast.
-"""
+Commands import slow modules when they run, so that `brewster --help` starts fast."""
 
 from __future__ import annotations
 
@@ -65,8 +64,7 @@ def cli() -> None:
     """Separate photos taken through glass into transmission and reflection.
 
     The transmission is the scene behind the glass. The reflection is the scene that the glass mirrors. `brewster PHOTO...` is
-    short for `brewster separate PHOTO...`; `brewster separate --help` shows its options.
-    """
+    short for `brewster separate PHOTO...`; `brewster separate --help` shows its options."""
 
 
 for _module in (separate, burst, models, doctor, train, assets, render, evaluate, ablate, serve, study):

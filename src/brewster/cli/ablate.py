@@ -35,8 +35,7 @@ def ablate(
     ABLATION is a TOML file with the base recipe, the key, its values and the benchmarks.
 
     The environment variable BREWSTER_DATA is the path of the data folder. To resume an interrupted run, run the same
-    command again. The tables are printed on standard output; the output folder gets the tables and report.html.
-    """
+    command again. The tables are printed on standard output; the output folder gets the tables and report.html."""
     require_extra("train", "training")
     require_extra("evaluate", "evaluating")
     from brewster.evaluate.ablation import ablate as run  # noqa: PLC0415  (imports torch, two seconds)

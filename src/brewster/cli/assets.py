@@ -72,8 +72,7 @@ def pull(
     of the photographs is not known, and these are left out.
 
     Existing files are skipped. If a download fails, the other files are still downloaded, the failed file is listed at the
-    end, and the exit code is 1.
-    """
+    end, and the exit code is 1."""
     if source == "photos":
         for name in options:
             if context.get_parameter_source(name) is click.core.ParameterSource.COMMANDLINE:

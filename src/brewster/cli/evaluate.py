@@ -142,8 +142,7 @@ def evaluate(context: click.Context, /, *, dry_run: bool, **options: Any) -> Non
     image), tables.md (also intervals and differences), table.tex, table.csv and report.html. To resume an interrupted run, run the same command again.
 
     Photos and ground truth are paired by file name. If a photo has no ground truth, or if a method fails on it, it is
-    listed, all other photos are scored, and the exit code is 1.
-    """
+    listed, all other photos are scored, and the exit code is 1."""
     require_extra("evaluate", "evaluating")
     command = _EvaluateCommand(**options)
     context.exit(0 if (command.list_cases() if dry_run else command.run()) else 1)

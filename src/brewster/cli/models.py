@@ -42,8 +42,7 @@ def list_models(*, as_json: bool) -> None:
     An entry has the name, the size of the file or download, and the licence. A diffusion model has two more lines: the layers
     that it predicts, its GPU memory (with the format of the weights, and with the weights offloaded to host memory), the
     download of its text encoder, and how to get it. Sizes and memory of diffusion models are estimates for a photo of 12
-    megapixels on an RTX 4090; --plan estimates them for another photo or GPU.
-    """
+    megapixels on an RTX 4090; --plan estimates them for another photo or GPU."""
     rows = [describe(model) for model in zoo.MODELS.values()]
     if as_json:
         print_out(
@@ -136,8 +135,7 @@ def import_model(
 
     SOURCE is a LoRA for kontext, klein or qwen (a .safetensors file, a folder or hub id with one such file, or
     OWNER/NAME/FILE on the hub) with the keys of peft, diffusers, kohya's sd-scripts or ComfyUI; or the checkpoint
-    GenSIRR.pt.
-    """
+    GenSIRR.pt."""
     require_extra("diffusion", "importing a model")
     if Path(source).suffix in _CHECKPOINT_SUFFIXES:
         from brewster.models.diffusion import gensirr  # noqa: PLC0415  (imports torch)
@@ -210,8 +208,7 @@ def push(
     """Upload the LoRA in FOLDER to the Hugging Face hub as OWNER/NAME, in one commit.
 
     The weights, the prompt embedding, the recipe and the model card are uploaded. Local paths in them are shortened to
-    their last part. The access token is the environment variable HF_TOKEN, or the token that `hf auth login` stored.
-    """
+    their last part. The access token is the environment variable HF_TOKEN, or the token that `hf auth login` stored."""
     require_extra("diffusion", "uploading a LoRA")
     from brewster.models.diffusion.adapter import hub  # noqa: PLC0415  (imports torch)
 

@@ -1,7 +1,6 @@
 """Generates the reference of all recipe keys from their pydantic models: `make docs` writes docs/recipes.md.
 
-.venv/bin/python -m brewster.cli.recipe_reference > docs/recipes.md
-"""
+.venv/bin/python -m brewster.cli.recipe_reference > docs/recipes.md"""
 
 from __future__ import annotations
 

@@ -1,7 +1,6 @@
 """Generates the reference of the command line from the commands: `make docs` writes docs/reference.md.
 
-.venv/bin/python -m brewster.cli.reference > docs/reference.md
-"""
+.venv/bin/python -m brewster.cli.reference > docs/reference.md"""
 
 from __future__ import annotations
 

@@ -187,8 +187,7 @@ def separate(
 
     Photos whose layers exist are skipped. A photo fails if these layers were made from another photo, for example one with the
     same name in another folder. If a photo fails, the other photos are still separated, the failed photo is listed at the
-    end, and the exit code is 1.
-    """
+    end, and the exit code is 1."""
     photos, output = tuple(map(local_path, photos)), output and local_path(output)
     options = parse_options(context, values, single_output=is_single_output(photos, output))
     if is_plan or gpu_name:

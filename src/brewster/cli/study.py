@@ -53,8 +53,7 @@ def study() -> None:
 
     `create` makes a study from folders of outputs, `plan` computes the required number of participants, `serve` serves
     the page for participants, `progress` shows how far they are, and `report` evaluates their answers. `export` and `import` are
-    for participants who cannot reach this machine. docs/study.md defines all terms.
-    """
+    for participants who cannot reach this machine. docs/study.md defines all terms."""
 
 
 @study.command
@@ -126,8 +125,7 @@ def create(
     Inputs and outputs are paired by dataset and file name, whatever their format. FOLDER/real/12.png and
     FOLDER/nature/3.jpg belong to the datasets real and nature; without subfolders, FOLDER/12.png belongs to a single
     dataset without a name. If an image is missing, duplicate, unreadable or of another size, the error lists it, and
-    nothing is written. The study folder contains copies of all images and can be moved.
-    """
+    nothing is written. The study folder contains copies of all images and can be moved."""
     from brewster.user_study.create import CATCH_POOL_SIZE, DEFAULT_CONSENT, create_study  # noqa: PLC0415  (imports pyvips)
     from brewster.user_study.folders import find_pictures, select_pictures  # noqa: PLC0415
 
@@ -214,8 +212,7 @@ def serve(
     """Serve the page for participants until Ctrl-C.
 
     Each answer is stored on the disk before it is acknowledged. After the server was stopped or killed, run the same
-    command again to continue the study.
-    """
+    command again to continue the study."""
     require_extra("web", "serving", without=frozenset({"matplotlib", "segno"}))
     from brewster.user_study.access_token import load_or_create_token  # noqa: PLC0415
     from brewster.user_study.store import AnswerStore  # noqa: PLC0415
@@ -261,8 +258,7 @@ def report(folder: Path, *, out: Path | None, as_json: bool, **rule: float) -> N
     """Evaluate the answers, both without the excluded participants and with all participants.
 
     The tables are printed on standard output. The output folder gets report.md, report.json, table.tex
-    (in the layout of the paper's Table 3), table.csv, answers.csv and plot.png. The server may run at the same time.
-    """
+    (in the layout of the paper's Table 3), table.csv, answers.csv and plot.png. The server may run at the same time."""
     require_extra("web", "the report", without=frozenset({"fastapi", "python-multipart", "segno", "uvicorn"}))
     from brewster.user_study.report.participants import ExclusionRule, collect_answers  # noqa: PLC0415
     from brewster.user_study.report.results import summarise, write  # noqa: PLC0415
@@ -353,8 +349,7 @@ def export_study(folder: Path, *, out: Path, participants: int, url: str | None)
     """Write the page of the study as static files, and print one personal link for each participant.
 
     Copy the folder to any web server that serves files. Participants download their answers as a file and send it to you;
-    `brewster study import` adds it to the study.
-    """
+    `brewster study import` adds it to the study."""
     from brewster.user_study.store import AnswerStore  # noqa: PLC0415  (imports pydantic)
     from brewster.user_study.study import read_study  # noqa: PLC0415
     from brewster.web.study_bundle import export_bundle  # noqa: PLC0415
@@ -378,8 +373,7 @@ def import_answers(context: click.Context, folder: Path, files: tuple[Path, ...]
     """Add the answers in files that participants of `brewster study export` have sent.
 
     A file can be imported again: answers that the study already has are kept. An invalid file is reported, the others are imported,
-    and the exit code is 1.
-    """
+    and the exit code is 1."""
     from brewster.user_study.answer_file import read_answer_file  # noqa: PLC0415  (imports pydantic)
     from brewster.user_study.store import AnswerStore  # noqa: PLC0415
     from brewster.user_study.study import read_study  # noqa: PLC0415

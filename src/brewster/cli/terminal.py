@@ -1,7 +1,6 @@
 """Standard output, standard error and Ctrl-C.
 
-Results are written to standard output. Status lines, errors and progress bars are written to standard error.
-"""
+Results are written to standard output. Status lines, errors and progress bars are written to standard error."""
 
 from __future__ import annotations
 

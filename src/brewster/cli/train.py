@@ -69,8 +69,7 @@ def train(
     The environment variable BREWSTER_DATA is the path of the data folder. To resume an interrupted run from its last
     checkpoint, run the same command again; on a CPU, the final weights are the same as without the interruption. To make a
     run longer, raise `steps` in the recipe and run the command again. To train a LoRA on several GPUs (data parallel),
-    start the command with torchrun.
-    """
+    start the command with torchrun."""
     if show_recipe:
         from brewster.scene.recipe_file import commented_toml  # noqa: PLC0415
         from brewster.training.recipe import read_template  # noqa: PLC0415

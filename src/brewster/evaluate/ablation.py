@@ -1,8 +1,8 @@
-"""Ablation studies: trains a model for each of several values of one key of a training recipe, and compares their scores.
+"""Ablation studies: trains a model for each of several values of one key of a training recipe, and compares their
+scores.
 
 A study is a TOML file with a base recipe, the key, its values and the benchmarks. The first value is the reference
-of the comparisons. A stopped study resumes both training and evaluation.
-"""
+of the comparisons. A stopped study resumes both training and evaluation."""
 
 from __future__ import annotations
 

@@ -62,16 +62,18 @@ def evaluate(
     intervals: bool = False,
     on_progress: ScoreCallback = lambda _done, _total, _row: None,
 ) -> Results:
-    """Scores the methods. Writes results.json, scores.csv, tables.md, table.tex, table.csv and report.html into `out`, and the
-    photos into `out`/inputs if they are resized. Returns the content of results.json.
+    """Scores the methods. Writes results.json, scores.csv, tables.md, table.tex, table.csv and report.html into `out`,
+    and the photos into `out`/inputs if they are resized. Returns the content of results.json.
 
-    A metric whose weights are missing is left out, and "unavailable" in the results says why; the next run adds it. A stopped
-    run is resumed from the files in `out`, a folder for this evaluation only. Each image is read and decoded once, unless an
-    earlier run has scored it, an exclusive method needs it, or the benchmark has more than `max_report_cases` cases.
+    A metric whose weights are missing is left out, and "unavailable" in the results says why; the next run adds it. A
+    stopped run is resumed from the files in `out`, a folder for this evaluation only. Each image is read and decoded
+    once, unless an earlier run has scored it, an exclusive method needs it, or the benchmark has more than
+    `max_report_cases` cases.
 
-    `methods` are in the order of the tables; the first one should be the baseline. The report has at most `max_report_cases`
-    cases of each benchmark: those with the worst scores of the first other method. With `intervals`, table.tex has the
-    confidence intervals. Raises BrewsterError as `check`, and OutputError if `out` cannot be written."""
+    `methods` are in the order of the tables; the first one should be the baseline. The report has at most
+    `max_report_cases` cases of each benchmark: those with the worst scores of the first other method. With `intervals`,
+    table.tex has the confidence intervals. Raises BrewsterError as `check`, and OutputError if `out` cannot be
+    written."""
     check(benchmarks, methods, config)
     cases = [case for benchmark in benchmarks for case in benchmark.cases]
     with TemporaryDirectory(prefix="brewster-report-") as folder:

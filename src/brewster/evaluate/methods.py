@@ -1,8 +1,7 @@
 """The methods to evaluate: the unprocessed input, brewster's models, and folders with predictions of other methods.
 
-A method predicts a transmission and, optionally, a reflection for a case. Its `key` identifies all inputs of the prediction
-except the photo. If the key and the photo are unchanged, a stored prediction is reused.
-"""
+A method predicts a transmission and, optionally, a reflection for a case. Its `key` identifies all inputs of the
+prediction except the photo. If the key and the photo are unchanged, a stored prediction is reused."""
 
 from __future__ import annotations
 
@@ -145,11 +144,8 @@ class ModelMethod:
         return f"{self._sha256} {self.quality} {PREDICTION_FORMAT_VERSION}{frames}"
 
     def predict(self, case: Case, photo: Photo) -> MethodOutput:
-        """Separates the photo and stores both layers. Raises BrewsterError.
-
-        Returns:
-            The layers, decoded from the stored bytes. So new and stored predictions have the same scores.
-        """
+        """Separates the photo and stores both layers. Returns the layers decoded from the stored bytes, so that new and stored
+        predictions have the same scores. Raises BrewsterError."""
         if (key := (self.model, self.device)) not in _separators:
             if self.exclusive:  # memory is limited: the previous model is freed first
                 _separators.clear()

@@ -1,7 +1,6 @@
 """Protocols by name: the choices of papers and contests that change the scores, each with its source.
 
-A published score can be compared with a measured score only if both use the same protocol. Reports list the choices.
-"""
+A published score can be compared with a measured score only if both use the same protocol. Reports list the choices."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
 """Scores every method on every case, in one or several processes. A stopped run can be resumed.
 
 `scores.jsonl` in the output folder has one line for each new result, scored or failed. A later run reuses a line if its
-inputs have not changed, and adds the columns that it lacks, such as LPIPS after its weights were missing. Each file of a
-case is read once: its bytes are hashed and, if a score is missing, decoded."""
+inputs have not changed, and adds the columns that it lacks, such as LPIPS after its weights were missing. Each file of
+a case is read once: its bytes are hashed and, if a score is missing, decoded."""
 
 from __future__ import annotations
 
@@ -53,11 +53,11 @@ def score(
 ) -> tuple[list[ScoreRow], dict[str, str]]:
     """Runs every method on every case and scores the predictions. Reuses the rows of an earlier run if nothing changed.
 
-    Exclusive methods run last, one after another, in this process. `on_case_scored` is called once for each case with new rows;
-    with several workers, it must be picklable. Returns one row for each case and method, in the order of benchmarks, cases and
-    methods, with an `error` if the method failed; and column -> reason for the columns that this machine cannot compute, for
-    example without weights. Raises BrewsterError if names of methods are not valid, or a worker process died, and OutputError if
-    `out` cannot be written."""
+    Exclusive methods run last, one after another, in this process. `on_case_scored` is called once for each case with
+    new rows; with several workers, it must be picklable. Returns one row for each case and method, in the order of
+    benchmarks, cases and methods, with an `error` if the method failed; and column -> reason for the columns that this
+    machine cannot compute, for example without weights. Raises BrewsterError if names of methods are not valid, or a
+    worker process died, and OutputError if `out` cannot be written."""
     check_names(methods)
     logged = read_score_rows(out / SCORES_FILE)
     cases = {(case.benchmark, case.name): case for benchmark in benchmarks for case in benchmark.cases}

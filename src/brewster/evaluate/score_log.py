@@ -22,9 +22,10 @@ RowId = tuple[str, str, str]
 class ScoreRow:
     """The scores of one method on one case, or the error; a line of scores.jsonl has these fields.
 
-    `score_key` and `prediction_key` are digests of all inputs of the scores and of the prediction, which are reused if it is
-    unchanged. `columns` were computed; those that are not in `scores` do not apply to the case. `registration` says how a
-    prediction of a folder is flipped or shifted. `digest` is the SHA-256 of the files of the prediction, if it has files."""
+    `score_key` and `prediction_key` are digests of all inputs of the scores and of the prediction, which are reused if
+    it is unchanged. `columns` were computed; those that are not in `scores` do not apply to the case. `registration`
+    says how a prediction of a folder is flipped or shifted. `digest` is the SHA-256 of the files of the prediction, if
+    it has files."""
 
     benchmark: str
     case: str

@@ -26,13 +26,12 @@ _DIGITS: Final = 6
 
 
 def resize(photo: Photo, config: EvaluationConfig) -> Photo:
-    """Downscales a photo to `config.short_side_px` by area means in linear light, and then its sides to the next smaller
-    multiples of `config.size_divisor`.
+    """Downscales a photo to `config.short_side_px` by area means in linear light, and then its sides to the next
+    smaller multiples of `config.size_divisor`.
 
     The second step interpolates the 8-bit values by cubic convolution (a = -0.5, antialiased), first along the rows, as
     Pillow's `Image.resize` does by default: the test code of DSRNet, RDNet and XReflection uses it. The result is 8-bit
-    sRGB, or the photo itself if both settings leave it as it is. A side is never enlarged.
-    """
+    sRGB, or the photo itself if both settings leave it as it is. A side is never enlarged."""
     shorter, divisor = config.short_side_px, config.size_divisor
     if shorter is not None and shorter < min(photo.size):
         width, height = (round(side * shorter / min(photo.size)) for side in photo.size)

@@ -1,7 +1,7 @@
 """Means with bootstrap confidence intervals, and paired differences between methods.
 
-Images of one scene, such as ten shots of a postcard, are not independent. The bootstrap therefore resamples whole scenes.
-"""
+Images of one scene, such as ten shots of a postcard, are not independent. The bootstrap therefore resamples whole
+scenes."""
 
 from __future__ import annotations
 
@@ -109,7 +109,8 @@ def differences(
 ) -> list[Difference]:
     """Compares each method with all methods before it, in every metric, paired by image, if an image has both scores.
 
-    `series` has (method, metric) of each column of the values of `strata`; `directions` is metric -> whether higher is better."""
+    `series` has (method, metric) of each column of the values of `strata`; `directions` is metric -> whether higher is
+    better."""
     column_of = {name: i for i, name in enumerate(series)}
     methods = list(dict.fromkeys(method for method, _ in series))
     comparisons = [

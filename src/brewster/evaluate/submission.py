@@ -42,10 +42,11 @@ def openrr_folder(benchmarks: Sequence[tuple[str, str]], *, has_method: bool) ->
 def export_ntire2026(
     folder: Path, method: Method, out: Path, *, on_progress: Callable[[str], None] = lambda _name: None
 ) -> list[Path]:
-    """Predicts all photos of the folders val_*_blended and test_*_blended of OpenRR-5k, writes a zip file for each, and returns
-    their paths. The README of OpenRR-5k asks for val_300_output.zip and test_100_output.zip with images only, and its evaluate.py
-    reads files "*.jpg" with the names of the photos. Stored predictions of "val" are used again. Raises PhotoError if the folder
-    has another layout or a photo cannot be read; BrewsterError if the method fails on a photo; OutputError."""
+    """Predicts all photos of the folders val_*_blended and test_*_blended of OpenRR-5k, writes a zip file for each, and
+    returns their paths. The README of OpenRR-5k asks for val_300_output.zip and test_100_output.zip with images only,
+    and its evaluate.py reads files "*.jpg" with the names of the photos. Stored predictions of "val" are used again.
+    Raises PhotoError if the folder has another layout or a photo cannot be read; BrewsterError if the method fails on a
+    photo; OutputError."""
     splits = {
         name: roles["photo"]
         for name, roles in find_numbered_splits(folder).items()

@@ -6,8 +6,7 @@ its map is averaged over the positions where the whole window is inside the imag
     uniform    7x7, sample covariance, as ERRNet, RAGNet and their successors report it. Equal to scikit-image's
                structural_similarity(a, b, channel_axis=2)
     gaussian   11x11, sigma 1.5, population covariance, as in the paper of Wang et al. Equal to the same call with
-               gaussian_weights=True, sigma=1.5, use_sample_covariance=False, data_range=255
-"""
+               gaussian_weights=True, sigma=1.5, use_sample_covariance=False, data_range=255"""
 
 from __future__ import annotations
 
@@ -49,8 +48,7 @@ def psnr(prediction: Image, truth: Image, *, region: Region | None = None) -> fl
     The mean squared error is over the three channels of all pixels, or of the pixels in `region`, bool (H, W).
 
     Raises:
-        ValueError: the images are not uint8 (H, W, 3) or differ in shape; the region is empty or of another shape.
-    """
+        ValueError: the images are not uint8 (H, W, 3) or differ in shape; the region is empty or of another shape."""
     if region is None:
         return psnr_of_counts(count_pairs(prediction, truth))
     check_images(prediction, truth)
@@ -80,14 +78,14 @@ def count_pairs(prediction: Image, truth: Image) -> PairCounts:
 
 
 def psnr_of_channels(prediction: Image, truth: Image) -> float:
-    """Returns the mean of the PSNR of red, green and blue, as the code of ERRNet (util/index.py) and XReflection computes it.
+    """Returns the mean of the PSNR of red, green and blue, as the code of ERRNet (util/index.py) and XReflection
+    computes it.
 
-    The value is never below that of `psnr`, which uses one mean squared error over all channels. It is in dB, and infinity if a
-    channel is equal in both images. Higher is better.
+    The value is never below that of `psnr`, which uses one mean squared error over all channels. It is in dB, and
+    infinity if a channel is equal in both images. Higher is better.
 
     Raises:
-        ValueError: the images are not uint8 (H, W, 3) or differ in shape.
-    """
+        ValueError: the images are not uint8 (H, W, 3) or differ in shape."""
     check_images(prediction, truth)
     difference = prediction.astype(np.int32) - truth
     mse = (difference * difference).mean(axis=(0, 1))
@@ -98,12 +96,11 @@ def linear_rmse(prediction: Image, truth: Image, *, region: Region | None = None
     """Returns the root mean squared error in linear light, in 0..1: sqrt(mean((L(prediction) - L(truth))^2)).
 
     L is the inverse of the sRGB curve (IEC 61966-2-1). The mean is over the three channels of all pixels, or of the
-    pixels in `region`, bool (H, W). This error is proportional to the light that is wrong; errors of encoded values are not.
-    Lower is better.
+    pixels in `region`, bool (H, W). This error is proportional to the light that is wrong; errors of encoded values are
+    not. Lower is better.
 
     Raises:
-        ValueError: the images are not uint8 (H, W, 3) or differ in shape; the region is empty or of another shape.
-    """
+        ValueError: the images are not uint8 (H, W, 3) or differ in shape; the region is empty or of another shape."""
     if region is None:
         return linear_rmse_of_counts(count_pairs(prediction, truth))
     check_images(prediction, truth)
@@ -121,13 +118,13 @@ def ssim(
 ) -> float:
     """Returns the mean structural similarity (Wang et al. 2004), with one of the two windows of this module.
 
-    The SSIM map is averaged over all its pixels, or over those in `region`, bool (H, W). The map has no values within
-    3 pixels of the image's border, or 5 pixels with the Gaussian window. The mean is 1 for equal images. Higher is better.
+    The SSIM map is averaged over all its pixels, or over those in `region`, bool (H, W). The map has no values within 3
+    pixels of the image's border, or 5 pixels with the Gaussian window. The mean is 1 for equal images. Higher is
+    better.
 
     Raises:
         ValueError: the images are not uint8 (H, W, 3), differ in shape, or are smaller than the window; the
-            region is empty, of another shape, or has only pixels without a value.
-    """
+            region is empty, of another shape, or has only pixels without a value."""
     return mean_ssim(ssim_map(prediction, truth, window=window), region=region)
 
 
@@ -179,11 +176,10 @@ def _ssim_formula(
 ) -> NDArray[np.float64]:
     """Returns SSIM = (2 mx my + C1) (2 cov + C2) / ((mx^2 + my^2 + C1) (vx + vy + C2)), computed from window sums.
 
-    `window_sums` has the sums of x, y, x^2 + y^2 and x y. Here m is a mean, v a variance and cov the covariance in the window.
-    Numerator and denominator are multiplied by powers of `pixel_count`, the number of pixels in a window sum (1 if the sums
-    are weighted means). So there is only one division, and integer sums stay integers until then. The formula needs only
-    vx + vy, so x^2 + y^2 is summed once.
-    """
+    `window_sums` has the sums of x, y, x^2 + y^2 and x y. Here m is a mean, v a variance and cov the covariance in the
+    window. Numerator and denominator are multiplied by powers of `pixel_count`, the number of pixels in a window sum (1
+    if the sums are weighted means). So there is only one division, and integer sums stay integers until then. The
+    formula needs only vx + vy, so x^2 + y^2 is summed once."""
     mean_x, mean_y, squares, products = window_sums
     mean_product, mean_squares = mean_x * mean_y, mean_x * mean_x + mean_y * mean_y
     luminance = _LUMINANCE_CONSTANT * pixel_count**2

@@ -4,10 +4,9 @@
     truth = metric.features(image)  # once for many predictions
     print([metric.difference(metric.features(prediction), truth).mean() for prediction in predictions])
 
-R. Zhang et al., "The Unreasonable Effectiveness of Deep Features as a Perceptual Metric", CVPR 2018. The
-definition and the weights are those of version 0.1 of the `lpips` package. Functions import torch when they are called; the
-import of this module does not.
-"""
+R. Zhang et al., "The Unreasonable Effectiveness of Deep Features as a Perceptual Metric", CVPR 2018. The definition and
+the weights are those of version 0.1 of the `lpips` package. Functions import torch when they are called; the import of
+this module does not."""
 
 from __future__ import annotations
 
@@ -89,9 +88,9 @@ class Lpips:
 
     @classmethod
     def load(cls) -> Lpips:
-        """Returns LPIPS with its published weights, always the same object. Raises MissingExtra if torch is not installed, ModelError if
-        the file of AlexNet's weights is damaged, DownloadError if it is missing and the download fails, and OutputError if it cannot be
-        stored."""
+        """Returns LPIPS with its published weights, always the same object. Raises MissingExtra if torch is not
+        installed, ModelError if the file of AlexNet's weights is damaged, DownloadError if it is missing and the
+        download fails, and OutputError if it cannot be stored."""
         return _load()
 
     def features(self, image: Image) -> Features:
@@ -116,13 +115,14 @@ class Lpips:
         return Features(tuple(maps), shape)
 
     def difference(self, one: Features, other: Features) -> DifferenceMaps:
-        """Returns the five maps of the LPIPS distance between two images of equal size, given by their features. Its `mean` is the
-        distance: 0 for equal images; lower is better.
+        """Returns the five maps of the LPIPS distance between two images of equal size, given by their features. Its
+        `mean` is the distance: 0 for equal images; lower is better.
 
-        The squared differences of the features are weighted by channel, averaged over each map, and summed over the five maps. With a
-        `region`, bool (H, W), each map is first upsampled to the size of the image (bilinear, align_corners=False; `spatial=True` in
-        `lpips`), and the sum of the maps is averaged over the region. A region that is the whole image gives a slightly different value
-        than no region, because upsampling changes the weight of the border. Raises ValueError if the images differ in size."""
+        The squared differences of the features are weighted by channel, averaged over each map, and summed over the
+        five maps. With a `region`, bool (H, W), each map is first upsampled to the size of the image (bilinear,
+        align_corners=False; `spatial=True` in `lpips`), and the sum of the maps is averaged over the region. A region
+        that is the whole image gives a slightly different value than no region, because upsampling changes the weight
+        of the border. Raises ValueError if the images differ in size."""
         import torch  # noqa: PLC0415 - an extra
 
         if one.shape != other.shape:
@@ -136,13 +136,13 @@ class Lpips:
 
 
 def lpips(prediction: Image, truth: Image, *, region: Region | None = None) -> float:
-    """Returns the LPIPS 0.1 (AlexNet) distance between two images, with weights from `Lpips.load`; see `Lpips.difference`.
+    """Returns the LPIPS 0.1 (AlexNet) distance between two images, with weights from `Lpips.load`; see
+    `Lpips.difference`.
 
     Raises:
         ValueError: the images are not uint8 (H, W, 3), differ in shape, or are smaller than 31x31 pixels; the
             region is empty or of another shape.
-        BrewsterError: the weights cannot be loaded; see `Lpips.load`.
-    """
+        BrewsterError: the weights cannot be loaded; see `Lpips.load`."""
     check_images(prediction, truth)
     metric = Lpips.load()
     return metric.difference(metric.features(prediction), metric.features(truth)).mean(region=region)

@@ -1,8 +1,8 @@
 """Loads the AlexNet of LPIPS, which is downloaded once. The small file of channel weights is part of brewster.
 
-The network is that of torchvision (BSD-3-Clause): the layers `features.0`, 3, 6, 8 and 10 of alexnet-owt-7be5be79.pth, stored
-as a state dict of ten tensors in the folder `weights` of the cache or of BREWSTER_DATA. The digest of the values is always
-checked, because other weights define a different metric."""
+The network is that of torchvision (BSD-3-Clause): the layers `features.0`, 3, 6, 8 and 10 of alexnet-owt-7be5be79.pth,
+stored as a state dict of ten tensors in the folder `weights` of the cache or of BREWSTER_DATA. The digest of the values
+is always checked, because other weights define a different metric."""
 
 from __future__ import annotations
 

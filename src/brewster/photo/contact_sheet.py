@@ -39,10 +39,11 @@ def is_contact_sheet(path: Path) -> bool:
 def write_contact_sheets(
     path: Path, rows: Sequence[tuple[Path, Sequence[Path]]], max_pixels: int, *, overwrite: bool = False
 ) -> Iterator[Path]:
-    """Writes the rows to `path`, and yields the path of each sheet. A sheet has at most 200 rows; further ones have a number:
-    `sheet.jpg`, `sheet-2.jpg` and so on. A contact sheet of an earlier run is replaced; with `overwrite`, other files are, too. A
-    row has the file of a photo, whose path is its label, and the files of its layers. Raises PhotoError if a file cannot be read or
-    has more than `max_pixels` pixels, and OutputError if the sheet cannot be written, or another file has its name."""
+    """Writes the rows to `path`, and yields the path of each sheet. A sheet has at most 200 rows; further ones have a
+    number: `sheet.jpg`, `sheet-2.jpg` and so on. A contact sheet of an earlier run is replaced; with `overwrite`, other
+    files are, too. A row has the file of a photo, whose path is its label, and the files of its layers. Raises
+    PhotoError if a file cannot be read or has more than `max_pixels` pixels, and OutputError if the sheet cannot be
+    written, or another file has its name."""
     if not _SYSTEM_FONTS.exists():
         os.environ.setdefault("FONTCONFIG_FILE", str(_PACKAGED_FONTS))  # ignored on Windows and macOS
     for number, first in enumerate(range(0, len(rows), _MAX_ROWS), 1):

@@ -1,7 +1,6 @@
 """Decodes the bytes of an image file to stored pixels and file metadata.
 
-The first bytes determine the format; the file name is not used. The header is checked before any pixel is decoded.
-"""
+The first bytes determine the format; the file name is not used. The header is checked before any pixel is decoded."""
 
 from __future__ import annotations
 
@@ -72,8 +71,7 @@ def read_size(data: bytes) -> tuple[int, int]:
 
     Raises:
         PhotoError: the image cannot be read, is not supported, or is too large (see `Photo.open`).
-        MissingExtra: the reader of EXR, HEIC or RAW is not installed.
-    """
+        MissingExtra: the reader of EXR, HEIC or RAW is not installed."""
     format_name = _detect_format(data)
     if format_name == "ora":
         data, format_name = _merged_image(data, DEFAULT_MAX_PIXELS), "png"

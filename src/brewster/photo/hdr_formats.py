@@ -1,7 +1,6 @@
 """Reads and writes floating-point images: OpenEXR with its own package, Radiance HDR with built-in code.
 
-Both formats store linear light. Header attributes are kept and written to new files.
-"""
+Both formats store linear light. Header attributes are kept and written to new files."""
 
 from __future__ import annotations
 
@@ -41,8 +40,7 @@ def read_exr(data: bytes, max_pixels: int) -> Decoded:
     Other channels, such as Z, are ignored. Raises MissingExtra if OpenEXR is not installed; PhotoTooLarge if the image
     has more pixels than `max_pixels`; UnreadablePhoto if the file is damaged or truncated; UnsupportedPhoto if the file
     has neither the channels R, G and B nor the channel Y, or its colours are stored as luminance and chroma (Y, RY,
-    BY).
-    """
+    BY)."""
     header = _exr_part(data, header_only=True).header
     low, high = header["dataWindow"]
     width, height = (int(side) for side in np.array(high) - np.array(low) + 1)
@@ -111,8 +109,7 @@ def write_exr_layers(layers: Mapping[str, Float32], header: Mapping[str, str]) -
 
     Raises:
         MissingExtra: OpenEXR is not installed.
-        UnsupportedPhoto: the name of an attribute is reserved by OpenEXR.
-    """
+        UnsupportedPhoto: the name of an attribute is reserved by OpenEXR."""
     exr = library_of("exr")
     if reserved := _RESERVED_ATTRIBUTES & header.keys():
         raise UnsupportedPhoto(
@@ -144,8 +141,7 @@ def read_exr_layers(data: bytes) -> dict[str, Float32]:
 
     Raises:
         MissingExtra: OpenEXR is not installed.
-        UnreadablePhoto: the file is damaged, or has no layer with R, G and B.
-    """
+        UnreadablePhoto: the file is damaged, or has no layer with R, G and B."""
     channels = _exr_part(data, header_only=False).channels
     stems = sorted(name.removesuffix(".R") for name in channels if name.endswith(".R"))
     names = {stem: [f"{stem}.{channel}" for channel in _LAYER_CHANNELS] for stem in stems}

@@ -1,8 +1,8 @@
 """Records the program that created a layer, and its options, in the metadata of the layer: XMP history, EXIF Software.
 
-The XMP block of a camera or an editor is kept, and an entry is added to it. The entry has no date, so that the same input
-gives the same bytes. XMP is defined by ISO 16684-1 and by part 2 of the XMP specification (xmpMM:History, stEvt:*).
-"""
+The XMP block of a camera or an editor is kept, and an entry is added to it. The entry has no date, so that the same
+input gives the same bytes. XMP is defined by ISO 16684-1 and by part 2 of the XMP specification (xmpMM:History,
+stEvt:*)."""
 
 from __future__ import annotations
 
@@ -66,11 +66,12 @@ def with_layer_history(file_info: FileInfo, layer: str, parameters: Mapping[str,
 
 
 def sampled_digest(file: BinaryIO) -> str:
-    """Returns 16 hexadecimal digits that identify the file of a photo: the start of the SHA-256 of at most 192 KiB of it.
+    """Returns 16 hexadecimal digits that identify the file of a photo: the start of the SHA-256 of at most 192 KiB of
+    it.
 
-    The samples are 64 KiB long: at the end of the file, at a distance of d from the end, and at d/2, where d is the largest power of
-    two that is not larger than the file. So they do not change with metadata at the start of a JPEG. They suffice, because the
-    pixels of photos contain noise. For an archive, reading whole files would take hours."""
+    The samples are 64 KiB long: at the end of the file, at a distance of d from the end, and at d/2, where d is the
+    largest power of two that is not larger than the file. So they do not change with metadata at the start of a JPEG.
+    They suffice, because the pixels of photos contain noise. For an archive, reading whole files would take hours."""
     size = file.seek(0, os.SEEK_END)
     distance, digest = 1 << max(size.bit_length() - 1, 0), hashlib.sha256()
     for position in (size - distance, size - distance // 2, size - _SAMPLE_BYTES):

@@ -3,8 +3,7 @@
     mask = Mask.open("mask.png", photo.size)
     mask.rows(0, 64)  # (64, W, 1) float32: 1 where the mask is white, 0 where it is black
 
-The stored values are weights, not light, so they are not converted by a transfer curve or a colour profile.
-"""
+The stored values are weights, not light, so they are not converted by a transfer curve or a colour profile."""
 
 from __future__ import annotations
 
@@ -38,8 +37,7 @@ class Mask:
 
         Raises:
             MaskError: the source cannot be read, has colours, transparent pixels or values outside 0..1, or does not
-                have the size of the photo.
-        """
+                have the size of the photo."""
         mask = f"the mask {source}" if isinstance(source, str | os.PathLike) else "the mask"
         photo = open_painted(source, size, mask)
         pixels = photo.pixels

@@ -1,9 +1,8 @@
 """Reads and writes metadata as bytes: JPEG tables, EXIF, PNG and WebP chunks.
 
-libvips writes EXIF with libexif, which drops unknown tags, and libvips ignores EXIF in TIFF files. This module copies the
-EXIF block of the source with all its tags; only the orientation and the thumbnail change. A block begins at its TIFF header,
-without the "Exif\\0\\0" of JPEG.
-"""
+libvips writes EXIF with libexif, which drops unknown tags, and libvips ignores EXIF in TIFF files. This module copies
+the EXIF block of the source with all its tags; only the orientation and the thumbnail change. A block begins at its
+TIFF header, without the "Exif\\0\\0" of JPEG."""
 
 from __future__ import annotations
 

@@ -1,10 +1,10 @@
-"""Assign comparisons to participants; the result depends only on the seed of the study and the number of the participant.
+"""Assign comparisons to participants; the result depends only on the seed of the study and the number of the
+participant.
 
 All participants share one infinite sequence of rounds. Each round is a random permutation of all comparisons, and each
 participant takes the next `pairs` items. At any time, the assignment counts of any two comparisons differ by at most 1.
 Every second round swaps the sides of each comparison, so each method is shown left and right equally often.
-The sequence is computed again from the seed; no state is stored.
-"""
+The sequence is computed again from the seed; no state is stored."""
 
 from __future__ import annotations
 

@@ -1,8 +1,7 @@
 """Create a study from folders of outputs: pair pictures by name and copy them under random names.
 
 All files are checked before anything is written, and one error lists all problems. Pictures are stored as upright 8-bit
-sRGB PNG without metadata, so every browser shows the same pixels, and neither format nor EXIF reveals the method.
-"""
+sRGB PNG without metadata, so every browser shows the same pixels, and neither format nor EXIF reveals the method."""
 
 from __future__ import annotations
 
@@ -78,8 +77,8 @@ def create_study(
         pairs, catch_trials: the numbers for each participant. None means the default, or all if there are fewer.
         seed: the seed of the assignment; None chooses a random one.
 
-    Raises BrewsterError if there are fewer than two methods, files are missing, unreadable or of different sizes, or more pairs
-    or catch trials are requested than exist, and OutputError if `out` is not empty or cannot be written."""
+    Raises BrewsterError if there are fewer than two methods, files are missing, unreadable or of different sizes, or
+    more pairs or catch trials are requested than exist, and OutputError if `out` is not empty or cannot be written."""
     require_empty(out)
     photos, outputs = _pair_pictures(inputs, methods, datasets, names)
     compared = list(combinations(methods, 2))

@@ -27,8 +27,7 @@ def find_pictures(folder: Path, datasets: Sequence[str] = ()) -> dict[Key, Path]
     `name.reflection.png` and `name.confidence.png` of the same photo are ignored. The keys are (dataset, stem), in
     natural order (2 before 10). With `datasets`, only these are used, in this order. Raises BrewsterError if the folder
     contains no picture, a dataset is missing, two files have the same name, or pictures are both in the folder and in
-    its subfolders, and `datasets` is empty.
-    """
+    its subfolders, and `datasets` is empty."""
     if not folder.is_dir():
         raise BrewsterError(f"{folder} is not a folder", "expected a folder with pictures", "check the path")
     subfolders = {

@@ -13,9 +13,9 @@ from brewster.errors import BrewsterError
 @final
 @dataclass(frozen=True)
 class PowerAnalysis:
-    """The required number of participants, and the quantities that it is computed from: `answers` of all participants, the
-    assumed `win` and `lose` rates, the `design_effect` (the number of real answers that are worth one independent answer), and the
-    standard `deviation`, over participants, of the difference between win and lose rate."""
+    """The required number of participants, and the quantities that it is computed from: `answers` of all participants,
+    the assumed `win` and `lose` rates, the `design_effect` (the number of real answers that are worth one independent
+    answer), and the standard `deviation`, over participants, of the difference between win and lose rate."""
 
     participants: int
     answers: int
@@ -43,13 +43,9 @@ def required_participants(
     `difference` is not above 0, or the lose rate would be negative.
 
     Args:
-        difference: the win rate minus the lose rate, 0 to 1.
-        tie: the rate of "similar", 0 to 1.
+        difference: the win rate minus the lose rate, 0 to 1; `tie` is the rate of "similar", 0 to 1.
         pairs: number of pairs of these two methods that a participant sees.
-        correlation: intraclass correlation of the scores of one participant; reports estimate it.
-        power: the probability of detecting the difference if it exists.
-        level: the significance level, the probability of detecting a difference that does not exist.
-    """
+        power: the probability of detecting the difference if it exists; `level`, if it does not exist."""
     win, lose = (1 - tie + difference) / 2, (1 - tie - difference) / 2
     if not (0 < difference <= 1 and 0 <= tie < 1 and lose >= 0):
         raise BrewsterError(

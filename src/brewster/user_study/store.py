@@ -1,9 +1,9 @@
 """Store the answers of a study in SQLite, with a write-ahead log and a disk sync after each commit.
 
-A participant has a number, the token of the personal link, the date of the consent and the trials; no name and no address. The
-trials are drawn once, at admission, and stored, so a later version of brewster cannot change them. A second answer to a trial
-is ignored: a browser repeats an answer if the response was lost. To change their last answer, participants withdraw it first.
-Withdrawn answers are kept."""
+A participant has a number, the token of the personal link, the date of the consent and the trials; no name and no
+address. The trials are drawn once, at admission, and stored, so a later version of brewster cannot change them. A
+second answer to a trial is ignored: a browser repeats an answer if the response was lost. To change their last answer,
+participants withdraw it first. Withdrawn answers are kept."""
 
 from __future__ import annotations
 

@@ -1,7 +1,6 @@
 """The description of a study: its pictures, its comparisons, and the number of trials of a participant.
 
-`create` writes the description once; it never changes. No other file says which method made which picture.
-"""
+`create` writes the description once; it never changes. No other file says which method made which picture."""
 
 from __future__ import annotations
 

@@ -1,8 +1,7 @@
 """Writes the HTML report: one self-contained page with all scores, the images and their error maps.
 
-The Jinja2 template page.html has the whole page, which is readable without JavaScript; page.js sorts it and compares images.
-Cases are written one at a time, so that memory does not grow with their number.
-"""
+The Jinja2 template page.html has the whole page, which is readable without JavaScript; page.js sorts it and compares
+images. Cases are written one at a time, so that memory does not grow with their number."""
 
 from __future__ import annotations
 

@@ -19,9 +19,9 @@ _METRICS: Final = {"psnr": "PSNR (dB)", "ssim": "SSIM", "lpips": "LPIPS", "lpips
 @final
 @dataclass(frozen=True)
 class PublishedScores:
-    """The scores of a method as a paper printed them. `source` is the paper, `copied_from` the table that the numbers were copied
-    from. `protocol` describes the images, and says what is unknown. `scores` is benchmark -> metric -> the printed number: PSNR
-    in dB, SSIM and LPIPS without a unit."""
+    """The scores of a method as a paper printed them. `source` is the paper, `copied_from` the table that the numbers
+    were copied from. `protocol` describes the images, and says what is unknown. `scores` is benchmark -> metric -> the
+    printed number: PSNR in dB, SSIM and LPIPS without a unit."""
 
     method: str
     source: str

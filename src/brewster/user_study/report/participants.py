@@ -20,8 +20,8 @@ Reason = Literal["failed", "fast"]
 @dataclass(frozen=True)
 class ParticipantAnswers:
     """The answers of one participant. `votes` maps the number of a comparison to an index of OUTCOMES. Of the answered
-    `catch_trials`, `failed` have a wrong answer. `seconds` is the median time for a trial. `trials` has the position of each
-    answered trial in the order of presentation, from 0, the trial, and its answer."""
+    `catch_trials`, `failed` have a wrong answer. `seconds` is the median time for a trial. `trials` has the position of
+    each answered trial in the order of presentation, from 0, the trial, and its answer."""
 
     number: int
     votes: Mapping[int, int]

@@ -1,7 +1,6 @@
 """Compute the results of a study from its answers, as plain JSON values, and write the files of the report.
 
-All results are given twice: for the participants after the exclusion rule, and for all participants.
-"""
+All results are given twice: for the participants after the exclusion rule, and for all participants."""
 
 from __future__ import annotations
 

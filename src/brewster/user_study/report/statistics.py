@@ -1,8 +1,7 @@
 """Rates and their confidence intervals. The bootstrap resamples whole participants, since their answers are correlated.
 
-Arrays of counts are (participants, pairs of methods, datasets, 3): wins, ties and losses of the first method. In shapes,
-p is the number of participants, r of resamples and d of datasets.
-"""
+Arrays of counts are (participants, pairs of methods, datasets, 3): wins, ties and losses of the first method. In
+shapes, p is the number of participants, r of resamples and d of datasets."""
 
 from __future__ import annotations
 
@@ -65,9 +64,9 @@ def averages(
 
 
 def bootstrap_interval(draws: Float64[Floats, "r ..."], participants: int) -> Float64[Floats, "2 ..."]:
-    """The 95 % expanded percentile interval (Hesterberg 2015, section 4.3.2) of a statistic with these values, one for each
-    resample; values that are not finite are ignored. Its percentiles are slightly wider than 2.5 and 97.5, because the plain
-    percentile interval is too narrow for few participants. The ends are NaN for a single participant."""
+    """The 95 % expanded percentile interval (Hesterberg 2015, section 4.3.2) of a statistic with these values, one for
+    each resample; values that are not finite are ignored. Its percentiles are slightly wider than 2.5 and 97.5, because
+    the plain percentile interval is too narrow for few participants. The ends are NaN for a single participant."""
     if participants < 2:
         return np.full((2, *draws.shape[1:]), np.nan)
     ends = _expanded_percentiles(participants)
@@ -83,11 +82,11 @@ def sign_flip_test(
 ) -> Float64[Floats, "... d+3"]:
     """The two-sided p-values of the differences win - lose, for each row of `rates`; NaN without answers.
 
-    The test exchanges wins and losses of whole participants at random, because their answers are correlated. It assumes that,
-    without a difference of the methods, each participant is as likely to prefer one as the other. (A randomisation test, Good
-    2005, "Permutation, Parametric and Bootstrap Tests of Hypotheses", 3.2; one is added to both counts as in Phipson and Smyth
-    2010.) The p-values are random estimates of the exact ones over all 2^n exchanges of n participants.
-    """
+    The test exchanges wins and losses of whole participants at random, because their answers are correlated. It assumes
+    that, without a difference of the methods, each participant is as likely to prefer one as the other. (A
+    randomisation test, Good 2005, "Permutation, Parametric and Bootstrap Tests of Hypotheses", 3.2; one is added to
+    both counts as in Phipson and Smyth 2010.) The p-values are random estimates of the exact ones over all 2^n
+    exchanges of n participants."""
     rng = np.random.default_rng([SEED, len(counts), 1])
     signs = rng.choice([-1.0, 1.0], (resamples, len(counts)))
     half_sum, half_difference = counts.copy(), np.zeros_like(counts)
@@ -163,11 +162,13 @@ def intraclass_correlation(counts: Float64[Floats, "p 3"]) -> float | None:
 
 
 def strengths(wins: Float64[Floats, "... m m"]) -> Float64[Floats, "... m"]:
-    """The maximum-likelihood strengths of methods in the model of Bradley and Terry (1952), for each table of wins, with mean 0.
+    """The maximum-likelihood strengths of methods in the model of Bradley and Terry (1952), for each table of wins,
+    with mean 0.
 
-    P(a beats b) = 1 / (1 + exp(strength_b - strength_a)); `wins[a, b]` is the number of wins of method a against method b, and a
-    tie adds 0.5 to both orders. NaN for a table without a maximum, where some methods never lose to the others (Ford 1957).
-    Damped Newton's method: each step is divided by 1 + its length, so the likelihood always increases (Nesterov 2004, 4.1.5)."""
+    P(a beats b) = 1 / (1 + exp(strength_b - strength_a)); `wins[a, b]` is the number of wins of method a against method
+    b, and a tie adds 0.5 to both orders. NaN for a table without a maximum, where some methods never lose to the others
+    (Ford 1957). Damped Newton's method: each step is divided by 1 + its length, so the likelihood always increases
+    (Nesterov 2004, 4.1.5)."""
     wins = wins * (1 - np.eye(wins.shape[-1]))
     total = wins + np.swapaxes(wins, -1, -2)
     is_bounded = all_connected(wins)
