@@ -79,11 +79,8 @@ def read_manifest(
         photo, mirrored = _photo(row, text)
         yield row, photo, photo.parent if output_folder is None else output_folder.joinpath(*mirrored)
     if row is None:
-        raise ManifestError(
-            f"{manifest} has only the names of its columns, and no rows",
-            "expected a row for each photo",
-            "add the paths of the photos",
-        )
+        happened = f"{manifest} has only the names of its columns, and no rows"
+        raise ManifestError(happened, "expected a row for each photo", "add the paths of the photos")
 
 
 def _photo(row: ManifestRow, text: object) -> tuple[Location, tuple[str, ...]]:

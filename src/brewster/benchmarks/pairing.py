@@ -292,11 +292,8 @@ def _find_subfolders(folder: Path, key_of: Callable[[str], str]) -> dict[str, Pa
     for path in list_folder(folder)[0]:
         key = key_of(path.name)
         if key and found.setdefault(key, path) != path:
-            raise PhotoError(
-                f"{folder} has two subfolders for {key}, {found[key].name} and {path.name}",
-                f"expected one subfolder for {key}",
-                "move or rename one of the two",
-            )
+            happened = f"{folder} has two subfolders for {key}, {found[key].name} and {path.name}"
+            raise PhotoError(happened, f"expected one subfolder for {key}", "move or rename one of the two")
     return found
 
 

@@ -58,11 +58,8 @@ def find_pictures(folder: Path, datasets: Sequence[str] = ()) -> dict[Key, Path]
         for path, stem in stems_by_dataset[name].items():
             found[name, stem].append(path)
     if not found:
-        raise BrewsterError(
-            f"{folder} contains no picture",
-            "expected pictures, or subfolders with pictures",
-            "check the path",
-        )
+        happened = f"{folder} contains no picture"
+        raise BrewsterError(happened, "expected pictures, or subfolders with pictures", "check the path")
     if duplicates := [" and ".join(sorted(map(str, paths))) for paths in found.values() if len(paths) > 1]:
         raise BrewsterError(
             f"{shorten_list(duplicates)} have the same name",
