@@ -14,21 +14,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final, final
 
+from brewster.benchmarks import pairing
 from brewster.benchmarks.bursts import find_bursts
 from brewster.benchmarks.image_files import Case, ImageFile, files_of, read_samples
-from brewster.benchmarks.pairing import (
-    SIR2_TREES,
-    FolderListing,
-    ImageGroup,
-    find_numbered_splits,
-    find_roles,
-    find_sets,
-    find_split,
-    find_subsets,
-    join_names,
-    read_folders,
-    read_tree,
-)
+from brewster.benchmarks.pairing import FolderListing, ImageGroup
 from brewster.errors import PhotoError, counted
 from brewster.files import natural_key
 from brewster.photo import read_size
@@ -85,36 +74,46 @@ def read_benchmark(name: str, folder: Path) -> list[Benchmark]:
 
 
 def _read_pairs(name: str, folder: Path) -> list[Benchmark]:
-    return [_from_listing(name, folder, read_folders(folder))]
+    return [_from_listing(name, folder, pairing.read_folders(folder))]
 
 
 def _read_sets(name: str, folder: Path) -> list[Benchmark]:
     """Reads a folder of pairs, or one benchmark for each subfolder with pairs."""
-    sets = [] if "photo" in find_roles(folder) else find_sets(folder)
+    sets = [] if "photo" in pairing.find_roles(folder) else pairing.find_sets(folder)
     return [part for path in sets or [folder] for part in _read_pairs(name, path)]
 
 
 def _read_split(name: str, folder: Path) -> list[Benchmark]:
-    complete = [roles for roles in find_numbered_splits(folder).values() if "transmission" in roles]
-    found = (folder, complete[0]) if len(complete) == 1 else (find_split(folder),)
-    return [_from_listing(name, folder, read_folders(*found))]
+    complete = [roles for roles in pairing.find_numbered_splits(folder).values() if "transmission" in roles]
+    found = (folder, complete[0]) if len(complete) == 1 else (pairing.find_split(folder),)
+    return [_from_listing(name, folder, pairing.read_folders(*found))]
 
 
 def _read_subset(name: str, folder: Path) -> list[Benchmark]:
-    root = find_subsets(folder).get(name, folder)
-    return [_from_listing(name, folder, read_folders(root) if find_roles(root) else read_tree(root, name))]
+    root = pairing.find_subsets(folder).get(name, folder)
+    return [
+        _from_listing(
+            name,
+            folder,
+            pairing.read_folders(root) if pairing.find_roles(root) else pairing.read_tree(root, name),
+        )
+    ]
 
 
 def _read_sir2(_: str, folder: Path) -> list[Benchmark]:
-    subsets = find_subsets(folder)
+    subsets = pairing.find_subsets(folder)
     if not subsets:
         raise PhotoError(
             f"{folder} contains no subset of SIR2",
             "expected folders whose names begin with Postcard, SolidObject and Wildscene",
             "give the path of their parent folder, or use postcard=, solidobject= or wildscene= for one subset",
         )
-    first, *others = [part for name in SIR2_TREES if name in subsets for part in _read_subset(name, folder)]
-    missing = [f"{BENCHMARKS[name].title} is not in {folder}" for name in SIR2_TREES if name not in subsets]
+    first, *others = [
+        part for name in pairing.SIR2_TREES if name in subsets for part in _read_subset(name, folder)
+    ]
+    missing = [
+        f"{BENCHMARKS[name].title} is not in {folder}" for name in pairing.SIR2_TREES if name not in subsets
+    ]
     return [replace(first, remarks=(*missing, *first.remarks)), *others]
 
 
@@ -180,7 +179,7 @@ def _make_benchmark(name: str, folder: Path, cases: Sequence[Case], listing: Fol
         remarks.append(f"found {counted(len(valid), 'image')}, expected {' or '.join(map(str, expected))}")
     missing = [case.name for case in valid if case.reflection is None]
     if 0 < len(missing) < len(valid):
-        remarks.append(f"there is no ground truth of the reflection for {join_names(missing)}")
+        remarks.append(f"there is no ground truth of the reflection for {pairing.join_names(missing)}")
     return Benchmark(
         _benchmark_name(name, folder),
         layout.title or folder_name(folder),

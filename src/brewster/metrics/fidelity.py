@@ -16,17 +16,8 @@ from typing import Any, Final, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from brewster.metrics.windows import (
-    BOX_SIDE,
-    GAUSSIAN_RADIUS,
-    Image,
-    Region,
-    box_sums,
-    check_images,
-    check_region,
-    gaussian_means,
-    mean_inside,
-)
+from brewster.metrics import windows
+from brewster.metrics.windows import Image, Region
 from brewster.srgb import to_linear
 
 Window = Literal["uniform", "gaussian"]
@@ -39,7 +30,10 @@ _SQUARED_ERRORS: Final = np.square(np.subtract.outer(np.arange(256.0), np.arange
 _LINEAR_SQUARED_ERRORS: Final = np.square(np.subtract.outer(_LINEAR, _LINEAR), dtype=np.float64).ravel()
 """The squared error of each pair of 8-bit values, (65536,), with the index of `count_pairs`."""
 _STRIP_ROWS: Final = 32
-_WINDOW_SIDES: Final[dict[Window, int]] = {"uniform": BOX_SIDE, "gaussian": 2 * GAUSSIAN_RADIUS + 1}
+_WINDOW_SIDES: Final[dict[Window, int]] = {
+    "uniform": windows.BOX_SIDE,
+    "gaussian": 2 * windows.GAUSSIAN_RADIUS + 1,
+}
 
 
 def psnr(prediction: Image, truth: Image, *, region: Region | None = None) -> float:
@@ -51,9 +45,9 @@ def psnr(prediction: Image, truth: Image, *, region: Region | None = None) -> fl
         ValueError: the images are not uint8 (H, W, 3) or differ in shape; the region is empty or of another shape."""
     if region is None:
         return psnr_of_counts(count_pairs(prediction, truth))
-    check_images(prediction, truth)
+    windows.check_images(prediction, truth)
     difference = prediction.astype(np.int32) - truth
-    return _to_decibels(mean_inside(difference * difference, region))
+    return _to_decibels(windows.mean_inside(difference * difference, region))
 
 
 def psnr_of_counts(counts: PairCounts) -> float:
@@ -70,7 +64,7 @@ def count_pairs(prediction: Image, truth: Image) -> PairCounts:
     Every mean over all pixels of a function of two values follows from it, and it is faster than the function of
     each pixel. The counts are int64 (65536,). The index is 256 times the value of the prediction, plus that of the
     ground truth. Raises ValueError if the images are not uint8 (H, W, 3) or differ in shape."""
-    check_images(prediction, truth)
+    windows.check_images(prediction, truth)
     pairs = prediction.astype(np.intp)
     pairs *= 256
     pairs += truth
@@ -86,7 +80,7 @@ def psnr_of_channels(prediction: Image, truth: Image) -> float:
 
     Raises:
         ValueError: the images are not uint8 (H, W, 3) or differ in shape."""
-    check_images(prediction, truth)
+    windows.check_images(prediction, truth)
     difference = prediction.astype(np.int32) - truth
     mse = (difference * difference).mean(axis=(0, 1))
     return float(np.mean(10 * np.log10(255**2 / mse))) if mse.all() else float("inf")
@@ -103,9 +97,9 @@ def linear_rmse(prediction: Image, truth: Image, *, region: Region | None = None
         ValueError: the images are not uint8 (H, W, 3) or differ in shape; the region is empty or of another shape."""
     if region is None:
         return linear_rmse_of_counts(count_pairs(prediction, truth))
-    check_images(prediction, truth)
+    windows.check_images(prediction, truth)
     difference = _LINEAR[prediction] - _LINEAR[truth]
-    return float(mean_inside(difference * difference, region) ** 0.5)
+    return float(windows.mean_inside(difference * difference, region) ** 0.5)
 
 
 def linear_rmse_of_counts(counts: PairCounts) -> float:
@@ -134,19 +128,19 @@ def mean_ssim(values: NDArray[np.float64], *, region: Region | None = None) -> f
     if region is None:
         return float(np.mean(values))
     border = (region.shape[0] - values.shape[0]) // 2
-    check_region(region, (values.shape[0] + 2 * border, values.shape[1] + 2 * border))
+    windows.check_region(region, (values.shape[0] + 2 * border, values.shape[1] + 2 * border))
     inside = region[border : border + values.shape[0], border : border + values.shape[1]]
     if not inside.any():
         raise ValueError(
             f"all pixels of the region are within {border} pixels of the border, where SSIM has no value"
         )
-    return float(mean_inside(values, inside))
+    return float(windows.mean_inside(values, inside))
 
 
 def ssim_map(prediction: Image, truth: Image, *, window: Window = "uniform") -> NDArray[np.float64]:
     """Returns the local SSIM, (H - side + 1, W - side + 1, 3) for a window with sides of `side` pixels. Raises
     ValueError if the images are not uint8 (H, W, 3), differ in shape, or are smaller than the window."""
-    check_images(prediction, truth)
+    windows.check_images(prediction, truth)
     side = _WINDOW_SIDES[window]
     height, width = prediction.shape[:2]
     if min(height, width) < side:
@@ -160,14 +154,14 @@ def ssim_map(prediction: Image, truth: Image, *, window: Window = "uniform") -> 
 def _ssim_uniform(prediction: Image, truth: Image) -> NDArray[np.float64]:
     """Returns the SSIM map with the uniform window. int16 holds sums of 8-bit values exactly, and int32 those of products."""
     x, y = prediction.astype(np.int32), truth.astype(np.int32)
-    sums = [box_sums(image.astype(np.int16)).astype(np.int32) for image in (prediction, truth)]
-    sums += [box_sums(x * x + y * y), box_sums(x * y)]
-    return _ssim_formula(sums, BOX_SIDE**2, sample_covariance=True)
+    sums = [windows.box_sums(image.astype(np.int16)).astype(np.int32) for image in (prediction, truth)]
+    sums += [windows.box_sums(x * x + y * y), windows.box_sums(x * y)]
+    return _ssim_formula(sums, windows.BOX_SIDE**2, sample_covariance=True)
 
 
 def _ssim_gaussian(prediction: Image, truth: Image) -> NDArray[np.float64]:
     x, y = prediction.astype(np.float64), truth.astype(np.float64)
-    means = [gaussian_means(values) for values in (x, y, x * x + y * y, x * y)]
+    means = [windows.gaussian_means(values) for values in (x, y, x * x + y * y, x * y)]
     return _ssim_formula(means, 1, sample_covariance=False)
 
 

@@ -16,21 +16,9 @@ from numpy.typing import NDArray
 import brewster
 from brewster.errors import BrewsterError
 from brewster.files import write_atomically
+from brewster.user_study.report import statistics
 from brewster.user_study.report.figure import plot
 from brewster.user_study.report.participants import OUTCOMES, ExclusionRule, ParticipantAnswers
-from brewster.user_study.report.statistics import (
-    MIN_PARTICIPANTS,
-    agreement_bounds,
-    alpha,
-    bootstrap_interval,
-    bootstrap_weights,
-    intraclass_correlation,
-    rates,
-    resampled_counts,
-    sign_flip_test,
-    strengths,
-    with_agreement_bounds,
-)
 from brewster.user_study.report.tables import answers_csv, to_csv, to_latex, to_markdown
 from brewster.user_study.study import Study
 
@@ -106,8 +94,8 @@ def _group(study: Study, participants: Sequence[ParticipantAnswers]) -> dict[str
     ratings = np.zeros((len(study.description.comparisons), len(OUTCOMES)))
     for participant in participants:
         np.add.at(ratings, (list(participant.votes), list(participant.votes.values())), 1)
-    weights = bootstrap_weights(len(participants))
-    agreement = alpha(ratings)
+    weights = statistics.bootstrap_weights(len(participants))
+    agreement = statistics.alpha(ratings)
     return summary | {
         "tables": _tables(study, counts, pictures, weights),
         "strengths": _strengths(study, counts, weights),
@@ -141,21 +129,23 @@ def _table_indices(study: Study) -> list[tuple[int, int]]:
 
 def _tables(study: Study, counts: Floats, pictures: Floats, weights: Floats) -> list[dict[str, Any]]:
     """A table for each pair of methods, with a row for each dataset and a row for each of the AVERAGES."""
-    means = rates(counts.sum(axis=0), pictures)
-    ends = bootstrap_interval(rates(resampled_counts(weights, counts), pictures), len(counts))
-    lows, highs = with_agreement_bounds(means, ends, agreement_bounds(counts, pictures))
+    means = statistics.rates(counts.sum(axis=0), pictures)
+    ends = statistics.bootstrap_interval(
+        statistics.rates(statistics.resampled_counts(weights, counts), pictures), len(counts)
+    )
+    lows, highs = statistics.with_agreement_bounds(means, ends, statistics.agreement_bounds(counts, pictures))
     answered = counts.sum(axis=-1) > 0
     pooled = answered.any(axis=-1).sum(axis=0)[:, None]
     # numbers of participants with an answer, for each row of a table: (pairs of methods, datasets + 3)
     sizes = np.concatenate([answered.sum(axis=0), np.repeat(pooled, len(AVERAGES), axis=1)], axis=1)
-    p_values = sign_flip_test(counts, pictures)
+    p_values = statistics.sign_flip_test(counts, pictures)
     titles = {name: _dataset_title(name) for name in study.description.datasets} | AVERAGES
     answers = counts.sum(axis=(0, 3))
     return [
         {
             "first": first,
             "second": second,
-            "intraclass_correlation": _round(intraclass_correlation(counts[:, i].sum(axis=1))),
+            "intraclass_correlation": _round(statistics.intraclass_correlation(counts[:, i].sum(axis=1))),
             "rows": [
                 {
                     "key": key,
@@ -163,7 +153,7 @@ def _tables(study: Study, counts: Floats, pictures: Floats, weights: Floats) -> 
                     "pictures": int(pictures[i, j] if j < answers.shape[1] else pictures[i].sum()),
                     "answers": int(answers[i, j] if j < answers.shape[1] else answers[i].sum()),
                     "participants": int(sizes[i, j]),
-                    "p": _round(p_values[i, j]) if sizes[i, j] >= MIN_PARTICIPANTS else None,
+                    "p": _round(p_values[i, j]) if sizes[i, j] >= statistics.MIN_PARTICIPANTS else None,
                     **dict(
                         zip(
                             (*OUTCOMES, "difference"),
@@ -190,10 +180,10 @@ def _strengths(study: Study, counts: Floats, weights: Floats) -> dict[str, Any]:
         a, b = methods.index(first), methods.index(second)
         wins[:, a, b] += won + tied / 2
         wins[:, b, a] += lost + tied / 2
-    means = strengths(wins.sum(axis=0))
-    resamples = strengths(resampled_counts(weights, wins))
+    means = statistics.strengths(wins.sum(axis=0))
+    resamples = statistics.strengths(statistics.resampled_counts(weights, wins))
     lows, highs = (
-        bootstrap_interval(resamples, len(counts))
+        statistics.bootstrap_interval(resamples, len(counts))
         if np.isfinite(resamples).all() and np.ptp(resamples, axis=0).min() > _MIN_SPREAD
         else np.full((2, len(means)), math.nan)
     )
