@@ -87,12 +87,8 @@ def test_values_are_compared_with_the_first_and_numbers_are_plotted(
 ):
     monkeypatch.setenv("BREWSTER_DATA", str(data))
     calls = []
-    results = ablate(
-        read_study(RECIPES / "size.toml"),
-        pairs,
-        tmp_path / "out",
-        on_progress=lambda *values: calls.append(values),
-    )
+    study = read_study(RECIPES / "size.toml")
+    results = ablate(study, pairs, tmp_path / "out", on_progress=lambda *values: calls.append(values))
     labels = [f"count {count}" for count in (0, 10, 50, 100, 300, 1000)]
     assert list(results["methods"]) == ["input (unprocessed)", *labels]
     assert [values[0] for values in calls] == labels

@@ -151,11 +151,8 @@ def test_a_full_standard_output_gives_one_error_line(model, tmp_path):
             check=False,
         )
     assert process.returncode == 1
-    assert (
-        process.stderr.decode()
-        .splitlines()[-1]
-        .startswith("error: -: standard output was not written (No space")
-    )
+    last = process.stderr.decode().splitlines()[-1]
+    assert last.startswith("error: -: standard output was not written (No space")
 
 
 def test_no_image_is_written_to_a_terminal(run, tmp_path, monkeypatch):

@@ -55,10 +55,8 @@ def test_a_prediction_is_found_under_every_name_that_is_documented(path, case, t
 
 def test_a_reflection_is_found_in_addition(case, tmp_path):
     both = write_predictions(tmp_path, "1/x_t.png", "1/x_r.png", "1/m_input.png", "1/t_label.png").files(case)
-    assert {layer: path.name for layer, path in both.items()} == {
-        "transmission": "x_t.png",
-        "reflection": "x_r.png",
-    }
+    names = {layer: path.name for layer, path in both.items()}
+    assert names == {"transmission": "x_t.png", "reflection": "x_r.png"}
     both = write_predictions(tmp_path / "more", "1.transmission.png", "1.reflection.png").files(case)
     assert both["reflection"].name == "1.reflection.png"
 
@@ -110,10 +108,8 @@ def test_a_model_stores_its_prediction(case, model, tmp_path):
     stored = ours.cached(case)
     assert np.array_equal(stored.transmission.srgb_8bit(), prediction.transmission.srgb_8bit())
     assert np.array_equal(stored.reflection.srgb_8bit(), prediction.reflection.srgb_8bit())
-    assert PredictionFolder("again", tmp_path / "predictions").files(case).keys() == {
-        "transmission",
-        "reflection",
-    }
+    files = PredictionFolder("again", tmp_path / "predictions").files(case)
+    assert files.keys() == {"transmission", "reflection"}
 
 
 def test_the_stored_layers_of_a_16_bit_wide_gamut_photo_are_scored(case, model, tmp_path):

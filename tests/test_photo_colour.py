@@ -68,12 +68,8 @@ def lut_profile(points=33):
     rgb = np.stack(np.meshgrid(grid, grid, grid, indexing="ij"), axis=-1)
     xyz = rgb**1.8 @ np.array(LUT_PRIMARIES) / (0.9642, 1.0, 0.8249)
     root = np.where(xyz > (6 / 29) ** 3, np.cbrt(xyz), xyz / (3 * (6 / 29) ** 2) + 4 / 29)
-    lightness, a, b = (
-        116 * root[..., 1] - 16,
-        500 * (root[..., 0] - root[..., 1]),
-        200 * (root[..., 1] - root[..., 2]),
-    )
-    lab = np.stack([lightness * 652.8, (a + 128) * 256, (b + 128) * 256], axis=-1)
+    a, b = (factor * (root[..., i] - root[..., i + 1]) for i, factor in enumerate((500, 200)))
+    lab = np.stack([(116 * root[..., 1] - 16) * 652.8, (a + 128) * 256, (b + 128) * 256], axis=-1)
     linear_curve = struct.pack(">6H", *(0, 65535) * 3)
     table = np.rint(lab).clip(0, 65535).astype(">u2").tobytes()
     matrix = struct.pack(">9i", *(65536 * (i % 4 == 0) for i in range(9)))
@@ -83,11 +79,7 @@ def lut_profile(points=33):
     return icc_file({b"wtpt": WHITE, b"A2B0": lut}, b"scnr", b"RGB ", b"Lab ")
 
 
-LUT_PRIMARIES = (
-    (0.35, 0.20, 0.05),
-    (0.42, 0.68, 0.09),
-    (0.1942, 0.12, 0.6849),
-)
+LUT_PRIMARIES = ((0.35, 0.20, 0.05), (0.42, 0.68, 0.09), (0.1942, 0.12, 0.6849))
 """XYZ of red, green and blue under D50. These colours are in the gamut of Display P3."""
 
 PROFILES = {
@@ -135,15 +127,9 @@ def test_unchanged_light_is_bit_equal_with_every_profile(name, dtype):
 
 def littlecms(pixels, source, target):
     """Converts pixels between two profiles with littleCMS."""
-    return np.asarray(
-        ImageCms.profileToProfile(
-            Image.fromarray(pixels),
-            source,
-            target,
-            renderingIntent=ImageCms.Intent.RELATIVE_COLORIMETRIC,
-            flags=ImageCms.Flags.NOOPTIMIZE,
-        )
-    )
+    intent, flags = ImageCms.Intent.RELATIVE_COLORIMETRIC, ImageCms.Flags.NOOPTIMIZE
+    image = Image.fromarray(pixels)
+    return np.asarray(ImageCms.profileToProfile(image, source, target, renderingIntent=intent, flags=flags))
 
 
 @pytest.mark.parametrize("name", PROFILES)
