@@ -26,14 +26,10 @@ STUDIES = [
 ]
 
 
-def names(paths):
-    return [path.stem for path in paths]
-
-
 """The studies of the compact model. runs/paper.sh --tiny runs the tiny variants of those of the diffusion model."""
 
 
-@pytest.mark.parametrize("path", STUDIES, ids=names(STUDIES))
+@pytest.mark.parametrize("path", STUDIES, ids=lambda path: path.stem)
 def test_a_study_changes_one_value_of_both_the_full_and_the_tiny_recipe(path):
     full, variant = read_study(path), path.with_stem(f"{path.stem}-tiny")
     tiny = (
@@ -91,12 +87,8 @@ def test_values_are_compared_with_the_first_and_numbers_are_plotted(
 ):
     monkeypatch.setenv("BREWSTER_DATA", str(data))
     calls = []
-    results = ablate(
-        read_study(RECIPES / "size.toml"),
-        pairs,
-        tmp_path / "out",
-        on_progress=lambda *values: calls.append(values),
-    )
+    study = read_study(RECIPES / "size.toml")
+    results = ablate(study, pairs, tmp_path / "out", on_progress=lambda *values: calls.append(values))
     labels = [f"count {count}" for count in (0, 10, 50, 100, 300, 1000)]
     assert list(results["methods"]) == ["input (unprocessed)", *labels]
     assert [values[0] for values in calls] == labels

@@ -76,28 +76,26 @@ def test_single_photos_are_not_read_as_bursts(tmp_path):
 def test_the_option_burst_renders_frames_of_any_recipe_and_resumes(
     run_without_model, fake_renderer, tmp_path
 ):
-    command = (
+    command = [
         "render",
         "set",
         "--recipe",
         "tiny",
         "--burst",
-        3,
+        "3",
         "--baseline-mm",
-        50,
+        "50",
         "--workers",
-        0,
+        "0",
         "--json",
-    )
+    ]
     code, out, err = run_without_model(*command, "--count", 1, "--first", 2)
     assert code == 0, err
     assert [line["index"] for line in json_lines(out)] == [6, 7, 8]
     code, out, _ = run_without_model(*command, "--count", 3)
     assert code == 0
-    assert (
-        sorted((line["status"] for line in json_lines(out)), reverse=True)
-        == ["skipped"] * 3 + ["rendered"] * 6
-    )
+    statuses = sorted(line["status"] for line in json_lines(out))
+    assert statuses == ["rendered"] * 6 + ["skipped"] * 3
     bursts = list(read_bursts(tmp_path / "set"))
     assert [burst.index for burst in bursts] == [0, 1, 2]
     assert {scene.burst.frames for burst in bursts for scene in burst.scenes} == {3}

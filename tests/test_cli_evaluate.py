@@ -18,22 +18,17 @@ def benchmark(tmp_path):
     return "real20=pairs"
 
 
+@pytest.fixture
+def evaluate(run_without_model, benchmark):
+    """Runs the command on the three pairs."""
+    return lambda *options: run_without_model("evaluate", "--benchmark", benchmark, *QUICK_OPTIONS, *options)
+
+
 QUICK_OPTIONS = ("--metrics", "psnr,ssim", "-o", "out")
 
 
-def test_tables_go_to_standard_output_and_all_results_into_a_folder(
-    run_without_model, benchmark, model, tmp_path
-):
-    code, out, err = run_without_model(
-        "evaluate",
-        "--benchmark",
-        benchmark,
-        "--model",
-        f"pane={model}",
-        "--predictions",
-        "theirs=theirs",
-        *QUICK_OPTIONS,
-    )
+def test_tables_go_to_standard_output_and_all_results_into_a_folder(evaluate, model, tmp_path):
+    code, out, err = evaluate("--model", f"pane={model}", "--predictions", "theirs=theirs")
     assert code == 0, err
     text = out.decode()
     assert text.count("input (unprocessed)") == text.count("\ntheirs") == 1
@@ -44,25 +39,21 @@ def test_tables_go_to_standard_output_and_all_results_into_a_folder(
     assert (tmp_path / "out" / "predictions" / "pane" / "real20" / "3.reflection.png").is_file()
 
 
-def test_a_dry_run_scores_nothing(run_without_model, benchmark, tmp_path):
-    code, out, err = run_without_model("evaluate", "--benchmark", benchmark, "--dry-run", *QUICK_OPTIONS)
+def test_a_dry_run_scores_nothing(evaluate, tmp_path):
+    code, out, err = evaluate("--dry-run")
     assert (code, out.decode().split()) == (0, ["real20/1", "real20/2", "real20/3"])
     assert "Real20: 3 images" in err
     assert not (tmp_path / "out").exists()
-    code, out, err = run_without_model(
-        "evaluate", "--benchmark", benchmark, "--dry-run", "--limit", 2, *QUICK_OPTIONS
-    )
+    code, out, err = evaluate("--dry-run", "--limit", 2)
     assert (code, out.decode().split()) == (0, ["real20/1", "real20/2"])
     assert "2 of 3 images are scored (--limit)" in err
 
 
-def test_photos_without_ground_truth_are_listed_and_the_others_are_scored(
-    run_without_model, benchmark, tmp_path
-):
+def test_photos_without_ground_truth_are_listed_and_the_others_are_scored(evaluate, tmp_path):
     paint(tmp_path / "pairs" / "blended" / "4.png", 4)
     paint(tmp_path / "pairs" / "blended" / "5.png", 5, size=(48, 32))
     paint(tmp_path / "pairs" / "transmission" / "5.png", 5)
-    code, out, err = run_without_model("evaluate", "--benchmark", benchmark, "--json", *QUICK_OPTIONS)
+    code, out, err = evaluate("--json")
     assert code == 1
     assert len(json.loads(out)["cases"]) == 3
     messages = error_lines(err)
@@ -70,13 +61,9 @@ def test_photos_without_ground_truth_are_listed_and_the_others_are_scored(
     assert any("blended/5:" in line and "resized by the factor 0.5" in line for line in messages)
 
 
-def test_a_method_that_fails_on_a_photo_is_listed_and_the_exit_code_is_one(
-    run_without_model, benchmark, tmp_path
-):
+def test_a_method_that_fails_on_a_photo_is_listed_and_the_exit_code_is_one(evaluate, tmp_path):
     (tmp_path / "theirs" / "2.png").write_bytes(b"not an image")
-    code, out, err = run_without_model(
-        "evaluate", "--benchmark", benchmark, "--predictions", "theirs=theirs", *QUICK_OPTIONS
-    )
+    code, out, err = evaluate("--predictions", "theirs=theirs")
     assert code == 1
     assert "(2 of 3)" in out.decode()
     assert any("1 prediction could not be scored" in line for line in error_lines(err))
@@ -124,9 +111,9 @@ def test_invalid_options_give_exit_code_2(options, run_without_model, benchmark)
     assert run_without_model("evaluate", *options)[0] == 2
 
 
-def test_several_thresholds_and_a_smaller_size_are_evaluated(run_without_model, benchmark):
+def test_several_thresholds_and_a_smaller_size_are_evaluated(evaluate):
     options = ("--metrics", "psnr,psnr_region", "--region-threshold", "0.01,0.03", "--size", "12")
-    code, out, _ = run_without_model("evaluate", "--benchmark", benchmark, "--json", "-o", "out", *options)
+    code, out, _ = evaluate("--json", *options)
     results = json.loads(out)
     assert code == 0
     assert list(results["metrics"]) == ["psnr", "psnr_region@0.01", "psnr_region@0.03"]

@@ -59,12 +59,6 @@ def test_damaged_models_are_found(run_without_model, model_zoo):
     assert (code, [bool(row["error"]) for row in json.loads(out)]) == (1, [False, True])
 
 
-def test_a_model_of_the_zoo_can_be_chosen_by_name(run_without_model, model_zoo, tmp_path):
-    (tmp_path / "a.jpg").write_bytes(image_bytes())
-    code, out, _ = run_without_model("a.jpg", "--json")
-    assert (code, json.loads(out)["model"]) == (0, "compact")
-
-
 # --- doctor
 
 

@@ -11,7 +11,7 @@ import pytest
 from benchmark_folders import paint
 from brewster import Photo
 from brewster.benchmarks.registry import Benchmark, read_benchmark
-from brewster.errors import BrewsterError, DownloadError, MissingExtra, PhotoError
+from brewster.errors import BrewsterError, DownloadError, PhotoError
 from brewster.evaluate.config import EvaluationConfig
 from brewster.evaluate.evaluation import evaluate
 from brewster.evaluate.methods import IdentityBaseline, ModelMethod, PredictionFolder
@@ -30,6 +30,24 @@ def real20(tmp_path):
 
 
 @pytest.fixture
+def late(monkeypatch):
+    """A metric "late" whose weights are missing while the list `weights` is empty. Returns `weights` and the calls."""
+    weights, calls = [], []
+
+    def prepare():
+        if not weights:
+            raise DownloadError("the weights are missing", "expected a network", "connect")
+
+    def measure(case):
+        calls.append(case)
+        return 0.5
+
+    row = replace(METRICS["lpips"], name="late", title="Late", score=measure, prepare=prepare)
+    monkeypatch.setitem(METRICS, "late", row)
+    return weights, calls
+
+
+@pytest.fixture
 def methods(model, tmp_path):
     return [
         IdentityBaseline(),
@@ -45,13 +63,7 @@ def test_an_evaluation_writes_results_tables_and_a_report(real20, methods, tmp_p
     assert results["tables"]["real20"]["theirs"]["psnr"]["mean"] > 30
     names = {path.name for path in (tmp_path / "out").iterdir()}
     assert names == {
-        "results.json",
-        "scores.csv",
-        "tables.md",
-        "table.tex",
-        "table.csv",
-        "report.html",
-        "scores.jsonl",
+        *["results.json", "scores.csv", "tables.md", "table.tex", "table.csv", "report.html", "scores.jsonl"]
     }
     text = (tmp_path / "out" / "tables.md").read_text()
     assert text.index("theirs") < text.index("not measured here")
@@ -135,53 +147,33 @@ def test_equal_benchmark_names_and_benchmarks_without_cases_are_an_error(real20,
 
 
 def test_a_metric_without_weights_does_not_stop_the_run_and_is_added_later(
-    real20, methods, tmp_path, monkeypatch
+    real20, methods, tmp_path, late, monkeypatch
 ):
-    def prepare():
-        if not weights:
-            raise DownloadError("the weights are missing", "expected a network", "connect")
-
-    weights, calls = [], []
-
-    def measure(case):
-        calls.append(case)
-        return 0.5
-
-    late = replace(METRICS["lpips"], name="late", title="Late", score=measure, prepare=prepare)
-    monkeypatch.setitem(METRICS, "late", late)
+    weights, calls = late
     config = EvaluationConfig(metrics=("psnr", "late"))
-    first = evaluate(real20, [IdentityBaseline(), methods[2]], config, tmp_path / "out")
+    run = partial(evaluate, real20, [IdentityBaseline(), methods[2]], config, tmp_path / "out")
+    first = run()
     assert "the weights are missing" in first["unavailable"]["late"]
     assert set(first["tables"]["real20"]["theirs"]) == {"psnr"}
     assert not calls
     assert "- not computed: late: the weights are missing" in (tmp_path / "out" / "tables.md").read_text()
     weights.append("found")
-    monkeypatch.setitem(
-        METRICS, "psnr", replace(METRICS["psnr"], score=lambda _: pytest.fail("scored again"))
-    )
-    second = evaluate(real20, [IdentityBaseline(), methods[2]], config, tmp_path / "out")
+    again = replace(METRICS["psnr"], score=lambda _: pytest.fail("scored again"))
+    monkeypatch.setitem(METRICS, "psnr", again)
+    second = run()
     assert not second["unavailable"]
     assert second["tables"]["real20"]["theirs"]["psnr"] == first["tables"]["real20"]["theirs"]["psnr"]
     assert second["tables"]["real20"]["theirs"]["late"]["mean"] == 0.5
     assert len(calls) == 4
-    evaluate(real20, [IdentityBaseline(), methods[2]], config, tmp_path / "out")
+    run()
     assert len(calls) == 4
 
 
 def test_an_outdated_score_does_not_count_as_computed_if_the_weights_are_missing_now(
-    real20, methods, tmp_path, monkeypatch
+    real20, methods, tmp_path, late
 ):
-    def load():
-        if not weights:
-            raise MissingExtra("torch is not installed", "expected torch", "install torch")
-
-    def measure(case):
-        load()
-        return 0.5
-
-    weights = ["found"]
-    late = replace(METRICS["lpips"], name="late", title="Late", score=measure, prepare=load)
-    monkeypatch.setitem(METRICS, "late", late)
+    weights, _ = late
+    weights.append("found")
     config = EvaluationConfig(metrics=("psnr", "late"))
     run = partial(evaluate, real20, [IdentityBaseline(), methods[2]], out=tmp_path / "out")
     run(config=config)
@@ -190,7 +182,7 @@ def test_an_outdated_score_does_not_count_as_computed_if_the_weights_are_missing
     assert not unchanged["unavailable"]
     assert unchanged["tables"]["real20"]["theirs"]["late"]["mean"] == 0.5
     changed = run(config=replace(config, border=1))
-    assert "torch is not installed" in changed["unavailable"]["late"]
+    assert "the weights are missing" in changed["unavailable"]["late"]
     assert set(changed["tables"]["real20"]["theirs"]) == {"psnr"}
 
 

@@ -17,9 +17,8 @@ def write_manifest(path, *rows, column="path"):
     """Writes a table in the format of the suffix."""
     path.parent.mkdir(parents=True, exist_ok=True)
     if path.suffix == ".csv":
-        path.write_text(
-            "\n".join([f"{column},year", *(f'"{row}",1987' for row in rows)]), encoding="utf-8-sig"
-        )
+        lines = [f"{column},year", *(f'"{row}",1987' for row in rows)]
+        path.write_text("\n".join(lines), encoding="utf-8-sig")
     else:
         parquet.write_table(pyarrow.table({"year": [1987] * len(rows), column: list(rows)}), path)
     return path
@@ -36,12 +35,8 @@ def test_relative_paths_absolute_paths_and_urls_are_mirrored_below_the_output(tm
         (location("memory://bucket/1987/c.jpg"), Path("out/bucket/1987")),
         (tmp_path / "d.jpg", Path("out")),
     ]
-    assert [folder for _, _, folder in read_manifest(manifest)] == [
-        tmp_path / "box, 4",
-        Path("/scans"),
-        location("memory://bucket/1987"),
-        tmp_path,
-    ]
+    beside = [tmp_path / "box, 4", Path("/scans"), location("memory://bucket/1987"), tmp_path]
+    assert [folder for _, _, folder in read_manifest(manifest)] == beside
 
 
 def test_a_batch_accepts_manifests_and_missing_photos_are_tasks_too(tmp_path):

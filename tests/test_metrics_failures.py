@@ -42,11 +42,6 @@ def scene():
     )
 
 
-def test_the_background_itself_scores_zero(scene):
-    background, photo, reflection = scene
-    assert [score(background, background, photo, reflection) for score in SCORES] == [0, 0, 0]
-
-
 @pytest.mark.parametrize("gain", [TRANSMITTANCE, 0.64, 0.5])
 def test_a_prediction_that_does_not_restore_absorbed_light_scores_zero(scene, gain):
     background, photo, reflection = scene

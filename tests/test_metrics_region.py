@@ -58,8 +58,3 @@ def test_an_image_may_be_smaller_than_the_window():
 def test_a_threshold_outside_0_to_1_is_refused(threshold):
     with pytest.raises(ValueError, match="threshold"):
         reflection_region(*make_pair(), threshold=threshold)
-
-
-def test_images_of_different_shapes_are_refused():
-    with pytest.raises(ValueError, match="shape"):
-        reflection_region(np.zeros((8, 8, 3), np.uint8), np.zeros((8, 9, 3), np.uint8))

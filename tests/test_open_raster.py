@@ -160,11 +160,8 @@ def test_an_encrypted_or_damaged_merged_image_is_refused():
     compressed[start + 20 : start + 60] = b"\xff" * 40
     encrypted = bytearray(SEPARATOR(image_bytes()).layered.encode())
     for signature, flags in ((b"PK\3\4", 6), (b"PK\1\2", 8)):
-        entry = encrypted.rindex(
-            signature,
-            0,
-            encrypted.rindex(b"mergedimage.png") if flags == 8 else encrypted.index(b"mergedimage.png"),
-        )
+        find = encrypted.rindex if flags == 8 else encrypted.index
+        entry = encrypted.rindex(signature, 0, find(b"mergedimage.png"))
         encrypted[entry + flags] |= 1
     for data in (bytes(compressed), bytes(encrypted)):
         with pytest.raises(UnreadablePhoto, match="the ora cannot be read completely"):

@@ -100,9 +100,7 @@ def test_a_run_is_resumed_and_rows_of_finished_photos_are_kept(root, options):
     kept = (root / "out/b/c.transmission.jpg").read_bytes()
     assert run_archive(root, options) == {"a.jpg": "skipped", "c.jpg": "separated", "d.jpg": "skipped"}
     after = read_index(root)
-    assert {name: after[name] for name in ("a.jpg", "d.jpg")} == {
-        name: before[name] for name in ("a.jpg", "d.jpg")
-    }
+    assert all(after[name] == before[name] for name in ("a.jpg", "d.jpg"))
     assert after["c.jpg"]["outputs"] == before["c.jpg"]["outputs"]
     assert (root / "out/b/c.transmission.jpg").read_bytes() == kept
     assert set(run_archive(root, Options(model="no-such-model")).values()) == {"skipped"}
@@ -119,15 +117,10 @@ def test_missing_and_damaged_photos_of_a_manifest_are_rows_and_the_rest_is_separ
     assert results["good.jpg"] == "separated"
     assert "missing.jpg cannot be read (No such file" in results["missing.jpg"]
     rows = read_index(tmp_path)
-    assert {name: row["status"] for name, row in rows.items()} == {
-        "damaged.jpg": "failed",
-        "good.jpg": "separated",
-        "missing.jpg": "failed",
-    }
+    statuses = {name: row["status"] for name, row in rows.items()}
+    assert statuses == {"damaged.jpg": "failed", "good.jpg": "separated", "missing.jpg": "failed"}
     assert rows["missing.jpg"]["error"] == results["missing.jpg"]
-    assert list_files(tmp_path / "out") == sorted(
-        [INDEX_FILE, *(f"scans/{name}" for name in layer_files("good"))]
-    )
+    assert list_files(tmp_path / "out") == [INDEX_FILE, *(f"scans/{name}" for name in layer_files("good"))]
     (tmp_path / "scans/missing.jpg").write_bytes(image_bytes())
     results = run_archive(tmp_path, options, source=manifest)
     assert (results["missing.jpg"], results["good.jpg"]) == ("separated", "skipped")
@@ -238,14 +231,13 @@ def test_layers_that_another_worker_has_written_in_the_meantime_are_kept(tmp_pat
     (tmp_path / "in/a.jpg").write_bytes(image_bytes())
     tasks = plan_files(tmp_path / "in", tmp_path / "out", options)
     (tmp_path / "out").mkdir()
-    for layer in layer_files("a"):
-        (tmp_path / "out" / layer).write_bytes(b"written by the other node")
+    layers = [tmp_path / "out" / layer for layer in layer_files("a")]
+    for layer in layers:
+        layer.write_bytes(b"written by the other node")
     monkeypatch.setattr("brewster.batch.runner.exists", lambda path: False)
     (result,) = SeparationRunner(options, tmp_path / "out")(tasks[0])
     assert (result.status, result.error) == ("skipped", None)
-    assert {(tmp_path / "out" / layer).read_bytes() for layer in layer_files("a")} == {
-        b"written by the other node"
-    }
+    assert {layer.read_bytes() for layer in layers} == {b"written by the other node"}
 
 
 def test_a_node_without_the_output_folder_ends_the_run(tmp_path, options):
@@ -259,16 +251,11 @@ def test_the_command_writes_the_index_and_separates_urls(run, tmp_path, store):
     (photos / "b.jpg").write_bytes(b"not an image")
     code, out, err = run("memory://bucket/in", "-o", "out", "--index", "--json")
     assert code == 1
-    assert {line["source"]: line["status"] for line in json_lines(out)} == {
-        "memory://bucket/in/a.jpg": "separated",
-        "memory://bucket/in/b.jpg": "failed",
-    }
+    expected = {"a.jpg": "separated", "b.jpg": "failed"}
+    assert {Path(line["source"]).name: line["status"] for line in json_lines(out)} == expected
     assert "error: memory://bucket/in/b.jpg: " in err
     assert "1 separated, 1 failed in " in err
-    assert {name: row["status"] for name, row in read_index(tmp_path).items()} == {
-        "a.jpg": "separated",
-        "b.jpg": "failed",
-    }
+    assert {name: row["status"] for name, row in read_index(tmp_path).items()} == expected
     (photos / "b.jpg").unlink()
     code, _, err = run("memory://bucket/in", "-o", "memory://bucket/out")
     assert code == 0, err
@@ -293,9 +280,7 @@ def write_archive(folder):
 
 def index_rows(root):
     """Path, status, layers and error of each row of the index."""
-    return [
-        [row[name] for name in ("path", "status", "outputs", "error")] for row in read_index(root).values()
-    ]
+    return [[row[key] for key in ("path", "status", "outputs", "error")] for row in read_index(root).values()]
 
 
 def test_the_index_of_one_process_and_of_several_has_the_same_absolute_paths(run, tmp_path):

@@ -23,6 +23,7 @@ quick = settings(max_examples=25, deadline=None, database=None)
 
 GAMMA = struct.pack(">4s4xIH", b"curv", 1, round(2.2 * 256))
 LINEAR = struct.pack(">4s4xI", b"curv", 0)
+WHITE = struct.pack(">4s4x3i", b"XYZ ", 63190, 65536, 54061)
 SAMPLED = (
     struct.pack(">4s4xI", b"curv", 1024) + (np.linspace(0, 1, 1024) ** 1.8 * 65535).astype(">u2").tobytes()
 )
@@ -41,19 +42,20 @@ def profile(curve, colourants):
         name: struct.pack(">4s4x3i", b"XYZ ", *(round(65536 * value) for value in values))
         for name, values in zip((b"rXYZ", b"gXYZ", b"bXYZ"), colourants or (), strict=False)
     }
-    white = struct.pack(">4s4x3i", b"XYZ ", 63190, 65536, 54061)
     text = struct.pack(">4s4xI", b"desc", 5) + b"test\0" + bytes(78)
     curves = dict.fromkeys((b"rTRC", b"gTRC", b"bTRC") if colourants else (b"kTRC",), curve)
-    tags = {b"desc": text + bytes(-len(text) % 4), b"wtpt": white, **xyz, **curves}
+    tags = {b"desc": text + bytes(-len(text) % 4), b"wtpt": WHITE, **xyz, **curves}
+    return icc_file(tags, b"mntr", b"RGB " if colourants else b"GRAY", b"XYZ ")
+
+
+def icc_file(tags, device, space, connection_space):
     rows, body = b"", b""
     for name, tag in tags.items():
         rows += struct.pack(">4sII", name, 132 + 12 * len(tags) + len(body), len(tag))
         body += tag
     body = struct.pack(">I", len(tags)) + rows + body
-    space = b"RGB " if colourants else b"GRAY"
-    head = struct.pack(
-        ">I4sI4s4s4s12x4s", 128 + len(body), bytes(4), 0x02400000, b"mntr", space, b"XYZ ", b"acsp"
-    )
+    words = (bytes(4), 0x02400000, device, space, connection_space, b"acsp")
+    head = struct.pack(">I4sI4s4s4s12x4s", 128 + len(body), *words)
     return head.ljust(68, b"\0") + struct.pack(">3i", 63190, 65536, 54061) + bytes(48) + body
 
 
@@ -66,34 +68,18 @@ def lut_profile(points=33):
     rgb = np.stack(np.meshgrid(grid, grid, grid, indexing="ij"), axis=-1)
     xyz = rgb**1.8 @ np.array(LUT_PRIMARIES) / (0.9642, 1.0, 0.8249)
     root = np.where(xyz > (6 / 29) ** 3, np.cbrt(xyz), xyz / (3 * (6 / 29) ** 2) + 4 / 29)
-    lightness, a, b = (
-        116 * root[..., 1] - 16,
-        500 * (root[..., 0] - root[..., 1]),
-        200 * (root[..., 1] - root[..., 2]),
-    )
-    lab = np.stack([lightness * 652.8, (a + 128) * 256, (b + 128) * 256], axis=-1)
+    a, b = (factor * (root[..., i] - root[..., i + 1]) for i, factor in enumerate((500, 200)))
+    lab = np.stack([(116 * root[..., 1] - 16) * 652.8, (a + 128) * 256, (b + 128) * 256], axis=-1)
     linear_curve = struct.pack(">6H", *(0, 65535) * 3)
     table = np.rint(lab).clip(0, 65535).astype(">u2").tobytes()
     matrix = struct.pack(">9i", *(65536 * (i % 4 == 0) for i in range(9)))
     lut = struct.pack(">4s4x4B", b"mft2", 3, 3, points, 0) + matrix + struct.pack(">2H", 2, 2)
     lut += linear_curve + table + linear_curve
     lut += bytes(-len(lut) % 4)
-    white = struct.pack(">4s4x3i", b"XYZ ", 63190, 65536, 54061)
-    body, rows, start = b"", b"", 132 + 2 * 12
-    for name, tag in ((b"wtpt", white), (b"A2B0", lut)):
-        rows += struct.pack(">4sII", name, start + len(body), len(tag))
-        body += tag
-    size = start + len(body)
-    head = struct.pack(">I4sI4s4s4s12x4s", size, bytes(4), 0x02400000, b"scnr", b"RGB ", b"Lab ", b"acsp")
-    head = head.ljust(68, b"\0") + struct.pack(">3i", 63190, 65536, 54061) + bytes(48)
-    return head + struct.pack(">I", 2) + rows + body
+    return icc_file({b"wtpt": WHITE, b"A2B0": lut}, b"scnr", b"RGB ", b"Lab ")
 
 
-LUT_PRIMARIES = (
-    (0.35, 0.20, 0.05),
-    (0.42, 0.68, 0.09),
-    (0.1942, 0.12, 0.6849),
-)
+LUT_PRIMARIES = ((0.35, 0.20, 0.05), (0.42, 0.68, 0.09), (0.1942, 0.12, 0.6849))
 """XYZ of red, green and blue under D50. These colours are in the gamut of Display P3."""
 
 PROFILES = {
@@ -141,15 +127,9 @@ def test_unchanged_light_is_bit_equal_with_every_profile(name, dtype):
 
 def littlecms(pixels, source, target):
     """Converts pixels between two profiles with littleCMS."""
-    return np.asarray(
-        ImageCms.profileToProfile(
-            Image.fromarray(pixels),
-            source,
-            target,
-            renderingIntent=ImageCms.Intent.RELATIVE_COLORIMETRIC,
-            flags=ImageCms.Flags.NOOPTIMIZE,
-        )
-    )
+    intent, flags = ImageCms.Intent.RELATIVE_COLORIMETRIC, ImageCms.Flags.NOOPTIMIZE
+    image = Image.fromarray(pixels)
+    return np.asarray(ImageCms.profileToProfile(image, source, target, renderingIntent=intent, flags=flags))
 
 
 @pytest.mark.parametrize("name", PROFILES)

@@ -4,13 +4,6 @@ from brewster.cli.evaluate import evaluate
 from brewster.evaluate.protocols import PROTOCOLS, describe_protocol, protocol_config
 
 
-def test_the_contest_crops_the_border_and_scores_its_metrics():
-    config = protocol_config("ntire2026")
-    assert config.border == 4
-    assert config.metrics == ("psnr", "ssim_clipped", "lpips", "niqe")
-    assert any("outermost 4 pixels" in line for line in config.describe())
-
-
 def test_a_changed_setting_is_named():
     lines = describe_protocol(protocol_config("xreflection", short_side_px=None, quality="draft"))
     assert lines[-1] == "This run differs from the protocol xreflection in: short_side_px."

@@ -7,7 +7,6 @@ import pytest
 from benchmark_folders import repacked, sir2
 from brewster.benchmarks.image_files import Case, ImageFile
 from brewster.benchmarks.registry import Benchmark, read_benchmark
-from brewster.errors import BrewsterError
 from brewster.evaluate.config import EvaluationConfig
 from brewster.evaluate.methods import IdentityBaseline, PredictionFolder
 from brewster.evaluate.results import summarise
@@ -38,12 +37,8 @@ def methods(tmp_path):
 
 def test_the_average_is_over_all_images(methods):
     parts = [make_benchmark("a", 20), make_benchmark("b", 80)]
-    results = summarise(
-        parts,
-        methods,
-        PSNR,
-        make_rows(parts, methods, lambda case, _: 20.0 if case.benchmark == "a" else 30.0),
-    )
+    rows = make_rows(parts, methods, lambda case, _: 20.0 if case.benchmark == "a" else 30.0)
+    results = summarise(parts, methods, PSNR, rows)
     assert results["tables"]["a"]["theirs"]["psnr"]["mean"] == 20
     assert results["tables"]["average"]["theirs"]["psnr"]["mean"] == 28
     assert results["selections"]["average"] == {"title": "Average", "cases": 100}
@@ -56,25 +51,8 @@ def test_a_single_benchmark_has_no_average(methods):
 
 def test_the_order_of_rows_does_not_matter(methods):
     parts = [make_benchmark("a", 9)]
-    score_rows = make_rows(
-        parts, methods, lambda case, method: int(case.name) ** 2 + (method.name == "theirs")
-    )
+    score_rows = make_rows(parts, methods, lambda case, one: int(case.name) ** 2 + (one.name == "theirs"))
     assert summarise(parts, methods, PSNR, score_rows) == summarise(parts, methods, PSNR, score_rows[::-1])
-
-
-def test_each_method_is_compared_with_the_methods_before_it(methods):
-    parts = [make_benchmark("a", 4)]
-    score_rows = make_rows(
-        parts, methods, lambda case, method: int(case.name) + 0.5 * (method.name == "theirs")
-    )
-    (row,) = summarise(parts, methods, PSNR, score_rows)["differences"]["a"]
-    assert (row["method"], row["reference"], row["mean"], row["improved_count"]) == (
-        "theirs",
-        "input (unprocessed)",
-        0.5,
-        4,
-    )
-    assert (row["low"], row["high"]) == (0.5, 0.5)
 
 
 def test_a_failed_case_is_not_counted_and_is_named(methods):
@@ -82,12 +60,8 @@ def test_a_failed_case_is_not_counted_and_is_named(methods):
     score_rows = make_rows(parts, methods, lambda case, method: float(case.name))
     score_rows[1] = ScoreRow("a", "0", "theirs", "", "", error="theirs failed")
     results = summarise(parts, methods, PSNR, score_rows)
-    assert results["tables"]["a"]["theirs"]["psnr"] | {"low": 0, "high": 0} == {
-        "mean": 1.5,
-        "low": 0,
-        "high": 0,
-        "count": 2,
-    }
+    mean = results["tables"]["a"]["theirs"]["psnr"]
+    assert (mean["mean"], mean["count"]) == (1.5, 2)
     assert results["cases"][0]["errors"] == {"theirs": "theirs failed"}
     assert results["benchmarks"]["a"]["excluded"] == ["x.png has no partner"]
 
@@ -109,16 +83,8 @@ def test_the_papers_protocol_averages_over_181_images_and_also_reports_whole_ben
     config = EvaluationConfig(metrics=("psnr",), paper_subset=True)
     results = summarise(parts, methods, config, make_rows(parts, methods, lambda *_: 1.0))
     pictures = {key: selection["cases"] for key, selection in results["selections"].items()}
-    assert pictures == {
-        "real20": 20,
-        "nature20": 20,
-        "postcard": 199,
-        "solidobject": 200,
-        "wildscene": 101,
-        "postcard:paper": 20,
-        "solidobject:paper": 20,
-        "average": 181,
-    }
+    whole = {"real20": 20, "nature20": 20, "postcard": 199, "solidobject": 200, "wildscene": 101}
+    assert pictures == whole | {"postcard:paper": 20, "solidobject:paper": 20, "average": 181}
     assert len(results["draw"]["postcard:paper"]) == 20
     json.dumps(results, allow_nan=False)
 
@@ -132,15 +98,3 @@ def test_the_papers_average_uses_only_the_papers_benchmarks_and_reports_missing_
         "over 181 images. The average of this evaluation is over 20 of real20, 10 of nature20."
         in results["protocol"]["choices"][-1]
     )
-
-
-def test_the_subset_of_the_paper_is_an_error_if_names_do_not_identify_the_scenes(tmp_path, methods):
-    repacked(tmp_path / "postcard", ["001", "002"])
-    parts = read_benchmark("postcard", tmp_path / "postcard")
-    with pytest.raises(BrewsterError, match="scene"):
-        summarise(
-            parts,
-            methods,
-            EvaluationConfig(metrics=("psnr",), paper_subset=True),
-            make_rows(parts, methods, lambda *_: 1.0),
-        )

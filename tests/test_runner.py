@@ -5,9 +5,8 @@ import os
 import subprocess
 import sys
 import time
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import final
 
 import numpy as np
 import pytest
@@ -56,6 +55,13 @@ class FakeMethod:
         return None
 
 
+def requested(benchmarks, out, config=None):
+    """Runs a method without failures, and returns the cases that it was run on."""
+    method = FakeMethod()
+    assert not any(row.error for row in score(benchmarks, [method], config or QUICK, out))
+    return method.requested
+
+
 @pytest.fixture
 def real20(tmp_path):
     for i, name in enumerate(NAMES):
@@ -95,26 +101,20 @@ def test_a_run_that_was_killed_in_the_middle_of_a_line_is_resumed(real20, tmp_pa
     fake = FakeMethod()
     assert comparable(score(real20, [fake], QUICK, tmp_path / "out")) == comparable(complete)
     assert fake.requested == ["2", "3"]
-    fake = FakeMethod()
-    score(real20, [fake], QUICK, tmp_path / "out")
-    assert fake.requested == []
+    assert requested(real20, tmp_path / "out") == []
 
 
 def test_a_changed_photo_ground_truth_or_setting_is_scored_again(real20, tmp_path):
     score(real20, [FakeMethod()], QUICK, tmp_path / "out")
     paint(tmp_path / "real20" / "transmission_layer" / "2.png", 77)
-    fake = FakeMethod()
-    score(real20, [fake], QUICK, tmp_path / "out")
-    assert fake.requested == ["2"]
+    assert requested(real20, tmp_path / "out") == ["2"]
     paint(tmp_path / "real20" / "blended" / "3.png", 78)
-    fake = FakeMethod()
-    score(real20, [fake], QUICK, tmp_path / "out")
-    assert fake.requested == ["3"]
-    fake = FakeMethod()
-    score(real20, [fake], replace(QUICK, thresholds=(0.2,)), tmp_path / "out")
-    assert fake.requested == NAMES
-    score(real20, [fake], replace(QUICK, thresholds=(0.2,), metrics=("psnr",)), tmp_path / "out")
-    assert fake.requested == NAMES  # the log has this column
+    assert requested(real20, tmp_path / "out") == ["3"]
+    other = replace(QUICK, thresholds=(0.2,))
+    assert requested(real20, tmp_path / "out", other) == NAMES
+    assert (
+        requested(real20, tmp_path / "out", replace(other, metrics=("psnr",))) == []
+    )  # the log has this column
 
 
 def test_other_metrics_do_not_run_the_model_again(real20, model, tmp_path, monkeypatch):
@@ -135,25 +135,23 @@ def test_a_stored_prediction_that_was_changed_is_computed_again(real20, model, t
 
 
 @pytest.mark.parametrize(
-    ("changed", "requested"),
+    ("changed", "names"),
     [("brewster.__version__", []), ("brewster.evaluate.runner.SCORE_FORMAT_VERSION", NAMES)],
 )
 def test_scores_are_computed_again_if_the_score_format_changes_but_not_for_a_new_release(
-    real20, tmp_path, monkeypatch, changed, requested
+    real20, tmp_path, monkeypatch, changed, names
 ):
     score(real20, [FakeMethod()], QUICK, tmp_path / "out")
     monkeypatch.setattr(changed, 99)
-    fake = FakeMethod()
-    score(real20, [fake], QUICK, tmp_path / "out")
-    assert fake.requested == requested
+    assert requested(real20, tmp_path / "out") == names
 
 
 @pytest.mark.parametrize(
-    ("changed", "requested"),
+    ("changed", "count"),
     [("brewster.__version__", 0), ("brewster.evaluate.methods.PREDICTION_FORMAT_VERSION", 3)],
 )
 def test_predictions_are_computed_again_if_their_format_changes_but_not_for_a_new_release(
-    real20, model, tmp_path, monkeypatch, changed, requested
+    real20, model, tmp_path, monkeypatch, changed, count
 ):
     method = ModelMethod("pane", str(model), tmp_path / "predictions")
     score(real20, [method], QUICK, tmp_path / "out")
@@ -161,7 +159,7 @@ def test_predictions_are_computed_again_if_their_format_changes_but_not_for_a_ne
     calls, predict = [], ModelMethod.predict
     monkeypatch.setattr(ModelMethod, "predict", lambda self, *case: calls.append(1) or predict(self, *case))
     score(real20, [method], QUICK, tmp_path / "out")
-    assert len(calls) == requested
+    assert len(calls) == count
 
 
 def test_a_worker_that_dies_is_an_error(real20, model, tmp_path):
@@ -169,42 +167,19 @@ def test_a_worker_that_dies_is_an_error(real20, model, tmp_path):
         score(real20, [IdentityBaseline(), MethodThatKillsItsProcess()], QUICK, tmp_path / "out", workers=2)
 
 
-@final
-@dataclass(frozen=True)
-class MethodThatKillsItsProcess:
+class MethodThatKillsItsProcess(FakeMethod):
     """A method whose prediction ends the process."""
-
-    name: str = "deadly"
-    exclusive: bool = False
-
-    def key(self, case):
-        return self.name
 
     def predict(self, case, photo):
         os._exit(1)
 
-    def cached(self, case):
-        return None
 
-
-@final
-@dataclass(frozen=True)
-class EndlessMethod:
+class EndlessMethod(FakeMethod):
     """A method that creates a file when it starts and never returns."""
 
-    started: Path
-    name: str = "endless"
-    exclusive: bool = False
-
-    def key(self, case):
-        return self.name
-
     def predict(self, case, photo):
-        (self.started / case.name).touch()
+        Path(self.name, case.name).touch()
         time.sleep(1000)
-
-    def cached(self, case):
-        return None
 
 
 def test_killing_a_run_ends_its_workers(real20, tmp_path):
@@ -215,11 +190,12 @@ from test_runner import QUICK, EndlessMethod, read_benchmark, score
 folder = Path({str(tmp_path)!r})
 if __name__ == "__main__":
     parts = read_benchmark("real20", folder / "real20")
-    score(parts, [EndlessMethod(folder / "started")], QUICK, folder / "out", workers=2)
+    score(parts, [EndlessMethod("started")], QUICK, folder / "out", workers=2)
 """
     (tmp_path / "run.py").write_text(code)
     with subprocess.Popen(
         [sys.executable, tmp_path / "run.py"],
+        cwd=tmp_path,
         env={**os.environ, "PYTHONPATH": os.pathsep.join([str(Path(__file__).parent), *sys.path])},
     ) as run:
         wait_for(lambda: len(list((tmp_path / "started").iterdir())) == 2, run)
@@ -229,20 +205,10 @@ if __name__ == "__main__":
     assert len(workers) >= 2
 
 
-def test_two_workers_give_the_same_rows_as_one(real20, model, tmp_path):
-    methods = [IdentityBaseline(), ModelMethod("pane", str(model), tmp_path / "predictions")]
-    config = EvaluationConfig(metrics=("psnr", "ssim", "psnr_region"))
-    one = score(real20, methods, config, tmp_path / "one")
-    two = score(real20, methods, config, tmp_path / "two", workers=2)
-    assert comparable(one) == comparable(two)
-
-
 def test_a_crash_is_reported_with_its_case_and_the_next_run_tries_again(real20, tmp_path):
     rows = score(real20, [FakeMethod(predictions={"2": RuntimeError("boom")})], QUICK, tmp_path / "out")
     assert rows[1].error == "fake failed on real20/2: RuntimeError: boom"
-    working = FakeMethod()
-    assert not any(row.error for row in score(real20, [working], QUICK, tmp_path / "out"))
-    assert working.requested == ["2"]
+    assert requested(real20, tmp_path / "out") == ["2"]
 
 
 def test_a_later_error_does_not_delete_scores(real20, tmp_path):

@@ -56,11 +56,8 @@ def rendered(tmp_path):
     background[8:40, 4:28] = 0.05
     reflection = np.zeros_like(background)
     reflection[:, 34:] = 0.2
-    for name, light in (
-        ("photo", background + reflection),
-        ("background", background),
-        ("reflection", reflection),
-    ):
+    layers = {"photo": background + reflection, "background": background, "reflection": reflection}
+    for name, light in layers.items():
         data = Photo.from_array(light, encoding="linear").encode("jpeg", depth=8)
         (tmp_path / "set" / "000000" / f"{name}.jpg").write_bytes(data)
     return tmp_path / "set"
@@ -91,14 +88,10 @@ def test_the_reflection_is_scored_if_there_is_a_ground_truth_and_a_prediction(tr
 def test_without_a_reflection_the_region_has_no_score(tmp_path):
     for role in ("blended", "transmission"):
         paint(tmp_path / "mine" / role / "a.png", 1)
-    truth, scorer = open_case(
-        tmp_path / "mine", EvaluationConfig(metrics=("psnr", "psnr_region", "ssim_region"))
-    )
-    assert scorer.score(MethodOutput(truth.photo)) == {
-        "psnr": 100.0,
-        "psnr_region": None,
-        "ssim_region": None,
-    }
+    config = EvaluationConfig(metrics=("psnr", "psnr_region", "ssim_region"))
+    truth, scorer = open_case(tmp_path / "mine", config)
+    expected = {"psnr": 100.0, "psnr_region": None, "ssim_region": None}
+    assert scorer.score(MethodOutput(truth.photo)) == expected
     assert scorer.region_share == 0
 
 
@@ -127,13 +120,11 @@ def make_metric(name, score, **more):
 
 def test_a_new_metric_is_one_row_with_its_function(triplet, tmp_path, monkeypatch):
     """The code of the evaluation does not depend on the names of metrics."""
-    monkeypatch.setitem(
-        METRICS,
-        "darkest",
-        make_metric(
-            "darkest", lambda case: float(case.prediction.pixels.min()) - float(case.truth.pixels.min())
-        ),
-    )
+
+    def darkest(case):
+        return float(case.prediction.pixels.min()) - float(case.truth.pixels.min())
+
+    monkeypatch.setitem(METRICS, "darkest", make_metric("darkest", darkest))
     config = EvaluationConfig(metrics=("darkest",))
     (row,) = score(read_benchmark("pairs", triplet), [IdentityBaseline()], config, tmp_path / "out")
     truth, _ = open_case(triplet, config)
@@ -198,9 +189,8 @@ def test_metrics_of_rendered_samples_and_reflections_give_the_scores_of_their_fu
     assert scores["psnr_reflection"] == pytest.approx(psnr(photo, reflection_image), abs=1e-6)
     assert scores["ssim_reflection"] == pytest.approx(ssim(photo, reflection_image), abs=1e-6)
     for name, measure in (("removed_content", removed_content), ("kept_reflection", kept_reflection)):
-        assert scores[name] == pytest.approx(measure(photo, background, photo, reflection_image), abs=1e-6), (
-            name
-        )
+        expected = measure(photo, background, photo, reflection_image)
+        assert scores[name] == pytest.approx(expected, abs=1e-6), name
     assert scores["removed_white"] is None  # the background of this sample has no white area
 
 

@@ -39,12 +39,6 @@ def test_the_first_method_or_every_method_is_compared_with_each_other_method(tmp
     assert len(make_study(tmp_path / "b", methods=names, all_pairs=True).pairs_of_methods) == 3
 
 
-def test_only_the_chosen_datasets_are_used_in_the_given_order(tmp_path):
-    study = make_study(tmp_path, datasets=("real",))
-    assert study.description.datasets == ("real",)
-    assert {row.dataset for row in study.description.comparisons} == {"real"}
-
-
 def test_outputs_named_by_brewster_are_found(tmp_path, folders):
     inputs, methods = folders
     for path in sorted(methods["ours"].rglob("*.png")):

@@ -101,22 +101,6 @@ def test_the_whole_study_works_with_the_keyboard_only(open_page, url, store):
     assert (shown.theme, shown.pointer, shown.view, shown.switches) == ("light", "fine", "all", 0)
 
 
-def test_a_participant_continues_on_another_device_with_the_personal_link_only(open_page, url):
-    page = open_page(url)
-    begin(page)
-    press(page, "1")
-    press(page, "2")
-    expect(page.get_by_text("Pair 3 of 4").first).to_be_visible()
-    link = page.url
-    page.context.close()
-    again = open_page(link)
-    expect(again.get_by_text("Pair 3 of 4").first).to_be_visible()
-    again.goto(link[:-1])
-    expect(again.get_by_role("alert")).to_contain_text(
-        "is unknown. Expected a complete link of this study. Check the link"
-    )
-
-
 def test_the_pictures_of_the_trial_are_shown_on_their_sides_and_have_names(open_page, url, store):
     page = open_page(url, viewport={"width": 1280, "height": 800})
     begin(page)
@@ -201,15 +185,3 @@ def test_a_phone_shows_everything_without_horizontal_scrolling_and_accepts_touch
     expect(page.get_by_text("Pair 2 of 4").first).to_be_visible()
     ((_, answers),) = store.all_answers()
     assert answers[0].choice == "right"
-
-
-def test_a_missing_picture_is_reported_when_its_trial_is_shown(open_page, url, store):
-    page = open_page(url)
-    gone = {"status": 410, "json": {"error": "result A of pair 2 is missing; expected three; tell it"}}
-    page.route("**/pictures/1/left", lambda route: route.fulfill(**gone))
-    begin(page)
-    press(page, "1")
-    expect(page.get_by_role("alert")).to_contain_text(
-        "Result A of pair 2 is missing. Expected three. Tell it."
-    )
-    expect(page.locator("#notice")).to_be_hidden()

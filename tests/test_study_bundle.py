@@ -18,16 +18,9 @@ pytestmark = pytest.mark.loopback
 
 ANSWERED_AT = "2026-11-22T12:00:00.250Z"
 CONDITIONS = {
-    "viewport_width": 1280,
-    "viewport_height": 720,
-    "pixel_ratio": 1,
-    "picture_width": 400,
-    "theme": "dark",
-    "pointer": "fine",
-    "view": "all",
-    "switches": 2,
-    "zoomed": False,
-}
+    "viewport_width": 1280, "viewport_height": 720, "pixel_ratio": 1, "picture_width": 400, "theme": "dark",
+    "pointer": "fine", "view": "all", "switches": 2, "zoomed": False,
+}  # fmt: skip
 
 
 @pytest.fixture
@@ -46,16 +39,8 @@ def answers(tmp_path):
     """Writes a file of answers."""
 
     def write(token, choices, **changes):
-        rows = [
-            {
-                "trial": i,
-                "choice": choice,
-                "seconds": 4.5,
-                "answered_at": ANSWERED_AT,
-                "conditions": CONDITIONS,
-            }
-            for i, choice in enumerate(choices)
-        ]
+        given = {"seconds": 4.5, "answered_at": ANSWERED_AT, "conditions": CONDITIONS}
+        rows = [{"trial": i, "choice": choice, **given} for i, choice in enumerate(choices)]
         content = {"format": 1, "participant": token, "consented_on": "2026-11-22", "answers": rows}
         path = tmp_path / "answers.json"
         path.write_text(json.dumps(content | changes))
@@ -205,12 +190,6 @@ def test_a_participant_answers_in_a_browser_and_the_file_is_imported(study, stor
     assert path.name == f"answers-{token[:8]}.json"
     assert store.import_answers(read_answer_file(path)) == 5
     ((_, stored),) = store.all_answers()
-    assert [answer.choice for answer in stored.values()] == [
-        "similar",
-        "right",
-        "similar",
-        "similar",
-        "similar",
-    ]
+    assert [answer.choice for answer in stored.values()] == ["similar", "right", *["similar"] * 3]
     assert stored[1].withdrawn == ("similar",)
     assert all(answer.conditions.viewport_width == 1280 for answer in stored.values())

@@ -1,11 +1,8 @@
-"""The index of an archive: a Parquet table with one row for each photo, in the output folder.
+"""The index of an archive: a Parquet table with one row for each photo, index.parquet in the output folder.
 
-    import pandas
-    index = pandas.read_parquet("out/index.parquet")
-
-During a run, rows are written to small tables in the folder .brewster-index, about every 30 seconds. At the end of the run, they
-are merged into index.parquet, together with the rows of earlier runs. A killed run loses only the rows after its last small table.
-"""
+About every 30 seconds, rows are written to small tables in the folder .brewster-index. At the end of the run, they are
+merged into index.parquet, together with the rows of earlier runs. A killed run loses only the rows after its last small
+table."""
 
 from __future__ import annotations
 
@@ -46,11 +43,8 @@ COLUMNS: Final[dict[str, tuple[str, Callable[[FileResult], object]]]] = {
 @final
 class IndexWriter:
     """Writes the index of an output folder. A context manager: all rows are merged into index.parquet when it exits.
-
-    Raises:
-        OutputError: the folder cannot be written to, or has another file named index.parquet.
-        MissingExtra: pyarrow is not installed.
-    """
+    Raises OutputError if the folder cannot be written to, or has another file named index.parquet, and MissingExtra
+    if pyarrow is not installed."""
 
     def __init__(self, folder: Location) -> None:
         self._index, self._parts_folder = folder / INDEX_FILE, folder / PARTS_FOLDER
@@ -70,12 +64,8 @@ class IndexWriter:
                 self._write_part()
 
     def close(self) -> None:
-        """Merges the parts of this run and of killed runs into index.parquet, and deletes them.
-
-        Raises:
-            OutputError: the index cannot be written. The parts are kept, and the next run merges them.
-            UnreadablePhoto: the object store of the folder cannot be read.
-        """
+        """Merges the parts of this run and of killed runs into index.parquet, and deletes them. Raises OutputError if
+        the index cannot be written (the next run then merges the parts), and UnreadablePhoto if they cannot be read."""
         self._write_part()
         parts = sorted(path for path in self._parts_folder.iterdir() if path.suffix == ".parquet")
         if not parts:
@@ -125,9 +115,8 @@ class IndexWriter:
         try:
             table = self._parquet.read_table(io.BytesIO(path.read_bytes()))
             # An index of an earlier version may have fewer columns.
-            return table.select(
-                ["path", "status", *(COLUMNS.keys() & {*table.column_names} - {"path", "status"})]
-            )
+            others = COLUMNS.keys() & {*table.column_names} - {"path", "status"}
+            return table.select(["path", "status", *others])
         except (OSError, ValueError, KeyError) as error:  # the errors of pyarrow are subclasses
             raise OutputError(
                 f"{path} is not an index ({str(error).partition(chr(10))[0]})",

@@ -1,7 +1,7 @@
 """Chooses the paths of the layers of a batch, so that no two photos have a layer with the same path.
 
-The names of a photo that is separated alone depend only on this photo. The other files in its folder do not change them.
-"""
+The names of a photo that is separated alone depend only on this photo. The other files in its folder do not change
+them."""
 
 from __future__ import annotations
 
@@ -22,20 +22,15 @@ _SUFFIX_RANKS: Final = {suffix: rank for rank, suffix in enumerate(SUFFIXES)}
 def name_layers(
     images: Iterable[tuple[Location, Location]], options: Options
 ) -> list[tuple[Location, dict[str, Location]]]:
-    """Returns the images with the paths of their layers. An image that occurs several times is included once.
+    """Returns the images with the paths of their layers, from pairs of an image and the folder of its layers, as
+    `images_in` yields them. An image that occurs several times is included once.
 
-    The name of a layer begins with the stem of the image: `a.jpg` gives `a.transmission.jpg`, and `a.png` gives
-    `a.transmission.png`. If a layer of two images of a folder would have the same path, as the confidence of these images, the
-    image whose suffix comes first in `SUFFIXES` keeps it, and the other one uses its full name: `a.confidence.png` and
-    `a.png.confidence.png`. Therefore `a.jpg` has the same names in all batches, whichever files are added to its folder. Only an
-    image whose name has no image suffix, which must be given by its name, comes before: its full name is its short name.
-
-    Args:
-        images: pairs of an image and the folder of its layers, as `images_in` yields them.
-
-    Raises:
-        OutputError: a layer of two images of different folders would have the same path.
-    """
+    `a.jpg` gives `a.transmission.jpg`, and `a.png` gives `a.transmission.png`. If a layer of two images of a folder
+    would have the same path, as their confidence, the image whose suffix comes first in `SUFFIXES` keeps it, and the
+    other one uses its full name: `a.confidence.png` and `a.png.confidence.png`. Therefore `a.jpg` has the same names in
+    all batches, whichever files are added to its folder. Only an image whose name has no image suffix comes before: its
+    full name is its short name. Raises OutputError if a layer of two images of different folders would have the same
+    path."""
     found: dict[str, SeparationPaths] = {}
     for image, folder in images:
         key = absolute(image)
@@ -64,11 +59,9 @@ def name_layers(
 
 
 def _content_format(image: Location) -> ImageFormat | None:
-    """Returns the format of the content of an image whose name has no image suffix.
-
-    The result is None for other images, unknown formats, pipes (which can be read only once), and files in an object store: one
-    request for each photo of an archive would take hours.
-    """
+    """Returns the format of the content of an image whose name has no image suffix. The result is None for other
+    images, unknown formats, pipes (which can be read only once), and files in an object store: one request for each
+    photo of an archive would take hours."""
     if format_of(image) or not isinstance(image, Path) or not os.path.isfile(image):  # noqa: PTH113  (is_file may raise)
         return None
     try:
@@ -79,11 +72,9 @@ def _content_format(image: Location) -> ImageFormat | None:
 
 
 def _naming_rank(image: Location) -> tuple[int, int, str]:
-    """Returns the key by which `name_layers` sorts the images: the first ones keep their short names.
-
-    Images without an image suffix are first, because they have only one name. Then images with short stems are first, because the
-    full name of `a.jpg` is the stem of `a.jpg.png`.
-    """
+    """Returns the key by which `name_layers` sorts the images: the first ones keep their short names. Images without an
+    image suffix are first, because they have only one name. Then images with short stems are first, because the full
+    name of `a.jpg` is the stem of `a.jpg.png`."""
     rank = _SUFFIX_RANKS.get(image.suffix.lower())
     return (0, 0, image.name) if rank is None else (len(image.stem), rank, image.name)
 

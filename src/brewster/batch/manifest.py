@@ -4,11 +4,10 @@
     1987/box-04/0017.tif
     s3://scans/1987/box-04/0018.tif
 
-The values of a CSV table are separated by commas, semicolons or tabs, as its header shows. Blank lines are skipped. Messages name the
-line of a CSV file, or the row of a Parquet table. Row 1 is its first row. A relative path is relative to the folder of the manifest,
-and its layers are written to the same relative path below the output folder. The layers of an absolute path or a URL are written to
-this path below the output folder, without the root or the protocol: to `OUT/scans/1987/box-04` for the second row. The output folder of a photo therefore does not depend on the other rows.
-"""
+The values of a CSV table are separated by commas, semicolons or tabs, as its header shows. A relative path is relative
+to the folder of the manifest, and its layers are written to the same relative path below the output folder. The layers
+of an absolute path or a URL are written to this path below the output folder, without the root or the protocol: to
+`OUT/scans/1987/box-04` for the second row. The output folder of a photo therefore does not depend on the other rows."""
 
 from __future__ import annotations
 
@@ -64,14 +63,10 @@ def read_manifest(
 ) -> Iterator[tuple[ManifestRow, Location, Location]]:
     """Yields each row of a manifest with its photo and the folder for its layers. Files that do not exist are included.
 
-    Layers are written below `output_folder`, by default next to their photo.
-
-    Raises:
-        ManifestError: the manifest cannot be read, is not a table, or has no rows; or a row has no path, a relative path outside the
-            folder of the manifest, or more values than the header.
-        BrewsterError: a row has a URL that cannot be read; see `location`.
-        MissingExtra: the package is not installed that a Parquet table (pyarrow) or a URL needs.
-    """
+    Layers are written below `output_folder`, by default next to their photo. Raises ManifestError if the manifest
+    cannot be read, is not a table, or has no rows, or if a row has no path, a relative path outside the folder of the
+    manifest, or more values than the header; BrewsterError if a row has a URL that `location` refuses; MissingExtra if
+    the package is not installed that a Parquet table (pyarrow) or a URL needs."""
     try:
         data = manifest.read_bytes()
     except (OSError, UnreadablePhoto) as error:
@@ -84,11 +79,8 @@ def read_manifest(
         photo, mirrored = _photo(row, text)
         yield row, photo, photo.parent if output_folder is None else output_folder.joinpath(*mirrored)
     if row is None:
-        raise ManifestError(
-            f"{manifest} has only the names of its columns, and no rows",
-            "expected a row for each photo",
-            "add the paths of the photos",
-        )
+        happened = f"{manifest} has only the names of its columns, and no rows"
+        raise ManifestError(happened, "expected a row for each photo", "add the paths of the photos")
 
 
 def _photo(row: ManifestRow, text: object) -> tuple[Location, tuple[str, ...]]:
@@ -177,8 +169,5 @@ def import_parquet(purpose: str) -> Any:  # noqa: ANN401  (pyarrow has no types)
     try:
         return importlib.import_module("pyarrow.parquet")
     except ImportError as error:
-        raise MissingExtra.for_extra(
-            "cluster",
-            "the package pyarrow is not installed",
-            f"expected pyarrow, because {purpose} is a Parquet table",
-        ) from error
+        expected = f"expected pyarrow, because {purpose} is a Parquet table"
+        raise MissingExtra.for_extra("cluster", "the package pyarrow is not installed", expected) from error

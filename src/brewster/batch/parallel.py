@@ -1,15 +1,8 @@
-"""Separates an archive: a batch in several processes or on a cluster, with an index of the results.
+"""Separates an archive: a batch in several processes or on a cluster.
 
-    tasks = plan_files("scans.parquet", "s3://bucket/clear", options)
-    create_runner = partial(SeparationRunner, options)
-    with RayExecutor(create_runner, "10.0.0.1:6379") as executor, IndexWriter(location("s3://bucket/clear")) as index:
-        for result in separate_in_parallel(tasks, executor):
-            index.append(result)
-
-A worker separates one photo at a time, with the same code as a batch in one process (`separate_tasks`). The worker itself reads the
-photo and writes the layers. Without `overwrite`, a layer that exists is never written again, even if two workers separate the same
-photo. If a node is lost, only the photos that it was separating are separated again. The same command resumes a stopped run.
-"""
+A worker separates one photo at a time, as a batch in one process does: it reads the photo and writes the layers.
+Without `overwrite`, a layer that exists is never written again, even if two workers separate the same photo. If a node
+is lost, only its photos are separated again. The same command resumes a stopped run."""
 
 from __future__ import annotations
 
@@ -32,17 +25,10 @@ from brewster.remote_path import Location
 def separate_in_parallel(
     tasks: Sequence[SeparationTask], executor: Executor[FileResult], *, overwrite: bool = False
 ) -> Iterator[FileResult]:
-    """Separates the photos of the tasks, and yields the results in the order in which workers finish them.
-
-    Args:
-        executor: runs a `SeparationRunner` in its workers. The caller enters its context.
-        overwrite: whether tasks whose layers exist are given to a worker. The runner needs the same value.
-
-    Raises:
-        OutputError: a layer would replace a photo of the archive, or a node cannot reach the output folder.
-        ModelError: the model does not exist or is damaged.
-        DeviceError: the requested device is not available.
-    """
+    """Separates the photos of the tasks, and yields the results in the order in which workers finish them. The caller
+    enters the context of the executor, which runs a `SeparationRunner` in its workers; both need the same `overwrite`.
+    Raises OutputError if a layer would replace a photo of the archive, or a node cannot reach the output folder, and
+    ModelError or DeviceError."""
     photos, cache = real_paths(task.source for task in tasks), _FileNameCache()
     for task in tasks:  # a worker cannot check this, because it does not get the paths of all photos
         check_outputs(task, photos)
@@ -65,14 +51,8 @@ def separate_in_parallel(
 
 @final
 class SeparationRunner:
-    """Separates photos in a worker. The model is loaded when the first photo is separated.
-
-    Args:
-        shared_folder: the output folder on a cluster. If it is not an object store, all nodes must share it.
-
-    Raises:
-        OutputError: the folder does not exist on this node.
-    """
+    """Separates photos in a worker. The model is loaded when the first photo is separated. Raises OutputError if the
+    `shared_folder`, the output folder on a cluster, is not an object store and does not exist on this node."""
 
     def __init__(
         self, options: Options, shared_folder: Location | None = None, *, overwrite: bool = False
@@ -87,11 +67,8 @@ class SeparationRunner:
         self._separator: Separator | None = None
 
     def __call__(self, task: SeparationTask) -> list[FileResult]:
-        """Separates one photo. If the photo fails, its result has the status "failed".
-
-        Raises:
-            ModelError, DeviceError, MissingExtra: the model cannot be loaded.
-        """
+        """Separates one photo. If the photo fails, its result has the status "failed". Raises ModelError, DeviceError
+        or MissingExtra if the model cannot be loaded."""
         self._separator = self._separator or Separator.load(**self._options.load_options())
         result = next(separate_tasks([task], self._options, self._separator, overwrite=self._overwrite))
         if result.error and not self._overwrite and _is_finished(task, exists):

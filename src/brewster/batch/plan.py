@@ -152,8 +152,8 @@ def plan_files(
     ]
     if not tasks:
         videos = sum(map(is_video, skipped))
-        counts = {"video": videos, "other file": len(skipped) - videos}
-        found = ", ".join(counted(number, kind) for kind, number in counts.items() if number)
+        counts = (("video", videos), ("other file", len(skipped) - videos))
+        found = ", ".join(counted(number, kind) for kind, number in counts if number)
         raise PhotoError(
             f"there is no photo in {', '.join(map(str, paths))}{f' ({found})' if found else ''}",
             f"expected files with one of the suffixes {' '.join(SUFFIXES)}",
@@ -174,19 +174,10 @@ def plan_bursts(
 ) -> list[SeparationTask]:
     """Groups photos into bursts, and returns a task for each burst with the paths of the layers of its reference photo.
 
-    The photos that are given by name are one burst, in their order. The photos of each folder are one burst, in the order of their
-    names. Each video that is given by name is one burst.
-
-    Args:
-        sources: photos, folders and videos.
-        output, options: see `separate_files`.
-        reference: the index of the reference photo in each burst, by default the middle one.
-        frames: the number of frames that are chosen from a video.
-
-    Raises:
-        PhotoError: the sources contain no photo, or a burst has no photo with the index `reference`.
-        OutputError: see `plan_files`.
-    """
+    The photos that are given by name are one burst, in their order, and so are the photos of each folder, in the order
+    of their names, and each video. `reference` is the index of the reference photo in each burst, by default the middle
+    one; `frames` is the number of frames that are chosen from a video. Raises PhotoError if there is no photo, or none
+    with the index `reference`, and OutputError as `plan_files`."""
     given = [location(source) for source in sources]
     groups: dict[object, list[SeparationTask]] = {}
     for task in plan_files(map(str, given), output, options):

@@ -1,8 +1,7 @@
 """Separates many files. A file that cannot be separated does not stop the batch.
 
-The tree of an input folder is mirrored in the output folder, and layers that exist already are skipped. Only one photo is in
-memory at a time. The model is loaded when the first photo needs it.
-"""
+The tree of an input folder is mirrored in the output folder, and layers that exist already are skipped. Only one photo
+is in memory at a time. The model is loaded when the first photo needs it."""
 
 from __future__ import annotations
 
@@ -59,8 +58,9 @@ def separate_files(
     """Separates files and folders of photos, and writes the layers as files.
 
     Layers are named after their photo (`a.transmission.jpg` for `a.jpg`). They never replace a photo of the batch. If
-    all layers of a photo exist, the photo is skipped. If some of its layers exist, only the missing layers are written. If an
-    existing layer was made from another photo, the photo fails. Each file is written atomically. If a photo fails, its result has the status `failed`, and the batch continues.
+    all layers of a photo exist, the photo is skipped. If some of its layers exist, only the missing layers are written.
+    If an existing layer was made from another photo, the photo fails. Each file is written atomically. If a photo
+    fails, its result has the status `failed`, and the batch continues.
 
     Args:
         sources: photos, folders that are searched recursively for photos, and manifests (CSV or Parquet tables with
@@ -85,8 +85,7 @@ def separate_files(
         ModelError: the model does not exist or is damaged (raised during iteration).
         DeviceError: the requested device is not available (raised during iteration).
         Exception: an unexpected exception, which is a bug in brewster. The result of its photo has the status `failed`, and
-            the first such exception is raised again after the last photo.
-    """
+            the first such exception is raised again after the last photo."""
     tasks = plan_files(sources, output, options)
     return separate_tasks(
         tasks, options, separator, overwrite=overwrite, dry_run=dry_run, on_progress=on_progress
@@ -123,14 +122,8 @@ def separate_tasks(
         # This is not in a try block, because no photo can be separated without a model: a model error ends the batch.
         separator = separator or Separator.load(**options.load_options())
         try:
-            separate_task(
-                replace(task, outputs=outputs),
-                options,
-                separator,
-                result,
-                overwrite=overwrite,
-                on_progress=partial(on_progress, done, task.name),
-            )
+            missing, progress = replace(task, outputs=outputs), partial(on_progress, done, task.name)
+            separate_task(missing, options, separator, result, overwrite=overwrite, on_progress=progress)
             result.outputs = _names(task.outputs)  # also the layers that existed before
         except BrewsterError as error:
             result.failed(error)
@@ -139,9 +132,8 @@ def separate_tasks(
                 "the photo does not fit into memory; expected more free memory; close other programs, or make the photo smaller.",
             )
         except Exception as error:  # noqa: BLE001  (raised again after the last photo)
-            unexpected = (
-                unexpected or error
-            )  # only the first, because each traceback keeps its photo in memory
+            # only the first, because each traceback keeps its photo in memory
+            unexpected = unexpected or error
             result.failed(f"internal error in brewster ({type(error).__name__}: {error}); please report it")
         yield result
     if unexpected:
@@ -157,11 +149,8 @@ def separate_task(
     overwrite: bool,
     on_progress: ProgressCallback,
 ) -> None:
-    """Separates one photo, writes its layers, and enters both into the result.
-
-    Raises:
-        BrewsterError: the photo cannot be read or separated, or a layer cannot be written.
-    """
+    """Separates one photo, writes its layers, and enters both into the result. Raises BrewsterError if the photo cannot
+    be read or separated, or a layer cannot be written."""
     result.model, result.model_sha256, result.device = separator.name, separator.sha256, separator.device
     with row_in_errors(task.row):
         photo = read_content(task.source)
@@ -229,11 +218,8 @@ def _separate_burst(
 
 
 def check_outputs(task: SeparationTask, photos: Set[str]) -> None:
-    """Checks that no layer would replace a photo of the batch. `photos` are their paths, from `real_paths`.
-
-    Raises:
-        OutputError: a layer has the path of a photo, or is a hard link to the photo of the task.
-    """
+    """Checks that no layer would replace a photo of the batch. `photos` are their paths, from `real_paths`. Raises
+    OutputError if a layer has the path of a photo, or is a hard link to the photo of the task."""
     for target in task.outputs.values():
         if not isinstance(target, Location):
             continue
@@ -260,18 +246,13 @@ def _names(outputs: Mapping[str, Location | OutputStream]) -> dict[str, str]:
 
 
 def check_layers(source: Location | InputStream, layers: Iterable[Location | OutputStream]) -> None:
-    """Checks that existing layers were made from this photo. See `find_layer_of_another_photo`.
-
-    Streams are not checked, because they can be read only once. Files in an object store are not checked either: two more
-    requests for each photo of an archive would take hours.
-
-    Raises:
-        OutputError: a layer was made from another photo, or from another version of this photo.
-    """
+    """Checks that existing layers were made from this photo. See `find_layer_of_another_photo`. Streams are not
+    checked, because they can be read only once. Files in an object store are not checked either: two more requests
+    for each photo of an archive would take hours. Raises OutputError if a layer was made from another photo, or from
+    another version of this photo."""
     if not isinstance(source, Path):
         return
-    layer = find_layer_of_another_photo(source, (path for path in layers if isinstance(path, Path)))
-    if layer:
+    if layer := find_layer_of_another_photo(source, (path for path in layers if isinstance(path, Path))):
         raise OutputError(
             f"{layer} was made from another photo, or from another version of {source}",
             "expected layers of this photo, or no files with their names",
@@ -281,11 +262,8 @@ def check_layers(source: Location | InputStream, layers: Iterable[Location | Out
 
 def read_content(source: Location | InputStream) -> Path | bytes:
     """Returns what a `Separator` reads: the path of a local file that can be opened, or the bytes of a URL or stream.
-
-    Raises:
-        UnreadablePhoto: the file does not exist, is a folder, or cannot be opened or read.
-        UnsupportedPhoto: the file has the suffix of a video.
-    """
+    Raises UnreadablePhoto if the file does not exist, is a folder, or cannot be opened or read, and UnsupportedPhoto
+    if the file has the suffix of a video."""
     if isinstance(source, Path):
         check_readable(source)
         return source

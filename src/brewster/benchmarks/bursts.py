@@ -1,11 +1,7 @@
 """Finds bursts with ground truth: several photos of one window by a moving camera, and the layers of the middle photo.
 
-Two layouts are supported:
-
-- A folder for each burst, with frame1.jpg, frame2.jpg ... and transmission3.jpg, reflection3.jpg for frame 3. A single such
-  folder may also be given.
-- A dataset of `brewster render --burst`.
-"""
+A burst is a folder with frame1.jpg, frame2.jpg ... and transmission3.jpg, reflection3.jpg for frame 3; or it is part of
+a dataset of `brewster render --burst`."""
 
 from __future__ import annotations
 
@@ -25,13 +21,10 @@ _LAYER_FILES: Final = ("photo.jpg", "transmission.jpg", "reflection.jpg")
 
 
 def find_bursts(folder: Path, benchmark: str) -> tuple[list[Case], FolderListing]:
-    """Returns a case for each burst in a folder, and a listing without groups: what is ignored and excluded.
-
-    Raises:
-        PhotoError: the folder cannot be read, or contains no burst.
-        RecipeError: the folder is a rendered dataset of single photos, or a scene file is damaged.
-        MissingExtra: torch is not installed, which brewster needs to read rendered datasets.
-    """
+    """Returns a case for each burst in a folder, and a listing without groups: what is ignored and excluded. Raises
+    PhotoError if the folder cannot be read, or contains no burst; RecipeError if the folder is a rendered dataset of
+    single photos, or a scene file is damaged; MissingExtra if torch is not installed, which brewster needs to read
+    rendered datasets."""
     folders, files = list_folder(folder)
     if any(_RENDERED.fullmatch(path.name) for path in (*folders, *files)):
         return _rendered_bursts(folder, benchmark)
@@ -58,9 +51,8 @@ _Roles = Mapping[str, Mapping[int, list[Path]]]
 
 def _read_roles(folder: Path) -> _Roles:
     """Returns the images of a folder by role and by the number in the name."""
-    roles: dict[str, dict[int, list[Path]]] = {
-        role: defaultdict(list) for role in ("frame", "transmission", "reflection")
-    }
+    names = ("frame", "transmission", "reflection")
+    roles: dict[str, dict[int, list[Path]]] = {role: defaultdict(list) for role in names}
     for path in image_files(folder)[0]:
         if match := _ROLE.fullmatch(path.stem):
             roles[match[1].lower()][int(match[2])].append(path)
@@ -80,19 +72,21 @@ def _exclusion_reason(roles: _Roles) -> str:
 
 
 def _burst(benchmark: str, root: Path, folder: Path, roles: _Roles) -> Case:
-    frames, numbers = roles["frame"], sorted(roles["frame"])
-    middle = numbers[len(numbers) // 2]
+    numbers = sorted(roles["frame"])
+    middle, name = numbers[len(numbers) // 2], folder.absolute().name
     reflection = roles["reflection"].get(middle)
-    name, photo = folder.absolute().name, frames[middle][0]
+    path = roles["frame"][middle][0].relative_to(root).with_suffix("").as_posix()
+    frames = tuple(ImageFile(roles["frame"][number][0]) for number in numbers)
+    photo, truth = frames[len(numbers) // 2], ImageFile(roles["transmission"][middle][0])
     return Case(
         benchmark,
         name,
         name,
-        photo.relative_to(root).with_suffix("").as_posix(),
-        ImageFile(photo),
-        ImageFile(roles["transmission"][middle][0]),
+        path,
+        photo,
+        truth,
         ImageFile(reflection[0]) if reflection else None,
-        frames=tuple(ImageFile(frames[number][0]) for number in numbers),
+        frames=frames,
     )
 
 

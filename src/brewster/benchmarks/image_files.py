@@ -17,20 +17,15 @@ if TYPE_CHECKING:
 @final
 @dataclass(frozen=True)
 class ImageFile:
-    """The location of an encoded image: a whole file, or a part of a tar shard.
-
-    `span` is the (offset, length) of the part in bytes, or None for a whole file.
-    """
+    """The location of an encoded image: a whole file, or a part of a tar shard. `span` is the (offset, length) of the
+    part in bytes, or None for a whole file."""
 
     path: Path
     span: tuple[int, int] | None = None
 
     def read(self) -> bytes:
-        """Returns the encoded bytes of the image.
-
-        Raises:
-            UnreadablePhoto: the file is missing, cannot be read, or ends before the end of the span.
-        """
+        """Returns the encoded bytes of the image. Raises UnreadablePhoto if the file is missing, cannot be read, or
+        ends before the end of the span."""
         offset, length = self.span or (0, -1)
         try:
             with self.path.open("rb") as file:
@@ -53,16 +48,13 @@ class ImageFile:
 @final
 @dataclass(frozen=True)
 class Case:
-    """A photo to separate, with its ground truth.
+    """A photo to separate, with its ground truth, whose `name` is unique within the benchmark.
 
-    `name` is unique within the benchmark. It is used in reports and in folders of predictions. Cases with the same `scene`
-    show the same objects, so they are not statistically independent. `scene` equals `name` if the scene is unknown.
-    `relative_path` is the photo's path relative to the benchmark folder, without the suffix and with forward slashes.
-    `ground_truth` is the ground truth of the transmission, and `reflection` is the ground truth of the reflection. If
-    `rendered` is True, both are exact: `ground_truth` is the background without the glass, and `reflection` is the light
-    that the glass adds. `frames` are the photos of a burst in order, of which `photo` is the middle one; they are empty for a
-    single photo. The ground truth of a burst is that of `photo`.
-    """
+    Cases with the same `scene` show the same objects, so they are not statistically independent; it equals `name` if it
+    is unknown. `relative_path` is that of the photo below the benchmark folder, without the suffix and with forward
+    slashes. `ground_truth` is the transmission. If `rendered` is True, it is the background without the glass, and
+    `reflection` is the light that the glass adds. `frames` are the photos of a burst in order, of which `photo` is the
+    middle one."""
 
     benchmark: str
     name: str
@@ -76,12 +68,8 @@ class Case:
 
 
 def read_samples(folder: Path) -> list[StoredSample]:
-    """Returns the samples of a rendered dataset.
-
-    Raises:
-        PhotoError: the folder is not a rendered dataset.
-        MissingExtra: torch is not installed.
-    """
+    """Returns the samples of a rendered dataset. Raises PhotoError if the folder is not a rendered dataset, and
+    MissingExtra if torch is not installed."""
     try:
         from brewster.rendered.store import read_dataset  # noqa: PLC0415  (needs torch, an optional dependency)
 
@@ -89,11 +77,8 @@ def read_samples(folder: Path) -> list[StoredSample]:
         if not entries:
             raise ValueError("it has no samples")  # noqa: TRY301
     except ImportError as error:
-        raise MissingExtra.for_extra(
-            "render",
-            "torch is not installed",
-            "expected torch, which brewster needs to read rendered datasets",
-        ) from error
+        expected = "expected torch, which brewster needs to read rendered datasets"
+        raise MissingExtra.for_extra("render", "torch is not installed", expected) from error
     except (OSError, tarfile.TarError, ValueError) as error:
         raise PhotoError(
             f"{folder} is not a rendered dataset ({error})",

@@ -1,14 +1,12 @@
-"""Groups the images of a benchmark folder by file name: photo, transmission and, if there is one, reflection.
-
-Files are paired by name only, never by their position in a sorted list. Two layouts are supported:
+"""Groups the images of a benchmark folder by file name, never by position: photo, transmission and, if there is one,
+reflection.
 
 - Pairs: one folder per role with equal file names: blended/a.png, transmission_layer/a.png.
 - The original folders of SIR2: one folder per shot. A letter in the file name denotes the role: ab/3/ab-3-m-32.png,
   ab/3/ab-3-g-32.png.
 
-A name with one photo, one transmission and at most one reflection becomes an `ImageGroup`. Every other name is excluded,
-with a reason.
-"""
+A name with one photo, one transmission and at most one reflection becomes an `ImageGroup`; others are excluded, with a
+reason."""
 
 from __future__ import annotations
 
@@ -57,9 +55,7 @@ _FilesByRole = Mapping[str, list[Path]]
 @dataclass(frozen=True)
 class ImageGroup:
     """The files with one name: photo, transmission (ground truth) and reflection (None if there is no such file).
-
-    `scene` is "" if the scene is unknown.
-    """
+    `scene` is "" if the scene is unknown."""
 
     name: str
     scene: str
@@ -71,10 +67,8 @@ class ImageGroup:
 @final
 @dataclass
 class FolderListing:
-    """The content of a folder. The groups are in natural order of their names (2 before 10).
-
-    `remarks` lists the ignored files. `excluded` lists the images without a unique partner, with the reason.
-    """
+    """The content of a folder. The groups are in natural order of their names (2 before 10). `remarks` lists the
+    ignored files. `excluded` lists the images without a unique partner, with the reason."""
 
     root: Path
     """The folder. Remarks and reasons name the files relative to it."""
@@ -121,11 +115,8 @@ class FolderListing:
 
 
 def list_folder(folder: Path) -> tuple[list[Path], list[Path]]:
-    """Returns the folders and the files in a folder, in natural order, without hidden files and system files.
-
-    Raises:
-        PhotoError: the folder cannot be read.
-    """
+    """Returns the folders and the files in a folder, in natural order, without hidden files and system files. Raises
+    PhotoError if the folder cannot be read."""
     kinds: tuple[list[Path], list[Path]] = ([], [])
     try:
         for path in sorted(folder.iterdir(), key=lambda path: natural_key(path.name)):
@@ -144,20 +135,14 @@ def list_folder(folder: Path) -> tuple[list[Path], list[Path]]:
 
 
 def find_roles(folder: Path) -> dict[str, Path]:
-    """Returns the subfolder of each role. A subfolder has a role if its name is in ROLES.
-
-    Raises:
-        PhotoError: the folder cannot be read, or has two subfolders for one role.
-    """
+    """Returns the subfolder of each role. A subfolder has a role if its name is in ROLES. Raises PhotoError if the
+    folder cannot be read, or has two subfolders for one role."""
     return _find_subfolders(folder, _role_of)
 
 
 def find_numbered_splits(folder: Path) -> dict[str, dict[str, Path]]:
     """Returns the subfolders by split and role, for names such as val_300_blended. The split of this name is "val_300".
-
-    Raises:
-        PhotoError: the folder cannot be read.
-    """
+    Raises PhotoError if the folder cannot be read."""
     splits: dict[str, dict[str, Path]] = defaultdict(dict)
     for path in list_folder(folder)[0]:
         prefix = _SPLIT_PREFIX.match(path.name)
@@ -179,10 +164,7 @@ def find_sets(folder: Path) -> list[Path]:
 
 def find_split(folder: Path) -> Path:
     """Returns the folder itself if it contains pairs, else its only subfolder with pairs, such as train, val or test.
-
-    Raises:
-        PhotoError: several subfolders contain pairs, or a folder cannot be read.
-    """
+    Raises PhotoError if several subfolders contain pairs, or a folder cannot be read."""
     if "photo" in find_roles(folder):
         return folder
     splits = [path for path in list_folder(folder)[0] if "photo" in find_roles(path)]
@@ -197,12 +179,8 @@ def find_split(folder: Path) -> Path:
 
 def read_folders(folder: Path, roles: Mapping[str, Path] | None = None) -> FolderListing:
     """Returns the groups of a folder with one subfolder per role. The file stems must be equal; suffixes may differ.
-
-    `roles` has the subfolder of each role; by default, it is the result of `find_roles`.
-
-    Raises:
-        PhotoError: a folder is missing, empty or unreadable, or two folders have the same role.
-    """
+    `roles` has the subfolder of each role; by default, it is the result of `find_roles`. Raises PhotoError if a
+    folder is missing, empty or unreadable, or two folders have the same role."""
     roles = find_roles(folder) if roles is None else roles
     by_name: dict[str, dict[str, list[Path]]] = defaultdict(lambda: defaultdict(list))
     ignored: list[Path] = []
@@ -230,11 +208,8 @@ def _role_files(folder: Path, role: str, roles: Mapping[str, Path]) -> tuple[lis
         )
     images, others = image_files(roles[role])
     if not images:
-        raise PhotoError(
-            f"{roles[role]} contains no images",
-            f"expected files ending in {', '.join(SUFFIXES)}",
-            "choose another folder",
-        )
+        expected = f"expected files ending in {', '.join(SUFFIXES)}"
+        raise PhotoError(f"{roles[role]} contains no images", expected, "choose another folder")
     return images, others
 
 
@@ -242,22 +217,20 @@ def _role_files(folder: Path, role: str, roles: Mapping[str, Path]) -> tuple[lis
 
 
 def find_subsets(folder: Path) -> dict[str, Path]:
-    """Returns the subfolder of each subset of SIR2. Only the start of the name is compared: "Postcard Dataset" is "postcard".
+    """Returns the subfolder of each subset of SIR2. Only the start of the name is compared: "Postcard Dataset" is
+    "postcard". Raises PhotoError if the folder cannot be read, or has two subfolders for one subset."""
 
-    Raises:
-        PhotoError: the folder cannot be read, or has two subfolders for one subset.
-    """
-    return _find_subfolders(folder, _subset_of)
+    def subset_of(name: str) -> str:
+        letters = re.sub(r"[^a-z]", "", name.lower())
+        return next((subset for subset in SIR2_TREES if letters.startswith(subset)), "")
+
+    return _find_subfolders(folder, subset_of)
 
 
 def read_tree(folder: Path, subset: str) -> FolderListing:
-    """Returns the groups of a subset of SIR2. Its folders have one subfolder per shot.
-
-    Files of a shot are grouped if their names, without the letter of the role, are equal.
-
-    Raises:
-        PhotoError: a folder cannot be read, or there is no shot.
-    """
+    """Returns the groups of a subset of SIR2. Its folders have one subfolder per shot. Files of a shot are grouped if
+    their names, without the letter of the role, are equal. Raises PhotoError if a folder cannot be read, or there is
+    no shot."""
     listing = FolderListing(folder)
     _read_branches(listing, folder, SIR2_TREES[subset], {})
     listing.groups.sort(key=lambda group: natural_key(group.name))
@@ -269,11 +242,6 @@ def read_tree(folder: Path, subset: str) -> FolderListing:
             "give the path of the subset in your copy of SIR2",
         )
     return listing
-
-
-def _subset_of(name: str) -> str:
-    letters = re.sub(r"[^a-z]", "", name.lower())
-    return next((subset for subset in SIR2_TREES if letters.startswith(subset)), "")
 
 
 def _read_branches(
@@ -324,11 +292,8 @@ def _find_subfolders(folder: Path, key_of: Callable[[str], str]) -> dict[str, Pa
     for path in list_folder(folder)[0]:
         key = key_of(path.name)
         if key and found.setdefault(key, path) != path:
-            raise PhotoError(
-                f"{folder} has two subfolders for {key}, {found[key].name} and {path.name}",
-                f"expected one subfolder for {key}",
-                "move or rename one of the two",
-            )
+            happened = f"{folder} has two subfolders for {key}, {found[key].name} and {path.name}"
+            raise PhotoError(happened, f"expected one subfolder for {key}", "move or rename one of the two")
     return found
 
 

@@ -1,8 +1,8 @@
-"""Reads public benchmarks from folders that the user has downloaded. Pairs each photo with its ground truth by file name.
+"""Reads public benchmarks from folders that the user has downloaded. Pairs each photo with its ground truth by file
+name.
 
-The module `pairing` groups the files by name. This module creates a `Case` for each group, compares the image sizes in the
-file headers, and checks the number of cases. `excluded` lists the files that cannot be used.
-"""
+The module `pairing` groups the files by name. This module creates a `Case` for each group, compares the image sizes in
+the file headers, and checks the number of cases. `excluded` lists the files that cannot be used."""
 
 from __future__ import annotations
 
@@ -14,21 +14,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final, final
 
+from brewster.benchmarks import pairing
 from brewster.benchmarks.bursts import find_bursts
 from brewster.benchmarks.image_files import Case, ImageFile, files_of, read_samples
-from brewster.benchmarks.pairing import (
-    SIR2_TREES,
-    FolderListing,
-    ImageGroup,
-    find_numbered_splits,
-    find_roles,
-    find_sets,
-    find_split,
-    find_subsets,
-    join_names,
-    read_folders,
-    read_tree,
-)
+from brewster.benchmarks.pairing import FolderListing, ImageGroup
 from brewster.errors import PhotoError, counted
 from brewster.files import natural_key
 from brewster.photo import read_size
@@ -41,11 +30,9 @@ _MAX_SCENES: Final = 20
 @final
 @dataclass(frozen=True)
 class Benchmark:
-    """The cases of a benchmark, in natural order of their names (2 before 10).
-
-    `expected_counts` are the numbers of images that papers report. `remarks` are notes for the user. `excluded` has one
-    line for each file or case that is not used, with the reason.
-    """
+    """The cases of a benchmark, in natural order of their names (2 before 10). `expected_counts` are the numbers of
+    images that papers report. `remarks` are notes for the user. `excluded` has one line for each file or case that
+    is not used, with the reason."""
 
     name: str
     title: str
@@ -59,10 +46,8 @@ class Benchmark:
 @dataclass(frozen=True)
 class BenchmarkLayout:
     """A row of BENCHMARKS: title ("" means the name of the folder), counts that papers report, and reader.
-
-    `scene_pattern` is a regular expression that matches the part of a file name that identifies the scene. It is set only
-    for the benchmarks from which the paper draws one case per scene.
-    """
+    `scene_pattern` is a regular expression that matches the part of a file name that identifies the scene. It is set
+    only for the benchmarks from which the paper draws one case per scene."""
 
     title: str
     expected_counts: tuple[int, ...]
@@ -71,16 +56,10 @@ class BenchmarkLayout:
 
 
 def read_benchmark(name: str, folder: Path) -> list[Benchmark]:
-    """Reads a benchmark from a folder. Decodes only the file headers.
-
-    Returns:
-        A list with one benchmark. For "sir2", a list with one benchmark for each of the three subsets in the folder.
-        If the copy is incomplete, `remarks` and `excluded` list the missing files.
-
-    Raises:
-        PhotoError: the name is not in BENCHMARKS, or the folder is missing or empty, or its layout is not supported.
-        MissingExtra: the extra for rendered datasets or for the image format is not installed.
-    """
+    """Reads a benchmark from a folder; decodes only the file headers. "sir2" gives one benchmark for each of its
+    subsets in the folder. If the copy is incomplete, `remarks` and `excluded` list the missing files. Raises PhotoError
+    if the name is not in BENCHMARKS, or the folder is missing, empty or of another layout, and MissingExtra if a reader
+    is not installed."""
     if name not in BENCHMARKS:
         close = difflib.get_close_matches(name.lower(), BENCHMARKS, 1)
         raise PhotoError(
@@ -95,29 +74,34 @@ def read_benchmark(name: str, folder: Path) -> list[Benchmark]:
 
 
 def _read_pairs(name: str, folder: Path) -> list[Benchmark]:
-    return [_from_listing(name, folder, read_folders(folder))]
+    return [_from_listing(name, folder, pairing.read_folders(folder))]
 
 
 def _read_sets(name: str, folder: Path) -> list[Benchmark]:
     """Reads a folder of pairs, or one benchmark for each subfolder with pairs."""
-    sets = [] if "photo" in find_roles(folder) else find_sets(folder)
-    return [_from_listing(name, path, read_folders(path)) for path in sets or [folder]]
+    sets = [] if "photo" in pairing.find_roles(folder) else pairing.find_sets(folder)
+    return [part for path in sets or [folder] for part in _read_pairs(name, path)]
 
 
 def _read_split(name: str, folder: Path) -> list[Benchmark]:
-    complete = [roles for roles in find_numbered_splits(folder).values() if "transmission" in roles]
-    is_complete = len(complete) == 1
-    listing = read_folders(folder, complete[0]) if is_complete else read_folders(find_split(folder))
-    return [_from_listing(name, folder, listing)]
+    complete = [roles for roles in pairing.find_numbered_splits(folder).values() if "transmission" in roles]
+    found = (folder, complete[0]) if len(complete) == 1 else (pairing.find_split(folder),)
+    return [_from_listing(name, folder, pairing.read_folders(*found))]
 
 
 def _read_subset(name: str, folder: Path) -> list[Benchmark]:
-    root = find_subsets(folder).get(name, folder)
-    return [_from_listing(name, folder, read_folders(root) if find_roles(root) else read_tree(root, name))]
+    root = pairing.find_subsets(folder).get(name, folder)
+    return [
+        _from_listing(
+            name,
+            folder,
+            pairing.read_folders(root) if pairing.find_roles(root) else pairing.read_tree(root, name),
+        )
+    ]
 
 
 def _read_sir2(_: str, folder: Path) -> list[Benchmark]:
-    subsets = find_subsets(folder)
+    subsets = pairing.find_subsets(folder)
     if not subsets:
         raise PhotoError(
             f"{folder} contains no subset of SIR2",
@@ -125,9 +109,11 @@ def _read_sir2(_: str, folder: Path) -> list[Benchmark]:
             "give the path of their parent folder, or use postcard=, solidobject= or wildscene= for one subset",
         )
     first, *others = [
-        benchmark for name in SIR2_TREES if name in subsets for benchmark in _read_subset(name, folder)
+        part for name in pairing.SIR2_TREES if name in subsets for part in _read_subset(name, folder)
     ]
-    missing = [f"{BENCHMARKS[name].title} is not in {folder}" for name in SIR2_TREES if name not in subsets]
+    missing = [
+        f"{BENCHMARKS[name].title} is not in {folder}" for name in pairing.SIR2_TREES if name not in subsets
+    ]
     return [replace(first, remarks=(*missing, *first.remarks)), *others]
 
 
@@ -139,9 +125,8 @@ def _read_rendered(name: str, folder: Path) -> list[Benchmark]:
             excluded.append(f"{key} is incomplete: expected {', '.join(_RENDERED_FILES)}")
             continue
         photo, background, reflection = files
-        cases.append(
-            Case(benchmark_name, key, key, f"{key}/photo", photo, background, reflection, rendered=True)
-        )
+        path = f"{key}/photo"
+        cases.append(Case(benchmark_name, key, key, path, photo, background, reflection, rendered=True))
     return [_make_benchmark(name, folder, cases, FolderListing(folder, excluded=excluded))]
 
 
@@ -187,15 +172,14 @@ def _make_benchmark(name: str, folder: Path, cases: Sequence[Case], listing: Fol
     """Returns the benchmark without the cases whose images cannot be read or differ in size."""
     layout, expected = BENCHMARKS[name], BENCHMARKS[name].expected_counts
     unusable = {case.name: reason for case in cases if (reason := _unusable_reason(case))}
-    valid = [
-        case for case in sorted(cases, key=lambda case: natural_key(case.name)) if case.name not in unusable
-    ]
+    usable = (case for case in cases if case.name not in unusable)
+    valid = sorted(usable, key=lambda case: natural_key(case.name))
     remarks = []
     if expected and len(valid) not in expected:
         remarks.append(f"found {counted(len(valid), 'image')}, expected {' or '.join(map(str, expected))}")
     missing = [case.name for case in valid if case.reflection is None]
     if 0 < len(missing) < len(valid):
-        remarks.append(f"there is no ground truth of the reflection for {join_names(missing)}")
+        remarks.append(f"there is no ground truth of the reflection for {pairing.join_names(missing)}")
     return Benchmark(
         _benchmark_name(name, folder),
         layout.title or folder_name(folder),
@@ -207,11 +191,9 @@ def _make_benchmark(name: str, folder: Path, cases: Sequence[Case], listing: Fol
 
 
 def _benchmark_name(name: str, folder: Path) -> str:
-    """Returns the name of the benchmark in results: `name` if its row has a title, else the name of the folder.
-
-    If the folder has the name "average" or the name of a benchmark with a title, the result is "{name}-{folder}", which
-    is unique.
-    """
+    """Returns the name of the benchmark in results: `name` if its row has a title, else the name of the folder. If the
+    folder has the name "average" or the name of a benchmark with a title, the result is "{name}-{folder}", which is
+    unique."""
     if BENCHMARKS[name].title:
         return name
     safe = safe_name(folder_name(folder)) or name

@@ -20,15 +20,9 @@ PAPER_SEED: Final = 181
 
 
 def paper_subset(benchmark: Benchmark, seed: int = PAPER_SEED) -> tuple[Case, ...]:
-    """Draws a random subset like that of the paper, which does not say which cases it uses.
-
-    This function draws one case of each scene with `Random(f"{seed}/{benchmark}/{scene}").choice(...)` from the cases in
-    natural order of their names. The case of a scene therefore does not depend on the other scenes. Other benchmarks than
-    Postcard and SolidObject keep all cases.
-
-    Raises:
-        PhotoError: the file names do not identify the scenes.
-    """
+    """Draws one case of each scene, as the paper does, which does not say which ones. Other benchmarks than Postcard
+    and SolidObject keep all cases. The choice, from the cases in natural order of their names, does not depend on the
+    other scenes. Raises PhotoError if the file names do not identify the scenes."""
     if benchmark.name not in BENCHMARKS or not BENCHMARKS[benchmark.name].scene_pattern:
         return benchmark.cases
     if any(case.scene == case.name for case in benchmark.cases):
@@ -52,21 +46,16 @@ def spread(benchmark: Benchmark, limit: int) -> Benchmark:
     if count <= limit:
         return benchmark
     cases = tuple(benchmark.cases[index * count // limit] for index in range(limit))
-    return replace(
-        benchmark,
-        cases=cases,
-        remarks=(*benchmark.remarks, f"{limit} of {count} images are scored (--limit)"),
-    )
+    remarks = (*benchmark.remarks, f"{limit} of {count} images are scored (--limit)")
+    return replace(benchmark, cases=cases, remarks=remarks)
 
 
 def with_unique_names(benchmarks: Sequence[Benchmark], folders: Sequence[Path]) -> list[Benchmark]:
     """Adds names of parent folders to names that occur twice: the folders a/test and b/test become a-test and b-test.
-
-    As many parent folders are added as are needed: x/a/test and y/a/test become x-a-test and y-a-test. Only equal folders
-    keep equal names.
-    """
+    As many parent folders are added as are needed: x/a/test and y/a/test become x-a-test and y-a-test. Only equal
+    folders keep equal names."""
     names = [benchmark.name for benchmark in benchmarks]
-    unique_names = list(names)
+    unique_names, renamed = list(names), list(benchmarks)
     # the names of all folders above each folder; links are not resolved
     above = [Path(os.path.abspath(folder)).parts[1:-1] for folder in folders]  # noqa: PTH100
     parents = [[name for part in parts if (name := safe_name(part))] for parts in above]
@@ -77,7 +66,6 @@ def with_unique_names(benchmarks: Sequence[Benchmark], folders: Sequence[Path]) 
             depth += 1
             for i in group:
                 unique_names[i] = "-".join([*parents[i][-depth:], name])
-    renamed = list(benchmarks)
     for i, name in enumerate(unique_names):
         if name != names[i]:
             cases = tuple(replace(case, benchmark=name) for case in benchmarks[i].cases)

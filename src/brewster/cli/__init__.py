@@ -1,7 +1,6 @@
 """The command `brewster`. No other package uses click or rich.
 
-Commands import slow modules when they run, so that `brewster --help` starts fast.
-"""
+Commands import slow modules when they run, so that `brewster --help` starts fast."""
 
 from __future__ import annotations
 
@@ -65,33 +64,17 @@ def cli() -> None:
     """Separate photos taken through glass into transmission and reflection.
 
     The transmission is the scene behind the glass. The reflection is the scene that the glass mirrors. `brewster PHOTO...` is
-    short for `brewster separate PHOTO...`; `brewster separate --help` shows its options.
-    """
+    short for `brewster separate PHOTO...`; `brewster separate --help` shows its options."""
 
 
-for _command in (
-    separate.separate,
-    burst.burst,
-    models.models,
-    doctor.doctor,
-    train.train,
-    assets.assets,
-    render.render,
-    evaluate.evaluate,
-    ablate.ablate,
-    serve.serve,
-    study.study,
-):
-    cli.add_command(_command)
+for _module in (separate, burst, models, doctor, train, assets, render, evaluate, ablate, serve, study):
+    cli.add_command(getattr(_module, _module.__name__.rpartition(".")[2]))
 
 
 def _leaf_commands(group: click.Group) -> Iterator[click.Command]:
     """Yields all commands that are not groups, including those in nested groups."""
     for command in group.commands.values():
-        if isinstance(command, click.Group):
-            yield from _leaf_commands(command)
-        else:
-            yield command
+        yield from _leaf_commands(command) if isinstance(command, click.Group) else [command]
 
 
 for _command in _leaf_commands(cli):
@@ -100,11 +83,7 @@ for _command in _leaf_commands(cli):
 
 
 def main(args: Sequence[str] | None = None) -> int:
-    """Runs the command line.
-
-    Returns:
-        The exit code: 0 success, 1 error, 2 invalid arguments, 130 interrupted by Ctrl-C.
-    """
+    """Runs the command line, and returns the exit code: 0 success, 1 error, 2 invalid arguments, 130 Ctrl-C."""
     standard_output.redirect_descriptor()
     try:
         with interrupts.captured():

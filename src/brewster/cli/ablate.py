@@ -9,18 +9,14 @@ import click
 
 from brewster.cli.evaluate import print_failures, print_remarks, print_tables
 from brewster.cli.extras import require_extra
-from brewster.cli.parameters import FILE, FOLDER, Number
+from brewster.cli.parameters import FILE, QUIET_TABLES, Number, output_folder
 from brewster.cli.terminal import interrupts, print_status
 
 
 @click.command
 @click.argument("path", metavar="ABLATION", type=FILE)
-@click.option(
-    "-o",
-    "--output",
-    "out",
-    type=FOLDER,
-    help="The folder for models, tables and the report; by default out/ablations/NAME for NAME.toml, and with --base BASE.toml, out/ablations/NAME-BASE.",
+@output_folder(
+    "The folder for models, tables and the report; by default out/ablations/NAME for NAME.toml, and with --base BASE.toml, out/ablations/NAME-BASE."
 )
 @click.option(
     "--base",
@@ -29,7 +25,7 @@ from brewster.cli.terminal import interrupts, print_status
     help="A training recipe that replaces the base recipe of ABLATION, such as a tiny one for a test run.",
 )
 @click.option("--workers", type=Number(1), default=1, help="The number of processes that compute scores.")
-@click.option("--quiet", is_flag=True, help="Print only errors, and no tables.")
+@QUIET_TABLES
 @click.pass_context
 def ablate(
     context: click.Context, /, *, path: Path, out: Path | None, base: Path | None, workers: int, quiet: bool
@@ -39,8 +35,7 @@ def ablate(
     ABLATION is a TOML file with the base recipe, the key, its values and the benchmarks.
 
     The environment variable BREWSTER_DATA is the path of the data folder. To resume an interrupted run, run the same
-    command again. The tables are printed on standard output; the output folder gets the tables and report.html.
-    """
+    command again. The tables are printed on standard output; the output folder gets the tables and report.html."""
     require_extra("train", "training")
     require_extra("evaluate", "evaluating")
     from brewster.evaluate.ablation import ablate as run  # noqa: PLC0415  (imports torch, two seconds)

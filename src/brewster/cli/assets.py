@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from brewster.cli.parameters import FILE, QUIET, Number
+from brewster.cli.parameters import FILE, QUIET, Number, flag, json_lines
 from brewster.cli.terminal import one_line, print_error, print_status, progress, standard_output, write_out
 
 if TYPE_CHECKING:
@@ -45,11 +45,9 @@ def assets() -> None:
     metavar="URL",
     help="The server: a mirror of https://api.polyhaven.com with the same API, or of https://github.com.",
 )
-@click.option(
-    "--json", "as_json", is_flag=True, help="Print one line of JSON for each file on standard output."
-)
+@json_lines("file")
 @QUIET
-@click.option("--dry-run", is_flag=True, help="Print the planned downloads, and write nothing.")
+@flag("--dry-run", help="Print the planned downloads, and write nothing.")
 @click.pass_context
 def pull(
     context: click.Context,
@@ -74,29 +72,23 @@ def pull(
     of the photographs is not known, and these are left out.
 
     Existing files are skipped. If a download fails, the other files are still downloaded, the failed file is listed at the
-    end, and the exit code is 1.
-    """
+    end, and the exit code is 1."""
     if source == "photos":
-        _check_no_map_options(context)
+        for name in options:
+            if context.get_parameter_source(name) is click.core.ParameterSource.COMMANDLINE:
+                raise click.UsageError(f"--{name} is for maps; photos have none.")
         results = _pull_photos(out, server, dry_run=dry_run, as_json=as_json, quiet=quiet)
-        context.exit(1 if any(result.error for result in results) else 0)
-    from brewster.environments.polyhaven import SERVER, DownloadRequest, maps_folder  # noqa: PLC0415  (imports urllib)
-    from brewster.environments.polyhaven import pull as fetch  # noqa: PLC0415
+    else:
+        from brewster.environments import polyhaven  # noqa: PLC0415  (imports urllib)
 
-    request = DownloadRequest(**options, dry_run=dry_run, server=server or SERVER)
-    total = request.indoor + request.outdoor
-    results = _print_results(fetch(request, out or maps_folder()), total, as_json=as_json, quiet=quiet)
-    if not quiet:
-        _print_missing_counts(request, results)
-        # The terms of service of Poly Haven require these words.
-        print_status("powered by Poly Haven, polyhaven.com")
+        request = polyhaven.DownloadRequest(**options, dry_run=dry_run, server=server or polyhaven.SERVER)
+        fetched = polyhaven.pull(request, out or polyhaven.maps_folder())
+        results = _print_results(fetched, request.indoor + request.outdoor, as_json=as_json, quiet=quiet)
+        if not quiet:
+            _print_missing_counts(request, results)
+            # The terms of service of Poly Haven require these words.
+            print_status("powered by Poly Haven, polyhaven.com")
     context.exit(1 if any(result.error for result in results) else 0)
-
-
-def _check_no_map_options(context: click.Context) -> None:
-    for name in ("indoor", "outdoor", "resolution", "format"):
-        if context.get_parameter_source(name) is click.core.ParameterSource.COMMANDLINE:
-            raise click.UsageError(f"--{name} is for maps; photos have none.")
 
 
 def _pull_photos(
@@ -119,7 +111,7 @@ def _pull_photos(
 def _print_results(
     fetched: Iterator[DownloadResult], total: int, *, as_json: bool, quiet: bool
 ) -> list[DownloadResult]:
-    """Downloads the files, and prints each result and a summary. After an interruption, the summary is printed too."""
+    """Downloads the files, and prints each result and, also after an interruption, a summary."""
     results: list[DownloadResult] = []
     shares_terminal = as_json and standard_output.stream.isatty()
     try:
@@ -129,7 +121,12 @@ def _print_results(
                 _print_result(result, as_json=as_json, quiet=quiet)
                 update_progress(sum(result.status != "missing" for result in results), result.asset)
     finally:
-        _print_summary(results, quiet=quiet)
+        counts = Counter(result.status for result in results)
+        if counts and not quiet:
+            print_status(", ".join(f"{count} {status}" for status, count in sorted(counts.items())))
+        for result in results:
+            if result.error:
+                print_error(f"{result.asset}: {result.error}")
     return results
 
 
@@ -138,25 +135,13 @@ def _print_result(result: DownloadResult, *, as_json: bool, quiet: bool) -> None
         write_out(f"{json.dumps(asdict(result))}\n".encode())
     elif result.status == "planned":
         write_out(f"{one_line(result.url)} -> {one_line(result.file)}\n".encode())
-    if quiet:
-        return
-    if result.status == "missing":
-        print_status(
-            f"{result.asset}: left out, because the server has no file in this resolution and format"
-        )
-    elif result.status == "skipped":
-        print_status(f"{result.file}: skipped, because it exists")
-    elif result.status == "downloaded":
-        print_status(f"{result.asset} -> {result.file} ({(result.bytes or 0) / 1e6:.1f} MB)")
-
-
-def _print_summary(results: Sequence[DownloadResult], *, quiet: bool) -> None:
-    counts = Counter(result.status for result in results)
-    if counts and not quiet:
-        print_status(", ".join(f"{count} {status}" for status, count in sorted(counts.items())))
-    for result in results:
-        if result.error:
-            print_error(f"{result.asset}: {result.error}")
+    lines = {
+        "missing": f"{result.asset}: left out, because the server has no file in this resolution and format",
+        "skipped": f"{result.file}: skipped, because it exists",
+        "downloaded": f"{result.asset} -> {result.file} ({(result.bytes or 0) / 1e6:.1f} MB)",
+    }
+    if not quiet and result.status in lines:
+        print_status(lines[result.status])
 
 
 def _print_missing_counts(request: DownloadRequest, results: Sequence[DownloadResult]) -> None:

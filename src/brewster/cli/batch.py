@@ -25,30 +25,12 @@ if TYPE_CHECKING:
     from brewster.executors.local import Executor
 
 
-def open_executor(
-    options: Options, output: str | None, *, overwrite: bool, workers: int | None, cluster: str | None
-) -> Executor[FileResult]:
-    """Returns the executor of a batch in several processes, or on a cluster. The caller enters its context."""
-    from brewster.batch.parallel import SeparationRunner  # noqa: PLC0415
-    from brewster.executors.local import ProcessExecutor  # noqa: PLC0415
-
-    shared_folder = location(output) if cluster and output else None
-    create_runner = partial(SeparationRunner, options, shared_folder, overwrite=overwrite)
-    if not cluster:
-        return ProcessExecutor(create_runner, workers or 1)
-    from brewster.executors.ray_cluster import RayExecutor  # noqa: PLC0415
-
-    return RayExecutor(create_runner, cluster, workers)
-
-
 @final
 @dataclass
 class BatchReport:
-    """Prints a line for each result, and at the end a summary, and writes the contact sheet and the index.
-
-    The summary is printed if all `count` photos have a result, also after an error. The results are not kept in memory, because
-    an archive can have millions of photos.
-    """
+    """Prints a line for each result, and at the end a summary, and writes the contact sheet and the index. The summary
+    is printed if all `count` photos have a result, also after an error. The results are not kept in memory, because
+    an archive can have millions of photos."""
 
     options: Options
     output: str | None
@@ -95,10 +77,8 @@ class BatchReport:
                 update_progress(done + fraction, name)
 
             if self.is_parallel:
-                executor = open_executor(
-                    self.options, self.output, overwrite=self.overwrite, workers=workers, cluster=cluster
-                )
-                results = separate_in_parallel(tasks, stack.enter_context(executor), overwrite=self.overwrite)
+                executor = stack.enter_context(self._executor(workers, cluster))
+                results = separate_in_parallel(tasks, executor, overwrite=self.overwrite)
             else:
                 results = separate_tasks(
                     tasks,
@@ -112,6 +92,19 @@ class BatchReport:
                 update_progress(self.counts.total(), result.source)
                 interrupts.raise_pending()
         return 1 if self.counts["failed"] else 0
+
+    def _executor(self, workers: int | None, cluster: str | None) -> Executor[FileResult]:
+        """Returns the executor of a batch in several processes, or on a cluster."""
+        from brewster.batch.parallel import SeparationRunner  # noqa: PLC0415
+        from brewster.executors.local import ProcessExecutor  # noqa: PLC0415
+
+        shared_folder = location(self.output) if cluster and self.output else None
+        create_runner = partial(SeparationRunner, self.options, shared_folder, overwrite=self.overwrite)
+        if not cluster:
+            return ProcessExecutor(create_runner, workers or 1)
+        from brewster.executors.ray_cluster import RayExecutor  # noqa: PLC0415
+
+        return RayExecutor(create_runner, cluster, workers)
 
     def _finish(self, kind: type[BaseException] | None, *_: object) -> None:
         """Writes the contact sheet if there was no error, and prints the summary."""
@@ -169,10 +162,8 @@ class BatchReport:
         from brewster.inference.layer_history import history_step  # noqa: PLC0415
         from brewster.photo.history import PROGRAM, recorded_parameters  # noqa: PLC0415
 
-        options = self.options
-        expected = history_step(
-            "", strength=options.strength, quality=options.quality, additive=options.additive
-        ) | {"model": _model_name(options.model)}
+        given = {name: getattr(self.options, name) for name in ("strength", "quality", "additive")}
+        expected = history_step("", **given) | {"model": _model_name(self.options.model)}
         metadata = (recorded_parameters(Path(path), PROGRAM) for path in result.outputs.values())
         recorded_options = next((parameters for parameters in metadata if parameters), {})
         return ", ".join(

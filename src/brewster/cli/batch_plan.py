@@ -29,10 +29,8 @@ _MAX_NAMES: Final = 10
 
 
 def local_path(text: str) -> str:
-    """Returns the path in an argument that is a file:// address or has quotes around it.
-
-    File managers and some terminals pass a dropped file in this form. The name of an existing file is never changed.
-    """
+    """Returns the path in an argument that is a file:// address or has quotes around it. File managers and some
+    terminals pass a dropped file in this form. The name of an existing file is never changed."""
     if os.path.lexists(text):
         return text
     if len(text) > 2 and text[0] == text[-1] and text[0] in "'\"":
@@ -47,10 +45,9 @@ def absolute_path(path: str) -> str:
 
 
 def skipped_files(files: Sequence[Location]) -> Iterator[str]:
-    """Yields a line about the videos, and a line about all other files, which do not have the suffix of an image either."""
-    videos = [file for file in files if is_video(file)]
+    """Yields a line about the videos, and a line about all other files without the suffix of an image."""
     others = [file for file in files if not is_video(file)]
-    if videos:
+    if videos := [file for file in files if is_video(file)]:
         yield f"{listed(videos, 'video')} skipped: brewster separates photos; extract single images first, for example with ffmpeg"
     if others:
         suffixes = Counter(file.suffix.lower() or "without a suffix" for file in others)
@@ -80,15 +77,8 @@ def is_single_output(photos: Sequence[str], output: str | None) -> bool:
 def plan(
     photos: Sequence[str], output: str | None, options: Options, skipped: list[Location] | None = None
 ) -> list[SeparationTask]:
-    """Returns a task for each photo in the files and folders. A task contains the paths of the photo and of its layers.
-
-    Files in the folders without the suffix of an image, such as videos, are appended to the list `skipped`.
-
-    Raises:
-        click.UsageError: the arguments contradict each other.
-        OutputError: the layers of two photos would have the same path, or the output folder cannot be created or written to.
-        PhotoError: the files and folders contain no photo.
-    """
+    """Returns a task for each photo in the files and folders, as `plan_files`, also for standard input and output and for an
+    image file as output. Raises click.UsageError if the arguments contradict each other."""
     from brewster.batch import plan_files  # noqa: PLC0415  (imports ONNX Runtime and pyvips)
 
     if is_single_output(photos, output):
@@ -123,8 +113,7 @@ def _check_format(image_format: ImageFormat | None, options: Options) -> None:
         raise click.UsageError(
             "If the photo is standard input, -o must be an image file such as clear.jpg, or be left out."
         )
-    name = image_format.name
-    layer = options.layers[0]
+    layer, name = options.layers[0], image_format.name
     if not image_format.is_writable and LAYER_FORMATS.get(layer) != name:
         raise click.UsageError(f"brewster cannot write {name.upper()}: choose another suffix for -o.")
     if layer != "confidence" and options.format_name(layer, name) != name:
@@ -134,11 +123,7 @@ def _check_format(image_format: ImageFormat | None, options: Options) -> None:
 
 
 def check_output(photos: Sequence[str], output: str | None) -> None:
-    """Checks that the output (-o) is not an existing file, and does not end in the suffix of a format that cannot be written.
-
-    Raises:
-        click.UsageError: it is or does.
-    """
+    """Raises click.UsageError if -o is an existing file, or ends in the suffix of a format that cannot be written."""
     # os.path and not pathlib, which raises for names that are too long
     if output is None or "://" in output:
         return
@@ -159,11 +144,8 @@ def check_output(photos: Sequence[str], output: str | None) -> None:
 
 
 def gpu_for_plan(name: str | None) -> GraphicsCard:
-    """Returns the GPU of this name, or that of this machine, or else that of the paper, with a message.
-
-    Raises:
-        DeviceError: the name is unknown.
-    """
+    """Returns the GPU of this name, or that of this machine, or else that of the paper, with a message. Raises
+    DeviceError if the name is unknown."""
     from brewster.models.diffusion_resources import PAPER_GPU, find_gpu, local_gpu  # noqa: PLC0415
 
     gpu = find_gpu(name) if name else local_gpu()

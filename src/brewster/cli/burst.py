@@ -68,8 +68,7 @@ def burst(
     alone, and the output reports why.
 
     PHOTO is an image file, a video, or a folder. All image files are one burst. The photos of each folder, and of each folder in
-    it, are one burst. The layers are named after the reference photo, or the video.
-    """
+    it, are one burst. The layers are named after the reference photo, or the video."""
     photos = tuple(map(local_path, photos))
     options = parse_options(context, values, single_output=is_single_output((), output))
     zoo.model_name(options.model)

@@ -10,6 +10,7 @@ import sys
 import warnings
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
+from itertools import groupby
 from typing import Final, Literal, final
 
 import click
@@ -59,8 +60,7 @@ def doctor(context: click.Context, *, as_json: bool, needs: str | None) -> None:
     """Check what works on this machine and what is missing.
 
     The command that installs a missing part is printed below it. Commands with constraints.txt must be run in the root of the
-    repository of brewster. The exit code is 1 if a required part does not work.
-    """
+    repository of brewster. The exit code is 1 if a required part does not work."""
     if needs is not None:
         _require_extras(needs.split(","))
         return
@@ -69,13 +69,11 @@ def doctor(context: click.Context, *, as_json: bool, needs: str | None) -> None:
     if as_json:
         print_out(json.dumps({"ok": is_healthy, "checks": [asdict(check) for check in checks]}))
     else:
-        area = None
-        for check in checks:
-            if check.area != area:
-                print_out(check.area)
-            area = check.area
-            cure = f"\n{'':8}{check.cure}" if check.cure else ""
-            print_out(f"  {_SYMBOLS[check.status]}  {check.name:16} {check.detail}{cure}")
+        for area, found in groupby(checks, key=lambda check: check.area):
+            print_out(area)
+            for check in found:
+                cure = f"\n{'':8}{check.cure}" if check.cure else ""
+                print_out(f"  {_SYMBOLS[check.status]}  {check.name:16} {check.detail}{cure}")
         print_out(
             "All required parts work."
             if is_healthy
@@ -114,7 +112,7 @@ def _packages() -> Iterator[Check]:
         versions = {package: _version(package) for package in packages}
         missing = [package for package, version in versions.items() if version is None]
         found = ", ".join(f"{package} {version}" for package, version in versions.items() if version)
-        detail = f"{'without ' + ', '.join(missing) if missing else found}"
+        detail = f"without {', '.join(missing)}" if missing else found
         cure = install_command(extra) if missing else None
         yield Check("extras", extra, "missing" if missing else "ok", detail, cure, needed=False)
 
@@ -205,9 +203,8 @@ def _mitsuba() -> Iterator[Check]:
         with warnings.catch_warnings(action="ignore", category=RuntimeWarning):
             variant.load()
     except MissingExtra as error:
-        yield Check(
-            "renderer", "mitsuba", "broken", str(error), variant.install_command(str(error)), needed=False
-        )
+        cure = variant.install_command(str(error))
+        yield Check("renderer", "mitsuba", "broken", str(error), cure, needed=False)
         return
     yield Check("renderer", "mitsuba", "ok", version)
     probed = variant.probe()
@@ -222,13 +219,13 @@ def _diffusion() -> Iterator[Check]:
     """Checks what diffusion models may need in addition to the extra `diffusion`."""
     if _version("diffusers") is None:
         return
-    version = _version("bitsandbytes")
-    detail = version or "not installed; needed for nf4 and 8-bit AdamW on NVIDIA GPUs"
-    cure = None if version else "pip install bitsandbytes"
-    yield Check("diffusion", "bitsandbytes", "ok" if version else "missing", detail, cure, needed=False)
     from brewster.models.diffusion.hub_download import has_hub_token  # noqa: PLC0415  (imports torch)
 
-    token_found = has_hub_token()
-    detail = "found" if token_found else "not found; gated models such as FLUX.1 Kontext need a token"
-    cure = None if token_found else "hf auth login"
-    yield Check("diffusion", "hub token", "ok" if token_found else "missing", detail, cure, needed=False)
+    for name, found, problem, cure in (
+        ("bitsandbytes", _version("bitsandbytes"), "not installed; needed for nf4 and 8-bit AdamW on NVIDIA GPUs", "pip install bitsandbytes"),
+        ("hub token", has_hub_token() and "found", "not found; gated models such as FLUX.1 Kontext need a token", "hf auth login"),
+    ):  # fmt: skip
+        if found:
+            yield Check("diffusion", name, "ok", found, needed=False)
+        else:
+            yield Check("diffusion", name, "missing", problem, cure, needed=False)

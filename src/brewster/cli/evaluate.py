@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Any, Final, final, get_args
 import click
 
 from brewster.cli.extras import require_extra
-from brewster.cli.parameters import DEVICE, FOLDER, Number, named_value
-from brewster.cli.terminal import interrupts, print_error, print_status, progress, write_out
+from brewster.cli.parameters import DEVICE, QUIET_TABLES, Number, flag, named_value, output_folder
+from brewster.cli.terminal import interrupts, print_error, print_out, print_status, progress, write_out
 from brewster.errors import counted
 from brewster.options import Device, Quality
 
@@ -63,11 +63,7 @@ def _size(text: str) -> int | str:
     multiple=True,
     help="A model to run, given in the same way as for `brewster --model`; NAME is its name in the tables; repeatable.",
 )
-@click.option(
-    "--burst",
-    is_flag=True,
-    help="Runs each model a second time, on all photos of each burst (the method NAME burst).",
-)
+@flag("--burst", help="Runs each model a second time, on all photos of each burst (the method NAME burst).")
 @click.option(
     "--predictions",
     metavar="NAME=FOLDER",
@@ -75,13 +71,8 @@ def _size(text: str) -> int | str:
     multiple=True,
     help="The name of another method and the folder of its predictions, named like the photos of the benchmark; repeatable.",
 )
-@click.option(
-    "-o",
-    "--output",
-    "out",
-    type=FOLDER,
-    default=Path("out/evaluate"),
-    help="The folder for results, tables, the report and the models' predictions.",
+@output_folder(
+    "The folder for results, tables, the report and the models' predictions.", default=Path("out/evaluate")
 )
 @click.option(
     "--metrics",
@@ -134,21 +125,15 @@ def _size(text: str) -> int | str:
     default=50,
     help="The number of images of each benchmark that the report shows: those with the worst scores of the first method.",
 )
-@click.option(
-    "--intervals", is_flag=True, help="Print 95 % confidence intervals in the terminal and in table.tex."
-)
+@flag("--intervals", help="Print 95 % confidence intervals in the terminal and in table.tex.")
 @click.option(
     "--export",
     type=click.Choice(["ntire2026"]),
     help="After scoring, also write the zip files that a contest takes, for each method: ntire2026 for openrr=FOLDER.",
 )
-@click.option("--json", "as_json", is_flag=True, help="Print the results as JSON instead of the tables.")
-@click.option("--quiet", is_flag=True, help="Print only errors, and no tables.")
-@click.option(
-    "--dry-run",
-    is_flag=True,
-    help="Check benchmarks and methods, print the names of the images, and score nothing.",
-)
+@flag("--json", "as_json", help="Print the results as JSON instead of the tables.")
+@QUIET_TABLES
+@flag("--dry-run", help="Check benchmarks and methods, print the names of the images, and score nothing.")
 @click.pass_context
 def evaluate(context: click.Context, /, *, dry_run: bool, **options: Any) -> None:  # noqa: ANN401  (the fields of _EvaluateCommand)
     """Score methods on benchmarks, with the unprocessed input as baseline.
@@ -157,8 +142,7 @@ def evaluate(context: click.Context, /, *, dry_run: bool, **options: Any) -> Non
     image), tables.md (also intervals and differences), table.tex, table.csv and report.html. To resume an interrupted run, run the same command again.
 
     Photos and ground truth are paired by file name. If a photo has no ground truth, or if a method fails on it, it is
-    listed, all other photos are scored, and the exit code is 1.
-    """
+    listed, all other photos are scored, and the exit code is 1."""
     require_extra("evaluate", "evaluating")
     command = _EvaluateCommand(**options)
     context.exit(0 if (command.list_cases() if dry_run else command.run()) else 1)
@@ -167,7 +151,7 @@ def evaluate(context: click.Context, /, *, dry_run: bool, **options: Any) -> Non
 @final
 @dataclass(frozen=True)
 class _EvaluateCommand:
-    """The options of the command. Its methods import torch, which takes two seconds, only when they run."""
+    """The options of the command. Its methods import torch, which takes two seconds."""
 
     benchmarks: tuple[tuple[str, str], ...]
     models: tuple[tuple[str, str], ...]
@@ -230,7 +214,7 @@ class _EvaluateCommand:
                 on_progress=on_progress,
             )
         if self.as_json:
-            write_out(f"{json.dumps(results)}\n".encode())
+            print_out(json.dumps(results))
         elif not self.quiet:
             print_tables(results, intervals=self.intervals)
             print_status(
@@ -261,12 +245,11 @@ class _EvaluateCommand:
         from brewster.benchmarks.registry import read_benchmark  # noqa: PLC0415
         from brewster.benchmarks.selection import spread, with_unique_names  # noqa: PLC0415
 
-        read = [
-            (benchmark, Path(folder))
-            for name, folder in self.benchmarks
-            for benchmark in read_benchmark(name, Path(folder))
-        ]
-        unique = with_unique_names([part for part, _ in read], [folder for _, folder in read])
+        parts, folders = [], []
+        for name, folder in self.benchmarks:
+            parts += (read := read_benchmark(name, Path(folder)))
+            folders += [Path(folder)] * len(read)
+        unique = with_unique_names(parts, folders)
         return [spread(benchmark, self.limit) for benchmark in unique] if self.limit else unique
 
     def _config(self) -> EvaluationConfig:
@@ -341,7 +324,6 @@ def print_failures(results: Results, *, quiet: bool) -> bool:
         )
     for error in failures(results):
         print_error(error)
-    count = sum(len(picture["errors"]) for picture in results["cases"])
-    if count:
-        print_error(f"{count} {'prediction' if count == 1 else 'predictions'} could not be scored")
+    if count := sum(len(picture["errors"]) for picture in results["cases"]):
+        print_error(f"{counted(count, 'prediction')} could not be scored")
     return not count and not results["unavailable"]

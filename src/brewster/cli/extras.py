@@ -44,13 +44,8 @@ def missing_packages(packages: Iterable[str]) -> list[str]:
 
 
 def require_extra(name: str, purpose: str, *, without: frozenset[str] = frozenset()) -> None:
-    """Checks that the packages of an extra are installed, except those in `without`.
-
-    `purpose` is what needs the extra, for the error message: "training".
-
-    Raises:
-        MissingExtra: a package is missing.
-    """
+    """Checks that the packages of an extra are installed, except those in `without`. `purpose` is what needs the extra,
+    for the error message: "training". Raises MissingExtra if a package is missing."""
     if missing := missing_packages(package for package in EXTRAS[name] if package not in without):
         raise MissingExtra.for_extra(
             name,

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, cast
 import click
 
 from brewster.cli.extras import require_extra
-from brewster.cli.parameters import FILE, JSON, Number
+from brewster.cli.parameters import FILE, JSON, Number, flag
 from brewster.cli.terminal import print_error, print_out, print_status
 from brewster.errors import BrewsterError, ModelError
 from brewster.files import write_atomically
@@ -42,8 +42,7 @@ def list_models(*, as_json: bool) -> None:
     An entry has the name, the size of the file or download, and the licence. A diffusion model has two more lines: the layers
     that it predicts, its GPU memory (with the format of the weights, and with the weights offloaded to host memory), the
     download of its text encoder, and how to get it. Sizes and memory of diffusion models are estimates for a photo of 12
-    megapixels on an RTX 4090; --plan estimates them for another photo or GPU.
-    """
+    megapixels on an RTX 4090; --plan estimates them for another photo or GPU."""
     rows = [describe(model) for model in zoo.MODELS.values()]
     if as_json:
         print_out(
@@ -55,11 +54,8 @@ def list_models(*, as_json: bool) -> None:
         print_out(f"{row['name']:20} {size:>10}  {row['licence']}")
     for model in DIFFUSION_MODELS.values():
         needs = _resources(model)
-        encoder = (
-            f"; text encoder: {needs['text_encoder_gb']} GB more to download"
-            if needs["text_encoder_gb"]
-            else ""
-        )
+        size = needs["text_encoder_gb"]
+        encoder = f"; text encoder: {size} GB more to download" if size else ""
         use = "" if model.allows_commercial_use else " (not for commercial use)"
         print_out(f"{model.name:20} {needs['download_gb']:>7g} GB  {model.licence}{use}")
         print_out(
@@ -132,16 +128,14 @@ def import_model(
     base_model: str,
     prompt: str | None,
     panels: str,
-    alpha: int | None,
     short_side: int,
-    device: str,
+    **options: Any,  # noqa: ANN401  (alpha and device)
 ) -> None:
     """Convert a model of another program to a FOLDER that --model opens.
 
     SOURCE is a LoRA for kontext, klein or qwen (a .safetensors file, a folder or hub id with one such file, or
     OWNER/NAME/FILE on the hub) with the keys of peft, diffusers, kohya's sd-scripts or ComfyUI; or the checkpoint
-    GenSIRR.pt.
-    """
+    GenSIRR.pt."""
     require_extra("diffusion", "importing a model")
     if Path(source).suffix in _CHECKPOINT_SUFFIXES:
         from brewster.models.diffusion import gensirr  # noqa: PLC0415  (imports torch)
@@ -153,9 +147,7 @@ def import_model(
         from brewster.models.diffusion.adapter.importer import import_lora  # noqa: PLC0415  (imports torch)
 
         names = cast("tuple[Panel, ...]", tuple(panels.split(",")))
-        import_lora(
-            source, folder, base_model=base_model, prompt=prompt, panels=names, alpha=alpha, device=device
-        )
+        import_lora(source, folder, base_model=base_model, prompt=prompt, panels=names, **options)
     print_status(f"{source} -> {folder}; use it with: --model {folder}")
 
 
@@ -204,13 +196,11 @@ def verify(context: click.Context, *, names: tuple[str, ...], as_json: bool) -> 
 @models.command
 @click.argument("folder", type=FILE)
 @click.argument("repo_id", metavar="OWNER/NAME")
-@click.option("--public", is_flag=True, help="Make the repository public; by default it is private.")
+@flag("--public", help="Make the repository public; by default it is private.")
 @click.option(
     "--message", metavar="TEXT", help="The commit message; by default, one with the base model and the rank."
 )
-@click.option(
-    "--dry-run", is_flag=True, help="Check the folder, print the planned upload, and upload nothing."
-)
+@flag("--dry-run", help="Check the folder, print the planned upload, and upload nothing.")
 @JSON
 def push(
     *, folder: Path, repo_id: str, public: bool, message: str | None, dry_run: bool, as_json: bool
@@ -218,8 +208,7 @@ def push(
     """Upload the LoRA in FOLDER to the Hugging Face hub as OWNER/NAME, in one commit.
 
     The weights, the prompt embedding, the recipe and the model card are uploaded. Local paths in them are shortened to
-    their last part. The access token is the environment variable HF_TOKEN, or the token that `hf auth login` stored.
-    """
+    their last part. The access token is the environment variable HF_TOKEN, or the token that `hf auth login` stored."""
     require_extra("diffusion", "uploading a LoRA")
     from brewster.models.diffusion.adapter import hub  # noqa: PLC0415  (imports torch)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import reduce
+from functools import partial, reduce
 from pathlib import Path
 from typing import Any, Final, TypeVar, final, get_args
 
@@ -11,13 +11,17 @@ import click
 
 from brewster.options import Device
 
+_Command = TypeVar("_Command", bound=Callable[..., Any])
+
 FILE: Final = click.Path(path_type=Path)
 FOLDER: Final = click.Path(path_type=Path, file_okay=False)
 EXISTING_FOLDER: Final = click.Path(path_type=Path, file_okay=False, exists=True)
 FOLDER.name = EXISTING_FOLDER.name = "folder"
-JSON: Final = click.option("--json", "as_json", is_flag=True, help="Print JSON.")
-QUIET: Final = click.option("--quiet", is_flag=True, help="Print only errors.")
-OVERWRITE: Final = click.option("--overwrite", is_flag=True, help="Replace existing layers.")
+flag: Final = partial(click.option, is_flag=True)
+JSON: Final = flag("--json", "as_json", help="Print JSON.")
+QUIET: Final = flag("--quiet", help="Print only errors.")
+QUIET_TABLES: Final = flag("--quiet", help="Print only errors, and no tables.")
+OVERWRITE: Final = flag("--overwrite", help="Replace existing layers.")
 DEVICE: Final = click.option(
     "--device", type=click.Choice(get_args(Device)), default="auto", help="The device that runs the models."
 )
@@ -37,7 +41,20 @@ class Fraction(click.FloatRange):
     name = "fraction"
 
 
-_Command = TypeVar("_Command", bound=Callable[..., Any])
+def json_lines(item: str) -> Callable[[_Command], _Command]:
+    """The option --json of a command that prints a line for each item."""
+    return flag("--json", "as_json", help=f"Print one line of JSON for each {item} on standard output.")
+
+
+def output_folder(description: str, **settings: Any) -> Callable[[_Command], _Command]:  # noqa: ANN401
+    """The option -o of a command that writes a folder; `settings` are those of click."""
+    return click.option("-o", "--output", "out", type=FOLDER, help=description, **settings)
+
+
+def gpu_name(example: str) -> Callable[[_Command], _Command]:
+    """The option --gpu of a command that estimates memory and time."""
+    text = f'Estimate for this GPU, such as "{example}", instead of the GPU of this machine; implies --plan.'
+    return click.option("--gpu", "gpu_name", metavar="NAME", help=text)
 
 
 def options(*decorators: Callable[[_Command], _Command]) -> Callable[[_Command], _Command]:

@@ -1,7 +1,6 @@
 """Generates the reference of all recipe keys from their pydantic models: `make docs` writes docs/recipes.md.
 
-.venv/bin/python -m brewster.cli.recipe_reference > docs/recipes.md
-"""
+.venv/bin/python -m brewster.cli.recipe_reference > docs/recipes.md"""
 
 from __future__ import annotations
 
@@ -54,11 +53,8 @@ def _sections() -> Iterator[str]:
             if table.name in seen:
                 yield f"The keys are those of {seen[table.name]}."
             else:
-                head = [
-                    "| key | type | allowed values | unit | default | meaning |",
-                    "|---|---|---|---|---|---|",
-                ]
-                yield "\n".join([*head, *map(_row, table.keys)])
+                head = "| key | type | allowed values | unit | default | meaning |\n|---|---|---|---|---|---|"
+                yield "\n".join([head, *map(_row, table.keys)])
             seen.setdefault(table.name, f'`[{table.path}]` in "{title}"')
 
 

@@ -1,7 +1,6 @@
 """Generates the reference of the command line from the commands: `make docs` writes docs/reference.md.
 
-.venv/bin/python -m brewster.cli.reference > docs/reference.md
-"""
+.venv/bin/python -m brewster.cli.reference > docs/reference.md"""
 
 from __future__ import annotations
 
@@ -22,12 +21,8 @@ by Ctrl-C."""
 
 def reference() -> str:
     """Returns the page in Markdown, with a section for each command and its options."""
-    return (
-        "\n\n".join(
-            [_BEGINNING, *_sections(cli, click.Context(cli, info_name="brewster", show_default=True))]
-        )
-        + "\n"
-    )
+    context = click.Context(cli, info_name="brewster", show_default=True)
+    return "\n\n".join([_BEGINNING, *_sections(cli, context)]) + "\n"
 
 
 def _sections(command: click.Command, context: click.Context) -> Iterator[str]:

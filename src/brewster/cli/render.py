@@ -15,7 +15,7 @@ import click
 from click.core import ParameterSource
 
 from brewster.cli.extras import require_extra
-from brewster.cli.parameters import EXISTING_FOLDER, FILE, QUIET, Number
+from brewster.cli.parameters import EXISTING_FOLDER, FILE, QUIET, Number, flag, json_lines
 from brewster.cli.terminal import (
     interrupts,
     print_error,
@@ -111,10 +111,8 @@ def _size(text: str) -> tuple[int, int]:
     multiple=True,
     help="A folder of photos that are placed in front of the environment maps; repeatable.",
 )
-@click.option(
-    "--shards", is_flag=True, help="Pack every 100 samples into a shard, a tar file in the WebDataset layout."
-)
-@click.option("--preview", is_flag=True, help="Also write preview.png, which shows the first 40 samples.")
+@flag("--shards", help="Pack every 100 samples into a shard, a tar file in the WebDataset layout.")
+@flag("--preview", help="Also write preview.png, which shows the first 40 samples.")
 @click.option(
     "--workers",
     type=Number(0),
@@ -128,9 +126,7 @@ def _size(text: str) -> tuple[int, int]:
     type=FILE,
     help="Render only the sample that this scene.toml describes, and write the files of the sample directly into OUT.",
 )
-@click.option(
-    "--json", "as_json", is_flag=True, help="Print one line of JSON for each sample on standard output."
-)
+@json_lines("sample")
 @QUIET
 @click.pass_context
 def render(
@@ -182,7 +178,7 @@ def render(
 @final
 @dataclass(frozen=True)
 class _RenderCommand:
-    """The options of the command. Its methods import torch, which takes two seconds, only when they run."""
+    """The options of the command. Its methods import torch, which takes two seconds."""
 
     out: Path
     recipe: str

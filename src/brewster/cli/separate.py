@@ -23,7 +23,7 @@ from brewster.cli.batch_plan import (
     skipped_files,
 )
 from brewster.cli.extras import require_extra
-from brewster.cli.parameters import FILE, OVERWRITE, QUIET, Number
+from brewster.cli.parameters import FILE, OVERWRITE, QUIET, Number, flag, gpu_name, json_lines
 from brewster.cli.terminal import print_out, print_status, standard_output
 from brewster.errors import BrewsterError
 from brewster.image_formats import FormatName, canonical_format, format_of
@@ -131,15 +131,9 @@ def _param_type(hint: object, field: dataclasses.Field[Any]) -> click.ParamType[
     help="Where to write the layers: a folder, an image file for a single layer, or - for standard output.",
 )
 @with_options
-@click.option(
-    "--json", "as_json", is_flag=True, help="Print one line of JSON for each photo on standard output."
-)
+@json_lines("photo")
 @QUIET
-@click.option(
-    "--dry-run",
-    is_flag=True,
-    help="Print the planned files, and the photos that cannot be opened. Write nothing.",
-)
+@flag("--dry-run", help="Print the planned files, and the photos that cannot be opened. Write nothing.")
 @OVERWRITE
 @click.option(
     "--contact-sheet",
@@ -157,21 +151,13 @@ def _param_type(hint: object, field: dataclasses.Field[Any]) -> click.ParamType[
     metavar="local|ADDRESS",
     help="Separate on a Ray cluster, and write the index; -o must be a URL, or a folder that all nodes share.",
 )
-@click.option(
-    "--index", is_flag=True, help="Write index.parquet into the folder -o: a table with a row for each photo."
-)
-@click.option(
+@flag("--index", help="Write index.parquet into the folder -o: a table with a row for each photo.")
+@flag(
     "--plan",
     "is_plan",
-    is_flag=True,
     help="For diffusion models: estimate memory, time and download for the first photo, and stop. Downloads nothing.",
 )
-@click.option(
-    "--gpu",
-    "gpu_name",
-    metavar="NAME",
-    help='Estimate for this GPU, such as "RTX 4060", instead of the GPU of this machine; implies --plan.',
-)
+@gpu_name("RTX 4060")
 @click.pass_context
 def separate(
     context: click.Context,
@@ -201,9 +187,7 @@ def separate(
 
     Photos whose layers exist are skipped. A photo fails if these layers were made from another photo, for example one with the
     same name in another folder. If a photo fails, the other photos are still separated, the failed photo is listed at the
-    end, and the exit code is 1.
-    """
-
+    end, and the exit code is 1."""
     photos, output = tuple(map(local_path, photos)), output and local_path(output)
     options = parse_options(context, values, single_output=is_single_output(photos, output))
     if is_plan or gpu_name:
@@ -243,11 +227,7 @@ def separate(
 
 
 def parse_options(context: click.Context, values: dict[str, Any], *, single_output: bool) -> Options:
-    """Returns the options; the only layer of a single output is the transmission by default.
-
-    Raises:
-        click.UsageError: a value is invalid.
-    """
+    """Returns the options, or raises click.UsageError. A single output is the transmission by default."""
     if single_output and context.get_parameter_source("layers") is ParameterSource.DEFAULT:
         values["layers"] = ("transmission",)
     try:
@@ -282,8 +262,7 @@ def _check_contact_sheet(
     """Checks that the contact sheet can be written before any photo is separated."""
     if cluster:
         raise click.UsageError("--contact-sheet cannot be combined with --cluster.")
-    row = format_of(path)
-    if row is None or not row.is_writable:
+    if not ((row := format_of(path)) and row.is_writable):
         raise click.UsageError(f"--contact-sheet must be an image file such as sheet.jpg, not {path}.")
     if "-" in (*photos, output):
         raise click.UsageError(

@@ -17,7 +17,7 @@ from typing import Any, Final
 import click
 
 from brewster.cli.extras import require_extra
-from brewster.cli.parameters import DEVICE, Number, options
+from brewster.cli.parameters import DEVICE, Number, flag, options
 from brewster.cli.terminal import print_out, print_status
 from brewster.files import DEFAULT_MAX_PIXELS
 from brewster.options import Device
@@ -42,10 +42,8 @@ def address_options(port: int, token_help: str) -> Callable[[Callable[..., Any]]
 
 
 def print_link(url: str, token: str | None, *, open_browser: bool = False, qr_code: bool = False) -> None:
-    """Prints the link to the server, including the token, on standard output.
-
-    `open_browser` also opens the link, and `qr_code` prints it as a QR code on standard error.
-    """
+    """Prints the link to the server, including the token, on standard output. `open_browser` also opens the link, and
+    `qr_code` prints it as a QR code on standard error."""
     link = f"{url}?token={token}" if token else url
     print_out(link)
     if qr_code:
@@ -68,10 +66,9 @@ def _print_qr_code(link: str) -> None:
 
 
 def _limit_arenas() -> None:
-    """Limits the allocator of glibc to two arenas, because an arena per thread keeps memory that other threads cannot use.
-
-    Over 1,500 different photos, the server then needs 257 to 290 MB, instead of 302 to 359 MB (as with MALLOC_ARENA_MAX=2).
-    """
+    """Limits the allocator of glibc to two arenas, because an arena per thread keeps memory that other threads cannot
+    use. Over 1,500 different photos, the server then needs 257 to 290 MB, instead of 302 to 359 MB (as with
+    MALLOC_ARENA_MAX=2)."""
     if sys.platform == "linux":
         with contextlib.suppress(AttributeError):  # another C library, such as musl
             ctypes.CDLL(None).mallopt(_M_ARENA_MAX, 2)
@@ -91,9 +88,8 @@ def _read_token(_context: click.Context, _parameter: click.Parameter, token: str
     8417,
     "The token that each request must contain; auto generates a token. By default, no token is required if --host is a loopback address such as 127.0.0.1; for any other address, the default is auto.",
 )
-@click.option(
+@flag(
     "--lan",
-    is_flag=True,
     help="Serve phones in the same network: bind to the address of this machine in it, require a token, and print the link as a QR code.",
 )
 @click.option(
@@ -123,12 +119,11 @@ def _read_token(_context: click.Context, _parameter: click.Parameter, token: str
     metavar="SECONDS",
     help="The maximum time for one photo, including the time in the queue.",
 )
-@click.option(
+@flag(
     "--verbose",
-    is_flag=True,
     help="Log each photo that fails on standard error, with the messages of the libraries that read it.",
 )
-@click.option("--open", "open_browser", is_flag=True, help="Open the page in the web browser.")
+@flag("--open", "open_browser", help="Open the page in the web browser.")
 def serve(
     *,
     host: str,
@@ -148,8 +143,7 @@ def serve(
 
     Drop photos on the page to separate them. Photos are neither sent to other machines nor written to the disk.
     Nothing is downloaded, except a diffusion model given with --model that is not in the cache. docs/serving.md
-    describes the API.
-    """
+    describes the API."""
     require_extra("web", "serving", without=frozenset({"matplotlib"}))
     from brewster.web import application as web  # noqa: PLC0415  (imports FastAPI)
     from brewster.web.job_queue import JobQueue  # noqa: PLC0415

@@ -8,12 +8,12 @@ import json
 import re
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import click
 
 from brewster.cli.extras import require_extra
-from brewster.cli.parameters import FOLDER, JSON, Fraction, Number, named_value, options
+from brewster.cli.parameters import FOLDER, JSON, Fraction, Number, flag, named_value, options, output_folder
 from brewster.cli.serve import AUTO, address_options, print_link
 from brewster.cli.terminal import print_error, print_out, print_status, progress, write_out
 from brewster.errors import BrewsterError, counted
@@ -53,8 +53,7 @@ def study() -> None:
 
     `create` makes a study from folders of outputs, `plan` computes the required number of participants, `serve` serves
     the page for participants, `progress` shows how far they are, and `report` evaluates their answers. `export` and `import` are
-    for participants who cannot reach this machine. docs/study.md defines all terms.
-    """
+    for participants who cannot reach this machine. docs/study.md defines all terms."""
 
 
 @study.command
@@ -88,10 +87,10 @@ def study() -> None:
     metavar="FILE",
     help="Use only the inputs in this text file, one per line: real/12 for picture 12 of the dataset real, or 12 without datasets.",
 )
-@click.option("--all-pairs", is_flag=True, help="Compare each method with every other method.")
+@flag("--all-pairs", help="Compare each method with every other method.")
 @click.option(
     "--comparisons",
-    "comparisons_per_participant",
+    "pairs",
     type=Number(1),
     help="The number of pairs per participant; by default 40, or all pairs if the study has fewer.",
 )
@@ -118,19 +117,15 @@ def create(
     methods: tuple[tuple[str, str], ...],
     datasets: tuple[str, ...],
     list_file: Path | None,
-    all_pairs: bool,
-    comparisons_per_participant: int | None,
-    catch_trials: int | None,
-    seed: int | None,
     consent: Path | None,
+    **options: Any,  # noqa: ANN401  (those of create_study)
 ) -> None:
     """Create a study in the folder OUT from folders of outputs.
 
     Inputs and outputs are paired by dataset and file name, whatever their format. FOLDER/real/12.png and
     FOLDER/nature/3.jpg belong to the datasets real and nature; without subfolders, FOLDER/12.png belongs to a single
     dataset without a name. If an image is missing, duplicate, unreadable or of another size, the error lists it, and
-    nothing is written. The study folder contains copies of all images and can be moved.
-    """
+    nothing is written. The study folder contains copies of all images and can be moved."""
     from brewster.user_study.create import CATCH_POOL_SIZE, DEFAULT_CONSENT, create_study  # noqa: PLC0415  (imports pyvips)
     from brewster.user_study.folders import find_pictures, select_pictures  # noqa: PLC0415
 
@@ -141,8 +136,8 @@ def create(
             "expected a different name for each method",
             "rename one of the methods",
         )
-    names = [line.strip() for line in _read_text(list_file).splitlines()] if list_file else []
-    names = [name for name in names if name]
+    lines = map(str.strip, _read_text(list_file).splitlines()) if list_file else ()
+    names = [line for line in lines if line]
     if list_file and not names:
         raise BrewsterError(f"{list_file} is empty", "expected one input per line", "add inputs to the list")
     pictures = select_pictures(find_pictures(inputs, datasets), names, inputs)
@@ -155,10 +150,7 @@ def create(
             folders,
             datasets=datasets,
             names=names,
-            pairs=comparisons_per_participant,
-            catch_trials=catch_trials,
-            all_pairs=all_pairs,
-            seed=seed,
+            **options,
             consent=DEFAULT_CONSENT if consent is None else _read_text(consent),
             on_progress=lambda done: update_progress(done, "copying"),
         ).description
@@ -220,8 +212,7 @@ def serve(
     """Serve the page for participants until Ctrl-C.
 
     Each answer is stored on the disk before it is acknowledged. After the server was stopped or killed, run the same
-    command again to continue the study.
-    """
+    command again to continue the study."""
     require_extra("web", "serving", without=frozenset({"matplotlib", "segno"}))
     from brewster.user_study.access_token import load_or_create_token  # noqa: PLC0415
     from brewster.user_study.store import AnswerStore  # noqa: PLC0415
@@ -260,17 +251,14 @@ def _read_answers(folder: Path) -> tuple[Study, list[tuple[Participant, dict[int
 
 @study.command
 @click.argument("folder", metavar="STUDY", type=FOLDER)
-@click.option(
-    "-o", "--output", "out", type=FOLDER, help="The folder for the report; by default STUDY/report."
-)
+@output_folder("The folder for the report; by default STUDY/report.")
 @_RULE_OPTIONS
-@click.option("--json", "as_json", is_flag=True, help="Print the results as JSON instead of the tables.")
-def report(folder: Path, *, out: Path | None, max_failed: float, min_seconds: float, as_json: bool) -> None:
+@flag("--json", "as_json", help="Print the results as JSON instead of the tables.")
+def report(folder: Path, *, out: Path | None, as_json: bool, **rule: float) -> None:
     """Evaluate the answers, both without the excluded participants and with all participants.
 
     The tables are printed on standard output. The output folder gets report.md, report.json, table.tex
-    (in the layout of the paper's Table 3), table.csv, answers.csv and plot.png. The server may run at the same time.
-    """
+    (in the layout of the paper's Table 3), table.csv, answers.csv and plot.png. The server may run at the same time."""
     require_extra("web", "the report", without=frozenset({"fastapi", "python-multipart", "segno", "uvicorn"}))
     from brewster.user_study.report.participants import ExclusionRule, collect_answers  # noqa: PLC0415
     from brewster.user_study.report.results import summarise, write  # noqa: PLC0415
@@ -278,8 +266,7 @@ def report(folder: Path, *, out: Path | None, max_failed: float, min_seconds: fl
 
     opened_study, records = _read_answers(folder)
     answers = collect_answers(records)
-    results = summarise(opened_study, answers, ExclusionRule(max_failed, min_seconds))
-    out = folder / "report" if out is None else out
+    results, out = summarise(opened_study, answers, ExclusionRule(**rule)), out or folder / "report"
     write(results, opened_study, answers, out)
     write_out((json.dumps(results) + "\n" if as_json else overview(results)).encode())
     print_status(f"the report is in {out}")
@@ -289,13 +276,13 @@ def report(folder: Path, *, out: Path | None, max_failed: float, min_seconds: fl
 @click.argument("folder", metavar="STUDY", type=FOLDER)
 @_RULE_OPTIONS
 @JSON
-def show_progress(folder: Path, *, max_failed: float, min_seconds: float, as_json: bool) -> None:
+def show_progress(folder: Path, *, as_json: bool, **rule: float) -> None:
     """Print how many trials each participant has answered, without any result. The server may run at the same time."""
     from brewster.user_study.report.participants import ExclusionRule  # noqa: PLC0415
     from brewster.user_study.report.progress import progress_text, summarise_progress  # noqa: PLC0415
 
     opened_study, records = _read_answers(folder)
-    found = summarise_progress(opened_study.description, records, ExclusionRule(max_failed, min_seconds))
+    found = summarise_progress(opened_study.description, records, ExclusionRule(**rule))
     write_out((json.dumps(found) + "\n" if as_json else progress_text(found)).encode())
 
 
@@ -309,7 +296,7 @@ def show_progress(folder: Path, *, max_failed: float, min_seconds: float, as_jso
 @click.option("--tie", type=Fraction(0, 1, max_open=True), default=0.25, help='The expected fraction of the answer "similar".')  # fmt: skip
 @click.option(
     "--comparisons",
-    "comparisons_per_participant",
+    "pairs",
     type=Number(1),
     default=40,
     help="The number of pairs of these two methods per participant.",
@@ -322,25 +309,11 @@ def show_progress(folder: Path, *, max_failed: float, min_seconds: float, as_jso
 )
 @click.option("--power", type=Fraction(0.5, 1, max_open=True), default=0.8, help="The probability of detecting the difference if it exists.")  # fmt: skip
 @JSON
-def plan(
-    *,
-    difference: float,
-    tie: float,
-    comparisons_per_participant: int,
-    correlation: float,
-    power: float,
-    as_json: bool,
-) -> None:
+def plan(*, pairs: int, correlation: float, power: float, as_json: bool, **rates: float) -> None:
     """Compute the number of participants needed to detect a difference at the 5 % significance level."""
     from brewster.user_study.power_analysis import required_participants  # noqa: PLC0415
 
-    estimate = required_participants(
-        difference=difference,
-        tie=tie,
-        pairs=comparisons_per_participant,
-        correlation=correlation,
-        power=power,
-    )
+    estimate = required_participants(pairs=pairs, correlation=correlation, power=power, **rates)
     if as_json:
         print_out(json.dumps(asdict(estimate)))
         return
@@ -349,7 +322,7 @@ def plan(
         f"{estimate.lose:.1%} losses with {power:.0%} power at the 5 % significance level."
     )
     print_out(
-        f"With {comparisons_per_participant} pairs each and correlation {correlation:g}, the design effect is {estimate.design_effect:.2f}: this number of "
+        f"With {pairs} pairs each and correlation {correlation:g}, the design effect is {estimate.design_effect:.2f}: this number of "
         f"answers carries as much information as one independent answer. The difference between win rate and loss rate varies "
         f"between participants, with a standard deviation of {estimate.deviation:.0%}."
     )
@@ -360,9 +333,7 @@ def plan(
 
 @study.command("export")
 @click.argument("folder", metavar="STUDY", type=FOLDER)
-@click.option(
-    "-o", "--output", "out", type=FOLDER, required=True, help="The new folder for the static files."
-)
+@output_folder("The new folder for the static files.", required=True)
 @click.option(
     "--participants",
     type=Number(1, 10_000),
@@ -378,8 +349,7 @@ def export_study(folder: Path, *, out: Path, participants: int, url: str | None)
     """Write the page of the study as static files, and print one personal link for each participant.
 
     Copy the folder to any web server that serves files. Participants download their answers as a file and send it to you;
-    `brewster study import` adds it to the study.
-    """
+    `brewster study import` adds it to the study."""
     from brewster.user_study.store import AnswerStore  # noqa: PLC0415  (imports pydantic)
     from brewster.user_study.study import read_study  # noqa: PLC0415
     from brewster.web.study_bundle import export_bundle  # noqa: PLC0415
@@ -403,8 +373,7 @@ def import_answers(context: click.Context, folder: Path, files: tuple[Path, ...]
     """Add the answers in files that participants of `brewster study export` have sent.
 
     A file can be imported again: answers that the study already has are kept. An invalid file is reported, the others are imported,
-    and the exit code is 1.
-    """
+    and the exit code is 1."""
     from brewster.user_study.answer_file import read_answer_file  # noqa: PLC0415  (imports pydantic)
     from brewster.user_study.store import AnswerStore  # noqa: PLC0415
     from brewster.user_study.study import read_study  # noqa: PLC0415

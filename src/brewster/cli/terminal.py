@@ -1,7 +1,6 @@
 """Standard output, standard error and Ctrl-C.
 
-Results are written to standard output. Status lines, errors and progress bars are written to standard error.
-"""
+Results are written to standard output. Status lines, errors and progress bars are written to standard error."""
 
 from __future__ import annotations
 
@@ -22,11 +21,9 @@ ProgressUpdater = Callable[[float, str], None]
 
 @final
 class _DeferredInterrupts:
-    """Remembers a KeyboardInterrupt that Python has dropped, and raises it later.
-
-    libvips calls Python to write its log. If Ctrl-C is pressed during such a call, the KeyboardInterrupt cannot pass
-    through the C code, so that Python drops it. Without this class, the command continues after Ctrl-C.
-    """
+    """Remembers a KeyboardInterrupt that Python has dropped, and raises it later. libvips calls Python to write its
+    log. If Ctrl-C is pressed during such a call, the KeyboardInterrupt cannot pass through the C code, so that
+    Python drops it. Without this class, the command continues after Ctrl-C."""
 
     def __init__(self) -> None:
         self._pending = False
@@ -78,11 +75,9 @@ def print_error(text: object) -> None:
 
 @final
 class _Output:
-    """Standard output, reserved for the results of the command. The output of libraries is redirected to standard error.
-
-    Libraries print in two ways, and each needs its own redirection. C code and child processes write to file
-    descriptor 1. Python code writes to `sys.stdout`, as OpenEXR does for a damaged file.
-    """
+    """Standard output, reserved for the results of the command. The output of libraries is redirected to standard
+    error. Libraries print in two ways, and each needs its own redirection. C code and child processes write to file
+    descriptor 1. Python code writes to `sys.stdout`, as OpenEXR does for a damaged file."""
 
     def __init__(self) -> None:
         self._stream: TextIO | None = None
@@ -93,10 +88,8 @@ class _Output:
         return self._stream or sys.stdout
 
     def redirect_descriptor(self) -> None:
-        """Redirects file descriptor 1 to standard error. `sys.stdout` writes to a copy of the original descriptor.
-
-        The redirection lasts until the process ends, because C code may write its buffered output only then.
-        """
+        """Redirects file descriptor 1 to standard error. `sys.stdout` writes to a copy of the original descriptor. The
+        redirection lasts until the process ends, because C code may write its buffered output only then."""
         try:
             if sys.stdout.fileno() != _STDOUT:  # a test or a notebook has replaced it
                 return
@@ -124,21 +117,15 @@ _STDERR: Final = 2
 
 
 def print_out(text: object) -> None:
-    """Prints one line on standard output, and flushes it.
-
-    Raises:
-        OutputError: standard output cannot be written, for example because the disk is full.
-    """
+    """Prints one line on standard output, and flushes it. Raises OutputError if standard output cannot be written, for
+    example because the disk is full."""
     stream = standard_output.stream
     write_out(f"{text}\n".encode(stream.encoding or "utf-8", stream.errors or "strict"))
 
 
 def write_out(data: bytes) -> None:
-    """Writes bytes to standard output, and flushes them.
-
-    Raises:
-        OutputError: standard output cannot be written, for example because the disk is full.
-    """
+    """Writes bytes to standard output, and flushes them. Raises OutputError if standard output cannot be written, for
+    example because the disk is full."""
     stream = standard_output.stream
     try:
         stream.buffer.write(data)
@@ -155,10 +142,8 @@ def write_out(data: bytes) -> None:
 
 @contextmanager
 def progress(total: int, *, shown: bool) -> Iterator[ProgressUpdater]:
-    """Shows a progress bar if `shown` is true and standard error is a terminal. Yields the function that updates the bar.
-
-    A single item has a percentage instead of the number of finished items.
-    """
+    """Shows a progress bar if `shown` is true and standard error is a terminal. Yields the function that updates the
+    bar. A single item has a percentage instead of the number of finished items."""
     if not (shown and sys.stderr.isatty()):
         yield lambda _done, _text: None
         return

@@ -13,7 +13,7 @@ import click
 
 from brewster.cli.batch_plan import gpu_for_plan
 from brewster.cli.extras import require_extra
-from brewster.cli.parameters import FILE, QUIET
+from brewster.cli.parameters import FILE, QUIET, flag, gpu_name
 from brewster.cli.terminal import interrupts, print_out, print_status, progress, standard_output
 from brewster.errors import OutputError, RecipeError
 
@@ -31,17 +31,11 @@ if TYPE_CHECKING:
     type=FILE,
     help="The folder for the checkpoint, the log, its curves, sample images and the trained model (model.onnx or the folder lora); by default out/NAME for NAME.toml.",
 )
-@click.option(
+@flag(
     "--plan",
-    is_flag=True,
     help="Do not train; estimate the memory, download and time that a recipe with a diffusion backbone needs, and check that the GPU has enough memory and that the data can be read.",
 )
-@click.option(
-    "--gpu",
-    "gpu_name",
-    metavar="NAME",
-    help='Estimate for this GPU, such as "RTX 4090", instead of the GPU of this machine; implies --plan.',
-)
+@gpu_name("RTX 4090")
 @click.option(
     "--show-recipe",
     metavar="NAME|FILE",
@@ -53,10 +47,9 @@ if TYPE_CHECKING:
     default="auto",
     help="The device to train on. auto is the GPU, or the CPU if there is no GPU. A diffusion backbone is trained on a CPU only with --device cpu, because this takes weeks.",
 )
-@click.option(
+@flag(
     "--json",
     "as_json",
-    is_flag=True,
     help="Print one line of JSON for each event on standard output: start, report (the metrics of a line of the log), end.",
 )
 @QUIET
@@ -76,8 +69,7 @@ def train(
     The environment variable BREWSTER_DATA is the path of the data folder. To resume an interrupted run from its last
     checkpoint, run the same command again; on a CPU, the final weights are the same as without the interruption. To make a
     run longer, raise `steps` in the recipe and run the command again. To train a LoRA on several GPUs (data parallel),
-    start the command with torchrun.
-    """
+    start the command with torchrun."""
     if show_recipe:
         from brewster.scene.recipe_file import commented_toml  # noqa: PLC0415
         from brewster.training.recipe import read_template  # noqa: PLC0415
@@ -141,14 +133,8 @@ class _TrainingPrinter:
             text = f"the run in {self.folder} is complete at {text}: to make it longer, raise steps in the recipe"
         elif step:
             text = f"resuming the run in {self.folder} from {text}"
-        self._print(
-            text if step else "",
-            event="start",
-            step=step,
-            steps=steps,
-            seconds=seconds,
-            folder=str(self.folder),
-        )
+        event = {"step": step, "steps": steps, "seconds": seconds, "folder": str(self.folder)}
+        self._print(text if step else "", event="start", **event)
 
     def report(self, step: int, steps: int, metrics: Mapping[str, float]) -> None:
         """Prints the metrics of a line of the log."""
@@ -193,9 +179,7 @@ def _print_data(recipe: LoraRecipe) -> None:
     from brewster.training.lora.latents import open_samples  # noqa: PLC0415
 
     samples = open_samples(recipe)
-    panels = [
-        fit.panel for fit in samples.check_sizes(recipe, backbone_class_of(recipe.backbone).size_divisor)
-    ]
-    sizes = sorted(set(panels), key=lambda size: size[0] * size[1])
+    fits = samples.check_sizes(recipe, backbone_class_of(recipe.backbone).size_divisor)
+    sizes = sorted({fit.panel for fit in fits}, key=lambda size: size[0] * size[1])
     span = " to ".join(f"{width} x {height}" for width, height in dict.fromkeys((*sizes[:1], *sizes[-1:])))
     print_out(f"{'data':24}{samples.description()}{f'; panels of {span}' if span else ''}")

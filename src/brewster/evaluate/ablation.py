@@ -1,8 +1,8 @@
-"""Ablation studies: trains a model for each of several values of one key of a training recipe, and compares their scores.
+"""Ablation studies: trains a model for each of several values of one key of a training recipe, and compares their
+scores.
 
 A study is a TOML file with a base recipe, the key, its values and the benchmarks. The first value is the reference
-of the comparisons. A stopped study resumes both training and evaluation.
-"""
+of the comparisons. A stopped study resumes both training and evaluation."""
 
 from __future__ import annotations
 
@@ -67,12 +67,8 @@ class AblationStudy(FrozenModel):
         return f"{self.key.rpartition('.')[2]} {str(value).replace('/', ' ')}"
 
     def open_benchmarks(self) -> list[Benchmark]:
-        """Reads the benchmarks of the study.
-
-        Raises:
-            RecipeError: BREWSTER_DATA is not a folder.
-            PhotoError: a benchmark cannot be read.
-        """
+        """Reads the benchmarks of the study. Raises RecipeError if BREWSTER_DATA is not a folder, and PhotoError if a
+        benchmark cannot be read."""
         root = data_folder()
         return [
             part for name, folder in self.benchmarks.items() for part in read_benchmark(name, root / folder)
@@ -80,11 +76,8 @@ class AblationStudy(FrozenModel):
 
 
 def read_study(path: Path) -> AblationStudy:
-    """Reads and validates a study. The path `base` is resolved relative to the folder of the file.
-
-    Raises:
-        RecipeError: the file is missing or not TOML, or its values are missing, unknown or invalid.
-    """
+    """Reads and validates a study. The path `base` is resolved relative to the folder of the file. Raises RecipeError
+    if the file is missing or not TOML, or its values are missing, unknown or invalid."""
     study = read_toml(AblationStudy, path, reference="docs/recipes.md")
     return study.model_copy(update={"base": path.parent / study.base})
 
@@ -97,20 +90,13 @@ def ablate(
     workers: int = 1,
     on_progress: AblationCallback = lambda _label, _step, _steps, _numbers, _logged: None,
 ) -> Results:
-    """Trains and evaluates a model for every value. `out` gets one folder per value and the files that `evaluate` writes.
-
-    If all values are numbers and any metric has a score, plot.png shows the metrics against the values. The results are
-    those of `evaluate`; the model of each value is a method.
-
-    Raises:
-        RecipeError: the base recipe, the key or a value is invalid, or data is missing.
-        BrewsterError: as raised by training and `evaluate`.
-    """
+    """Trains and evaluates a model for every value. `out` gets one folder per value and the files that `evaluate`
+    writes. If all values are numbers and any metric has a score, plot.png shows the metrics against the values. The
+    results are those of `evaluate`; the model of each value is a method. Raises RecipeError if the base recipe, the
+    key or a value is invalid, or data is missing, and BrewsterError as training and `evaluate` do."""
     config = EvaluationConfig(metrics=study.metrics)
     for metric in config.columns().values():
-        if (
-            metric.prepare
-        ):  # loads the weights of LPIPS: a download that fails must not fail after hours of training
+        if metric.prepare:  # loads weights: a download must not fail after hours of training
             metric.prepare()
     base = read_recipe(study.base)
     recipes = {study.label(value): with_value(base, study.key, value) for value in study.values}
@@ -121,9 +107,8 @@ def ablate(
         def on_step(*values: Any, label: str = label) -> None:  # noqa: ANN401  (the arguments of the training callback)
             on_progress(label, *values)
 
-        models.append(
-            ModelMethod(label, str(_train(recipe, folder, on_step)), out / "predictions" / folder.name)
-        )
+        model = _train(recipe, folder, on_step)
+        models.append(ModelMethod(label, str(model), out / "predictions" / folder.name))
     results = evaluate(benchmarks, [IdentityBaseline(), *models], config, out, workers=workers)
     numbers = [
         value for value in study.values if isinstance(value, int | float) and not isinstance(value, bool)
@@ -142,10 +127,8 @@ def _train(recipe: CompactRecipe | LoraRecipe, folder: Path, on_step: loop.StepC
 
 def _plot(study: AblationStudy, numbers: Sequence[float], results: Results) -> bytes:
     """Returns a PNG plot: PSNR, SSIM and LPIPS as functions of the value, or all metrics if these three have no scores.
-
-    There is one line for each benchmark and one for the average. The bands are the 95 % intervals. A line has no point
-    for a model without a score.
-    """
+    There is one line for each benchmark and one for the average. The bands are the 95 % intervals. A line has no
+    point for a model without a score."""
     import io  # noqa: PLC0415
 
     from matplotlib.figure import Figure  # noqa: PLC0415  (only needed for plots)

@@ -59,11 +59,8 @@ class EvaluationConfig:
                 "choose other numbers",
             )
         if self.short_side_px is not None and self.short_side_px < 1:
-            raise BrewsterError(
-                f"the size is {self.short_side_px} px",
-                "expected a shorter side of 1 px or more",
-                "choose a larger number",
-            )
+            happened = f"the size is {self.short_side_px} px"
+            raise BrewsterError(happened, "expected a shorter side of 1 px or more", "choose a larger number")
         if self.size_divisor < 1 or self.border < 0:
             raise BrewsterError(
                 f"the sides are multiples of {self.size_divisor} px, and the border has {self.border} px",

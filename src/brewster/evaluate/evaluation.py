@@ -34,11 +34,10 @@ from brewster.evaluate.report.latex import to_latex
 from brewster.evaluate.report.published import read_published
 from brewster.evaluate.report.published import to_markdown as published_to_markdown
 from brewster.evaluate.report.tables import scores_to_csv, to_csv, to_markdown
-from brewster.evaluate.resizing import resize
 from brewster.evaluate.results import Results, paper_subsets, summarise
 from brewster.evaluate.runner import ScoreCallback, get_prediction, score
 from brewster.evaluate.score_log import RowId, ScoreRow
-from brewster.evaluate.scoring import GroundTruth
+from brewster.evaluate.scoring import GroundTruth, resize
 from brewster.files import write_atomically
 from brewster.metrics import IDENTICAL_DB
 from brewster.photo import Photo
@@ -63,35 +62,24 @@ def evaluate(
     intervals: bool = False,
     on_progress: ScoreCallback = lambda _done, _total, _row: None,
 ) -> Results:
-    """Scores the methods. Writes results.json, scores.csv, tables.md, table.tex, table.csv and report.html into `out`.
+    """Scores the methods. Writes results.json, scores.csv, tables.md, table.tex, table.csv and report.html into `out`,
+    and the photos into `out`/inputs if they are resized. Returns the content of results.json.
 
-    A metric whose weights are missing is left out, and "unavailable" in the results says why; the next run adds it. If
-    photos are resized, it also writes them into `out`/inputs. Each image is read and decoded once, with four exceptions.
-    The files are read twice if an earlier run has all scores. Exclusive methods read the cases again. The report reads the
-    images of a case again if the benchmark has more than `max_report_cases` cases, or if an earlier run scored the case.
-    The result is the content of results.json.
+    A metric whose weights are missing is left out, and "unavailable" in the results says why; the next run adds it. A
+    stopped run is resumed from the files in `out`, a folder for this evaluation only. Each image is read and decoded
+    once, unless an earlier run has scored it, an exclusive method needs it, or the benchmark has more than
+    `max_report_cases` cases.
 
-    Args:
-        methods: the methods, in the order of the tables. The first one should be the baseline.
-        out: a folder for this evaluation only. A stopped run is resumed from its files.
-        max_report_cases: the maximum of cases of each benchmark in the report. They are the cases with the worst scores of
-            the first method that is not the baseline.
-        intervals: whether table.tex has the confidence intervals.
-
-    Raises:
-        BrewsterError: there is no case or no method, names are not unique, an image matches two cases, the file names do
-            not identify the scenes, which the subsets of the paper need, or an optional dependency is missing.
-        OutputError: `out` cannot be written.
-    """
+    `methods` are in the order of the tables; the first one should be the baseline. The report has at most
+    `max_report_cases` cases of each benchmark: those with the worst scores of the first other method. With `intervals`,
+    table.tex has the confidence intervals. Raises BrewsterError as `check`, and OutputError if `out` cannot be
+    written."""
     check(benchmarks, methods, config)
     cases = [case for benchmark in benchmarks for case in benchmark.cases]
     with TemporaryDirectory(prefix="brewster-report-") as folder:
-        complete = frozenset(
-            benchmark.name for benchmark in benchmarks if len(benchmark.cases) <= max_report_cases
-        )
-        thumbnails = _ThumbnailCache(
-            Path(folder), complete, config, out, {method.name: method for method in methods}
-        )
+        complete = frozenset(part.name for part in benchmarks if len(part.cases) <= max_report_cases)
+        by_name = {method.name: method for method in methods}
+        thumbnails = _ThumbnailCache(Path(folder), complete, config, out, by_name)
         rows, unavailable = score(
             benchmarks,
             methods,
@@ -120,23 +108,20 @@ def evaluate(
         }
         for name, text in tables.items():
             write_atomically(out / name, text.encode(errors="backslashreplace"), overwrite=True)
-        write_report(
-            results, _report_cases(cases, methods, rows, max_report_cases, thumbnails), out / REPORT_FILE
-        )
+        report_cases = _report_cases(cases, methods, rows, max_report_cases, thumbnails)
+        write_report(results, report_cases, out / REPORT_FILE)
     return results
 
 
 def check(benchmarks: Sequence[Benchmark], methods: Sequence[Method], config: EvaluationConfig) -> None:
-    """Checks everything that can be checked before the evaluation starts; see `evaluate` for the errors."""
+    """Checks everything that can be checked before the evaluation starts. Raises BrewsterError if there is no case or no
+    method, names are not unique, an image matches two cases, or the paper's subsets need scenes that the names do not identify."""
     check_names(methods)
     names = [benchmark.name for benchmark in benchmarks]
     for name, count in Counter(names).items():
         if count > 1:
-            raise BrewsterError(
-                f"{count} benchmarks have the name {name!r}",
-                "expected unique names",
-                "rename one of the folders",
-            )
+            happened = f"{count} benchmarks have the name {name!r}"
+            raise BrewsterError(happened, "expected unique names", "rename one of the folders")
     if not any(benchmark.cases for benchmark in benchmarks):
         reasons = [reason for benchmark in benchmarks for reason in benchmark.excluded]
         raise PhotoError(
@@ -179,11 +164,9 @@ def _input_path(folder: Path, case: Case) -> Path:
 @final
 @dataclass(frozen=True)
 class _ThumbnailCache:
-    """Writes the thumbnails of the report and the resized photos while a case is decoded.
-
-    It stores the thumbnails of `benchmarks`, of which the report shows all cases. They are stored in files, because worker
-    processes create them, and because memory must not grow with the number of cases.
-    """
+    """Writes the thumbnails of the report and the resized photos while a case is decoded. It stores the thumbnails of
+    `benchmarks`, of which the report shows all cases. They are stored in files, because worker processes create
+    them, and because memory must not grow with the number of cases."""
 
     folder: Path
     benchmarks: frozenset[str]
@@ -269,8 +252,7 @@ def _report_cases(
             for method in methods
             if method.name != BASELINE and (row := scored_rows.get((case.benchmark, case.name, method.name)))
         }
-        cached = thumbnails.read(case, [method.name for method in method_rows])
-        if cached:
+        if cached := thumbnails.read(case, [method.name for method in method_rows]):
             yield cached
             continue
         try:

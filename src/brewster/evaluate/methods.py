@@ -1,8 +1,7 @@
 """The methods to evaluate: the unprocessed input, brewster's models, and folders with predictions of other methods.
 
-A method predicts a transmission and, optionally, a reflection for a case. Its `key` identifies all inputs of the prediction
-except the photo. If the key and the photo are unchanged, a stored prediction is reused.
-"""
+A method predicts a transmission and, optionally, a reflection for a case. Its `key` identifies all inputs of the
+prediction except the photo. If the key and the photo are unchanged, a stored prediction is reused."""
 
 from __future__ import annotations
 
@@ -41,10 +40,8 @@ _STEM_SUFFIXES: Final = {"transmission": ("_t", "_l"), "reflection": ("_r",)}
 @final
 @dataclass(frozen=True, eq=False)
 class MethodOutput:
-    """The layers that a method predicts for a photo.
-
-    `seconds` is the wall time of the prediction, if it was measured. `digest` is that of the files of the layers, if stored.
-    """
+    """The layers that a method predicts for a photo. `seconds` is the wall time of the prediction, if it was measured.
+    `digest` is that of the files of the layers, if stored."""
 
     transmission: Photo
     reflection: Photo | None = None
@@ -80,11 +77,8 @@ class Method(Protocol):
         ...
 
     def predict(self, case: Case, photo: Photo) -> MethodOutput:
-        """Returns the predicted layers for the photo of a case.
-
-        Raises:
-            BrewsterError: the method failed. Any other exception counts as a failure too.
-        """
+        """Returns the predicted layers for the photo of a case. Raises BrewsterError if the method failed. Any other
+        exception counts as a failure too."""
         ...
 
     def cached(self, case: Case) -> MethodOutput | None:
@@ -117,13 +111,15 @@ class IdentityBaseline:
         return None
 
 
+_separators: dict[tuple[str, Device], Separator] = {}
+"""The models that this process has loaded. Each is loaded once, but a diffusion model replaces the one before it."""
+
+
 @final
 @dataclass(frozen=True)
 class ModelMethod:
-    """A model, run by `Separator`. Its predictions are stored as PNG files in `folder`.
-
-    `PredictionFolder` can read this folder.
-    """
+    """A model, run by `Separator`. Its predictions are stored as PNG files in `folder`. `PredictionFolder` can read
+    this folder."""
 
     name: str
     model: str
@@ -148,22 +144,25 @@ class ModelMethod:
         return f"{self._sha256} {self.quality} {PREDICTION_FORMAT_VERSION}{frames}"
 
     def predict(self, case: Case, photo: Photo) -> MethodOutput:
-        """Separates the photo and stores both layers. Raises BrewsterError.
-
-        Returns:
-            The layers, decoded from the stored bytes. So new and stored predictions have the same scores.
-        """
-        separator = _load_separator(self.model, self.device, self.exclusive)
+        """Separates the photo and stores both layers. Returns the layers decoded from the stored bytes, so that new and stored
+        predictions have the same scores. Raises BrewsterError."""
+        if (key := (self.model, self.device)) not in _separators:
+            if self.exclusive:  # memory is limited: the previous model is freed first
+                _separators.clear()
+                gc.collect()
+            _separators[key] = Separator.load(self.model, device=self.device)
+        separator = _separators[key]
         started = time.perf_counter()
         if self.burst and case.frames:
             from brewster.burst import separate_burst  # noqa: PLC0415  (imports torch)
 
             # The photo may have been resized
+            frames = [Photo.open(file.read()) for file in case.frames]
             frames = [
                 frame
                 if frame.size == photo.size
                 else Photo.from_array(frame.resized(*photo.size), encoding="linear")
-                for frame in (Photo.open(file.read()) for file in case.frames)
+                for frame in frames
             ]
             separation = separate_burst(frames, separator=separator, quality=self.quality)
         else:
@@ -194,19 +193,6 @@ class ModelMethod:
         """Returns layer -> file in which the prediction for a case is stored."""
         folder = self.folder / case.benchmark
         return {layer: folder / f"{case.name}.{layer}.png" for layer in ("transmission", "reflection")}
-
-
-_separators: dict[tuple[str, Device], Separator] = {}
-"""The models that this process has loaded. Each is loaded once, but a diffusion model replaces the one before it."""
-
-
-def _load_separator(model: str, device: Device, exclusive: bool) -> Separator:
-    if (model, device) not in _separators:
-        if exclusive:  # memory is limited: the previous model is freed first
-            _separators.clear()
-            gc.collect()
-        _separators[model, device] = Separator.load(model, device=device)
-    return _separators[model, device]
 
 
 @final
@@ -247,11 +233,8 @@ class PredictionFolder:
         return {layer: read_image(path) for layer, path in self.files(case).items()}
 
     def files(self, case: Case) -> dict[str, Path]:
-        """Returns layer -> file for a case: the transmission and, if there is one, the reflection.
-
-        Raises:
-            PhotoError: there is no transmission, or there are several files for a layer.
-        """
+        """Returns layer -> file for a case: the transmission and, if there is one, the reflection. Raises PhotoError if
+        there is no transmission, or there are several files for a layer."""
         found = {layer: self._candidates(case, layer) for layer in ("transmission", "reflection")}
         for layer, paths in found.items():
             if len(paths) > 1:
@@ -276,11 +259,8 @@ class PredictionFolder:
         return sum(map(len, self._images.values())) - len(used)
 
     def check_pairing(self, cases: Sequence[Case]) -> None:
-        """Checks that the folder can be paired with the cases by name.
-
-        Raises:
-            PhotoError: the folder is missing, one image matches two cases, or no image matches a case.
-        """
+        """Checks that the folder can be paired with the cases by name. Raises PhotoError if the folder is missing, one
+        image matches two cases, or no image matches a case."""
         if not self.folder.is_dir():
             raise PhotoError(
                 f"{self.folder} is not a folder",
@@ -359,11 +339,8 @@ def check_names(methods: Sequence[Method]) -> None:
         )
     (name, count), *_ = Counter(method.name for method in methods).most_common(1)
     if count > 1:
-        raise BrewsterError(
-            f"{count} methods have the name {name!r}",
-            "expected unique names",
-            "rename one method with NAME=...",
-        )
+        happened = f"{count} methods have the name {name!r}"
+        raise BrewsterError(happened, "expected unique names", "rename one method with NAME=...")
     for method in methods:
         if method.name in ("", ".", "..") or set("/\\") & set(method.name) or not method.name.isprintable():
             raise BrewsterError(

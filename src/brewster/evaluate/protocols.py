@@ -1,7 +1,6 @@
 """Protocols by name: the choices of papers and contests that change the scores, each with its source.
 
-A published score can be compared with a measured score only if both use the same protocol. Reports list the choices.
-"""
+A published score can be compared with a measured score only if both use the same protocol. Reports list the choices."""
 
 from __future__ import annotations
 
@@ -24,10 +23,7 @@ class ProtocolPreset:
 
 def protocol_config(name: str, **changes: Any) -> EvaluationConfig:  # noqa: ANN401  (the fields of EvaluationConfig)
     """Returns the settings of a protocol. `changes` are fields of `EvaluationConfig` that replace or complete them.
-
-    Raises:
-        BrewsterError: there is no protocol of this name, or a value is invalid.
-    """
+    Raises BrewsterError if there is no protocol of this name, or a value is invalid."""
     if name not in PROTOCOLS:
         raise BrewsterError(
             f"there is no protocol {name!r}", f"expected one of {', '.join(PROTOCOLS)}", "choose one of them"

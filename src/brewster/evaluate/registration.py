@@ -1,7 +1,6 @@
 """Finds predictions that are mirrored or shifted against their photo, which ruins all scores of a good method.
 
-The comparison is with the photo, not with the ground truth: refraction can shift the ground truth by some pixels.
-"""
+The comparison is with the photo, not with the ground truth: refraction can shift the ground truth by some pixels."""
 
 from __future__ import annotations
 
@@ -39,13 +38,9 @@ _Plane = NDArray[np.float64]
 
 
 def find_misregistration(prediction: Image, photo: Image) -> str:
-    """Compares a prediction with its photo, both uint8 (H, W, 3) of one size.
-
-    Flips are found by the correlation of the pixels, shifts by phase correlation (Kuglin and Hines 1975).
-
-    Returns:
-        How the prediction is flipped or shifted; "" if it is not, or if this cannot be decided.
-    """
+    """Compares a prediction with its photo, both uint8 (H, W, 3) of one size: flips are found by the correlation of the
+    pixels, shifts by phase correlation (Kuglin and Hines 1975). Returns how the prediction is flipped or shifted; "" if
+    it is not, or if this cannot be decided."""
     factor = max(1, -(-max(photo.shape) // MAX_SIDE_PX))
     one, other = (_reduced(image, factor) for image in (prediction, photo))
     if min(one.shape) < 8 or not one.any() or not other.any():

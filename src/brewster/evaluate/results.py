@@ -45,22 +45,14 @@ def summarise(
     rows: Sequence[ScoreRow],
     unavailable: Mapping[str, str] | None = None,
 ) -> Results:
-    """Returns the content of results.json. The order of the rows does not matter.
-
-    `unavailable` is column -> reason, for the columns that could not be computed.
-
-    Raises:
-        BrewsterError: the subsets of the paper are requested, but the file names of a benchmark do not identify its scenes.
-    """
+    """Returns the content of results.json. The order of the rows does not matter. `unavailable` is column -> reason,
+    for the columns that could not be computed. Raises BrewsterError if the subsets of the paper are requested, but
+    the file names of a benchmark do not identify its scenes."""
     by_id = {row.id: row for row in rows}
     method_names = [method.name for method in methods]
     measured = {column for row in rows for column, score in row.scores.items() if score is not None}
     columns = {name: metric for name, metric in config.columns().items() if name in measured}
-    full = [
-        Selection(benchmark.name, benchmark.title, benchmark.cases)
-        for benchmark in benchmarks
-        if benchmark.cases
-    ]
+    full = [Selection(part.name, part.title, part.cases) for part in benchmarks if part.cases]
     subsets = paper_subsets(benchmarks) if config.paper_subset else []
     # the average is over the subset of each benchmark, or over the whole benchmark if it has no subset
     subset_of = {subset.key.partition(":")[0]: subset for subset in subsets}
@@ -70,12 +62,8 @@ def summarise(
     selections |= {AVERAGE: averaged} if averaged else {}
     series = [(method, column) for method in method_names for column in columns]
     directions = {name: metric.higher_is_better for name, metric in columns.items()}
-    strata = {
-        key: [_stratum(selection, series, by_id) for selection in group] for key, group in selections.items()
-    }
-    tables: dict[str, dict[str, dict[str, Any]]] = {
-        key: {method: {} for method, _ in series} for key in selections
-    }
+    strata = {key: [_stratum(part, series, by_id) for part in group] for key, group in selections.items()}
+    tables: dict[str, dict[str, Any]] = {key: {method: {} for method, _ in series} for key in selections}
     for key, table in tables.items():
         for (method, column), mean in zip(series, estimate(strata[key]), strict=True):
             if mean:
@@ -118,9 +106,7 @@ def summarise(
         "draw": {"seed": PAPER_SEED}
         | {subset.key: [case.name for case in subset.cases] for subset in subsets},
         "cases": [
-            _describe_case(
-                [by_id[case.benchmark, case.name, method] for method in method_names], case, columns
-            )
+            _describe_case([by_id[case.benchmark, case.name, name] for name in method_names], case, columns)
             for benchmark in benchmarks
             for case in benchmark.cases
         ],
@@ -136,11 +122,8 @@ def summarise(
 
 
 def paper_subsets(benchmarks: Sequence[Benchmark]) -> list[Selection]:
-    """Returns the subset that the paper uses of each benchmark, without the benchmarks that it uses as a whole.
-
-    Raises:
-        BrewsterError: the file names of a benchmark do not identify its scenes.
-    """
+    """Returns the subset that the paper uses of each benchmark, without the benchmarks that it uses as a whole. Raises
+    BrewsterError if the file names of a benchmark do not identify its scenes."""
     subsets = [(benchmark, paper_subset(benchmark)) for benchmark in benchmarks if benchmark.cases]
     return [
         Selection(f"{benchmark.name}:paper", f"{benchmark.title}, subset of the paper", cases)
@@ -156,11 +139,8 @@ def _choices(config: EvaluationConfig, averaged: Sequence[Selection]) -> list[st
     if not config.paper_subset or counts == PAPER_COUNTS:
         return choices
     found = ", ".join(f"{count} of {name}" for name, count in counts.items())
-    difference = (
-        f"The average of this evaluation is over {found}."
-        if found
-        else "This evaluation has no average, because it has fewer than two of the paper's benchmarks."
-    )
+    missing = "This evaluation has no average, because it has fewer than two of the paper's benchmarks."
+    difference = f"The average of this evaluation is over {found}." if found else missing
     return [*choices, f"The paper's average is over {sum(PAPER_COUNTS.values())} images. {difference}"]
 
 
@@ -186,9 +166,7 @@ def _describe_case(rows: Sequence[ScoreRow], case: Case, columns: Collection[str
         "benchmark": case.benchmark,
         "name": case.name,
         "scene": case.scene,
-        "width": scored.width if scored else None,
-        "height": scored.height if scored else None,
-        "region_share": scored.region_share if scored else None,
+        **{name: getattr(scored, name, None) for name in ("width", "height", "region_share")},
         "scores": {
             row.method: {column: row.scores[column] for column in columns if column in row.scores}
             for row in rows

@@ -1,10 +1,8 @@
 """Scores every method on every case, in one or several processes. A stopped run can be resumed.
 
-The file `scores.jsonl` in the output folder has one line for each new result, scored or failed. A later run reuses a line if its inputs
-have not changed, and adds the columns that it does not have, such as LPIPS after its weights were missing. Each file of a
-case is read once: its bytes are hashed and, if a score is missing, decoded. If an earlier run has all scores of a metric that needs
-weights, the files are read twice: first to find out whether these weights are needed.
-"""
+`scores.jsonl` in the output folder has one line for each new result, scored or failed. A later run reuses a line if its
+inputs have not changed, and adds the columns that it lacks, such as LPIPS after its weights were missing. Each file of
+a case is read once: its bytes are hashed and, if a score is missing, decoded."""
 
 from __future__ import annotations
 
@@ -55,20 +53,11 @@ def score(
 ) -> tuple[list[ScoreRow], dict[str, str]]:
     """Runs every method on every case and scores the predictions. Reuses the rows of an earlier run if nothing changed.
 
-    Exclusive methods run last, one after another, in this process. Each of them reads the cases again. A column is left out if
-    it cannot be computed on this machine, for example without weights.
-
-    Args:
-        on_case_scored: called once for each case with new rows. With several workers, it must be picklable.
-
-    Returns:
-        One row for each case and method, in the order of benchmarks, cases and methods. The number of workers does not
-        change the order. If a method failed on a case, its row has an `error`. And column -> reason, for the columns left out.
-
-    Raises:
-        BrewsterError: two methods have the same name, a name is not valid for a folder, or a worker process died.
-        OutputError: `out` cannot be written.
-    """
+    Exclusive methods run last, one after another, in this process. `on_case_scored` is called once for each case with
+    new rows; with several workers, it must be picklable. Returns one row for each case and method, in the order of
+    benchmarks, cases and methods, with an `error` if the method failed; and column -> reason for the columns that this
+    machine cannot compute, for example without weights. Raises BrewsterError if names of methods are not valid, or a
+    worker process died, and OutputError if `out` cannot be written."""
     check_names(methods)
     logged = read_score_rows(out / SCORES_FILE)
     cases = {(case.benchmark, case.name): case for benchmark in benchmarks for case in benchmark.cases}
@@ -98,11 +87,9 @@ def _find_unavailable(
     config: EvaluationConfig,
     logged: Mapping[RowId, ScoreRow],
 ) -> dict[str, str]:
-    """Loads the weights of all metrics before the workers start. Returns column -> reason, for the columns without weights.
-
-    A metric is not tried if every row of an earlier run has it and no row is outdated. The files of the cases are read only if
-    every row has it.
-    """
+    """Loads the weights of all metrics before the workers start. Returns column -> reason, for the columns without
+    weights. A metric is not tried if every row of an earlier run has it and no row is outdated. The files of the
+    cases are read only if every row has it."""
     columns: dict[Callable[[], object], list[str]] = {}
     for column, metric in config.columns().items():
         if metric.prepare:
@@ -154,16 +141,15 @@ class _WorkerState:
     logged: Mapping[RowId, ScoreRow]
     on_case_scored: CaseCallback | None
 
-    def missing_columns(self, row: ScoreRow) -> list[str]:
-        """Returns the columns that a row of an earlier run does not have, or all if its inputs have changed."""
+    def earlier(self, row: ScoreRow) -> ScoreRow | None:
+        """Returns the row of an earlier run if its inputs have not changed."""
         old = self.logged.get(row.id)
-        known = old.columns if old and old.score_key == row.score_key else ()
-        return [column for column in self.columns if column not in known]
+        return old if old and old.score_key == row.score_key else None
 
     def reusable(self, row: ScoreRow) -> ScoreRow | None:
         """Returns the row of an earlier run if its inputs have not changed and it has all columns."""
-        old = self.logged.get(row.id)
-        return old if old and old.score_key == row.score_key and not self.missing_columns(row) else None
+        old = self.earlier(row)
+        return old if old and {*self.columns} <= {*old.columns} else None
 
 
 def _score_case(task: _Task, state: _WorkerState) -> list[ScoreRow]:
@@ -197,7 +183,8 @@ def _score_method(
     """Returns the row of a method with all its scores. A new prediction is added to `predictions`."""
     if reused := state.reusable(row):
         return reused
-    columns, old = state.missing_columns(row), state.logged.get(row.id)
+    old = state.earlier(row)
+    columns = [column for column in state.columns if old is None or column not in old.columns]
     try:
         prediction = get_prediction(truth, state.methods[row.method], row)
         truth.check(prediction, row.method)
@@ -206,19 +193,18 @@ def _score_method(
         return replace(row, error=f"{row.method} failed on {row.benchmark}/{row.case}: {reason}")
     predictions[row.method] = prediction
     is_stored = isinstance(state.methods[row.method], PredictionFolder)
-    width, height = truth.photo.size
     new = replace(
         row,
         scores=scorer.score(prediction, columns),
         columns=tuple(columns),
         seconds=prediction.seconds,
         digest=prediction.digest,
-        width=width,
-        height=height,
+        width=truth.photo.size[0],
+        height=truth.photo.size[1],
         region_share=scorer.region_share,
         registration=scorer.registration(prediction) if is_stored else "",
     )
-    if old is None or old.score_key != new.score_key:
+    if old is None:
         return new
     seconds = old.seconds if new.seconds is None else new.seconds
     return replace(new, scores=old.scores | new.scores, columns=(*old.columns, *new.columns), seconds=seconds)
@@ -241,11 +227,8 @@ def _empty_row(
 
 
 def get_prediction(truth: GroundTruth, method: Method, row: ScoreRow) -> MethodOutput:
-    """Returns the stored prediction if it has the digest of the row, else a new prediction.
-
-    Raises:
-        BrewsterError: the method failed.
-    """
+    """Returns the stored prediction if it has the digest of the row, else a new prediction. Raises BrewsterError if the
+    method failed."""
     cached = method.cached(truth.case) if row.digest else None
     return cached if cached and cached.digest == row.digest else method.predict(truth.case, truth.photo)
 
@@ -263,10 +246,8 @@ def _run_tasks(
     on_rows: Callable[[Sequence[ScoreRow]], None],
     workers: int,
 ) -> None:
-    """Runs the tasks in this process or in several worker processes. Calls `on_rows` after each task.
-
-    Each process computes metrics with one thread, so that the scores do not depend on the number of workers.
-    """
+    """Runs the tasks in this process or in several worker processes. Calls `on_rows` after each task. Each process
+    computes metrics with one thread, so that the scores do not depend on the number of workers."""
     if workers == 1:
         with single_torch_thread():
             for task in tasks:

@@ -20,13 +20,12 @@ RowId = tuple[str, str, str]
 @final
 @dataclass(frozen=True)
 class ScoreRow:
-    """The scores of one method on one case, or the error. These are also the fields of a line of scores.jsonl.
+    """The scores of one method on one case, or the error; a line of scores.jsonl has these fields.
 
-    `score_key` is a digest of all inputs of the scores, `prediction_key` of all inputs of the prediction. A score or a
-    prediction is reused if its key is unchanged. `columns` are the columns that were computed. A column that is not in `scores`
-    does not apply to the case. `registration` says how a prediction of a folder is flipped or shifted. `digest` is the SHA-256
-    of the files of the prediction; None if it is not stored in files.
-    """
+    `score_key` and `prediction_key` are digests of all inputs of the scores and of the prediction, which are reused if
+    it is unchanged. `columns` were computed; those that are not in `scores` do not apply to the case. `registration`
+    says how a prediction of a folder is flipped or shifted. `digest` is the SHA-256 of the files of the prediction, if
+    it has files."""
 
     benchmark: str
     case: str
@@ -68,9 +67,8 @@ def append_row(path: Path, row: ScoreRow) -> None:
 
 
 def read_score_rows(path: Path) -> dict[RowId, ScoreRow]:
-    """Returns the last row for each id. Skips rows with errors, incomplete lines and lines with other fields.
-
-    A row may be outdated: the caller compares its `score_key`."""
+    """Returns the last row for each id. Skips rows with errors, incomplete lines and lines with other fields. A row may
+    be outdated: the caller compares its `score_key`."""
     rows = {}
     for line in path.read_text(errors="replace").splitlines() if path.is_file() else ():
         try:

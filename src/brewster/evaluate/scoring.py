@@ -17,13 +17,36 @@ from brewster.errors import PhotoError
 from brewster.evaluate.config import EvaluationConfig
 from brewster.evaluate.methods import MethodOutput
 from brewster.evaluate.registration import find_misregistration
-from brewster.evaluate.resizing import resize
 from brewster.metrics import CachedImage, Comparison, Image, Metric, Region
 from brewster.photo import Photo
 
 _Array = TypeVar("_Array", bound=NDArray[Any])
 _DIGITS: Final = 6
 """Decimal places of the scores in scores.jsonl and results.json."""
+
+
+def resize(photo: Photo, config: EvaluationConfig) -> Photo:
+    """Downscales a photo to `config.short_side_px` by area means in linear light, and then its sides to the next
+    smaller multiples of `config.size_divisor`.
+
+    The second step interpolates the 8-bit values by cubic convolution (a = -0.5, antialiased), first along the rows, as
+    Pillow's `Image.resize` does by default: the test code of DSRNet, RDNet and XReflection uses it. The result is 8-bit
+    sRGB, or the photo itself if both settings leave it as it is. A side is never enlarged."""
+    shorter, divisor = config.short_side_px, config.size_divisor
+    if shorter is not None and shorter < min(photo.size):
+        width, height = (round(side * shorter / min(photo.size)) for side in photo.size)
+        small = Photo.from_array(photo.resized(width, height), encoding="linear")
+        photo = Photo.from_array(small.srgb_8bit(), encoding="srgb")
+    width, height = (max(side // divisor * divisor, min(side, divisor)) for side in photo.size)
+    if (width, height) == photo.size:
+        return photo
+    import torch  # noqa: PLC0415 - an extra
+    from torch.nn.functional import interpolate  # noqa: PLC0415
+
+    pixels = torch.from_numpy(photo.srgb_8bit().copy()).permute(2, 0, 1)[None].double()
+    for size in ((photo.size[1], width), (height, width)):
+        pixels = interpolate(pixels, size, mode="bicubic", antialias=True).add(0.5).floor().clamp(0, 255)
+    return Photo.from_array(pixels[0].byte().permute(1, 2, 0).numpy(), encoding="srgb")
 
 
 @final
@@ -49,10 +72,8 @@ class CaseFiles:
 @final
 @dataclass(frozen=True, eq=False)
 class GroundTruth:
-    """A decoded case: the photo for the methods, and role -> image, 8-bit sRGB, uint8 (H, W, 3).
-
-    The roles are "photo", "transmission" and, if there is one, "reflection".
-    """
+    """A decoded case: the photo for the methods, and role -> image, 8-bit sRGB, uint8 (H, W, 3). The roles are "photo",
+    "transmission" and, if there is one, "reflection"."""
 
     case: Case
     photo: Photo
@@ -65,38 +86,27 @@ class GroundTruth:
 
     @classmethod
     def decode(cls, files: CaseFiles, config: EvaluationConfig) -> GroundTruth:
-        """Decodes the images of a case and resizes them as `config` says.
-
-        Raises:
-            PhotoError: an image cannot be decoded, or the images differ in size.
-        """
+        """Decodes the images of a case and resizes them as `config` says. Raises PhotoError if an image cannot be
+        decoded, or the images differ in size."""
         case = files.case
         photos = {role: resize(Photo.open(data), config) for role, data in files.data.items()}
         for role, photo in photos.items():
-            _check_size(
-                f"the {role} of {case.benchmark}/{case.name}",
-                photo,
-                photos["photo"].size,
-                "replace the file in the benchmark",
-            )
+            name = f"the {role} of {case.benchmark}/{case.name}"
+            _check_size(name, photo, photos["photo"].size, "replace the file in the benchmark")
         return cls(case, photos["photo"], {role: photo.srgb_8bit() for role, photo in photos.items()})
 
     def region(self, threshold: float) -> Region:
         """Returns the reflection region, bool (H, W). `threshold` is a difference, as a fraction of full scale."""
-        return metrics.reflection_region(
-            self.images["photo"], self.images["transmission"], threshold=threshold
-        )
+        photo, transmission = self.images["photo"], self.images["transmission"]
+        return metrics.reflection_region(photo, transmission, threshold=threshold)
 
     def check(self, prediction: MethodOutput, name: str) -> None:
         """Checks the size of a prediction. Raises PhotoError if a layer differs from the photo in size."""
         for layer in ("transmission", "reflection"):
             if photo := getattr(prediction, layer):
-                _check_size(
-                    f"{name}'s {layer} of {self.case.benchmark}/{self.case.name}",
-                    photo,
-                    self.photo.size,
-                    "run the method on photos of that size (if photos are resized, they are in the folder inputs)",
-                )
+                what = f"{name}'s {layer} of {self.case.benchmark}/{self.case.name}"
+                cure = "run the method on photos of that size (if photos are resized, they are in the folder inputs)"
+                _check_size(what, photo, self.photo.size, cure)
 
 
 @final
@@ -121,11 +131,9 @@ class Scorer:
     def score(
         self, prediction: MethodOutput, columns: Iterable[str] | None = None
     ) -> dict[str, float | None]:
-        """Returns column -> score, for all columns of the evaluation or for some of them.
-
-        A score is None if it is undefined, because the region is empty or the image is too small for the metric. There is
-        no column if the metric compares a layer that the prediction or the ground truth does not have.
-        """
+        """Returns column -> score, for all columns of the evaluation or for some of them. A score is None if it is
+        undefined, because the region is empty or the image is too small for the metric. There is no column if the
+        metric compares a layer that the prediction or the ground truth does not have."""
         layers = {"transmission": prediction.transmission, "reflection": prediction.reflection}
         comparisons = {
             layer: Comparison(
@@ -169,9 +177,5 @@ class Scorer:
 
 def _check_size(name: str, photo: Photo, size: tuple[int, int], suggestion: str) -> None:
     if photo.size != size:
-        (width, height), (expected_width, expected_height) = photo.size, size
-        raise PhotoError(
-            f"{name} is {width}x{height}",
-            f"expected {expected_width}x{expected_height}, the size of the photo",
-            suggestion,
-        )
+        found, expected = ("x".join(map(str, sides)) for sides in (photo.size, size))
+        raise PhotoError(f"{name} is {found}", f"expected {expected}, the size of the photo", suggestion)

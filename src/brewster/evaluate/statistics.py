@@ -1,7 +1,7 @@
 """Means with bootstrap confidence intervals, and paired differences between methods.
 
-Images of one scene, such as ten shots of a postcard, are not independent. The bootstrap therefore resamples whole scenes.
-"""
+Images of one scene, such as ten shots of a postcard, are not independent. The bootstrap therefore resamples whole
+scenes."""
 
 from __future__ import annotations
 
@@ -37,11 +37,9 @@ class Estimate:
 @final
 @dataclass(frozen=True, eq=False)
 class Stratum:
-    """The scores of a benchmark: `values` (n, s) for n images and s series, and the scene of each image.
-
-    A missing score is NaN. `name` seeds the bootstrap, so that the intervals of a benchmark do not depend on the other
-    benchmarks of the run.
-    """
+    """The scores of a benchmark: `values` (n, s) for n images and s series, and the scene of each image. A missing
+    score is NaN. `name` seeds the bootstrap, so that the intervals of a benchmark do not depend on the other
+    benchmarks of the run."""
 
     name: str
     scenes: Sequence[str]
@@ -49,12 +47,10 @@ class Stratum:
 
 
 def estimate(strata: Sequence[Stratum]) -> list[Estimate | None]:
-    """Computes the mean of each series over all images of all strata, and its 95 % interval.
-
-    Stratified cluster bootstrap with percentile intervals (Efron and Tibshirani 1993, chapter 13), 10,000 resamples and a
-    fixed seed. For a stratum of k scenes, each resample draws k scenes with replacement, and all images of these scenes. A
-    series without values has no estimate.
-    """
+    """Computes the mean of each series over all images of all strata, and its 95 % interval. Stratified cluster
+    bootstrap with percentile intervals (Efron and Tibshirani 1993, chapter 13), 10,000 resamples and a fixed seed.
+    For a stratum of k scenes, each resample draws k scenes with replacement, and all images of these scenes. A
+    series without values has no estimate."""
     resampled = [_resample(stratum) for stratum in strata]
     sums, counts = (np.sum([part[i] for part in resampled], axis=0) for i in range(2))
     values = np.concatenate([stratum.values for stratum in strata])
@@ -99,9 +95,7 @@ def _estimate(
 @dataclass(frozen=True)
 class Difference:
     """The mean of score(method) - score(reference) in one metric, over the images with both scores, with its interval.
-
-    `improved_count` is the number of images on which `method` has a better score than `reference`.
-    """
+    `improved_count` is the number of images on which `method` has a better score than `reference`."""
 
     method: str
     reference: str
@@ -113,15 +107,10 @@ class Difference:
 def differences(
     strata: Sequence[Stratum], series: Sequence[tuple[str, str]], directions: Mapping[str, bool]
 ) -> list[Difference]:
-    """Compares each method with all methods before it, in every metric, paired by image.
+    """Compares each method with all methods before it, in every metric, paired by image, if an image has both scores.
 
-    There is a difference for each pair of methods and metric, if an image has both scores.
-
-    Args:
-        strata: the scores. Column i of `values` is `series[i]`.
-        series: (method, metric) of each column.
-        directions: metric -> whether higher is better.
-    """
+    `series` has (method, metric) of each column of the values of `strata`; `directions` is metric -> whether higher is
+    better."""
     column_of = {name: i for i, name in enumerate(series)}
     methods = list(dict.fromkeys(method for method, _ in series))
     comparisons = [

@@ -21,11 +21,8 @@ _BENCHMARK: Final = "openrr"
 
 
 def openrr_folder(benchmarks: Sequence[tuple[str, str]], *, has_method: bool) -> Path:
-    """Returns the folder of OpenRR-5k among the benchmarks, as (name, folder).
-
-    Raises:
-        BrewsterError: there is not exactly one benchmark openrr, or there is no method whose predictions can be packed.
-    """
+    """Returns the folder of OpenRR-5k among the benchmarks, as (name, folder). Raises BrewsterError if there is not
+    exactly one benchmark openrr, or there is no method whose predictions can be packed."""
     folders = [Path(folder) for name, folder in benchmarks if name == _BENCHMARK]
     if len(folders) != 1:
         raise BrewsterError(
@@ -45,17 +42,11 @@ def openrr_folder(benchmarks: Sequence[tuple[str, str]], *, has_method: bool) ->
 def export_ntire2026(
     folder: Path, method: Method, out: Path, *, on_progress: Callable[[str], None] = lambda _name: None
 ) -> list[Path]:
-    """Predicts all photos of the folders val_*_blended and test_*_blended of OpenRR-5k, and writes a zip file for each.
-
-    The README of OpenRR-5k asks for val_300_output.zip and test_100_output.zip with images only, and its evaluate.py reads
-    files "*.jpg" with the names of the photos. The predictions of "val" that an evaluation has stored are used again.
-    Returns the paths of the zip files. The method must not fail on any photo.
-
-    Raises:
-        PhotoError: the folder has no photos in the layout of OpenRR-5k, or a photo cannot be read.
-        BrewsterError: the method fails.
-        OutputError: a zip file cannot be written.
-    """
+    """Predicts all photos of the folders val_*_blended and test_*_blended of OpenRR-5k, writes a zip file for each, and
+    returns their paths. The README of OpenRR-5k asks for val_300_output.zip and test_100_output.zip with images only,
+    and its evaluate.py reads files "*.jpg" with the names of the photos. Stored predictions of "val" are used again.
+    Raises PhotoError if the folder has another layout or a photo cannot be read; BrewsterError if the method fails on a
+    photo; OutputError."""
     splits = {
         name: roles["photo"]
         for name, roles in find_numbered_splits(folder).items()

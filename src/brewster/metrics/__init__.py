@@ -10,8 +10,7 @@
     bright       loss of clipped light and of white
     failures     removed content and remaining reflection, for rendered samples
 
-`METRICS` is the table of all metrics, with the definition of each.
-"""
+`METRICS` is the table of all metrics, with the definition of each."""
 
 from __future__ import annotations
 
@@ -232,8 +231,7 @@ def find_metric(name: str) -> Metric:
     """Returns the metric with this name.
 
     Raises:
-        BrewsterError: there is no metric with this name. The message suggests the closest name.
-    """
+        BrewsterError: there is no metric with this name. The message suggests the closest name."""
     if name in METRICS:
         return METRICS[name]
     close = difflib.get_close_matches(name.lower(), METRICS, n=1)

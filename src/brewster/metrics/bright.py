@@ -1,7 +1,8 @@
-"""Harm to bright light: lamps and skies that turn grey, and whites that turn dark or coloured. For photos with a real ground truth.
+"""Harm to bright light: lamps and skies that turn grey, and whites that turn dark or coloured. For photos with a real
+ground truth.
 
-The pixels are those that are bright in the photo *and* in the ground truth, so that removing a bright reflection costs nothing.
-"""
+The pixels are those that are bright in the photo *and* in the ground truth, so that removing a bright reflection costs
+nothing."""
 
 from __future__ import annotations
 
@@ -22,13 +23,13 @@ MIN_COUNT: Final = 64
 
 
 def lost_clipped(prediction: Image, truth: Image, photo: Image) -> float:
-    """Returns the share of the channel values of at least 250 in photo and truth that are below 240 in the prediction, 0..1.
+    """Returns the share of the channel values of at least 250 in photo and truth that are below 240 in the prediction,
+    0..1.
 
     The channels of a pixel are counted apart, because a coloured lamp clips in one or two of them. Lower is better.
 
     Raises:
-        ValueError: the images are not uint8 (H, W, 3) or differ in shape, or fewer than 64 values are clipped.
-    """
+        ValueError: the images are not uint8 (H, W, 3) or differ in shape, or fewer than 64 values are clipped."""
     check_images(prediction, truth, photo)
     is_clipped = np.minimum(photo, truth) >= MIN_CLIPPED
     _check_count(int(is_clipped.sum()), f"channel values are at least {MIN_CLIPPED}")
@@ -42,16 +43,15 @@ def lost_near_white(prediction: Image, truth: Image, photo: Image) -> float:
 
     Raises:
         ValueError: the images are not uint8 (H, W, 3) or differ in shape, or fewer than 64 pixels are above 200 in all channels
-            of photo and truth.
-    """
+            of photo and truth."""
     return float(_near_white_losses(prediction, truth, photo).mean())
 
 
 def near_white_cast(prediction: Image, truth: Image, photo: Image) -> float:
-    """Returns the colour cast of the near-white pixels, in 8-bit levels: the largest minus the smallest channel of their mean loss.
+    """Returns the colour cast of the near-white pixels, in 8-bit levels: the largest minus the smallest channel of
+    their mean loss.
 
-    0 is best. The errors are those of `lost_near_white`.
-    """
+    0 is best. The errors are those of `lost_near_white`."""
     return float(np.ptp(_near_white_losses(prediction, truth, photo)))
 
 

@@ -3,13 +3,12 @@
 They need a sample whose photo I, background B and reflection R have the same exposure and tone curve. All values are
 luminance in linear light, with I = T + R, where the transmission T is the part of B that passes through the glass.
 
-Some methods restore the light that the glass absorbs, and others do not. To score both in the same way, the prediction is
-first multiplied by one gain: the median of B / prediction over the pixels without reflection that are neither black nor
-clipped in either image. If B has too few such pixels, the scores are undefined (ValueError). If only the prediction
+Some methods restore the light that the glass absorbs, and others do not. To score both in the same way, the prediction
+is first multiplied by one gain: the median of B / prediction over the pixels without reflection that are neither black
+nor clipped in either image. If B has too few such pixels, the scores are undefined (ValueError). If only the prediction
 has too few such pixels, the gain is 1.
 
-Each score is a fraction of light in 0..1; lower is better.
-"""
+Each score is a fraction of light in 0..1; lower is better."""
 
 from __future__ import annotations
 
@@ -59,8 +58,7 @@ def removed_content(prediction: Image, background: Image, photo: Image, reflecti
 
     Raises:
         ValueError: the images are not uint8 (H, W, 3) or differ in shape, or the score or the background has fewer
-            than 64 valid pixels.
-    """
+            than 64 valid pixels."""
     luminance = _Luminances.of(prediction, background, photo, reflection)
     return luminance.removed_fraction(luminance.unreflected, f"R < {NEGLIGIBLE_FRACTION:.0%} of I")
 
@@ -70,30 +68,23 @@ def removed_white(prediction: Image, background: Image, photo: Image, reflection
 
     The formula is that of `removed_content`, over the pixels that are also white in B: every encoded channel is above
     0.75, and the largest is less than 0.12 above the smallest. The score is high if a method removes white objects
-    because it mistakes them for reflections. The errors are those of `removed_content`.
-    """
+    because it mistakes them for reflections. The errors are those of `removed_content`."""
     luminance = _Luminances.of(prediction, background, photo, reflection)
-    return luminance.removed_fraction(
-        luminance.unreflected & _is_white(background), f"R < {NEGLIGIBLE_FRACTION:.0%} of I and white in B"
-    )
+    condition = f"R < {NEGLIGIBLE_FRACTION:.0%} of I and white in B"
+    return luminance.removed_fraction(luminance.unreflected & _is_white(background), condition)
 
 
 def kept_reflection(prediction: Image, background: Image, photo: Image, reflection: Image) -> float:
     """Returns the fraction of the reflection's light that the prediction still contains.
 
     The score is sum min(max(g prediction - B, 0), R) / sum R over the pixels with R >= 10 % of I and I not clipped. The
-    module docstring defines the gain g. The errors are those of `removed_content`.
-    """
-    luminance = _Luminances.of(prediction, background, photo, reflection)
-    reflective = (
-        (luminance.reflection >= NOTICEABLE_FRACTION * luminance.photo)
-        & (luminance.reflection > 0)
-        & ~_is_clipped(photo)
-    )
-    remaining = np.clip(luminance.prediction - luminance.background, 0, luminance.reflection)
-    return _fraction(
-        remaining, luminance.reflection, reflective, f"R >= {NOTICEABLE_FRACTION:.0%} of I and I not clipped"
-    )
+    module docstring defines the gain g. The errors are those of `removed_content`."""
+    light = _Luminances.of(prediction, background, photo, reflection)
+    is_noticeable = light.reflection >= NOTICEABLE_FRACTION * light.photo
+    reflective = is_noticeable & (light.reflection > 0) & ~_is_clipped(photo)
+    remaining = np.clip(light.prediction - light.background, 0, light.reflection)
+    condition = f"R >= {NOTICEABLE_FRACTION:.0%} of I and I not clipped"
+    return _fraction(remaining, light.reflection, reflective, condition)
 
 
 @final
@@ -114,9 +105,8 @@ class _Luminances:
         p, b, i, r = map(_luminance, (prediction, background, photo, reflection))
         unreflected = r < NEGLIGIBLE_FRACTION * i
         comparable_background = unreflected & (b >= BLACK_LUMINANCE) & ~_is_clipped(background)
-        _require_pixels(
-            comparable_background, f"R < {NEGLIGIBLE_FRACTION:.0%} of I and B neither black nor clipped"
-        )
+        condition = f"R < {NEGLIGIBLE_FRACTION:.0%} of I and B neither black nor clipped"
+        _require_pixels(comparable_background, condition)
         comparable = comparable_background & (p >= BLACK_LUMINANCE) & ~_is_clipped(prediction)
         # The median is used, because content that is missing in less than half of the pixels must not change the gain.
         gain = np.median(b[comparable] / p[comparable]) if comparable.sum() >= MIN_PIXELS else 1.0

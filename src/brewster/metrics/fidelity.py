@@ -6,8 +6,7 @@ its map is averaged over the positions where the whole window is inside the imag
     uniform    7x7, sample covariance, as ERRNet, RAGNet and their successors report it. Equal to scikit-image's
                structural_similarity(a, b, channel_axis=2)
     gaussian   11x11, sigma 1.5, population covariance, as in the paper of Wang et al. Equal to the same call with
-               gaussian_weights=True, sigma=1.5, use_sample_covariance=False, data_range=255
-"""
+               gaussian_weights=True, sigma=1.5, use_sample_covariance=False, data_range=255"""
 
 from __future__ import annotations
 
@@ -17,17 +16,8 @@ from typing import Any, Final, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from brewster.metrics.windows import (
-    BOX_SIDE,
-    GAUSSIAN_RADIUS,
-    Image,
-    Region,
-    box_sums,
-    check_images,
-    check_region,
-    gaussian_means,
-    mean_inside,
-)
+from brewster.metrics import windows
+from brewster.metrics.windows import Image, Region
 from brewster.srgb import to_linear
 
 Window = Literal["uniform", "gaussian"]
@@ -40,7 +30,10 @@ _SQUARED_ERRORS: Final = np.square(np.subtract.outer(np.arange(256.0), np.arange
 _LINEAR_SQUARED_ERRORS: Final = np.square(np.subtract.outer(_LINEAR, _LINEAR), dtype=np.float64).ravel()
 """The squared error of each pair of 8-bit values, (65536,), with the index of `count_pairs`."""
 _STRIP_ROWS: Final = 32
-_WINDOW_SIDES: Final[dict[Window, int]] = {"uniform": BOX_SIDE, "gaussian": 2 * GAUSSIAN_RADIUS + 1}
+_WINDOW_SIDES: Final[dict[Window, int]] = {
+    "uniform": windows.BOX_SIDE,
+    "gaussian": 2 * windows.GAUSSIAN_RADIUS + 1,
+}
 
 
 def psnr(prediction: Image, truth: Image, *, region: Region | None = None) -> float:
@@ -49,13 +42,12 @@ def psnr(prediction: Image, truth: Image, *, region: Region | None = None) -> fl
     The mean squared error is over the three channels of all pixels, or of the pixels in `region`, bool (H, W).
 
     Raises:
-        ValueError: the images are not uint8 (H, W, 3) or differ in shape; the region is empty or of another shape.
-    """
+        ValueError: the images are not uint8 (H, W, 3) or differ in shape; the region is empty or of another shape."""
     if region is None:
         return psnr_of_counts(count_pairs(prediction, truth))
-    check_images(prediction, truth)
+    windows.check_images(prediction, truth)
     difference = prediction.astype(np.int32) - truth
-    return _to_decibels(mean_inside(difference * difference, region))
+    return _to_decibels(windows.mean_inside(difference * difference, region))
 
 
 def psnr_of_counts(counts: PairCounts) -> float:
@@ -69,14 +61,10 @@ def _to_decibels(mse: float) -> float:
 
 def count_pairs(prediction: Image, truth: Image) -> PairCounts:
     """Counts the pairs of 8-bit values at the same position: the joint histogram of two images, over all channels.
-
-    Every mean over all pixels of a function of two values follows from it, and it is faster than the function of each pixel.
-    The counts are int64 (65536,). The index is 256 times the value of the prediction, plus that of the ground truth.
-
-    Raises:
-        ValueError: the images are not uint8 (H, W, 3) or differ in shape.
-    """
-    check_images(prediction, truth)
+    Every mean over all pixels of a function of two values follows from it, and it is faster than the function of
+    each pixel. The counts are int64 (65536,). The index is 256 times the value of the prediction, plus that of the
+    ground truth. Raises ValueError if the images are not uint8 (H, W, 3) or differ in shape."""
+    windows.check_images(prediction, truth)
     pairs = prediction.astype(np.intp)
     pairs *= 256
     pairs += truth
@@ -84,15 +72,15 @@ def count_pairs(prediction: Image, truth: Image) -> PairCounts:
 
 
 def psnr_of_channels(prediction: Image, truth: Image) -> float:
-    """Returns the mean of the PSNR of red, green and blue, as the code of ERRNet (util/index.py) and XReflection computes it.
+    """Returns the mean of the PSNR of red, green and blue, as the code of ERRNet (util/index.py) and XReflection
+    computes it.
 
-    The value is never below that of `psnr`, which uses one mean squared error over all channels. It is in dB, and infinity if a
-    channel is equal in both images. Higher is better.
+    The value is never below that of `psnr`, which uses one mean squared error over all channels. It is in dB, and
+    infinity if a channel is equal in both images. Higher is better.
 
     Raises:
-        ValueError: the images are not uint8 (H, W, 3) or differ in shape.
-    """
-    check_images(prediction, truth)
+        ValueError: the images are not uint8 (H, W, 3) or differ in shape."""
+    windows.check_images(prediction, truth)
     difference = prediction.astype(np.int32) - truth
     mse = (difference * difference).mean(axis=(0, 1))
     return float(np.mean(10 * np.log10(255**2 / mse))) if mse.all() else float("inf")
@@ -102,17 +90,16 @@ def linear_rmse(prediction: Image, truth: Image, *, region: Region | None = None
     """Returns the root mean squared error in linear light, in 0..1: sqrt(mean((L(prediction) - L(truth))^2)).
 
     L is the inverse of the sRGB curve (IEC 61966-2-1). The mean is over the three channels of all pixels, or of the
-    pixels in `region`, bool (H, W). This error is proportional to the light that is wrong; errors of encoded values are not.
-    Lower is better.
+    pixels in `region`, bool (H, W). This error is proportional to the light that is wrong; errors of encoded values are
+    not. Lower is better.
 
     Raises:
-        ValueError: the images are not uint8 (H, W, 3) or differ in shape; the region is empty or of another shape.
-    """
+        ValueError: the images are not uint8 (H, W, 3) or differ in shape; the region is empty or of another shape."""
     if region is None:
         return linear_rmse_of_counts(count_pairs(prediction, truth))
-    check_images(prediction, truth)
+    windows.check_images(prediction, truth)
     difference = _LINEAR[prediction] - _LINEAR[truth]
-    return float(mean_inside(difference * difference, region) ** 0.5)
+    return float(windows.mean_inside(difference * difference, region) ** 0.5)
 
 
 def linear_rmse_of_counts(counts: PairCounts) -> float:
@@ -125,64 +112,56 @@ def ssim(
 ) -> float:
     """Returns the mean structural similarity (Wang et al. 2004), with one of the two windows of this module.
 
-    The SSIM map is averaged over all its pixels, or over those in `region`, bool (H, W). The map has no values within
-    3 pixels of the image's border, or 5 pixels with the Gaussian window. The mean is 1 for equal images. Higher is better.
+    The SSIM map is averaged over all its pixels, or over those in `region`, bool (H, W). The map has no values within 3
+    pixels of the image's border, or 5 pixels with the Gaussian window. The mean is 1 for equal images. Higher is
+    better.
 
     Raises:
         ValueError: the images are not uint8 (H, W, 3), differ in shape, or are smaller than the window; the
-            region is empty, of another shape, or has only pixels without a value.
-    """
+            region is empty, of another shape, or has only pixels without a value."""
     return mean_ssim(ssim_map(prediction, truth, window=window), region=region)
 
 
 def mean_ssim(values: NDArray[np.float64], *, region: Region | None = None) -> float:
-    """Returns the mean of a map of `ssim_map`, over all its pixels or over those in `region`, bool (H, W).
-
-    Raises:
-        ValueError: the region is empty, of another shape, or has only pixels without a value.
-    """
+    """Returns the mean of a map of `ssim_map`, over all its pixels or over those in `region`, bool (H, W). Raises
+    ValueError if the region is empty, of another shape, or has only pixels without a value."""
     if region is None:
         return float(np.mean(values))
     border = (region.shape[0] - values.shape[0]) // 2
-    check_region(region, (values.shape[0] + 2 * border, values.shape[1] + 2 * border))
+    windows.check_region(region, (values.shape[0] + 2 * border, values.shape[1] + 2 * border))
     inside = region[border : border + values.shape[0], border : border + values.shape[1]]
     if not inside.any():
         raise ValueError(
             f"all pixels of the region are within {border} pixels of the border, where SSIM has no value"
         )
-    return float(mean_inside(values, inside))
+    return float(windows.mean_inside(values, inside))
 
 
 def ssim_map(prediction: Image, truth: Image, *, window: Window = "uniform") -> NDArray[np.float64]:
-    """Returns the local SSIM, (H - side + 1, W - side + 1, 3) for a window with sides of `side` pixels.
-
-    Raises:
-        ValueError: the images are not uint8 (H, W, 3), differ in shape, or are smaller than the window.
-    """
-    check_images(prediction, truth)
+    """Returns the local SSIM, (H - side + 1, W - side + 1, 3) for a window with sides of `side` pixels. Raises
+    ValueError if the images are not uint8 (H, W, 3), differ in shape, or are smaller than the window."""
+    windows.check_images(prediction, truth)
     side = _WINDOW_SIDES[window]
     height, width = prediction.shape[:2]
     if min(height, width) < side:
         raise ValueError(f"SSIM needs at least {side}x{side} pixels, not {height}x{width}")
     # Strips of 32 rows fit into the processor's cache.
     windowed_ssim, strip_height = _WINDOWED_SSIM[window], _STRIP_ROWS + side - 1
-    tops = range(0, height - side + 1, _STRIP_ROWS)
-    return np.concatenate(
-        [windowed_ssim(prediction[top : top + strip_height], truth[top : top + strip_height]) for top in tops]
-    )
+    strips = [np.s_[top : top + strip_height] for top in range(0, height - side + 1, _STRIP_ROWS)]
+    return np.concatenate([windowed_ssim(prediction[strip], truth[strip]) for strip in strips])
 
 
 def _ssim_uniform(prediction: Image, truth: Image) -> NDArray[np.float64]:
     """Returns the SSIM map with the uniform window. int16 holds sums of 8-bit values exactly, and int32 those of products."""
     x, y = prediction.astype(np.int32), truth.astype(np.int32)
-    sums = [box_sums(image.astype(np.int16)).astype(np.int32) for image in (prediction, truth)]
-    sums += [box_sums(x * x + y * y), box_sums(x * y)]
-    return _ssim_formula(sums, BOX_SIDE**2, sample_covariance=True)
+    sums = [windows.box_sums(image.astype(np.int16)).astype(np.int32) for image in (prediction, truth)]
+    sums += [windows.box_sums(x * x + y * y), windows.box_sums(x * y)]
+    return _ssim_formula(sums, windows.BOX_SIDE**2, sample_covariance=True)
 
 
 def _ssim_gaussian(prediction: Image, truth: Image) -> NDArray[np.float64]:
     x, y = prediction.astype(np.float64), truth.astype(np.float64)
-    means = [gaussian_means(values) for values in (x, y, x * x + y * y, x * y)]
+    means = [windows.gaussian_means(values) for values in (x, y, x * x + y * y, x * y)]
     return _ssim_formula(means, 1, sample_covariance=False)
 
 
@@ -191,11 +170,10 @@ def _ssim_formula(
 ) -> NDArray[np.float64]:
     """Returns SSIM = (2 mx my + C1) (2 cov + C2) / ((mx^2 + my^2 + C1) (vx + vy + C2)), computed from window sums.
 
-    `window_sums` has the sums of x, y, x^2 + y^2 and x y. Here m is a mean, v a variance and cov the covariance in the window.
-    Numerator and denominator are multiplied by powers of `pixel_count`, the number of pixels in a window sum (1 if the sums
-    are weighted means). So there is only one division, and integer sums stay integers until then. The formula needs only
-    vx + vy, so x^2 + y^2 is summed once.
-    """
+    `window_sums` has the sums of x, y, x^2 + y^2 and x y. Here m is a mean, v a variance and cov the covariance in the
+    window. Numerator and denominator are multiplied by powers of `pixel_count`, the number of pixels in a window sum (1
+    if the sums are weighted means). So there is only one division, and integer sums stay integers until then. The
+    formula needs only vx + vy, so x^2 + y^2 is summed once."""
     mean_x, mean_y, squares, products = window_sums
     mean_product, mean_squares = mean_x * mean_y, mean_x * mean_x + mean_y * mean_y
     luminance = _LUMINANCE_CONSTANT * pixel_count**2

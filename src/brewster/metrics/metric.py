@@ -32,9 +32,8 @@ class CachedImage:
 class Comparison:
     """The predicted layer to score, its ground truth, and the photo.
 
-    For a metric whose `ground_truth` is "rendered", `prediction` is the predicted transmission, `truth` is the background, and
-    `reflection` is never None.
-    """
+    For a metric whose `ground_truth` is "rendered", `prediction` is the predicted transmission, `truth` is the
+    background, and `reflection` is never None."""
 
     prediction: CachedImage
     truth: CachedImage
@@ -46,10 +45,8 @@ class Comparison:
     _shared: dict[Callable[[Comparison], Any], Any] = field(default_factory=dict, repr=False)
 
     def shared(self, compute: Callable[[Comparison], _Shared]) -> _Shared:
-        """Returns the result of `compute` for this pair of images. The result must not depend on the region.
-
-        It is computed once and reused by all metrics of the pair, with or without a region.
-        """
+        """Returns the result of `compute` for this pair of images. The result must not depend on the region. It is
+        computed once and reused by all metrics of the pair, with or without a region."""
         if compute not in self._shared:
             self._shared[compute] = compute(self)
         return cast("_Shared", self._shared[compute])

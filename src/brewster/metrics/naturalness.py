@@ -1,10 +1,10 @@
-"""NIQE: the distance between the local statistics of an image and those of undistorted photographs, without ground truth.
+"""NIQE: the distance between the local statistics of an image and those of undistorted photographs, without ground
+truth.
 
 A. Mittal, R. Soundararajan, A. C. Bovik, "Making a 'Completely Blind' Image Quality Analyzer", IEEE Signal Process.
 Lett. 20(3), 2013. The multivariate Gaussian of undistorted photographs was published by the authors; the file
 niqe_pristine.npz has its mean (36,) and covariance (36, 36). Luma is 0.299 R + 0.587 G + 0.114 B of the 8-bit values,
-rounded, as in the package pyiqa. The NTIRE challenges report the values of pyiqa.
-"""
+rounded, as in the package pyiqa. The NTIRE challenges report the values of pyiqa."""
 
 from __future__ import annotations
 
@@ -47,8 +47,7 @@ def niqe(image: Image) -> float:
     Gaussians, at least 0; lower is better. Undistorted photographs have values of 2 to 5.
 
     Raises:
-        ValueError: the image is not uint8 (H, W, 3), or fewer than two blocks have features.
-    """
+        ValueError: the image is not uint8 (H, W, 3), or fewer than two blocks have features."""
     check_images(image)
     luma = np.rint(image @ np.array(_LUMA))
     rows, columns = (side // BLOCK_SIDE for side in luma.shape)
@@ -121,11 +120,9 @@ def _filtered(
 def _fit_asymmetric_gaussian(
     blocks: Blocks,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Fits an asymmetric generalised Gaussian to each block (N. Lasmar et al., ICIP 2009).
-
-    Returns the shape, and the scales of the left and the right half, (blocks,) each. The scales are NaN for a block without
-    negative or without positive values.
-    """
+    """Fits an asymmetric generalised Gaussian to each block (N. Lasmar et al., ICIP 2009). Returns the shape, and the
+    scales of the left and the right half, (blocks,) each. The scales are NaN for a block without negative or without
+    positive values."""
     flat = blocks.reshape(len(blocks), -1)
     squares = flat * flat
     with np.errstate(invalid="ignore", divide="ignore"):

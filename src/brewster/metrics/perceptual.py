@@ -4,15 +4,13 @@
     truth = metric.features(image)  # once for many predictions
     print([metric.difference(metric.features(prediction), truth).mean() for prediction in predictions])
 
-R. Zhang et al., "The Unreasonable Effectiveness of Deep Features as a Perceptual Metric", CVPR 2018. The
-definition and the weights are those of version 0.1 of the `lpips` package. Functions import torch when they are called; the
-import of this module does not.
-"""
+R. Zhang et al., "The Unreasonable Effectiveness of Deep Features as a Perceptual Metric", CVPR 2018. The definition and
+the weights are those of version 0.1 of the `lpips` package. Functions import torch when they are called; the import of
+this module does not."""
 
 from __future__ import annotations
 
 import functools
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, final
 
@@ -46,10 +44,8 @@ _POOLED: Final = (1, 2)
 @final
 @dataclass(frozen=True, eq=False)
 class Features:
-    """AlexNet's features of an image: five float32 maps (C, h, w), normalised to unit length over C.
-
-    `shape` is the (height, width) of the image.
-    """
+    """AlexNet's features of an image: five float32 maps (C, h, w), normalised to unit length over C. `shape` is the
+    (height, width) of the image."""
 
     maps: tuple[Map, ...]
     shape: tuple[int, int]
@@ -58,27 +54,26 @@ class Features:
 @final
 @dataclass(frozen=True, eq=False)
 class DifferenceMaps:
-    """The weighted squared differences of the features of two images: five float32 maps (h, w).
-
-    `shape` is the (height, width) of the images.
-    """
+    """The weighted squared differences of the features of two images: five float32 maps (h, w). `shape` is the (height,
+    width) of the images."""
 
     maps: tuple[Tensor, ...]
     shape: tuple[int, int]
 
     def mean(self, *, region: Region | None = None) -> float:
-        """Returns the distance, averaged over the whole maps or over a region; see `Lpips.difference`.
-
-        Raises:
-            ValueError: the region is empty or of another shape.
-        """
+        """Returns the distance, averaged over the whole maps or over a region; see `Lpips.difference`. Raises
+        ValueError if the region is empty or of another shape."""
         import torch  # noqa: PLC0415 - an extra
 
         if region is None:
             return float(sum(_mean(map_.numpy()) for map_ in self.maps))
         check_region(region, self.shape)
+        upsample = functools.partial(
+            torch.nn.functional.interpolate, size=self.shape, mode="bilinear", align_corners=False
+        )
         with torch.inference_mode():
-            return _mean(_upsampled(self.maps, self.shape).numpy()[region])
+            full = [upsample(map_[None, None])[0, 0] for map_ in self.maps]
+            return _mean(sum(full[1:], start=full[0]).numpy()[region])
 
 
 @final
@@ -93,22 +88,14 @@ class Lpips:
 
     @classmethod
     def load(cls) -> Lpips:
-        """Returns LPIPS with its published weights. All calls return the same object.
-
-        Raises:
-            MissingExtra: torch is not installed.
-            ModelError: the file of AlexNet's weights is damaged, or contains other weights.
-            DownloadError: AlexNet's weights are not on this machine, and the download fails.
-            OutputError: the downloaded weights cannot be written to the cache folder.
-        """
+        """Returns LPIPS with its published weights, always the same object. Raises MissingExtra if torch is not
+        installed, ModelError if the file of AlexNet's weights is damaged, DownloadError if it is missing and the
+        download fails, and OutputError if it cannot be stored."""
         return _load()
 
     def features(self, image: Image) -> Features:
-        """Returns the features of an image, uint8 (H, W, 3).
-
-        Raises:
-            ValueError: the image is not uint8 (H, W, 3), or has fewer than 31 pixels on a side.
-        """
+        """Returns the features of an image, uint8 (H, W, 3). Raises ValueError if the image is not uint8 (H, W, 3), or
+        has fewer than 31 pixels on a side."""
         import torch  # noqa: PLC0415 - an extra
         from torch.nn import functional  # noqa: PLC0415
 
@@ -119,9 +106,8 @@ class Lpips:
         maps = []
         with torch.inference_mode():
             activations = torch.from_numpy(_normalised(image)).permute(2, 0, 1)[None]
-            for i, ((weight, bias), how) in enumerate(
-                zip(self.convolutions, _STRIDES_AND_PADDINGS, strict=True)
-            ):
+            layers = zip(self.convolutions, _STRIDES_AND_PADDINGS, strict=True)
+            for i, ((weight, bias), how) in enumerate(layers):
                 if i in _POOLED:
                     activations = functional.max_pool2d(activations, 3, 2)
                 activations = functional.conv2d(activations, weight, bias, *how).relu_()
@@ -129,17 +115,14 @@ class Lpips:
         return Features(tuple(maps), shape)
 
     def difference(self, one: Features, other: Features) -> DifferenceMaps:
-        """Returns the five maps of the LPIPS distance between two images, given by their features. Its `mean` is the distance.
+        """Returns the five maps of the LPIPS distance between two images of equal size, given by their features. Its
+        `mean` is the distance: 0 for equal images; lower is better.
 
-        The squared differences of the features are weighted by channel. Without a region, they are averaged over each map, and
-        summed over the five maps. With a `region`, bool (H, W), each map of differences is first upsampled to the size of the
-        image (bilinear, align_corners=False; `spatial=True` in `lpips`), and the sum of the maps is averaged over the region. A
-        region that is the whole image gives a slightly different value than no region, because upsampling changes the weight of
-        the pixels at the border of a map. The distance is 0 for equal images; lower is better.
-
-        Raises:
-            ValueError: the images differ in size.
-        """
+        The squared differences of the features are weighted by channel, averaged over each map, and summed over the
+        five maps. With a `region`, bool (H, W), each map is first upsampled to the size of the image (bilinear,
+        align_corners=False; `spatial=True` in `lpips`), and the sum of the maps is averaged over the region. A region
+        that is the whole image gives a slightly different value than no region, because upsampling changes the weight
+        of the border. Raises ValueError if the images differ in size."""
         import torch  # noqa: PLC0415 - an extra
 
         if one.shape != other.shape:
@@ -153,13 +136,13 @@ class Lpips:
 
 
 def lpips(prediction: Image, truth: Image, *, region: Region | None = None) -> float:
-    """Returns the LPIPS 0.1 (AlexNet) distance between two images, with weights from `Lpips.load`; see `Lpips.difference`.
+    """Returns the LPIPS 0.1 (AlexNet) distance between two images, with weights from `Lpips.load`; see
+    `Lpips.difference`.
 
     Raises:
         ValueError: the images are not uint8 (H, W, 3), differ in shape, or are smaller than 31x31 pixels; the
             region is empty or of another shape.
-        BrewsterError: the weights cannot be loaded; see `Lpips.load`.
-    """
+        BrewsterError: the weights cannot be loaded; see `Lpips.load`."""
     check_images(prediction, truth)
     metric = Lpips.load()
     return metric.difference(metric.features(prediction), metric.features(truth)).mean(region=region)
@@ -170,11 +153,8 @@ def _load() -> Lpips:
     try:
         import torch  # noqa: PLC0415 - an extra
     except ImportError as error:
-        raise MissingExtra.for_extra(
-            "evaluate",
-            "torch is not installed",
-            "expected torch, which brewster needs for LPIPS",
-        ) from error
+        expected = "expected torch, which brewster needs for LPIPS"
+        raise MissingExtra.for_extra("evaluate", "torch is not installed", expected) from error
     tensors = [*load_alexnet().values()]
     weights = [weight.to(memory_format=torch.channels_last) for weight in tensors[::2]]  # faster on the CPU
     channel_weights = tuple(map(torch.from_numpy, read_lpips_channel_weights()))
@@ -182,11 +162,9 @@ def _load() -> Lpips:
 
 
 def _normalised(image: Image) -> NDArray[np.float32]:
-    """Returns (value / 127.5 - 1 - shift) / scale, (H, W, 3).
-
-    The channels stay last in memory, because convolutions on a CPU are fastest in this layout. The arithmetic is done on
-    whole rows, because numpy is slow along an axis of length 3.
-    """
+    """Returns (value / 127.5 - 1 - shift) / scale, (H, W, 3). The channels stay last in memory, because convolutions on
+    a CPU are fastest in this layout. The arithmetic is done on whole rows, because numpy is slow along an axis of
+    length 3."""
     height, width, _ = image.shape
     values = image.reshape(height, -1).astype(np.float32, order="C")
     values *= np.tile(1 / (127.5 * _SCALE), width).astype(np.float32)
@@ -197,10 +175,3 @@ def _normalised(image: Image) -> NDArray[np.float32]:
 def _mean(values: NDArray[np.float32]) -> float:
     """Returns the mean. It is computed by numpy, because the order of torch's sums depends on the number of threads."""
     return float(values.mean(dtype=np.float64))
-
-
-def _upsampled(maps: Sequence[Tensor], shape: tuple[int, int]) -> Tensor:
-    from torch.nn.functional import interpolate  # noqa: PLC0415 - an extra
-
-    full = [interpolate(map_[None, None], shape, mode="bilinear", align_corners=False)[0, 0] for map_ in maps]
-    return sum(full[1:], start=full[0])

@@ -21,8 +21,7 @@ def reflection_region(photo: Image, truth: Image, *, threshold: float = DEFAULT_
     repeated beyond the border of the image. The region is a bool mask (H, W).
 
     Raises:
-        ValueError: the images are not uint8 (H, W, 3) or differ in shape, or the threshold is not in 0..1.
-    """
+        ValueError: the images are not uint8 (H, W, 3) or differ in shape, or the threshold is not in 0..1."""
     check_images(photo, truth)
     if not 0 <= threshold <= 1:
         raise ValueError(f"the threshold must be in 0..1, not {threshold}")

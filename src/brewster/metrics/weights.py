@@ -1,10 +1,8 @@
 """Loads the AlexNet of LPIPS, which is downloaded once. The small file of channel weights is part of brewster.
 
 The network is that of torchvision (BSD-3-Clause): the layers `features.0`, 3, 6, 8 and 10 of alexnet-owt-7be5be79.pth,
-stored as a state dict of ten tensors, `lpips_alexnet_features.pth`. It is searched for in the folder `brewster/weights` of
-the user's cache folder, then in the folder `weights` of BREWSTER_DATA. The digest of the values is always checked, because
-other weights define a different metric.
-"""
+stored as a state dict of ten tensors in the folder `weights` of the cache or of BREWSTER_DATA. The digest of the values
+is always checked, because other weights define a different metric."""
 
 from __future__ import annotations
 
@@ -49,12 +47,8 @@ def load_alexnet(
     downloader: Downloader | None = None,
 ) -> dict[str, Tensor]:
     """Returns AlexNet's ten tensors by name, float32: from the cache, from BREWSTER_DATA, or downloaded into the cache.
-
-    Raises:
-        ModelError: the file is damaged, or contains other weights.
-        DownloadError: there is no file, and the download fails.
-        OutputError: the cache folder cannot be written.
-    """
+    Raises ModelError if the file is damaged, or contains other weights; DownloadError if there is no file, and the
+    download fails; OutputError if the cache folder cannot be written."""
     cached, data = cache_folder() / "weights" / ALEXNET_FILE, os.environ.get("BREWSTER_DATA")
     for path in (cached, *([Path(data) / "weights" / ALEXNET_FILE] if data else [])):
         if path.is_file():
@@ -63,11 +57,8 @@ def load_alexnet(
 
 
 def read_alexnet(path: Path, digest: str = ALEXNET_DIGEST) -> dict[str, Tensor]:
-    """Reads the ten tensors of a state dict and checks their digest. Other tensors in the file are ignored.
-
-    Raises:
-        ModelError: the file is damaged, or contains other weights.
-    """
+    """Reads the ten tensors of a state dict and checks their digest. Other tensors in the file are ignored. Raises
+    ModelError if the file is damaged, or contains other weights."""
     import torch  # noqa: PLC0415 - an extra
 
     try:
@@ -96,11 +87,8 @@ def alexnet_digest(tensors: dict[str, Tensor]) -> str:
 
 
 def _fetch(remote: RemoteFile, digest: str, cached: Path, downloader: Downloader) -> dict[str, Tensor]:
-    """Downloads the whole network, stores ten of its tensors in `cached`, and deletes the download.
-
-    The other tensors, 96 % of the file, are not needed. Before the download, its size and licence are printed on standard
-    error, and how to avoid it.
-    """
+    """Downloads the whole network, stores ten of its tensors, 4 % of the file, in `cached`, and deletes the download. Before, prints
+    its size and licence on standard error, and how to avoid it."""
     import torch  # noqa: PLC0415 - an extra
 
     size = f"{remote.size / 2**20:.0f} MiB"

@@ -30,11 +30,8 @@ _GAUSSIAN: Final = _HALF_TAPS / (2 * _HALF_TAPS.sum() - _HALF_TAPS[-1])
 
 
 def check_images(*images: Image) -> None:
-    """Checks that all images are uint8 (H, W, 3) and of the same shape.
-
-    Raises:
-        ValueError: an image is not uint8 (H, W, 3) or has no pixels, or the shapes differ.
-    """
+    """Checks that all images are uint8 (H, W, 3) and of the same shape. Raises ValueError if an image is not uint8 (H,
+    W, 3) or has no pixels, or the shapes differ."""
     for image in images:
         if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3 or not image.size:
             raise ValueError(f"an image must be uint8 (H, W, 3), not {image.dtype} {image.shape}")
@@ -43,11 +40,8 @@ def check_images(*images: Image) -> None:
 
 
 def check_region(region: Region, shape: tuple[int, int]) -> None:
-    """Checks that a region is a bool mask of this (height, width) with at least one pixel.
-
-    Raises:
-        ValueError: the region is not bool (H, W), or is empty.
-    """
+    """Checks that a region is a bool mask of this (height, width) with at least one pixel. Raises ValueError if the
+    region is not bool (H, W), or is empty."""
     if region.dtype != np.bool_ or region.shape != shape:
         raise ValueError(f"the region must be bool {shape}, not {region.dtype} {region.shape}")
     if not region.any():

@@ -3,8 +3,7 @@
     photo = Photo.open("window.jpg")
     photo.with_linear(photo.linear() * 0.5).save("darker.jpg")
 
-Only this package imports pyvips. OpenEXR, pillow-heif and rawpy are imported when a file needs them.
-"""
+Only this package imports pyvips. OpenEXR, pillow-heif and rawpy are imported when a file needs them."""
 
 from brewster.files import DEFAULT_MAX_PIXELS
 from brewster.photo.decode import read_size

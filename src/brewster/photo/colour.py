@@ -1,13 +1,13 @@
 """Converts stored pixels to linear Rec.709 light and back.
 
-A `ColourSpace` has a tone curve for each channel, and a matrix from linear RGB to linear Rec.709. It is read from an ICC
-matrix profile (ICC.1:2022) or from the chromaticities of an EXR file. Without a profile and chromaticities, integers are
-sRGB and floats are linear Rec.709. Colours outside the Rec.709 gamut have values below 0 or above 1, which are not clipped.
+A `ColourSpace` has a tone curve for each channel, and a matrix from linear RGB to linear Rec.709. It is read from an
+ICC matrix profile (ICC.1:2022) or from the chromaticities of an EXR file. Without a profile and chromaticities,
+integers are sRGB and floats are linear Rec.709. Colours outside the Rec.709 gamut have values below 0 or above 1, which
+are not clipped.
 
-A photo with a LUT-based profile, which scanners and some cameras write, or with CMYK colours is converted to Display P3 when it
-is opened, by littleCMS in libvips. Display P3 is the largest colour space whose profile libvips includes. Colours outside
-Display P3 are clipped.
-"""
+A photo with a LUT-based profile, which scanners and some cameras write, or with CMYK colours is converted to Display P3
+when it is opened, by littleCMS in libvips. Display P3 is the largest colour space whose profile libvips includes.
+Colours outside Display P3 are clipped."""
 
 from __future__ import annotations
 
@@ -36,11 +36,9 @@ _BRADFORD = np.array([[0.8951, 0.2664, -0.1614], [-0.7502, 1.7135, 0.0367], [0.0
 
 @dataclass(frozen=True)
 class ToneCurve:
-    """A tone curve from stored values 0..1 to linear light (ICC.1:2022 10.6 and 10.18).
-
-    If `samples` is not empty, the curve interpolates them linearly over 0..1. Otherwise it is parametric, with the
-    parameters g, a, b, c, d, e, f: (a x + b)^g + e for x >= d, and c x + f for x < d.
-    """
+    """A tone curve from stored values 0..1 to linear light (ICC.1:2022 10.6 and 10.18). If `samples` is not empty, the
+    curve interpolates them linearly over 0..1. Otherwise it is parametric, with the parameters g, a, b, c, d, e, f:
+    (a x + b)^g + e for x >= d, and c x + f for x < d."""
 
     samples: tuple[float, ...] = ()
     parameters: tuple[float, ...] = (1, 1, 0, 0, 0, 0, 0)
@@ -90,11 +88,9 @@ class ColourSpace:
         return np.stack(_apply_matrix(self.matrix, channels) if self.matrix else channels, axis=2)
 
     def to_stored(self, linear: Float32, original: Stored) -> Stored:
-        """Converts linear Rec.709 (H, W, 3) to stored pixels with the dtype and the channels of `original`.
-
-        `original` has the stored pixels before a change. Pixels with unchanged light keep exactly these stored values.
-        In integers, NaN becomes black; floats keep NaN.
-        """
+        """Converts linear Rec.709 (H, W, 3) to stored pixels with the dtype and the channels of `original`. `original`
+        has the stored pixels before a change. Pixels with unchanged light keep exactly these stored values. In
+        integers, NaN becomes black; floats keep NaN."""
         stored = np.empty_like(original)
         curves = self._curves(original)
         channels = [linear[..., i] for i in range(3)]
@@ -102,26 +98,20 @@ class ColourSpace:
             red, green, blue = channels
             weights = np.array(srgb.REC709_LUMINANCE, np.float32)
             luminance = weights[0] * red + weights[1] * green + weights[2] * blue
-            channels = [
-                np.where((red == green) & (green == blue), green, luminance)
-            ]  # equal channels stay exact
+            channels = [np.where((red == green) & (green == blue), green, luminance)]  # equal ones stay exact
         elif self.matrix:
             channels = _apply_matrix(_inverse(self.matrix), channels)
         for i, curve in enumerate(curves):
             stored[..., i] = _encoded(channels[i], curve, original.dtype)
         is_exact = self == LINEAR_REC709 or (self == SRGB and original.dtype.kind == "u")
-        if (
-            not is_exact
-        ):  # in an exact space, decoding and encoding returns the same values; a test checks this
+        if not is_exact:  # in an exact space, encoding returns the decoded values; a test checks this
             same = np.all(linear == self.to_linear(original), axis=2)
             stored[same] = original[same]
         return stored
 
     def _curves(self, stored: Stored) -> tuple[ToneCurve, ...]:
-        """Returns the curve of each stored channel.
-
-        Grey pixels use the green curve. In a grey profile all three curves are the same. In an RGB profile they usually are.
-        """
+        """Returns the curve of each stored channel. Grey pixels use the green curve. In a grey profile all three curves
+        are the same. In an RGB profile they usually are."""
         return self.curves if stored.shape[-1] == 3 else (self.curves[1],)
 
 
@@ -131,11 +121,9 @@ LINEAR_REC709 = ColourSpace((ToneCurve(),) * 3)
 
 @lru_cache(maxsize=16)
 def colour_space_of(icc: bytes | None, primaries: tuple[float, ...] | None, is_float: bool) -> ColourSpace:
-    """Returns the colour space of stored pixels from their ICC profile or chromaticities.
-
-    Without a profile and chromaticities, integers are sRGB and floats are linear Rec.709. Raises UnsupportedPhoto if the
-    profile is neither a grey profile with a curve nor an RGB profile with curves and a matrix.
-    """
+    """Returns the colour space of stored pixels from their ICC profile or chromaticities. Without a profile and
+    chromaticities, integers are sRGB and floats are linear Rec.709. Raises UnsupportedPhoto if the profile is
+    neither a grey profile with a curve nor an RGB profile with curves and a matrix."""
     if icc is not None:
         return _profile_space(icc)
     if primaries is not None and not np.allclose(primaries, REC709_CHROMATICITIES, atol=1e-4):
@@ -145,15 +133,13 @@ def colour_space_of(icc: bytes | None, primaries: tuple[float, ...] | None, is_f
 
 def _decoded(stored: Stored, curve: ToneCurve) -> Float32:
     if stored.dtype.kind == "f":
-        is_identity = curve == ToneCurve()
-        return stored if is_identity else curve.decode(stored.astype(np.float64)).astype(np.float32)
+        return stored if curve == ToneCurve() else curve.decode(stored.astype(np.float64)).astype(np.float32)
     return _decode_table(curve, np.iinfo(stored.dtype).max).take(stored)
 
 
 def _encoded(linear: Float32, curve: ToneCurve, dtype: np.dtype[Any]) -> Stored:
     if dtype.kind == "f":
-        is_identity = curve == ToneCurve()
-        return linear if is_identity else curve.encode(linear.astype(np.float64)).astype(np.float32)
+        return linear if curve == ToneCurve() else curve.encode(linear.astype(np.float64)).astype(np.float32)
     table = _encode_table(curve, np.iinfo(dtype).max)
     sqrt_light = np.sqrt(np.fmin(np.fmax(linear, np.float32(0)), np.float32(1)))
     return table.take((sqrt_light * np.float32(len(table) - 1) + np.float32(0.5)).astype(np.intp))
@@ -166,21 +152,17 @@ def _decode_table(curve: ToneCurve, white: int) -> Float32:
 
 @lru_cache(maxsize=16)
 def _encode_table(curve: ToneCurve, white: int) -> NDArray[Any]:
-    """Returns a lookup table from the square root of linear light to stored integers.
-
-    With the square root, dark values have more entries, as in tone curves. With 2**16 entries, the rounding error is below
-    0.01 levels of 8 bits; with 2**20 entries, it is below 0.1 levels of 16 bits.
-    """
+    """Returns a lookup table from the square root of linear light to stored integers. With the square root, dark values
+    have more entries, as in tone curves. With 2**16 entries, the rounding error is below 0.01 levels of 8 bits; with
+    2**20 entries, it is below 0.1 levels of 16 bits."""
     sqrt_light = np.linspace(0, 1, 2**16 if white < 256 else 2**20)
     levels = np.rint(np.clip(curve.encode(sqrt_light**2), 0, 1) * white)
     return levels.astype(np.uint8 if white < 256 else np.uint16)
 
 
 def _apply_matrix(matrix: Matrix, channels: list[Float32]) -> list[Float32]:
-    """Multiplies the channels of each pixel by a matrix.
-
-    BLAS is not used, because its rounding depends on the position of a pixel in the strip.
-    """
+    """Multiplies the channels of each pixel by a matrix. BLAS is not used, because its rounding depends on the position
+    of a pixel in the strip."""
     red, green, blue = channels
     rows = np.array(matrix, np.float32)
     return [row[0] * red + row[1] * green + row[2] * blue for row in rows]
@@ -195,13 +177,10 @@ def _as_matrix(array: Float64) -> Matrix:
 
 
 def _to_d50(primaries: tuple[float, ...]) -> Float64:
-    """Returns the matrix from linear RGB with these chromaticities to XYZ under D50.
-
-    The white point is adapted by the Bradford transform (ICC.1:2022 annex E).
-    """
-    xyz = np.array(
-        [[x / y, 1, (1 - x - y) / y] for x, y in zip(primaries[::2], primaries[1::2], strict=True)]
-    ).T
+    """Returns the matrix from linear RGB with these chromaticities to XYZ under D50. The white point is adapted by the
+    Bradford transform (ICC.1:2022 annex E)."""
+    points = zip(primaries[::2], primaries[1::2], strict=True)
+    xyz = np.array([[x / y, 1, (1 - x - y) / y] for x, y in points]).T
     white = xyz[:, 3]
     to_xyz = xyz[:, :3] * np.linalg.solve(xyz[:, :3], white)
     gains = np.diag((_BRADFORD @ _D50) / (_BRADFORD @ white))
@@ -240,11 +219,7 @@ def _snap_to_srgb(space: ColourSpace) -> ColourSpace:
 
 
 def icc_tags(icc: bytes) -> dict[bytes, bytes]:
-    """Returns the data of each tag of an ICC profile, by the signature of the tag.
-
-    Raises:
-        struct.error: the profile is truncated.
-    """
+    """Returns the data of each tag of an ICC profile by its signature. Raises struct.error if the profile is truncated."""
     (count,) = struct.unpack_from(">I", icc, 128)
     rows = (struct.unpack_from(">4sII", icc, 132 + 12 * i) for i in range(min(count, 100)))
     return {name: icc[start : start + size] for name, start, size in rows}
@@ -308,28 +283,25 @@ def convert_to_display_p3(pixels: NDArray[Any], file_info: FileInfo) -> tuple[ND
         )
     icc = file_info.icc or b""
     try:
-        profile_is_ignored = np.array_equal(
-            _convert(_PROBE_COLOURS, icc), _convert(_PROBE_COLOURS, pyvips.Image.profile_load("srgb"))
+        own, srgb_probe = (
+            _convert(_PROBE_COLOURS, used) for used in (icc, pyvips.Image.profile_load("srgb"))
         )
         array = _convert(pixels, icc)
     except pyvips.Error as error:
         raise _damaged_profile(icc) from error
-    if profile_is_ignored:
+    if np.array_equal(own, srgb_probe):
         raise _damaged_profile(icc)
     return array, replace(file_info, icc=bytes(pyvips.Image.profile_load("p3")))
 
 
 def convert_cmyk(image: pyvips.Image, file_info: FileInfo) -> tuple[pyvips.Image, FileInfo]:
-    """Returns a CMYK image in Display P3 (relative colorimetric), and `file_info` with its profile and a note.
-
-    Without a usable CMYK profile, the default profile of libvips is used.
-    """
+    """Returns a CMYK image in Display P3 (relative colorimetric), and `file_info` with its profile and a note. Without
+    a usable CMYK profile, the default profile of libvips is used."""
     is_cmyk = file_info.icc is not None and file_info.icc[16:20] == b"CMYK"
     profile = "its profile" if is_cmyk else "a default profile, because it has none"
     depth = 16 if image.format == "ushort" else 8
-    converted = image.icc_transform(
-        "p3", embedded=is_cmyk, input_profile="cmyk", intent="relative", depth=depth
-    )
+    given = {"embedded": is_cmyk, "input_profile": "cmyk", "intent": "relative", "depth": depth}
+    converted = image.icc_transform("p3", **given)
     note = f"its CMYK colours were converted to RGB (Display P3) with {profile}"
     return converted, replace(file_info, icc=bytes(pyvips.Image.profile_load("p3")), note=note)
 

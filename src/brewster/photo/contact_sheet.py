@@ -39,16 +39,11 @@ def is_contact_sheet(path: Path) -> bool:
 def write_contact_sheets(
     path: Path, rows: Sequence[tuple[Path, Sequence[Path]]], max_pixels: int, *, overwrite: bool = False
 ) -> Iterator[Path]:
-    """Writes the rows to `path`. Yields the path of each sheet.
-
-    A sheet has at most 200 rows. Further sheets have a number: `sheet.jpg`, `sheet-2.jpg` and so on. A contact sheet of an
-    earlier run is replaced; with `overwrite`, other files are, too. A row has the file of a photo, whose path is its label, and
-    the files of its layers. Files with more than `max_pixels` pixels are refused.
-
-    Raises:
-        PhotoError: an image file cannot be read.
-        OutputError: the sheet cannot be written, or another file has its name.
-    """
+    """Writes the rows to `path`, and yields the path of each sheet. A sheet has at most 200 rows; further ones have a
+    number: `sheet.jpg`, `sheet-2.jpg` and so on. A contact sheet of an earlier run is replaced; with `overwrite`, other
+    files are, too. A row has the file of a photo, whose path is its label, and the files of its layers. Raises
+    PhotoError if a file cannot be read or has more than `max_pixels` pixels, and OutputError if the sheet cannot be
+    written, or another file has its name."""
     if not _SYSTEM_FONTS.exists():
         os.environ.setdefault("FONTCONFIG_FILE", str(_PACKAGED_FONTS))  # ignored on Windows and macOS
     for number, first in enumerate(range(0, len(rows), _MAX_ROWS), 1):
@@ -57,10 +52,8 @@ def write_contact_sheets(
             for source, layers in rows[first : first + _MAX_ROWS]
         ]
         width = max(image.shape[1] for image in images)
-        padded = [
-            np.pad(image, [(0, 0), (0, width - image.shape[1]), (0, 0)], constant_values=255)
-            for image in images
-        ]
+        gaps = ([(0, 0), (0, width - image.shape[1]), (0, 0)] for image in images)
+        padded = [np.pad(image, gap, constant_values=255) for image, gap in zip(images, gaps, strict=True)]
         sheet = path if number == 1 else path.with_stem(f"{path.stem}-{number}")
         photo = Photo(np.concatenate(padded))
         file_info = with_layer_history(photo.file_info, _LAYER, {})

@@ -1,7 +1,6 @@
 """Decodes the bytes of an image file to stored pixels and file metadata.
 
-The first bytes determine the format; the file name is not used. The header is checked before any pixel is decoded.
-"""
+The first bytes determine the format; the file name is not used. The header is checked before any pixel is decoded."""
 
 from __future__ import annotations
 
@@ -42,12 +41,8 @@ Stored = NDArray[Any]
 
 
 def decode(data: bytes, max_pixels: int) -> Decoded:
-    """Decodes the bytes of an image file.
-
-    Raises:
-        PhotoError: the image cannot be read, is not supported, or is too large (see `Photo.open`).
-        MissingExtra: the reader of EXR, HEIC or RAW is not installed.
-    """
+    """Decodes the bytes of an image file. Raises PhotoError if the image cannot be read, is not supported, or is too
+    large (see `Photo.open`), and MissingExtra if the reader of EXR, HEIC or RAW is not installed."""
     format_name = _detect_format(data)
     if format_name == "ora":
         data, format_name = _merged_image(data, max_pixels), "png"
@@ -76,8 +71,7 @@ def read_size(data: bytes) -> tuple[int, int]:
 
     Raises:
         PhotoError: the image cannot be read, is not supported, or is too large (see `Photo.open`).
-        MissingExtra: the reader of EXR, HEIC or RAW is not installed.
-    """
+        MissingExtra: the reader of EXR, HEIC or RAW is not installed."""
     format_name = _detect_format(data)
     if format_name == "ora":
         data, format_name = _merged_image(data, DEFAULT_MAX_PIXELS), "png"
@@ -170,12 +164,8 @@ def _unreadable_error(format_name: str, reason: str = "") -> PhotoError:
 
 
 def _check_supported(image: pyvips.Image, data: bytes, format_name: str, max_pixels: int) -> None:
-    """Checks the header of an image.
-
-    Raises:
-        PhotoTooLarge: the image has more pixels than `max_pixels`.
-        UnsupportedPhoto: the image is an animation, has several pages, or unsupported channels.
-    """
+    """Checks the header of an image. Raises PhotoTooLarge if the image has more pixels than `max_pixels`, and
+    UnsupportedPhoto if the image is an animation, has several pages, or unsupported channels."""
     check_pixel_count(image.width, image.height, max_pixels)
     if _has_frames(image, data, format_name):
         raise UnsupportedPhoto(
@@ -237,14 +227,9 @@ _SRGB_TRANSFERS = (1, 2, 6, 13, 14, 15)  # BT.709, unspecified, BT.601, sRGB, BT
 
 
 def _profile_of(data: bytes, format_name: str) -> bytes | None:
-    """Returns the ICC profile for the code points (ITU-T H.273) of a file.
-
-    Returns Display P3 if the primaries are those of Display P3; otherwise None, which means sRGB.
-
-    Raises:
-        UnsupportedPhoto: the file has other primaries, or a transfer function unlike that of sRGB: for example linear (8), or
-            PQ (16) or HLG (18) of HDR video.
-    """
+    """Returns the ICC profile for the code points (ITU-T H.273) of a file. Returns Display P3 if the primaries are
+    those of Display P3; otherwise None, which means sRGB. Raises UnsupportedPhoto if the file has other primaries,
+    or a transfer function unlike that of sRGB: for example linear (8), or PQ (16) or HLG (18) of HDR video."""
     codes = metadata.cicp(data) if FORMATS[format_name].has_cicp else None
     primaries, transfer = codes[:2] if codes else (1, 13)
     if transfer not in _SRGB_TRANSFERS or primaries not in (1, 2, 5, 6, 12):
@@ -337,11 +322,8 @@ _TRANSPOSED = (5, 6, 7, 8)
 
 
 def _full_scale(array: Stored, bits: int) -> Stored:
-    """Scales 10- and 12-bit values to 16 bits, so that white is 65535.
-
-    The libraries return such values in the upper bits of 16-bit integers. The lower bits are filled with a copy of the
-    upper bits.
-    """
+    """Scales 10- and 12-bit values to 16 bits, so that white is 65535. The libraries return such values in the upper
+    bits of 16-bit integers. The lower bits are filled with a copy of the upper bits."""
     return array | array >> bits if bits in (10, 12) else array
 
 

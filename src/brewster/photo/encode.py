@@ -27,12 +27,9 @@ _DEFAULT_RESOLUTION = (72 / 25.4, 72 / 25.4)
 
 
 def encode(pixels: Stored, alpha: Stored | None, file_info: FileInfo, quality: int | None = None) -> bytes:
-    """Returns the bytes of a file. `pixels` (H, W, 1|3) and `alpha` (H, W) have the dtype for `file_info.bits`.
-
-    Raises:
-        UnsupportedPhoto: the format cannot store the image, or the quality is not 1..100 or the format has none.
-        MissingExtra: the writer of EXR or HEIC is not installed.
-    """
+    """Returns the bytes of a file. `pixels` (H, W, 1|3) and `alpha` (H, W) have the dtype for `file_info.bits`. Raises
+    UnsupportedPhoto if the format cannot store the image, or the quality is not 1..100 or the format has none, and
+    MissingExtra if the writer of EXR or HEIC is not installed."""
     if alpha is not None and not FORMATS[file_info.format_name].has_alpha:
         raise UnsupportedPhoto(
             f"the photo has an alpha channel, which {file_info.format_name} cannot store",
@@ -50,8 +47,7 @@ def encode(pixels: Stored, alpha: Stored | None, file_info: FileInfo, quality: i
             f"expected 1..100 for {', '.join(_DEFAULT_QUALITIES)}, and no quality for other formats",
             "correct the quality, or choose one of these formats",
         )
-    if file_info.format_name in ("exr", "hdr"):
-        write = write_exr if file_info.format_name == "exr" else write_hdr
+    if write := {"exr": write_exr, "hdr": write_hdr}.get(file_info.format_name):
         return write(Decoded(pixels, alpha, file_info))
     array = pixels if alpha is None else np.concatenate([pixels, alpha[..., None]], axis=2)
     if file_info.format_name == "heic":
@@ -65,11 +61,8 @@ def _encode_vips(array: Stored, file_info: FileInfo, quality: int) -> bytes:
     contiguous = np.ascontiguousarray(array)
     band_format = {"uint8": "uchar", "uint16": "ushort", "float32": "float"}[array.dtype.name]
     image = pyvips.Image.new_from_memory(contiguous.data, width, height, channels, band_format)
-    is_grey = channels < 3
-    grey, colour = {"uint8": ("b-w", "srgb"), "uint16": ("grey16", "rgb16")}.get(
-        array.dtype.name, ("b-w", "scrgb")
-    )
-    image = image.copy(interpretation=grey if is_grey else colour, xres=across, yres=down)
+    spaces = {"uint8": ("b-w", "srgb"), "uint16": ("grey16", "rgb16")}.get(array.dtype.name, ("b-w", "scrgb"))
+    image = image.copy(interpretation=spaces[channels >= 3], xres=across, yres=down)
     image.set_type(pyvips.GValue.gstr_type, "resolution-unit", "in")
     blobs = {"icc-profile-data": file_info.icc, "xmp-data": file_info.xmp, "iptc-data": file_info.iptc}
     if file_info.format_name == "avif":
@@ -90,9 +83,8 @@ def _encode_vips(array: Stored, file_info: FileInfo, quality: int) -> bytes:
 
 
 def _save_options(file_info: FileInfo, dtype: np.dtype[Any], quality: int) -> dict[str, Any]:
-    """Returns the options of the libvips saver for a format. The chroma of a JPEG is subsampled only if
-    that of the source is; that of an AVIF never is. Lossy WebP has no format without chroma subsampling (RFC 6386).
-    """
+    """Returns the options of the libvips saver for a format. The chroma of a JPEG is subsampled only if that of the
+    source is; that of an AVIF never is. Lossy WebP has no format without chroma subsampling (RFC 6386)."""
     match file_info.format_name:
         case "jpeg":
             mode = "on" if file_info.subsampling == "4:2:0" else "off"
@@ -103,14 +95,8 @@ def _save_options(file_info: FileInfo, dtype: np.dtype[Any], quality: int) -> di
             return {"Q": quality, "lossless": file_info.lossless, "exact": True}
         case "avif":
             # Effort 1 takes 1/7 of the time of the default effort. The files are 1/8 larger.
-            return {
-                "compression": "av1",
-                "bitdepth": file_info.bits,
-                "effort": 1,
-                "Q": quality,
-                "lossless": file_info.lossless,
-                "subsample_mode": "off",
-            }
+            fixed = {"compression": "av1", "effort": 1, "subsample_mode": "off"}
+            return {**fixed, "bitdepth": file_info.bits, "Q": quality, "lossless": file_info.lossless}
     compression = file_info.compression or "deflate"
     if compression == "jpeg" and dtype != np.uint8:
         compression = "deflate"

@@ -97,12 +97,10 @@ def format_name_of(path: Path) -> str:
 
 
 def depth_for(file_info: FileInfo, format_name: str, bit_depth: int | None) -> int:
-    """Returns the bits per channel to write.
-
-    The result is `bit_depth` if it is not None. Otherwise it is the largest depth of the format that is not larger than the
-    depth of the file, or the smallest depth of the format if all its depths are larger. Raises UnsupportedPhoto if brewster
-    does not write this format, or does not write it at this bit depth.
-    """
+    """Returns the bits per channel to write. The result is `bit_depth` if it is not None. Otherwise it is the largest
+    depth of the format that is not larger than the depth of the file, or the smallest depth of the format if all its
+    depths are larger. Raises UnsupportedPhoto if brewster does not write this format, or does not write it at this
+    bit depth."""
     depths = WRITABLE[format_name].bit_depths if format_name in WRITABLE else ()
     if not depths or (bit_depth is not None and bit_depth not in depths):
         raise UnsupportedPhoto(

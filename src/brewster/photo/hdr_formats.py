@@ -1,7 +1,6 @@
 """Reads and writes floating-point images: OpenEXR with its own package, Radiance HDR with built-in code.
 
-Both formats store linear light. Header attributes are kept and written to new files.
-"""
+Both formats store linear light. Header attributes are kept and written to new files."""
 
 from __future__ import annotations
 
@@ -20,10 +19,8 @@ Float32 = NDArray[np.float32]
 
 
 def _valid_chromaticities(chromaticities: Sequence[float | str]) -> tuple[float, ...] | None:
-    """Returns chromaticities if red, green and blue form a triangle, otherwise None.
-
-    Some programs write no chromaticities, or zeros.
-    """
+    """Returns chromaticities if red, green and blue form a triangle, otherwise None. Some programs write no
+    chromaticities, or zeros."""
     try:
         points = np.array(chromaticities, np.float64).reshape(4, 2)
     except ValueError:
@@ -40,15 +37,10 @@ def _valid_chromaticities(chromaticities: Sequence[float | str]) -> tuple[float,
 def read_exr(data: bytes, max_pixels: int) -> Decoded:
     """Reads the first part of an EXR: the channels R, G and B, or Y alone, and the channel A if there is one.
 
-    Other channels, such as Z, are ignored.
-
-    Raises:
-        MissingExtra: OpenEXR is not installed.
-        PhotoTooLarge: the image has more pixels than `max_pixels`.
-        UnreadablePhoto: the file is damaged or truncated.
-        UnsupportedPhoto: the file has neither the channels R, G and B nor the channel Y, or its colours are stored as luminance
-            and chroma (Y, RY, BY).
-    """
+    Other channels, such as Z, are ignored. Raises MissingExtra if OpenEXR is not installed; PhotoTooLarge if the image
+    has more pixels than `max_pixels`; UnreadablePhoto if the file is damaged or truncated; UnsupportedPhoto if the file
+    has neither the channels R, G and B nor the channel Y, or its colours are stored as luminance and chroma (Y, RY,
+    BY)."""
     header = _exr_part(data, header_only=True).header
     low, high = header["dataWindow"]
     width, height = (int(side) for side in np.array(high) - np.array(low) + 1)
@@ -62,11 +54,8 @@ def _exr_part(data: bytes, *, header_only: bool) -> Any:  # noqa: ANN401  (OpenE
     try:
         return exr.File(io.BytesIO(data), separate_channels=True, header_only=header_only).parts[0]
     except (RuntimeError, ValueError, TypeError, IndexError) as error:
-        raise UnreadablePhoto(
-            "the EXR cannot be read completely",
-            "expected a complete file",
-            "export the image again",
-        ) from error
+        happened = "the EXR cannot be read completely"
+        raise UnreadablePhoto(happened, "expected a complete file", "export the image again") from error
 
 
 def _exr_pixels(channels: dict[str, NDArray[Any]], header: dict[str, Any]) -> Decoded:
@@ -94,32 +83,20 @@ def write_exr(image: Decoded) -> bytes:
     planes = {name: image.pixels[..., i] for i, name in enumerate(names)}
     if image.alpha is not None:
         planes["A"] = image.alpha
-    dtype: type[np.floating[Any]] = np.float16 if image.file_info.bits == 16 else np.float32
-    max_value = float(np.finfo(dtype).max)
-    channels = {name: plane.clip(-max_value, max_value).astype(dtype) for name, plane in planes.items()}
     header = {
         "compression": exr.ZIP_COMPRESSION,
         **(image.file_info.header or {}),
         **({"software": image.file_info.software} if image.file_info.software else {}),
         "type": exr.scanlineimage,
     }
-    file = io.BytesIO()
-    exr.File(header, channels).write(file)
-    return file.getvalue()
+    return _exr_bytes(planes, np.float16 if image.file_info.bits == 16 else np.float32, header)
 
 
 # --- OpenEXR with several layers
 
 _LAYER_CHANNELS = ("R", "G", "B")
 _RESERVED_ATTRIBUTES = {
-    "channels",
-    "chunkCount",
-    "compression",
-    "dataWindow",
-    "lineOrder",
-    "tiles",
-    "type",
-    "version",
+    *["channels", "chunkCount", "compression", "dataWindow", "lineOrder", "tiles", "type", "version"]
 }
 """Attributes that OpenEXR defines. It drops text attributes with some of these names without an error."""
 
@@ -132,8 +109,7 @@ def write_exr_layers(layers: Mapping[str, Float32], header: Mapping[str, str]) -
 
     Raises:
         MissingExtra: OpenEXR is not installed.
-        UnsupportedPhoto: the name of an attribute is reserved by OpenEXR.
-    """
+        UnsupportedPhoto: the name of an attribute is reserved by OpenEXR."""
     exr = library_of("exr")
     if reserved := _RESERVED_ATTRIBUTES & header.keys():
         raise UnsupportedPhoto(
@@ -141,18 +117,22 @@ def write_exr_layers(layers: Mapping[str, Float32], header: Mapping[str, str]) -
             "expected other names, because these are reserved by OpenEXR",
             "choose other names",
         )
-    max_value = float(np.finfo(np.float16).max)
-    half_layers = {
-        name: layer.clip(-max_value, max_value).astype(np.float16) for name, layer in layers.items()
-    }
-    channels = {
-        f"{name}.{channel}": np.ascontiguousarray(half[..., i])
-        for name, half in half_layers.items()
+    planes = {
+        f"{name}.{channel}": layer[..., i]
+        for name, layer in layers.items()
         for i, channel in enumerate(_LAYER_CHANNELS)
     }
-    file = io.BytesIO()
     attributes = {**header, "compression": exr.ZIP_COMPRESSION, "type": exr.scanlineimage}
-    exr.File(attributes, channels).write(file)
+    return _exr_bytes(planes, np.float16, attributes)
+
+
+def _exr_bytes(planes: Mapping[str, Float32], dtype: type[np.floating[Any]], header: dict[str, Any]) -> bytes:
+    max_value, file = float(np.finfo(dtype).max), io.BytesIO()
+    channels = {
+        name: np.ascontiguousarray(plane.clip(-max_value, max_value).astype(dtype))
+        for name, plane in planes.items()
+    }
+    library_of("exr").File(header, channels).write(file)
     return file.getvalue()
 
 
@@ -161,8 +141,7 @@ def read_exr_layers(data: bytes) -> dict[str, Float32]:
 
     Raises:
         MissingExtra: OpenEXR is not installed.
-        UnreadablePhoto: the file is damaged, or has no layer with R, G and B.
-    """
+        UnreadablePhoto: the file is damaged, or has no layer with R, G and B."""
     channels = _exr_part(data, header_only=False).channels
     stems = sorted(name.removesuffix(".R") for name in channels if name.endswith(".R"))
     names = {stem: [f"{stem}.{channel}" for channel in _LAYER_CHANNELS] for stem in stems}
@@ -187,23 +166,16 @@ _FACTORS = ("EXPOSURE", "COLORCORR", "PIXASPECT")
 
 
 def read_hdr(data: bytes, max_pixels: int) -> Decoded:
-    """Reads a Radiance HDR image: red, green and blue with a shared exponent (RGBE).
-
-    Raises:
-        PhotoTooLarge: the image has more pixels than `max_pixels`.
-        UnreadablePhoto: the image is empty or truncated.
-        UnsupportedPhoto: the image has XYZ colours, its scan lines are not ordered from top to bottom, or its header has no size.
-    """
+    """Reads a Radiance HDR image: red, green and blue with a shared exponent (RGBE). Raises PhotoTooLarge if the image
+    has more pixels than `max_pixels`; UnreadablePhoto if the image is empty or truncated; UnsupportedPhoto if the
+    image has XYZ colours, its scan lines are not ordered from top to bottom, or its header has no size."""
     header_text, separator, rest = data.partition(b"\n\n")
     resolution, _, body = rest.partition(b"\n")
     resolution_match = re.fullmatch(rb"-Y (\d{1,9}) \+X (\d{1,9})\s*", resolution)
     lines = header_text.decode("latin-1").splitlines()[1:]
     if any(line.startswith("FORMAT=") and "xyze" in line for line in lines):
-        raise UnsupportedPhoto(
-            "the HDR image has XYZ colours (FORMAT=32-bit_rle_xyze)",
-            "expected RGBE colours",
-            "export the image as RGBE",
-        )
+        happened = "the HDR image has XYZ colours (FORMAT=32-bit_rle_xyze)"
+        raise UnsupportedPhoto(happened, "expected RGBE colours", "export the image as RGBE")
     if not separator or resolution_match is None:
         raise UnsupportedPhoto(
             f"the header of the HDR image ends in {resolution[:40]!r}",
@@ -212,11 +184,8 @@ def read_hdr(data: bytes, max_pixels: int) -> Decoded:
         )
     height, width = int(resolution_match[1]), int(resolution_match[2])
     if width * height == 0:
-        raise UnreadablePhoto(
-            f"the HDR image has {width} x {height} pixels",
-            "expected at least one pixel",
-            "export the image again",
-        )
+        happened = f"the HDR image has {width} x {height} pixels"
+        raise UnreadablePhoto(happened, "expected at least one pixel", "export the image again")
     check_pixel_count(width, height, max_pixels)
     header: dict[str, str] = {}
     for line in lines:
@@ -260,48 +229,38 @@ def _scan_lines(body: bytes, width: int, height: int) -> NDArray[np.uint8]:
 
 
 def _decode_runs(body: bytes, width: int, height: int) -> bytes:
-    """Decodes run-length encoded lines.
-
-    Each line has a header of 4 bytes, followed by runs (128 + length, value) and literals (length, values...).
-    """
+    """Decodes run-length encoded lines. Each line has a header of 4 bytes, followed by runs (128 + length, value) and
+    literals (length, values...)."""
     planes, position = bytearray(), 0
     for line in range(height):
         position += 4
         end = 4 * width * (line + 1)
         while len(planes) < end:
             run = body[position]
-            planes += (
-                body[position + 1 : position + 2] * (run - 128)
-                if run > 128
-                else body[position + 1 : position + 1 + run]
-            )
-            position += 2 if run > 128 else 1 + run
+            size = 1 if run > 128 else run
+            planes += body[position + 1 : position + 1 + size] * (run - 128 if run > 128 else 1)
+            position += 1 + size
     return bytes(planes)
 
 
 def _decode_old_runs(body: bytes, count: int) -> bytes:
-    """Decodes the run-length encoding of Radiance 1.4 and earlier to `count` pixels.
-
-    The pixel (1, 1, 1, n) repeats the pixel before it n times. If k such pixels follow each other, the last one has the weight
-    256**(k-1). Raises ValueError if the runs do not have `count` pixels together.
-    """
+    """Decodes the run-length encoding of Radiance 1.4 and earlier to `count` pixels. The pixel (1, 1, 1, n) repeats the
+    pixel before it n times. If k such pixels follow each other, the last one has the weight 256**(k-1). Raises
+    ValueError if the runs do not have `count` pixels together."""
     pixels = np.frombuffer(body, np.uint8, len(body) // 4 * 4).reshape(-1, 4)
     is_run = (pixels[:, :3] == 1).all(axis=1)
     positions = np.arange(len(pixels))
     last_literal = np.maximum.accumulate(np.where(is_run, -1, positions))
-    repeats = np.where(
-        is_run, pixels[:, 3].astype(np.int64) << np.minimum(8 * (positions - last_literal - 1), 24), 1
-    )
+    shifts = np.minimum(8 * (positions - last_literal - 1), 24)
+    repeats = np.where(is_run, pixels[:, 3].astype(np.int64) << shifts, 1)
     if last_literal[:1].tolist() != [0] or repeats.sum() != count:
         raise ValueError
     return np.repeat(pixels[last_literal], repeats, axis=0).tobytes()
 
 
 def write_hdr(image: Decoded) -> bytes:
-    """Encodes a Radiance HDR image with flat lines, which all readers support. Grey becomes three equal channels.
-
-    For light from `read_hdr`, the values are exactly those that were read. Negative light becomes black.
-    """
+    """Encodes a Radiance HDR image with flat lines, which all readers support. Grey becomes three equal channels. For
+    light from `read_hdr`, the values are exactly those that were read. Negative light becomes black."""
     height, width = image.pixels.shape[:2]
     header = dict(image.file_info.header or {})
     if image.file_info.software:

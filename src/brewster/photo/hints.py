@@ -1,8 +1,8 @@
-"""Hints: an image of the size of a photo, on which a person has painted where there is reflection, and where only the scene.
+"""Hints: an image of the size of a photo, on which a person has painted where there is reflection, and where only the
+scene.
 
 hints = Hints.open("hints.png", photo.size)
-hints.sampled(516, 387)  # (387, 516, 2) float32: reflection (red), scene (green); 0 is no hint
-"""
+hints.sampled(516, 387)  # (387, 516, 2) float32: reflection (red), scene (green); 0 is no hint"""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
 """Records the program that created a layer, and its options, in the metadata of the layer: XMP history, EXIF Software.
 
-The XMP block of a camera or an editor is kept, and an entry is added to it. The entry has no date, so that the same input
-gives the same bytes. XMP is defined by ISO 16684-1 and by part 2 of the XMP specification (xmpMM:History, stEvt:*).
-"""
+The XMP block of a camera or an editor is kept, and an entry is added to it. The entry has no date, so that the same
+input gives the same bytes. XMP is defined by ISO 16684-1 and by part 2 of the XMP specification (xmpMM:History,
+stEvt:*)."""
 
 from __future__ import annotations
 
@@ -44,9 +44,8 @@ _ENTRY = (
 
 
 def with_history(file_info: FileInfo, software: str, parameters: Mapping[str, str]) -> FileInfo:
-    """Returns the metadata of an input with an entry about a processing step: the program with its version, and the options by
-    name. Names and values contain neither "; " nor "=".
-    """
+    """Returns the metadata of an input with an entry about a processing step: the program with its version, and the
+    options by name. Names and values contain neither "; " nor "="."""
     text = "; ".join(f"{name}={value}" for name, value in parameters.items())
     entry = _ENTRY.format(software=quoteattr(software), parameters=quoteattr(text)).encode()
     packet = file_info.xmp or _PACKET.format(software=quoteattr(software)).encode()
@@ -54,9 +53,8 @@ def with_history(file_info: FileInfo, software: str, parameters: Mapping[str, st
     if history := re.search(rb"<xmpMM:History>.*?(?=</rdf:Seq>)", packet, re.DOTALL):
         packet = packet[: history.end()] + entry + packet[history.end() :]
     elif (end := packet.rfind(b"</rdf:RDF>")) >= 0:  # a block without an RDF element stays unchanged
-        about = re.search(
-            rb"""rdf:about=("[^"]*"|'[^']*')""", packet
-        )  # all descriptions are of the same resource
+        # all descriptions are of the same resource
+        about = re.search(rb"""rdf:about=("[^"]*"|'[^']*')""", packet)
         block = _HISTORY.encode().replace(b"{about}", about[1] if about else b'""').replace(b"{entry}", entry)
         packet = packet[:end] + block + packet[end:]
     return replace(file_info, xmp=packet, exif=exif, software=software)
@@ -68,12 +66,12 @@ def with_layer_history(file_info: FileInfo, layer: str, parameters: Mapping[str,
 
 
 def sampled_digest(file: BinaryIO) -> str:
-    """Returns 16 hexadecimal digits that identify the file of a photo: the start of the SHA-256 of at most 192 KiB of it.
+    """Returns 16 hexadecimal digits that identify the file of a photo: the start of the SHA-256 of at most 192 KiB of
+    it.
 
-    The samples are 64 KiB long: at the end of the file, at a distance of d from the end, and at d/2, where d is the largest power
-    of two that is not larger than the file. Positions from the end do not change if metadata at the start of a JPEG are edited.
-    Samples suffice to distinguish photos: their pixels contain noise. For an archive, reading whole files would take hours.
-    """
+    The samples are 64 KiB long: at the end of the file, at a distance of d from the end, and at d/2, where d is the
+    largest power of two that is not larger than the file. So they do not change with metadata at the start of a JPEG.
+    They suffice, because the pixels of photos contain noise. For an archive, reading whole files would take hours."""
     size = file.seek(0, os.SEEK_END)
     distance, digest = 1 << max(size.bit_length() - 1, 0), hashlib.sha256()
     for position in (size - distance, size - distance // 2, size - _SAMPLE_BYTES):
@@ -84,9 +82,8 @@ def sampled_digest(file: BinaryIO) -> str:
 
 def recorded_parameters(path: Path, program: str) -> dict[str, str] | None:
     """Returns the parameters of the last step of a program in the history of a file, or None if there is no such step.
-
-    Only the first 256 KiB are read, and the last 256 KiB if the first contain no such step: all writers put the metadata there.
-    """
+    Only the first 256 KiB are read, and the last 256 KiB if the first contain no such step: all writers put the
+    metadata there."""
     try:
         with path.open("rb") as file:
             head = file.read(_SEARCHED_BYTES)
@@ -116,11 +113,9 @@ def _last_parameters(data: bytes, program: str) -> dict[str, str] | None:
 
 
 def _with_exif_software(exif: bytes, software: str) -> bytes:
-    """Sets the tag Software of an EXIF block. All existing bytes keep their positions.
-
-    The directory with the new tag is appended, and the offset of the first directory is set to it. Therefore the offsets in
-    maker notes stay valid. A damaged block is returned unchanged, and so is a block that becomes too large for a JPEG.
-    """
+    """Sets the tag Software of an EXIF block. All existing bytes keep their positions. The directory with the new tag
+    is appended, and the offset of the first directory is set to it. Therefore the offsets in maker notes stay valid.
+    A damaged block is returned unchanged, and so is a block that becomes too large for a JPEG."""
     byte_order, first_row, end = first_directory(exif)
     if end == first_row or end + 4 > len(exif):
         return exif
@@ -131,16 +126,8 @@ def _with_exif_software(exif: bytes, software: str) -> bytes:
     rows.append(struct.pack(byte_order + "HHII", _EXIF_SOFTWARE, 2, len(value), start))
     rows.sort(key=lambda row: struct.unpack_from(byte_order + "H", row))
     directory = start + len(value) + len(value) % 2
-    changed = b"".join(
-        (
-            exif[:4],
-            struct.pack(byte_order + "I", directory),
-            exif[8:].ljust(start - 8, b"\0"),
-            value.ljust(directory - start, b"\0"),
-            struct.pack(byte_order + "H", len(rows)),
-            *rows,
-            exif[end : end + 4],
-        )
-    )
+    head = exif[:4] + struct.pack(byte_order + "I", directory) + exif[8:].ljust(start - 8, b"\0")
+    count = struct.pack(byte_order + "H", len(rows))
+    changed = b"".join((head, value.ljust(directory - start, b"\0"), count, *rows, exif[end : end + 4]))
     fits = len(changed) <= _MAX_EXIF_BYTES or len(exif) > _MAX_EXIF_BYTES
     return changed if fits else exif

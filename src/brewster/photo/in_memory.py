@@ -18,13 +18,8 @@ Stored = NDArray[Any]
 Encoding = Literal["srgb", "linear"]
 WHITE_LEVELS = {"uint8": 255, "uint16": 65535, "float16": 1, "float32": 1, "float64": 1}
 """The value of white for each supported dtype."""
-_PIL_CONVERSIONS = {
-    "1": ("L", "LA"),
-    "L": ("L", "LA"),
-    "P": ("RGB", "RGBA"),
-    "PA": ("RGBA", "RGBA"),
-    "RGB": ("RGB", "RGBA"),
-}
+_GREY, _COLOUR = ("L", "LA"), ("RGB", "RGBA")
+_PIL_CONVERSIONS = {"1": _GREY, "L": _GREY, "P": _COLOUR, "PA": ("RGBA", "RGBA"), "RGB": _COLOUR}
 """The modes of Pillow to which a mode is converted: without and with a transparent colour in `info`."""
 _ROUNDING = 1e-3
 """Floats may be outside 0..1 by this amount because of rounding. It is less than half a level of 8 bits."""
@@ -103,11 +98,8 @@ def _check_array(array: Stored, encoding: Encoding | None) -> None:
             'pass encoding="srgb" or encoding="linear"',
         )
     if not np.isfinite(array).all():
-        raise UnsupportedPhoto(
-            "the array contains infinity or NaN",
-            "expected finite values",
-            "replace these values first",
-        )
+        happened = "the array contains infinity or NaN"
+        raise UnsupportedPhoto(happened, "expected finite values", "replace these values first")
     if array.dtype.kind != "f":
         return
     bounded = array if encoding == "srgb" else array[..., 3:]  # linear light has no limits; alpha has
@@ -129,9 +121,8 @@ def decode_pil(image: Any) -> Decoded:  # noqa: ANN401  (Pillow is optional, so 
             "expected a single image",
             "select a frame with image.seek, and pass image.copy()",
         )
-    transparency = image.info.get(
-        "transparency"
-    )  # of a PNG or GIF: one transparent colour, or alpha per entry
+    # of a PNG or GIF: one transparent colour, or alpha per entry
+    transparency = image.info.get("transparency")
     opaque_mode, alpha_mode = _PIL_CONVERSIONS.get(image.mode, (image.mode, image.mode))
     mode = opaque_mode if transparency is None else alpha_mode
     if mode != image.mode:

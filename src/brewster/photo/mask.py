@@ -3,8 +3,7 @@
     mask = Mask.open("mask.png", photo.size)
     mask.rows(0, 64)  # (64, W, 1) float32: 1 where the mask is white, 0 where it is black
 
-The stored values are weights, not light, so they are not converted by a transfer curve or a colour profile.
-"""
+The stored values are weights, not light, so they are not converted by a transfer curve or a colour profile."""
 
 from __future__ import annotations
 
@@ -38,8 +37,7 @@ class Mask:
 
         Raises:
             MaskError: the source cannot be read, has colours, transparent pixels or values outside 0..1, or does not
-                have the size of the photo.
-        """
+                have the size of the photo."""
         mask = f"the mask {source}" if isinstance(source, str | os.PathLike) else "the mask"
         photo = open_painted(source, size, mask)
         pixels = photo.pixels
@@ -53,11 +51,8 @@ class Mask:
             )
         values = np.ascontiguousarray(pixels[..., 0])
         if values.dtype.kind == "f" and not (values.min() >= 0 and values.max() <= 1):
-            raise MaskError(
-                f"{mask} has values from {values.min():g} to {values.max():g}",
-                "expected values from 0 to 1",
-                "scale the mask",
-            )
+            happened = f"{mask} has values from {values.min():g} to {values.max():g}"
+            raise MaskError(happened, "expected values from 0 to 1", "scale the mask")
         return cls(values)
 
     def rows(self, top: int, bottom: int) -> Float32:
@@ -84,11 +79,8 @@ def sampled(values: Stored, width: int, height: int) -> Stored:
 
 
 def open_painted(source: Source, size: tuple[int, int], name: str) -> Photo:
-    """Opens an image that was painted for a photo of this (width, height). `name` is its name in messages.
-
-    Raises:
-        MaskError: the source cannot be read, or has another size.
-    """
+    """Opens an image that was painted for a photo of this (width, height). `name` is its name in messages. Raises
+    MaskError if the source cannot be read, or has another size."""
     try:
         if isinstance(source, np.ndarray):
             array = np.uint8(255) * source if source.dtype == np.bool_ else source

@@ -1,9 +1,8 @@
 """Reads and writes metadata as bytes: JPEG tables, EXIF, PNG and WebP chunks.
 
-libvips writes EXIF with libexif, which drops unknown tags, and libvips ignores EXIF in TIFF files. This module copies the
-EXIF block of the source with all its tags; only the orientation and the thumbnail change. A block begins at its TIFF header,
-without the "Exif\\0\\0" of JPEG.
-"""
+libvips writes EXIF with libexif, which drops unknown tags, and libvips ignores EXIF in TIFF files. This module copies
+the EXIF block of the source with all its tags; only the orientation and the thumbnail change. A block begins at its
+TIFF header, without the "Exif\\0\\0" of JPEG."""
 
 from __future__ import annotations
 
@@ -126,18 +125,14 @@ def with_webp_exif(data: bytes, exif: bytes, size: tuple[int, int], has_alpha: b
     ordered = {b"VP8X": bytes((flags, 0, 0, 0)) + canvas, **chunks, b"EXIF": exif}
     if xmp is not None:
         ordered[b"XMP "] = xmp
-    body = b"".join(
-        name + struct.pack("<I", len(chunk)) + chunk + bytes(len(chunk) % 2)
-        for name, chunk in ordered.items()
-    )
+    padded = ((name, len(chunk), chunk + bytes(len(chunk) % 2)) for name, chunk in ordered.items())
+    body = b"".join(name + struct.pack("<I", size) + chunk for name, size, chunk in padded)
     return b"RIFF" + struct.pack("<I", len(body) + 4) + b"WEBP" + body
 
 
 def cicp(data: bytes) -> tuple[int, int, int] | None:
     """Returns the code points (CICP, ITU-T H.273) of primaries, transfer function and matrix of an AVIF, HEIC or PNG.
-
-    Returns None for a file without code points.
-    """
+    Returns None for a file without code points."""
     if data.startswith(b"\x89PNG"):
         chunk = dict(png_chunks(data)).get(b"cICP", b"")
         return (chunk[0], chunk[1], chunk[2]) if len(chunk) >= 3 else None
@@ -149,10 +144,8 @@ def cicp(data: bytes) -> tuple[int, int, int] | None:
 
 
 def with_avif_exif(data: bytes, exif: bytes) -> bytes:
-    """Replaces the Exif item of an AVIF that libvips has written.
-
-    The new block is appended to the file, and the location of the item is set to this block.
-    """
+    """Replaces the Exif item of an AVIF that libvips has written. The new block is appended to the file, and the
+    location of the item is set to this block."""
     item = re.search(rb"infe\x02...(..)..Exif", data, re.DOTALL)
     row = _item_location(data, item[1]) if item else None
     if row is None:
@@ -164,10 +157,8 @@ def with_avif_exif(data: bytes, exif: bytes) -> bytes:
 
 
 def _item_location(data: bytes, item: bytes) -> int | None:
-    """Returns the position of the location of an item (base, count, offset, length) in an iloc box.
-
-    Returns None if the box does not have the layout that libheif writes.
-    """
+    """Returns the position of the location of an item (base, count, offset, length) in an iloc box. Returns None if the
+    box does not have the layout that libheif writes."""
     table = data.find(b"iloc")
     version, size_fields, index_fields = data[table + 4], data[table + 8], data[table + 9]
     if table < 0 or version > 1 or (size_fields, index_fields) != (0x44, 0x40):
@@ -188,18 +179,10 @@ Tags = dict[int, "tuple[int, int, bytes] | Tags"]
 """The tags of a directory by number. An entry is (type, count, little-endian value), or the directory for a pointer tag."""
 
 _POINTER_TAGS = (34665, 34853, 40965)  # Exif, GPS, interoperability
-_CAMERA_TAGS = (
-    270,
-    271,
-    272,
-    305,
-    306,
-    315,
-    33432,
-    34665,
-    34853,
-)  # camera, date, author, copyright, and the pointers to Exif and GPS
+_CAMERA_TAGS = (270, 271, 272, 305, 306, 315, 33432, 34665, 34853)
+"""Camera, date, author, copyright, and the pointers to Exif and GPS."""
 _ORIENTATION = 274
+_BYTE_ORDERS = {b"II*\0": "<", b"MM\0*": ">"}
 _TIFF_HEADER_BYTES = 8  # byte order, the number 42, and the position of the first directory
 _TYPE_BYTES = {1: 1, 2: 1, 3: 2, 4: 4, 5: 4, 6: 1, 7: 1, 8: 2, 9: 4, 10: 4, 11: 4, 12: 8, 13: 4}
 _RATIONAL_TYPES = (5, 10)  # two numbers: numerator and denominator
@@ -207,7 +190,7 @@ _RATIONAL_TYPES = (5, 10)  # two numbers: numerator and denominator
 
 def read_tags(data: bytes) -> Tags:
     """Returns the first directory of a TIFF or EXIF block with its subdirectories, or an empty dict for other data."""
-    byte_order = {b"II*\0": "<", b"MM\0*": ">"}.get(data[:4])
+    byte_order = _BYTE_ORDERS.get(data[:4])
     if byte_order is None or len(data) < _TIFF_HEADER_BYTES:
         return {}
     return _directory(data, byte_order, struct.unpack_from(byte_order + "I", data, 4)[0], _POINTER_TAGS)
@@ -241,12 +224,8 @@ def number_of(tags: Tags, tag: int, default: int) -> int:
 
 def pixel_data_end(tags: Tags) -> int:
     """Returns the end position of the last strip or tile of a TIFF, or 0 if its tags contain no positions."""
-    ends = [0]
-    for starts, sizes in ((273, 279), (324, 325)):
-        ends += [
-            start + size for start, size in zip(numbers(tags, starts), numbers(tags, sizes), strict=False)
-        ]
-    return max(ends)
+    parts = ((numbers(tags, starts), numbers(tags, sizes)) for starts, sizes in ((273, 279), (324, 325)))
+    return max((start + size for part in parts for start, size in zip(*part, strict=False)), default=0)
 
 
 def numbers(tags: Tags, tag: int) -> list[int]:
@@ -301,11 +280,9 @@ def with_tiff_exif(data: bytes, exif: bytes) -> bytes:
 
 
 def first_directory(exif: bytes) -> tuple[str, int, int]:
-    """Returns the byte order of an EXIF block for `struct`, and the start and the end of the rows of its first directory.
-
-    Without a directory, all values are empty or 0.
-    """
-    byte_order = {b"II*\0": "<", b"MM\0*": ">"}.get(exif[:4])
+    """Returns the byte order of an EXIF block for `struct`, and the start and the end of the rows of its first
+    directory. Without a directory, all values are empty or 0."""
+    byte_order = _BYTE_ORDERS.get(exif[:4])
     if byte_order is None or len(exif) < 10:
         return "", 0, 0
     (position,) = struct.unpack_from(byte_order + "I", exif, 4)
@@ -314,20 +291,17 @@ def first_directory(exif: bytes) -> tuple[str, int, int]:
 
 
 def upright_exif(exif: bytes) -> bytes:
-    """Returns an EXIF block with orientation 1 and without the thumbnail. The result begins at the TIFF header.
-
-    The thumbnail shows the input before rotation and separation, so the pointer to its directory is set to 0. All other
-    bytes are unchanged.
-    """
+    """Returns an EXIF block with orientation 1 and without the thumbnail. The result begins at the TIFF header. The
+    thumbnail shows the input before rotation and separation, so the pointer to its directory is set to 0. All other
+    bytes are unchanged."""
     exif = exif.removeprefix(_EXIF_NAME)
     block = bytearray(exif)
     byte_order, first_row, next_directory = first_directory(exif)
     for row in range(first_row, min(next_directory, len(block) - 11), 12):
         tag, kind = struct.unpack_from(byte_order + "HH", block, row)
         if tag == _ORIENTATION:
-            struct.pack_into(
-                byte_order + ("I" if kind == 4 else "HH"), block, row + 8, *((1,) if kind == 4 else (1, 0))
-            )
+            kind_format, values = ("I", (1,)) if kind == 4 else ("HH", (1, 0))
+            struct.pack_into(byte_order + kind_format, block, row + 8, *values)
     if first_row and next_directory + 4 <= len(block):
         struct.pack_into(byte_order + "I", block, next_directory, 0)
     return bytes(block)

@@ -50,8 +50,7 @@ class Photo:
     """A photo: stored pixels, alpha and file metadata, with the EXIF orientation applied. Immutable and thread-safe.
 
     `pixels` is (H, W, 1|3) and `alpha` (H, W) or None; both are uint8, uint16 or float32. The ICC profile in
-    `file_info` defines their encoding. Without a profile, integers are sRGB and floats are linear Rec.709 light.
-    """
+    `file_info` defines their encoding. Without a profile, integers are sRGB and floats are linear Rec.709 light."""
 
     pixels: Stored = field(repr=False)
     alpha: Stored | None = field(default=None, repr=False)
@@ -92,8 +91,7 @@ class Photo:
             MissingExtra: the reader of EXR, HEIC or RAW is not installed.
             PhotoError: the encoding of an array is unknown, or missing for floats; or an encoding was passed for another source.
             BrewsterError: the URL cannot be read, for example because it is a web address; see `location`.
-            TypeError: the source has an unsupported type, such as None, a list or a file in text mode.
-        """
+            TypeError: the source has an unsupported type, such as None, a list or a file in text mode."""
         if isinstance(source, np.ndarray):
             height, width = (*source.shape, 1, 1)[:2]
             check_pixel_count(width, height, max_pixels)
@@ -133,14 +131,13 @@ class Photo:
     def from_array(cls, array: Stored, *, encoding: Encoding | None = None) -> Photo:
         """Creates a photo from an array (H, W) or (H, W, 1|3|4) of uint8, uint16 or floats; for floats, 1.0 is white.
 
-        Integers are sRGB-encoded by default, as in most files; floats need an `encoding`. sRGB-encoded integers are stored
-        unchanged. All other values are stored as linear float32.
+        Integers are sRGB-encoded by default, as in most files; floats need an `encoding`. sRGB-encoded integers are
+        stored unchanged. All other values are stored as linear float32.
 
         Raises:
             UnsupportedPhoto: the array has another shape or dtype, no pixel, values that are not finite, sRGB-encoded floats
                 or an alpha channel outside 0..1.
-            PhotoError: the encoding is neither "srgb" nor "linear".
-        """
+            PhotoError: the encoding is neither "srgb" nor "linear"."""
         decoded = decode_array(array, encoding)
         return cls(decoded.pixels, decoded.alpha, decoded.file_info)
 
@@ -157,10 +154,8 @@ class Photo:
     def __repr__(self) -> str:
         """Returns a short description: `Photo(4000 x 3000, RGB, uint8, jpeg, ICC profile, EXIF)`."""
         width, height = self.size
-        mode = ("grey" if self.pixels.shape[2] == 1 else "RGB") + (
-            " with alpha" if self.alpha is not None else ""
-        )
-        info = self.file_info
+        mode, info = "grey" if self.pixels.shape[2] == 1 else "RGB", self.file_info
+        mode += "" if self.alpha is None else " with alpha"
         present = {"ICC profile": info.icc, "EXIF": info.exif, "XMP": info.xmp}
         parts = (f"{width} x {height}", mode, self.pixels.dtype.name, info.format_name)
         return f"Photo({', '.join((*parts, *(name for name, block in present.items() if block)))})"
@@ -168,18 +163,17 @@ class Photo:
     def __array__(self, dtype: np.dtype[Any] | None = None, copy: bool | None = None) -> Stored:
         """Returns the stored pixels (H, W, 1|3) for `np.asarray(photo)`, without alpha, in the encoding of the file.
 
-        For linear light, use `linear()`. For sRGB values, use `srgb_8bit()`.
-        """
+        For linear light, use `linear()`. For sRGB values, use `srgb_8bit()`."""
         return np.array(self.pixels, dtype=dtype, copy=copy)
 
     def to_pil(self) -> Any:  # noqa: ANN401  (Pillow is optional, so its types cannot be named)
-        """Returns a PIL image with the ICC profile and the EXIF of the photo: L, LA, RGB, RGBA, or I;16 for 16-bit grey.
+        """Returns a PIL image with the ICC profile and the EXIF of the photo: L, LA, RGB, RGBA, or I;16 for 16-bit
+        grey.
 
         Other 16-bit photos and floats are converted to 8 bits, because Pillow has no such colour images.
 
         Raises:
-            MissingExtra: Pillow is not installed.
-        """
+            MissingExtra: Pillow is not installed."""
         has_16_bit_mode = self.pixels.dtype == np.uint16 and self.pixels.shape[2] == 1 and self.alpha is None
         stored = self if has_16_bit_mode else self.stored_as("png", 8)
         return pil_image(stored.pixels, stored.alpha, stored.file_info)
@@ -218,18 +212,16 @@ class Photo:
         """Converts new linear light (n, W, 3) for n rows to stored pixels in the colour space and dtype of this photo.
 
         `top` is the first of these rows. This is the inverse of `linear_rows`: pixels with unchanged light keep their
-        stored values exactly. Other pixels are clipped to the range of the dtype. To process a photo in strips, write the
-        strips to an array with the shape and dtype of `pixels`, and call `with_pixels`.
-        """
-        return self.colour_space().to_stored(
-            np.asarray(linear, np.float32), self.pixels[top : top + len(linear)]
-        )
+        stored values exactly. Other pixels are clipped to the range of the dtype. To process a photo in strips, write
+        the strips to an array with the shape and dtype of `pixels`, and call `with_pixels`."""
+        original = self.pixels[top : top + len(linear)]
+        return self.colour_space().to_stored(np.asarray(linear, np.float32), original)
 
     def srgb_8bit(self) -> NDArray[np.uint8]:
-        """Returns 8-bit sRGB values (H, W, 3), clipped to the sRGB gamut, without alpha. Benchmarks compare these values.
+        """Returns 8-bit sRGB values (H, W, 3), clipped to the sRGB gamut, without alpha. Benchmarks compare these
+        values.
 
-        For an 8-bit sRGB photo, these are the stored values. Grey values are repeated in all three channels.
-        """
+        For an 8-bit sRGB photo, these are the stored values. Grey values are repeated in all three channels."""
         dtype = np.dtype(np.uint8)
         if self.colour_space() == SRGB and self.pixels.dtype.kind == "u":
             pixels = _rescaled(self.pixels, dtype) if self.pixels.dtype != dtype else self.pixels
@@ -242,19 +234,18 @@ class Photo:
     def with_linear(self, linear: Float32) -> Photo:
         """Returns a copy of the photo with other linear light (H, W, 3).
 
-        Pixels with unchanged light keep their stored values exactly.
-        """
+        Pixels with unchanged light keep their stored values exactly."""
         pixels = np.empty_like(self.pixels)
         for rows in self.strips():
             pixels[rows] = self.stored_rows(linear[rows], rows.start)
         return self.with_pixels(pixels)
 
     def with_pixels(self, pixels: Stored) -> Photo:
-        """Returns a copy of the photo with other stored pixels of the same shape and dtype. The array becomes read-only.
+        """Returns a copy of the photo with other stored pixels of the same shape and dtype. The array becomes
+        read-only.
 
         Raises:
-            PhotoError: the pixels have another shape or dtype.
-        """
+            PhotoError: the pixels have another shape or dtype."""
         if pixels.shape != self.pixels.shape or pixels.dtype != self.pixels.dtype:
             raise PhotoError(
                 f"the new pixels have the shape {pixels.shape} and the dtype {pixels.dtype}",
@@ -301,8 +292,7 @@ class Photo:
 
         Raises:
             UnsupportedPhoto: the format cannot store this photo, cannot store it at this bit depth, or has no quality.
-            MissingExtra: the writer of EXR or HEIC is not installed.
-        """
+            MissingExtra: the writer of EXR or HEIC is not installed."""
         format_name = canonical_format(format_name) if format_name else self.file_info.format_name
         bits = depth_for(self.file_info, format_name, depth)
         stored = self.stored_as(format_name, bits)

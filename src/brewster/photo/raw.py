@@ -1,8 +1,8 @@
 """Develops the RAW files of cameras with LibRaw (package rawpy) to 16-bit Display P3.
 
-LibRaw computes linear light with the white balance and the colour matrix of the camera, without automatic brightening. The
-pixels are stored with the tone curve of Display P3, so that all programs show a TIFF file of these pixels correctly.
-"""
+LibRaw computes linear light with the white balance and the colour matrix of the camera, without automatic brightening.
+The pixels are stored with the tone curve of Display P3, so that all programs show a TIFF file of these pixels
+correctly."""
 
 from __future__ import annotations
 
@@ -29,48 +29,32 @@ _DAMAGED = "the RAW file cannot be read completely"
 
 
 def is_raw(tags: metadata.Tags) -> bool:
-    """Returns whether the first directory of a TIFF is that of a RAW file.
-
-    A DNG has the tag DNGVersion (50706). Other RAW files begin with a reduced image (NewSubfileType, bit 0), or with
-    colour filter array data (PhotometricInterpretation 32803).
-    """
+    """Returns whether the first directory of a TIFF is that of a RAW file. A DNG has the tag DNGVersion (50706). Other
+    RAW files begin with a reduced image (NewSubfileType, bit 0), or with colour filter array data
+    (PhotometricInterpretation 32803)."""
     is_reduced = metadata.number_of(tags, 254, 0) & 1 == 1
     return 50706 in tags or is_reduced or metadata.number_of(tags, 262, 0) == 32803
 
 
 def read_raw(data: bytes, max_pixels: int) -> tuple[NDArray[np.uint16], FileInfo]:
-    """Returns the pixels (H, W, 1|3) in Display P3, upright, and the metadata of a RAW file.
-
-    Raises:
-        MissingExtra: rawpy is not installed.
-        PhotoTooLarge: the image has more pixels than `max_pixels`.
-        UnreadablePhoto: the file is damaged or truncated, or LibRaw does not support the camera.
-    """
+    """Returns the pixels (H, W, 1|3) in Display P3, upright, and the metadata of a RAW file. Raises MissingExtra if
+    rawpy is not installed; PhotoTooLarge if the image has more pixels than `max_pixels`; UnreadablePhoto if the file
+    is damaged or truncated, or LibRaw does not support the camera."""
     with _opened(data) as raw:
         _upright_size(raw, max_pixels)  # checks the limit before the pixels are decoded
-        linear = raw.postprocess(
-            use_camera_wb=True,
-            no_auto_bright=True,
-            gamma=(1, 1),
-            output_bps=16,
-            output_color=library_of("raw").ColorSpace.P3D65,
-        )
+        options = {"use_camera_wb": True, "no_auto_bright": True, "gamma": (1, 1), "output_bps": 16}
+        linear = raw.postprocess(**options, output_color=library_of("raw").ColorSpace.P3D65)
     icc = bytes(pyvips.Image.profile_load("p3"))
     curve = colour_space_of(icc, None, is_float=False).curves[1]
     encoded = np.rint(65535 * np.clip(curve.encode(np.arange(65536) / 65535), 0, 1)).astype(np.uint16)
-    return encoded[linear.reshape(*linear.shape[:2], -1)], FileInfo(
-        FORMATS["raw"].written_as, bits=16, icc=icc, exif=_exif(data)
-    )
+    file_info = FileInfo(FORMATS["raw"].written_as, bits=16, icc=icc, exif=_exif(data))
+    return encoded[linear.reshape(*linear.shape[:2], -1)], file_info
 
 
 def read_raw_size(data: bytes, max_pixels: int) -> tuple[int, int]:
-    """Returns (width, height) of the upright image of a RAW file.
-
-    Raises:
-        MissingExtra: rawpy is not installed.
-        PhotoTooLarge: the image has more pixels than `max_pixels`.
-        UnreadablePhoto: the file is damaged, or LibRaw does not support the camera.
-    """
+    """Returns (width, height) of the upright image of a RAW file. Raises MissingExtra if rawpy is not installed;
+    PhotoTooLarge if the image has more pixels than `max_pixels`; UnreadablePhoto if the file is damaged, or LibRaw
+    does not support the camera."""
     with _opened(data) as raw:
         return _upright_size(raw, max_pixels)
 
@@ -79,10 +63,8 @@ def with_raw_suffix(error: UnreadablePhoto, suffix: str) -> UnreadablePhoto:
     """Returns the error for a file with the suffix of a RAW file. The content of a damaged RAW file may look like another format."""
     if error.happened == _DAMAGED:
         return error
-    is_installed = importlib.util.find_spec("rawpy") is not None
-    extra = (
-        "" if is_installed else f", and install the extra raw, which RAW files need: {install_command('raw')}"
-    )
+    extra = f", and install the extra raw, which RAW files need: {install_command('raw')}"
+    extra = "" if importlib.util.find_spec("rawpy") else extra
     return UnreadablePhoto(
         f"{error.happened}, and its suffix {suffix} is that of a RAW file",
         "expected a complete RAW file",

@@ -14,14 +14,9 @@ _PATTERN: Final = re.compile(r"[A-Za-z0-9_-]{16,200}")
 
 
 def load_or_create_token(folder: Path) -> str:
-    """Read the token from the study folder, or create it in a file with permissions 0600.
-
-    The token has 16 to 200 URL-safe characters.
-
-    Raises:
-        BrewsterError: the file exists but does not contain a valid token.
-        OutputError: the file cannot be read or written.
-    """
+    """Read the token from the study folder, or create it in a file with permissions 0600. The token has 16 to 200
+    URL-safe characters. Raises BrewsterError if the file exists but does not contain a valid token, and OutputError
+    if the file cannot be read or written."""
     path = folder / "token"
     try:
         if not path.exists():

@@ -21,11 +21,10 @@ Px = Annotated[int, Field(ge=0, le=100_000)]
 @final
 @dataclass(frozen=True)
 class ViewingConditions:
-    """How the pictures of a trial were shown. Lengths are in CSS px. Multiply them by `pixel_ratio` to get screen pixels.
-
-    `view` is the arrangement at the time of the answer: three pictures, the pair A and B, or one picture at a time. `switches` counts how often
-    the picture was replaced by another one in place; `zoomed` is true if the pictures were enlarged at any time.
-    """
+    """How the pictures of a trial were shown. Lengths are in CSS px. Multiply them by `pixel_ratio` to get screen
+    pixels. `view` is the arrangement at the time of the answer: three pictures, the pair A and B, or one picture at
+    a time. `switches` counts how often the picture was replaced by another one in place; `zoomed` is true if the
+    pictures were enlarged at any time."""
 
     __pydantic_config__ = ConfigDict(extra="forbid")
 
@@ -72,11 +71,8 @@ _ANSWER_FILE: Final = TypeAdapter(AnswerFile)
 
 
 def read_answer_file(path: Path) -> AnswerFile:
-    """Reads a file of answers. Nothing in it is trusted: types, ranges, names and size are checked.
-
-    Raises:
-        BrewsterError: the file cannot be read, is too large, or is not a valid file of answers.
-    """
+    """Reads a file of answers. Nothing in it is trusted: types, ranges, names and size are checked. Raises
+    BrewsterError if the file cannot be read, is too large, or is not a valid file of answers."""
     try:
         with path.open("rb") as file:
             data = file.read(MAX_ANSWER_FILE_BYTES + 1)

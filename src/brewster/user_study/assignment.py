@@ -1,10 +1,10 @@
-"""Assign comparisons to participants; the result depends only on the seed of the study and the number of the participant.
+"""Assign comparisons to participants; the result depends only on the seed of the study and the number of the
+participant.
 
 All participants share one infinite sequence of rounds. Each round is a random permutation of all comparisons, and each
 participant takes the next `pairs` items. At any time, the assignment counts of any two comparisons differ by at most 1.
 Every second round swaps the sides of each comparison, so each method is shown left and right equally often.
-The sequence is computed again from the seed; no state is stored.
-"""
+The sequence is computed again from the seed; no state is stored."""
 
 from __future__ import annotations
 
@@ -23,11 +23,9 @@ CHOICES: Final[tuple[Choice, ...]] = ("left", "similar", "right")
 @final
 @dataclass(frozen=True)
 class Trial:
-    """One trial: the names of its three pictures, and the comparison or the catch trial that they belong to.
-
-    In a normal trial, `comparison` is the number of the comparison, and `flipped` is true if the first method of the
-    comparison is on the right. In a catch trial, `comparison` is None, and `expected` is the correct choice.
-    """
+    """One trial: the names of its three pictures, and the comparison or the catch trial that they belong to. In a
+    normal trial, `comparison` is the number of the comparison, and `flipped` is true if the first method of the
+    comparison is on the right. In a catch trial, `comparison` is None, and `expected` is the correct choice."""
 
     photo: str
     left: str
@@ -38,16 +36,13 @@ class Trial:
 
 
 def draw_trials(description: StudyDescription, number: int) -> tuple[Trial, ...]:
-    """The trials of one participant, in the order of presentation; `number` counts participants from 0.
-
-    The sequence is computed from its start, which takes 0.3 s for participant 10,000.
-    """
+    """The trials of one participant, in the order of presentation; `number` counts participants from 0. The sequence is
+    computed from its start, which takes 0.3 s for participant 10,000."""
     count, pairs = len(description.comparisons), description.pairs
     sequence = comparison_sequence(count, pairs, description.seed)
-    assigned = list(itertools.islice(sequence, number * pairs, (number + 1) * pairs))
     rng = Random(f"{description.seed}/participant/{number}")  # noqa: S311  (not a secret: the seed is published)
     trials = []
-    for index, flipped in assigned:
+    for index, flipped in itertools.islice(sequence, number * pairs, (number + 1) * pairs):
         comparison = description.comparisons[index]
         left, right = comparison.outputs[::-1] if flipped else comparison.outputs
         trials.append(Trial(comparison.photo, left, right, index, flipped))
@@ -61,10 +56,8 @@ def draw_trials(description: StudyDescription, number: int) -> tuple[Trial, ...]
 
 
 def draw_practice(description: StudyDescription, number: int, trials: Sequence[Trial]) -> Trial:
-    """The practice trial of the participant with these trials: an output and its degraded copy.
-
-    Its pictures are those of a catch trial that the participant does not see otherwise, unless the study has too few.
-    """
+    """The practice trial of the participant with these trials: an output and its degraded copy. Its pictures are those
+    of a catch trial that the participant does not see otherwise, unless the study has too few."""
     seen = {trial.photo for trial in trials}
     rng = Random(f"{description.seed}/practice/{number}")  # noqa: S311
     pool = rng.sample(description.catch_pool, len(description.catch_pool))
@@ -72,12 +65,9 @@ def draw_practice(description: StudyDescription, number: int, trials: Sequence[T
 
 
 def comparison_sequence(count: int, pairs: int, seed: int) -> Iterator[tuple[int, bool]]:
-    """The infinite sequence of (comparison number, sides swapped).
-
-    Items `n * pairs` to `(n + 1) * pairs - 1` belong to participant n and contain no comparison twice. For each
-    comparison, the numbers of items with and without swapped sides differ by at most 1 at any time; for each participant
-    they are nearly equal.
-    """
+    """The infinite sequence of (comparison number, sides swapped). Items `n * pairs` to `(n + 1) * pairs - 1` belong to
+    participant n and contain no comparison twice. For each comparison, the numbers of items with and without swapped
+    sides differ by at most 1 at any time; for each participant they are nearly equal."""
     flips: dict[int, bool] = {}
     order: list[int] = []
     for round_number in itertools.count():

@@ -1,8 +1,7 @@
 """Create a study from folders of outputs: pair pictures by name and copy them under random names.
 
 All files are checked before anything is written, and one error lists all problems. Pictures are stored as upright 8-bit
-sRGB PNG without metadata, so every browser shows the same pixels, and neither format nor EXIF reveals the method.
-"""
+sRGB PNG without metadata, so every browser shows the same pixels, and neither format nor EXIF reveals the method."""
 
 from __future__ import annotations
 
@@ -15,11 +14,13 @@ from pathlib import Path
 from random import Random
 from typing import Final, final
 
+import numpy as np
+from numpy.typing import NDArray
+
 import brewster
 from brewster.errors import BrewsterError, OutputError, PhotoError, counted
 from brewster.files import atomic_path, write_atomically
 from brewster.photo import Photo
-from brewster.user_study.degrade import degrade
 from brewster.user_study.folders import Key, find_pictures, select_pictures, shorten_list
 from brewster.user_study.study import (
     PICTURES_FOLDER,
@@ -34,6 +35,10 @@ from brewster.user_study.study import (
 DEFAULT_PAIRS: Final = 40
 DEFAULT_CATCHES: Final = 4
 CATCH_POOL_SIZE: Final = 24
+_BLUR_RADIUS: Final = 0.02
+"""The radius of the box blur of degraded pictures, as a fraction of the longer side."""
+_NOISE_STD: Final = 28.0
+"""Standard deviation of the noise of degraded pictures, in 8-bit code values."""
 DEFAULT_CONSENT: Final = """\
 In this study you compare pictures. You see a photo that was taken through glass, and two results of removing the \
 reflection from it. Choose the one that looks better to you, or say that they are similar. There are no right or wrong \
@@ -67,19 +72,13 @@ def create_study(
 
     Args:
         out: the folder of the new study. It must be empty, or not exist yet.
-        methods: the folder of outputs by method name. The first method is compared with each of the others.
-        datasets: the datasets to use; all if empty.
-        names: the inputs to use, as "dataset/stem", or "stem" if there are no datasets; all if empty.
-        pairs: number of comparisons for each participant. None means DEFAULT_PAIRS, or all if there are fewer.
-        catch_trials: number of catch trials for each participant. None means DEFAULT_CATCHES, or all if there are fewer.
-        all_pairs: whether each method is compared with each other method, instead of the first method only.
+        methods: the folder of outputs by method name. The first method is compared with each other one; with `all_pairs`, all are.
+        datasets, names: those to use, as "dataset/stem", or "stem" if there are no datasets; all if empty.
+        pairs, catch_trials: the numbers for each participant. None means the default, or all if there are fewer.
         seed: the seed of the assignment; None chooses a random one.
 
-    Raises:
-        BrewsterError: there are fewer than two methods; files are missing, unreadable or of different sizes; or more pairs
-            or catch trials are requested than exist.
-        OutputError: `out` is not empty or cannot be written.
-    """
+    Raises BrewsterError if there are fewer than two methods, files are missing, unreadable or of different sizes, or
+    more pairs or catch trials are requested than exist, and OutputError if `out` is not empty or cannot be written."""
     require_empty(out)
     photos, outputs = _pair_pictures(inputs, methods, datasets, names)
     compared = list(combinations(methods, 2))
@@ -129,11 +128,8 @@ def _pair_pictures(
 ) -> tuple[Mapping[Key, Path], _Outputs]:
     """Returns the inputs and the outputs, after checking them. One error lists all problems."""
     if len(methods) < 2:
-        raise BrewsterError(
-            f"the number of methods is {len(methods)}",
-            "expected two or more methods",
-            "add another --method NAME=FOLDER",
-        )
+        happened = f"the number of methods is {len(methods)}"
+        raise BrewsterError(happened, "expected two or more methods", "add another --method NAME=FOLDER")
     photos, *found = (
         select_pictures(find_pictures(path, datasets), names, path) for path in (inputs, *methods.values())
     )
@@ -170,11 +166,8 @@ def _file_problems(photos: Mapping[Key, Path], outputs: _Outputs) -> Iterator[st
 
 def _limited(requested: int | None, default: int, maximum: int, what: str) -> int:
     if requested is not None and requested > maximum:
-        raise BrewsterError(
-            f"{requested} {what} for each participant were requested",
-            f"at most {maximum} are available",
-            "request fewer",
-        )
+        happened = f"{requested} {what} for each participant were requested"
+        raise BrewsterError(happened, f"at most {maximum} are available", "request fewer")
     return min(default, maximum) if requested is None else requested
 
 
@@ -204,7 +197,7 @@ class _Copier:
             source = path.read_bytes()
             pixels = Photo.open(source).srgb_8bit()
             if degraded:
-                pixels = degrade(pixels, self.rng.getrandbits(32))
+                pixels = _degraded(pixels, self.rng.getrandbits(32))
             photo, name = Photo.from_array(pixels, encoding="srgb"), f"{self.rng.getrandbits(64):016x}.png"
             data = photo.encode("png")
             write_atomically(self.folder / name, data)
@@ -212,3 +205,23 @@ class _Copier:
             self.pictures[key] = StudyPicture(name, *photo.size, *digests)
             self.on_progress(len(self.pictures))
         return self.pictures[key].name
+
+
+def _degraded(picture: NDArray[np.uint8], seed: int) -> NDArray[np.uint8]:
+    """Blurs an sRGB picture (H, W, 3) twice with a box filter, which preserves large shapes, and adds grey noise."""
+    radius = max(2, round(_BLUR_RADIUS * max(picture.shape[:2])))
+    blurred = picture.astype(np.float32)
+    for axis in (
+        0,
+        1,
+        0,
+        1,
+    ):  # moving means over 2 radius + 1 values; edge values are repeated beyond the border
+        padding = [(0, 0)] * 3
+        padding[axis] = (radius + 1, radius)
+        sums = np.cumsum(np.pad(blurred, padding, mode="edge"), axis=axis, dtype=np.float64)
+        starts = np.arange(picture.shape[axis])
+        sums = np.take(sums, starts + 2 * radius + 1, axis=axis) - np.take(sums, starts, axis=axis)
+        blurred = (sums / (2 * radius + 1)).astype(np.float32)
+    noise = np.random.default_rng(seed).normal(0, _NOISE_STD, (*picture.shape[:2], 1))
+    return np.rint(blurred + noise).clip(0, 255).astype(np.uint8)

@@ -24,23 +24,19 @@ def find_pictures(folder: Path, datasets: Sequence[str] = ()) -> dict[Key, Path]
     """Find pictures in the subfolders, one for each dataset, or in the folder itself if no subfolder has pictures.
 
     Outputs may be named as `brewster -o` names them: `name.transmission.png` counts as `name`, and the files
-    `name.reflection.png` and `name.confidence.png` of the same photo are ignored. The keys are (dataset, stem), in natural
-    order (2 before 10). With `datasets`, only these are used, in this order.
-
-    Raises:
-        BrewsterError: the folder contains no picture; a dataset is missing; two files have the same name; or pictures are both
-            in the folder and in its subfolders, and `datasets` is empty.
-    """
+    `name.reflection.png` and `name.confidence.png` of the same photo are ignored. The keys are (dataset, stem), in
+    natural order (2 before 10). With `datasets`, only these are used, in this order. Raises BrewsterError if the folder
+    contains no picture, a dataset is missing, two files have the same name, or pictures are both in the folder and in
+    its subfolders, and `datasets` is empty."""
     if not folder.is_dir():
         raise BrewsterError(f"{folder} is not a folder", "expected a folder with pictures", "check the path")
     subfolders = {
-        _normalised(subfolder.name): subfolder
-        for subfolder in folder.iterdir()
-        if subfolder.is_dir() and subfolder.name[0] != "."
+        _normalised(path.name): path for path in folder.iterdir() if path.is_dir() and path.name[0] != "."
     }
-    subfolders = {name: subfolders[name] for name in sorted(subfolders, key=natural_key)}
     stems_by_dataset = {
-        name: stems for name, subfolder in subfolders.items() if (stems := _list_pictures(subfolder))
+        name: stems
+        for name in sorted(subfolders, key=natural_key)
+        if (stems := _list_pictures(subfolders[name]))
     }
     if missing := [name for name in datasets if name not in stems_by_dataset]:
         raise BrewsterError(
@@ -62,11 +58,8 @@ def find_pictures(folder: Path, datasets: Sequence[str] = ()) -> dict[Key, Path]
         for path, stem in stems_by_dataset[name].items():
             found[name, stem].append(path)
     if not found:
-        raise BrewsterError(
-            f"{folder} contains no picture",
-            "expected pictures, or subfolders with pictures",
-            "check the path",
-        )
+        happened = f"{folder} contains no picture"
+        raise BrewsterError(happened, "expected pictures, or subfolders with pictures", "check the path")
     if duplicates := [" and ".join(sorted(map(str, paths))) for paths in found.values() if len(paths) > 1]:
         raise BrewsterError(
             f"{shorten_list(duplicates)} have the same name",
@@ -77,14 +70,8 @@ def find_pictures(folder: Path, datasets: Sequence[str] = ()) -> dict[Key, Path]
 
 
 def select_pictures(pictures: Mapping[Key, Path], names: Sequence[str], folder: Path) -> dict[Key, Path]:
-    """The pictures with these names, in the order of `pictures`; all of them if `names` is empty.
-
-    Args:
-        names: "dataset/stem" for each picture, or "stem" if there are no datasets. A suffix is allowed.
-
-    Raises:
-        BrewsterError: a name has no picture.
-    """
+    """The pictures with these names, in the order of `pictures`; all of them if `names` is empty. A name is "dataset/stem", or
+    "stem" if there are no datasets; a suffix is allowed. Raises BrewsterError if a name has no picture."""
     by_name = {"/".join(filter(None, key)): key for key in pictures}
     stems = {
         name: name.rpartition(".")[0] if f".{name.rpartition('.')[2]}".lower() in SUFFIXES else name
@@ -113,13 +100,11 @@ def _list_pictures(folder: Path) -> dict[Path, str]:
         for path in folder.iterdir()
         if path.suffix.lower() in SUFFIXES and not path.name.startswith(".") and path.is_file()
     }
-    separated = {
+    separated = [
         stem.removesuffix(_TRANSMISSION) for stem in pictures.values() if stem.endswith(_TRANSMISSION)
-    }
-    other_layers = {f"{stem}{layer}" for stem in separated for layer in (".reflection", ".confidence")}
-    stems = {
-        path: stem.removesuffix(_TRANSMISSION) for path, stem in pictures.items() if stem not in other_layers
-    }
+    ]
+    others = {f"{stem}{layer}" for stem in separated for layer in (".reflection", ".confidence")}
+    stems = {path: stem.removesuffix(_TRANSMISSION) for path, stem in pictures.items() if stem not in others}
     return dict(sorted(stems.items(), key=lambda pair: (natural_key(pair[1]), pair[0])))
 
 

@@ -13,12 +13,9 @@ from brewster.errors import BrewsterError
 @final
 @dataclass(frozen=True)
 class PowerAnalysis:
-    """The required number of participants, and the quantities that it is computed from.
-
-    `answers` is the number of participants times the number of pairs. `win` and `lose` are the assumed rates.
-    `design_effect` is the number of real answers that have the information of one independent answer. `deviation` is
-    the standard deviation, over participants, of the difference between win and lose rate.
-    """
+    """The required number of participants, and the quantities that it is computed from: `answers` of all participants,
+    the assumed `win` and `lose` rates, the `design_effect` (the number of real answers that are worth one independent
+    answer), and the standard `deviation`, over participants, of the difference between win and lose rate."""
 
     participants: int
     answers: int
@@ -42,19 +39,13 @@ def required_participants(
     An answer scores 1, 0 or -1 (win, tie, lose), with mean d and variance s^2 = 1 - tie - d^2. Answers of one
     participant have the intraclass `correlation` r, so k of them are worth k / (1 + (k - 1) r) independent answers
     (design effect: Donner and Klar 2000, section 5.2). Two-sided z test, with the correction of Guenther 1981 for an
-    estimated variance: n = (z_level + z_power)^2 s^2 (1 + (k - 1) r) / (k d^2) + z_level^2 / 2.
+    estimated variance: n = (z_level + z_power)^2 s^2 (1 + (k - 1) r) / (k d^2) + z_level^2 / 2. Raises BrewsterError if
+    `difference` is not above 0, or the lose rate would be negative.
 
     Args:
-        difference: the win rate minus the lose rate, 0 to 1.
-        tie: the rate of "similar", 0 to 1.
+        difference: the win rate minus the lose rate, 0 to 1; `tie` is the rate of "similar", 0 to 1.
         pairs: number of pairs of these two methods that a participant sees.
-        correlation: intraclass correlation of the scores of one participant; reports estimate it.
-        power: the probability of detecting the difference if it exists.
-        level: the significance level, the probability of detecting a difference that does not exist.
-
-    Raises:
-        BrewsterError: `difference` is not above 0, or the lose rate would be negative.
-    """
+        power: the probability of detecting the difference if it exists; `level`, if it does not exist."""
     win, lose = (1 - tie + difference) / 2, (1 - tie - difference) / 2
     if not (0 < difference <= 1 and 0 <= tie < 1 and lose >= 0):
         raise BrewsterError(

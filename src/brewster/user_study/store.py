@@ -1,14 +1,9 @@
 """Store the answers of a study in SQLite, with a write-ahead log and a disk sync after each commit.
 
-    store = AnswerStore(study)
-    participant = store.participant(store.admit())
-    store.record_answer(participant, 0, "left", seconds=4.2)
-
-For each participant, the database contains a number, the token of the personal link, the date of the consent and the
-trials; it contains no name and no address. The trials are drawn once, at admission, and stored, so a later version of
-brewster cannot change them. A second answer to a trial is ignored: a browser repeats an answer if the response was lost. To
-change their last answer, participants withdraw it first. Withdrawn answers are kept.
-"""
+A participant has a number, the token of the personal link, the date of the consent and the trials; no name and no
+address. The trials are drawn once, at admission, and stored, so a later version of brewster cannot change them. A
+second answer to a trial is ignored: a browser repeats an answer if the response was lost. To change their last answer,
+participants withdraw it first. Withdrawn answers are kept."""
 
 from __future__ import annotations
 
@@ -68,10 +63,8 @@ _CONDITIONS: Final = TypeAdapter(ViewingConditions | None)
 @final
 @dataclass(frozen=True)
 class StoredAnswer:
-    """A choice, and the seconds for which the pictures were shown before it.
-
-    `answered_at` is the time in UTC, ISO 8601. `withdrawn` has the choices that the participant withdrew before this one.
-    """
+    """A choice, and the seconds for which the pictures were shown before it. `answered_at` is the time in UTC, ISO
+    8601. `withdrawn` has the choices that the participant withdrew before this one."""
 
     choice: Choice
     seconds: float
@@ -82,10 +75,8 @@ class StoredAnswer:
 
 @final
 class AnswerStore:
-    """The answers of one study; safe to use from many threads and many processes at the same time.
-
-    With `read_only`, nothing can be written, and no database file is created for a study without answers.
-    """
+    """The answers of one study; safe to use from many threads and many processes at the same time. With `read_only`,
+    nothing can be written, and no database file is created for a study without answers."""
 
     def __init__(self, study: Study, *, read_only: bool = False) -> None:
         self.study = study
@@ -124,47 +115,35 @@ class AnswerStore:
         return int(number)
 
     def admit(self, *, max_participants: int | None = None) -> str | None:
-        """Add a participant who has given consent.
+        """Add a participant who has given consent. Returns the token of their link, or None if `max_participants` are
+        admitted already."""
+        return self._insert_participant(datetime.now(UTC).date().isoformat(), max_participants)
 
-        Returns the token of their link, or None if `max_participants` are admitted already.
-        """
+    def admit_exported(self) -> str:
+        """Add a participant of a static bundle, who has not given consent yet. Returns the token."""
+        return self._insert_participant(_NO_CONSENT) or ""
+
+    def _insert_participant(self, consented_on: str, max_participants: int | None = None) -> str | None:
         with self._transaction("IMMEDIATE") as database:
             (number,) = database.execute("SELECT count(*) FROM participants").fetchone()
             if max_participants is not None and number >= max_participants:
                 return None
-            today = datetime.now(UTC).date().isoformat()
-            return self._insert_participant(database, consented_on=today)
-
-    def admit_exported(self) -> str:
-        """Add a participant of a static bundle, who has not given consent yet. Returns the token."""
-        with self._transaction("IMMEDIATE") as database:
-            return self._insert_participant(database, consented_on=_NO_CONSENT)
-
-    def _insert_participant(self, database: sqlite3.Connection, *, consented_on: str) -> str:
-        (number,) = database.execute("SELECT count(*) FROM participants").fetchone()
-        token = secrets.token_urlsafe(24)
-        drawn = draw_trials(self.study.description, number)
-        trials = json.dumps([asdict(trial) for trial in drawn])
-        practice = json.dumps(asdict(draw_practice(self.study.description, number, drawn)))
-        database.execute(
-            "INSERT INTO participants VALUES (?, ?, ?, ?, ?)", (number, token, consented_on, trials, practice)
-        )
+            drawn, token = draw_trials(self.study.description, number), secrets.token_urlsafe(24)
+            trials = json.dumps([asdict(trial) for trial in drawn])
+            practice = json.dumps(asdict(draw_practice(self.study.description, number, drawn)))
+            row = number, token, consented_on, trials, practice
+            database.execute("INSERT INTO participants VALUES (?, ?, ?, ?, ?)", row)
         return token
 
     def participant(self, token: str, *, exported: bool = False) -> Participant | None:
-        """The participant with this token, or None if the token is unknown.
-
-        A participant of a static bundle whose answers are not imported is returned only with `exported`, because the study does
-        not have the consent yet.
-        """
+        """The participant with this token, or None if the token is unknown. A participant of a static bundle whose
+        answers are not imported is returned only with `exported`, because the study does not have the consent yet."""
         with self._transaction() as database:
             row = database.execute(
                 "SELECT number, trials, practice FROM participants WHERE token = ? AND (consented_on != ? OR ?)",
                 (token, _NO_CONSENT, exported),
             ).fetchone()
-        return (
-            None if row is None else Participant(row[0], _parse_trials(row[1]), Trial(**json.loads(row[2])))
-        )
+        return row and Participant(row[0], _parse_trials(row[1]), Trial(**json.loads(row[2])))
 
     def next_trial(self, participant: Participant) -> int | None:
         """The index of the first trial without an answer, or None if all trials have one."""
@@ -182,18 +161,13 @@ class AnswerStore:
 
     def withdraw_answer(self, participant: Participant, trial: int) -> None:
         """Withdraw the answer to the last answered trial, so that the trial can be answered again. The answer is kept.
-
-        Nothing is changed if the trial has no answer, for example because it was withdrawn already.
-
-        Raises:
-            BrewsterError: a later trial has an answer.
-            OutputError: the database cannot be written.
-        """
+        Nothing is changed if the trial has no answer, for example because it was withdrawn already. Raises
+        BrewsterError if a later trial has an answer, and OutputError if the database cannot be written."""
         key = (participant.number, trial)
         with self._transaction("IMMEDIATE") as database:
-            last = database.execute(
+            (last,) = database.execute(
                 "SELECT max(trial) FROM answers WHERE participant = ?", key[:1]
-            ).fetchone()[0]
+            ).fetchone()
             if last is not None and last > trial:
                 raise BrewsterError(
                     f"the answer to pair {trial + 1} cannot be withdrawn",
@@ -214,15 +188,10 @@ class AnswerStore:
         seconds: float,
         conditions: ViewingConditions | None = None,
     ) -> Choice:
-        """Store an answer, unless the trial already has one. The answer is synced to the disk on return.
-
-        `trial` is the index of the trial, from 0. `seconds` is how long the pictures were shown, clipped to 0..MAX_SECONDS.
-        Returns the stored choice, which is that of the first answer.
-
-        Raises:
-            BrewsterError: the trial or the choice does not exist.
-            OutputError: the database cannot be written.
-        """
+        """Store an answer, unless the trial already has one. The answer is synced to the disk on return. `trial` is the
+        index of the trial, from 0. `seconds` is how long the pictures were shown, clipped to 0..MAX_SECONDS. Returns
+        the stored choice, which is that of the first answer. Raises BrewsterError if the trial or the choice does
+        not exist, and OutputError if the database cannot be written."""
         if not 0 <= trial < len(participant.trials) or choice not in CHOICES:
             raise BrewsterError(
                 f"trial {trial} was answered with {choice!r}",
@@ -244,14 +213,9 @@ class AnswerStore:
         return stored
 
     def import_answers(self, answer_file: AnswerFile) -> int:
-        """Store the answers of a participant of a static bundle in one transaction. An answer that is stored already is kept.
-
-        Returns the number of answers that were not stored before.
-
-        Raises:
-            BrewsterError: the participant or a trial does not exist in this study.
-            OutputError: the database cannot be written.
-        """
+        """Store the answers of a participant of a static bundle in one transaction. An answer that is stored already is
+        kept. Returns the number of answers that were not stored before. Raises BrewsterError if the participant or a
+        trial does not exist in this study, and OutputError if the database cannot be written."""
         participant = self.participant(answer_file.participant, exported=True)
         if participant is None:
             raise BrewsterError(
@@ -259,15 +223,14 @@ class AnswerStore:
                 "expected a participant of a bundle that `brewster study export` wrote from this study",
                 "choose the study that the bundle belongs to",
             )
-        count = len(participant.trials)
+        last, number = len(participant.trials) - 1, participant.number
         for answer in (*answer_file.answers, *answer_file.withdrawn):
-            if answer.trial >= count:
+            if answer.trial > last:
                 raise BrewsterError(
                     f"the file of answers has an answer to trial {answer.trial}",
-                    f"expected trials from 0 to {count - 1}",
+                    f"expected trials from 0 to {last}",
                     "ask the participant to download the answers again",
                 )
-        number = participant.number
         with self._transaction("IMMEDIATE") as database:
             database.execute(
                 "UPDATE participants SET consented_on = ? WHERE number = ? AND consented_on = ?",
@@ -308,11 +271,9 @@ class AnswerStore:
     def _transaction(
         self, kind: Literal["DEFERRED", "IMMEDIATE"] = "DEFERRED"
     ) -> Iterator[sqlite3.Connection]:
-        """A transaction. All statements of the block read the same state of the database.
-
-        DEFERRED is for a block that only reads. IMMEDIATE is for a block that writes: it waits for other writers, and the changes
-        are synced to the disk at the end of the block.
-        """
+        """A transaction. All statements of the block read the same state of the database. DEFERRED is for a block that
+        only reads. IMMEDIATE is for a block that writes: it waits for other writers, and the changes are synced to
+        the disk at the end of the block."""
         with self._database_errors(), self._lock:
             database = self._database
             database.execute(f"BEGIN {kind}")
@@ -338,11 +299,9 @@ class AnswerStore:
 
 
 def _read_only_uri(file: Path) -> str:
-    """The SQLite URI that opens a file read-only, or an empty database in memory if the file does not exist.
-
-    A reader of a database in WAL mode creates a shared-memory file in the same folder. In a folder that is not writable,
-    `immutable=1` avoids that; it is correct only if the log is empty.
-    """
+    """The SQLite URI that opens a file read-only, or an empty database in memory if the file does not exist. A reader
+    of a database in WAL mode creates a shared-memory file in the same folder. In a folder that is not writable,
+    `immutable=1` avoids that; it is correct only if the log is empty."""
     if not file.exists():
         return "file::memory:"
     log = file.with_name(f"{file.name}-wal")

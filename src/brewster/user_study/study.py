@@ -1,7 +1,6 @@
 """The description of a study: its pictures, its comparisons, and the number of trials of a participant.
 
-`create` writes the description once; it never changes. No other file says which method made which picture.
-"""
+`create` writes the description once; it never changes. No other file says which method made which picture."""
 
 from __future__ import annotations
 
@@ -28,10 +27,8 @@ UNNAMED_DATASET: Final = ""
 @final
 @dataclass(frozen=True)
 class StudyPicture:
-    """A picture of the study: an 8-bit sRGB PNG with a random name.
-
-    `width` and `height` are in px; `sha256` is the digest of the PNG file, `source_sha256` that of its source file.
-    """
+    """A picture of the study: an 8-bit sRGB PNG with a random name. `width` and `height` are in px; `sha256` is the
+    digest of the PNG file, `source_sha256` that of its source file."""
 
     name: str
     width: int
@@ -43,11 +40,8 @@ class StudyPicture:
 @final
 @dataclass(frozen=True)
 class PairedComparison:
-    """A comparison of two methods on one photo.
-
-    `dataset` and `name` identify the source file. `photo` and `outputs` are names of pictures; `outputs` has the order of
-    `methods`.
-    """
+    """A comparison of two methods on one photo. `dataset` and `name` identify the source file. `photo` and `outputs`
+    are names of pictures; `outputs` has the order of `methods`."""
 
     dataset: str
     name: str
@@ -60,9 +54,7 @@ class PairedComparison:
 @dataclass(frozen=True)
 class CatchTrial:
     """Pictures for a catch trial, which tests attention: an output is compared with itself or with a degraded copy.
-
-    `photo`, `good` and `degraded` are names of pictures: the photo, the output, and the degraded copy of the output.
-    """
+    `photo`, `good` and `degraded` are names of pictures: the photo, the output, and the degraded copy of the output."""
 
     dataset: str
     name: str
@@ -74,11 +66,9 @@ class CatchTrial:
 @final
 @dataclass(frozen=True)
 class StudyDescription:
-    """Everything that is fixed before the first answer; the content of study.json.
-
-    `pairs` and `catch_trials` count the comparisons and catch trials of one participant. `consent` is the text that participants
-    agree to, with an empty line between paragraphs.
-    """
+    """Everything that is fixed before the first answer; the content of study.json. `pairs` and `catch_trials` count the
+    comparisons and catch trials of one participant. `consent` is the text that participants agree to, with an empty
+    line between paragraphs."""
 
     brewster: str
     seed: int
@@ -123,17 +113,14 @@ class Study:
         return tuple(dict.fromkeys(comparison.methods for comparison in self.description.comparisons))
 
     def verify_pictures(self) -> None:
-        """Check that all pictures exist and are unchanged.
+        """Check that all pictures exist and are unchanged. Raises BrewsterError if a picture is missing, or its digest
+        differs from the description."""
 
-        Raises:
-            BrewsterError: a picture is missing, or its digest differs from the description.
-        """
-        changed = []
-        for picture in self.description.pictures:
+        def is_unchanged(picture: StudyPicture) -> bool:
             path = self.picture_file(picture.name)
-            if not path.is_file() or hashlib.sha256(path.read_bytes()).hexdigest() != picture.sha256:
-                changed.append(picture.name)
-        if changed:
+            return path.is_file() and hashlib.sha256(path.read_bytes()).hexdigest() == picture.sha256
+
+        if changed := [picture.name for picture in self.description.pictures if not is_unchanged(picture)]:
             raise BrewsterError(
                 f"pictures of the study are missing or changed: {len(changed)}, such as {self.picture_file(changed[0])}",
                 "expected all pictures as `brewster study create` wrote them",
@@ -152,11 +139,8 @@ def write_study(folder: Path, description: StudyDescription) -> None:
 
 
 def read_study(folder: Path) -> Study:
-    """Read the study in a folder.
-
-    Raises:
-        BrewsterError: the description cannot be read, is invalid, or has the format of another version.
-    """
+    """Read the study in a folder. Raises BrewsterError if the description cannot be read, is invalid, or has the format
+    of another version."""
     path = folder / DESCRIPTION_FILE
     try:
         description = _DESCRIPTION.validate_json(path.read_bytes(), extra="forbid")

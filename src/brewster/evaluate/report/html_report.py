@@ -1,8 +1,7 @@
 """Writes the HTML report: one self-contained page with all scores, the images and their error maps.
 
-The Jinja2 template page.html has the whole page, which is readable without JavaScript; page.js sorts it and compares images.
-Cases are written one at a time, so that memory does not grow with their number.
-"""
+The Jinja2 template page.html has the whole page, which is readable without JavaScript; page.js sorts it and compares
+images. Cases are written one at a time, so that memory does not grow with their number."""
 
 from __future__ import annotations
 
@@ -22,13 +21,8 @@ _FOLDER: Final = Path(__file__).parent
 
 
 def write_report(results: Results, cases: Iterable[CaseThumbnails], path: Path) -> None:
-    """Writes the page atomically and replaces an older one. Equal arguments give equal bytes.
-
-    `results` is the content of results.json. The cases are read one at a time.
-
-    Raises:
-        OutputError: the file cannot be written.
-    """
+    """Writes the page atomically and replaces an older one. Equal arguments give equal bytes. `results` is the content
+    of results.json. The cases are read one at a time. Raises OutputError if the file cannot be written."""
     import jinja2  # noqa: PLC0415 - an extra
 
     environment = jinja2.Environment(
@@ -75,10 +69,8 @@ def _notes(results: Results) -> list[tuple[str, list[str]]]:
         for image in images
         for error in image["errors"].items()
     ]
-    counts = Counter(method for _, method, _ in errors)
-    counted = ", ".join(
-        f"{method} on {count} of {_count(len(images), 'image')}" for method, count in counts.items()
-    )
+    counts, total = Counter(method for _, method, _ in errors), _count(len(images), "image")
+    counted = ", ".join(f"{method} on {count} of {total}" for method, count in counts.items())
     excluded, all_remarks = (
         [f"{benchmark['title']}: {text}" for benchmark in benchmarks for text in benchmark[kind]]
         for kind in ("excluded", "remarks")

@@ -45,10 +45,8 @@ Thumbnail = tuple[str, str, str]
 @final
 @dataclass(frozen=True)
 class CaseThumbnails:
-    """The embedded images of a case, by method; the photo and the ground truth are those of the baseline.
-
-    Sizes are (width, height) in px: that of the photo, and that of the embedded images.
-    """
+    """The embedded images of a case, by method; the photo and the ground truth are those of the baseline. Sizes are
+    (width, height) in px: that of the photo, and that of the embedded images."""
 
     benchmark: str
     name: str
@@ -63,13 +61,8 @@ def to_thumbnails(
     region: Region,
     links: Mapping[tuple[str, str], str],
 ) -> CaseThumbnails:
-    """Downscales and encodes all images of a case.
-
-    Args:
-        predictions: method -> prediction, without the baseline.
-        links: (layer, method) -> URL of the image at full size, relative to the page; the method is "" for the layers
-            "photo", "transmission" and "reflection" of the benchmark.
-    """
+    """Downscales and encodes all images of a case. `predictions` has no baseline. `links` is (layer, method) -> URL of the image
+    at full size, relative to the page; the method is "" for the photo, transmission and reflection of the benchmark."""
     photo, ground_truth = truth.images["photo"], truth.images["transmission"]
 
     def thumbnail(caption: str, data: bytes, layer: str = "", method: str = "") -> Thumbnail:
@@ -112,10 +105,8 @@ def embedded_size(image: NDArray[Any]) -> tuple[int, int]:
 
 
 def encode_photo(image: Pixels) -> bytes:
-    """Downscales an sRGB image (H, W, 3) to its embedded size by area means in linear light; returns a JPEG file.
-
-    WebP files are 1/8 smaller, but their encoder takes seven times as long.
-    """
+    """Downscales an sRGB image (H, W, 3) to its embedded size by area means in linear light; returns a JPEG file. WebP
+    files are 1/8 smaller, but their encoder takes seven times as long."""
     if embedded_size(image) != image.shape[1::-1]:
         light = Photo.from_array(image, encoding="srgb").resized(*embedded_size(image))
         image = Photo.from_array(light, encoding="linear").srgb_8bit()
@@ -123,15 +114,12 @@ def encode_photo(image: Pixels) -> bytes:
 
 
 def error_map(prediction: Pixels, truth: Pixels) -> Pixels:
-    """Returns the error of a prediction (H, W, 3) in colours of COLOUR_MAP, uint8 (h, w, 3), at the embedded size.
-
-    The error is max over channels |prediction - truth|, averaged over the area of each new pixel.
-    """
+    """Returns the error of a prediction (H, W, 3) in colours of COLOUR_MAP, uint8 (h, w, 3), at the embedded size. The
+    error is max over channels |prediction - truth|, averaged over the area of each new pixel."""
     red, green, blue = np.moveaxis(np.abs(prediction.astype(np.int16) - truth), 2, 0)
     largest = np.maximum(np.maximum(red, green), blue).astype(np.float32)  # much faster than max(axis=2)
     photo = Photo.from_array(largest[..., None].repeat(3, axis=2), encoding="linear")
     means = photo.resized(*embedded_size(largest))[..., 0]
-    colours: Pixels = COLOUR_MAP[
-        (means / MAX_ERROR * len(COLOUR_MAP)).astype(int).clip(0, len(COLOUR_MAP) - 1)
-    ]
+    indices = (means / MAX_ERROR * len(COLOUR_MAP)).astype(int).clip(0, len(COLOUR_MAP) - 1)
+    colours: Pixels = COLOUR_MAP[indices]
     return colours

@@ -20,12 +20,10 @@ _DAGGER: Final = "$^\\dagger$"
 
 
 def to_latex(results: Results, *, intervals: bool = False) -> str:
-    """Returns a table with one row per method and up to three metrics per benchmark. The average is the last column group.
-
-    The best three values of a column are marked as in the paper, but the worst value has no mark. A dagger marks a mean
-    over fewer images than those of other methods. With `intervals`, each mean has its 95 % interval. The first line names
-    the LaTeX packages that the table needs.
-    """
+    """Returns a table with one row per method and up to three metrics per benchmark. The average is the last column
+    group. The best three values of a column are marked as in the paper, but the worst one is not. A dagger marks a mean
+    over fewer images than those of other methods. With `intervals`, each mean has its 95 % interval. The first line
+    names the LaTeX packages."""
     metrics = main_metrics(results)
     keys = _table_selections(results)
     if not metrics or not keys:

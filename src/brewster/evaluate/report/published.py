@@ -19,12 +19,9 @@ _METRICS: Final = {"psnr": "PSNR (dB)", "ssim": "SSIM", "lpips": "LPIPS", "lpips
 @final
 @dataclass(frozen=True)
 class PublishedScores:
-    """The scores of a method as a paper printed them.
-
-    `source` is the paper, `copied_from` the table that the numbers were copied from. `protocol` describes the images, their
-    number and size, and says what is unknown. `scores` is benchmark -> metric -> the printed number: PSNR in dB, SSIM and
-    LPIPS without a unit.
-    """
+    """The scores of a method as a paper printed them. `source` is the paper, `copied_from` the table that the numbers
+    were copied from. `protocol` describes the images, and says what is unknown. `scores` is benchmark -> metric -> the
+    printed number: PSNR in dB, SSIM and LPIPS without a unit."""
 
     method: str
     source: str
@@ -45,9 +42,7 @@ def read_published() -> list[PublishedScores]:
 
 def to_markdown(published: Sequence[PublishedScores]) -> str:
     """Returns a Markdown section with one table per protocol. The protocol and the sources are above the table.
-
-    Consecutive rows with the same protocol are in one table.
-    """
+    Consecutive rows with the same protocol are in one table."""
     groups = groupby(published, key=lambda row: row.protocol)
     parts = [_table(protocol, list(rows)) for protocol, rows in groups]
     return "\n\n".join([f"## {_HEADING}", *parts]) + "\n"

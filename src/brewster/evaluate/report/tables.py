@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from typing import Any, Final
 
 from brewster.evaluate.results import Results
@@ -56,11 +56,9 @@ def tables_to_markdown(results: Results) -> str:
 
 
 def to_terminal(results: Results, width: int = 100, *, intervals: bool = False) -> str:
-    """Returns the means for a terminal with `width` columns: a table per selection, with one row per method.
-
-    A table that is too wide is continued below, and long names of methods are shortened. With `intervals`, each mean has its
-    95 % interval.
-    """
+    """Returns the means for a terminal with `width` columns: a table per selection, with one row per method. A table
+    that is too wide is continued below, and long names of methods are shortened. With `intervals`, each mean has its
+    95 % interval."""
     parts = [
         f"{selection['title']} ({selection['cases']} images)\n{_terminal_table(results, key, width, intervals)}"
         for key, selection in results["selections"].items()
@@ -69,7 +67,7 @@ def to_terminal(results: Results, width: int = 100, *, intervals: bool = False) 
 
 
 def _terminal_table(results: Results, key: str, width: int, intervals: bool) -> str:
-    table, image_count = results["tables"][key], results["selections"][key]["cases"]
+    table = results["tables"][key]
     # "…" replaces the middle of longer names, because names often differ at the end
     kept = max(12, width // 3) - 1
     names = [
@@ -79,11 +77,8 @@ def _terminal_table(results: Results, key: str, width: int, intervals: bool) -> 
     columns = []
     for metric in results["metrics"]:
         if any(metric in row for row in table.values()):
-            cells = (
-                _mean(results, metric, table[method].get(metric), image_count, intervals=intervals)
-                for method in results["methods"]
-            )
-            counted = [f"{mean} ({count})" if count else mean for mean, count in cells]
+            means = _means(results, metric, key, intervals=intervals)
+            counted = [f"{mean} ({count})" if count else mean for mean, count in means]
             columns.append([_heading(results, metric), *counted])
     blocks, used = list[list[list[str]]](), width
     for column in columns:
@@ -136,25 +131,23 @@ def _details(results: Results, key: str) -> str:
         if not any(metric in table[method] for method in methods):
             continue
         by_pair = {(row["method"], row["reference"]): row for row in differences if row["metric"] == metric}
-        cells = (
-            _mean(results, metric, table[method].get(metric), selection["cases"], intervals=True)
-            for method in methods
-        )
+        cells = _means(results, metric, key, intervals=True)
         means = [f"{mean}, {count}" if count else mean for mean, count in cells]
         changes = [_difference_cell(results, metric, by_pair.get(pair)) for pair in pairs]
         rows.append([_heading(results, metric), *means, *changes])
     return f"### {selection['title']} ({selection['cases']} images)\n\n{markdown_table(rows)}"
 
 
-def _mean(
-    results: Results, metric: str, entry: Mapping[str, Any] | None, image_count: int, *, intervals: bool
-) -> tuple[str, str]:
-    """Returns the text of a mean, and that of the number of images, which is empty if it is `image_count`."""
-    if entry is None:
-        return "-", ""
-    count = f"{entry['count']} of {image_count}" if entry["count"] != image_count else ""
-    interval = _interval(results, metric, entry) if intervals else ""
-    return f"{_number(results, metric, entry['mean'])}{interval}", count
+def _means(results: Results, metric: str, key: str, *, intervals: bool) -> Iterator[tuple[str, str]]:
+    """Yields the text of the mean of each method, and that of the number of images, which is empty if it is the usual one."""
+    image_count = results["selections"][key]["cases"]
+    for method in results["methods"]:
+        if entry := results["tables"][key][method].get(metric):
+            count = f"{entry['count']} of {image_count}" if entry["count"] != image_count else ""
+            interval = _interval(results, metric, entry) if intervals else ""
+            yield f"{_number(results, metric, entry['mean'])}{interval}", count
+        else:
+            yield "-", ""
 
 
 def _difference_cell(results: Results, metric: str, row: Mapping[str, Any] | None) -> str:
@@ -202,11 +195,8 @@ def _number(results: Results, metric: str, value: float, *, sign: str = "") -> s
 
 
 def ranking(table: Mapping[str, Any], metric: str, metric_info: Mapping[str, Any]) -> list[str]:
-    """Returns the distinct means in descending order of quality, as they are printed.
-
-    The list has no means of methods with scores on fewer images than other methods. It is empty if fewer than two methods
-    remain.
-    """
+    """Returns the distinct means in descending order of quality, as they are printed. The list has no means of methods
+    with scores on fewer images than other methods. It is empty if fewer than two methods remain."""
     means = [row[metric]["mean"] for method, row in table.items() if is_complete(table, method, metric)]
     if len(means) < 2:
         return []

@@ -12,15 +12,11 @@ _LABEL_COLOURS: Final = {"win": "white", "tie": "#333333", "lose": "#222222"}
 _HEADING_COLOURS: Final = {"win": "#1f6f8b", "tie": "#666666", "lose": "#a8561b"}
 _MIN_LABELLED_RATE: Final = 0.06
 """Smaller rates get no label, because a label does not fit into so short a bar."""
-_AVERAGE_KEYS: Final = ("/average",)
-_EVERYONE_TITLE: Final = "All participants: the rule excludes everyone"
 
 
 def plot(results: Mapping[str, Any]) -> bytes:
-    """Plots the results after the exclusion rule, or those of all participants if the rule excludes everyone.
-
-    The plot is a PNG file.
-    """
+    """Plots the results after the exclusion rule, or those of all participants if the rule excludes everyone. The plot
+    is a PNG file."""
     from matplotlib.figure import Figure  # noqa: PLC0415  (an optional dependency, and slow to import)
 
     included = results["included"]["tables"]
@@ -33,7 +29,8 @@ def plot(results: Mapping[str, Any]) -> bytes:
     for table, rows, ax in zip(tables, rows_of_tables, axes, strict=True):
         _bars(ax, table, rows)
     if not included:
-        figure.suptitle(_EVERYONE_TITLE, fontsize=9, color="#a8561b")
+        title = "All participants: the rule excludes everyone"
+        figure.suptitle(title, fontsize=9, color="#a8561b")
     data = io.BytesIO()
     with warnings.catch_warnings():  # a missing glyph is drawn as a box; the tables have the full name
         warnings.filterwarnings("ignore", message="Glyph .* missing")
@@ -44,7 +41,7 @@ def plot(results: Mapping[str, Any]) -> bytes:
 def _plotted_rows(results: Mapping[str, Any], table: Mapping[str, Any]) -> list[Mapping[str, Any]]:
     """Returns the rows to plot: the datasets, if there are several, and the average. Rows without answers are left out."""
     datasets = results["study"]["datasets"]
-    keys = [*(datasets if len(datasets) > 1 else ()), *_AVERAGE_KEYS]
+    keys = [*(datasets if len(datasets) > 1 else ()), "/average"]
     return [row for row in table["rows"] if row["key"] in keys and row["win"]["mean"] is not None]
 
 

@@ -19,12 +19,9 @@ Reason = Literal["failed", "fast"]
 @final
 @dataclass(frozen=True)
 class ParticipantAnswers:
-    """The answers of one participant.
-
-    `votes` maps the number of a comparison to an index of OUTCOMES. `catch_trials` is the number of answered catch trials,
-    `failed` is the number of wrong answers to them. `seconds` is the median time for a trial. `trials` has the position of
-    each answered trial in the order of presentation, from 0, the trial, and its answer.
-    """
+    """The answers of one participant. `votes` maps the number of a comparison to an index of OUTCOMES. Of the answered
+    `catch_trials`, `failed` have a wrong answer. `seconds` is the median time for a trial. `trials` has the position of
+    each answered trial in the order of presentation, from 0, the trial, and its answer."""
 
     number: int
     votes: Mapping[int, int]
@@ -66,21 +63,14 @@ def collect_answers(
             continue
         trials = [(i, participant.trials[i], answer) for i, answer in answers.items()]
         passed = [trial.expected == answer.choice for _, trial, answer in trials if trial.expected]
-        collected.append(
-            ParticipantAnswers(
-                participant.number,
-                {
-                    trial.comparison: outcome(trial, answer.choice)
-                    for _, trial, answer in trials
-                    if trial.comparison is not None
-                },
-                len(passed),
-                passed.count(False),
-                median(answer.seconds for answer in answers.values()),
-                len(answers) == len(participant.trials),
-                trials,
-            )
-        )
+        votes = {
+            trial.comparison: outcome(trial, answer.choice)
+            for _, trial, answer in trials
+            if trial.comparison is not None
+        }
+        seconds = median(answer.seconds for answer in answers.values())
+        is_complete, counts = len(answers) == len(participant.trials), (len(passed), passed.count(False))
+        collected.append(ParticipantAnswers(participant.number, votes, *counts, seconds, is_complete, trials))
     return collected
 
 

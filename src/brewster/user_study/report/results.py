@@ -1,7 +1,6 @@
 """Compute the results of a study from its answers, as plain JSON values, and write the files of the report.
 
-All results are given twice: for the participants after the exclusion rule, and for all participants.
-"""
+All results are given twice: for the participants after the exclusion rule, and for all participants."""
 
 from __future__ import annotations
 
@@ -17,23 +16,10 @@ from numpy.typing import NDArray
 import brewster
 from brewster.errors import BrewsterError
 from brewster.files import write_atomically
-from brewster.user_study.report.answers import answers_csv
+from brewster.user_study.report import statistics
 from brewster.user_study.report.figure import plot
 from brewster.user_study.report.participants import OUTCOMES, ExclusionRule, ParticipantAnswers
-from brewster.user_study.report.statistics import (
-    MIN_PARTICIPANTS,
-    agreement_bounds,
-    alpha,
-    bootstrap_interval,
-    bootstrap_weights,
-    intraclass_correlation,
-    rates,
-    resampled_counts,
-    sign_flip_test,
-    strengths,
-    with_agreement_bounds,
-)
-from brewster.user_study.report.tables import to_csv, to_latex, to_markdown
+from brewster.user_study.report.tables import answers_csv, to_csv, to_latex, to_markdown
 from brewster.user_study.study import Study
 
 AVERAGES: Final = {
@@ -54,11 +40,8 @@ Floats = NDArray[np.float64]
 
 
 def summarise(study: Study, participants: Sequence[ParticipantAnswers], rule: ExclusionRule) -> Results:
-    """Compute the results of a study from the answers of all participants: the content of report.json.
-
-    Raises:
-        BrewsterError: there is no answer yet.
-    """
+    """Compute the results of a study from the answers of all participants: the content of report.json. Raises
+    BrewsterError if there is no answer yet."""
     if not any(participant.votes for participant in participants):
         raise BrewsterError(
             f"{study.folder} has no answers yet",
@@ -87,9 +70,7 @@ def summarise(study: Study, participants: Sequence[ParticipantAnswers], rule: Ex
 
 
 def _dataset_title(dataset: str) -> str:
-    if dataset in AVERAGES.values():
-        return f"{dataset} (dataset)"
-    return dataset or "All pictures"
+    return f"{dataset} (dataset)" if dataset in AVERAGES.values() else dataset or "All pictures"
 
 
 def _group(study: Study, participants: Sequence[ParticipantAnswers]) -> dict[str, Any]:
@@ -97,10 +78,10 @@ def _group(study: Study, participants: Sequence[ParticipantAnswers]) -> dict[str
     participants = [participant for participant in participants if participant.votes]
     summary = {
         "participants": len(participants),
-        "complete": sum(participant.is_complete for participant in participants),
-        "answers": sum(len(participant.votes) for participant in participants),
-        "catch_trials": sum(participant.catch_trials for participant in participants),
-        "failed": sum(participant.failed for participant in participants),
+        "complete": sum(one.is_complete for one in participants),
+        "answers": sum(len(one.votes) for one in participants),
+        "catch_trials": sum(one.catch_trials for one in participants),
+        "failed": sum(one.failed for one in participants),
         "tables": [],
         "strengths": {},
         "agreement": None,
@@ -113,8 +94,8 @@ def _group(study: Study, participants: Sequence[ParticipantAnswers]) -> dict[str
     ratings = np.zeros((len(study.description.comparisons), len(OUTCOMES)))
     for participant in participants:
         np.add.at(ratings, (list(participant.votes), list(participant.votes.values())), 1)
-    weights = bootstrap_weights(len(participants))
-    agreement = alpha(ratings)
+    weights = statistics.bootstrap_weights(len(participants))
+    agreement = statistics.alpha(ratings)
     return summary | {
         "tables": _tables(study, counts, pictures, weights),
         "strengths": _strengths(study, counts, weights),
@@ -148,21 +129,23 @@ def _table_indices(study: Study) -> list[tuple[int, int]]:
 
 def _tables(study: Study, counts: Floats, pictures: Floats, weights: Floats) -> list[dict[str, Any]]:
     """A table for each pair of methods, with a row for each dataset and a row for each of the AVERAGES."""
-    means = rates(counts.sum(axis=0), pictures)
-    ends = bootstrap_interval(rates(resampled_counts(weights, counts), pictures), len(counts))
-    lows, highs = with_agreement_bounds(means, ends, agreement_bounds(counts, pictures))
+    means = statistics.rates(counts.sum(axis=0), pictures)
+    ends = statistics.bootstrap_interval(
+        statistics.rates(statistics.resampled_counts(weights, counts), pictures), len(counts)
+    )
+    lows, highs = statistics.with_agreement_bounds(means, ends, statistics.agreement_bounds(counts, pictures))
     answered = counts.sum(axis=-1) > 0
     pooled = answered.any(axis=-1).sum(axis=0)[:, None]
     # numbers of participants with an answer, for each row of a table: (pairs of methods, datasets + 3)
     sizes = np.concatenate([answered.sum(axis=0), np.repeat(pooled, len(AVERAGES), axis=1)], axis=1)
-    p_values = sign_flip_test(counts, pictures)
+    p_values = statistics.sign_flip_test(counts, pictures)
     titles = {name: _dataset_title(name) for name in study.description.datasets} | AVERAGES
     answers = counts.sum(axis=(0, 3))
     return [
         {
             "first": first,
             "second": second,
-            "intraclass_correlation": _round(intraclass_correlation(counts[:, i].sum(axis=1))),
+            "intraclass_correlation": _round(statistics.intraclass_correlation(counts[:, i].sum(axis=1))),
             "rows": [
                 {
                     "key": key,
@@ -170,11 +153,14 @@ def _tables(study: Study, counts: Floats, pictures: Floats, weights: Floats) -> 
                     "pictures": int(pictures[i, j] if j < answers.shape[1] else pictures[i].sum()),
                     "answers": int(answers[i, j] if j < answers.shape[1] else answers[i].sum()),
                     "participants": int(sizes[i, j]),
-                    "p": _round(p_values[i, j]) if sizes[i, j] >= MIN_PARTICIPANTS else None,
-                    **{
-                        name: _estimate(*(part[i, j, k] for part in (means, lows, highs)))
-                        for k, name in enumerate((*OUTCOMES, "difference"))
-                    },
+                    "p": _round(p_values[i, j]) if sizes[i, j] >= statistics.MIN_PARTICIPANTS else None,
+                    **dict(
+                        zip(
+                            (*OUTCOMES, "difference"),
+                            map(_estimate, means[i, j], lows[i, j], highs[i, j]),
+                            strict=True,
+                        )
+                    ),
                 }
                 for j, (key, title) in enumerate(titles.items())
             ],
@@ -184,11 +170,8 @@ def _tables(study: Study, counts: Floats, pictures: Floats, weights: Floats) -> 
 
 
 def _strengths(study: Study, counts: Floats, weights: Floats) -> dict[str, Any]:
-    """The strength of each method, with its interval.
-
-    There is no interval if the likelihood of a resample has no maximum, because a method only won or only lost. There is
-    also none if all resamples are equal.
-    """
+    """The strength of each method, with its interval. There is no interval if the likelihood of a resample has no
+    maximum, because a method only won or only lost. There is also none if all resamples are equal."""
     methods = study.description.methods
     # wins of each method against each other method, (participants, methods, methods); a tie is half a win
     wins = np.zeros((len(counts), len(methods), len(methods)))
@@ -197,16 +180,14 @@ def _strengths(study: Study, counts: Floats, weights: Floats) -> dict[str, Any]:
         a, b = methods.index(first), methods.index(second)
         wins[:, a, b] += won + tied / 2
         wins[:, b, a] += lost + tied / 2
-    means = strengths(wins.sum(axis=0))
-    resamples = strengths(resampled_counts(weights, wins))
+    means = statistics.strengths(wins.sum(axis=0))
+    resamples = statistics.strengths(statistics.resampled_counts(weights, wins))
     lows, highs = (
-        bootstrap_interval(resamples, len(counts))
+        statistics.bootstrap_interval(resamples, len(counts))
         if np.isfinite(resamples).all() and np.ptp(resamples, axis=0).min() > _MIN_SPREAD
         else np.full((2, len(means)), math.nan)
     )
-    return {
-        method: _estimate(*(part[i] for part in (means, lows, highs))) for i, method in enumerate(methods)
-    }
+    return dict(zip(methods, map(_estimate, means, lows, highs), strict=True))
 
 
 def _estimate(mean: float, low: float, high: float) -> dict[str, float | None]:

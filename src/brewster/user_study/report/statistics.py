@@ -1,8 +1,7 @@
 """Rates and their confidence intervals. The bootstrap resamples whole participants, since their answers are correlated.
 
-Arrays of counts are (participants, pairs of methods, datasets, 3): wins, ties and losses of the first method. In shapes,
-p is the number of participants, r of resamples and d of datasets.
-"""
+Arrays of counts are (participants, pairs of methods, datasets, 3): wins, ties and losses of the first method. In
+shapes, p is the number of participants, r of resamples and d of datasets."""
 
 from __future__ import annotations
 
@@ -45,11 +44,8 @@ def rates(
     counts: Float64[Floats, "... d 3"], pictures: Float64[Floats, "... d"]
 ) -> Float64[Floats, "... d+3 4"]:
     """Rates of win, tie and lose, and the difference win - lose. `pictures` is the number of pictures of each dataset.
-
-    Returns:
-        A row for each dataset, then three averages: the mean weighted by the number of pictures (as in the paper), the
-        mean of the datasets, and the rates of all answers together. Rows without answers are NaN.
-    """
+    Returns a row for each dataset, then three averages: the mean weighted by the number of pictures (as in the
+    paper), the mean of the datasets, and the rates of all answers together. Rows without answers are NaN."""
     with np.errstate(invalid="ignore"):
         shares = counts / counts.sum(axis=-1, keepdims=True)
         pooled = counts.sum(axis=-2, keepdims=True)
@@ -62,22 +58,15 @@ def averages(
     shares: Float64[Floats, "... d k"], pictures: Float64[Floats, "... d"]
 ) -> Float64[Floats, "... 2 k"]:
     """Two means over datasets: one weighted by the number of pictures, as in the paper's Table 3, and one unweighted.
-
-    The leading axes of the two arguments broadcast: `shares` may have an axis of resamples that `pictures` lacks.
-    """
+    The leading axes of the two arguments broadcast: `shares` may have an axis of resamples that `pictures` lacks."""
     weights = pictures / pictures.sum(axis=-1, keepdims=True)
     return np.stack([(shares * weights[..., None]).sum(axis=-2), shares.mean(axis=-2)], axis=-2)
 
 
 def bootstrap_interval(draws: Float64[Floats, "r ..."], participants: int) -> Float64[Floats, "2 ..."]:
-    """The 95 % expanded percentile interval (Hesterberg 2015, section 4.3.2).
-
-    Its percentiles are slightly wider than 2.5 and 97.5, because the plain percentile interval is too narrow for few
-    participants. The ends are NaN for a single participant.
-
-    Args:
-        draws: the values of a statistic, one for each resample; values that are not finite are ignored.
-    """
+    """The 95 % expanded percentile interval (Hesterberg 2015, section 4.3.2) of a statistic with these values, one for
+    each resample; values that are not finite are ignored. Its percentiles are slightly wider than 2.5 and 97.5, because
+    the plain percentile interval is too narrow for few participants. The ends are NaN for a single participant."""
     if participants < 2:
         return np.full((2, *draws.shape[1:]), np.nan)
     ends = _expanded_percentiles(participants)
@@ -93,11 +82,11 @@ def sign_flip_test(
 ) -> Float64[Floats, "... d+3"]:
     """The two-sided p-values of the differences win - lose, for each row of `rates`; NaN without answers.
 
-    The test exchanges wins and losses of whole participants at random, because their answers are correlated. It assumes that,
-    without a difference of the methods, each participant is as likely to prefer one as the other. (A randomisation test, Good
-    2005, "Permutation, Parametric and Bootstrap Tests of Hypotheses", 3.2; one is added to both counts as in Phipson and Smyth
-    2010.) The p-values are random estimates of the exact ones over all 2^n exchanges of n participants.
-    """
+    The test exchanges wins and losses of whole participants at random, because their answers are correlated. It assumes
+    that, without a difference of the methods, each participant is as likely to prefer one as the other. (A
+    randomisation test, Good 2005, "Permutation, Parametric and Bootstrap Tests of Hypotheses", 3.2; one is added to
+    both counts as in Phipson and Smyth 2010.) The p-values are random estimates of the exact ones over all 2^n
+    exchanges of n participants."""
     rng = np.random.default_rng([SEED, len(counts), 1])
     signs = rng.choice([-1.0, 1.0], (resamples, len(counts)))
     half_sum, half_difference = counts.copy(), np.zeros_like(counts)
@@ -113,12 +102,10 @@ def sign_flip_test(
 def agreement_bounds(
     counts: Float64[Floats, "p ... d 3"], pictures: Float64[Floats, "... d"]
 ) -> Float64[Floats, "... d+3"]:
-    """The lower end of the 95 % interval for an observed rate of 1, for each row of `rates`; NaN without answers.
-
-    If all answers agree, the bootstrap has no spread. The bound is then that of Clopper and Pearson (1934) for n successes of
-    n trials, 0.025^(1 / n). Here n is the number of participants, not of answers, since answers of one participant are not
-    independent. The bound of an average of rates is the average of their bounds.
-    """
+    """The lower end of the 95 % interval for an observed rate of 1, for each row of `rates`; NaN without answers. If
+    all answers agree, the bootstrap has no spread. The bound is then that of Clopper and Pearson (1934) for n
+    successes of n trials, 0.025^(1 / n). Here n is the number of participants, not of answers, since answers of one
+    participant are not independent. The bound of an average of rates is the average of their bounds."""
     sizes = counts.sum(axis=-1)
     with np.errstate(divide="ignore"):
         bounds = 0.025 ** (1 / (sizes > 0).sum(axis=0))
@@ -130,11 +117,9 @@ def agreement_bounds(
 def with_agreement_bounds(
     rows: Float64[Floats, "... n 4"], ends: Float64[Floats, "2 ... n 4"], bounds: Float64[Floats, "... n"]
 ) -> Float64[Floats, "2 ... n 4"]:
-    """The intervals of `rates`, with those of width 0 replaced by intervals from `agreement_bounds`.
-
-    An interval is NaN if its width is 0 although answers differ, for example if only one participant has answered
-    comparisons of a dataset.
-    """
+    """The intervals of `rates`, with those of width 0 replaced by intervals from `agreement_bounds`. An interval is NaN
+    if its width is 0 although answers differ, for example if only one participant has answered comparisons of a
+    dataset."""
     bound, shares = bounds[..., None], rows[..., :3]
     is_one, is_zero = shares > 1 - _TOLERANCE, shares < _TOLERANCE
     lows = np.where(is_one, bound, np.where(is_zero, 0.0, np.nan))
@@ -147,11 +132,9 @@ def with_agreement_bounds(
 
 
 def _expanded_percentiles(participants: int) -> tuple[float, float]:
-    """The percentiles of a bootstrap that match the 95 % interval of Student's t with n - 1 degrees of freedom.
-
-    They also correct the bootstrap's spread, which is too small by the factor sqrt((n - 1) / n). The quantile of t is the
-    expansion 26.7.5 of Abramowitz and Stegun 1972.
-    """
+    """The percentiles of a bootstrap that match the 95 % interval of Student's t with n - 1 degrees of freedom. They
+    also correct the bootstrap's spread, which is too small by the factor sqrt((n - 1) / n). The quantile of t is the
+    expansion 26.7.5 of Abramowitz and Stegun 1972."""
     z, v = NormalDist().inv_cdf(0.975), participants - 1
     t = z + (z**3 + z) / (4 * v) + (5 * z**5 + 16 * z**3 + 3 * z) / (96 * v**2)
     tail = 100 * NormalDist().cdf(-t * math.sqrt(participants / v))
@@ -159,11 +142,9 @@ def _expanded_percentiles(participants: int) -> tuple[float, float]:
 
 
 def intraclass_correlation(counts: Float64[Floats, "p 3"]) -> float | None:
-    """The intraclass correlation of the scores 1, 0, -1 for win, tie, lose, with participants as classes.
-
-    The estimator from the analysis of variance (Donner 1986, equation 2.1). It can be below 0 by chance. It is None with
-    fewer than two participants, one answer for each participant, or no variance.
-    """
+    """The intraclass correlation of the scores 1, 0, -1 for win, tie, lose, with participants as classes. The estimator
+    from the analysis of variance (Donner 1986, equation 2.1). It can be below 0 by chance. It is None with fewer
+    than two participants, one answer for each participant, or no variance."""
     counts = counts[counts.sum(axis=1) > 0]
     sizes, sums, squares = counts.sum(axis=1), counts[:, 0] - counts[:, 2], counts[:, 0] + counts[:, 2]
     participants, answers = len(sizes), float(sizes.sum())
@@ -181,20 +162,13 @@ def intraclass_correlation(counts: Float64[Floats, "p 3"]) -> float | None:
 
 
 def strengths(wins: Float64[Floats, "... m m"]) -> Float64[Floats, "... m"]:
-    """The maximum-likelihood strengths of methods in the model of Bradley and Terry (1952), for each table of wins.
+    """The maximum-likelihood strengths of methods in the model of Bradley and Terry (1952), for each table of wins,
+    with mean 0.
 
-    P(a beats b) = 1 / (1 + exp(strength_b - strength_a)). A tie counts as half a win for each of the two methods.
-
-    Damped Newton's method: each step is divided by 1 + its length, so the likelihood always increases (Nesterov 2004,
-    section 4.1.5).
-
-    Args:
-        wins: `wins[a, b]` is the number of wins of method a against method b; a tie adds 0.5 to both orders.
-
-    Returns:
-        The strengths, with mean 0; NaN for a table without a maximum, where some methods never lose to the others
-        (Ford 1957).
-    """
+    P(a beats b) = 1 / (1 + exp(strength_b - strength_a)); `wins[a, b]` is the number of wins of method a against method
+    b, and a tie adds 0.5 to both orders. NaN for a table without a maximum, where some methods never lose to the others
+    (Ford 1957). Damped Newton's method: each step is divided by 1 + its length, so the likelihood always increases
+    (Nesterov 2004, 4.1.5)."""
     wins = wins * (1 - np.eye(wins.shape[-1]))
     total = wins + np.swapaxes(wins, -1, -2)
     is_bounded = all_connected(wins)
@@ -224,16 +198,10 @@ def all_connected(wins: Float64[Floats, "... m m"]) -> NDArray[np.bool_]:
 
 
 def alpha(ratings: Float64[NDArray[np.float64], "u c"]) -> float | None:
-    """Krippendorff's alpha, the agreement of raters on nominal categories: 1 - observed / expected disagreement.
-
-    Krippendorff 2011, "Computing Krippendorff's alpha-reliability", part D. Ratings may be missing.
-
-    Args:
-        ratings: number of ratings by unit and category. Units with fewer than two ratings are ignored.
-
-    Returns:
-        1 for perfect agreement, 0 for agreement by chance; None if no unit has two ratings, or all ratings are equal.
-    """
+    """Krippendorff's alpha, the agreement of raters on nominal categories: 1 - observed / expected disagreement
+    (Krippendorff 2011, "Computing Krippendorff's alpha-reliability", part D), 1 for perfect agreement and 0 for
+    agreement by chance. `ratings` is the number of ratings by unit and category; units with fewer than two are
+    ignored. None if no unit has two ratings, or all ratings are equal."""
     paired = ratings[ratings.sum(axis=1) >= 2]
     sizes, totals = paired.sum(axis=1), paired.sum(axis=0)
     count = sizes.sum()

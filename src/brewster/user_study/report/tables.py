@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, fields
 from typing import Any, Final
 
 from brewster.errors import counted
 from brewster.tables import csv_table, escape_latex, markdown_table
+from brewster.user_study.answer_file import ViewingConditions
+from brewster.user_study.assignment import Trial
+from brewster.user_study.report.participants import OUTCOMES, ParticipantAnswers, outcome
+from brewster.user_study.study import StudyDescription
 
 _GROUPS: Final = {"included": "After the exclusion rule", "everyone": "All participants"}
 _DEFINITIONS: Final = """\
@@ -22,6 +27,13 @@ participant, an input of `brewster study plan`.
 Strength is the parameter of a method in the Bradley-Terry model of all answers; a tie is half a win for each method, and \
 the mean is 0.
 Agreement is Krippendorff's alpha of win, tie and lose over comparisons; 1 is perfect, 0 is chance."""
+
+_CONDITIONS: Final = tuple(field.name for field in fields(ViewingConditions))
+ANSWER_COLUMNS: Final = (
+    "participant", "position", "kind", "dataset", "name", "first", "second", "left", "right",
+    "choice", "outcome", "expected", "seconds", "answered_at", "withdrawn", *_CONDITIONS, "left_out",
+)  # fmt: skip
+"""The columns of answers.csv; docs/study.md describes them."""
 
 Results = Mapping[str, Any]
 
@@ -114,11 +126,9 @@ def _strength_text(entry: Mapping[str, Any]) -> str:
 
 
 def to_latex(results: Results) -> str:
-    """The results after the exclusion rule, in the layout of the paper's Table 3, with intervals below the rates.
-
-    One row for each dataset and one for the average; columns win, tie and lose for each pair of methods. Needs the LaTeX
-    package booktabs.
-    """
+    """The results after the exclusion rule, in the layout of the paper's Table 3, with intervals below the rates. One
+    row for each dataset and one for the average; columns win, tie and lose for each pair of methods. Needs the LaTeX
+    package booktabs."""
     tables = results["included"]["tables"]
     if not tables:
         return "% the rule excludes everyone\n"
@@ -157,10 +167,8 @@ def _latex_row(tables: Iterable[Mapping[str, Any]], key: str) -> str:
 
 
 def to_csv(results: Results) -> str:
-    """One line for each group, pair of methods, row (dataset or average) and rate. Rates are fractions, not percentages.
-
-    The key is the name of the dataset, or begins with a slash for an average.
-    """
+    """One line for each group, pair of methods, row (dataset or average) and rate. Rates are fractions, not
+    percentages. The key is the name of the dataset, or begins with a slash for an average."""
     header = ["group", "first", "second", "key", "dataset", "rate", "mean", "low", "high", "answers", "participants", "p"]  # fmt: skip
     rows: list[list[Any]] = [header]
     for key in _GROUPS:
@@ -172,3 +180,48 @@ def to_csv(results: Results) -> str:
                     p = row["p"] if name == "difference" else None
                     rows.append([*columns, name, *ends, row["answers"], row["participants"], p])
     return csv_table(rows)
+
+
+def answers_csv(
+    description: StudyDescription, participants: Sequence[ParticipantAnswers], left_out: Mapping[str, str]
+) -> str:
+    """The answers of all participants, in the order of presentation. `left_out` is the number of a participant -> why excluded."""
+    rows: list[Sequence[object]] = [ANSWER_COLUMNS]
+    for participant in participants:
+        for position, trial, answer in participant.trials:
+            shown = _comparison(description, trial) if trial.expected is None else _catch(description, trial)
+            row = shown | (asdict(answer.conditions) if answer.conditions else {})
+            row |= {
+                "participant": participant.number,
+                "position": position + 1,
+                "choice": answer.choice,
+                "outcome": None if trial.expected else OUTCOMES[outcome(trial, answer.choice)],
+                "seconds": round(answer.seconds, 3),
+                "answered_at": answer.answered_at,
+                "withdrawn": " ".join(answer.withdrawn),
+                "left_out": left_out.get(str(participant.number)),
+            }
+            rows.append([row.get(name) for name in ANSWER_COLUMNS])
+    return csv_table(rows)
+
+
+def _comparison(description: StudyDescription, trial: Trial) -> dict[str, object]:
+    assert trial.comparison is not None
+    row = description.comparisons[trial.comparison]
+    left, right = row.methods[::-1] if trial.flipped else row.methods
+    return {
+        "kind": "comparison", "dataset": row.dataset, "name": row.name,
+        "first": row.methods[0], "second": row.methods[1], "left": left, "right": right,
+    }  # fmt: skip
+
+
+def _catch(description: StudyDescription, trial: Trial) -> dict[str, object]:
+    """A catch trial: the sides have an unchanged output or its degraded copy, and no methods are compared."""
+    catch = next(catch for catch in description.catch_pool if catch.photo == trial.photo)
+    left, right = (
+        "degraded" if side == catch.degraded else "unchanged" for side in (trial.left, trial.right)
+    )
+    return {
+        "kind": "catch", "dataset": catch.dataset, "name": catch.name,
+        "left": left, "right": right, "expected": trial.expected,
+    }  # fmt: skip
