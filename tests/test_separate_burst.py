@@ -178,6 +178,8 @@ def solve_at_80(frames, prior):
         (0.0, 0.02, "reflection remains", "single photo"),
         (0.0, 0.02, "little found", "unchanged"),
         (0.5, 0.02, "little found", "burst"),
+        (0.5, 0.012, "little found", "unchanged"),
+        (0.5, 0.012, "reflection remains", "burst"),
         (0.15, 0.02, "reflection remains", "single photo"),
         (0.5, 0.004, "removed", "single photo"),  # too small a motion
         (0.3, 0.2, "removed", "single photo"),  # a large motion must explain more

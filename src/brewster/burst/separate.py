@@ -246,7 +246,9 @@ def burst_report(
     advice = "Move the camera 5 to 10 cm sideways between the photos."
     if solution is None:
         message = "No other photo shows the same scene as the reference photo."
-    elif explained >= needed and motion >= _MIN_MOTION_PX:
+    elif explained >= needed and motion >= (
+        _USEFUL_MOTION_PX if verdict == "little found" else _MIN_MOTION_PX
+    ):
         method, message = "burst", f"The layers moved {motion:.0f} px apart in a photo of 1,000 px."
         if solution.naming < _MIN_CERTAIN_NAMING:
             message += " They may have each other's names, because the reference photo alone does not tell them apart."
