@@ -101,11 +101,9 @@ class ModelSource:
         return not self.has_prompt and not self.base.startswith(TINY_PREFIX)
 
     def digest_parts(self) -> list[str]:
-        """Returns the digests of the LoRA, its settings and its prompt, and that of the base.
-
-        A base on the hub is identified by its name. A base in a folder is identified by the names, sizes, and first and
-        last MiB of its files, because reading them completely takes a minute.
-        """
+        """Returns the digests of the LoRA, its settings and its prompt, and that of the base. A base on the hub is
+        identified by its name. A base in a folder is identified by the names, sizes, and first and last MiB of its
+        files, because reading them completely takes a minute."""
         base, folder = self.base, Path(self.base)
         if not is_registered(base) and folder.is_dir():
             digest = hashlib.sha256()

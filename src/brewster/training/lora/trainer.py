@@ -170,11 +170,9 @@ class LoraTrainer:
         return self._prompt
 
     def initialize(self) -> None:
-        """Loads or encodes the prompt of the recipe, then loads the backbone.
-
-        Only rank 0 loads the text encoders. It releases them before the backbone is loaded. Raises DownloadError, ModelError,
-        DeviceError or MissingExtra if a text encoder, the prompt or the backbone cannot be loaded.
-        """
+        """Loads or encodes the prompt of the recipe, then loads the backbone. Only rank 0 loads the text encoders. It
+        releases them before the backbone is loaded. Raises DownloadError, ModelError, DeviceError or MissingExtra if a
+        text encoder, the prompt or the backbone cannot be loaded."""
 
         def load_prompt_of_recipe() -> PromptEmbedding:
             if self.recipe.prompt.endswith(ENCODED_SUFFIX):
@@ -198,13 +196,10 @@ class LoraTrainer:
         self._prompt = PromptEmbedding(self._backbone_class.name, **state["prompt"])
 
     def training_step(self, step: int) -> dict[str, float]:
-        """Runs one step of AdamW on one batch. Returns `loss` and the term of each panel, `loss_panel_NAME`.
-
-        Raises:
-            ModelError: the loss is NaN or infinite. The last checkpoint is still valid.
-            DeviceError: the GPU is out of memory. The message lists the values to lower.
-            RecipeError, PhotoError: a sample is missing, damaged or too small.
-        """
+        """Runs one step of AdamW on one batch. Returns `loss` and the term of each panel, `loss_panel_NAME`. Raises
+        ModelError if the loss is NaN or infinite. The last checkpoint is still valid; DeviceError if the GPU is out of
+        memory. The message lists the values to lower; RecipeError or PhotoError if a sample is missing, damaged or too
+        small."""
         self._optimizer.zero_grad()
         parts: dict[str, Tensor] = {}
         with explain_out_of_memory(_MEMORY_CURE):
@@ -226,10 +221,8 @@ class LoraTrainer:
 
     @torch.no_grad()
     def validate(self) -> tuple[dict[str, float], Tensor]:
-        """Returns the mean PSNR gain of the generated T over the photo in dB for each folder, and an image of the panels.
-
-        The samples are divided among the processes. All processes must call this method.
-        """
+        """Returns the mean PSNR gain of the generated T over the photo in dB for each folder, and an image of the
+        panels. The samples are divided among the processes. All processes must call this method."""
         samples = [layers for folder in self._validation_samples.values() for layers in folder]
         columns = [f"ground truth {panel}" for panel in "ITR"]
         columns += [f"generated {panel}" for panel in self.recipe.panels]
@@ -257,9 +250,8 @@ class LoraTrainer:
         return means, sample_sheet(columns, rows)
 
     def export(self, folder: Path) -> Path:
-        """Writes LoRA, prompt, recipe and model card to the folder `lora` in `folder`, and returns its path. diffusers can load
-        the LoRA. Raises OutputError if the folder cannot be written.
-        """
+        """Writes LoRA, prompt, recipe and model card to the folder `lora` in `folder`, and returns its path. diffusers
+        can load the LoRA. Raises OutputError if the folder cannot be written."""
         lora_folder = folder / LORA_FOLDER
         base_model = self.recipe.backbone
         if Path(base_model).is_dir():
@@ -280,16 +272,13 @@ class LoraTrainer:
         return lora_folder
 
     def separate(self, photo: Tensor, *, seed: int = 0) -> Mapping[str, Tensor]:
-        """Generates the panels of a photo, (1, 3, h, w) in [-1, 1], in the same way as at inference. The photo has the size of
-        a panel. Raises DeviceError if the GPU is out of memory. The message lists the values to lower.
-        """
+        """Generates the panels of a photo, (1, 3, h, w) in [-1, 1], in the same way as at inference. The photo has the
+        size of a panel. Raises DeviceError if the GPU is out of memory. The message lists the values to lower."""
         return DecompositionPipeline(self.backbone, self.prompt, self.recipe.task)(photo, seeds=[seed])
 
     def _losses(self, rng: SampleRng) -> dict[str, Tensor]:
-        """Returns the weighted mean squared error of the predicted velocity for each panel. The loss is the sum of these errors.
-
-        The true velocity is start - composite.
-        """
+        """Returns the weighted mean squared error of the predicted velocity for each panel. The loss is the sum of
+        these errors. The true velocity is start - composite."""
         encoded, device = self._encoded_samples(rng), self.backbone.device
         start, sigma = self._start_and_sigma(rng, encoded)
         noisy = (1 - sigma) * encoded.composite + sigma * start
@@ -311,10 +300,9 @@ class LoraTrainer:
         }
 
     def _start_and_sigma(self, rng: SampleRng, encoded: EncodedSample) -> tuple[Tensor, Tensor]:
-        """Returns the start of the path (noise, or the photo for one_step) and the time sigma: 1 at the start, 0 at the composite.
-
-        The distribution of times is logit-normal (Esser et al. 2024). Times are then shifted for the resolution.
-        """
+        """Returns the start of the path (noise, or the photo for one_step) and the time sigma: 1 at the start, 0 at the
+        composite. The distribution of times is logit-normal (Esser et al. 2024). Times are then shifted for the
+        resolution."""
         if encoded.start is not None:
             return encoded.start, torch.ones(1)
         recipe, grid = self.recipe, encoded.composite

@@ -70,13 +70,10 @@ class UploadPlan:
 
 
 def plan_push(folder: Path, repo_id: str, *, message: str = "", public: bool = False) -> UploadPlan:
-    """Checks a LoRA's folder and prepares its upload; needs no network connection.
-
-    Raises:
-        ModelError: a file is missing or damaged, the prompt does not belong to the LoRA, the model card has no front
-            matter, a file or the message contains the path of a home folder, or `repo_id` is not OWNER/NAME.
-        MissingExtra: huggingface_hub is not installed.
-    """
+    """Checks a LoRA's folder and prepares its upload; needs no network connection. Raises ModelError if a file is
+    missing or damaged, the prompt does not belong to the LoRA, the model card has no front matter, a file or the
+    message contains the path of a home folder, or `repo_id` is not OWNER/NAME; MissingExtra if huggingface_hub is not
+    installed."""
     reason = "" if "/" in repo_id else "it has no owner"
     try:
         import_library("huggingface_hub.utils").validate_repo_id(repo_id)
@@ -128,15 +125,9 @@ def plan_push(folder: Path, repo_id: str, *, message: str = "", public: bool = F
 def push(plan: UploadPlan, token: str | None = None) -> str:
     """Creates the repository if it does not exist, and sends the files in one commit.
 
-    The token is `token`, HF_TOKEN, or that of `hf auth login`.
-
-    Returns:
-        The URL of the commit.
-
-    Raises:
-        DownloadError: there is no token, the token is invalid or may not write, the repository exists with the other
-            visibility (public or private), or there is no network connection.
-        MissingExtra: huggingface_hub is not installed.
+    The token is `token`, HF_TOKEN, or that of `hf auth login`. Returns the URL of the commit. Raises DownloadError if
+    there is no token, the token is invalid or may not write, the repository exists with the other visibility (public or
+    private), or there is no network connection; MissingExtra if huggingface_hub is not installed.
     """
     hub = import_library("huggingface_hub")
     if not (token or hub.get_token()):
@@ -221,10 +212,8 @@ def _replace_paths(value: Any, replacements: dict[str, str]) -> Any:  # noqa: AN
 
 
 def _refuse_home_folders(source: str, text: str) -> None:
-    """Refuses a text with the path of a home folder, because the path can contain the user's name.
-
-    `source` is the path of the file, or "the commit message".
-    """
+    """Refuses a text with the path of a home folder, because the path can contain the user's name. `source` is the path
+    of the file, or "the commit message"."""
     home = str(Path.home())
     match = _HOME_FOLDERS.search(text)
     if match or (len(home) > 1 and home in text):

@@ -71,14 +71,8 @@ def read_metadata(folder: Path) -> LoraMetadata:
 
 
 def load(folder: Path, backbone: Backbone) -> tuple[LoraMetadata, PromptEmbedding]:
-    """Adds the LoRA of this folder to its backbone.
-
-    Returns:
-        The metadata, and the trained prompt embedding.
-
-    Raises:
-        ModelError: a file is missing or damaged, or a weight belongs to no layer of the backbone.
-    """
+    """Adds the LoRA of this folder to its backbone. Returns the metadata, and the trained prompt embedding. Raises
+    ModelError if a file is missing or damaged, or a weight belongs to no layer of the backbone."""
     metadata, prompt = read_metadata(folder), _read_prompt(folder)
     tensors, _ = read_tensors(folder / WEIGHTS_FILE)
     config = read_json(folder / CONFIG_FILE)

@@ -105,10 +105,8 @@ class Backbone(ABC):
         distilled: bool = False,
         dtype: torch.dtype | None = None,
     ) -> None:
-        """`dtype` is the data type of the transformer's computations, by default that of its parameters.
-
-        It cannot be read from a quantized transformer: with nf4, only a few float32 layers are floating-point.
-        """
+        """`dtype` is the data type of the transformer's computations, by default that of its parameters. It cannot be
+        read from a quantized transformer: with nf4, only a few float32 layers are floating-point."""
         self.dtype: torch.dtype = dtype or transformer.dtype
         self.transformer = transformer.eval().requires_grad_(False)
         self.vae = vae.eval().requires_grad_(False)
@@ -129,11 +127,9 @@ class Backbone(ABC):
 
     @torch.no_grad()
     def encode(self, image: Float[Tensor, "n 3 h w"]) -> Float[Tensor, "n c h/16 w/16"]:
-        """Encodes images in [-1, 1] to normalised latent grids, float32: the mode of the VAE's distribution.
-
-        Encode the whole composite at once. Panels that are encoded separately differ at the seams and, because of
-        GroupNorm, everywhere. The sides must be multiples of `size_divisor`.
-        """
+        """Encodes images in [-1, 1] to normalised latent grids, float32: the mode of the VAE's distribution. Encode the
+        whole composite at once. Panels that are encoded separately differ at the seams and, because of GroupNorm,
+        everywhere. The sides must be multiples of `size_divisor`."""
         mean, deviation = self.statistics()
         cells = self._vae_encode(image.to(self.vae.device, self.vae.dtype))
         return (functional.pixel_unshuffle(cells, PATCH).float() - mean) / deviation
@@ -160,10 +156,8 @@ class Backbone(ABC):
         prompt: PromptEmbedding,
         guidance: float,
     ) -> Float[Tensor, "n c h w"]:
-        """The velocity (noise - latents of the image) at time sigma, float32; differentiable.
-
-        `condition` may be `no_condition()`. Raises ModelError if the prompt lacks an embedding that this guidance needs.
-        """
+        """The velocity (noise - latents of the image) at time sigma, float32; differentiable. `condition` may be
+        `no_condition()`. Raises ModelError if the prompt lacks an embedding that this guidance needs."""
 
     @abstractmethod
     def positions(self, latents: Tensor, condition: Tensor) -> Any:  # noqa: ANN401 - each backbone has its own type
@@ -184,20 +178,16 @@ class Backbone(ABC):
         return torch.empty(1, self.channels, 0, 0, device=self.device)
 
     def noise(self, size: tuple[int, int], seed: int) -> Float[Tensor, "1 c h w"]:
-        """The noise from which the diffusers pipeline starts for a composite of this (width, height) and seed.
-
-        It is drawn on the CPU, so it is the same for every device. The sides must be multiples of `size_divisor`.
-        """
+        """The noise from which the diffusers pipeline starts for a composite of this (width, height) and seed. It is
+        drawn on the CPU, so it is the same for every device. The sides must be multiples of `size_divisor`."""
         width, height = (side // self.size_divisor * PATCH for side in size)
         shape = (1, self.channels // PATCH**2, height, width)
         return functional.pixel_unshuffle(_seeded_noise(shape, seed), PATCH)
 
     def shift(self, tokens: int, steps: int) -> float:  # noqa: ARG002 - the shift of klein depends on the steps
-        """The schedule's shift mu for a composite of this many generated tokens, without those of the condition.
-
-        A linear function of the number of tokens, through the points (base_image_seq_len, base_shift) and
-        (max_image_seq_len, max_shift) of the scheduler (Esser et al. 2024; FLUX).
-        """
+        """The schedule's shift mu for a composite of this many generated tokens, without those of the condition. A
+        linear function of the number of tokens, through the points (base_image_seq_len, base_shift) and
+        (max_image_seq_len, max_shift) of the scheduler (Esser et al. 2024; FLUX)."""
         config = self.scheduler.config
         low, high = config.base_image_seq_len, config.max_image_seq_len
         slope = (config.max_shift - config.base_shift) / (high - low)
@@ -206,10 +196,8 @@ class Backbone(ABC):
     def shifted(
         self, sigma: Tensor, tokens: int, steps: int = 20, *, timestep_shift: float | None = None
     ) -> Tensor:
-        """Shifts times in (0, 1] towards noise. Used in training.
-
-        The default is the shift of the sampling schedule. A given `timestep_shift` s replaces it: s sigma / (1 + (s - 1) sigma).
-        """
+        """Shifts times in (0, 1] towards noise. Used in training. The default is the shift of the sampling schedule. A
+        given `timestep_shift` s replaces it: s sigma / (1 + (s - 1) sigma)."""
         scheduler = self.scheduler
         if timestep_shift is None and scheduler.config.use_dynamic_shifting:
             shifted = scheduler.time_shift(self.shift(tokens, steps), 1.0, sigma)
@@ -329,6 +317,22 @@ def tokens_to_grid(
     """The generated tokens, which come first, as a grid of the shape of `like`, float32."""
     generated = tokens[:, : like.shape[2] * like.shape[3]].mT.float()
     return generated.reshape(like.shape)
+
+
+FLUX_SCHEDULER: Final = {
+    "shift": 3.0, "use_dynamic_shifting": True, "base_shift": 0.5, "max_shift": 1.15,
+    "base_image_seq_len": 256, "max_image_seq_len": 4096,
+}  # fmt: skip
+"""The scheduler of FLUX.1 and FLUX.2."""
+
+
+def flux_positions(latents: Tensor, condition: Tensor, condition_id: int, *last_columns: Tensor) -> Tensor:
+    """Position ids of FLUX, a row for each token: image (0: generated, `condition_id`: conditioning), row, column, others."""
+    ids = [
+        torch.cartesian_prod(torch.tensor([image]), *map(torch.arange, grid.shape[2:]), *last_columns)
+        for grid, image in ((latents, 0), (condition, condition_id))
+    ]
+    return torch.cat(ids)
 
 
 def random_prompt(backbone: str, seed: int, **shapes: tuple[int, ...]) -> PromptEmbedding:

@@ -64,11 +64,9 @@ class Qwen(ClassifierFreeBackbone):
         return mean.view(1, -1, 1, 1), deviation.view(1, -1, 1, 1)
 
     def positions(self, latents: Tensor, condition: Tensor) -> list[list[tuple[int, int, int]]]:
-        """For each sample, (frames, rows, columns) of the generated image and of the conditioning image.
-
-        The transformer computes the rotary position embedding from them, centred on each image. A conditioning image
-        without tokens is left out.
-        """
+        """For each sample, (frames, rows, columns) of the generated image and of the conditioning image. The
+        transformer computes the rotary position embedding from them, centred on each image. A conditioning image
+        without tokens is left out."""
         grids = (latents, condition) if condition.numel() else (latents,)
         shapes = [(1, int(grid.shape[2]), int(grid.shape[3])) for grid in grids]
         return [shapes] * len(latents)
