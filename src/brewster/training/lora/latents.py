@@ -52,10 +52,8 @@ class TrainingSample:
 
 @dataclass(frozen=True, eq=False)
 class EncodedSample:
-    """Latents of a sample, float32, on the CPU: the composite of all panels, and the conditioning image.
-
-    `start` contains the photo in every panel for the objective one_step. It is None for flow, which starts from noise.
-    """
+    """Latents of a sample, float32, on the CPU: the composite of all panels, and the conditioning image. `start` contains the
+    photo in every panel for the objective one_step. It is None for flow, which starts from noise."""
 
     composite: Float[Tensor, "1 c h w"]
     condition: Float[Tensor, "1 c p q"]
@@ -84,10 +82,8 @@ class SampleSequence:
         """Returns the panel sizes for the first rendered sample and for every pair. Training calls this first, so that
         an unusable sample stops it before any step. Raises RecipeError or PhotoError if a file is damaged or missing,
         or a sample is too small, see `fit_sample`."""
-        first = [self._rendered.sample(0)] if self._rendered else []
-        return [
-            fit_sample(layers, recipe, size_divisor) for layers in (*first, *(p.layers for p in self._pairs))
-        ]
+        first = [TrainingSample(self._rendered.sample(0))] if self._rendered else []
+        return [fit_sample(sample.layers, recipe, size_divisor) for sample in (*first, *self._pairs)]
 
     def description(self) -> str:
         """Returns the number of samples of each source in words."""
@@ -118,8 +114,8 @@ class EncodedSampleLoader:
 
     def _encode(self, number: int, mirrored: bool, crop: int) -> EncodedSample:
         sample, layout, encode = self._samples[number], self._recipe.layout, self._backbone.encode
-        fit = fit_sample(sample.layers, self._recipe, self._backbone.size_divisor)
         layers = sample.layers
+        fit = fit_sample(layers, self._recipe, self._backbone.size_divisor)
         if crop:
             # A negative step gives other random numbers than any training step.
             layers = crop_sample(SampleRng(self._recipe.seed, -1 - number, crop), layers, fit)
@@ -138,10 +134,7 @@ def crop_sample(rng: SampleRng, layers: UInt8[Tensor, "h w 9"], fit: PanelFit) -
     height, width, _ = layers.shape
     min_side = max(_MIN_CROP_SIDE, fit.content[0] / width, fit.content[1] / height)
     side = rng.uniform((min_side, 1.0))
-    columns, rows = (
-        max(smallest, round(side * whole))
-        for smallest, whole in zip(fit.content, (width, height), strict=True)
-    )
+    columns, rows = max(fit.content[0], round(side * width)), max(fit.content[1], round(side * height))
     top, left = rng.randint(height - rows + 1), rng.randint(width - columns + 1)
     return layers[top : top + rows, left : left + columns]
 

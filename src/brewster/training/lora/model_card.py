@@ -101,16 +101,7 @@ def card_text(
             for index, panel in enumerate(recipe.panels)
         },
         scores={
-            next(
-                (
-                    title.format(name.removeprefix(prefix))
-                    for prefix, title in _SCORE_TITLES.items()
-                    if name.startswith(prefix)
-                ),
-                name.replace("_", " "),
-            ): value
-            for name, value in scores.items()
-            if name not in {"step", "seconds"}
+            _score_title(name): value for name, value in scores.items() if name not in {"step", "seconds"}
         },
         benchmark_heading=_BENCHMARK_HEADING,
         licence=licence.title,
@@ -129,6 +120,13 @@ def with_benchmark_tables(card: str, tables: str) -> str:
             "train again to write a new card",
         )
     return f"{before}{heading}\n{tables.strip()}\n\n{rest[after.start() :]}"
+
+
+def _score_title(name: str) -> str:
+    for prefix, title in _SCORE_TITLES.items():
+        if name.startswith(prefix):
+            return title.format(name.removeprefix(prefix))
+    return name.replace("_", " ")
 
 
 def _dataset_description(folder: Path) -> str:
