@@ -149,9 +149,7 @@ def load_pipeline(
             LoRA or a timestep shift is given for a model that takes one step.
         DeviceError: there is no such device, it is out of memory, or the weights cannot be offloaded.
     """
-    _check_before_download(
-        model, base_model, device, (quantization, offload), has_file=transformer is not None
-    )
+    _check_before_download(model, base_model, device, (quantization, offload), transformer)
     source = find_model_source(model, base_model)
     for option, value in {"few-step LoRA": fast_lora, "timestep shift": timestep_shift}.items():
         if value is not None and source.task.objective != "flow":
@@ -213,26 +211,16 @@ def load_pipeline(
     return DecompositionPipeline(backbone, embedding, task, model_name(model), digest)
 
 
-def fingerprint(
-    model: str,
-    *,
-    device: str = "auto",
-    base_model: str | None = None,
-    quantization: Quantization | None = None,
-    prompt: str = "detailed",
-) -> str:
-    """The SHA-256 of what `load_pipeline` would load, which also raises the same errors: LoRA, prompt, base model (see
+def fingerprint(model: str, *, device: str = "auto") -> str:
+    """The SHA-256 of what `load_pipeline` would load by default, which also raises the same errors: LoRA, prompt, base model (see
     `ModelSource.digest_parts`), and the quantization of the base model."""
-    source = find_model_source(model, base_model)
-    placement = _choose_placement(source, device, quantization)
-    return _digest(source, placement.quantization, PROMPTS.get(prompt, prompt), {})
+    source = find_model_source(model)
+    return _digest(source, _choose_placement(source, device).quantization, PROMPTS["detailed"], {})
 
 
 def _digest(source: ModelSource, quantization: str | None, text: str, changes: Mapping[str, object]) -> str:
     """The digest of a model. `changes` are the options that change its result, by name; None for those that are not set."""
-    parts = [*source.digest_parts(), str(quantization)]
-    if source.layout is None:
-        parts.append(text)
+    parts = [*source.digest_parts(), str(quantization), *([] if source.layout else [text])]
     parts += [f"{name} {value}" for name, value in changes.items() if value is not None]
     return hashlib.sha256("\0".join(parts).encode()).hexdigest()
 
@@ -242,8 +230,7 @@ def _check_before_download(
     base_model: str | None,
     device: str,
     storage: tuple[Quantization | None, Offload],
-    *,
-    has_file: bool,
+    transformer: str | None,
 ) -> None:
     """Checks the machine before the files of a LoRA are downloaded, if its base is known without them. The memory for
     the text encoders is checked later, because the files of the model show whether its prompt is stored. If the
@@ -253,18 +240,18 @@ def _check_before_download(
         source = find_model_source(model, base_model, allow_download=False)
     except (DownloadError, ModelError):
         return  # files are missing or damaged: `load_pipeline` downloads them, or reports the error
-    if has_file:
+    if transformer:
         weights = count_weights(source.base, source.backbone_class)
         check_device(source.base, weights, chosen_device, requested=device)
-        return
-    placement = _choose_placement(source, device, *storage)
-    check_machine(source.base, source.backbone_class, placement, requested=device)
+    else:
+        placement = _choose_placement(source, device, *storage)
+        check_machine(source.base, source.backbone_class, placement, requested=device)
 
 
 def _choose_placement(
     source: ModelSource,
     device: str,
-    quantization: Quantization | None,
+    quantization: Quantization | None = None,
     offload: Offload = "auto",
     transformer_file: Path | None = None,
 ) -> Placement:

@@ -103,9 +103,8 @@ def load() -> ModuleType:
 
 def install_command(reason: str) -> str:
     """Returns the command that installs the missing package when the import of Mitsuba fails for this reason."""
-    return (
-        "apt install libatomic1" if "libatomic" in reason else "pip install --force-reinstall mitsuba drjit"
-    )
+    has_package = "libatomic" not in reason
+    return "pip install --force-reinstall mitsuba drjit" if has_package else "apt install libatomic1"
 
 
 @lru_cache(maxsize=1)
@@ -113,11 +112,8 @@ def probe() -> VariantProbe:
     """Tries each LLVM in a separate process. Returns the variant to use; the result is cached. Raises MissingExtra if
     mitsuba is not installed."""
     if find_spec("mitsuba") is None:
-        raise MissingExtra.for_extra(
-            "render",
-            "mitsuba is not installed",
-            "expected the package mitsuba for this renderer",
-        )
+        expected = "expected the package mitsuba for this renderer"
+        raise MissingExtra.for_extra("render", "mitsuba is not installed", expected)
     reasons = []
     for library in _candidates():
         reason = _failure_reason(library)
@@ -151,9 +147,8 @@ def _packaged_llvm() -> list[str]:
         files = metadata.files(_LLVM_PACKAGE) or []
     except metadata.PackageNotFoundError:
         return []
-    return [
-        str(Path(file.locate()).resolve()) for file in files if re.fullmatch(r"libLLVM\.so[.\d]+", file.name)
-    ]
+    libraries = (file for file in files if re.fullmatch(r"libLLVM\.so[.\d]+", file.name))
+    return [str(Path(file.locate()).resolve()) for file in libraries]
 
 
 def _runtime_libraries(library: str | None) -> list[str]:

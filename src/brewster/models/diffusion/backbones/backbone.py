@@ -274,16 +274,36 @@ class Backbone(ABC):
     def _vae_decode(self, latent: Tensor) -> Tensor:
         return self.vae.decode(latent, return_dict=False)[0]  # type: ignore[no-any-return]
 
-    def _tokens(self, latents: Tensor, condition: Tensor) -> Float[Tensor, "n t c"]:
-        """The input of the transformer: generated tokens, then conditioning tokens, each row by row."""
+    def _run(
+        self, latents: Tensor, condition: Tensor, sigma: Tensor, embeds: Tensor, **inputs: object
+    ) -> Tensor:
+        """The transformer's prediction for a prompt embedding (1, tokens, width), as a grid, float32. `inputs` are the inputs
+        that only this transformer has."""
+        # Generated tokens, then conditioning tokens, each row by row.
         grids = [latents, condition.expand(len(latents), -1, -1, -1)]
-        return torch.cat([grid.flatten(2).mT for grid in grids], dim=1).to(self.device, self.dtype)
+        tokens = self.transformer(
+            hidden_states=torch.cat([grid.flatten(2).mT for grid in grids], dim=1).to(
+                self.device, self.dtype
+            ),
+            encoder_hidden_states=embeds.to(self.device, self.dtype).expand(len(latents), -1, -1),
+            timestep=sigma.to(self.device, self.dtype),
+            return_dict=False,
+            **inputs,
+        )[0]
+        generated: Tensor = tokens[:, : latents.shape[2] * latents.shape[3]].mT.float()
+        return generated.reshape(latents.shape)
 
 
 class ClassifierFreeBackbone(Backbone):
     """A backbone with classifier-free guidance (Ho & Salimans 2022): a guidance above 1 needs a second prediction."""
 
     guided_by_embedding = False
+
+    @classmethod
+    def random_prompt(cls, transformer: Any, seed: int) -> PromptEmbedding:  # noqa: ANN401 - a transformer of diffusers
+        """Eight random tokens for the prompt, and six for the empty prompt."""
+        width = transformer.config.joint_attention_dim
+        return random_prompt(cls.name, seed, embeds=(1, 8, width), negative=(1, 6, width))
 
     def predict(
         self, latents: Tensor, condition: Tensor, sigma: Tensor, prompt: PromptEmbedding, guidance: float
@@ -309,14 +329,6 @@ class ClassifierFreeBackbone(Backbone):
     def _guided(self, conditional: Tensor, unconditional: Tensor, guidance: float) -> Tensor:
         """Extrapolates from the prediction for the empty prompt to that for the prompt."""
         return unconditional + guidance * (conditional - unconditional)
-
-
-def tokens_to_grid(
-    tokens: Float[Tensor, "n t c"], like: Float[Tensor, "n c h w"]
-) -> Float[Tensor, "n c h w"]:
-    """The generated tokens, which come first, as a grid of the shape of `like`, float32."""
-    generated = tokens[:, : like.shape[2] * like.shape[3]].mT.float()
-    return generated.reshape(like.shape)
 
 
 FLUX_SCHEDULER: Final = {

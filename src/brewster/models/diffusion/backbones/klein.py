@@ -13,8 +13,6 @@ from brewster.models.diffusion.backbones.backbone import (
     ClassifierFreeBackbone,
     DiffusersUsage,
     flux_positions,
-    random_prompt,
-    tokens_to_grid,
 )
 from brewster.models.diffusion.prompt import PromptEmbedding
 from brewster.models.diffusion_resources import BACKBONE_COSTS
@@ -93,22 +91,14 @@ class Klein(ClassifierFreeBackbone):
         negative, _ = pipeline.encode_prompt(prompt="")
         return PromptEmbedding(cls.name, text, embeds.detach(), negative=negative.detach())
 
-    @classmethod
-    def random_prompt(cls, transformer: Any, seed: int) -> PromptEmbedding:  # noqa: ANN401 - a transformer of diffusers
-        """Eight random tokens each for the prompt and the empty prompt."""
-        shape = (1, 8, transformer.config.joint_attention_dim)
-        return random_prompt(cls.name, seed, embeds=shape, negative=shape)
-
     def _velocity(self, latents: Tensor, condition: Tensor, sigma: Tensor, embeds: Tensor) -> Tensor:
-        embeds = embeds.to(self.device, self.dtype).expand(len(latents), -1, -1)
         zero = torch.arange(1)
-        tokens = self.transformer(
-            hidden_states=self._tokens(latents, condition),
-            encoder_hidden_states=embeds,
-            timestep=sigma.to(self.device, self.dtype),
+        return self._run(
+            latents,
+            condition,
+            sigma,
+            embeds,
             guidance=None,
             txt_ids=torch.cartesian_prod(zero, zero, zero, torch.arange(embeds.shape[1])).to(self.device),
             img_ids=self.positions(latents, condition),
-            return_dict=False,
-        )[0]
-        return tokens_to_grid(tokens, latents)
+        )

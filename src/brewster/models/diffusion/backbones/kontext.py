@@ -14,7 +14,6 @@ from brewster.models.diffusion.backbones.backbone import (
     Licence,
     flux_positions,
     random_prompt,
-    tokens_to_grid,
 )
 from brewster.models.diffusion.prompt import PromptEmbedding
 from brewster.models.diffusion_resources import BACKBONE_COSTS
@@ -69,9 +68,9 @@ class Kontext(Backbone):
 
     def statistics(self) -> tuple[Tensor, Tensor]:
         """See `Backbone.statistics`: (1, 1, 1, 1), because FLUX.1's VAE has one shift and one scale for all channels."""
-        values = (self.vae.config.shift_factor, 1 / torch.tensor(self.vae.config.scaling_factor))
-        mean, deviation = (torch.full((1, 1, 1, 1), float(value), device=self.vae.device) for value in values)
-        return mean, deviation
+        config = self.vae.config
+        mean = torch.full((1, 1, 1, 1), config.shift_factor, device=self.vae.device)
+        return mean, 1 / torch.full_like(mean, config.scaling_factor)
 
     def positions(self, latents: Tensor, condition: Tensor) -> Tensor:
         """See `flux_positions`, (tokens, 3)."""
@@ -81,20 +80,18 @@ class Kontext(Backbone):
         self, latents: Tensor, condition: Tensor, sigma: Tensor, prompt: PromptEmbedding, guidance: float
     ) -> Tensor:
         """See `Backbone.predict`. The guidance scale is an input of the transformer."""
-        count, embedding = len(latents), prompt.to(self.device, self.dtype)
-        takes_guidance = self.transformer.config.guidance_embeds
-        assert embedding.pooled is not None
-        tokens = self.transformer(
-            hidden_states=self._tokens(latents, condition),
-            encoder_hidden_states=embedding.embeds.expand(count, -1, -1),
-            pooled_projections=embedding.pooled.expand(count, -1),
-            timestep=sigma.to(self.device, self.dtype),
-            guidance=torch.full((count,), guidance, device=self.device) if takes_guidance else None,
-            txt_ids=torch.zeros(embedding.embeds.shape[1], 3, device=self.device),
+        count, has_guidance = len(latents), self.transformer.config.guidance_embeds
+        assert prompt.pooled is not None
+        return self._run(
+            latents,
+            condition,
+            sigma,
+            prompt.embeds,
+            pooled_projections=prompt.pooled.to(self.device, self.dtype).expand(count, -1),
+            guidance=torch.full((count,), guidance, device=self.device) if has_guidance else None,
+            txt_ids=torch.zeros(prompt.embeds.shape[1], 3, device=self.device),
             img_ids=self.positions(latents, condition).float(),
-            return_dict=False,
-        )[0]
-        return tokens_to_grid(tokens, latents)
+        )
 
     @classmethod
     def embed(cls, pipeline: Any, text: str) -> PromptEmbedding:  # noqa: ANN401 - a pipeline of diffusers

@@ -74,8 +74,8 @@ def load_backbone(
     is_tiny = source.startswith(TINY_PREFIX)
     if (quantization and (transformer_file or is_tiny)) or (transformer_file and is_tiny):
         raise ModelError(
-            f"{transformer_file or 'no file'} was given for {source} with quantization={quantization}",
-            "expected a tiny version without both, or no quantization, because the file has its own precision",
+            f"quantization={quantization} and the file {transformer_file} were given for {source}",
+            "expected neither for a tiny version, and one of them for others, because the file has its own precision",
             "leave quantization out",
         )
     if is_tiny:

@@ -11,8 +11,6 @@ from brewster.models.diffusion.backbones.backbone import (
     APACHE_2,
     PATCH,
     ClassifierFreeBackbone,
-    random_prompt,
-    tokens_to_grid,
 )
 from brewster.models.diffusion.prompt import PromptEmbedding
 from brewster.models.diffusion_resources import BACKBONE_COSTS
@@ -79,21 +77,9 @@ class Qwen(ClassifierFreeBackbone):
         negative, _ = pipeline.encode_prompt(prompt=" ", image=grey)
         return PromptEmbedding(cls.name, text, embeds.detach(), negative=negative.detach())
 
-    @classmethod
-    def random_prompt(cls, transformer: Any, seed: int) -> PromptEmbedding:  # noqa: ANN401 - a transformer of diffusers
-        """Eight random tokens for the prompt, and six for the empty prompt."""
-        width = transformer.config.joint_attention_dim
-        return random_prompt(cls.name, seed, embeds=(1, 8, width), negative=(1, 6, width))
-
     def _velocity(self, latents: Tensor, condition: Tensor, sigma: Tensor, embeds: Tensor) -> Tensor:
-        tokens = self.transformer(
-            hidden_states=self._tokens(latents, condition),
-            encoder_hidden_states=embeds.to(self.device, self.dtype).expand(len(latents), -1, -1),
-            timestep=sigma.to(self.device, self.dtype),
-            img_shapes=self.positions(latents, condition),
-            return_dict=False,
-        )[0]
-        return tokens_to_grid(tokens, latents)
+        shapes = self.positions(latents, condition)
+        return self._run(latents, condition, sigma, embeds, img_shapes=shapes)
 
     def _guided(self, conditional: Tensor, unconditional: Tensor, guidance: float) -> Tensor:
         """The guided prediction, rescaled per token to the norm of the conditional one."""

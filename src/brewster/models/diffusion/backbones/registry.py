@@ -64,7 +64,7 @@ def build(
     dtype: torch.dtype = torch.float32,
 ) -> Backbone:
     """Builds a backbone with seeded random weights, by default in full size. Device "meta" needs no memory. Raises
-    ModelError or DeviceError if the name is not in the table (out of memory)."""
+    ModelError if the name is not in the table; DeviceError if the device is out of memory."""
     backbone_class = find_backbone_class(name)
     architecture = architecture or backbone_class.full_size
     part_classes = {part: diffusers_class(backbone_class.classes[part]) for part in CONFIG_FILES}
