@@ -59,7 +59,8 @@ class Assets:
         highlight = ((picture.max(axis=2, keepdims=True) - 0.8) / 0.2).clip(0, 1)
         mean = (picture @ _LUMINANCE).mean() + np.float32(1e-4)
         boost: Float32 = 1 + np.float32(plane.highlight_boost) * highlight**2
-        return picture * boost * (np.float32(plane.luminance) / mean)
+        light: Float32 = picture * boost * (np.float32(plane.luminance) / mean)
+        return light
 
     def _cached(self, kind: str, source: AssetSource, read: Callable[[AssetSource], Float32]) -> Float32:
         key = (kind, source.file, source.sha256)

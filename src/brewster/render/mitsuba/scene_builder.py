@@ -86,7 +86,7 @@ class MitsubaSceneBuilder:
             projection = {"type": "thinlens", "aperture_radius": camera.aperture_mm / 2}
             projection["focus_distance"] = camera.focus_mm
         colours = "rgb" if self._channel is None else "luminance"
-        film = {"type": "hdrfilm", "pixel_format": colours, "component_format": "float32"}
+        film: Plugin = {"type": "hdrfilm", "pixel_format": colours, "component_format": "float32"}
         film |= {"rfilter": {"type": "box"}, "width": camera.width, "height": camera.height}
         return {
             **projection,

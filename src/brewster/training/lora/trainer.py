@@ -260,10 +260,12 @@ class LoraTrainer:
         encoded, device = self._encoded_samples(rng), self.backbone.device
         start, sigma = self._start_and_sigma(rng, encoded)
         noisy = (1 - sigma) * encoded.composite + sigma * start
-        inputs = (tensor.to(device) for tensor in (noisy, encoded.condition, sigma))
-        velocity = self.backbone.predict(*inputs, self.prompt, self.recipe.guidance)
+        noisy, condition, sigma = (each.to(device) for each in (noisy, encoded.condition, sigma))
+        velocity = self.backbone.predict(noisy, condition, sigma, self.prompt, self.recipe.guidance)
         errors = (velocity - (start - encoded.composite).to(device)).square()
-        weights = {panel: self.recipe.panel_weights.get(panel, 1.0) for panel in self.recipe.panels}
+        weights: dict[str, float] = {
+            panel: self.recipe.panel_weights.get(panel, 1.0) for panel in self.recipe.panels
+        }
         total, reliability = sum(weights.values()), {"R": encoded.reflection_weight}
         return {
             f"panel_{name}": weights[name] / total * reliability.get(name, 1.0) * panel.mean()
