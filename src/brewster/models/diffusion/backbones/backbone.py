@@ -298,12 +298,14 @@ class ClassifierFreeBackbone(Backbone):
     """A backbone with classifier-free guidance (Ho & Salimans 2022): a guidance above 1 needs a second prediction."""
 
     guided_by_embedding = False
+    random_empty_tokens: ClassVar[int] = 8
+    """The tokens of the empty prompt in `random_prompt`."""
 
     @classmethod
     def random_prompt(cls, transformer: Any, seed: int) -> PromptEmbedding:  # noqa: ANN401 - a transformer of diffusers
-        """Eight random tokens for the prompt, and six for the empty prompt."""
-        width = transformer.config.joint_attention_dim
-        return random_prompt(cls.name, seed, embeds=(1, 8, width), negative=(1, 6, width))
+        """Eight random tokens for the prompt, and `random_empty_tokens` for the empty prompt."""
+        width, count = transformer.config.joint_attention_dim, cls.random_empty_tokens
+        return random_prompt(cls.name, seed, embeds=(1, 8, width), negative=(1, count, width))
 
     def predict(
         self, latents: Tensor, condition: Tensor, sigma: Tensor, prompt: PromptEmbedding, guidance: float

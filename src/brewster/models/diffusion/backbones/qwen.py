@@ -36,6 +36,7 @@ class Qwen(ClassifierFreeBackbone):
     diffusers_usage = "but resizes the conditioning image to one megapixel, so that its panels differ from those in training"
     other_pipelines = ("QwenImageEditPlusPipeline",)
     unquantized = ("transformer_blocks.0.img_mod",)
+    random_empty_tokens = 6
     few_step_shift = 3.0  # that of Qwen-Image-Lightning
     text_encoder_requirements = ("torchvision",)
     classes: ClassVar = {
