@@ -228,7 +228,7 @@ def test_a_retry_waits_as_long_as_a_busy_server_requests(haven, fetch, retry_del
 def test_after_five_failures_in_a_row_no_further_map_is_requested(haven, tmp_path):
     haven.assets = {f"room_{i}": INDOOR for i in range(9)}
     haven.faults = {f"/file/room_{i}": [404] for i in range(9)}
-    with pytest.raises(DownloadError, match="5 assets in a row"):
+    with pytest.raises(DownloadError, match="5 downloads in a row"):
         list(pull(DownloadRequest(server=haven.url), tmp_path))
     assert haven.ranges("room_4")
     assert not haven.ranges("room_5")

@@ -91,7 +91,7 @@ def test_a_server_without_photos_is_given_up_after_five(monkeypatch, origins, tm
     rows = [photo._replace(file=f"{n}.webp") for n in range(9) for photo in read_table() if photo.origin]
     monkeypatch.setattr(training_photos, "read_table", lambda: rows)
     origins.bodies.clear()
-    with pytest.raises(DownloadError, match="5 photos in a row failed"):
+    with pytest.raises(DownloadError, match="5 downloads in a row failed"):
         list(pull(tmp_path / "photos", server=origins.url))
     assert len(origins.requests) == 5
 

@@ -40,46 +40,33 @@ class Assets:
     def map_radiance(self, environment: EnvironmentMap) -> Float32:
         """Returns the radiance of a lat-long map, (H, 2 H, 3).
 
-        The map is scaled to the mean luminance in the scene. To compute the mean, values are clipped at ten times the mean
-        of the map, so that lamps have little weight.
-
-        Raises:
-            RecipeError: the file is missing, or has another sha256 than in the scene.
-            UnsupportedPhoto: the map is not 2:1, has values that are not finite, is black, or is clipped (not HDR).
-            PhotoError: the file cannot be decoded.
+        The map is scaled to the mean luminance in the scene. To compute the mean, values are clipped at ten times the
+        mean of the map, so that lamps have little weight. Raises RecipeError if the file is missing, or has another
+        sha256 than in the scene; UnsupportedPhoto if the map is not 2:1, has values that are not finite, is black, or
+        is clipped (not HDR); PhotoError if the file cannot be decoded.
         """
-        light: Float32 = self._cached("map", environment.source, self._read_map) * np.float32(
-            environment.luminance
-        )
-        return light
+        light = self._cached("map", environment.source, self._read_map)
+        return light * np.float32(environment.luminance)
 
     def plane_radiance(self, plane: Plane) -> Float32:
         """Returns the radiance of a picture, (H, W, 3), with brighter highlights (see `Plane.highlight_boost`).
 
         The file is decoded with its colour profile; without a profile as sRGB (integers) or linear Rec.709 (floats).
-
-        Raises:
-            RecipeError: the file is missing, or has another sha256 than in the scene.
-            PhotoError: the file cannot be decoded.
+        Raises RecipeError if the file is missing, or has another sha256 than in the scene; PhotoError if the file
+        cannot be decoded.
         """
         picture = self._cached("picture", plane.source, lambda source: self._open(source).linear().clip(0, 1))
         highlight = ((picture.max(axis=2, keepdims=True) - 0.8) / 0.2).clip(0, 1)
         mean = (picture @ _LUMINANCE).mean() + np.float32(1e-4)
-        light: Float32 = (
-            picture
-            * (1 + np.float32(plane.highlight_boost) * highlight**2)
-            * (np.float32(plane.luminance) / mean)
-        )
+        boost: Float32 = 1 + np.float32(plane.highlight_boost) * highlight**2
+        light: Float32 = picture * boost * (np.float32(plane.luminance) / mean)
         return light
 
     def _cached(self, kind: str, source: AssetSource, read: Callable[[AssetSource], Float32]) -> Float32:
         key = (kind, source.file, source.sha256)
         if key not in self._cache:
             self._cache[key] = read(source)
-            while (
-                sum(array.nbytes for array in self._cache.values()) > _MAX_CACHE_BYTES
-                and len(self._cache) > 1
-            ):
+            while len(self._cache) > 1 and sum(a.nbytes for a in self._cache.values()) > _MAX_CACHE_BYTES:
                 self._cache.popitem(last=False)
         self._cache.move_to_end(key)
         return self._cache[key]
@@ -138,11 +125,8 @@ def read_bytes(path: Path) -> bytes:
 
 
 def check_map(texels: Float32, name: str) -> Float32:
-    """Returns the map, if it can light a scene.
-
-    Raises:
-        UnsupportedPhoto: the map is not 2:1, has values that are not finite, is black, or is clipped like an 8-bit image.
-    """
+    """Returns the map, if it can light a scene. Raises UnsupportedPhoto if the map is not 2:1, has values that are not
+    finite, is black, or is clipped like an 8-bit image."""
     height, width = texels.shape[:2]
     if width != 2 * height:
         raise UnsupportedPhoto(

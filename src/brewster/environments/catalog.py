@@ -34,15 +34,14 @@ def read_catalog(
 ) -> tuple[Catalog, list[BrewsterError]]:
     """Lists the maps and pictures in folders.
 
-    Maps are decoded and validated. Only the headers of pictures are read, so a picture with damaged pixels raises an error
-    only when it is used. A `manifest.csv` with the columns file and category contains the categories of maps. If no folder
-    of maps is given, the built-in maps are listed, and likewise for pictures. Files that match a pattern in `exclude` are
-    skipped.
+    Maps are decoded and validated. Only the headers of pictures are read, so a picture with damaged pixels raises an
+    error only when it is used. A `manifest.csv` with the columns file and category contains the categories of maps. If
+    no folder of maps is given, the built-in maps are listed, and likewise for pictures. Files that match a pattern in
+    `exclude` are skipped.
 
     Returns: the catalog, and an error for each file that cannot be used.
 
-    Raises:
-        RecipeError: a folder or its manifest cannot be read, or none of the files can be used.
+    Raises RecipeError if a folder or its manifest cannot be read, or none of the files can be used.
     """
     refused: list[BrewsterError] = []
     catalog = Catalog(
@@ -77,9 +76,8 @@ def _read_folders(
 def _read_asset(path: Path, category: str, is_map: bool) -> Asset:
     data = read_bytes(path)
     with add_file_name_to_errors(str(path)):
-        width, height = (
-            check_map(Photo.open(data).linear(), str(path)).shape[1::-1] if is_map else read_size(data)
-        )
+        pixels = check_map(Photo.open(data).linear(), str(path)) if is_map else None
+        width, height = read_size(data) if pixels is None else pixels.shape[1::-1]
     source = AssetSource(file=path.name, sha256=hashlib.sha256(data).hexdigest())
     return Asset(source=source, width=width, height=height, category=category)
 

@@ -9,11 +9,11 @@ import csv
 import io
 import json
 import re
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from time import sleep
-from typing import Literal, NamedTuple, final
+from typing import Literal, final
 
 from brewster.download import Downloader, RemoteFile, file_digest, output_errors
 from brewster.errors import DownloadError, OutputError
@@ -24,7 +24,7 @@ _COLUMNS = ("file", "asset", "category", "resolution", "md5", "authors", "licenc
 _SAFE_NAME = re.compile(r"[A-Za-z0-9][\w.-]{0,200}", re.ASCII)
 _RETRY_DELAYS_S = (1.0, 2.0, 4.0, 8.0)  # between five attempts
 _TIMEOUT_S = 30.0
-_MAX_CONSECUTIVE_FAILURES = 5  # then the cause is the server or the connection, not a single asset
+_MAX_CONSECUTIVE_FAILURES = 5
 
 
 @final
@@ -55,12 +55,18 @@ class DownloadResult:
     error: str | None = None
 
 
-class _Asset(NamedTuple):
-    """A map in the list of the server. The id is not checked: it may be unsafe as a file name."""
-
-    id: str
-    category: str
-    authors: str
+def stop_after_failures(results: Iterable[DownloadResult]) -> Iterator[DownloadResult]:
+    """Yields the results. Raises DownloadError after five failures in a row: their cause is the server or the connection."""
+    failures = 0
+    for result in results:
+        yield result
+        failures = failures + 1 if result.status == "failed" else 0
+        if failures == _MAX_CONSECUTIVE_FAILURES:
+            raise DownloadError(
+                f"{failures} downloads in a row failed",
+                "expected at least one successful download",
+                "see their errors, and run again to resume the downloads",
+            )
 
 
 def maps_folder() -> Path:
@@ -76,39 +82,34 @@ def pull(request: DownloadRequest, out: Path) -> Iterator[DownloadResult]:
 
     Yields: a result for each asset.
 
-    Raises:
-        DownloadError: the list of the server cannot be downloaded, or several assets in a row failed.
-        OutputError: the folder cannot be written to, or contains the manifest.csv of another program.
+    Raises DownloadError if the list of the server cannot be downloaded, or several assets in a row failed; OutputError
+    if the folder cannot be written to, or contains the manifest.csv of another program.
     """
     _read_manifest(out)  # refuses the manifest of another program before any download
-    assets = _list_assets(request)
-    consecutive_failures = 0
+    yield from stop_after_failures(_download_assets(request, out))
+
+
+def _download_assets(request: DownloadRequest, out: Path) -> Iterator[DownloadResult]:
+    listed = sorted(_fetch_json(f"{request.server.rstrip('/')}/assets?type=hdris").items())
     for category, wanted in (("indoor", request.indoor), ("outdoor", request.outdoor)):
-        candidates = (asset for asset in assets if asset.category == category)
+        assets = ((name, record) for name, record in listed if _category(record) == category)
         count = 0
-        while count < wanted and (asset := next(candidates, None)):
-            result = _download_asset(asset, request, out)
+        while count < wanted and (asset := next(assets, None)):
+            result = _download_asset(DownloadResult(asset[0], category), asset[1], request, out)
             yield result
             count += result.status != "missing"
-            consecutive_failures = consecutive_failures + 1 if result.status == "failed" else 0
-            if consecutive_failures == _MAX_CONSECUTIVE_FAILURES:
-                cure = "see their errors, and run again to resume the downloads"
-                raise DownloadError(
-                    f"{consecutive_failures} assets in a row failed",
-                    "expected at least one successful download",
-                    cure,
-                )
 
 
-def _download_asset(asset: _Asset, request: DownloadRequest, out: Path) -> DownloadResult:
-    result = DownloadResult(asset.id, asset.category)
+def _download_asset(
+    result: DownloadResult, record: object, request: DownloadRequest, out: Path
+) -> DownloadResult:
     try:
-        name = f"{asset.id}_{request.resolution}.{request.format}"
+        name = f"{result.asset}_{request.resolution}.{request.format}"
         if not _SAFE_NAME.fullmatch(name):
             expected, cure = "expected letters, digits, '_', '-' and '.' only", "try another --server"
             raise DownloadError(f"{name!r} is not a safe file name", expected, cure)  # noqa: TRY301
         target = out / name
-        remote = _find_remote_file(asset, request)
+        remote = _find_remote_file(result.asset, request)
         if remote is None:
             return result
         url, size, _, md5 = remote
@@ -121,23 +122,14 @@ def _download_asset(asset: _Asset, request: DownloadRequest, out: Path) -> Downl
     except DownloadError as error:
         return replace(result, status="failed", error=str(error))
     if not request.dry_run:
-        row = (target.name, asset.id, asset.category, request.resolution, md5, asset.authors, "CC0")
+        names = _nested(record, "authors")
+        authors = "; ".join(names)[:1000] if isinstance(names, dict) else ""
+        row = (target.name, result.asset, result.category, request.resolution, md5, authors, "CC0")
         _add_to_manifest(out, dict(zip(_COLUMNS, row, strict=True)))
     return result
 
 
 # --- the API of the server (api.polyhaven.com; swagger.yml in github.com/Poly-Haven/Public-API)
-
-
-def _list_assets(request: DownloadRequest) -> list[_Asset]:
-    listed = _fetch_json(f"{request.server.rstrip('/')}/assets?type=hdris")
-    assets = []
-    for name, record in sorted(listed.items()):
-        authors = _nested(record, "authors")
-        names = "; ".join(authors)[:1000] if isinstance(authors, dict) else ""
-        if category := _category(record):
-            assets.append(_Asset(name, category, names))
-    return assets
 
 
 def _category(record: object) -> str | None:
@@ -148,8 +140,8 @@ def _category(record: object) -> str | None:
     return next((category for category in ("indoor", "outdoor") if category in words), None)
 
 
-def _find_remote_file(asset: _Asset, request: DownloadRequest) -> RemoteFile | None:
-    url = f"{request.server.rstrip('/')}/files/{asset.id}"
+def _find_remote_file(asset: str, request: DownloadRequest) -> RemoteFile | None:
+    url = f"{request.server.rstrip('/')}/files/{asset}"
     match _nested(_fetch_json(url), "hdri", request.resolution, request.format):
         case None:
             return None
@@ -163,17 +155,16 @@ def _find_remote_file(asset: _Asset, request: DownloadRequest) -> RemoteFile | N
 
 
 def _fetch_json(url: str) -> dict[str, object]:
+    response = _downloader().read(url)
     try:
-        parsed = json.loads(_downloader().read(url))
-    except (ValueError, RecursionError) as error:
-        raise DownloadError(
-            f"the response of {url} is not JSON ({error})", "expected JSON", "check --server"
-        ) from error
-    if not isinstance(parsed, dict):
-        raise DownloadError(
-            f"the response of {url} is {parsed!r:.40}", "expected a JSON object", "check --server"
-        )
-    return parsed
+        parsed = json.loads(response)
+    except (ValueError, RecursionError):
+        parsed = response
+    if isinstance(parsed, dict):
+        return parsed
+    raise DownloadError(
+        f"the response of {url} is {parsed!r:.40}", "expected a JSON object", "check --server"
+    )
 
 
 def _nested(tree: object, *keys: str) -> object:

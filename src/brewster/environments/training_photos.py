@@ -22,7 +22,7 @@ from urllib.parse import quote
 import numpy as np
 
 from brewster.download import Downloader, output_errors
-from brewster.environments.polyhaven import DownloadResult
+from brewster.environments.polyhaven import DownloadResult, stop_after_failures
 from brewster.errors import BrewsterError, DownloadError
 from brewster.files import cache_folder, write_atomically
 from brewster.photo import Photo
@@ -32,7 +32,6 @@ TABLE: Final = Path(__file__).with_name("training_photos.csv")
 SERVER: Final = "https://github.com"
 MAX_DIFFERENT_BITS: Final = 10
 """Of 64. Other sizes and compressions change a few bits; the hashes of different photos differ in about 32."""
-_MAX_CONSECUTIVE_FAILURES: Final = 5  # then the cause is the server or the connection, not a single photo
 
 
 class TrainingPhoto(NamedTuple):
@@ -75,25 +74,14 @@ def pull(out: Path, *, server: str = SERVER, dry_run: bool = False) -> Iterator[
 
     Yields: a result for each photo with an origin.
 
-    Raises:
-        DownloadError: several photos in a row failed.
-        OutputError: the folder cannot be written to.
+    Raises DownloadError if several photos in a row failed; OutputError if the folder cannot be written to.
     """
-    downloader = Downloader()
-    failures = 0
+    downloader = None if dry_run else Downloader()
+    photos = [photo for photo in read_table() if photo.origin]
     finished = []
-    for photo in read_table():
-        if not photo.origin:
-            continue
-        result = _pull_photo(photo, out, server, None if dry_run else downloader)
+    results = (_pull_photo(photo, out, server, downloader) for photo in photos)
+    for photo, result in zip(photos, stop_after_failures(results), strict=True):
         yield result
-        failures = failures + 1 if result.error else 0
-        if failures == _MAX_CONSECUTIVE_FAILURES:
-            raise DownloadError(
-                f"{failures} photos in a row failed",
-                "expected at least one successful download",
-                "see their errors, and run again to continue",
-            )
         finished += [] if result.error or dry_run else [photo]
     if finished:
         text = io.StringIO()
@@ -125,11 +113,8 @@ def _pull_photo(
 
 
 def _prepared(photo: TrainingPhoto, data: bytes) -> bytes:
-    """Returns the file of the reduced photo.
-
-    Raises:
-        BrewsterError: the data are not an image, or show another photo.
-    """
+    """Returns the file of the reduced photo. Raises BrewsterError if the data are not an image, or show another
+    photo."""
     linear = Photo.open(data).resized(int(photo.width), int(photo.height))
     reduced = Photo.from_array(np.clip(linear, 0, 1), encoding="linear")
     different_bits = (difference_hash(reduced) ^ int(photo.difference_hash, 16)).bit_count()

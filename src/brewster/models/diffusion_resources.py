@@ -14,6 +14,7 @@ import subprocess
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from difflib import get_close_matches
+from functools import cached_property
 from typing import Final, final
 
 from brewster.errors import DeviceError
@@ -60,28 +61,19 @@ class BackboneCost:
 
     def scaled(self, parameters: int, *, blocks: int, width: int) -> BackboneCost:
         """The cost of another size of the same architecture; the parameters of all streams grow alike."""
-        image, text = (
-            round(count * parameters / self.parameters)
-            for count in (self.image_parameters, self.text_parameters)
-        )
-        return replace(
-            self,
-            parameters=parameters,
-            blocks=blocks,
-            width=width,
-            image_parameters=image,
-            text_parameters=text,
-        )
+        streams = {
+            name: round(getattr(self, name) * parameters / self.parameters)
+            for name in ("image_parameters", "text_parameters")
+        }
+        return replace(self, parameters=parameters, blocks=blocks, width=width, **streams)
 
     def tiny(self) -> BackboneCost:
         """The cost of the tiny version, which is negligible: it has no text encoder, and is not downloaded."""
         return replace(self.scaled(0, blocks=0, width=0), vae_parameters=0, text_encoder_parameters=0)
 
     def forward_tflop(self, tokens: int) -> float:
-        """The TFLOP of one prediction for this number of image tokens.
-
-        A multiplication with addition is two operations. Attention multiplies queries with keys, and weights with values.
-        """
+        """The TFLOP of one prediction for this number of image tokens. A multiplication with addition is two
+        operations. Attention multiplies queries with keys, and weights with values."""
         linear = 2 * (self.image_parameters * tokens + self.text_parameters * PROMPT_TOKENS)
         return (linear + 4 * self.blocks * self.width * (tokens + PROMPT_TOKENS) ** 2) / 1e12
 
@@ -133,12 +125,12 @@ CARDS: Final = {
 PAPER_GPU: Final = CARDS["RTX 4090"]
 _OTHER_MAKERS: Final = {"Apple": ("apple", "m1", "m2", "m3", "m4", "m5"), "Intel": ("intel", "arc")}
 """The first words of the names of GPUs that run no diffusion models, by maker."""
-_MAKER_WORDS: Final = {"nvidia", "geforce", "amd", "radeon", "instinct"}
 
 
 def _model_number(name: str) -> str:
     """Returns the name in lower case without the words of its maker: `rtx 4090` for `NVIDIA GeForce RTX 4090`."""
-    return " ".join(word for word in name.lower().split() if word not in _MAKER_WORDS)
+    maker_words = {"nvidia", "geforce", "amd", "radeon", "instinct"}
+    return " ".join(word for word in name.lower().split() if word not in maker_words)
 
 
 def find_gpu(name: str) -> GraphicsCard:
@@ -163,10 +155,8 @@ def find_gpu(name: str) -> GraphicsCard:
 
 
 def local_gpu() -> GraphicsCard | None:
-    """Returns the GPU of this machine, or None. torch finds it, or the driver of NVIDIA if torch is not installed.
-
-    Its speed is that of the GPU in `CARDS` whose name it begins with, or of the RTX 4090 if there is none.
-    """
+    """Returns the GPU of this machine, or None. torch finds it, or the driver of NVIDIA if torch is not installed. Its
+    speed is that of the GPU in `CARDS` whose name it begins with, or of the RTX 4090 if there is none."""
     if importlib.util.find_spec("torch"):
         import torch  # noqa: PLC0415  (slow to import)
 
@@ -215,10 +205,8 @@ class Placement:
         return weights_gib(weights, self.quantization)
 
     def __str__(self) -> str:
-        """Returns the number format and the place, for a table."""
-        return (
-            f"{self.quantization or 'bf16'}, {'offloaded by layers' if self.is_offloaded else 'on the GPU'}"
-        )
+        place = "offloaded by layers" if self.is_offloaded else "on the GPU"
+        return f"{self.quantization or 'bf16'}, {place}"
 
 
 def weights_gib(parameters: int, quantization: Quantization | None) -> float:
@@ -262,13 +250,12 @@ def place_on_gpu(
     device: str = "cuda",
     has_nf4: bool | None = None,
 ) -> Placement:
-    """The placement on a GPU with this memory.
+    """The placement on a GPU with this memory. Raises DeviceError if offloading was requested with nf4.
 
-    If no quantization is given, it is the first of (`preferred`, int8, nf4) with which the weights fit into the GPU. The total
-    memory decides, not the free one: the same machine always gives the same result. If none fits, or the weights are offloaded
-    on request, it is `preferred`. Int8 replaces nf4 without `has_nf4` (by default, if bitsandbytes is not installed), or if the
-    weights are offloaded. With `offload` "auto", they are offloaded if they do not fit into the free memory. Raises DeviceError
-    if offloading was requested with nf4, which cannot be offloaded.
+    If no quantization is given, it is the first of (`preferred`, int8, nf4) with which the weights fit into the total memory: the
+    same machine always gives the same result. If none fits, or the weights are offloaded on request, it is `preferred`. Int8
+    replaces nf4 without `has_nf4` (by default, if bitsandbytes is not installed), or if the weights are offloaded. With `offload`
+    "auto", they are offloaded if they do not fit into the free memory.
     """
     quantization, preferred, offload = choice.quantization, choice.preferred, choice.offload
     if offload == "layers" and quantization == "nf4":
@@ -293,37 +280,68 @@ def place_on_gpu(
     return Placement(device, chosen, is_offloaded)
 
 
-def check_gpu_memory(name: str, needed_gib: float, card: GraphicsCard, cure: str) -> None:
-    """Checks that an estimate for the model `name` fits into the memory of a GPU; `cure` says what to do if it does not. Raises
-    DeviceError if it does not fit."""
-    if needed_gib > card.memory_gib:
-        raise DeviceError(
-            f"{name} needs about {needed_gib:.1f} GiB",
-            f"expected at most the {card.memory_gib:g} GiB of {card.name}",
-            cure,
-        )
+@dataclass(frozen=True, kw_only=True)
+class CostEstimate:
+    """The estimated resources of a separation or of a training step on a GPU.
 
-
-def cost_table(
-    model: Mapping[str, str],
-    time: Mapping[str, str],
-    *,
-    memory_gib: Mapping[str, float],
-    card: GraphicsCard,
-    host_memory: str,
-    download_gb: float,
-    text_encoder_gb: float,
-) -> str:
-    """Returns an estimate as lines of name and value: the rows of the model, memory, host memory and download, and the rows of the time.
-
-    `memory_gib` is the GPU memory of each part. `text_encoder_gb` is the part of the download that encodes prompts.
+    `memory_gib` is the GPU memory of each part, `tflop` the operations of the transformer, and `seconds` their time.
+    `text_encoder_gib` is the host memory of the text encoders; 0 if the prompt is encoded already. `downloaded_weights` is the
+    number of the transformer's weights on the hub. `cure` says what to do if the memory is too small. `model_rows` and `time_rows`
+    are the first and the last rows of the table.
     """
-    rows = {
-        **model,
-        **{f"memory, {name}": f"{gib:.1f} GiB" for name, gib in memory_gib.items()},
-        "memory": f"{sum(memory_gib.values()):.1f} GiB of {card.memory_gib:g} on {card.name} (estimate)",
-        "host memory": f"{host_memory} (estimate)",
-        "download": f"{download_gb:.0f} GB, of which {text_encoder_gb:.0f} GB are text encoders (estimate)",
-        **time,
-    }
-    return "\n".join(f"{name:24}{value}" for name, value in rows.items())
+
+    name: str
+    card: GraphicsCard
+    cost: BackboneCost
+    memory_gib: Mapping[str, float]
+    host_memory: str
+    text_encoder_gib: float
+    tflop: float
+    seconds: float
+    downloaded_weights: int
+    is_local: bool
+    cure: str
+    model_rows: Mapping[str, str]
+    time_rows: Mapping[str, str]
+
+    @cached_property
+    def is_downloaded(self) -> bool:
+        """Whether nothing is downloaded: a tiny version or a folder."""
+        return self.is_local
+
+    @property
+    def text_encoder_gb(self) -> float:
+        """The download of the text encoders."""
+        return 0.0 if self.is_downloaded else self.text_encoder_gib * GIB / 1e9
+
+    @property
+    def download_gb(self) -> float:
+        """The size of all downloads."""
+        weights = 0 if self.is_downloaded else self.cost.vae_parameters + self.downloaded_weights
+        return 2e-9 * weights + self.text_encoder_gb
+
+    @property
+    def total_gib(self) -> float:
+        """The peak GPU memory in GiB."""
+        return sum(self.memory_gib.values())
+
+    def table(self) -> str:
+        """Returns the estimate as lines of name and value."""
+        rows = {
+            **self.model_rows,
+            **{f"memory, {name}": f"{gib:.1f} GiB" for name, gib in self.memory_gib.items()},
+            "memory": f"{self.total_gib:.1f} GiB of {self.card.memory_gib:g} on {self.card.name} (estimate)",
+            "host memory": f"{self.host_memory} (estimate)",
+            "download": f"{self.download_gb:.0f} GB, of which {self.text_encoder_gb:.0f} GB are text encoders (estimate)",
+            **self.time_rows,
+        }
+        return "\n".join(f"{name:24}{value}" for name, value in rows.items())
+
+    def check_fits(self) -> None:
+        """Checks that the estimate fits into the memory of the GPU. Raises DeviceError with the first change with which it fits."""
+        if self.total_gib > self.card.memory_gib:
+            raise DeviceError(
+                f"{self.name} needs about {self.total_gib:.1f} GiB",
+                f"expected at most the {self.card.memory_gib:g} GiB of {self.card.name}",
+                self.cure,
+            )

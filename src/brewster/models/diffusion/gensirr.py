@@ -33,39 +33,28 @@ _IGNORED: Final = ("text_encoder.",)
 def convert(checkpoint: Path, folder: Path, *, base_model: str = "kontext", short_side_px: int = 768) -> None:
     """Reads the checkpoint and writes the folder. The weights keep their precision.
 
-    `base_model` is "kontext", or "tiny:kontext" for tests. `short_side_px`, that of the input, is 768 or 512.
-
-    Raises:
-        ModelError: the file is not such a checkpoint, or its weights do not match the architecture of the base model.
-        OutputError: the folder cannot be written.
+    `base_model` is "kontext", or "tiny:kontext" for tests. `short_side_px`, that of the input, is 768 or 512. Raises
+    ModelError if the file is not such a checkpoint, or its weights do not match the architecture of the base model;
+    OutputError if the folder cannot be written.
     """
     if base_model.removeprefix(TINY_PREFIX) != Kontext.name:
-        raise ModelError(
-            f"the base model {base_model} was given for GenSIRR",
-            f"expected {Kontext.name}",
-            "leave the base model out",
-        )
+        happened = f"the base model {base_model} was given for GenSIRR"
+        raise ModelError(happened, f"expected {Kontext.name}", "leave the base model out")
     state = _read_checkpoint(checkpoint)
     prompt = _prompt(checkpoint, state)
     backbone = build_on_meta(base_model)
     parts: dict[str, nn.Module] = {"transformer.": backbone.transformer, "vae.": backbone.vae}
     unknown = [key for key in state if not key.startswith((*parts, *_IGNORED))]
     if unknown:
-        raise ModelError(
-            f"{checkpoint} contains {unknown[0]}",
-            f"expected only {', '.join(parts)}",
-            "use the file GenSIRR.pt",
-        )
+        raise _refused(f"{checkpoint} contains {unknown[0]}", f"expected only {', '.join(parts)}")
     for prefix, part in parts.items():
         weights = {key.removeprefix(prefix): value for key, value in state.items() if key.startswith(prefix)}
         try:
             part.load_state_dict(weights, strict=True, assign=True)
         except RuntimeError as error:
-            raise ModelError(
-                f"{checkpoint} does not match the {prefix[:-1]} of {backbone.name}: {' '.join(str(error).split())[:200]}",
-                f"expected the weights of a {type(part).__name__}",
-                "use the file GenSIRR.pt",
-            ) from error
+            reason = " ".join(str(error).split())[:200]
+            happened = f"{checkpoint} does not match the {prefix[:-1]} of {backbone.name}: {reason}"
+            raise _refused(happened, f"expected the weights of a {type(part).__name__}") from error
     backbone.save(folder)
     prompt.save(folder / PROMPT_FILE)
     save_task(gensirr_task(short_side_px), folder / TASK_FILE)
@@ -76,38 +65,30 @@ def _read_checkpoint(path: Path) -> dict[str, Tensor]:
     try:
         content: Any = torch.load(path, map_location="cpu", weights_only=True, mmap=True)
     except (OSError, RuntimeError, ValueError, EOFError, pickle.UnpicklingError) as error:
-        raise ModelError(
-            f"{path} cannot be read ({' '.join(str(error).split())[:200]})",
-            "expected a checkpoint of GenSIRR that contains tensors only",
-            "download it again",
-        ) from error
-    module = content.get("module") if isinstance(content, dict) else None
-    if not isinstance(module, Mapping) or not any(str(key).startswith(_PREFIX) for key in module):
-        found = (
-            ", ".join(map(str, list(content)[:5])) if isinstance(content, Mapping) else type(content).__name__
-        )
-        raise ModelError(
-            f"{path} contains {found}",
-            f'expected a checkpoint of GenSIRR: weights {_PREFIX}... under "module"',
-            "use the file GenSIRR.pt",
-        )
-    return {key.removeprefix(_PREFIX): value for key, value in module.items() if key.startswith(_PREFIX)}
+        reason = " ".join(str(error).split())[:200]
+        expected = "expected a checkpoint of GenSIRR that contains tensors only"
+        raise ModelError(f"{path} cannot be read ({reason})", expected, "download it again") from error
+    content = content if isinstance(content, Mapping) else {type(content).__name__: None}
+    module = content.get("module")
+    weights = {str(key): value for key, value in module.items()} if isinstance(module, Mapping) else {}
+    if not any(key.startswith(_PREFIX) for key in weights):
+        found = ", ".join(map(str, list(content)[:5]))
+        expected = f'expected a checkpoint of GenSIRR: weights {_PREFIX}... under "module"'
+        raise _refused(f"{path} contains {found}", expected)
+    return {key.removeprefix(_PREFIX): value for key, value in weights.items() if key.startswith(_PREFIX)}
 
 
 def _prompt(path: Path, state: dict[str, Tensor]) -> PromptEmbedding:
     """Removes the prompt from the state, and returns it."""
+    names = ("prompt_embeds", "pooled_prompt_embeds", "text_ids")
     try:
-        embeds, pooled, ids = (
-            state.pop(f"cached_{name}") for name in ("prompt_embeds", "pooled_prompt_embeds", "text_ids")
-        )
+        embeds, pooled, ids = (state.pop(f"cached_{name}") for name in names)
     except KeyError as error:
-        raise ModelError(
-            f"{path} lacks {error}", "expected the stored prompt embedding", "use the file GenSIRR.pt"
-        ) from error
+        raise _refused(f"{path} lacks {error}", "expected the stored prompt embedding") from error
     if ids.count_nonzero():
-        raise ModelError(
-            f"{path} has position ids of the prompt that are not zero",
-            "expected zeros",
-            "use another checkpoint",
-        )
+        raise _refused(f"{path} has position ids of the prompt that are not zero", "expected zeros")
     return PromptEmbedding(Kontext.name, _PROMPT_TEXT, embeds.detach().clone(), pooled.detach().clone())
+
+
+def _refused(happened: str, expected: str) -> ModelError:
+    return ModelError(happened, expected, "use the file GenSIRR.pt")

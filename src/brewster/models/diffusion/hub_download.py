@@ -29,13 +29,10 @@ def resolve_model_folder(source: str, patterns: list[str]) -> Path:
     """Returns the local folder of a model, and downloads its files if necessary.
 
     If `source` is a folder, it is returned unchanged. Otherwise `source` is a hub id, and the files that match the
-    patterns are found in the cache or downloaded. The token is that of `hf auth login` or HF_TOKEN.
-
-    Raises:
-        DownloadError: the account has no access (the message says how to get it), the hub has no such model, there is
-            no network connection, or the disk is full.
-        ModelError: `source` is neither a folder nor a hub id.
-        MissingExtra: huggingface_hub is not installed.
+    patterns are found in the cache or downloaded. The token is that of `hf auth login` or HF_TOKEN. Raises
+    DownloadError if the account has no access (the message says how to get it), the hub has no such model, there is no
+    network connection, or the disk is full; ModelError if `source` is neither a folder nor a hub id; MissingExtra if
+    huggingface_hub is not installed.
     """
     if Path(source).is_dir():
         return Path(source)
@@ -58,35 +55,29 @@ def cached_model_folder(source: str, patterns: list[str]) -> Path | None:
 
 
 def list_root_files(source: str) -> list[str]:
-    """The names of the files of a folder or a repository on the hub, without those in subfolders.
-
-    Without a network connection, these are the files in the cache. Raises DownloadError, ModelError or MissingExtra, see
-    `resolve_model_folder`.
-    """
-    if folder := Path(source) if Path(source).is_dir() else None:
-        return sorted(path.name for path in folder.iterdir() if path.is_file())
+    """The names of the files of a folder or a repository on the hub, without those in subfolders. Without a network
+    connection, these are the files in the cache. Raises DownloadError, ModelError or MissingExtra, see
+    `resolve_model_folder`."""
+    folder = Path(source)
     hub, errors = import_library("huggingface_hub"), import_library("huggingface_hub.errors")
     with translate_hub_errors(source):
         try:
-            return sorted(name for name in hub.HfApi().list_repo_files(source) if "/" not in name)
+            if not folder.is_dir():
+                return sorted(name for name in hub.HfApi().list_repo_files(source) if "/" not in name)
         except (errors.HfHubHTTPError, errors.HFValidationError):
             raise
         except (OSError, errors.HTTPError):
             folder = Path(hub.snapshot_download(source, local_files_only=True))
-            return sorted(path.name for path in folder.iterdir() if path.is_file())
+    return sorted(path.name for path in folder.iterdir() if path.is_file())
 
 
 def find_weights_file(source: str, suffixes: tuple[str, ...], companions: Sequence[str] = ()) -> Path:
     """The file with the weights of a LoRA or a transformer, downloaded if it is on the hub.
 
-    `source` is a file, a folder or hub id with one file that has such a suffix, or OWNER/NAME/FILE on the hub, where FILE may
-    contain folders. Subfolders are not searched. `companions` are other files of the same folder that are downloaded with it, if
-    they exist.
-
-    Raises:
-        ModelError: the file does not exist, the folder or repository does not have exactly one such file, or `source` is none
-            of these.
-        DownloadError, MissingExtra: see `resolve_model_folder`.
+    `source` is a file, a folder or hub id with one file that has such a suffix, or OWNER/NAME/FILE on the hub, where
+    FILE may contain folders. Subfolders are not searched. `companions` are other files of the same folder that are
+    downloaded with it, if they exist. Raises ModelError if the file does not exist, the folder or repository does not
+    have exactly one such file, or `source` is none of these; DownloadError or MissingExtra, see `resolve_model_folder`.
     """
     if Path(source).is_file():
         return Path(source)
@@ -195,10 +186,8 @@ def _status(error: Exception) -> int | None:
 
 
 def _announce_download(source: str, patterns: list[str]) -> None:
-    """Prints the size and the licence on stderr if files that match the patterns are not in the cache yet.
-
-    Raises DownloadError if the files do not fit on the disk, or an exception of huggingface_hub if the request fails.
-    """
+    """Prints the size and the licence on stderr if files that match the patterns are not in the cache yet. Raises
+    DownloadError if the files do not fit on the disk, or an exception of huggingface_hub if the request fails."""
     hub = import_library("huggingface_hub")
     planned = hub.snapshot_download(source, allow_patterns=patterns, dry_run=True)
     size = sum(file.file_size or 0 for file in planned if file.will_download)

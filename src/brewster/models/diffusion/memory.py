@@ -80,22 +80,17 @@ def backbone_cost(source: str, backbone_class: type[Backbone]) -> BackboneCost:
 
 
 def count_weights(source: str, backbone_class: type[Backbone], transformer_file: Path | None = None) -> int:
-    """The number of parameters of the transformer; 0 for a tiny version.
-
-    For a `transformer_file`, it is the number of bf16 weights that need the same memory. Raises ModelError if the configuration
-    is damaged.
-    """
+    """The number of parameters of the transformer; 0 for a tiny version. For a `transformer_file`, it is the number of
+    bf16 weights that need the same memory. Raises ModelError if the configuration is damaged."""
     if transformer_file:
         return transformer_file.stat().st_size // _FILE_BYTES_PER_WEIGHT
     return backbone_cost(source, backbone_class).parameters
 
 
 def choose_placement(weights: int, choice: WeightChoice, device: str) -> Placement:
-    """The placement of a transformer with this number of weights on this machine. `device` is what the user chose, or "auto".
-
-    On a CPU the default is no quantization, because int8 is slower there. Raises DeviceError if diffusion models do not run on
-    this device, or cannot be offloaded in this way.
-    """
+    """The placement of a transformer with this number of weights on this machine. `device` is what the user chose, or
+    "auto". On a CPU the default is no quantization, because int8 is slower there. Raises DeviceError if diffusion
+    models do not run on this device, or cannot be offloaded in this way."""
     device = torch_device(device)
     if device == "cpu":
         if choice.offload == "layers":
@@ -121,13 +116,10 @@ def check_machine(
     """Checks that a backbone can run on this machine: device, free memory, and free disk for the download.
 
     For `source` and `transformer_file`, see `load_backbone`. `requested` is the device that the user chose, or "auto".
-    `with_text_encoders` is whether the prompt must be encoded, so that the text encoders are downloaded too. They are loaded in
-    host memory, also if they compute on the GPU, and released before the transformer is loaded.
-
-    Raises:
-        DeviceError: there is no GPU and the CPU was not chosen explicitly, or the free memory is too small.
-        DownloadError: the free disk is too small.
-        MissingExtra: the weights will be stored in nf4, and bitsandbytes is not installed.
+    `with_text_encoders` is whether the prompt must be encoded, so that the text encoders are downloaded too. They are
+    loaded in host memory, also if they compute on the GPU, and released before the transformer is loaded. Raises
+    DeviceError if there is no GPU and the CPU was not chosen explicitly, or the free memory is too small; DownloadError
+    if the free disk is too small; MissingExtra if the weights will be stored in nf4, and bitsandbytes is not installed.
     """
     weights = count_weights(source, backbone_class, transformer_file)
     if weights < _MIN_LARGE:

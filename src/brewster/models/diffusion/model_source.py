@@ -41,38 +41,25 @@ from brewster.options import Quantization
 @final
 @dataclass(frozen=True)
 class LoraLayout:
-    """A row of LAYOUTS."""
+    """A row of LAYOUTS. A folder with the file `weights` has this layout, and `files` are all files to download. `load` adds the
+    LoRA of a folder to a backbone. Both functions raise ModelError if a file is damaged."""
 
-    name: str
     weights: str
-    """The file with the weights. A folder with this file has this layout."""
     files: tuple[str, ...]
-    """All files to download."""
     read_metadata: Callable[[Path], LoraMetadata]
-    """Reads the metadata of a folder. May raise ModelError."""
     load: Callable[[Path, Backbone], tuple[LoraMetadata, PromptEmbedding]]
-    """Adds the LoRA of a folder to a backbone, and returns its metadata and prompt. May raise ModelError."""
 
 
 LAYOUTS: Final = (
-    LoraLayout(
-        "brewster", LORA_FILE, (LORA_FILE, PROMPT_FILE), lora.read_lora_metadata, lora.load_lora
-    ),
-    LoraLayout(
-        "windowseat", windowseat.WEIGHTS_FILE, windowseat.FILES, windowseat.read_metadata, windowseat.load
-    ),
-)  # fmt: skip
+    LoraLayout(LORA_FILE, (LORA_FILE, PROMPT_FILE), lora.read_lora_metadata, lora.load_lora),
+    LoraLayout(windowseat.WEIGHTS_FILE, windowseat.FILES, windowseat.read_metadata, windowseat.load),
+)
 """The layouts of LoRA folders. To support another published layout, write a module and add a row."""
 
 
 _FINGERPRINT_BYTES: Final = 1 << 20
 """The number of bytes at the start and at the end of a file that a digest reads."""
-_FILES: Final = [
-    *(name for layout in LAYOUTS for name in layout.files),
-    *DESCRIPTION_FILES,
-    PROMPT_FILE,
-    TASK_FILE,
-]
+_FILES: Final = [name for layout in LAYOUTS for name in layout.files] + [*DESCRIPTION_FILES, TASK_FILE]
 
 
 @final
@@ -101,11 +88,9 @@ class ModelSource:
         return not self.has_prompt and not self.base.startswith(TINY_PREFIX)
 
     def digest_parts(self) -> list[str]:
-        """Returns the digests of the LoRA, its settings and its prompt, and that of the base.
-
-        A base on the hub is identified by its name. A base in a folder is identified by the names, sizes, and first and
-        last MiB of its files, because reading them completely takes a minute.
-        """
+        """Returns the digests of the LoRA, its settings and its prompt, and that of the base. A base on the hub is
+        identified by its name. A base in a folder is identified by the names, sizes, and first and last MiB of its
+        files, because reading them completely takes a minute."""
         base, folder = self.base, Path(self.base)
         if not is_registered(base) and folder.is_dir():
             digest = hashlib.sha256()

@@ -22,10 +22,8 @@ _CPU_MEMORY_ERROR: Final = re.compile(r"out of memory|not enough memory|can't al
 
 
 def offload_layers(transformer: Any, vae: Any, device: str) -> None:  # noqa: ANN401 - modules of diffusers
-    """Keeps the weights of the transformer in host memory, and copies each block to the device while it computes.
-
-    The VAE is moved to the device. A LoRA must be added before this call.
-    """
+    """Keeps the weights of the transformer in host memory, and copies each block to the device while it computes. The
+    VAE is moved to the device. A LoRA must be added before this call."""
     vae.to(device)
     import_library("diffusers.hooks").apply_group_offloading(
         transformer,

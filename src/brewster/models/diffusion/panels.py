@@ -87,13 +87,11 @@ def count_tokens(panel: tuple[int, int], layout: PanelLayout, size_divisor: int)
 def conditioning_image(photo: Float[Tensor, "n 3 h w"], layout: PanelLayout) -> Tensor:
     """The conditioning image: the photo in panel I, and white space in the other panels.
 
-    White space turns the task into inpainting, which "is not necessary, but it turns out easier to converge" (Text-to-image
-    Model Fine-tuning). Without white space, or if I is not among the generated panels, the photo alone is the conditioning
-    image (Experimental Setup: "control image"). It has 1/3 of the tokens of a composite of
-    three panels.
-
-    Returns:
-        (N, 3, H, W). Its size is that of the composite if there is white space; otherwise it is the photo itself.
+    White space turns the task into inpainting, which "is not necessary, but it turns out easier to converge"
+    (Text-to-image Model Fine-tuning). Without white space, or if I is not among the generated panels, the photo alone
+    is the conditioning image (Experimental Setup: "control image"). It has 1/3 of the tokens of a composite of three
+    panels. Returns (N, 3, H, W). Its size is that of the composite if there is white space; otherwise it is the photo
+    itself.
     """
     if not layout.has_white_space:
         return photo

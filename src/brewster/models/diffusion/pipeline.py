@@ -35,7 +35,7 @@ from brewster.models.diffusion.model_source import ModelSource, digest_file, fin
 from brewster.models.diffusion.offloading import explain_out_of_memory, offload_layers
 from brewster.models.diffusion.panels import PanelLayout, compose, conditioning_image, split
 from brewster.models.diffusion.prompt import PROMPT_FILE, PROMPTS, PromptEmbedding, load_prompt
-from brewster.models.diffusion.sampling import euler, sample
+from brewster.models.diffusion.sampling import sample
 from brewster.models.diffusion.task import DecompositionTask
 from brewster.models.diffusion_resources import Placement, WeightChoice
 from brewster.models.zoo import model_name
@@ -46,7 +46,6 @@ if TYPE_CHECKING:
 
 TRANSFORMER_SUFFIXES: Final = (".gguf", ".safetensors")
 """The suffixes of files with the weights of a transformer."""
-_MEMORY_HINT: Final = "use a quantized or a smaller backbone"
 
 
 @final
@@ -73,55 +72,34 @@ class DecompositionPipeline:
         With the objectives "one_step" and "direct", `steps` and `seeds` have no effect, and there is one prediction.
         `on_progress(done, total)` is called after each step.
 
-        Returns:
-            The panels by name, (seeds, 3, H, W) in [-1, 1], float32, on the CPU.
-
-        Raises:
-            ModelError: there is no step or no seed.
-            DeviceError: out of memory; the message says what to reduce.
+        Returns the panels by name, (seeds, 3, H, W) in [-1, 1], float32, on the CPU. Raises ModelError if there is no step or no
+        seed; DeviceError if the device is out of memory.
         """
-        layout = self.task.layout
-        if self.task.objective == "direct":
+        task, layout = self.task, self.task.layout
+        if task.objective == "direct":
             return self._direct(photo, on_progress)
-        if self.task.objective == "one_step":
-            images = self._one_step(photo)
-            if on_progress:
-                on_progress(1, 1)
-            return split(images, layout)
         height, width = photo.shape[-2:]
+        is_one_step = task.objective == "one_step"
         images = sample(
             self.backbone,
             conditioning_image(photo, layout),
             self.prompt,
             size=layout.composite_size((width, height)),
-            steps=self.task.steps if steps is None else steps,
-            guidance=self.task.guidance,
-            timestep_shift=self.task.timestep_shift,
-            last_sigma=self.task.last_sigma,
-            seeds=seeds,
+            steps=1 if is_one_step else task.steps if steps is None else steps,
+            guidance=task.guidance,
+            timestep_shift=task.timestep_shift,
+            last_sigma=task.last_sigma,
+            seeds=(0,) if is_one_step else seeds,
+            start=one_step_start(photo, layout) if is_one_step else None,
             on_progress=on_progress,
         )
         return split(images, layout)
 
     @torch.no_grad()
-    def _one_step(self, photo: Tensor) -> Tensor:
-        backbone, layout = self.backbone, self.task.layout
-        with explain_out_of_memory(_MEMORY_HINT):
-            latents = euler(
-                backbone,
-                one_step_latents(photo, backbone, layout),
-                backbone.encode(conditioning_image(photo, layout)),
-                self.prompt,
-                sigmas=torch.tensor([1.0, 0.0]),
-                guidance=self.task.guidance,
-            )
-            return backbone.decode(latents).clamp(-1, 1).cpu()
-
-    @torch.no_grad()
     def _direct(self, photo: Tensor, on_progress: Callable[[int, int], None] | None) -> dict[str, Tensor]:
         """Transmission = photo - prediction, as latents (Zakarin et al. 2025). Each panel is decoded separately."""
         backbone, task = self.backbone, self.task
-        with explain_out_of_memory(_MEMORY_HINT):
+        with explain_out_of_memory("use a quantized or a smaller backbone"):
             latents = backbone.encode(photo)
             time = torch.full((len(latents),), task.time, device=latents.device)
             prediction = backbone.predict(latents, backbone.no_condition(), time, self.prompt, task.guidance)
@@ -134,11 +112,9 @@ class DecompositionPipeline:
         return images
 
 
-def one_step_latents(
-    photo: Float[Tensor, "1 3 h w"], backbone: Backbone, layout: PanelLayout
-) -> Float[Tensor, "1 c p q"]:
-    """The latents at the start of the single step: the photo in every panel, encoded."""
-    return backbone.encode(compose(dict.fromkeys(layout.panels, photo), layout))
+def one_step_start(photo: Float[Tensor, "1 3 h w"], layout: PanelLayout) -> Tensor:
+    """The image from which the single step starts: the photo in every panel."""
+    return compose(dict.fromkeys(layout.panels, photo), layout)
 
 
 def load_pipeline(
@@ -173,14 +149,7 @@ def load_pipeline(
             LoRA or a timestep shift is given for a model that takes one step.
         DeviceError: there is no such device, it is out of memory, or the weights cannot be offloaded.
     """
-    _check_before_download(
-        model,
-        base_model,
-        device=device,
-        quantization=quantization,
-        offload=offload,
-        has_transformer_file=transformer is not None,
-    )
+    _check_before_download(model, base_model, device, (quantization, offload), transformer)
     source = find_model_source(model, base_model)
     for option, value in {"few-step LoRA": fast_lora, "timestep shift": timestep_shift}.items():
         if value is not None and source.task.objective != "flow":
@@ -223,8 +192,14 @@ def load_pipeline(
         attach_layers(backbone, few_step_layers, adapter="few_step")
     if placement.is_offloaded:
         offload_layers(backbone.transformer, backbone.vae, placement.device)
-    task = task_with_options(
-        source, guidance=guidance, timestep_shift=timestep_shift, has_few_step_lora=bool(fast_lora)
+    if fast_lora:
+        if guidance is None and not source.backbone_class.guided_by_embedding:
+            guidance = 1.0
+        timestep_shift = timestep_shift or source.backbone_class.few_step_shift
+    task = replace(
+        source.task,
+        guidance=source.task.guidance if guidance is None else guidance,
+        timestep_shift=timestep_shift or source.task.timestep_shift,
     )
     changes = {
         "transformer": digest_file(transformer_file) if transformer_file else None,
@@ -236,29 +211,16 @@ def load_pipeline(
     return DecompositionPipeline(backbone, embedding, task, model_name(model), digest)
 
 
-def fingerprint(
-    model: str,
-    *,
-    device: str = "auto",
-    base_model: str | None = None,
-    quantization: Quantization | None = None,
-    prompt: str = "detailed",
-) -> str:
-    """The SHA-256 of what `load_pipeline` would load: LoRA, prompt, base model, and the quantization of the base model.
-
-    See `ModelSource.digest_parts` for how a base model is identified. Raises ModelError, DownloadError or DeviceError, see
-    `load_pipeline`.
-    """
-    source = find_model_source(model, base_model)
-    placement = _choose_placement(source, device, quantization)
-    return _digest(source, placement.quantization, PROMPTS.get(prompt, prompt), {})
+def fingerprint(model: str, *, device: str = "auto") -> str:
+    """The SHA-256 of what `load_pipeline` would load by default, which also raises the same errors: LoRA, prompt, base model (see
+    `ModelSource.digest_parts`), and the quantization of the base model."""
+    source = find_model_source(model)
+    return _digest(source, _choose_placement(source, device).quantization, PROMPTS["detailed"], {})
 
 
 def _digest(source: ModelSource, quantization: str | None, text: str, changes: Mapping[str, object]) -> str:
     """The digest of a model. `changes` are the options that change its result, by name; None for those that are not set."""
-    parts = [*source.digest_parts(), str(quantization)]
-    if source.layout is None:
-        parts.append(text)
+    parts = [*source.digest_parts(), str(quantization), *([] if source.layout else [text])]
     parts += [f"{name} {value}" for name, value in changes.items() if value is not None]
     return hashlib.sha256("\0".join(parts).encode()).hexdigest()
 
@@ -266,53 +228,33 @@ def _digest(source: ModelSource, quantization: str | None, text: str, changes: M
 def _check_before_download(
     model: str,
     base_model: str | None,
-    *,
     device: str,
-    quantization: Quantization | None,
-    offload: Offload,
-    has_transformer_file: bool,
+    storage: tuple[Quantization | None, Offload],
+    transformer: str | None,
 ) -> None:
-    """Checks the machine before the files of a LoRA are downloaded, if its base is known without them.
-
-    The memory for the text encoders is checked later, because the files of the model show whether its prompt is stored. If
-    the transformer is in a file, only the device is checked, because the size of a file on the hub is not known.
-    """
+    """Checks the machine before the files of a LoRA are downloaded, if its base is known without them. The memory for
+    the text encoders is checked later, because the files of the model show whether its prompt is stored. If the
+    transformer is in a file, only the device is checked, because the size of a file on the hub is not known."""
     chosen_device = torch_device(device)
     try:
         source = find_model_source(model, base_model, allow_download=False)
     except (DownloadError, ModelError):
         return  # files are missing or damaged: `load_pipeline` downloads them, or reports the error
-    if has_transformer_file:
+    if transformer:
         weights = count_weights(source.base, source.backbone_class)
         check_device(source.base, weights, chosen_device, requested=device)
-        return
-    placement = _choose_placement(source, device, quantization, offload)
-    check_machine(source.base, source.backbone_class, placement, requested=device)
+    else:
+        placement = _choose_placement(source, device, *storage)
+        check_machine(source.base, source.backbone_class, placement, requested=device)
 
 
 def _choose_placement(
     source: ModelSource,
     device: str,
-    quantization: Quantization | None,
+    quantization: Quantization | None = None,
     offload: Offload = "auto",
     transformer_file: Path | None = None,
 ) -> Placement:
     weights = count_weights(source.base, source.backbone_class, transformer_file)
     choice = WeightChoice(quantization, source.trained_quantization, offload, transformer_file is not None)
     return choose_placement(weights, choice, device)
-
-
-def task_with_options(
-    source: ModelSource, *, guidance: float | None, timestep_shift: float | None, has_few_step_lora: bool
-) -> DecompositionTask:
-    """Returns the task of a model with the options that are not None. For their defaults, see `load_pipeline`."""
-    task, backbone_class = source.task, source.backbone_class
-    if has_few_step_lora:
-        if guidance is None and not backbone_class.guided_by_embedding:
-            guidance = 1.0
-        timestep_shift = timestep_shift or backbone_class.few_step_shift
-    return replace(
-        task,
-        guidance=task.guidance if guidance is None else guidance,
-        timestep_shift=timestep_shift or task.timestep_shift,
-    )

@@ -41,19 +41,16 @@ def sample(
     timestep_shift: float | None = None,
     last_sigma: float | None = None,
     seeds: Sequence[int] = (0,),
+    start: Float[Tensor, "1 3 h w"] | None = None,
     on_progress: Callable[[int, int], None] | None = None,
 ) -> Float[Tensor, "seeds 3 h w"]:
     """Generates one composite per seed, of this (width, height) in pixels.
 
-    The noise is drawn on the CPU, so a seed gives the same noise on every device. For `timestep_shift` and `last_sigma`, see
-    `Backbone.schedule`. `on_progress(done, total)` is called after each step.
+    The noise is drawn on the CPU, so a seed gives the same noise on every device. A `start` image in [-1, 1] replaces it. For
+    `timestep_shift` and `last_sigma`, see `Backbone.schedule`. `on_progress(done, total)` is called after each step.
 
-    Returns:
-        The composites in [-1, 1], float32, on the CPU. `.mean(0, keepdim=True)` averages them.
-
-    Raises:
-        ModelError: the prompt lacks the embedding that guidance needs, or `steps` or the number of seeds is less than one.
-        DeviceError: out of memory; the message says what to reduce.
+    Returns the composites in [-1, 1], float32, on the CPU. `.mean(0, keepdim=True)` averages them. Raises ModelError if the prompt
+    lacks the embedding that guidance needs, or there is no step or seed; DeviceError if the device is out of memory.
     """
     for noun, number, default in (("steps", steps, STEPS), ("seeds", len(seeds), 1)):
         if number < 1:
@@ -63,53 +60,20 @@ def sample(
                 f"use {default}, the default",
             )
     done = itertools.count(1)
-
-    def report_step() -> None:
-        if on_progress:
-            on_progress(next(done), steps * len(seeds))
-
     images = []
     with explain_out_of_memory(_MEMORY_HINT):
         condition_latents = backbone.encode(condition)
         for seed in seeds:
-            noise = backbone.noise(size, seed)
-            sigmas = backbone.schedule(
-                noise.shape[2] * noise.shape[3], steps, timestep_shift=timestep_shift, last_sigma=last_sigma
-            )
-            latents = euler(
-                backbone,
-                noise,
-                condition_latents,
-                prompt,
-                sigmas=sigmas,
-                guidance=guidance,
-                on_progress=report_step,
-            )
+            noise = backbone.noise(size, seed) if start is None else backbone.encode(start)
+            tokens = noise.shape[2] * noise.shape[3]
+            sigmas = backbone.schedule(tokens, steps, timestep_shift=timestep_shift, last_sigma=last_sigma)
+            latents = noise.to(backbone.device)
+            # An Euler step in float32: x(next sigma) = x(sigma) + (next sigma - sigma) velocity.
+            for sigma, next_sigma in itertools.pairwise(sigmas.to(latents.device)):
+                time = sigma.expand(len(latents))
+                velocity = backbone.predict(latents, condition_latents, time, prompt, guidance)
+                latents = latents + (next_sigma - sigma) * velocity
+                if on_progress:
+                    on_progress(next(done), steps * len(seeds))
             images.append(backbone.decode(latents).clamp(-1, 1).cpu())
     return torch.cat(images)
-
-
-def euler(
-    backbone: Backbone,
-    noise: Float[Tensor, "n c h w"],
-    condition: Float[Tensor, "1 c p q"],
-    prompt: PromptEmbedding,
-    *,
-    sigmas: Float[Tensor, " sigmas"],
-    guidance: float,
-    on_progress: Callable[[], None] | None = None,
-) -> Float[Tensor, "n c h w"]:
-    """Integrates the flow along `sigmas`: x(next sigma) = x(sigma) + (next sigma - sigma) velocity, in float32.
-
-    `condition` is the encoded conditioning image. `on_progress()` is called after each step.
-
-    Returns:
-        The latents at the last sigma, usually 0.
-    """
-    latents = noise.to(backbone.device)
-    for sigma, next_sigma in itertools.pairwise(sigmas.to(latents.device)):
-        velocity = backbone.predict(latents, condition, sigma.expand(len(latents)), prompt, guidance)
-        latents = latents + (next_sigma - sigma) * velocity
-        if on_progress:
-            on_progress()
-    return latents

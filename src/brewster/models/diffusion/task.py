@@ -78,9 +78,8 @@ class DecompositionTask:
 
 
 def windowseat_task(side_px: int = 768) -> DecompositionTask:
-    """The task of a WindowSeat with this processing resolution, as in its published inference code: time 0.499, latents minus
-    prediction, square tiles, no guidance.
-    """
+    """The task of a WindowSeat with this processing resolution, as in its published inference code: time 0.499, latents
+    minus prediction, square tiles, no guidance."""
     # Panel I is the encoded photo, decoded again. It separates the errors of the VAE from the change by the model.
     return DecompositionTask(
         PanelLayout(("I", "T")),
@@ -94,9 +93,8 @@ def windowseat_task(side_px: int = 768) -> DecompositionTask:
 
 
 def gensirr_task(short_side_px: int = 768) -> DecompositionTask:
-    """The task of GenSIRR, as in its published inference code: 28 steps with guidance 3.5 from sigma 1 to 0.001, and an input
-    with a short side of 768 (or 512) pixels.
-    """
+    """The task of GenSIRR, as in its published inference code: 28 steps with guidance 3.5 from sigma 1 to 0.001, and an
+    input with a short side of 768 (or 512) pixels."""
     return DecompositionTask(
         PanelLayout(("T",)),
         max_composite_pixels=short_side_px**2,

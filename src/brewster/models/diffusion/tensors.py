@@ -35,35 +35,23 @@ def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
         data = path.read_bytes()
         tensors = import_library("safetensors.torch").load(data)
         return dict(sorted(tensors.items())), read_metadata(data)
-    except FileNotFoundError as error:
-        raise ModelError(
-            f"{path} is missing", "expected a safetensors file", "copy the whole folder of the model"
-        ) from error
     except (OSError, ValueError, safetensors.SafetensorError) as error:
-        raise ModelError(
-            f"{path} cannot be read: {error}",
-            "expected a complete safetensors file",
-            "copy or write it again",
-        ) from error
+        problem = "is missing" if isinstance(error, FileNotFoundError) else f"cannot be read: {error}"
+        cure = "copy the whole folder of the model, or write it again"
+        raise ModelError(f"{path} {problem}", "expected a safetensors file that is complete", cure) from error
 
 
 def read_json(path: Path) -> dict[str, Any]:
     """The JSON object in a file of a model. Raises ModelError if the file is missing or damaged, or contains no object."""
     try:
         value = json.loads(path.read_text("utf-8"))
-    except FileNotFoundError as error:
-        raise ModelError(
-            f"{path} is missing", "expected a complete model", "copy or download it again"
-        ) from error
+        problem, cause = "contains no settings", None
     except (OSError, ValueError) as error:
-        raise ModelError(
-            f"{path} is not JSON: {error}", "expected a complete JSON file", "copy or download it again"
-        ) from error
-    if not isinstance(value, dict):
-        raise ModelError(
-            f"{path} contains no settings", "expected a JSON object", "copy or download it again"
-        )
-    return value
+        value, cause = None, error
+        problem = "is missing" if isinstance(error, FileNotFoundError) else f"is not JSON: {error}"
+    if isinstance(value, dict):
+        return value
+    raise ModelError(f"{path} {problem}", "expected a JSON object", "copy or download it again") from cause
 
 
 def _header(data: bytes) -> tuple[dict[str, Any], int]:

@@ -69,35 +69,28 @@ def trace(
         PhotoError: a file cannot be decoded, or is not an environment map.
     """
     mi = load()
-    with _active_variant(mi, _variant(polarised)):
-        builders = [
-            MitsubaSceneBuilder(mi, scene, assets, channel)
-            for channel in (range(3) if polarised else (None,))
-        ]
+    with _active_variant(mi, polarised=polarised):
+        channels = range(3) if polarised else (None,)
+        builders = [MitsubaSceneBuilder(mi, scene, assets, channel) for channel in channels]
         return _render_layers(builders, noise_threshold, max_samples, denoise)
 
 
 @contextmanager
-def _active_variant(mi: ModuleType, name: str) -> Iterator[None]:
+def _active_variant(mi: ModuleType, *, polarised: bool) -> Iterator[None]:
     """Selects a variant of Mitsuba for the whole process, and restores the previous variant afterwards."""
-    previous = mi.variant()
-    mi.set_variant(name)
-    try:
-        yield
-    finally:
-        if previous:
-            mi.set_variant(previous)
-
-
-def _variant(polarised: bool) -> str:
-    name = probe().variant
+    previous, name = mi.variant(), probe().variant
     if polarised and name != COMPILED:
         raise DeviceError(
             "polarised light cannot be traced",
             "expected a working LLVM",
             f"install LLVM 17 or newer: {INSTALL_LLVM}",
         )
-    return _POLARISED if polarised else name
+    mi.set_variant(_POLARISED if polarised else name)
+    try:
+        yield
+    finally:
+        if previous:
+            mi.set_variant(previous)
 
 
 def _render_layers(
@@ -131,11 +124,8 @@ def _to_tensor(light: NDArray[np.float64], denoise: bool) -> Tensor:
         try:
             denoiser = importlib.import_module("mitsuba_oidn")
         except ImportError as error:
-            happened, expected = (
-                "mitsuba_oidn is not installed",
-                "expected the package mitsuba-oidn for denoising",
-            )
-            raise MissingExtra.for_extra("render", happened, expected) from error
+            expected = "expected the package mitsuba-oidn for denoising"
+            raise MissingExtra.for_extra("render", "mitsuba_oidn is not installed", expected) from error
         image = np.array(denoiser.denoise(image, hdr=True), np.float32)
     return torch.from_numpy(image).permute(2, 0, 1).contiguous()
 

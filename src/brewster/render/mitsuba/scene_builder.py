@@ -36,9 +36,8 @@ last pane (the paper's R); `mirror`: the first surface is a perfect mirror (MR);
 """
 
 _BLACK: Final[Plugin] = {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.0}}
-_MIN_EXTINCTION_FRACTION: Final = (
-    1e-6  # Mitsuba returns NaN for a medium with an extinction of 0 in one colour
-)
+# Mitsuba returns NaN for a medium with an extinction of 0 in one colour.
+_MIN_EXTINCTION_FRACTION: Final = 1e-6
 _LENS_GRID: Final = 256  # squares of the mesh along each side of a lens
 _MIN_MAP_ROWS: Final = 512  # a map is cut off at the glass plane with an error of at most 180 / 512 degrees
 _RUSSIAN_ROULETTE_DEPTH: Final = 64
@@ -57,35 +56,24 @@ class MitsubaSceneBuilder:
         self.mi, self.scene, self._assets, self._channel = mi, scene, assets, channel
         self._glass = scene.glass
         self._to_glass: Doubles = np.array(axes(scene.glass.heading_deg, scene.glass.pitch_deg))
-        self._camera_position = self._to_glass @ np.subtract(
-            scene.camera.position_mm, scene.glass.position_mm
-        )
-        self._view_corners = self._first_surface_corners()
-        self._half_extent_mm = (
-            4 * float(np.abs(self._view_corners).max()) + 50 * scene.glass.depth_mm + scene.camera.aperture_mm
-        )
-        _check_wedges(scene.glass, self._view_corners[:, 0])
+        offset = np.subtract(scene.camera.position_mm, scene.glass.position_mm)
+        self._camera_position = self._to_glass @ offset
+        corners = self._first_surface_corners()
+        largest = 4 * float(np.abs(corners).max())
+        self._half_extent_mm = largest + 50 * scene.glass.depth_mm + scene.camera.aperture_mm
+        _check_wedges(scene.glass, corners[:, 0])
 
     def scene_dict(self, *, lit_from_behind: bool, glass_mode: GlassMode) -> Plugin:
-        """Returns the whole scene, lit from one side of the glass. Objects of the other side are black.
-
-        Raises:
-            RecipeError: a lens has no thickness somewhere in its frame.
-        """
+        """Returns the whole scene, lit from one side of the glass. Objects of the other side are black. Raises
+        RecipeError if a lens has no thickness somewhere in its frame."""
         is_tinted = glass_mode not in {"mirror", "none"} and any(
             any(pane.absorption_per_m) for pane in self._glass.panes
         )
         parts = [*self._surfaces(glass_mode), *self._wall(), *self._emitters(lit_from_behind)]
-        return {
-            "type": "scene",
-            "integrator": {
-                "type": "volpath" if is_tinted else "path",
-                "max_depth": -1,
-                "rr_depth": _RUSSIAN_ROULETTE_DEPTH,
-            },
-            "sensor": self._sensor(),
-            **{f"part{number}": part for number, part in enumerate(parts)},
-        }
+        kind = "volpath" if is_tinted else "path"
+        integrator = {"type": kind, "max_depth": -1, "rr_depth": _RUSSIAN_ROULETTE_DEPTH}
+        numbered = {f"part{number}": part for number, part in enumerate(parts)}
+        return {"type": "scene", "integrator": integrator, "sensor": self._sensor(), **numbered}
 
     # Camera and common helpers
 
@@ -93,27 +81,22 @@ class MitsubaSceneBuilder:
         """Returns the camera. Mitsuba's cameras look along +z with +x to the left. The pixel filter is a box."""
         camera = self.scene.camera
         right, up, back = (self._to_glass @ axis for axis in np.array(camera.axes))
-        lens = {
-            "type": "thinlens",
-            "aperture_radius": camera.aperture_mm / 2,
-            "focus_distance": camera.focus_mm,
-        }
+        projection: Plugin = {"type": "perspective"}
+        if camera.aperture_mm > 0:
+            projection = {"type": "thinlens", "aperture_radius": camera.aperture_mm / 2}
+            projection["focus_distance"] = camera.focus_mm
         colours = "rgb" if self._channel is None else "luminance"
-        film = {
-            "type": "hdrfilm",
-            "pixel_format": colours,
-            "component_format": "float32",
-            "rfilter": {"type": "box"},
-        }
+        film: Plugin = {"type": "hdrfilm", "pixel_format": colours, "component_format": "float32"}
+        film |= {"rfilter": {"type": "box"}, "width": camera.width, "height": camera.height}
         return {
-            **(lens if camera.aperture_mm > 0 else {"type": "perspective"}),
+            **projection,
             "to_world": self._transform((-right, up, -back), self._camera_position),
             "fov": camera.fov_deg,
             "fov_axis": "x",
             "near_clip": 1.0,
             "far_clip": 1e9,
             "sampler": {"type": "multijitter"},
-            "film": {**film, "width": camera.width, "height": camera.height},
+            "film": film,
         }
 
     def _transform(self, columns: ArrayLike, origin: ArrayLike, scale: ArrayLike = (1, 1, 1)) -> object:
@@ -126,11 +109,8 @@ class MitsubaSceneBuilder:
     def _rectangle(
         self, columns: ArrayLike, origin: ArrayLike, half_size: Sequence[float], properties: Plugin
     ) -> Plugin:
-        return {
-            "type": "rectangle",
-            "to_world": self._transform(columns, origin, (*half_size, 1)),
-            **properties,
-        }
+        to_world = self._transform(columns, origin, (*half_size, 1))
+        return {"type": "rectangle", "to_world": to_world, **properties}
 
     def _select_channel(self, colours: ArrayLike) -> Floats:
         """Returns the colours (..., 3), or the selected channel repeated three times if the builder has a `channel`."""
@@ -171,25 +151,19 @@ class MitsubaSceneBuilder:
         """Returns the pane's far surface. It ends at the edge where the two surfaces of a wedge meet."""
         sine, cosine = math.sin(math.radians(pane.wedge_deg)), math.cos(math.radians(pane.wedge_deg))
         edge = -pane.thickness_mm / sine if sine else math.inf
-        low, high = (
-            (max(edge, -self._half_extent_mm), self._half_extent_mm)
-            if edge < 0
-            else (-self._half_extent_mm, min(edge, self._half_extent_mm))
-        )
+        extent = self._half_extent_mm
+        low, high = (max(edge, -extent), extent) if edge < 0 else (-extent, min(edge, extent))
         across = np.array((cosine, 0, -sine))
         middle = np.array((0, 0, height)) + across * (low + high) / 2
         columns = -across, np.array((0, 1, 0)), np.array((-sine, 0, -cosine))
-        return self._rectangle(columns, middle, ((high - low) / 2, self._half_extent_mm), material)
+        return self._rectangle(columns, middle, ((high - low) / 2, extent), material)
 
     def _material(self, pane: Pane, glass_mode: GlassMode) -> tuple[bool, Plugin]:
         """Returns whether light enters the pane, and the materials of its surfaces and its interior."""
         if glass_mode == "mirror":
             return False, {"bsdf": {"type": "conductor", "material": "none"}}
-        rough = (
-            {"alpha": pane.roughness, "distribution": "ggx"}
-            if pane.roughness and pane.refractive_index > 1
-            else {}
-        )
+        is_rough = pane.roughness and pane.refractive_index > 1
+        rough = {"alpha": pane.roughness, "distribution": "ggx"} if is_rough else {}
         kind = "rough" if rough else ""
         if glass_mode == "truncated_reflection" and pane is self._glass.panes[-1]:
             # A conductor with k = 0 has the reflectance of glass, and Mitsuba traces no transmitted rays.
@@ -207,14 +181,8 @@ class MitsubaSceneBuilder:
             return {}
         relative = self._select_channel(pane.absorption_per_m) / max_absorption
         sigma = {"type": "rgb", "value": relative.clip(min=_MIN_EXTINCTION_FRACTION).tolist()}
-        return {
-            "interior": {
-                "type": "homogeneous",
-                "albedo": 0.0,
-                "sigma_t": sigma,
-                "scale": max_absorption / 1000,
-            }
-        }
+        medium = {"type": "homogeneous", "albedo": 0.0, "sigma_t": sigma, "scale": max_absorption / 1000}
+        return {"interior": medium}
 
     def _wall(self) -> Iterator[Plugin]:
         """Yields a black wall around the frame's opening, in the plane of the first surface, as four rectangles."""
@@ -262,9 +230,8 @@ class MitsubaSceneBuilder:
     def _mesh(self, points: Doubles, normals: Doubles, material: Plugin) -> object:
         """Returns a mesh of triangles over a grid of points (rows, columns, 3). Mitsuba interpolates the normals."""
         corner = np.arange(points[..., 0].size).reshape(points.shape[:2])
-        a, b, c, d = (
-            part.ravel() for part in (corner[:-1, :-1], corner[:-1, 1:], corner[1:, 1:], corner[1:, :-1])
-        )
+        squares = corner[:-1, :-1], corner[:-1, 1:], corner[1:, 1:], corner[1:, :-1]
+        a, b, c, d = (part.ravel() for part in squares)
         faces = np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)]).astype(np.uint32)
         props = self.mi.Properties()
         for name, plugin in material.items():
@@ -316,41 +283,26 @@ class MitsubaSceneBuilder:
         height, width = self._map_size(envmap)
         u, v = (np.arange(width) + 0.5) / width, np.arange(2 * height + 1) / (2 * height)
         columns = self._to_glass @ np.array(axes(envmap.heading_deg, 0)).T
-        texels = self._texels(envmap, is_behind, u, v)
-        return {
-            "type": "envmap",
-            "bitmap": self.mi.Bitmap(texels),
-            "to_world": self._transform(columns.T, (0, 0, 0)),
-        }
+        bitmap = self.mi.Bitmap(self._texels(envmap, is_behind, u, v))
+        return {"type": "envmap", "bitmap": bitmap, "to_world": self._transform(columns.T, (0, 0, 0))}
 
     def _dome(self, envmap: EnvironmentMap, is_behind: bool) -> Plugin:
-        """Returns a sphere around the glass that emits inwards.
-
-        Mitsuba's longitude increases in the other direction, so the map is mirrored. Mitsuba repeats the texture in both
-        directions, so an additional row at each pole prevents interpolation between the poles.
-        """
+        """Returns a sphere around the glass that emits inwards. Mitsuba's longitude increases in the other direction,
+        so the map is mirrored. Mitsuba repeats the texture in both directions, so an additional row at each pole
+        prevents interpolation between the poles."""
         height, width = self._map_size(envmap)
         u, v = (np.arange(width) + 0.5) / width, (np.arange(height) + 0.5) / height
         texels = np.pad(self._texels(envmap, is_behind, u, v)[:, ::-1], ((1, 1), (0, 0), (0, 0)), "edge")
         to_inner_rows = np.array(((1, 0, 0), (0, height / (height + 2), 1 / (height + 2)), (0, 0, 1)))
         texture = self._bitmap(texels, wrap_mode="repeat", to_uv=self.mi.ScalarTransform3f(to_inner_rows))
         right, up, back = (self._to_glass @ axis for axis in np.array(axes(envmap.heading_deg, 0)))
-        return {
-            "type": "sphere",
-            "to_world": self._transform((-back, -right, up), (0, 0, 0)),
-            "radius": envmap.radius_mm,
-            "flip_normals": True,
-            "bsdf": _BLACK,
-            "emitter": {"type": "area", "radiance": texture},
-        }
+        to_world = self._transform((-back, -right, up), (0, 0, 0))
+        dome = {"type": "sphere", "to_world": to_world, "radius": envmap.radius_mm, "flip_normals": True}
+        return {**dome, "bsdf": _BLACK, "emitter": {"type": "area", "radiance": texture}}
 
     def _bitmap(self, image: Floats, **properties: object) -> Plugin:
-        return {
-            "type": "bitmap",
-            "raw": True,
-            "bitmap": self.mi.Bitmap(np.ascontiguousarray(image)),
-            **properties,
-        }
+        bitmap = self.mi.Bitmap(np.ascontiguousarray(image))
+        return {"type": "bitmap", "raw": True, "bitmap": bitmap, **properties}
 
     def _map_size(self, envmap: EnvironmentMap) -> tuple[int, int]:
         """Returns the height and the width of the map. Coarse maps are enlarged by an odd factor, which keeps texel centres."""
@@ -369,10 +321,8 @@ class MitsubaSceneBuilder:
 
 
 def sample_bilinear(texels: Floats, u: Doubles, v: Doubles) -> Floats:
-    """Interpolates a map (H, W, 3) bilinearly on the grid of columns u (n,) and rows v (m,) in 0..1: (m, n, 3).
-
-    u wraps around; v is clamped to the centres of the first and last row.
-    """
+    """Interpolates a map (H, W, 3) bilinearly on the grid of columns u (n,) and rows v (m,) in 0..1: (m, n, 3). u wraps
+    around; v is clamped to the centres of the first and last row."""
     height, width = texels.shape[:2]
     row, column = v * height - 0.5, u * width - 0.5
     top, left = np.floor(row).astype(int), np.floor(column).astype(int)
@@ -387,10 +337,8 @@ def _check_wedges(glass: Glazing, across: Doubles) -> None:
     """Checks that wedged panes have thickness and do not touch at these x coordinates (n,) on the first surface."""
     for number, pane in enumerate(glass.panes):
         added_mm = across * math.tan(math.radians(pane.wedge_deg))
-        is_last = number == len(glass.panes) - 1
-        if (pane.thickness_mm + added_mm).min() <= 0 or (
-            not is_last and (glass.gap_mm - added_mm).min() <= 0
-        ):
+        gap_mm = math.inf if pane is glass.panes[-1] else glass.gap_mm
+        if (pane.thickness_mm + added_mm).min() <= 0 or (gap_mm - added_mm).min() <= 0:
             raise RecipeError(
                 f"the wedge of {pane.wedge_deg:g} degrees makes pane {number + 1} meet another surface",
                 "expected surfaces that do not meet in the view",

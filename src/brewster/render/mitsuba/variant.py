@@ -73,13 +73,9 @@ class VariantProbe:
 
 
 def load() -> ModuleType:
-    """Imports Mitsuba with a working LLVM. If no LLVM works, only scalar variants can be selected, and a warning is given.
-
-    The first call takes a second or two.
-
-    Raises:
-        MissingExtra: mitsuba is not installed, or a system library that it needs is missing.
-    """
+    """Imports Mitsuba with a working LLVM. If no LLVM works, only scalar variants can be selected, and a warning is
+    given. The first call takes a second or two. Raises MissingExtra if mitsuba is not installed, or a system library
+    that it needs is missing."""
     found = probe()
     for runtime in _runtime_libraries(found.library):
         # RTLD_GLOBAL is not set, because with it, exceptions of other C++ libraries end the process.
@@ -107,24 +103,17 @@ def load() -> ModuleType:
 
 def install_command(reason: str) -> str:
     """Returns the command that installs the missing package when the import of Mitsuba fails for this reason."""
-    return (
-        "apt install libatomic1" if "libatomic" in reason else "pip install --force-reinstall mitsuba drjit"
-    )
+    has_package = "libatomic" not in reason
+    return "pip install --force-reinstall mitsuba drjit" if has_package else "apt install libatomic1"
 
 
 @lru_cache(maxsize=1)
 def probe() -> VariantProbe:
-    """Tries each LLVM in a separate process. Returns the variant to use; the result is cached.
-
-    Raises:
-        MissingExtra: mitsuba is not installed.
-    """
+    """Tries each LLVM in a separate process. Returns the variant to use; the result is cached. Raises MissingExtra if
+    mitsuba is not installed."""
     if find_spec("mitsuba") is None:
-        raise MissingExtra.for_extra(
-            "render",
-            "mitsuba is not installed",
-            "expected the package mitsuba for this renderer",
-        )
+        expected = "expected the package mitsuba for this renderer"
+        raise MissingExtra.for_extra("render", "mitsuba is not installed", expected)
     reasons = []
     for library in _candidates():
         reason = _failure_reason(library)
@@ -158,16 +147,14 @@ def _packaged_llvm() -> list[str]:
         files = metadata.files(_LLVM_PACKAGE) or []
     except metadata.PackageNotFoundError:
         return []
-    return [
-        str(Path(file.locate()).resolve()) for file in files if re.fullmatch(r"libLLVM\.so[.\d]+", file.name)
-    ]
+    libraries = (file for file in files if re.fullmatch(r"libLLVM\.so[.\d]+", file.name))
+    return [str(Path(file.locate()).resolve()) for file in libraries]
 
 
 def _runtime_libraries(library: str | None) -> list[str]:
     """Returns the libraries of the C++ runtime that the package installs next to its LLVM; empty for any other LLVM.
-
-    They must be loaded before the LLVM: it finds them through links, which the package creates only when Python starts.
-    """
+    They must be loaded before the LLVM: it finds them through links, which the package creates only when Python
+    starts."""
     folder = Path(library or "").parent / "x86_64-unknown-linux-gnu"
     return [str(folder / name) for name in _RUNTIME_LIBRARIES if (folder / name).exists()]
 
@@ -180,9 +167,7 @@ def _version(path: Path) -> int:
 
 def _failure_reason(library: str | None) -> str:
     """Renders a test image with this LLVM in a separate process. Returns the error in one line, or "" if it succeeds.
-
-    The home folder of the process is empty, so that Dr.Jit does not reuse cached kernels of another LLVM.
-    """
+    The home folder of the process is empty, so that Dr.Jit does not reuse cached kernels of another LLVM."""
     with tempfile.TemporaryDirectory() as home:
         folders = {"HOME": home, "LOCALAPPDATA": home, "PYTHONUSERBASE": site.getuserbase()}
         llvm = {LLVM_PATH_VARIABLE: library} if library else {}

@@ -22,7 +22,7 @@ from brewster.benchmarks.pairing import ImageGroup, read_folders
 from brewster.errors import RecipeError
 from brewster.models.diffusion.backbones.backbone import Backbone
 from brewster.models.diffusion.panels import PanelFit, compose, conditioning_image
-from brewster.models.diffusion.pipeline import one_step_latents
+from brewster.models.diffusion.pipeline import one_step_start
 from brewster.photo import Photo
 from brewster.srgb import to_encoded, to_linear
 from brewster.training.data.image_loading import read_pairs
@@ -52,10 +52,8 @@ class TrainingSample:
 
 @dataclass(frozen=True, eq=False)
 class EncodedSample:
-    """Latents of a sample, float32, on the CPU: the composite of all panels, and the conditioning image.
-
-    `start` contains the photo in every panel for the objective one_step. It is None for flow, which starts from noise.
-    """
+    """Latents of a sample, float32, on the CPU: the composite of all panels, and the conditioning image. `start` contains the
+    photo in every panel for the objective one_step. It is None for flow, which starts from noise."""
 
     composite: Float[Tensor, "1 c h w"]
     condition: Float[Tensor, "1 c p q"]
@@ -81,14 +79,11 @@ class SampleSequence:
         return self._pairs[number - self._first_pair]
 
     def check_sizes(self, recipe: LoraRecipe, size_divisor: int) -> list[PanelFit]:
-        """Returns the panel sizes for the first rendered sample and for every pair. Training calls this first, so that an
-        unusable sample stops it before any step. Raises RecipeError or PhotoError if a file is damaged or missing, or a sample
-        is too small, see `fit_sample`.
-        """
-        first = [self._rendered.sample(0)] if self._rendered else []
-        return [
-            fit_sample(layers, recipe, size_divisor) for layers in (*first, *(p.layers for p in self._pairs))
-        ]
+        """Returns the panel sizes for the first rendered sample and for every pair. Training calls this first, so that
+        an unusable sample stops it before any step. Raises RecipeError or PhotoError if a file is damaged or missing,
+        or a sample is too small, see `fit_sample`."""
+        first = [TrainingSample(self._rendered.sample(0))] if self._rendered else []
+        return [fit_sample(sample.layers, recipe, size_divisor) for sample in (*first, *self._pairs)]
 
     def description(self) -> str:
         """Returns the number of samples of each source in words."""
@@ -119,8 +114,8 @@ class EncodedSampleLoader:
 
     def _encode(self, number: int, mirrored: bool, crop: int) -> EncodedSample:
         sample, layout, encode = self._samples[number], self._recipe.layout, self._backbone.encode
-        fit = fit_sample(sample.layers, self._recipe, self._backbone.size_divisor)
         layers = sample.layers
+        fit = fit_sample(layers, self._recipe, self._backbone.size_divisor)
         if crop:
             # A negative step gives other random numbers than any training step.
             layers = crop_sample(SampleRng(self._recipe.seed, -1 - number, crop), layers, fit)
@@ -128,34 +123,25 @@ class EncodedSampleLoader:
         return EncodedSample(
             encode(compose(panels, layout)).cpu(),
             encode(conditioning_image(panels["I"], layout)).cpu(),
-            None
-            if self._recipe.objective == "flow"
-            else one_step_latents(panels["I"], self._backbone, layout).cpu(),
+            None if self._recipe.objective == "flow" else encode(one_step_start(panels["I"], layout)).cpu(),
             sample.reflection_weight,
         )
 
 
 def crop_sample(rng: SampleRng, layers: UInt8[Tensor, "h w 9"], fit: PanelFit) -> UInt8[Tensor, "p q 9"]:
-    """Returns a random crop with the aspect ratio of the sample. Its sides are 0.5 to 1 of those of the sample, and at least
-    those of `fit.content`.
-    """
+    """Returns a random crop with the aspect ratio of the sample. Its sides are 0.5 to 1 of those of the sample, and at
+    least those of `fit.content`."""
     height, width, _ = layers.shape
     min_side = max(_MIN_CROP_SIDE, fit.content[0] / width, fit.content[1] / height)
     side = rng.uniform((min_side, 1.0))
-    columns, rows = (
-        max(smallest, round(side * whole))
-        for smallest, whole in zip(fit.content, (width, height), strict=True)
-    )
+    columns, rows = max(fit.content[0], round(side * width)), max(fit.content[1], round(side * height))
     top, left = rng.randint(height - rows + 1), rng.randint(width - columns + 1)
     return layers[top : top + rows, left : left + columns]
 
 
 def make_panels(layers: UInt8[Tensor, "h w 9"], fit: PanelFit) -> dict[str, Float[Tensor, "1 3 p q"]]:
-    """Resizes photo, transmission and reflection in linear light and pads them.
-
-    Returns:
-        The panels I, T and R, sRGB-encoded in [-1, 1].
-    """
+    """Resizes photo, transmission and reflection in linear light and pads them. Returns the panels I, T and R,
+    sRGB-encoded in [-1, 1]."""
     linear = to_linear(layers.permute(2, 0, 1)[None] / 255)
     small = functional.interpolate(linear, fit.content[::-1], mode="bilinear", antialias=True)
     padded = fit.pad(2 * to_encoded(small.clamp(0, 1)) - 1)
@@ -163,22 +149,17 @@ def make_panels(layers: UInt8[Tensor, "h w 9"], fit: PanelFit) -> dict[str, Floa
 
 
 def fit_sample(layers: Tensor, recipe: LoraRecipe, size_divisor: int) -> PanelFit:
-    """Returns the size of the panels of a sample, and the position of the sample in them, as for photos at inference.
-
-    A sample is never enlarged: a small sample gets small panels. Raises PhotoError if a side of the sample is smaller than
-    `size_divisor`, or its aspect ratio is too extreme.
-    """
+    """Returns the size of the panels of a sample, and the position of the sample in them, as for photos at inference. A
+    sample is never enlarged: a small sample gets small panels. Raises PhotoError if a side of the sample is smaller
+    than `size_divisor`, or its aspect ratio is too extreme."""
     height, width, _ = layers.shape
     return recipe.task.fit((width, height), size_divisor)
 
 
 def open_samples(recipe: LoraRecipe) -> SampleSequence:
-    """Opens the rendered datasets and pairs of a recipe. Data with a share of 0 is not read.
-
-    Raises:
-        RecipeError: a folder is missing, empty or without reflections, or there are too few rendered samples.
-        PhotoError: an image cannot be read.
-    """
+    """Opens the rendered datasets and pairs of a recipe. Data with a share of 0 is not read. Raises RecipeError if a
+    folder is missing, empty or without reflections, or there are too few rendered samples; PhotoError if an image
+    cannot be read."""
     data, rendered, datasets = recipe.data, recipe.data.rendered, None
     if rendered and data.pairs_share < 1 and data.rendered_share:
         datasets = RenderedDatasets(
@@ -220,10 +201,8 @@ def _read_sample(
 
 
 def layers_from_pair(photo: Tensor, transmission: Tensor) -> Tensor:
-    """Returns photo, transmission and reflection as (H, W, 9) sRGB uint8.
-
-    The reflection is photo - transmission in linear light, at least 0.
-    """
+    """Returns photo, transmission and reflection as (H, W, 9) sRGB uint8. The reflection is photo - transmission in
+    linear light, at least 0."""
     difference = to_linear(photo / 255) - to_linear(transmission / 255)
     reflection = (to_encoded(difference.clamp(0, 1)) * 255).round().to(torch.uint8)
     return torch.cat([photo, transmission, reflection], dim=2)

@@ -46,14 +46,9 @@ _SCORE_TITLES: Final = {
 def write_card(
     folder: Path, recipe: LoraRecipe, scores: Mapping[str, float], backbone_class: type[Backbone]
 ) -> None:
-    """Writes or replaces the model card in a folder that contains the LoRA and its prompt.
-
-    `scores` is the last line of the run's log.
-
-    Raises:
-        ModelError: the prompt is missing, damaged, or of another backbone.
-        OutputError: the folder cannot be written.
-    """
+    """Writes or replaces the model card in a folder that contains the LoRA and its prompt. `scores` is the last line of
+    the run's log. Raises ModelError if the prompt is missing, damaged, or of another backbone; OutputError if the
+    folder cannot be written."""
     prompt = load_prompt(folder / PROMPT_FILE, backbone_class.name).text
     text = card_text(recipe, scores=scores, backbone_class=backbone_class, prompt=prompt)
     write_atomically(folder / CARD_FILE, text.encode(), overwrite=True)
@@ -106,16 +101,7 @@ def card_text(
             for index, panel in enumerate(recipe.panels)
         },
         scores={
-            next(
-                (
-                    title.format(name.removeprefix(prefix))
-                    for prefix, title in _SCORE_TITLES.items()
-                    if name.startswith(prefix)
-                ),
-                name.replace("_", " "),
-            ): value
-            for name, value in scores.items()
-            if name not in {"step", "seconds"}
+            _score_title(name): value for name, value in scores.items() if name not in {"step", "seconds"}
         },
         benchmark_heading=_BENCHMARK_HEADING,
         licence=licence.title,
@@ -134,6 +120,13 @@ def with_benchmark_tables(card: str, tables: str) -> str:
             "train again to write a new card",
         )
     return f"{before}{heading}\n{tables.strip()}\n\n{rest[after.start() :]}"
+
+
+def _score_title(name: str) -> str:
+    for prefix, title in _SCORE_TITLES.items():
+        if name.startswith(prefix):
+            return title.format(name.removeprefix(prefix))
+    return name.replace("_", " ")
 
 
 def _dataset_description(folder: Path) -> str:

@@ -74,16 +74,10 @@ class LoraTrainer:
     """The `Trainer` of a LoRA: a frozen backbone, a float32 LoRA on it, and AdamW.
 
     The constructor checks the data and the machine. The backbone is loaded later, at its first use, so that `initialize` can
-    load and release the text encoders before.
-
-    Args:
-        recipe: the settings.
-        device: "auto" for the GPU, or "cpu".
-
-    Raises:
-        RecipeError, PhotoError: the data is missing, damaged, too small, or without reflections.
-        DeviceError: there is no GPU and `device` is not "cpu", the memory is too small, or the optimiser is not available.
-        DownloadError, ModelError, MissingExtra: the backbone is unknown, or the disk is too small for its download.
+    load and release the text encoders before. `device` is "auto" for the GPU, or "cpu". Raises RecipeError or PhotoError if the
+    data is missing, damaged, too small, or without reflections; DeviceError if there is no GPU and `device` is not "cpu", the
+    memory is too small, or the optimiser is not available; DownloadError, ModelError or MissingExtra if the backbone is unknown,
+    or the disk is too small for its download.
     """
 
     def __init__(self, recipe: LoraRecipe, device: str = "auto") -> None:
@@ -135,13 +129,8 @@ class LoraTrainer:
         MissingExtra if the backbone cannot be loaded."""
         recipe = self.recipe
         backbone = load_backbone(recipe.backbone, device=self._device, quantization=recipe.quantization)
-        add_lora(
-            backbone,
-            rank=recipe.rank,
-            alpha=recipe.alpha,
-            seed=recipe.seed,
-            target_modules=recipe.target_modules,
-        )
+        names = ("rank", "alpha", "seed", "target_modules")
+        add_lora(backbone, **{name: getattr(recipe, name) for name in names})
         backbone.transformer.enable_gradient_checkpointing()
         return backbone
 
@@ -155,11 +144,10 @@ class LoraTrainer:
 
     @cached_property
     def _optimizer(self) -> torch.optim.Optimizer:
-        is_8_bit = self.recipe.optimizer == "adamw8bit"
+        recipe = self.recipe
+        is_8_bit = recipe.optimizer == "adamw8bit"
         create = importlib.import_module("bitsandbytes.optim").AdamW8bit if is_8_bit else torch.optim.AdamW
-        optimizer = create(
-            self._parameters, lr=self.recipe.learning_rate, weight_decay=self.recipe.weight_decay
-        )
+        optimizer = create(self._parameters, lr=recipe.learning_rate, weight_decay=recipe.weight_decay)
         assert isinstance(optimizer, torch.optim.Optimizer)
         return optimizer
 
@@ -170,18 +158,17 @@ class LoraTrainer:
         return self._prompt
 
     def initialize(self) -> None:
-        """Loads or encodes the prompt of the recipe, then loads the backbone.
+        """Loads or encodes the prompt of the recipe, then loads the backbone. Only rank 0 loads the text encoders. It
+        releases them before the backbone is loaded. Raises DownloadError, ModelError, DeviceError or MissingExtra if a
+        text encoder, the prompt or the backbone cannot be loaded."""
 
-        Only rank 0 loads the text encoders. It releases them before the backbone is loaded. Raises DownloadError, ModelError,
-        DeviceError or MissingExtra if a text encoder, the prompt or the backbone cannot be loaded.
-        """
+        def load() -> PromptEmbedding:
+            name, backbone = self.recipe.prompt, self.recipe.backbone
+            if name.endswith(ENCODED_SUFFIX):
+                return load_prompt(Path(name), self._backbone_class.name)
+            return encode_prompt(backbone, PROMPTS[name], device=self._device)
 
-        def load_prompt_of_recipe() -> PromptEmbedding:
-            if self.recipe.prompt.endswith(ENCODED_SUFFIX):
-                return load_prompt(Path(self.recipe.prompt), self._backbone_class.name)
-            return encode_prompt(self.recipe.backbone, PROMPTS[self.recipe.prompt], device=self._device)
-
-        self._prompt = distributed.from_main_process(load_prompt_of_recipe)
+        self._prompt = distributed.from_main_process(load)
         _ = self.backbone
 
     def state_dict(self) -> dict[str, Any]:
@@ -198,13 +185,10 @@ class LoraTrainer:
         self._prompt = PromptEmbedding(self._backbone_class.name, **state["prompt"])
 
     def training_step(self, step: int) -> dict[str, float]:
-        """Runs one step of AdamW on one batch. Returns `loss` and the term of each panel, `loss_panel_NAME`.
-
-        Raises:
-            ModelError: the loss is NaN or infinite. The last checkpoint is still valid.
-            DeviceError: the GPU is out of memory. The message lists the values to lower.
-            RecipeError, PhotoError: a sample is missing, damaged or too small.
-        """
+        """Runs one step of AdamW on one batch. Returns `loss` and the term of each panel, `loss_panel_NAME`. Raises
+        ModelError if the loss is NaN or infinite. The last checkpoint is still valid; DeviceError if the GPU is out of
+        memory. The message lists the values to lower; RecipeError or PhotoError if a sample is missing, damaged or too
+        small."""
         self._optimizer.zero_grad()
         parts: dict[str, Tensor] = {}
         with explain_out_of_memory(_MEMORY_CURE):
@@ -213,9 +197,7 @@ class LoraTrainer:
                 scaled = {name: loss / self.recipe.batch_size for name, loss in losses.items()}
                 torch.stack(list(scaled.values())).sum().backward()  # type: ignore[no-untyped-call]
                 parts = {name: parts.get(name, 0) + loss.detach() for name, loss in scaled.items()}
-        distributed.all_reduce_sum(
-            [parameter.grad for parameter in self._parameters if parameter.grad is not None]
-        )
+        distributed.all_reduce_sum([each.grad for each in self._parameters if each.grad is not None])
         distributed.all_reduce_sum(list(parts.values()))
         loss = check_finite(torch.stack(list(parts.values())).sum(), step)
         check_finite(nn.utils.clip_grad_norm_(self._parameters, _MAX_GRADIENT_NORM), step, "gradient")
@@ -226,21 +208,14 @@ class LoraTrainer:
 
     @torch.no_grad()
     def validate(self) -> tuple[dict[str, float], Tensor]:
-        """Returns the mean PSNR gain of the generated T over the photo in dB for each folder, and an image of the panels.
-
-        The samples are divided among the processes. All processes must call this method.
-        """
+        """Returns the mean PSNR gain of the generated T over the photo in dB for each folder, and an image of the
+        panels. The samples are divided among the processes. All processes must call this method."""
         samples = [layers for folder in self._validation_samples.values() for layers in folder]
         columns = [f"ground truth {panel}" for panel in "ITR"]
         columns += [f"generated {panel}" for panel in self.recipe.panels]
+        height, width = _THUMBNAIL_SHAPE_PX
         gains = torch.zeros(len(samples), device=self._device)
-        images = torch.zeros(
-            len(samples),
-            3,
-            _THUMBNAIL_SHAPE_PX[0],
-            len(columns) * _THUMBNAIL_SHAPE_PX[1],
-            device=self._device,
-        )
+        images = torch.zeros(len(samples), 3, height, len(columns) * width, device=self._device)
         for index in range(distributed.rank(), len(samples), distributed.world_size()):
             gain, image = self._validate_sample(samples[index])
             gains[index], images[index] = gain, image.clamp(0, 1).to(self._device)
@@ -250,28 +225,23 @@ class LoraTrainer:
         for name, folder in self._validation_samples.items():
             part = list(itertools.islice(results, len(folder)))
             means[f"psnr_gain_db_{name}"] = sum(gain for gain, _ in part) / len(part)
-            rows += [
-                (f"{name} {number}: PSNR gain {gain:+.2f} dB", image)
-                for number, (gain, image) in enumerate(part, start=1)
-            ]
+            for number, (gain, image) in enumerate(part, start=1):
+                rows.append((f"{name} {number}: PSNR gain {gain:+.2f} dB", image))
         return means, sample_sheet(columns, rows)
 
     def export(self, folder: Path) -> Path:
-        """Writes LoRA, prompt, recipe and model card to the folder `lora` in `folder`, and returns its path. diffusers can load
-        the LoRA. Raises OutputError if the folder cannot be written.
-        """
-        lora_folder = folder / LORA_FOLDER
-        base_model = self.recipe.backbone
-        if Path(base_model).is_dir():
-            base_model = str(Path(base_model).resolve())
+        """Writes LoRA, prompt, recipe and model card to the folder `lora` in `folder`, and returns its path. diffusers
+        can load the LoRA. Raises OutputError if the folder cannot be written."""
+        lora_folder, recipe = folder / LORA_FOLDER, self.recipe
+        base = Path(recipe.backbone)
         save_lora(
             lora_folder,
             self.backbone,
             self.prompt,
-            self.recipe.task,
-            base_model=base_model,
-            quantization=self.recipe.quantization,
-            target_modules=self.recipe.target_modules,
+            recipe.task,
+            base_model=str(base.resolve()) if base.is_dir() else recipe.backbone,
+            quantization=recipe.quantization,
+            target_modules=recipe.target_modules,
         )
         text = json.dumps(self.recipe.model_dump(mode="json"), indent=2)
         write_atomically(lora_folder / RECIPE_FILE, f"{text}\n".encode(), overwrite=True)
@@ -280,26 +250,18 @@ class LoraTrainer:
         return lora_folder
 
     def separate(self, photo: Tensor, *, seed: int = 0) -> Mapping[str, Tensor]:
-        """Generates the panels of a photo, (1, 3, h, w) in [-1, 1], in the same way as at inference. The photo has the size of
-        a panel. Raises DeviceError if the GPU is out of memory. The message lists the values to lower.
-        """
+        """Generates the panels of a photo, (1, 3, h, w) in [-1, 1], in the same way as at inference. The photo has the
+        size of a panel. Raises DeviceError if the GPU is out of memory. The message lists the values to lower."""
         return DecompositionPipeline(self.backbone, self.prompt, self.recipe.task)(photo, seeds=[seed])
 
     def _losses(self, rng: SampleRng) -> dict[str, Tensor]:
-        """Returns the weighted mean squared error of the predicted velocity for each panel. The loss is the sum of these errors.
-
-        The true velocity is start - composite.
-        """
+        """Returns the weighted mean squared error of the predicted velocity for each panel. The loss is the sum of
+        these errors. The true velocity is start - composite."""
         encoded, device = self._encoded_samples(rng), self.backbone.device
         start, sigma = self._start_and_sigma(rng, encoded)
         noisy = (1 - sigma) * encoded.composite + sigma * start
-        velocity = self.backbone.predict(
-            noisy.to(device),
-            encoded.condition.to(device),
-            sigma.to(device),
-            self.prompt,
-            self.recipe.guidance,
-        )
+        noisy, condition, sigma = (each.to(device) for each in (noisy, encoded.condition, sigma))
+        velocity = self.backbone.predict(noisy, condition, sigma, self.prompt, self.recipe.guidance)
         errors = (velocity - (start - encoded.composite).to(device)).square()
         weights: dict[str, float] = {
             panel: self.recipe.panel_weights.get(panel, 1.0) for panel in self.recipe.panels
@@ -311,17 +273,15 @@ class LoraTrainer:
         }
 
     def _start_and_sigma(self, rng: SampleRng, encoded: EncodedSample) -> tuple[Tensor, Tensor]:
-        """Returns the start of the path (noise, or the photo for one_step) and the time sigma: 1 at the start, 0 at the composite.
-
-        The distribution of times is logit-normal (Esser et al. 2024). Times are then shifted for the resolution.
-        """
+        """Returns the start of the path (noise, or the photo for one_step) and the time sigma: 1 at the start, 0 at the
+        composite. The distribution of times is logit-normal (Esser et al. 2024). Times are then shifted for the
+        resolution."""
         if encoded.start is not None:
             return encoded.start, torch.ones(1)
         recipe, grid = self.recipe, encoded.composite
         normal = recipe.logit_mean + recipe.logit_std * rng.normal(1)
-        sigma = self.backbone.shifted(
-            normal.sigmoid(), grid.shape[2] * grid.shape[3], timestep_shift=recipe.timestep_shift
-        )
+        tokens = grid.shape[2] * grid.shape[3]
+        sigma = self.backbone.shifted(normal.sigmoid(), tokens, timestep_shift=recipe.timestep_shift)
         return rng.normal(*grid.shape), sigma
 
     def _validate_sample(self, layers: Tensor) -> tuple[float, Tensor]:

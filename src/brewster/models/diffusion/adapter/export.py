@@ -8,13 +8,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Final
 
 import torch
 from torch import Tensor, nn
 
 from brewster.errors import DeviceError, ModelError, OutputError
-from brewster.models.diffusion.adapter.lora import read_lora, read_prompt
+from brewster.models.diffusion.adapter.lora import PREFIX, read_lora, read_prompt
 from brewster.models.diffusion.adapter.lora_formats import DOWN_SUFFIX, UP_SUFFIX, adapted_layers
 from brewster.models.diffusion.backbones.backbone import Backbone
 from brewster.models.diffusion.backbones.loading import load_backbone
@@ -27,23 +26,17 @@ from brewster.models.diffusion.task import TASK_FILE, save_task
 from brewster.models.diffusion.tensors import write_tensors
 from brewster.models.diffusion_resources import GIB, weights_gib
 
-_PREFIX: Final = "transformer."
-_ALPHA: Final = ".alpha"
-
 
 def export_comfyui(folder: Path, target: Path) -> None:
     """Writes the LoRA as one file with the keys that ComfyUI reads: those of diffusers, and alpha for each layer.
-
-    Raises:
-        ModelError: the LoRA is missing or damaged, or was not written by brewster.
-        OutputError: `target` exists or cannot be written.
-    """
+    Raises ModelError if the LoRA is missing or damaged, or was not written by brewster; OutputError if `target` exists
+    or cannot be written."""
     _check_target(target)
     state, metadata = read_lora(folder)
-    tensors = {_PREFIX + name: tensor for name, tensor in state.items()}
+    tensors = {PREFIX + name: tensor for name, tensor in state.items()}
     # safetensors refuses tensors that share memory, so each layer gets its own. An imported layer has alpha = rank.
     alphas = {
-        layer + _ALPHA: torch.tensor(
+        layer + ".alpha": torch.tensor(
             float(len(tensors[layer + DOWN_SUFFIX]) if metadata.imported else metadata.alpha)
         )
         for layer in adapted_layers(tensors)
@@ -54,16 +47,14 @@ def export_comfyui(folder: Path, target: Path) -> None:
 def export_merged(folder: Path, target: Path, base_model: str | None = None) -> None:
     """Adds the LoRA to the weights of its base, and writes the result as a folder in diffusers' layout, in bfloat16.
 
-    The sums are computed in float32 on the CPU. The folder also gets the encoded prompt and the task, but no text encoders.
-    It is for programs that cannot load a LoRA; `load_pipeline` opens it, too.
+    The sums are computed in float32 on the CPU. The folder also gets the encoded prompt and the task, but no text
+    encoders. It is for programs that cannot load a LoRA; `load_pipeline` opens it, too.
 
     `base_model` is the folder or hub id of the base, if it has moved since training.
 
-    Raises:
-        ModelError: the LoRA or its base is missing or damaged, or they do not match.
-        DownloadError: the base cannot be downloaded.
-        DeviceError: the free memory is too small.
-        OutputError: `target` exists or cannot be written, or its disk is too small.
+    Raises ModelError if the LoRA or its base is missing or damaged, or they do not match; DownloadError if the base
+    cannot be downloaded; DeviceError if the free memory is too small; OutputError if `target` exists or cannot be
+    written, or its disk is too small.
     """
     _check_target(target)
     state, metadata = read_lora(folder)
@@ -77,20 +68,24 @@ def export_merged(folder: Path, target: Path, base_model: str | None = None) -> 
             "choose another base",
         )
     needed = weights_gib(count_weights(base, backbone_class) + backbone_class.cost.vae_parameters, None)
-    memory = import_library("psutil").virtual_memory().available / GIB
-    if needed > memory:
-        raise DeviceError(
-            f"{base} needs about {needed:.1f} GiB of host memory, and {memory:.1f} GiB are free",
-            "expected enough memory for all weights in bfloat16",
-            "close other programs, or export on another machine",
-        )
-    disk = free_disk_bytes(target) / GIB
-    if needed > disk:
-        raise OutputError(
-            f"{target} needs about {needed:.1f} GiB on the disk, and {disk:.1f} GiB are free",
-            "expected enough free disk for all weights in bfloat16",
-            "free disk space, or choose a folder on a larger disk",
-        )
+    memory = import_library("psutil").virtual_memory().available
+    resources = (
+        (base, "of host memory", memory, DeviceError, "close other programs, or export on another machine"),
+        (
+            target,
+            "on the disk",
+            free_disk_bytes(target),
+            OutputError,
+            "free disk space, or choose a larger disk",
+        ),
+    )
+    for name, where, free, error, cure in resources:
+        if needed > free / GIB:
+            raise error(
+                f"{name} needs about {needed:.1f} GiB {where}, and {free / GIB:.1f} GiB are free",
+                "expected enough for all weights in bfloat16",
+                cure,
+            )
     backbone = load_backbone(base, dtype=torch.bfloat16)
     merge(backbone, state, 1.0 if metadata.imported else metadata.alpha / metadata.rank)
     backbone.save(target)

@@ -70,24 +70,16 @@ class UploadPlan:
 
 
 def plan_push(folder: Path, repo_id: str, *, message: str = "", public: bool = False) -> UploadPlan:
-    """Checks a LoRA's folder and prepares its upload; needs no network connection.
-
-    Raises:
-        ModelError: a file is missing or damaged, the prompt does not belong to the LoRA, the model card has no front
-            matter, a file or the message contains the path of a home folder, or `repo_id` is not OWNER/NAME.
-        MissingExtra: huggingface_hub is not installed.
-    """
-    reason = "" if "/" in repo_id else "it has no owner"
+    """Checks a LoRA's folder and prepares its upload; needs no network connection. Raises ModelError if a file is
+    missing or damaged, the prompt does not belong to the LoRA, the model card has no front matter, a file or the
+    message contains the path of a home folder, or `repo_id` is not OWNER/NAME; MissingExtra if huggingface_hub is not
+    installed."""
     try:
-        import_library("huggingface_hub.utils").validate_repo_id(repo_id)
+        import_library("huggingface_hub.utils").validate_repo_id(repo_id if "/" in repo_id else f"/{repo_id}")
     except import_library("huggingface_hub.errors").HFValidationError as error:
-        reason = str(error).rstrip(".")
-    if reason:
-        raise ModelError(
-            f"{repo_id!r} is not a valid hub id ({reason})",
-            "expected OWNER/NAME",
-            "pass your user name and a repository name",
-        )
+        happened = f"{repo_id!r} is not a valid hub id ({str(error).rstrip('.')})"
+        cure = "pass your user name and a repository name"
+        raise ModelError(happened, "expected OWNER/NAME", cure) from error
     data, recipe = _read_files(folder)
     metadata = read_lora_metadata(folder)
     read_prompt(folder, metadata)
@@ -112,13 +104,11 @@ def plan_push(folder: Path, repo_id: str, *, message: str = "", public: bool = F
     _refuse_home_folders("the commit message", message)
     remarks = [f"{path} is replaced by {name} in the uploaded files" for path, name in replacements.items()]
     licence = backbone_class.licence
+    limits = f"has the licence {licence.title}, which also applies to the LoRA: not for commercial use"
     if is_tiny:
-        remarks.insert(0, f"the base of the LoRA is {base}, a tiny version: the LoRA cannot separate photos")
-    elif not licence.allows_commercial_use:
-        remarks.insert(
-            0,
-            f"the base of the LoRA has the licence {licence.title}, which also applies to the LoRA: not for commercial use",
-        )
+        limits = f"is {base}, a tiny version: the LoRA cannot separate photos"
+    if is_tiny or not licence.allows_commercial_use:
+        remarks.insert(0, f"the base of the LoRA {limits}")
     if other_files := sorted(path.name for path in folder.iterdir() if path.name not in FILES):
         remarks.append(f"not sent: {', '.join(other_files)}")
     message = message or f"LoRA of {base}, rank {metadata.rank}"
@@ -128,15 +118,9 @@ def plan_push(folder: Path, repo_id: str, *, message: str = "", public: bool = F
 def push(plan: UploadPlan, token: str | None = None) -> str:
     """Creates the repository if it does not exist, and sends the files in one commit.
 
-    The token is `token`, HF_TOKEN, or that of `hf auth login`.
-
-    Returns:
-        The URL of the commit.
-
-    Raises:
-        DownloadError: there is no token, the token is invalid or may not write, the repository exists with the other
-            visibility (public or private), or there is no network connection.
-        MissingExtra: huggingface_hub is not installed.
+    The token is `token`, HF_TOKEN, or that of `hf auth login`. Returns the URL of the commit. Raises DownloadError if
+    there is no token, the token is invalid or may not write, the repository exists with the other visibility (public or
+    private), or there is no network connection; MissingExtra if huggingface_hub is not installed.
     """
     hub = import_library("huggingface_hub")
     if not (token or hub.get_token()):
@@ -164,43 +148,33 @@ def _read_files(folder: Path) -> tuple[dict[str, bytes], Any]:
     """The content of each file by name, and the recipe."""
     try:
         data = {name: (folder / name).read_bytes() for name in FILES}
+        return data, json.loads(data[RECIPE_FILE])
     except OSError as error:
         raise ModelError(
             f"{error.filename} cannot be read ({error.strerror})",
             f"expected a LoRA's folder, with {', '.join(FILES)}",
             "pass the folder named `lora` in the output folder of brewster train, or train again to write it",
         ) from error
-    try:
-        recipe = json.loads(data[RECIPE_FILE])
     except ValueError as error:
-        raise ModelError(
-            f"{folder / RECIPE_FILE} is not JSON: {error}",
-            "expected the recipe of the LoRA",
-            "train again to write it",
-        ) from error
-    return data, recipe
+        happened = f"{folder / RECIPE_FILE} is not JSON: {error}"
+        raise ModelError(happened, "expected the recipe of the LoRA", "train again to write it") from error
 
 
 def _check_front_matter(folder: Path, card: bytes, *, is_tiny: bool) -> None:
     """Checks the front matter of the model card: the hub reads licence, base and library from it."""
-    yaml_errors = (ValueError, TypeError, import_library("yaml").YAMLError)
     required = {"license", "library_name"} | (set() if is_tiny else {"base_model"})
+    fields: dict[str, Any] = {}
+    problem = ""
     try:
         text = card.decode()
-        fields = (
-            import_library("huggingface_hub").ModelCard(text).data.to_dict() if text.startswith("---") else {}
-        )
-    except yaml_errors as error:
+        if text.startswith("---"):
+            fields = import_library("huggingface_hub").ModelCard(text).data.to_dict()
+    except (ValueError, TypeError, import_library("yaml").YAMLError) as error:
+        problem = f"is not YAML: {error}"
+    if missing := sorted(required - {name for name, value in fields.items() if value}):
         raise ModelError(
-            f"the front matter of {folder / CARD_FILE} is not YAML: {error}",
-            "expected YAML that the hub can read",
-            _CARD_HINT,
-        ) from error
-    missing = sorted(required - {name for name, value in fields.items() if value})
-    if missing:
-        raise ModelError(
-            f"the front matter of {folder / CARD_FILE} has no {', '.join(missing)}",
-            "expected these fields as YAML between two lines ---",
+            f"the front matter of {folder / CARD_FILE} {problem or 'has no ' + ', '.join(missing)}",
+            f"expected {', '.join(sorted(required))} as YAML between two lines ---",
             _CARD_HINT,
         )
 
@@ -221,10 +195,8 @@ def _replace_paths(value: Any, replacements: dict[str, str]) -> Any:  # noqa: AN
 
 
 def _refuse_home_folders(source: str, text: str) -> None:
-    """Refuses a text with the path of a home folder, because the path can contain the user's name.
-
-    `source` is the path of the file, or "the commit message".
-    """
+    """Refuses a text with the path of a home folder, because the path can contain the user's name. `source` is the path
+    of the file, or "the commit message"."""
     home = str(Path.home())
     match = _HOME_FOLDERS.search(text)
     if match or (len(home) > 1 and home in text):
@@ -242,12 +214,11 @@ def _translate_push_errors(repo_id: str) -> Iterator[None]:
         with translate_hub_errors(repo_id, "write"):
             yield
     except json.JSONDecodeError as error:
-        raise DownloadError(
+        happened, cure = (
             f"the server's response is not JSON ({error})",
-            "expected a Hugging Face hub",
             "check HF_ENDPOINT and your proxy settings",
-        ) from error
+        )
+        raise DownloadError(happened, "expected a Hugging Face hub", cure) from error
     except ValueError as error:  # huggingface_hub raises it if the hub rejects the front matter
-        raise DownloadError(
-            f"the hub refused {CARD_FILE}: {error}", "expected valid front matter", _CARD_HINT
-        ) from error
+        happened = f"the hub refused {CARD_FILE}: {error}"
+        raise DownloadError(happened, "expected valid front matter", _CARD_HINT) from error

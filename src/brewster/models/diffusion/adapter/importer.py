@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Final
 
 from brewster.errors import ModelError
-from brewster.models.diffusion.adapter.lora import LoraMetadata, layer_settings, write_lora
+from brewster.models.diffusion.adapter.lora import PEFT_KEY, PREFIX, LoraMetadata, layer_settings, write_lora
 from brewster.models.diffusion.adapter.lora_formats import (
     LowRankLayer,
     ScalingFunction,
@@ -35,8 +35,6 @@ from brewster.models.diffusion.tensors import read_json, read_tensors
 
 PEFT_CONFIG_FILE: Final = "adapter_config.json"
 """The file with peft's settings of a LoRA, next to its weights."""
-_DIFFUSERS_KEY: Final = "lora_adapter_metadata"
-_PREFIX: Final = "transformer."
 
 
 def import_lora(
@@ -51,18 +49,12 @@ def import_lora(
 ) -> LoraMetadata:
     """Reads the LoRA, encodes the prompt, and writes the folder.
 
-    For `source`, see `find_weights_file`; for `base_model`, see `load_backbone`; for `alpha`, see `read_layers`. `prompt` is a
-    name in `PROMPTS`, or the text itself, which `device` encodes. `panels` are those that the LoRA generates from the photo.
-
-    Returns:
-        The metadata of the written LoRA.
-
-    Raises:
-        ModelError: there is no LoRA, or a key or shape does not belong to the base model (the message names the key style), or
-            alpha is missing or given twice.
-        RecipeError: the panels do not contain T, or are repeated.
-        DownloadError, DeviceError, MissingExtra: see `encode_prompt`.
-        OutputError: the folder cannot be written.
+    For `source`, see `find_weights_file`; for `base_model`, see `load_backbone`; for `alpha`, see `read_layers`.
+    `prompt` is a name in `PROMPTS`, or the text itself, which `device` encodes. `panels` are those that the LoRA
+    generates from the photo. Returns the metadata of the written LoRA. Raises ModelError if there is no LoRA, or a key
+    or shape does not belong to the base model (the message names the key style), or alpha is missing or given twice;
+    RecipeError if the panels do not contain T, or are repeated; DownloadError, DeviceError, MissingExtra, see
+    `encode_prompt`; OutputError if the folder cannot be written.
     """
     task = DecompositionTask(PanelLayout(panels))
     base = build_on_meta(base_model)
@@ -112,10 +104,10 @@ def _refuse_unknown_alpha(name: str, rank: int) -> float:  # noqa: ARG001  (a Sc
 def _scale(path: Path, metadata: Mapping[str, str]) -> ScalingFunction | None:
     """The scale of the layers by the settings in the file (diffusers) or next to it (peft), or None without settings."""
     config = path.with_name(PEFT_CONFIG_FILE)
-    if _DIFFUSERS_KEY not in metadata:
+    if PEFT_KEY not in metadata:
         return scaling_from_config(read_json(config)) if config.is_file() else None
     try:
-        return scaling_from_config(dict(json.loads(metadata[_DIFFUSERS_KEY])), _PREFIX)
+        return scaling_from_config(dict(json.loads(metadata[PEFT_KEY])), PREFIX)
     except (ValueError, TypeError) as error:
         raise ModelError(
             f"the settings of {path} cannot be read ({error})", "expected a JSON object", "copy it again"

@@ -11,12 +11,12 @@ Adam's updates are smaller than the rounding error of bf16.
 
 from __future__ import annotations
 
+import fnmatch
 import json
 import re
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
-from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Annotated, Any, Final, final
 
@@ -36,9 +36,9 @@ from brewster.options import Quantization
 
 LORA_FILE: Final = "pytorch_lora_weights.safetensors"
 """The file name that diffusers expects."""
-_PREFIX: Final = "transformer."
+PREFIX: Final = "transformer."
 _METADATA_KEY: Final = "brewster"
-_PEFT_KEY: Final = "lora_adapter_metadata"
+PEFT_KEY: Final = "lora_adapter_metadata"
 ADAPTER_NAME: Final = "default"
 
 
@@ -68,59 +68,45 @@ class LoraMetadata:
     @classmethod
     def from_json(cls, text: str) -> LoraMetadata:
         """Parses the result of `to_json`. Raises ModelError if the text is not valid metadata."""
-        problem: BrewsterError
-        cause: Exception
+        cure = "copy the folder again, or save the LoRA again"
         try:
             return TypeAdapter(LoraMetadata).validate_json(text, strict=True, extra="forbid")
+        except RecipeError as error:
+            cause: Exception = error
+            problem: BrewsterError = error
         except ValidationError as error:
             cause, details = error, error.errors()[0]
-            if details["type"] in {"extra_forbidden", "unexpected_keyword_argument"}:
-                raise ModelError(
-                    f"the metadata of the LoRA has the unknown key {'.'.join(map(str, details['loc']))}",
-                    "expected only keys of the metadata format of this version",
-                    "update brewster: a newer version wrote the LoRA",
-                ) from error
             problem = invalid_value(details)
-        except RecipeError as error:
-            cause = problem = error
-        raise ModelError(
-            f"the metadata of the LoRA cannot be read: {problem.happened}",
-            f"{problem.expected}, as in the metadata that brewster writes",
-            "copy the folder again, or save the LoRA again",
-        ) from cause
+            if details["type"] in {"extra_forbidden", "unexpected_keyword_argument"}:
+                cure = "update brewster: a newer version wrote the LoRA"
+                problem.happened = f"it has the unknown key {'.'.join(map(str, details['loc']))}"
+        happened = f"the metadata of the LoRA cannot be read: {problem.happened}"
+        expected = f"{problem.expected}, as in the metadata that brewster writes"
+        raise ModelError(happened, expected, cure) from cause
 
 
 def select_target_modules(backbone: Backbone, patterns: Sequence[str] = ()) -> list[str]:
-    """The full names of the linear layers of the blocks that match a pattern; without patterns, of all of them.
-
-    In a pattern, * and ? are wildcards as in a shell: "*.attn.*" selects the layers of the attention. Raises ModelError if a
-    pattern matches no layer.
-    """
+    """The full names of the linear layers of the blocks that match a pattern; without patterns, of all of them. In a
+    pattern, * and ? are wildcards as in a shell: "*.attn.*" selects the layers of the attention. Raises ModelError if a
+    pattern matches no layer."""
     names = backbone.lora_targets()
-    for pattern in patterns:
-        if not any(fnmatchcase(name, pattern) for name in names):
+    selected = {pattern: fnmatch.filter(names, pattern) for pattern in patterns or "*"}
+    for pattern, found in selected.items():
+        if not found:
             raise ModelError(
                 f"no linear layer of {backbone.name} matches the target {pattern!r}",
                 f"expected a name with wildcards, such as *.attn.*, that matches layers such as {names[0]}",
                 "correct target_modules, or leave it out to adapt all linear layers of the blocks",
             )
-    return [name for name in names if not patterns or any(fnmatchcase(name, each) for each in patterns)]
+    return [name for name in names if any(name in found for found in selected.values())]
 
 
 def add_lora(
     backbone: Backbone, *, rank: int = 16, alpha: int = 16, seed: int = 0, target_modules: Sequence[str] = ()
 ) -> list[nn.Parameter]:
-    """Adds a LoRA to the linear layers of the blocks; for `target_modules` see `select_target_modules`.
-
-    Its B matrices are zero, so predictions do not change yet.
-
-    Returns:
-        The parameters to train.
-
-    Raises:
-        ModelError: a target matches no layer.
-        MissingExtra: peft is not installed.
-    """
+    """Adds a LoRA to the linear layers of the blocks; for `target_modules` see `select_target_modules`. Its B matrices
+    are zero, so predictions do not change yet. Returns the parameters to train. Raises ModelError if a target matches
+    no layer; MissingExtra if peft is not installed."""
     names = select_target_modules(backbone, target_modules)
     config = import_library("peft").LoraConfig(r=rank, lora_alpha=alpha, target_modules=names)
     with torch.random.fork_rng(devices=[backbone.device] if backbone.device.type == "cuda" else []):
@@ -134,12 +120,9 @@ def attach_layers(
 ) -> None:
     """Adds a LoRA with these layers to a backbone for inference. Each layer has its own rank.
 
-    A second LoRA, such as a few-step LoRA (Lightning, turbo), needs another name as `adapter`: both changes of the weights are
-    added. The weights are in the dtype in which the backbone computes, see `load_lora`.
-
-    Raises:
-        ModelError: a layer is not in the backbone, or has another shape.
-        MissingExtra: peft is not installed.
+    A second LoRA, such as a few-step LoRA (Lightning, turbo), needs another name as `adapter`: both changes of the
+    weights are added. The weights are in the dtype in which the backbone computes, see `load_lora`. Raises ModelError
+    if a layer is not in the backbone, or has another shape; MissingExtra if peft is not installed.
     """
     others = [*(getattr(backbone.transformer, "peft_config", None) or ())]
     modules = dict(backbone.transformer.named_modules())
@@ -170,8 +153,7 @@ def load_lora_state(backbone: Backbone, state: Mapping[str, Tensor]) -> None:
     """Loads weights from `lora_state_dict` into a backbone with a LoRA of the same shapes. Raises ModelError if the weights are
     those of another backbone or rank."""
     expected = lora_state_dict(backbone)
-    mismatched = sorted(set(expected) ^ set(state))
-    if mismatched:
+    if mismatched := sorted(expected.keys() ^ state.keys()):
         raise ModelError(
             f"{len(mismatched)} weights of the LoRA are missing or unexpected, for example {mismatched[0]}",
             "expected one pair of matrices for each adapted layer",
@@ -199,16 +181,9 @@ def save_lora(
     quantization: Quantization | None = None,
     target_modules: Sequence[str] = (),
 ) -> LoraMetadata:
-    """Writes a folder with the LoRA, in a file that diffusers can load, and the prompt. The bytes are reproducible.
-
-    By default `base_model` is the backbone's hub id. `target_modules` are those of `add_lora`.
-
-    Returns:
-        The metadata that is stored in the file.
-
-    Raises:
-        OutputError: the folder cannot be written.
-    """
+    """Writes a folder with the LoRA, in a file that diffusers can load, and the prompt. The bytes are reproducible. By
+    default `base_model` is the backbone's hub id. `target_modules` are those of `add_lora`. Returns the metadata that
+    is stored in the file. Raises OutputError if the folder cannot be written."""
     config = backbone.transformer.peft_config[ADAPTER_NAME]
     source, rank, alpha = base_model or backbone.hub_id, config.r, config.lora_alpha
     metadata = LoraMetadata(
@@ -228,10 +203,10 @@ def write_lora(
     metadata: LoraMetadata,
 ) -> None:
     """Writes prompt and weights. `settings` are those that diffusers reads from the file. May raise OutputError."""
-    tensors = {_PREFIX + name: tensor for name, tensor in state.items()}
-    prefixed = {_PREFIX + name: value for name, value in settings.items()}
+    tensors = {PREFIX + name: tensor for name, tensor in state.items()}
+    prefixed = {PREFIX + name: value for name, value in settings.items()}
     prompt.save(folder / PROMPT_FILE)
-    entries = {_METADATA_KEY: metadata.to_json(), _PEFT_KEY: json.dumps(prefixed, sort_keys=True)}
+    entries = {_METADATA_KEY: metadata.to_json(), PEFT_KEY: json.dumps(prefixed, sort_keys=True)}
     write_tensors(folder / LORA_FILE, tensors, entries)
 
 
@@ -257,15 +232,9 @@ def read_prompt(folder: Path, metadata: LoraMetadata) -> PromptEmbedding:
 def load_lora(folder: Path, backbone: Backbone) -> tuple[LoraMetadata, PromptEmbedding]:
     """Adds the LoRA of a folder to its backbone for inference.
 
-    The LoRA has the dtype in which the backbone computes, because a float32 LoRA would convert the activations of every layer
-    of a bf16 base twice.
-
-    Returns:
-        The metadata of the LoRA, and its prompt.
-
-    Raises:
-        ModelError: its weights do not match the rank in its metadata or the backbone, a file is damaged, or the prompt does
-            not belong to it.
+    The LoRA has the dtype in which the backbone computes, because a float32 LoRA would convert the activations of every
+    layer of a bf16 base twice. Returns the metadata of the LoRA, and its prompt. Raises ModelError if its weights do
+    not match the rank in its metadata or the backbone, a file is damaged, or the prompt does not belong to it.
     """
     state, metadata = read_lora(folder)
     prompt = read_prompt(folder, metadata)
@@ -294,7 +263,7 @@ def read_lora(folder: Path) -> tuple[dict[str, Tensor], LoraMetadata]:
             "convert it: brewster models import SOURCE FOLDER --base-model BASE --prompt TEXT --panels T",
         )
     metadata = LoraMetadata.from_json(entries[_METADATA_KEY])
-    return {name.removeprefix(_PREFIX): tensor for name, tensor in tensors.items()}, metadata
+    return {name.removeprefix(PREFIX): tensor for name, tensor in tensors.items()}, metadata
 
 
 def _add_adapter(backbone: Backbone, config: Any, name: str = ADAPTER_NAME) -> None:  # noqa: ANN401 - peft's configuration

@@ -39,7 +39,6 @@ DOWN_SUFFIX: Final = ".lora_A.weight"
 UP_SUFFIX: Final = ".lora_B.weight"
 """The suffixes of the keys of a layer's two matrices in a state dict of brewster, peft and diffusers."""
 _DOWN: Final = ("lora_A", "lora_down")
-_TEXT_ENCODERS: Final = ("lora_te", "text_encoder", "te1_", "te2_")
 _UNSUPPORTED: Final = {
     r"dora_scale|lora_magnitude": "DoRA matrices",
     r"lokr_": "LoKr matrices",
@@ -48,6 +47,7 @@ _UNSUPPORTED: Final = {
     r"\.bias$": "biases",
     r"\.processor\.(qkv|proj)_lora": "keys of XLabs",
     r"lora\.(down|up)\.": "keys of an old version of diffusers",
+    r"(^|\.)(lora_te|text_encoder|te1_|te2_)": "a LoRA that also changes a text encoder",
 }
 """Regular expression for a part of a key -> what a file with this key contains."""
 
@@ -259,30 +259,22 @@ def check_shape(name: str, layer: LowRankLayer, module: Any) -> None:  # noqa: A
 
 
 def _repeated(layer: str) -> ModelError:
+    cure = "use a file with one LoRA, in one style of keys"
     return ModelError(
-        f"the file has more than one LoRA for the layer {layer}",
-        "expected each layer once",
-        "use a file with one LoRA, in one style of keys",
+        f"the file has more than one LoRA for the layer {layer}", "expected each layer once", cure
     )
 
 
 def _unknown(key: str, tensors: Mapping[str, Tensor], backbone: str) -> ModelError:
-    style = lora_format(tensors)
     for pattern, kind in _UNSUPPORTED.items():
         if found := next((name for name in tensors if re.search(pattern, name)), ""):
             return ModelError(
                 f"the file has {kind} ({found})",
-                "expected only LoRA matrices, with the keys of peft, diffusers, sd-scripts or ComfyUI",
+                "expected only LoRA matrices of the transformer, with the keys of peft, diffusers, sd-scripts or ComfyUI",
                 "use another file of this LoRA, or another LoRA",
             )
-    if key.startswith(_TEXT_ENCODERS):
-        return ModelError(
-            f"the LoRA also changes a text encoder ({key})",
-            "expected a LoRA of the transformer only",
-            "train it without the text encoder",
-        )
     return ModelError(
-        f"the key {key} of the LoRA, in the style of {style}, belongs to no layer of {backbone}",
+        f"the key {key} of the LoRA, in the style of {lora_format(tensors)}, belongs to no layer of {backbone}",
         f"expected two matrices for each of some linear layers of {backbone}",
         "choose the base with which it was trained",
     )
@@ -290,9 +282,7 @@ def _unknown(key: str, tensors: Mapping[str, Tensor], backbone: str) -> ModelErr
 
 def scaling_from_config(settings: Mapping[str, Any], prefix: str = "") -> ScalingFunction:
     """alpha / rank from the settings of peft: `lora_alpha`, `alpha_pattern` and `use_rslora` (Kalajdzievski 2023).
-
-    `prefix` is that of the keys in the settings, such as "transformer." in the metadata that diffusers writes.
-    """
+    `prefix` is that of the keys in the settings, such as "transformer." in the metadata that diffusers writes."""
     values = {key.removeprefix(prefix): value for key, value in settings.items()}
     patterns = {
         key.removeprefix(prefix): float(alpha) for key, alpha in (values.get("alpha_pattern") or {}).items()

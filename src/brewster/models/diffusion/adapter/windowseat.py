@@ -33,6 +33,7 @@ PROMPT_FILE: Final = "text_embeddings/state_dict.safetensors"
 FILES: Final = (INDEX_FILE, CONFIG_FILE, WEIGHTS_FILE, PROMPT_FILE)
 
 BACKBONE: Final = Qwen
+_CURE: Final = "download the model again"
 _PROMPT_TEXT: Final = "WindowSeat's trained embedding"
 
 
@@ -54,11 +55,8 @@ def read_metadata(folder: Path) -> LoraMetadata:
         config = _Config.model_validate(read_json(folder / CONFIG_FILE))
     except ValidationError as error:
         problem = invalid_value(error.errors()[0])
-        raise ModelError(
-            f"{folder} lacks a setting of WindowSeat ({problem.happened})",
-            problem.expected,
-            "download the model again",
-        ) from error
+        happened = f"{folder} lacks a setting of WindowSeat ({problem.happened})"
+        raise ModelError(happened, problem.expected, _CURE) from error
     return LoraMetadata(
         BACKBONE.name,
         index.base_model,
@@ -71,14 +69,8 @@ def read_metadata(folder: Path) -> LoraMetadata:
 
 
 def load(folder: Path, backbone: Backbone) -> tuple[LoraMetadata, PromptEmbedding]:
-    """Adds the LoRA of this folder to its backbone.
-
-    Returns:
-        The metadata, and the trained prompt embedding.
-
-    Raises:
-        ModelError: a file is missing or damaged, or a weight belongs to no layer of the backbone.
-    """
+    """Adds the LoRA of this folder to its backbone. Returns the metadata, and the trained prompt embedding. Raises
+    ModelError if a file is missing or damaged, or a weight belongs to no layer of the backbone."""
     metadata, prompt = read_metadata(folder), _read_prompt(folder)
     tensors, _ = read_tensors(folder / WEIGHTS_FILE)
     config = read_json(folder / CONFIG_FILE)
@@ -95,18 +87,14 @@ def _read_prompt(folder: Path) -> PromptEmbedding:
     embeds_shape = shapes.get("prompt_embeds", ())
     is_valid = len(embeds_shape) == 3 and embeds_shape[0] >= 1
     if not is_valid or shapes != {"prompt_embeds": embeds_shape, "prompt_mask": embeds_shape[:2]}:
-        raise ModelError(
-            f"{path} contains {shapes}",
-            "expected prompt_embeds (n, tokens, width) and prompt_mask (n, tokens), with n of at least 1",
-            "download the model again",
+        expected = (
+            "expected prompt_embeds (n, tokens, width) and prompt_mask (n, tokens), with n of at least 1"
         )
+        raise ModelError(f"{path} contains {shapes}", expected, _CURE)
     mask = tensors["prompt_mask"][0] > 0
     count = int(mask.sum())
     # The tokens that are not masked come first, so the position of each stays the same.
     if count == 0 or not mask[:count].all():
-        raise ModelError(
-            f"prompt_mask in {path} masks tokens before the end, or all of them",
-            "expected padding at the end only",
-            "download the model again",
-        )
+        happened = f"prompt_mask in {path} masks tokens before the end, or all of them"
+        raise ModelError(happened, "expected padding at the end only", _CURE)
     return PromptEmbedding(Qwen.name, _PROMPT_TEXT, tensors["prompt_embeds"][:1, :count].contiguous())

@@ -105,10 +105,8 @@ class Backbone(ABC):
         distilled: bool = False,
         dtype: torch.dtype | None = None,
     ) -> None:
-        """`dtype` is the data type of the transformer's computations, by default that of its parameters.
-
-        It cannot be read from a quantized transformer: with nf4, only a few float32 layers are floating-point.
-        """
+        """`dtype` is the data type of the transformer's computations, by default that of its parameters. It cannot be
+        read from a quantized transformer: with nf4, only a few float32 layers are floating-point."""
         self.dtype: torch.dtype = dtype or transformer.dtype
         self.transformer = transformer.eval().requires_grad_(False)
         self.vae = vae.eval().requires_grad_(False)
@@ -129,11 +127,9 @@ class Backbone(ABC):
 
     @torch.no_grad()
     def encode(self, image: Float[Tensor, "n 3 h w"]) -> Float[Tensor, "n c h/16 w/16"]:
-        """Encodes images in [-1, 1] to normalised latent grids, float32: the mode of the VAE's distribution.
-
-        Encode the whole composite at once. Panels that are encoded separately differ at the seams and, because of
-        GroupNorm, everywhere. The sides must be multiples of `size_divisor`.
-        """
+        """Encodes images in [-1, 1] to normalised latent grids, float32: the mode of the VAE's distribution. Encode the
+        whole composite at once. Panels that are encoded separately differ at the seams and, because of GroupNorm,
+        everywhere. The sides must be multiples of `size_divisor`."""
         mean, deviation = self.statistics()
         cells = self._vae_encode(image.to(self.vae.device, self.vae.dtype))
         return (functional.pixel_unshuffle(cells, PATCH).float() - mean) / deviation
@@ -160,10 +156,8 @@ class Backbone(ABC):
         prompt: PromptEmbedding,
         guidance: float,
     ) -> Float[Tensor, "n c h w"]:
-        """The velocity (noise - latents of the image) at time sigma, float32; differentiable.
-
-        `condition` may be `no_condition()`. Raises ModelError if the prompt lacks an embedding that this guidance needs.
-        """
+        """The velocity (noise - latents of the image) at time sigma, float32; differentiable. `condition` may be
+        `no_condition()`. Raises ModelError if the prompt lacks an embedding that this guidance needs."""
 
     @abstractmethod
     def positions(self, latents: Tensor, condition: Tensor) -> Any:  # noqa: ANN401 - each backbone has its own type
@@ -184,20 +178,16 @@ class Backbone(ABC):
         return torch.empty(1, self.channels, 0, 0, device=self.device)
 
     def noise(self, size: tuple[int, int], seed: int) -> Float[Tensor, "1 c h w"]:
-        """The noise from which the diffusers pipeline starts for a composite of this (width, height) and seed.
-
-        It is drawn on the CPU, so it is the same for every device. The sides must be multiples of `size_divisor`.
-        """
+        """The noise from which the diffusers pipeline starts for a composite of this (width, height) and seed. It is
+        drawn on the CPU, so it is the same for every device. The sides must be multiples of `size_divisor`."""
         width, height = (side // self.size_divisor * PATCH for side in size)
         shape = (1, self.channels // PATCH**2, height, width)
         return functional.pixel_unshuffle(_seeded_noise(shape, seed), PATCH)
 
     def shift(self, tokens: int, steps: int) -> float:  # noqa: ARG002 - the shift of klein depends on the steps
-        """The schedule's shift mu for a composite of this many generated tokens, without those of the condition.
-
-        A linear function of the number of tokens, through the points (base_image_seq_len, base_shift) and
-        (max_image_seq_len, max_shift) of the scheduler (Esser et al. 2024; FLUX).
-        """
+        """The schedule's shift mu for a composite of this many generated tokens, without those of the condition. A
+        linear function of the number of tokens, through the points (base_image_seq_len, base_shift) and
+        (max_image_seq_len, max_shift) of the scheduler (Esser et al. 2024; FLUX)."""
         config = self.scheduler.config
         low, high = config.base_image_seq_len, config.max_image_seq_len
         slope = (config.max_shift - config.base_shift) / (high - low)
@@ -206,10 +196,8 @@ class Backbone(ABC):
     def shifted(
         self, sigma: Tensor, tokens: int, steps: int = 20, *, timestep_shift: float | None = None
     ) -> Tensor:
-        """Shifts times in (0, 1] towards noise. Used in training.
-
-        The default is the shift of the sampling schedule. A given `timestep_shift` s replaces it: s sigma / (1 + (s - 1) sigma).
-        """
+        """Shifts times in (0, 1] towards noise. Used in training. The default is the shift of the sampling schedule. A
+        given `timestep_shift` s replaces it: s sigma / (1 + (s - 1) sigma)."""
         scheduler = self.scheduler
         if timestep_shift is None and scheduler.config.use_dynamic_shifting:
             shifted = scheduler.time_shift(self.shift(tokens, steps), 1.0, sigma)
@@ -286,16 +274,38 @@ class Backbone(ABC):
     def _vae_decode(self, latent: Tensor) -> Tensor:
         return self.vae.decode(latent, return_dict=False)[0]  # type: ignore[no-any-return]
 
-    def _tokens(self, latents: Tensor, condition: Tensor) -> Float[Tensor, "n t c"]:
-        """The input of the transformer: generated tokens, then conditioning tokens, each row by row."""
+    def _run(
+        self, latents: Tensor, condition: Tensor, sigma: Tensor, embeds: Tensor, **inputs: object
+    ) -> Tensor:
+        """The transformer's prediction for a prompt embedding (1, tokens, width), as a grid, float32. `inputs` are the inputs
+        that only this transformer has."""
+        # Generated tokens, then conditioning tokens, each row by row.
         grids = [latents, condition.expand(len(latents), -1, -1, -1)]
-        return torch.cat([grid.flatten(2).mT for grid in grids], dim=1).to(self.device, self.dtype)
+        tokens = self.transformer(
+            hidden_states=torch.cat([grid.flatten(2).mT for grid in grids], dim=1).to(
+                self.device, self.dtype
+            ),
+            encoder_hidden_states=embeds.to(self.device, self.dtype).expand(len(latents), -1, -1),
+            timestep=sigma.to(self.device, self.dtype),
+            return_dict=False,
+            **inputs,
+        )[0]
+        generated: Tensor = tokens[:, : latents.shape[2] * latents.shape[3]].mT.float()
+        return generated.reshape(latents.shape)
 
 
 class ClassifierFreeBackbone(Backbone):
     """A backbone with classifier-free guidance (Ho & Salimans 2022): a guidance above 1 needs a second prediction."""
 
     guided_by_embedding = False
+    random_empty_tokens: ClassVar[int] = 8
+    """The tokens of the empty prompt in `random_prompt`."""
+
+    @classmethod
+    def random_prompt(cls, transformer: Any, seed: int) -> PromptEmbedding:  # noqa: ANN401 - a transformer of diffusers
+        """Eight random tokens for the prompt, and `random_empty_tokens` for the empty prompt."""
+        width, count = transformer.config.joint_attention_dim, cls.random_empty_tokens
+        return random_prompt(cls.name, seed, embeds=(1, 8, width), negative=(1, count, width))
 
     def predict(
         self, latents: Tensor, condition: Tensor, sigma: Tensor, prompt: PromptEmbedding, guidance: float
@@ -323,12 +333,20 @@ class ClassifierFreeBackbone(Backbone):
         return unconditional + guidance * (conditional - unconditional)
 
 
-def tokens_to_grid(
-    tokens: Float[Tensor, "n t c"], like: Float[Tensor, "n c h w"]
-) -> Float[Tensor, "n c h w"]:
-    """The generated tokens, which come first, as a grid of the shape of `like`, float32."""
-    generated = tokens[:, : like.shape[2] * like.shape[3]].mT.float()
-    return generated.reshape(like.shape)
+FLUX_SCHEDULER: Final = {
+    "shift": 3.0, "use_dynamic_shifting": True, "base_shift": 0.5, "max_shift": 1.15,
+    "base_image_seq_len": 256, "max_image_seq_len": 4096,
+}  # fmt: skip
+"""The scheduler of FLUX.1 and FLUX.2."""
+
+
+def flux_positions(latents: Tensor, condition: Tensor, condition_id: int, *last_columns: Tensor) -> Tensor:
+    """Position ids of FLUX, a row for each token: image (0: generated, `condition_id`: conditioning), row, column, others."""
+    ids = [
+        torch.cartesian_prod(torch.tensor([image]), *map(torch.arange, grid.shape[2:]), *last_columns)
+        for grid, image in ((latents, 0), (condition, condition_id))
+    ]
+    return torch.cat(ids)
 
 
 def random_prompt(backbone: str, seed: int, **shapes: tuple[int, ...]) -> PromptEmbedding:

@@ -9,18 +9,14 @@ from torch import Tensor
 
 from brewster.models.diffusion.backbones.backbone import (
     APACHE_2,
+    FLUX_SCHEDULER,
     ClassifierFreeBackbone,
     DiffusersUsage,
-    random_prompt,
-    tokens_to_grid,
+    flux_positions,
 )
 from brewster.models.diffusion.prompt import PromptEmbedding
 from brewster.models.diffusion_resources import BACKBONE_COSTS
 
-_SCHEDULER: Final = {
-    "shift": 3.0, "use_dynamic_shifting": True, "base_shift": 0.5, "max_shift": 1.15,
-    "base_image_seq_len": 256, "max_image_seq_len": 4096,
-}  # fmt: skip
 _CONDITION_TIME: Final = 10
 """The time coordinate of conditioning tokens. Generated tokens have 0; FLUX.2's first reference image has 10."""
 
@@ -50,7 +46,7 @@ class Klein(ClassifierFreeBackbone):
             "joint_attention_dim": 7680,
         },
         "vae": {},
-        "scheduler": _SCHEDULER,
+        "scheduler": FLUX_SCHEDULER,
     }  # fmt: skip
     tiny: ClassVar = {
         "transformer": {
@@ -59,7 +55,7 @@ class Klein(ClassifierFreeBackbone):
             "axes_dims_rope": (4, 4, 4, 4),
         },
         "vae": {"block_out_channels": (8, 8, 16, 16), "layers_per_block": 1, "norm_num_groups": 4},
-        "scheduler": _SCHEDULER,
+        "scheduler": FLUX_SCHEDULER,
     }  # fmt: skip
 
     cost = BACKBONE_COSTS["klein"]
@@ -76,10 +72,8 @@ class Klein(ClassifierFreeBackbone):
         return torch.randn(1, self.channels, height, width, generator=torch.Generator().manual_seed(seed))
 
     def shift(self, tokens: int, steps: int) -> float:
-        """mu by the empirical formula of Black Forest Labs.
-
-        Up to 4300 tokens it is linear in the steps, through its values at 10 and 200 steps; above, it does not depend on them.
-        """
+        """mu by the empirical formula of Black Forest Labs. Up to 4300 tokens it is linear in the steps, through its
+        values at 10 and 200 steps; above, it does not depend on them."""
         at_200 = 0.00016927 * tokens + 0.45666666
         if tokens > 4300:
             return at_200
@@ -87,10 +81,8 @@ class Klein(ClassifierFreeBackbone):
         return at_200 + (at_200 - at_10) / 190 * (steps - 200)
 
     def positions(self, latents: Tensor, condition: Tensor) -> Tensor:
-        """Position ids, (tokens, 4): time (0: generated, 10: conditioning), row, column, index in the text (0)."""
-        return torch.cat([_position_ids(latents, 0), _position_ids(condition, _CONDITION_TIME)]).to(
-            self.device
-        )
+        """See `flux_positions`, (tokens, 4). The last column is the index in the text, which is 0 for images."""
+        return flux_positions(latents, condition, _CONDITION_TIME, torch.arange(1)).to(self.device)
 
     @classmethod
     def embed(cls, pipeline: Any, text: str) -> PromptEmbedding:  # noqa: ANN401 - a pipeline of diffusers
@@ -99,27 +91,14 @@ class Klein(ClassifierFreeBackbone):
         negative, _ = pipeline.encode_prompt(prompt="")
         return PromptEmbedding(cls.name, text, embeds.detach(), negative=negative.detach())
 
-    @classmethod
-    def random_prompt(cls, transformer: Any, seed: int) -> PromptEmbedding:  # noqa: ANN401 - a transformer of diffusers
-        """Eight random tokens each for the prompt and the empty prompt."""
-        shape = (1, 8, transformer.config.joint_attention_dim)
-        return random_prompt(cls.name, seed, embeds=shape, negative=shape)
-
     def _velocity(self, latents: Tensor, condition: Tensor, sigma: Tensor, embeds: Tensor) -> Tensor:
-        embeds = embeds.to(self.device, self.dtype).expand(len(latents), -1, -1)
         zero = torch.arange(1)
-        tokens = self.transformer(
-            hidden_states=self._tokens(latents, condition),
-            encoder_hidden_states=embeds,
-            timestep=sigma.to(self.device, self.dtype),
+        return self._run(
+            latents,
+            condition,
+            sigma,
+            embeds,
             guidance=None,
             txt_ids=torch.cartesian_prod(zero, zero, zero, torch.arange(embeds.shape[1])).to(self.device),
             img_ids=self.positions(latents, condition),
-            return_dict=False,
-        )[0]
-        return tokens_to_grid(tokens, latents)
-
-
-def _position_ids(grid: Tensor, time: int) -> Tensor:
-    rows, columns = (torch.arange(side) for side in grid.shape[2:])
-    return torch.cartesian_prod(torch.tensor([time]), rows, columns, torch.arange(1))
+        )

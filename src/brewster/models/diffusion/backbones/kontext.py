@@ -8,19 +8,16 @@ import torch
 from torch import Tensor
 
 from brewster.models.diffusion.backbones.backbone import (
+    FLUX_SCHEDULER,
     Backbone,
     DiffusersUsage,
     Licence,
+    flux_positions,
     random_prompt,
-    tokens_to_grid,
 )
 from brewster.models.diffusion.prompt import PromptEmbedding
 from brewster.models.diffusion_resources import BACKBONE_COSTS
 
-_SCHEDULER: Final = {
-    "shift": 3.0, "use_dynamic_shifting": True, "base_shift": 0.5, "max_shift": 1.15,
-    "base_image_seq_len": 256, "max_image_seq_len": 4096,
-}  # fmt: skip
 _VAE: Final = {
     "down_block_types": ("DownEncoderBlock2D",) * 4, "up_block_types": ("UpDecoderBlock2D",) * 4,
     "latent_channels": 16, "scaling_factor": 0.3611, "shift_factor": 0.1159,
@@ -55,7 +52,7 @@ class Kontext(Backbone):
     full_size: ClassVar = {
         "transformer": {"guidance_embeds": True},
         "vae": {**_VAE, "block_out_channels": (128, 256, 512, 512), "layers_per_block": 2},
-        "scheduler": _SCHEDULER,
+        "scheduler": FLUX_SCHEDULER,
     }
     tiny: ClassVar = {
         "transformer": {
@@ -64,7 +61,7 @@ class Kontext(Backbone):
             "axes_dims_rope": (4, 6, 6),
         },
         "vae": {**_VAE, "block_out_channels": (8, 8, 16, 16), "layers_per_block": 1, "norm_num_groups": 4},
-        "scheduler": _SCHEDULER,
+        "scheduler": FLUX_SCHEDULER,
     }  # fmt: skip
     guided_by_embedding = True
     cost = BACKBONE_COSTS["kontext"]
@@ -72,32 +69,29 @@ class Kontext(Backbone):
     def statistics(self) -> tuple[Tensor, Tensor]:
         """See `Backbone.statistics`: (1, 1, 1, 1), because FLUX.1's VAE has one shift and one scale for all channels."""
         config = self.vae.config
-        mean = torch.tensor(config.shift_factor, device=self.vae.device)
-        deviation = 1 / torch.tensor(config.scaling_factor, device=self.vae.device)
-        return mean.view(1, 1, 1, 1), deviation.view(1, 1, 1, 1)
+        mean = torch.full((1, 1, 1, 1), config.shift_factor, device=self.vae.device)
+        return mean, 1 / torch.full_like(mean, config.scaling_factor)
 
     def positions(self, latents: Tensor, condition: Tensor) -> Tensor:
-        """Position ids, (tokens, 3): image (0: generated, 1: conditioning), row, column."""
-        return torch.cat([_position_ids(latents, 0), _position_ids(condition, 1)]).to(self.device)
+        """See `flux_positions`, (tokens, 3)."""
+        return flux_positions(latents, condition, 1).to(self.device)
 
     def predict(
         self, latents: Tensor, condition: Tensor, sigma: Tensor, prompt: PromptEmbedding, guidance: float
     ) -> Tensor:
         """See `Backbone.predict`. The guidance scale is an input of the transformer."""
-        count, embedding = len(latents), prompt.to(self.device, self.dtype)
-        assert embedding.pooled is not None
-        takes_guidance = self.transformer.config.guidance_embeds
-        tokens = self.transformer(
-            hidden_states=self._tokens(latents, condition),
-            encoder_hidden_states=embedding.embeds.expand(count, -1, -1),
-            pooled_projections=embedding.pooled.expand(count, -1),
-            timestep=sigma.to(self.device, self.dtype),
-            guidance=torch.full((count,), guidance, device=self.device) if takes_guidance else None,
-            txt_ids=torch.zeros(embedding.embeds.shape[1], 3, device=self.device),
+        count, has_guidance = len(latents), self.transformer.config.guidance_embeds
+        assert prompt.pooled is not None
+        return self._run(
+            latents,
+            condition,
+            sigma,
+            prompt.embeds,
+            pooled_projections=prompt.pooled.to(self.device, self.dtype).expand(count, -1),
+            guidance=torch.full((count,), guidance, device=self.device) if has_guidance else None,
+            txt_ids=torch.zeros(prompt.embeds.shape[1], 3, device=self.device),
             img_ids=self.positions(latents, condition).float(),
-            return_dict=False,
-        )[0]
-        return tokens_to_grid(tokens, latents)
+        )
 
     @classmethod
     def embed(cls, pipeline: Any, text: str) -> PromptEmbedding:  # noqa: ANN401 - a pipeline of diffusers
@@ -111,8 +105,3 @@ class Kontext(Backbone):
         config = transformer.config
         shapes = {"embeds": (1, 8, config.joint_attention_dim), "pooled": (1, config.pooled_projection_dim)}
         return random_prompt(cls.name, seed, **shapes)
-
-
-def _position_ids(grid: Tensor, image: int) -> Tensor:
-    rows, columns = (torch.arange(side) for side in grid.shape[2:])
-    return torch.cartesian_prod(torch.tensor([image]), rows, columns)

@@ -48,11 +48,6 @@ _BACKBONE_PATTERNS: Final = [INDEX_FILE, *(f"{part}/*" for part in CONFIG_FILES)
 _SINGLE_FILE_PATTERNS: Final = [INDEX_FILE, "transformer/config.json", "vae/*", "scheduler/*"]
 _ENCODING_BYTES: Final = 2 << 30
 """GPU memory for the activations of the text encoders and the CUDA context."""
-_FEWER_BITS: Final = {
-    None: 'use quantization="int8"', "int8": 'use quantization="nf4"', "float8": 'use quantization="nf4"',
-}  # fmt: skip
-"""Quantization -> what to do if the GPU is out of memory."""
-_CLOSE_OTHERS: Final = "close other programs that use the GPU"
 _TEXT_ENCODER_PATTERNS: Final = [INDEX_FILE, "scheduler/*", "text_encoder*/*", "tokenizer*/*", "processor/*"]
 
 
@@ -67,30 +62,23 @@ def load_backbone(
     """Loads a backbone without its text encoders.
 
     `source` is a name in the table, a hub id, a folder in diffusers' layout, or "tiny:" and a name for a tiny version.
-    By default `dtype` is bfloat16 on an accelerator and float32 on the CPU. `quantization` stores the transformer's weights
-    in 8 bits (torchao) or 4 bits (bitsandbytes, CUDA only). `transformer_file` is a single file, .gguf or .safetensors, whose
-    weights replace those of the transformer, which are then not downloaded. It cannot be quantized again.
-
-    Raises:
-        DownloadError: see `resolve_model_folder`.
-        ModelError: a file is missing or damaged, the architecture is not supported, or a name or quantization is unknown.
-        DeviceError: there is no such device, or it is out of memory; the message says what to reduce.
-        MissingExtra: diffusers, torchao or bitsandbytes is not installed.
+    By default `dtype` is bfloat16 on an accelerator and float32 on the CPU. `quantization` stores the transformer's
+    weights in 8 bits (torchao) or 4 bits (bitsandbytes, CUDA only). `transformer_file` is a single file, .gguf or
+    .safetensors, whose weights replace those of the transformer, which are then not downloaded. It cannot be quantized
+    again. Raises DownloadError, see `resolve_model_folder`; ModelError if a file is missing or damaged, the
+    architecture is not supported, or a name or quantization is unknown; DeviceError if there is no such device, or it
+    is out of memory (the message says what to reduce); MissingExtra if diffusers, torchao or bitsandbytes is not
+    installed.
     """
     _check_device(device)
-    if transformer_file and (quantization or source.startswith(TINY_PREFIX)):
+    is_tiny = source.startswith(TINY_PREFIX)
+    if (quantization and (transformer_file or is_tiny)) or (transformer_file and is_tiny):
         raise ModelError(
-            f"{transformer_file} was given for {source} with quantization={quantization}",
-            "expected a base that is no tiny version, and no quantization, because the file has its own precision",
+            f"quantization={quantization} and the file {transformer_file} were given for {source}",
+            "expected neither for a tiny version, and one of them for others, because the file has its own precision",
             "leave quantization out",
         )
-    if source.startswith(TINY_PREFIX):
-        if quantization:
-            raise ModelError(
-                f"{source} was requested with quantization={quantization}",
-                "expected a tiny version without quantization",
-                "leave quantization out",
-            )
+    if is_tiny:
         backbone, _ = tiny(source.removeprefix(TINY_PREFIX))
         backbone.transformer.to(device)
         backbone.vae.to(device)
@@ -103,20 +91,17 @@ def load_backbone(
     backbone_class, index = read_index(folder)
     if quantization == "nf4" and backbone_class.unquantized:
         options["quantization_config"].llm_int8_skip_modules = list(backbone_class.unquantized)
-    with explain_out_of_memory(f"{_FEWER_BITS.get(quantization, _CLOSE_OTHERS)}, or {MEMORY_HINT}"):
+    fewer_bits = f'use quantization="{"nf4" if quantization else "int8"}"'
+    cure = "close other programs that use the GPU" if quantization == "nf4" else fewer_bits
+    with explain_out_of_memory(f"{cure}, or {MEMORY_HINT}"):
         vae = _load_part(folder, backbone_class, "vae", dtype=dtype, **_device_map(device))
         if transformer_file:
-            transformer = _load_single_file(
-                transformer_file, folder, backbone_class, dtype=dtype, device=device
-            )
+            transformer = _load_single_file(transformer_file, folder, backbone_class, dtype, device)
         else:
-            transformer = _load_part(
-                folder, backbone_class, "transformer", dtype=dtype, **_device_map(device), **options
-            )
-    scheduler = _load_part(folder, backbone_class, "scheduler")
-    backbone = backbone_class(
-        transformer, vae, scheduler, distilled=bool(index.get("is_distilled")), dtype=dtype
-    )
+            options |= {"dtype": dtype, **_device_map(device)}
+            transformer = _load_part(folder, backbone_class, "transformer", **options)
+    scheduler, distilled = _load_part(folder, backbone_class, "scheduler"), bool(index.get("is_distilled"))
+    backbone = backbone_class(transformer, vae, scheduler, distilled=distilled, dtype=dtype)
     packed = backbone.statistics()[0].shape[1]
     if packed not in {1, backbone.channels}:
         raise ModelError(
@@ -145,11 +130,8 @@ def encode_prompt(source: str, text: str = PROMPT, *, device: str = "cpu") -> Pr
     They are loaded in bfloat16, on `device` if its free memory suffices, otherwise on the CPU. Call this before
     `load_backbone`: together with the base, most text encoders fit no consumer GPU.
 
-    Returns:
-        The embedding on the CPU, bfloat16; float32 for a tiny version.
-
-    Raises:
-        DownloadError, ModelError, DeviceError, MissingExtra: see `load_backbone`.
+    Returns the embedding on the CPU, bfloat16; float32 for a tiny version. Raises DownloadError, ModelError,
+    DeviceError, MissingExtra, see `load_backbone`.
     """
     _check_device(device)
     if source.startswith(TINY_PREFIX):
@@ -178,14 +160,12 @@ def encode_prompt(source: str, text: str = PROMPT, *, device: str = "cpu") -> Pr
     if device != "cpu" and size + _ENCODING_BYTES >= torch.cuda.mem_get_info(device)[0]:
         device = "cpu"
     dtype = torch.bfloat16
-    pipeline_class = diffusers_class(index["_class_name"])
     with (
         explain_out_of_memory("close other programs, or pass an encoded prompt"),
         _translate_load_errors(folder),
     ):
-        pipeline = pipeline_class.from_pretrained(
-            folder, transformer=None, vae=None, dtype=dtype, local_files_only=True
-        ).to(device)
+        parts = {"transformer": None, "vae": None, "dtype": dtype, "local_files_only": True}
+        pipeline = diffusers_class(index["_class_name"]).from_pretrained(folder, **parts).to(device)
         with torch.no_grad():
             embedding = backbone_class.embed(pipeline, text).to("cpu", dtype)
     del pipeline
@@ -223,7 +203,7 @@ def _load_part(folder: Path, backbone_class: type[Backbone], part: str, **option
 
 
 def _load_single_file(
-    path: Path, folder: Path, backbone_class: type[Backbone], *, dtype: torch.dtype, device: str
+    path: Path, folder: Path, backbone_class: type[Backbone], dtype: torch.dtype, device: str
 ) -> Any:  # noqa: ANN401 - a transformer of diffusers
     """Loads the transformer from one file, with the keys of diffusers or of the original code, and the config of the folder."""
     expected, options = backbone_class.classes["transformer"], {}

@@ -11,8 +11,6 @@ from brewster.models.diffusion.backbones.backbone import (
     APACHE_2,
     PATCH,
     ClassifierFreeBackbone,
-    random_prompt,
-    tokens_to_grid,
 )
 from brewster.models.diffusion.prompt import PromptEmbedding
 from brewster.models.diffusion_resources import BACKBONE_COSTS
@@ -38,6 +36,7 @@ class Qwen(ClassifierFreeBackbone):
     diffusers_usage = "but resizes the conditioning image to one megapixel, so that its panels differ from those in training"
     other_pipelines = ("QwenImageEditPlusPipeline",)
     unquantized = ("transformer_blocks.0.img_mod",)
+    random_empty_tokens = 6
     few_step_shift = 3.0  # that of Qwen-Image-Lightning
     text_encoder_requirements = ("torchvision",)
     classes: ClassVar = {
@@ -64,11 +63,9 @@ class Qwen(ClassifierFreeBackbone):
         return mean.view(1, -1, 1, 1), deviation.view(1, -1, 1, 1)
 
     def positions(self, latents: Tensor, condition: Tensor) -> list[list[tuple[int, int, int]]]:
-        """For each sample, (frames, rows, columns) of the generated image and of the conditioning image.
-
-        The transformer computes the rotary position embedding from them, centred on each image. A conditioning image
-        without tokens is left out.
-        """
+        """For each sample, (frames, rows, columns) of the generated image and of the conditioning image. The
+        transformer computes the rotary position embedding from them, centred on each image. A conditioning image
+        without tokens is left out."""
         grids = (latents, condition) if condition.numel() else (latents,)
         shapes = [(1, int(grid.shape[2]), int(grid.shape[3])) for grid in grids]
         return [shapes] * len(latents)
@@ -81,21 +78,9 @@ class Qwen(ClassifierFreeBackbone):
         negative, _ = pipeline.encode_prompt(prompt=" ", image=grey)
         return PromptEmbedding(cls.name, text, embeds.detach(), negative=negative.detach())
 
-    @classmethod
-    def random_prompt(cls, transformer: Any, seed: int) -> PromptEmbedding:  # noqa: ANN401 - a transformer of diffusers
-        """Eight random tokens for the prompt, and six for the empty prompt."""
-        width = transformer.config.joint_attention_dim
-        return random_prompt(cls.name, seed, embeds=(1, 8, width), negative=(1, 6, width))
-
     def _velocity(self, latents: Tensor, condition: Tensor, sigma: Tensor, embeds: Tensor) -> Tensor:
-        tokens = self.transformer(
-            hidden_states=self._tokens(latents, condition),
-            encoder_hidden_states=embeds.to(self.device, self.dtype).expand(len(latents), -1, -1),
-            timestep=sigma.to(self.device, self.dtype),
-            img_shapes=self.positions(latents, condition),
-            return_dict=False,
-        )[0]
-        return tokens_to_grid(tokens, latents)
+        shapes = self.positions(latents, condition)
+        return self._run(latents, condition, sigma, embeds, img_shapes=shapes)
 
     def _guided(self, conditional: Tensor, unconditional: Tensor, guidance: float) -> Tensor:
         """The guided prediction, rescaled per token to the norm of the conditional one."""

@@ -63,11 +63,8 @@ def build(
     device: str = "cpu",
     dtype: torch.dtype = torch.float32,
 ) -> Backbone:
-    """Builds a backbone with seeded random weights, by default in full size. Device "meta" needs no memory.
-
-    Raises:
-        ModelError, DeviceError: the name is not in the table; out of memory.
-    """
+    """Builds a backbone with seeded random weights, by default in full size. Device "meta" needs no memory. Raises
+    ModelError if the name is not in the table; DeviceError if the device is out of memory."""
     backbone_class = find_backbone_class(name)
     architecture = architecture or backbone_class.full_size
     part_classes = {part: diffusers_class(backbone_class.classes[part]) for part in CONFIG_FILES}
@@ -89,11 +86,9 @@ def build(
 
 
 def build_on_meta(source: str, *, dtype: torch.dtype = torch.float32) -> Backbone:
-    """The backbone on the device "meta": the names and shapes of its weights, which need no memory.
-
-    For `source`, see `load_backbone`. For a hub id, only configuration files are downloaded. Raises DownloadError, ModelError
-    or MissingExtra, see `load_backbone`.
-    """
+    """The backbone on the device "meta": the names and shapes of its weights, which need no memory. For `source`, see
+    `load_backbone`. For a hub id, only configuration files are downloaded. Raises DownloadError, ModelError or
+    MissingExtra, see `load_backbone`."""
     if is_registered(source):
         backbone_class = find_backbone_class(source.removeprefix(TINY_PREFIX))
         is_tiny = source.startswith(TINY_PREFIX)
@@ -119,10 +114,8 @@ def build_on_meta(source: str, *, dtype: torch.dtype = torch.float32) -> Backbon
 
 
 def find_description(source: str) -> Path | None:
-    """The folder with the index and the configuration of a backbone, or None if they are not in the cache. Downloads nothing.
-
-    `source` is a folder, which is returned unchanged, or a hub id.
-    """
+    """The folder with the index and the configuration of a backbone, or None if they are not in the cache. Downloads
+    nothing. `source` is a folder, which is returned unchanged, or a hub id."""
     folder = cached_model_folder(source, list(DESCRIPTION_FILES))
     if folder is None or Path(source).is_dir():
         return folder
@@ -130,11 +123,8 @@ def find_description(source: str) -> Path | None:
 
 
 def find_backbone_class(name: str) -> type[Backbone]:
-    """The Backbone class of this name.
-
-    Raises:
-        ModelError: the name is not in the table; the message suggests the closest one.
-    """
+    """The Backbone class of this name. Raises ModelError if the name is not in the table (the message suggests the
+    closest one)."""
     if name in BACKBONES:
         return BACKBONES[name]
     close = difflib.get_close_matches(name, BACKBONES, n=1)
