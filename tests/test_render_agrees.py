@@ -8,6 +8,7 @@ import torch
 from brewster.errors import MissingExtra
 from brewster.render.analytic import render
 from brewster.render.mitsuba import renderer
+from brewster.render.mitsuba.variant import VariantProbe
 from synthetic_scenes import ASSETS, camera_towards_glass, make_scene, plane_side
 
 SCENE = make_scene(
@@ -30,7 +31,7 @@ def traced_layers():
             action="ignore", category=RuntimeWarning
         ),  # the warning about LLVM, which this test does not need
     ):
-        patch.setattr(renderer, "_variant", lambda polarised: "scalar_rgb")
+        patch.setattr(renderer, "probe", lambda: VariantProbe("scalar_rgb"))
         try:
             samples = [
                 renderer.trace(scene, ASSETS, noise_threshold=0.02, max_samples=512).images()
