@@ -50,6 +50,17 @@ def test_an_image_without_paint_or_of_another_size_is_an_error(image):
         Hints.open(image, (40, 30))
 
 
+def test_strokes_may_be_painted_over_a_copy_of_the_photo():
+    photo = np.asarray(Image.open("tests/pictures/mixture-coffee-rocket.jpg").convert("RGB"))
+    image = photo.copy()
+    image[:40, :50] = RED
+    values = Hints.open(image, photo.shape[1::-1]).values
+    assert (values[:40, :50, 0] == 255).all()
+    assert (values[40:] > 80).mean() < 0.01
+    with pytest.raises(MaskError):
+        Hints.open(np.full_like(photo, (150, 60, 50)), photo.shape[1::-1])
+
+
 class Eraser:
     """Removes all light where the hint says reflection. Stores the hints of each call."""
 

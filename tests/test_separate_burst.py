@@ -208,8 +208,9 @@ def test_a_burst_keeps_depth_and_respects_strength_and_reference(small_burst, fe
 
 
 def test_photos_without_relative_motion_are_not_separated_by_motion(small_burst):
-    photo = brewster.Photo.from_array(small_burst.frames[0], encoding="srgb")
-    result = separate_burst([photo] * 3)
+    noise = np.random.default_rng(1).integers(0, 2, (3, *small_burst.frames[0].shape), np.uint8)
+    still = [small_burst.frames[0] // 2 * 2 + each for each in noise]
+    result = separate_burst([brewster.Photo.from_array(frame, encoding="srgb") for frame in still])
     assert result.burst.method != "burst"
     assert result.burst.relative_motion_px < 10 or result.burst.explained < 0.2
 
@@ -230,6 +231,17 @@ def test_bad_bursts_are_refused(shapes, reference):
     photos = [brewster.Photo.from_array(np.zeros((*shape, 3), np.uint8), encoding="srgb") for shape in shapes]
     with pytest.raises(PhotoError):
         separate_burst(photos, reference=reference)
+
+
+def test_the_same_photo_several_times_is_no_burst(burst_files):
+    with pytest.raises(PhotoError, match="are the same"):
+        separate_burst([burst_files[0].read_bytes()] * 3)
+
+
+def test_a_photo_of_another_size_is_named(burst_files, tmp_path):
+    brewster.Photo.from_array(np.zeros((9, 8, 3), np.uint8), encoding="srgb").save(tmp_path / "small.png")
+    with pytest.raises(PhotoError, match=r"photo 3 of the burst \(.*small.png\) has 8 x 9 pixels"):
+        separate_burst([*burst_files[:2], tmp_path / "small.png"])
 
 
 def test_an_unreadable_photo_is_named_by_its_number(burst_files):
@@ -312,4 +324,22 @@ def test_the_command_reports_bursts_that_cannot_be_separated(tmp_path, burst_fil
     reports = [json.loads(line) for line in out.splitlines()]
     assert (code, [report["status"] for report in reports]) == (1, ["failed", "failed"])
     assert "1 photo" in reports[0]["error"]
-    assert "window.mp4" in reports[1]["error"]
+    assert "window.mp4 cannot be read as a video" in reports[1]["error"]
+
+
+def test_the_command_separates_a_video(tmp_path, small_burst, few_steps, capfd):
+    video = tmp_path / "window.mp4"
+    write_video(video, small_burst.frames)
+    code, out = run_burst(capfd, video, "-o", tmp_path / "out", "--json", "--format", "png")
+    assert (code, json.loads(out)["burst"]["frames"]) == (0, len(small_burst.frames))
+    assert {path.name for path in (tmp_path / "out").iterdir()} == {
+        f"window.mp4.{layer}.png" for layer in ("transmission", "reflection")
+    }
+
+
+def test_layers_of_the_same_command_were_not_made_with_other_options(tmp_path, burst_files, few_steps, capfd):
+    for _ in range(2):
+        main(["burst", *map(str, burst_files), "-o", str(tmp_path / "out")])
+    message = capfd.readouterr().err
+    assert "skipped" in message
+    assert "other options" not in message

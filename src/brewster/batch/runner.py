@@ -6,6 +6,7 @@ is in memory at a time. The model is loaded when the first photo needs it."""
 from __future__ import annotations
 
 import hashlib
+import io
 import os
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Set
@@ -153,7 +154,8 @@ def separate_task(
     be read or separated, or a layer cannot be written."""
     result.model, result.model_sha256, result.device = separator.name, separator.sha256, separator.device
     with row_in_errors(task.row):
-        photo = read_content(task.source)
+        shows_video = task.burst and isinstance(task.source, Path) and is_video(task.source)
+        photo = task.source if shows_video else read_content(task.source)
     if task.burst:
         separation = _separate_burst(task.burst, separator, options, on_progress)
     else:
@@ -272,7 +274,8 @@ def read_content(source: Location | InputStream) -> Path | bytes:
 
 def _sha256(photo: Path | bytes) -> str | None:
     try:
-        return hashlib.sha256(photo if isinstance(photo, bytes) else photo.read_bytes()).hexdigest()
+        with io.BytesIO(photo) if isinstance(photo, bytes) else photo.open("rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()
     except OSError:  # the separator opens the photo later, and reports the error
         return None
 

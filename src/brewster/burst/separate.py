@@ -10,6 +10,7 @@ a prediction of a model is. If the motion does not separate the layers, the resu
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -146,7 +147,8 @@ def fit_burst(
             _FixedPredictor(solution), name=name, sha256=separator.sha256, device=separator.device
         )
     elif report.method == "unchanged":
-        separator = Separator(lambda tile: (tile, np.zeros_like(tile)), name="unchanged")
+        name = f"unchanged with {separator.name}"
+        separator = Separator(lambda tile: (tile, np.zeros_like(tile)), name=name)
     return FittedBurst(photo, separator, hints, report, seconds)
 
 
@@ -201,8 +203,14 @@ def _open(photos: Sequence[Source], index: int, max_pixels: int) -> Photo:
     try:
         return Photo.open(photos[index], max_pixels=max_pixels)
     except PhotoError as error:
-        happened = f"photo {index + 1} of the burst: {error.happened}"
+        happened = f"{_name(photos, index)}: {error.happened}"
         raise type(error)(happened, error.expected, error.cure) from error
+
+
+def _name(photos: Sequence[Source], index: int) -> str:
+    photo = photos[index]
+    path = f" ({os.fspath(photo)})" if isinstance(photo, str | os.PathLike) else ""
+    return f"photo {index + 1} of the burst{path}"
 
 
 def _working_frames(photos: Sequence[Source], reference: int, photo: Photo, max_pixels: int) -> list[Floats]:
@@ -214,11 +222,17 @@ def _working_frames(photos: Sequence[Source], reference: int, photo: Photo, max_
         frame = photo if k == reference else _open(photos, k, max_pixels)
         if frame.size != photo.size:
             raise PhotoError(
-                f"photo {k + 1} of the burst has {frame.size[0]} x {frame.size[1]} pixels",
-                f"expected {photo.size[0]} x {photo.size[1]}, as photo {reference + 1}",
-                "leave it out, or pass photos that were taken with the same camera, orientation and zoom",
+                f"{_name(photos, k)} has {frame.size[0]} x {frame.size[1]} pixels",
+                f"expected {photo.size[0]} x {photo.size[1]}, as {_name(photos, reference)}",
+                "leave one of them out, or pass photos that were taken with the same camera, orientation and zoom",
             )
         frames.append(frame.resized(width, height))
+    if all(np.array_equal(frame, frames[reference]) for frame in frames):
+        raise PhotoError(
+            f"the {len(frames)} photos of the burst are the same",
+            "expected photos of one window from different places",
+            "move the camera 5 to 10 cm sideways between the photos, or separate one of them alone",
+        )
     white = white_level(frames[reference])
     return [np.clip(frame / white, 0, 1) for frame in frames]
 

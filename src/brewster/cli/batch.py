@@ -169,7 +169,9 @@ class BatchReport:
         return ", ".join(
             f"{name}={recorded_options[name]}"
             for name, value in expected.items()
-            if value is not None and recorded_options.get(name, value) != value
+            # The layers of a burst have the model "burst with compact" or "unchanged with compact"
+            if value is not None
+            and str(recorded_options.get(name, value)).rpartition(" with ")[-1] != str(value)
         )
 
     def _print_summary(self) -> None:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 from dataclasses import dataclass
-from typing import Self, final
+from typing import Final, Self, final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +17,9 @@ from brewster.errors import MaskError
 from brewster.photo.in_memory import WHITE_LEVELS
 from brewster.photo.mask import open_painted, sampled
 from brewster.photo.photo import Float32, Source
+
+_MIN_PURITY: Final = 0.8
+"""The smallest distance of red from the larger of green and blue, as a share of red, and the same for green."""
 
 
 @final
@@ -46,7 +49,9 @@ class Hints:
             np.broadcast_to(photo.pixels, (*photo.pixels.shape[:2], 3)), 2, 0
         ).astype(np.float32)
         values = np.stack([red - np.maximum(green, blue), green - np.maximum(red, blue)], axis=2)
-        values = np.clip(values * np.atleast_3d(scale), 0, 255).astype(np.uint8)
+        # The strokes may be painted over a copy of the photo, whose colours are not as pure
+        is_pure = values >= _MIN_PURITY * np.stack([red, green], axis=2)
+        values = np.clip(values * is_pure * np.atleast_3d(scale), 0, 255).astype(np.uint8)
         if not values.any():
             raise MaskError(
                 f"{name} have neither red nor green pixels",
