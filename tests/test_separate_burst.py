@@ -182,7 +182,8 @@ def solve_at_80(frames, prior):
         (0.5, 0.012, "reflection remains", "burst"),
         (0.15, 0.02, "reflection remains", "single photo"),
         (0.5, 0.004, "removed", "single photo"),  # too small a motion
-        (0.3, 0.2, "removed", "single photo"),  # a large motion must explain more
+        (0.3, 0.2, "removed", "burst"),
+        (0.3, 0.2, "little found", "unchanged"),  # a large motion must explain more
     ],
 )
 def test_the_self_check_chooses_the_method(explained, motion, verdict, method):

@@ -41,7 +41,7 @@ _MIN_EXPLAINED: Final = 0.2
 """The smallest share of the errors of one layer that a second motion must explain."""
 _LARGE_MOTION_PX: Final = 60.0
 _MIN_EXPLAINED_IF_DOUBTED: Final = 0.4
-"""A larger motion must explain more, because the parts of a layer that only one frame shows explain everything there."""
+"""If the single photo shows little reflection, a larger motion must explain more: what only one frame shows explains everything there."""
 _USEFUL_MOTION_PX: Final = 16
 _MIN_CERTAIN_NAMING: Final = 0.08
 """Of six simulated bursts below, two had exchanged layers; of four above, none."""
@@ -255,18 +255,17 @@ def burst_report(
     explained = (
         max(0.0, 1 - solution.two_layer_error / (solution.one_layer_error + 1e-9)) if solution else 0.0
     )
-    needed = _MIN_EXPLAINED_IF_DOUBTED if motion >= _LARGE_MOTION_PX else _MIN_EXPLAINED
+    is_doubted = verdict == "little found"
+    needed = _MIN_EXPLAINED_IF_DOUBTED if is_doubted and motion >= _LARGE_MOTION_PX else _MIN_EXPLAINED
     method: Literal["burst", "single photo", "unchanged"] = "single photo"
     advice = "Move the camera 5 to 10 cm sideways between the photos."
     if solution is None:
         message = "No other photo shows the same scene as the reference photo."
-    elif explained >= needed and motion >= (
-        _USEFUL_MOTION_PX if verdict == "little found" else _MIN_MOTION_PX
-    ):
+    elif explained >= needed and motion >= (_USEFUL_MOTION_PX if is_doubted else _MIN_MOTION_PX):
         method, message = "burst", f"The layers moved {motion:.0f} px apart in a photo of 1,000 px."
         if solution.naming < _MIN_CERTAIN_NAMING:
             message += " They may have each other's names, because the reference photo alone does not tell them apart."
-    elif verdict == "little found":
+    elif is_doubted:
         method = "unchanged"
         message = "Little reflection was found, in the motion and in the reference photo. If there is one, separate this photo alone."
     elif explained < needed:
@@ -284,6 +283,8 @@ def burst_report(
 @final
 class _FixedPredictor(Predictor):
     """Returns the solution of a burst as the prediction for its reference photo."""
+
+    is_measured = True
 
     def __init__(self, solution: Solution) -> None:
         self._solution = solution

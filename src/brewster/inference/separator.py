@@ -236,8 +236,9 @@ class Separator:
             images = self._with_hints(inputs, photo, hints)
         on_progress(0.0)
         with _timed(seconds, "network"):
-            prediction = self._predictor(images, quality, lambda done: on_progress(_NETWORK_SHARE * done))
-            prediction = keep_clipped_light(inputs[-1], prediction)
+            prediction = self._predict(
+                inputs[-1], images, quality, lambda done: on_progress(_NETWORK_SHARE * done)
+            )
         with _timed(seconds, "upsampling"):
             upsampler = _fit_upsampler(inputs[-1], prediction, strength, white)
             transmission, reflection, residual = upsample_layers(
@@ -293,9 +294,15 @@ class Separator:
         Options(quality=quality)  # checks the value
         inputs, white = self._inputs(photo, quality)
         images = self._with_hints(inputs, photo, hints)
-        prediction = keep_clipped_light(inputs[-1], self._predictor(images, quality, on_progress))
+        prediction = self._predict(inputs[-1], images, quality, on_progress)
         upsampler = _fit_upsampler(inputs[-1], prediction, Options.strength, white)
         return upsampler, prediction, self._assess(inputs[-1], prediction)
+
+    def _predict(
+        self, largest_input: Floats, images: list[Floats], quality: Quality, on_progress: ProgressCallback
+    ) -> Prediction:
+        prediction = self._predictor(images, quality, on_progress)
+        return prediction if self._predictor.is_measured else keep_clipped_light(largest_input, prediction)
 
     def _assess(
         self,
