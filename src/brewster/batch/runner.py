@@ -154,8 +154,10 @@ def separate_task(
     be read or separated, or a layer cannot be written."""
     result.model, result.model_sha256, result.device = separator.name, separator.sha256, separator.device
     with row_in_errors(task.row):
-        shows_video = task.burst and isinstance(task.source, Path) and is_video(task.source)
-        photo = task.source if shows_video else read_content(task.source)
+        if task.burst and isinstance(task.source, Path) and is_video(task.source):
+            photo: Path | bytes = task.source
+        else:
+            photo = read_content(task.source)
     if task.burst:
         separation = _separate_burst(task.burst, separator, options, on_progress)
     else:
