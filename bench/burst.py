@@ -56,7 +56,8 @@ def quality(folder, long_side_px, numbers):
         upsampler, _, single = separator.fit(photos[reference])
         frame = frames[reference]
         prior = upsampler.apply(frame, 0, len(frame))[0].clip(0, frame)
-        solution, left_out = separate.measure_layers(frames, reference, prior)
+        refine_prior = partial(separate.prior_with_hints, separator, frame)
+        solution, left_out = separate.measure_layers(frames, reference, prior, refine_prior=refine_prior)
         report = separate.burst_report(solution, single.verdict, len(photos), left_out, reference)
         if solution is None:
             print(f"| {case.name} | | | | {single.verdict} | {report.method} | | | | | |")

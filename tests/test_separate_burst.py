@@ -48,9 +48,9 @@ def run_burst(capfd, *args):
 
 @pytest.fixture(scope="module")
 def small_burst():
-    """Five frames of 120 x 90 pixels, in which the reflection moves by 12 pixels."""
+    """Five frames of 128 x 96 pixels, in which the reflection moves by 12 pixels."""
     return simulate_burst(
-        *linear_pictures((160, 120)), relative_px=12, common_px=3, strength=0.4, noise=0, size=(120, 90)
+        *linear_pictures((160, 120)), relative_px=12, common_px=3, strength=0.4, noise=0, size=(128, 96)
     )
 
 
@@ -122,7 +122,7 @@ def test_a_burst_is_separated_by_its_motion(small_burst, burst_files):
     result = brewster.separate_burst(burst_files)
     report = result.burst
     assert report.method == "burst"
-    assert 60 < report.relative_motion_px < 160  # 100 px in a photo of 1,000 px
+    assert 60 < report.relative_motion_px < 160  # 94 px in a photo of 1,000 px
     single = brewster.separate(burst_files[2])
     scores = [psnr_db(layers.transmission.linear(), small_burst.transmission) for layers in (result, single)]
     assert scores[0] > scores[1]
@@ -166,10 +166,58 @@ def test_the_single_photo_names_the_layers(small_burst):
         assert psnr_db(solution.transmission, transmission) > psnr_db(solution.transmission, reflection) + 3
 
 
+def test_the_measured_reflection_refines_the_prior(small_burst):
+    """What the single photo gets wrong in large areas is corrected as soon as the layers are measured."""
+    frames = [to_linear(frame / 255).astype(np.float32) for frame in small_burst.frames]
+    wrong = frames[2] * np.float32(0.5)
+    shares = []
+
+    def refine(share):
+        shares.append(share)
+        return small_burst.transmission.astype(np.float32)
+
+    levels = (Level(80, 20, None), Level(160, 25, None), Level(160, 25, None))
+    plain, refined = (solve_few(frames, wrong, levels=levels, refine_prior=each) for each in (None, refine))
+    (share,) = shares  # not after the last level
+    truth = small_burst.reflection.mean(-1) / (small_burst.reflection + small_burst.transmission).mean(-1)
+    truth = cv2.GaussianBlur(cv2.resize(truth, share.shape[1::-1]), (0, 0), 3)
+    assert share.shape == (120, 160, 1)
+    assert np.corrcoef(share.ravel(), truth.ravel())[0, 1] > 0.5
+    truth = cv2.resize(small_burst.transmission, share.shape[1::-1])
+    assert psnr_db(refined.transmission, truth) > psnr_db(plain.transmission, truth) + 0.1
+
+
+@pytest.mark.parametrize("painted", [False, True])
+def test_the_model_gets_the_measured_reflection_as_a_hint_unless_a_person_gave_hints(
+    monkeypatch, burst_files, painted
+):
+    levels = (Level(80, 2, None), Level(160, 2, None), Level(160, 2, None))
+    monkeypatch.setattr("brewster.burst.separate.solve", partial(solve, levels=levels))
+    given = []
+    separator = brewster.Separator.load()
+    fit = separator.fit
+
+    def spy(photo, **options):
+        given.append(options.get("hints"))
+        return fit(photo, **options)
+
+    monkeypatch.setattr(separator, "fit", spy)
+    hints = None
+    if painted:
+        hints = np.zeros((*brewster.Photo.open(burst_files[0]).size[::-1], 3), np.uint8)
+        hints[:9, :9, 0] = 255
+    separate_burst(burst_files, separator=separator, hints=hints)
+    assert given[0] is hints
+    assert (len(given) == 1) is painted
+
+
 def solve_at_80(frames, prior):
+    return solve_few(frames, prior, levels=LEVELS[:1])
+
+
+def solve_few(frames, prior, **options):
     motions = frame_motions(frames, 2, frames[2] / 2)
-    candidates = motion_candidates(frames, 2, motions)
-    return solve(frames, 2, prior, candidates, levels=LEVELS[:1])
+    return solve(frames, 2, prior, motion_candidates(frames, 2, motions), **options)
 
 
 @pytest.mark.parametrize(

@@ -15,6 +15,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, Final, Literal, final
 
 import cv2
@@ -45,6 +46,8 @@ _MIN_EXPLAINED_IF_DOUBTED: Final = 0.4
 _USEFUL_MOTION_PX: Final = 16
 _MIN_CERTAIN_NAMING: Final = 0.08
 """Of six simulated bursts below, two had exchanged layers; of four above, none."""
+_HINTED_SHARE: Final = 0.3
+"""Where the reflection measured on small frames has more of the light, the model gets a hint: on 13 simulated bursts, T gained a median of 0.3 dB."""
 _DETAIL_LIMITS: Final = (0.5, 2.0)
 """The detail of the reference photo changes the sum of the layers by no more than these factors."""
 
@@ -136,7 +139,12 @@ def fit_burst(
     started = time.perf_counter()
     upsampler, _, single = separator.fit(photo, quality=quality, hints=hints)
     prior = _applied(upsampler.apply, frames[reference])
-    solution, left_out = measure_layers(frames, reference, prior, on_progress=on_progress)
+    refine_prior = None
+    if separator.takes_hints and hints is None:  # a person knows better than the measured layers
+        refine_prior = partial(prior_with_hints, separator, frames[reference])
+    solution, left_out = measure_layers(
+        frames, reference, prior, refine_prior=refine_prior, on_progress=on_progress
+    )
     seconds["motion"] = time.perf_counter() - started
     report = burst_report(solution, single.verdict, len(photos), left_out, reference)
     if report.method != "single photo":
@@ -157,6 +165,7 @@ def measure_layers(
     reference: int,
     prior: Floats,
     *,
+    refine_prior: Callable[[Floats], Floats] | None = None,
     on_progress: ProgressCallback = lambda _fraction: None,
 ) -> tuple[Solution | None, tuple[int, ...]]:
     """Measures the layers of the reference frame from the motion, with one thread.
@@ -165,6 +174,7 @@ def measure_layers(
         frames: (h, w, 3) linear light in 0..1, of one size.
         reference: the index of the reference frame.
         prior: T of the reference frame from a single photo, (h, w, 3).
+        refine_prior: see `solve`.
         on_progress: called with the completed fraction, 0 to 1.
 
     Returns:
@@ -178,7 +188,21 @@ def measure_layers(
             return None, left_out
         chosen, middle = [frames[k] for k in used], used.index(reference)
         candidates = motion_candidates(chosen, middle, [motions[k] for k in used])
-        return solve(chosen, middle, prior, candidates, on_progress=on_progress), left_out
+        solution = solve(
+            chosen, middle, prior, candidates, refine_prior=refine_prior, on_progress=on_progress
+        )
+        return solution, left_out
+
+
+def prior_with_hints(separator: Separator, frame: Floats, reflection_share: Floats) -> Floats:
+    """Returns T of the working frame, predicted with hints where the measured share (h, w, 1) of the reflection is large."""
+    is_reflection = cv2.resize(reflection_share, frame.shape[1::-1]) > _HINTED_SHARE
+    hints = np.zeros(frame.shape, np.uint8)
+    hints[is_reflection, 0] = 255
+    upsampler, _, _ = separator.fit(
+        Photo.from_array(frame, encoding="linear"), hints=hints if is_reflection.any() else None
+    )
+    return _applied(upsampler.apply, frame)
 
 
 def _checked_reference(count: int, reference: int | None) -> int:

@@ -76,6 +76,7 @@ def solve(
     prior: Floats,
     candidates: Sequence[MotionCandidate],
     *,
+    refine_prior: Callable[[Floats], Floats] | None = None,
     weights: Weights = DEFAULT_WEIGHTS,
     levels: Sequence[Level] = LEVELS,
     on_progress: Callable[[float], None] = lambda _fraction: None,
@@ -87,6 +88,7 @@ def solve(
         reference: the index of the reference frame.
         prior: T of the reference frame from a single photo, (h, w, 3).
         candidates: guesses for the motions. One of them is locked.
+        refine_prior: returns a better `prior`, given the measured share of R in the light of the reference frame, (h, w, 1).
         weights: the weights of the loss.
         levels: the sizes of the frames.
         on_progress: called with the completed fraction.
@@ -99,8 +101,11 @@ def solve(
     motions = np.stack([[c.transmission for c in candidates], [c.reflection for c in candidates]])
     is_locked = torch.tensor([candidate.is_locked for candidate in candidates])
     model, names, errors = None, [candidate.name for candidate in candidates], (0.0, 0.0)
+    refined = prior
     for index, level in enumerate(levels):
-        small, small_prior = _packed(frames, level.long_side_px), _packed([prior], level.long_side_px)[0]
+        small, small_prior, small_refined = (
+            _packed(images, level.long_side_px) for images in (frames, [prior], [refined])
+        )
         if model is None:
             model = JointModel.start(small, torch.from_numpy(motions).float(), is_locked, reference)
         else:
@@ -119,7 +124,7 @@ def solve(
             on_progress(done / sum(work))
 
         model = optimise(
-            model, small, small_prior, level.steps, rates=rates, weights=weights, on_step=on_step
+            model, small, small_refined[0], level.steps, rates=rates, weights=weights, on_step=on_step
         )
         losses |= dict(zip(names, model.losses.tolist(), strict=True))
         if level.long_side_px <= COMPARED_PX:
@@ -127,10 +132,12 @@ def solve(
         if level.long_side_px >= COMPARED_PX or level is levels[-1]:
             kept = _best(model, with_locked=False)
             best = model.selected(kept)
-            layers, naming = _named(best, small, small_prior)
+            layers, naming = _named(best, small, small_prior[0])
             if naming < -_MIN_NAMING:  # the next level corrects the brightness of large areas
                 model, names = best.exchanged(), [names[i] for i in kept]
                 layers, naming = layers.flip(0), -naming
+            if refine_prior and level is not levels[-1]:
+                refined = refine_prior(_reflection_share(layers))
     assert model
     model = model.selected(_best(model, with_locked=False))
     with torch.no_grad():
@@ -151,6 +158,13 @@ def _named(model: JointModel, frames: Tensor, prior: Tensor) -> tuple[Tensor, fl
     gram = details @ details.T
     transmission, reflection = torch.linalg.lstsq(gram[:2, :2] + 1e-6 * torch.eye(2), gram[:2, 2]).solution
     return layers, float(transmission - reflection)
+
+
+def _reflection_share(layers: Tensor) -> Floats:
+    """Returns the share of R in the light of both layers (2, 3, h, w), without noise: (h, w, 1) in 0..1."""
+    transmission, reflection = functional.avg_pool2d(layers.mean(1), _DETAIL_PX, 1, _DETAIL_PX // 2)
+    share: Floats = (reflection / (transmission + reflection + 1e-3))[..., None].numpy()
+    return share
 
 
 def _best_of_families(model: JointModel, candidates: Sequence[MotionCandidate]) -> list[int]:
