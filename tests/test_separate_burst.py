@@ -176,14 +176,14 @@ def test_the_measured_reflection_refines_the_prior(small_burst):
         shares.append(share)
         return small_burst.transmission.astype(np.float32)
 
-    levels = (Level(80, 20, None), Level(160, 25, None), Level(160, 25, None))
+    levels = (Level(80, 20, None), Level(160, 25, None), Level(166, 25, None))
     plain, refined = (solve_few(frames, wrong, levels=levels, refine_prior=each) for each in (None, refine))
     (share,) = shares  # not after the last level
     truth = small_burst.reflection.mean(-1) / (small_burst.reflection + small_burst.transmission).mean(-1)
     truth = cv2.GaussianBlur(cv2.resize(truth, share.shape[1::-1]), (0, 0), 3)
-    assert share.shape == (120, 160, 1)
+    assert share.shape == (120, 160, 1)  # of the level of 160 pixels
     assert np.corrcoef(share.ravel(), truth.ravel())[0, 1] > 0.5
-    truth = cv2.resize(small_burst.transmission, share.shape[1::-1])
+    truth = cv2.resize(small_burst.transmission, refined.transmission.shape[1::-1])
     assert psnr_db(refined.transmission, truth) > psnr_db(plain.transmission, truth) + 0.1
 
 
@@ -191,7 +191,7 @@ def test_the_measured_reflection_refines_the_prior(small_burst):
 def test_the_model_gets_the_measured_reflection_as_a_hint_unless_a_person_gave_hints(
     monkeypatch, burst_files, painted
 ):
-    levels = (Level(80, 2, None), Level(160, 2, None), Level(160, 2, None))
+    levels = (Level(80, 2, None), Level(160, 2, None), Level(166, 2, None))
     monkeypatch.setattr("brewster.burst.separate.solve", partial(solve, levels=levels))
     given = []
     separator = brewster.Separator.load()
