@@ -287,7 +287,10 @@ def _penalties(model: JointModel, frames: Tensor, prior: Tensor, weights: Weight
     for layer, weight in zip(
         model.layers, (weights.transmission_gradients, weights.reflection_gradients), strict=True
     ):
-        terms = terms + weight * sum(charbonnier(d).mean((1, 2, 3)) for d in _differences(layer))
+        x, y = _differences(layer)
+        # The length of the gradient, not the sum of its components, which favours edges along the axes
+        lengths = _smooth_root(x[..., :-1, :].square() + y[..., :-1].square())
+        terms = terms + weight * lengths.mean((1, 2, 3))
     if weights.common_edges:
         terms = terms + weights.common_edges * _common_edges(*model.layers)
     if weights.prior:
@@ -315,7 +318,11 @@ def data_errors(predicted: Tensor, frames: Tensor) -> Tensor:
 
 def charbonnier(values: Tensor) -> Tensor:
     """Returns a smooth absolute value."""
-    return (values.square() + _CHARBONNIER_EPSILON**2).sqrt() - _CHARBONNIER_EPSILON
+    return _smooth_root(values.square())
+
+
+def _smooth_root(squares: Tensor) -> Tensor:
+    return (squares + _CHARBONNIER_EPSILON**2).sqrt() - _CHARBONNIER_EPSILON
 
 
 def pixel_grid(height: int, width: int) -> Tensor:
