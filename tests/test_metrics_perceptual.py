@@ -13,7 +13,7 @@ from torch.nn import functional
 
 from brewster.download import RemoteFile
 from brewster.errors import ModelError
-from brewster.metrics import Lpips, lpips, perceptual
+from brewster.metrics import Lpips, lpips
 from brewster.metrics.weights import (
     ALEXNET_FILE,
     ALEXNET_TENSORS,
@@ -34,9 +34,9 @@ def cache(monkeypatch, tmp_path):
     """An empty folder for cached weights. BREWSTER_DATA is not set, and no weights are in memory."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     monkeypatch.delenv("BREWSTER_DATA", raising=False)
-    perceptual._load.cache_clear()
+    Lpips.load.cache_clear()
     yield tmp_path / "brewster" / "weights"
-    perceptual._load.cache_clear()
+    Lpips.load.cache_clear()
 
 
 @pytest.fixture(scope="module")

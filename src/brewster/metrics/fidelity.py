@@ -39,10 +39,8 @@ _WINDOW_SIDES: Final[dict[Window, int]] = {
 def psnr(prediction: Image, truth: Image, *, region: Region | None = None) -> float:
     """Returns the peak signal-to-noise ratio in dB, 10 log10(255^2 / MSE); infinity for equal images. Higher is better.
 
-    The mean squared error is over the three channels of all pixels, or of the pixels in `region`, bool (H, W).
-
-    Raises:
-        ValueError: the images are not uint8 (H, W, 3) or differ in shape; the region is empty or of another shape."""
+    The mean squared error is over the three channels of all pixels, or of the pixels in `region`, bool (H, W). Raises
+    ValueError if the images are not uint8 (H, W, 3) or differ in shape, or the region is empty or of another shape."""
     if region is None:
         return psnr_of_counts(count_pairs(prediction, truth))
     windows.check_images(prediction, truth)
@@ -76,10 +74,7 @@ def psnr_of_channels(prediction: Image, truth: Image) -> float:
     computes it.
 
     The value is never below that of `psnr`, which uses one mean squared error over all channels. It is in dB, and
-    infinity if a channel is equal in both images. Higher is better.
-
-    Raises:
-        ValueError: the images are not uint8 (H, W, 3) or differ in shape."""
+    infinity if a channel is equal in both images. Higher is better. Raises ValueError as `psnr`."""
     windows.check_images(prediction, truth)
     difference = prediction.astype(np.int32) - truth
     mse = (difference * difference).mean(axis=(0, 1))
@@ -91,10 +86,7 @@ def linear_rmse(prediction: Image, truth: Image, *, region: Region | None = None
 
     L is the inverse of the sRGB curve (IEC 61966-2-1). The mean is over the three channels of all pixels, or of the
     pixels in `region`, bool (H, W). This error is proportional to the light that is wrong; errors of encoded values are
-    not. Lower is better.
-
-    Raises:
-        ValueError: the images are not uint8 (H, W, 3) or differ in shape; the region is empty or of another shape."""
+    not. Lower is better. Raises ValueError as `psnr`."""
     if region is None:
         return linear_rmse_of_counts(count_pairs(prediction, truth))
     windows.check_images(prediction, truth)
@@ -114,11 +106,8 @@ def ssim(
 
     The SSIM map is averaged over all its pixels, or over those in `region`, bool (H, W). The map has no values within 3
     pixels of the image's border, or 5 pixels with the Gaussian window. The mean is 1 for equal images. Higher is
-    better.
-
-    Raises:
-        ValueError: the images are not uint8 (H, W, 3), differ in shape, or are smaller than the window; the
-            region is empty, of another shape, or has only pixels without a value."""
+    better. Raises ValueError as `psnr`, and if the images are smaller than the window or the region has only pixels
+    without a value."""
     return mean_ssim(ssim_map(prediction, truth, window=window), region=region)
 
 
