@@ -9,11 +9,12 @@ from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Final, final
 from urllib.parse import quote
 
-from brewster.benchmarks.image_files import Case, ImageFile
+from brewster.benchmarks.image_files import Case
 from brewster.benchmarks.pairing import join_names
 from brewster.benchmarks.registry import Benchmark
 from brewster.errors import BrewsterError, PhotoError, counted
@@ -21,7 +22,6 @@ from brewster.evaluate.config import EvaluationConfig
 from brewster.evaluate.methods import (
     BASELINE,
     Method,
-    MethodOutput,
     ModelMethod,
     PredictionFolder,
     check_names,
@@ -93,7 +93,8 @@ def evaluate(
         write_atomically(out / name, text.encode(errors="backslashreplace"), overwrite=True)
     scored_rows = {row.id: row for row in rows if not row.error}
     worst = _worst_cases(cases, methods, config, scored_rows, max_report_cases)
-    thumbnails = _ReportImages(methods, config, scored_rows, out).thumbnails(worst)
+    others = {method.name: method for method in methods if method.name != BASELINE}
+    thumbnails = _ReportImages(others, config, scored_rows, out).thumbnails(worst)
     write_report(results, thumbnails, out / REPORT_FILE)
     return results
 
@@ -147,58 +148,50 @@ def _method_remarks(method: Method, cases: Sequence[Case], rows: Sequence[ScoreR
 class _ReportImages:
     """Makes the thumbnails of the report, with links to the files at full size."""
 
-    methods: Sequence[Method]
+    methods: Mapping[str, Method]
     config: EvaluationConfig
     rows: Mapping[RowId, ScoreRow]
     out: Path
 
     def thumbnails(self, cases: Iterable[Case]) -> Iterator[CaseThumbnails]:
         """Yields the thumbnails of the cases that can be read."""
-        others = [method for method in self.methods if method.name != BASELINE]
         for case in cases:
             try:
                 truth = GroundTruth.open(case, self.config)
             except PhotoError:
                 continue  # the row of the case has this error, and the tables show it
             outputs = {
-                method.name: get_prediction(truth, method, row)
-                for method in others
-                if (row := self.rows.get((case.benchmark, case.name, method.name)))
+                name: get_prediction(truth, method, row)
+                for name, method in self.methods.items()
+                if (row := self.rows.get((case.benchmark, case.name, name)))
             }
-            region = truth.region(self.config.thresholds[0])
-            yield to_thumbnails(truth, outputs, region, dict(self._links(truth, outputs)))
+            link = partial(self._link, case)
+            yield to_thumbnails(truth, outputs, truth.region(self.config.thresholds[0]), link)
 
-    def _links(
-        self, truth: GroundTruth, outputs: Mapping[str, MethodOutput]
-    ) -> Iterator[tuple[tuple[str, str], str]]:
-        case = truth.case
-        sources = {"photo": case.photo, "transmission": case.ground_truth, "reflection": case.reflection}
-        if self.config.resizes:
-            sources = {"photo": ImageFile(input_path(self.out, case))}
-        for layer, image in truth.images.items():
-            photo = Photo.from_array(image, encoding="srgb")
-            yield (layer, ""), self._link(case, sources.get(layer), photo, layer)
-        for method in self.methods:
-            if output := outputs.get(method.name):
-                files = method.files(case) if isinstance(method, ModelMethod | PredictionFolder) else {}
-                layers = {"transmission": output.transmission, "reflection": output.reflection}
-                for layer, photo in layers.items():
-                    if photo:
-                        source = ImageFile(files[layer]) if layer in files else None
-                        name = f"{method.name}.{layer}"
-                        yield (layer, method.name), self._link(case, source, photo, name)
-
-    def _link(self, case: Case, source: ImageFile | None, photo: Photo, name: str) -> str:
-        """Returns the URL of a file, relative to the report. Writes a PNG file if a browser cannot open the source."""
-        path = source.path if source and source.span is None else None
+    def _link(self, case: Case, method: str, layer: str, photo: Photo) -> str:
+        """Returns the URL of a layer at full size, relative to the report. Writes a PNG file if a browser cannot open
+        its file. `method` is "" for the photo, transmission and reflection of the benchmark."""
+        path = self._file(case, method, layer)
         if path is None or path.suffix.lower() not in _BROWSER_SUFFIXES:
-            path = self.out / PICTURES_FOLDER / case.benchmark / case.name / f"{name}.png"
+            name = f"{method}.{layer}.png" if method else f"{layer}.png"
+            path = self.out / PICTURES_FOLDER / case.benchmark / case.name / name
             write_atomically(path, photo.encode("png", depth=8), overwrite=True)
         try:
             relative = os.path.relpath(path, self.out)
         except ValueError:  # on Windows, a path on another drive
             return path.resolve().as_uri()
         return quote(relative.replace(os.sep, "/"))
+
+    def _file(self, case: Case, method: str, layer: str) -> Path | None:
+        if method:
+            stored = self.methods[method]
+            is_stored = isinstance(stored, ModelMethod | PredictionFolder)
+            return stored.files(case).get(layer) if is_stored else None
+        if self.config.resizes:
+            return input_path(self.out, case) if layer == "photo" else None
+        sources = {"photo": case.photo, "transmission": case.ground_truth, "reflection": case.reflection}
+        source = sources[layer]
+        return source.path if source and source.span is None else None
 
 
 def _worst_cases(

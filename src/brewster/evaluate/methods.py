@@ -207,7 +207,7 @@ class PredictionFolder:
     def key(self, case: Case) -> str:
         """Returns the digest of the files. If they cannot be read, returns the error message; `predict` then fails."""
         try:
-            return _digest(self._read(case).values())
+            return _digest(map(read_image, self.files(case).values()))
         except BrewsterError as error:
             return str(error)
 
@@ -217,10 +217,7 @@ class PredictionFolder:
 
     def cached(self, case: Case) -> MethodOutput:
         """Returns the same as `predict`, and raises the same errors: the predictions are stored in the folder."""
-        return MethodOutput.decode(self._read(case))
-
-    def _read(self, case: Case) -> dict[str, bytes]:
-        return {layer: read_image(path) for layer, path in self.files(case).items()}
+        return MethodOutput.decode({layer: read_image(path) for layer, path in self.files(case).items()})
 
     def files(self, case: Case) -> dict[str, Path]:
         """Returns layer -> file for a case: the transmission and, if there is one, the reflection. Raises PhotoError if

@@ -79,14 +79,14 @@ def summarise(
         },
         "metrics": {name: metric.to_dict() for name, metric in columns.items()},
         "benchmarks": {
-            benchmark.name: {
-                "title": benchmark.title,
-                "cases": len(benchmark.cases),
-                "expected": list(benchmark.expected_counts),
-                "remarks": list(benchmark.remarks),
-                "excluded": list(benchmark.excluded),
+            part.name: {
+                "title": part.title,
+                "cases": len(part.cases),
+                "expected": list(part.expected_counts),
+                "remarks": list(part.remarks),
+                "excluded": list(part.excluded),
             }
-            for benchmark in benchmarks
+            for part in benchmarks
         },
         "selections": {
             key: {
@@ -107,8 +107,8 @@ def summarise(
         | {subset.key: [case.name for case in subset.cases] for subset in subsets},
         "cases": [
             _describe_case([by_id[case.benchmark, case.name, name] for name in method_names], case, columns)
-            for benchmark in benchmarks
-            for case in benchmark.cases
+            for part in benchmarks
+            for case in part.cases
         ],
         "tables": tables,
         "differences": {
@@ -161,16 +161,17 @@ def _rounded(row: dict[str, Any]) -> dict[str, Any]:
 
 
 def _describe_case(rows: Sequence[ScoreRow], case: Case, columns: Collection[str]) -> dict[str, Any]:
-    scored = next((row for row in rows if not row.error), None)
+    scored = [row for row in rows if not row.error]
     return {
         "benchmark": case.benchmark,
         "name": case.name,
         "scene": case.scene,
-        **{name: getattr(scored, name, None) for name in ("width", "height", "region_share")},
+        **{
+            name: getattr(scored[0], name) if scored else None for name in ("width", "height", "region_share")
+        },
         "scores": {
             row.method: {column: row.scores[column] for column in columns if column in row.scores}
-            for row in rows
-            if not row.error
+            for row in scored
         },
         "errors": {row.method: row.error for row in rows if row.error},
     }

@@ -30,10 +30,6 @@ _SQUARED_ERRORS: Final = np.square(np.subtract.outer(np.arange(256.0), np.arange
 _LINEAR_SQUARED_ERRORS: Final = np.square(np.subtract.outer(_LINEAR, _LINEAR), dtype=np.float64).ravel()
 """The squared error of each pair of 8-bit values, (65536,), with the index of `count_pairs`."""
 _STRIP_ROWS: Final = 32
-_WINDOW_SIDES: Final[dict[Window, int]] = {
-    "uniform": windows.BOX_SIDE,
-    "gaussian": 2 * windows.GAUSSIAN_RADIUS + 1,
-}
 
 
 def psnr(prediction: Image, truth: Image, *, region: Region | None = None) -> float:
@@ -130,13 +126,12 @@ def ssim_map(prediction: Image, truth: Image, *, window: Window = "uniform") -> 
     """Returns the local SSIM, (H - side + 1, W - side + 1, 3) for a window with sides of `side` pixels. Raises
     ValueError if the images are not uint8 (H, W, 3), differ in shape, or are smaller than the window."""
     windows.check_images(prediction, truth)
-    side = _WINDOW_SIDES[window]
+    side, windowed_ssim = _WINDOWS[window]
     height, width = prediction.shape[:2]
     if min(height, width) < side:
         raise ValueError(f"SSIM needs at least {side}x{side} pixels, not {height}x{width}")
     # Strips of 32 rows fit into the processor's cache.
-    windowed_ssim, strip_height = _WINDOWED_SSIM[window], _STRIP_ROWS + side - 1
-    strips = [np.s_[top : top + strip_height] for top in range(0, height - side + 1, _STRIP_ROWS)]
+    strips = [np.s_[top : top + _STRIP_ROWS + side - 1] for top in range(0, height - side + 1, _STRIP_ROWS)]
     return np.concatenate([windowed_ssim(prediction[strip], truth[strip]) for strip in strips])
 
 
@@ -173,7 +168,8 @@ def _ssim_formula(
     return values
 
 
-_WINDOWED_SSIM: Final[dict[Window, Callable[[Image, Image], NDArray[np.float64]]]] = {
-    "uniform": _ssim_uniform,
-    "gaussian": _ssim_gaussian,
+_WINDOWS: Final[dict[Window, tuple[int, Callable[[Image, Image], NDArray[np.float64]]]]] = {
+    "uniform": (windows.BOX_SIDE, _ssim_uniform),
+    "gaussian": (2 * windows.GAUSSIAN_RADIUS + 1, _ssim_gaussian),
 }
+"""The side of each window in pixels, and the function that computes the map."""
