@@ -76,8 +76,12 @@ def _burst(benchmark: str, root: Path, folder: Path, roles: _Roles) -> Case:
     middle, name = numbers[len(numbers) // 2], folder.absolute().name
     path = roles["frame"][middle][0].relative_to(root).with_suffix("").as_posix()
     frames = {number: ImageFile(roles["frame"][number][0]) for number in numbers}
-    truths = [ImageFile(roles[role][middle][0]) for role in _LAYERS if middle in roles[role]]
-    return Case(benchmark, name, name, path, frames[middle], *truths, frames=tuple(frames.values()))
+    transmission, reflection = (
+        ImageFile(roles[role][middle][0]) if middle in roles[role] else None for role in _LAYERS
+    )
+    assert transmission, "other bursts are excluded"
+    photo = frames[middle]
+    return Case(benchmark, name, name, path, photo, transmission, reflection, frames=tuple(frames.values()))
 
 
 def _rendered_bursts(folder: Path, benchmark: str) -> tuple[list[Case], FolderListing]:
@@ -94,7 +98,10 @@ def _rendered_bursts(folder: Path, benchmark: str) -> tuple[list[Case], FolderLi
         if len(layers) < len(_LAYER_FILES) or len(frames) < len(burst.frames):
             excluded.append(f"burst {burst.index} is incomplete: expected {', '.join(_LAYER_FILES)}")
             continue
+        photo, transmission, reflection = layers
         name, path = f"burst-{burst.index:06d}", f"{reference.name}/photo"
-        bursts.append(Case(benchmark, name, name, path, *layers, frames=tuple(frames)))
+        bursts.append(
+            Case(benchmark, name, name, path, photo, transmission, reflection, frames=tuple(frames))
+        )
     excluded += [f"{name} is a frame of an incomplete burst" for name in samples.values()]
     return bursts, FolderListing(folder, excluded=excluded)

@@ -118,7 +118,9 @@ def _read_rendered(name: str, folder: Path) -> list[Benchmark]:
     for sample in read_samples(folder):
         key, files = sample.name, files_of(sample, _RENDERED_FILES)
         if len(files) == len(_RENDERED_FILES):
-            cases.append(Case(benchmark_name, key, key, f"{key}/photo", *files, rendered=True))
+            photo, background, reflection = files
+            path = f"{key}/photo"
+            cases.append(Case(benchmark_name, key, key, path, photo, background, reflection, rendered=True))
         else:
             excluded.append(f"{key} is incomplete: expected {', '.join(_RENDERED_FILES)}")
     return [_make_benchmark(name, folder, cases, FolderListing(folder, excluded=excluded))]

@@ -185,8 +185,9 @@ class _ReportImages:
     def _file(self, case: Case, method: str, layer: str) -> Path | None:
         if method:
             stored = self.methods[method]
-            is_stored = isinstance(stored, ModelMethod | PredictionFolder)
-            return stored.files(case).get(layer) if is_stored else None
+            if isinstance(stored, ModelMethod | PredictionFolder):
+                return stored.files(case).get(layer)
+            return None
         if self.config.resizes:
             return input_path(self.out, case) if layer == "photo" else None
         sources = {"photo": case.photo, "transmission": case.ground_truth, "reflection": case.reflection}

@@ -88,9 +88,11 @@ def _group(study: Study, participants: Sequence[ParticipantAnswers]) -> dict[str
     }
     if not participants:
         return summary
-    comparisons, indices = study.description.comparisons, _table_indices(study)
-    shape = len(study.pairs_of_methods), len(study.description.datasets)
-    pictures, ratings = np.zeros(shape), np.zeros((len(comparisons), len(OUTCOMES)))
+    pairs = {pair: i for i, pair in enumerate(study.pairs_of_methods)}
+    datasets = {name: i for i, name in enumerate(study.description.datasets)}
+    indices = [(pairs[row.methods], datasets[row.dataset]) for row in study.description.comparisons]
+    shape = len(pairs), len(datasets)
+    pictures, ratings = np.zeros(shape), np.zeros((len(indices), len(OUTCOMES)))
     np.add.at(pictures, tuple(np.array(indices).T), 1)
     # wins, ties and losses of the first method: (participants, pairs of methods, datasets, 3)
     counts = np.zeros((len(participants), *shape, len(OUTCOMES)))
@@ -104,13 +106,6 @@ def _group(study: Study, participants: Sequence[ParticipantAnswers]) -> dict[str
         "strengths": _strengths(study, counts, weights),
         "agreement": _round(statistics.alpha(ratings)),
     }
-
-
-def _table_indices(study: Study) -> list[tuple[int, int]]:
-    """For each comparison, the index of its pair of methods and of its dataset."""
-    pairs = {pair: i for i, pair in enumerate(study.pairs_of_methods)}
-    datasets = {name: i for i, name in enumerate(study.description.datasets)}
-    return [(pairs[row.methods], datasets[row.dataset]) for row in study.description.comparisons]
 
 
 # --- estimating
