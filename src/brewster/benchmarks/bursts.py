@@ -76,12 +76,9 @@ def _burst(benchmark: str, root: Path, folder: Path, roles: _Roles) -> Case:
     middle, name = numbers[len(numbers) // 2], folder.absolute().name
     path = roles["frame"][middle][0].relative_to(root).with_suffix("").as_posix()
     frames = {number: ImageFile(roles["frame"][number][0]) for number in numbers}
-    transmission, reflection = (
-        ImageFile(roles[role][middle][0]) if middle in roles[role] else None for role in _LAYERS
-    )
-    assert transmission, "other bursts are excluded"
-    photo = frames[middle]
-    return Case(benchmark, name, name, path, photo, transmission, reflection, frames=tuple(frames.values()))
+    photo, truth = frames[middle], ImageFile(roles["transmission"][middle][0])
+    reflection = ImageFile(roles["reflection"][middle][0]) if middle in roles["reflection"] else None
+    return Case(benchmark, name, name, path, photo, truth, reflection, frames=tuple(frames.values()))
 
 
 def _rendered_bursts(folder: Path, benchmark: str) -> tuple[list[Case], FolderListing]:
