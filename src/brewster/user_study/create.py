@@ -136,9 +136,8 @@ def _pair_pictures(
     outputs = dict(zip(methods, found, strict=True))
     problems = []
     for name, paths in outputs.items():
-        missing, extra = photos.keys() - paths.keys(), paths.keys() - photos.keys()
-        problems += [f"{name} has no {methods[name] / dataset / stem}.*" for dataset, stem in missing]
-        problems += [f"{paths[key]} has no input in {inputs / key[0]}" for key in extra]
+        problems += [f"{name} has no {methods[name].joinpath(*key)}.*" for key in photos if key not in paths]
+        problems += [f"{paths[key]} has no input in {inputs / key[0]}" for key in paths if key not in photos]
     problems += _file_problems(photos, outputs)
     if problems:
         raise BrewsterError(
