@@ -7,7 +7,6 @@ import pytest
 
 from benchmark_folders import picture, write
 from brewster.benchmarks.registry import read_benchmark
-from brewster.cli import main
 from brewster.errors import RecipeError
 from brewster.evaluate.config import EvaluationConfig
 from brewster.evaluate.scoring import GroundTruth
@@ -177,12 +176,3 @@ def test_an_unusable_burst_is_excluded_with_the_reason(tmp_path, numbers, truths
     assert [case.name for case in benchmark.cases] == ["fine"]
     assert len(benchmark.excluded) == 1
     assert reason in benchmark.excluded[0]
-
-
-def test_evaluate_scores_bursts(tmp_path, monkeypatch):
-    photographed(tmp_path / "bursts" / "toy")
-    monkeypatch.chdir(tmp_path)
-    assert (
-        main(["evaluate", "--benchmark", "bursts=bursts", "--metrics", "psnr", "-o", "out", "--quiet"]) == 0
-    )
-    assert "toy" in (tmp_path / "out" / "scores.csv").read_text()

@@ -117,7 +117,7 @@ def make_thumbnails(name="a", method="compact", size=(40, 60), **changes):
         predictions[key] = MethodOutput(*(Photo.from_array(layer, encoding="srgb") for layer in pair))
     case = Case("nature20", name, name, name, ImageFile(Path()), ImageFile(Path()))
     truth = GroundTruth(case, Photo.from_array(given["photo"], encoding="srgb"), images)
-    return to_thumbnails(truth, predictions, given["region"], {})
+    return to_thumbnails(truth, predictions, given["region"], lambda *_: "")
 
 
 @pytest.fixture

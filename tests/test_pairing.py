@@ -102,10 +102,7 @@ def test_names_in_both_unicode_forms_are_equal(tmp_path):
 
 def test_system_files_are_ignored_silently_and_other_files_with_a_remark(tmp_path):
     repacked(tmp_path, ["a"])
-    write(
-        tmp_path,
-        *["blended/._a.png", "blended/.DS_Store", "blended/thumbs.db", ".hidden/x.png", "__MACOSX/a.png"],
-    )
+    write(tmp_path, "blended/._a.png", "blended/thumbs.db", ".hidden/x.png", "__MACOSX/a.png")
     assert read_folders(tmp_path).remarks == []
     write(tmp_path, "blended/README.txt", "transmission_layer/old/a.png", "licence.md")
     (remark,) = read_folders(tmp_path).remarks

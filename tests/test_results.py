@@ -44,11 +44,6 @@ def test_the_average_is_over_all_images(methods):
     assert results["selections"]["average"] == {"title": "Average", "cases": 100}
 
 
-def test_a_single_benchmark_has_no_average(methods):
-    parts = [make_benchmark("a", 3)]
-    assert list(summarise(parts, methods, PSNR, make_rows(parts, methods, lambda *_: 1.0))["tables"]) == ["a"]
-
-
 def test_the_order_of_rows_does_not_matter(methods):
     parts = [make_benchmark("a", 9)]
     score_rows = make_rows(parts, methods, lambda case, one: int(case.name) ** 2 + (one.name == "theirs"))
@@ -66,7 +61,7 @@ def test_a_failed_case_is_not_counted_and_is_named(methods):
     assert results["benchmarks"]["a"]["excluded"] == ["x.png has no partner"]
 
 
-def test_a_benchmark_without_pairs_is_listed_and_has_no_table(methods):
+def test_a_benchmark_without_pairs_is_listed_and_has_no_table_and_one_benchmark_no_average(methods):
     parts = [make_benchmark("a", 2), make_benchmark("b", 0, excluded=("b.png has no partner",))]
     results = summarise(parts, methods, PSNR, make_rows(parts, methods, lambda *_: 1.0))
     assert list(results["tables"]) == ["a"]

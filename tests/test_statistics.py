@@ -24,16 +24,8 @@ def test_the_mean_is_over_all_images_not_over_benchmarks():
     assert estimated.count == 4
 
 
-def test_the_interval_of_a_constant_has_no_width():
-    estimated = estimate_one([make_stratum([3.0] * 10)])
-    assert (estimated.low, estimated.mean, estimated.high) == (3.0, 3.0, 3.0)
-
-
-def test_one_scene_has_no_interval():
+def test_a_score_of_a_single_image_or_scene_has_no_interval():
     assert estimate_one([make_stratum([1.0, 2.0, 3.0], scenes=["x"] * 3)]).low is None
-
-
-def test_a_score_of_a_single_image_has_no_interval():
     assert estimate_one([make_stratum([1.0, np.nan, np.nan])]).low is None
     assert estimate_one([make_stratum([1.0], name="a"), make_stratum([2.0], name="b")]).low is None
     assert estimate_one([make_stratum([1.0], name="a"), make_stratum([2.0, 3.0], name="b")]).low is not None

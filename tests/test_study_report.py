@@ -236,7 +236,7 @@ def simulate_participant(
             wrong = "left" if trial.expected != "left" else "right"
             choice = trial.expected if rng.random() < catch_trials else wrong
         answers[i] = StoredAnswer(choice, seconds * rng.uniform(0.5, 2))
-    return Participant(number, row), answers
+    return Participant(number, row, row[0]), answers
 
 
 @pytest.fixture(scope="module")

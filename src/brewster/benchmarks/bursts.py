@@ -17,6 +17,7 @@ from brewster.errors import PhotoError
 
 _ROLE: Final = re.compile(r"(frame|transmission|reflection)[-_ ]?([0-9]+)", re.IGNORECASE)
 _RENDERED: Final = re.compile(r"[0-9]{6,}|shard-[0-9]{6,}\.tar|set\.toml")
+_LAYERS: Final = ("transmission", "reflection")
 _LAYER_FILES: Final = ("photo.jpg", "transmission.jpg", "reflection.jpg")
 
 
@@ -51,8 +52,7 @@ _Roles = Mapping[str, Mapping[int, list[Path]]]
 
 def _read_roles(folder: Path) -> _Roles:
     """Returns the images of a folder by role and by the number in the name."""
-    names = ("frame", "transmission", "reflection")
-    roles: dict[str, dict[int, list[Path]]] = {role: defaultdict(list) for role in names}
+    roles: dict[str, dict[int, list[Path]]] = {role: defaultdict(list) for role in ("frame", *_LAYERS)}
     for path in image_files(folder)[0]:
         if match := _ROLE.fullmatch(path.stem):
             roles[match[1].lower()][int(match[2])].append(path)
@@ -74,20 +74,11 @@ def _exclusion_reason(roles: _Roles) -> str:
 def _burst(benchmark: str, root: Path, folder: Path, roles: _Roles) -> Case:
     numbers = sorted(roles["frame"])
     middle, name = numbers[len(numbers) // 2], folder.absolute().name
-    reflection = roles["reflection"].get(middle)
     path = roles["frame"][middle][0].relative_to(root).with_suffix("").as_posix()
-    frames = tuple(ImageFile(roles["frame"][number][0]) for number in numbers)
-    photo, truth = frames[len(numbers) // 2], ImageFile(roles["transmission"][middle][0])
-    return Case(
-        benchmark,
-        name,
-        name,
-        path,
-        photo,
-        truth,
-        ImageFile(reflection[0]) if reflection else None,
-        frames=frames,
-    )
+    frames = {number: ImageFile(roles["frame"][number][0]) for number in numbers}
+    photo, truth = frames[middle], ImageFile(roles["transmission"][middle][0])
+    reflection = ImageFile(roles["reflection"][middle][0]) if middle in roles["reflection"] else None
+    return Case(benchmark, name, name, path, photo, truth, reflection, frames=tuple(frames.values()))
 
 
 def _rendered_bursts(folder: Path, benchmark: str) -> tuple[list[Case], FolderListing]:
@@ -104,8 +95,8 @@ def _rendered_bursts(folder: Path, benchmark: str) -> tuple[list[Case], FolderLi
         if len(layers) < len(_LAYER_FILES) or len(frames) < len(burst.frames):
             excluded.append(f"burst {burst.index} is incomplete: expected {', '.join(_LAYER_FILES)}")
             continue
-        _, transmission, reflection = layers
-        name, path, photo = f"burst-{burst.index:06d}", f"{reference.name}/photo", frames[len(frames) // 2]
+        photo, transmission, reflection = layers
+        name, path = f"burst-{burst.index:06d}", f"{reference.name}/photo"
         bursts.append(
             Case(benchmark, name, name, path, photo, transmission, reflection, frames=tuple(frames))
         )

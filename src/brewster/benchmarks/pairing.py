@@ -6,7 +6,7 @@ reflection.
   ab/3/ab-3-g-32.png.
 
 A name with one photo, one transmission and at most one reflection becomes an `ImageGroup`; others are excluded, with a
-reason."""
+reason. All functions that take a folder raise PhotoError if it cannot be read."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ class ImageGroup:
     scene: str
     photo: Path
     transmission: Path
-    reflection: Path | None
+    reflection: Path | None = None
 
 
 @final
@@ -78,22 +78,20 @@ class FolderListing:
 
     def add(self, name: str, scene: str, files: _FilesByRole) -> None:
         """Adds a group, or the reason why its files are excluded."""
-        for role, paths in files.items():
-            if len(paths) > 1:
-                self.excluded.append(
-                    f"{self._names(paths)} are ambiguous: expected one {role} with this name"
-                )
-                return
-        paths = [path for paths in files.values() for path in paths]
-        for role in ("photo", "transmission"):
-            if not files.get(role):
-                verb = "has" if len(paths) == 1 else "have"
-                self.excluded.append(
-                    f"{self._names(paths)} {verb} no partner: there is no {role} with this name"
-                )
-                return
-        reflection = files["reflection"][0] if files.get("reflection") else None
-        self.groups.append(ImageGroup(name, scene, files["photo"][0], files["transmission"][0], reflection))
+        ambiguous = next((role for role, paths in files.items() if len(paths) > 1), None)
+        missing = next((role for role in ("photo", "transmission") if not files.get(role)), None)
+        if ambiguous:
+            names = self._names(files[ambiguous])
+            self.excluded.append(f"{names} are ambiguous: expected one {ambiguous} with this name")
+        elif missing:
+            paths = [path for paths in files.values() for path in paths]
+            have = "has" if len(paths) == 1 else "have"
+            self.excluded.append(
+                f"{self._names(paths)} {have} no partner: there is no {missing} with this name"
+            )
+        else:
+            paths = [files[role][0] for role in ROLES if files.get(role)]
+            self.groups.append(ImageGroup(name, scene, *paths))
 
     def ignore(self, paths: Sequence[Path]) -> None:
         """Adds a remark on files that belong to no group."""
@@ -115,8 +113,7 @@ class FolderListing:
 
 
 def list_folder(folder: Path) -> tuple[list[Path], list[Path]]:
-    """Returns the folders and the files in a folder, in natural order, without hidden files and system files. Raises
-    PhotoError if the folder cannot be read."""
+    """Returns the folders and the files in a folder, in natural order, without hidden files and system files."""
     kinds: tuple[list[Path], list[Path]] = ([], [])
     try:
         for path in sorted(folder.iterdir(), key=lambda path: natural_key(path.name)):
@@ -135,14 +132,13 @@ def list_folder(folder: Path) -> tuple[list[Path], list[Path]]:
 
 
 def find_roles(folder: Path) -> dict[str, Path]:
-    """Returns the subfolder of each role. A subfolder has a role if its name is in ROLES. Raises PhotoError if the
-    folder cannot be read, or has two subfolders for one role."""
+    """Returns the subfolder of each role. A subfolder has a role if its name is in ROLES. Raises PhotoError if there are
+    two subfolders for one role."""
     return _find_subfolders(folder, _role_of)
 
 
 def find_numbered_splits(folder: Path) -> dict[str, dict[str, Path]]:
-    """Returns the subfolders by split and role, for names such as val_300_blended. The split of this name is "val_300".
-    Raises PhotoError if the folder cannot be read."""
+    """Returns the subfolders by split and role, for names such as val_300_blended. The split of this name is "val_300"."""
     splits: dict[str, dict[str, Path]] = defaultdict(dict)
     for path in list_folder(folder)[0]:
         prefix = _SPLIT_PREFIX.match(path.name)
@@ -158,13 +154,13 @@ def _role_of(name: str) -> str:
 
 
 def find_sets(folder: Path) -> list[Path]:
-    """Returns the subfolders that contain pairs, in natural order. Raises PhotoError if a folder cannot be read."""
+    """Returns the subfolders that contain pairs, in natural order."""
     return [path for path in list_folder(folder)[0] if {"photo", "transmission"} <= find_roles(path).keys()]
 
 
 def find_split(folder: Path) -> Path:
     """Returns the folder itself if it contains pairs, else its only subfolder with pairs, such as train, val or test.
-    Raises PhotoError if several subfolders contain pairs, or a folder cannot be read."""
+    Raises PhotoError if several subfolders contain pairs."""
     if "photo" in find_roles(folder):
         return folder
     splits = [path for path in list_folder(folder)[0] if "photo" in find_roles(path)]
@@ -180,12 +176,23 @@ def find_split(folder: Path) -> Path:
 def read_folders(folder: Path, roles: Mapping[str, Path] | None = None) -> FolderListing:
     """Returns the groups of a folder with one subfolder per role. The file stems must be equal; suffixes may differ.
     `roles` has the subfolder of each role; by default, it is the result of `find_roles`. Raises PhotoError if a
-    folder is missing, empty or unreadable, or two folders have the same role."""
+    folder is missing or empty, or two folders have the same role."""
     roles = find_roles(folder) if roles is None else roles
     by_name: dict[str, dict[str, list[Path]]] = defaultdict(lambda: defaultdict(list))
     ignored: list[Path] = []
     for role in ROLES:
-        images, others = _role_files(folder, role, roles)
+        if role not in roles:
+            if role == "reflection":  # it is optional
+                continue
+            raise PhotoError(
+                f"{folder} has no subfolder for the {role}",
+                f"expected a subfolder with the name {join_names(ROLES[role], ' or ')}",
+                "rename the subfolder, or give the path of its parent folder",
+            )
+        images, others = image_files(roles[role])
+        if not images:
+            expected = f"expected files ending in {', '.join(SUFFIXES)}"
+            raise PhotoError(f"{roles[role]} contains no images", expected, "choose another folder")
         ignored += others
         for image in images:
             by_name[unicodedata.normalize("NFC", image.stem)][role].append(image)
@@ -196,29 +203,12 @@ def read_folders(folder: Path, roles: Mapping[str, Path] | None = None) -> Folde
     return listing
 
 
-def _role_files(folder: Path, role: str, roles: Mapping[str, Path]) -> tuple[list[Path], list[Path]]:
-    """Returns the image files of a role and the other files in its folder. A reflection is optional."""
-    if role not in roles:
-        if role == "reflection":
-            return [], []
-        raise PhotoError(
-            f"{folder} has no subfolder for the {role}",
-            f"expected a subfolder with the name {join_names(ROLES[role], ' or ')}",
-            "rename the subfolder, or give the path of its parent folder",
-        )
-    images, others = image_files(roles[role])
-    if not images:
-        expected = f"expected files ending in {', '.join(SUFFIXES)}"
-        raise PhotoError(f"{roles[role]} contains no images", expected, "choose another folder")
-    return images, others
-
-
 # --- the original folders of SIR2
 
 
 def find_subsets(folder: Path) -> dict[str, Path]:
     """Returns the subfolder of each subset of SIR2. Only the start of the name is compared: "Postcard Dataset" is
-    "postcard". Raises PhotoError if the folder cannot be read, or has two subfolders for one subset."""
+    "postcard". Raises PhotoError if there are two subfolders for one subset."""
 
     def subset_of(name: str) -> str:
         letters = re.sub(r"[^a-z]", "", name.lower())
@@ -229,8 +219,7 @@ def find_subsets(folder: Path) -> dict[str, Path]:
 
 def read_tree(folder: Path, subset: str) -> FolderListing:
     """Returns the groups of a subset of SIR2. Its folders have one subfolder per shot. Files of a shot are grouped if
-    their names, without the letter of the role, are equal. Raises PhotoError if a folder cannot be read, or there is
-    no shot."""
+    their names, without the letter of the role, are equal. Raises PhotoError if there is no shot."""
     listing = FolderListing(folder)
     _read_branches(listing, folder, SIR2_TREES[subset], {})
     listing.groups.sort(key=lambda group: natural_key(group.name))

@@ -91,13 +91,9 @@ def _read_split(name: str, folder: Path) -> list[Benchmark]:
 
 def _read_subset(name: str, folder: Path) -> list[Benchmark]:
     root = pairing.find_subsets(folder).get(name, folder)
-    return [
-        _from_listing(
-            name,
-            folder,
-            pairing.read_folders(root) if pairing.find_roles(root) else pairing.read_tree(root, name),
-        )
-    ]
+    is_repacked = pairing.find_roles(root)
+    listing = pairing.read_folders(root) if is_repacked else pairing.read_tree(root, name)
+    return [_from_listing(name, folder, listing)]
 
 
 def _read_sir2(_: str, folder: Path) -> list[Benchmark]:
@@ -108,25 +104,25 @@ def _read_sir2(_: str, folder: Path) -> list[Benchmark]:
             "expected folders whose names begin with Postcard, SolidObject and Wildscene",
             "give the path of their parent folder, or use postcard=, solidobject= or wildscene= for one subset",
         )
-    first, *others = [
-        part for name in pairing.SIR2_TREES if name in subsets for part in _read_subset(name, folder)
-    ]
-    missing = [
-        f"{BENCHMARKS[name].title} is not in {folder}" for name in pairing.SIR2_TREES if name not in subsets
-    ]
-    return [replace(first, remarks=(*missing, *first.remarks)), *others]
+    parts, missing = [], []
+    for name in pairing.SIR2_TREES:
+        if name in subsets:
+            parts += _read_subset(name, folder)
+        else:
+            missing.append(f"{BENCHMARKS[name].title} is not in {folder}")
+    return [replace(parts[0], remarks=(*missing, *parts[0].remarks)), *parts[1:]]
 
 
 def _read_rendered(name: str, folder: Path) -> list[Benchmark]:
     benchmark_name, cases, excluded = _benchmark_name(name, folder), [], []
     for sample in read_samples(folder):
         key, files = sample.name, files_of(sample, _RENDERED_FILES)
-        if len(files) < len(_RENDERED_FILES):
+        if len(files) == len(_RENDERED_FILES):
+            photo, background, reflection = files
+            path = f"{key}/photo"
+            cases.append(Case(benchmark_name, key, key, path, photo, background, reflection, rendered=True))
+        else:
             excluded.append(f"{key} is incomplete: expected {', '.join(_RENDERED_FILES)}")
-            continue
-        photo, background, reflection = files
-        path = f"{key}/photo"
-        cases.append(Case(benchmark_name, key, key, path, photo, background, reflection, rendered=True))
     return [_make_benchmark(name, folder, cases, FolderListing(folder, excluded=excluded))]
 
 
@@ -172,8 +168,8 @@ def _make_benchmark(name: str, folder: Path, cases: Sequence[Case], listing: Fol
     """Returns the benchmark without the cases whose images cannot be read or differ in size."""
     layout, expected = BENCHMARKS[name], BENCHMARKS[name].expected_counts
     unusable = {case.name: reason for case in cases if (reason := _unusable_reason(case))}
-    usable = (case for case in cases if case.name not in unusable)
-    valid = sorted(usable, key=lambda case: natural_key(case.name))
+    ordered = sorted(cases, key=lambda case: natural_key(case.name))
+    valid = [case for case in ordered if case.name not in unusable]
     remarks = []
     if expected and len(valid) not in expected:
         remarks.append(f"found {counted(len(valid), 'image')}, expected {' or '.join(map(str, expected))}")

@@ -50,25 +50,28 @@ def spread(benchmark: Benchmark, limit: int) -> Benchmark:
     return replace(benchmark, cases=cases, remarks=remarks)
 
 
-def with_unique_names(benchmarks: Sequence[Benchmark], folders: Sequence[Path]) -> list[Benchmark]:
-    """Adds names of parent folders to names that occur twice: the folders a/test and b/test become a-test and b-test.
-    As many parent folders are added as are needed: x/a/test and y/a/test become x-a-test and y-a-test. Only equal
-    folders keep equal names."""
-    names = [benchmark.name for benchmark in benchmarks]
-    unique_names, renamed = list(names), list(benchmarks)
+def with_unique_names(benchmarks: Sequence[tuple[Benchmark, Path]]) -> list[Benchmark]:
+    """Adds names of parent folders to names of (benchmark, folder) that occur twice: the folders a/test and b/test
+    become a-test and b-test. As many parent folders are added as are needed: x/a/test and y/a/test become x-a-test and
+    y-a-test. Only equal folders keep equal names."""
+    names = [benchmark.name for benchmark, _ in benchmarks]
     # the names of all folders above each folder; links are not resolved
-    above = [Path(os.path.abspath(folder)).parts[1:-1] for folder in folders]  # noqa: PTH100
+    above = [Path(os.path.abspath(folder)).parts[1:-1] for _, folder in benchmarks]  # noqa: PTH100
     parents = [[name for part in parts if (name := safe_name(part))] for parts in above]
+    unique = list(names)
     for name, count in Counter(names).items():
         group = [i for i in range(len(names)) if names[i] == name]
         depth = 0
-        while len({unique_names[i] for i in group}) < count and depth < max(len(parents[i]) for i in group):
+        while len({unique[i] for i in group}) < count and depth < max(len(parents[i]) for i in group):
             depth += 1
             for i in group:
-                unique_names[i] = "-".join([*parents[i][-depth:], name])
-    for i, name in enumerate(unique_names):
-        if name != names[i]:
-            cases = tuple(replace(case, benchmark=name) for case in benchmarks[i].cases)
-            title = f"{benchmarks[i].title} ({name})"
-            renamed[i] = replace(benchmarks[i], name=name, title=title, cases=cases)
-    return renamed
+                unique[i] = "-".join([*parents[i][-depth:], name])
+    return [
+        benchmark if name == benchmark.name else _renamed(benchmark, name)
+        for (benchmark, _), name in zip(benchmarks, unique, strict=True)
+    ]
+
+
+def _renamed(benchmark: Benchmark, name: str) -> Benchmark:
+    cases = tuple(replace(case, benchmark=name) for case in benchmark.cases)
+    return replace(benchmark, name=name, title=f"{benchmark.title} ({name})", cases=cases)

@@ -6,9 +6,8 @@ import json
 import os
 import shutil
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, final, get_args
+from typing import TYPE_CHECKING, Any, Final, get_args
 
 import click
 
@@ -26,6 +25,8 @@ if TYPE_CHECKING:
     from brewster.evaluate.score_log import ScoreRow
 
 
+_ENCODE_ERRORS: Final = "backslashreplace"
+"""The error handler for file names with bytes that are not valid text: these bytes are printed as escapes."""
 _NATIVE: Final = "native"
 _CASES_PER_WORKER: Final = 25
 """A worker process imports torch and loads the weights of LPIPS, which takes as long as it takes to score some images."""
@@ -135,7 +136,26 @@ def _size(text: str) -> int | str:
 @QUIET_TABLES
 @flag("--dry-run", help="Check benchmarks and methods, print the names of the images, and score nothing.")
 @click.pass_context
-def evaluate(context: click.Context, /, *, dry_run: bool, **options: Any) -> None:  # noqa: ANN401  (the fields of _EvaluateCommand)
+def evaluate(
+    context: click.Context,
+    /,
+    *,
+    benchmarks: tuple[tuple[str, str], ...],
+    models: tuple[tuple[str, str], ...],
+    burst: bool,
+    predictions: tuple[tuple[str, str], ...],
+    out: Path,
+    limit: int | None,
+    workers: int | None,
+    pictures: int,
+    intervals: bool,
+    export: str | None,
+    as_json: bool,
+    quiet: bool,
+    dry_run: bool,
+    device: Device,
+    **settings: Any,  # noqa: ANN401  (those of _config)
+) -> None:
     """Score methods on benchmarks, with the unprocessed input as baseline.
 
     The tables are printed on standard output. The output folder gets results.json and scores.csv (the scores of every
@@ -144,145 +164,99 @@ def evaluate(context: click.Context, /, *, dry_run: bool, **options: Any) -> Non
     Photos and ground truth are paired by file name. If a photo has no ground truth, or if a method fails on it, it is
     listed, all other photos are scored, and the exit code is 1."""
     require_extra("evaluate", "evaluating")
-    command = _EvaluateCommand(**options)
-    context.exit(0 if (command.list_cases() if dry_run else command.run()) else 1)
+    from brewster.evaluate import evaluation  # noqa: PLC0415  (imports torch, two seconds)
+    from brewster.evaluate.methods import IdentityBaseline, ModelMethod, PredictionFolder  # noqa: PLC0415
+    from brewster.evaluate.submission import openrr_folder  # noqa: PLC0415
+    from brewster.models.zoo import model_name  # noqa: PLC0415
+
+    export_folder = openrr_folder(benchmarks, has_method=bool(models or predictions)) if export else None
+    config, parts = _config(**settings), _read_benchmarks(benchmarks, limit)
+    named = [(name or model_name(model), model, False) for name, model in models]
+    named += [(f"{name} burst", model, True) for name, model, _ in named if burst]
+    methods: list[Method] = [IdentityBaseline()]
+    for name, model, is_burst in named:
+        folder = out / "predictions" / name
+        methods.append(ModelMethod(name, model, folder, config.quality, device, is_burst))
+    methods += [PredictionFolder(name, Path(folder)) for name, folder in predictions]
+    is_complete = print_remarks(parts, quiet=quiet)
+    if dry_run:
+        evaluation.check(parts, methods, config)
+        _print_cases(parts, methods)
+        context.exit(0 if is_complete else 1)
+    case_count = sum(len(part.cases) for part in parts)
+    with progress(len(methods) * case_count, shown=not quiet) as update_progress:
+
+        def on_progress(done: int, _total: int, row: ScoreRow) -> None:
+            interrupts.raise_pending()
+            update_progress(done, f"{row.benchmark}/{row.case} {row.method}")
+
+        results = evaluation.evaluate(
+            parts,
+            methods,
+            config,
+            out,
+            workers=workers or _default_workers(case_count),
+            max_report_cases=pictures,
+            intervals=intervals,
+            on_progress=on_progress,
+        )
+    if as_json:
+        print_out(json.dumps(results))
+    elif not quiet:
+        print_tables(results, intervals=intervals)
+        print_status(
+            f"the results are in {out}; {out / evaluation.REPORT_FILE} shows the images, and tables.md has intervals and differences"
+        )
+    if export_folder:
+        _export(export_folder, methods[1:], out / "export")  # without the baseline
+    context.exit(0 if print_failures(results, quiet=quiet) and is_complete else 1)
 
 
-@final
-@dataclass(frozen=True)
-class _EvaluateCommand:
-    """The options of the command. Its methods import torch, which takes two seconds."""
+def _config(
+    protocol: str,
+    quality: Quality,
+    metrics: str | None,
+    size: int | str | None,
+    thresholds: tuple[float, ...] | None,
+) -> EvaluationConfig:
+    from brewster.evaluate.protocols import protocol_config  # noqa: PLC0415
 
-    benchmarks: tuple[tuple[str, str], ...]
-    models: tuple[tuple[str, str], ...]
-    burst: bool
-    predictions: tuple[tuple[str, str], ...]
-    out: Path
-    metrics: str | None
-    protocol: str
-    size: int | str | None
-    thresholds: tuple[float, ...] | None
-    quality: Quality
-    device: Device
-    workers: int | None
-    limit: int | None
-    pictures: int
-    intervals: bool
-    export: str | None
-    as_json: bool
-    quiet: bool
-
-    def list_cases(self) -> bool:
-        """Prints the names of images and methods. Returns whether no image was left out of a benchmark."""
-        from brewster.evaluate.evaluation import check  # noqa: PLC0415
-
-        self._check_export()
-        benchmarks, methods = self._read_benchmarks(), self._methods()
-        is_complete = print_remarks(benchmarks, quiet=self.quiet)
-        check(benchmarks, methods, self._config())
-        for benchmark in benchmarks:
-            print_status(f"{benchmark.title}: {counted(len(benchmark.cases), 'image')}")
-            names = "".join(f"{benchmark.name}/{case.name}\n" for case in benchmark.cases)
-            write_out(names.encode(errors=_ENCODE_ERRORS))
-        for method in methods:
-            print_status(f"method: {method.name}")
-        return is_complete
-
-    def run(self) -> bool:
-        """Scores all methods and prints the tables. Returns whether no image was left out and no method failed."""
-        from brewster.evaluate.evaluation import REPORT_FILE  # noqa: PLC0415
-        from brewster.evaluate.evaluation import evaluate as measure  # noqa: PLC0415
-
-        export_folder = self._check_export()
-        config, benchmarks, methods = self._config(), self._read_benchmarks(), self._methods()
-        is_complete = print_remarks(benchmarks, quiet=self.quiet)
-        total = len(methods) * sum(len(benchmark.cases) for benchmark in benchmarks)
-        with progress(total, shown=not self.quiet) as update_progress:
-
-            def on_progress(done: int, _total: int, row: ScoreRow) -> None:
-                interrupts.raise_pending()
-                update_progress(done, f"{row.benchmark}/{row.case} {row.method}")
-
-            results = measure(
-                benchmarks,
-                methods,
-                config,
-                self.out,
-                workers=self.workers or _default_workers(total // len(methods)),
-                max_report_cases=self.pictures,
-                intervals=self.intervals,
-                on_progress=on_progress,
-            )
-        if self.as_json:
-            print_out(json.dumps(results))
-        elif not self.quiet:
-            print_tables(results, intervals=self.intervals)
-            print_status(
-                f"the results are in {self.out}; {self.out / REPORT_FILE} shows the images, and tables.md has intervals and differences"
-            )
-        if export_folder:
-            self._export(export_folder, methods)
-        return print_failures(results, quiet=self.quiet) and is_complete
-
-    def _check_export(self) -> Path | None:
-        """Returns the folder that `export` needs; None without `export`."""
-        from brewster.evaluate.submission import openrr_folder  # noqa: PLC0415
-
-        has_method = bool(self.models or self.predictions)
-        return openrr_folder(self.benchmarks, has_method=has_method) if self.export else None
-
-    def _export(self, folder: Path, methods: Sequence[Method]) -> None:
-        from brewster.evaluate.submission import export_ntire2026  # noqa: PLC0415
-
-        for method in methods[1:]:  # the first one is the baseline
-            out = self.out / "export" / method.name
-            for path in export_ntire2026(
-                folder, method, out, on_progress=lambda _: interrupts.raise_pending()
-            ):
-                print_status(f"wrote {path}")
-
-    def _read_benchmarks(self) -> list[Benchmark]:
-        from brewster.benchmarks.registry import read_benchmark  # noqa: PLC0415
-        from brewster.benchmarks.selection import spread, with_unique_names  # noqa: PLC0415
-
-        parts, folders = [], []
-        for name, folder in self.benchmarks:
-            parts += (read := read_benchmark(name, Path(folder)))
-            folders += [Path(folder)] * len(read)
-        unique = with_unique_names(parts, folders)
-        return [spread(benchmark, self.limit) for benchmark in unique] if self.limit else unique
-
-    def _config(self) -> EvaluationConfig:
-        from brewster.evaluate.protocols import protocol_config  # noqa: PLC0415
-
-        values: dict[str, Any] = {"quality": self.quality}
-        if self.size is not None:
-            values["short_side_px"] = None if self.size == _NATIVE else self.size
-        if self.metrics is not None:
-            values["metrics"] = tuple(name.strip() for name in self.metrics.split(","))
-        if self.thresholds is not None:
-            values["thresholds"] = self.thresholds
-        return protocol_config(self.protocol.lower(), **values)
-
-    def _methods(self) -> list[Method]:
-        from brewster.evaluate.methods import IdentityBaseline, ModelMethod, PredictionFolder  # noqa: PLC0415
-        from brewster.models.zoo import model_name  # noqa: PLC0415
-
-        models = [(name or model_name(model), model, False) for name, model in self.models]
-        models += [(f"{name} burst", model, True) for name, model, _ in models if self.burst]
-        folder = self.out / "predictions"
-        return [
-            IdentityBaseline(),
-            *(
-                ModelMethod(name, model, folder / name, self.quality, self.device, is_burst)
-                for name, model, is_burst in models
-            ),
-            *(PredictionFolder(name, Path(folder)) for name, folder in self.predictions),
-        ]
+    changes: dict[str, Any] = {"quality": quality}
+    if size is not None:
+        changes["short_side_px"] = None if size == _NATIVE else size
+    if metrics is not None:
+        changes["metrics"] = tuple(name.strip() for name in metrics.split(","))
+    if thresholds is not None:
+        changes["thresholds"] = thresholds
+    return protocol_config(protocol.lower(), **changes)
 
 
-_ENCODE_ERRORS: Final = "backslashreplace"
-"""The error handler for file names with bytes that are not valid text: these bytes are printed as escapes."""
+def _read_benchmarks(folders: Sequence[tuple[str, str]], limit: int | None) -> list[Benchmark]:
+    from brewster.benchmarks.registry import read_benchmark  # noqa: PLC0415
+    from brewster.benchmarks.selection import spread, with_unique_names  # noqa: PLC0415
+
+    read = [(part, Path(folder)) for name, folder in folders for part in read_benchmark(name, Path(folder))]
+    unique = with_unique_names(read)
+    return [spread(part, limit) for part in unique] if limit else unique
+
+
+def _print_cases(benchmarks: Sequence[Benchmark], methods: Sequence[Method]) -> None:
+    for benchmark in benchmarks:
+        print_status(f"{benchmark.title}: {counted(len(benchmark.cases), 'image')}")
+        names = "".join(f"{benchmark.name}/{case.name}\n" for case in benchmark.cases)
+        write_out(names.encode(errors=_ENCODE_ERRORS))
+    for method in methods:
+        print_status(f"method: {method.name}")
+
+
+def _export(folder: Path, methods: Sequence[Method], out: Path) -> None:
+    from brewster.evaluate.submission import export_ntire2026  # noqa: PLC0415
+
+    for method in methods:
+        for path in export_ntire2026(
+            folder, method, out / method.name, on_progress=lambda _: interrupts.raise_pending()
+        ):
+            print_status(f"wrote {path}")
 
 
 def print_remarks(benchmarks: Sequence[Benchmark], *, quiet: bool) -> bool:

@@ -19,8 +19,7 @@ from brewster.cli.terminal import print_error, print_out, print_status, progress
 from brewster.errors import BrewsterError, counted
 
 if TYPE_CHECKING:
-    from brewster.user_study.store import Participant, StoredAnswer
-    from brewster.user_study.study import Study
+    from brewster.user_study.store import AnswerStore
 
 _HOST_NAME: Final = re.compile(r"[a-z0-9_-]+(\.[a-z0-9_-]+)*", re.IGNORECASE)
 _MAX_BYTES: Final = 10_000  # an answer has about 80 bytes
@@ -136,8 +135,7 @@ def create(
             "expected a different name for each method",
             "rename one of the methods",
         )
-    lines = map(str.strip, _read_text(list_file).splitlines()) if list_file else ()
-    names = [line for line in lines if line]
+    names = [line.strip() for line in _read_text(list_file).splitlines() if line.strip()] if list_file else []
     if list_file and not names:
         raise BrewsterError(f"{list_file} is empty", "expected one input per line", "add inputs to the list")
     pictures = select_pictures(find_pictures(inputs, datasets), names, inputs)
@@ -240,13 +238,12 @@ def serve(
     print_status("stopped; all answers are stored")
 
 
-def _read_answers(folder: Path) -> tuple[Study, list[tuple[Participant, dict[int, StoredAnswer]]]]:
+def _open(folder: Path, *, read_only: bool = False) -> contextlib.closing[AnswerStore]:
+    """The answers of the study in a folder, for a `with` block."""
     from brewster.user_study.store import AnswerStore  # noqa: PLC0415  (imports pydantic)
     from brewster.user_study.study import read_study  # noqa: PLC0415
 
-    opened = read_study(folder)
-    with contextlib.closing(AnswerStore(opened, read_only=True)) as store:
-        return opened, list(store.all_answers())
+    return contextlib.closing(AnswerStore(read_study(folder), read_only=read_only))
 
 
 @study.command
@@ -264,10 +261,11 @@ def report(folder: Path, *, out: Path | None, as_json: bool, **rule: float) -> N
     from brewster.user_study.report.results import summarise, write  # noqa: PLC0415
     from brewster.user_study.report.tables import overview  # noqa: PLC0415
 
-    opened_study, records = _read_answers(folder)
-    answers = collect_answers(records)
-    results, out = summarise(opened_study, answers, ExclusionRule(**rule)), out or folder / "report"
-    write(results, opened_study, answers, out)
+    out = out or folder / "report"
+    with _open(folder, read_only=True) as store:
+        answers = collect_answers(store.all_answers())
+    results = summarise(store.study, answers, ExclusionRule(**rule))
+    write(results, store.study, answers, out)
     write_out((json.dumps(results) + "\n" if as_json else overview(results)).encode())
     print_status(f"the report is in {out}")
 
@@ -281,8 +279,8 @@ def show_progress(folder: Path, *, as_json: bool, **rule: float) -> None:
     from brewster.user_study.report.participants import ExclusionRule  # noqa: PLC0415
     from brewster.user_study.report.progress import progress_text, summarise_progress  # noqa: PLC0415
 
-    opened_study, records = _read_answers(folder)
-    found = summarise_progress(opened_study.description, records, ExclusionRule(**rule))
+    with _open(folder, read_only=True) as store:
+        found = summarise_progress(store.study.description, store.all_answers(), ExclusionRule(**rule))
     write_out((json.dumps(found) + "\n" if as_json else progress_text(found)).encode())
 
 
@@ -350,13 +348,10 @@ def export_study(folder: Path, *, out: Path, participants: int, url: str | None)
 
     Copy the folder to any web server that serves files. Participants download their answers as a file and send it to you;
     `brewster study import` adds it to the study."""
-    from brewster.user_study.store import AnswerStore  # noqa: PLC0415  (imports pydantic)
-    from brewster.user_study.study import read_study  # noqa: PLC0415
-    from brewster.web.study_bundle import export_bundle  # noqa: PLC0415
+    from brewster.web.study_bundle import export_bundle  # noqa: PLC0415  (imports pydantic)
 
-    opened_study = read_study(folder)
-    with contextlib.closing(AnswerStore(opened_study)) as store:
-        tokens = export_bundle(opened_study, store, out, participants=participants)
+    with _open(folder) as store:
+        tokens = export_bundle(store.study, store, out, participants=participants)
     root = f"{url.rstrip('/')}/" if url else ""
     for token in tokens:
         print_out(f"{root}?p={token}")
@@ -375,11 +370,9 @@ def import_answers(context: click.Context, folder: Path, files: tuple[Path, ...]
     A file can be imported again: answers that the study already has are kept. An invalid file is reported, the others are imported,
     and the exit code is 1."""
     from brewster.user_study.answer_file import read_answer_file  # noqa: PLC0415  (imports pydantic)
-    from brewster.user_study.store import AnswerStore  # noqa: PLC0415
-    from brewster.user_study.study import read_study  # noqa: PLC0415
 
     failed = False
-    with contextlib.closing(AnswerStore(read_study(folder))) as store:
+    with _open(folder) as store:
         for path in files:
             try:
                 answer_file = read_answer_file(path)

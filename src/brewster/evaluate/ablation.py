@@ -6,6 +6,7 @@ of the comparisons. A stopped study resumes both training and evaluation."""
 
 from __future__ import annotations
 
+import io
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Final, final
@@ -129,8 +130,6 @@ def _plot(study: AblationStudy, numbers: Sequence[float], results: Results) -> b
     """Returns a PNG plot: PSNR, SSIM and LPIPS as functions of the value, or all metrics if these three have no scores.
     There is one line for each benchmark and one for the average. The bands are the 95 % intervals. A line has no
     point for a model without a score."""
-    import io  # noqa: PLC0415
-
     from matplotlib.figure import Figure  # noqa: PLC0415  (only needed for plots)
 
     measured = list(results["metrics"])

@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import math
 import os
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Final, final
 from urllib.parse import quote
 
-from brewster.benchmarks.image_files import Case, ImageFile
+from brewster.benchmarks.image_files import Case
 from brewster.benchmarks.pairing import join_names
 from brewster.benchmarks.registry import Benchmark
 from brewster.errors import BrewsterError, PhotoError, counted
@@ -23,7 +22,6 @@ from brewster.evaluate.config import EvaluationConfig
 from brewster.evaluate.methods import (
     BASELINE,
     Method,
-    MethodOutput,
     ModelMethod,
     PredictionFolder,
     check_names,
@@ -35,7 +33,7 @@ from brewster.evaluate.report.published import read_published
 from brewster.evaluate.report.published import to_markdown as published_to_markdown
 from brewster.evaluate.report.tables import scores_to_csv, to_csv, to_markdown
 from brewster.evaluate.results import Results, paper_subsets, summarise
-from brewster.evaluate.runner import ScoreCallback, get_prediction, score
+from brewster.evaluate.runner import ScoreCallback, get_prediction, input_path, score
 from brewster.evaluate.score_log import RowId, ScoreRow
 from brewster.evaluate.scoring import GroundTruth, resize
 from brewster.files import write_atomically
@@ -43,7 +41,7 @@ from brewster.metrics import IDENTICAL_DB
 from brewster.photo import Photo
 
 _BROWSER_SUFFIXES: Final = (".png", ".jpg", ".jpeg", ".webp", ".avif", ".gif", ".bmp")
-RESULTS_FILE, REPORT_FILE, INPUTS_FOLDER = "results.json", "report.html", "inputs"
+RESULTS_FILE, REPORT_FILE = "results.json", "report.html"
 SCORES_TABLE_FILE: Final = "scores.csv"
 PICTURES_FOLDER: Final = "pictures"
 """The folder of full-size copies for the report, of images that a browser cannot open in the user's own folders."""
@@ -66,9 +64,7 @@ def evaluate(
     and the photos into `out`/inputs if they are resized. Returns the content of results.json.
 
     A metric whose weights are missing is left out, and "unavailable" in the results says why; the next run adds it. A
-    stopped run is resumed from the files in `out`, a folder for this evaluation only. Each image is read and decoded
-    once, unless an earlier run has scored it, an exclusive method needs it, or the benchmark has more than
-    `max_report_cases` cases.
+    stopped run is resumed from the files in `out`, a folder for this evaluation only.
 
     `methods` are in the order of the tables; the first one should be the baseline. The report has at most
     `max_report_cases` cases of each benchmark: those with the worst scores of the first other method. With `intervals`,
@@ -76,40 +72,30 @@ def evaluate(
     written."""
     check(benchmarks, methods, config)
     cases = [case for benchmark in benchmarks for case in benchmark.cases]
-    with TemporaryDirectory(prefix="brewster-report-") as folder:
-        complete = frozenset(part.name for part in benchmarks if len(part.cases) <= max_report_cases)
-        by_name = {method.name: method for method in methods}
-        thumbnails = _ThumbnailCache(Path(folder), complete, config, out, by_name)
-        rows, unavailable = score(
-            benchmarks,
-            methods,
-            config,
-            out,
-            workers=workers,
-            on_progress=on_progress,
-            on_case_scored=thumbnails,
-        )
-        if config.resizes:
-            for case in cases:  # that this run did not decode
-                path = _input_path(out / INPUTS_FOLDER, case)
-                if not path.exists():
-                    with suppress(PhotoError):  # an unreadable photo has a row with the error
-                        resize(Photo.open(case.photo.read()), config).save(path)
-        results = summarise(benchmarks, methods, config, rows, unavailable)
-        for method in methods:
-            if remarks := list(_method_remarks(method, cases, rows)):
-                results["methods"][method.name]["remark"] = "; ".join(remarks)
-        tables = {
-            RESULTS_FILE: json.dumps(results, indent=1, allow_nan=False) + "\n",
-            "tables.md": f"{to_markdown(results)}\n{published_to_markdown(read_published())}",
-            "table.tex": to_latex(results, intervals=intervals),
-            "table.csv": to_csv(results),
-            SCORES_TABLE_FILE: scores_to_csv(results),
-        }
-        for name, text in tables.items():
-            write_atomically(out / name, text.encode(errors="backslashreplace"), overwrite=True)
-        report_cases = _report_cases(cases, methods, rows, max_report_cases, thumbnails)
-        write_report(results, report_cases, out / REPORT_FILE)
+    rows, unavailable = score(benchmarks, methods, config, out, workers=workers, on_progress=on_progress)
+    if config.resizes:
+        for case in cases:  # that this run did not decode
+            if not (path := input_path(out, case)).exists():
+                with suppress(PhotoError):  # an unreadable photo has a row with the error
+                    resize(Photo.open(case.photo.read()), config).save(path)
+    results = summarise(benchmarks, methods, config, rows, unavailable)
+    for method in methods:
+        if remarks := list(_method_remarks(method, cases, rows)):
+            results["methods"][method.name]["remark"] = "; ".join(remarks)
+    tables = {
+        RESULTS_FILE: json.dumps(results, indent=1, allow_nan=False) + "\n",
+        "tables.md": f"{to_markdown(results)}\n{published_to_markdown(read_published())}",
+        "table.tex": to_latex(results, intervals=intervals),
+        "table.csv": to_csv(results),
+        SCORES_TABLE_FILE: scores_to_csv(results),
+    }
+    for name, text in tables.items():
+        write_atomically(out / name, text.encode(errors="backslashreplace"), overwrite=True)
+    scored_rows = {row.id: row for row in rows if not row.error}
+    worst = _worst_cases(cases, methods, config, scored_rows, max_report_cases)
+    others = {method.name: method for method in methods if method.name != BASELINE}
+    thumbnails = _ReportImages(others, config, scored_rows, out).thumbnails(worst)
+    write_report(results, thumbnails, out / REPORT_FILE)
     return results
 
 
@@ -154,77 +140,41 @@ def _method_remarks(method: Method, cases: Sequence[Case], rows: Sequence[ScoreR
         yield f"{counted(unmatched, 'image')} in the folder {'matches' if unmatched == 1 else 'match'} no case"
 
 
-def _input_path(folder: Path, case: Case) -> Path:
-    return folder / case.benchmark / f"{case.name}.png"
-
-
 # --- images of the report
 
 
 @final
 @dataclass(frozen=True)
-class _ThumbnailCache:
-    """Writes the thumbnails of the report and the resized photos while a case is decoded. It stores the thumbnails of
-    `benchmarks`, of which the report shows all cases. They are stored in files, because worker processes create
-    them, and because memory must not grow with the number of cases."""
+class _ReportImages:
+    """Makes the thumbnails of the report, with links to the files at full size."""
 
-    folder: Path
-    benchmarks: frozenset[str]
-    config: EvaluationConfig
-    out: Path
     methods: Mapping[str, Method]
+    config: EvaluationConfig
+    rows: Mapping[RowId, ScoreRow]
+    out: Path
 
-    def __call__(self, truth: GroundTruth, predictions: Mapping[str, MethodOutput]) -> None:
-        """Stores the thumbnails and the resized photo of a case. `score` calls this after it has scored the case."""
-        case = truth.case
-        if self.config.resizes:
-            truth.photo.save(_input_path(self.out / INPUTS_FOLDER, case), overwrite=True)
-        if case.benchmark not in self.benchmarks:
-            return
-        thumbnails = self.create(truth, predictions)
-        for method, images in thumbnails.methods.items():
-            path = self._path(case, method)
-            path.write_text(json.dumps([thumbnails.size, thumbnails.embedded_size, images]))
+    def thumbnails(self, cases: Iterable[Case]) -> Iterator[CaseThumbnails]:
+        """Yields the thumbnails of the cases that can be read."""
+        for case in cases:
+            try:
+                truth = GroundTruth.open(case, self.config)
+            except PhotoError:
+                continue  # the row of the case has this error, and the tables show it
+            outputs = {
+                name: get_prediction(truth, method, row)
+                for name, method in self.methods.items()
+                if (row := self.rows.get((case.benchmark, case.name, name)))
+            }
+            link = partial(self._link, case)
+            yield to_thumbnails(truth, outputs, truth.region(self.config.thresholds[0]), link)
 
-    def read(self, case: Case, methods: Sequence[str]) -> CaseThumbnails | None:
-        """Returns the stored thumbnails of a case and the methods, or None if a file is missing."""
-        paths = {method: self._path(case, method) for method in (BASELINE, *methods)}
-        if not all(path.exists() for path in paths.values()):
-            return None
-        stored = {method: json.loads(path.read_text()) for method, path in paths.items()}
-        thumbnails = {method: images for method, (*_, images) in stored.items()}
-        size, embedded_size, _ = stored[BASELINE]
-        return CaseThumbnails(case.benchmark, case.name, size, embedded_size, thumbnails)
-
-    def create(self, truth: GroundTruth, predictions: Mapping[str, MethodOutput]) -> CaseThumbnails:
-        """Returns the thumbnails of a case, with links to files at full size."""
-        others = {name: output for name, output in predictions.items() if name != BASELINE}
-        region = truth.region(self.config.thresholds[0])
-        return to_thumbnails(truth, others, region, dict(self._links(truth, others)))
-
-    def _links(
-        self, truth: GroundTruth, predictions: Mapping[str, MethodOutput]
-    ) -> Iterator[tuple[tuple[str, str], str]]:
-        case = truth.case
-        sources = {"photo": case.photo, "transmission": case.ground_truth, "reflection": case.reflection}
-        for layer, image in truth.images.items():
-            source = None if self.config.resizes else sources[layer]
-            if self.config.resizes and layer == "photo":
-                source = ImageFile(_input_path(self.out / INPUTS_FOLDER, case))
-            yield (layer, ""), self._link(case, source, Photo.from_array(image, encoding="srgb"), layer)
-        for name, output in predictions.items():
-            method = self.methods[name]
-            files = method.files(case) if isinstance(method, ModelMethod | PredictionFolder) else {}
-            for layer, photo in (("transmission", output.transmission), ("reflection", output.reflection)):
-                if photo:
-                    source = ImageFile(files[layer]) if layer in files else None
-                    yield (layer, name), self._link(case, source, photo, f"{name}.{layer}")
-
-    def _link(self, case: Case, source: ImageFile | None, photo: Photo, name: str) -> str:
-        """Returns the URL of a file, relative to the report. Writes a PNG file if a browser cannot open the source."""
-        path = source.path if source and source.span is None else None
+    def _link(self, case: Case, method: str, layer: str, photo: Photo) -> str:
+        """Returns the URL of a layer at full size, relative to the report. Writes a PNG file if a browser cannot open
+        its file. `method` is "" for the photo, transmission and reflection of the benchmark."""
+        path = self._file(case, method, layer)
         if path is None or path.suffix.lower() not in _BROWSER_SUFFIXES:
-            path = self.out / PICTURES_FOLDER / case.benchmark / case.name / f"{name}.png"
+            name = f"{method}.{layer}.png" if method else f"{layer}.png"
+            path = self.out / PICTURES_FOLDER / case.benchmark / case.name / name
             write_atomically(path, photo.encode("png", depth=8), overwrite=True)
         try:
             relative = os.path.relpath(path, self.out)
@@ -232,35 +182,17 @@ class _ThumbnailCache:
             return path.resolve().as_uri()
         return quote(relative.replace(os.sep, "/"))
 
-    def _path(self, case: Case, method: str) -> Path:
-        name = json.dumps([case.benchmark, case.name, method])
-        return self.folder / f"{hashlib.sha256(name.encode()).hexdigest()}.json"
-
-
-def _report_cases(
-    cases: Sequence[Case],
-    methods: Sequence[Method],
-    rows: Sequence[ScoreRow],
-    limit: int,
-    thumbnails: _ThumbnailCache,
-) -> Iterator[CaseThumbnails]:
-    """Yields the cases of the report. Cases without stored thumbnails are read and decoded again."""
-    scored_rows = {row.id: row for row in rows if not row.error}
-    for case in _worst_cases(cases, methods, thumbnails.config, scored_rows, limit):
-        method_rows = {
-            method: row
-            for method in methods
-            if method.name != BASELINE and (row := scored_rows.get((case.benchmark, case.name, method.name)))
-        }
-        if cached := thumbnails.read(case, [method.name for method in method_rows]):
-            yield cached
-            continue
-        try:
-            truth = GroundTruth.open(case, thumbnails.config)
-        except PhotoError:
-            continue  # the row of the case has this error, and the tables show it
-        predictions = {method.name: get_prediction(truth, method, row) for method, row in method_rows.items()}
-        yield thumbnails.create(truth, predictions)
+    def _file(self, case: Case, method: str, layer: str) -> Path | None:
+        if method:
+            stored = self.methods[method]
+            if isinstance(stored, ModelMethod | PredictionFolder):
+                return stored.files(case).get(layer)
+            return None
+        if self.config.resizes:
+            return input_path(self.out, case) if layer == "photo" else None
+        sources = {"photo": case.photo, "transmission": case.ground_truth, "reflection": case.reflection}
+        source = sources[layer]
+        return source.path if source and source.span is None else None
 
 
 def _worst_cases(

@@ -11,7 +11,7 @@ import time
 import unicodedata
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Final, Protocol, final
@@ -156,14 +156,10 @@ class ModelMethod:
         if self.burst and case.frames:
             from brewster.burst import separate_burst  # noqa: PLC0415  (imports torch)
 
-            # The photo may have been resized
             frames = [Photo.open(file.read()) for file in case.frames]
-            frames = [
-                frame
-                if frame.size == photo.size
-                else Photo.from_array(frame.resized(*photo.size), encoding="linear")
-                for frame in frames
-            ]
+            for i, frame in enumerate(frames):
+                if frame.size != photo.size:  # the photo was resized
+                    frames[i] = Photo.from_array(frame.resized(*photo.size), encoding="linear")
             separation = separate_burst(frames, separator=separator, quality=self.quality)
         else:
             separation = separator(photo, quality=self.quality)
@@ -203,10 +199,6 @@ class PredictionFolder:
     name: str
     folder: Path
     exclusive: Final = False
-    _last_read: dict[Case, dict[str, bytes]] = field(
-        default_factory=dict, init=False, repr=False, compare=False
-    )
-    """The files that `key` read last, by case. `predict` decodes these bytes, so that each file is read once."""
 
     def about(self) -> dict[str, str]:
         """See `Method.about`."""
@@ -214,12 +206,10 @@ class PredictionFolder:
 
     def key(self, case: Case) -> str:
         """Returns the digest of the files. If they cannot be read, returns the error message; `predict` then fails."""
-        self._last_read.clear()
         try:
-            data = self._last_read[case] = self._read(case)
+            return _digest(map(read_image, self.files(case).values()))
         except BrewsterError as error:
             return str(error)
-        return _digest(data.values())
 
     def predict(self, case: Case, photo: Photo) -> MethodOutput:  # noqa: ARG002  (the predictions exist already)
         """Returns the stored prediction. Raises PhotoError if a layer has no file, several, or one that cannot be read."""
@@ -227,10 +217,7 @@ class PredictionFolder:
 
     def cached(self, case: Case) -> MethodOutput:
         """Returns the same as `predict`, and raises the same errors: the predictions are stored in the folder."""
-        return MethodOutput.decode(self._last_read.pop(case, {}) or self._read(case))
-
-    def _read(self, case: Case) -> dict[str, bytes]:
-        return {layer: read_image(path) for layer, path in self.files(case).items()}
+        return MethodOutput.decode({layer: read_image(path) for layer, path in self.files(case).items()})
 
     def files(self, case: Case) -> dict[str, Path]:
         """Returns layer -> file for a case: the transmission and, if there is one, the reflection. Raises PhotoError if

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import asdict, dataclass
-from typing import Any, Final, final
+from dataclasses import asdict, replace
+from typing import Any, Final
 
 import numpy as np
 
@@ -28,16 +28,6 @@ Results = dict[str, Any]
 """The content of results.json; docs/evaluation.md describes it."""
 
 
-@final
-@dataclass(frozen=True)
-class Selection:
-    """The cases of a table: a whole benchmark, or the subset of it that the paper uses."""
-
-    key: str
-    title: str
-    cases: tuple[Case, ...]
-
-
 def summarise(
     benchmarks: Sequence[Benchmark],
     methods: Sequence[Method],
@@ -52,13 +42,13 @@ def summarise(
     method_names = [method.name for method in methods]
     measured = {column for row in rows for column, score in row.scores.items() if score is not None}
     columns = {name: metric for name, metric in config.columns().items() if name in measured}
-    full = [Selection(part.name, part.title, part.cases) for part in benchmarks if part.cases]
+    full = [part for part in benchmarks if part.cases]
     subsets = paper_subsets(benchmarks) if config.paper_subset else []
     # the average is over the subset of each benchmark, or over the whole benchmark if it has no subset
-    subset_of = {subset.key.partition(":")[0]: subset for subset in subsets}
-    whole = [selection for selection in full if not config.paper_subset or selection.key in PAPER_COUNTS]
-    averaged = [subset_of.get(selection.key, selection) for selection in whole] if len(whole) > 1 else []
-    selections = {selection.key: [selection] for selection in (*full, *subsets)}
+    subset_of = {subset.name.partition(":")[0]: subset for subset in subsets}
+    whole = [part for part in full if not config.paper_subset or part.name in PAPER_COUNTS]
+    averaged = [subset_of.get(part.name, part) for part in whole] if len(whole) > 1 else []
+    selections = {part.name: [part] for part in (*full, *subsets)}
     selections |= {AVERAGE: averaged} if averaged else {}
     series = [(method, column) for method in method_names for column in columns]
     directions = {name: metric.higher_is_better for name, metric in columns.items()}
@@ -79,19 +69,19 @@ def summarise(
         },
         "metrics": {name: metric.to_dict() for name, metric in columns.items()},
         "benchmarks": {
-            benchmark.name: {
-                "title": benchmark.title,
-                "cases": len(benchmark.cases),
-                "expected": list(benchmark.expected_counts),
-                "remarks": list(benchmark.remarks),
-                "excluded": list(benchmark.excluded),
+            part.name: {
+                "title": part.title,
+                "cases": len(part.cases),
+                "expected": list(part.expected_counts),
+                "remarks": list(part.remarks),
+                "excluded": list(part.excluded),
             }
-            for benchmark in benchmarks
+            for part in benchmarks
         },
         "selections": {
             key: {
                 "title": "Average" if key == AVERAGE else group[0].title,
-                "cases": sum(len(selection.cases) for selection in group),
+                "cases": sum(len(part.cases) for part in group),
             }
             for key, group in selections.items()
         },
@@ -104,11 +94,11 @@ def summarise(
             and name not in {*measured, *(unavailable or {})}
         ],
         "draw": {"seed": PAPER_SEED}
-        | {subset.key: [case.name for case in subset.cases] for subset in subsets},
+        | {subset.name: [case.name for case in subset.cases] for subset in subsets},
         "cases": [
             _describe_case([by_id[case.benchmark, case.name, name] for name in method_names], case, columns)
-            for benchmark in benchmarks
-            for case in benchmark.cases
+            for part in benchmarks
+            for case in part.cases
         ],
         "tables": tables,
         "differences": {
@@ -121,21 +111,20 @@ def summarise(
     }
 
 
-def paper_subsets(benchmarks: Sequence[Benchmark]) -> list[Selection]:
+def paper_subsets(benchmarks: Sequence[Benchmark]) -> list[Benchmark]:
     """Returns the subset that the paper uses of each benchmark, without the benchmarks that it uses as a whole. Raises
     BrewsterError if the file names of a benchmark do not identify its scenes."""
-    subsets = [(benchmark, paper_subset(benchmark)) for benchmark in benchmarks if benchmark.cases]
     return [
-        Selection(f"{benchmark.name}:paper", f"{benchmark.title}, subset of the paper", cases)
-        for benchmark, cases in subsets
-        if len(cases) < len(benchmark.cases)
+        replace(part, name=f"{part.name}:paper", title=f"{part.title}, subset of the paper", cases=cases)
+        for part in benchmarks
+        if part.cases and len(cases := paper_subset(part)) < len(part.cases)
     ]
 
 
-def _choices(config: EvaluationConfig, averaged: Sequence[Selection]) -> list[str]:
+def _choices(config: EvaluationConfig, averaged: Sequence[Benchmark]) -> list[str]:
     """Returns sentences: the settings, how the average is computed, and how it differs from that of the paper."""
     choices = [*describe_protocol(config), *config.describe(), *([_AVERAGE_NOTE] if averaged else [])]
-    counts = {selection.key.partition(":")[0]: len(selection.cases) for selection in averaged}
+    counts = {part.name.partition(":")[0]: len(part.cases) for part in averaged}
     if not config.paper_subset or counts == PAPER_COUNTS:
         return choices
     found = ", ".join(f"{count} of {name}" for name, count in counts.items())
@@ -145,15 +134,15 @@ def _choices(config: EvaluationConfig, averaged: Sequence[Selection]) -> list[st
 
 
 def _stratum(
-    selection: Selection, series: Sequence[tuple[str, str]], rows: Mapping[tuple[str, str, str], ScoreRow]
+    part: Benchmark, series: Sequence[tuple[str, str]], rows: Mapping[tuple[str, str, str], ScoreRow]
 ) -> Stratum:
     values = [
         [rows[case.benchmark, case.name, method].scores.get(column) for method, column in series]
-        for case in selection.cases
+        for case in part.cases
     ]
-    shape = len(selection.cases), len(series)
-    scenes = [case.scene for case in selection.cases]
-    return Stratum(selection.key, scenes, np.array(values, float).reshape(shape))  # None becomes NaN
+    scenes = [case.scene for case in part.cases]
+    array = np.array(values, float).reshape(len(part.cases), len(series))  # None becomes NaN
+    return Stratum(part.name, scenes, array)
 
 
 def _rounded(row: dict[str, Any]) -> dict[str, Any]:
@@ -161,16 +150,17 @@ def _rounded(row: dict[str, Any]) -> dict[str, Any]:
 
 
 def _describe_case(rows: Sequence[ScoreRow], case: Case, columns: Collection[str]) -> dict[str, Any]:
-    scored = next((row for row in rows if not row.error), None)
+    scored = [row for row in rows if not row.error]
     return {
         "benchmark": case.benchmark,
         "name": case.name,
         "scene": case.scene,
-        **{name: getattr(scored, name, None) for name in ("width", "height", "region_share")},
+        **{
+            name: getattr(scored[0], name) if scored else None for name in ("width", "height", "region_share")
+        },
         "scores": {
             row.method: {column: row.scores[column] for column in columns if column in row.scores}
-            for row in rows
-            if not row.error
+            for row in scored
         },
         "errors": {row.method: row.error for row in rows if row.error},
     }

@@ -15,13 +15,13 @@ from concurrent.futures.process import BrokenProcessPool
 from dataclasses import asdict, dataclass, replace
 from multiprocessing import get_context
 from pathlib import Path
-from typing import final
+from typing import Final, final
 
 from brewster.benchmarks.image_files import Case
 from brewster.benchmarks.registry import Benchmark
 from brewster.errors import BrewsterError
 from brewster.evaluate.config import EvaluationConfig
-from brewster.evaluate.methods import Method, MethodOutput, PredictionFolder, check_names
+from brewster.evaluate.methods import Method, MethodOutput, PredictionFolder
 from brewster.evaluate.score_log import (
     SCORE_FORMAT_VERSION,
     SCORES_FILE,
@@ -34,11 +34,11 @@ from brewster.evaluate.scoring import CaseFiles, GroundTruth, Scorer
 from brewster.executors.local import exit_with_parent
 from brewster.worker_setup import single_torch_thread
 
-ScoreCallback = Callable[[int, int, "ScoreRow"], None]
-"""Called with (done, total, row) after each new result, scored or failed."""
+INPUTS_FOLDER: Final = "inputs"
+"""The folder of the resized photos, if `EvaluationConfig.resizes`."""
 
-CaseCallback = Callable[[GroundTruth, Mapping[str, MethodOutput]], None]
-"""Called with (case, method -> new prediction) after a case is scored, in the process that scored it."""
+ScoreCallback = Callable[[int, int, ScoreRow], None]
+"""Called with (done, total, row) after each new result, scored or failed."""
 
 
 def score(
@@ -49,20 +49,17 @@ def score(
     *,
     workers: int = 1,
     on_progress: ScoreCallback = lambda _done, _total, _row: None,
-    on_case_scored: CaseCallback | None = None,
 ) -> tuple[list[ScoreRow], dict[str, str]]:
     """Runs every method on every case and scores the predictions. Reuses the rows of an earlier run if nothing changed.
 
-    Exclusive methods run last, one after another, in this process. `on_case_scored` is called once for each case with
-    new rows; with several workers, it must be picklable. Returns one row for each case and method, in the order of
-    benchmarks, cases and methods, with an `error` if the method failed; and column -> reason for the columns that this
-    machine cannot compute, for example without weights. Raises BrewsterError if names of methods are not valid, or a
-    worker process died, and OutputError if `out` cannot be written."""
-    check_names(methods)
+    Exclusive methods run last, one after another, in this process. Returns one row for each case and method, in the
+    order of benchmarks, cases and methods, with an `error` if the method failed; and column -> reason for the columns
+    that this machine cannot compute, for example without weights. Raises BrewsterError if a worker process died, and
+    OutputError if `out` cannot be written."""
     logged = read_score_rows(out / SCORES_FILE)
-    cases = {(case.benchmark, case.name): case for benchmark in benchmarks for case in benchmark.cases}
-    ids = [(*case, method.name) for case in cases for method in methods]
-    unavailable = _find_unavailable(cases.values(), methods, config, logged)
+    cases = [case for benchmark in benchmarks for case in benchmark.cases]
+    ids = [(case.benchmark, case.name, method.name) for case in cases for method in methods]
+    unavailable = _find_unavailable(cases, methods, config, logged)
     rows = dict[RowId, ScoreRow]()
 
     def log_rows(case_rows: Sequence[ScoreRow]) -> None:
@@ -73,11 +70,12 @@ def score(
                 on_progress(len(rows), len(ids), row)
 
     columns = tuple(column for column in config.columns() if column not in unavailable)
-    state = _WorkerState({method.name: method for method in methods}, config, columns, logged, on_case_scored)
-    together = [method.name for method in methods if not method.exclusive]
-    for names in filter(None, (together, *([method.name] for method in methods if method.exclusive))):
-        tasks = [(case, names) for case in cases.values()]
-        _run_tasks(tasks, state, log_rows, workers if names == together else 1)
+    scorer = _CaseScorer({method.name: method for method in methods}, config, columns, logged, out)
+    if together := [method.name for method in methods if not method.exclusive]:
+        _run_tasks([(case, together) for case in cases], scorer, log_rows, workers)
+    for method in methods:
+        if method.exclusive:
+            _run_tasks([(case, [method.name]) for case in cases], scorer, log_rows, workers=1)
     return [rows[row_id] for row_id in ids], unavailable
 
 
@@ -90,37 +88,34 @@ def _find_unavailable(
     """Loads the weights of all metrics before the workers start. Returns column -> reason, for the columns without
     weights. A metric is not tried if every row of an earlier run has it and no row is outdated. The files of the
     cases are read only if every row has it."""
+
+    def is_outdated(case: Case) -> bool:
+        try:
+            files = CaseFiles.read(case)
+        except BrewsterError:  # the case fails without a score
+            return False
+        rows = (_empty_row(files, method, config, logged) for method in methods)
+        return any(logged[row.id].score_key != row.score_key for row in rows)
+
     columns: dict[Callable[[], object], list[str]] = {}
     for column, metric in config.columns().items():
         if metric.prepare:
             columns.setdefault(metric.prepare, []).append(column)
-    ids = [(case.benchmark, case.name, method.name) for case in cases for method in methods]
-    complete = {
-        prepare
+    earlier = [logged.get((case.benchmark, case.name, method.name)) for case in cases for method in methods]
+    missing = {
+        prepare: names
         for prepare, names in columns.items()
-        if all(row_id in logged and set(names) <= {*logged[row_id].columns} for row_id in ids)
+        if not all(row and {*names} <= {*row.columns} for row in earlier)
     }
-    if complete and any(_has_outdated_row(case, methods, config, logged) for case in cases):
-        complete = set()
-    unavailable: dict[str, str] = {}
-    for prepare in [prepare for prepare in columns if prepare not in complete]:
+    if missing != columns and any(map(is_outdated, cases)):
+        missing = columns
+    reasons: dict[str, str] = {}
+    for prepare, names in missing.items():
         try:
             prepare()
         except BrewsterError as error:
-            unavailable |= dict.fromkeys(columns[prepare], str(error))
-    return {column: unavailable[column] for column in config.columns() if column in unavailable}
-
-
-def _has_outdated_row(
-    case: Case, methods: Sequence[Method], config: EvaluationConfig, logged: Mapping[RowId, ScoreRow]
-) -> bool:
-    """Whether a row of an earlier run for this case cannot be reused, because its inputs have changed."""
-    try:
-        files = CaseFiles.read(case)
-    except BrewsterError:  # the case fails without a score
-        return False
-    rows = (_empty_row(files, method, config, logged) for method in methods)
-    return any(logged[row.id].score_key != row.score_key for row in rows)
+            reasons |= dict.fromkeys(names, str(error))
+    return {column: reasons[column] for column in config.columns() if column in reasons}
 
 
 # --- one case
@@ -132,82 +127,79 @@ _Task = tuple[Case, Sequence[str]]
 
 @final
 @dataclass(frozen=True)
-class _WorkerState:
-    """The data that a process needs to score cases."""
+class _CaseScorer:
+    """Scores the methods on one case. A worker process gets it once."""
 
     methods: Mapping[str, Method]
     config: EvaluationConfig
     columns: tuple[str, ...]
     logged: Mapping[RowId, ScoreRow]
-    on_case_scored: CaseCallback | None
+    out: Path
 
-    def earlier(self, row: ScoreRow) -> ScoreRow | None:
+    def __call__(self, task: _Task) -> list[ScoreRow]:
+        """Returns the rows of a case. Decodes its images only if a row of an earlier run cannot be reused."""
+        case, names = task
+        rows = [ScoreRow(case.benchmark, case.name, name, "", "") for name in names]
+        try:
+            files = CaseFiles.read(case)
+            rows = [_empty_row(files, self.methods[name], self.config, self.logged) for name in names]
+            if all(map(self._is_complete, rows)):
+                return [self.logged[row.id] for row in rows]
+            truth = GroundTruth.decode(files, self.config)
+        except BrewsterError as error:
+            reason = f"{case.benchmark}/{case.name}: {error}"
+            return [
+                self.logged[row.id] if self._is_complete(row) else replace(row, error=reason) for row in rows
+            ]
+        if self.config.resizes:
+            truth.photo.save(input_path(self.out, case), overwrite=True)
+        scorer = Scorer(truth, self.config)
+        return [
+            self.logged[row.id] if self._is_complete(row) else self._score(row, scorer, truth) for row in rows
+        ]
+
+    def _earlier(self, row: ScoreRow) -> ScoreRow | None:
         """Returns the row of an earlier run if its inputs have not changed."""
         old = self.logged.get(row.id)
         return old if old and old.score_key == row.score_key else None
 
-    def reusable(self, row: ScoreRow) -> ScoreRow | None:
-        """Returns the row of an earlier run if its inputs have not changed and it has all columns."""
-        old = self.earlier(row)
-        return old if old and {*self.columns} <= {*old.columns} else None
+    def _is_complete(self, row: ScoreRow) -> bool:
+        """Whether the row of an earlier run has all columns, and its inputs have not changed."""
+        old = self._earlier(row)
+        return old is not None and {*self.columns} <= {*old.columns}
+
+    def _score(self, row: ScoreRow, scorer: Scorer, truth: GroundTruth) -> ScoreRow:
+        """Returns the row of a method with all its scores. Only the columns that are missing are computed."""
+        method, old = self.methods[row.method], self._earlier(row)
+        columns = [column for column in self.columns if old is None or column not in old.columns]
+        try:
+            prediction = get_prediction(truth, method, row)
+            truth.check(prediction, row.method)
+        except Exception as error:  # noqa: BLE001  (a crash on one image must not stop the evaluation)
+            reason = str(error) if isinstance(error, BrewsterError) else f"{type(error).__name__}: {error}"
+            return replace(row, error=f"{row.method} failed on {row.benchmark}/{row.case}: {reason}")
+        new = replace(
+            row,
+            scores=scorer.score(prediction, columns),
+            columns=tuple(columns),
+            seconds=prediction.seconds,
+            digest=prediction.digest,
+            width=truth.photo.size[0],
+            height=truth.photo.size[1],
+            region_share=scorer.region_share,
+            registration=scorer.registration(prediction) if isinstance(method, PredictionFolder) else "",
+        )
+        if old is None:
+            return new
+        seconds = old.seconds if new.seconds is None else new.seconds
+        return replace(
+            new, scores=old.scores | new.scores, columns=(*old.columns, *new.columns), seconds=seconds
+        )
 
 
-def _score_case(task: _Task, state: _WorkerState) -> list[ScoreRow]:
-    """Returns the rows of a case. Decodes its images only if a row of an earlier run cannot be reused."""
-    case, names = task
-    rows = [ScoreRow(case.benchmark, case.name, name, "", "") for name in names]
-    try:
-        files = CaseFiles.read(case)
-        rows = [_empty_row(files, state.methods[name], state.config, state.logged) for name in names]
-        reused = [old for row in rows if (old := state.reusable(row))]
-        if len(reused) == len(rows):
-            return reused
-        truth = GroundTruth.decode(files, state.config)
-    except BrewsterError as error:
-        reason = f"{case.benchmark}/{case.name}: {error}"
-        return [state.reusable(row) or replace(row, error=reason) for row in rows]
-    scorer, predictions = Scorer(truth, state.config), dict[str, MethodOutput]()
-    scored = [_score_method(row, scorer, truth, predictions, state) for row in rows]
-    if state.on_case_scored:
-        state.on_case_scored(truth, predictions)
-    return scored
-
-
-def _score_method(
-    row: ScoreRow,
-    scorer: Scorer,
-    truth: GroundTruth,
-    predictions: dict[str, MethodOutput],
-    state: _WorkerState,
-) -> ScoreRow:
-    """Returns the row of a method with all its scores. A new prediction is added to `predictions`."""
-    if reused := state.reusable(row):
-        return reused
-    old = state.earlier(row)
-    columns = [column for column in state.columns if old is None or column not in old.columns]
-    try:
-        prediction = get_prediction(truth, state.methods[row.method], row)
-        truth.check(prediction, row.method)
-    except Exception as error:  # noqa: BLE001  (a crash on one image must not stop the evaluation)
-        reason = str(error) if isinstance(error, BrewsterError) else f"{type(error).__name__}: {error}"
-        return replace(row, error=f"{row.method} failed on {row.benchmark}/{row.case}: {reason}")
-    predictions[row.method] = prediction
-    is_stored = isinstance(state.methods[row.method], PredictionFolder)
-    new = replace(
-        row,
-        scores=scorer.score(prediction, columns),
-        columns=tuple(columns),
-        seconds=prediction.seconds,
-        digest=prediction.digest,
-        width=truth.photo.size[0],
-        height=truth.photo.size[1],
-        region_share=scorer.region_share,
-        registration=scorer.registration(prediction) if is_stored else "",
-    )
-    if old is None:
-        return new
-    seconds = old.seconds if new.seconds is None else new.seconds
-    return replace(new, scores=old.scores | new.scores, columns=(*old.columns, *new.columns), seconds=seconds)
+def input_path(out: Path, case: Case) -> Path:
+    """Returns the file of a resized photo, for methods that run elsewhere."""
+    return out / INPUTS_FOLDER / case.benchmark / f"{case.name}.png"
 
 
 def _empty_row(
@@ -242,19 +234,19 @@ def _digest(*parts: object) -> str:
 
 def _run_tasks(
     tasks: Sequence[_Task],
-    state: _WorkerState,
+    scorer: _CaseScorer,
     on_rows: Callable[[Sequence[ScoreRow]], None],
     workers: int,
 ) -> None:
-    """Runs the tasks in this process or in several worker processes. Calls `on_rows` after each task. Each process
+    """Scores the cases in this process or in several worker processes. Calls `on_rows` after each case. Each process
     computes metrics with one thread, so that the scores do not depend on the number of workers."""
     if workers == 1:
         with single_torch_thread():
             for task in tasks:
-                on_rows(_score_case(task, state))
+                on_rows(scorer(task))
         return
-    pool = ProcessPoolExecutor(workers, get_context("spawn"), _initialize_worker, (state,))
-    futures = {pool.submit(_score_case_in_worker, task) for task in tasks}
+    pool = ProcessPoolExecutor(workers, get_context("spawn"), _initialize_worker, (scorer,))
+    futures = {pool.submit(_score_in_worker, task) for task in tasks}
     try:
         for future in as_completed(set(futures)):
             futures.remove(future)
@@ -275,16 +267,16 @@ def _run_tasks(
         pool.shutdown(cancel_futures=True)
 
 
-_worker_state: list[_WorkerState] = []  # empty, or with one element in a worker process
+_scorers: list[_CaseScorer] = []  # empty, or with one element in a worker process
 
 
-def _initialize_worker(state: _WorkerState) -> None:
+def _initialize_worker(scorer: _CaseScorer) -> None:
     # Only the parent process handles Ctrl-C, so that the workers can finish their current case.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     exit_with_parent()
-    _worker_state.append(state)
+    _scorers.append(scorer)
 
 
-def _score_case_in_worker(task: _Task) -> list[ScoreRow]:
+def _score_in_worker(task: _Task) -> list[ScoreRow]:
     with single_torch_thread():
-        return _score_case(task, _worker_state[0])
+        return _scorers[0](task)

@@ -58,17 +58,16 @@ def export_ntire2026(
             "expected the folders val_300_blended and test_100_blended of OpenRR-5k",
             "give the path of their parent folder with --benchmark openrr=FOLDER",
         )
-    paths = []
+
+    def predictions(split: str, photos: Path) -> Iterator[tuple[str, bytes]]:
+        for path in image_files(photos)[0]:
+            on_progress(path.stem)
+            yield f"{path.stem}.jpg", _prediction(split, photos, path, method)
+
+    paths = {split: out / f"{split}_output.zip" for split in splits}
     for split, photos in splits.items():
-
-        def predictions(split: str = split, photos: Path = photos) -> Iterator[tuple[str, bytes]]:
-            for path in image_files(photos)[0]:
-                on_progress(path.stem)
-                yield f"{path.stem}.jpg", _prediction(split, photos, path, method)
-
-        paths.append(out / f"{split}_output.zip")
-        write_atomically(paths[-1], zip_images(predictions()), overwrite=True)
-    return paths
+        write_atomically(paths[split], zip_images(predictions(split, photos)), overwrite=True)
+    return list(paths.values())
 
 
 def _prediction(split: str, photos: Path, path: Path, method: Method) -> bytes:

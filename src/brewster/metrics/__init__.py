@@ -228,10 +228,7 @@ METRICS: Final = {metric.name: metric for metric in _ROWS}
 
 
 def find_metric(name: str) -> Metric:
-    """Returns the metric with this name.
-
-    Raises:
-        BrewsterError: there is no metric with this name. The message suggests the closest name."""
+    """Returns the metric with this name. Raises BrewsterError if there is none; the message suggests the closest name."""
     if name in METRICS:
         return METRICS[name]
     close = difflib.get_close_matches(name.lower(), METRICS, n=1)

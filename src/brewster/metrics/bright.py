@@ -27,9 +27,7 @@ def lost_clipped(prediction: Image, truth: Image, photo: Image) -> float:
     0..1.
 
     The channels of a pixel are counted apart, because a coloured lamp clips in one or two of them. Lower is better.
-
-    Raises:
-        ValueError: the images are not uint8 (H, W, 3) or differ in shape, or fewer than 64 values are clipped."""
+    Raises ValueError if the images are not uint8 (H, W, 3) or differ in shape, or fewer than 64 values are clipped."""
     check_images(prediction, truth, photo)
     is_clipped = np.minimum(photo, truth) >= MIN_CLIPPED
     _check_count(int(is_clipped.sum()), f"channel values are at least {MIN_CLIPPED}")
@@ -39,11 +37,8 @@ def lost_clipped(prediction: Image, truth: Image, photo: Image) -> float:
 def lost_near_white(prediction: Image, truth: Image, photo: Image) -> float:
     """Returns the mean of truth - prediction over the channels of the near-white pixels, in 8-bit levels.
 
-    0 is best, and a negative value is a brighter prediction.
-
-    Raises:
-        ValueError: the images are not uint8 (H, W, 3) or differ in shape, or fewer than 64 pixels are above 200 in all channels
-            of photo and truth."""
+    0 is best, and a negative value is a brighter prediction. Raises ValueError if the images are not uint8 (H, W, 3) or
+    differ in shape, or fewer than 64 pixels are near white."""
     return float(_near_white_losses(prediction, truth, photo).mean())
 
 

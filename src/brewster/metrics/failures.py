@@ -54,11 +54,8 @@ def removed_content(prediction: Image, background: Image, photo: Image, reflecti
     """Returns the fraction of the background's light that the prediction lacks where there is no reflection.
 
     The score is sum max(B - g prediction, 0) / sum B over the pixels with R < 2 % of I and B > 0. The module docstring
-    defines the gain g.
-
-    Raises:
-        ValueError: the images are not uint8 (H, W, 3) or differ in shape, or the score or the background has fewer
-            than 64 valid pixels."""
+    defines the gain g. Raises ValueError if the images are not uint8 (H, W, 3) or differ in shape, or the score or the
+    background has fewer than 64 valid pixels."""
     luminance = _Luminances.of(prediction, background, photo, reflection)
     return luminance.removed_fraction(luminance.unreflected, f"R < {NEGLIGIBLE_FRACTION:.0%} of I")
 

@@ -30,19 +30,13 @@ _SQUARED_ERRORS: Final = np.square(np.subtract.outer(np.arange(256.0), np.arange
 _LINEAR_SQUARED_ERRORS: Final = np.square(np.subtract.outer(_LINEAR, _LINEAR), dtype=np.float64).ravel()
 """The squared error of each pair of 8-bit values, (65536,), with the index of `count_pairs`."""
 _STRIP_ROWS: Final = 32
-_WINDOW_SIDES: Final[dict[Window, int]] = {
-    "uniform": windows.BOX_SIDE,
-    "gaussian": 2 * windows.GAUSSIAN_RADIUS + 1,
-}
 
 
 def psnr(prediction: Image, truth: Image, *, region: Region | None = None) -> float:
     """Returns the peak signal-to-noise ratio in dB, 10 log10(255^2 / MSE); infinity for equal images. Higher is better.
 
-    The mean squared error is over the three channels of all pixels, or of the pixels in `region`, bool (H, W).
-
-    Raises:
-        ValueError: the images are not uint8 (H, W, 3) or differ in shape; the region is empty or of another shape."""
+    The mean squared error is over the three channels of all pixels, or of the pixels in `region`, bool (H, W). Raises
+    ValueError if the images are not uint8 (H, W, 3) or differ in shape, or the region is empty or of another shape."""
     if region is None:
         return psnr_of_counts(count_pairs(prediction, truth))
     windows.check_images(prediction, truth)
@@ -76,10 +70,7 @@ def psnr_of_channels(prediction: Image, truth: Image) -> float:
     computes it.
 
     The value is never below that of `psnr`, which uses one mean squared error over all channels. It is in dB, and
-    infinity if a channel is equal in both images. Higher is better.
-
-    Raises:
-        ValueError: the images are not uint8 (H, W, 3) or differ in shape."""
+    infinity if a channel is equal in both images. Higher is better. Raises ValueError as `psnr`."""
     windows.check_images(prediction, truth)
     difference = prediction.astype(np.int32) - truth
     mse = (difference * difference).mean(axis=(0, 1))
@@ -91,10 +82,7 @@ def linear_rmse(prediction: Image, truth: Image, *, region: Region | None = None
 
     L is the inverse of the sRGB curve (IEC 61966-2-1). The mean is over the three channels of all pixels, or of the
     pixels in `region`, bool (H, W). This error is proportional to the light that is wrong; errors of encoded values are
-    not. Lower is better.
-
-    Raises:
-        ValueError: the images are not uint8 (H, W, 3) or differ in shape; the region is empty or of another shape."""
+    not. Lower is better. Raises ValueError as `psnr`."""
     if region is None:
         return linear_rmse_of_counts(count_pairs(prediction, truth))
     windows.check_images(prediction, truth)
@@ -114,11 +102,8 @@ def ssim(
 
     The SSIM map is averaged over all its pixels, or over those in `region`, bool (H, W). The map has no values within 3
     pixels of the image's border, or 5 pixels with the Gaussian window. The mean is 1 for equal images. Higher is
-    better.
-
-    Raises:
-        ValueError: the images are not uint8 (H, W, 3), differ in shape, or are smaller than the window; the
-            region is empty, of another shape, or has only pixels without a value."""
+    better. Raises ValueError as `psnr`, and if the images are smaller than the window or the region has only pixels
+    without a value."""
     return mean_ssim(ssim_map(prediction, truth, window=window), region=region)
 
 
@@ -141,13 +126,12 @@ def ssim_map(prediction: Image, truth: Image, *, window: Window = "uniform") -> 
     """Returns the local SSIM, (H - side + 1, W - side + 1, 3) for a window with sides of `side` pixels. Raises
     ValueError if the images are not uint8 (H, W, 3), differ in shape, or are smaller than the window."""
     windows.check_images(prediction, truth)
-    side = _WINDOW_SIDES[window]
+    side, windowed_ssim = _WINDOWS[window]
     height, width = prediction.shape[:2]
     if min(height, width) < side:
         raise ValueError(f"SSIM needs at least {side}x{side} pixels, not {height}x{width}")
     # Strips of 32 rows fit into the processor's cache.
-    windowed_ssim, strip_height = _WINDOWED_SSIM[window], _STRIP_ROWS + side - 1
-    strips = [np.s_[top : top + strip_height] for top in range(0, height - side + 1, _STRIP_ROWS)]
+    strips = [np.s_[top : top + _STRIP_ROWS + side - 1] for top in range(0, height - side + 1, _STRIP_ROWS)]
     return np.concatenate([windowed_ssim(prediction[strip], truth[strip]) for strip in strips])
 
 
@@ -184,7 +168,8 @@ def _ssim_formula(
     return values
 
 
-_WINDOWED_SSIM: Final[dict[Window, Callable[[Image, Image], NDArray[np.float64]]]] = {
-    "uniform": _ssim_uniform,
-    "gaussian": _ssim_gaussian,
+_WINDOWS: Final[dict[Window, tuple[int, Callable[[Image, Image], NDArray[np.float64]]]]] = {
+    "uniform": (windows.BOX_SIDE, _ssim_uniform),
+    "gaussian": (2 * windows.GAUSSIAN_RADIUS + 1, _ssim_gaussian),
 }
+"""The side of each window in pixels, and the function that computes the map."""

@@ -44,10 +44,8 @@ def niqe(image: Image) -> float:
     """Returns the NIQE of an image, uint8 sRGB (H, W, 3) (equation 10 of the paper).
 
     The image is cropped to whole blocks of 96x96 pixels, from the upper left corner. The NIQE is a distance between two
-    Gaussians, at least 0; lower is better. Undistorted photographs have values of 2 to 5.
-
-    Raises:
-        ValueError: the image is not uint8 (H, W, 3), or fewer than two blocks have features."""
+    Gaussians, at least 0; lower is better. Undistorted photographs have values of 2 to 5. Raises ValueError if the image
+    is not uint8 (H, W, 3), or fewer than two blocks have features."""
     check_images(image)
     luma = np.rint(image @ np.array(_LUMA))
     rows, columns = (side // BLOCK_SIDE for side in luma.shape)
@@ -88,17 +86,12 @@ def _features(luma: Float64[NDArray[np.float64], "h w"], rows: int, columns: int
 
 def _normalised(luma: NDArray[np.float64]) -> NDArray[np.float64]:
     """Returns (luma - local mean) / (local standard deviation + 1), equation 1 of the paper."""
-    mean = _blurred(luma)
-    deviation = np.sqrt(np.abs(_blurred(luma * luma) - mean * mean))
+    mean, mean_square = (_filtered(values, _TAPS, 1, "edge") for values in (luma, luma * luma))
+    deviation = np.sqrt(np.abs(mean_square - mean * mean))
     normalised: NDArray[np.float64] = (luma - mean) / (deviation + 1)
     # In flat areas, such as clipped skies, the result consists of rounding errors. They are set to 0, so that their random
     # signs do not change the features. Other implementations keep them, which changes the distance by up to about 0.01.
     return np.where(np.abs(normalised) < _ROUNDING_ERROR, 0, normalised)
-
-
-def _blurred(values: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Returns Gaussian 7x7 means. Edge pixels are repeated beyond the border."""
-    return _filtered(values, _TAPS, 1, "edge")
 
 
 def _filtered(
@@ -107,7 +100,7 @@ def _filtered(
     step: int,
     beyond_border: Literal["edge", "symmetric"],
 ) -> NDArray[np.float64]:
-    """Filters rows and columns, and keeps every `step`-th value."""
+    """Filters rows and columns, and keeps every `step`-th value. Values are repeated beyond the border, as in np.pad."""
     for axis in (0, 1):
         padding = [(_RADIUS, _RADIUS) if i == axis else (0, 0) for i in range(2)]
         along_axis = np.moveaxis(np.pad(values, padding, beyond_border), axis, 0)

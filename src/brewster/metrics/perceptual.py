@@ -87,11 +87,22 @@ class Lpips:
     """The weight of each channel of the five maps, (C,): the linear layers of LPIPS."""
 
     @classmethod
+    @functools.cache
     def load(cls) -> Lpips:
         """Returns LPIPS with its published weights, always the same object. Raises MissingExtra if torch is not
         installed, ModelError if the file of AlexNet's weights is damaged, DownloadError if it is missing and the
         download fails, and OutputError if it cannot be stored."""
-        return _load()
+        try:
+            import torch  # noqa: PLC0415 - an extra
+        except ImportError as error:
+            expected = "expected torch, which brewster needs for LPIPS"
+            raise MissingExtra.for_extra("evaluate", "torch is not installed", expected) from error
+        tensors = [*load_alexnet().values()]
+        weights = [
+            weight.to(memory_format=torch.channels_last) for weight in tensors[::2]
+        ]  # faster on the CPU
+        channel_weights = tuple(map(torch.from_numpy, read_lpips_channel_weights()))
+        return cls(tuple(zip(weights, tensors[1::2], strict=True)), channel_weights)
 
     def features(self, image: Image) -> Features:
         """Returns the features of an image, uint8 (H, W, 3). Raises ValueError if the image is not uint8 (H, W, 3), or
@@ -137,28 +148,11 @@ class Lpips:
 
 def lpips(prediction: Image, truth: Image, *, region: Region | None = None) -> float:
     """Returns the LPIPS 0.1 (AlexNet) distance between two images, with weights from `Lpips.load`; see
-    `Lpips.difference`.
-
-    Raises:
-        ValueError: the images are not uint8 (H, W, 3), differ in shape, or are smaller than 31x31 pixels; the
-            region is empty or of another shape.
-        BrewsterError: the weights cannot be loaded; see `Lpips.load`."""
+    `Lpips.difference`. Raises ValueError as `psnr`, and if the images are smaller than 31x31 pixels; BrewsterError as
+    `Lpips.load`."""
     check_images(prediction, truth)
     metric = Lpips.load()
     return metric.difference(metric.features(prediction), metric.features(truth)).mean(region=region)
-
-
-@functools.cache
-def _load() -> Lpips:
-    try:
-        import torch  # noqa: PLC0415 - an extra
-    except ImportError as error:
-        expected = "expected torch, which brewster needs for LPIPS"
-        raise MissingExtra.for_extra("evaluate", "torch is not installed", expected) from error
-    tensors = [*load_alexnet().values()]
-    weights = [weight.to(memory_format=torch.channels_last) for weight in tensors[::2]]  # faster on the CPU
-    channel_weights = tuple(map(torch.from_numpy, read_lpips_channel_weights()))
-    return Lpips(tuple(zip(weights, tensors[1::2], strict=True)), channel_weights)
 
 
 def _normalised(image: Image) -> NDArray[np.float32]:

@@ -18,10 +18,8 @@ def reflection_region(photo: Image, truth: Image, *, threshold: float = DEFAULT_
     """Returns the pixels where a photo differs from its ground truth by more than a threshold.
 
     The difference is the maximum of |photo - truth| / 255 over the channels, averaged over 7x7 pixels. Edge pixels are
-    repeated beyond the border of the image. The region is a bool mask (H, W).
-
-    Raises:
-        ValueError: the images are not uint8 (H, W, 3) or differ in shape, or the threshold is not in 0..1."""
+    repeated beyond the border of the image. The region is a bool mask (H, W). Raises ValueError if the images are not
+    uint8 (H, W, 3) or differ in shape, or the threshold is not in 0..1."""
     check_images(photo, truth)
     if not 0 <= threshold <= 1:
         raise ValueError(f"the threshold must be in 0..1, not {threshold}")

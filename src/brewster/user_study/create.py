@@ -136,9 +136,8 @@ def _pair_pictures(
     outputs = dict(zip(methods, found, strict=True))
     problems = []
     for name, paths in outputs.items():
-        missing, extra = photos.keys() - paths.keys(), paths.keys() - photos.keys()
-        problems += [f"{name} has no {methods[name] / dataset / stem}.*" for dataset, stem in missing]
-        problems += [f"{paths[key]} has no input in {inputs / key[0]}" for key in extra]
+        problems += [f"{name} has no {methods[name].joinpath(*key)}.*" for key in photos if key not in paths]
+        problems += [f"{paths[key]} has no input in {inputs / key[0]}" for key in paths if key not in photos]
     problems += _file_problems(photos, outputs)
     if problems:
         raise BrewsterError(
@@ -211,12 +210,8 @@ def _degraded(picture: NDArray[np.uint8], seed: int) -> NDArray[np.uint8]:
     """Blurs an sRGB picture (H, W, 3) twice with a box filter, which preserves large shapes, and adds grey noise."""
     radius = max(2, round(_BLUR_RADIUS * max(picture.shape[:2])))
     blurred = picture.astype(np.float32)
-    for axis in (
-        0,
-        1,
-        0,
-        1,
-    ):  # moving means over 2 radius + 1 values; edge values are repeated beyond the border
+    # moving means over 2 radius + 1 values; edge values are repeated beyond the border
+    for axis in (0, 1, 0, 1):
         padding = [(0, 0)] * 3
         padding[axis] = (radius + 1, radius)
         sums = np.cumsum(np.pad(blurred, padding, mode="edge"), axis=axis, dtype=np.float64)

@@ -17,7 +17,7 @@ from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from threading import Lock
-from typing import Final, Literal, final
+from typing import Final, Literal, cast, final
 
 from pydantic import TypeAdapter
 
@@ -45,6 +45,8 @@ CREATE TABLE IF NOT EXISTS withdrawn (
     seconds REAL NOT NULL, answered_at TEXT NOT NULL, conditions TEXT NOT NULL
 ) STRICT;
 """
+_PARTICIPANTS: Final = "SELECT number, trials, practice FROM participants"
+_INSERT_ANSWER: Final = "INSERT OR IGNORE INTO answers VALUES (?, ?, ?, ?, ?, ?)"
 
 
 @final
@@ -54,7 +56,7 @@ class Participant:
 
     number: int
     trials: tuple[Trial, ...]
-    practice: Trial | None = None
+    practice: Trial
 
 
 _CONDITIONS: Final = TypeAdapter(ViewingConditions | None)
@@ -111,28 +113,28 @@ class AnswerStore:
     def count_participants(self) -> int:
         """The number of admitted participants."""
         with self._transaction() as database:
-            (number,) = database.execute("SELECT count(*) FROM participants").fetchone()
-        return int(number)
+            return _count(database)
 
     def admit(self, *, max_participants: int | None = None) -> str | None:
         """Add a participant who has given consent. Returns the token of their link, or None if `max_participants` are
         admitted already."""
-        return self._insert_participant(datetime.now(UTC).date().isoformat(), max_participants)
+        with self._transaction("IMMEDIATE") as database:
+            if max_participants is not None and _count(database) >= max_participants:
+                return None
+            return self._insert_participant(database, datetime.now(UTC).date().isoformat())
 
     def admit_exported(self) -> str:
         """Add a participant of a static bundle, who has not given consent yet. Returns the token."""
-        return self._insert_participant(_NO_CONSENT) or ""
-
-    def _insert_participant(self, consented_on: str, max_participants: int | None = None) -> str | None:
         with self._transaction("IMMEDIATE") as database:
-            (number,) = database.execute("SELECT count(*) FROM participants").fetchone()
-            if max_participants is not None and number >= max_participants:
-                return None
-            drawn, token = draw_trials(self.study.description, number), secrets.token_urlsafe(24)
-            trials = json.dumps([asdict(trial) for trial in drawn])
-            practice = json.dumps(asdict(draw_practice(self.study.description, number, drawn)))
-            row = number, token, consented_on, trials, practice
-            database.execute("INSERT INTO participants VALUES (?, ?, ?, ?, ?)", row)
+            return self._insert_participant(database, _NO_CONSENT)
+
+    def _insert_participant(self, database: sqlite3.Connection, consented_on: str) -> str:
+        number, token = _count(database), secrets.token_urlsafe(24)
+        drawn = draw_trials(self.study.description, number)
+        trials = json.dumps([asdict(trial) for trial in drawn])
+        practice = json.dumps(asdict(draw_practice(self.study.description, number, drawn)))
+        row = number, token, consented_on, trials, practice
+        database.execute("INSERT INTO participants VALUES (?, ?, ?, ?, ?)", row)
         return token
 
     def participant(self, token: str, *, exported: bool = False) -> Participant | None:
@@ -140,24 +142,21 @@ class AnswerStore:
         answers are not imported is returned only with `exported`, because the study does not have the consent yet."""
         with self._transaction() as database:
             row = database.execute(
-                "SELECT number, trials, practice FROM participants WHERE token = ? AND (consented_on != ? OR ?)",
+                f"{_PARTICIPANTS} WHERE token = ? AND (consented_on != ? OR ?)",
                 (token, _NO_CONSENT, exported),
             ).fetchone()
-        return row and Participant(row[0], _parse_trials(row[1]), Trial(**json.loads(row[2])))
+        return row and _participant(*row)
 
     def next_trial(self, participant: Participant) -> int | None:
         """The index of the first trial without an answer, or None if all trials have one."""
-        answered = self._answered(participant)
+        with self._transaction() as database:
+            answered = _answered(database, participant)
         return next((trial for trial in range(len(participant.trials)) if trial not in answered), None)
 
     def last_trial(self, participant: Participant) -> int | None:
         """The index of the last trial with an answer, or None if there is no answer."""
-        return max(self._answered(participant), default=None)
-
-    def _answered(self, participant: Participant) -> set[int]:
         with self._transaction() as database:
-            rows = database.execute("SELECT trial FROM answers WHERE participant = ?", (participant.number,))
-            return {trial for (trial,) in rows}
+            return max(_answered(database, participant), default=None)
 
     def withdraw_answer(self, participant: Participant, trial: int) -> None:
         """Withdraw the answer to the last answered trial, so that the trial can be answered again. The answer is kept.
@@ -165,10 +164,8 @@ class AnswerStore:
         BrewsterError if a later trial has an answer, and OutputError if the database cannot be written."""
         key = (participant.number, trial)
         with self._transaction("IMMEDIATE") as database:
-            (last,) = database.execute(
-                "SELECT max(trial) FROM answers WHERE participant = ?", key[:1]
-            ).fetchone()
-            if last is not None and last > trial:
+            last = max(_answered(database, participant), default=trial)
+            if last > trial:
                 raise BrewsterError(
                     f"the answer to pair {trial + 1} cannot be withdrawn",
                     f"expected pair {last + 1}, because only the last answer can be withdrawn",
@@ -198,19 +195,14 @@ class AnswerStore:
                 f"expected a trial from 0 to {len(participant.trials) - 1} and one of the choices {', '.join(CHOICES)}",
                 "load the page again",
             )
-        seconds_shown = min(max(seconds, 0.0), MAX_SECONDS)
-        now = datetime.now(UTC).isoformat(timespec="seconds")
-        conditions_json = _CONDITIONS.dump_json(conditions).decode()
+        answer = ExportedAnswer(trial, choice, max(seconds, 0.0), datetime.now(UTC), conditions)
+        row = _row(participant.number, answer)
         with self._transaction("IMMEDIATE") as database:
-            database.execute(
-                "INSERT INTO answers VALUES (?, ?, ?, ?, ?, ?) ON CONFLICT DO NOTHING",
-                (participant.number, trial, choice, seconds_shown, now, conditions_json),
-            )
-            row = database.execute(
-                "SELECT choice FROM answers WHERE participant = ? AND trial = ?", (participant.number, trial)
+            database.execute(_INSERT_ANSWER, row)
+            (stored,) = database.execute(
+                "SELECT choice FROM answers WHERE participant = ? AND trial = ?", row[:2]
             ).fetchone()
-        stored: Choice = row[0]
-        return stored
+        return cast("Choice", stored)
 
     def import_answers(self, answer_file: AnswerFile) -> int:
         """Store the answers of a participant of a static bundle in one transaction. An answer that is stored already is
@@ -241,10 +233,8 @@ class AnswerStore:
                 "WHERE participant = ?1 AND trial = ?2 AND choice = ?3 AND answered_at = ?5)",
                 [_row(number, answer) for answer in answer_file.withdrawn],
             )
-            return database.executemany(
-                "INSERT OR IGNORE INTO answers VALUES (?, ?, ?, ?, ?, ?)",
-                [_row(number, answer) for answer in answer_file.answers],
-            ).rowcount
+            answers = [_row(number, answer) for answer in answer_file.answers]
+            return database.executemany(_INSERT_ANSWER, answers).rowcount
 
     def all_answers(self) -> Iterator[tuple[Participant, dict[int, StoredAnswer]]]:
         """Yield every participant, in order of number, and a dict of the answers by trial, which may be empty."""
@@ -253,19 +243,14 @@ class AnswerStore:
             withdrawn_rows = database.execute(
                 "SELECT participant, trial, choice FROM withdrawn ORDER BY rowid"
             ).fetchall()
-            participants = database.execute(
-                "SELECT number, trials FROM participants ORDER BY number"
-            ).fetchall()
-        answers: dict[int, dict[int, StoredAnswer]] = {number: {} for number, _ in participants}
-        withdrawn: dict[tuple[int, int], tuple[Choice, ...]] = {}
-        for number, trial, choice in withdrawn_rows:
-            withdrawn[number, trial] = (*withdrawn.get((number, trial), ()), choice)
+            participants = database.execute(f"{_PARTICIPANTS} ORDER BY number").fetchall()
+        answers: dict[int, dict[int, StoredAnswer]] = {number: {} for number, *_ in participants}
         for number, trial, choice, seconds, answered_at, conditions_json in answer_rows:
             conditions = _CONDITIONS.validate_json(conditions_json)
-            before = withdrawn.get((number, trial), ())
+            before = tuple(row[2] for row in withdrawn_rows if row[:2] == (number, trial))
             answers[number][trial] = StoredAnswer(choice, seconds, answered_at, conditions, before)
-        for number, trials in participants:
-            yield Participant(number, _parse_trials(trials)), dict(sorted(answers[number].items()))
+        for row in participants:
+            yield _participant(*row), dict(sorted(answers[row[0]].items()))
 
     @contextmanager
     def _transaction(
@@ -309,6 +294,16 @@ def _read_only_uri(file: Path) -> str:
     return f"{file.resolve().as_uri()}?mode=ro{'&immutable=1' if is_immutable else ''}"
 
 
+def _count(database: sqlite3.Connection) -> int:
+    (number,) = database.execute("SELECT count(*) FROM participants").fetchone()
+    return int(number)
+
+
+def _answered(database: sqlite3.Connection, participant: Participant) -> set[int]:
+    rows = database.execute("SELECT trial FROM answers WHERE participant = ?", (participant.number,))
+    return {trial for (trial,) in rows}
+
+
 def _row(participant: int, answer: ExportedAnswer) -> tuple[int, int, str, float, str, str]:
     """The row of an answer in the tables answers and withdrawn."""
     seconds = min(answer.seconds, MAX_SECONDS)
@@ -317,5 +312,7 @@ def _row(participant: int, answer: ExportedAnswer) -> tuple[int, int, str, float
     return participant, answer.trial, answer.choice, seconds, answered_at, conditions
 
 
-def _parse_trials(text: str) -> tuple[Trial, ...]:
-    return tuple(Trial(**row) for row in json.loads(text))
+def _participant(number: int, trials: str, practice: str) -> Participant:
+    return Participant(
+        number, tuple(Trial(**row) for row in json.loads(trials)), Trial(**json.loads(practice))
+    )

@@ -115,14 +115,15 @@ class Study:
     def verify_pictures(self) -> None:
         """Check that all pictures exist and are unchanged. Raises BrewsterError if a picture is missing, or its digest
         differs from the description."""
-
-        def is_unchanged(picture: StudyPicture) -> bool:
-            path = self.picture_file(picture.name)
-            return path.is_file() and hashlib.sha256(path.read_bytes()).hexdigest() == picture.sha256
-
-        if changed := [picture.name for picture in self.description.pictures if not is_unchanged(picture)]:
+        files = {self.picture_file(picture.name): picture.sha256 for picture in self.description.pictures}
+        changed = [
+            path
+            for path, digest in files.items()
+            if not path.is_file() or hashlib.sha256(path.read_bytes()).hexdigest() != digest
+        ]
+        if changed:
             raise BrewsterError(
-                f"pictures of the study are missing or changed: {len(changed)}, such as {self.picture_file(changed[0])}",
+                f"pictures of the study are missing or changed: {len(changed)}, such as {changed[0]}",
                 "expected all pictures as `brewster study create` wrote them",
                 "copy the study again from its original folder",
             )

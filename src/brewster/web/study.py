@@ -24,9 +24,6 @@ from brewster.user_study.store import AnswerStore, Participant
 from brewster.user_study.study import Study
 from brewster.web.application import page_response
 
-_CACHED: Final = {"Cache-Control": "private, max-age=86400, immutable"}
-_NOT_CACHED: Final = {"Cache-Control": "no-store"}
-
 
 class _Strict(BaseModel):
     model_config = ConfigDict(extra="forbid")
@@ -166,7 +163,7 @@ class _StudyRoutes:
 
     def next_trial(self, participant_token: Token, response: Response) -> TrialResponse:
         """Returns the first trial without an answer."""
-        response.headers.update(_NOT_CACHED)
+        response.headers["Cache-Control"] = "no-store"
         return self._next(self._participant(participant_token))
 
     def privacy(self) -> Response:
@@ -175,7 +172,7 @@ class _StudyRoutes:
 
     def practice_picture(self, participant_token: Token, side: Side) -> Response:
         """Returns a picture of the practice trial."""
-        return self._picture(_practice(self._participant(participant_token)), side, "the practice pair")
+        return self._picture(self._participant(participant_token).practice, side, "the practice pair")
 
     def picture(self, participant_token: Token, trial: int, side: Side) -> Response:
         """Returns a picture of a trial."""
@@ -191,7 +188,9 @@ class _StudyRoutes:
                 f"{_CAPTIONS[side]} of {pair} is missing on the server; expected three pictures for each pair; "
                 "tell this to the person who runs the study",
             ) from error
-        return Response(data, media_type="image/png", headers=_CACHED)
+        return Response(
+            data, media_type="image/png", headers={"Cache-Control": "private, max-age=86400, immutable"}
+        )
 
     def answer(self, participant_token: Token, answer: Annotated[AnswerRequest, Body()]) -> AnswerResponse:
         """Stores an answer. A second answer to a trial changes nothing, unless the first answer was withdrawn."""
@@ -225,30 +224,19 @@ class _StudyRoutes:
         return participant
 
     def _next(self, participant: Participant) -> TrialResponse:
-        trial, count = self.store.next_trial(participant), len(participant.trials)
-        last = self.store.last_trial(participant)
-        if trial is None:
-            return TrialResponse(trial=None, trials=count, last=last)
-        practice_trial = None
-        if last is None:
-            practice = _practice(participant)
-            assert practice.expected
-            photo = self.study.picture(practice.photo)
-            practice_trial = PracticeTrial(width=photo.width, height=photo.height, expected=practice.expected)
-        photo = self.study.picture(participant.trials[trial].photo)
-        return TrialResponse(
-            trial=trial,
-            trials=count,
-            width=photo.width,
-            height=photo.height,
-            practice=practice_trial,
-            last=last,
-        )
-
-
-def _practice(participant: Participant) -> assignment.Trial:
-    assert participant.practice, "a participant of the store has a practice trial"
-    return participant.practice
+        trial, last = self.store.next_trial(participant), self.store.last_trial(participant)
+        response = TrialResponse(trial=trial, trials=len(participant.trials), last=last)
+        if trial is not None:
+            photo = self.study.picture(participant.trials[trial].photo)
+            response.width, response.height = photo.width, photo.height
+            if last is None:
+                photo, expected = (
+                    self.study.picture(participant.practice.photo),
+                    participant.practice.expected,
+                )
+                assert expected, "a practice trial has a correct choice"
+                response.practice = PracticeTrial(width=photo.width, height=photo.height, expected=expected)
+        return response
 
 
 def _trial(participant: Participant, trial: int) -> assignment.Trial:

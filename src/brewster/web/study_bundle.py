@@ -23,6 +23,7 @@ from brewster.user_study.study import PICTURES_FOLDER, Study
 PARTICIPANTS_FOLDER: Final = "participants"
 _PAGE_FOLDER: Final = Path(__file__).parent / "page"
 _COPIED: Final = ("style.css", "study.css", "study.js", "study_bundle.js", "pan_zoom.js", "icon.svg")
+_SIDES: Final = ("photo", "left", "right")
 _HEAD: Final = """<meta http-equiv="Content-Security-Policy" content="default-src 'self'; img-src 'self' data:; base-uri 'none'; form-action 'none'">
 <meta name="study-bundle" content="static">
 """
@@ -52,18 +53,16 @@ def export_bundle(study: Study, store: AnswerStore, out: Path, *, participants: 
         for token in tokens:
             participant = store.participant(token, exported=True)
             assert participant
-            practice = [participant.practice] if participant.practice else []
-            trials = [*participant.trials, *practice]
-            for name in {name for trial in trials for name in (trial.photo, trial.left, trial.right)}:
+            trials, practice = participant.trials, participant.practice
+            for name in {getattr(trial, side) for trial in (*trials, practice) for side in _SIDES}:
                 target = folder / PICTURES_FOLDER / Path(name).name
                 if not target.exists():
                     shutil.copyfile(study.picture_file(name), target)
-            described = [_describe_trial(study, trial) | {"expected": trial.expected} for trial in practice]
             text = json.dumps(
                 {  # without the correct choices of catch trials
                     "consent": study.description.consent,
-                    "trials": [_describe_trial(study, trial) for trial in participant.trials],
-                    "practice": described[0] if described else None,
+                    "trials": [_describe_trial(study, trial) for trial in trials],
+                    "practice": _describe_trial(study, practice) | {"expected": practice.expected},
                 }
             )
             (folder / PARTICIPANTS_FOLDER / f"{token}.json").write_text(text, "utf-8")
@@ -82,5 +81,5 @@ def _write_page(folder: Path) -> None:
 
 def _describe_trial(study: Study, trial: Trial) -> dict[str, Any]:
     photo = study.picture(trial.photo)
-    names = {side: Path(getattr(trial, side)).name for side in ("photo", "left", "right")}
+    names = {side: Path(getattr(trial, side)).name for side in _SIDES}
     return names | {"width": photo.width, "height": photo.height}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import base64
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final, final
 
@@ -59,40 +59,44 @@ def to_thumbnails(
     truth: GroundTruth,
     predictions: Mapping[str, MethodOutput],
     region: Region,
-    links: Mapping[tuple[str, str], str],
+    link: Callable[[str, str, Photo], str],
 ) -> CaseThumbnails:
-    """Downscales and encodes all images of a case. `predictions` has no baseline. `links` is (layer, method) -> URL of the image
-    at full size, relative to the page; the method is "" for the photo, transmission and reflection of the benchmark."""
+    """Downscales and encodes all images of a case. `predictions` has no baseline. `link` returns the URL of an image at
+    full size for a method, "" for the benchmark, a layer (photo, transmission or reflection) and the image."""
     photo, ground_truth = truth.images["photo"], truth.images["transmission"]
 
-    def thumbnail(caption: str, data: bytes, layer: str = "", method: str = "") -> Thumbnail:
+    def plain(caption: str, data: bytes, url: str = "") -> Thumbnail:
         media_type = "image/png" if data.startswith(b"\x89PNG") else "image/jpeg"
-        url = f"data:{media_type};base64,{base64.b64encode(data).decode()}"
-        return caption, links.get((layer, method), ""), url
+        return caption, url, f"data:{media_type};base64,{base64.b64encode(data).decode()}"
+
+    def linked(caption: str, image: Photo, layer: str, method: str = "") -> Thumbnail:
+        return plain(caption, encode_photo(image.srgb_8bit()), link(method, layer, image))
 
     def error(caption: str, image: Pixels) -> Thumbnail:
-        colours = error_map(image, ground_truth)
-        return thumbnail(f"error of {caption}", Photo(colours, None, FileInfo(format_name="png")).encode())
+        colours = Photo(error_map(image, ground_truth), None, FileInfo(format_name="png"))
+        return plain(f"error of {caption}", colours.encode())
 
-    tinted = (photo.astype(np.uint16) + _REGION_COLOUR) // 2
-    tinted = np.where(region[..., None], tinted, photo).astype(np.uint8)
+    layers = {layer: Photo.from_array(image, encoding="srgb") for layer, image in truth.images.items()}
+    tinted = np.where(region[..., None], (photo.astype(np.uint16) + _REGION_COLOUR) // 2, photo)
     methods = {
         BASELINE: [
-            thumbnail("photo", encode_photo(photo), "photo"),
+            linked("photo", layers["photo"], "photo"),
             error("the photo", photo),
-            thumbnail("ground truth", encode_photo(ground_truth), "transmission"),
-            thumbnail("reflection region", encode_photo(tinted)),
+            linked("ground truth", layers["transmission"], "transmission"),
+            plain("reflection region", encode_photo(tinted.astype(np.uint8))),
         ]
     }
-    if "reflection" in truth.images:
-        data = encode_photo(truth.images["reflection"])
-        methods[BASELINE].append(thumbnail("ground truth of the reflection", data, "reflection"))
+    if "reflection" in layers:
+        caption = "ground truth of the reflection"
+        methods[BASELINE].append(linked(caption, layers["reflection"], "reflection"))
     for name, output in predictions.items():
-        image = output.transmission.srgb_8bit()
-        methods[name] = [thumbnail(name, encode_photo(image), "transmission", name), error(name, image)]
-        if output.reflection:
-            data = encode_photo(output.reflection.srgb_8bit())
-            methods[name].append(thumbnail(f"reflection by {name}", data, "reflection", name))
+        transmission, reflection = output.transmission, output.reflection
+        methods[name] = [
+            linked(name, transmission, "transmission", name),
+            error(name, transmission.srgb_8bit()),
+        ]
+        if reflection:
+            methods[name].append(linked(f"reflection by {name}", reflection, "reflection", name))
     case, size = truth.case, photo.shape[1::-1]
     return CaseThumbnails(case.benchmark, case.name, size, embedded_size(photo), methods)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
-from typing import Any, Final
+from typing import Final
 
 from brewster.evaluate.report.tables import is_complete, main_metrics, ranking
 from brewster.evaluate.results import AVERAGE, Results
@@ -51,9 +51,8 @@ def to_latex(results: Results, *, intervals: bool = False) -> str:
         "",
     ]
     text = "\n".join(lines)
-    needed = [package for command, package in _PACKAGES.items() if command in text]
-    needs = f"; needs {' and '.join(dict.fromkeys(needed))}" if needed else ""
-    return f"% brewster evaluate{needs}\n{text}"
+    needed = " and ".join(package for command, package in _PACKAGES.items() if command in text)
+    return f"% brewster evaluate{'; needs ' if needed else ''}{needed}\n{text}"
 
 
 def _table_selections(results: Results) -> list[str]:
@@ -106,17 +105,17 @@ def _cells(results: Results, key: str, method: str, metrics: Iterable[str], inte
     """Yields the means with their marks and, on request, their intervals."""
     table = results["tables"][key]
     for metric in metrics:
-        metric_info: dict[str, Any] = results["metrics"][metric]
-        entry = table[method].get(metric)
+        about, entry = results["metrics"][metric], table[method].get(metric)
         if entry is None:
             yield "--"
             continue
-        text = f"{entry['mean']:.{metric_info['digits']}f}"
-        has_interval = intervals and entry["low"] is not None
-        ends = (f"{entry[end]:.{metric_info['digits']}f}" for end in ("low", "high"))
-        interval = f" {{\\scriptsize [{', '.join(ends)}]}}" if has_interval else ""
+        text = f"{entry['mean']:.{about['digits']}f}"
+        marks = dict(zip(ranking(table, metric, about)[:-1], _MARKS, strict=False))
         if not is_complete(table, method, metric):
-            yield f"{text}{_DAGGER}{interval}"
-            continue
-        marks = dict(zip(ranking(table, metric, metric_info)[:-1], _MARKS, strict=False))
-        yield (f"{marks[text]}{{{text}}}" if text in marks else text) + interval
+            text += _DAGGER
+        elif text in marks:
+            text = f"{marks[text]}{{{text}}}"
+        if intervals and entry["low"] is not None:
+            ends = (f"{entry[end]:.{about['digits']}f}" for end in ("low", "high"))
+            text += f" {{\\scriptsize [{', '.join(ends)}]}}"
+        yield text

@@ -43,8 +43,7 @@ def read_published() -> list[PublishedScores]:
 def to_markdown(published: Sequence[PublishedScores]) -> str:
     """Returns a Markdown section with one table per protocol. The protocol and the sources are above the table.
     Consecutive rows with the same protocol are in one table."""
-    groups = groupby(published, key=lambda row: row.protocol)
-    parts = [_table(protocol, list(rows)) for protocol, rows in groups]
+    parts = [_table(protocol, list(rows)) for protocol, rows in groupby(published, lambda row: row.protocol)]
     return "\n\n".join([f"## {_HEADING}", *parts]) + "\n"
 
 

@@ -26,27 +26,24 @@ def main_metrics(results: Results) -> list[str]:
 
 def to_markdown(results: Results) -> str:
     """Returns all tables as Markdown: an overview, a table per benchmark with intervals and differences, notes, settings."""
-    benchmarks = results["benchmarks"].values()
-    notes = [
-        f"{entry['title']}: {text}"
-        for entry in benchmarks
-        for text in (*entry["remarks"], *(f"excluded: {reason}" for reason in entry["excluded"]))
-    ]
+    notes = []
+    for entry in results["benchmarks"].values():
+        notes += [f"{entry['title']}: {remark}" for remark in entry["remarks"]]
+        notes += [f"{entry['title']}: excluded: {reason}" for reason in entry["excluded"]]
     notes += remarks(results)
     notes += [f"not computed: {metrics}" for metrics in unavailable_metrics(results)]
-    notes += [
-        f"{name} is not scored: no image has the ground truth that it needs" for name in results["unmeasured"]
-    ]
+    unmeasured = "is not scored: no image has the ground truth that it needs"
+    notes += [f"{name} {unmeasured}" for name in results["unmeasured"]]
     notes += failures(results)
     metrics = (f"{entry['title']}: {entry['definition']}" for entry in results["metrics"].values())
-    settings = [*results["protocol"]["choices"], *metrics]
-    lists = {"Notes": notes, "Settings and definitions": settings}
-    parts = [
-        "\n".join([f"### {title}", "", *(f"- {line}" for line in lines)])
-        for title, lines in lists.items()
-        if lines
-    ]
-    return "\n\n".join([tables_to_markdown(results).strip("\n"), *parts]) + "\n"
+    text = tables_to_markdown(results)
+    for title, lines in (
+        ("Notes", notes),
+        ("Settings and definitions", [*results["protocol"]["choices"], *metrics]),
+    ):
+        if lines:
+            text += "\n".join([f"\n### {title}\n", *(f"- {line}" for line in lines)]) + "\n"
+    return text
 
 
 def tables_to_markdown(results: Results) -> str:
@@ -103,22 +100,24 @@ def _overview(results: Results) -> str:
         [method, *(_cell(results, key, method, metrics) for key in selections)]
         for method in results["methods"]
     ]
-    has_unequal_counts = any(
-        metric in row and not is_complete(table, method, metric)
-        for table in results["tables"].values()
+    tables = results["tables"].values()
+    is_fair = all(
+        is_complete(table, method, metric)
+        for table in tables
         for method, row in table.items()
-        for metric in metrics
+        for metric in set(metrics) & set(row)
     )
-    return f"{titles}\n\n{markdown_table(rows)}{_UNEQUAL_COUNTS_NOTE if has_unequal_counts else ''}"
+    return f"{titles}\n\n{markdown_table(rows)}{'' if is_fair else _UNEQUAL_COUNTS_NOTE}"
 
 
 def _cell(results: Results, key: str, method: str, metrics: Iterable[str]) -> str:
     row, image_count = results["tables"][key][method], results["selections"][key]["cases"]
     text = " / ".join(_number(results, name, row[name]["mean"]) if name in row else "-" for name in metrics)
-    counts = sorted({row[name]["count"] if name in row else 0 for name in metrics})
-    if counts == [image_count]:
+    counts = {row[name]["count"] if name in row else 0 for name in metrics}
+    if counts == {image_count}:
         return text
-    return f"{text} ({' to '.join(map(str, dict.fromkeys((counts[0], counts[-1]))))} of {image_count})"
+    least, most = min(counts), max(counts)
+    return f"{text} ({least if least == most else f'{least} to {most}'} of {image_count})"
 
 
 def _details(results: Results, key: str) -> str:
@@ -180,8 +179,7 @@ def unavailable_metrics(results: Mapping[str, Any]) -> list[str]:
 
 def failures(results: Results) -> list[str]:
     """Returns the errors of methods, without repetitions."""
-    errors = (error for picture in results["cases"] for error in picture["errors"].values())
-    return list(dict.fromkeys(errors))
+    return list(dict.fromkeys(error for case in results["cases"] for error in case["errors"].values()))
 
 
 def _heading(results: Results, metric: str) -> str:

@@ -68,9 +68,17 @@ def collect_answers(
             for _, trial, answer in trials
             if trial.comparison is not None
         }
-        seconds = median(answer.seconds for answer in answers.values())
-        is_complete, counts = len(answers) == len(participant.trials), (len(passed), passed.count(False))
-        collected.append(ParticipantAnswers(participant.number, votes, *counts, seconds, is_complete, trials))
+        collected.append(
+            ParticipantAnswers(
+                participant.number,
+                votes,
+                catch_trials=len(passed),
+                failed=passed.count(False),
+                seconds=median(answer.seconds for answer in answers.values()),
+                is_complete=len(answers) == len(participant.trials),
+                trials=trials,
+            )
+        )
     return collected
 
 

@@ -88,40 +88,24 @@ def _group(study: Study, participants: Sequence[ParticipantAnswers]) -> dict[str
     }
     if not participants:
         return summary
-    counts = _counts(study, participants)
-    pictures = np.zeros((len(study.pairs_of_methods), len(study.description.datasets)))
-    np.add.at(pictures, tuple(np.array(_table_indices(study)).T), 1)
-    ratings = np.zeros((len(study.description.comparisons), len(OUTCOMES)))
-    for participant in participants:
-        np.add.at(ratings, (list(participant.votes), list(participant.votes.values())), 1)
-    weights = statistics.bootstrap_weights(len(participants))
-    agreement = statistics.alpha(ratings)
-    return summary | {
-        "tables": _tables(study, counts, pictures, weights),
-        "strengths": _strengths(study, counts, weights),
-        "agreement": None if agreement is None else round(agreement, _DIGITS),
-    }
-
-
-# --- counting
-
-
-def _counts(study: Study, participants: Sequence[ParticipantAnswers]) -> Floats:
-    """Numbers of wins, ties and losses of the first method: (participants, pairs of methods, datasets, 3)."""
-    indices = _table_indices(study)
-    shape = len(study.pairs_of_methods), len(study.description.datasets), len(OUTCOMES)
-    counts = np.zeros((len(participants), *shape))
+    pairs = {pair: i for i, pair in enumerate(study.pairs_of_methods)}
+    datasets = {name: i for i, name in enumerate(study.description.datasets)}
+    indices = [(pairs[row.methods], datasets[row.dataset]) for row in study.description.comparisons]
+    shape = len(pairs), len(datasets)
+    pictures, ratings = np.zeros(shape), np.zeros((len(indices), len(OUTCOMES)))
+    np.add.at(pictures, tuple(np.array(indices).T), 1)
+    # wins, ties and losses of the first method: (participants, pairs of methods, datasets, 3)
+    counts = np.zeros((len(participants), *shape, len(OUTCOMES)))
     for i, participant in enumerate(participants):
         for comparison, outcome in participant.votes.items():
             counts[i, *indices[comparison], outcome] += 1
-    return counts
-
-
-def _table_indices(study: Study) -> list[tuple[int, int]]:
-    """For each comparison, the index of its pair of methods and of its dataset."""
-    pairs = {pair: i for i, pair in enumerate(study.pairs_of_methods)}
-    datasets = {name: i for i, name in enumerate(study.description.datasets)}
-    return [(pairs[row.methods], datasets[row.dataset]) for row in study.description.comparisons]
+            ratings[comparison, outcome] += 1
+    weights = statistics.bootstrap_weights(len(participants))
+    return summary | {
+        "tables": _tables(study, counts, pictures, weights),
+        "strengths": _strengths(study, counts, weights),
+        "agreement": _round(statistics.alpha(ratings)),
+    }
 
 
 # --- estimating
@@ -129,18 +113,24 @@ def _table_indices(study: Study) -> list[tuple[int, int]]:
 
 def _tables(study: Study, counts: Floats, pictures: Floats, weights: Floats) -> list[dict[str, Any]]:
     """A table for each pair of methods, with a row for each dataset and a row for each of the AVERAGES."""
+
+    def with_averages(values: Floats, pooled: Floats) -> NDArray[np.int64]:
+        """Appends a column for each of the AVERAGES: (pairs of methods, datasets + 3)."""
+        return np.concatenate([values, np.repeat(pooled[:, None], len(AVERAGES), axis=1)], axis=1).astype(int)
+
     means = statistics.rates(counts.sum(axis=0), pictures)
-    ends = statistics.bootstrap_interval(
-        statistics.rates(statistics.resampled_counts(weights, counts), pictures), len(counts)
-    )
+    draws = statistics.rates(statistics.resampled_counts(weights, counts), pictures)
+    ends = statistics.bootstrap_interval(draws, len(counts))
     lows, highs = statistics.with_agreement_bounds(means, ends, statistics.agreement_bounds(counts, pictures))
-    answered = counts.sum(axis=-1) > 0
-    pooled = answered.any(axis=-1).sum(axis=0)[:, None]
-    # numbers of participants with an answer, for each row of a table: (pairs of methods, datasets + 3)
-    sizes = np.concatenate([answered.sum(axis=0), np.repeat(pooled, len(AVERAGES), axis=1)], axis=1)
     p_values = statistics.sign_flip_test(counts, pictures)
+    answers, answered = counts.sum(axis=(0, 3)), counts.sum(axis=-1) > 0
+    numbers = {
+        "pictures": with_averages(pictures, pictures.sum(axis=1)),
+        "answers": with_averages(answers, answers.sum(axis=1)),
+        "participants": with_averages(answered.sum(axis=0), answered.any(axis=-1).sum(axis=0)),
+    }
+    p_values[numbers["participants"] < statistics.MIN_PARTICIPANTS] = np.nan
     titles = {name: _dataset_title(name) for name in study.description.datasets} | AVERAGES
-    answers = counts.sum(axis=(0, 3))
     return [
         {
             "first": first,
@@ -150,17 +140,12 @@ def _tables(study: Study, counts: Floats, pictures: Floats, weights: Floats) -> 
                 {
                     "key": key,
                     "title": title,
-                    "pictures": int(pictures[i, j] if j < answers.shape[1] else pictures[i].sum()),
-                    "answers": int(answers[i, j] if j < answers.shape[1] else answers[i].sum()),
-                    "participants": int(sizes[i, j]),
-                    "p": _round(p_values[i, j]) if sizes[i, j] >= statistics.MIN_PARTICIPANTS else None,
-                    **dict(
-                        zip(
-                            (*OUTCOMES, "difference"),
-                            map(_estimate, means[i, j], lows[i, j], highs[i, j]),
-                            strict=True,
-                        )
-                    ),
+                    **{name: int(values[i, j]) for name, values in numbers.items()},
+                    "p": _round(p_values[i, j]),
+                }
+                | {
+                    name: _estimate(means[i, j, k], lows[i, j, k], highs[i, j, k])
+                    for k, name in enumerate((*OUTCOMES, "difference"))
                 }
                 for j, (key, title) in enumerate(titles.items())
             ],

@@ -189,8 +189,7 @@ def answers_csv(
     rows: list[Sequence[object]] = [ANSWER_COLUMNS]
     for participant in participants:
         for position, trial, answer in participant.trials:
-            shown = _comparison(description, trial) if trial.expected is None else _catch(description, trial)
-            row = shown | (asdict(answer.conditions) if answer.conditions else {})
+            row = _shown(description, trial) | (asdict(answer.conditions) if answer.conditions else {})
             row |= {
                 "participant": participant.number,
                 "position": position + 1,
@@ -205,23 +204,18 @@ def answers_csv(
     return csv_table(rows)
 
 
-def _comparison(description: StudyDescription, trial: Trial) -> dict[str, object]:
-    assert trial.comparison is not None
+def _shown(description: StudyDescription, trial: Trial) -> dict[str, Any]:
+    """What a trial showed: two methods, or an unchanged output next to itself or to its degraded copy."""
+    if trial.comparison is None:
+        catch = next(catch for catch in description.catch_pool if catch.photo == trial.photo)
+        left, right = (
+            "degraded" if side == catch.degraded else "unchanged" for side in (trial.left, trial.right)
+        )
+        shown = {"kind": "catch", "dataset": catch.dataset, "name": catch.name, "expected": trial.expected}
+        return shown | {"left": left, "right": right}
     row = description.comparisons[trial.comparison]
     left, right = row.methods[::-1] if trial.flipped else row.methods
     return {
         "kind": "comparison", "dataset": row.dataset, "name": row.name,
         "first": row.methods[0], "second": row.methods[1], "left": left, "right": right,
-    }  # fmt: skip
-
-
-def _catch(description: StudyDescription, trial: Trial) -> dict[str, object]:
-    """A catch trial: the sides have an unchanged output or its degraded copy, and no methods are compared."""
-    catch = next(catch for catch in description.catch_pool if catch.photo == trial.photo)
-    left, right = (
-        "degraded" if side == catch.degraded else "unchanged" for side in (trial.left, trial.right)
-    )
-    return {
-        "kind": "catch", "dataset": catch.dataset, "name": catch.name,
-        "left": left, "right": right, "expected": trial.expected,
     }  # fmt: skip
