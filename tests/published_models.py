@@ -26,6 +26,15 @@ def random_pair(module, rank, generator):
     return down, 0.3 * torch.randn(module.out_features, rank, generator=generator)
 
 
+def random_lora(backbone, rank):
+    """Random matrices for all linear layers of the blocks, as `read_lora_layers` returns them."""
+    layers, generator, state = linear_layers(backbone.transformer), torch.Generator().manual_seed(5), {}
+    for name in backbone.lora_targets():
+        pair = random_pair(layers[name], rank, generator)
+        state |= {f"{name}.lora_A.weight": pair[0], f"{name}.lora_B.weight": pair[1]}
+    return state
+
+
 def velocity(backbone, prompt):
     """The prediction for fixed random latents, without guidance."""
     generator = torch.Generator().manual_seed(0)

@@ -25,8 +25,13 @@ from pydantic import Field, TypeAdapter, ValidationError
 from torch import Tensor, nn
 
 from brewster.errors import BrewsterError, ModelError, RecipeError, invalid_value
-from brewster.models.diffusion.adapter import lora_formats
-from brewster.models.diffusion.adapter.lora_formats import LowRankLayer
+from brewster.models.diffusion.adapter.lora_formats import (
+    DOWN_SUFFIX,
+    UP_SUFFIX,
+    adapted_layers,
+    check_shape,
+    read_lora_layers,
+)
 from brewster.models.diffusion.backbones.backbone import Backbone
 from brewster.models.diffusion.lazy_imports import import_library
 from brewster.models.diffusion.prompt import PROMPT_FILE, PromptEmbedding, load_prompt
@@ -115,25 +120,20 @@ def add_lora(
     return lora_parameters(backbone)
 
 
-def attach_layers(
-    backbone: Backbone, layers: Mapping[str, LowRankLayer], *, adapter: str = ADAPTER_NAME
-) -> None:
-    """Adds a LoRA with these layers to a backbone for inference. Each layer has its own rank.
+def attach_layers(backbone: Backbone, state: Mapping[str, Tensor], *, adapter: str = ADAPTER_NAME) -> None:
+    """Adds a LoRA with the weights of `read_lora_layers` to a backbone for inference. Each layer has its own rank.
 
     A second LoRA, such as a few-step LoRA (Lightning, turbo), needs another name as `adapter`: both changes of the
-    weights are added. The weights are in the dtype in which the backbone computes, see `load_lora`. Raises ModelError
-    if a layer is not in the backbone, or has another shape; MissingExtra if peft is not installed.
+    weights are added. The weights are in the dtype in which the backbone computes, see `load_lora`.
     """
     others = [*(getattr(backbone.transformer, "peft_config", None) or ())]
     modules = dict(backbone.transformer.named_modules())
-    for name, layer in layers.items():
-        lora_formats.check_shape(name, layer, modules.get(name))
+    for name in adapted_layers(state):
+        check_shape(name, state[name + DOWN_SUFFIX], state[name + UP_SUFFIX], modules.get(name))
     peft = import_library("peft")
-    _add_adapter(backbone, peft.LoraConfig(**layer_settings(layers)), adapter)
+    _add_adapter(backbone, peft.LoraConfig(**layer_settings(state)), adapter)
     _convert_for_inference(backbone)
-    peft.set_peft_model_state_dict(
-        backbone.transformer, lora_formats.to_state_dict(layers), adapter_name=adapter
-    )
+    peft.set_peft_model_state_dict(backbone.transformer, dict(state), adapter_name=adapter)
     if others:
         backbone.transformer.set_adapters([*others, adapter])
 
@@ -239,7 +239,7 @@ def load_lora(folder: Path, backbone: Backbone) -> tuple[LoraMetadata, PromptEmb
     state, metadata = read_lora(folder)
     prompt = read_prompt(folder, metadata)
     if metadata.imported:
-        attach_layers(backbone, lora_formats.read_lora_layers(state, backbone.transformer, backbone.name))
+        attach_layers(backbone, read_lora_layers(state, backbone.transformer, backbone.name))
         return metadata, prompt
     add_lora(backbone, rank=metadata.rank, alpha=metadata.alpha, target_modules=metadata.target_modules)
     load_lora_state(backbone, state)
@@ -274,9 +274,9 @@ def _add_adapter(backbone: Backbone, config: Any, name: str = ADAPTER_NAME) -> N
     import_library("diffusers.training_utils").cast_training_params(backbone.transformer, torch.float32)
 
 
-def layer_settings(layers: Mapping[str, LowRankLayer]) -> dict[str, Any]:
+def layer_settings(state: Mapping[str, Tensor]) -> dict[str, Any]:
     """The settings of peft for layers of any rank. The names are regular expressions that match only the full name."""
-    ranks = {re.escape(name): layer.rank for name, layer in sorted(layers.items())}
+    ranks = {re.escape(name): len(state[name + DOWN_SUFFIX]) for name in adapted_layers(state)}
     rank = max(ranks.values())
     pattern = {f"^{name}": value for name, value in ranks.items() if value != rank}
     return {

@@ -73,8 +73,7 @@ def load(folder: Path, backbone: Backbone) -> tuple[LoraMetadata, PromptEmbeddin
     ModelError if a file is missing or damaged, or a weight belongs to no layer of the backbone."""
     metadata, prompt = read_metadata(folder), _read_prompt(folder)
     tensors, _ = read_tensors(folder / WEIGHTS_FILE)
-    config = read_json(folder / CONFIG_FILE)
-    scale = scaling_from_config(config)
+    scale = scaling_from_config(read_json(folder / CONFIG_FILE))
     attach_layers(backbone, read_lora_layers(tensors, backbone.transformer, backbone.name, scale))
     return metadata, prompt
 
