@@ -187,11 +187,9 @@ def test_nf4_needs_an_nvidia_gpu():
         load_backbone("kontext", quantization="nf4")
 
 
-def test_unknown_names_get_suggestions():
+def test_an_unknown_name_gets_a_suggestion():
     with pytest.raises(ModelError, match="did you mean kontext"):
         tiny("kontxt")
-    with pytest.raises(ModelError, match="there is no quantization 'int2'"):
-        load_backbone("kontext", quantization="int2")
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="this machine has a GPU")

@@ -105,8 +105,6 @@ class Separator:
                 f"there is no option {min(unknown)}; expected {', '.join(LoadOptions.__annotations__)}"
             )
         changed = {name: value for name, value in options.items() if value != getattr(Options, name)}
-        device: str = options.pop("device", Options.device)
-        changed.pop("device", None)
         if is_diffusion_model(model):
             if options.get("fast_lora") and options.get("steps") is None:
                 raise ModelError(
@@ -114,7 +112,8 @@ class Separator:
                     "expected the number for which it was trained",
                     "set the option steps, for example 4 or 8",
                 )
-            return cls._load_diffusion_model(model, device, changed)
+            return cls._load_diffusion_model(model, changed)
+        changed.pop("device", None)
         if changed:
             raise ModelError(
                 f"{', '.join(changed)} was set for the model {model}",
@@ -123,14 +122,14 @@ class Separator:
             )
         model_file = find_model(model)
         digest = model_file.verify()
-        backend = OnnxBackend(model_file.path, device)
+        backend = OnnxBackend(model_file.path, options.get("device", Options.device))
         is_shipped = model_file.sha256 is not None
         return cls(
             backend, name=model_file.name, sha256=digest, device=backend.device, is_calibrated=is_shipped
         )
 
     @classmethod
-    def _load_diffusion_model(cls, model: str, device: str, options: dict[str, Any]) -> Separator:
+    def _load_diffusion_model(cls, model: str, options: dict[str, Any]) -> Separator:
         try:
             from brewster.inference.diffusion_predictor import DiffusionPredictor  # noqa: PLC0415  (imports torch)
             from brewster.models.diffusion.pipeline import load_pipeline  # noqa: PLC0415
@@ -140,8 +139,8 @@ class Separator:
                 f"{error.name} is not installed",
                 f"expected {error.name}, because the model {model} needs it",
             ) from error
-        of_predictor = {name: options.pop(name) for name in _PREDICTOR_OPTIONS if name in options}
-        pipeline = load_pipeline(model, device=device, **options)
+        pipeline = load_pipeline(model, **options)
+        of_predictor = {name: options[name] for name in _PREDICTOR_OPTIONS if name in options}
         predictor = DiffusionPredictor(pipeline, **of_predictor)
         return cls(
             predictor, name=pipeline.name, sha256=pipeline.sha256, device=str(pipeline.backbone.device)
