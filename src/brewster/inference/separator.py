@@ -29,12 +29,7 @@ from brewster.inference.full_size import upsample_layers
 from brewster.inference.guided_upsampling import Floats, GuidedUpsampler
 from brewster.inference.layer_history import PHOTO, history_step, with_step
 from brewster.inference.onnx_backend import OnnxBackend
-from brewster.inference.predictor import (
-    MultiScalePredictor,
-    Prediction,
-    Predictor,
-    ProgressCallback,
-)
+from brewster.inference.predictor import MultiScalePredictor, Prediction, Predictor, ProgressCallback
 from brewster.inference.separation import Separation
 from brewster.inference.tiles import Backend
 from brewster.models.zoo import find_model, is_diffusion_model
@@ -231,15 +226,13 @@ class Separator:
         with _timed(seconds, "decode"):
             photo = Photo.open(source, encoding=encoding, max_pixels=max_pixels)
             weights = None if mask is None else Mask.open(mask, photo.size)
-            inputs, white = self._inputs(photo, quality)
-            images = self._with_hints(inputs, photo, hints)
+            inputs, white = self._inputs(photo, quality, hints)
+            largest_input = _without_hints(inputs[-1])
         on_progress(0.0)
         with _timed(seconds, "network"):
-            prediction = self._predict(
-                inputs[-1], images, quality, lambda done: on_progress(_NETWORK_SHARE * done)
-            )
+            prediction = self._predict(inputs, quality, lambda done: on_progress(_NETWORK_SHARE * done))
         with _timed(seconds, "upsampling"):
-            upsampler = _fit_upsampler(inputs[-1], prediction, strength, white)
+            upsampler = _fit_upsampler(largest_input, prediction, strength, white)
             transmission, reflection, residual = upsample_layers(
                 photo,
                 upsampler,
@@ -257,7 +250,7 @@ class Separator:
             prediction.confidence_map,
             residual,
             prediction.reconstruction_error,
-            self._assess(inputs[-1], prediction, strength, weights),
+            self._assess(largest_input, prediction, strength, weights),
             self.name,
             self.sha256,
             self.device,
@@ -273,35 +266,24 @@ class Separator:
         hints: Source | None = Options.hints,
         on_progress: ProgressCallback = lambda _fraction: None,
     ) -> tuple[GuidedUpsampler, Prediction, Assessment]:
-        """Predicts the layers of a photo, but does not compute them at full size.
-
-        Args:
-            photo: the photo.
-            quality: see the call of a separator.
-            hints: see the call of a separator.
-            on_progress: see the call of a separator.
+        """Predicts the layers of a photo, but does not compute them at full size. For the arguments, see the call.
 
         Returns:
             The upsampler at strength 1, which computes the layers of any rows of the photo; the prediction; and its
             assessment.
-
-        Raises:
-            BrewsterError: quality is unknown.
-            ModelError: the model returns an invalid output.
-            MaskError: the model takes no hints, or the hints cannot be read, or have another size than the photo.
         """
         Options(quality=quality)  # checks the value
-        inputs, white = self._inputs(photo, quality)
-        images = self._with_hints(inputs, photo, hints)
-        prediction = self._predict(inputs[-1], images, quality, on_progress)
-        upsampler = _fit_upsampler(inputs[-1], prediction, Options.strength, white)
-        return upsampler, prediction, self._assess(inputs[-1], prediction)
+        inputs, white = self._inputs(photo, quality, hints)
+        largest_input = _without_hints(inputs[-1])
+        prediction = self._predict(inputs, quality, on_progress)
+        upsampler = _fit_upsampler(largest_input, prediction, Options.strength, white)
+        return upsampler, prediction, self._assess(largest_input, prediction)
 
-    def _predict(
-        self, largest_input: Floats, images: list[Floats], quality: Quality, on_progress: ProgressCallback
-    ) -> Prediction:
-        prediction = self._predictor(images, quality, on_progress)
-        return prediction if self._predictor.is_measured else keep_clipped_light(largest_input, prediction)
+    def _predict(self, inputs: list[Floats], quality: Quality, on_progress: ProgressCallback) -> Prediction:
+        prediction = self._predictor(inputs, quality, on_progress)
+        if self._predictor.is_measured:
+            return prediction
+        return keep_clipped_light(_without_hints(inputs[-1]), prediction)
 
     def _assess(
         self,
@@ -320,16 +302,16 @@ class Separator:
             is_calibrated=self._is_calibrated,
         )
 
-    def _inputs(self, photo: Photo, quality: Quality) -> tuple[list[Floats], np.float32]:
-        """Returns the inputs of the model in 0..1, smallest first, and the white level by which they are divided."""
+    def _inputs(
+        self, photo: Photo, quality: Quality, hints: Source | None
+    ) -> tuple[list[Floats], np.float32]:
+        """Returns the inputs of the model in 0..1, smallest first, and the white level by which they are divided. If there are
+        hints, the inputs have two more channels."""
         inputs = [photo.resized(*size) for size in self._predictor.input_sizes(photo.size, quality)]
         white = white_level(inputs[-1])
-        return [np.clip(scaled_input / white, 0, 1) for scaled_input in inputs], white
-
-    def _with_hints(self, inputs: list[Floats], photo: Photo, hints: Source | None) -> list[Floats]:
-        """Returns the inputs with two more channels if there are hints."""
+        inputs = [np.clip(scaled_input / white, 0, 1) for scaled_input in inputs]
         if hints is None:
-            return inputs
+            return inputs, white
         if not self.takes_hints:
             raise MaskError(
                 f"hints were given to the model {self.name}, which takes none",
@@ -337,7 +319,9 @@ class Separator:
                 "leave the hints out, or choose another model",
             )
         painted = Hints.open(hints, photo.size)
-        return [np.concatenate([image, painted.sampled(*image.shape[1::-1])], axis=2) for image in inputs]
+        return [
+            np.concatenate([image, painted.sampled(*image.shape[1::-1])], axis=2) for image in inputs
+        ], white
 
 
 def separate(
@@ -369,6 +353,10 @@ def separate(
     call = {name: load_options.pop(name) for name in _CALL_OPTIONS if name in load_options}
     separator = Separator.load(model, **load_options)
     return separator(source, mask=mask, hints=hints, encoding=encoding, **call)
+
+
+def _without_hints(model_input: Floats) -> Floats:
+    return np.ascontiguousarray(model_input[..., :3])
 
 
 def _fit_upsampler(

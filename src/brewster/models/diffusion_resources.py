@@ -134,8 +134,7 @@ def _model_number(name: str) -> str:
 
 
 def find_gpu(name: str) -> GraphicsCard:
-    """Returns the GPU of this name, such as `RTX 4090`, `nvidia geforce rtx 4090` or `AMD Radeon RX 7900 XTX`. Raises
-    DeviceError if the name is not in `CARDS`."""
+    """Returns the GPU of this name, such as `RTX 4090`, `nvidia geforce rtx 4090` or `AMD Radeon RX 7900 XTX`."""
     known = {_model_number(other): card for other, card in CARDS.items()}
     if (number := _model_number(name)) in known:
         return known[number]
@@ -338,7 +337,7 @@ class CostEstimate:
         return "\n".join(f"{name:24}{value}" for name, value in rows.items())
 
     def check_fits(self) -> None:
-        """Checks that the estimate fits into the memory of the GPU. Raises DeviceError with the first change with which it fits."""
+        """Checks that the estimate fits into the memory of the GPU. The error has the first change with which it fits."""
         if self.total_gib > self.card.memory_gib:
             raise DeviceError(
                 f"{self.name} needs about {self.total_gib:.1f} GiB",

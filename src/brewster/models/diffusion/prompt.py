@@ -79,15 +79,13 @@ class PromptEmbedding:
         return PromptEmbedding(self.backbone, self.text, **moved)
 
     def save(self, path: Path) -> None:
-        """Writes a safetensors file. The same embedding always gives the same bytes. Raises OutputError if the file cannot be
-        written."""
+        """Writes a safetensors file. The same embedding always gives the same bytes."""
         metadata = {"kind": _FORMAT, "backbone": self.backbone, "text": self.text, "sha256": self.sha256}
         write_tensors(path, self.tensors, metadata)
 
 
 def load_prompt(path: Path, backbone: str) -> PromptEmbedding:
-    """Reads a file that `PromptEmbedding.save` wrote. Raises ModelError if the file is missing, damaged or not a prompt, or
-    belongs to another backbone."""
+    """Reads a file that `PromptEmbedding.save` wrote."""
     tensors, metadata = read_tensors(path)
     is_prompt = metadata.get("kind") == _FORMAT and {"backbone", "text", "sha256"} <= metadata.keys()
     if not (is_prompt and {"embeds"} <= set(tensors) <= {"embeds", "pooled", "negative"}):

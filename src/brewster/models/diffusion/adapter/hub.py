@@ -70,10 +70,7 @@ class UploadPlan:
 
 
 def plan_push(folder: Path, repo_id: str, *, message: str = "", public: bool = False) -> UploadPlan:
-    """Checks a LoRA's folder and prepares its upload; needs no network connection. Raises ModelError if a file is
-    missing or damaged, the prompt does not belong to the LoRA, the model card has no front matter, a file or the
-    message contains the path of a home folder, or `repo_id` is not OWNER/NAME; MissingExtra if huggingface_hub is not
-    installed."""
+    """Checks a LoRA's folder and prepares its upload; needs no network connection."""
     try:
         import_library("huggingface_hub.utils").validate_repo_id(repo_id if "/" in repo_id else f"/{repo_id}")
     except import_library("huggingface_hub.errors").HFValidationError as error:
@@ -118,9 +115,7 @@ def plan_push(folder: Path, repo_id: str, *, message: str = "", public: bool = F
 def push(plan: UploadPlan, token: str | None = None) -> str:
     """Creates the repository if it does not exist, and sends the files in one commit.
 
-    The token is `token`, HF_TOKEN, or that of `hf auth login`. Returns the URL of the commit. Raises DownloadError if
-    there is no token, the token is invalid or may not write, the repository exists with the other visibility (public or
-    private), or there is no network connection; MissingExtra if huggingface_hub is not installed.
+    The token is `token`, HF_TOKEN, or that of `hf auth login`. Returns the URL of the commit.
     """
     hub = import_library("huggingface_hub")
     if not (token or hub.get_token()):

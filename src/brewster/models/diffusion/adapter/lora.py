@@ -72,7 +72,7 @@ class LoraMetadata:
 
     @classmethod
     def from_json(cls, text: str) -> LoraMetadata:
-        """Parses the result of `to_json`. Raises ModelError if the text is not valid metadata."""
+        """Parses the result of `to_json`."""
         cure = "copy the folder again, or save the LoRA again"
         try:
             return TypeAdapter(LoraMetadata).validate_json(text, strict=True, extra="forbid")
@@ -92,8 +92,7 @@ class LoraMetadata:
 
 def select_target_modules(backbone: Backbone, patterns: Sequence[str] = ()) -> list[str]:
     """The full names of the linear layers of the blocks that match a pattern; without patterns, of all of them. In a
-    pattern, * and ? are wildcards as in a shell: "*.attn.*" selects the layers of the attention. Raises ModelError if a
-    pattern matches no layer."""
+    pattern, * and ? are wildcards as in a shell: "*.attn.*" selects the layers of the attention."""
     names = backbone.lora_targets()
     selected = {pattern: fnmatch.filter(names, pattern) for pattern in patterns or "*"}
     for pattern, found in selected.items():
@@ -110,8 +109,7 @@ def add_lora(
     backbone: Backbone, *, rank: int = 16, alpha: int = 16, seed: int = 0, target_modules: Sequence[str] = ()
 ) -> list[nn.Parameter]:
     """Adds a LoRA to the linear layers of the blocks; for `target_modules` see `select_target_modules`. Its B matrices
-    are zero, so predictions do not change yet. Returns the parameters to train. Raises ModelError if a target matches
-    no layer; MissingExtra if peft is not installed."""
+    are zero, so predictions do not change yet. Returns the parameters to train."""
     names = select_target_modules(backbone, target_modules)
     config = import_library("peft").LoraConfig(r=rank, lora_alpha=alpha, target_modules=names)
     with torch.random.fork_rng(devices=[backbone.device] if backbone.device.type == "cuda" else []):
@@ -150,8 +148,7 @@ def lora_state_dict(backbone: Backbone) -> dict[str, Tensor]:
 
 
 def load_lora_state(backbone: Backbone, state: Mapping[str, Tensor]) -> None:
-    """Loads weights from `lora_state_dict` into a backbone with a LoRA of the same shapes. Raises ModelError if the weights are
-    those of another backbone or rank."""
+    """Loads weights from `lora_state_dict` into a backbone with a LoRA of the same shapes."""
     expected = lora_state_dict(backbone)
     if mismatched := sorted(expected.keys() ^ state.keys()):
         raise ModelError(
@@ -183,7 +180,7 @@ def save_lora(
 ) -> LoraMetadata:
     """Writes a folder with the LoRA, in a file that diffusers can load, and the prompt. The bytes are reproducible. By
     default `base_model` is the backbone's hub id. `target_modules` are those of `add_lora`. Returns the metadata that
-    is stored in the file. Raises OutputError if the folder cannot be written."""
+    is stored in the file."""
     config = backbone.transformer.peft_config[ADAPTER_NAME]
     source, rank, alpha = base_model or backbone.hub_id, config.r, config.lora_alpha
     metadata = LoraMetadata(
@@ -202,7 +199,7 @@ def write_lora(
     prompt: PromptEmbedding,
     metadata: LoraMetadata,
 ) -> None:
-    """Writes prompt and weights. `settings` are those that diffusers reads from the file. May raise OutputError."""
+    """Writes prompt and weights. `settings` are those that diffusers reads from the file."""
     tensors = {PREFIX + name: tensor for name, tensor in state.items()}
     prefixed = {PREFIX + name: value for name, value in settings.items()}
     prompt.save(folder / PROMPT_FILE)
@@ -211,14 +208,12 @@ def write_lora(
 
 
 def read_lora_metadata(folder: Path) -> LoraMetadata:
-    """The metadata of the LoRA in this folder. It names the backbone to load. Raises ModelError if the LoRA is missing or
-    damaged, or was not written by brewster."""
+    """The metadata of the LoRA in this folder. It names the backbone to load."""
     return read_lora(folder)[1]
 
 
 def read_prompt(folder: Path, metadata: LoraMetadata) -> PromptEmbedding:
-    """The prompt of the LoRA in this folder. Raises ModelError if the prompt is missing or damaged, or is not the one with
-    which the LoRA was trained."""
+    """The prompt of the LoRA in this folder."""
     prompt = load_prompt(folder / PROMPT_FILE, metadata.backbone)
     if prompt.sha256 != metadata.prompt_sha256:
         raise ModelError(
@@ -233,8 +228,7 @@ def load_lora(folder: Path, backbone: Backbone) -> tuple[LoraMetadata, PromptEmb
     """Adds the LoRA of a folder to its backbone for inference.
 
     The LoRA has the dtype in which the backbone computes, because a float32 LoRA would convert the activations of every
-    layer of a bf16 base twice. Returns the metadata of the LoRA, and its prompt. Raises ModelError if its weights do
-    not match the rank in its metadata or the backbone, a file is damaged, or the prompt does not belong to it.
+    layer of a bf16 base twice. Returns the metadata of the LoRA, and its prompt.
     """
     state, metadata = read_lora(folder)
     prompt = read_prompt(folder, metadata)
@@ -253,8 +247,7 @@ def _convert_for_inference(backbone: Backbone) -> None:
 
 
 def read_lora(folder: Path) -> tuple[dict[str, Tensor], LoraMetadata]:
-    """The weights of the LoRA in this folder, as `lora_state_dict` names them, and its metadata. Raises ModelError if the LoRA
-    is missing or damaged, or was not written by brewster."""
+    """The weights of the LoRA in this folder, as `lora_state_dict` names them, and its metadata."""
     tensors, entries = read_tensors(folder / LORA_FILE)
     if _METADATA_KEY not in entries:
         raise ModelError(

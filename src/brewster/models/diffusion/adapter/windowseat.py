@@ -48,8 +48,8 @@ class _Config(BaseModel):
 
 
 def read_metadata(folder: Path) -> LoraMetadata:
-    """The base, rank, task and prompt digest of the model in this folder. The quantization is that of the published inference
-    code. Raises ModelError if a file is missing or damaged, or lacks a value."""
+    """The base, rank, task and prompt digest of the model in this folder. The quantization is that of the published
+    inference code."""
     try:
         index = _Index.model_validate(read_json(folder / INDEX_FILE))
         config = _Config.model_validate(read_json(folder / CONFIG_FILE))
