@@ -256,12 +256,11 @@ def test_a_prompt_is_encoded_by_the_text_encoders_of_the_folder(text_encoder_fol
 
 
 def test_missing_text_encoders_are_named(tiny_folders, text_encoder_folders, tmp_path):
-    cure = r"set prompt to an encoded prompt"
-    with pytest.raises(ModelError, match=f"has no text_encoder.*; .*{cure}"):
+    with pytest.raises(ModelError, match="has no text_encoder"):
         encode_prompt(str(tiny_folders / "kontext"))
     folder = shutil.copytree(text_encoder_folders / "klein", tmp_path / "klein")
     shutil.rmtree(folder / "tokenizer")
-    with pytest.raises(ModelError, match=f"klein has no tokenizer; .*{cure}"):
+    with pytest.raises(ModelError, match="klein has no tokenizer"):
         encode_prompt(str(folder))
 
 

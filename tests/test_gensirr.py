@@ -7,7 +7,6 @@ import pytest
 import torch
 from torch.nn import functional
 
-from brewster import Separator
 from brewster.errors import ModelError
 from brewster.inference.diffusion_predictor import DiffusionPredictor
 from brewster.models.diffusion.backbones.registry import tiny
@@ -91,12 +90,6 @@ def test_the_converted_model_predicts_as_the_published_call(model):
 def test_the_short_side_of_the_input_is_that_of_the_published_call(model, size, inputs):
     pipeline = load_pipeline(str(model))
     assert DiffusionPredictor(pipeline).input_sizes(size, "standard") == inputs
-
-
-@pytest.mark.parametrize("name", ["gensirr", "lime-j/GenSIRR"])
-def test_the_name_is_not_opened_without_a_conversion(name):
-    with pytest.raises(ModelError, match=r"hf download lime-j/GenSIRR"):
-        Separator.load(name)
 
 
 def test_the_command_of_the_documentation_converts_with_a_short_side(run_without_model, tmp_path):
