@@ -9,7 +9,7 @@ the real input.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from threading import Lock
 from typing import final
 
@@ -87,11 +87,14 @@ class DiffusionPredictor(Predictor):
         if self._no_guided_upsampling:
             everywhere = np.ones_like(generated_transmission[..., :1])
             override = GeneratedOverride(generated_transmission, everywhere)
-        confidence = confidence_from_spread(spread + reconstruction_error)
+        if self._reconstructs_input or (len(self._seeds) > 1 and self._pipeline.task.objective == "flow"):
+            confidence = confidence_from_spread(spread + reconstruction_error)
+        else:  # there is neither a reconstruction error nor a spread of several samples
+            confidence = np.zeros_like(spread[..., :1])
         return Prediction(
             change,
             reflection,
-            confidence if self._has_confidence else np.zeros_like(confidence),
+            confidence,
             override,
             mean_error,
             reflection_is_derived="R" not in self._pipeline.task.layout.panels,
@@ -100,11 +103,6 @@ class DiffusionPredictor(Predictor):
     @property
     def _reconstructs_input(self) -> bool:
         return bool({"I", "R"} & set(self._pipeline.task.layout.panels))
-
-    @property
-    def _has_confidence(self) -> bool:
-        """Whether a confidence can be computed, from the reconstruction error or from the spread of several samples."""
-        return self._reconstructs_input or (len(self._seeds) > 1 and self._pipeline.task.objective == "flow")
 
     def _predict_tile(
         self, tile: Floats, steps: int, on_step: Callable[[int, int], None]
@@ -125,42 +123,31 @@ class DiffusionPredictor(Predictor):
         panels = self._pipeline(
             panel_fit.pad(panel_input), steps=steps, seeds=self._seeds, on_progress=on_step
         )
-        _check_finite(panels)
-        linear_panels = {name: _to_linear_light(panel_fit.crop(panel)) for name, panel in panels.items()}
+        linear_panels: dict[str, NDArray[np.float32]] = {}
+        for name, panel in panels.items():
+            if not panel.isfinite().all():
+                raise ModelError(
+                    f"panel {name} of the model contains NaN or infinity",
+                    "expected finite values",
+                    "choose another value of quantization, or train the LoRA again: its weights may be damaged",
+                )
+            encoded = ((panel_fit.crop(panel) + 1) / 2).clamp(0, 1)
+            linear_panels[name] = to_linear(encoded.permute(0, 2, 3, 1).numpy())
         photo = linear_panels.get("I", tile)
         change = linear_panels["T"] - photo
         reflection = linear_panels.get("R", np.maximum(-change, 0))
-        reconstruction_encoded = to_encoded(_reconstruction(linear_panels, tile))
+        reconstruction = tile[None]  # if the model generates neither I nor R
+        if "I" in linear_panels:
+            reconstruction = linear_panels["I"]
+        elif "R" in linear_panels:
+            reconstruction = np.minimum(linear_panels["T"] + linear_panels["R"], 1)
         return (
             change.mean(axis=0),
             reflection.mean(axis=0),
             linear_panels["T"].mean(axis=0),
             np.ptp(to_encoded(linear_panels["T"]), axis=0),
-            np.abs(reconstruction_encoded - to_encoded(tile)).mean(axis=0),
+            np.abs(to_encoded(reconstruction) - to_encoded(tile)).mean(axis=0),
         )
-
-
-def _reconstruction(linear_panels: Mapping[str, Floats], tile: Floats) -> Floats:
-    """Returns the generated input: panel I, or T + R. If the model generates neither I nor R, returns the tile itself."""
-    if "I" in linear_panels:
-        return linear_panels["I"]
-    return np.minimum(linear_panels["T"] + linear_panels["R"], 1) if "R" in linear_panels else tile[None]
-
-
-def _check_finite(panels: Mapping[str, torch.Tensor]) -> None:
-    for name, panel in panels.items():
-        if not panel.isfinite().all():
-            raise ModelError(
-                f"panel {name} of the model contains NaN or infinity",
-                "expected finite values",
-                "choose another value of quantization, or train the LoRA again: its weights may be damaged",
-            )
-
-
-def _to_linear_light(panels: torch.Tensor) -> NDArray[np.float32]:
-    """Converts panels (n, 3, h, w) in [-1, 1] to linear light (n, h, w, 3)."""
-    light: NDArray[np.float32] = to_linear(((panels + 1) / 2).clamp(0, 1).permute(0, 2, 3, 1).numpy())
-    return light
 
 
 def _resize(image: Floats, size: tuple[int, ...], mode: str) -> Floats:

@@ -158,11 +158,9 @@ def _read_files(folder: Path) -> tuple[dict[str, bytes], Any]:
 def _check_front_matter(folder: Path, card: bytes, *, is_tiny: bool) -> None:
     """Checks the front matter of the model card: the hub reads licence, base and library from it."""
     required = {"license", "library_name"} | (set() if is_tiny else {"base_model"})
-    fields: dict[str, Any] = {}
-    problem = ""
+    fields, problem = {}, ""
     try:
-        text = card.decode()
-        if text.startswith("---"):
+        if (text := card.decode()).startswith("---"):
             fields = import_library("huggingface_hub").ModelCard(text).data.to_dict()
     except (ValueError, TypeError, import_library("yaml").YAMLError) as error:
         problem = f"is not YAML: {error}"
@@ -209,10 +207,8 @@ def _translate_push_errors(repo_id: str) -> Iterator[None]:
         with translate_hub_errors(repo_id, "write"):
             yield
     except json.JSONDecodeError as error:
-        happened, cure = (
-            f"the server's response is not JSON ({error})",
-            "check HF_ENDPOINT and your proxy settings",
-        )
+        happened = f"the server's response is not JSON ({error})"
+        cure = "check HF_ENDPOINT and your proxy settings"
         raise DownloadError(happened, "expected a Hugging Face hub", cure) from error
     except ValueError as error:  # huggingface_hub raises it if the hub rejects the front matter
         happened = f"the hub refused {CARD_FILE}: {error}"
