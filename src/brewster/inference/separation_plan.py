@@ -108,7 +108,7 @@ def plan_separation(options: Options, size: tuple[int, int], card: GraphicsCard)
     memory = {
         "weights": placement.resident_gib(weights),
         "VAE": 2 * cost.vae_parameters / GIB,
-        "activations": max(cost.block_bytes(max(tokens)), pixels * DECODING_BYTES_PER_PIXEL) / GIB,
+        "activations": max(cost.activation_bytes(max(tokens)), pixels * DECODING_BYTES_PER_PIXEL) / GIB,
         "CUDA": _CONTEXT_GIB,
     }
     # The text encoders are released before the transformer is loaded.
