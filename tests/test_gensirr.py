@@ -13,7 +13,7 @@ from brewster.models.diffusion.backbones.registry import tiny
 from brewster.models.diffusion.gensirr import convert
 from brewster.models.diffusion.model_source import find_model_source
 from brewster.models.diffusion.pipeline import load_pipeline
-from brewster.models.diffusion.task import TASK_FILE
+from brewster.models.diffusion.task import TASK_FILE, load_task
 
 SIDE = 64
 
@@ -132,11 +132,6 @@ def test_a_checkpoint_cannot_run_code(tmp_path):
 
 def test_a_damaged_task_is_an_error(model, tmp_path):
     values = json.loads((model / TASK_FILE).read_text())
-    copy = tmp_path / "copy"
-    copy.mkdir()
-    for path in model.iterdir():
-        (copy / path.name).symlink_to(path)
-    (copy / TASK_FILE).unlink()
-    (copy / TASK_FILE).write_text(json.dumps(values | {"steps": 0}))
+    (tmp_path / TASK_FILE).write_text(json.dumps(values | {"steps": 0}))
     with pytest.raises(ModelError, match="expected the task of a model"):
-        load_pipeline(str(copy))
+        load_task(tmp_path / TASK_FILE)

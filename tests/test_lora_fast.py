@@ -7,11 +7,7 @@ from safetensors.torch import save_file
 from brewster import Separator
 from brewster.errors import ModelError
 from brewster.models.diffusion.adapter.export import merge
-from brewster.models.diffusion.adapter.lora import (
-    attach_layers,
-    lora_state_dict,
-    save_lora,
-)
+from brewster.models.diffusion.adapter.lora import attach_layers, lora_state_dict, save_lora
 from brewster.models.diffusion.backbones.qwen import Qwen
 from brewster.models.diffusion.backbones.registry import BACKBONES, tiny
 from brewster.models.diffusion.panels import PanelLayout

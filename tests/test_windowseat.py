@@ -13,9 +13,11 @@ from safetensors.torch import load_file, save_file
 
 from brewster import Photo, Separator
 from brewster.errors import ModelError
+from brewster.inference.diffusion_work import DiffusionWork
 from brewster.models.diffusion.adapter.windowseat import CONFIG_FILE, INDEX_FILE, PROMPT_FILE, WEIGHTS_FILE
 from brewster.models.diffusion.backbones.loading import load_backbone
 from brewster.models.diffusion.pipeline import fingerprint, load_pipeline
+from brewster.models.diffusion.task import windowseat_task
 from brewster.models.diffusion_models import DIFFUSION_MODELS
 from brewster.srgb import to_encoded, to_linear
 from published_models import SIDE, hub_snapshot, write_qwen_edit_plus, write_windowseat
@@ -116,22 +118,8 @@ def test_a_square_photo_separates_as_published_with_a_derived_reflection(model, 
     ("size", "tiles"),
     [((SIDE, SIDE), 1), ((2 * SIDE, SIDE), 3), ((5 * SIDE, SIDE), 6), ((40, 30), 2), ((256, 192), 2)],
 )
-def test_photos_of_any_shape_are_divided_into_squares_of_the_published_side(model, size, tiles):
-    pipeline = load_pipeline(str(model))
-    separator, shapes = Separator.load(str(model)), []
-    call = type(pipeline).__call__
-
-    def record(self, photo, **options):
-        shapes.append(tuple(photo.shape[-2:]))
-        return call(self, photo, **options)
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(type(pipeline), "__call__", record)
-        separation = separator(
-            Photo.from_array(np.full((size[1], size[0], 3), 90, np.uint8), encoding="srgb")
-        )
-    assert separation.transmission.size == size
-    assert shapes == [(SIDE, SIDE)] * tiles
+def test_photos_of_any_shape_are_divided_into_squares_of_the_published_side(size, tiles):
+    assert DiffusionWork(windowseat_task(SIDE)).panel_sizes(size) == [(SIDE, SIDE)] * tiles
 
 
 def test_the_name_is_opened_from_the_hub_and_only_its_subfolders_are_fetched(
