@@ -93,6 +93,7 @@ class Separator:
             DeviceError: the device is not available, or the model does not fit into its memory.
             DownloadError: a diffusion model cannot be downloaded, for example because access was not granted.
             MissingExtra: a diffusion model needs the extra `diffusion`.
+            BrewsterError: the value of an option of a diffusion model is invalid.
             TypeError: there is no such option.
         """
         if unknown := options.keys() - LoadOptions.__annotations__.keys():
