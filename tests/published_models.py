@@ -26,6 +26,15 @@ def random_pair(module, rank, generator):
     return down, 0.3 * torch.randn(module.out_features, rank, generator=generator)
 
 
+def random_lora(backbone, rank):
+    """Random matrices for all linear layers of the blocks, as `read_lora_layers` returns them."""
+    layers, generator, state = linear_layers(backbone.transformer), torch.Generator().manual_seed(5), {}
+    for name in backbone.lora_targets():
+        pair = random_pair(layers[name], rank, generator)
+        state |= {f"{name}.lora_A.weight": pair[0], f"{name}.lora_B.weight": pair[1]}
+    return state
+
+
 def velocity(backbone, prompt):
     """The prediction for fixed random latents, without guidance."""
     generator = torch.Generator().manual_seed(0)
@@ -48,9 +57,19 @@ def write_json(path, value):
     path.write_text(json.dumps(value))
 
 
+def hub_snapshot(cache, hub_id, monkeypatch):
+    """The folder for a model in a cache of the hub, which becomes the cache of this process; there is no network."""
+    repository = cache / f"models--{hub_id.replace('/', '--')}"
+    (repository / "refs").mkdir(parents=True)
+    (repository / "refs" / "main").write_text("1" * 40)
+    monkeypatch.setattr(huggingface_hub.constants, "HF_HUB_OFFLINE", True)
+    monkeypatch.setattr(huggingface_hub.constants, "HF_HUB_CACHE", str(cache))
+    return repository / "snapshots" / ("1" * 40)
+
+
 def write_klein_9b(folder, monkeypatch):
-    """Writes a cache of the hub with the configuration of FLUX.2-klein-9B, and makes it the cache of this process."""
-    snapshot = folder / f"models--{KLEIN_9B.replace('/', '--')}" / "snapshots" / ("1" * 40)
+    """Writes the configuration of FLUX.2-klein-9B into the cache of the hub."""
+    snapshot = hub_snapshot(folder, KLEIN_9B, monkeypatch)
     transformer = {
         "guidance_embeds": False, "num_layers": 8, "num_single_layers": 24, "num_attention_heads": 32,
         "joint_attention_dim": 12288,
@@ -59,10 +78,6 @@ def write_klein_9b(folder, monkeypatch):
     write_json(snapshot / "transformer" / "config.json", transformer)
     write_json(snapshot / "vae" / "config.json", {})
     write_json(snapshot / "scheduler" / "scheduler_config.json", {})
-    (snapshot.parents[1] / "refs").mkdir()
-    (snapshot.parents[1] / "refs" / "main").write_text(snapshot.name)
-    monkeypatch.setattr(huggingface_hub.constants, "HF_HUB_OFFLINE", True)
-    monkeypatch.setattr(huggingface_hub.constants, "HF_HUB_CACHE", str(folder))
 
 
 def write_qwen_edit_plus(folder):

@@ -187,11 +187,9 @@ def test_nf4_needs_an_nvidia_gpu():
         load_backbone("kontext", quantization="nf4")
 
 
-def test_unknown_names_get_suggestions():
+def test_an_unknown_name_gets_a_suggestion():
     with pytest.raises(ModelError, match="did you mean kontext"):
         tiny("kontxt")
-    with pytest.raises(ModelError, match="there is no quantization 'int2'"):
-        load_backbone("kontext", quantization="int2")
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="this machine has a GPU")
@@ -258,12 +256,11 @@ def test_a_prompt_is_encoded_by_the_text_encoders_of_the_folder(text_encoder_fol
 
 
 def test_missing_text_encoders_are_named(tiny_folders, text_encoder_folders, tmp_path):
-    cure = r"set prompt to an encoded prompt"
-    with pytest.raises(ModelError, match=f"has no text_encoder.*; .*{cure}"):
+    with pytest.raises(ModelError, match="has no text_encoder"):
         encode_prompt(str(tiny_folders / "kontext"))
     folder = shutil.copytree(text_encoder_folders / "klein", tmp_path / "klein")
     shutil.rmtree(folder / "tokenizer")
-    with pytest.raises(ModelError, match=f"klein has no tokenizer; .*{cure}"):
+    with pytest.raises(ModelError, match="klein has no tokenizer"):
         encode_prompt(str(folder))
 
 

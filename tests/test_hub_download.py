@@ -7,93 +7,95 @@ import huggingface_hub
 import pytest
 
 from brewster.errors import DownloadError, ModelError
+from brewster.models.diffusion.adapter.importer import find_lora_file
 from brewster.models.diffusion.hub_download import find_weights_file, resolve_model_folder
 
 
 @pytest.fixture
 def hub(monkeypatch, tmp_path):
-    """huggingface_hub with a cache in a temporary folder, which has to download two of three files."""
-    calls = []
-    files = [
-        SimpleNamespace(file_size=size, will_download=missing)
-        for size, missing in ((40_000_000_000, True), (250_000_000, True), (7_000_000_000, False))
-    ]
+    """huggingface_hub, whose repositories have the content of `folder`. `errors` are those of a dry run and of a download."""
+    hub = SimpleNamespace(folder=tmp_path / "repository", calls=[], planned=[], errors={})
+    hub.folder.mkdir()
 
     def snapshot_download(source, *, allow_patterns, dry_run=False):
-        calls.append("dry run" if dry_run else "download")
-        return files if dry_run else str(tmp_path)
+        kind = "dry run" if dry_run else "download"
+        hub.calls.append((kind, source, *allow_patterns))
+        if kind in hub.errors:
+            raise hub.errors[kind]
+        return hub.planned if dry_run else str(hub.folder)
 
     monkeypatch.setattr(huggingface_hub, "snapshot_download", snapshot_download)
     monkeypatch.setattr(huggingface_hub.constants, "HF_HUB_CACHE", str(tmp_path / "not" / "yet"))
-    return SimpleNamespace(calls=calls, files=files, free=lambda free: monkeypatch.setattr(
-        shutil, "disk_usage", lambda _: SimpleNamespace(free=free)
-    ))  # fmt: skip
+    return hub
 
 
-def test_size_and_licence_are_printed_before_the_download(hub, capsys):
-    hub.free(50_000_000_000)
+def set_download(hub, monkeypatch, *, free):
+    """Two of three files must be downloaded, and the disk has `free` bytes."""
+    sizes = ((40_000_000_000, True), (250_000_000, True), (7_000_000_000, False))
+    hub.planned = [SimpleNamespace(file_size=size, will_download=missing) for size, missing in sizes]
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(free=free))
+
+
+def test_size_and_licence_are_printed_before_the_download(hub, monkeypatch, capsys):
+    set_download(hub, monkeypatch, free=50_000_000_000)
     resolve_model_folder("Qwen/Qwen-Image-Edit-2509", ["*"])
-    assert hub.calls == ["dry run", "download"]
+    assert [call[0] for call in hub.calls] == ["dry run", "download"]
     printed = capsys.readouterr()
     assert printed.out == ""
     assert "downloading 40.2 GB of Qwen/Qwen-Image-Edit-2509" in printed.err
     assert "licence: Apache-2.0" in printed.err
 
 
-def test_a_download_that_does_not_fit_on_the_disk_is_refused(hub):
-    hub.free(41_000_000_000)
+def test_a_download_that_does_not_fit_on_the_disk_is_refused(hub, monkeypatch):
+    set_download(hub, monkeypatch, free=41_000_000_000)
     with pytest.raises(DownloadError, match=r"has 40\.2 GB to download, and 41\.0 GB are free in .*HF_HOME"):
         resolve_model_folder("Qwen/Qwen-Image-Edit-2509", ["*"])
-    assert hub.calls == ["dry run"]
+    assert [call[0] for call in hub.calls] == ["dry run"]
 
 
-def test_the_hub_that_cannot_be_asked_does_not_prevent_the_use_of_the_cache(monkeypatch, tmp_path):
-    def snapshot_download(source, *, allow_patterns, dry_run=False):
-        if dry_run:
-            raise huggingface_hub.errors.DryRunError("no network")
-        return str(tmp_path)
-
-    monkeypatch.setattr(huggingface_hub, "snapshot_download", snapshot_download)
-    assert resolve_model_folder("someone/model", ["*"]) == tmp_path
+def test_the_hub_that_cannot_be_asked_does_not_prevent_the_use_of_the_cache(hub):
+    hub.errors["dry run"] = huggingface_hub.errors.DryRunError("no network")
+    assert resolve_model_folder("someone/model", ["*"]) == hub.folder
 
 
-def test_a_connection_that_fails_during_the_download_is_an_error(monkeypatch):
-    def snapshot_download(source, *, allow_patterns, dry_run=False):
-        raise huggingface_hub.errors.HTTPError("the server closed the connection")
-
-    monkeypatch.setattr(huggingface_hub, "snapshot_download", snapshot_download)
+def test_a_connection_that_fails_during_the_download_is_an_error(hub):
+    hub.errors["download"] = huggingface_hub.errors.HTTPError("the server closed the connection")
     with pytest.raises(DownloadError, match=r"because the connection failed .*the server closed the connec"):
         resolve_model_folder("someone/model", ["*"])
 
 
-def test_a_file_that_does_not_exist_is_refused(tmp_path, monkeypatch):
+def test_a_file_that_does_not_exist_is_refused(hub, tmp_path):
     for path in ("missing.gguf", tmp_path / "missing.gguf", tmp_path / "no" / "folder" / "missing.gguf"):
         with pytest.raises(ModelError, match=r"there is no file .*missing\.gguf; expected one \.gguf file"):
             find_weights_file(str(path), (".gguf",))
-
-    def snapshot_download(source, *, allow_patterns, dry_run=False):
-        return [] if dry_run else str(tmp_path)
-
-    monkeypatch.setattr(huggingface_hub, "snapshot_download", snapshot_download)
     with pytest.raises(ModelError, match=r"someone/model contains no file missing\.gguf"):
         find_weights_file("someone/model/missing.gguf", (".gguf",))
     (tmp_path / "missing.gguf").write_bytes(b"")
     assert find_weights_file(str(tmp_path / "missing.gguf"), (".gguf",)).is_file()
 
 
-def test_a_file_in_a_subfolder_of_a_repository_is_found_with_its_companion(tmp_path, monkeypatch):
+def test_a_file_in_a_subfolder_of_a_repository_is_found_with_its_companion(hub):
     """Published few-step LoRAs are in subfolders, such as that of Qwen-Image-Edit-2509."""
-    requests = []
+    file = hub.folder / "steps" / "4" / "lora.safetensors"
+    file.parent.mkdir(parents=True)
+    file.touch()
+    source = "someone/fast/steps/4/lora.safetensors"
+    assert find_weights_file(source, (".safetensors",), ["adapter_config.json"]) == file
+    requested = ("someone/fast", "steps/4/lora.safetensors", "steps/4/adapter_config.json")
+    assert {call[1:] for call in hub.calls} == {requested}
 
-    def snapshot_download(source, *, allow_patterns, dry_run=False):
-        requests.append((source, *allow_patterns))
-        return [] if dry_run else str(tmp_path)
 
-    monkeypatch.setattr(huggingface_hub, "snapshot_download", snapshot_download)
-    (tmp_path / "steps" / "4").mkdir(parents=True)
-    (tmp_path / "steps" / "4" / "lora.safetensors").touch()
-    found = find_weights_file(
-        "someone/fast/steps/4/lora.safetensors", (".safetensors",), ["adapter_config.json"]
-    )
-    assert found == tmp_path / "steps" / "4" / "lora.safetensors"
-    assert set(requests) == {("someone/fast", "steps/4/lora.safetensors", "steps/4/adapter_config.json")}
+def test_only_the_file_in_the_root_of_a_repository_is_downloaded(hub, monkeypatch):
+    files = [
+        "README.md",
+        "lora.safetensors",
+        "transformer/diffusion_pytorch_model-00001-of-00041.safetensors",
+    ]
+    monkeypatch.setattr(huggingface_hub.HfApi, "list_repo_files", lambda self, source: files)
+    (hub.folder / "lora.safetensors").touch()
+    for source in ("someone/glass", "someone/glass/lora.safetensors"):
+        assert find_lora_file(source) == hub.folder / "lora.safetensors"
+    assert {call[1:] for call in hub.calls} == {("someone/glass", "lora.safetensors", "adapter_config.json")}
+    files.append("other.safetensors")
+    with pytest.raises(ModelError, match=r"contains lora\.safetensors, other\.safetensors;"):
+        find_lora_file("someone/glass")

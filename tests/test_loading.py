@@ -11,12 +11,11 @@ from safetensors.torch import save_file
 from brewster.errors import ModelError
 from brewster.models.diffusion.adapter.export import merge
 from brewster.models.diffusion.adapter.lora import attach_layers
-from brewster.models.diffusion.adapter.lora_formats import LowRankLayer, to_state_dict
 from brewster.models.diffusion.backbones.loading import load_backbone
 from brewster.models.diffusion.backbones.registry import BACKBONES, tiny
 from brewster.models.diffusion.pipeline import load_pipeline
 from brewster.models.diffusion.prompt import PROMPT_FILE
-from published_models import linear_layers, random_pair, velocity
+from published_models import random_lora, velocity
 
 Q8 = gguf.GGMLQuantizationType.Q8_0
 
@@ -61,12 +60,9 @@ def test_a_gguf_file_and_a_lora_predict_as_its_dequantized_weights(name, bases, 
     assert type(weight) is not torch.nn.Parameter
     torch.testing.assert_close(velocity(found, prompt), velocity(expected, prompt), atol=1e-5, rtol=0)
     assert 0 < (velocity(found, prompt) - original).std() < 0.05 * original.std()
-    layers, generator = linear_layers(expected.transformer), torch.Generator().manual_seed(5)
-    lora = {
-        target: LowRankLayer(*random_pair(layers[target], 2, generator)) for target in expected.lora_targets()
-    }
+    lora = random_lora(expected, 2)
     attach_layers(found, lora)
-    merge(expected, to_state_dict(lora), 1.0)
+    merge(expected, lora, 1.0)
     torch.testing.assert_close(velocity(found, prompt), velocity(expected, prompt), atol=1e-4, rtol=0)
 
 

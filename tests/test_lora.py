@@ -197,34 +197,10 @@ def test_another_or_a_smaller_backbone_is_refused(saved):
         load_lora(saved, fresh)
 
 
-NEWER = LoraMetadata("kontext", "x", None, 4, 4, DecompositionTask(), "abc").to_json()
-
-
-@pytest.mark.parametrize(
-    ("entries", "message"),
-    [
-        ({}, "was not written by brewster"),
-        (
-            {"brewster": NEWER.replace("{", '{"colour": 1, ', 1)},
-            r"has the unknown key colour; .*; update brewster",
-        ),
-        ({"brewster": '{"rank": 4}'}, "the metadata of the LoRA cannot be read"),
-    ],
-)
-def test_other_metadata_are_refused(saved, entries, message):
-    write_tensors(saved / LORA_FILE, read_tensors(saved / LORA_FILE)[0], entries)
-    with pytest.raises(ModelError, match=message):
+def test_a_file_without_metadata_of_brewster_is_refused(saved):
+    write_tensors(saved / LORA_FILE, read_tensors(saved / LORA_FILE)[0], {})
+    with pytest.raises(ModelError, match="was not written by brewster"):
         read_lora_metadata(saved)
-
-
-def test_a_truncated_or_missing_file_is_refused(saved):
-    path = saved / LORA_FILE
-    path.write_bytes(path.read_bytes()[:1000])
-    with pytest.raises(ModelError, match="cannot be read"):
-        load_lora(saved, tiny("kontext")[0])
-    path.unlink()
-    with pytest.raises(ModelError, match="is missing"):
-        load_lora(saved, tiny("kontext")[0])
 
 
 @pytest.mark.parametrize("alpha", [4, 16])

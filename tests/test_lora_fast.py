@@ -7,35 +7,31 @@ from safetensors.torch import save_file
 from brewster import Separator
 from brewster.errors import ModelError
 from brewster.models.diffusion.adapter.export import merge
-from brewster.models.diffusion.adapter.lora import (
-    attach_layers,
-    lora_state_dict,
-    save_lora,
-)
-from brewster.models.diffusion.adapter.lora_formats import LowRankLayer, to_state_dict
+from brewster.models.diffusion.adapter.lora import attach_layers, lora_state_dict, save_lora
 from brewster.models.diffusion.backbones.qwen import Qwen
 from brewster.models.diffusion.backbones.registry import BACKBONES, tiny
 from brewster.models.diffusion.panels import PanelLayout
 from brewster.models.diffusion.pipeline import load_pipeline
 from brewster.models.diffusion.task import DecompositionTask
-from published_models import linear_layers, random_pair, velocity, with_random_lora
+from published_models import random_lora, velocity, with_random_lora
 
 
 def few_step_layers(name):
     """Random matrices of rank 3 for all linear layers of the blocks: more than those of `with_random_lora`."""
     backbone, _ = tiny(name)
-    layers, generator = linear_layers(backbone.transformer), torch.Generator().manual_seed(5)
-    return {
-        target: LowRankLayer(*random_pair(layers[target], 3, generator)) for target in backbone.lora_targets()
-    }
+    return random_lora(backbone, 3)
+
+
+def write_few_step_lora(name, path):
+    """Writes a LoRA file with the keys of diffusers."""
+    save_file({f"transformer.{key}": value for key, value in few_step_layers(name).items()}, path)
+    return path
 
 
 @pytest.fixture
 def fast_file(tmp_path):
-    """A LoRA file of a tiny klein with the keys of diffusers."""
-    tensors = {f"transformer.{key}": value for key, value in to_state_dict(few_step_layers("klein")).items()}
-    save_file(tensors, tmp_path / "lightning-4steps.safetensors")
-    return tmp_path / "lightning-4steps.safetensors"
+    """A LoRA file of a tiny klein."""
+    return write_few_step_lora("klein", tmp_path / "lightning-4steps.safetensors")
 
 
 @pytest.mark.parametrize("name", list(BACKBONES))
@@ -44,7 +40,7 @@ def test_a_stacked_lora_is_the_sum_of_both_changes(name):
     state, layers = lora_state_dict(stacked), few_step_layers(name)
     merged, _ = tiny(name)
     merge(merged, state, 4 / 2)
-    merge(merged, to_state_dict(layers), 1.0)
+    merge(merged, layers, 1.0)
     alone = velocity(stacked, prompt)
     attach_layers(stacked, layers, adapter="few_step")
     torch.testing.assert_close(velocity(stacked, prompt), velocity(merged, prompt), atol=1e-5, rtol=0)
@@ -72,19 +68,15 @@ def test_a_lora_for_few_steps_is_an_option_with_its_steps_and_guidance(fast_file
 
 
 def test_a_guidance_that_is_an_input_of_the_transformer_stays(fast_file, tmp_path):
-    tensors = {
-        f"transformer.{key}": value for key, value in to_state_dict(few_step_layers("kontext")).items()
-    }
-    save_file(tensors, tmp_path / "turbo.safetensors")
-    pipeline = load_pipeline("tiny:kontext", fast_lora=str(tmp_path / "turbo.safetensors"))
+    turbo = write_few_step_lora("kontext", tmp_path / "turbo.safetensors")
+    pipeline = load_pipeline("tiny:kontext", fast_lora=str(turbo))
     assert pipeline.task.guidance == 4
     with pytest.raises(ModelError, match="in the style of diffusers, belongs to no layer of kontext"):
         load_pipeline("tiny:kontext", fast_lora=str(fast_file))
 
 
 def test_a_few_step_lora_for_qwen_is_sampled_at_the_times_of_its_training(tmp_path, monkeypatch):
-    tensors = {f"transformer.{key}": value for key, value in to_state_dict(few_step_layers("qwen")).items()}
-    save_file(tensors, tmp_path / "lightning.safetensors")
+    fast_lora = str(write_few_step_lora("qwen", tmp_path / "lightning.safetensors"))
     predict, sigmas = Qwen.predict, []
 
     def record(self, latents, condition, sigma, *arguments):
@@ -93,8 +85,8 @@ def test_a_few_step_lora_for_qwen_is_sampled_at_the_times_of_its_training(tmp_pa
 
     monkeypatch.setattr(Qwen, "predict", record)
     plain = load_pipeline("tiny:qwen")
-    fast = load_pipeline("tiny:qwen", fast_lora=str(tmp_path / "lightning.safetensors"))
-    other = load_pipeline("tiny:qwen", fast_lora=str(tmp_path / "lightning.safetensors"), timestep_shift=1.0)
+    fast = load_pipeline("tiny:qwen", fast_lora=fast_lora)
+    other = load_pipeline("tiny:qwen", fast_lora=fast_lora, timestep_shift=1.0)
     fast(torch.zeros(1, 3, 32, 48), steps=4)
     assert sigmas == [1, 0.9, 0.75, 0.5]
     shifts = [pipeline.task.timestep_shift for pipeline in (plain, fast, other)]

@@ -2,17 +2,15 @@
 
 import json
 
-import huggingface_hub
 import pytest
 import torch
 from safetensors.torch import save_file
 
 from brewster import Separator
 from brewster.errors import ModelError, RecipeError
-from brewster.models.diffusion.adapter import importer
 from brewster.models.diffusion.adapter.importer import import_lora, read_layers
 from brewster.models.diffusion.adapter.lora import LORA_FILE, load_lora, read_lora_metadata
-from brewster.models.diffusion.adapter.lora_formats import LowRankLayer, read_lora_layers, scaling_from_config
+from brewster.models.diffusion.adapter.lora_formats import read_lora_layers, scaling_from_config
 from brewster.models.diffusion.backbones.registry import tiny
 from brewster.models.diffusion.pipeline import load_pipeline
 from brewster.models.diffusion.tensors import read_tensors
@@ -224,9 +222,9 @@ def test_a_lora_of_peft_without_its_settings_needs_its_alpha(prefix, tmp_path):
     with pytest.raises(ModelError, match=r"no alpha for .*to_q; expected adapter_config\.json"):
         read_layers(path, backbone)
     expected = 8 / len(pair[0]) * pair[1].bfloat16().float()
-    torch.testing.assert_close(read_layers(path, backbone, alpha=8)[name].up, expected)
+    torch.testing.assert_close(read_layers(path, backbone, alpha=8)[f"{name}.lora_B.weight"], expected)
     (tmp_path / "adapter_config.json").write_text(json.dumps({"lora_alpha": 8}))
-    torch.testing.assert_close(read_layers(path, backbone)[name].up, expected)
+    torch.testing.assert_close(read_layers(path, backbone)[f"{name}.lora_B.weight"], expected)
     with pytest.raises(ModelError, match=r"alpha = 4 was given for .*, which has its own alpha"):
         read_layers(path, backbone, alpha=4)
     path = tmp_path / "kohya" / "lora.safetensors"
@@ -240,7 +238,6 @@ def test_rank_stabilised_loras_have_their_own_scale():
     assert scaling_from_config({"lora_alpha": 8, "use_rslora": True})("x", 4) == 4
     assert scaling_from_config({"lora_alpha": 8})("x", 4) == 2
     assert scaling_from_config({})("x", 4) == 1
-    assert LowRankLayer(torch.zeros(3, 2), torch.zeros(5, 3)).rank == 3
 
 
 @pytest.mark.parametrize(
@@ -306,37 +303,9 @@ def test_a_folder_must_contain_one_file_and_panels_need_t(tmp_path):
         import_lora(str(tmp_path), tmp_path / "out", base_model="tiny:qwen", prompt="x", panels=("R",))
 
 
-def test_only_the_file_in_the_root_of_a_repository_is_downloaded(tmp_path, monkeypatch):
-    save_file(STYLES["diffusers"]("qwen"), tmp_path / "lora.safetensors")
-    requests = []
-
-    def snapshot_download(source, *, allow_patterns, dry_run=False):
-        requests.append((source, allow_patterns))
-        return [] if dry_run else str(tmp_path)
-
-    files = [
-        "README.md",
-        "lora.safetensors",
-        "transformer/diffusion_pytorch_model-00001-of-00041.safetensors",
-    ]
-    monkeypatch.setattr(huggingface_hub, "snapshot_download", snapshot_download)
-    monkeypatch.setattr(huggingface_hub.HfApi, "list_repo_files", lambda self, source: files)
-    assert importer.find_lora_file("someone/glass") == tmp_path / "lora.safetensors"
-    assert importer.find_lora_file("someone/glass/lora.safetensors") == tmp_path / "lora.safetensors"
-    assert {tuple(patterns) for _, patterns in requests} == {("lora.safetensors", "adapter_config.json")}
-    assert {source for source, _ in requests} == {"someone/glass"}
-    files.append("other.safetensors")
-    with pytest.raises(ModelError, match=r"contains lora\.safetensors, other\.safetensors;"):
-        importer.find_lora_file("someone/glass")
-    with pytest.raises(ModelError, match=r"there is no file absent\.safetensors"):
-        importer.find_lora_file("absent.safetensors")
-
-
 def test_a_lora_and_a_checkpoint_are_imported(run_without_model, tmp_path):
-    matrices = {"A": torch.ones(2, 32), "B": torch.ones(32, 2)}
-    tensors = {
-        f"transformer.transformer_blocks.0.attn.to_q.lora_{part}.weight": m for part, m in matrices.items()
-    }
+    matrices = torch.ones(2, 32), torch.ones(32, 2)
+    tensors = peft({f"{BLOCK}attn.to_q": matrices}, "transformer.")
     save_file(tensors, tmp_path / "lora.safetensors")
     arguments = ("models", "import", "lora.safetensors", "imported", "--base-model", "tiny:kontext")
     code, _, err = run_without_model(*arguments)
@@ -345,10 +314,8 @@ def test_a_lora_and_a_checkpoint_are_imported(run_without_model, tmp_path):
         *arguments, "--prompt", "remove the reflection", "--panels", "T,R", "--alpha", "4"
     )
     assert (code, "use it with: --model imported" in err) == (0, True)
-    (up,) = (
-        value for key, value in read_tensors(tmp_path / "imported" / LORA_FILE)[0].items() if "lora_B" in key
-    )
-    assert torch.equal(up, 4 / 2 * matrices["B"])
+    written, _ = read_tensors(tmp_path / "imported" / LORA_FILE)
+    assert torch.equal(written[f"transformer.{BLOCK}attn.to_q.lora_B.weight"], 4 / 2 * matrices[1])
     assert read_lora_metadata(tmp_path / "imported").task.layout.panels == ("T", "R")
     (tmp_path / "model.pt").write_bytes(b"nothing")
     code, _, err = run_without_model("models", "import", "model.pt", "out")

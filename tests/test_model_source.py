@@ -59,6 +59,8 @@ def test_a_plan_requests_only_the_cache(tmp_path, monkeypatch):
         find_model_source("me/glass", allow_download=False)
     with pytest.raises(ModelError, match=r"expected the folder that `brewster models import` writes"):
         find_model_source("gensirr", allow_download=False)
+    with pytest.raises(ModelError, match="hf download lime-j/GenSIRR"):
+        find_model_source("lime-j/GenSIRR")
 
 
 def test_a_name_is_a_backbone_without_files():

@@ -32,21 +32,15 @@ def model_file(network, tmp_path_factory):
 
 
 @pytest.mark.parametrize("size", [(64, 96), (160, 32), (320, 448)])
-def test_the_exported_model_equals_the_network_at_any_size(network, model_file, size):
-    tile = np.random.default_rng(1).random((*size, 3), np.float32)
-    with torch.no_grad():
-        expected = LinearSeparator(network)(torch.from_numpy(tile).permute(2, 0, 1)[None])
-    for layer, expected_layer in zip(OnnxBackend(model_file, "cpu")(tile), expected, strict=True):
-        np.testing.assert_allclose(layer, expected_layer[0].permute(1, 2, 0).numpy(), atol=2e-4)
-
-
 @pytest.mark.parametrize("has_hints", [True, False])
-def test_an_exported_model_with_hints_equals_its_network(network, model_file, has_hints):
+def test_the_exported_model_equals_the_network_at_any_size_with_and_without_hints(
+    network, model_file, size, has_hints
+):
     rng = np.random.default_rng(3)
-    tile, hints = rng.random((64, 96, 3), np.float32), rng.random((64, 96, 2), np.float32)
-    hints_tensor = torch.from_numpy(hints * has_hints).permute(2, 0, 1)[None]
+    tile, hints = rng.random((*size, 3), np.float32), rng.random((*size, 2), np.float32)
+    tensors = [torch.from_numpy(image).permute(2, 0, 1)[None] for image in (tile, hints)]
     with torch.no_grad():
-        expected = LinearSeparator(network)(torch.from_numpy(tile).permute(2, 0, 1)[None], hints_tensor)
+        expected = LinearSeparator(network)(*tensors[: 1 + has_hints])
     layers = OnnxBackend(model_file, "cpu")(tile, hints if has_hints else None)
     for layer, expected_layer in zip(layers, expected, strict=True):
         np.testing.assert_allclose(layer, expected_layer[0].permute(1, 2, 0).numpy(), atol=5e-4)

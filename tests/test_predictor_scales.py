@@ -10,7 +10,6 @@ import pytest
 from brewster import Photo, Separator
 from brewster.inference import QUALITIES
 from brewster.inference.predictor import MultiScalePredictor, confidence_from_spread
-from brewster.srgb import to_linear
 
 EXPLANATION = Path(__file__).parents[1] / "docs" / "explanation.md"
 
@@ -75,22 +74,3 @@ def test_the_confidence_is_1_e_where_the_largest_spread_of_the_channels_is_0_05(
     spread = np.float32([[[0.05, 0, 0], [0, 0.1, 0.05], [0.05, 0.05, 0.05], [0, 0, 0]]])
     expected = [[[math.exp(-1)], [math.exp(-2)], [math.exp(-1)], [1]]]
     np.testing.assert_allclose(confidence_from_spread(spread), expected, rtol=1e-5)
-
-
-def test_a_spread_in_one_channel_lowers_the_confidence_as_much_as_in_all_channels():
-    def make_left_right_dependent_backend(channels):
-        def backend(tile):
-            transmission = tile.copy()
-            half = tile.shape[1] // 2
-            transmission[:, :half, channels] = to_linear(np.float32(0.45))
-            return transmission, np.zeros_like(tile)
-
-        return backend
-
-    grey = Photo.from_array(to_linear(np.full((64, 64, 3), 0.5, np.float32)), encoding="linear")
-    red, all_channels = (
-        Separator(make_left_right_dependent_backend(channels))(grey).confidence.pixels
-        for channels in (slice(0, 1), slice(0, 3))
-    )
-    assert all_channels.mean() == pytest.approx(255 / math.e, rel=0.1)
-    np.testing.assert_allclose(red, all_channels, atol=1)

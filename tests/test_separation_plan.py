@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from brewster import Photo
-from brewster.errors import DeviceError, ModelError
+from brewster.errors import DeviceError
 from brewster.inference.diffusion_predictor import DiffusionPredictor
 from brewster.inference.separation_plan import plan_separation
 from brewster.models.diffusion.adapter.lora import add_lora, save_lora
@@ -19,7 +19,7 @@ from brewster.models.diffusion.backbones.registry import tiny
 from brewster.models.diffusion.pipeline import load_pipeline
 from brewster.models.diffusion.task import DecompositionTask
 from brewster.models.diffusion_models import DIFFUSION_MODELS
-from brewster.models.diffusion_resources import CARDS, GraphicsCard, weights_gib
+from brewster.models.diffusion_resources import CARDS, weights_gib
 from brewster.options import Options
 
 CARD = CARDS["RTX 4090"]
@@ -141,8 +141,3 @@ def test_the_planned_passes_are_those_of_the_separation(name, quality, monkeypat
     with torch.no_grad():
         predictor(inputs, quality, lambda fraction: None)
     assert len(calls) == plan.passes
-
-
-def test_a_model_without_diffusion_has_no_plan():
-    with pytest.raises(ModelError, match="for the model compact; expected a diffusion model"):
-        plan_separation(Options(), (64, 64), GraphicsCard("toy", 1, 1))

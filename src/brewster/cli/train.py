@@ -175,11 +175,11 @@ def _print_data(recipe: LoraRecipe) -> None:
     if not os.environ.get("BREWSTER_DATA"):
         print_status("the data was not checked: BREWSTER_DATA is not set")
         return
-    from brewster.models.diffusion.backbones.registry import backbone_class_of  # noqa: PLC0415
+    from brewster.models.diffusion.backbones.registry import find_backbone  # noqa: PLC0415
     from brewster.training.lora.latents import open_samples  # noqa: PLC0415
 
     samples = open_samples(recipe)
-    fits = samples.check_sizes(recipe, backbone_class_of(recipe.backbone).size_divisor)
+    fits = samples.check_sizes(recipe, find_backbone(recipe.backbone)[0].size_divisor)
     sizes = sorted({fit.panel for fit in fits}, key=lambda size: size[0] * size[1])
     span = " to ".join(f"{width} x {height}" for width, height in dict.fromkeys((*sizes[:1], *sizes[-1:])))
     print_out(f"{'data':24}{samples.description()}{f'; panels of {span}' if span else ''}")

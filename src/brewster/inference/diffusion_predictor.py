@@ -8,8 +8,8 @@ the real input.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+import itertools
+from collections.abc import Callable, Sequence
 from threading import Lock
 from typing import final
 
@@ -38,9 +38,6 @@ class DiffusionPredictor(Predictor):
         steps: see `DiffusionWork`.
         ensemble_size: the number of samples with different seeds whose mean is the prediction; the mean has less invented detail.
         no_guided_upsampling: whether the transmission is the generated panel, upsampled, without the detail of the photo.
-
-    Raises:
-        ModelError: see `DiffusionWork`.
     """
 
     def __init__(
@@ -61,12 +58,8 @@ class DiffusionPredictor(Predictor):
         size: tuple[int, int],
         quality: Quality,  # noqa: ARG002
     ) -> list[tuple[int, int]]:
-        """Returns the (width, height) of the only input, which is never larger than the photo.
-
-        Raises:
-            PhotoError: a side of the photo has fewer than 16 pixels, or its aspect ratio is too large.
-        """
-        return [self._work.input_size(size)]
+        """Returns the (width, height) of the only input, see `DiffusionWork`."""
+        return [self._work.task.input_size(size, self._work.size_divisor)]
 
     def __call__(
         self, inputs: Sequence[Floats], quality: Quality, on_progress: ProgressCallback
@@ -75,25 +68,33 @@ class DiffusionPredictor(Predictor):
         (scaled_input,) = inputs
         height, width, _ = scaled_input.shape
         tiling, steps = self._work.tiling((height, width)), self._work.sampling_steps(quality)
-        progress = _ProgressCounter(on_progress, len(tile_slices((height, width), **tiling)))
+        tiles, started = len(tile_slices((height, width), **tiling)), itertools.count()
+
+        def predict_tile(tile: Floats) -> tuple[Floats, ...]:
+            index = next(started)
+            return self._predict_tile(
+                tile, steps, lambda step, total: on_progress((index + step / total) / tiles)
+            )
+
         with self._lock:  # two predictions at the same time would need twice the GPU memory
             change, reflection, generated_transmission, spread, reconstruction_error = run_tiled(
-                lambda tile: self._predict_tile(tile, steps, progress), scaled_input, **tiling
+                predict_tile, scaled_input, **tiling
             )
         override, mean_error = None, None
-        if self._no_guided_upsampling:
-            override = GeneratedOverride(
-                generated_transmission, np.ones_like(generated_transmission[..., :1])
-            )
-        elif self._reconstructs_input:
-            override = GeneratedOverride.weighted_by_detail(generated_transmission, reflection)
         if self._reconstructs_input:
+            override = GeneratedOverride.weighted_by_detail(generated_transmission, reflection)
             mean_error = float(reconstruction_error.mean())
-        confidence = confidence_from_spread(spread + reconstruction_error)
+        if self._no_guided_upsampling:
+            everywhere = np.ones_like(generated_transmission[..., :1])
+            override = GeneratedOverride(generated_transmission, everywhere)
+        if self._reconstructs_input or (len(self._seeds) > 1 and self._pipeline.task.objective == "flow"):
+            confidence = confidence_from_spread(spread + reconstruction_error)
+        else:  # there is neither a reconstruction error nor a spread of several samples
+            confidence = np.zeros_like(spread[..., :1])
         return Prediction(
             change,
             reflection,
-            confidence if self._has_confidence else np.zeros_like(confidence),
+            confidence,
             override,
             mean_error,
             reflection_is_derived="R" not in self._pipeline.task.layout.panels,
@@ -103,12 +104,9 @@ class DiffusionPredictor(Predictor):
     def _reconstructs_input(self) -> bool:
         return bool({"I", "R"} & set(self._pipeline.task.layout.panels))
 
-    @property
-    def _has_confidence(self) -> bool:
-        """Whether a confidence can be computed, from the reconstruction error or from the spread of several samples."""
-        return self._reconstructs_input or (len(self._seeds) > 1 and self._pipeline.task.objective == "flow")
-
-    def _predict_tile(self, tile: Floats, steps: int, progress: _ProgressCounter) -> tuple[Floats, ...]:
+    def _predict_tile(
+        self, tile: Floats, steps: int, on_step: Callable[[int, int], None]
+    ) -> tuple[Floats, ...]:
         """Returns five maps (h, w, 3) for a tile (h, w, 3).
 
         In linear light, means over the samples: change, reflection and transmission. In sRGB-encoded units: the spread
@@ -118,65 +116,38 @@ class DiffusionPredictor(Predictor):
         enlarged_size = self._work.enlarged((width, height))
         if enlarged_size != (width, height):
             enlarged = np.clip(_resize(tile, enlarged_size[::-1], "bicubic"), 0, 1)
-            maps = self._predict_tile(enlarged, steps, progress)
+            maps = self._predict_tile(enlarged, steps, on_step)
             return tuple(_resize(map_, (height, width), "bilinear") for map_ in maps)
         panel_fit = PanelFit((width, height), self._work.panel_size((width, height)))
         panel_input = torch.from_numpy(2 * to_encoded(tile) - 1).permute(2, 0, 1)[None]
         panels = self._pipeline(
-            panel_fit.pad(panel_input), steps=steps, seeds=self._seeds, on_progress=progress.within_tile
+            panel_fit.pad(panel_input), steps=steps, seeds=self._seeds, on_progress=on_step
         )
-        progress.tile_done()
-        _check_finite(panels)
-        linear_panels = {name: _to_linear_light(panel_fit.crop(panel)) for name, panel in panels.items()}
+        linear_panels: dict[str, NDArray[np.float32]] = {}
+        for name, panel in panels.items():
+            if not panel.isfinite().all():
+                raise ModelError(
+                    f"panel {name} of the model contains NaN or infinity",
+                    "expected finite values",
+                    "choose another value of quantization, or train the LoRA again: its weights may be damaged",
+                )
+            encoded = ((panel_fit.crop(panel) + 1) / 2).clamp(0, 1)
+            linear_panels[name] = to_linear(encoded.permute(0, 2, 3, 1).numpy())
         photo = linear_panels.get("I", tile)
         change = linear_panels["T"] - photo
         reflection = linear_panels.get("R", np.maximum(-change, 0))
-        reconstruction_encoded = to_encoded(_reconstruction(linear_panels, tile))
+        reconstruction = tile[None]  # if the model generates neither I nor R
+        if "I" in linear_panels:
+            reconstruction = linear_panels["I"]
+        elif "R" in linear_panels:
+            reconstruction = np.minimum(linear_panels["T"] + linear_panels["R"], 1)
         return (
             change.mean(axis=0),
             reflection.mean(axis=0),
             linear_panels["T"].mean(axis=0),
             np.ptp(to_encoded(linear_panels["T"]), axis=0),
-            np.abs(reconstruction_encoded - to_encoded(tile)).mean(axis=0),
+            np.abs(to_encoded(reconstruction) - to_encoded(tile)).mean(axis=0),
         )
-
-
-@dataclass
-class _ProgressCounter:
-    """Counts tiles and sampling steps, and reports the completed fraction."""
-
-    on_progress: ProgressCallback
-    tiles: int
-    done: int = 0
-
-    def within_tile(self, step: int, steps: int) -> None:
-        self.on_progress((self.done + step / steps) / self.tiles)
-
-    def tile_done(self) -> None:
-        self.done += 1
-
-
-def _reconstruction(linear_panels: Mapping[str, Floats], tile: Floats) -> Floats:
-    """Returns the generated input: panel I, or T + R. If the model generates neither I nor R, returns the tile itself."""
-    if "I" in linear_panels:
-        return linear_panels["I"]
-    return np.minimum(linear_panels["T"] + linear_panels["R"], 1) if "R" in linear_panels else tile[None]
-
-
-def _check_finite(panels: Mapping[str, torch.Tensor]) -> None:
-    for name, panel in panels.items():
-        if not panel.isfinite().all():
-            raise ModelError(
-                f"panel {name} of the model contains NaN or infinity",
-                "expected finite values",
-                "choose another value of quantization, or train the LoRA again: its weights may be damaged",
-            )
-
-
-def _to_linear_light(panels: torch.Tensor) -> NDArray[np.float32]:
-    """Converts panels (n, 3, h, w) in [-1, 1] to linear light (n, h, w, 3)."""
-    light: NDArray[np.float32] = to_linear(((panels + 1) / 2).clamp(0, 1).permute(0, 2, 3, 1).numpy())
-    return light
 
 
 def _resize(image: Floats, size: tuple[int, ...], mode: str) -> Floats:

@@ -25,9 +25,6 @@ class DiffusionWork:
 
     `steps` is the number of sampling steps, by default that of the task (20 as in the paper), and at most 4 for "draft".
     `ensemble_size` is the number of samples with different seeds. The sides of a panel are multiples of `size_divisor`.
-
-    Raises:
-        ModelError: `steps` or `ensemble_size` is below 1, or one of them is set for a one-step model.
     """
 
     task: DecompositionTask
@@ -36,7 +33,7 @@ class DiffusionWork:
     ensemble_size: int = 1
 
     def __post_init__(self) -> None:
-        """Checks the numbers."""
+        """Raises ModelError if a number is below 1, or set for a one-step model."""
         given = f"steps = {self.steps}, ensemble_size = {self.ensemble_size}"
         if (self.steps is not None and self.steps < 1) or self.ensemble_size < 1:
             raise ModelError(given, "expected both to be at least 1", "set them to 1 or more")
@@ -46,14 +43,6 @@ class DiffusionWork:
                 "expected neither, because it takes one step and is deterministic",
                 "leave them out",
             )
-
-    def input_size(self, size: tuple[int, int]) -> tuple[int, int]:
-        """The size of the only input, which is never larger than the photo.
-
-        Raises:
-            PhotoError: a side of the photo has fewer than 16 pixels, or its aspect ratio is too large.
-        """
-        return self.task.input_size(size, self.size_divisor)
 
     def sampling_steps(self, quality: Quality) -> int:
         """The number of sampling steps of each prediction."""
@@ -77,12 +66,8 @@ class DiffusionWork:
         return width, height
 
     def panel_sizes(self, size: tuple[int, int]) -> list[tuple[int, int]]:
-        """The size of the panels for a photo of this size, one for each tile.
-
-        Raises:
-            PhotoError: see `input_size`.
-        """
-        width, height = self.input_size(size)
+        """The size of the panels for a photo of this size, one for each tile."""
+        width, height = self.task.input_size(size, self.size_divisor)
         return [
             self.panel_size(self.enlarged((columns.stop - columns.start, rows.stop - rows.start)))
             for rows, columns in tile_slices((height, width), **self.tiling((height, width)))

@@ -65,13 +65,9 @@ class Separation:
     @cached_property
     def confidence(self) -> Photo:
         """The confidence as a grey 8-bit image of the size of the photo: 255 is certain. Computed on first use."""
-        return _upsample_confidence(self.confidence_map, self.photo)
-
-
-def _upsample_confidence(map_: Floats, photo: Photo) -> Photo:
-    """Upsamples a map (h, w, 1) in 0..1 to a grey 8-bit image of the size of the photo."""
-    width, height = photo.size
-    canvas = np.empty((height, width, 1), np.uint8)
-    for rows in photo.strips():
-        canvas[rows] = np.rint(255 * upsample_rows(map_, rows.start, rows.stop - rows.start, (height, width)))
-    return Photo(canvas)
+        width, height = self.photo.size
+        canvas = np.empty((height, width, 1), np.uint8)
+        for rows in self.photo.strips():
+            enlarged = upsample_rows(self.confidence_map, rows.start, rows.stop - rows.start, (height, width))
+            canvas[rows] = np.rint(255 * enlarged)
+        return Photo(canvas)

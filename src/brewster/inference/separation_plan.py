@@ -67,17 +67,19 @@ class SeparationPlan(CostEstimate):
 def plan_separation(options: Options, size: tuple[int, int], card: GraphicsCard) -> SeparationPlan:
     """Estimates the separation of a photo of this (width, height) on a card.
 
-    A base on the hub whose configuration is not in the cache is assumed to have the size of its backbone. Raises
-    ModelError if the model is unknown, is no diffusion model, or its files are damaged; DownloadError if the metadata
-    of the model is not in the cache; PhotoError if the photo is too small for the model; DeviceError if the weights
-    cannot be offloaded with the requested quantization; MissingExtra if the model is not in `brewster models list`, and
-    diffusers is not installed.
+    A base on the hub whose configuration is not in the cache is assumed to have the size of its backbone.
     """
     check_diffusion_model(options.model)
     hub_id, task, cost, quantization, has_prompt = _find_model(options)
     work = DiffusionWork(task, cost.size_divisor, options.steps, options.ensemble_size)
     panels = work.panel_sizes(size)
-    file = _local_file(options.transformer) if options.transformer else None
+    file = Path(options.transformer) if options.transformer else None
+    if file and not file.is_file():
+        raise ModelError(
+            f"there is no file {options.transformer}",
+            "expected a file of this machine, because a plan downloads nothing",
+            "download the file first",
+        )
     weights = file.stat().st_size // 2 if file else cost.parameters
     choice = WeightChoice(options.quantization, quantization, options.offload, file is not None)
     placement, with_nf4 = (
@@ -106,7 +108,7 @@ def plan_separation(options: Options, size: tuple[int, int], card: GraphicsCard)
     memory = {
         "weights": placement.resident_gib(weights),
         "VAE": 2 * cost.vae_parameters / GIB,
-        "activations": max(cost.block_bytes(max(tokens)), pixels * DECODING_BYTES_PER_PIXEL) / GIB,
+        "activations": max(cost.activation_bytes(max(tokens)), pixels * DECODING_BYTES_PER_PIXEL) / GIB,
         "CUDA": _CONTEXT_GIB,
     }
     # The text encoders are released before the transformer is loaded.
@@ -195,14 +197,3 @@ def _cure(
         if needed <= card.memory_gib and (other.is_offloaded or not is_single_file):
             return f"use {option}, which needs {needed:.1f} GiB"
     return "use a GPU with more memory, or the model compact"
-
-
-def _local_file(transformer: str) -> Path:
-    path = Path(transformer)
-    if path.is_file():
-        return path
-    raise ModelError(
-        f"there is no file {transformer}",
-        "expected a file of this machine, because a plan downloads nothing",
-        "download the file first",
-    )

@@ -29,12 +29,7 @@ from brewster.inference.full_size import upsample_layers
 from brewster.inference.guided_upsampling import Floats, GuidedUpsampler
 from brewster.inference.layer_history import PHOTO, history_step, with_step
 from brewster.inference.onnx_backend import OnnxBackend
-from brewster.inference.predictor import (
-    MultiScalePredictor,
-    Prediction,
-    Predictor,
-    ProgressCallback,
-)
+from brewster.inference.predictor import MultiScalePredictor, Prediction, Predictor, ProgressCallback
 from brewster.inference.separation import Separation
 from brewster.inference.tiles import Backend
 from brewster.models.zoo import find_model, is_diffusion_model
@@ -98,6 +93,7 @@ class Separator:
             DeviceError: the device is not available, or the model does not fit into its memory.
             DownloadError: a diffusion model cannot be downloaded, for example because access was not granted.
             MissingExtra: a diffusion model needs the extra `diffusion`.
+            BrewsterError: the value of an option of a diffusion model is invalid.
             TypeError: there is no such option.
         """
         if unknown := options.keys() - LoadOptions.__annotations__.keys():
@@ -105,8 +101,6 @@ class Separator:
                 f"there is no option {min(unknown)}; expected {', '.join(LoadOptions.__annotations__)}"
             )
         changed = {name: value for name, value in options.items() if value != getattr(Options, name)}
-        device: str = options.pop("device", Options.device)
-        changed.pop("device", None)
         if is_diffusion_model(model):
             if options.get("fast_lora") and options.get("steps") is None:
                 raise ModelError(
@@ -114,7 +108,8 @@ class Separator:
                     "expected the number for which it was trained",
                     "set the option steps, for example 4 or 8",
                 )
-            return cls._load_diffusion_model(model, device, changed)
+            return cls._load_diffusion_model(model, changed)
+        changed.pop("device", None)
         if changed:
             raise ModelError(
                 f"{', '.join(changed)} was set for the model {model}",
@@ -123,14 +118,14 @@ class Separator:
             )
         model_file = find_model(model)
         digest = model_file.verify()
-        backend = OnnxBackend(model_file.path, device)
+        backend = OnnxBackend(model_file.path, options.get("device", Options.device))
         is_shipped = model_file.sha256 is not None
         return cls(
             backend, name=model_file.name, sha256=digest, device=backend.device, is_calibrated=is_shipped
         )
 
     @classmethod
-    def _load_diffusion_model(cls, model: str, device: str, options: dict[str, Any]) -> Separator:
+    def _load_diffusion_model(cls, model: str, options: dict[str, Any]) -> Separator:
         try:
             from brewster.inference.diffusion_predictor import DiffusionPredictor  # noqa: PLC0415  (imports torch)
             from brewster.models.diffusion.pipeline import load_pipeline  # noqa: PLC0415
@@ -140,8 +135,8 @@ class Separator:
                 f"{error.name} is not installed",
                 f"expected {error.name}, because the model {model} needs it",
             ) from error
-        of_predictor = {name: options.pop(name) for name in _PREDICTOR_OPTIONS if name in options}
-        pipeline = load_pipeline(model, device=device, **options)
+        pipeline = load_pipeline(model, **options)
+        of_predictor = {name: options[name] for name in _PREDICTOR_OPTIONS if name in options}
         predictor = DiffusionPredictor(pipeline, **of_predictor)
         return cls(
             predictor, name=pipeline.name, sha256=pipeline.sha256, device=str(pipeline.backbone.device)
@@ -232,15 +227,13 @@ class Separator:
         with _timed(seconds, "decode"):
             photo = Photo.open(source, encoding=encoding, max_pixels=max_pixels)
             weights = None if mask is None else Mask.open(mask, photo.size)
-            inputs, white = self._inputs(photo, quality)
-            images = self._with_hints(inputs, photo, hints)
+            inputs, white = self._inputs(photo, quality, hints)
+            largest_input = _without_hints(inputs[-1])
         on_progress(0.0)
         with _timed(seconds, "network"):
-            prediction = self._predict(
-                inputs[-1], images, quality, lambda done: on_progress(_NETWORK_SHARE * done)
-            )
+            prediction = self._predict(inputs, quality, lambda done: on_progress(_NETWORK_SHARE * done))
         with _timed(seconds, "upsampling"):
-            upsampler = _fit_upsampler(inputs[-1], prediction, strength, white)
+            upsampler = _fit_upsampler(largest_input, prediction, strength, white)
             transmission, reflection, residual = upsample_layers(
                 photo,
                 upsampler,
@@ -258,7 +251,7 @@ class Separator:
             prediction.confidence_map,
             residual,
             prediction.reconstruction_error,
-            self._assess(inputs[-1], prediction, strength, weights),
+            self._assess(largest_input, prediction, strength, weights),
             self.name,
             self.sha256,
             self.device,
@@ -274,35 +267,24 @@ class Separator:
         hints: Source | None = Options.hints,
         on_progress: ProgressCallback = lambda _fraction: None,
     ) -> tuple[GuidedUpsampler, Prediction, Assessment]:
-        """Predicts the layers of a photo, but does not compute them at full size.
-
-        Args:
-            photo: the photo.
-            quality: see the call of a separator.
-            hints: see the call of a separator.
-            on_progress: see the call of a separator.
+        """Predicts the layers of a photo, but does not compute them at full size. For the arguments, see the call.
 
         Returns:
             The upsampler at strength 1, which computes the layers of any rows of the photo; the prediction; and its
             assessment.
-
-        Raises:
-            BrewsterError: quality is unknown.
-            ModelError: the model returns an invalid output.
-            MaskError: the model takes no hints, or the hints cannot be read, or have another size than the photo.
         """
         Options(quality=quality)  # checks the value
-        inputs, white = self._inputs(photo, quality)
-        images = self._with_hints(inputs, photo, hints)
-        prediction = self._predict(inputs[-1], images, quality, on_progress)
-        upsampler = _fit_upsampler(inputs[-1], prediction, Options.strength, white)
-        return upsampler, prediction, self._assess(inputs[-1], prediction)
+        inputs, white = self._inputs(photo, quality, hints)
+        largest_input = _without_hints(inputs[-1])
+        prediction = self._predict(inputs, quality, on_progress)
+        upsampler = _fit_upsampler(largest_input, prediction, Options.strength, white)
+        return upsampler, prediction, self._assess(largest_input, prediction)
 
-    def _predict(
-        self, largest_input: Floats, images: list[Floats], quality: Quality, on_progress: ProgressCallback
-    ) -> Prediction:
-        prediction = self._predictor(images, quality, on_progress)
-        return prediction if self._predictor.is_measured else keep_clipped_light(largest_input, prediction)
+    def _predict(self, inputs: list[Floats], quality: Quality, on_progress: ProgressCallback) -> Prediction:
+        prediction = self._predictor(inputs, quality, on_progress)
+        if self._predictor.is_measured:
+            return prediction
+        return keep_clipped_light(_without_hints(inputs[-1]), prediction)
 
     def _assess(
         self,
@@ -321,16 +303,16 @@ class Separator:
             is_calibrated=self._is_calibrated,
         )
 
-    def _inputs(self, photo: Photo, quality: Quality) -> tuple[list[Floats], np.float32]:
-        """Returns the inputs of the model in 0..1, smallest first, and the white level by which they are divided."""
+    def _inputs(
+        self, photo: Photo, quality: Quality, hints: Source | None
+    ) -> tuple[list[Floats], np.float32]:
+        """Returns the inputs of the model in 0..1, smallest first, and the white level by which they are divided. If there are
+        hints, the inputs have two more channels."""
         inputs = [photo.resized(*size) for size in self._predictor.input_sizes(photo.size, quality)]
         white = white_level(inputs[-1])
-        return [np.clip(scaled_input / white, 0, 1) for scaled_input in inputs], white
-
-    def _with_hints(self, inputs: list[Floats], photo: Photo, hints: Source | None) -> list[Floats]:
-        """Returns the inputs with two more channels if there are hints."""
+        inputs = [np.clip(scaled_input / white, 0, 1) for scaled_input in inputs]
         if hints is None:
-            return inputs
+            return inputs, white
         if not self.takes_hints:
             raise MaskError(
                 f"hints were given to the model {self.name}, which takes none",
@@ -338,7 +320,9 @@ class Separator:
                 "leave the hints out, or choose another model",
             )
         painted = Hints.open(hints, photo.size)
-        return [np.concatenate([image, painted.sampled(*image.shape[1::-1])], axis=2) for image in inputs]
+        return [
+            np.concatenate([image, painted.sampled(*image.shape[1::-1])], axis=2) for image in inputs
+        ], white
 
 
 def separate(
@@ -370,6 +354,10 @@ def separate(
     call = {name: load_options.pop(name) for name in _CALL_OPTIONS if name in load_options}
     separator = Separator.load(model, **load_options)
     return separator(source, mask=mask, hints=hints, encoding=encoding, **call)
+
+
+def _without_hints(model_input: Floats) -> Floats:
+    return np.ascontiguousarray(model_input[..., :3])
 
 
 def _fit_upsampler(

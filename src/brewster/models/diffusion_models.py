@@ -67,8 +67,7 @@ DIFFUSION_MODELS: Final = {
 
 
 def check_is_converted(model: str) -> None:
-    """Checks that this is not the name or hub id of a published model that must be converted first. Raises ModelError if it is.
-    The message says how to get and convert the model."""
+    """Checks that this is not a published model that must be converted first. The message says how to get and convert it."""
     for row in DIFFUSION_MODELS.values():
         if model in (row.name, row.hub_id) and not row.is_opened_by_name:
             raise ModelError(

@@ -77,13 +77,10 @@ class BackboneCost:
         linear = 2 * (self.image_parameters * tokens + self.text_parameters * PROMPT_TOKENS)
         return (linear + 4 * self.blocks * self.width * (tokens + PROMPT_TOKENS) ** 2) / 1e12
 
-    def hidden_state_bytes(self, tokens: int) -> int:
-        """The memory in bytes of one hidden state of this number of image tokens and the text, in bf16."""
-        return 2 * (tokens + PROMPT_TOKENS) * self.width
-
-    def block_bytes(self, tokens: int) -> int:
-        """The memory in bytes of the activations of one block while it computes, in bf16."""
-        return _HIDDEN_STATES_PER_BLOCK * self.hidden_state_bytes(tokens)
+    def activation_bytes(self, tokens: int, kept_blocks: int = 0) -> int:
+        """The memory in bytes, in bf16, of the activations of one block while it computes, for this number of image tokens and
+        the text. Training keeps the inputs of `kept_blocks` for the backward pass."""
+        return (_HIDDEN_STATES_PER_BLOCK + kept_blocks) * 2 * (tokens + PROMPT_TOKENS) * self.width
 
 
 BACKBONE_COSTS: Final = {
@@ -134,8 +131,7 @@ def _model_number(name: str) -> str:
 
 
 def find_gpu(name: str) -> GraphicsCard:
-    """Returns the GPU of this name, such as `RTX 4090`, `nvidia geforce rtx 4090` or `AMD Radeon RX 7900 XTX`. Raises
-    DeviceError if the name is not in `CARDS`."""
+    """Returns the GPU of this name, such as `RTX 4090`, `nvidia geforce rtx 4090` or `AMD Radeon RX 7900 XTX`."""
     known = {_model_number(other): card for other, card in CARDS.items()}
     if (number := _model_number(name)) in known:
         return known[number]
@@ -250,7 +246,7 @@ def place_on_gpu(
     device: str = "cuda",
     has_nf4: bool | None = None,
 ) -> Placement:
-    """The placement on a GPU with this memory. Raises DeviceError if offloading was requested with nf4.
+    """The placement on a GPU with this memory. Weights in nf4 cannot be offloaded.
 
     If no quantization is given, it is the first of (`preferred`, int8, nf4) with which the weights fit into the total memory: the
     same machine always gives the same result. If none fits, or the weights are offloaded on request, it is `preferred`. Int8
@@ -268,13 +264,15 @@ def place_on_gpu(
     movable: Quantization | None = "int8" if preferred == "nf4" else preferred
     preferred = preferred if has_nf4 else movable
     chosen = quantization
-    if quantization is None and offload == "layers" and not choice.is_single_file:
-        chosen = movable
-    elif quantization is None and not choice.is_single_file:
+    if quantization is None and not choice.is_single_file:
         candidates = [preferred, "int8", *(("nf4",) if has_nf4 else ())]
         fitting = fitting_quantizations(weights, total_gib - INFERENCE_OVERHEAD_GIB, candidates)
-        fallback = preferred if offload == "none" else movable or "int8"
-        chosen = fitting[0] if fitting else fallback
+        if offload == "layers":
+            chosen = movable
+        elif fitting:
+            chosen = fitting[0]
+        else:
+            chosen = preferred if offload == "none" else movable or "int8"
     fits = Placement(device, chosen).gpu_gib(weights) <= free_gib
     is_offloaded = offload == "layers" or (offload == "auto" and not fits and chosen != "nf4" and weights > 0)
     return Placement(device, chosen, is_offloaded)
@@ -338,7 +336,7 @@ class CostEstimate:
         return "\n".join(f"{name:24}{value}" for name, value in rows.items())
 
     def check_fits(self) -> None:
-        """Checks that the estimate fits into the memory of the GPU. Raises DeviceError with the first change with which it fits."""
+        """Checks that the estimate fits into the memory of the GPU. The error has the first change with which it fits."""
         if self.total_gib > self.card.memory_gib:
             raise DeviceError(
                 f"{self.name} needs about {self.total_gib:.1f} GiB",

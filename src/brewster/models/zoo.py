@@ -26,8 +26,7 @@ class ModelFile:
     licence: str
 
     def verify(self) -> str:
-        """Checks the file and returns its SHA-256. Raises ModelError if the file is missing, or its digest is not the expected
-        one."""
+        """Checks that the file has its expected digest, and returns its SHA-256."""
         if not self.path.is_file():
             raise ModelError(
                 f"{self.path} is missing", f"expected the file of model {self.name}", "reinstall brewster"
@@ -42,8 +41,7 @@ class ModelFile:
         return digest
 
     def card(self) -> str:
-        """The text of the model card, Markdown. It is the file next to the model file with the suffix .md. Raises ModelError if
-        the model has no card."""
+        """The text of the model card, Markdown. It is the file next to the model file with the suffix .md."""
         path = self.path.with_suffix(".md")
         if not path.is_file():
             raise ModelError(f"{self.name} has no model card", f"expected a file {path}", "write this file")
@@ -91,8 +89,7 @@ def is_diffusion_model(name: str) -> bool:
 
 
 def check_diffusion_model(name: str) -> None:
-    """Checks that `name` is that of a diffusion model, because only these need a plan. Needs no torch. Raises ModelError if it
-    is not, or it is unknown."""
+    """Checks that `name` is that of a diffusion model, because only these need a plan. Needs no torch."""
     if name in DIFFUSION_MODELS:  # also one that must be imported first
         return
     model_name(name)
@@ -105,8 +102,7 @@ def check_diffusion_model(name: str) -> None:
 
 
 def model_name(model: str) -> str:
-    """The short name of a model for reports: a registered name, the stem of a file, or the name of a folder. Raises ModelError
-    if `model` is neither a diffusion model, a name in the registry, nor a file."""
+    """The short name of a model for reports: a registered name, the stem of a file, or the name of a folder."""
     if is_diffusion_model(model):
         return Path(model).resolve().name.replace(":", "-")
     return find_model(model).name
@@ -119,8 +115,7 @@ def _run_model(name: str) -> Path | None:
 
 
 def find_model(name: str) -> ModelFile:
-    """The model file with this registered name or path. Raises ModelError if there is no such model or file, or it is a
-    diffusion model, which has no single file."""
+    """The model file with this registered name or path. A diffusion model has no single file."""
     if name in MODELS:
         return MODELS[name]
     if is_diffusion_model(name):

@@ -4,5 +4,7 @@
     pipeline      a backbone with its LoRA and prompt: photo in, panels out, by the steps of `sampling`
     memory        checks device, memory and disk before a download (../diffusion_resources.py has the tables and formulas)
 
+All functions raise errors of brewster only: ModelError (a name is unknown, or a file is missing, damaged or of another model),
+DownloadError, DeviceError (no such device, or too little memory), MissingExtra and OutputError.
 `panels`, `task` and `hub_download` need no torch; no module imports diffusers, transformers or peft before its first use.
 """

@@ -56,8 +56,7 @@ def cached_model_folder(source: str, patterns: list[str]) -> Path | None:
 
 def list_root_files(source: str) -> list[str]:
     """The names of the files of a folder or a repository on the hub, without those in subfolders. Without a network
-    connection, these are the files in the cache. Raises DownloadError, ModelError or MissingExtra, see
-    `resolve_model_folder`."""
+    connection, these are the files in the cache."""
     folder = Path(source)
     hub, errors = import_library("huggingface_hub"), import_library("huggingface_hub.errors")
     with translate_hub_errors(source):
@@ -76,8 +75,7 @@ def find_weights_file(source: str, suffixes: tuple[str, ...], companions: Sequen
 
     `source` is a file, a folder or hub id with one file that has such a suffix, or OWNER/NAME/FILE on the hub, where
     FILE may contain folders. Subfolders are not searched. `companions` are other files of the same folder that are
-    downloaded with it, if they exist. Raises ModelError if the file does not exist, the folder or repository does not
-    have exactly one such file, or `source` is none of these; DownloadError or MissingExtra, see `resolve_model_folder`.
+    downloaded with it, if they exist.
     """
     if Path(source).is_file():
         return Path(source)

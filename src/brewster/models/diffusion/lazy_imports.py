@@ -13,7 +13,7 @@ from brewster.errors import MissingExtra
 
 
 def import_library(name: str) -> Any:  # noqa: ANN401 - a module of a library that may be missing
-    """Imports a module of a third-party library and returns it. Raises MissingExtra if the library is not installed."""
+    """Imports a module of a third-party library and returns it."""
     try:
         with suppress_log_messages():
             return importlib.import_module(name)
@@ -26,8 +26,7 @@ def import_library(name: str) -> Any:  # noqa: ANN401 - a module of a library th
 
 
 def import_bitsandbytes() -> None:
-    """Imports bitsandbytes, which stores weights in nf4. The extra `diffusion` does not install it. Raises MissingExtra if it
-    is not installed, or cannot be imported."""
+    """Imports bitsandbytes, which stores weights in nf4. The extra `diffusion` does not install it."""
     try:
         import_library("bitsandbytes")
     except MissingExtra as error:

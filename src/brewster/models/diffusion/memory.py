@@ -13,7 +13,7 @@ from typing import Final
 
 import torch
 
-from brewster.errors import DeviceError, DownloadError
+from brewster.errors import BrewsterError, DeviceError, DownloadError
 from brewster.models.diffusion.backbones.backbone import Backbone
 from brewster.models.diffusion.backbones.registry import (
     build_on_meta,
@@ -48,8 +48,7 @@ _DEVICES: Final = {"auto": "", "cuda": "cuda", "rocm": "cuda", "cpu": "cpu"}
 
 
 def torch_device(device: str) -> str:
-    """torch's name, "cuda" or "cpu", for a value of the option --device. Raises DeviceError if diffusion models do not run on
-    this device."""
+    """torch's name, "cuda" or "cpu", for a value of the option --device."""
     if device not in _DEVICES:
         raise DeviceError(
             f"diffusion models do not run on {device}",
@@ -60,14 +59,14 @@ def torch_device(device: str) -> str:
 
 
 def backbone_cost(source: str, backbone_class: type[Backbone]) -> BackboneCost:
-    """The cost of a backbone. A folder, or a hub id in the cache, is counted by its configuration; another source by its class.
-    Raises ModelError if the configuration is damaged."""
+    """The cost of a backbone. A folder, or a hub id in the cache, is counted by its configuration; another source by its class."""
     cost = backbone_class.cost
     if source.startswith(TINY_PREFIX):
         return cost.tiny()
-    if is_registered(source) or (folder := find_description(source)) is None:
+    description = find_description(source)
+    if description is None or is_registered(description):
         return cost
-    backbone = build_on_meta(str(folder))
+    backbone = build_on_meta(description)
     config = backbone.transformer.config
     blocks = len(backbone.transformer.transformer_blocks)
     blocks += len(getattr(backbone.transformer, "single_transformer_blocks", ()))
@@ -81,7 +80,7 @@ def backbone_cost(source: str, backbone_class: type[Backbone]) -> BackboneCost:
 
 def count_weights(source: str, backbone_class: type[Backbone], transformer_file: Path | None = None) -> int:
     """The number of parameters of the transformer; 0 for a tiny version. For a `transformer_file`, it is the number of
-    bf16 weights that need the same memory. Raises ModelError if the configuration is damaged."""
+    bf16 weights that need the same memory."""
     if transformer_file:
         return transformer_file.stat().st_size // _FILE_BYTES_PER_WEIGHT
     return backbone_cost(source, backbone_class).parameters
@@ -89,8 +88,7 @@ def count_weights(source: str, backbone_class: type[Backbone], transformer_file:
 
 def choose_placement(weights: int, choice: WeightChoice, device: str) -> Placement:
     """The placement of a transformer with this number of weights on this machine. `device` is what the user chose, or
-    "auto". On a CPU the default is no quantization, because int8 is slower there. Raises DeviceError if diffusion
-    models do not run on this device, or cannot be offloaded in this way."""
+    "auto". On a CPU the default is no quantization, because int8 is slower there."""
     device = torch_device(device)
     if device == "cpu":
         if choice.offload == "layers":
@@ -117,9 +115,8 @@ def check_machine(
 
     For `source` and `transformer_file`, see `load_backbone`. `requested` is the device that the user chose, or "auto".
     `with_text_encoders` is whether the prompt must be encoded, so that the text encoders are downloaded too. They are
-    loaded in host memory, also if they compute on the GPU, and released before the transformer is loaded. Raises
-    DeviceError if there is no GPU and the CPU was not chosen explicitly, or the free memory is too small; DownloadError
-    if the free disk is too small; MissingExtra if the weights will be stored in nf4, and bitsandbytes is not installed.
+    loaded in host memory, also if they compute on the GPU, and released before the transformer is loaded. If there is no
+    GPU, the CPU must be chosen explicitly.
     """
     weights = count_weights(source, backbone_class, transformer_file)
     if weights < _MIN_LARGE:
@@ -136,7 +133,7 @@ def check_machine(
         free = torch.cuda.mem_get_info(placement.device)[0] / GIB
         fitting = fitting_quantizations(weights, free - INFERENCE_OVERHEAD_GIB)
         cure = f"choose quantization {fitting[0]}" if fitting else _SMALLER_MODEL
-        _check_fits(source, placement.gpu_gib(weights), free, f"of memory on {placement.device}", cure)
+        check_free(source, placement.gpu_gib(weights), free, f"of memory on {placement.device}", cure)
     if placement.quantization == "nf4" and not is_cpu:
         import_bitsandbytes()
     hub_id = hub_id_of(source)
@@ -154,8 +151,7 @@ def check_machine(
 
 
 def check_device(source: str, weights: int, device: str, *, requested: str) -> None:
-    """Checks that a transformer with this number of weights does not run on the CPU, unless the user chose the CPU. Raises
-    DeviceError if it would."""
+    """Checks that a transformer with this number of weights does not run on the CPU, unless the user chose the CPU."""
     if weights >= _MIN_LARGE and device == "cpu" and requested != "cpu":
         raise DeviceError(
             f"torch finds no GPU, and {source} has {weights / 1e9:.1f} billion parameters",
@@ -164,15 +160,29 @@ def check_device(source: str, weights: int, device: str, *, requested: str) -> N
         )
 
 
+def free_host_gib() -> float:
+    """The free memory of this machine in GiB."""
+    return float(import_library("psutil").virtual_memory().available) / GIB
+
+
 def _check_host_memory(source: str, needed_gib: float, where: str) -> None:
-    available = import_library("psutil").virtual_memory().available / GIB
-    _check_fits(source, needed_gib + _HOST_OVERHEAD_GIB, available, where, _SMALLER_MODEL)
+    check_free(source, needed_gib + _HOST_OVERHEAD_GIB, free_host_gib(), where, _SMALLER_MODEL)
 
 
-def _check_fits(source: str, needed_gib: float, free_gib: float, where: str, cure: str) -> None:
+def check_free(
+    source: object,
+    needed_gib: float,
+    free_gib: float,
+    where: str,
+    cure: str,
+    *,
+    purpose: str = "memory for the weights and one prediction",
+    error: type[BrewsterError] = DeviceError,
+) -> None:
+    """Checks that enough is free. `where` is that of the memory or the disk, and `purpose` is what it is needed for."""
     if needed_gib > free_gib:
-        raise DeviceError(
+        raise error(
             f"{source} needs about {needed_gib:.1f} GiB {where}, and {free_gib:.1f} GiB are free",
-            "expected enough memory for the weights and one prediction",
+            f"expected enough {purpose}",
             cure,
         )

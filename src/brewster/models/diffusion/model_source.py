@@ -20,7 +20,7 @@ from brewster.models.diffusion.backbones.backbone import Backbone
 from brewster.models.diffusion.backbones.registry import (
     DESCRIPTION_FILES,
     INDEX_FILE,
-    backbone_class_of,
+    find_backbone,
     find_backbone_class,
     find_description,
     is_registered,
@@ -42,7 +42,7 @@ from brewster.options import Quantization
 @dataclass(frozen=True)
 class LoraLayout:
     """A row of LAYOUTS. A folder with the file `weights` has this layout, and `files` are all files to download. `load` adds the
-    LoRA of a folder to a backbone. Both functions raise ModelError if a file is damaged."""
+    LoRA of a folder to a backbone."""
 
     weights: str
     files: tuple[str, ...]
@@ -114,10 +114,6 @@ def find_model_source(
     `model` and `base_model` are those of `load_pipeline`. Without `allow_download`, files that are not in the cache are not
     downloaded. If the base is not in the cache then, its class is read from the LoRA's metadata. A WindowSeat that is not in the
     cache gets its published task.
-
-    Raises:
-        DownloadError: see `resolve_model_folder`; or a download is not allowed.
-        ModelError: a file is missing or damaged, the LoRA belongs to another backbone, or the name is unknown.
     """
     if is_registered(model):
         _check_no_base(model, base_model)
@@ -184,9 +180,9 @@ def _find_base(
             f"expected a {metadata.backbone} in diffusers' layout",
             "pass its folder or hub id with --base-model",
         )
-    if not allow_download and not is_registered(base) and not find_description(base):
+    if not allow_download and not find_description(base):
         return base, find_backbone_class(metadata.backbone)
-    backbone_class = backbone_class_of(base)  # checked before the download, which may take an hour
+    backbone_class, _ = find_backbone(base)  # checked before the download, which may take an hour
     if backbone_class.name != metadata.backbone:
         raise ModelError(
             f"{model} is a LoRA of {metadata.backbone}",

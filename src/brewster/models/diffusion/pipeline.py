@@ -13,7 +13,7 @@ import hashlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, final
+from typing import TYPE_CHECKING, Final, Unpack, final
 
 import torch
 from torch import Tensor
@@ -39,7 +39,7 @@ from brewster.models.diffusion.sampling import sample
 from brewster.models.diffusion.task import DecompositionTask
 from brewster.models.diffusion_resources import Placement, WeightChoice
 from brewster.models.zoo import model_name
-from brewster.options import Offload, Quantization
+from brewster.options import Device, LoadOptions, Options
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -72,8 +72,7 @@ class DecompositionPipeline:
         With the objectives "one_step" and "direct", `steps` and `seeds` have no effect, and there is one prediction.
         `on_progress(done, total)` is called after each step.
 
-        Returns the panels by name, (seeds, 3, H, W) in [-1, 1], float32, on the CPU. Raises ModelError if there is no step or no
-        seed; DeviceError if the device is out of memory.
+        Returns the panels by name, (seeds, 3, H, W) in [-1, 1], float32, on the CPU.
         """
         task, layout = self.task, self.task.layout
         if task.objective == "direct":
@@ -118,57 +117,40 @@ def one_step_start(photo: Float[Tensor, "1 3 h w"], layout: PanelLayout) -> Tens
 
 
 def load_pipeline(
-    model: str,
-    *,
-    device: str = "auto",
-    base_model: str | None = None,
-    quantization: Quantization | None = None,
-    offload: Offload = "auto",
-    transformer: str | None = None,
-    fast_lora: str | None = None,
-    guidance: float | None = None,
-    timestep_shift: float | None = None,
-    prompt: str = "detailed",
+    model: str, *, prompt: str = "detailed", **options: Unpack[LoadOptions]
 ) -> DecompositionPipeline:
     """Loads a LoRA with its base model, or a backbone without a LoRA.
 
-    For the other options, see `brewster.options.Options`.
-
     Args:
         model: a LoRA by its folder or hub id, or a backbone by its name, folder or hub id.
-        device: "auto" uses an NVIDIA or AMD GPU if torch finds one, otherwise the CPU.
-        quantization: on a GPU, the default is that of the training; if it does not fit, int8, then nf4. On a CPU: none.
-        transformer, fast_lora: see `find_weights_file`.
-        guidance: with a few-step LoRA and classifier-free guidance, the default is 1, which saves the second prediction.
         prompt: for a backbone without a LoRA: a name in `PROMPTS`, or the text itself. A finetuned backbone with a stored
             prompt uses that one.
-
-    Raises:
-        DownloadError, MissingExtra: see `load_backbone`.
-        ModelError: a file is missing or damaged, a LoRA belongs to another backbone, the name is unknown, or a few-step
-            LoRA or a timestep shift is given for a model that takes one step.
-        DeviceError: there is no such device, it is out of memory, or the weights cannot be offloaded.
+        options: see `brewster.options.Options`.
     """
-    _check_before_download(model, base_model, device, (quantization, offload), transformer)
-    source = find_model_source(model, base_model)
-    for option, value in {"few-step LoRA": fast_lora, "timestep shift": timestep_shift}.items():
+    chosen = Options(model=model, **options)
+    _check_before_download(chosen)
+    source = find_model_source(model, chosen.base_model)
+    guidance, timestep_shift = chosen.guidance, chosen.timestep_shift
+    for option, value in {"few-step LoRA": chosen.fast_lora, "timestep shift": timestep_shift}.items():
         if value is not None and source.task.objective != "flow":
             raise ModelError(
                 f"a {option} was given for {model}, which takes one step",
                 "expected a model that samples in several steps",
                 f"leave the {option} out",
             )
-    transformer_file = find_weights_file(transformer, TRANSFORMER_SUFFIXES) if transformer else None
-    placement = _choose_placement(source, device, quantization, offload, transformer_file)
+    transformer_file = (
+        find_weights_file(chosen.transformer, TRANSFORMER_SUFFIXES) if chosen.transformer else None
+    )
+    placement = _choose_placement(source, chosen, transformer_file)
     check_machine(
         source.base,
         source.backbone_class,
         placement,
-        requested=device,
+        requested=chosen.device,
         with_text_encoders=source.needs_text_encoders,
         transformer_file=transformer_file,
     )
-    fast_lora_file = find_lora_file(fast_lora) if fast_lora else None
+    fast_lora_file = find_lora_file(chosen.fast_lora) if chosen.fast_lora else None
     text = PROMPTS.get(prompt, prompt)
     # The prompt is encoded before the backbone is loaded, because memory may be too small for both.
     if source.layout:
@@ -192,7 +174,7 @@ def load_pipeline(
         attach_layers(backbone, few_step_layers, adapter="few_step")
     if placement.is_offloaded:
         offload_layers(backbone.transformer, backbone.vae, placement.device)
-    if fast_lora:
+    if fast_lora_file:
         if guidance is None and not source.backbone_class.guided_by_embedding:
             guidance = 1.0
         timestep_shift = timestep_shift or source.backbone_class.few_step_shift
@@ -211,11 +193,13 @@ def load_pipeline(
     return DecompositionPipeline(backbone, embedding, task, model_name(model), digest)
 
 
-def fingerprint(model: str, *, device: str = "auto") -> str:
+def fingerprint(model: str, *, device: Device = "auto") -> str:
     """The SHA-256 of what `load_pipeline` would load by default, which also raises the same errors: LoRA, prompt, base model (see
     `ModelSource.digest_parts`), and the quantization of the base model."""
     source = find_model_source(model)
-    return _digest(source, _choose_placement(source, device).quantization, PROMPTS["detailed"], {})
+    return _digest(
+        source, _choose_placement(source, Options(device=device)).quantization, PROMPTS["detailed"], {}
+    )
 
 
 def _digest(source: ModelSource, quantization: str | None, text: str, changes: Mapping[str, object]) -> str:
@@ -225,36 +209,28 @@ def _digest(source: ModelSource, quantization: str | None, text: str, changes: M
     return hashlib.sha256("\0".join(parts).encode()).hexdigest()
 
 
-def _check_before_download(
-    model: str,
-    base_model: str | None,
-    device: str,
-    storage: tuple[Quantization | None, Offload],
-    transformer: str | None,
-) -> None:
+def _check_before_download(options: Options) -> None:
     """Checks the machine before the files of a LoRA are downloaded, if its base is known without them. The memory for
     the text encoders is checked later, because the files of the model show whether its prompt is stored. If the
     transformer is in a file, only the device is checked, because the size of a file on the hub is not known."""
-    chosen_device = torch_device(device)
+    device = torch_device(options.device)
     try:
-        source = find_model_source(model, base_model, allow_download=False)
+        source = find_model_source(options.model, options.base_model, allow_download=False)
     except (DownloadError, ModelError):
         return  # files are missing or damaged: `load_pipeline` downloads them, or reports the error
-    if transformer:
+    if options.transformer:
         weights = count_weights(source.base, source.backbone_class)
-        check_device(source.base, weights, chosen_device, requested=device)
+        check_device(source.base, weights, device, requested=options.device)
     else:
-        placement = _choose_placement(source, device, *storage)
-        check_machine(source.base, source.backbone_class, placement, requested=device)
+        placement = _choose_placement(source, options)
+        check_machine(source.base, source.backbone_class, placement, requested=options.device)
 
 
 def _choose_placement(
-    source: ModelSource,
-    device: str,
-    quantization: Quantization | None = None,
-    offload: Offload = "auto",
-    transformer_file: Path | None = None,
+    source: ModelSource, options: Options, transformer_file: Path | None = None
 ) -> Placement:
     weights = count_weights(source.base, source.backbone_class, transformer_file)
-    choice = WeightChoice(quantization, source.trained_quantization, offload, transformer_file is not None)
-    return choose_placement(weights, choice, device)
+    choice = WeightChoice(
+        options.quantization, source.trained_quantization, options.offload, transformer_file is not None
+    )
+    return choose_placement(weights, choice, options.device)

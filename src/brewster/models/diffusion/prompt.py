@@ -7,7 +7,6 @@ Therefore training and inference do not load the text encoders (4.9 billion para
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, final
@@ -71,7 +70,13 @@ class PromptEmbedding:
     @property
     def sha256(self) -> str:
         """SHA-256 of backbone, text and tensors; independent of file and device."""
-        return _digest(self.backbone, self.text, self.tensors)
+        import torch  # noqa: PLC0415 - recipes are read without torch
+
+        digest = hashlib.sha256(f"{self.backbone}\0{self.text}".encode())
+        for name, tensor in sorted(self.tensors.items()):
+            digest.update(f"\0{name} {tensor.dtype} {tuple(tensor.shape)}\0".encode())
+            digest.update(tensor.detach().cpu().contiguous().view(torch.uint8).numpy().tobytes())
+        return digest.hexdigest()
 
     def to(self, device: torch.device | str, dtype: torch.dtype) -> PromptEmbedding:
         """Copies the embedding to this device and dtype."""
@@ -79,15 +84,13 @@ class PromptEmbedding:
         return PromptEmbedding(self.backbone, self.text, **moved)
 
     def save(self, path: Path) -> None:
-        """Writes a safetensors file. The same embedding always gives the same bytes. Raises OutputError if the file cannot be
-        written."""
+        """Writes a safetensors file. The same embedding always gives the same bytes."""
         metadata = {"kind": _FORMAT, "backbone": self.backbone, "text": self.text, "sha256": self.sha256}
         write_tensors(path, self.tensors, metadata)
 
 
 def load_prompt(path: Path, backbone: str) -> PromptEmbedding:
-    """Reads a file that `PromptEmbedding.save` wrote. Raises ModelError if the file is missing, damaged or not a prompt, or
-    belongs to another backbone."""
+    """Reads a file that `PromptEmbedding.save` wrote."""
     tensors, metadata = read_tensors(path)
     is_prompt = metadata.get("kind") == _FORMAT and {"backbone", "text", "sha256"} <= metadata.keys()
     if not (is_prompt and {"embeds"} <= set(tensors) <= {"embeds", "pooled", "negative"}):
@@ -100,20 +103,11 @@ def load_prompt(path: Path, backbone: str) -> PromptEmbedding:
             f"expected a prompt for {backbone}",
             f"encode it with {backbone}'s text encoder",
         )
-    if _digest(metadata["backbone"], metadata["text"], tensors) != metadata["sha256"]:
+    prompt = PromptEmbedding(backbone, metadata["text"], **tensors)
+    if prompt.sha256 != metadata["sha256"]:
         raise ModelError(
             f"{path} does not have the digest in its metadata",
             f"expected {metadata['sha256'][:12]}...",
             "copy it again",
         )
-    return PromptEmbedding(metadata["backbone"], metadata["text"], **tensors)
-
-
-def _digest(backbone: str, text: str, tensors: Mapping[str, Tensor]) -> str:
-    import torch  # noqa: PLC0415 - recipes are read without torch
-
-    digest = hashlib.sha256(f"{backbone}\0{text}".encode())
-    for name, tensor in sorted(tensors.items()):
-        digest.update(f"\0{name} {tensor.dtype} {tuple(tensor.shape)}\0".encode())
-        digest.update(tensor.detach().cpu().contiguous().view(torch.uint8).numpy().tobytes())
-    return digest.hexdigest()
+    return prompt

@@ -49,8 +49,7 @@ def sample(
     The noise is drawn on the CPU, so a seed gives the same noise on every device. A `start` image in [-1, 1] replaces it. For
     `timestep_shift` and `last_sigma`, see `Backbone.schedule`. `on_progress(done, total)` is called after each step.
 
-    Returns the composites in [-1, 1], float32, on the CPU. `.mean(0, keepdim=True)` averages them. Raises ModelError if the prompt
-    lacks the embedding that guidance needs, or there is no step or seed; DeviceError if the device is out of memory.
+    Returns the composites in [-1, 1], float32, on the CPU. `.mean(0, keepdim=True)` averages them.
     """
     for noun, number, default in (("steps", steps, STEPS), ("seeds", len(seeds), 1)):
         if number < 1:

@@ -112,12 +112,12 @@ def named_task(model: str) -> DecompositionTask:
 
 
 def save_task(task: DecompositionTask, path: Path) -> None:
-    """Writes a JSON file, and replaces an existing one. Raises OutputError if the file cannot be written."""
+    """Writes a JSON file, and replaces an existing one."""
     write_atomically(path, f"{json.dumps(asdict(task), indent=2)}\n".encode(), overwrite=True)
 
 
 def load_task(path: Path) -> DecompositionTask:
-    """Reads a file that `save_task` wrote. Raises ModelError if the file cannot be read, or is not a valid task."""
+    """Reads a file that `save_task` wrote."""
     try:
         return TypeAdapter(DecompositionTask).validate_json(path.read_bytes(), strict=True, extra="forbid")
     except (OSError, ValueError, RecipeError) as error:

@@ -16,8 +16,7 @@ if TYPE_CHECKING:
 
 
 def write_tensors(path: Path, tensors: Mapping[str, Tensor], metadata: Mapping[str, str]) -> None:
-    """Writes the tensors and their metadata atomically, and replaces an existing file. Raises OutputError if the file cannot be
-    written, and MissingExtra if safetensors is not installed."""
+    """Writes the tensors and their metadata atomically, and replaces an existing file."""
     cpu_tensors = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
     metadata = {"format": "pt", **metadata}
     # safetensors writes metadata in an order that differs between runs, so the header is written again in sorted order.
@@ -27,8 +26,7 @@ def write_tensors(path: Path, tensors: Mapping[str, Tensor], metadata: Mapping[s
 
 
 def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
-    """The tensors of a file by name, on the CPU, and its metadata. Raises ModelError if the file is missing or damaged, and
-    MissingExtra if safetensors is not installed."""
+    """The tensors of a file by name, on the CPU, and its metadata."""
     safetensors = import_library("safetensors")
     try:
         # Not memory-mapped: mapped tensors would change if another process rewrote the file.
@@ -42,7 +40,7 @@ def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
 
 
 def read_json(path: Path) -> dict[str, Any]:
-    """The JSON object in a file of a model. Raises ModelError if the file is missing or damaged, or contains no object."""
+    """The JSON object in a file of a model."""
     try:
         value = json.loads(path.read_text("utf-8"))
         problem, cause = "contains no settings", None

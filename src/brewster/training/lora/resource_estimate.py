@@ -64,13 +64,11 @@ def estimate_resources(recipe: LoraRecipe, card: GraphicsCard) -> ResourceEstima
     layers = map(backbone.transformer.get_submodule, select_target_modules(backbone, recipe.target_modules))
     lora_parameters = sum(recipe.rank * (layer.in_features + layer.out_features) for layer in layers)
     tokens = generated_tokens + condition_tokens
-    # The inputs of all blocks are kept, and the activations of one block while it computes.
-    activations = cost.blocks * cost.hidden_state_bytes(tokens) + cost.block_bytes(tokens)
     memory = {
         "backbone": weights_gib(cost.parameters, recipe.quantization),
         "VAE": 2 * cost.vae_parameters / GIB,
         "LoRA and AdamW": lora_parameters * _BYTES_PER_LORA_WEIGHT[recipe.optimizer] / GIB,
-        "activations": activations / GIB,
+        "activations": cost.activation_bytes(tokens, kept_blocks=cost.blocks) / GIB,
         "rest": _OVERHEAD_GIB,
     }
     tflop = _FORWARD_PASSES_PER_STEP * recipe.batch_size * cost.forward_tflop(tokens)

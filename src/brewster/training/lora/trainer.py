@@ -35,7 +35,7 @@ from brewster.models.diffusion.adapter.lora import (
 )
 from brewster.models.diffusion.backbones.backbone import Backbone
 from brewster.models.diffusion.backbones.loading import encode_prompt, load_backbone
-from brewster.models.diffusion.backbones.registry import backbone_class_of
+from brewster.models.diffusion.backbones.registry import find_backbone
 from brewster.models.diffusion.memory import check_machine
 from brewster.models.diffusion.offloading import explain_out_of_memory
 from brewster.models.diffusion.panels import split
@@ -88,7 +88,7 @@ class LoraTrainer:
                 "raise batch_size to a multiple, or start fewer processes",
             )
         self.recipe, self._device = recipe, str(distributed.best_device(device))
-        self._backbone_class = backbone_class_of(recipe.backbone)
+        self._backbone_class, _ = find_backbone(recipe.backbone)
         samples = self._samples = open_samples(recipe)
         samples.check_sizes(recipe, self._backbone_class.size_divisor)
         # Up to four validation pairs of each folder, (H, W, 9), or training samples if the recipe names no such folder.

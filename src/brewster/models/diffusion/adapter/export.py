@@ -12,15 +12,14 @@ from pathlib import Path
 import torch
 from torch import Tensor, nn
 
-from brewster.errors import DeviceError, ModelError, OutputError
+from brewster.errors import ModelError, OutputError
 from brewster.models.diffusion.adapter.lora import PREFIX, read_lora, read_prompt
 from brewster.models.diffusion.adapter.lora_formats import DOWN_SUFFIX, UP_SUFFIX, adapted_layers
 from brewster.models.diffusion.backbones.backbone import Backbone
 from brewster.models.diffusion.backbones.loading import load_backbone
-from brewster.models.diffusion.backbones.registry import backbone_class_of
+from brewster.models.diffusion.backbones.registry import find_backbone
 from brewster.models.diffusion.hub_download import free_disk_bytes
-from brewster.models.diffusion.lazy_imports import import_library
-from brewster.models.diffusion.memory import count_weights
+from brewster.models.diffusion.memory import check_free, count_weights, free_host_gib
 from brewster.models.diffusion.prompt import PROMPT_FILE
 from brewster.models.diffusion.task import TASK_FILE, save_task
 from brewster.models.diffusion.tensors import write_tensors
@@ -28,9 +27,7 @@ from brewster.models.diffusion_resources import GIB, weights_gib
 
 
 def export_comfyui(folder: Path, target: Path) -> None:
-    """Writes the LoRA as one file with the keys that ComfyUI reads: those of diffusers, and alpha for each layer.
-    Raises ModelError if the LoRA is missing or damaged, or was not written by brewster; OutputError if `target` exists
-    or cannot be written."""
+    """Writes the LoRA as one file with the keys that ComfyUI reads: those of diffusers, and alpha for each layer."""
     _check_target(target)
     state, metadata = read_lora(folder)
     tensors = {PREFIX + name: tensor for name, tensor in state.items()}
@@ -51,16 +48,12 @@ def export_merged(folder: Path, target: Path, base_model: str | None = None) -> 
     encoders. It is for programs that cannot load a LoRA; `load_pipeline` opens it, too.
 
     `base_model` is the folder or hub id of the base, if it has moved since training.
-
-    Raises ModelError if the LoRA or its base is missing or damaged, or they do not match; DownloadError if the base
-    cannot be downloaded; DeviceError if the free memory is too small; OutputError if `target` exists or cannot be
-    written, or its disk is too small.
     """
     _check_target(target)
     state, metadata = read_lora(folder)
     prompt = read_prompt(folder, metadata)
     base = base_model or metadata.base_model
-    backbone_class = backbone_class_of(base)
+    backbone_class, _ = find_backbone(base)
     if backbone_class.name != metadata.backbone:
         raise ModelError(
             f"{folder} is a LoRA of {metadata.backbone}",
@@ -68,24 +61,11 @@ def export_merged(folder: Path, target: Path, base_model: str | None = None) -> 
             "choose another base",
         )
     needed = weights_gib(count_weights(base, backbone_class) + backbone_class.cost.vae_parameters, None)
-    memory = import_library("psutil").virtual_memory().available
-    resources = (
-        (base, "of host memory", memory, DeviceError, "close other programs, or export on another machine"),
-        (
-            target,
-            "on the disk",
-            free_disk_bytes(target),
-            OutputError,
-            "free disk space, or choose a larger disk",
-        ),
-    )
-    for name, where, free, error, cure in resources:
-        if needed > free / GIB:
-            raise error(
-                f"{name} needs about {needed:.1f} GiB {where}, and {free / GIB:.1f} GiB are free",
-                "expected enough for all weights in bfloat16",
-                cure,
-            )
+    purpose = "for all weights in bfloat16"
+    cure = "close other programs, or export on another machine"
+    check_free(base, needed, free_host_gib(), "of host memory", cure, purpose=purpose)
+    free, cure = free_disk_bytes(target) / GIB, "free disk space, or choose a larger disk"
+    check_free(target, needed, free, "on the disk", cure, purpose=purpose, error=OutputError)
     backbone = load_backbone(base, dtype=torch.bfloat16)
     merge(backbone, state, 1.0 if metadata.imported else metadata.alpha / metadata.rank)
     backbone.save(target)
@@ -95,8 +75,7 @@ def export_merged(folder: Path, target: Path, base_model: str | None = None) -> 
 
 @torch.no_grad()
 def merge(backbone: Backbone, state: Mapping[str, Tensor], scale: float) -> None:
-    """Replaces the weight W of each adapted layer by W + scale B A (Hu et al. 2021). `state` is that of `lora_state_dict`.
-    Raises ModelError if the backbone has no such layer."""
+    """Replaces the weight W of each adapted layer by W + scale B A (Hu et al. 2021). `state` is that of `lora_state_dict`."""
     modules = backbone.transformer.named_modules()
     layers = {name for name, module in modules if isinstance(module, nn.Linear)}
     for layer in adapted_layers(state):

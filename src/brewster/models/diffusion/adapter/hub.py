@@ -70,10 +70,7 @@ class UploadPlan:
 
 
 def plan_push(folder: Path, repo_id: str, *, message: str = "", public: bool = False) -> UploadPlan:
-    """Checks a LoRA's folder and prepares its upload; needs no network connection. Raises ModelError if a file is
-    missing or damaged, the prompt does not belong to the LoRA, the model card has no front matter, a file or the
-    message contains the path of a home folder, or `repo_id` is not OWNER/NAME; MissingExtra if huggingface_hub is not
-    installed."""
+    """Checks a LoRA's folder and prepares its upload; needs no network connection."""
     try:
         import_library("huggingface_hub.utils").validate_repo_id(repo_id if "/" in repo_id else f"/{repo_id}")
     except import_library("huggingface_hub.errors").HFValidationError as error:
@@ -118,9 +115,7 @@ def plan_push(folder: Path, repo_id: str, *, message: str = "", public: bool = F
 def push(plan: UploadPlan, token: str | None = None) -> str:
     """Creates the repository if it does not exist, and sends the files in one commit.
 
-    The token is `token`, HF_TOKEN, or that of `hf auth login`. Returns the URL of the commit. Raises DownloadError if
-    there is no token, the token is invalid or may not write, the repository exists with the other visibility (public or
-    private), or there is no network connection; MissingExtra if huggingface_hub is not installed.
+    The token is `token`, HF_TOKEN, or that of `hf auth login`. Returns the URL of the commit.
     """
     hub = import_library("huggingface_hub")
     if not (token or hub.get_token()):
@@ -163,11 +158,9 @@ def _read_files(folder: Path) -> tuple[dict[str, bytes], Any]:
 def _check_front_matter(folder: Path, card: bytes, *, is_tiny: bool) -> None:
     """Checks the front matter of the model card: the hub reads licence, base and library from it."""
     required = {"license", "library_name"} | (set() if is_tiny else {"base_model"})
-    fields: dict[str, Any] = {}
-    problem = ""
+    fields, problem = {}, ""
     try:
-        text = card.decode()
-        if text.startswith("---"):
+        if (text := card.decode()).startswith("---"):
             fields = import_library("huggingface_hub").ModelCard(text).data.to_dict()
     except (ValueError, TypeError, import_library("yaml").YAMLError) as error:
         problem = f"is not YAML: {error}"
@@ -214,10 +207,8 @@ def _translate_push_errors(repo_id: str) -> Iterator[None]:
         with translate_hub_errors(repo_id, "write"):
             yield
     except json.JSONDecodeError as error:
-        happened, cure = (
-            f"the server's response is not JSON ({error})",
-            "check HF_ENDPOINT and your proxy settings",
-        )
+        happened = f"the server's response is not JSON ({error})"
+        cure = "check HF_ENDPOINT and your proxy settings"
         raise DownloadError(happened, "expected a Hugging Face hub", cure) from error
     except ValueError as error:  # huggingface_hub raises it if the hub rejects the front matter
         happened = f"the hub refused {CARD_FILE}: {error}"

@@ -14,15 +14,15 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Final
 
+from torch import Tensor
+
 from brewster.errors import ModelError
 from brewster.models.diffusion.adapter.lora import PEFT_KEY, PREFIX, LoraMetadata, layer_settings, write_lora
 from brewster.models.diffusion.adapter.lora_formats import (
-    LowRankLayer,
     ScalingFunction,
     lora_format,
     read_lora_layers,
     scaling_from_config,
-    to_state_dict,
 )
 from brewster.models.diffusion.backbones.backbone import Backbone
 from brewster.models.diffusion.backbones.loading import encode_prompt
@@ -51,18 +51,16 @@ def import_lora(
 
     For `source`, see `find_weights_file`; for `base_model`, see `load_backbone`; for `alpha`, see `read_layers`.
     `prompt` is a name in `PROMPTS`, or the text itself, which `device` encodes. `panels` are those that the LoRA
-    generates from the photo. Returns the metadata of the written LoRA. Raises ModelError if there is no LoRA, or a key
-    or shape does not belong to the base model (the message names the key style), or alpha is missing or given twice;
-    RecipeError if the panels do not contain T, or are repeated; DownloadError, DeviceError, MissingExtra, see
-    `encode_prompt`; OutputError if the folder cannot be written.
+    generates from the photo. Returns the metadata of the written LoRA.
     """
     task = DecompositionTask(PanelLayout(panels))
     base = build_on_meta(base_model)
-    layers = read_layers(find_lora_file(source), base, alpha)
+    state = read_layers(find_lora_file(source), base, alpha)
+    settings = layer_settings(state)
     embedding = encode_prompt(base_model, PROMPTS.get(prompt, prompt), device=device)
-    rank = max(layer.rank for layer in layers.values())
+    rank = settings["r"]
     written = LoraMetadata(base.name, base_model, None, rank, rank, task, embedding.sha256, imported=True)
-    write_lora(folder, to_state_dict(layers), layer_settings(layers), embedding, written)
+    write_lora(folder, state, settings, embedding, written)
     return written
 
 
@@ -71,12 +69,10 @@ def find_lora_file(source: str) -> Path:
     return find_weights_file(source, (".safetensors",), companions=[PEFT_CONFIG_FILE])
 
 
-def read_layers(path: Path, base: Backbone, alpha: int | None = None) -> dict[str, LowRankLayer]:
+def read_layers(path: Path, base: Backbone, alpha: int | None = None) -> dict[str, Tensor]:
     """The layers of the LoRA in a file, see `read_lora_layers`. The base must have no LoRA; it may be on the device "meta".
 
-    `alpha` is that of all layers, for a LoRA of peft without its adapter_config.json. Raises ModelError if the file is missing
-    or damaged, a key or shape does not belong to the base, a LoRA of peft has no alpha, or alpha is given for a LoRA that has
-    its own.
+    `alpha` is that of all layers, for a LoRA of peft without its adapter_config.json, which must have one.
     """
     tensors, metadata = read_tensors(path)
     scale = _scale(path, metadata)

@@ -25,8 +25,13 @@ from pydantic import Field, TypeAdapter, ValidationError
 from torch import Tensor, nn
 
 from brewster.errors import BrewsterError, ModelError, RecipeError, invalid_value
-from brewster.models.diffusion.adapter import lora_formats
-from brewster.models.diffusion.adapter.lora_formats import LowRankLayer
+from brewster.models.diffusion.adapter.lora_formats import (
+    DOWN_SUFFIX,
+    UP_SUFFIX,
+    adapted_layers,
+    check_shape,
+    read_lora_layers,
+)
 from brewster.models.diffusion.backbones.backbone import Backbone
 from brewster.models.diffusion.lazy_imports import import_library
 from brewster.models.diffusion.prompt import PROMPT_FILE, PromptEmbedding, load_prompt
@@ -67,7 +72,7 @@ class LoraMetadata:
 
     @classmethod
     def from_json(cls, text: str) -> LoraMetadata:
-        """Parses the result of `to_json`. Raises ModelError if the text is not valid metadata."""
+        """Parses the result of `to_json`."""
         cure = "copy the folder again, or save the LoRA again"
         try:
             return TypeAdapter(LoraMetadata).validate_json(text, strict=True, extra="forbid")
@@ -87,8 +92,7 @@ class LoraMetadata:
 
 def select_target_modules(backbone: Backbone, patterns: Sequence[str] = ()) -> list[str]:
     """The full names of the linear layers of the blocks that match a pattern; without patterns, of all of them. In a
-    pattern, * and ? are wildcards as in a shell: "*.attn.*" selects the layers of the attention. Raises ModelError if a
-    pattern matches no layer."""
+    pattern, * and ? are wildcards as in a shell: "*.attn.*" selects the layers of the attention."""
     names = backbone.lora_targets()
     selected = {pattern: fnmatch.filter(names, pattern) for pattern in patterns or "*"}
     for pattern, found in selected.items():
@@ -105,8 +109,7 @@ def add_lora(
     backbone: Backbone, *, rank: int = 16, alpha: int = 16, seed: int = 0, target_modules: Sequence[str] = ()
 ) -> list[nn.Parameter]:
     """Adds a LoRA to the linear layers of the blocks; for `target_modules` see `select_target_modules`. Its B matrices
-    are zero, so predictions do not change yet. Returns the parameters to train. Raises ModelError if a target matches
-    no layer; MissingExtra if peft is not installed."""
+    are zero, so predictions do not change yet. Returns the parameters to train."""
     names = select_target_modules(backbone, target_modules)
     config = import_library("peft").LoraConfig(r=rank, lora_alpha=alpha, target_modules=names)
     with torch.random.fork_rng(devices=[backbone.device] if backbone.device.type == "cuda" else []):
@@ -115,25 +118,20 @@ def add_lora(
     return lora_parameters(backbone)
 
 
-def attach_layers(
-    backbone: Backbone, layers: Mapping[str, LowRankLayer], *, adapter: str = ADAPTER_NAME
-) -> None:
-    """Adds a LoRA with these layers to a backbone for inference. Each layer has its own rank.
+def attach_layers(backbone: Backbone, state: Mapping[str, Tensor], *, adapter: str = ADAPTER_NAME) -> None:
+    """Adds a LoRA with the weights of `read_lora_layers` to a backbone for inference. Each layer has its own rank.
 
     A second LoRA, such as a few-step LoRA (Lightning, turbo), needs another name as `adapter`: both changes of the
-    weights are added. The weights are in the dtype in which the backbone computes, see `load_lora`. Raises ModelError
-    if a layer is not in the backbone, or has another shape; MissingExtra if peft is not installed.
+    weights are added. The weights are in the dtype in which the backbone computes, see `load_lora`.
     """
     others = [*(getattr(backbone.transformer, "peft_config", None) or ())]
     modules = dict(backbone.transformer.named_modules())
-    for name, layer in layers.items():
-        lora_formats.check_shape(name, layer, modules.get(name))
+    for name in adapted_layers(state):
+        check_shape(name, state[name + DOWN_SUFFIX], state[name + UP_SUFFIX], modules.get(name))
     peft = import_library("peft")
-    _add_adapter(backbone, peft.LoraConfig(**layer_settings(layers)), adapter)
+    _add_adapter(backbone, peft.LoraConfig(**layer_settings(state)), adapter)
     _convert_for_inference(backbone)
-    peft.set_peft_model_state_dict(
-        backbone.transformer, lora_formats.to_state_dict(layers), adapter_name=adapter
-    )
+    peft.set_peft_model_state_dict(backbone.transformer, dict(state), adapter_name=adapter)
     if others:
         backbone.transformer.set_adapters([*others, adapter])
 
@@ -150,8 +148,7 @@ def lora_state_dict(backbone: Backbone) -> dict[str, Tensor]:
 
 
 def load_lora_state(backbone: Backbone, state: Mapping[str, Tensor]) -> None:
-    """Loads weights from `lora_state_dict` into a backbone with a LoRA of the same shapes. Raises ModelError if the weights are
-    those of another backbone or rank."""
+    """Loads weights from `lora_state_dict` into a backbone with a LoRA of the same shapes."""
     expected = lora_state_dict(backbone)
     if mismatched := sorted(expected.keys() ^ state.keys()):
         raise ModelError(
@@ -183,7 +180,7 @@ def save_lora(
 ) -> LoraMetadata:
     """Writes a folder with the LoRA, in a file that diffusers can load, and the prompt. The bytes are reproducible. By
     default `base_model` is the backbone's hub id. `target_modules` are those of `add_lora`. Returns the metadata that
-    is stored in the file. Raises OutputError if the folder cannot be written."""
+    is stored in the file."""
     config = backbone.transformer.peft_config[ADAPTER_NAME]
     source, rank, alpha = base_model or backbone.hub_id, config.r, config.lora_alpha
     metadata = LoraMetadata(
@@ -202,7 +199,7 @@ def write_lora(
     prompt: PromptEmbedding,
     metadata: LoraMetadata,
 ) -> None:
-    """Writes prompt and weights. `settings` are those that diffusers reads from the file. May raise OutputError."""
+    """Writes prompt and weights. `settings` are those that diffusers reads from the file."""
     tensors = {PREFIX + name: tensor for name, tensor in state.items()}
     prefixed = {PREFIX + name: value for name, value in settings.items()}
     prompt.save(folder / PROMPT_FILE)
@@ -211,14 +208,12 @@ def write_lora(
 
 
 def read_lora_metadata(folder: Path) -> LoraMetadata:
-    """The metadata of the LoRA in this folder. It names the backbone to load. Raises ModelError if the LoRA is missing or
-    damaged, or was not written by brewster."""
+    """The metadata of the LoRA in this folder. It names the backbone to load."""
     return read_lora(folder)[1]
 
 
 def read_prompt(folder: Path, metadata: LoraMetadata) -> PromptEmbedding:
-    """The prompt of the LoRA in this folder. Raises ModelError if the prompt is missing or damaged, or is not the one with
-    which the LoRA was trained."""
+    """The prompt of the LoRA in this folder."""
     prompt = load_prompt(folder / PROMPT_FILE, metadata.backbone)
     if prompt.sha256 != metadata.prompt_sha256:
         raise ModelError(
@@ -233,13 +228,12 @@ def load_lora(folder: Path, backbone: Backbone) -> tuple[LoraMetadata, PromptEmb
     """Adds the LoRA of a folder to its backbone for inference.
 
     The LoRA has the dtype in which the backbone computes, because a float32 LoRA would convert the activations of every
-    layer of a bf16 base twice. Returns the metadata of the LoRA, and its prompt. Raises ModelError if its weights do
-    not match the rank in its metadata or the backbone, a file is damaged, or the prompt does not belong to it.
+    layer of a bf16 base twice. Returns the metadata of the LoRA, and its prompt.
     """
     state, metadata = read_lora(folder)
     prompt = read_prompt(folder, metadata)
     if metadata.imported:
-        attach_layers(backbone, lora_formats.read_lora_layers(state, backbone.transformer, backbone.name))
+        attach_layers(backbone, read_lora_layers(state, backbone.transformer, backbone.name))
         return metadata, prompt
     add_lora(backbone, rank=metadata.rank, alpha=metadata.alpha, target_modules=metadata.target_modules)
     load_lora_state(backbone, state)
@@ -253,8 +247,7 @@ def _convert_for_inference(backbone: Backbone) -> None:
 
 
 def read_lora(folder: Path) -> tuple[dict[str, Tensor], LoraMetadata]:
-    """The weights of the LoRA in this folder, as `lora_state_dict` names them, and its metadata. Raises ModelError if the LoRA
-    is missing or damaged, or was not written by brewster."""
+    """The weights of the LoRA in this folder, as `lora_state_dict` names them, and its metadata."""
     tensors, entries = read_tensors(folder / LORA_FILE)
     if _METADATA_KEY not in entries:
         raise ModelError(
@@ -274,9 +267,9 @@ def _add_adapter(backbone: Backbone, config: Any, name: str = ADAPTER_NAME) -> N
     import_library("diffusers.training_utils").cast_training_params(backbone.transformer, torch.float32)
 
 
-def layer_settings(layers: Mapping[str, LowRankLayer]) -> dict[str, Any]:
+def layer_settings(state: Mapping[str, Tensor]) -> dict[str, Any]:
     """The settings of peft for layers of any rank. The names are regular expressions that match only the full name."""
-    ranks = {re.escape(name): layer.rank for name, layer in sorted(layers.items())}
+    ranks = {re.escape(name): len(state[name + DOWN_SUFFIX]) for name in adapted_layers(state)}
     rank = max(ranks.values())
     pattern = {f"^{name}": value for name, value in ranks.items() if value != rank}
     return {

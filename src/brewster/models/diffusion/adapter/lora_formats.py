@@ -1,7 +1,7 @@
 """Reads LoRAs of other programs: the key styles of peft, diffusers, kohya's sd-scripts and ComfyUI.
 
-    layers = read_lora_layers(tensors, backbone.transformer, "kontext", scaling_from_config(settings))
-    attach_layers(backbone, layers)         # in lora.py
+    state = read_lora_layers(tensors, backbone.transformer, "kontext", scaling_from_config(settings))
+    attach_layers(backbone, state)         # in lora.py
 
 Any rank and any selection of layers are accepted. The scale alpha / rank of a layer is multiplied into its B matrix, so the change of a
 layer's weight is B @ A. Keys that are not understood are an error, never ignored.
@@ -12,15 +12,11 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final, final
+from typing import Any, Final
 
 from torch import Tensor, nn
 
 from brewster.errors import ModelError
-
-if TYPE_CHECKING:
-    from jaxtyping import Float
 
 _PREFIXES: Final = {
     "base_model.model.": "peft",
@@ -31,14 +27,17 @@ _PREFIXES: Final = {
     "lora_transformer_": "kohya",
 }
 """Prefix of a key -> the program that writes it. A key may have several of these prefixes."""
+_PREFIX: Final = re.compile(f"^({'|'.join(map(re.escape, _PREFIXES))})+")
 _KEY: Final = re.compile(
-    r"(?P<module>.+?)\.(?:(?P<matrix>lora_A|lora_B|lora_down|lora_up)(?:\.(?!weight$)[^.]+)?\.weight|(?P<alpha>alpha))"
+    r"(?P<layer>.+?)\.(?:(?P<matrix>lora_A|lora_B|lora_down|lora_up)(?:\.(?!weight$)[^.]+)?\.weight|alpha)"
 )
 """A layer, then `lora_A`, `lora_B` (peft) or `lora_down`, `lora_up` (kohya), the name of the adapter, or `alpha`."""
 DOWN_SUFFIX: Final = ".lora_A.weight"
 UP_SUFFIX: Final = ".lora_B.weight"
 """The suffixes of the keys of a layer's two matrices in a state dict of brewster, peft and diffusers."""
-_DOWN: Final = ("lora_A", "lora_down")
+_SUFFIXES: Final = {
+    "lora_A": DOWN_SUFFIX, "lora_down": DOWN_SUFFIX, "lora_B": UP_SUFFIX, "lora_up": UP_SUFFIX, None: "alpha",
+}  # fmt: skip
 _UNSUPPORTED: Final = {
     r"dora_scale|lora_magnitude": "DoRA matrices",
     r"lokr_": "LoKr matrices",
@@ -105,65 +104,55 @@ _SCALE_SHIFT_SWAPPED: Final = "norm_out.linear"
 """The layer whose two halves, scale and shift, have the opposite order in the original code."""
 
 
-@final
-@dataclass(frozen=True, eq=False)
-class LowRankLayer:
-    """The LoRA of one linear layer: the change of its weight is `up @ down`."""
-
-    down: Float[Tensor, "r i"]
-    up: Float[Tensor, "o r"]
-
-    @property
-    def rank(self) -> int:
-        """The number of rows of `down`."""
-        return len(self.down)
-
-
 ScalingFunction = Callable[[str, int], float]
 """The factor alpha / rank for a layer, by its name in the file, and its rank."""
 
 
 def read_lora_layers(
     tensors: Mapping[str, Tensor], transformer: nn.Module, backbone: str, scale: ScalingFunction | None = None
-) -> dict[str, LowRankLayer]:
-    """The LoRA of each layer by the layer's name in the transformer, float32, with the scale multiplied in.
+) -> dict[str, Tensor]:
+    """The two matrices of each layer with the keys of `lora_state_dict`, float32, with the scale multiplied into B.
 
     Only names and shapes of the transformer are read, so it may be on the device "meta". The scale alpha / rank is for files
-    without alphas; by default 1, as in diffusers, sd-scripts and ComfyUI. Raises ModelError if a key is not understood, a
-    matrix is missing, a layer occurs twice, or a layer or shape is not that of the transformer. The message names the style of
-    the keys.
+    without alphas; by default 1, as in diffusers, sd-scripts and ComfyUI.
     """
-    matrices, alphas = _parse(tensors, backbone)
     targets = _layer_names(transformer, backbone)
-    layers: dict[str, LowRankLayer] = {}
-    for name, pair in matrices.items():
+    state: dict[str, Tensor] = {}
+    for name, parts in _parse(tensors, backbone).items():
+        if parts.keys() == {"alpha"}:
+            raise _unknown(f"{name}.alpha", tensors, backbone)
         if name not in targets:
             raise _unknown(name, tensors, backbone)
-        if set(pair) != {"down", "up"}:
+        if not parts.keys() >= {DOWN_SUFFIX, UP_SUFFIX}:
             raise ModelError(
                 f"the LoRA has only one of two matrices for {name}", "expected both", "copy the file again"
             )
-        rank = len(pair["down"])
-        factor = alphas[name] / rank if name in alphas else scale(name, rank) if scale else 1.0
-        layer = LowRankLayer(pair["down"].float(), pair["up"].float() * factor)
-        parts = _split(name, layer, targets[name], transformer)
-        if repeated := sorted(parts.keys() & layers.keys()):
-            raise _repeated(repeated[0])
-        layers |= parts
-    return layers
+        down, up = parts[DOWN_SUFFIX].float(), parts[UP_SUFFIX].float()
+        rank = len(down)
+        up = up * (float(parts["alpha"]) / rank if "alpha" in parts else scale(name, rank) if scale else 1.0)
+        # A layer of the original code may be several in diffusers, which have equal matrices `down`.
+        modules = {target: transformer.get_submodule(target) for target in targets[name]}
+        sizes = [int(module.out_features) for module in modules.values()]  # type: ignore[arg-type]
+        if sum(sizes) != len(up):
+            raise ModelError(
+                f"the LoRA of {name} has {len(up)} rows",
+                f"expected {sum(sizes)}",
+                "use the base with which it was trained",
+            )
+        if targets[name] == (_SCALE_SHIFT_SWAPPED,) and not name.startswith("norm_out"):
+            up = up.roll(len(up) // 2, dims=0)
+        for (target, module), rows in zip(modules.items(), up.split(sizes), strict=True):  # type: ignore[no-untyped-call]
+            if target + DOWN_SUFFIX in state:
+                raise _repeated(target)
+            check_shape(target, down, rows, module)
+            # safetensors refuses tensors that share memory.
+            state |= {target + DOWN_SUFFIX: down.clone(), target + UP_SUFFIX: rows.clone()}
+    return dict(sorted(state.items()))
 
 
 def adapted_layers(state: Mapping[str, Tensor]) -> list[str]:
-    """Returns the names of the layers whose weights are in `state`, which has keys as those of `lora_state_dict`, sorted."""
+    """Returns the names of the layers whose weights are in `state`, which has the keys of `lora_state_dict`, sorted."""
     return sorted(key.removesuffix(UP_SUFFIX) for key in state if key.endswith(UP_SUFFIX))
-
-
-def to_state_dict(layers: Mapping[str, LowRankLayer]) -> dict[str, Tensor]:
-    """The weights with the names that `lora_state_dict` uses."""
-    state: dict[str, Tensor] = {}
-    for name, layer in sorted(layers.items()):
-        state |= {name + DOWN_SUFFIX: layer.down, name + UP_SUFFIX: layer.up}
-    return state
 
 
 def lora_format(tensors: Mapping[str, Tensor]) -> str:
@@ -175,34 +164,23 @@ def lora_format(tensors: Mapping[str, Tensor]) -> str:
     return " and ".join(sorted(styles))
 
 
-def _parse(
-    tensors: Mapping[str, Tensor], backbone: str
-) -> tuple[dict[str, dict[str, Tensor]], dict[str, float]]:
-    """The matrices "down" and "up" of each layer, and the alphas, by the layer's name in the file without its prefix."""
-    matrices: dict[str, dict[str, Tensor]] = {}
-    alphas: dict[str, float] = {}
+def _parse(tensors: Mapping[str, Tensor], backbone: str) -> dict[str, dict[str, Tensor]]:
+    """The parts of each layer, by the layer's name in the file without its prefix: matrices by suffix, and perhaps "alpha"."""
+    layers: dict[str, dict[str, Tensor]] = {}
     for key, tensor in tensors.items():
-        match = _KEY.fullmatch(key)
-        if not match:
+        if not (match := _KEY.fullmatch(key)):
             raise _unknown(key, tensors, backbone)
-        name, part = match["module"], "down" if match["matrix"] in _DOWN else "up"
-        while prefix := next((prefix for prefix in _PREFIXES if name.startswith(prefix)), ""):
-            name = name.removeprefix(prefix)
-        if name in alphas if match["alpha"] else part in matrices.get(name, {}):
+        name, part = _PREFIX.sub("", match["layer"]), _SUFFIXES[match["matrix"]]
+        if part in layers.setdefault(name, {}):
             raise _repeated(name)
-        if match["alpha"]:
-            alphas[name] = float(tensor)
-        else:
-            matrices.setdefault(name, {})[part] = tensor
-    if unused := sorted(alphas.keys() - matrices.keys()):
-        raise _unknown(f"{unused[0]}.alpha", tensors, backbone)
-    if not matrices:
+        layers[name][part] = tensor
+    if not layers:
         raise ModelError(
             "the file contains no LoRA",
             "expected matrices lora_A and lora_B for each layer",
             "check the file",
         )
-    return matrices, alphas
+    return layers
 
 
 def _layer_names(transformer: nn.Module, backbone: str) -> dict[str, tuple[str, ...]]:
@@ -221,36 +199,12 @@ def _layer_names(transformer: nn.Module, backbone: str) -> dict[str, tuple[str, 
     return {name.replace(".", "_"): targets for name, targets in names.items()} | names
 
 
-def _split(
-    name: str, layer: LowRankLayer, targets: tuple[str, ...], transformer: nn.Module
-) -> dict[str, LowRankLayer]:
-    """Divides a layer of the original code into its layers in diffusers, which have equal matrices `down`."""
-    sizes = [int(transformer.get_submodule(target).out_features) for target in targets]  # type: ignore[arg-type]
-    if sum(sizes) != len(layer.up):
-        raise ModelError(
-            f"the LoRA of {name} has {len(layer.up)} rows",
-            f"expected {sum(sizes)}",
-            "use the base with which it was trained",
-        )
-    parts = layer.up.split(sizes)  # type: ignore[no-untyped-call]
-    if targets == (_SCALE_SHIFT_SWAPPED,) and not name.startswith("norm_out"):
-        parts = (layer.up.roll(len(layer.up) // 2, dims=0),)
-    layers = {
-        target: LowRankLayer(layer.down.clone(), part.clone())  # safetensors refuses shared memory
-        for target, part in zip(targets, parts, strict=True)
-    }
-    for target, part in layers.items():
-        check_shape(target, part, transformer.get_submodule(target))
-    return layers
-
-
-def check_shape(name: str, layer: LowRankLayer, module: Any) -> None:  # noqa: ANN401 - quantized layers differ in type
-    """Checks that the LoRA fits a linear layer. Raises ModelError if the module is not a linear layer, or has another shape."""
+def check_shape(name: str, down: Tensor, up: Tensor, module: Any) -> None:  # noqa: ANN401 - quantized layers differ in type
+    """Checks that the LoRA fits the module, which must be a linear layer of this shape."""
     expected = (module.out_features, module.in_features) if hasattr(module, "out_features") else None
-    up, down = tuple(layer.up.shape), tuple(layer.down.shape)
-    if expected is None or up != (expected[0], layer.rank) or down != (layer.rank, expected[1]):
+    if expected is None or (*up.shape, *down.shape) != (expected[0], len(down), len(down), expected[1]):
         raise ModelError(
-            f"the LoRA of {name} has matrices of {up} and {down}",
+            f"the LoRA of {name} has matrices of {tuple(up.shape)} and {tuple(down.shape)}",
             f"expected a layer with {' x '.join(map(str, expected))} weights"
             if expected
             else "expected a linear layer",

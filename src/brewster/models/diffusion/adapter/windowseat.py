@@ -48,8 +48,8 @@ class _Config(BaseModel):
 
 
 def read_metadata(folder: Path) -> LoraMetadata:
-    """The base, rank, task and prompt digest of the model in this folder. The quantization is that of the published inference
-    code. Raises ModelError if a file is missing or damaged, or lacks a value."""
+    """The base, rank, task and prompt digest of the model in this folder. The quantization is that of the published
+    inference code."""
     try:
         index = _Index.model_validate(read_json(folder / INDEX_FILE))
         config = _Config.model_validate(read_json(folder / CONFIG_FILE))
@@ -73,8 +73,7 @@ def load(folder: Path, backbone: Backbone) -> tuple[LoraMetadata, PromptEmbeddin
     ModelError if a file is missing or damaged, or a weight belongs to no layer of the backbone."""
     metadata, prompt = read_metadata(folder), _read_prompt(folder)
     tensors, _ = read_tensors(folder / WEIGHTS_FILE)
-    config = read_json(folder / CONFIG_FILE)
-    scale = scaling_from_config(config)
+    scale = scaling_from_config(read_json(folder / CONFIG_FILE))
     attach_layers(backbone, read_lora_layers(tensors, backbone.transformer, backbone.name, scale))
     return metadata, prompt
 

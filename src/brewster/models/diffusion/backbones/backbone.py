@@ -157,7 +157,7 @@ class Backbone(ABC):
         guidance: float,
     ) -> Float[Tensor, "n c h w"]:
         """The velocity (noise - latents of the image) at time sigma, float32; differentiable. `condition` may be
-        `no_condition()`. Raises ModelError if the prompt lacks an embedding that this guidance needs."""
+        `no_condition()`."""
 
     @abstractmethod
     def positions(self, latents: Tensor, condition: Tensor) -> Any:  # noqa: ANN401 - each backbone has its own type
@@ -249,8 +249,7 @@ class Backbone(ABC):
         ]
 
     def pipeline(self) -> Any:  # noqa: ANN401 - a pipeline of diffusers
-        """The pipeline of diffusers with the same transformer, VAE and scheduler, without text encoders. Raises MissingExtra if
-        diffusers is not installed."""
+        """The pipeline of diffusers with the same transformer, VAE and scheduler, without text encoders."""
         pipeline_class = diffusers_class(self.classes["pipeline"])
         parts = {"transformer": self.transformer, "vae": self.vae, "scheduler": self.scheduler}
         parameters = inspect.signature(pipeline_class.__init__).parameters
@@ -310,8 +309,7 @@ class ClassifierFreeBackbone(Backbone):
     def predict(
         self, latents: Tensor, condition: Tensor, sigma: Tensor, prompt: PromptEmbedding, guidance: float
     ) -> Tensor:
-        """See `Backbone.predict`. A distilled model ignores the guidance. Raises ModelError if the guidance is above 1, and the
-        prompt has no embedding of the empty prompt."""
+        """See `Backbone.predict`. A distilled model ignores the guidance."""
         conditional = self._velocity(latents, condition, sigma, prompt.embeds)
         if guidance <= 1 or self.distilled:
             return conditional

@@ -15,7 +15,7 @@ import zlib
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Final, get_args
+from typing import Any, Final
 
 import torch
 from torch import Tensor, nn
@@ -26,7 +26,7 @@ from brewster.models.diffusion.backbones.registry import (
     CONFIG_FILES,
     INDEX_FILE,
     MEMORY_HINT,
-    backbone_class_of,
+    find_backbone,
     hub_id_of,
     read_index,
     tiny,
@@ -65,10 +65,7 @@ def load_backbone(
     By default `dtype` is bfloat16 on an accelerator and float32 on the CPU. `quantization` stores the transformer's
     weights in 8 bits (torchao) or 4 bits (bitsandbytes, CUDA only). `transformer_file` is a single file, .gguf or
     .safetensors, whose weights replace those of the transformer, which are then not downloaded. It cannot be quantized
-    again. Raises DownloadError, see `resolve_model_folder`; ModelError if a file is missing or damaged, the
-    architecture is not supported, or a name or quantization is unknown; DeviceError if there is no such device, or it
-    is out of memory (the message says what to reduce); MissingExtra if diffusers, torchao or bitsandbytes is not
-    installed.
+    again.
     """
     _check_device(device)
     is_tiny = source.startswith(TINY_PREFIX)
@@ -130,15 +127,14 @@ def encode_prompt(source: str, text: str = PROMPT, *, device: str = "cpu") -> Pr
     They are loaded in bfloat16, on `device` if its free memory suffices, otherwise on the CPU. Call this before
     `load_backbone`: together with the base, most text encoders fit no consumer GPU.
 
-    Returns the embedding on the CPU, bfloat16; float32 for a tiny version. Raises DownloadError, ModelError,
-    DeviceError, MissingExtra, see `load_backbone`.
+    Returns the embedding on the CPU, bfloat16; float32 for a tiny version.
     """
     _check_device(device)
     if source.startswith(TINY_PREFIX):
         seed = 0 if text == PROMPT else zlib.crc32(text.encode()) or 1  # the sum of "" is 0
         return replace(tiny(source.removeprefix(TINY_PREFIX), seed)[1], text=text)
     # Checked before the download, which may take an hour.
-    for name in backbone_class_of(source).text_encoder_requirements:
+    for name in find_backbone(source)[0].text_encoder_requirements:
         if importlib.util.find_spec(name) is None:
             raise MissingExtra(
                 f"{name} is not installed",
@@ -252,14 +248,8 @@ def _translate_load_errors(folder: Path) -> Iterator[None]:
         ) from error
 
 
-def _quantization_options(quantization: str, device: str) -> dict[str, Any]:
-    """The keyword argument of from_pretrained for a quantization. The quantization is checked before any download."""
-    if quantization not in get_args(Quantization):
-        raise ModelError(
-            f"there is no quantization {quantization!r}",
-            f"expected one of {', '.join(get_args(Quantization))}",
-            "choose one of them",
-        )
+def _quantization_options(quantization: Quantization, device: str) -> dict[str, Any]:
+    """The keyword argument of from_pretrained for a quantization, whose libraries are checked before any download."""
     if quantization == "nf4":
         if not device.startswith("cuda"):
             raise DeviceError(

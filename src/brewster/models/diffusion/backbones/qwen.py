@@ -7,11 +7,7 @@ from typing import Any, ClassVar, Final, final
 import torch
 from torch import Tensor
 
-from brewster.models.diffusion.backbones.backbone import (
-    APACHE_2,
-    PATCH,
-    ClassifierFreeBackbone,
-)
+from brewster.models.diffusion.backbones.backbone import APACHE_2, PATCH, ClassifierFreeBackbone
 from brewster.models.diffusion.prompt import PromptEmbedding
 from brewster.models.diffusion_resources import BACKBONE_COSTS
 

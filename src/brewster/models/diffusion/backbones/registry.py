@@ -48,8 +48,7 @@ normalisation."""
 
 
 def tiny(name: str, seed: int = 0) -> tuple[Backbone, PromptEmbedding]:
-    """Builds a tiny version of a backbone, with the same classes and seeded random weights, and a random prompt for it. Raises
-    ModelError if the name is not in the table."""
+    """Builds a tiny version of a backbone, with the same classes and seeded random weights, and a random prompt for it."""
     backbone_class = find_backbone_class(name)
     backbone = build(name, backbone_class.tiny, seed=seed)
     return backbone, backbone_class.random_prompt(backbone.transformer, seed)
@@ -63,8 +62,7 @@ def build(
     device: str = "cpu",
     dtype: torch.dtype = torch.float32,
 ) -> Backbone:
-    """Builds a backbone with seeded random weights, by default in full size. Device "meta" needs no memory. Raises
-    ModelError if the name is not in the table; DeviceError if the device is out of memory."""
+    """Builds a backbone with seeded random weights, by default in full size. Device "meta" needs no memory."""
     backbone_class = find_backbone_class(name)
     architecture = architecture or backbone_class.full_size
     part_classes = {part: diffusers_class(backbone_class.classes[part]) for part in CONFIG_FILES}
@@ -87,15 +85,12 @@ def build(
 
 def build_on_meta(source: str, *, dtype: torch.dtype = torch.float32) -> Backbone:
     """The backbone on the device "meta": the names and shapes of its weights, which need no memory. For `source`, see
-    `load_backbone`. For a hub id, only configuration files are downloaded. Raises DownloadError, ModelError or
-    MissingExtra, see `load_backbone`."""
-    if is_registered(source):
-        backbone_class = find_backbone_class(source.removeprefix(TINY_PREFIX))
-        is_tiny = source.startswith(TINY_PREFIX)
-        architecture = backbone_class.tiny if is_tiny else backbone_class.full_size
+    `load_backbone`. For a hub id, only configuration files are downloaded."""
+    backbone_class, folder = find_backbone(source)
+    if folder is None:
+        architecture = backbone_class.tiny if source.startswith(TINY_PREFIX) else backbone_class.full_size
         return build(backbone_class.name, architecture, device="meta", dtype=dtype)
-    folder = resolve_model_folder(source, list(DESCRIPTION_FILES))
-    backbone_class, index = read_index(folder)
+    _, index = read_index(folder)
     parts = {}
     for part, file in CONFIG_FILES.items():
         class_name, config_file = backbone_class.classes[part], folder / part / file
@@ -113,18 +108,27 @@ def build_on_meta(source: str, *, dtype: torch.dtype = torch.float32) -> Backbon
     return backbone_class(**parts, distilled=bool(index.get("is_distilled")))
 
 
-def find_description(source: str) -> Path | None:
-    """The folder with the index and the configuration of a backbone, or None if they are not in the cache. Downloads
-    nothing. `source` is a folder, which is returned unchanged, or a hub id."""
+def find_backbone(source: str) -> tuple[type[Backbone], Path | None]:
+    """The class that `load_backbone` would use for this source, and the folder with its description: None for a name in the
+    table or a tiny version. The description of a hub id is downloaded, but no weights."""
+    if is_registered(source):
+        return find_backbone_class(source.removeprefix(TINY_PREFIX)), None
+    folder = resolve_model_folder(source, list(DESCRIPTION_FILES))
+    return read_index(folder)[0], folder
+
+
+def find_description(source: str) -> str | None:
+    """A source of the same backbone for which `find_backbone` needs no download: a name in the table, a tiny version, or a
+    folder, which may be in the cache. None if a hub id is not in the cache."""
+    if is_registered(source) or Path(source).is_dir():
+        return source
     folder = cached_model_folder(source, list(DESCRIPTION_FILES))
-    if folder is None or Path(source).is_dir():
-        return folder
-    return folder if all((folder / name).is_file() for name in DESCRIPTION_FILES) else None
+    is_complete = folder is not None and all((folder / name).is_file() for name in DESCRIPTION_FILES)
+    return str(folder) if is_complete else None
 
 
 def find_backbone_class(name: str) -> type[Backbone]:
-    """The Backbone class of this name. Raises ModelError if the name is not in the table (the message suggests the
-    closest one)."""
+    """The Backbone class of this name in the table."""
     if name in BACKBONES:
         return BACKBONES[name]
     close = difflib.get_close_matches(name, BACKBONES, n=1)
@@ -133,14 +137,6 @@ def find_backbone_class(name: str) -> type[Backbone]:
         f"expected one of {', '.join(BACKBONES)}",
         f"did you mean {close[0]}?" if close else "choose one of them",
     )
-
-
-def backbone_class_of(source: str) -> type[Backbone]:
-    """The Backbone class that `load_backbone` would use for this source. The files of its description are downloaded, but no
-    weights. Raises DownloadError, ModelError or MissingExtra, see `load_backbone`."""
-    if is_registered(source):
-        return find_backbone_class(source.removeprefix(TINY_PREFIX))
-    return read_index(resolve_model_folder(source, list(DESCRIPTION_FILES)))[0]
 
 
 def is_registered(source: str) -> bool:
@@ -154,8 +150,7 @@ def hub_id_of(source: str) -> str:
 
 
 def read_index(folder: Path) -> tuple[type[Backbone], dict[str, Any]]:
-    """The Backbone class of a folder in diffusers' layout, and the content of its index. Raises ModelError if the index is
-    missing or damaged, or names a pipeline of another model."""
+    """The Backbone class of a folder in diffusers' layout, and the content of its index."""
     index = read_json(folder / INDEX_FILE)
     class_name = index.get("_class_name")
     by_pipeline = {
