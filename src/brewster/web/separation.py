@@ -112,13 +112,7 @@ JobName = Annotated[
 
 
 def separation_router(model_cache: ModelCache, job_queue: JobQueue, *, max_pixels: int) -> APIRouter:
-    """Returns the routes of the API, and the previews and tiles for the page.
-
-    Args:
-        model_cache: the models that clients can choose.
-        job_queue: runs the separations.
-        max_pixels: the maximum number of pixels of a photo.
-    """
+    """Returns the routes of the API, and the previews and tiles for the page. Clients choose a model of `model_cache`."""
     router = APIRouter()
     content = {"multipart/form-data": {"schema": form_schema(model_cache.names)}}
     body = {"requestBody": {"required": True, "content": content}}
@@ -179,7 +173,9 @@ def _add_page_routes(
 
     @router.post("/photo", include_in_schema=False)
     async def keep_photo(request: Request, job: JobName = None) -> Response:
-        return await run(request, job, partial(_keep_photo, photos))
+        return await run(
+            request, job, lambda _models, form, _progress: Response(headers=_open_photo(photos, form)[1])
+        )
 
     @router.get("/tile/{key}/{level}/{column}/{row}", include_in_schema=False)
     def tile(key: str, level: int, column: int, row: int) -> Response:
@@ -234,7 +230,9 @@ def _separate(
         headers["Brewster-Reflection"] = "derived"
     if separation.reconstruction_error is not None:
         headers["Brewster-Reconstruction-Error"] = f"{separation.reconstruction_error:.6f}"
-    return Response(data, headers=headers, media_type=_media_type(name))
+    is_image = Path(name).suffix.lower() in SUFFIXES
+    media_type = SUFFIXES[Path(name).suffix.lower()].mime_type if is_image else "application/zip"
+    return Response(data, headers=headers, media_type=media_type)
 
 
 def _preview(
@@ -264,27 +262,12 @@ def _burst_headers(report: BurstReport) -> dict[str, str]:
     return {"Brewster-Burst": report.method, "Brewster-Burst-Message": report.message}
 
 
-def _keep_photo(
-    photos: PhotoCache,
-    model_cache: ModelCache,  # noqa: ARG001
-    form: SeparationRequest,
-    on_progress: ProgressCallback,  # noqa: ARG001
-) -> Response:
-    return Response(headers=_open_photo(photos, form)[1])
-
-
 def _open_photo(photos: PhotoCache, form: SeparationRequest) -> tuple[Photo, dict[str, str]]:
     """Returns the decoded photo, and the headers with its key and its size. The photo is stored in the cache for the tiles."""
     key = hashlib.sha256(form.photo).hexdigest()
     photo = photos.get(key) or Photo.open(form.photo, max_pixels=form.options.max_pixels)
     photos.put(key, photo)
     return photo, {"Brewster-Photo": key, "Brewster-Size": "{}x{}".format(*photo.size)}
-
-
-def _media_type(name: str) -> str:
-    if name.endswith(".zip"):
-        return "application/zip"
-    return SUFFIXES[Path(name).suffix.lower()].mime_type
 
 
 def _content_disposition(name: str) -> str:

@@ -107,18 +107,17 @@ def study_router(
 ) -> APIRouter:
     """Returns the routes of a study. The token of the server is added to personal links."""
     routes, router = _StudyRoutes(study, store, max_participants, token), APIRouter(tags=["study"])
+    personal = "/s/{participant_token}"
     router.get("/invitation")(routes.invitation)
     router.post("/participants", status_code=201)(routes.admit)
-    router.get("/s/{participant_token}", include_in_schema=False)(routes.begin)
-    router.get("/s/{participant_token}/link")(routes.link)
-    router.get("/s/{participant_token}/trial")(routes.next_trial)
-    router.get("/s/{participant_token}/pictures/practice/{side}", response_class=Response)(
-        routes.practice_picture
-    )
-    router.get("/s/{participant_token}/pictures/{trial}/{side}", response_class=Response)(routes.picture)
-    router.post("/s/{participant_token}/answers")(routes.answer)
-    router.post("/s/{participant_token}/withdrawals")(routes.withdraw)
-    router.get("/privacy", include_in_schema=False)(routes.privacy)
+    router.get(personal, include_in_schema=False)(routes.begin)
+    router.get(f"{personal}/link")(routes.link)
+    router.get(f"{personal}/trial")(routes.next_trial)
+    router.get(f"{personal}/pictures/practice/{{side}}", response_class=Response)(routes.practice_picture)
+    router.get(f"{personal}/pictures/{{trial}}/{{side}}", response_class=Response)(routes.picture)
+    router.post(f"{personal}/answers")(routes.answer)
+    router.post(f"{personal}/withdrawals")(routes.withdraw)
+    router.get("/privacy", include_in_schema=False)(lambda: page_response("privacy.html"))
     return router
 
 
@@ -168,10 +167,6 @@ class _StudyRoutes:
         """Returns the first trial without an answer."""
         response.headers.update(_NOT_CACHED)
         return self._next(self._participant(participant_token))
-
-    def privacy(self) -> Response:
-        """Returns the page that lists what the study stores about a participant."""
-        return page_response("privacy.html")
 
     def practice_picture(self, participant_token: Token, side: Side) -> Response:
         """Returns a picture of the practice trial."""
@@ -229,21 +224,14 @@ class _StudyRoutes:
         last = self.store.last_trial(participant)
         if trial is None:
             return TrialResponse(trial=None, trials=count, last=last)
-        practice_trial = None
+        photo = self.study.picture(participant.trials[trial].photo)
+        found = TrialResponse(trial=trial, trials=count, width=photo.width, height=photo.height, last=last)
         if last is None:
             practice = _practice(participant)
             assert practice.expected
             photo = self.study.picture(practice.photo)
-            practice_trial = PracticeTrial(width=photo.width, height=photo.height, expected=practice.expected)
-        photo = self.study.picture(participant.trials[trial].photo)
-        return TrialResponse(
-            trial=trial,
-            trials=count,
-            width=photo.width,
-            height=photo.height,
-            practice=practice_trial,
-            last=last,
-        )
+            found.practice = PracticeTrial(width=photo.width, height=photo.height, expected=practice.expected)
+        return found
 
 
 def _practice(participant: Participant) -> assignment.Trial:
