@@ -12,7 +12,7 @@ import pyvips
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
-from PIL import Image, ImageOps
+from PIL import Image
 
 from brewster.errors import MissingExtra, OutputError, PhotoError, UnreadablePhoto, UnsupportedPhoto
 from brewster.image_formats import FORMATS
@@ -248,14 +248,6 @@ def test_a_photo_does_not_change_with_the_array_it_came_from():
         photo.pixels[0] = 1
 
 
-def test_profile_exif_and_orientation_of_a_pil_image_are_read():
-    image = pil(file_of(smooth(), "JPEG", exif=exif_block(), icc_profile=P3))
-    photo = Photo.open(image)
-    assert photo.file_info.icc == P3
-    assert photo.file_info.exif == exif_block(1).removeprefix(b"Exif\0\0")
-    assert np.array_equal(photo.pixels, np.asarray(ImageOps.exif_transpose(image)))
-
-
 def test_a_pil_jpeg_followed_by_previews_is_one_image():
     image = Image.fromarray(smooth())
     data = file_of(smooth(), "MPO", save_all=True, append_images=[image.resize((8, 8))])
@@ -328,8 +320,3 @@ def test_sixteen_bits_are_rounded_to_eight():
     photo = Photo.from_array(np.repeat(values[None, :, None], 3, axis=2), encoding="srgb")
     stored = Photo.open(photo.encode("png", depth=8)).pixels[0, :, 0]
     assert (stored == np.rint(values / 257)).all()
-
-
-def test_a_jpeg_has_quality_95_if_the_source_has_none():
-    photo = Photo.from_array(np.full((16, 16, 3), 99, np.uint8), encoding="srgb")
-    assert Photo.open(photo.encode("jpeg")).file_info.jpeg_quality == 95

@@ -154,10 +154,8 @@ def separate_task(
     be read or separated, or a layer cannot be written."""
     result.model, result.model_sha256, result.device = separator.name, separator.sha256, separator.device
     with row_in_errors(task.row):
-        if task.burst and isinstance(task.source, Path) and is_video(task.source):
-            photo: Path | bytes = task.source
-        else:
-            photo = read_content(task.source)
+        is_video_file = task.burst and isinstance(task.source, Path) and is_video(task.source)
+        photo = task.source if is_video_file and isinstance(task.source, Path) else read_content(task.source)
     if task.burst:
         separation = _separate_burst(task.burst, separator, options, on_progress)
     else:
@@ -192,13 +190,12 @@ def _check_sources(task: SeparationTask) -> None:
 
 def _missing_outputs(task: SeparationTask, *, overwrite: bool) -> dict[str, Location | OutputStream]:
     """Returns the layers that must be written, with their outputs. The others must have been made from this photo."""
-    missing = {
-        layer: target
-        for layer, target in task.outputs.items()
-        if not isinstance(target, Location) or overwrite or not exists(target)
-    }
-    check_layers(task.source, [target for layer, target in task.outputs.items() if layer not in missing])
-    return missing
+    outputs = task.outputs.items()
+    kept = (
+        {} if overwrite else {name: out for name, out in outputs if isinstance(out, Location) and exists(out)}
+    )
+    _check_layers(task.source, kept.values())
+    return {name: out for name, out in outputs if name not in kept}
 
 
 def _separate_burst(
@@ -206,14 +203,11 @@ def _separate_burst(
 ) -> Separation:
     from brewster.burst import read_video, separate_burst  # noqa: PLC0415  (imports torch)
 
-    first, *_ = burst.photos
-    photos: list[Source] = (
-        [*read_video(Path(first), burst.frames, max_pixels=options.max_pixels)]
-        if is_video(first)
-        else [read_content(photo) for photo in burst.photos]
-    )
+    photos: Sequence[Source] = [read_content(photo) for photo in burst.photos if not is_video(photo)]
+    if not photos:
+        photos = read_video(Path(burst.photos[0]), burst.frames, max_pixels=options.max_pixels)
     return separate_burst(
-        photos,
+        [*photos],
         reference=burst.reference,
         separator=separator,
         on_progress=on_progress,
@@ -228,7 +222,7 @@ def check_outputs(task: SeparationTask, photos: Set[str]) -> None:
         if not isinstance(target, Location):
             continue
         is_own_photo = isinstance(task.source, Location) and is_same_file(target, task.source)
-        if is_own_photo or real_path(target) in photos:
+        if is_own_photo or photos & real_paths([target]):
             raise OutputError(
                 f"{target} is itself a photo of the batch",
                 "expected another path, because photos of the batch are never overwritten",
@@ -239,7 +233,7 @@ def check_outputs(task: SeparationTask, photos: Set[str]) -> None:
 def skipped_result(task: SeparationTask) -> FileResult:
     """Returns the result of a photo whose layers all exist: skipped, or failed if they were made from another photo."""
     try:
-        check_layers(task.source, task.outputs.values())
+        _check_layers(task.source, task.outputs.values())
     except OutputError as error:
         return FileResult(task.name).failed(error)
     return FileResult(task.name, "skipped", _names(task.outputs))
@@ -249,14 +243,12 @@ def _names(outputs: Mapping[str, Location | OutputStream]) -> dict[str, str]:
     return {layer: display_name(target) for layer, target in outputs.items()}
 
 
-def check_layers(source: Location | InputStream, layers: Iterable[Location | OutputStream]) -> None:
-    """Checks that existing layers were made from this photo. See `find_layer_of_another_photo`. Streams are not
-    checked, because they can be read only once. Files in an object store are not checked either: two more requests
-    for each photo of an archive would take hours. Raises OutputError if a layer was made from another photo, or from
-    another version of this photo."""
-    if not isinstance(source, Path):
-        return
-    if layer := find_layer_of_another_photo(source, (path for path in layers if isinstance(path, Path))):
+def _check_layers(source: Location | InputStream, layers: Iterable[Location | OutputStream]) -> None:
+    """Checks that existing layers were made from this photo, or raises OutputError. Streams are not checked, because they can
+    be read only once. Files in an object store are not checked either: two more requests for each photo of an archive
+    would take hours."""
+    files = (path for path in layers if isinstance(path, Path))
+    if isinstance(source, Path) and (layer := find_layer_of_another_photo(source, files)):
         raise OutputError(
             f"{layer} was made from another photo, or from another version of {source}",
             "expected layers of this photo, or no files with their names",
@@ -283,10 +275,6 @@ def _sha256(photo: Path | bytes) -> str | None:
 
 
 def real_paths(files: Iterable[object]) -> frozenset[str]:
-    """Returns the real paths of the files. Streams have no path, and are left out."""
-    return frozenset(real_path(file) for file in files if isinstance(file, Location))
-
-
-def real_path(path: Location) -> str:
-    """Returns the absolute path without symbolic links; a URL is returned unchanged."""
-    return str(path) if isinstance(path, RemotePath) else os.path.realpath(path)
+    """Returns the absolute paths of the files without symbolic links, and URLs unchanged. Streams are left out."""
+    found = (file for file in files if isinstance(file, Location))
+    return frozenset(str(file) if isinstance(file, RemotePath) else os.path.realpath(file) for file in found)
