@@ -19,8 +19,6 @@ from brewster.batch.manifest import row_in_errors
 from brewster.batch.plan import (
     Burst,
     FileResult,
-    InputStream,
-    OutputStream,
     SeparationTask,
     display_name,
     plan_files,
@@ -34,6 +32,7 @@ from brewster.inference.separation import Separation
 from brewster.inference.separator import Separator
 from brewster.options import Options
 from brewster.photo import Source
+from brewster.photo.in_memory import BinaryFile, WritableFile
 from brewster.remote_path import Location, RemotePath, check_readable, read_image
 
 BatchProgressCallback = Callable[[int, str, float], None]
@@ -188,7 +187,7 @@ def _check_sources(task: SeparationTask) -> None:
                 check_readable(source)
 
 
-def _missing_outputs(task: SeparationTask, *, overwrite: bool) -> dict[str, Location | OutputStream]:
+def _missing_outputs(task: SeparationTask, *, overwrite: bool) -> dict[str, Location | WritableFile]:
     """Returns the layers that must be written, with their outputs. The others must have been made from this photo."""
     outputs = task.outputs.items()
     kept = (
@@ -239,11 +238,11 @@ def skipped_result(task: SeparationTask) -> FileResult:
     return FileResult(task.name, "skipped", _names(task.outputs))
 
 
-def _names(outputs: Mapping[str, Location | OutputStream]) -> dict[str, str]:
+def _names(outputs: Mapping[str, Location | WritableFile]) -> dict[str, str]:
     return {layer: display_name(target) for layer, target in outputs.items()}
 
 
-def _check_layers(source: Location | InputStream, layers: Iterable[Location | OutputStream]) -> None:
+def _check_layers(source: Location | BinaryFile, layers: Iterable[Location | WritableFile]) -> None:
     """Checks that existing layers were made from this photo, or raises OutputError. Streams are not checked, because they can
     be read only once. Files in an object store are not checked either: two more requests for each photo of an archive
     would take hours."""
@@ -256,7 +255,7 @@ def _check_layers(source: Location | InputStream, layers: Iterable[Location | Ou
         )
 
 
-def read_content(source: Location | InputStream) -> Path | bytes:
+def read_content(source: Location | BinaryFile) -> Path | bytes:
     """Returns what a `Separator` reads: the path of a local file that can be opened, or the bytes of a URL or stream.
     Raises UnreadablePhoto if the file does not exist, is a folder, or cannot be opened or read, and UnsupportedPhoto
     if the file has the suffix of a video."""
