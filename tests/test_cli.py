@@ -90,13 +90,6 @@ def test_additive_layers_are_floats_that_sum_to_the_photo(run, tmp_path, format_
     assert (layers[0].linear() + layers[1].linear() == Photo.open(tmp_path / "a.jpg").linear()).all()
 
 
-def test_an_image_file_as_the_output_gets_the_transmission(run, tmp_path):
-    (tmp_path / "a.jpg").write_bytes(image_bytes())
-    assert run("a.jpg", "-o", "new/clear.png")[0] == 0
-    assert list_files(tmp_path / "new") == ["clear.png"]
-    assert Photo.open(tmp_path / "new" / "clear.png").file_info.format_name == "png"
-
-
 # --- standard input and output
 
 
@@ -122,6 +115,8 @@ def test_a_file_can_go_to_standard_output_and_standard_input_to_a_file(run, tmp_
     assert code == 0
     assert run("-", "-o", "b.jpg", "--json", stdin=image_bytes())[0] == 0
     assert (tmp_path / "b.jpg").read_bytes() == out
+    assert run("a.jpg", "-o", "new/clear.png")[0] == 0
+    assert Photo.open(tmp_path / "new" / "clear.png").file_info.format_name == "png"
 
 
 @pytest.mark.parametrize("stdin", [b"", b"hello"])
