@@ -153,8 +153,10 @@ def separate_task(
     be read or separated, or a layer cannot be written."""
     result.model, result.model_sha256, result.device = separator.name, separator.sha256, separator.device
     with row_in_errors(task.row):
-        is_video_file = task.burst and isinstance(task.source, Path) and is_video(task.source)
-        photo = task.source if is_video_file and isinstance(task.source, Path) else read_content(task.source)
+        if task.burst and isinstance(task.source, Path) and is_video(task.source):
+            photo: Path | bytes = task.source
+        else:
+            photo = read_content(task.source)
     if task.burst:
         separation = _separate_burst(task.burst, separator, options, on_progress)
     else:
@@ -190,9 +192,7 @@ def _check_sources(task: SeparationTask) -> None:
 def _missing_outputs(task: SeparationTask, *, overwrite: bool) -> dict[str, Location | WritableFile]:
     """Returns the layers that must be written, with their outputs. The others must have been made from this photo."""
     outputs = task.outputs.items()
-    kept = (
-        {} if overwrite else {name: out for name, out in outputs if isinstance(out, Location) and exists(out)}
-    )
+    kept = {name: out for name, out in outputs if not overwrite and isinstance(out, Location) and exists(out)}
     _check_layers(task.source, kept.values())
     return {name: out for name, out in outputs if name not in kept}
 
