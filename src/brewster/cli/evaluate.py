@@ -27,7 +27,8 @@ if TYPE_CHECKING:
 
 
 _NATIVE: Final = "native"
-_CASES_PER_WORKER: Final = 25  # importing torch and loading LPIPS takes as long as scoring some images
+_CASES_PER_WORKER: Final = 25
+"""A worker process imports torch and loads the weights of LPIPS, which takes as long as it takes to score some images."""
 
 
 def _numbers(text: str) -> tuple[float, ...]:
@@ -220,14 +221,7 @@ class _EvaluateCommand:
                 f"the results are in {self.out}; {self.out / REPORT_FILE} shows the images, and tables.md has intervals and differences"
             )
         if export_folder:
-            from brewster.evaluate.submission import export_ntire2026  # noqa: PLC0415
-
-            for method in methods[1:]:  # the first one is the baseline
-                out = self.out / "export" / method.name
-                for path in export_ntire2026(
-                    export_folder, method, out, on_progress=lambda _: interrupts.raise_pending()
-                ):
-                    print_status(f"wrote {path}")
+            self._export(export_folder, methods)
         return print_failures(results, quiet=self.quiet) and is_complete
 
     def _check_export(self) -> Path | None:
@@ -236,6 +230,16 @@ class _EvaluateCommand:
 
         has_method = bool(self.models or self.predictions)
         return openrr_folder(self.benchmarks, has_method=has_method) if self.export else None
+
+    def _export(self, folder: Path, methods: Sequence[Method]) -> None:
+        from brewster.evaluate.submission import export_ntire2026  # noqa: PLC0415
+
+        for method in methods[1:]:  # the first one is the baseline
+            out = self.out / "export" / method.name
+            for path in export_ntire2026(
+                folder, method, out, on_progress=lambda _: interrupts.raise_pending()
+            ):
+                print_status(f"wrote {path}")
 
     def _read_benchmarks(self) -> list[Benchmark]:
         from brewster.benchmarks.registry import read_benchmark  # noqa: PLC0415

@@ -117,7 +117,7 @@ def study_router(
     router.get(f"{personal}/pictures/{{trial}}/{{side}}", response_class=Response)(routes.picture)
     router.post(f"{personal}/answers")(routes.answer)
     router.post(f"{personal}/withdrawals")(routes.withdraw)
-    router.get("/privacy", include_in_schema=False)(lambda: page_response("privacy.html"))
+    router.get("/privacy", include_in_schema=False)(routes.privacy)
     return router
 
 
@@ -167,6 +167,10 @@ class _StudyRoutes:
         """Returns the first trial without an answer."""
         response.headers.update(_NOT_CACHED)
         return self._next(self._participant(participant_token))
+
+    def privacy(self) -> Response:
+        """Returns the page that lists what the study stores about a participant."""
+        return page_response("privacy.html")
 
     def practice_picture(self, participant_token: Token, side: Side) -> Response:
         """Returns a picture of the practice trial."""
@@ -224,14 +228,21 @@ class _StudyRoutes:
         last = self.store.last_trial(participant)
         if trial is None:
             return TrialResponse(trial=None, trials=count, last=last)
-        photo = self.study.picture(participant.trials[trial].photo)
-        found = TrialResponse(trial=trial, trials=count, width=photo.width, height=photo.height, last=last)
+        practice_trial = None
         if last is None:
             practice = _practice(participant)
             assert practice.expected
             photo = self.study.picture(practice.photo)
-            found.practice = PracticeTrial(width=photo.width, height=photo.height, expected=practice.expected)
-        return found
+            practice_trial = PracticeTrial(width=photo.width, height=photo.height, expected=practice.expected)
+        photo = self.study.picture(participant.trials[trial].photo)
+        return TrialResponse(
+            trial=trial,
+            trials=count,
+            width=photo.width,
+            height=photo.height,
+            practice=practice_trial,
+            last=last,
+        )
 
 
 def _practice(participant: Participant) -> assignment.Trial:
