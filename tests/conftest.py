@@ -217,3 +217,12 @@ def rendered_recipe(monkeypatch):
     monkeypatch.setattr("brewster.training.streams.Assets", lambda folders: assets)
     monkeypatch.delenv("BREWSTER_DATA", raising=False)
     return read_recipe(RECIPES / "ablations/tiny.toml")
+
+
+@pytest.fixture
+def store():
+    """The empty memory store of fsspec, which behaves like S3 without a network."""
+    memory = pytest.importorskip("fsspec").filesystem("memory")
+    memory.store.clear()
+    yield memory
+    memory.store.clear()

@@ -2,7 +2,6 @@
 
 import errno
 import os
-import re
 import sys
 from dataclasses import fields
 
@@ -65,16 +64,6 @@ def test_damaged_photos_are_named_at_the_end_and_the_others_are_separated(run, t
     for name in (*damaged, "nan.exr"):
         assert sum(f"in/{name}" in line for line in error_lines(err)) == 1, name
     assert len(list_files(folder)) == len(damaged) + 4
-
-
-def test_a_photo_above_the_pixel_limit_is_rejected_and_one_at_the_limit_is_not(run, tmp_path):
-    (tmp_path / "large.jpg").write_bytes(image_bytes(61, 40))
-    (tmp_path / "small.jpg").write_bytes(image_bytes(60, 40))
-    code, _, err = run("large.jpg", "small.jpg", "--max-pixels", 2400, "-o", "out")
-    assert code == 1
-    assert len(error_lines(err)) == 1
-    assert "large.jpg" in error_lines(err)[0]
-    assert list_files(tmp_path / "out") == layer_files("small")
 
 
 def test_a_photo_that_does_not_fit_into_memory_does_not_stop_the_others(run, tmp_path, monkeypatch):
@@ -276,20 +265,6 @@ def test_json_has_the_result_of_each_photo(run, tmp_path, model):
     assert separated["residual"] == pytest.approx(0, abs=0.01)
     assert (failed["source"], failed["status"], failed["outputs"]) == ("b.jpg", "failed", {})
     assert failed["error"]
-
-
-def test_a_batch_ends_with_a_summary(run, tmp_path):
-    for name in ("a", "b", "c"):
-        (tmp_path / f"{name}.jpg").write_bytes(image_bytes())
-    run("a.jpg")
-    (tmp_path / "b.jpg").write_bytes(b"")
-    pattern = r"^1 separated, 1 skipped, 1 failed in \d+\.\d s; the layers are (.*)$"
-    assert re.search(pattern, run(".")[2], re.MULTILINE)[1] == "next to the photos"
-    (tmp_path / "b.jpg").write_bytes(b"")
-    err = run("a.jpg", "b.jpg", "c.jpg", "-o", "out")[2]
-    assert (
-        re.search(r"^2 separated, 1 failed in .* s; the layers are (.*)$", err, re.MULTILINE)[1] == "in out"
-    )
 
 
 def test_quiet_prints_nothing_if_no_photo_fails(run, tmp_path):

@@ -5,7 +5,6 @@ import os
 import subprocess
 import sys
 import urllib.request
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -64,15 +63,6 @@ def test_an_address_of_another_machine_is_refused(run, tmp_path, address, option
 # --- suffixes
 
 
-@pytest.mark.parametrize("name", ["clear.bmp", "clear.jp2", "clear.psd", "clear.jpgg"])
-def test_an_output_with_an_unknown_suffix_is_refused(run_without_model, tmp_path, name):
-    (tmp_path / "a.jpg").write_bytes(image_bytes())
-    code, _, err = run_without_model("a.jpg", "-o", name)
-    assert code == 2
-    assert f"-o ends in {Path(name).suffix}, but" in " ".join(err.split())
-    assert list_files(tmp_path) == ["a.jpg"]
-
-
 @pytest.mark.parametrize("name", ["notes", "notes.txt", "notes.jpg/"])
 @pytest.mark.parametrize("photos", [["a.jpg"], ["a.jpg", "b.jpg"], ["."]])
 def test_an_output_folder_that_is_a_file_is_refused(run_without_model, tmp_path, name, photos):
@@ -105,24 +95,6 @@ def test_raw_files_without_the_extra_are_counted_and_named_once(run, tmp_path, m
     assert "3 photos (a.dng, b.dng, c.dng): the rawpy package is not installed" in line
     assert "pip install -c constraints.txt -e '.[raw]'" in line
     assert "1 separated, 3 failed" in err
-
-
-def test_videos_are_counted_and_named(run, run_without_model, tmp_path):
-    (tmp_path / "a.jpg").write_bytes(image_bytes())
-    for name in ("b.mp4", "c.MOV"):
-        (tmp_path / name).write_bytes(b"\0\0\0\x18ftypisom" + bytes(100))
-    code, _, err = run(".")
-    assert code == 0
-    assert "2 videos (b.mp4, c.MOV) skipped" in err
-    code, _, err = run("b.mp4")
-    assert code == 1
-    assert error_lines(err)[0].startswith("error: b.mp4 is a video; expected a photo; extract single images")
-    (tmp_path / "a.jpg").unlink()
-    for layer in layer_files("a"):
-        (tmp_path / layer).unlink()
-    assert "no photo in . (2 videos)" in run_without_model(".")[2]
-    (tmp_path / "c.MOV").rename(tmp_path / "notes")
-    assert "no photo in . (1 video, 1 other file)" in run_without_model(".")[2]
 
 
 def test_other_files_in_a_folder_are_counted_by_suffix_with_an_example(run, tmp_path):

@@ -1,6 +1,5 @@
 """The command `brewster render`."""
 
-import importlib.util
 from pathlib import Path
 
 import pytest
@@ -78,14 +77,3 @@ def test_a_wrong_usage_is_explained(run_without_model, args, message):
     code, _, err = run_without_model("render", *args)
     assert code == 2
     assert message in err
-
-
-def test_the_error_for_a_missing_package_has_the_command_that_installs_it(run_without_model, monkeypatch):
-    find_spec = importlib.util.find_spec
-    monkeypatch.setattr(
-        importlib.util, "find_spec", lambda name, *rest: None if name == "torch" else find_spec(name, *rest)
-    )
-    code, _, err = run_without_model("render", "set")
-    assert code == 1
-    assert "rendering needs packages that are not installed: torch" in err
-    assert "pip install -c constraints.txt -e '.[render]'" in err

@@ -3,27 +3,15 @@
 import inspect
 import math
 import pickle
-from concurrent.futures import ProcessPoolExecutor
 from datetime import date
-from multiprocessing import get_context
 from typing import Annotated
 
 import pytest
 from pydantic import AfterValidator, AwareDatetime, BaseModel, ConfigDict, Field, ValidationError
 
 from brewster import errors
-from brewster.errors import PhotoError, counted
 
 ERROR_CLASSES = [value for value in vars(errors).values() if inspect.isclass(value)]
-
-
-def raise_photo_error():
-    raise PhotoError("the width is 7", "expected an even width", "crop the image")
-
-
-@pytest.mark.parametrize(("number", "text"), [(0, "0 videos"), (1, "1 video"), (2, "2 videos")])
-def test_a_noun_has_the_number_in_front_of_it(number, text):
-    assert counted(number, "video") == text
 
 
 @pytest.mark.parametrize("kind", ERROR_CLASSES)
@@ -34,13 +22,6 @@ def test_every_error_is_pickled_with_its_three_parts(kind):
     assert type(copy) is kind
     assert (copy.happened, copy.expected, copy.cure) == (error.happened, error.expected, error.cure)
     assert str(copy) == "row 3: the value is 7; expected at most 5; 0 is allowed; did you mean 5?"
-
-
-def test_an_error_that_is_raised_in_a_worker_arrives_unchanged():
-    with ProcessPoolExecutor(1, get_context("spawn")) as pool, pytest.raises(PhotoError) as raised:
-        pool.submit(raise_photo_error).result()
-    assert str(raised.value) == "the width is 7; expected an even width; crop the image."
-    assert raised.value.cure == "crop the image"
 
 
 class Described(BaseModel):

@@ -6,16 +6,14 @@ import errno
 import os
 from pathlib import Path
 
-import platformdirs
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from platformdirs import macos, unix
 
 from brewster import files
 from brewster.batch.layer_names import name_layers
 from brewster.errors import OutputError
-from brewster.files import cache_folder, check_output_folder, images_in, write_atomically
+from brewster.files import check_output_folder, images_in, write_atomically
 from brewster.image_formats import SUFFIXES
 from brewster.options import Options
 
@@ -223,16 +221,6 @@ def test_an_unreadable_folder_is_listed_so_that_opening_it_reports_the_error(tmp
     assert list(find(tmp_path)) == ["locked", "z.jpg"]
 
 
-def test_nothing_is_overwritten_by_default(tmp_path):
-    path = tmp_path / "a.png"
-    path.write_bytes(b"old")
-    with pytest.raises(OutputError, match="overwrite"):
-        write_atomically(path, b"new")
-    assert path.read_bytes() == b"old"
-    write_atomically(path, b"new", overwrite=True)
-    assert path.read_bytes() == b"new"
-
-
 def test_a_file_that_appears_during_writing_is_not_replaced(tmp_path, monkeypatch):
     path, fsync = tmp_path / "a.png", os.fsync
 
@@ -306,23 +294,6 @@ def test_impossible_targets_are_errors(tmp_path, target, word):
     with pytest.raises(OutputError, match=word) as raised:
         write_atomically(tmp_path / target, b"layer")
     assert "--overwrite" not in str(raised.value)
-
-
-@pytest.mark.parametrize(
-    ("system", "variables", "folder"),
-    [
-        (unix.Unix, {"XDG_CACHE_HOME": "/cache"}, "/cache/brewster"),
-        (unix.Unix, {"HOME": "/home/ann"}, "/home/ann/.cache/brewster"),
-        (unix.Unix, {"HOME": "/home/ann", "XDG_CACHE_HOME": "relative"}, "/home/ann/.cache/brewster"),
-        (macos.MacOS, {"HOME": "/Users/ann"}, "/Users/ann/Library/Caches/brewster"),
-    ],
-)
-def test_downloads_are_in_the_cache_folder_of_the_system(monkeypatch, system, variables, folder):
-    monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
-    for name, value in variables.items():
-        monkeypatch.setenv(name, value)
-    monkeypatch.setattr(platformdirs, "PlatformDirs", system)
-    assert cache_folder() == Path(folder)
 
 
 def test_ctrl_c_just_after_the_rename_leaves_nothing_else(tmp_path, monkeypatch):

@@ -3,22 +3,10 @@
 import re
 from pathlib import Path
 
-import pytest
-
 from brewster import image_formats
-from brewster.image_formats import FORMATS, SUFFIXES, format_of
+from brewster.image_formats import FORMATS, SUFFIXES
 
 PAGE = Path(image_formats.__file__).parent / "web" / "page" / "index.html"
-
-
-@pytest.mark.parametrize(("name", "expected"), [("a.JPG", "jpeg"), ("a.b.tif", "tiff"), ("a.gif", "gif")])
-def test_the_format_of_a_file_name_is_that_of_its_suffix(name, expected):
-    assert format_of(Path(name)).name == expected
-
-
-@pytest.mark.parametrize("name", ["a", "a.txt", ".png"])
-def test_other_suffixes_have_no_format(name):
-    assert format_of(Path(name)) is None
 
 
 def test_exactly_the_formats_of_libvips_have_a_name_there():

@@ -129,14 +129,6 @@ def test_blank_lines_are_skipped_and_rows_are_numbered_by_the_lines_of_the_file(
         plan_files(manifest)
 
 
-@pytest.mark.parametrize("suffix", [".csv", ".parquet"])
-@pytest.mark.parametrize("column", ["Path", " PATH "])
-def test_a_column_that_differs_from_path_by_case_or_spaces_is_named(tmp_path, suffix, column):
-    manifest = write_manifest(tmp_path / f"list{suffix}", "a.jpg", column=column)
-    with pytest.raises(ManifestError, match=f"rename the column '{column}' to 'path'"):
-        plan_files(manifest)
-
-
 @pytest.mark.parametrize("encoding", ["latin-1", "utf-16"])
 def test_a_csv_table_in_another_encoding_must_be_saved_as_utf_8(tmp_path, encoding):
     manifest = tmp_path / "list.csv"

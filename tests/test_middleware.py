@@ -144,12 +144,12 @@ def test_no_response_has_cors_headers(app):
         assert response.status_code == 405
 
 
-def test_the_response_to_a_bug_has_security_headers():
+def test_the_response_to_a_bug_has_security_headers_and_no_traceback():
     router = APIRouter()
 
     @router.get("/bug")
     def bug() -> None:
-        raise ZeroDivisionError
+        raise ZeroDivisionError("secret")
 
     async def once():
         app = create_app(router, policy=AccessPolicy())
@@ -159,6 +159,8 @@ def test_the_response_to_a_bug_has_security_headers():
 
     response = asyncio.run(once())
     assert response.status_code == 500
+    assert "please report it" in response.json()["error"]
+    assert "secret" not in response.text
     assert "default-src 'none'" in response.headers["content-security-policy"]
 
 

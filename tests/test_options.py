@@ -68,13 +68,9 @@ def test_help_describes_every_parameter_once(function):
         ({"strength": 1.5}, "strength is 1.5; expected a number of at most 1"),
         ({"strength": float("nan")}, "strength is nan; expected a finite number; correct strength"),
         ({"guidance": float("inf")}, "guidance is inf; expected a finite number; correct guidance"),
-        ({"strength": None}, "strength is None; expected a number"),
-        ({"device": "gpu"}, "device is 'gpu'; expected 'auto', 'cuda', "),
         ({"steps": 0}, "steps is 0; expected a number of at least 1"),
-        ({"ensemble_size": 1.5}, "ensemble_size is 1.5; expected an integer"),
         ({"additive": "perhaps"}, "additive is 'perhaps'; expected true or false"),
         ({"mask": 3}, "mask is 3; expected a path"),
-        ({"model": None}, "model is None; expected a text"),
         ({"additive": True, "format": "jpg"}, "additive layers were requested as jpeg; expected tiff or exr"),
     ],
 )

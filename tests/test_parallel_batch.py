@@ -30,15 +30,6 @@ def options(model):
     return Options(model=str(model))
 
 
-@pytest.fixture
-def store():
-    """The empty memory store."""
-    memory = fsspec.filesystem("memory")
-    memory.store.clear()
-    yield memory
-    memory.store.clear()
-
-
 @pytest.fixture(params=["folder", "store"])
 def root(request, tmp_path, store):
     """A folder, or a folder in the memory store, with three photos in `in`."""

@@ -12,7 +12,7 @@ import pyvips
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
-from PIL import Image, ImageOps
+from PIL import Image
 
 from brewster.errors import MissingExtra, OutputError, PhotoError, UnreadablePhoto, UnsupportedPhoto
 from brewster.image_formats import FORMATS
@@ -36,7 +36,8 @@ def random_image(height=24, width=40, channels=3, dtype=np.uint8):
 @quick
 @given(
     arrays.arrays(
-        st.sampled_from([np.uint8, np.uint16]), st.tuples(*[st.integers(1, 9)] * 2, st.sampled_from([1, 3]))
+        st.sampled_from([np.uint8, np.uint16]),
+        st.tuples(*[st.integers(1, 9)] * 2, st.sampled_from([1, 3, 4])),
     )
 )
 def test_pixels_survive_lossless_files_bit_for_bit(pixels):
@@ -44,7 +45,8 @@ def test_pixels_survive_lossless_files_bit_for_bit(pixels):
     for format_name in LOSSLESS:
         again = Photo.open(photo.encode(format_name))
         assert again.pixels.dtype == pixels.dtype
-        assert np.array_equal(again.pixels, pixels)
+        assert np.array_equal(again.pixels, pixels[..., :3])
+        assert pixels.shape[2] < 4 or np.array_equal(again.alpha, pixels[..., 3])
 
 
 @quick
@@ -64,13 +66,6 @@ def test_grey_stays_grey_and_alpha_is_kept(format_name, mode, channels):
     if format_name != "webp":  # WebP stores RGB only
         assert again.mode == mode
     assert np.array_equal(np.asarray(again.convert("RGBA")), np.asarray(pil(data).convert("RGBA")))
-
-
-def test_sixteen_bit_alpha_survives():
-    pixels = random_image(channels=4, dtype=np.uint16)
-    again = Photo.open(Photo.from_array(pixels, encoding="srgb").encode())
-    assert np.array_equal(again.alpha, pixels[..., 3])
-    assert np.array_equal(again.pixels, pixels[..., :3])
 
 
 @pytest.mark.parametrize("mode", ["1", "P"])
@@ -248,14 +243,6 @@ def test_a_photo_does_not_change_with_the_array_it_came_from():
         photo.pixels[0] = 1
 
 
-def test_profile_exif_and_orientation_of_a_pil_image_are_read():
-    image = pil(file_of(smooth(), "JPEG", exif=exif_block(), icc_profile=P3))
-    photo = Photo.open(image)
-    assert photo.file_info.icc == P3
-    assert photo.file_info.exif == exif_block(1).removeprefix(b"Exif\0\0")
-    assert np.array_equal(photo.pixels, np.asarray(ImageOps.exif_transpose(image)))
-
-
 def test_a_pil_jpeg_followed_by_previews_is_one_image():
     image = Image.fromarray(smooth())
     data = file_of(smooth(), "MPO", save_all=True, append_images=[image.resize((8, 8))])
@@ -328,8 +315,3 @@ def test_sixteen_bits_are_rounded_to_eight():
     photo = Photo.from_array(np.repeat(values[None, :, None], 3, axis=2), encoding="srgb")
     stored = Photo.open(photo.encode("png", depth=8)).pixels[0, :, 0]
     assert (stored == np.rint(values / 257)).all()
-
-
-def test_a_jpeg_has_quality_95_if_the_source_has_none():
-    photo = Photo.from_array(np.full((16, 16, 3), 99, np.uint8), encoding="srgb")
-    assert Photo.open(photo.encode("jpeg")).file_info.jpeg_quality == 95

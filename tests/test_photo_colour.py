@@ -16,7 +16,7 @@ from PIL import Image, ImageCms
 from brewster import srgb
 from brewster.errors import UnsupportedPhoto
 from brewster.photo import FileInfo, Photo
-from brewster.photo.colour import SRGB, ToneCurve, colour_space_of, convert_to_display_p3
+from brewster.photo.colour import SRGB, colour_space_of, convert_to_display_p3
 from brewster.photo.decode import read_size
 
 quick = settings(max_examples=25, deadline=None, database=None)
@@ -237,15 +237,6 @@ def test_chromaticities_are_converted_to_rec709_and_white_stays_white():
     np.testing.assert_allclose(
         red, (2.5217, -0.2765, -0.0154), atol=0.01
     )  # ACES2065-1 to linear sRGB, Bradford
-
-
-@pytest.mark.parametrize(
-    "parameters", [(2.4, 1 / 1.055, 0.055 / 1.055, 1 / 12.92, 0.04045, 0, 0), (1.8, 1, 0, 0, 0, 0, 0)]
-)
-def test_a_parametric_curve_and_its_inverse_agree(parameters):
-    values = np.linspace(0, 1.5, 1000)
-    curve = ToneCurve(parameters=parameters)
-    np.testing.assert_allclose(curve.encode(curve.decode(values)), values, atol=1e-4)
 
 
 @pytest.mark.parametrize(("function", "count"), [(0, 1), (1, 3), (2, 4), (3, 5), (4, 7)])

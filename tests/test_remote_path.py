@@ -15,16 +15,7 @@ from brewster.options import Options
 from brewster.remote_path import RemotePath, check_readable, location, read_image
 from cli_helpers import image_bytes
 
-fsspec = pytest.importorskip("fsspec")
-
-
-@pytest.fixture(autouse=True)
-def store():
-    """The empty memory store."""
-    memory = fsspec.filesystem("memory")
-    memory.store.clear()
-    yield memory
-    memory.store.clear()
+pytestmark = pytest.mark.usefixtures("store")
 
 
 def fail(*_, **__):

@@ -105,8 +105,6 @@ def test_an_empty_field_counts_as_omitted():
     [
         ({"strength": "1.5"}, "strength is '1.5'"),
         ({"strength": "nan"}, "strength is 'nan'; expected a finite number; correct strength"),
-        ({"strength": "inf"}, "strength is 'inf'; expected a finite number; correct strength"),
-        ({"strength": "-1"}, "strength is '-1'"),
         ({"strength": "a lot"}, "strength is 'a lot'"),
         ({"quality": "best"}, "quality is 'best'; expected 'draft' or 'standard'"),
         ({"format": "gif"}, "format is 'gif'"),

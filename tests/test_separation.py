@@ -9,6 +9,7 @@ from urllib.parse import unquote
 
 import numpy as np
 import pytest
+import pyvips
 import schemathesis
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
@@ -115,13 +116,8 @@ def test_no_file_name_breaks_the_response(app, name):
     "name",
     [
         "x.jpg_large",
-        "photo",
-        "IMG 1 ü.JPG",
         "IMG 1 u\N{COMBINING DIAERESIS}.JPG",  # the form of file names on macOS
-        "Ångström.v2.final.png",
-        ".hidden.png",
         " a  b .png",
-        "3.04.05\N{NARROW NO-BREAK SPACE}PM.png",
         "日本 👨\N{ZERO WIDTH JOINER}👩.webp",
         "100%41 it's;a=b.png",
     ],
@@ -153,6 +149,7 @@ def test_layers_have_the_file_names_of_the_command_line(app, tmp_path, name):
         (SMALL[:60], 422, "cannot be read completely"),
         (file_of(np.zeros((40, 50, 4), np.uint8), "tiff"), 200, ""),
         (file_of(smooth(200, 300), "png"), 413, "pixels"),
+        (pyvips.Image.black(8, 8, bands=5).tiffsave_buffer(), 415, "5 channels"),
     ],
 )
 def test_uploads_that_cannot_be_decoded_are_refused(photo, status, message):
@@ -160,14 +157,6 @@ def test_uploads_that_cannot_be_decoded_are_refused(photo, status, message):
     assert response.status_code == status
     if message:
         assert message in error_of(response)
-
-
-def test_an_unsupported_kind_of_image_is_refused(app):
-    import pyvips  # noqa: PLC0415
-
-    response = separate(app, pyvips.Image.black(8, 8, bands=5).tiffsave_buffer(), "a.tif")
-    assert response.status_code == 415
-    assert "5 channels" in error_of(response)
 
 
 def test_wrong_values_are_refused_before_any_work():
@@ -185,23 +174,6 @@ def test_unknown_paths_and_methods_are_refused(app):
     assert request(app, "GET", "/page/%2e%2e/separation.py").status_code == 404
     response = request(app, "GET", "/separate")
     assert (response.status_code, response.headers["allow"]) == (405, "POST")
-
-
-def test_a_bug_is_reported_without_its_traceback():
-    def broken(tile):
-        raise ZeroDivisionError("secret")
-
-    async def once():
-        import httpx  # noqa: PLC0415
-
-        transport = httpx.ASGITransport(make_app(broken), raise_app_exceptions=False)
-        async with httpx.AsyncClient(transport=transport, base_url="http://localhost") as http:
-            return await http.post("/separate", **form(SMALL))
-
-    response = asyncio.run(once())
-    assert response.status_code == 500
-    assert "please report it" in error_of(response)
-    assert "secret" not in response.text
 
 
 # --- the job queue
@@ -225,10 +197,6 @@ def test_progress_is_available_while_the_job_runs():
     assert again.status_code == 409
     assert after.status_code == 404
     assert "job" in error_of(after)
-
-
-def test_an_invalid_job_name_is_refused(app):
-    assert request(app, "POST", "/separate?job=../x", **form(SMALL)).status_code == 422
 
 
 # --- OpenAPI

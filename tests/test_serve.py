@@ -115,13 +115,6 @@ def test_models_that_are_missing_or_share_a_name_are_refused_at_the_start(
     assert not served_apps
 
 
-def test_a_port_in_use_is_an_error_without_a_traceback(run_without_model, reachable):
-    with reachable.create_server(("127.0.0.1", 0)) as taken:
-        code, _, err = run_without_model("serve", "--port", taken.getsockname()[1])
-    assert code == 1
-    assert err.startswith("error: 127.0.0.1 port")
-
-
 @pytest.fixture
 def lan(monkeypatch, model, tmp_path):
     """A server for phones: its link, and the log with the QR code."""

@@ -11,7 +11,6 @@ import pytest
 import torch
 
 from brewster.errors import OutputError, RecipeError
-from brewster.executors import local
 from brewster.executors.local import ProcessExecutor
 from brewster.rendered import store
 from brewster.rendered.generation import workers
@@ -78,7 +77,7 @@ def test_ctrl_c_stops_all_workers_and_leaves_no_partial_files(tmp_path):
 
 
 def test_a_sample_that_kills_every_worker_fails_and_the_others_are_rendered(tmp_path, monkeypatch):
-    monkeypatch.setattr(local, "MAX_ATTEMPTS", 1)
+    monkeypatch.setattr(ProcessExecutor, "attempts", 1)
     results = render_set(
         tmp_path / "set", renderer="crashing", executor=partial(ProcessExecutor, worker_count=1)
     )

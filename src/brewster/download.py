@@ -16,7 +16,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from http.client import HTTPException, HTTPResponse, InvalidURL
 from pathlib import Path
-from typing import Literal, NamedTuple, TypeVar, cast, final
+from typing import Literal, NamedTuple, TypeVar, final
 from urllib import request
 from urllib.error import HTTPError
 
@@ -71,7 +71,7 @@ class Downloader:
         it, or all attempts fail."""
 
         def attempt() -> bytes:
-            with self._open(url) as response:
+            with self._response(url) as response:
                 return _read(response)
 
         return self._with_retries(url, attempt)
@@ -79,12 +79,8 @@ class Downloader:
     def fetch(self, remote: RemoteFile, target: Path) -> None:
         """Downloads a file to the path `target` and creates its folder.
 
-        The file gets the name `target` only after its digest is verified.
-
-        Raises:
-            DownloadError: the URL is invalid, the server refuses it, all attempts fail, or the digest is not the
-                expected one.
-            OutputError: the folder cannot be written.
+        The file gets the name `target` only after its digest is verified. Raises DownloadError as `read`, and if the digest is
+        not the expected one; and OutputError if the folder cannot be written.
         """
         part = target.with_name(f"{target.name}.part")
         with output_errors(target):
@@ -98,59 +94,52 @@ class Downloader:
             part.replace(target)
 
     def _with_retries(self, url: str, attempt: Callable[[], _T]) -> _T:
-        delays = iter(self.retry_delays_s)
-        while True:
+        for delay in (*self.retry_delays_s, None):
             try:
                 return attempt()
             except _RetryableError as error:
-                if (delay := next(delays, None)) is None:
-                    happened = (
-                        f"{url} could not be downloaded in {len(self.retry_delays_s) + 1} attempts ({error})"
-                    )
-                    cure = "check the connection, or run again later to resume the download"
+                if delay is None:
                     raise DownloadError(
-                        happened, "expected a server that responds and a stable connection", cure
+                        f"{url} could not be downloaded in {len(self.retry_delays_s) + 1} attempts ({error})",
+                        "expected a server that responds and a stable connection",
+                        "check the connection, or run again later to resume the download",
                     ) from error
                 self.sleep(max(delay, error.wait_s))
+        raise AssertionError("the last attempt returns or raises")
 
-    def _open(self, url: str, start: int = 0) -> HTTPResponse:
-        """Returns the open response. It starts at byte `start` if the server supports range requests."""
-        headers = {"User-Agent": _USER_AGENT.format(brewster.__version__)} | (
-            {"Range": f"bytes={start}-"} if start else {}
-        )
+    @contextmanager
+    def _response(self, url: str, start: int = 0) -> Iterator[HTTPResponse]:
+        """Yields the open response, which starts at byte `start` if the server supports range requests."""
+        headers = {"User-Agent": _USER_AGENT.format(brewster.__version__)}
+        headers |= {"Range": f"bytes={start}-"} if start else {}
         try:
             query = request.Request(url, headers=headers)  # noqa: S310  (the opener supports http and https only)
             response = _opener().open(query, timeout=self.timeout_s)
         except HTTPError as error:
             error.close()
             if error.code in _RETRYABLE_STATUS:
-                retry_after = error.headers.get("Retry-After", "")
-                raise _RetryableError(
-                    error, min(float(retry_after), _MAX_RETRY_AFTER_S) if retry_after.isdecimal() else 0
-                ) from error
-            raise DownloadError(
-                f"the server refused the request for {url} ({error})", "expected a file", "run again later"
-            ) from error
+                wait = error.headers.get("Retry-After", "")
+                wait_s = min(float(wait), _MAX_RETRY_AFTER_S) if wait.isdecimal() else 0
+                raise _RetryableError(error, wait_s) from error
+            happened = f"the server refused the request for {url} ({error})"
+            raise DownloadError(happened, "expected a file", "run again later") from error
         except (ValueError, InvalidURL) as error:
-            raise DownloadError(
-                f"{url!r} is not a valid URL ({error})", _EXPECTED_URL, "check the URL"
-            ) from error
+            happened = f"{url!r} is not a valid URL ({error})"
+            raise DownloadError(happened, _EXPECTED_URL, "check the URL") from error
         except (OSError, HTTPException) as error:
             raise _RetryableError(error) from error
         if response is None:
-            raise DownloadError(
-                f"{url!r} or a URL that it redirects to has another scheme than http or https",
-                _EXPECTED_URL,
-                "check the URL",
-            )
-        return cast("HTTPResponse", response)
+            happened = f"{url!r} or a URL that it redirects to has another scheme than http or https"
+            raise DownloadError(happened, _EXPECTED_URL, "check the URL")
+        with response:
+            yield response
 
     def _fetch_rest(self, remote: RemoteFile, part: Path) -> None:
         partial_bytes = part.stat().st_size if part.exists() else 0
         if partial_bytes == remote.size:
             return
         start = partial_bytes if partial_bytes < remote.size else 0
-        with self._open(remote.url, start) as response:
+        with self._response(remote.url, start) as response:
             received = start if response.status == 206 else 0  # 206: the server honours the range
             with part.open("ab" if received else "wb") as file:
                 while block := _read(response, min(_BLOCK_BYTES, remote.size - received)):

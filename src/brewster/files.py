@@ -101,10 +101,14 @@ def write_atomically(path: Location, data: bytes, *, overwrite: bool = False) ->
                 path.parent.mkdir(parents=True, exist_ok=True)
             except (
                 FileExistsError
-            ) as error:  # has another cure: --overwrite does not replace a file by a folder
-                raise NotADirectoryError(errno.ENOTDIR, os.strerror(errno.ENOTDIR)) from error
-            _check_writable(path, overwrite)
-            _write_synced(part, data)
+            ) as error:  # the cure is another one: --overwrite replaces no file by a folder
+                raise _os_error(errno.ENOTDIR) from error
+            if path.is_dir():
+                raise _os_error(errno.EISDIR)
+            if path.exists() and not (overwrite and os.access(path, os.W_OK)):
+                raise _os_error(errno.EACCES if overwrite else errno.EEXIST)
+            part.write_bytes(data)
+            _sync(part)
             _publish(part, path, overwrite)
     except OSError as error:
         raise _output_error(path, error) from error
@@ -125,7 +129,7 @@ def check_output_folder(folder: Location) -> None:
                 existing.lstat()
                 break
         if not existing.is_dir():
-            raise NotADirectoryError(errno.ENOTDIR, os.strerror(errno.ENOTDIR))
+            raise _os_error(errno.ENOTDIR)
         with _temporary(existing / folder.name) as part:
             part.mkdir()
     except OSError as error:
@@ -190,9 +194,8 @@ def _sync(path: Path) -> None:
     is_folder = path.is_dir()
     if is_folder and sys.platform == "win32":  # Windows cannot open a folder
         return
-    file = os.open(
-        path, os.O_RDONLY if is_folder else os.O_RDWR
-    )  # Windows syncs only files opened for writing
+    # Windows syncs only files opened for writing
+    file = os.open(path, os.O_RDONLY if is_folder else os.O_RDWR)
     try:
         os.fsync(file)
     finally:
@@ -284,36 +287,21 @@ def exists(path: Location) -> bool:
     return path.exists() if isinstance(path, RemotePath) else os.path.lexists(path)
 
 
-def _check_writable(path: Path, overwrite: bool) -> None:
-    if path.is_dir():
-        raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
-    if path.exists() and not overwrite:
-        raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST))
-    if path.exists() and not os.access(path, os.W_OK):
-        raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
-
-
-def _write_synced(path: Path, data: bytes) -> None:
-    with path.open("xb") as file:
-        file.write(data)
-        file.flush()
-        os.fsync(file.fileno())
-
-
 def _publish(part: Path, path: Path, overwrite: bool) -> None:
-    if overwrite:
-        part.replace(path)
-        return
-    try:
-        os.link(
-            part, path
-        )  # unlike a rename, a link never replaces a file that another process has just written
-    except OSError as error:
-        if error.errno not in (errno.EPERM, errno.ENOTSUP, errno.ENOSYS, errno.EMLINK):
-            raise
-        part.replace(
-            path
-        )  # a file system without hard links (FAT); _check_writable has found no file at this path
+    if not overwrite:
+        try:
+            # unlike a rename, a link never replaces a file that another process has just written
+            os.link(part, path)
+        except OSError as error:  # a file system without hard links (FAT)
+            if error.errno not in (errno.EPERM, errno.ENOTSUP, errno.ENOSYS, errno.EMLINK):
+                raise
+        else:
+            return
+    part.replace(path)
+
+
+def _os_error(code: int) -> OSError:
+    return OSError(code, os.strerror(code))
 
 
 _REMEDIES = {
@@ -343,9 +331,8 @@ _DEFAULT_REMEDY = ("expected a writable file", "choose another folder with -o")
 def _output_error(path: Location, error: OSError) -> OutputError:
     expected, cure = _REMEDIES.get(error.errno or 0, _DEFAULT_REMEDY)
     if sys.platform == "win32" and len(absolute(path)) >= _MAX_WINDOWS_PATH and error.errno == errno.ENOENT:
-        expected = (
-            f"expected a path of fewer than {_MAX_WINDOWS_PATH} characters, the limit of Windows by default"
-        )
+        limit = f"{_MAX_WINDOWS_PATH} characters, the limit of Windows by default"
+        expected = f"expected a path of fewer than {limit}"
         cure = "choose a shorter folder with -o, or enable long paths in the settings of Windows"
     return OutputError(f"{path} was not written ({error.strerror or error})", expected, cure)
 

@@ -45,19 +45,14 @@ class RemotePath(PurePosixPath):
         return super().__str__().replace(":/", "://", 1)
 
     def read_bytes(self) -> bytes:
-        """Returns the content of the file. Raises UnreadablePhoto if the file does not exist, or the store fails, and
-        MissingExtra if the package of the store is not installed."""
-        with self._read_errors() as store:
+        """Returns the content of the file. Raises UnreadablePhoto if the file does not exist, or the store fails."""
+        with self._reading() as store:
             return bytes(store.cat_file(str(self)))
 
     def check_readable(self) -> None:
-        """Checks that the URL is that of a file with content, with one request that does not read the content.
-
-        Raises:
-            UnreadablePhoto: the file does not exist, is empty or is a folder, or the store fails.
-            MissingExtra: the package of the store is not installed.
-        """
-        with self._read_errors() as store:
+        """Checks that the URL is that of a file with content, with one request that does not read the content. Raises
+        UnreadablePhoto if the file does not exist, is empty or is a folder, or the store fails."""
+        with self._reading() as store:
             info = store.info(str(self))
         if info["type"] == "directory":
             raise UnreadablePhoto(
@@ -66,52 +61,49 @@ class RemotePath(PurePosixPath):
         if info.get("size") == 0:
             raise empty_file_error()
 
+    def walk_files(self) -> list[RemotePath]:
+        """Returns all files below this folder, sorted. Raises UnreadablePhoto if the store fails."""
+        with self._reading("listed") as store:
+            found = store.find(str(self))
+            root = store._strip_protocol(str(self))  # the prefix of all names that `find` returns
+        return sorted(self / str(name)[len(root) :].lstrip("/") for name in found)
+
     @contextlib.contextmanager
-    def _read_errors(self) -> Iterator[Any]:
+    def _reading(self, action: str = "read") -> Iterator[Any]:
         """Yields the store. Translates its errors within this block into `UnreadablePhoto`."""
         store = _store(self)
         try:
             yield store
-        except FileNotFoundError as error:
-            raise UnreadablePhoto(
-                f"{self} cannot be read (it does not exist)", "expected an image file", "check the URL"
-            ) from error
-        except Exception as error:
-            raise UnreadablePhoto(
-                f"{self} cannot be read ({_reason(error)})", "expected a store that responds", _RETRY
-            ) from error
+        except Exception as error:  # each store has its own errors
+            if isinstance(error, FileNotFoundError) and action == "read":
+                raise UnreadablePhoto(
+                    f"{self} cannot be read (it does not exist)", "expected an image file", "check the URL"
+                ) from error
+            happened = f"{self} cannot be {action} ({_reason(error)})"
+            raise UnreadablePhoto(happened, "expected a store that responds", _RETRY) from error
 
     def write_bytes(self, data: bytes, *, overwrite: bool = False) -> None:
-        """Writes the file with one upload. In S3, GCS and Azure an upload is atomic.
-
-        Raises:
-            FileExistsError: the file exists and `overwrite` is False.
-            OutputError: the store fails, or refuses the upload.
-            MissingExtra: the package of the store is not installed.
-        """
+        """Writes the file with one upload, which is atomic in S3, GCS and Azure. Raises FileExistsError if the file
+        exists and `overwrite` is False, and OutputError if the store fails, or refuses the upload."""
         store = _store(self)
         try:
             store.pipe_file(str(self), data, mode="overwrite" if overwrite else "create")
         except FileExistsError as error:
             raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST)) from error
         except Exception as error:
-            raise OutputError(
-                f"{self} was not written ({_reason(error)})",
-                "expected a store that can be written to",
-                _RETRY,
-            ) from error
+            happened = f"{self} was not written ({_reason(error)})"
+            raise OutputError(happened, "expected a store that can be written to", _RETRY) from error
 
     def exists(self) -> bool:
         """Whether the file exists. False if the store fails: reading or writing the file then raises the error."""
         store = _store(self)
-        try:
+        with contextlib.suppress(Exception):
             return bool(store.exists(str(self)))
-        except Exception:  # noqa: BLE001  (each store has its own errors)
-            return False
+        return False
 
     def unlink(self) -> None:
         """Deletes the file. Ignores errors, because only temporary files are deleted."""
-        with contextlib.suppress(Exception):  # each store has its own errors
+        with contextlib.suppress(Exception):
             _store(self).rm_file(str(self))
 
     def rmdir(self) -> None:
@@ -119,24 +111,10 @@ class RemotePath(PurePosixPath):
 
     def iterdir(self) -> Iterator[RemotePath]:
         """Yields the files and folders in this folder. Yields nothing if the store fails."""
-        store = _store(self)
-        try:
+        store, names = _store(self), []
+        with contextlib.suppress(Exception):
             names = store.ls(str(self), detail=False)
-        except Exception:  # noqa: BLE001  (each store has its own errors)
-            names = []
         yield from (self / PurePosixPath(name).name for name in names)
-
-    def walk_files(self) -> list[RemotePath]:
-        """Returns all files below this folder, sorted. Raises UnreadablePhoto if the store fails."""
-        store = _store(self)
-        try:
-            found = store.find(str(self))
-            root = store._strip_protocol(str(self))  # the prefix of all names that `find` returns
-        except Exception as error:
-            raise UnreadablePhoto(
-                f"{self} cannot be listed ({_reason(error)})", "expected a store that responds", _RETRY
-            ) from error
-        return sorted(self / str(name)[len(root) :].lstrip("/") for name in found)
 
 
 Location: TypeAlias = Path | RemotePath
@@ -183,13 +161,8 @@ def path_of_file_url(url: str) -> str:
 
 
 def read_image(path: Location) -> bytes:
-    """Returns the bytes of an image file.
-
-    Raises:
-        UnreadablePhoto: the file does not exist, is a folder, or cannot be read.
-        UnsupportedPhoto: the file has the suffix of a video. Its content is not read, because it may not fit into memory.
-        MissingExtra: the package of the object store is not installed.
-    """
+    """Returns the bytes of an image file. Raises UnreadablePhoto if the file does not exist, is a folder, or cannot be read,
+    and UnsupportedPhoto for the suffix of a video, whose content may not fit into memory."""
     if isinstance(path, RemotePath):
         check_not_video(path)
         return path.read_bytes()

@@ -32,11 +32,10 @@ def name_layers(
     full name is its short name. Raises OutputError if a layer of two images of different folders would have the same
     path."""
     found: dict[str, SeparationPaths] = {}
+    targets: dict[str, dict[str, Location]] = {}
     for image, folder in images:
-        key = absolute(image)
-        if key not in found:
-            found[key] = SeparationPaths(image, folder, _content_format(image))
-    targets: dict[str, dict[str, Location]] = {key: {} for key in found}
+        if (key := absolute(image)) not in found:
+            found[key], targets[key] = SeparationPaths(image, folder, _content_format(image)), {}
     in_naming_order = sorted(found, key=lambda key: _naming_rank(found[key].source))
     for layer in options.layers:
         owners: dict[str, Location] = {}

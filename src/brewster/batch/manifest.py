@@ -73,9 +73,7 @@ def read_manifest(
         reason = str(error) if isinstance(error, UnreadablePhoto) else error.strerror
         raise ManifestError(f"{manifest} cannot be read ({reason})", _EXPECTED, "check its name") from error
     row = None
-    paths = _csv_paths(manifest, data) if _is_csv(manifest) else _parquet_paths(manifest, data)
-    for number, text in paths:
-        row = ManifestRow(manifest, number)
+    for row, text in _csv_paths(manifest, data) if _is_csv(manifest) else _parquet_paths(manifest, data):
         photo, mirrored = _photo(row, text)
         yield row, photo, photo.parent if output_folder is None else output_folder.joinpath(*mirrored)
     if row is None:
@@ -105,22 +103,22 @@ def _is_csv(manifest: Location) -> bool:
     return manifest.suffix.lower() == ".csv"
 
 
-def _csv_paths(manifest: Location, data: bytes) -> Iterator[tuple[int, object]]:
-    """Yields the number of each row, as in `ManifestRow`, and the value of its column `path`."""
+def _csv_paths(manifest: Location, data: bytes) -> Iterator[tuple[ManifestRow, object]]:
+    """Yields each row, and the value of its column `path`."""
     try:
         file = io.StringIO(data.decode("utf-8-sig"), newline="")
         delimiter = _delimiter(file.readline())
         file.seek(0)
         rows = csv.DictReader(file, delimiter=delimiter, strict=True)
         _check_columns(manifest, rows.fieldnames or [])
-        for row in rows:
-            if any(row.get(None, ())):
+        for values in rows:
+            row = ManifestRow(manifest, rows.line_num)
+            if any(values.get(None, ())):
+                cure = f"write a path that contains {delimiter!r} in double quotes"
                 raise ManifestError(
-                    f"{ManifestRow(manifest, rows.line_num)} has more values than the header",
-                    "expected one value for each column",
-                    f"write a path that contains {delimiter!r} in double quotes",
+                    f"{row} has more values than the header", "expected one value for each column", cure
                 )
-            yield rows.line_num, row[COLUMN]
+            yield row, values[COLUMN]
     except UnicodeDecodeError as error:
         raise _not_a_table(manifest, error, "save the file as UTF-8") from error
     except csv.Error as error:
@@ -140,13 +138,14 @@ def _delimiter(header: str) -> str:
     return max(_DELIMITERS, key=lambda delimiter: (COLUMN in columns[delimiter], len(columns[delimiter])))
 
 
-def _parquet_paths(manifest: Location, data: bytes) -> Iterator[tuple[int, object]]:
+def _parquet_paths(manifest: Location, data: bytes) -> Iterator[tuple[ManifestRow, object]]:
     parquet = import_parquet(str(manifest))
     try:
         table = parquet.ParquetFile(io.BytesIO(data))
         _check_columns(manifest, table.schema_arrow.names)
         batches = table.iter_batches(columns=[COLUMN])
-        yield from enumerate((path for batch in batches for path in batch.column(0).to_pylist()), 1)
+        paths = (path for batch in batches for path in batch.column(0).to_pylist())
+        yield from ((ManifestRow(manifest, number), path) for number, path in enumerate(paths, 1))
     except (OSError, ValueError) as error:  # the errors of pyarrow are subclasses
         raise _not_a_table(manifest, error) from error
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import socket
 from collections.abc import Callable, Iterator, Sequence
-from functools import partial
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import final
 
@@ -29,14 +29,14 @@ def separate_in_parallel(
     enters the context of the executor, which runs a `SeparationRunner` in its workers; both need the same `overwrite`.
     Raises OutputError if a layer would replace a photo of the archive, or a node cannot reach the output folder, and
     ModelError or DeviceError."""
-    photos, cache = real_paths(task.source for task in tasks), _FileNameCache()
+    photos, has = real_paths(task.source for task in tasks), _file_finder()
     for task in tasks:  # a worker cannot check this, because it does not get the paths of all photos
         check_outputs(task, photos)
     finished: list[FileResult] = []
 
     def unfinished() -> Iterator[SeparationTask]:
         for task in tasks:
-            if not overwrite and _is_finished(task, cache.has):
+            if not overwrite and _is_finished(task, has):
                 finished.append(skipped_result(task))  # without a worker
             else:
                 yield task
@@ -82,20 +82,15 @@ def _is_finished(task: SeparationTask, has: Callable[[Location], bool]) -> bool:
     return all(isinstance(target, Location) and has(target) for target in task.outputs.values())
 
 
-@final
-class _FileNameCache:
-    """The file names in the folder of the last request. One listing replaces thousands of requests to an object store."""
+def _file_finder() -> Callable[[Location], bool]:
+    """Returns a function that checks whether a file exists. It keeps the file names in the folder of the last call, because
+    one listing replaces thousands of requests to an object store."""
 
-    def __init__(self) -> None:
-        self._folder: Location | None = None
-        self._names: set[str] = set()
+    @lru_cache(maxsize=1)
+    def names(folder: Location) -> set[str]:
+        try:
+            return {entry.name for entry in folder.iterdir()}
+        except OSError:  # the folder does not exist yet
+            return set()
 
-    def has(self, path: Location) -> bool:
-        """Whether the folder contains the file."""
-        if path.parent != self._folder:
-            self._folder = path.parent
-            try:
-                self._names = {entry.name for entry in path.parent.iterdir()}
-            except OSError:  # the folder does not exist yet
-                self._names = set()
-        return path.name in self._names
+    return lambda path: path.name in names(path.parent)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
-from typing import Final, Literal, Protocol, final
+from typing import Final, Literal, final
 
 from brewster.batch.layer_names import name_layers
 from brewster.batch.manifest import ManifestRow, is_manifest, read_manifest
@@ -15,24 +15,11 @@ from brewster.image_formats import SUFFIXES, is_video
 from brewster.inference.assessment import Assessment
 from brewster.inference.burst_report import BurstReport
 from brewster.options import DEFAULT_FRAMES, Options
+from brewster.photo.in_memory import BinaryFile, WritableFile
 from brewster.remote_path import Location, location
 
 _STREAM_NAME: Final = "-"
 _DEFAULT_OPTIONS: Final = Options()
-
-
-class InputStream(Protocol):
-    """A readable object with the bytes of one photo, such as an open binary file."""
-
-    def read(self) -> bytes:
-        """Returns all bytes."""
-
-
-class OutputStream(Protocol):
-    """A writable object for the bytes of one encoded layer, such as an open binary file."""
-
-    def write(self, data: bytes, /) -> object:
-        """Writes all bytes."""
 
 
 @final
@@ -53,8 +40,8 @@ class Burst:
 class SeparationTask:
     """One photo, and the output of each of its layers: a path, a URL or a stream."""
 
-    source: Location | InputStream
-    outputs: Mapping[str, Location | OutputStream]
+    source: Location | BinaryFile
+    outputs: Mapping[str, Location | WritableFile]
     """The output of each layer, by layer name (`transmission`, `reflection` or `confidence`)."""
     row: ManifestRow | None = None
     """The first row of a manifest that has the path of the photo, or None if there is none."""

@@ -19,8 +19,6 @@ from brewster.batch.manifest import row_in_errors
 from brewster.batch.plan import (
     Burst,
     FileResult,
-    InputStream,
-    OutputStream,
     SeparationTask,
     display_name,
     plan_files,
@@ -34,6 +32,7 @@ from brewster.inference.separation import Separation
 from brewster.inference.separator import Separator
 from brewster.options import Options
 from brewster.photo import Source
+from brewster.photo.in_memory import BinaryFile, WritableFile
 from brewster.remote_path import Location, RemotePath, check_readable, read_image
 
 BatchProgressCallback = Callable[[int, str, float], None]
@@ -190,15 +189,12 @@ def _check_sources(task: SeparationTask) -> None:
                 check_readable(source)
 
 
-def _missing_outputs(task: SeparationTask, *, overwrite: bool) -> dict[str, Location | OutputStream]:
+def _missing_outputs(task: SeparationTask, *, overwrite: bool) -> dict[str, Location | WritableFile]:
     """Returns the layers that must be written, with their outputs. The others must have been made from this photo."""
-    missing = {
-        layer: target
-        for layer, target in task.outputs.items()
-        if not isinstance(target, Location) or overwrite or not exists(target)
-    }
-    check_layers(task.source, [target for layer, target in task.outputs.items() if layer not in missing])
-    return missing
+    outputs = task.outputs.items()
+    kept = {name: out for name, out in outputs if not overwrite and isinstance(out, Location) and exists(out)}
+    _check_layers(task.source, kept.values())
+    return {name: out for name, out in outputs if name not in kept}
 
 
 def _separate_burst(
@@ -206,14 +202,11 @@ def _separate_burst(
 ) -> Separation:
     from brewster.burst import read_video, separate_burst  # noqa: PLC0415  (imports torch)
 
-    first, *_ = burst.photos
-    photos: list[Source] = (
-        [*read_video(Path(first), burst.frames, max_pixels=options.max_pixels)]
-        if is_video(first)
-        else [read_content(photo) for photo in burst.photos]
-    )
+    photos: Sequence[Source] = [read_content(photo) for photo in burst.photos if not is_video(photo)]
+    if not photos:
+        photos = read_video(Path(burst.photos[0]), burst.frames, max_pixels=options.max_pixels)
     return separate_burst(
-        photos,
+        [*photos],
         reference=burst.reference,
         separator=separator,
         on_progress=on_progress,
@@ -228,7 +221,7 @@ def check_outputs(task: SeparationTask, photos: Set[str]) -> None:
         if not isinstance(target, Location):
             continue
         is_own_photo = isinstance(task.source, Location) and is_same_file(target, task.source)
-        if is_own_photo or real_path(target) in photos:
+        if is_own_photo or photos & real_paths([target]):
             raise OutputError(
                 f"{target} is itself a photo of the batch",
                 "expected another path, because photos of the batch are never overwritten",
@@ -239,24 +232,22 @@ def check_outputs(task: SeparationTask, photos: Set[str]) -> None:
 def skipped_result(task: SeparationTask) -> FileResult:
     """Returns the result of a photo whose layers all exist: skipped, or failed if they were made from another photo."""
     try:
-        check_layers(task.source, task.outputs.values())
+        _check_layers(task.source, task.outputs.values())
     except OutputError as error:
         return FileResult(task.name).failed(error)
     return FileResult(task.name, "skipped", _names(task.outputs))
 
 
-def _names(outputs: Mapping[str, Location | OutputStream]) -> dict[str, str]:
+def _names(outputs: Mapping[str, Location | WritableFile]) -> dict[str, str]:
     return {layer: display_name(target) for layer, target in outputs.items()}
 
 
-def check_layers(source: Location | InputStream, layers: Iterable[Location | OutputStream]) -> None:
-    """Checks that existing layers were made from this photo. See `find_layer_of_another_photo`. Streams are not
-    checked, because they can be read only once. Files in an object store are not checked either: two more requests
-    for each photo of an archive would take hours. Raises OutputError if a layer was made from another photo, or from
-    another version of this photo."""
-    if not isinstance(source, Path):
-        return
-    if layer := find_layer_of_another_photo(source, (path for path in layers if isinstance(path, Path))):
+def _check_layers(source: Location | BinaryFile, layers: Iterable[Location | WritableFile]) -> None:
+    """Checks that existing layers were made from this photo, or raises OutputError. Streams are not checked, because they can
+    be read only once. Files in an object store are not checked either: two more requests for each photo of an archive
+    would take hours."""
+    files = (path for path in layers if isinstance(path, Path))
+    if isinstance(source, Path) and (layer := find_layer_of_another_photo(source, files)):
         raise OutputError(
             f"{layer} was made from another photo, or from another version of {source}",
             "expected layers of this photo, or no files with their names",
@@ -264,7 +255,7 @@ def check_layers(source: Location | InputStream, layers: Iterable[Location | Out
         )
 
 
-def read_content(source: Location | InputStream) -> Path | bytes:
+def read_content(source: Location | BinaryFile) -> Path | bytes:
     """Returns what a `Separator` reads: the path of a local file that can be opened, or the bytes of a URL or stream.
     Raises UnreadablePhoto if the file does not exist, is a folder, or cannot be opened or read, and UnsupportedPhoto
     if the file has the suffix of a video."""
@@ -283,10 +274,6 @@ def _sha256(photo: Path | bytes) -> str | None:
 
 
 def real_paths(files: Iterable[object]) -> frozenset[str]:
-    """Returns the real paths of the files. Streams have no path, and are left out."""
-    return frozenset(real_path(file) for file in files if isinstance(file, Location))
-
-
-def real_path(path: Location) -> str:
-    """Returns the absolute path without symbolic links; a URL is returned unchanged."""
-    return str(path) if isinstance(path, RemotePath) else os.path.realpath(path)
+    """Returns the absolute paths of the files without symbolic links, and URLs unchanged. Streams are left out."""
+    found = (file for file in files if isinstance(file, Location))
+    return frozenset(str(file) if isinstance(file, RemotePath) else os.path.realpath(file) for file in found)

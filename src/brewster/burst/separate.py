@@ -150,14 +150,14 @@ def fit_burst(
     report = burst_report(solution, single.verdict, len(photos), left_out, reference)
     if report.method != "single photo":
         hints = None
+    name = separator.name
     if solution and report.method == "burst":
-        name = f"burst with {separator.name}"
+        sha256, device = separator.sha256, separator.device
         separator = Separator(
-            _FixedPredictor(solution), name=name, sha256=separator.sha256, device=separator.device
+            _FixedPredictor(solution), name=name, method="burst", sha256=sha256, device=device
         )
     elif report.method == "unchanged":
-        name = f"unchanged with {separator.name}"
-        separator = Separator(lambda tile: (tile, np.zeros_like(tile)), name=name)
+        separator = Separator(lambda tile: (tile, np.zeros_like(tile)), name=name, method="unchanged")
     return FittedBurst(photo, separator, hints, report, seconds)
 
 

@@ -4,18 +4,25 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 import click
 
 from brewster.cli.parameters import FILE, QUIET, Number, flag, json_lines
-from brewster.cli.terminal import one_line, print_error, print_status, progress, standard_output, write_out
+from brewster.cli.terminal import one_line, print_error, print_status, progress, write_out
 
 if TYPE_CHECKING:
-    from brewster.environments.polyhaven import DownloadRequest, DownloadResult
+    from brewster.environments.polyhaven import DownloadResult
+
+_STATUS_LINES: Final = {
+    "missing": "{0.asset}: left out, because the server has no file in this resolution and format",
+    "skipped": "{0.file}: skipped, because it exists",
+    "downloaded": "{0.asset} -> {0.file} ({1:.1f} MB)",
+}
+"""The line about a result and its size in MB, by its status."""
 
 
 @click.group
@@ -84,8 +91,14 @@ def pull(
         request = polyhaven.DownloadRequest(**options, dry_run=dry_run, server=server or polyhaven.SERVER)
         fetched = polyhaven.pull(request, out or polyhaven.maps_folder())
         results = _print_results(fetched, request.indoor + request.outdoor, as_json=as_json, quiet=quiet)
+        for category, requested in (("indoor", request.indoor), ("outdoor", request.outdoor)):
+            found = sum(result.category == category and result.status != "missing" for result in results)
+            if found < requested and not quiet:
+                print_status(
+                    f"{found} of {requested} {category} maps found: the server has no more {category} maps in "
+                    f"{request.resolution} {request.format}"
+                )
         if not quiet:
-            _print_missing_counts(request, results)
             # The terms of service of Poly Haven require these words.
             print_status("powered by Poly Haven, polyhaven.com")
     context.exit(1 if any(result.error for result in results) else 0)
@@ -113,12 +126,16 @@ def _print_results(
 ) -> list[DownloadResult]:
     """Downloads the files, and prints each result and, also after an interruption, a summary."""
     results: list[DownloadResult] = []
-    shares_terminal = as_json and standard_output.stream.isatty()
     try:
-        with progress(total, shown=not quiet and not shares_terminal) as update_progress:
+        with progress(total, shown=not quiet, as_json=as_json) as update_progress:
             for result in fetched:
                 results.append(result)
-                _print_result(result, as_json=as_json, quiet=quiet)
+                if as_json:
+                    write_out(f"{json.dumps(asdict(result))}\n".encode())
+                elif result.status == "planned":
+                    write_out(f"{one_line(result.url)} -> {one_line(result.file)}\n".encode())
+                if not quiet and result.status in _STATUS_LINES:
+                    print_status(_STATUS_LINES[result.status].format(result, (result.bytes or 0) / 1e6))
                 update_progress(sum(result.status != "missing" for result in results), result.asset)
     finally:
         counts = Counter(result.status for result in results)
@@ -128,28 +145,3 @@ def _print_results(
             if result.error:
                 print_error(f"{result.asset}: {result.error}")
     return results
-
-
-def _print_result(result: DownloadResult, *, as_json: bool, quiet: bool) -> None:
-    if as_json:
-        write_out(f"{json.dumps(asdict(result))}\n".encode())
-    elif result.status == "planned":
-        write_out(f"{one_line(result.url)} -> {one_line(result.file)}\n".encode())
-    lines = {
-        "missing": f"{result.asset}: left out, because the server has no file in this resolution and format",
-        "skipped": f"{result.file}: skipped, because it exists",
-        "downloaded": f"{result.asset} -> {result.file} ({(result.bytes or 0) / 1e6:.1f} MB)",
-    }
-    if not quiet and result.status in lines:
-        print_status(lines[result.status])
-
-
-def _print_missing_counts(request: DownloadRequest, results: Sequence[DownloadResult]) -> None:
-    """Prints one line for each category of which the server has fewer maps than requested."""
-    for category, requested in (("indoor", request.indoor), ("outdoor", request.outdoor)):
-        found = sum(result.category == category and result.status != "missing" for result in results)
-        if found < requested:
-            print_status(
-                f"{found} of {requested} {category} maps found: the server has no more {category} maps in "
-                f"{request.resolution} {request.format}"
-            )

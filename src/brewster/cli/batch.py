@@ -6,7 +6,7 @@ import json
 import time
 from collections import Counter, defaultdict
 from collections.abc import Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import KW_ONLY, asdict, dataclass, field
 from functools import partial
 from pathlib import Path
@@ -76,16 +76,13 @@ class BatchReport:
                 interrupts.raise_pending()
                 update_progress(done + fraction, name)
 
+            overwrite, dry_run = self.overwrite, self.dry_run
             if self.is_parallel:
                 executor = stack.enter_context(self._executor(workers, cluster))
-                results = separate_in_parallel(tasks, executor, overwrite=self.overwrite)
+                results = separate_in_parallel(tasks, executor, overwrite=overwrite)
             else:
                 results = separate_tasks(
-                    tasks,
-                    self.options,
-                    overwrite=self.overwrite,
-                    dry_run=self.dry_run,
-                    on_progress=on_progress,
+                    tasks, self.options, overwrite=overwrite, dry_run=dry_run, on_progress=on_progress
                 )
             for result in results:
                 self.add(result)
@@ -107,10 +104,16 @@ class BatchReport:
         return RayExecutor(create_runner, cluster, workers)
 
     def _finish(self, kind: type[BaseException] | None, *_: object) -> None:
-        """Writes the contact sheet if there was no error, and prints the summary."""
+        """Writes the contact sheet of the photos whose layers are files if there was no error, and prints the summary."""
         try:
             if kind is None and self.contact_sheet and not self.dry_run:
-                self._write_contact_sheet(self.contact_sheet)
+                from brewster.photo.contact_sheet import write_contact_sheets  # noqa: PLC0415
+
+                rows = sorted(self._contact_sheet_rows) if self.is_parallel else self._contact_sheet_rows
+                limit, overwrite = self.options.max_pixels, self.overwrite
+                for sheet in write_contact_sheets(self.contact_sheet, rows, limit, overwrite=overwrite):
+                    if not self.quiet:
+                        print_status(f"contact sheet: {sheet}")
         finally:
             if self.counts.total() == self.count:
                 self._print_summary()
@@ -163,16 +166,14 @@ class BatchReport:
         from brewster.photo.history import PROGRAM, recorded_parameters  # noqa: PLC0415
 
         given = {name: getattr(self.options, name) for name in ("strength", "quality", "additive")}
-        expected = history_step("", **given) | {"model": _model_name(self.options.model)}
+        expected = history_step(**given)
+        with suppress(ModelError):  # the model is unknown
+            if not zoo.is_diffusion_model(self.options.model):  # whose name is known only after loading
+                expected["model"] = zoo.find_model(self.options.model).name
         metadata = (recorded_parameters(Path(path), PROGRAM) for path in result.outputs.values())
-        recorded_options = next((parameters for parameters in metadata if parameters), {})
-        return ", ".join(
-            f"{name}={recorded_options[name]}"
-            for name, value in expected.items()
-            # The layers of a burst have the model "burst with compact" or "unchanged with compact"
-            if value is not None
-            and str(recorded_options.get(name, value)).rpartition(" with ")[-1] != str(value)
-        )
+        recorded = next((parameters for parameters in metadata if parameters), {})
+        different = {name for name, value in expected.items() if recorded.get(name, value) != value}
+        return ", ".join(f"{name}={recorded[name]}" for name in expected if name in different)
 
     def _print_summary(self) -> None:
         """Prints the counts, the time and the errors. Photos that need the same missing extra share a message."""
@@ -191,23 +192,6 @@ class BatchReport:
             print_error(message)
         for message, sources in self._sources_by_missing_extra.items():
             print_error(f"{sources[0] if len(sources) == 1 else listed(sources, 'photo')}: {message}")
-
-    def _write_contact_sheet(self, path: Path) -> None:
-        """Writes the contact sheet of the photos whose layers are files; a parallel batch is sorted by name."""
-        from brewster.photo.contact_sheet import write_contact_sheets  # noqa: PLC0415
-
-        rows = sorted(self._contact_sheet_rows) if self.is_parallel else self._contact_sheet_rows
-        for sheet in write_contact_sheets(path, rows, self.options.max_pixels, overwrite=self.overwrite):
-            if not self.quiet:
-                print_status(f"contact sheet: {sheet}")
-
-
-def _model_name(model: str) -> str | None:
-    """Returns the name of the model in the metadata of layers; None if it is unknown, or known only after loading."""
-    try:
-        return None if zoo.is_diffusion_model(model) else zoo.find_model(model).name
-    except ModelError:
-        return None
 
 
 def _duration(seconds: float) -> str:

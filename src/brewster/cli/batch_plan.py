@@ -38,12 +38,6 @@ def local_path(text: str) -> str:
     return path_of_file_url(text) if text.startswith("file://") else text
 
 
-def absolute_path(path: str) -> str:
-    """Returns the absolute path, or the URL."""
-    found = location(path)
-    return os.path.abspath(found) if isinstance(found, Path) else str(found)  # noqa: PTH100  (keeps links)
-
-
 def skipped_files(files: Sequence[Location]) -> Iterator[str]:
     """Yields a line about the videos, and a line about all other files without the suffix of an image."""
     others = [file for file in files if not is_video(file)]

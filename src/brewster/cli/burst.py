@@ -10,7 +10,7 @@ import click
 from brewster.cli.batch import BatchReport
 from brewster.cli.batch_plan import check_output, is_single_output, local_path, plan
 from brewster.cli.extras import require_extra
-from brewster.cli.parameters import OVERWRITE, QUIET, Number
+from brewster.cli.parameters import OVERWRITE, QUIET, Number, flag, json_lines
 from brewster.cli.separate import parse_options, with_options
 from brewster.models import zoo
 from brewster.options import DEFAULT_FRAMES, MAX_BURST_PHOTOS, Options
@@ -40,11 +40,9 @@ if TYPE_CHECKING:
     help="The number of frames to choose from a video.",
 )
 @with_options
-@click.option(
-    "--json", "as_json", is_flag=True, help="Print one line of JSON for each burst on standard output."
-)
+@json_lines("burst")
 @QUIET
-@click.option("--dry-run", is_flag=True, help="Print the planned files. Write nothing.")
+@flag("--dry-run", help="Print the planned files. Write nothing.")
 @OVERWRITE
 @click.pass_context
 def burst(
@@ -55,11 +53,7 @@ def burst(
     output: str | None,
     reference: int | None,
     frames: int,
-    as_json: bool,
-    quiet: bool,
-    dry_run: bool,
-    overwrite: bool,
-    **values: Any,  # noqa: ANN401  (those of Options)
+    **values: Any,  # noqa: ANN401  (those of Options, and the flags of BatchReport)
 ) -> None:
     """Separate several photos of one window by the motion of the layers.
 
@@ -74,16 +68,7 @@ def burst(
     zoo.model_name(options.model)
     require_extra("burst", "a burst")
     tasks = _plan(photos, output, options, reference=reference and reference - 1, frames=frames)
-    report = BatchReport(
-        options,
-        output,
-        len(tasks),
-        dry_run=dry_run,
-        as_json=as_json,
-        quiet=quiet,
-        overwrite=overwrite,
-    )
-    context.exit(report.run(tasks))
+    context.exit(BatchReport(options, output, len(tasks), **values).run(tasks))
 
 
 def _plan(

@@ -6,7 +6,6 @@ import importlib
 import json
 import platform
 import shutil
-import sys
 import warnings
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
@@ -23,7 +22,6 @@ from brewster.errors import INSTALL_COMMAND, BrewsterError, MissingExtra, instal
 from brewster.image_formats import FORMATS, WRITABLE
 from brewster.models import zoo
 
-_MIN_PYTHON: Final = (3, 11)
 _GIF: Final = bytes.fromhex(
     "47494638396101000100800000ffffff00000021f90401000000002c00000000010001000002024401003b"
 )
@@ -74,11 +72,8 @@ def doctor(context: click.Context, *, as_json: bool, needs: str | None) -> None:
             for check in found:
                 cure = f"\n{'':8}{check.cure}" if check.cure else ""
                 print_out(f"  {_SYMBOLS[check.status]}  {check.name:16} {check.detail}{cure}")
-        print_out(
-            "All required parts work."
-            if is_healthy
-            else "A required part does not work: see the lines with !! and -- above."
-        )
+        problem = "A required part does not work: see the lines with !! and -- above."
+        print_out("All required parts work." if is_healthy else problem)
     context.exit(0 if is_healthy else 1)
 
 
@@ -93,11 +88,8 @@ def _require_extras(names: list[str]) -> None:
 
 def run_checks() -> Iterator[Check]:
     """Runs all checks, and yields their results. Each part is checked after the parts that it depends on."""
-    version = platform.python_version()
-    if sys.version_info >= _MIN_PYTHON:
-        yield Check("python", "python", "ok", f"{version}, {platform.platform()}")
-    else:
-        yield Check("python", "python", "broken", version, "install Python 3.11 or newer")
+    # pip installs brewster only for a Python that it supports
+    yield Check("python", "python", "ok", f"{platform.python_version()}, {platform.platform()}")
     yield from _packages()
     yield from _devices()
     yield from _formats()
@@ -221,11 +213,13 @@ def _diffusion() -> Iterator[Check]:
         return
     from brewster.models.diffusion.hub_download import has_hub_token  # noqa: PLC0415  (imports torch)
 
-    for name, found, problem, cure in (
-        ("bitsandbytes", _version("bitsandbytes"), "not installed; needed for nf4 and 8-bit AdamW on NVIDIA GPUs", "pip install bitsandbytes"),
-        ("hub token", has_hub_token() and "found", "not found; gated models such as FLUX.1 Kontext need a token", "hf auth login"),
-    ):  # fmt: skip
-        if found:
-            yield Check("diffusion", name, "ok", found, needed=False)
-        else:
-            yield Check("diffusion", name, "missing", problem, cure, needed=False)
+    problem = "not installed; needed for nf4 and 8-bit AdamW on NVIDIA GPUs"
+    yield _optional("bitsandbytes", _version("bitsandbytes"), problem, "pip install bitsandbytes")
+    problem = "not found; gated models such as FLUX.1 Kontext need a token"
+    yield _optional("hub token", "found" if has_hub_token() else None, problem, "hf auth login")
+
+
+def _optional(name: str, found: str | None, problem: str, cure: str) -> Check:
+    if found:
+        return Check("diffusion", name, "ok", found, needed=False)
+    return Check("diffusion", name, "missing", problem, cure, needed=False)

@@ -16,15 +16,7 @@ from click.core import ParameterSource
 
 from brewster.cli.extras import require_extra
 from brewster.cli.parameters import EXISTING_FOLDER, FILE, QUIET, Number, flag, json_lines
-from brewster.cli.terminal import (
-    interrupts,
-    print_error,
-    print_out,
-    print_status,
-    progress,
-    standard_output,
-    write_out,
-)
+from brewster.cli.terminal import interrupts, print_error, print_out, print_status, progress, write_out
 
 if TYPE_CHECKING:
     from brewster.executors.local import Executor
@@ -213,9 +205,8 @@ class _RenderCommand:
         from brewster.rendered.generation.preview import write_preview  # noqa: PLC0415
 
         job, counts = self._job(), Counter[str]()
-        shares_terminal = self.as_json and standard_output.stream.isatty()
         frames = job.recipe.frames
-        with progress(self.count * frames, shown=not self.quiet and not shares_terminal) as update_progress:
+        with progress(self.count * frames, shown=not self.quiet, as_json=self.as_json) as update_progress:
 
             def on_result(result: RenderResult) -> None:
                 counts[result.status] += 1  # the results are not stored, so that memory stays constant

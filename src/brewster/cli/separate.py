@@ -14,22 +14,16 @@ from click.core import ParameterSource
 from click.shell_completion import CompletionItem
 
 from brewster.cli.batch import BatchReport
-from brewster.cli.batch_plan import (
-    absolute_path,
-    gpu_for_plan,
-    is_single_output,
-    local_path,
-    plan,
-    skipped_files,
-)
+from brewster.cli.batch_plan import gpu_for_plan, is_single_output, local_path, plan, skipped_files
 from brewster.cli.extras import require_extra
 from brewster.cli.parameters import FILE, OVERWRITE, QUIET, Number, flag, gpu_name, json_lines
 from brewster.cli.terminal import print_out, print_status, standard_output
 from brewster.errors import BrewsterError
+from brewster.files import absolute
 from brewster.image_formats import FormatName, canonical_format, format_of
 from brewster.models import zoo
 from brewster.options import Options
-from brewster.remote_path import Location
+from brewster.remote_path import Location, location
 
 if TYPE_CHECKING:
     from brewster.batch import SeparationTask
@@ -199,7 +193,10 @@ def separate(
             raise click.UsageError(
                 "With --cluster, --workers and --index, layers are written to files: give a folder with -o."
             )
-        photos, output = tuple(map(absolute_path, photos)), output and absolute_path(output)
+        photos, output = (
+            tuple(absolute(location(photo)) for photo in photos),
+            output and absolute(location(output)),
+        )
         contact_sheet = contact_sheet and contact_sheet.absolute()
     # An unknown name is an error, even if no photo needs the model. Nothing is loaded.
     zoo.model_name(options.model)
@@ -227,11 +224,12 @@ def separate(
 
 
 def parse_options(context: click.Context, values: dict[str, Any], *, single_output: bool) -> Options:
-    """Returns the options, or raises click.UsageError. A single output is the transmission by default."""
+    """Takes the values of the options out of `values`, and returns them, or raises click.UsageError. A single output is the
+    transmission by default."""
     if single_output and context.get_parameter_source("layers") is ParameterSource.DEFAULT:
         values["layers"] = ("transmission",)
     try:
-        return Options(**values)
+        return Options(**{field.name: values.pop(field.name) for field in dataclasses.fields(Options)})
     except BrewsterError as error:
         raise click.UsageError(str(error)) from error
 
@@ -259,7 +257,7 @@ def _print_plan(photos: tuple[str, ...], output: str | None, options: Options, g
 def _check_contact_sheet(
     path: Path, photos: tuple[str, ...], output: str | None, cluster: str | None
 ) -> None:
-    """Checks that the contact sheet can be written before any photo is separated."""
+    """Checks the arguments before any photo is separated."""
     if cluster:
         raise click.UsageError("--contact-sheet cannot be combined with --cluster.")
     if not ((row := format_of(path)) and row.is_writable):

@@ -141,10 +141,11 @@ def write_out(data: bytes) -> None:
 
 
 @contextmanager
-def progress(total: int, *, shown: bool) -> Iterator[ProgressUpdater]:
-    """Shows a progress bar if `shown` is true and standard error is a terminal. Yields the function that updates the
-    bar. A single item has a percentage instead of the number of finished items."""
-    if not (shown and sys.stderr.isatty()):
+def progress(total: int, *, shown: bool, as_json: bool = False) -> Iterator[ProgressUpdater]:
+    """Shows a progress bar if `shown` is true, standard error is a terminal, and no JSON is printed on the same terminal. Yields
+    the function that updates the bar. A single item has a percentage instead of the number of finished items."""
+    shares_terminal = as_json and standard_output.stream.isatty()
+    if not (shown and sys.stderr.isatty()) or shares_terminal:
         yield lambda _done, _text: None
         return
     from rich import progress as rich_progress  # noqa: PLC0415

@@ -14,7 +14,7 @@ import click
 from brewster.cli.batch_plan import gpu_for_plan
 from brewster.cli.extras import require_extra
 from brewster.cli.parameters import FILE, QUIET, flag, gpu_name
-from brewster.cli.terminal import interrupts, print_out, print_status, progress, standard_output
+from brewster.cli.terminal import interrupts, print_out, print_status, progress
 from brewster.errors import OutputError, RecipeError
 
 if TYPE_CHECKING:
@@ -103,8 +103,7 @@ def train(
     printer = _TrainingPrinter(
         as_json=as_json and is_main_process(), quiet=quiet or not is_main_process(), folder=out
     )
-    shares_terminal = as_json and standard_output.stream.isatty()
-    with progress(parsed.steps, shown=not printer.quiet and not shares_terminal) as update_progress:
+    with progress(parsed.steps, shown=not printer.quiet, as_json=as_json) as update_progress:
 
         def on_progress(step: int, steps: int, metrics: Mapping[str, float], is_logged: bool) -> None:
             interrupts.raise_pending()
@@ -155,6 +154,7 @@ class _TrainingPrinter:
 
 
 def _print_plan(recipe: CompactRecipe | LoraRecipe, gpu_name: str | None) -> None:
+    """Prints the estimate, and the number of samples and the sizes of their panels, read in the same way as in training."""
     from brewster.training.lora.resource_estimate import estimate_resources  # noqa: PLC0415
     from brewster.training.recipe import LoraRecipe  # noqa: PLC0415
 
@@ -167,11 +167,6 @@ def _print_plan(recipe: CompactRecipe | LoraRecipe, gpu_name: str | None) -> Non
     estimate = estimate_resources(recipe, gpu_for_plan(gpu_name))
     print_out(estimate.table())
     estimate.check_fits()
-    _print_data(recipe)
-
-
-def _print_data(recipe: LoraRecipe) -> None:
-    """Reads the data in the same way as training, and prints the number of samples and the sizes of their panels."""
     if not os.environ.get("BREWSTER_DATA"):
         print_status("the data was not checked: BREWSTER_DATA is not set")
         return

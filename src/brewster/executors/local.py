@@ -19,7 +19,7 @@ from concurrent.futures.process import BrokenProcessPool
 from contextlib import AbstractContextManager, contextmanager
 from multiprocessing import active_children, get_context, parent_process, resource_tracker
 from multiprocessing.process import BaseProcess
-from typing import Any, Final, Generic, Protocol, Self, TypeVar, final
+from typing import Any, Final, Protocol, Self, TypeVar, final
 
 ResultT = TypeVar("ResultT")
 
@@ -48,9 +48,9 @@ class Executor(AbstractContextManager[Any], Protocol[ResultT]):
     results are lost.
     """
 
-    chunk_size: int
+    chunk_size: int = 1
     """Number of items per task."""
-    attempts: int
+    attempts: int = 1
     """How often `run_tasks` starts a task whose worker is lost."""
 
     def capacity(self) -> int:
@@ -103,10 +103,8 @@ def run_tasks(
 
 
 @final
-class SerialExecutor(Generic[ResultT]):
+class SerialExecutor(Executor[ResultT]):
     """Runs tasks in this process, one at a time."""
-
-    chunk_size = attempts = 1
 
     def __init__(self, create_runner: Callable[[], Runner[ResultT]]) -> None:
         self._create_runner = create_runner
@@ -127,24 +125,20 @@ class SerialExecutor(Generic[ResultT]):
         """Raises the exception: there is no worker."""
         raise error
 
-    def __enter__(self) -> Self:
-        return self
-
     def __exit__(self, *_: object) -> None:
         """Does nothing."""
 
 
 @final
-class ProcessExecutor(Generic[ResultT]):
+class ProcessExecutor(Executor[ResultT]):
     """Runs tasks in several processes, one task in each. If a process dies, another process runs its task again.
 
     Each process is a pool of its own, because the death of one breaks its whole pool.
     """
 
-    chunk_size = 1
+    attempts = MAX_ATTEMPTS
 
     def __init__(self, create_runner: Callable[[], Runner[ResultT]], worker_count: int) -> None:
-        self.attempts = MAX_ATTEMPTS
         self._create_runner, self._worker_count = create_runner, worker_count
         self._processes: dict[ProcessPoolExecutor, BaseProcess] = {}
         self._idle: list[ProcessPoolExecutor] = []
@@ -158,11 +152,8 @@ class ProcessExecutor(Generic[ResultT]):
         """Sends the task to an idle worker, or to a new one."""
         others = active_children()
         with _interrupts_blocked():  # the first task starts the process
-            pool = (
-                self._idle.pop()
-                if self._idle
-                else ProcessPoolExecutor(1, get_context("spawn"), _start_worker)
-            )
+            new = None if self._idle else ProcessPoolExecutor(1, get_context("spawn"), _start_worker)
+            pool = new or self._idle.pop()
             try:
                 future = pool.submit(_run_task, self._create_runner, task)
             except BrokenProcessPool:  # the process died while it was idle
@@ -189,14 +180,8 @@ class ProcessExecutor(Generic[ResultT]):
         pool.shutdown()
         return f"the worker died {self.attempts} times (exit code {self._processes.pop(pool).exitcode})"
 
-    def __enter__(self) -> Self:
-        return self
-
     def __exit__(self, _kind: object, error: object, _trace: object) -> None:
-        """Waits until the workers exit: at once if they are idle, otherwise after their task.
-
-        After an error, all workers are killed.
-        """
+        """Waits until the workers exit: at once if they are idle, otherwise after their task. After an error, kills them all."""
         for pool, process in self._processes.items():
             if error:
                 process.kill()

@@ -9,10 +9,10 @@ import socket
 from collections.abc import Callable
 from concurrent.futures import Future
 from types import ModuleType
-from typing import Any, Final, Generic, Self, final
+from typing import Any, Final, Self, final
 
 from brewster.errors import DeviceError, MissingExtra
-from brewster.executors.local import MAX_ATTEMPTS, ResultT, Runner, Task
+from brewster.executors.local import MAX_ATTEMPTS, Executor, ResultT, Runner, Task
 
 LOCAL: Final = "local"
 _CONNECT_TIMEOUT_S: Final = 10.0
@@ -21,23 +21,19 @@ _TASKS_PER_CPU: Final = 2
 
 
 @final
-class RayExecutor(Generic[ResultT]):
+class RayExecutor(Executor[ResultT]):
     """Runs tasks on the Ray cluster at an address, or on a cluster of this machine only ("local").
 
     If a node is lost, its tasks are run on another node.
     """
 
-    chunk_size = 4
-    attempts = 1
-    """Ray itself tries a task several times."""
+    chunk_size = 4  # and one attempt, because Ray itself tries a task several times
 
     def __init__(
-        self,
-        create_runner: Callable[[], Runner[ResultT]],
-        address: str = LOCAL,
-        worker_count: int | None = None,
+        self, create_runner: Callable[[], Runner[ResultT]], address: str = LOCAL, workers: int | None = None
     ) -> None:
-        self._create_runner, self._address, self._worker_count = create_runner, address, worker_count
+        self._create_runner, self._address = create_runner, address
+        self._options = {"num_cpus": workers, "include_dashboard": False} if address == LOCAL else {}
 
     def capacity(self) -> int:
         """Two tasks for each processor of the current nodes."""
@@ -46,17 +42,13 @@ class RayExecutor(Generic[ResultT]):
 
     def start(self, task: Task[ResultT]) -> Future[list[ResultT]]:
         """Sends a task to the cluster."""
-        future: Future[list[ResultT]] = self._run_task.remote(
-            self._run_id, self._create_runner_ref, task
-        ).future()
+        submitted = self._run_task.remote(self._run_id, self._create_runner_ref, task)
+        future: Future[list[ResultT]] = submitted.future()
         return future
 
     def lost_reason(self, error: Exception) -> str:
-        """Returns how the process or the node was lost.
-
-        Raises:
-            Exception: raised by the runner; its cause is Ray's error with the traceback of the worker.
-        """
+        """Returns how the process or the node was lost. Raises the exception of the runner; its cause is Ray's error with
+        the traceback of the worker."""
         ray_error = self._ray.exceptions.RayError
         if not isinstance(error, ray_error):
             raise error
@@ -68,22 +60,15 @@ class RayExecutor(Generic[ResultT]):
         raise cause from error
 
     def __enter__(self) -> Self:
-        """Connects to the cluster, or starts a cluster on this machine if the address is "local".
-
-        Raises:
-            MissingExtra: Ray is not installed.
-            DeviceError: no cluster responds at the address.
-        """
+        """Connects to the cluster, or starts a cluster on this machine if the address is "local". Raises MissingExtra if Ray
+        is not installed, and DeviceError if no cluster responds at the address."""
         self._ray = _ray()
-        local_options = (
-            {"num_cpus": self._worker_count, "include_dashboard": False} if self._address == LOCAL else {}
-        )
         try:
             # OSError if no program listens at HOST:PORT: Ray itself retries for many minutes
             host, _, port = self._address.rpartition(":")
             if host and port.isdigit() and "/" not in host:
                 socket.create_connection((host, int(port)), timeout=_CONNECT_TIMEOUT_S).close()
-            self._ray.init(self._address, log_to_driver=False, logging_level="error", **local_options)
+            self._ray.init(self._address, log_to_driver=False, logging_level="error", **self._options)
         except (OSError, RuntimeError, ValueError) as error:
             raise DeviceError(
                 f"there is no cluster at {self._address} ({error})",
@@ -105,11 +90,8 @@ def _ray() -> ModuleType:
     try:
         ray = importlib.import_module("ray")
     except ImportError as error:
-        raise MissingExtra.for_extra(
-            "cluster",
-            "the package ray is not installed",
-            "expected the package ray for --cluster",
-        ) from error
+        expected = "expected the package ray for --cluster"
+        raise MissingExtra.for_extra("cluster", "the package ray is not installed", expected) from error
     # Ray prints lost processes on standard output, which is reserved for --json. There is no option to prevent this.
     importlib.import_module("ray._private.worker")._worker_logs_enabled = False  # type: ignore[attr-defined]
     return ray

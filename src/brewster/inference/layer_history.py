@@ -14,14 +14,9 @@ PHOTO: Final = "photo"
 """The name of the parameter that identifies the photo of a layer: its `sampled_digest`."""
 
 
-def history_step(model: str, *, strength: float, quality: str, additive: bool) -> dict[str, str]:
+def history_step(*, strength: float, quality: str, additive: bool) -> dict[str, str]:
     """Returns the options of a separation as names and values for the metadata of its layers."""
-    return {
-        "model": model,
-        "strength": f"{strength:g}",
-        "quality": quality,
-        "additive": "yes" if additive else "no",
-    }
+    return {"strength": f"{strength:g}", "quality": quality, "additive": "yes" if additive else "no"}
 
 
 def with_step(photo: Photo, layer: str, step: dict[str, str]) -> Photo:

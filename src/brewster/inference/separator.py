@@ -62,6 +62,7 @@ class Separator:
         name: str = "custom",
         sha256: str | None = None,
         device: str = "cpu",
+        method: str | None = None,
         is_calibrated: bool = False,
     ) -> None:
         if not callable(model):
@@ -70,7 +71,8 @@ class Separator:
                 "pass one, or load a model by its name with Separator.load"
             )
         self._predictor = model if isinstance(model, Predictor) else MultiScalePredictor(model)
-        self.name, self.sha256, self.device = name, sha256, device
+        self.name, self.sha256, self.device = f"{method} with {name}" if method else name, sha256, device
+        self._recorded = {"model": name, **({"method": method} if method else {})}
         self.takes_hints = self._predictor.takes_hints
         self._is_calibrated = is_calibrated
 
@@ -241,7 +243,7 @@ class Separator:
                 additive=additive,
                 on_progress=lambda done: on_progress(_NETWORK_SHARE + (1 - _NETWORK_SHARE) * done),
             )
-        step = history_step(self.name, strength=strength, quality=quality, additive=additive)
+        step = self._recorded | history_step(strength=strength, quality=quality, additive=additive)
         step |= {"sha256": self.sha256[:12]} if self.sha256 else {}
         step |= {PHOTO: photo.file_info.digest} if photo.file_info.digest else {}
         return Separation(

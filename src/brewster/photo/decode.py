@@ -43,9 +43,7 @@ Stored = NDArray[Any]
 def decode(data: bytes, max_pixels: int) -> Decoded:
     """Decodes the bytes of an image file. Raises PhotoError if the image cannot be read, is not supported, or is too
     large (see `Photo.open`), and MissingExtra if the reader of EXR, HEIC or RAW is not installed."""
-    format_name = _detect_format(data)
-    if format_name == "ora":
-        data, format_name = _merged_image(data, max_pixels), "png"
+    data, format_name = _detect_format(data, max_pixels)
     if format_name == "raw":
         return split_alpha(*read_raw(data, max_pixels))
     if format_name in _FLOAT_READERS:
@@ -65,16 +63,10 @@ def decode(data: bytes, max_pixels: int) -> Decoded:
 
 
 def read_size(data: bytes) -> tuple[int, int]:
-    """Returns (width, height), equal to `Photo.open(data).size`, from the header only.
+    """Returns (width, height), equal to `Photo.open(data).size`, from the header only. Raises the errors of `Photo.open`.
 
-    The header is checked as in `Photo.open`. Damaged pixel data are not found. EXR and HDR files are read completely.
-
-    Raises:
-        PhotoError: the image cannot be read, is not supported, or is too large (see `Photo.open`).
-        MissingExtra: the reader of EXR, HEIC or RAW is not installed."""
-    format_name = _detect_format(data)
-    if format_name == "ora":
-        data, format_name = _merged_image(data, DEFAULT_MAX_PIXELS), "png"
+    Damaged pixel data are not found. EXR and HDR files are read completely."""
+    data, format_name = _detect_format(data, DEFAULT_MAX_PIXELS)
     if format_name == "raw":
         return read_raw_size(data, DEFAULT_MAX_PIXELS)
     if format_name in _FLOAT_READERS:
@@ -99,12 +91,15 @@ def _check_profile(icc: bytes | None, *, is_float: bool) -> None:
 _FLOAT_READERS = {"exr": read_exr, "hdr": read_hdr}
 
 
-def _detect_format(data: bytes) -> str:
+def _detect_format(data: bytes, max_pixels: int) -> tuple[bytes, str]:
+    """Returns the data and the name of their format; of an OpenRaster file, those of its merged image."""
     if not data:
         raise empty_file_error()
     if image_format := format_of_content(data):
+        if image_format.name == "ora":
+            return _merged_image(data, max_pixels), "png"
         is_raw_tiff = image_format.name == "tiff" and is_raw(metadata.read_tags(data))
-        return "raw" if is_raw_tiff else image_format.name
+        return data, "raw" if is_raw_tiff else image_format.name
     if re.match(VIDEO_SIGNATURE, data, re.DOTALL):
         raise video_error("the file")
     is_text = data[:12].isascii() and data[:12].decode().isprintable()

@@ -59,7 +59,7 @@ def _exr_part(data: bytes, *, header_only: bool) -> Any:  # noqa: ANN401  (OpenE
 
 
 def _exr_pixels(channels: dict[str, NDArray[Any]], header: dict[str, Any]) -> Decoded:
-    names = ["R", "G", "B"] if {"R", "G", "B"} <= channels.keys() else ["Y"]
+    names = _LAYER_CHANNELS if {*_LAYER_CHANNELS} <= channels.keys() else ("Y",)
     if not set(names) <= channels.keys() or "RY" in channels:
         raise UnsupportedPhoto(
             f"the EXR has the channels {', '.join(sorted(channels))}",
@@ -117,11 +117,8 @@ def write_exr_layers(layers: Mapping[str, Float32], header: Mapping[str, str]) -
             "expected other names, because these are reserved by OpenEXR",
             "choose other names",
         )
-    planes = {
-        f"{name}.{channel}": layer[..., i]
-        for name, layer in layers.items()
-        for i, channel in enumerate(_LAYER_CHANNELS)
-    }
+    channels = [*enumerate(_LAYER_CHANNELS)]
+    planes = {f"{name}.{channel}": layer[..., i] for name, layer in layers.items() for i, channel in channels}
     attributes = {**header, "compression": exr.ZIP_COMPRESSION, "type": exr.scanlineimage}
     return _exr_bytes(planes, np.float16, attributes)
 
@@ -144,12 +141,11 @@ def read_exr_layers(data: bytes) -> dict[str, Float32]:
         UnreadablePhoto: the file is damaged, or has no layer with R, G and B."""
     channels = _exr_part(data, header_only=False).channels
     stems = sorted(name.removesuffix(".R") for name in channels if name.endswith(".R"))
-    names = {stem: [f"{stem}.{channel}" for channel in _LAYER_CHANNELS] for stem in stems}
-    layers = {
-        stem: np.stack([channels[name].pixels.astype(np.float32) for name in channel_names], axis=2)
-        for stem, channel_names in names.items()
-        if channels.keys() >= set(channel_names)
-    }
+    layers = {}
+    for stem in stems:
+        names = [f"{stem}.{channel}" for channel in _LAYER_CHANNELS]
+        if channels.keys() >= {*names}:
+            layers[stem] = np.stack([channels[name].pixels.astype(np.float32) for name in names], axis=2)
     if not layers:
         raise UnreadablePhoto(
             f"the EXR has the channels {', '.join(sorted(channels))}",

@@ -37,9 +37,8 @@ def is_raw(tags: metadata.Tags) -> bool:
 
 
 def read_raw(data: bytes, max_pixels: int) -> tuple[NDArray[np.uint16], FileInfo]:
-    """Returns the pixels (H, W, 1|3) in Display P3, upright, and the metadata of a RAW file. Raises MissingExtra if
-    rawpy is not installed; PhotoTooLarge if the image has more pixels than `max_pixels`; UnreadablePhoto if the file
-    is damaged or truncated, or LibRaw does not support the camera."""
+    """Returns the pixels (H, W, 1|3) in Display P3, upright, and the metadata of a RAW file. Raises the errors of
+    `read_raw_size`."""
     with _opened(data) as raw:
         _upright_size(raw, max_pixels)  # checks the limit before the pixels are decoded
         options = {"use_camera_wb": True, "no_auto_bright": True, "gamma": (1, 1), "output_bps": 16}

@@ -14,8 +14,7 @@ import ipaddress
 import logging
 import signal
 import socket
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from http import HTTPStatus
 from pathlib import Path
 from typing import Any, Final, final
@@ -64,9 +63,8 @@ request nor receives a byte between the checks."""
 GRACE_SECONDS: Final = 2.0
 """The time for which running requests may continue after the shutdown begins."""
 _BACKLOG: Final = 128
-_SEND_BUFFER_BYTES: Final = (
-    1 << 17
-)  # with a larger kernel buffer, the server cannot see whether a slow client still receives
+_SEND_BUFFER_BYTES: Final = 1 << 17
+"""With a larger buffer of the kernel, the server cannot see whether a slow client still receives."""
 
 
 def create_app(*routers: APIRouter, policy: AccessPolicy, index: str = "index.html") -> FastAPI:
@@ -97,7 +95,7 @@ def listen(host: str, port: int) -> socket.socket:
     """Opens a listening socket; port 0 chooses a free port. Raises OutputError if the address or the port cannot be used."""
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     try:
-        return socket.create_server((host, port), family=family, backlog=128)
+        return socket.create_server((host, port), family=family, backlog=_BACKLOG)
     except OSError as error:
         raise OutputError(
             f"{host} port {port} cannot be used ({error.strerror})",
@@ -107,11 +105,7 @@ def listen(host: str, port: int) -> socket.socket:
 
 
 def lan_address() -> str:
-    """Returns the IPv4 address of this machine in its local network.
-
-    Raises:
-        OutputError: this machine is in no network, or its address is public.
-    """
+    """Returns the IPv4 address of this machine in its local network. Raises OutputError if it has none, or a public one."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         try:
             probe.connect(_ANY_ROUTED_ADDRESS)  # chooses the address of this machine, and sends no packet
@@ -135,27 +129,16 @@ def server_url(listening: socket.socket) -> str:
 
 
 def serve(app: FastAPI, *, host: str, port: int, on_ready: Callable[[str], None] = print) -> None:
-    """Serves the application until it is interrupted. Call this in the main thread, because it handles signals.
-
-    Port 0 chooses a free port. `on_ready` is called with the URL when the socket is open.
-
-    Raises:
-        KeyboardInterrupt: Ctrl-C or SIGTERM has ended the server.
-        OutputError: the address or the port cannot be used.
-    """
-    with _sigterm_as_sigint(), listen(host, port) as listening:
+    """Serves the application until Ctrl-C or SIGTERM, and raises KeyboardInterrupt then. Call this in the main thread, because
+    it handles signals. `on_ready` is called with the URL when the socket is open. Raises the errors of `listen`."""
+    with listen(host, port) as listening:
         on_ready(server_url(listening))
-        create_server(app).run(sockets=[listening])
-
-
-@contextmanager
-def _sigterm_as_sigint() -> Iterator[None]:
-    """Handles SIGTERM like Ctrl-C. uvicorn raises the signal again after its shutdown, which kills the process if SIGTERM is not handled."""
-    previous_handler = signal.signal(signal.SIGTERM, lambda *_: signal.raise_signal(signal.SIGINT))
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, previous_handler)
+        # uvicorn raises SIGTERM again after its shutdown, which kills the process if the signal is not handled
+        previous_handler = signal.signal(signal.SIGTERM, lambda *_: signal.raise_signal(signal.SIGINT))
+        try:
+            create_server(app).run(sockets=[listening])
+        finally:
+            signal.signal(signal.SIGTERM, previous_handler)
 
 
 async def _error_response(request: Request, error: Exception) -> Response:
@@ -166,12 +149,11 @@ async def _error_response(request: Request, error: Exception) -> Response:
     if isinstance(error, ClientDisconnect):
         return Response(status_code=499)  # the client has disconnected and does not read the response
     if isinstance(error, HTTPException):
-        message, path = error.detail, request.url.path
-        if message == HTTPStatus(error.status_code).phrase:
+        message, path, allowed = error.detail, request.url.path, (error.headers or {}).get("Allow")
+        if message == HTTPStatus.METHOD_NOT_ALLOWED.phrase:
+            message = f"{path} does not accept {request.method}; expected {allowed}; repeat the request with this method"
+        elif message == HTTPStatus(error.status_code).phrase:
             message = f"{request.method} {path} does not exist; expected an existing route; choose one from GET /openapi.json"
-            if error.status_code == HTTPStatus.METHOD_NOT_ALLOWED:
-                allowed = (error.headers or {}).get("Allow", "another method")
-                message = f"{path} does not accept {request.method}; expected {allowed}; repeat the request with this method"
         return JSONResponse({"error": message}, error.status_code, error.headers)
     if isinstance(error, RequestValidationError):
         return JSONResponse({"error": validation_message(error.errors())}, 422)
@@ -179,10 +161,11 @@ async def _error_response(request: Request, error: Exception) -> Response:
         _LOGGER.info("%s %s failed", request.method, request.url.path, exc_info=error)
         body = {"error": str(error), "kind": type(error).__name__}
         return JSONResponse(body, _STATUS_CODES.get(type(error), 422))
-    body = {
-        "error": f"brewster has an internal error ({type(error).__name__}); expected no such error; please report it"
-    }
-    return JSONResponse(body, 500, SECURITY_HEADERS)  # Starlette sends this response outside AccessMiddleware
+    message = (
+        f"brewster has an internal error ({type(error).__name__}); expected no such error; please report it"
+    )
+    # Starlette sends this response outside AccessMiddleware
+    return JSONResponse({"error": message}, 500, SECURITY_HEADERS)
 
 
 def create_server(app: FastAPI) -> uvicorn.Server:

@@ -97,13 +97,10 @@ class JobQueue:
 
     @contextmanager
     def reserve(self, name: str | None = None) -> Iterator[SeparationJob]:
-        """Reserves a place for a job, before its upload is read.
+        """Reserves a place for a job, before its upload is read. Raises HTTPException 503 if the queue is full, and 409 if
+        a job with this name exists.
 
-        The place is released at the end of the `with` block, or later, when the thread of the job has finished.
-
-        Raises:
-            HTTPException: 503 if the queue is full; 409 if a job with this name exists.
-        """
+        The place is released at the end of the `with` block, or later, when the thread of the job has finished."""
         if self.job_count >= self.workers + self.max_waiting:
             raise HTTPException(
                 503,
@@ -128,14 +125,8 @@ class JobQueue:
     async def run_job(
         self, job: SeparationJob, work: Callable[[ProgressCallback], Result], receive: Receive
     ) -> Result:
-        """Runs a work function in a worker thread, and returns its result.
-
-        `receive` is the ASGI receive channel of the request; it reports when the client disconnects.
-
-        Raises:
-            HTTPException: 504 if the time limit is exceeded.
-            ClientDisconnect: the client has disconnected.
-        """
+        """Runs a work function in a worker thread, and returns its result. Raises HTTPException 504 if the time limit is
+        exceeded, and ClientDisconnect if the client has disconnected, as `receive` of the request (ASGI) reports."""
 
         async def wait_for_disconnect() -> None:
             while (await receive())["type"] != "http.disconnect":

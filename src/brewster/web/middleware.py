@@ -168,10 +168,7 @@ class _Exchange:
 
     async def receive(self) -> Message:
         """Receives the next part of the body, or the message that the client has disconnected after the end of the body.
-
-        Raises:
-            HTTPException: 413 if the body is too large; 408 if it takes too long.
-        """
+        Raises HTTPException 413 if the body is too large, and 408 if it takes too long."""
         if self._is_complete:
             return await self._receive()
         try:
@@ -250,8 +247,6 @@ def _is_same_origin(headers: Headers) -> bool:
 
 
 def _is_ip_address(name: str) -> bool:
-    try:
-        ipaddress.ip_address(name)
-    except ValueError:
-        return False
-    return True
+    with contextlib.suppress(ValueError):
+        return bool(ipaddress.ip_address(name))
+    return False

@@ -11,7 +11,7 @@ from __future__ import annotations
 import gzip
 import hashlib
 import time
-from collections.abc import Awaitable, Callable
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, final
@@ -63,37 +63,7 @@ class HealthResponse(BaseModel):
     """Maximum value of `jobs`."""
 
 
-@final
-class BurstCache:
-    """The layers of the last burst, so that a download after a preview does not measure the motion again. Thread-safe."""
-
-    _last: tuple[object, FittedBurst] | None = None
-
-    def fit(
-        self, form: SeparationRequest, separator: Separator, on_progress: ProgressCallback
-    ) -> FittedBurst:
-        """Measures the layers of the burst in the form, or returns those of the last request with the same photos and model."""
-        from brewster.burst import fit_burst  # noqa: PLC0415  (imports torch)
-
-        quality, max_pixels = form.options.quality, form.options.max_pixels
-        digests = tuple(hashlib.sha256(file).digest() for file in (*form.burst, form.hints or b""))
-        key, last = (digests, form.reference, quality, separator), self._last
-        if last and last[0] == key:
-            return last[1]
-        fitted = fit_burst(
-            form.burst,
-            reference=form.reference,
-            separator=separator,
-            quality=quality,
-            hints=form.hints,
-            max_pixels=max_pixels,
-            on_progress=on_progress,
-        )
-        self._last = key, fitted
-        return fitted
-
-
-Handler = Callable[[ModelCache, SeparationRequest, ProgressCallback], Response]
+Handler = Callable[[SeparationRequest, ProgressCallback], Response]
 _ERROR: Final[dict[str, Any]] = {"model": ErrorResponse}
 _RESPONSES: Final[dict[int | str, dict[str, Any]]] = {
     200: {
@@ -112,38 +82,50 @@ JobName = Annotated[
 
 
 def separation_router(model_cache: ModelCache, job_queue: JobQueue, *, max_pixels: int) -> APIRouter:
-    """Returns the routes of the API, and the previews and tiles for the page.
-
-    Args:
-        model_cache: the models that clients can choose.
-        job_queue: runs the separations.
-        max_pixels: the maximum number of pixels of a photo.
-    """
-    router = APIRouter()
+    """Returns the routes of the API, and the previews and tiles for the page. Clients choose a model of `model_cache`."""
+    router, routes = APIRouter(), _SeparationRoutes(model_cache, job_queue, max_pixels)
     content = {"multipart/form-data": {"schema": form_schema(model_cache.names)}}
     body = {"requestBody": {"required": True, "content": content}}
+    router.post("/separate", responses=_RESPONSES, response_class=Response, openapi_extra=body)(
+        routes.separate
+    )
+    router.get("/progress/{job}", responses={404: _ERROR})(routes.progress)
+    router.get("/models")(routes.models)
+    router.get("/health")(routes.health)
+    router.head("/health", include_in_schema=False)(routes.health)
+    # only for the page
+    router.post("/preview", include_in_schema=False)(routes.preview)
+    router.post("/photo", include_in_schema=False)(routes.keep_photo)
+    router.get("/tile/{key}/{level}/{column}/{row}", include_in_schema=False)(routes.tile)
+    return router
 
-    async def run(request: Request, job: str | None, handler: Handler) -> Response:
-        """Reserves a place in the queue, reads the form, and runs the handler."""
-        with job_queue.reserve(job) as reserved_job:
-            form = await read_form(request, model_cache.names, max_pixels)
-            return await job_queue.run_job(reserved_job, partial(handler, model_cache, form), request.receive)
 
-    bursts = BurstCache()
+@final
+class _SeparationRoutes:
+    """The handlers of the routes, the photos of the last previews, and the layers of the last burst."""
 
-    @router.post("/separate", responses=_RESPONSES, response_class=Response, openapi_extra=body)
-    async def separate(request: Request, job: JobName = None) -> Response:
+    def __init__(self, model_cache: ModelCache, job_queue: JobQueue, max_pixels: int) -> None:
+        self._model_cache, self._job_queue, self._max_pixels = model_cache, job_queue, max_pixels
+        self._photos = PhotoCache()
+        self._last_burst: tuple[object, FittedBurst] | None = None
+
+    async def _run(self, request: Request, job: str | None, handler: Handler) -> Response:
+        """Reserves a place in the queue, reads the form, and runs the handler in a worker thread."""
+        with self._job_queue.reserve(job) as reserved_job:
+            form = await read_form(request, self._model_cache.names, self._max_pixels)
+            return await self._job_queue.run_job(reserved_job, partial(handler, form), request.receive)
+
+    async def separate(self, request: Request, job: JobName = None) -> Response:
         """Separates a photo, or a burst: several photos of one window. A single layer is returned as an image in the format and
         colour space of the photo, several layers as a zip.
 
         The names of the files are those of the command line. The separation stops if the client disconnects.
         """
-        return await run(request, job, partial(_separate, bursts))
+        return await self._run(request, job, self._separate)
 
-    @router.get("/progress/{job}", responses={404: _ERROR})
-    async def progress(job: str) -> JobProgress:
+    async def progress(self, job: str) -> JobProgress:
         """Returns the progress of the job with this name. The status is 404 before the job begins and after its end."""
-        found = job_queue.progress(job)
+        found = self._job_queue.progress(job)
         if found is None:
             raise HTTPException(
                 404,
@@ -152,38 +134,28 @@ def separation_router(model_cache: ModelCache, job_queue: JobQueue, *, max_pixel
             )
         return found
 
-    @router.get("/models")
-    def models() -> list[ModelRow]:
+    def models(self) -> list[ModelRow]:
         """Returns the available models, the default first."""
-        return model_cache.rows()
+        return self._model_cache.rows()
 
-    @router.head("/health", include_in_schema=False)
-    @router.get("/health")
-    async def health() -> HealthResponse:
+    async def health(self) -> HealthResponse:
         """Returns the version of the server and the number of its jobs."""
-        return HealthResponse(jobs=job_queue.job_count, places=job_queue.workers + job_queue.max_waiting)
+        queue = self._job_queue
+        return HealthResponse(jobs=queue.job_count, places=queue.workers + queue.max_waiting)
 
-    _add_page_routes(router, run, bursts)
-    return router
+    async def preview(self, request: Request, job: JobName = None) -> Response:
+        """Returns the preview of a photo, which the server keeps for the tiles."""
+        return await self._run(request, job, self._preview)
 
+    async def keep_photo(self, request: Request, job: JobName = None) -> Response:
+        """Keeps a photo for the tiles."""
+        return await self._run(
+            request, job, lambda form, _progress: Response(headers=self._open_photo(form)[1])
+        )
 
-def _add_page_routes(
-    router: APIRouter, run: Callable[[Request, str | None, Handler], Awaitable[Response]], bursts: BurstCache
-) -> None:
-    """Adds the routes that only the page uses: the preview of a photo, and its tiles."""
-    photos = PhotoCache()
-
-    @router.post("/preview", include_in_schema=False)
-    async def preview_maps(request: Request, job: JobName = None) -> Response:
-        return await run(request, job, partial(_preview, photos, bursts))
-
-    @router.post("/photo", include_in_schema=False)
-    async def keep_photo(request: Request, job: JobName = None) -> Response:
-        return await run(request, job, partial(_keep_photo, photos))
-
-    @router.get("/tile/{key}/{level}/{column}/{row}", include_in_schema=False)
-    def tile(key: str, level: int, column: int, row: int) -> Response:
-        photo = photos.get(key)
+    def tile(self, key: str, level: int, column: int, row: int) -> Response:
+        """Returns a tile of a photo that the server keeps."""
+        photo = self._photos.get(key)
         found = None if photo is None else photo_tile(photo, level, column, row)
         if found is None:
             raise HTTPException(
@@ -193,98 +165,98 @@ def _add_page_routes(
             )
         return Response(found.encode("png"), media_type="image/png", headers=_TILE_HEADERS)
 
-
-def _separate(
-    bursts: BurstCache, model_cache: ModelCache, form: SeparationRequest, on_progress: ProgressCallback
-) -> Response:
-    """Separates a photo or a burst. Returns one layer as an image file, or several layers as a zip."""
-    started = time.perf_counter()
-    options = form.options
-    separator = model_cache.separator(options.model)
-    if form.burst:
-        fitted = bursts.fit(form, separator, lambda done: on_progress(0.9 * done))
-        separation = fitted.separate(
-            lambda done: on_progress(0.9 + 0.1 * done),
-            strength=options.strength,
-            quality=options.quality,
-            mask=form.mask,
-            additive=options.additive,
+    def _separate(self, form: SeparationRequest, on_progress: ProgressCallback) -> Response:
+        """Separates a photo or a burst. Returns one layer as an image file, or several layers as a zip."""
+        started = time.perf_counter()
+        options = form.options
+        separator = self._model_cache.separator(options.model)
+        if form.burst:
+            separation = self._fit_burst(form, separator, lambda done: on_progress(0.9 * done)).separate(
+                lambda done: on_progress(0.9 + 0.1 * done),
+                strength=options.strength,
+                quality=options.quality,
+                mask=form.mask,
+                additive=options.additive,
+            )
+        else:
+            call_options = options.call_options() | {"mask": form.mask, "hints": form.hints}
+            separation = separator(form.photo, on_progress=on_progress, **call_options)
+        files = {}
+        for layer in options.layers:
+            on_progress(1)  # raises JobCancelled if the job is cancelled, because encoding also takes time
+            name = form.target(layer, separation.photo.file_info.format_name)
+            files[name] = getattr(separation, layer).encode(SUFFIXES[Path(name).suffix.lower()].name)
+        name, data = (
+            next(iter(files.items())) if len(files) == 1 else (form.zip_name, zip_images(files.items()))
         )
-    else:
-        call_options = options.call_options() | {"mask": form.mask, "hints": form.hints}
-        separation = separator(form.photo, on_progress=on_progress, **call_options)
-    files = {}
-    for layer in options.layers:
-        on_progress(1)  # raises JobCancelled if the job is cancelled, because encoding also takes time
-        name = form.target(layer, separation.photo.file_info.format_name)
-        files[name] = getattr(separation, layer).encode(SUFFIXES[Path(name).suffix.lower()].name)
-    name, data = next(iter(files.items())) if len(files) == 1 else (form.zip_name, zip_images(files.items()))
-    headers = {
-        "Content-Disposition": _content_disposition(name),
-        "Brewster-Model": quote(separation.model),
-        "Brewster-SHA256": separation.sha256 or "",
-        "Brewster-Device": separation.device,
-        "Brewster-Residual": f"{separation.residual:.6f}",
-        "Brewster-Verdict": separation.assessment.verdict,
-        "Brewster-Seconds": f"{time.perf_counter() - started:.4f}",
-    }
-    if separation.burst:
-        headers |= _burst_headers(separation.burst)
-    if separation.reflection_is_derived:
-        headers["Brewster-Reflection"] = "derived"
-    if separation.reconstruction_error is not None:
-        headers["Brewster-Reconstruction-Error"] = f"{separation.reconstruction_error:.6f}"
-    return Response(data, headers=headers, media_type=_media_type(name))
+        headers = {
+            "Content-Disposition": _content_disposition(name),
+            "Brewster-Model": quote(separation.model),
+            "Brewster-SHA256": separation.sha256 or "",
+            "Brewster-Device": separation.device,
+            "Brewster-Residual": f"{separation.residual:.6f}",
+            "Brewster-Verdict": separation.assessment.verdict,
+            "Brewster-Seconds": f"{time.perf_counter() - started:.4f}",
+        }
+        if separation.burst:
+            headers |= _burst_headers(separation.burst)
+        if separation.reflection_is_derived:
+            headers["Brewster-Reflection"] = "derived"
+        if separation.reconstruction_error is not None:
+            headers["Brewster-Reconstruction-Error"] = f"{separation.reconstruction_error:.6f}"
+        media_type = SUFFIXES[Path(name).suffix.lower()].mime_type if len(files) == 1 else "application/zip"
+        return Response(data, headers=headers, media_type=media_type)
 
+    def _preview(self, form: SeparationRequest, on_progress: ProgressCallback) -> Response:
+        photo, headers = self._open_photo(form)
+        separator = self._model_cache.separator(form.options.model)
+        hints: Source | None = form.hints
+        if separator.takes_hints:
+            headers["Brewster-Takes-Hints"] = "yes"
+        if form.burst:
+            fitted = self._fit_burst(form, separator, lambda done: on_progress(0.9 * done))
+            headers |= _burst_headers(fitted.report)
+            separator, hints = fitted.separator, fitted.hints
+        start = 0.9 if form.burst else 0.0
+        maps = preview(
+            separator, photo, form.options, lambda done: on_progress(start + (1 - start) * done), hints
+        )
+        data = gzip.compress(maps, _GZIP_LEVEL, mtime=0)
+        return Response(data, headers=headers, media_type="application/gzip")
 
-def _preview(
-    photos: PhotoCache,
-    bursts: BurstCache,
-    model_cache: ModelCache,
-    form: SeparationRequest,
-    on_progress: ProgressCallback,
-) -> Response:
-    photo, headers = _open_photo(photos, form)
-    separator = model_cache.separator(form.options.model)
-    hints: Source | None = form.hints
-    if separator.takes_hints:
-        headers["Brewster-Takes-Hints"] = "yes"
-    if form.burst:
-        fitted = bursts.fit(form, separator, lambda done: on_progress(0.9 * done))
-        headers |= _burst_headers(fitted.report)
-        separator, hints = fitted.separator, fitted.hints
-    start = 0.9 if form.burst else 0.0
-    maps = preview(
-        separator, photo, form.options, lambda done: on_progress(start + (1 - start) * done), hints
-    )
-    return Response(gzip.compress(maps, _GZIP_LEVEL, mtime=0), headers=headers, media_type="application/gzip")
+    def _fit_burst(
+        self, form: SeparationRequest, separator: Separator, on_progress: ProgressCallback
+    ) -> FittedBurst:
+        """Measures the layers of the burst in the form, or returns those of the last request with the same photos and model, so
+        that a download after a preview does not measure the motion again."""
+        from brewster.burst import fit_burst  # noqa: PLC0415  (imports torch)
+
+        digests = tuple(hashlib.sha256(file).digest() for file in (*form.burst, form.hints or b""))
+        key, last = (digests, form.reference, form.options.quality, separator), self._last_burst
+        if last and last[0] == key:
+            return last[1]
+        fitted = fit_burst(
+            form.burst,
+            reference=form.reference,
+            separator=separator,
+            quality=form.options.quality,
+            hints=form.hints,
+            max_pixels=form.options.max_pixels,
+            on_progress=on_progress,
+        )
+        self._last_burst = key, fitted
+        return fitted
+
+    def _open_photo(self, form: SeparationRequest) -> tuple[Photo, dict[str, str]]:
+        """Returns the decoded photo, and the headers with its key and its size. The photo is stored in the cache for the tiles."""
+        key = hashlib.sha256(form.photo).hexdigest()
+        photo = self._photos.get(key) or Photo.open(form.photo, max_pixels=form.options.max_pixels)
+        self._photos.put(key, photo)
+        return photo, {"Brewster-Photo": key, "Brewster-Size": "{}x{}".format(*photo.size)}
 
 
 def _burst_headers(report: BurstReport) -> dict[str, str]:
     return {"Brewster-Burst": report.method, "Brewster-Burst-Message": report.message}
-
-
-def _keep_photo(
-    photos: PhotoCache,
-    model_cache: ModelCache,  # noqa: ARG001
-    form: SeparationRequest,
-    on_progress: ProgressCallback,  # noqa: ARG001
-) -> Response:
-    return Response(headers=_open_photo(photos, form)[1])
-
-
-def _open_photo(photos: PhotoCache, form: SeparationRequest) -> tuple[Photo, dict[str, str]]:
-    """Returns the decoded photo, and the headers with its key and its size. The photo is stored in the cache for the tiles."""
-    key = hashlib.sha256(form.photo).hexdigest()
-    photo = photos.get(key) or Photo.open(form.photo, max_pixels=form.options.max_pixels)
-    photos.put(key, photo)
-    return photo, {"Brewster-Photo": key, "Brewster-Size": "{}x{}".format(*photo.size)}
-
-
-def _media_type(name: str) -> str:
-    if name.endswith(".zip"):
-        return "application/zip"
-    return SUFFIXES[Path(name).suffix.lower()].mime_type
 
 
 def _content_disposition(name: str) -> str:

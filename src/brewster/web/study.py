@@ -104,17 +104,16 @@ def study_router(
 ) -> APIRouter:
     """Returns the routes of a study. The token of the server is added to personal links."""
     routes, router = _StudyRoutes(study, store, max_participants, token), APIRouter(tags=["study"])
+    personal = "/s/{participant_token}"
     router.get("/invitation")(routes.invitation)
     router.post("/participants", status_code=201)(routes.admit)
-    router.get("/s/{participant_token}", include_in_schema=False)(routes.begin)
-    router.get("/s/{participant_token}/link")(routes.link)
-    router.get("/s/{participant_token}/trial")(routes.next_trial)
-    router.get("/s/{participant_token}/pictures/practice/{side}", response_class=Response)(
-        routes.practice_picture
-    )
-    router.get("/s/{participant_token}/pictures/{trial}/{side}", response_class=Response)(routes.picture)
-    router.post("/s/{participant_token}/answers")(routes.answer)
-    router.post("/s/{participant_token}/withdrawals")(routes.withdraw)
+    router.get(personal, include_in_schema=False)(routes.begin)
+    router.get(f"{personal}/link")(routes.link)
+    router.get(f"{personal}/trial")(routes.next_trial)
+    router.get(f"{personal}/pictures/practice/{{side}}", response_class=Response)(routes.practice_picture)
+    router.get(f"{personal}/pictures/{{trial}}/{{side}}", response_class=Response)(routes.picture)
+    router.post(f"{personal}/answers")(routes.answer)
+    router.post(f"{personal}/withdrawals")(routes.withdraw)
     router.get("/privacy", include_in_schema=False)(routes.privacy)
     return router
 
