@@ -301,3 +301,14 @@ def test_public_names_exist_in_any_order_of_imports():
         code += "assert callable(brewster.separate) and not hasattr(brewster, 'nonsense')\n"
         code += "assert set(brewster.__all__) <= set(dir(brewster)); from brewster import *"
         subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_a_single_photo_has_a_percentage_but_not_with_json(model, tmp_path):
+    (tmp_path / "a.jpg").write_bytes(image_bytes())
+    out, shown = run_on_terminal("a.jpg", "--model", model, folder=tmp_path)
+    assert out == b""
+    assert re.search(r"\d%", shown)
+    assert "/1" not in shown
+    for option in ("--json", "--quiet"):
+        out, shown = run_on_terminal("a.jpg", "--model", model, "--overwrite", option, folder=tmp_path)
+        assert (bool(out), "%" in shown) == (option == "--json", False)

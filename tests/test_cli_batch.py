@@ -2,6 +2,7 @@
 
 import errno
 import os
+import re
 import sys
 from dataclasses import fields
 
@@ -271,3 +272,27 @@ def test_quiet_prints_nothing_if_no_photo_fails(run, tmp_path):
     (tmp_path / "a.jpg").write_bytes(image_bytes())
     assert run("a.jpg", "--quiet") == (0, b"", "")
     assert run("a.jpg", "--quiet") == (0, b"", "")
+
+
+def test_a_photo_above_the_pixel_limit_is_rejected_and_one_at_the_limit_is_not(run, tmp_path):
+    (tmp_path / "large.jpg").write_bytes(image_bytes(61, 40))
+    (tmp_path / "small.jpg").write_bytes(image_bytes(60, 40))
+    code, _, err = run("large.jpg", "small.jpg", "--max-pixels", 2400, "-o", "out")
+    assert code == 1
+    assert len(error_lines(err)) == 1
+    assert "large.jpg" in error_lines(err)[0]
+    assert list_files(tmp_path / "out") == layer_files("small")
+
+
+def test_a_batch_ends_with_a_summary(run, tmp_path):
+    for name in ("a", "b", "c"):
+        (tmp_path / f"{name}.jpg").write_bytes(image_bytes())
+    run("a.jpg")
+    (tmp_path / "b.jpg").write_bytes(b"")
+    pattern = r"^1 separated, 1 skipped, 1 failed in \d+\.\d s; the layers are (.*)$"
+    assert re.search(pattern, run(".")[2], re.MULTILINE)[1] == "next to the photos"
+    (tmp_path / "b.jpg").write_bytes(b"")
+    err = run("a.jpg", "b.jpg", "c.jpg", "-o", "out")[2]
+    assert (
+        re.search(r"^2 separated, 1 failed in .* s; the layers are (.*)$", err, re.MULTILINE)[1] == "in out"
+    )

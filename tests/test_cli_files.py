@@ -199,3 +199,21 @@ print(pyvips.Image.text("mmmm").width > 2 * pyvips.Image.text("iiii").width)
     )
     assert done.stdout == "True\n"
     assert "Fontconfig" not in done.stderr
+
+
+def test_videos_are_counted_and_named(run, run_without_model, tmp_path):
+    (tmp_path / "a.jpg").write_bytes(image_bytes())
+    for name in ("b.mp4", "c.MOV"):
+        (tmp_path / name).write_bytes(b"\0\0\0\x18ftypisom" + bytes(100))
+    code, _, err = run(".")
+    assert code == 0
+    assert "2 videos (b.mp4, c.MOV) skipped" in err
+    code, _, err = run("b.mp4")
+    assert code == 1
+    assert error_lines(err)[0].startswith("error: b.mp4 is a video; expected a photo; extract single images")
+    (tmp_path / "a.jpg").unlink()
+    for layer in layer_files("a"):
+        (tmp_path / layer).unlink()
+    assert "no photo in . (2 videos)" in run_without_model(".")[2]
+    (tmp_path / "c.MOV").rename(tmp_path / "notes")
+    assert "no photo in . (1 video, 1 other file)" in run_without_model(".")[2]
