@@ -6,12 +6,12 @@ import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from brewster.errors import ModelError, RecipeError
-from brewster.training.compact.trainer import CompactTrainer, train
+from brewster.training.compact.trainer import CompactTrainer
 from brewster.training.data.image_loading import read_photos
 from brewster.training.loop import Checkpoint, run
 from brewster.training.recipe import with_value
 from cli_helpers import image_bytes
-from training_helpers import Killed, ignore_step, kill_after
+from training_helpers import Killed, ignore_step, kill_after, train
 
 
 class CountingTrainer:

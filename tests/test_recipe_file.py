@@ -9,7 +9,7 @@ import pytest
 from brewster.errors import RecipeError
 from brewster.scene.recipe import RECIPES, SceneRecipe, read_scene_recipe
 from brewster.scene.recipe_file import commented_toml, read_toml
-from brewster.scene.recipe_keys import recipe_keys
+from brewster.scene.recipe_keys import recipe_tables
 from brewster.training.recipe import TEMPLATES, LoraRecipe, read_recipe, read_template
 
 _FOLDER = Path(__file__).parents[1] / "recipes"
@@ -118,7 +118,7 @@ def test_a_training_recipe_that_is_printed_and_read_is_the_same(name):
 
 def test_every_key_is_printed_below_its_meaning():
     text = commented_toml(read_template("lora"))
-    for key in recipe_keys(LoraRecipe):
+    for key in (key for table in recipe_tables(LoraRecipe) for key in table.keys):
         name = key.path.rpartition(".")[2]
         assert f"\n{name} =" in text or f"\n# {name} =" in text
         assert key.meaning.split()[0] in text

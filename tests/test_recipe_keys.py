@@ -7,7 +7,7 @@ import pytest
 from pydantic import Field
 
 from brewster.cli.recipe_reference import RECIPE_KINDS, recipe_reference
-from brewster.scene.recipe_keys import REQUIRED, describe, recipe_keys, recipe_tables
+from brewster.scene.recipe_keys import REQUIRED, describe, recipe_tables
 from brewster.scene.values import FrozenModel, KeyNote, LogRange, Pixels, Share
 
 DOCS = Path(__file__).parents[1] / "docs"
@@ -35,7 +35,7 @@ class Outer(FrozenModel):
 
 
 def keys(model):
-    return {key.path: key for key in recipe_keys(model)}
+    return {key.path: key for table in recipe_tables(model) for key in table.keys}
 
 
 def test_a_key_has_type_allowed_values_unit_default_and_meaning():
@@ -75,7 +75,7 @@ def test_a_place_inside_a_value_is_described_too(path, words):
 @pytest.mark.parametrize("title", RECIPE_KINDS)
 def test_every_key_of_every_recipe_is_explained_in_a_sentence(title):
     model, _ = RECIPE_KINDS[title]
-    for key in recipe_keys(model):
+    for key in keys(model).values():
         assert key.meaning[:1].isupper() or key.meaning.partition(":")[0].isalnum(), key.path
         assert key.meaning.endswith("."), key.path
     assert all(table.meaning.endswith(".") for table in recipe_tables(model))

@@ -47,8 +47,7 @@ def write_card(
     folder: Path, recipe: LoraRecipe, scores: Mapping[str, float], backbone_class: type[Backbone]
 ) -> None:
     """Writes or replaces the model card in a folder that contains the LoRA and its prompt. `scores` is the last line of
-    the run's log. Raises ModelError if the prompt is missing, damaged, or of another backbone; OutputError if the
-    folder cannot be written."""
+    the run's log. Raises ModelError if the prompt is missing, damaged, or of another backbone."""
     prompt = load_prompt(folder / PROMPT_FILE, backbone_class.name).text
     text = card_text(recipe, scores=scores, backbone_class=backbone_class, prompt=prompt)
     write_atomically(folder / CARD_FILE, text.encode(), overwrite=True)
