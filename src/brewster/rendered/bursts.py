@@ -31,11 +31,7 @@ class StoredBurst:
         return len(self.frames) // 2
 
     def motion(self, frame: int) -> LayerMotion:
-        """Computes the motion of both layers from the reference frame to another frame.
-
-        Raises:
-            RecipeError: the motion cannot be computed (see `layer_motion`).
-        """
+        """Computes the motion of both layers from the reference frame to another frame (see `layer_motion`)."""
         return layer_motion(self.scenes[self.reference], self.scenes[frame])
 
 

@@ -188,11 +188,12 @@ class MitsubaSceneBuilder:
         """Yields a black wall around the frame's opening, in the plane of the first surface, as four rectangles."""
         if not self._glass.opening_mm:
             return
-        right, top = self._glass.opening_mm[0] / 2, self._glass.opening_mm[1] / 2
-        half_side, half_top = (_WALL_MM, _WALL_MM), (right, _WALL_MM)
+        right, top = np.array(self._glass.opening_mm) / 2
         for sign in (-1, 1):
-            yield self._rectangle(np.eye(3), (sign * (right + _WALL_MM), 0, 0), half_side, {"bsdf": _BLACK})
-            yield self._rectangle(np.eye(3), (0, sign * (top + _WALL_MM), 0), half_top, {"bsdf": _BLACK})
+            for centre, half_width in ((right + _WALL_MM, 0, 0), _WALL_MM), ((0, top + _WALL_MM, 0), right):
+                yield self._rectangle(
+                    np.eye(3), sign * np.array(centre), (half_width, _WALL_MM), {"bsdf": _BLACK}
+                )
 
     # A lens
 

@@ -107,13 +107,12 @@ def _combine(layers: list[_TransmittanceReflectance]) -> _TransmittanceReflectan
 
 def _truncated_layers(panes: list[_SurfaceAndInterior]) -> _TransmittanceReflectance:
     """Returns the transmittance without any reflection, and the reflectance without light that enters the last pane."""
-    transmittance: Tensor | float = 1.0
+    transmittance = torch.ones_like(panes[0][0])
     for r, a in panes:
         transmittance = transmittance * (1 - r) ** 2 * a
     # No light of R enters the last pane, so the first surface of the pane replaces the pane.
     first_surface, _ = panes[-1]
     before = [_slab(*pane) for pane in panes[:-1]]
-    assert isinstance(transmittance, Tensor)
     return transmittance, _combine([*before, (transmittance, first_surface)])[1]
 
 
@@ -176,34 +175,23 @@ _State = tuple[int, bool, _Counts, _Counts, _Counts]
 def _branches(state: _State) -> list[_State]:
     """Returns the state after transmission and the state after reflection at the next surface of a path."""
     surface, is_downward, reflections, transmissions, traversals = state
-    pane = surface // 2
-    ahead, back = (surface + 1, surface - 1) if is_downward else (surface - 1, surface + 1)
-    return [
-        (
-            ahead,
-            is_downward,
-            reflections,
-            _incremented(transmissions, pane),
-            _traversed(traversals, surface, ahead),
-        ),
-        (
-            back,
-            not is_downward,
-            _incremented(reflections, pane),
-            transmissions,
-            _traversed(traversals, surface, back),
-        ),
-    ]
+    pane, branches = surface // 2, []
+    for is_reflected in (False, True):
+        downward = is_downward != is_reflected
+        next_surface = surface + (1 if downward else -1)
+        layer = min(surface, next_surface)  # outside the stack there is no layer to traverse
+        branches.append((
+            next_surface,
+            downward,
+            _incremented(reflections, pane) if is_reflected else reflections,
+            transmissions if is_reflected else _incremented(transmissions, pane),
+            _incremented(traversals, layer) if 0 <= layer < len(traversals) else traversals,
+        ))  # fmt: skip
+    return branches
 
 
 def _incremented(counts: _Counts, which: int) -> _Counts:
     return (*counts[:which], counts[which] + 1, *counts[which + 1 :])
-
-
-def _traversed(traversals: _Counts, surface: int, next_surface: int) -> _Counts:
-    """Counts the traversal of the layer between two surfaces; there is no layer outside the stack."""
-    layer = min(surface, next_surface)
-    return _incremented(traversals, layer) if 0 <= layer < len(traversals) else traversals
 
 
 def _weight(counts: tuple[_Counts, _Counts] | list[_Counts], reflectances: tuple[float, ...]) -> float:
