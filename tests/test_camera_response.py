@@ -90,13 +90,6 @@ def test_lamps_do_not_change_the_exposure():
     assert exposures == pytest.approx([2, 2], abs=0.03)
 
 
-def test_the_overexposed_fraction_counts_pixels_that_clip_in_any_channel():
-    picture = torch.full((3, 10, 10), 0.01)
-    picture[0, :2] = 100
-    picture[1, 1:3] = 100
-    assert develop(sample_of(picture, target_luminance=0.25)).overexposed_fraction == 0.3
-
-
 # --- all layers alike
 
 

@@ -7,10 +7,8 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 from brewster.errors import ModelError, RecipeError
 from brewster.training.compact.trainer import CompactTrainer
-from brewster.training.data.image_loading import read_photos
 from brewster.training.loop import Checkpoint, run
 from brewster.training.recipe import with_value
-from cli_helpers import image_bytes
 from training_helpers import Killed, ignore_step, kill_after, train
 
 
@@ -86,15 +84,6 @@ def test_a_killed_and_resumed_run_ends_with_bit_identical_weights(recipe, tmp_pa
         assert torch.equal(value, resumed.state_dict()[name]), name
 
 
-def test_a_killed_run_on_rendered_samples_ends_with_bit_identical_weights(rendered_recipe, tmp_path):
-    uninterrupted = train(rendered_recipe, tmp_path / "one", ignore_step)
-    with pytest.raises(Killed):
-        train(rendered_recipe, tmp_path / "two", kill_after(3))
-    resumed = train(rendered_recipe, tmp_path / "two", ignore_step)
-    for name, value in uninterrupted.state_dict().items():
-        assert torch.equal(value, resumed.state_dict()[name]), name
-
-
 def test_a_run_resumes_after_a_key_was_added_to_the_recipe_schema(recipe, tmp_path):
     with pytest.raises(Killed):
         train(recipe, tmp_path, kill_after(5))
@@ -165,9 +154,3 @@ def test_a_damaged_checkpoint_is_named(tmp_path):
     (tmp_path / "checkpoint.pt").write_bytes(b"not a checkpoint")
     with pytest.raises(ModelError, match=r"checkpoint\.pt"):
         Checkpoint.read(tmp_path / "checkpoint.pt")
-
-
-def test_a_photo_is_read_with_every_known_suffix(tmp_path):
-    for name in ("a.jpg", "b.JFIF", "c.txt"):
-        (tmp_path / name).write_bytes(image_bytes())
-    assert len(read_photos([tmp_path])) == 2

@@ -10,7 +10,7 @@ from brewster.errors import RecipeError
 from brewster.scene.recipe import RECIPES, SceneRecipe, read_scene_recipe
 from brewster.scene.recipe_file import commented_toml, read_toml
 from brewster.scene.recipe_keys import recipe_tables
-from brewster.training.recipe import TEMPLATES, LoraRecipe, read_recipe, read_template
+from brewster.training.recipe import TEMPLATES, LoraRecipe, read_template
 
 _FOLDER = Path(__file__).parents[1] / "recipes"
 SCENES = sorted(_FOLDER.glob("render/*.toml"))
@@ -65,19 +65,6 @@ def test_a_misspelt_choice_is_corrected_and_an_unknown_key_lists_the_known_ones(
     lines = problems('name = "mine"\nabout = ""\norders = "truncatd"\n[glass]\nsparkle = true')
     assert any(line.endswith('did you mean "truncated"?') for line in lines)
     assert any("expected a key of [glass], one of double_probability, gap_mm" in line for line in lines)
-
-
-def test_problems_of_a_training_recipe_are_reported_in_the_same_way(problems):
-    text = 'backbone = "kontext"\nrnk = 4\nseed = 1.5\npanel_weights = { X = 1 }\n[data]\npairs = ["a"]\npairs_share = 3'
-    found = "\n".join(problems(text, read_recipe))
-    for part in (
-        "seed is 1.5",
-        "steps is missing",
-        "data.pairs_share is 3",
-        "no key panel_weights.X",
-        "no key rnk",
-    ):
-        assert part in found
 
 
 def test_an_error_with_several_problems_can_be_pickled(problems, tmp_path):

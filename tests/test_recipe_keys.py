@@ -7,7 +7,7 @@ import pytest
 from pydantic import Field
 
 from brewster.cli.recipe_reference import RECIPE_KINDS, recipe_reference
-from brewster.scene.recipe_keys import REQUIRED, describe, recipe_tables
+from brewster.scene.recipe_keys import REQUIRED, recipe_tables
 from brewster.scene.values import FrozenModel, KeyNote, LogRange, Pixels, Share
 
 DOCS = Path(__file__).parents[1] / "docs"
@@ -50,26 +50,6 @@ def test_a_key_has_type_allowed_values_unit_default_and_meaning():
     assert shares.allowed == "each from 0 to 1, at least 1 entry, all different"
     assert (found["inner.width_px"].allowed, found["inner.width_px"].unit) == ("at least 16", "px")
     assert found["inner.mode"].allowed == 'one of "fast", "slow"'
-
-
-def test_tables_are_listed_with_what_they_are_about():
-    assert [(table.path, table.meaning) for table in recipe_tables(Outer)] == [
-        ("", "A recipe."),
-        ("inner", "An optional table."),
-    ]
-
-
-@pytest.mark.parametrize(
-    ("path", "words"),
-    [
-        (["shares", 3], "a number, from 0 to 1"),
-        (["length_mm", 1], "a number, above 0"),
-        (["inner", "mode"], 'a string, one of "fast", "slow"'),
-        (["inner", "width_px"], "an integer, at least 16"),
-    ],
-)
-def test_a_place_inside_a_value_is_described_too(path, words):
-    assert describe(Outer, path) == words
 
 
 @pytest.mark.parametrize("title", RECIPE_KINDS)

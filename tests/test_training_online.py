@@ -59,13 +59,6 @@ def test_both_kinds_of_mixing_have_the_same_background(assets):
     assert not torch.equal(light[:3], mixed[:3])
 
 
-def test_layers_are_photo_target_and_reflection_of_the_batch(assets):
-    samples = stream(assets)
-    batch, layers = samples(0, 2, 32), samples.layers(1, 32)
-    pictures = batch.photo_encoded[1], batch.transmission_encoded[1], batch.reflection_encoded[1]
-    assert torch.equal(layers, torch.cat(pictures))
-
-
 def test_threads_that_share_a_stream_get_the_same_batches(assets):
     alone = [stream(assets)(step, 1, 32) for step in range(4)]
     shared = stream(Assets())

@@ -76,15 +76,6 @@ def test_a_batch_from_disk_depends_on_seed_and_step_alone(folder):
     assert not torch.equal(batch.photo_encoded, RenderedDatasets([folder], seed=2)(7, 4, 32).photo_encoded)
 
 
-def test_shards_and_folders_contain_the_same_samples(folder, tmp_path):
-    render_set(tmp_path / "shards", count=3, shards=True)
-    assert list((tmp_path / "shards").glob("*.tar"))
-    one, other = (
-        RenderedDatasets([place], seed=1, blend_space="srgb") for place in (folder, tmp_path / "shards")
-    )
-    assert same(one(0, 4, 32), other(0, 4, 32))
-
-
 def test_only_the_first_samples_are_used_where_a_count_is_given(folder):
     shutil.rmtree(folder / "000002")
     (folder / "000002").mkdir()
@@ -148,14 +139,6 @@ def test_a_cached_sample_is_rendered_once_per_size():
         stream(step, 4, 8)
         stream(step, 4, 16)
     assert sorted(source.rendered) == [(index, size) for index in range(3) for size in (8, 16)]
-
-
-def test_a_batch_from_memory_depends_on_seed_and_step_alone():
-    one, other = (CachedRendered(FakeOnline(), 3, seed=1) for _ in range(2))
-    batch = one(7, 4, 16)
-    other(0, 9, 16)
-    assert same(batch, other(7, 4, 16))
-    assert same(batch, one(7, 4, 16))
 
 
 def test_a_cached_sample_is_mirrored_at_random():

@@ -297,7 +297,8 @@ class SideEmitters:
             * (distance > 0)
         )
         image = plane.texture(u, v, self._plane_footprint(rays.relative_footprint))
-        return light + coverage * (image - light)
+        covered: Tensor = light + coverage * (image - light)
+        return covered
 
 
 def _plane_emitter(plane: Plane, assets: Assets, is_behind: bool, device: Device) -> _PlaneEmitter:

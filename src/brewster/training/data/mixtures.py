@@ -193,8 +193,8 @@ class Pairs:
             [self._crop_pair(SampleRng(self._seed, step, slot), size) for slot in range(count)]
         )
         photo, transmission = crops.chunk(2, dim=1)
-        layers = photo, transmission, (photo - transmission).clamp(min=0)
-        return TrainingBatch(*map(to_encoded, layers), torch.full((count,), self.reflection_weight))
+        reflection, weight = (photo - transmission).clamp(min=0), torch.full((count,), self.reflection_weight)
+        return TrainingBatch(to_encoded(photo), to_encoded(transmission), to_encoded(reflection), weight)
 
     def _crop_pair(self, rng: SampleRng, size: int) -> Tensor:
         both = torch.cat(self._pairs[rng.randint(len(self._pairs))], dim=2)
