@@ -242,18 +242,6 @@ def test_values_for_inference_are_stored_with_the_lora(make_trainer, tmp_path):
     assert len(steps) == 3
 
 
-def test_the_learning_rate_falls_to_zero_in_the_last_share_of_the_steps(make_trainer):
-    def rates(**changes):
-        trainer, rates = make_trainer(warmup_steps=2, steps=8, **changes), []
-        for step in (0, 1, 4, 6, 7):
-            trainer.training_step(step)
-            rates.append(trainer._optimizer.param_groups[0]["lr"] / trainer.recipe.learning_rate)
-        return rates
-
-    assert rates() == [0.5, 1, 1, 1, 1]
-    assert rates(learning_rate_decay_share=0.5) == pytest.approx([0.5, 1, 1, 0.5, 0.1464], abs=1e-3)
-
-
 def test_the_timestep_shift_moves_training_times_towards_noise(make_trainer):
     def sigma(**changes):
         trainer = make_trainer(**changes)

@@ -2,13 +2,15 @@ import shutil
 
 import pytest
 import torch
+from hypothesis import given
+from hypothesis import strategies as st
 
 import brewster.training.data.rendered as rendered_module
 from brewster.errors import PhotoError, RecipeError
 from brewster.photo import Photo
 from brewster.render.camera_response import encode_jpeg
 from brewster.rendered.store import read_dataset, read_scene_of
-from brewster.training.data.rendered import CachedRendered, RenderedDatasets, blended_layers
+from brewster.training.data.rendered import CachedRendered, RenderedDatasets, blend, blended_layers
 from set_folders import render_set
 from training_helpers import same
 
@@ -157,3 +159,19 @@ def test_a_full_cache_does_not_change_the_samples():
     large = CachedRendered(FakeOnline(), 4, seed=1)
     assert all(same(small(step, 4, 8), large(step, 4, 8)) for step in range(10))
     assert len(source.rendered) > 4
+
+
+# --- the formula
+
+BYTES = st.integers(0, 255)
+
+
+def constant_image(value):
+    return torch.full((3, 2, 2), value / 255)
+
+
+@given(BYTES, BYTES, st.floats(0.8, 1), st.floats(0.4, 1))
+def test_a_blend_is_the_formula_in_eight_bits(t, r, alpha, beta):
+    exact = alpha * t / 255 + beta * r / 255 - t * r / 255**2
+    found = blend(constant_image(t), constant_image(r), alpha, beta)
+    assert abs(found[0, 0, 0].item() - min(max(exact, 0), 1)) <= 0.5 / 255 + 1e-6

@@ -123,7 +123,8 @@ def similar_key(model: type[FrozenModel], path: Sequence[str | int]) -> str | No
     close = get_close_matches(str(name), choices(model, table), n=1)
     if close:
         return _dotted([*table, close[0]])
-    paths = (entry.path for known in recipe_tables(model) for entry in (known, *known.keys))
+    tables = list(recipe_tables(model))
+    paths = [key.path for table in tables for key in table.keys] + [table.path for table in tables]
     return next((known for known in paths if known.rpartition(".")[2] == name), None)
 
 

@@ -17,7 +17,7 @@ REQUIRED: Final = object()
 """The default of a key that must be set."""
 
 Schema = Mapping[str, Any]
-"""A JSON schema. Those of tables have "properties". `KeyNote` adds the entry "notes"."""
+"""A JSON schema. Those of tables have "properties". `KeyNote` adds the entry "note"."""
 
 _UNITS: Final = {"mm": "mm", "deg": "degrees", "px": "px", "per_m": "1/m", "px_per_texel": "px per texel"}
 _SUFFIX: Final = re.compile(rf"(?:^|_)({'|'.join(sorted(_UNITS, key=len, reverse=True))})$")
@@ -77,8 +77,7 @@ def _tables(schema: Schema, path: str, meaning: str) -> Iterator[RecipeTable]:
             tables.append((field, prefix + name, field.get("meaning", "")))
             continue
         suffix = _SUFFIX.search(name)
-        units = [note["unit"] for note in field.get("notes", ()) if note["unit"]]
-        unit = units[0] if units else _UNITS[suffix[1]] if suffix else ""
+        unit = field.get("note", {}).get("unit") or (_UNITS[suffix[1]] if suffix else "")
         default = REQUIRED if name in schema.get("required", ()) else field.get("default")
         text = " ".join(field.get("description", "").split())
         keys.append(RecipeKey(prefix + name, *_in_words(field), unit, default, text))
@@ -93,12 +92,9 @@ def _tables(schema: Schema, path: str, meaning: str) -> Iterator[RecipeTable]:
 
 def _in_words(schema: Schema) -> tuple[str, str]:
     """Returns the type and the allowed values in words."""
-    notes = schema.get("notes", ())
-    kind, parts = _kind(schema)
-    kind = next((note["kind"] for note in notes if note["kind"]), kind)
-    if any(note["replaces_constraints"] for note in notes):
-        parts = []
-    return kind, ", ".join(filter(None, [*parts, *(note["allowed"] for note in notes)]))
+    note, (kind, parts) = schema.get("note", {}), _kind(schema)
+    parts = [] if note.get("replaces_constraints") else parts
+    return note.get("kind") or kind, ", ".join(filter(None, [*parts, note.get("allowed")]))
 
 
 def _kind(schema: Schema) -> tuple[str, list[str]]:

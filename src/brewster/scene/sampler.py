@@ -142,7 +142,8 @@ def _draw_once(recipe: SceneRecipe, catalog: Catalog, rng: _SceneRng, seed: int,
 
 def _draw_glazing(recipe: GlassRecipe, rng: _SceneRng) -> Glazing:
     count = 2 if rng.bernoulli(recipe.double_probability) else 1
-    structural = rng.bernoulli(recipe.structural_probability)
+    is_structural = rng.bernoulli(recipe.structural_probability)
+    thickness_mm = recipe.structural_thickness_mm if is_structural else recipe.thickness_mm
     tint, strength = rng.choice(recipe.absorption_per_m), rng.from_log_range(recipe.tint_strength)
     rough = rng.from_log_range(recipe.roughness) if rng.bernoulli(recipe.rough_probability) else 0.0
     wedged = rng.bernoulli(recipe.wedge_probability)
@@ -151,9 +152,7 @@ def _draw_glazing(recipe: GlassRecipe, rng: _SceneRng) -> Glazing:
 
     def pane() -> Pane:
         return Pane(
-            thickness_mm=rng.from_log_range(
-                recipe.structural_thickness_mm if structural else recipe.thickness_mm
-            ),
+            thickness_mm=rng.from_log_range(thickness_mm),
             refractive_index=refractive_index,
             absorption_per_m=(red, green, blue),
             roughness=rough,
@@ -169,12 +168,12 @@ def _draw_glazing(recipe: GlassRecipe, rng: _SceneRng) -> Glazing:
 
 def _choose_map(recipe: SideRecipe, camera: CameraRecipe, catalog: Catalog, rng: _SceneRng) -> Asset | None:
     """Draws a map that is sharp enough for the widest view; None for a side without one, or if pictures replace it."""
-    candidates = [
+    sufficient = [
         asset
         for asset in catalog.maps
-        if not recipe.map_categories or asset.category in ("", *recipe.map_categories)
+        if (not recipe.map_categories or asset.category in ("", *recipe.map_categories))
+        and _min_fov_deg(asset, recipe, camera) <= camera.fov_deg[1]
     ]
-    sufficient = [asset for asset in candidates if _min_fov_deg(asset, recipe, camera) <= camera.fov_deg[1]]
     if not rng.bernoulli(recipe.map_probability) or (not sufficient and recipe.plane_probability > 0):
         return None
     if not sufficient:
@@ -195,9 +194,8 @@ def _min_fov_deg(asset: Asset, recipe: SideRecipe, camera: CameraRecipe) -> floa
 def _draw_camera(recipe: SceneRecipe, maps: list[tuple[SideRecipe, Asset | None]], rng: _SceneRng) -> Camera:
     """Draws a camera whose axis meets the glass near its centre. Its focus is set in `_focus_camera`."""
     ranges = recipe.camera
-    min_fov_deg = max(
-        [ranges.fov_deg[0], *(_min_fov_deg(asset, side, ranges) for side, asset in maps if asset)]
-    )
+    sharp_fovs_deg = (_min_fov_deg(asset, side, ranges) for side, asset in maps if asset)
+    min_fov_deg = max([ranges.fov_deg[0], *sharp_fovs_deg])
     heading, pitch = rng.from_range(ranges.incidence_deg), rng.from_range(ranges.pitch_deg)
     _, _, back = axes(heading, pitch)
     distance_mm = rng.from_log_range(ranges.distance_mm) / max(back[2], 0.1)

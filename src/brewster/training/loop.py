@@ -130,31 +130,24 @@ class Trainer(Protocol):
     @property
     def recipe(self) -> TrainingRecipe:
         """The recipe of the run."""
-        ...
 
     def initialize(self) -> None:
         """Loads the initial state that the recipe selects. Called when a new run starts, not when a run is resumed."""
-        ...
 
     def training_step(self, step: int) -> dict[str, float]:
         """Trains on the batch of `step` (from 0). Returns `loss` and its terms, `loss_NAME`."""
-        ...
 
     def state_dict(self) -> dict[str, Any]:
         """Returns everything that the next step depends on, as tensors, numbers and strings by name."""
-        ...
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Restores a state that `state_dict` returned."""
-        ...
 
     def validate(self) -> tuple[dict[str, float], Tensor]:
         """Returns the validation metrics by name, and an image of sample predictions: (H, W, 3), sRGB-encoded, in 0..1."""
-        ...
 
     def export(self, folder: Path) -> Path:
         """Writes the model for inference into `folder`. Returns the path of the model."""
-        ...
 
 
 def run(

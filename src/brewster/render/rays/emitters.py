@@ -297,7 +297,7 @@ class SideEmitters:
             * (distance > 0)
         )
         image = plane.texture(u, v, self._plane_footprint(rays.relative_footprint))
-        covered: Tensor = light + coverage * (image - light)
+        covered: Tensor = light + coverage * (image - light)  # lerp rounds in another way
         return covered
 
 

@@ -113,11 +113,7 @@ def build(
     """Renders the missing samples of a dataset, packs them into shards if `shards` is True, and writes the index.
 
     A sample that fails is reported and skipped. The next call renders it again. `report` is called with the result of every
-    sample.
-
-    Raises:
-        OutputError: the folder has other content, another run writes to it, or the disk is full or read-only.
-        MissingExtra, DeviceError: the renderer cannot run on this machine.
+    sample. Raises FATAL_ERRORS: OutputError if the folder has other content, another run writes to it, or the disk is full.
     """
     with _exclusive_lock(job.out):
         _check_record(job)

@@ -84,12 +84,8 @@ def find_renderer(name: str) -> Renderer:
 
 
 def render_again(path: Path, folder: Path, folders: Sequence[Path] = (), renderer: str | None = None) -> None:
-    """Renders a scene file into a new folder, by default with the renderer that is recorded in the file.
-
-    Raises:
-        RecipeError: the scene cannot be read, or a file of the scene is missing.
-        OutputError: the folder is not empty, or cannot be written.
-    """
+    """Renders a scene file into a new folder, by default with the renderer that is recorded in the file. Raises OutputError
+    if the folder is not empty."""
     scene = read_scene(path)
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise OutputError(

@@ -69,7 +69,6 @@ class Stream(Protocol):
 
     def __call__(self, step: int, count: int, size: int) -> TrainingBatch:
         """Returns the batch of this step: `count` samples with sides of `size` px."""
-        ...
 
 
 class Mixtures:
@@ -93,8 +92,8 @@ class Mixtures:
     def __call__(self, step: int, count: int, size: int) -> TrainingBatch:
         """Returns the batch of a step (see `Stream`)."""
         samples = [self._sample(SampleRng(self._seed, step, slot), size) for slot in range(count)]
-        layers = map(torch.stack, zip(*samples, strict=True))
-        return TrainingBatch(*layers, torch.ones(count))
+        photo, transmission, reflection = map(torch.stack, zip(*samples, strict=True))
+        return TrainingBatch(photo, transmission, reflection, torch.ones(count))
 
     def _sample(self, rng: SampleRng, size: int) -> tuple[Tensor, Tensor, Tensor]:
         recipe = self._recipe

@@ -194,8 +194,9 @@ def _entries(folder: Path) -> list[StoredSample]:
 def _blended_sample(entry: StoredSample) -> Tensor:
     with _file_errors(entry, SCENE_FILE):
         scene = read_scene_of(entry)
-    sources = [_read_image(entry, name).permute(2, 0, 1) / 255 for name in ("background", "mirror")]
-    photo, *layers = blended_layers(*sources, scene)
+    names = "background", "mirror"
+    background, mirror = (_read_image(entry, name).permute(2, 0, 1) / 255 for name in names)
+    photo, *layers = blended_layers(background, mirror, scene)
     compressed = Photo.open(encode_jpeg(photo, scene.camera_response.jpeg_quality)).pixels.copy()
     return torch.cat([torch.from_numpy(image) for image in (compressed, *map(to_uint8, layers))], dim=2)
 
@@ -227,9 +228,11 @@ def blend(transmission_encoded: Tensor, reflection_encoded: Tensor, alpha: float
 
 def blended(developed: DevelopedSample) -> DevelopedSample:
     """Returns the sample as an 8-bit mixture: T is the background, R is beta times the mirror image, and I is their blend."""
-    layers = blended_layers(developed.background_encoded, developed.mirror_encoded, developed.scene)
-    names = "photo_encoded", "transmission_encoded", "reflection_encoded"
-    return replace(developed, **dict(zip(names, layers, strict=True)))
+    scene, background, mirror = developed.scene, developed.background_encoded, developed.mirror_encoded
+    photo, transmission, reflection = blended_layers(background, mirror, scene)
+    return replace(
+        developed, photo_encoded=photo, transmission_encoded=transmission, reflection_encoded=reflection
+    )
 
 
 def blended_layers(background: Tensor, mirror: Tensor, scene: Scene) -> tuple[Tensor, Tensor, Tensor]:

@@ -254,7 +254,9 @@ class LoraTrainer:
         noisy, condition, sigma = (each.to(device) for each in (noisy, encoded.condition, sigma))
         velocity = self.backbone.predict(noisy, condition, sigma, self.prompt, self.recipe.guidance)
         errors = (velocity - (start - encoded.composite).to(device)).square()
-        weights = {panel: self.recipe.panel_weights.get(panel, 1.0) for panel in self.recipe.panels}
+        weights: dict[str, float] = {
+            name: self.recipe.panel_weights.get(name, 1.0) for name in self.recipe.panels
+        }
         whole, reliability = sum(weights.values()), {"R": encoded.reflection_weight}
         return {
             f"panel_{name}": weights[name] / whole * reliability.get(name, 1.0) * panel.mean()
