@@ -17,20 +17,15 @@ from itertools import product
 from pathlib import Path
 from typing import Final
 
-import numpy as np
-from numpy.typing import NDArray
-
 import brewster
 from brewster.errors import RecipeError
 from brewster.files import TEMPORARY_PREFIX, atomic_path, discard, temporary_path, write_atomically
-from brewster.photo import read_exr_layers, write_exr_layers
+from brewster.photo import write_exr_layers
 from brewster.render.analytic import ghost_distance_px
 from brewster.render.camera_response import DevelopedSample, develop, encode_jpeg, luminance
 from brewster.render.sample import SAMPLE_IMAGES, LinearSample
 from brewster.scene.recipe_file import validated
 from brewster.scene.scene import Scene
-
-Float32 = NDArray[np.float32]
 
 SHARD_SIZE: Final = 100
 """Number of samples in a shard."""
@@ -185,13 +180,6 @@ def read_block(out: Path, block: int) -> Iterator[StoredSample]:
     entries = {int(folder.name): StoredSample(int(folder.name), folder) for folder in _folders(out, block)}
     entries |= {entry.index: entry for entry in _members(out / shard_name(block))}
     yield from (entry for _, entry in sorted(entries.items()))
-
-
-def open_sample(entry: StoredSample) -> tuple[dict[str, Float32], Scene]:
-    """Reads the five images of a sample by name, each (H, W, 3) in linear light, and its scene. Raises PhotoError or
-    RecipeError if its file is damaged, and MissingExtra if OpenEXR is not installed."""
-    light = read_exr_layers(entry.read(LIGHT_FILE))
-    return {name: light[name] for name in SAMPLE_IMAGES}, read_scene_of(entry)
 
 
 def read_scene_of(entry: StoredSample) -> Scene:
