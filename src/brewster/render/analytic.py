@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -210,20 +210,19 @@ def _thin_lens_rays(prepared: _PreparedScene, pixels: slice, sobol: SobolPoints)
 def _trace_smooth(prepared: _PreparedScene, rays: Rays, _: SobolPoints | None = None) -> list[Tensor]:
     """Returns I, T, B, R and MR along the rays, (3, N) each, for smooth parallel panes: all orders, no randomness."""
     glass = prepared.scene.glass
-    point, mirrored = _mirror_at_first_surface(rays)
-    cosine = mirrored[2]
-    complete = total_throughput(glass, cosine)
-    in_layers = truncated_throughput(glass, cosine) if prepared.scene.orders == "truncated" else complete
+    mirrored = _mirror_at_first_surface(rays)
+    complete = in_layers = total_throughput(glass, mirrored.direction[2])
+    if prepared.scene.orders == "truncated":
+        in_layers = truncated_throughput(glass, mirrored.direction[2])
     layers = []
-    for side, origin, direction, total_ratio, layer_ratio in (
-        (prepared.behind, rays.origin, rays.direction, complete.transmittance, in_layers.transmittance),
-        (prepared.front, point, mirrored, complete.reflectance, in_layers.reflectance),
+    for side, seen, total_ratio, layer_ratio in (
+        (prepared.behind, rays, complete.transmittance, in_layers.transmittance),
+        (prepared.front, mirrored, complete.reflectance, in_layers.reflectance),
     ):
-        far = side.emitters.far_radiance(direction, rays.relative_footprint)
-        unattenuated = side.emitters.add_near(far, origin, direction, rays.relative_footprint)
+        far = side.emitters.far_radiance(seen)
+        unattenuated = side.emitters.add_near(far, seen)
         if len(side.groups) > 1:
-            exiting = Rays(point, direction, rays.relative_footprint)
-            total, layer = _shifted_orders(prepared, side, exiting, far)
+            total, layer = _shifted_orders(prepared, side, replace(seen, origin=mirrored.origin), far)
         else:
             total, layer = total_ratio * unattenuated, layer_ratio * unattenuated
         layers.append((total, layer, unattenuated))
@@ -249,7 +248,7 @@ def _shifted_orders(
     total, layer = torch.zeros_like(direction), torch.zeros_like(direction)
     for group in side.groups:
         exit_point = surface + in_plane * _in_plane_shift(group[0], shifts)
-        radiance = side.emitters.add_near(far, exit_point, direction, exiting.relative_footprint)
+        radiance = side.emitters.add_near(far, replace(exiting, origin=exit_point))
         weights = list(zip(group, throughputs, strict=False))
         total += sum((weight for _, weight in weights), torch.zeros_like(cosine)) * radiance
         if prepared.scene.orders == "truncated":
@@ -299,13 +298,14 @@ def _trace_rough(prepared: _PreparedScene, rays: Rays, sobol: SobolPoints) -> li
         if prepared.scene.orders == "all" or exiting.in_truncated_layers:
             in_layer.index_add_(1, exiting.rays, exiting.light)
     (transmitted, transmission), (reflected, reflection) = sides[True], sides[False]
-    point, mirrored = _mirror_at_first_surface(rays)
-    background = prepared.behind.emitters.radiance(rays.origin, rays.direction, rays.relative_footprint)
-    mirror = prepared.front.emitters.radiance(point, mirrored, rays.relative_footprint)
+    background = prepared.behind.emitters.radiance(rays)
+    mirror = prepared.front.emitters.radiance(_mirror_at_first_surface(rays))
     return [transmitted + reflected, transmission, background, reflection, mirror]
 
 
-def _mirror_at_first_surface(rays: Rays) -> tuple[Tensor, Tensor]:
-    """Intersects rays with the first surface: the points and the directions after a perfect mirror, (3, N) each."""
+def _mirror_at_first_surface(rays: Rays) -> Rays:
+    """Returns the rays after a perfect mirror at the first surface."""
     point = rays.origin - rays.direction * (rays.origin[2] / rays.direction[2])
-    return point, rays.direction * rays.direction.new_tensor([1, 1, -1])[:, None]
+    return replace(
+        rays, origin=point, direction=rays.direction * rays.direction.new_tensor([1, 1, -1])[:, None]
+    )

@@ -182,28 +182,24 @@ class SideEmitters:
         width_mm = self._view.footprint_mm(self.plane_distance_mm)
         return relative_footprint * width_mm * self.plane.texture.width / (2 * self.plane.half_width_mm)
 
-    def far_radiance(self, direction: Tensor, relative_footprint: float) -> Tensor | None:
-        """Returns light from infinity along unit directions (3, N): (3, N), or None if this side has no such light."""
+    def far_radiance(self, rays: Rays) -> Tensor | None:
+        """Returns light from infinity along rays: (3, N), or None if this side has no such light."""
         if self.envmap is None or self.has_dome:
             return None
-        return self._lookup_map(direction, relative_footprint)[0]
+        return self._lookup_map(rays.direction, rays.relative_footprint)[0]
 
-    def radiance(self, origin: Tensor, direction: Tensor, relative_footprint: float) -> Tensor:
-        """Returns all light along rays from `origin` in unit `direction`, (3, N) each: (3, N)."""
-        far = self.far_radiance(direction, relative_footprint)
-        return self.add_near(far, origin, direction, relative_footprint)
+    def radiance(self, rays: Rays) -> Tensor:
+        """Returns all light along rays: (3, N)."""
+        return self.add_near(self.far_radiance(rays), rays)
 
-    def add_near(
-        self, far: Tensor | None, origin: Tensor, direction: Tensor, relative_footprint: float
-    ) -> Tensor:
+    def add_near(self, far: Tensor | None, rays: Rays) -> Tensor:
         """Adds the light of the dome and the plane along rays to `far`, the result of `far_radiance`: (3, N).
 
         Far light does not depend on origins, so rays with the same directions need only one call of `far_radiance`.
         """
         if self.has_dome:
-            far, _ = self._lookup_map(self._intersect_dome(origin, direction)[0], relative_footprint)
-        light = torch.zeros_like(direction) if far is None else far
-        return self._add_plane(light, Rays(origin, direction, relative_footprint))
+            far, _ = self._lookup_map(self._intersect_dome(rays)[0], rays.relative_footprint)
+        return self._add_plane(torch.zeros_like(rays.direction) if far is None else far, rays)
 
     def _lookup_map(
         self, direction: Tensor, relative_footprint: float
@@ -252,7 +248,7 @@ class SideEmitters:
         """Returns all light along rays, (3, N), and the density of `towards` at their directions, per steradian: (N,)."""
         point = rays.direction
         if self.has_dome:
-            point, distance = self._intersect_dome(rays.origin, rays.direction)
+            point, distance = self._intersect_dome(rays)
         light, uv = self._lookup_map(point, rays.relative_footprint)
         pdf = self._distribution.pdf(*uv)
         if self.has_dome:
@@ -266,11 +262,12 @@ class SideEmitters:
         """
         return (distance / self.radius_mm) ** 2 / dot(point, direction).clamp(min=1e-6)
 
-    def _intersect_dome(self, origin: Tensor, direction: Tensor) -> tuple[Tensor, Tensor]:
+    def _intersect_dome(self, rays: Rays) -> tuple[Tensor, Tensor]:
         """Returns unit directions (3, N) from the dome's centre to the intersections of rays, and distances along the rays in mm."""
-        along = dot(origin, direction)
-        distance = torch.sqrt((along**2 - dot(origin, origin) + self.radius_mm**2).clamp(min=0)) - along
-        return (origin + distance * direction) / self.radius_mm, distance
+        along = dot(rays.origin, rays.direction)
+        squared = along**2 - dot(rays.origin, rays.origin) + self.radius_mm**2
+        distance = torch.sqrt(squared.clamp(min=0)) - along
+        return (rays.origin + distance * rays.direction) / self.radius_mm, distance
 
     @cached_property
     def _distribution(self) -> EnvmapDistribution:

@@ -283,10 +283,9 @@ def _exit_radiance(
     `light_uniforms` are random numbers for light samples, (N,); None if microfacet samples are sufficient. The heuristic
     weights a sample by its density divided by the sum of both densities (Veach 1997, eq. 9.8).
     """
-    weight = (path.s + path.p) / 2
+    weight, rays = (path.s + path.p) / 2, Rays(path.origin, path.direction, relative_footprint)
     if light_uniforms is None:
-        return weight * emitters.radiance(path.origin, path.direction, relative_footprint)
-    rays = Rays(path.origin, path.direction, relative_footprint)
+        return weight * emitters.radiance(rays)
     radiance, light_pdf = emitters.radiance_and_pdf(rays)
     facet_pdf = _scattering_pdf(interaction, interaction.facet, interaction.cosine, interaction.wo)
     light = weight * radiance * (facet_pdf / (facet_pdf + light_pdf).clamp(min=1e-20))
