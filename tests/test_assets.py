@@ -194,12 +194,6 @@ def test_an_ordinary_photo_saved_as_a_map_is_refused(folder, rng):
     check_message(error, "photo.hdr", "use the image as a picture")
 
 
-def test_a_map_with_one_sun_is_not_clipped(folder, rng):
-    texels = sky(rng)
-    texels[10, 10:12] = 5000
-    assert map_radiance(folder, "sun.hdr", hdr_of(texels)).max() > 1000
-
-
 # --- pictures
 
 

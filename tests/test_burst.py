@@ -146,15 +146,6 @@ def test_a_camera_that_rolls_clockwise_turns_the_photo_counterclockwise():
     )
 
 
-def test_motion_forth_and_back_is_no_motion_and_the_same_scene_does_not_move():
-    scene = frames_of(3)[2]
-    still = layer_motion(scene, scene)
-    for layer in (still.transmission, still.reflection):
-        assert layer.shape == (32, 48, 2)
-        assert layer.dtype == np.float32
-        np.testing.assert_allclose(layer, 0, atol=1e-4)
-
-
 def test_pixels_without_content_have_no_motion():
     narrow = plane_side(width_mm=200, height_mm=100)
     scene = make_scene(camera_towards_glass(0.0), behind=narrow, front=Scene().front)

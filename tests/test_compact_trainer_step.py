@@ -71,15 +71,6 @@ def test_the_learning_rate_falls_along_a_cosine_over_the_last_share_of_the_run(
     assert rates == pytest.approx([1e-4 * share, 1e-3 * share], rel=0.01)
 
 
-def test_the_learning_rate_rises_linearly_during_warm_up(make_trainer):
-    trainer = make_trainer(learning_rate=1e-3, warmup_steps=4, learning_rate_decay_share=0.0)
-    rates = []
-    for step in range(5):
-        trainer.training_step(step)
-        rates.append(trainer.optimizer.param_groups[1]["lr"])
-    assert rates == pytest.approx([0.25e-3, 0.5e-3, 0.75e-3, 1e-3, 1e-3])
-
-
 def test_a_large_gradient_is_clipped_to_norm_one(make_trainer):
     trainer, norms = make_trainer(), []
     batch = hard_batch(0, 2, 64)
@@ -104,14 +95,6 @@ def test_the_moving_average_has_the_decay_of_the_recipe_and_a_smaller_one_at_fir
     for name, new in copy_parameters(trainer.network).items():
         expected = decay * before[name] + (1 - decay) * new
         torch.testing.assert_close(trainer.ema_weights[name], expected, atol=1e-6, rtol=1e-6)
-
-
-def test_the_exported_network_has_the_ema_weights(make_trainer):
-    trainer = make_trainer(learning_rate=0.1, encoder_learning_rate=0.1)
-    trainer.training_step(0)
-    exported, trained = copy_parameters(trainer.ema_network()), copy_parameters(trainer.network)
-    assert all(value.equal(trainer.ema_weights[name]) for name, value in exported.items())
-    assert not any(value.equal(trained[name]) for name, value in exported.items() if "head" in name)
 
 
 # --- a LoRA on a diffusion backbone

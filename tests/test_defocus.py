@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from brewster.render.analytic import render
-from brewster.render.rays.defocus import _disc_kernel, defocus_blur, margin_px
+from brewster.render.rays.defocus import defocus_blur, margin_px
 from brewster.scene.camera import Camera
 from synthetic_scenes import (
     ASSETS,
@@ -22,25 +22,6 @@ def lens_camera(aperture_mm, focus_mm=500.0, **more):
     return Camera(
         **{"width": 32, "height": 32, "fov_deg": 40, **more}, aperture_mm=aperture_mm, focus_mm=focus_mm
     )
-
-
-def test_without_an_aperture_the_camera_is_a_pinhole():
-    image = torch.rand(3, 32, 32)
-    assert margin_px(lens_camera(0.0)) == 0
-    assert defocus_blur(image, lens_camera(0.0), 0) is image
-
-
-@pytest.mark.parametrize("radius_px", [0.1, 0.5, 1.3, 4.0, 9.7])
-def test_the_disc_kernel_sums_to_one_and_has_the_requested_radius(radius_px):
-    half_size = math.ceil(radius_px + 0.5)
-    kernel = _disc_kernel(radius_px, half_size)
-    assert kernel.shape == (2 * half_size + 1, 2 * half_size + 1)
-    assert float(kernel.sum()) == pytest.approx(1, abs=1e-9)
-    assert torch.equal(kernel, kernel.T)
-    assert torch.equal(kernel, kernel.flip(0))
-    if radius_px > 1:
-        centre = float(kernel[half_size, half_size])
-        assert 1 / centre == pytest.approx(math.pi * radius_px**2, rel=0.04)
 
 
 @pytest.mark.parametrize("aperture_mm", [20.0, 55.0, 100.0])

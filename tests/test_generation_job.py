@@ -235,13 +235,6 @@ def test_two_runs_in_one_folder_are_refused_until_one_has_ended(four_samples):
     render_set(four_samples)
 
 
-def test_a_run_releases_its_lock_even_if_it_fails(four_samples):
-    with pytest.raises(OutputError, match="its seed is"):
-        render_set(four_samples, seed=8)
-    with filelock.FileLock(four_samples / ".lock", blocking=False):
-        pass
-
-
 def test_rendering_starts_without_the_module_fcntl():
     """Windows has no such module."""
     code = "import sys; sys.modules['fcntl'] = None; import brewster.rendered.generation.workers"

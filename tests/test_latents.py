@@ -197,11 +197,6 @@ def test_a_small_sample_gets_the_panels_that_it_gets_at_inference(recipe, backbo
     assert samples.description() == "3 rendered samples, 3 real pairs"
 
 
-def test_too_few_rendered_samples_are_refused(recipe):
-    with pytest.raises(RecipeError, match="3 rendered samples; expected at least 9"):
-        open_samples(recipe({"rendered": {"datasets": ["set"], "count": 9}}))
-
-
 def test_the_sides_of_crops_are_0_5_to_1_times_those_of_the_sample():
     fit = fit_panel((300, 200), PanelLayout(), max_composite_pixels=3 * 48 * 32, size_divisor=16)
     whole = torch.zeros(200, 300, 9, dtype=torch.uint8)

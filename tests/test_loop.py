@@ -1,4 +1,6 @@
 import json
+import sys
+import time
 from dataclasses import replace
 
 import pytest
@@ -6,12 +8,10 @@ import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from brewster.errors import ModelError, RecipeError
-from brewster.training.compact.trainer import CompactTrainer, train
-from brewster.training.data.image_loading import read_photos
-from brewster.training.loop import Checkpoint, run
+from brewster.training.compact.trainer import CompactTrainer
+from brewster.training.loop import IMAGE_TAG, Checkpoint, TensorBoardLog, run
 from brewster.training.recipe import with_value
-from cli_helpers import image_bytes
-from training_helpers import Killed, ignore_step, kill_after
+from training_helpers import Killed, ignore_step, kill_after, train
 
 
 class CountingTrainer:
@@ -82,15 +82,6 @@ def test_a_killed_and_resumed_run_ends_with_bit_identical_weights(recipe, tmp_pa
     with pytest.raises(Killed):
         train(recipe, tmp_path / "two", kill_after(5))
     resumed = train(recipe, tmp_path / "two", ignore_step)
-    for name, value in uninterrupted.state_dict().items():
-        assert torch.equal(value, resumed.state_dict()[name]), name
-
-
-def test_a_killed_run_on_rendered_samples_ends_with_bit_identical_weights(rendered_recipe, tmp_path):
-    uninterrupted = train(rendered_recipe, tmp_path / "one", ignore_step)
-    with pytest.raises(Killed):
-        train(rendered_recipe, tmp_path / "two", kill_after(3))
-    resumed = train(rendered_recipe, tmp_path / "two", ignore_step)
     for name, value in uninterrupted.state_dict().items():
         assert torch.equal(value, resumed.state_dict()[name]), name
 
@@ -167,7 +158,27 @@ def test_a_damaged_checkpoint_is_named(tmp_path):
         Checkpoint.read(tmp_path / "checkpoint.pt")
 
 
-def test_a_photo_is_read_with_every_known_suffix(tmp_path):
-    for name in ("a.jpg", "b.JFIF", "c.txt"):
-        (tmp_path / name).write_bytes(image_bytes())
-    assert len(read_photos([tmp_path])) == 2
+# --- TensorBoard
+
+
+def test_a_resumed_run_discards_events_of_later_steps(tmp_path):
+    image = torch.zeros(4, 6, 3)
+    killed = TensorBoardLog(tmp_path, 0)
+    for step in (1, 2, 3):
+        killed.log(step, {"loss": 10.0}, image)
+    time.sleep(1.1)  # event files are named and sorted by the second of their creation
+    resumed = TensorBoardLog(tmp_path, 1)
+    for step in (2, 3, 4):
+        resumed.log(step, {"loss": 5.0}, image)
+    events = EventAccumulator(str(tmp_path), size_guidance={"images": 0}).Reload()
+    assert [(event.step, event.value) for event in events.Scalars("loss")] == [
+        (1, 10.0), (2, 5.0), (3, 5.0), (4, 5.0),
+    ]  # fmt: skip
+    assert [event.step for event in events.Images(IMAGE_TAG)] == [1, 2, 3, 4]
+
+
+def test_without_tensorboard_nothing_is_written(tmp_path, monkeypatch):
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    monkeypatch.setitem(sys.modules, "torch.utils.tensorboard", None)
+    TensorBoardLog(tmp_path, 0).log(1, {"loss": 1.0}, torch.zeros(4, 6, 3))
+    assert not list(tmp_path.iterdir())

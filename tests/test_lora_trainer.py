@@ -101,12 +101,6 @@ def test_a_run_writes_a_log_images_and_a_folder_for_diffusers(recipe, tmp_path):
     assert Photo.open(tmp_path / "samples.png").size == (6 * 240, 20 + 20 + 160)
 
 
-def test_a_checkpoint_contains_the_lora_and_no_weights_of_the_backbone(make_trainer):
-    state = make_trainer().state_dict()
-    assert state.keys() == {"lora", "optimizer", "prompt"}
-    assert all("lora_" in name and tensor.dtype == torch.float32 for name, tensor in state["lora"].items())
-
-
 @pytest.mark.parametrize("backbone", ["kontext", "klein", "qwen"])
 @pytest.mark.parametrize("objective", ["flow", "one_step"])
 def test_training_lowers_the_loss_of_a_repeated_step(make_trainer, backbone, objective):
@@ -246,18 +240,6 @@ def test_values_for_inference_are_stored_with_the_lora(make_trainer, tmp_path):
     trainer.separate(photo())
     monitor.remove()
     assert len(steps) == 3
-
-
-def test_the_learning_rate_falls_to_zero_in_the_last_share_of_the_steps(make_trainer):
-    def rates(**changes):
-        trainer, rates = make_trainer(warmup_steps=2, steps=8, **changes), []
-        for step in (0, 1, 4, 6, 7):
-            trainer.training_step(step)
-            rates.append(trainer._optimizer.param_groups[0]["lr"] / trainer.recipe.learning_rate)
-        return rates
-
-    assert rates() == [0.5, 1, 1, 1, 1]
-    assert rates(learning_rate_decay_share=0.5) == pytest.approx([0.5, 1, 1, 0.5, 0.1464], abs=1e-3)
 
 
 def test_the_timestep_shift_moves_training_times_towards_noise(make_trainer):

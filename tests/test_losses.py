@@ -33,16 +33,6 @@ def test_an_even_error_counts_once_at_each_of_three_scales():
     assert parts["reflection"] == 0
 
 
-def test_a_reflection_counts_three_tenths_of_a_transmission_with_the_same_error():
-    parts = loss_of(reflection_error=0.1)
-    assert parts["reflection"] == pytest.approx(0.3 * 3 * 0.1, rel=1e-5)
-    assert parts["transmission"] == parts["edges"] == 0
-
-
-def test_the_loss_of_a_reflection_is_scaled_by_its_weight():
-    assert loss_of(reflection_error=0.1, weight=0.5)["reflection"] == pytest.approx(0.3 * 3 * 0.05, rel=1e-5)
-
-
 def test_the_weight_of_an_image_scales_only_its_own_reflection():
     """A batch mixes samples with and without a known reflection."""
     batch = make_batch()

@@ -71,21 +71,6 @@ def pane_reflectances(incidence_deg, index=1.5):
     return 2 * s / (1 + s), 2 * p / (1 + p)
 
 
-def test_glass_with_index_one_is_invisible():
-    sample = traced(a_scene(behind=map_side("mottled"), glass=Glazing(panes=(Pane(refractive_index=1.0),))))
-    assert sample.photo.shape == (3, 32, 32)
-    assert float((sample.transmission - sample.background).abs().max()) < 0.02
-    assert float(sample.reflection.abs().max()) == 0
-
-
-def test_a_pane_of_ordinary_glass_reflects_about_eight_percent():
-    sample = traced(a_scene(camera=at(0)), noise_threshold=0.003, max_samples=4096)
-    s, _ = pane_reflectances(0)
-    assert float(sample.reflection.mean()) == pytest.approx(s, rel=0.02)
-    assert float(sample.transmission.mean()) == pytest.approx(1 - s, rel=0.002)
-    assert float(sample.photo.mean()) == pytest.approx(1, abs=0.003)
-
-
 def test_truncated_layers_are_the_first_reflection_and_the_path_without_reflection():
     sample = traced(a_scene(camera=at(0), orders="truncated"), noise_threshold=0.002)
     assert float(sample.reflection.mean()) == pytest.approx(0.04, rel=0.001)
@@ -130,29 +115,6 @@ def red_half(image):
     green = image[..., 1] / image[..., 0].max()
     halves = {"left": green[:, :13], "right": green[:, -13:], "top": green[:13], "bottom": green[-13:]}
     return " ".join(name for name, half in halves.items() if half.max() < 0.05)
-
-
-def test_the_right_half_of_a_plane_appears_on_the_right_of_the_image():
-    scene = a_scene(behind=plane_side("red right"), front=plane_side("red right"))
-    assert (
-        red_half(render_image(scene, "behind", "none"))
-        == red_half(render_image(scene, "behind", "truncated_transmission"))
-        == "right"
-    )
-    assert (
-        red_half(render_image(scene, "front", "mirror"))
-        == red_half(render_image(scene, "front", "truncated_reflection"))
-        == "left"
-    )
-
-
-def test_the_top_half_of_a_plane_appears_at_the_top_of_the_image():
-    scene = a_scene(behind=plane_side("red top"), front=plane_side("red top"))
-    assert (
-        red_half(render_image(scene, "behind", "none"))
-        == red_half(render_image(scene, "front", "mirror"))
-        == "top"
-    )
 
 
 @pytest.mark.parametrize("radius_mm", [math.inf, 3000])

@@ -210,14 +210,6 @@ def test_the_target_is_the_transmission_or_the_background(photos):
     assert (light["transmission"] / light["background"]).item() == pytest.approx(0.8, rel=0.05)
 
 
-def test_glass_that_covers_a_part_does_not_change_the_rest(photos):
-    recipe = NO_EFFECTS.model_copy(update={"partial_probability": 1.0, "transmittance": (0.5, 0.5)})
-    batch = Mixtures(photos, [], recipe, seed=1)(0, 8, 64)
-    same = (batch.photo_encoded - batch.transmission_encoded).abs().amax(dim=1) < 2 / 255
-    assert (batch.reflection_encoded.amax(dim=1)[same] < 0.1).all()
-    assert 0.05 < same.float().mean() < 0.95
-
-
 def test_an_overexposed_background_is_white_in_photo_and_target(photos):
     recipe = NO_EFFECTS.model_copy(update={"overexposed_probability": 1.0, "overexposed_share": (0.2, 0.2)})
     batch = Mixtures(photos, [], recipe, seed=1)(0, 8, 64)

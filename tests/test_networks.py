@@ -8,10 +8,10 @@ from brewster.errors import RecipeError
 from brewster.inference.onnx_backend import OnnxBackend
 from brewster.models.compact import CompactNetwork
 from brewster.models.networks import DEFAULT_NETWORK, MAX_STRIDE, NETWORKS, NetworkEntry
-from brewster.training.compact.trainer import CompactTrainer, train
+from brewster.training.compact.trainer import CompactTrainer
 from brewster.training.loop import Checkpoint
 from brewster.training.recipe import with_value
-from training_helpers import ignore_step
+from training_helpers import ignore_step, train
 
 
 class SmallNetwork(nn.Module):

@@ -3,11 +3,9 @@
 import csv
 import hashlib
 import json
-from dataclasses import fields
 
 import pytest
 
-from brewster.cli import cli
 from brewster.environments import polyhaven
 from brewster.environments.polyhaven import DownloadRequest, pull
 from brewster.errors import DownloadError, OutputError
@@ -291,13 +289,6 @@ def test_a_manifest_of_another_program_is_refused_before_any_download(haven, fet
 @pytest.fixture
 def command(run_without_model, haven):
     return lambda *args: run_without_model("assets", "pull", "polyhaven", "--server", haven.url, *args)
-
-
-def test_the_command_has_an_option_for_every_field_of_a_request():
-    command = cli.commands["assets"].commands["pull"]
-    defaults = command.make_context("pull", ["polyhaven"]).params
-    expected = vars(DownloadRequest()) | {"server": None}  # its default depends on the source
-    assert {field.name: defaults[field.name] for field in fields(DownloadRequest)} == expected
 
 
 def test_the_command_prints_results_and_how_many_maps_are_missing(command, tmp_path):

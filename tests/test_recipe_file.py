@@ -1,16 +1,20 @@
-"""Recipe files: all problems are reported at once, and a recipe is printed with all its keys."""
+"""Recipe files: all problems are reported at once, and a recipe is printed with all its keys, which are described in words."""
 
 import pickle
 import tomllib
 from pathlib import Path
+from typing import Annotated, Literal
 
 import pytest
+from pydantic import Field
 
+from brewster.cli.recipe_reference import RECIPE_KINDS, recipe_reference
 from brewster.errors import RecipeError
 from brewster.scene.recipe import RECIPES, SceneRecipe, read_scene_recipe
 from brewster.scene.recipe_file import commented_toml, read_toml
-from brewster.scene.recipe_keys import recipe_keys
-from brewster.training.recipe import TEMPLATES, LoraRecipe, read_recipe, read_template
+from brewster.scene.recipe_keys import REQUIRED, recipe_tables
+from brewster.scene.values import FrozenModel, KeyNote, LogRange, Pixels, Share
+from brewster.training.recipe import TEMPLATES, LoraRecipe, read_template
 
 _FOLDER = Path(__file__).parents[1] / "recipes"
 SCENES = sorted(_FOLDER.glob("render/*.toml"))
@@ -67,19 +71,6 @@ def test_a_misspelt_choice_is_corrected_and_an_unknown_key_lists_the_known_ones(
     assert any("expected a key of [glass], one of double_probability, gap_mm" in line for line in lines)
 
 
-def test_problems_of_a_training_recipe_are_reported_in_the_same_way(problems):
-    text = 'backbone = "kontext"\nrnk = 4\nseed = 1.5\npanel_weights = { X = 1 }\n[data]\npairs = ["a"]\npairs_share = 3'
-    found = "\n".join(problems(text, read_recipe))
-    for part in (
-        "seed is 1.5",
-        "steps is missing",
-        "data.pairs_share is 3",
-        "no key panel_weights.X",
-        "no key rnk",
-    ):
-        assert part in found
-
-
 def test_an_error_with_several_problems_can_be_pickled(problems, tmp_path):
     (tmp_path / "mine.toml").write_text("")
     with pytest.raises(RecipeError) as caught:
@@ -118,7 +109,7 @@ def test_a_training_recipe_that_is_printed_and_read_is_the_same(name):
 
 def test_every_key_is_printed_below_its_meaning():
     text = commented_toml(read_template("lora"))
-    for key in recipe_keys(LoraRecipe):
+    for key in keys(LoraRecipe).values():
         name = key.path.rpartition(".")[2]
         assert f"\n{name} =" in text or f"\n# {name} =" in text
         assert key.meaning.split()[0] in text
@@ -139,3 +130,60 @@ def test_an_unknown_recipe_cannot_be_shown(run_without_model):
     code, _, err = run_without_model("train", "--show-recipe", "compat")
     assert (code, "no training recipe 'compat'" in err) == (1, True)
     assert run_without_model("train")[0] == 2
+
+
+# --- descriptions of keys
+
+
+class Inner(FrozenModel):
+    """An inner table."""
+
+    width_px: Pixels = 64
+    """A width."""
+    mode: Literal["fast", "slow"] | None = None
+    """A mode."""
+
+
+class Outer(FrozenModel):
+    """A recipe."""
+
+    length_mm: LogRange = (1.0, 2.0)
+    """A length,
+    over two lines."""
+    shares: Annotated[list[Share], Field(min_length=1), KeyNote(allowed="all different")]
+    """Some shares."""
+    inner: Inner | None = None
+    """An optional table."""
+
+
+def keys(model):
+    return {key.path: key for table in recipe_tables(model) for key in table.keys}
+
+
+def test_a_key_has_type_allowed_values_unit_default_and_meaning():
+    found = keys(Outer)
+    assert list(found) == ["length_mm", "shares", "inner.width_px", "inner.mode"]
+    length = found["length_mm"]
+    assert (length.kind, length.unit, length.default) == ("range [low, high]", "mm", [1.0, 2.0])
+    assert length.allowed == "each above 0, sampled log-uniformly"
+    assert length.meaning == "A length, over two lines."
+    shares = found["shares"]
+    assert (shares.kind, shares.default) == ("list of numbers", REQUIRED)
+    assert shares.allowed == "each from 0 to 1, at least 1 entry, all different"
+    assert (found["inner.width_px"].allowed, found["inner.width_px"].unit) == ("at least 16", "px")
+    assert found["inner.mode"].allowed == 'one of "fast", "slow"'
+
+
+@pytest.mark.parametrize("title", RECIPE_KINDS)
+def test_every_key_of_every_recipe_is_explained_in_a_sentence(title):
+    model, _ = RECIPE_KINDS[title]
+    for key in keys(model).values():
+        assert key.meaning[:1].isupper() or key.meaning.partition(":")[0].isalnum(), key.path
+        assert key.meaning.endswith("."), key.path
+    assert all(table.meaning.endswith(".") for table in recipe_tables(model))
+
+
+def test_the_reference_in_the_docs_is_up_to_date():
+    assert (Path(__file__).parents[1] / "docs" / "recipes.md").read_text() == recipe_reference(), (
+        "run make docs"
+    )

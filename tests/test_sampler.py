@@ -1,8 +1,5 @@
 """Scenes are the same on every machine, possible, and within the ranges of their recipe."""
 
-import os
-import subprocess
-import sys
 from collections import Counter
 from pathlib import Path
 
@@ -53,23 +50,6 @@ def test_every_packaged_recipe_draws_possible_scenes(fifty, recipe):
 
 def test_a_scene_depends_on_its_index_and_not_on_scenes_drawn_before(fifty):
     assert [drawn("tiny", index) for index in (9, 3, 40)] == [fifty["tiny"][index] for index in (9, 3, 40)]
-
-
-def test_another_process_draws_the_same_scene(fifty):
-    code = """
-from brewster.scene.recipe import read_scene_recipe
-from brewster.scene.sampler import draw
-from brewster.environments.catalog import builtin_catalog
-print(draw(read_scene_recipe("tiny"), builtin_catalog(), 7, 12).to_toml(), end="")
-"""
-    done = subprocess.run(
-        [sys.executable, "-c", code],
-        env={**os.environ, "PYTHONHASHSEED": "5"},
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    assert done.stdout == fifty["tiny"][12].to_toml()
 
 
 def test_index_seed_and_name_each_make_another_scene():

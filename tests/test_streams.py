@@ -5,13 +5,11 @@ import pytest
 import torch
 
 from brewster.environments.assets import Assets
-from brewster.environments.catalog import builtin_catalog
 from brewster.errors import RecipeError, UnsupportedPhoto
 from brewster.photo import Photo
-from brewster.scene.recipe import read_scene_recipe
 from brewster.training.data.data_recipe import DataRecipe
 from brewster.training.data.image_loading import source_weights
-from brewster.training.data.rendered import OnlineRendered, RenderedDatasets
+from brewster.training.data.rendered import RenderedDatasets
 from brewster.training.recipe import read_recipe, with_value
 from brewster.training.streams import open_stream, validation_pairs
 from cli_helpers import image_bytes
@@ -83,12 +81,6 @@ def test_datasets_have_a_path_in_the_data_folder_or_an_absolute_path(recipe, roo
     assert isinstance(below, RenderedDatasets)
     assert len(below) == 2
     assert same(below(3, 2, 32), absolute(3, 2, 32))
-
-
-def test_online_samples_of_builtin_environments_need_no_data_folder(recipe, builtin):
-    endless = with_value(recipe, "data.rendered.count", None)
-    plain = OnlineRendered(read_scene_recipe("tiny"), builtin_catalog(), builtin, seed=recipe.seed)
-    assert same(open_stream(endless)(1, 2, 32), plain(1, 2, 32))
 
 
 def test_orders_and_seed_of_a_recipe_reach_the_scenes(recipe, builtin):

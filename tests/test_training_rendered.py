@@ -1,14 +1,27 @@
 import shutil
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 import torch
+from hypothesis import given
+from hypothesis import strategies as st
 
 import brewster.training.data.rendered as rendered_module
+from brewster.environments.assets import Assets
+from brewster.environments.catalog import builtin_catalog
 from brewster.errors import PhotoError, RecipeError
 from brewster.photo import Photo
 from brewster.render.camera_response import encode_jpeg
 from brewster.rendered.store import read_dataset, read_scene_of
-from brewster.training.data.rendered import CachedRendered, RenderedDatasets, blended_layers
+from brewster.scene.recipe import read_scene_recipe
+from brewster.scene.sampler import draw
+from brewster.training.data.rendered import (
+    CachedRendered,
+    OnlineRendered,
+    RenderedDatasets,
+    blend,
+    blended_layers,
+)
 from set_folders import render_set
 from training_helpers import same
 
@@ -76,15 +89,6 @@ def test_a_batch_from_disk_depends_on_seed_and_step_alone(folder):
     assert not torch.equal(batch.photo_encoded, RenderedDatasets([folder], seed=2)(7, 4, 32).photo_encoded)
 
 
-def test_shards_and_folders_contain_the_same_samples(folder, tmp_path):
-    render_set(tmp_path / "shards", count=3, shards=True)
-    assert list((tmp_path / "shards").glob("*.tar"))
-    one, other = (
-        RenderedDatasets([place], seed=1, blend_space="srgb") for place in (folder, tmp_path / "shards")
-    )
-    assert same(one(0, 4, 32), other(0, 4, 32))
-
-
 def test_only_the_first_samples_are_used_where_a_count_is_given(folder):
     shutil.rmtree(folder / "000002")
     (folder / "000002").mkdir()
@@ -150,14 +154,6 @@ def test_a_cached_sample_is_rendered_once_per_size():
     assert sorted(source.rendered) == [(index, size) for index in range(3) for size in (8, 16)]
 
 
-def test_a_batch_from_memory_depends_on_seed_and_step_alone():
-    one, other = (CachedRendered(FakeOnline(), 3, seed=1) for _ in range(2))
-    batch = one(7, 4, 16)
-    other(0, 9, 16)
-    assert same(batch, other(7, 4, 16))
-    assert same(batch, one(7, 4, 16))
-
-
 def test_a_cached_sample_is_mirrored_at_random():
     batch = CachedRendered(FakeOnline(), 1, seed=1)(0, 16, 8)
     whole = FakeOnline().layers(0, 8)
@@ -174,3 +170,76 @@ def test_a_full_cache_does_not_change_the_samples():
     large = CachedRendered(FakeOnline(), 4, seed=1)
     assert all(same(small(step, 4, 8), large(step, 4, 8)) for step in range(10))
     assert len(source.rendered) > 4
+
+
+# --- the formula
+
+BYTES = st.integers(0, 255)
+
+
+def constant_image(value):
+    return torch.full((3, 2, 2), value / 255)
+
+
+@given(BYTES, BYTES, st.floats(0.8, 1), st.floats(0.4, 1))
+def test_a_blend_is_the_formula_in_eight_bits(t, r, alpha, beta):
+    exact = alpha * t / 255 + beta * r / 255 - t * r / 255**2
+    found = blend(constant_image(t), constant_image(r), alpha, beta)
+    assert abs(found[0, 0, 0].item() - min(max(exact, 0), 1)) <= 0.5 / 255 + 1e-6
+
+
+# --- rendered during training
+
+
+@pytest.fixture(scope="module")
+def assets():
+    return Assets()
+
+
+def tiny_catalog():
+    return builtin_catalog().model_copy(update={"maps": builtin_catalog().maps[:2]})
+
+
+def online(assets, **options):
+    return OnlineRendered(read_scene_recipe("tiny"), tiny_catalog(), assets, seed=7, **options)
+
+
+def test_a_batch_is_a_function_of_seed_and_step_alone(assets):
+    one = online(assets)
+    second = one(1, 2, 32)
+    assert same(second, online(assets)(1, 2, 32))
+    assert not torch.equal(second.photo_encoded, one(0, 2, 32).photo_encoded)
+
+
+@pytest.mark.parametrize("blend_space", ["linear", "srgb"])
+def test_the_photo_has_jpeg_artefacts_and_the_ground_truth_has_none(assets, blend_space):
+    """A second JPEG of the same quality changes the image hardly at all."""
+    photo, background, _ = online(assets, blend_space=blend_space).layers(0, 96).split(3)
+    scene = draw(read_scene_recipe("tiny"), tiny_catalog(), 7, 0)
+
+    def change(encoded):
+        decoded = Photo.open(encode_jpeg(encoded, scene.camera_response.jpeg_quality)).pixels.copy()
+        return (torch.from_numpy(decoded).permute(2, 0, 1) / 255 - encoded).abs().mean()
+
+    assert change(photo) < change(background) / 10
+
+
+def test_the_target_is_the_background_or_the_transmission(assets):
+    background = online(assets)(0, 1, 32).transmission_encoded
+    transmission = online(assets, target="transmission")(0, 1, 32).transmission_encoded
+    assert transmission.mean() < background.mean()
+
+
+def test_both_kinds_of_mixing_have_the_same_background(assets):
+    light = online(assets).layers(3, 64)
+    mixed = online(assets, blend_space="srgb", target="transmission").layers(3, 64)
+    assert (light[3:6] - mixed[3:6]).abs().max() <= 0.5 / 255 + 1e-6
+    assert not torch.equal(light[:3], mixed[:3])
+
+
+def test_threads_that_share_a_stream_get_the_same_batches(assets):
+    alone = [online(assets)(step, 1, 32) for step in range(4)]
+    shared = online(Assets())
+    with ThreadPoolExecutor(4) as pool:
+        together = list(pool.map(lambda step: shared(step, 1, 32), range(4)))
+    assert all(map(same, alone, together))

@@ -8,7 +8,6 @@ from functools import partial
 from pathlib import Path
 
 import pytest
-import torch
 
 from brewster.errors import OutputError, RecipeError
 from brewster.executors.local import ProcessExecutor
@@ -85,16 +84,6 @@ def test_a_sample_that_kills_every_worker_fails_and_the_others_are_rendered(tmp_
     assert "the worker died 1 times (exit code -9)" in next(
         result.error for result in results if result.error
     )
-
-
-def test_serial_rendering_restores_the_number_of_torch_threads(tmp_path):
-    threads = torch.get_num_threads()
-    torch.set_num_threads(2)
-    try:
-        render_set(tmp_path / "set", count=1)
-        assert torch.get_num_threads() == 2
-    finally:
-        torch.set_num_threads(threads)
 
 
 def test_a_scene_file_cannot_run_a_renderer_that_is_not_in_the_table(tmp_path):

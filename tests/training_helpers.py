@@ -2,6 +2,16 @@
 
 import torch
 
+from brewster.training.compact.trainer import CompactTrainer
+from brewster.training.loop import run
+
+
+def train(recipe, out, on_step):
+    """Trains a recipe in the folder `out`, or resumes its run. Returns the network with the averaged weights."""
+    trainer = CompactTrainer(recipe)
+    run(trainer, out, on_step)
+    return trainer.ema_network()
+
 
 class Killed(Exception):
     """Simulates the end of a process in the middle of a run."""

@@ -38,12 +38,10 @@ class Assets:
         self._cache: OrderedDict[tuple[str, str, str], Float32] = OrderedDict()
 
     def map_radiance(self, environment: EnvironmentMap) -> Float32:
-        """Returns the radiance of a lat-long map, (H, 2 H, 3).
+        """Returns the radiance of a lat-long map, (H, 2 H, 3), scaled to the mean luminance in the scene.
 
-        The map is scaled to the mean luminance in the scene. To compute the mean, values are clipped at ten times the
-        mean of the map, so that lamps have little weight. Raises RecipeError if the file is missing, or has another
-        sha256 than in the scene; UnsupportedPhoto if the map is not 2:1, has values that are not finite, is black, or
-        is clipped (not HDR); PhotoError if the file cannot be decoded.
+        Raises RecipeError if the file is missing, or has another sha256 than in the scene; PhotoError if the file cannot be
+        decoded, or cannot light a scene (see `check_map`).
         """
         light = self._cached("map", environment.source, self._read_map)
         return light * np.float32(environment.luminance)
@@ -52,8 +50,6 @@ class Assets:
         """Returns the radiance of a picture, (H, W, 3), with brighter highlights (see `Plane.highlight_boost`).
 
         The file is decoded with its colour profile; without a profile as sRGB (integers) or linear Rec.709 (floats).
-        Raises RecipeError if the file is missing, or has another sha256 than in the scene; PhotoError if the file
-        cannot be decoded.
         """
         picture = self._cached("picture", plane.source, lambda source: self._open(source).linear().clip(0, 1))
         highlight = ((picture.max(axis=2, keepdims=True) - 0.8) / 0.2).clip(0, 1)
@@ -72,9 +68,8 @@ class Assets:
         return self._cache[key]
 
     def _read_map(self, source: AssetSource) -> Float32:
-        texels = check_map(self._open(source).linear(), source.file)
-        light: Float32 = np.maximum(texels, np.float32(0))
-        light /= _mean_luminance(texels)
+        light: Float32 = np.maximum(check_map(self._open(source).linear(), source.file), np.float32(0))
+        light /= _mean_luminance(light)
         return light
 
     def _open(self, source: AssetSource) -> Photo:
@@ -154,7 +149,7 @@ def _mean_luminance(texels: Float32) -> np.float32:
     """Returns the mean luminance over the sphere. Values are clipped at ten times the mean, so lamps have little weight."""
     height = texels.shape[0]
     solid_angle = np.sin((np.arange(height) + 0.5) / height * np.pi)[:, None]
-    luminance = np.maximum(texels, 0) @ _LUMINANCE
+    luminance = texels @ _LUMINANCE
     weights = np.broadcast_to(solid_angle / solid_angle.sum() / luminance.shape[1], luminance.shape)
     limit = 10 * (luminance * weights).sum()
     return np.float32((np.minimum(luminance, limit) * weights).sum())

@@ -37,11 +37,8 @@ def read_catalog(
     Maps are decoded and validated. Only the headers of pictures are read, so a picture with damaged pixels raises an
     error only when it is used. A `manifest.csv` with the columns file and category contains the categories of maps. If
     no folder of maps is given, the built-in maps are listed, and likewise for pictures. Files that match a pattern in
-    `exclude` are skipped.
-
-    Returns: the catalog, and an error for each file that cannot be used.
-
-    Raises RecipeError if a folder or its manifest cannot be read, or none of the files can be used.
+    `exclude` are skipped. Returns the catalog, and an error for each file that cannot be used. Raises RecipeError if a folder
+    or its manifest cannot be read, or none of the files can be used.
     """
     refused: list[BrewsterError] = []
     catalog = Catalog(

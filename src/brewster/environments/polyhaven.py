@@ -75,15 +75,12 @@ def maps_folder() -> Path:
 
 
 def pull(request: DownloadRequest, out: Path) -> Iterator[DownloadResult]:
-    """Downloads maps into a folder, in the order of their ids, and lists them in its manifest.csv.
+    """Downloads maps into a folder, in the order of their ids, and lists them in its manifest.csv. Yields a result for each.
 
     A map that exists already is skipped. An asset without a suitable file is replaced by the next asset. A failed
-    download is not replaced, so that the next call downloads the same maps.
-
-    Yields: a result for each asset.
-
-    Raises DownloadError if the list of the server cannot be downloaded, or several assets in a row failed; OutputError
-    if the folder cannot be written to, or contains the manifest.csv of another program.
+    download is not replaced, so that the next call downloads the same maps. Raises DownloadError if the list of the server
+    cannot be downloaded, or several assets in a row failed; OutputError if the folder cannot be written to, or contains the
+    manifest.csv of another program.
     """
     _read_manifest(out)  # refuses the manifest of another program before any download
     yield from stop_after_failures(_download_assets(request, out))

@@ -70,11 +70,8 @@ def photos_folder() -> Path:
 def pull(out: Path, *, server: str = SERVER, dry_run: bool = False) -> Iterator[DownloadResult]:
     """Downloads the photos with a known origin, reduces them to their size in training, and lists them in manifest.csv.
 
-    Existing photos are skipped.
-
-    Yields: a result for each photo with an origin.
-
-    Raises DownloadError if several photos in a row failed; OutputError if the folder cannot be written to.
+    Existing photos are skipped. Yields a result for each photo with an origin. Raises DownloadError if several photos in a
+    row failed; OutputError if the folder cannot be written to.
     """
     downloader = None if dry_run else Downloader()
     photos = [photo for photo in read_table() if photo.origin]

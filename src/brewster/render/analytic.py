@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -33,7 +33,7 @@ from brewster.render.rays.layered_glass import (
 from brewster.render.rays.rough_glass import trace_orders
 from brewster.render.rays.sobol import SobolPoints
 from brewster.render.rays.vectors import normalize
-from brewster.render.sample import SAMPLE_IMAGES, LinearSample
+from brewster.render.sample import LinearSample
 from brewster.scene.camera import axes, dot
 from brewster.scene.scene import Scene
 from brewster.scene.world import Side
@@ -45,7 +45,7 @@ orders. The throughput of each order is exact; the last order of each side also 
 _CPU_BATCH_RAYS = 1 << 15  # small enough for the cache of a CPU
 _ROUGH_BATCH_RAYS = (
     1 << 18
-)  # large, because most orders of rough glass contain only a few of the rays of a batch
+)  # large, because most orders of rough glass have only a few of the rays of a batch
 _GPU_BATCH_RAYS = 1 << 20
 
 
@@ -70,12 +70,13 @@ class _PreparedScene:
     up: Tensor
     back: Tensor
 
+    def directions(self, across: Tensor, upward: Tensor) -> Tensor:
+        """Returns the directions (3, N) through points of the plane at distance 1, (N,) each. They are not normalised."""
+        return self.right[:, None] * across + self.up[:, None] * upward - self.back[:, None]
+
 
 def render(scene: Scene, assets: Assets, device: Device = "cpu") -> LinearSample:
-    """Renders the five images of a scene (the paper's section "Data Generation").
-
-    Returns:
-        Linear light, float32 (3, H, W) each, on `device`.
+    """Renders the five images of a scene (the paper's section "Data Generation") in float32, on `device`.
 
     Raises:
         RecipeError: the glass is framed or curved (only Mitsuba renders it), or a file is missing.
@@ -88,13 +89,9 @@ def render(scene: Scene, assets: Assets, device: Device = "cpu") -> LinearSample
             "use --renderer mitsuba",
         )
     prepared = _prepare(scene, assets, device)
+    trace = _render_monte_carlo if needs_monte_carlo(scene) else _render_deterministic
     with torch.no_grad():
-        layers = (
-            _render_monte_carlo(prepared, device)
-            if needs_monte_carlo(scene)
-            else _render_deterministic(prepared)
-        )
-    return LinearSample(scene, **dict(zip(SAMPLE_IMAGES, layers, strict=True)))
+        return LinearSample(scene, *trace(prepared))
 
 
 def ghost_distance_px(scene: Scene) -> float:
@@ -136,11 +133,16 @@ def needs_monte_carlo(scene: Scene) -> bool:
 
 
 def _render_deterministic(prepared: _PreparedScene) -> list[Tensor]:
-    """Traces a regular grid of rays in each pixel, then applies the defocus blur of the lens: I, T, B, R and MR, (3, H, W) each."""
-    camera = prepared.scene.camera
+    """Traces a regular grid of rays in each pixel, then applies the defocus blur of the lens: I, T, B, R and MR, (3, H, W) each.
+
+    Along each side of a pixel there are ceil(3 * texels per pixel) rays, at most sqrt(samples_per_pixel). Textures are filtered
+    to the distance between the rays.
+    """
+    scene, camera = prepared.scene, prepared.scene.camera
     margin = margin_px(camera)
     width, height = camera.width + 2 * margin, camera.height + 2 * margin
-    rays_per_axis = _rays_per_axis(prepared)
+    finest = max(side.emitters.texels_per_pixel() for side in (prepared.behind, prepared.front))
+    rays_per_axis = min(max(1, math.ceil(3 * finest)), math.isqrt(scene.samples_per_pixel))
     total = torch.zeros(5, 3, width * height, device=prepared.origin.device)
     for row in range(rays_per_axis):
         for column in range(rays_per_axis):
@@ -148,15 +150,6 @@ def _render_deterministic(prepared: _PreparedScene) -> list[Tensor]:
             for rays, pixels in _pinhole_rays(prepared, offset, margin, 1 / rays_per_axis):
                 total[:, :, pixels] += torch.stack(_trace_smooth(prepared, rays)) / rays_per_axis**2
     return [defocus_blur(layer.view(3, height, width), camera, margin) for layer in total]
-
-
-def _rays_per_axis(prepared: _PreparedScene) -> int:
-    """Returns the number of rays along each side of a pixel: ceil(3 * texels per pixel), at most sqrt(samples_per_pixel).
-
-    Textures are filtered to the distance between the rays.
-    """
-    finest = max(side.emitters.texels_per_pixel() for side in (prepared.behind, prepared.front))
-    return min(max(1, math.ceil(3 * finest)), math.isqrt(prepared.scene.samples_per_pixel))
 
 
 def _pinhole_rays(
@@ -173,24 +166,17 @@ def _pinhole_rays(
     y = camera.height / camera.width - y
     rows = max(1, (_GPU_BATCH_RAYS if prepared.origin.is_cuda else _CPU_BATCH_RAYS) // width)
     for top in range(0, height, rows):
-        batch = y[top : top + rows]
-        across, upward = x.expand(len(batch), -1).reshape(-1), batch[:, None].expand(-1, width).reshape(-1)
-        direction = _outer(prepared.right, across * camera.half_width) + _outer(
-            prepared.up, upward * camera.half_width
-        )
-        direction = direction - prepared.back[:, None]
-        origin = prepared.origin[:, None].expand(3, len(across))
-        yield (
-            Rays(origin, normalize(direction), relative_footprint),
-            slice(top * width, top * width + len(across)),
-        )
+        upward, across = (part.reshape(-1) for part in torch.meshgrid(y[top : top + rows], x, indexing="ij"))
+        direction = prepared.directions(across * camera.half_width, upward * camera.half_width)
+        rays = Rays(prepared.origin[:, None].expand_as(direction), normalize(direction), relative_footprint)
+        yield rays, slice(top * width, top * width + len(across))
 
 
-def _render_monte_carlo(prepared: _PreparedScene, device: Device) -> list[Tensor]:
+def _render_monte_carlo(prepared: _PreparedScene) -> list[Tensor]:
     """Traces `samples_per_pixel` random rays per pixel, over pixel, lens and microfacets: I, T, B, R and MR, (3, H, W) each."""
     scene, camera = prepared.scene, prepared.scene.camera
     count = camera.width * camera.height
-    sobol = SobolPoints(scene.seed, scene.index, count, scene.samples_per_pixel, device)
+    sobol = SobolPoints(scene.seed, scene.index, count, scene.samples_per_pixel, prepared.origin.device)
     is_traced = scene.glass.is_rough or scene.glass.is_wedged
     trace, batch_rays = (_trace_rough, _ROUGH_BATCH_RAYS) if is_traced else (_trace_smooth, _CPU_BATCH_RAYS)
     total = torch.zeros(5, 3, count, device=prepared.origin.device)
@@ -210,42 +196,35 @@ def _thin_lens_rays(prepared: _PreparedScene, pixels: slice, sobol: SobolPoints)
     jitter = sobol.next_2d()
     across = ((pixel % camera.width + jitter[0]) / camera.width * 2 - 1) * camera.half_width
     upward = (camera.height - (pixel // camera.width + jitter[1]) * 2) / camera.width * camera.half_width
-    direction = _outer(prepared.right, across) + _outer(prepared.up, upward) - prepared.back[:, None]
+    direction = prepared.directions(across, upward)
     origin = prepared.origin[:, None].expand_as(direction)
     if camera.aperture_mm > 0:
         x, y = sobol.next_disc() * (camera.aperture_mm / 2)
-        lens = _outer(prepared.right, x) + _outer(prepared.up, y)
+        lens = prepared.right[:, None] * x + prepared.up[:, None] * y
         origin, direction = origin + lens, direction - lens / camera.focus_mm
     # The footprint is half the mean distance between the samples in a pixel. A full footprint blurs too much, because the
     # average over the samples is also a filter.
     return Rays(origin, normalize(direction), 1 / (2 * math.sqrt(prepared.scene.samples_per_pixel)))
 
 
-def _outer(axis: Tensor, values: Tensor) -> Tensor:
-    return axis[:, None] * values
-
-
 def _trace_smooth(prepared: _PreparedScene, rays: Rays, _: SobolPoints | None = None) -> list[Tensor]:
     """Returns I, T, B, R and MR along the rays, (3, N) each, for smooth parallel panes: all orders, no randomness."""
     glass = prepared.scene.glass
-    point, mirrored = _mirror_at_first_surface(rays)
-    cosine = mirrored[2]
-    complete = total_throughput(glass, cosine)
-    in_layers = truncated_throughput(glass, cosine) if prepared.scene.orders == "truncated" else complete
+    mirrored = _mirror_at_first_surface(rays)
+    complete = in_layers = total_throughput(glass, mirrored.direction[2])
+    if prepared.scene.orders == "truncated":
+        in_layers = truncated_throughput(glass, mirrored.direction[2])
     layers = []
-    for side, origin, direction, total_ratio, layer_ratio in (
-        (prepared.behind, rays.origin, rays.direction, complete.transmittance, in_layers.transmittance),
-        (prepared.front, point, mirrored, complete.reflectance, in_layers.reflectance),
+    for side, seen, total_ratio, layer_ratio in (
+        (prepared.behind, rays, complete.transmittance, in_layers.transmittance),
+        (prepared.front, mirrored, complete.reflectance, in_layers.reflectance),
     ):
-        far = side.emitters.far_radiance(direction, rays.relative_footprint)
-        unattenuated = side.emitters.add_near(far, origin, direction, rays.relative_footprint)
+        far = side.emitters.far_radiance(seen)
+        unattenuated = side.emitters.add_near(far, seen)
         if len(side.groups) > 1:
-            total, layer = _shifted_orders(
-                prepared, side, Rays(point, direction, rays.relative_footprint), far
-            )
+            total, layer = _shifted_orders(prepared, side, replace(seen, origin=mirrored.origin), far)
         else:
-            total = total_ratio * unattenuated
-            layer = layer_ratio * unattenuated if in_layers is not complete else total
+            total, layer = total_ratio * unattenuated, layer_ratio * unattenuated
         layers.append((total, layer, unattenuated))
     (transmitted, transmission, background), (reflected, reflection, mirror) = layers
     return [transmitted + reflected, transmission, background, reflection, mirror]
@@ -269,7 +248,7 @@ def _shifted_orders(
     total, layer = torch.zeros_like(direction), torch.zeros_like(direction)
     for group in side.groups:
         exit_point = surface + in_plane * _in_plane_shift(group[0], shifts)
-        radiance = side.emitters.add_near(far, exit_point, direction, exiting.relative_footprint)
+        radiance = side.emitters.add_near(far, replace(exiting, origin=exit_point))
         weights = list(zip(group, throughputs, strict=False))
         total += sum((weight for _, weight in weights), torch.zeros_like(cosine)) * radiance
         if prepared.scene.orders == "truncated":
@@ -300,18 +279,12 @@ def _group_orders(scene: Scene, emitters: SideEmitters, *, is_behind: bool) -> l
     table = enumerate_orders(tuple(round(min(r, _MAX_TABLE_REFLECTANCE), 3) for r in reflectances))
     shifts = in_plane_shifts_mm(scene.glass, cosine)
     pixel_mm = scene.camera.pixel_rad * (scene.camera_above_glass_mm + emitters.distance_mm)
-    groups: list[tuple[float, list[ReflectionOrder]]] = []
-    for order in table:
-        if order.is_transmitted != is_behind:
-            continue
+    groups: dict[float, list[ReflectionOrder]] = {}
+    for order in (order for order in table if order.is_transmitted == is_behind):
         shift_px = float(_in_plane_shift(order, shifts) * cosine) / pixel_mm
-        for group_px, group in groups:
-            if abs(shift_px - group_px) < _MERGE_DISTANCE_PX:
-                group.append(order)
-                break
-        else:
-            groups.append((shift_px, [order]))
-    return [group for _, group in groups]
+        group_px = next((px for px in groups if abs(shift_px - px) < _MERGE_DISTANCE_PX), shift_px)
+        groups.setdefault(group_px, []).append(order)
+    return list(groups.values())
 
 
 def _trace_rough(prepared: _PreparedScene, rays: Rays, sobol: SobolPoints) -> list[Tensor]:
@@ -325,13 +298,14 @@ def _trace_rough(prepared: _PreparedScene, rays: Rays, sobol: SobolPoints) -> li
         if prepared.scene.orders == "all" or exiting.in_truncated_layers:
             in_layer.index_add_(1, exiting.rays, exiting.light)
     (transmitted, transmission), (reflected, reflection) = sides[True], sides[False]
-    point, mirrored = _mirror_at_first_surface(rays)
-    background = prepared.behind.emitters.radiance(rays.origin, rays.direction, rays.relative_footprint)
-    mirror = prepared.front.emitters.radiance(point, mirrored, rays.relative_footprint)
+    background = prepared.behind.emitters.radiance(rays)
+    mirror = prepared.front.emitters.radiance(_mirror_at_first_surface(rays))
     return [transmitted + reflected, transmission, background, reflection, mirror]
 
 
-def _mirror_at_first_surface(rays: Rays) -> tuple[Tensor, Tensor]:
-    """Intersects rays with the first surface: the points and the directions after a perfect mirror, (3, N) each."""
+def _mirror_at_first_surface(rays: Rays) -> Rays:
+    """Returns the rays after a perfect mirror at the first surface."""
     point = rays.origin - rays.direction * (rays.origin[2] / rays.direction[2])
-    return point, rays.direction * rays.direction.new_tensor([1, 1, -1])[:, None]
+    return replace(
+        rays, origin=point, direction=rays.direction * rays.direction.new_tensor([1, 1, -1])[:, None]
+    )

@@ -101,13 +101,7 @@ def to_uint8(encoded: Tensor) -> NDArray[np.uint8]:
 
 
 def encode_jpeg(encoded: Tensor, quality: int) -> bytes:
-    """Returns an encoded image (3, H, W) in 0..1 as the bytes of a JPEG file, without chroma subsampling.
-
-    `quality` is in 1..100.
-
-    Raises:
-        UnsupportedPhoto: a side is longer than 65535 pixels.
-    """
+    """Returns an encoded image (3, H, W) in 0..1 as the bytes of a JPEG file, without chroma subsampling."""
     return Photo(to_uint8(encoded), file_info=FileInfo(format_name="jpeg", jpeg_quality=quality)).encode()
 
 
@@ -164,23 +158,17 @@ def _white_balance_gains(photo: Tensor, response: CameraResponse) -> tuple[float
     """Returns RGB gains that correct the illuminant's colour by the requested strength and keep its luminance.
 
     The colour is estimated on the exposed image. Pixels that clip in any channel are ignored, because clipping changes
-    their colour. If all pixels clip, all of them are used.
+    their colour. If all pixels clip, all of them are used. All gains are 1 if the colour is nearly black.
     """
     if response.white_balance == "none":
         return 1.0, 1.0, 1.0
     exposed = (photo * math.exp2(_exposure_ev(photo, response.target_luminance))).clamp(0, 1)
     valid = (exposed < 1).all(0)
     colour = _ILLUMINANT_ESTIMATORS[response.white_balance](exposed, valid if valid.any() else ~valid)
-    return _gains(colour, response.white_balance_strength)
-
-
-def _gains(colour: Tensor, strength: float) -> tuple[float, float, float]:
-    """Returns RGB gains for an illuminant's colour (3,); all gains are 1 if that colour is nearly black."""
     brightness = luminance(colour)
     if brightness < 1e-9:
         return 1.0, 1.0, 1.0
-    full = brightness / colour.clamp(min=brightness * 1e-6)
-    partial = full**strength
+    partial = (brightness / colour.clamp(min=brightness * 1e-6)) ** response.white_balance_strength
     normalised = partial * (brightness / luminance(colour * partial))
     red, green, blue = normalised.clamp(1 / _MAX_GAIN, _MAX_GAIN).tolist()
     return round(red, 4), round(green, 4), round(blue, 4)

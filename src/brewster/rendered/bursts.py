@@ -31,20 +31,13 @@ class StoredBurst:
         return len(self.frames) // 2
 
     def motion(self, frame: int) -> LayerMotion:
-        """Computes the motion of both layers from the reference frame to another frame.
-
-        Raises:
-            RecipeError: the motion cannot be computed (see `layer_motion`).
-        """
+        """Computes the motion of both layers from the reference frame to another frame (see `layer_motion`)."""
         return layer_motion(self.scenes[self.reference], self.scenes[frame])
 
 
 def read_bursts(out: Path) -> Iterator[StoredBurst]:
     """Yields the complete bursts of a dataset in order. A burst of which a frame failed or is not yet rendered is left out.
-
-    Raises:
-        RecipeError: the dataset has a sample that is not a frame of a burst, or a scene file is damaged.
-    """
+    Raises RecipeError if a sample is not a frame of a burst."""
     frames = ((entry, read_scene_of(entry)) for entry in read_dataset(out))
     for (index, count), group in groupby(frames, key=lambda frame: _burst_of(*frame)):
         entries, scenes = zip(*group, strict=True)

@@ -10,27 +10,22 @@ import os
 import re
 import tarfile
 import tomllib
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from io import BytesIO
 from itertools import product
 from pathlib import Path
 from typing import Final
 
-import numpy as np
-from numpy.typing import NDArray
-
 import brewster
 from brewster.errors import RecipeError
 from brewster.files import TEMPORARY_PREFIX, atomic_path, discard, temporary_path, write_atomically
-from brewster.photo import read_exr_layers, write_exr_layers
+from brewster.photo import write_exr_layers
 from brewster.render.analytic import ghost_distance_px
 from brewster.render.camera_response import DevelopedSample, develop, encode_jpeg, luminance
 from brewster.render.sample import SAMPLE_IMAGES, LinearSample
 from brewster.scene.recipe_file import validated
 from brewster.scene.scene import Scene
-
-Float32 = NDArray[np.float32]
 
 SHARD_SIZE: Final = 100
 """Number of samples in a shard."""
@@ -45,16 +40,7 @@ _CURE: Final = "delete this sample, and render the dataset again"
 # --- encoding a sample
 
 
-def _reflection_to_transmission(sample: LinearSample, _: DevelopedSample) -> float:
-    means = [luminance(layer.double().mean((1, 2))) for layer in (sample.reflection, sample.transmission)]
-    return means[0] / max(means[1], 1e-12)
-
-
-STATISTICS: Final[dict[str, Callable[[LinearSample, DevelopedSample], float]]] = {
-    "reflection_to_transmission": _reflection_to_transmission,
-    "overexposed_fraction": lambda _, developed: developed.overexposed_fraction,
-    "ghost_px": lambda sample, _: ghost_distance_px(sample.scene),
-}
+STATISTICS: Final = ("reflection_to_transmission", "overexposed_fraction", "ghost_px")
 """Statistics for the selection of samples. They are stored in every scene.toml and in the index.
 
 `reflection_to_transmission` is the mean luminance of R divided by that of T, `overexposed_fraction` the fraction of the
@@ -64,7 +50,12 @@ pixels of I with a clipped channel, and `ghost_px` the distance between the firs
 
 def statistics(sample: LinearSample, developed: DevelopedSample) -> dict[str, float]:
     """Returns the values of STATISTICS, rounded to six significant digits."""
-    return {name: float(f"{measure(sample, developed):.6g}") for name, measure in STATISTICS.items()}
+    reflection, transmission = (
+        luminance(layer.double().mean((1, 2))) for layer in (sample.reflection, sample.transmission)
+    )
+    ratio = reflection / max(transmission, 1e-12)
+    values = ratio, developed.overexposed_fraction, ghost_distance_px(sample.scene)
+    return {name: float(f"{value:.6g}") for name, value in zip(STATISTICS, values, strict=True)}
 
 
 SAMPLE_FORMAT: Final = 3
@@ -77,10 +68,11 @@ def encode_sample(sample: LinearSample, renderer: str) -> dict[str, bytes]:
     developed = develop(sample)
     origin = {"version": brewster.__version__, "renderer": renderer}
     outcome = {**origin, **developed.camera_settings(), **statistics(sample, developed)}
-    qualities = dict.fromkeys(SAMPLE_IMAGES, _GROUND_TRUTH_QUALITY) | {
-        "photo": sample.scene.camera_response.jpeg_quality
+    qualities = {"photo": sample.scene.camera_response.jpeg_quality}
+    files = {
+        f"{name}.jpg": encode_jpeg(layer, qualities.get(name, _GROUND_TRUTH_QUALITY))
+        for name, layer in developed.images().items()
     }
-    files = {f"{name}.jpg": encode_jpeg(layer, qualities[name]) for name, layer in developed.images().items()}
     light = {name: layer.permute(1, 2, 0).float().cpu().numpy() for name, layer in sample.images().items()}
     files[LIGHT_FILE] = write_exr_layers(light, {"software": f"brewster {brewster.__version__}"})
     files[SCENE_FILE] = sample.scene.to_toml(outcome=outcome).encode()
@@ -96,11 +88,7 @@ def key(index: int) -> str:
 
 
 def write_folder(folder: Path, files: Mapping[str, bytes]) -> None:
-    """Writes the folder of a sample. An existing folder stays, because another process may have written the same sample.
-
-    Raises:
-        OutputError: a file or folder cannot be written, for example because the disk is full.
-    """
+    """Writes the folder of a sample. An existing folder stays, because another process may have written the same sample."""
     with atomic_path(folder) as part:
         part.mkdir(parents=True)
         for name, data in files.items():
@@ -126,9 +114,6 @@ def pack(out: Path, block: int) -> None:
 
     The names of the members follow the convention of WebDataset (000007.photo.jpg). The bytes of the shard depend only on
     the samples.
-
-    Raises:
-        OutputError: a file or folder cannot be written, for example because the disk is full.
     """
     entries = list(read_block(out, block))
     if any(not entry.spans for entry in entries):
@@ -141,9 +126,7 @@ def pack(out: Path, block: int) -> None:
                 member.size = len(data)
                 tar.addfile(member, BytesIO(data))
     for folder in _folders(out, block):
-        hidden = temporary_path(
-            folder
-        )  # the folder is renamed first, so that no reader finds a partial sample
+        hidden = temporary_path(folder)  # it is renamed first, so that no reader finds a partial sample
         with contextlib.suppress(OSError):  # another process has removed it
             folder.replace(hidden)
             discard(hidden)
@@ -197,20 +180,6 @@ def read_block(out: Path, block: int) -> Iterator[StoredSample]:
     entries = {int(folder.name): StoredSample(int(folder.name), folder) for folder in _folders(out, block)}
     entries |= {entry.index: entry for entry in _members(out / shard_name(block))}
     yield from (entry for _, entry in sorted(entries.items()))
-
-
-def open_sample(entry: StoredSample) -> tuple[dict[str, Float32], Scene]:
-    """Reads a sample.
-
-    Returns: the five images by name, each (H, W, 3) in linear light, and the scene.
-
-    Raises:
-        MissingExtra: OpenEXR is not installed.
-        PhotoError: the image file is damaged.
-        RecipeError: the scene file is damaged.
-    """
-    light = read_exr_layers(entry.read(LIGHT_FILE))
-    return {name: light[name] for name in SAMPLE_IMAGES}, read_scene_of(entry)
 
 
 def read_scene_of(entry: StoredSample) -> Scene:

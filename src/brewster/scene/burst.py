@@ -57,12 +57,11 @@ def layer_motion(reference: Scene, frame: Scene) -> LayerMotion:
             has no height_mm.
     """
     _check_same_burst(reference, frame)
-    glass = reference.glass
     camera = reference.camera
     y, x = np.mgrid[: camera.height, : camera.width]
     motions = []
     for side, is_behind in ((reference.behind, True), (reference.front, False)):
-        content = _Content(side, glass, is_behind=is_behind)
+        content = _Content(side, reference.glass, is_behind=is_behind)
         points = content.intersect(content.origin(camera), _pixel_rays(camera, content.to_glass))
         positions = _project(content, frame.camera, points).reshape(camera.height, camera.width, 2)
         motions.append(np.asarray(positions - np.stack([x, y], -1), np.float32))
@@ -89,17 +88,13 @@ class _Content:
 
     def shift(self, rays: _Doubles) -> _Doubles:
         """Returns how far the refraction moves rays along the glass, compared with straight lines."""
-        if not self._is_behind:
-            return np.zeros_like(rays)
-        across = rays[:, :2]
-        sine = np.hypot(*across.T) / np.linalg.norm(rays, axis=1)
-        total = np.zeros_like(sine)
-        for pane in self._glass.panes:
-            straight = 1 / np.sqrt(1 - sine**2)
-            refracted = 1 / np.sqrt(pane.refractive_index**2 - sine**2)
-            total += pane.thickness_mm * (refracted - straight)
         moved = np.zeros_like(rays)
-        moved[:, :2] = across * (total / np.linalg.norm(rays, axis=1))[:, None]
+        if self._is_behind:
+            across, length = rays[:, :2], np.linalg.norm(rays, axis=1)
+            sine = np.hypot(*across.T) / length
+            for pane in self._glass.panes:
+                tangents = 1 / np.sqrt(pane.refractive_index**2 - sine**2) - 1 / np.sqrt(1 - sine**2)
+                moved[:, :2] += across * (pane.thickness_mm * tangents / length)[:, None]
         return moved
 
     def intersect(self, origin: _Doubles, rays: _Doubles) -> _Doubles:
@@ -116,8 +111,7 @@ class _Content:
 
 def _project(content: _Content, camera: Camera, points: _Doubles) -> _Doubles:
     """Returns the image coordinates (N, 2) of homogeneous points (N, 4). The centre of the first pixel is at (0, 0)."""
-    straight = points[:, :3] - points[:, 3:] * content.origin(camera)
-    rays = straight
+    rays = straight = points[:, :3] - points[:, 3:] * content.origin(camera)
     for _ in range(_REFRACTION_STEPS):
         rays = straight - points[:, 3:] * content.shift(rays)
     right, up, back = (content.to_glass @ axis for axis in np.array(camera.axes))
@@ -182,17 +176,13 @@ def _check_same_burst(reference: Scene, frame: Scene) -> None:
             "expected flat glass that fills the view",
             "use a burst of the analytic renderer",
         )
-    for name in ("glass", "behind", "front"):
-        if getattr(reference, name) != getattr(frame, name):
-            raise RecipeError(
-                f"the two scenes differ in {name}",
-                "expected two frames of one burst",
-                "choose frames of one burst",
-            )
     sizes = [(scene.camera.width, scene.camera.height) for scene in (reference, frame)]
+    differences = [
+        f"the two scenes differ in {name}"
+        for name in ("glass", "behind", "front")
+        if getattr(reference, name) != getattr(frame, name)
+    ]
     if sizes[0] != sizes[1]:
-        raise RecipeError(
-            f"the images of the two scenes have the sizes {sizes[0]} and {sizes[1]}",
-            "expected two frames of one burst",
-            "choose frames of one burst",
-        )
+        differences.append(f"the images of the two scenes have the sizes {sizes[0]} and {sizes[1]}")
+    if differences:
+        raise RecipeError(differences[0], "expected two frames of one burst", "choose frames of one burst")

@@ -36,31 +36,20 @@ class Camera(FrozenModel):
         """Unit vectors (right, up, back) in world coordinates. `back` is opposite to the viewing direction."""
         right, up, back = axes(self.heading_deg, self.pitch_deg)
         cosine, sine = math.cos(math.radians(self.roll_deg)), math.sin(math.radians(self.roll_deg))
-        return (
-            _add(_scale(right, cosine), _scale(up, -sine)),
-            _add(_scale(up, cosine), _scale(right, sine)),
-            back,
-        )
+        rolled = _add(_scale(right, cosine), _scale(up, -sine)), _add(_scale(up, cosine), _scale(right, sine))
+        return (*rolled, back)
 
     def moved(self, offset_mm: Point, turn_deg: Point) -> Camera:
         """Returns the camera at another position, with another orientation and the same lens.
 
-        Args:
-            offset_mm: the move to the right, up and back.
-            turn_deg: what is added to heading, pitch and roll.
-
-        Raises:
-            ValidationError: the pitch is above 80 degrees.
+        `offset_mm` is the move to the right, up and back, `turn_deg` what is added to heading, pitch and roll. Raises
+        ValidationError if the pitch is then above 80 degrees.
         """
-        moves = (_scale(axis, distance) for axis, distance in zip(self.axes, offset_mm, strict=True))
-        heading, pitch, roll = turn_deg
-        values = {
-            "position_mm": _add(self.position_mm, *moves),
-            "heading_deg": self.heading_deg + heading,
-            "pitch_deg": self.pitch_deg + pitch,
-            "roll_deg": self.roll_deg + roll,
-        }
-        return Camera.model_validate(dict(self) | values)
+        moves = map(_scale, self.axes, offset_mm)
+        values = {"position_mm": _add(self.position_mm, *moves)}
+        angles = zip(("heading_deg", "pitch_deg", "roll_deg"), turn_deg, strict=True)
+        turned = {name: getattr(self, name) + turn for name, turn in angles}
+        return Camera.model_validate(dict(self) | values | turned)
 
     @property
     def half_width(self) -> float:
@@ -84,10 +73,7 @@ class Camera(FrozenModel):
 
 
 def axes(heading_deg: float, pitch_deg: float) -> Axes:
-    """Returns the axes of an object with a heading (0 is -z, 90 is +x) and a pitch above the horizon.
-
-    Returns: unit vectors (right, up, back) in world coordinates. `back` is opposite to the viewing direction.
-    """
+    """Returns the axes of an object with a heading (0 is -z, 90 is +x) and a pitch above the horizon, like `Camera.axes`."""
     heading, pitch = math.radians(heading_deg), math.radians(pitch_deg)
     forward = (math.sin(heading) * math.cos(pitch), math.sin(pitch), -math.cos(heading) * math.cos(pitch))
     right = (math.cos(heading), 0.0, math.sin(heading))

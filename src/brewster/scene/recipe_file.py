@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import textwrap
 import tomllib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Any, Final, TypeVar
@@ -14,15 +14,7 @@ from pydantic import ValidationError
 from pydantic_core import ErrorDetails
 
 from brewster.errors import RecipeError, expected_value
-from brewster.scene.recipe_keys import (
-    REQUIRED,
-    RecipeKey,
-    allowed_keys,
-    describe,
-    literal_values,
-    recipe_keys,
-    recipe_tables,
-)
+from brewster.scene.recipe_keys import REQUIRED, RecipeKey, choices, describe, recipe_tables
 from brewster.scene.values import FrozenModel
 
 Model = TypeVar("Model", bound=FrozenModel)
@@ -37,8 +29,6 @@ _MAX_VALUE_LENGTH: Final = 60
 
 def read_toml(model: type[Model], path: Path, *, reference: str) -> Model:
     """Reads and validates a TOML file. Error messages refer the user to `reference`.
-
-    Returns: the values as an instance of `model`.
 
     Raises:
         RecipeError: the file is missing or not TOML, or keys are missing, unknown or have impossible values.
@@ -63,21 +53,15 @@ def validated(model: type[Model], values: Mapping[str, Any], *, source: str, ref
     try:
         return model.model_validate(values)
     except ValidationError as error:
-        problems = {
-            str(problem): problem
-            for problem in (
-                _problem(model, values, details, (source, reference)) for details in error.errors()
-            )
-        }
-        first, *others = problems.values()
+        problems = [_problem(model, values, details, source, reference) for details in error.errors()]
+        first, *others = {str(problem): problem for problem in problems}.values()
         raise RecipeError(first.happened, first.expected, first.cure, tuple(others)) from error
 
 
 def _problem(
-    model: type[FrozenModel], values: Mapping[str, Any], details: ErrorDetails, names: tuple[str, str]
+    model: type[FrozenModel], values: Mapping[str, Any], details: ErrorDetails, source: str, reference: str
 ) -> RecipeError:
-    """Translates an error of pydantic into a RecipeError. `names` are the source of the values and the reference."""
-    source, reference = names
+    """Translates an error of pydantic into a RecipeError."""
     location, kind = details["loc"], details["type"]
     path, value = _look_up(values, location)
     cure = f"compare with {reference}"
@@ -94,11 +78,10 @@ def _problem(
     happened = f"{source}: {_dotted(path)} is {_shortened(value)}"
     if kind in {"value_error", "finite_number"}:
         return RecipeError(happened, expected_value(details), cure)
-    allowed = [name for name in literal_values(model, path) if isinstance(name, str)]
-    close = get_close_matches(str(value), allowed, n=1)
-    return RecipeError(
-        happened, f"expected {describe(model, path)}", f'did you mean "{close[0]}"?' if close else cure
-    )
+    known = [name for name in choices(model, path) if isinstance(name, str)]
+    if close := get_close_matches(str(value), known, n=1):
+        cure = f'did you mean "{close[0]}"?'
+    return RecipeError(happened, f"expected {describe(model, path)}", cure)
 
 
 def _look_up(
@@ -123,7 +106,7 @@ def _unknown_key(
     table = path[:-1]
     owner = f"[{_dotted(table)}]" if table else "the recipe"
     close = similar_key(model, path)
-    known = "" if close else f", one of {', '.join(allowed_keys(model, table))}"
+    known = "" if close else f", one of {', '.join(choices(model, table))}"
     return RecipeError(
         f"{source}: there is no key {_dotted(path)} (its value is {_shortened(value)})",
         f"expected a key of {owner}{known}",
@@ -137,11 +120,21 @@ def similar_key(model: type[FrozenModel], path: Sequence[str | int]) -> str | No
     The result is a key of the same table with a similar name, else a key of another table with the same name, else None.
     """
     *table, name = path
-    close = get_close_matches(str(name), allowed_keys(model, table), n=1)
+    close = get_close_matches(str(name), choices(model, table), n=1)
     if close:
         return _dotted([*table, close[0]])
-    paths = [key.path for key in recipe_keys(model)] + [table.path for table in recipe_tables(model)]
+    tables = list(recipe_tables(model))
+    paths = [key.path for table in tables for key in table.keys] + [table.path for table in tables]
     return next((known for known in paths if known.rpartition(".")[2] == name), None)
+
+
+def flatten(table: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, object]]:
+    """Yields the dotted path and the value of every value in nested tables."""
+    for name, value in table.items():
+        if isinstance(value, Mapping):
+            yield from flatten(value, f"{prefix}{name}.")
+        else:
+            yield prefix + name, value
 
 
 def _dotted(path: Sequence[str | int]) -> str:
@@ -204,10 +197,10 @@ def _toml(value: object) -> str:
         case bool():
             return str(value).lower()
         case Mapping():
-            names = [
-                name if re.fullmatch(r"[A-Za-z0-9_-]+", name) else _toml(name) for name in map(str, value)
+            is_bare = re.compile(r"[A-Za-z0-9_-]+").fullmatch
+            pairs = [
+                f"{name if is_bare(name) else _toml(name)} = {_toml(inner)}" for name, inner in value.items()
             ]
-            pairs = [f"{name} = {_toml(inner)}" for name, inner in zip(names, value.values(), strict=True)]
             return f"{{ {', '.join(pairs)} }}" if pairs else "{}"
         case list() | tuple():
             return f"[{', '.join(map(_toml, value))}]"

@@ -17,7 +17,7 @@ REQUIRED: Final = object()
 """The default of a key that must be set."""
 
 Schema = Mapping[str, Any]
-"""A JSON schema. Those of tables have "properties". `KeyNote` adds the entry "notes"."""
+"""A JSON schema. Those of tables have "properties". `KeyNote` adds the entry "note"."""
 
 _UNITS: Final = {"mm": "mm", "deg": "degrees", "px": "px", "per_m": "1/m", "px_per_texel": "px per texel"}
 _SUFFIX: Final = re.compile(rf"(?:^|_)({'|'.join(sorted(_UNITS, key=len, reverse=True))})$")
@@ -55,13 +55,7 @@ class RecipeTable(NamedTuple):
 
 def recipe_tables(model: type[FrozenModel]) -> Iterator[RecipeTable]:
     """Yields the recipe itself and all its tables, including optional ones."""
-    yield from _tables(_schema(model), "", "")
-
-
-def recipe_keys(model: type[FrozenModel]) -> Iterator[RecipeKey]:
-    """Yields all keys of a recipe, table by table, without the tables themselves."""
-    for table in recipe_tables(model):
-        yield from table.keys
+    return _tables(_schema(model), "", "")
 
 
 def describe(model: type[FrozenModel], path: Sequence[str | int]) -> str:
@@ -70,15 +64,10 @@ def describe(model: type[FrozenModel], path: Sequence[str | int]) -> str:
     return f"{'an' if kind[:1] in 'aeiou' else 'a'} {kind}{', ' if allowed else ''}{allowed}"
 
 
-def literal_values(model: type[FrozenModel], path: Sequence[str | int]) -> tuple[Any, ...]:
-    """Returns the allowed values at a path if they are listed, else an empty tuple."""
-    return tuple(_choices(_schema_at(model, path)))
-
-
-def allowed_keys(model: type[FrozenModel], path: Sequence[str | int]) -> list[str]:
-    """Returns the allowed keys of the table at a path; an empty list if any key is allowed."""
+def choices(model: type[FrozenModel], path: Sequence[str | int]) -> list[Any]:
+    """Returns the allowed keys of a table, or the allowed values of a key. The list is empty if they are not listed."""
     schema = _schema_at(model, path)
-    return list(schema.get("properties", ())) or _choices(schema.get("propertyNames", {}))
+    return list(schema.get("properties", ())) or _choices(schema.get("propertyNames", schema))
 
 
 def _tables(schema: Schema, path: str, meaning: str) -> Iterator[RecipeTable]:
@@ -88,21 +77,12 @@ def _tables(schema: Schema, path: str, meaning: str) -> Iterator[RecipeTable]:
             tables.append((field, prefix + name, field.get("meaning", "")))
             continue
         suffix = _SUFFIX.search(name)
-        units = [note["unit"] for note in field.get("notes", ()) if note["unit"]]
+        unit = field.get("note", {}).get("unit") or (_UNITS[suffix[1]] if suffix else "")
         default = REQUIRED if name in schema.get("required", ()) else field.get("default")
-        unit = units[0] if units else _UNITS[suffix[1]] if suffix else ""
-        keys.append(
-            RecipeKey(
-                prefix + name,
-                *_in_words(field),
-                unit,
-                default,
-                " ".join(field.get("description", "").split()),
-            )
-        )
-    yield RecipeTable(
-        path, schema["title"], tuple(keys), " ".join((meaning or schema.get("description", "")).split())
-    )
+        text = " ".join(field.get("description", "").split())
+        keys.append(RecipeKey(prefix + name, *_in_words(field), unit, default, text))
+    text = " ".join((meaning or schema.get("description", "")).split())
+    yield RecipeTable(path, schema["title"], tuple(keys), text)
     for table in tables:
         yield from _tables(*table)
 
@@ -112,34 +92,29 @@ def _tables(schema: Schema, path: str, meaning: str) -> Iterator[RecipeTable]:
 
 def _in_words(schema: Schema) -> tuple[str, str]:
     """Returns the type and the allowed values in words."""
-    notes = schema.get("notes", ())
-    kind, parts = _kind(schema)
-    kind = next((note["kind"] for note in notes if note["kind"]), kind)
-    if any(note["replaces_constraints"] for note in notes):
-        parts = []
-    return kind, ", ".join(part for part in [*parts, *(note["allowed"] for note in notes)] if part)
+    note, (kind, parts) = schema.get("note", {}), _kind(schema)
+    parts = [] if note.get("replaces_constraints") else parts
+    return note.get("kind") or kind, ", ".join(filter(None, [*parts, note.get("allowed")]))
 
 
 def _kind(schema: Schema) -> tuple[str, list[str]]:
     """Returns the type in words, and the parts of the description of the allowed values."""
     kind, allowed = str(schema.get("type", "table")).replace("object", "table"), ""
-    if choices := _choices(schema):
-        kind = "string" if isinstance(choices[0], str) else "integer"
-        allowed = f"one of {', '.join(json.dumps(value) for value in choices)}"
+    if values := _choices(schema):
+        kind = "string" if isinstance(values[0], str) else "integer"
+        allowed = f"one of {', '.join(map(json.dumps, values))}"
     elif "anyOf" in schema:
         kind = " or ".join(_in_words(member)[0] for member in schema["anyOf"])
     elif isinstance(value := schema.get("additionalProperties"), Mapping):
-        kinds, limits = zip(
-            *map(_in_words, (schema.get("propertyNames", {"type": "string"}), value)), strict=True
-        )
-        kind, allowed = f"table of {' -> '.join(kinds)}", _limits_of_parts(*limits)
+        kind, allowed = _join(" -> ", schema.get("propertyNames", {"type": "string"}), value)
+        kind = f"table of {kind}"
     elif "prefixItems" in schema:
-        kinds, limits = zip(*map(_in_words, schema["prefixItems"]), strict=True)
-        return f"list [{', '.join(kinds)}]", [_limits_of_parts(*limits)]
+        kind, allowed = _join(", ", *schema["prefixItems"])
+        return f"list [{kind}]", [allowed]
     elif "items" in schema:
-        item, limit = _in_words(schema["items"])
+        item, allowed = _join("", schema["items"])
         plural = item.replace("list", "lists", 1) if item.startswith("list") else f"{item}s"
-        kind, allowed = f"list of {plural}", _limits_of_parts(limit)
+        kind = f"list of {plural}"
     elif schema.get("format") == "path":
         kind = "path"
     return kind, [allowed, *_limits(schema)]
@@ -159,11 +134,13 @@ def _limits(schema: Schema) -> Iterator[str]:
         yield f"at least {count} {'entry' if count == 1 else 'entries'}"
 
 
-def _limits_of_parts(*allowed: str) -> str:
-    """Returns the allowed values of the parts of a list or a table in words, only once if all parts have the same."""
+def _join(separator: str, *parts: Schema) -> tuple[str, str]:
+    """Returns the types of the parts of a list or table, and their allowed values, only once if all parts have the same."""
+    kinds, allowed = zip(*map(_in_words, parts), strict=True)
+    limits = "; ".join(allowed)
     if len(set(allowed)) == 1:
-        return f"each {allowed[0].removeprefix('each ')}" if allowed[0] else ""
-    return "; ".join(allowed)
+        limits = f"each {allowed[0].removeprefix('each ')}" if allowed[0] else ""
+    return separator.join(kinds), limits
 
 
 # --- schemas
@@ -181,9 +158,7 @@ def _schema(model: type[FrozenModel]) -> Schema:
             return schema
         members = [member for member in schema.get("anyOf", ()) if member != {"type": "null"}]
         if len(members) == 1:
-            schema = members[0] | {
-                name: part for name, part in schema.items() if name not in ("anyOf", "title")
-            }
+            schema = members[0] | {name: schema[name] for name in schema.keys() - {"anyOf", "title"}}
         if "$ref" in schema:
             table = root["$defs"][schema["$ref"].rpartition("/")[2]]
             schema = table | {"meaning": schema.get("description", "")}

@@ -56,11 +56,7 @@ def draw(recipe: SceneRecipe, catalog: Catalog, seed: int, index: int) -> Scene:
 
 
 def draw_frames(recipe: SceneRecipe, catalog: Catalog, seed: int, index: int) -> list[Scene]:
-    """Draws the scenes of all frames of the burst with this index: one scene if the recipe has no table [burst].
-
-    Raises:
-        RecipeError: as `draw`.
-    """
+    """Draws the scenes of all frames of the burst with this index, as `draw`: one scene without a table [burst]."""
     key = f"{recipe.name}/{seed}/{index}"
     rng = _SceneRng(key)
     motion = _draw_motion(recipe.burst, _SceneRng(f"{key}/burst")) if recipe.burst else None
@@ -107,6 +103,16 @@ class _PartialScene:
     glass: Glazing
     camera: Camera
 
+    @property
+    def camera_distance_mm(self) -> float:
+        """The distance of the camera from the first surface. All glazings that are drawn are at the origin."""
+        return self.to_glass(self.camera.position_mm)[2]
+
+    def to_glass(self, vector: Point) -> Point:
+        """Returns a vector of the world in the axes of the glass."""
+        right, up, back = axes(self.glass.heading_deg, self.glass.pitch_deg)
+        return dot(vector, right), dot(vector, up), dot(vector, back)
+
 
 def _draw_once(recipe: SceneRecipe, catalog: Catalog, rng: _SceneRng, seed: int, index: int) -> Scene:
     if recipe.setups:
@@ -118,7 +124,7 @@ def _draw_once(recipe: SceneRecipe, catalog: Catalog, rng: _SceneRng, seed: int,
     camera = _draw_camera(recipe, [(recipe.behind, behind_map), (recipe.front, front_map)], rng)
     partial = _PartialScene(rng, catalog, glass, camera)
     behind = _draw_side(recipe.behind, behind_map, partial, glass.depth_mm)
-    front = _draw_side(recipe.front, front_map, partial, _camera_in_glass_frame(camera, glass)[2])
+    front = _draw_side(recipe.front, front_map, partial, partial.camera_distance_mm)
     return Scene(
         recipe=recipe.name,
         seed=seed,
@@ -136,7 +142,8 @@ def _draw_once(recipe: SceneRecipe, catalog: Catalog, rng: _SceneRng, seed: int,
 
 def _draw_glazing(recipe: GlassRecipe, rng: _SceneRng) -> Glazing:
     count = 2 if rng.bernoulli(recipe.double_probability) else 1
-    structural = rng.bernoulli(recipe.structural_probability)
+    is_structural = rng.bernoulli(recipe.structural_probability)
+    thickness_mm = recipe.structural_thickness_mm if is_structural else recipe.thickness_mm
     tint, strength = rng.choice(recipe.absorption_per_m), rng.from_log_range(recipe.tint_strength)
     rough = rng.from_log_range(recipe.roughness) if rng.bernoulli(recipe.rough_probability) else 0.0
     wedged = rng.bernoulli(recipe.wedge_probability)
@@ -145,9 +152,7 @@ def _draw_glazing(recipe: GlassRecipe, rng: _SceneRng) -> Glazing:
 
     def pane() -> Pane:
         return Pane(
-            thickness_mm=rng.from_log_range(
-                recipe.structural_thickness_mm if structural else recipe.thickness_mm
-            ),
+            thickness_mm=rng.from_log_range(thickness_mm),
             refractive_index=refractive_index,
             absorption_per_m=(red, green, blue),
             roughness=rough,
@@ -163,12 +168,12 @@ def _draw_glazing(recipe: GlassRecipe, rng: _SceneRng) -> Glazing:
 
 def _choose_map(recipe: SideRecipe, camera: CameraRecipe, catalog: Catalog, rng: _SceneRng) -> Asset | None:
     """Draws a map that is sharp enough for the widest view; None for a side without one, or if pictures replace it."""
-    candidates = [
+    sufficient = [
         asset
         for asset in catalog.maps
-        if not recipe.map_categories or asset.category in ("", *recipe.map_categories)
+        if (not recipe.map_categories or asset.category in ("", *recipe.map_categories))
+        and _min_fov_deg(asset, recipe, camera) <= camera.fov_deg[1]
     ]
-    sufficient = [asset for asset in candidates if _min_fov_deg(asset, recipe, camera) <= camera.fov_deg[1]]
     if not rng.bernoulli(recipe.map_probability) or (not sufficient and recipe.plane_probability > 0):
         return None
     if not sufficient:
@@ -189,9 +194,8 @@ def _min_fov_deg(asset: Asset, recipe: SideRecipe, camera: CameraRecipe) -> floa
 def _draw_camera(recipe: SceneRecipe, maps: list[tuple[SideRecipe, Asset | None]], rng: _SceneRng) -> Camera:
     """Draws a camera whose axis meets the glass near its centre. Its focus is set in `_focus_camera`."""
     ranges = recipe.camera
-    min_fov_deg = max(
-        [ranges.fov_deg[0], *(_min_fov_deg(asset, side, ranges) for side, asset in maps if asset)]
-    )
+    sharp_fovs_deg = (_min_fov_deg(asset, side, ranges) for side, asset in maps if asset)
+    min_fov_deg = max([ranges.fov_deg[0], *sharp_fovs_deg])
     heading, pitch = rng.from_range(ranges.incidence_deg), rng.from_range(ranges.pitch_deg)
     _, _, back = axes(heading, pitch)
     distance_mm = rng.from_log_range(ranges.distance_mm) / max(back[2], 0.1)
@@ -233,7 +237,7 @@ def _draw_plane(recipe: SideRecipe, partial: _PartialScene, luminance: float, di
             "choose a folder with --photos",
         )
     rng, asset = partial.rng, partial.rng.choice(partial.catalog.pictures)
-    (left, right), (bottom, top) = _visible_extent(partial.camera, partial.glass, distance_mm)
+    (left, right), (bottom, top) = _visible_extent(partial, distance_mm)
     cover = max(right - left, (top - bottom) * asset.width / asset.height)
     return Plane(
         source=asset.source,
@@ -247,27 +251,17 @@ def _draw_plane(recipe: SideRecipe, partial: _PartialScene, luminance: float, di
     )
 
 
-def _camera_in_glass_frame(camera: Camera, glass: Glazing) -> Point:
-    (x, y, z), (glass_x, glass_y, glass_z) = camera.position_mm, glass.position_mm
-    return _to_glass_frame((x - glass_x, y - glass_y, z - glass_z), glass)
-
-
-def _to_glass_frame(vector: Point, glass: Glazing) -> Point:
-    right, up, back = axes(glass.heading_deg, glass.pitch_deg)
-    return dot(vector, right), dot(vector, up), dot(vector, back)
-
-
 def _visible_extent(
-    camera: Camera, glass: Glazing, distance_mm: float
+    partial: _PartialScene, distance_mm: float
 ) -> tuple[tuple[float, float], tuple[float, float]]:
     """Returns the ranges of x and y in mm that the view covers on a plane at this distance behind the glass.
 
     A mirrored plane at the same distance in front of the glass covers the same ranges.
     """
-    x, y, z = _camera_in_glass_frame(camera, glass)
+    x, y, z = partial.to_glass(partial.camera.position_mm)
     points = []
-    for corner in camera.corners():
-        x_rate, y_rate, z_rate = _to_glass_frame(corner, glass)
+    for corner in partial.camera.corners():
+        x_rate, y_rate, z_rate = partial.to_glass(corner)
         length = (z + distance_mm) / max(-z_rate, 1e-3)
         points.append((x + length * x_rate, y + length * y_rate))
     xs, ys = zip(*points, strict=True)
@@ -280,8 +274,8 @@ def _focus_camera(recipe: CameraRecipe, partial: _PartialScene, behind: Side, fr
     focused_side = front if rng.bernoulli(recipe.focus_on_front_probability) else behind
     is_pinhole = rng.bernoulli(recipe.pinhole_probability)
     aperture = rng.from_log_range(recipe.aperture_mm)
-    distance_mm = _camera_in_glass_frame(camera, partial.glass)[2] + focused_side.distance_mm
-    cosine = _to_glass_frame(camera.axes[2], partial.glass)[2]
+    distance_mm = partial.camera_distance_mm + focused_side.distance_mm
+    cosine = partial.to_glass(camera.axes[2])[2]
     return camera.model_copy(
         update={
             "focus_mm": _six_digits(min(distance_mm / max(cosine, 0.1), _MAX_FOCUS_MM)),
@@ -305,20 +299,15 @@ def _draw_camera_response(recipe: CameraResponseRecipe, rng: _SceneRng) -> Camer
 # --- bursts
 
 
-@dataclass(frozen=True)
-class _CameraMove:
-    """A frame relative to the reference frame: mm to the right, up and back; what is added to heading, pitch and roll; exposure."""
-
-    offset_mm: Point = (0.0, 0.0, 0.0)
-    turn_deg: Point = (0.0, 0.0, 0.0)
-    exposure_ev: float = 0.0
+_CameraMove = tuple[Point, Point, float]
+"""A frame relative to the reference frame: mm to the right, up and back; what is added to heading, pitch and roll; exposure."""
 
 
 @dataclass(frozen=True)
 class _BurstMotion:
     """What a burst adds to a scene. It does not depend on the scene, so a scene that is drawn again keeps it."""
 
-    moves: tuple[_CameraMove, ...]
+    moves: list[_CameraMove]
     at_equal_distance: bool
     without_glass: bool
 
@@ -330,16 +319,15 @@ def _draw_motion(recipe: BurstRecipe, rng: _SceneRng) -> _BurstMotion:
     baseline_mm = 0.0 if is_still else rng.from_range(recipe.baseline_mm) * rng.choice((-1, 1))
     direction = math.radians(rng.from_range(recipe.direction_deg))
     reference = recipe.frames // 2
-    moves = []
+    moves: list[_CameraMove] = []
     for frame in range(recipe.frames):
         along_mm = baseline_mm * (frame - reference) / (recipe.frames - 1)
         line = along_mm * math.cos(direction), along_mm * math.sin(direction), 0.0
         x, y, z = (_six_digits(place + rng.gauss(0, recipe.tremble_mm)) for place in line)
         heading, pitch, roll = (_six_digits(rng.gauss(0, recipe.tremble_deg)) for _ in range(3))
-        exposure_ev = rng.gauss(0, recipe.exposure_jitter_ev)
-        moves.append(_CameraMove((x, y, z), (heading, pitch, roll), exposure_ev))
-    moves[reference] = _CameraMove()
-    return _BurstMotion(tuple(moves), is_at_equal_distance, without_glass)
+        moves.append(((x, y, z), (heading, pitch, roll), rng.gauss(0, recipe.exposure_jitter_ev)))
+    moves[reference] = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 0.0
+    return _BurstMotion(moves, is_at_equal_distance, without_glass)
 
 
 def _frames(scene: Scene, motion: _BurstMotion, catalog: Catalog) -> list[Scene]:
@@ -348,21 +336,15 @@ def _frames(scene: Scene, motion: _BurstMotion, catalog: Catalog) -> list[Scene]
     if motion.at_equal_distance:
         behind, front = at_equal_distance(behind, front)
     glass = scene.glass.without_effect() if motion.without_glass else scene.glass
-    values = dict(scene) | {"behind": behind, "front": front, "glass": glass}
-    target = scene.camera_response.target_luminance
-    return [
-        Scene(
-            **values
-            | {
-                "camera": scene.camera.moved(move.offset_mm, move.turn_deg),
-                "camera_response": scene.camera_response.model_copy(
-                    update={"target_luminance": min(1.0, _six_digits(target * 2**move.exposure_ev))}
-                ),
-                "burst": BurstFrame(frame=frame, frames=len(motion.moves)),
-            }
-        )
-        for frame, move in enumerate(motion.moves)
-    ]
+    values, response, frames = dict(scene), scene.camera_response, []
+    values |= {"behind": behind, "front": front, "glass": glass}
+    for number, (offset_mm, turn_deg, exposure_ev) in enumerate(motion.moves):
+        target = min(1.0, _six_digits(response.target_luminance * 2**exposure_ev))
+        values["camera"] = scene.camera.moved(offset_mm, turn_deg)
+        values["camera_response"] = response.model_copy(update={"target_luminance": target})
+        values["burst"] = BurstFrame(frame=number, frames=len(motion.moves))
+        frames.append(Scene(**values))
+    return frames
 
 
 def _with_height(side: Side, catalog: Catalog) -> Side:

@@ -105,7 +105,21 @@ class Scene(FrozenModel):
             raise ValueError(
                 f"expected a focus_mm in front of the glass or behind it, but the focus is {focus_depth_mm:g} mm inside the glass"
             )
-        self._check_distances()
+        return self
+
+    @model_validator(mode="after")
+    def _check_distances(self) -> Scene:
+        """Checks that glass and camera are inside every dome, and that no plane touches the glass."""
+        camera_distance_mm = math.dist(self.camera.position_mm, self.glass.position_mm)
+        for side, surface_mm in ((self.behind, self.glass.depth_mm), (self.front, 0.0)):
+            if side.map and side.map.radius_mm <= max(camera_distance_mm, self.glass.depth_mm):
+                raise ValueError(
+                    f"expected the camera and the glass inside the dome, but its radius_mm is {side.map.radius_mm:g}: increase this radius"
+                )
+            if side.plane and side.plane.nearest_mm <= surface_mm:
+                raise ValueError(
+                    f"expected a plane that does not touch the glass, but its distance_mm is {side.plane.distance_mm:g}: increase this distance"
+                )
         return self
 
     @property
@@ -121,19 +135,6 @@ class Scene(FrozenModel):
         seeds = self.seed, self.index
         return seeds if self.burst is None or self.burst.is_reference else (*seeds, self.burst.frame + 1)
 
-    def _check_distances(self) -> None:
-        """Checks that glass and camera are inside every dome, and that no plane touches the glass."""
-        camera_distance_mm = math.dist(self.camera.position_mm, self.glass.position_mm)
-        for side, surface_mm in ((self.behind, self.glass.depth_mm), (self.front, 0.0)):
-            if side.map and side.map.radius_mm <= max(camera_distance_mm, self.glass.depth_mm):
-                raise ValueError(
-                    f"expected the camera and the glass inside the dome, but its radius_mm is {side.map.radius_mm:g}: increase this radius"
-                )
-            if side.plane and side.plane.nearest_mm <= surface_mm:
-                raise ValueError(
-                    f"expected a plane that does not touch the glass, but its distance_mm is {side.plane.distance_mm:g}: increase this distance"
-                )
-
     def to_toml(self, **extra_tables: dict[str, Any]) -> str:
         """Returns the scene as TOML, followed by extra tables. `read_scene` returns an equal scene if it reads this text."""
         import tomli_w  # noqa: PLC0415  (not needed to read a scene)
@@ -147,13 +148,11 @@ def read_scene(path: Path) -> Scene:
     Raises:
         RecipeError: the file is missing or not TOML, or its values are unknown or not possible.
     """
-    return read_toml(_SceneFile, path, reference="brewster render --help").scene()
+    found = read_toml(_SceneFile, path, reference="brewster render --help")
+    return Scene.model_validate(found.model_dump(exclude={"outcome"}))
 
 
 class _SceneFile(Scene):
     """A scene and the outcome of its rendering."""
 
     outcome: dict[str, Any] = Field(default_factory=dict)
-
-    def scene(self) -> Scene:
-        return Scene.model_validate(self.model_dump(exclude={"outcome"}))

@@ -35,8 +35,7 @@ class KeyNote:
         self, core_schema: CoreSchema, handler: GetJsonSchemaHandler
     ) -> dict[str, Any]:
         """Adds this note to the JSON schema of the key, where `recipe_keys` reads it."""
-        schema = handler(core_schema)
-        return {**schema, "notes": [*schema.get("notes", ()), asdict(self)]}
+        return handler(core_schema) | {"note": asdict(self)}
 
 
 def _ascending(bounds: tuple[float, float]) -> tuple[float, float]:

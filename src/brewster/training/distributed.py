@@ -34,12 +34,8 @@ _Value = TypeVar("_Value")
 
 
 def initialize() -> None:
-    """Joins the process group if a launcher (torchrun, accelerate launch) started several processes.
-
-    Raises:
-        DeviceError: the environment is incomplete, or fewer processes joined than WORLD_SIZE.
-        MissingExtra: there are several processes, and accelerate is not installed.
-    """
+    """Joins the process group if a launcher (torchrun, accelerate launch) started several processes. Raises DeviceError if
+    the environment is incomplete, or fewer processes joined than WORLD_SIZE."""
     _check_launch_variables()
     try:
         state = _partial_state()

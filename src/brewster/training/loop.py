@@ -12,7 +12,7 @@ import io
 import json
 import pickle
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from contextlib import closing
 from dataclasses import dataclass
 from functools import cached_property
@@ -26,6 +26,7 @@ from torch import Tensor
 from brewster.errors import ModelError, RecipeError
 from brewster.files import write_atomically
 from brewster.photo import Photo
+from brewster.scene.recipe_file import flatten
 from brewster.srgb import to_linear
 from brewster.training.distributed import is_main_process
 from brewster.training.plots import plot_log
@@ -69,16 +70,14 @@ class Checkpoint:
     seconds: float = 0.0
 
     def write(self, path: Path) -> None:
-        """Writes or replaces the file atomically: a killed process leaves either the old or the new checkpoint. Raises
-        OutputError if the file cannot be written."""
+        """Writes or replaces the file atomically: a killed process leaves either the old or the new checkpoint."""
         stream = io.BytesIO()
         torch.save({"step": self.step, "recipe": self.recipe, "seconds": self.seconds, **self.state}, stream)
         write_atomically(path, stream.getvalue(), overwrite=True)
 
     @classmethod
     def read(cls, path: Path) -> Checkpoint:
-        """Reads a checkpoint without running code from it (`weights_only`). Raises ModelError if the file is missing, damaged,
-        or not a checkpoint of brewster."""
+        """Reads a checkpoint without running code from it (`weights_only`). Raises ModelError if the file cannot be read."""
         try:
             state = dict(torch.load(path, map_location="cpu", weights_only=True))
             # Checkpoints of brewster 0.1.0 have no seconds.
@@ -117,9 +116,7 @@ class TensorBoardLog:
 
     @cached_property
     def _writer(self) -> SummaryWriter | None:
-        """The writer of the event file, or None without tensorboard. The file is created at the first event, so that a completed
-        run that is resumed gets no empty file.
-        """
+        """The writer, or None without tensorboard. It creates its file, so a completed run that is resumed must not open it."""
         if not importlib.util.find_spec("tensorboard"):
             return None
         from torch.utils.tensorboard import SummaryWriter  # noqa: PLC0415  (imports tensorboard)
@@ -133,31 +130,24 @@ class Trainer(Protocol):
     @property
     def recipe(self) -> TrainingRecipe:
         """The recipe of the run."""
-        ...
 
     def initialize(self) -> None:
         """Loads the initial state that the recipe selects. Called when a new run starts, not when a run is resumed."""
-        ...
 
     def training_step(self, step: int) -> dict[str, float]:
         """Trains on the batch of `step` (from 0). Returns `loss` and its terms, `loss_NAME`."""
-        ...
 
     def state_dict(self) -> dict[str, Any]:
         """Returns everything that the next step depends on, as tensors, numbers and strings by name."""
-        ...
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Restores a state that `state_dict` returned."""
-        ...
 
     def validate(self) -> tuple[dict[str, float], Tensor]:
         """Returns the validation metrics by name, and an image of sample predictions: (H, W, 3), sRGB-encoded, in 0..1."""
-        ...
 
     def export(self, folder: Path) -> Path:
         """Writes the model for inference into `folder`. Returns the path of the model."""
-        ...
 
 
 def run(
@@ -199,11 +189,9 @@ def run(
             scores, image = trainer.validate() if reports else ({}, None)
             if logged and image is not None:
                 metrics |= scores | {"seconds": time.monotonic() - started}
-                line = json.dumps(
-                    {name: round(value, 5) for name, value in {"step": step, **metrics}.items()}
-                )
+                line = {name: round(value, 5) for name, value in {"step": step, **metrics}.items()}
                 with log.open("a") as stream:
-                    stream.write(f"{line}\n")
+                    stream.write(f"{json.dumps(line)}\n")
                 linear = to_linear(image.clamp(0, 1)).numpy()
                 Photo.from_array(linear, encoding="linear").save(out / SAMPLES_FILE, depth=8, overwrite=True)
                 write_atomically(out / CURVES_FILE, plot_log(read_log(out)), overwrite=True)
@@ -222,11 +210,7 @@ def read_log(folder: Path) -> list[dict[str, float]]:
 
 
 def _resume_or_initialize(trainer: Trainer, path: Path) -> tuple[int, float]:
-    """Restores the checkpoint at `path`, or initializes the trainer if there is none.
-
-    Returns:
-        The number of completed steps, and the seconds that they took.
-    """
+    """Restores the checkpoint at `path`, or initializes the trainer. Returns the completed steps, and their seconds."""
     if not path.exists():
         trainer.initialize()
         return 0, 0.0
@@ -269,13 +253,4 @@ def _compared_values(text: str, recipe: TrainingRecipe) -> dict[str, object]:
         stored = type(recipe).model_validate_json(text)
     except ValidationError:
         return {}
-    return dict(_flatten(stored.model_dump(mode="json", exclude=set(_NOT_COMPARED))))
-
-
-def _flatten(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, object]]:
-    """Yields the path and the value of every key in nested tables."""
-    for name, value in values.items():
-        if isinstance(value, Mapping):
-            yield from _flatten(value, f"{prefix}{name}.")
-        else:
-            yield prefix + name, value
+    return dict(flatten(stored.model_dump(mode="json", exclude=set(_NOT_COMPARED))))

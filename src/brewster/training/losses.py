@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Final
 
 import torch
@@ -74,6 +74,11 @@ def separation_loss(
     }
 
 
+def total(parts: Mapping[str, Tensor]) -> Tensor:
+    """Returns the loss: the sum of its parts."""
+    return torch.stack(list(parts.values())).sum()
+
+
 def _multiscale_error(error: Tensor) -> Float[Tensor, " n"]:
     return sum(  # type: ignore[return-value]
         functional.avg_pool2d(error, scale).abs().mean(dim=(1, 2, 3)) for scale in _SCALES
@@ -81,10 +86,7 @@ def _multiscale_error(error: Tensor) -> Float[Tensor, " n"]:
 
 
 def psnr_gain_db(prediction: Tensor, photo: Tensor, ground_truth: Tensor) -> float:
-    """Returns the PSNR of the prediction minus the PSNR of the photo, in dB.
-
-    All images have the same shape. They are sRGB-encoded, in 0..1.
-    """
+    """Returns the PSNR of the prediction minus the PSNR of the photo, in dB. All are sRGB-encoded images of one shape."""
     errors = [functional.mse_loss(image, ground_truth).item() for image in (photo, prediction)]
     before, after = (max(error, _QUANTIZATION_MSE) for error in errors)
     return 10 * math.log10(before / after)
@@ -108,8 +110,7 @@ def exposure_ratio(prediction: Tensor, photo: Tensor, ground_truth: Tensor) -> f
 
 
 def check_finite(value: Tensor, step: int, name: str = "loss") -> Tensor:
-    """Returns `value`, a scalar, if it is finite. Raises ModelError if the value is NaN or infinite. The last checkpoint is
-    still valid."""
+    """Returns `value`, a scalar, if it is finite, else raises ModelError. The last checkpoint is still valid."""
     if value.isfinite():
         return value
     raise ModelError(

@@ -28,13 +28,9 @@ _DPI: Final = 128  # a power of two: sides in inches, and therefore in pixels, a
 
 
 def plot_log(lines: Sequence[Mapping[str, float]]) -> bytes:
-    """Plots the metrics of a run against the training step.
+    """Plots the metrics of a run against the training step. Returns the bytes of a PNG file.
 
-    Args:
-        lines: the lines of the log, at least one. Each has `step`; the first and the last may have different metrics.
-
-    Returns:
-        The plot as the bytes of a PNG file.
+    `lines` are the lines of the log, at least one. Each has `step`; the first and the last may have different metrics.
     """
     from matplotlib.figure import Figure  # noqa: PLC0415  (slow to import)
 
@@ -68,13 +64,8 @@ def sample_sheet(
 ) -> Float[Tensor, "sheet_h w 3"]:
     """Returns a sheet with a line of column titles, and for each row a line with its caption above its images.
 
-    Args:
-        columns: the titles of the images of a row. The images have equal widths.
-        rows: the caption of each row, and its images side by side in one array; at least one row. All arrays have the same
-            size. Values are sRGB-encoded, in 0..1.
-
-    Returns:
-        The sheet, (H, w, 3), sRGB-encoded, with H = CAPTION_PX + len(rows) (CAPTION_PX + h).
+    A row is its caption, and its images, which have equal widths, side by side in one array. All arrays have the same size.
+    Values are sRGB-encoded, in 0..1. The height of the sheet is CAPTION_PX + len(rows) (CAPTION_PX + h).
     """
     from matplotlib.figure import Figure  # noqa: PLC0415  (slow to import)
 

@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 import os
 import tomllib
-from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal, Self, TypeVar
@@ -276,8 +275,7 @@ AnyRecipe = TypeVar("AnyRecipe", bound=TrainingRecipe)
 
 
 def _sample_count(batch_size: int, name: str, share: float) -> int:
-    """Returns the number of samples of a source in a batch: round(batch_size * share). Raises ValueError if a share between 0
-    and 1 gives no sample or all samples."""
+    """Returns the number of samples of a source in a batch. A share between 0 and 1 must give some, and not all, of them."""
     count = round(batch_size * share)
     if batch_size and 0 < share < 1 and count in (0, batch_size):
         raise ValueError(
@@ -288,7 +286,7 @@ def _sample_count(batch_size: int, name: str, share: float) -> int:
 
 
 def read_recipe(path: Path) -> CompactRecipe | LoraRecipe:
-    """Reads and validates a recipe, and resolves the paths in it that are relative to the file.
+    """Reads a recipe, and resolves the paths in it that are relative to the file.
 
     Returns:
         A LoraRecipe if the file has the key `backbone`, else a CompactRecipe.
@@ -310,8 +308,7 @@ def read_recipe(path: Path) -> CompactRecipe | LoraRecipe:
 
 
 def read_template(name: str) -> CompactRecipe | LoraRecipe:
-    """Reads a packaged recipe (a name of TEMPLATES) or a recipe file. Relative paths are not resolved. Raises RecipeError if
-    the name is unknown, or the file is not a valid recipe (see `read_recipe`)."""
+    """Reads a packaged recipe (a name of TEMPLATES) or a recipe file, as `read_recipe`. Relative paths are not resolved."""
     if name in TEMPLATES:
         return _read_unresolved(_TEMPLATE_FOLDER / f"{name}.toml")
     if not name.endswith(".toml"):
@@ -337,34 +334,28 @@ def with_value(recipe: AnyRecipe, key_path: str, value: object) -> AnyRecipe:
     `key_path` is the key with its tables, such as "data.rendered.blend_space". Raises RecipeError if the recipe has no such key,
     or the value is not allowed for it.
     """
-    if key_path not in _key_paths(recipe):
-        suggestion = similar_key(type(recipe), key_path.split("."))
-        raise RecipeError(
-            f"the recipe has no key {key_path}",
-            "expected a key with its tables, such as data.pairs_share",
-            f"did you mean {suggestion}?" if suggestion else f"see {_REFERENCE}",
-        )
     values = table = recipe.model_dump(exclude_unset=True)
-    *tables, last = key_path.split(".")
-    for name in tables:
+    path = key_path.split(".")
+    owner: object = recipe
+    for name in path:
+        # The keys of an optional table exist only if it is set.
+        if name not in getattr(type(owner), "model_fields", ()):
+            suggestion = similar_key(type(recipe), path)
+            raise RecipeError(
+                f"the recipe has no key {key_path}",
+                "expected a key with its tables, such as data.pairs_share",
+                f"did you mean {suggestion}?" if suggestion else f"see {_REFERENCE}",
+            )
+        owner = getattr(owner, name)
+    for name in path[:-1]:
         table = table.setdefault(name, {})
-    table[last] = value
+    table[path[-1]] = value
     source = f"the recipe with {key_path} = {value!r}"
     return validated(type(recipe), values, source=source, reference=_REFERENCE)
 
 
-def _key_paths(values: FrozenModel, prefix: str = "") -> Iterator[str]:
-    """Yields the paths of all keys and tables of the recipe. The keys of an optional table are included only if it is set."""
-    for name in type(values).model_fields:
-        yield prefix + name
-        inner = getattr(values, name)
-        if isinstance(inner, FrozenModel):
-            yield from _key_paths(inner, f"{prefix}{name}.")
-
-
 def data_folder() -> Path:
-    """Returns the folder in the environment variable BREWSTER_DATA. Raises RecipeError if the variable is not set, or the
-    folder does not exist."""
+    """Returns the folder in the environment variable BREWSTER_DATA. Raises RecipeError if it is not set, or does not exist."""
     folder = os.environ.get("BREWSTER_DATA", "")
     if not Path(folder or "/nowhere").is_dir():
         raise RecipeError(

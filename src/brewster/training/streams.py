@@ -51,15 +51,7 @@ def open_stream(recipe: CompactRecipe, device: torch.device | str = "cpu") -> St
 
 
 def validation_pairs(data: DataRecipe) -> dict[str, list[tuple[Tensor, Tensor]]]:
-    """Reads the aligned (photo, transmission) pairs of `validate_on`, uint8 sRGB (H, W, 3).
-
-    Returns:
-        The pairs of each folder, by a short unique name of the folder.
-
-    Raises:
-        RecipeError: a folder is missing or empty, or pairs do not match.
-        PhotoError: an image cannot be read.
-    """
+    """Reads the pairs of `validate_on` as `read_pairs` does, by a short unique name of their folder."""
     folders = tuple(dict.fromkeys(data.validate_on))
     root = data_folder() if folders else Path()
     return {
@@ -72,14 +64,8 @@ def held_out_mixtures(recipe: CompactRecipe) -> Stream | None:
     """Opens mixtures of the recipe's held-out photos and maps, for validation.
 
     Their random numbers and distributions do not depend on the recipe: the seed is fixed, and all values are the defaults of
-    `MixRecipe`. The metrics of two runs with the same held-out files can therefore be compared.
-
-    Returns:
-        The stream, or None if the recipe has no `held_out` or no photos.
-
-    Raises:
-        RecipeError: no photo matches `held_out`.
-        PhotoError: a photo cannot be read.
+    `MixRecipe`. The metrics of two runs with the same held-out files can therefore be compared. Returns None if the recipe
+    has no `held_out` or no photos. Raises RecipeError if no photo matches `held_out`.
     """
     data = recipe.data
     if not (data.held_out and data.photos):
@@ -160,6 +146,5 @@ def _empty_stream(step: int, count: int, size: int) -> TrainingBatch:  # noqa: A
 
 
 def resolve_folders(folders: Sequence[Path]) -> list[Path]:
-    """Returns the folders of a recipe as paths. Relative folders are in the folder BREWSTER_DATA. Raises RecipeError if a path
-    is relative, and BREWSTER_DATA is unset or not a folder."""
+    """Returns the folders of a recipe as paths. Relative folders are in `data_folder`."""
     return [folder if folder.is_absolute() else data_folder() / folder for folder in folders]

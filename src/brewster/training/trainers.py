@@ -12,10 +12,6 @@ def open_trainer(recipe: CompactRecipe | LoraRecipe, device: str = "auto") -> Tr
     """Creates the trainer of a recipe, for `loop.run`. Joins the process group if there are several processes.
 
     `device` is "auto" or "cpu". A diffusion backbone is trained on a CPU only if "cpu" is chosen explicitly.
-
-    Raises:
-        RecipeError, PhotoError: data is missing or damaged, or the batch cannot be divided among the processes.
-        DownloadError, ModelError, DeviceError, MissingExtra: a backbone cannot be loaded.
     """
     distributed.initialize()
     if isinstance(recipe, LoraRecipe):

@@ -54,13 +54,7 @@ def trace(
 
     Mitsuba's colour variants average s- and p-polarised light at every surface, which is wrong for glass with several
     surfaces. `polarised` traces each colour with the polarised variant, at several times the cost. In Mitsuba, light is
-    unpolarised after a rough surface.
-
-    Args:
-        denoise: whether to filter the result with Intel Open Image Denoise.
-
-    Returns:
-        Linear light, float32 (3, H, W) each.
+    unpolarised after a rough surface. `denoise` filters the result with Intel Open Image Denoise.
 
     Raises:
         MissingExtra: mitsuba cannot be imported, or `denoise` is set and mitsuba-oidn is not installed.
@@ -105,17 +99,15 @@ def _render_layers(
         _converge(estimates, noise_threshold, max_samples)
         return estimates
 
-    lit_from_behind, lit_from_front = estimate((True, "full"), (False, "full"))
-    estimates = {"transmission": lit_from_behind, "reflection": lit_from_front}
+    transmission, reflection = lit_from_behind, lit_from_front = estimate((True, "full"), (False, "full"))
     if scene.orders == "truncated":
-        [estimates["transmission"]] = estimate((True, "truncated_transmission"))
-        [estimates["reflection"]] = estimate((False, "truncated_reflection"))
+        [transmission] = estimate((True, "truncated_transmission"))
+        [reflection] = estimate((False, "truncated_reflection"))
     [background] = estimate((True, "none"))
     [mirror] = estimate((False, "mirror"))
-    layers = {name: image.light for name, image in estimates.items()}
-    layers["photo"] = lit_from_behind.light + lit_from_front.light
-    layers |= {"background": background.light, "mirror": mirror.light}
-    return LinearSample(scene, **{name: _to_tensor(light, denoise) for name, light in layers.items()})
+    layers = [image.light for image in (transmission, background, reflection, mirror)]
+    layers.insert(0, lit_from_behind.light + lit_from_front.light)
+    return LinearSample(scene, *(_to_tensor(light, denoise) for light in layers))
 
 
 def _to_tensor(light: NDArray[np.float64], denoise: bool) -> Tensor:

@@ -46,11 +46,8 @@ _WALL_MM: Final = 1e6  # half the width of each part of the wall around a frame
 
 
 class MitsubaSceneBuilder:
-    """Builds a scene for Mitsuba: in colour, or in grey from one `channel` 0..2 (for polarised light).
-
-    Raises:
-        RecipeError: a wedged pane has no thickness somewhere in the view, or meets the next pane there.
-    """
+    """Builds a scene for Mitsuba: in colour, or in grey from one `channel` 0..2 (for polarised light). Raises RecipeError if a
+    wedged pane has no thickness somewhere in the view, or meets the next pane there."""
 
     def __init__(self, mi: ModuleType, scene: Scene, assets: Assets, channel: int | None = None) -> None:
         self.mi, self.scene, self._assets, self._channel = mi, scene, assets, channel
@@ -162,9 +159,9 @@ class MitsubaSceneBuilder:
         """Returns whether light enters the pane, and the materials of its surfaces and its interior."""
         if glass_mode == "mirror":
             return False, {"bsdf": {"type": "conductor", "material": "none"}}
-        is_rough = pane.roughness and pane.refractive_index > 1
-        rough = {"alpha": pane.roughness, "distribution": "ggx"} if is_rough else {}
-        kind = "rough" if rough else ""
+        kind, rough = "", {}
+        if pane.roughness and pane.refractive_index > 1:
+            kind, rough = "rough", {"alpha": pane.roughness, "distribution": "ggx"}
         if glass_mode == "truncated_reflection" and pane is self._glass.panes[-1]:
             # A conductor with k = 0 has the reflectance of glass, and Mitsuba traces no transmitted rays.
             index = {"type": "spectrum", "value": pane.refractive_index}
@@ -188,11 +185,12 @@ class MitsubaSceneBuilder:
         """Yields a black wall around the frame's opening, in the plane of the first surface, as four rectangles."""
         if not self._glass.opening_mm:
             return
-        right, top = self._glass.opening_mm[0] / 2, self._glass.opening_mm[1] / 2
-        half_side, half_top = (_WALL_MM, _WALL_MM), (right, _WALL_MM)
+        right, top = np.array(self._glass.opening_mm) / 2
         for sign in (-1, 1):
-            yield self._rectangle(np.eye(3), (sign * (right + _WALL_MM), 0, 0), half_side, {"bsdf": _BLACK})
-            yield self._rectangle(np.eye(3), (0, sign * (top + _WALL_MM), 0), half_top, {"bsdf": _BLACK})
+            for centre, half_width in ((right + _WALL_MM, 0, 0), _WALL_MM), ((0, top + _WALL_MM, 0), right):
+                yield self._rectangle(
+                    np.eye(3), sign * np.array(centre), (half_width, _WALL_MM), {"bsdf": _BLACK}
+                )
 
     # A lens
 

@@ -74,8 +74,7 @@ class VariantProbe:
 
 def load() -> ModuleType:
     """Imports Mitsuba with a working LLVM. If no LLVM works, only scalar variants can be selected, and a warning is
-    given. The first call takes a second or two. Raises MissingExtra if mitsuba is not installed, or a system library
-    that it needs is missing."""
+    given. Raises MissingExtra if mitsuba is not installed, or a system library that it needs is missing."""
     found = probe()
     for runtime in _runtime_libraries(found.library):
         # RTLD_GLOBAL is not set, because with it, exceptions of other C++ libraries end the process.
@@ -124,19 +123,14 @@ def probe() -> VariantProbe:
 
 
 def _candidates() -> list[str | None]:
-    """Returns the paths of the LLVMs to try, in order. None means the LLVM that Dr.Jit finds.
-
-    If `DRJIT_LIBLLVM_PATH` is set, it is the only candidate. Otherwise, the candidates are the LLVM of the pip package,
-    those of the system (versions known to work first), and None. If Dr.Jit is already imported, its LLVM cannot change,
-    so there is only one candidate.
-    """
+    """Returns the paths of the LLVMs to try, in order: versions known to work first. None means the LLVM that Dr.Jit finds."""
     configured = os.environ.get(LLVM_PATH_VARIABLE)
-    if configured or "drjit" in sys.modules:
+    if configured or "drjit" in sys.modules:  # if Dr.Jit is already imported, its LLVM cannot change
         return [configured]
-    paths = {
+    found = {
         path.resolve() for folder in _FOLDERS for pattern in _PATTERNS for path in Path(folder).glob(pattern)
     }
-    by_version = {_version(path): str(path) for path in sorted(paths)}
+    by_version = {_version(path): str(path) for path in sorted(found)}
     newer = sorted(version for version in by_version if version > max(_KNOWN_GOOD))
     ordered = [by_version[version] for version in (*_KNOWN_GOOD, *newer) if version in by_version]
     return [*_packaged_llvm(), *ordered, None]
@@ -153,8 +147,7 @@ def _packaged_llvm() -> list[str]:
 
 def _runtime_libraries(library: str | None) -> list[str]:
     """Returns the libraries of the C++ runtime that the package installs next to its LLVM; empty for any other LLVM.
-    They must be loaded before the LLVM: it finds them through links, which the package creates only when Python
-    starts."""
+    They must be loaded before the LLVM: it finds them through links, which the package creates only when Python starts."""
     folder = Path(library or "").parent / "x86_64-unknown-linux-gnu"
     return [str(folder / name) for name in _RUNTIME_LIBRARIES if (folder / name).exists()]
 

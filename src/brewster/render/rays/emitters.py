@@ -9,7 +9,8 @@ represents. Textures are filtered to that size before the lookup.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -99,10 +100,6 @@ class LightSamples:
     radiance: Tensor
     pdf: Tensor
 
-    def at(self, indices: Tensor) -> LightSamples:
-        """Returns the samples with these indices."""
-        return LightSamples(self.point[:, indices], self.radiance[:, indices], self.pdf[indices])
-
 
 @dataclass(frozen=True)
 class CameraView:
@@ -146,26 +143,17 @@ class SideEmitters:
         to_world: Tensor,
         device: Device,
     ) -> None:
-        self._distribution: EnvmapDistribution | None = None
+        self._view, self._is_behind, self._to_world = view, is_behind, to_world
         self._light_table: LightSamples | None = None
-        self.radius_mm = side.map.radius_mm if side.map else math.inf
-        self.envmap = (
-            MipmappedTexture(torch.from_numpy(assets.map_radiance(side.map)).to(device), wraps=True)
-            if side.map
-            else None
-        )
-        self._view = view
-        self._u_offset = -(side.map.heading_deg if side.map else 0.0) / 360
-        self._is_behind = is_behind
-        self._to_world = to_world
+        self.envmap, self.radius_mm, self._u_offset = None, math.inf, 0.0
+        if side.map:
+            radiance = torch.from_numpy(assets.map_radiance(side.map)).to(device)
+            self.envmap, self.radius_mm = MipmappedTexture(radiance, wraps=True), side.map.radius_mm
+            self._u_offset = -side.map.heading_deg / 360
         self.plane = _plane_emitter(side.plane, assets, is_behind, device) if side.plane else None
         self.plane_distance_mm = side.plane.distance_mm if side.plane else math.inf
         self.distance_mm = side.distance_mm
-
-    @property
-    def has_dome(self) -> bool:
-        """Whether the map is at a finite radius, which causes parallax."""
-        return self.envmap is not None and math.isfinite(self.radius_mm)
+        self.has_dome = math.isfinite(self.radius_mm)  # a map at a finite radius, which causes parallax
 
     @property
     def has_near_light(self) -> bool:
@@ -194,35 +182,32 @@ class SideEmitters:
         width_mm = self._view.footprint_mm(self.plane_distance_mm)
         return relative_footprint * width_mm * self.plane.texture.width / (2 * self.plane.half_width_mm)
 
-    def far_radiance(self, direction: Tensor, relative_footprint: float) -> Tensor | None:
-        """Returns light from infinity along unit directions (3, N): (3, N), or None if this side has no such light."""
+    def far_radiance(self, rays: Rays) -> Tensor | None:
+        """Returns light from infinity along rays: (3, N), or None if this side has no such light."""
         if self.envmap is None or self.has_dome:
             return None
-        return self.lookup_map(direction, relative_footprint)
+        return self._lookup_map(rays.direction, rays.relative_footprint)[0]
 
-    def radiance(self, origin: Tensor, direction: Tensor, relative_footprint: float) -> Tensor:
-        """Returns all light along rays from `origin` in unit `direction`, (3, N) each: (3, N)."""
-        return self.add_near(
-            self.far_radiance(direction, relative_footprint), origin, direction, relative_footprint
-        )
+    def radiance(self, rays: Rays) -> Tensor:
+        """Returns all light along rays: (3, N)."""
+        return self.add_near(self.far_radiance(rays), rays)
 
-    def add_near(
-        self, far: Tensor | None, origin: Tensor, direction: Tensor, relative_footprint: float
-    ) -> Tensor:
+    def add_near(self, far: Tensor | None, rays: Rays) -> Tensor:
         """Adds the light of the dome and the plane along rays to `far`, the result of `far_radiance`: (3, N).
 
         Far light does not depend on origins, so rays with the same directions need only one call of `far_radiance`.
         """
         if self.has_dome:
-            far = self.lookup_map(self._intersect_dome(origin, direction)[0], relative_footprint)
-        light = torch.zeros_like(direction) if far is None else far
-        return self._add_plane(light, origin, direction, relative_footprint)
+            far, _ = self._lookup_map(self._intersect_dome(rays)[0], rays.relative_footprint)
+        return self._add_plane(torch.zeros_like(rays.direction) if far is None else far, rays)
 
-    def lookup_map(self, direction: Tensor, relative_footprint: float) -> Tensor:
-        """Returns the light of the map in unit directions (3, N) from its centre: (3, N)."""
+    def _lookup_map(
+        self, direction: Tensor, relative_footprint: float
+    ) -> tuple[Tensor, tuple[Tensor, Tensor]]:
+        """Returns the light of the map in unit directions (3, N) from its centre: (3, N), and their u and v, (N,)."""
         assert self.envmap is not None
         u, v = direction_to_uv(self._to_world @ direction, self._u_offset)
-        return self.envmap(u, v, self._map_footprint(relative_footprint))
+        return self.envmap(u, v, self._map_footprint(relative_footprint)), (u, v)
 
     def sample_map(self, uniforms: Tensor, relative_footprint: float) -> LightSamples:
         """Draws points of the map with a density proportional to its luminance, for `towards`.
@@ -232,19 +217,19 @@ class SideEmitters:
         """
         if self._light_table is None:
             self._light_table = self._tabulate_light(relative_footprint)
-        return self._light_table.at((uniforms * _LIGHT_TABLE_SIZE).long())
+        table, indices = self._light_table, (uniforms * _LIGHT_TABLE_SIZE).long()
+        return LightSamples(table.point[:, indices], table.radiance[:, indices], table.pdf[indices])
 
     def _tabulate_light(self, relative_footprint: float) -> LightSamples:
         """Returns _LIGHT_TABLE_SIZE points of the map, in the order of its texels."""
         engine = SobolEngine(2, scramble=True, seed=0)  # type: ignore[no-untyped-call]
         points = engine.draw(_LIGHT_TABLE_SIZE).to(self._to_world.device)
         points = points[points[:, 0].argsort()].T
-        distribution = self._map_distribution()
-        direction = distribution.sample(points, self._u_offset)
+        direction = self._distribution.sample(points, self._u_offset)
         u, v = direction_to_uv(direction, self._u_offset)
         assert self.envmap is not None
         radiance = self.envmap(u, v, self._map_footprint(relative_footprint))
-        return LightSamples(self._to_world.T @ direction, radiance, distribution.pdf(u, v))
+        return LightSamples(self._to_world.T @ direction, radiance, self._distribution.pdf(u, v))
 
     def towards(self, samples: LightSamples, rays: Rays) -> tuple[Tensor, Tensor, Tensor]:
         """Returns the unit directions (3, N) from the origins of `rays` to points of the map, the light from there (3, N), and
@@ -256,21 +241,19 @@ class SideEmitters:
             distance = torch.sqrt(dot(offset, offset))
             direction = offset / distance
             pdf = pdf * self._dome_density_ratio(samples.point, direction, distance)
-        light = self._add_plane(samples.radiance, rays.origin, direction, rays.relative_footprint)
+        light = self._add_plane(samples.radiance, replace(rays, direction=direction))
         return direction, light, pdf
 
     def radiance_and_pdf(self, rays: Rays) -> tuple[Tensor, Tensor]:
         """Returns all light along rays, (3, N), and the density of `towards` at their directions, per steradian: (N,)."""
-        assert self.envmap is not None
-        point, ratio = rays.direction, None
+        point = rays.direction
         if self.has_dome:
-            point, distance = self._intersect_dome(rays.origin, rays.direction)
-            ratio = self._dome_density_ratio(point, rays.direction, distance)
-        u, v = direction_to_uv(self._to_world @ point, self._u_offset)
-        light = self.envmap(u, v, self._map_footprint(rays.relative_footprint))
-        pdf = self._map_distribution().pdf(u, v)
-        light = self._add_plane(light, rays.origin, rays.direction, rays.relative_footprint)
-        return light, pdf if ratio is None else pdf * ratio
+            point, distance = self._intersect_dome(rays)
+        light, uv = self._lookup_map(point, rays.relative_footprint)
+        pdf = self._distribution.pdf(*uv)
+        if self.has_dome:
+            pdf = pdf * self._dome_density_ratio(point, rays.direction, distance)
+        return self._add_plane(light, rays), pdf
 
     def _dome_density_ratio(self, point: Tensor, direction: Tensor, distance: Tensor) -> Tensor:
         """Returns the density per steradian at a ray's origin divided by that at the dome's centre, (N,).
@@ -279,46 +262,40 @@ class SideEmitters:
         """
         return (distance / self.radius_mm) ** 2 / dot(point, direction).clamp(min=1e-6)
 
-    def _intersect_dome(self, origin: Tensor, direction: Tensor) -> tuple[Tensor, Tensor]:
+    def _intersect_dome(self, rays: Rays) -> tuple[Tensor, Tensor]:
         """Returns unit directions (3, N) from the dome's centre to the intersections of rays, and distances along the rays in mm."""
-        along = dot(origin, direction)
-        distance = torch.sqrt((along**2 - dot(origin, origin) + self.radius_mm**2).clamp(min=0)) - along
-        return (origin + distance * direction) / self.radius_mm, distance
+        along = dot(rays.origin, rays.direction)
+        squared = along**2 - dot(rays.origin, rays.origin) + self.radius_mm**2
+        distance = torch.sqrt(squared.clamp(min=0)) - along
+        return (rays.origin + distance * rays.direction) / self.radius_mm, distance
 
-    def _map_distribution(self) -> EnvmapDistribution:
-        """Returns the distribution of the map's light on this side of the glass. It is computed at the first call."""
-        if self._distribution is None:
-            assert self.envmap is not None
-            outward = self._to_world @ self._to_world.new_tensor([0, 0, -1 if self._is_behind else 1])
-            self._distribution = EnvmapDistribution(self.envmap.texels, outward, self._u_offset)
-        return self._distribution
+    @cached_property
+    def _distribution(self) -> EnvmapDistribution:
+        """The distribution of the map's light on this side of the glass."""
+        assert self.envmap is not None
+        outward = self._to_world @ self._to_world.new_tensor([0, 0, -1 if self._is_behind else 1])
+        return EnvmapDistribution(self.envmap.texels, outward, self._u_offset)
 
-    def _add_plane(
-        self, light: Tensor, origin: Tensor, direction: Tensor, relative_footprint: float
-    ) -> Tensor:
-        """Returns the light along rays, with the plane in front of `light`: (3, N)."""
-        if self.plane is None:
+    def _add_plane(self, light: Tensor, rays: Rays) -> Tensor:
+        """Returns the light along rays, with the plane in front of `light`: (3, N). At its edges, it covers a part of a ray."""
+        plane = self.plane
+        if plane is None:
             return light
-        image, coverage = self._plane_radiance(self.plane, origin, direction, relative_footprint)
-        return light + coverage * (image - light)
-
-    def _plane_radiance(
-        self, plane: _PlaneEmitter, origin: Tensor, direction: Tensor, relative_footprint: float
-    ) -> tuple[Tensor, Tensor]:
-        """Returns the plane's light along rays, (3, N), and the fraction of each footprint that it covers, (N,) in 0..1."""
         normal = torch.linalg.cross(plane.right, plane.up)
-        cosine = normal @ direction
-        distance = normal @ (plane.centre[:, None] - origin) / torch.where(cosine == 0, 1e-9, cosine)
-        point = origin + distance * direction - plane.centre[:, None]
+        cosine = normal @ rays.direction
+        distance = normal @ (plane.centre[:, None] - rays.origin) / torch.where(cosine == 0, 1e-9, cosine)
+        point = rays.origin + distance * rays.direction - plane.centre[:, None]
         x, y = plane.right @ point, plane.up @ point
         u, v = x / (2 * plane.half_width_mm) + 0.5, 0.5 - y / (2 * plane.half_height_mm)
-        edge_mm = relative_footprint * self._view.footprint_mm(self.plane_distance_mm)
+        edge_mm = rays.relative_footprint * self._view.footprint_mm(self.plane_distance_mm)
         coverage = (
             ((plane.half_width_mm - x.abs()) / edge_mm + 0.5).clamp(0, 1)
             * ((plane.half_height_mm - y.abs()) / edge_mm + 0.5).clamp(0, 1)
             * (distance > 0)
         )
-        return plane.texture(u, v, self._plane_footprint(relative_footprint)), coverage
+        image = plane.texture(u, v, self._plane_footprint(rays.relative_footprint))
+        covered: Tensor = light + coverage * (image - light)  # lerp rounds in another way
+        return covered
 
 
 def _plane_emitter(plane: Plane, assets: Assets, is_behind: bool, device: Device) -> _PlaneEmitter:

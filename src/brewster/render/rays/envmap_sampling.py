@@ -42,9 +42,8 @@ class EnvmapDistribution:
         _, height, width = texels.shape
         luminance = (texels * texels.new_tensor(REC709_LUMINANCE)[:, None, None]).sum(0)
         # Bilinear lookups spread a bright texel over its neighbours, so the density must be high there too.
-        smoothed = functional.avg_pool2d(
-            functional.pad(luminance[None, None], (1, 1, 1, 1), mode="replicate"), 3, 1
-        )[0, 0]
+        padded = functional.pad(luminance[None, None], (1, 1, 1, 1), mode="replicate")
+        smoothed = functional.avg_pool2d(padded, 3, 1)[0, 0]
         self._polar = (torch.arange(height, device=texels.device) + 0.5) / height * math.pi
         solid_angle = self._polar.sin() * (math.pi / height) * (2 * math.pi / width)
         u = (torch.arange(width, device=texels.device) + 0.5) / width

@@ -13,6 +13,7 @@ from collections import defaultdict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache, reduce
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -46,8 +47,7 @@ def internal_transmittance(pane: Pane, cosine: Tensor) -> Tensor:
     return torch.exp(-absorption.view(3, *[1] * cosine.ndim) * path_m)
 
 
-@dataclass(frozen=True)
-class Throughput:
+class Throughput(NamedTuple):
     """Transmittance and reflectance of a glazing along a camera ray; each (3, ...) if tinted, else (...)."""
 
     transmittance: Tensor
@@ -56,17 +56,15 @@ class Throughput:
 
 def total_throughput(glazing: Glazing, cosine: Tensor) -> Throughput:
     """Returns the sum of all orders in closed form. Panes are combined by the adding method."""
-    return _average_polarisations(
-        [_combine([_slab(r, a) for r, a in panes]) for panes in _by_polarisation(glazing, cosine)]
-    )
+    s, p = (_combine([_slab(*pane) for pane in panes]) for panes in _by_polarisation(glazing, cosine))
+    return _mean(s, p)
 
 
 def truncated_throughput(glazing: Glazing, cosine: Tensor) -> Throughput:
     """Returns the paper's layers: T without any reflection, and R of all light that never enters the last pane."""
-    return _average_polarisations([_truncated_layers(panes) for panes in _by_polarisation(glazing, cosine)])
+    return _mean(*map(_truncated_layers, _by_polarisation(glazing, cosine)))
 
 
-_TransmittanceReflectance = tuple[Tensor, Tensor]
 _SurfaceAndInterior = tuple[Tensor, Tensor | float]
 """The reflectance r of a surface of a pane for one polarisation, and the internal transmittance a of the pane."""
 
@@ -80,46 +78,44 @@ def _by_polarisation(glazing: Glazing, cosine: Tensor) -> list[list[_SurfaceAndI
     return [[(r[which], a) for r, a in zip(surfaces, interiors, strict=True)] for which in (0, 1)]
 
 
-def _slab(r: Tensor, a: Tensor | float) -> _TransmittanceReflectance:
+def _slab(r: Tensor, a: Tensor | float) -> Throughput:
     """Returns the transmittance and the reflectance of one pane, the sums of the paper's two series of light paths.
 
     T = (1 - r)^2 a (1 + (r a)^2 + (r a)^4 + ...) and R = r + (1 - r)^2 r a^2 (1 + (r a)^2 + ...) are geometric series.
     """
     transmittance = (1 - r) ** 2 * a / (1 - (r * a) ** 2)
-    return transmittance, r + transmittance * r * a
+    return Throughput(transmittance, r + transmittance * r * a)
 
 
-def _combine(layers: list[_TransmittanceReflectance]) -> _TransmittanceReflectance:
+def _combine(layers: list[Throughput]) -> Throughput:
     """Combines layers with the adding method (Stokes 1862): T = T1 T2 / (1 - R1 R2), R = R1 + T1^2 R2 / (1 - R1 R2).
 
     The method requires that each layer has the same properties from both sides, as uniform panes do. The first layer is
     the one nearest to the camera.
     """
-    transmittance, reflectance = layers[-1]
-    for t, r in reversed(layers[:-1]):
-        interreflection = 1 / (1 - r * reflectance)
-        transmittance, reflectance = (
-            t * transmittance * interreflection,
-            r + t**2 * reflectance * interreflection,
-        )
-    return transmittance, reflectance
+    *others, stack = layers
+    for t, r in reversed(others):
+        interreflection = 1 / (1 - r * stack.reflectance)
+        reflectance = r + t**2 * stack.reflectance * interreflection
+        stack = Throughput(t * stack.transmittance * interreflection, reflectance)
+    return stack
 
 
-def _truncated_layers(panes: list[_SurfaceAndInterior]) -> _TransmittanceReflectance:
+def _truncated_layers(panes: list[_SurfaceAndInterior]) -> Throughput:
     """Returns the transmittance without any reflection, and the reflectance without light that enters the last pane."""
-    transmittance: Tensor | float = 1.0
+    transmittance = torch.ones_like(panes[0][0])
     for r, a in panes:
         transmittance = transmittance * (1 - r) ** 2 * a
     # No light of R enters the last pane, so the first surface of the pane replaces the pane.
     first_surface, _ = panes[-1]
     before = [_slab(*pane) for pane in panes[:-1]]
-    assert isinstance(transmittance, Tensor)
-    return transmittance, _combine([*before, (transmittance, first_surface)])[1]
+    reflectance = _combine([*before, Throughput(transmittance, first_surface)]).reflectance
+    return Throughput(transmittance, reflectance)
 
 
-def _average_polarisations(polarised: list[_TransmittanceReflectance]) -> Throughput:
-    (s_transmittance, s_reflectance), (p_transmittance, p_reflectance) = polarised
-    return Throughput((s_transmittance + p_transmittance) / 2, (s_reflectance + p_reflectance) / 2)
+def _mean(s: Throughput, p: Throughput) -> Throughput:
+    """Returns the throughput of unpolarised light."""
+    return Throughput((s.transmittance + p.transmittance) / 2, (s.reflectance + p.reflectance) / 2)
 
 
 @dataclass(frozen=True)
@@ -176,34 +172,23 @@ _State = tuple[int, bool, _Counts, _Counts, _Counts]
 def _branches(state: _State) -> list[_State]:
     """Returns the state after transmission and the state after reflection at the next surface of a path."""
     surface, is_downward, reflections, transmissions, traversals = state
-    pane = surface // 2
-    ahead, back = (surface + 1, surface - 1) if is_downward else (surface - 1, surface + 1)
-    return [
-        (
-            ahead,
-            is_downward,
-            reflections,
-            _incremented(transmissions, pane),
-            _traversed(traversals, surface, ahead),
-        ),
-        (
-            back,
-            not is_downward,
-            _incremented(reflections, pane),
-            transmissions,
-            _traversed(traversals, surface, back),
-        ),
-    ]
+    pane, branches = surface // 2, []
+    for is_reflected in (False, True):
+        downward = is_downward != is_reflected
+        next_surface = surface + (1 if downward else -1)
+        layer = min(surface, next_surface)  # outside the stack there is no layer to traverse
+        branches.append((
+            next_surface,
+            downward,
+            _incremented(reflections, pane) if is_reflected else reflections,
+            transmissions if is_reflected else _incremented(transmissions, pane),
+            _incremented(traversals, layer) if 0 <= layer < len(traversals) else traversals,
+        ))  # fmt: skip
+    return branches
 
 
 def _incremented(counts: _Counts, which: int) -> _Counts:
     return (*counts[:which], counts[which] + 1, *counts[which + 1 :])
-
-
-def _traversed(traversals: _Counts, surface: int, next_surface: int) -> _Counts:
-    """Counts the traversal of the layer between two surfaces; there is no layer outside the stack."""
-    layer = min(surface, next_surface)
-    return _incremented(traversals, layer) if 0 <= layer < len(traversals) else traversals
 
 
 def _weight(counts: tuple[_Counts, _Counts] | list[_Counts], reflectances: tuple[float, ...]) -> float:

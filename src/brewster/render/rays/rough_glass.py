@@ -217,28 +217,20 @@ def _interact(
         interaction = _SurfaceInteraction(
             axes, wi, surface.alpha, index_in, index_out, reflects, before, wo, facet, cosine
         )
-        weights = _facet_weights(interaction, cosine, reflectances, wo)
-        is_last_pane = path.surface == len(stack) - 2
-        yield _path_after(interaction, weights, is_last_pane=is_last_pane), interaction
-
-
-def _path_after(
-    interaction: _SurfaceInteraction, weights: tuple[Tensor, Tensor], *, is_last_pane: bool
-) -> _PathState:
-    """Returns the path after a surface. `is_last_pane` is True at the first surface of the last pane."""
-    before = interaction.before
-    is_downward = before.is_downward != interaction.reflects
-    return _PathState(
-        before.origin,
-        interaction.axes.T @ interaction.wo,
-        before.s * weights[0],
-        before.p * weights[1],
-        before.surface + (1 if is_downward else -1),
-        is_downward,
-        before.reflections + interaction.reflects,
-        before.entered_last_pane or (is_last_pane and before.is_downward and not interaction.reflects),
-        before.rays,
-    )
+        s_weight, p_weight = _facet_weights(interaction, cosine, reflectances, wo)
+        is_downward = path.is_downward != reflects
+        enters_last_pane = path.surface == len(stack) - 2 and path.is_downward and not reflects
+        after = replace(
+            before,
+            direction=axes.T @ wo,
+            s=s * s_weight,
+            p=p * p_weight,
+            surface=path.surface + (1 if is_downward else -1),
+            is_downward=is_downward,
+            reflections=path.reflections + reflects,
+            entered_last_pane=path.entered_last_pane or enters_last_pane,
+        )
+        yield after, interaction
 
 
 def _scattered_direction(wi: Tensor, facet: Tensor, cosine: Tensor, ratio: float | None) -> Tensor:
@@ -291,10 +283,9 @@ def _exit_radiance(
     `light_uniforms` are random numbers for light samples, (N,); None if microfacet samples are sufficient. The heuristic
     weights a sample by its density divided by the sum of both densities (Veach 1997, eq. 9.8).
     """
-    weight = (path.s + path.p) / 2
+    weight, rays = (path.s + path.p) / 2, Rays(path.origin, path.direction, relative_footprint)
     if light_uniforms is None:
-        return weight * emitters.radiance(path.origin, path.direction, relative_footprint)
-    rays = Rays(path.origin, path.direction, relative_footprint)
+        return weight * emitters.radiance(rays)
     radiance, light_pdf = emitters.radiance_and_pdf(rays)
     facet_pdf = _scattering_pdf(interaction, interaction.facet, interaction.cosine, interaction.wo)
     light = weight * radiance * (facet_pdf / (facet_pdf + light_pdf).clamp(min=1e-20))

@@ -32,15 +32,12 @@ class SobolPoints:
         """
         self._sample, self._pixels, self._next = number, pixels, 0
 
-    def next_2d(self, subset: Tensor | None = None) -> Tensor:
-        """Returns the next point of each selected pixel, (2, n) in [0, 1), or only of the pixels with the indices `subset`."""
-        return self._next_point(subset, slice(None))
-
     def next_1d(self, subset: Tensor | None = None) -> Tensor:
         """Returns the first coordinate of the next points, (n,); see `next_2d`."""
-        return self._next_point(subset, slice(1))[0]
+        return self.next_2d(subset, slice(1))[0]
 
-    def _next_point(self, subset: Tensor | None, axes: slice) -> Tensor:
+    def next_2d(self, subset: Tensor | None = None, axes: slice = slice(None)) -> Tensor:
+        """Returns the next point of each selected pixel, (2, n) in [0, 1), or only of the pixels with the indices `subset`."""
         if self._next == len(self._sequences):
             self._sequences.append(self._new_sequence())
         points, shift = self._sequences[self._next]

@@ -25,6 +25,7 @@ from brewster.files import write_atomically
 from brewster.rendered import store
 from brewster.rendered.generation.preview import write_index
 from brewster.scene.recipe import SceneRecipe
+from brewster.scene.recipe_file import flatten
 from brewster.scene.sampler import Catalog
 
 RECORD_FILE: Final = "set.toml"
@@ -76,14 +77,11 @@ class RenderTask:
 
     def failed_results(self, reason: str) -> list[RenderResult]:
         """Returns a failed result for each index of a task that no worker could finish."""
-        message = (
+        error = (
             f"{reason}; expected a sample that fits into memory; use fewer --workers, or a smaller --size."
         )
-        first = 1 if self.kind == "render" else store.SHARD_SIZE
-        return [
-            RenderResult(number * first, "failed", error=message, kind="WorkerLost")
-            for number in self.indices
-        ]
+        size = 1 if self.kind == "render" else store.SHARD_SIZE
+        return [RenderResult(n * size, "failed", error=error, kind="WorkerLost") for n in self.indices]
 
 
 @final
@@ -115,11 +113,7 @@ def build(
     """Renders the missing samples of a dataset, packs them into shards if `shards` is True, and writes the index.
 
     A sample that fails is reported and skipped. The next call renders it again. `report` is called with the result of every
-    sample.
-
-    Raises:
-        OutputError: the folder has other content, another run writes to it, or the disk is full or read-only.
-        MissingExtra, DeviceError: the renderer cannot run on this machine.
+    sample. Raises FATAL_ERRORS: OutputError if the folder has other content, another run writes to it, or the disk is full.
     """
     with _exclusive_lock(job.out):
         _check_record(job)
@@ -150,11 +144,9 @@ class _Schedule:
 
     def next(self) -> RenderTask | None:
         """Returns the next task. Returns None after the last task, and if no task can start before the next result."""
-        return (
-            RenderTask("pack", (self._blocks_to_pack.popleft(),))
-            if self._blocks_to_pack
-            else next(self._render_tasks, None)
-        )
+        if self._blocks_to_pack:
+            return RenderTask("pack", (self._blocks_to_pack.popleft(),))
+        return next(self._render_tasks, None)
 
     def record_result(self, result: RenderResult) -> None:
         """Records a result. When all samples of a block are rendered, the block is scheduled for packing."""
@@ -234,13 +226,13 @@ def _check_record(job: RenderJob) -> None:
         write_atomically(path, text.encode())
         return
     try:
-        existing = dict(_flatten(tomllib.loads(path.read_text("utf-8"))))
+        existing = dict(flatten(tomllib.loads(path.read_text("utf-8"))))
     except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
         raise OutputError(
             f"{path} cannot be read ({error})", "expected the record of a dataset", "choose another folder"
         ) from error
-    requested = dict(_flatten(tomllib.loads(text)))
-    for name in {**existing, **requested}:
+    requested = dict(flatten(tomllib.loads(text)))
+    for name in existing | requested:
         old, new = existing.get(name, "not set"), requested.get(name, "not set")
         if old != new:
             raise OutputError(
@@ -248,12 +240,3 @@ def _check_record(job: RenderJob) -> None:
                 "expected the settings of that dataset, or a new folder",
                 "choose another folder, or use the same settings",
             )
-
-
-def _flatten(table: dict[str, Any], before: str = "") -> Iterator[tuple[str, object]]:
-    """Yields the dotted name and the value of every value of nested tables."""
-    for name, value in table.items():
-        if isinstance(value, dict):
-            yield from _flatten(value, f"{before}{name}.")
-        else:
-            yield f"{before}{name}", value

@@ -68,9 +68,6 @@ def write_index(out: Path) -> None:
     """Writes index.parquet, with a row for each sample in order. Its bytes depend only on the samples and their paths.
 
     The column `path` is the folder or the shard of the sample, relative to `out`.
-
-    Raises:
-        OutputError: the file cannot be written, for example because the disk is full.
     """
     import pyarrow as pa  # noqa: PLC0415  (not needed to read a dataset)
     from pyarrow import parquet  # noqa: PLC0415
@@ -108,26 +105,19 @@ _WHITE: Final = 255
 
 
 def write_preview(out: Path) -> None:
-    """Writes preview.png with the first 40 samples, in two columns. Each sample is a row of five images.
-
-    Raises:
-        OutputError: the file cannot be written.
-    """
-    rows = [
-        np.concatenate([_cell(entry.read(f"{layer}.jpg")) for layer in SAMPLE_IMAGES], axis=1)
-        for entry in islice(read_dataset(out), _SHEET_ROWS * _SHEET_COLUMNS)
-    ]
-    columns = [
-        np.concatenate(rows[first : first + _SHEET_ROWS]) for first in range(0, len(rows), _SHEET_ROWS)
-    ]
-    if columns:
-        height = len(columns[0])
-        padded = [
-            np.pad(column, ((0, height - len(column)), (0, 0), (0, 0)), constant_values=_WHITE)
-            for column in columns
-        ]
-        sheet = Photo.from_array(np.concatenate(padded, axis=1), encoding="srgb")
-        write_atomically(out / PREVIEW_FILE, sheet.encode("png"), overwrite=True)
+    """Writes preview.png with the first 40 samples, in two columns. Each sample is a row of five images."""
+    entries = list(islice(read_dataset(out), _SHEET_ROWS * _SHEET_COLUMNS))
+    if entries:
+        columns, (height, width) = -(-len(entries) // _SHEET_ROWS), _CELL
+        rows, row_width = min(len(entries), _SHEET_ROWS), width * len(SAMPLE_IMAGES)
+        sheet = np.full((rows * height, columns * row_width, 3), _WHITE, np.uint8)
+        for number, entry in enumerate(entries):
+            column, row = divmod(number, _SHEET_ROWS)
+            images = [_cell(entry.read(f"{layer}.jpg")) for layer in SAMPLE_IMAGES]
+            left, top = column * row_width, row * height
+            sheet[top : top + height, left : left + row_width] = np.concatenate(images, axis=1)
+        data = Photo.from_array(sheet, encoding="srgb").encode("png")
+        write_atomically(out / PREVIEW_FILE, data, overwrite=True)
 
 
 def _cell(data: bytes) -> NDArray[np.uint8]:

@@ -10,6 +10,7 @@ import importlib
 import time
 import tomllib
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Final, final
 
@@ -39,22 +40,16 @@ class TaskRunner:
         self._job, self._assets = job, Assets(job.folders)
 
     def __call__(self, task: RenderTask) -> list[RenderResult]:
-        """Runs a task. Returns the results of all samples. A task that packs samples returns only failed results.
-
-        Raises:
-            OutputError, MissingExtra, DeviceError: an error that occurs for every sample.
-        """
+        """Runs a task. Returns the results of all samples. A task that packs samples returns only failed results. Raises
+        FATAL_ERRORS."""
         with single_torch_thread():
-            return self._run(task)
-
-    def _run(self, task: RenderTask) -> list[RenderResult]:
-        if task.kind == "render":
-            return [self._attempt(index, lambda index=index: self._render(index)) for index in task.indices]  # type: ignore[misc]
-        results = [
-            self._attempt(block * store.SHARD_SIZE, lambda block=block: store.pack(self._job.out, block))  # type: ignore[misc]
-            for block in task.indices
-        ]
-        return [result for result in results if result.error]
+            if task.kind == "render":
+                return [self._attempt(index, partial(self._render, index)) for index in task.indices]
+            results = (
+                self._attempt(block * store.SHARD_SIZE, partial(store.pack, self._job.out, block))
+                for block in task.indices
+            )
+            return [result for result in results if result.error]
 
     def _render(self, index: int) -> None:
         folder = self._job.out / store.key(index)
@@ -67,21 +62,18 @@ class TaskRunner:
         started = time.perf_counter()
         try:
             work()
+            return RenderResult(index, "rendered", time.perf_counter() - started)
         except FATAL_ERRORS:
             raise
-        except BrewsterError as error:
-            return RenderResult(index, "failed", error=str(error), kind=type(error).__name__)
-        except MemoryError:
-            return RenderResult(
-                index,
-                "failed",
-                error="the sample does not fit into memory; expected more free memory; use fewer --workers",
-                kind="MemoryError",
-            )
-        except Exception as bug:  # noqa: BLE001  (a bug in one sample must not end the run)
-            message = f"internal error ({type(bug).__name__}: {bug}); please report it"
-            return RenderResult(index, "failed", error=message, kind=type(bug).__name__)
-        return RenderResult(index, "rendered", time.perf_counter() - started)
+        except Exception as error:  # noqa: BLE001  (a bug in one sample must not end the run)
+            message = f"internal error ({type(error).__name__}: {error}); please report it"
+            if isinstance(error, BrewsterError):
+                message = str(error)
+            elif isinstance(error, MemoryError):
+                message = (
+                    "the sample does not fit into memory; expected more free memory; use fewer --workers"
+                )
+            return RenderResult(index, "failed", error=message, kind=type(error).__name__)
 
 
 def find_renderer(name: str) -> Renderer:
@@ -92,12 +84,8 @@ def find_renderer(name: str) -> Renderer:
 
 
 def render_again(path: Path, folder: Path, folders: Sequence[Path] = (), renderer: str | None = None) -> None:
-    """Renders a scene file into a new folder, by default with the renderer that is recorded in the file.
-
-    Raises:
-        RecipeError: the scene cannot be read, or a file of the scene is missing.
-        OutputError: the folder is not empty, or cannot be written.
-    """
+    """Renders a scene file into a new folder, by default with the renderer that is recorded in the file. Raises OutputError
+    if the folder is not empty."""
     scene = read_scene(path)
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise OutputError(

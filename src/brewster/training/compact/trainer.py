@@ -1,6 +1,7 @@
 """Trains the compact network with AdamW and an exponential moving average (EMA) of the weights, on a GPU if there is one.
 
-network = train(read_recipe(Path("recipes/train/compact.toml")), Path("out/compact"), on_step)
+trainer = CompactTrainer(read_recipe(Path("recipes/train/compact.toml")))
+run(trainer, Path("out/compact"), on_step)
 """
 
 from __future__ import annotations
@@ -24,8 +25,7 @@ from brewster.training.compact.export import export_onnx, read_weights
 from brewster.training.data.hints import simulate_hints
 from brewster.training.data.mixtures import Stream, TrainingBatch
 from brewster.training.distributed import best_device
-from brewster.training.loop import StepCallback, run
-from brewster.training.losses import check_finite, exposure_ratio, psnr_gain_db, separation_loss
+from brewster.training.losses import check_finite, exposure_ratio, psnr_gain_db, separation_loss, total
 from brewster.training.plots import sample_sheet
 from brewster.training.recipe import CompactRecipe
 from brewster.training.streams import held_out_mixtures, open_stream, validation_pairs
@@ -49,30 +49,10 @@ _SAMPLE_COLUMNS: Final = (
 _MAX_GRADIENT_NORM: Final = 1.0
 
 
-def train(recipe: CompactRecipe, out: Path, on_step: StepCallback) -> nn.Module:
-    """Trains a recipe in the folder `out`, or resumes its run if `out` contains one.
-
-    Returns:
-        The network with the EMA of the weights, in evaluation mode.
-
-    Raises:
-        RecipeError: data is missing, or `out` contains a run of another recipe.
-        PhotoError: an image cannot be read.
-        ModelError: a checkpoint is missing, damaged or of another network, or the loss is NaN or infinite.
-        OutputError: `out` cannot be written to.
-    """
-    trainer = CompactTrainer(recipe)
-    run(trainer, out, on_step)
-    return trainer.ema_network()
-
-
 class CompactTrainer:
     """The `Trainer` of a compact network. It contains the network, the EMA of its weights, and the optimiser AdamW.
 
     A `stream` replaces the training data of the recipe. `device` is "auto" for the GPU if there is one, or "cpu".
-
-    Raises:
-        RecipeError, PhotoError: the data is missing or damaged.
     """
 
     def __init__(self, recipe: CompactRecipe, stream: Stream | None = None, device: str = "auto") -> None:
@@ -80,9 +60,13 @@ class CompactTrainer:
         self._entry = NETWORKS[recipe.network]
         self.stream = stream or open_stream(recipe, self.device)
         self._uses_bfloat16 = recipe.precision == "auto" and _has_bfloat16(self.device)
-        self._validation_pairs: ValidationPairs = _resize_pairs(
-            validation_pairs(recipe.data), self._entry.stride
-        ) | _held_out_pairs(recipe)
+        self._validation_pairs: ValidationPairs = {
+            name: [
+                (_resize(photo, self._entry.stride), _resize(truth, self._entry.stride))
+                for photo, truth in pairs
+            ]
+            for name, pairs in validation_pairs(recipe.data).items()
+        } | _held_out_pairs(recipe)
         self._data_workers = 1 if self.device.type == "cpu" else os.cpu_count() or 1
         self._chunk_count = torch.get_num_threads() if self.device.type == "cpu" else 1
         self._chunk_pool = _single_thread_pool(self._chunk_count)
@@ -92,44 +76,34 @@ class CompactTrainer:
         network = self._entry.pretrained()
         self.network = network.to(self.device, memory_format=torch.channels_last)  # type: ignore[call-overload]
         self._reset_ema()
-        named = list(self.network.named_parameters())
-        for name, parameter in named:
+        encoder, others = list[nn.Parameter](), list[nn.Parameter]()
+        for name, parameter in self.network.named_parameters():
             parameter.requires_grad_(name.startswith(recipe.trained_part))
-        self._parameters = [parameter for _, parameter in named if parameter.requires_grad]
-        encoder = [parameter for name, parameter in named if name.startswith("encoder.")]
-        others = [parameter for name, parameter in named if not name.startswith("encoder.")]
-        self.optimizer = torch.optim.AdamW(
-            [
-                {"params": encoder, "peak": recipe.encoder_learning_rate},
-                {"params": others, "peak": recipe.learning_rate},
-            ],
-            weight_decay=recipe.weight_decay,
-            fused=True,
-        )
+            (encoder if name.startswith("encoder.") else others).append(parameter)
+        self._parameters = [parameter for parameter in self.network.parameters() if parameter.requires_grad]
+        groups = [
+            {"params": encoder, "peak": recipe.encoder_learning_rate},
+            {"params": others, "peak": recipe.learning_rate},
+        ]
+        self.optimizer = torch.optim.AdamW(groups, weight_decay=recipe.weight_decay, fused=True)
 
     def initialize(self) -> None:
-        """Loads the weights of `init`, except those of `trained_part`, which start from zero.
-
-        Raises:
-            ModelError: the model is unknown or damaged, or contains another network.
-        """
+        """Loads the weights of `init`, except those of `trained_part`, which start from zero. Raises ModelError if the model is
+        unknown or damaged, or contains another network."""
         if self.recipe.init is None:
             return
         weights, new = read_weights(find_model(self.recipe.init).path), self.recipe.trained_part
-        shapes = [
-            {name: value.shape for name, value in state.items()}
-            for state in (weights, self.network.state_dict())
-        ]
-        if shapes[0] == shapes[1]:
-            kept = {name: value for name, value in weights.items() if not (new and name.startswith(new))}
-            self.network.load_state_dict(kept, strict=False)
-            self._reset_ema()
-            return
-        raise ModelError(
-            f"{self.recipe.init} contains another network",
-            f"expected the network {self.recipe.network}",
-            "correct init in the recipe",
-        )
+        states = weights, self.network.state_dict()
+        shapes, expected = ({name: value.shape for name, value in state.items()} for state in states)
+        if shapes != expected:
+            raise ModelError(
+                f"{self.recipe.init} contains another network",
+                f"expected the network {self.recipe.network}",
+                "correct init in the recipe",
+            )
+        kept = {name: value for name, value in weights.items() if not (new and name.startswith(new))}
+        self.network.load_state_dict(kept, strict=False)
+        self._reset_ema()
 
     def state_dict(self) -> dict[str, Any]:
         """Returns the weights, their EMA, and the state of the optimiser."""
@@ -146,17 +120,14 @@ class CompactTrainer:
         self.optimizer.load_state_dict(state["optimizer"])
 
     def training_step(self, step: int) -> dict[str, float]:
-        """Runs one step of AdamW on one batch. Returns `loss` and its terms, `loss_NAME`.
-
-        Raises:
-            ModelError: the loss is NaN or infinite. The last checkpoint is still valid.
-        """
+        """Runs one step of AdamW on one batch. Returns `loss` and its terms. Raises ModelError if the loss is not finite."""
         batch = self._batch(step).to(self.device)
         # With two threads for the optimiser, each waits actively for the other: a quarter of the time on a busy machine.
         with single_torch_thread():
             parts = self._compute_gradients(batch)
-            loss = check_finite(torch.stack(list(parts.values())).sum(), step)
-            self._set_learning_rates(step)
+            loss = check_finite(total(parts), step)
+            for group in self.optimizer.param_groups:
+                group["lr"] = group["peak"] * self.recipe.learning_rate_factor(step)
             norm = nn.utils.clip_grad_norm_(self._parameters, _MAX_GRADIENT_NORM)
             # Skip the batch if its gradient is infinite: one such step makes all weights invalid.
             if norm.isfinite():
@@ -187,14 +158,13 @@ class CompactTrainer:
         with torch.autocast(
             self.device.type, torch.bfloat16, enabled=self._uses_bfloat16, cache_enabled=False
         ):
-            photo = _channels_last(batch.photo_encoded)
+            photo = batch.photo_encoded.contiguous(memory_format=torch.channels_last)
             layers = self.network(photo) if batch.hints is None else self.network(photo, batch.hints)
         recipe = self.recipe
         parts = separation_loss(
             layers, batch, recipe.edge_weight, recipe.edge_scales_px, recipe.clipped_weight
         )
-        total = torch.stack(list(parts.values())).sum()
-        gradients = torch.autograd.grad(total, self._parameters, materialize_grads=True)
+        gradients = torch.autograd.grad(total(parts), self._parameters, materialize_grads=True)
         return len(batch.photo_encoded), {name: part.detach() for name, part in parts.items()}, gradients
 
     def validate(self) -> tuple[dict[str, float], Tensor]:
@@ -204,11 +174,7 @@ class CompactTrainer:
         return metrics, _draw_samples(network, self._validation_pairs or self._training_pairs())
 
     def export(self, folder: Path) -> Path:
-        """Writes the EMA network to model.onnx in `folder`. Returns the path of the file.
-
-        Raises:
-            OutputError: the file cannot be written.
-        """
+        """Writes the EMA network to model.onnx in `folder`. Returns the path of the file."""
         export_onnx(self.ema_network(), folder / MODEL_FILE, self._entry)
         return folder / MODEL_FILE
 
@@ -239,10 +205,6 @@ class CompactTrainer:
             return batch
         hints = simulate_hints(batch, probability=recipe.hint_probability, seed=recipe.seed, step=step)
         return replace(batch, hints=hints)
-
-    def _set_learning_rates(self, step: int) -> None:
-        for group in self.optimizer.param_groups:
-            group["lr"] = group["peak"] * self.recipe.learning_rate_factor(step)
 
     @torch.no_grad()
     def _update_ema(self, steps: int) -> None:
@@ -295,13 +257,6 @@ def _draw_samples(network: nn.Module, pairs: ValidationPairs) -> Tensor:
     return sample_sheet(_SAMPLE_COLUMNS, rows)
 
 
-def _resize_pairs(folders: ValidationPairs, stride: int) -> dict[str, list[tuple[Tensor, Tensor]]]:
-    return {
-        name: [(_resize(photo, stride), _resize(ground_truth, stride)) for photo, ground_truth in pairs]
-        for name, pairs in folders.items()
-    }
-
-
 def _single_thread_pool(count: int) -> ThreadPoolExecutor:
     """Returns a thread pool in which each torch operation uses one core, so that threads do not wait at barriers."""
     return ThreadPoolExecutor(count, initializer=torch.set_num_threads, initargs=(1,))
@@ -320,14 +275,11 @@ def _held_out_pairs(recipe: CompactRecipe) -> dict[str, list[tuple[Tensor, Tenso
     if stream is None:
         return {}
     batch = stream(0, _HELD_OUT_COUNT, _HELD_OUT_SIDE_PX)
-    pairs = list(zip(batch.photo_encoded[:, None], batch.transmission_encoded[:, None], strict=True))
-    visible = [functional.mse_loss(*pair).item() > _MIN_VISIBLE_MSE for pair in pairs]
-    return {
-        name: [
-            pair for pair, has_reflection in zip(pairs, visible, strict=True) if has_reflection is expected
-        ]
-        for name, expected in (("mixtures", True), ("plain", False))
-    }
+    found: dict[str, list[tuple[Tensor, Tensor]]] = {"mixtures": [], "plain": []}
+    for pair in zip(batch.photo_encoded[:, None], batch.transmission_encoded[:, None], strict=True):
+        has_reflection = functional.mse_loss(*pair).item() > _MIN_VISIBLE_MSE
+        found["mixtures" if has_reflection else "plain"].append(pair)
+    return found
 
 
 def _resize(image: Tensor, stride: int) -> Tensor:
@@ -337,7 +289,3 @@ def _resize(image: Tensor, stride: int) -> Tensor:
     size = [max(1, round(side * scale / stride)) * stride for side in (height, width)]
     planes = image.permute(2, 0, 1)[None] / 255
     return functional.interpolate(planes, size, mode="bilinear", antialias=True)
-
-
-def _channels_last(images: Tensor) -> Tensor:
-    return images.contiguous(memory_format=torch.channels_last)

@@ -53,9 +53,8 @@ class RenderedRecipe(FrozenModel):
             raise ValueError(
                 "expected either datasets (rendered before) or recipe (rendered during training): exactly one of the two"
             )
-        unused = [
-            name for name in ("orders", "seed", "maps", "photos") if getattr(self, name) not in (None, ())
-        ]
+        names = "orders", "seed", "maps", "photos"
+        unused = [name for name in names if getattr(self, name) not in (None, ())]
         if self.datasets and unused:
             raise ValueError(
                 f"expected no {', '.join(unused)}: datasets are already rendered, so that these keys have no effect"
@@ -129,8 +128,8 @@ class DataRecipe(FrozenModel):
 class MixRecipe(FrozenModel):
     """Distributions of mixtures of photos: a background behind glass plus a reflection, in linear light.
 
-    Luminances are linear. Lengths in pixels refer to an
-    image of 256 px and scale with the size of the training images, unless their description says otherwise.
+    Luminances are linear. Lengths in pixels refer to an image of 256 px and scale with the size of the training images,
+    unless their description says otherwise.
     """
 
     target: Target = "transmission"

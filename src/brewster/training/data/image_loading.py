@@ -33,11 +33,8 @@ def read_photos(
 ) -> list[Tensor]:
     """Reads every photo of the folders: uint8 sRGB (H, W, 3), longest side at most 1,024 px, sorted by path.
 
-    `exclude` and `only` are patterns of file names, as in `fnmatch`.
-
-    Raises:
-        RecipeError: a folder cannot be read, or none of the folders contains a photo.
-        PhotoError: a photo cannot be decoded.
+    `exclude` and `only` are patterns of file names, as in `fnmatch`. Raises RecipeError if a folder cannot be read, or none of
+    them contains a photo.
     """
     photos = []
     for path in _list_images(folders, _PHOTOS, exclude, only):
@@ -50,8 +47,7 @@ def source_weights(folders: Sequence[Path], exclude: Sequence[str] = ()) -> list
     """Returns sampling weights for the photos of `read_photos`, so that no single source dominates.
 
     Photos whose file names start with the same word (letters and digits) belong to one source. The n photos of a source have
-    the total weight n^(2/3): a large source counts more, but does not dominate. Raises RecipeError if a folder cannot be read,
-    or none of the folders contains a photo.
+    the total weight n^(2/3): a large source counts more, but does not dominate.
     """
     sources = [_WORD_END.split(path.name)[0] for path in _list_images(folders, _PHOTOS, exclude)]
     counts = Counter(sources)
@@ -61,14 +57,7 @@ def source_weights(folders: Sequence[Path], exclude: Sequence[str] = ()) -> list
 def read_maps(
     folders: Sequence[Path], exclude: Sequence[str] = (), only: Sequence[str] = ("*",)
 ) -> list[Tensor]:
-    """Reads every lat-long map of the folders: float16 (3, H, 2 H), at most 512 px high, linear light.
-
-    `exclude` and `only` are patterns of file names, as in `fnmatch`.
-
-    Raises:
-        RecipeError: a folder cannot be read, or none of the folders contains a map.
-        PhotoError: a map cannot be decoded.
-    """
+    """Reads every lat-long map of the folders, as `read_photos`: float16 (3, H, 2 H), at most 512 px high, linear light."""
     maps = []
     for path in _list_images(folders, _MAPS, exclude, only):
         linear = np.clip(_downscaled(Photo.open(path), 2 * _MAP_HEIGHT_PX), 0, _MAX_FLOAT16)
@@ -79,11 +68,8 @@ def read_maps(
 def read_pairs(folders: Sequence[Path], max_pairs: int | None = None) -> list[tuple[Tensor, Tensor]]:
     """Reads aligned pairs (photo, transmission), uint8 sRGB (H, W, 3), sorted by path.
 
-    `pairing.read_folders` matches the files by name. At most `max_pairs` pairs are read from each folder, evenly spaced.
-
-    Raises:
-        RecipeError: a folder cannot be read or is empty, or a photo has no transmission with its name and size.
-        PhotoError: an image cannot be decoded.
+    `pairing.read_folders` matches the files by name. At most `max_pairs` pairs are read from each folder, evenly spaced. Raises
+    RecipeError if a folder cannot be read or is empty, or a photo has no transmission with its name and size.
     """
     pairs = []
     for folder in folders:

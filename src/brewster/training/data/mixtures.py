@@ -69,7 +69,6 @@ class Stream(Protocol):
 
     def __call__(self, step: int, count: int, size: int) -> TrainingBatch:
         """Returns the batch of this step: `count` samples with sides of `size` px."""
-        ...
 
 
 class Mixtures:
@@ -91,9 +90,9 @@ class Mixtures:
         self._cumulative = torch.tensor(weights or [1.0] * len(photos), dtype=torch.float64).cumsum(0)
 
     def __call__(self, step: int, count: int, size: int) -> TrainingBatch:
-        """Returns the batch of this step: `count` samples with sides of `size` px."""
+        """Returns the batch of a step (see `Stream`)."""
         samples = [self._sample(SampleRng(self._seed, step, slot), size) for slot in range(count)]
-        photo, transmission, reflection = (torch.stack(layer) for layer in zip(*samples, strict=True))
+        photo, transmission, reflection = map(torch.stack, zip(*samples, strict=True))
         return TrainingBatch(photo, transmission, reflection, torch.ones(count))
 
     def _sample(self, rng: SampleRng, size: int) -> tuple[Tensor, Tensor, Tensor]:
@@ -188,17 +187,17 @@ class Pairs:
         self._pairs, self._crop, self._seed = pairs, crop, seed
 
     def __call__(self, step: int, count: int, size: int) -> TrainingBatch:
-        """Returns the batch of this step: `count` samples with sides of `size` px."""
-        samples = [self._sample(SampleRng(self._seed, step, slot), size) for slot in range(count)]
-        photo, transmission = (torch.stack(layer) for layer in zip(*samples, strict=True))
-        reflection = (photo - transmission).clamp(min=0)
-        weight = torch.full((count,), self.reflection_weight)
+        """Returns the batch of a step (see `Stream`)."""
+        crops = torch.stack(
+            [self._crop_pair(SampleRng(self._seed, step, slot), size) for slot in range(count)]
+        )
+        photo, transmission = crops.chunk(2, dim=1)
+        reflection, weight = (photo - transmission).clamp(min=0), torch.full((count,), self.reflection_weight)
         return TrainingBatch(to_encoded(photo), to_encoded(transmission), to_encoded(reflection), weight)
 
-    def _sample(self, rng: SampleRng, size: int) -> tuple[Tensor, Tensor]:
+    def _crop_pair(self, rng: SampleRng, size: int) -> Tensor:
         both = torch.cat(self._pairs[rng.randint(len(self._pairs))], dim=2)
-        crop = random_crop(rng, both, self._crop, size)
-        return crop[:3], crop[3:]
+        return random_crop(rng, both, self._crop, size)
 
 
 class InterleavedStream:
@@ -211,7 +210,7 @@ class InterleavedStream:
         self._first, self._second, self._share = first, second, first_share
 
     def __call__(self, step: int, count: int, size: int) -> TrainingBatch:
-        """Returns the batch of this step: `count` samples with sides of `size` px."""
+        """Returns the batch of a step (see `Stream`)."""
         first_count = round(count * self._share)
         counts = (self._first, first_count), (self._second, count - first_count)
         parts = [stream(step, part_count, size) for stream, part_count in counts if part_count]

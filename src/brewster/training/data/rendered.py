@@ -16,7 +16,6 @@ import tarfile
 from collections.abc import Callable, Hashable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from random import Random
 from threading import Lock
@@ -30,7 +29,7 @@ from brewster.errors import RecipeError
 from brewster.photo import Photo
 from brewster.render.analytic import render
 from brewster.render.camera_response import DevelopedSample, develop, encode_jpeg, to_uint8, with_jpeg
-from brewster.rendered.store import SCENE_FILE, StoredSample, key, read_dataset, read_scene_of
+from brewster.rendered.store import SCENE_FILE, StoredSample, read_dataset, read_scene_of
 from brewster.scene.recipe import SceneRecipe
 from brewster.scene.sampler import Catalog, draw
 from brewster.scene.scene import Scene
@@ -51,8 +50,7 @@ class RenderedDatasets:
     """A `Stream` of random crops of the first `count` samples of rendered datasets, mirrored at random. It is thread-safe.
 
     With `blend_space` "srgb", the photo is a blend of the sample's background and mirror image. The blend is compressed as JPEG
-    with the same quality as the photo of the sample. Raises RecipeError if a dataset cannot be read, or all datasets together
-    have fewer than `count` samples.
+    with the same quality as the photo of the sample. Raises RecipeError if a dataset cannot be read, or there are too few samples.
     """
 
     def __init__(
@@ -80,8 +78,7 @@ class RenderedDatasets:
         return len(self._entries)
 
     def __call__(self, step: int, count: int, size: int) -> TrainingBatch:
-        """Returns the batch of this step: `count` samples with sides of `size` px. Raises RecipeError or PhotoError if a file
-        of a sample is missing or damaged."""
+        """Returns the batch of a step (see `Stream`)."""
         rngs = (SampleRng(self._seed, step, slot) for slot in range(count))
         crops = [random_crop(each, self.sample(each.randint(len(self))), self._crop, size) for each in rngs]
         return TrainingBatch.from_layers(to_encoded(torch.stack(crops)))
@@ -89,13 +86,12 @@ class RenderedDatasets:
     def sample(self, number: int) -> Tensor:
         """Returns photo, target and reflection of a whole sample as channels: (H, W, 9) sRGB uint8. Raises RecipeError or
         PhotoError if a file of the sample is missing or damaged."""
-        entry = self._entries[number]
+        return self._cache.get_or_create(number, lambda: self._read(self._entries[number]))
+
+    def _read(self, entry: StoredSample) -> Tensor:
         if self._blend_space == "srgb":
-            return self._cache.get_or_create(number, partial(_blended_sample, entry))
-        names = ("photo", self._target, "reflection")
-        return self._cache.get_or_create(
-            number, lambda: torch.cat([_read_image(entry, name) for name in names], dim=2)
-        )
+            return _blended_sample(entry)
+        return torch.cat([_read_image(entry, name) for name in ("photo", self._target, "reflection")], dim=2)
 
 
 class OnlineRendered:
@@ -121,19 +117,13 @@ class OnlineRendered:
         self._render_lock = Lock()
 
     def __call__(self, step: int, count: int, size: int) -> TrainingBatch:
-        """Returns the batch of this step: `count` new samples with sides of `size` px."""
-        return TrainingBatch.from_layers(
-            torch.stack([self.layers(step * count + slot, size) for slot in range(count)])
-        )
+        """Returns the batch of a step (see `Stream`)."""
+        samples = [self.layers(step * count + slot, size) for slot in range(count)]
+        return TrainingBatch.from_layers(torch.stack(samples))
 
     def layers(self, index: int, size: int) -> Tensor:
         """Renders the sample of this index as a square. Returns photo, `target` and reflection as channels, (9, size, size),
-        encoded, in 0..1. The photo has JPEG artefacts.
-
-        Raises:
-            RecipeError: no valid scene can be drawn from the recipe, or a file is missing.
-            PhotoError: a file cannot be decoded.
-        """
+        encoded, in 0..1. The photo has JPEG artefacts."""
         camera = self._recipe.camera.model_copy(update={"width": size, "height": size})
         scene = draw(self._recipe.model_copy(update={"camera": camera}), self._catalog, self._seed, index)
         with self._render_lock:
@@ -155,19 +145,18 @@ class CachedRendered:
         self._source, self._count, self._seed, self._cache = source, count, seed, _TensorCache(max_bytes)
 
     def __call__(self, step: int, count: int, size: int) -> TrainingBatch:
-        """Returns the batch of this step: `count` samples with sides of `size` px. Raises RecipeError if no valid scene can be
-        drawn from the recipe, or a file is missing, and PhotoError if a file cannot be decoded."""
-        samples = []
-        for slot in range(count):
-            rng = SampleRng(self._seed, step, slot)
-            index = rng.randint(self._count)
-            # A sample has the 8-bit values of the cache also when it is first used.
-            layers = self._cache.get_or_create((index, size), partial(self._render, index, size))
-            samples.append(layers.flip(2) if rng.bernoulli(0.5) else layers)
+        """Returns the batch of a step (see `Stream`)."""
+        samples = [self._sample(SampleRng(self._seed, step, slot), size) for slot in range(count)]
         return TrainingBatch.from_layers(torch.stack(samples) / 255)
 
-    def _render(self, index: int, size: int) -> Tensor:
-        return (self._source.layers(index, size).clamp(0, 1) * 255).round().to(torch.uint8)
+    def _sample(self, rng: SampleRng, size: int) -> Tensor:
+        index = rng.randint(self._count)
+
+        def render_8bit() -> Tensor:  # a sample has the 8-bit values of the cache also when it is first used
+            return (self._source.layers(index, size).clamp(0, 1) * 255).round().to(torch.uint8)
+
+        layers = self._cache.get_or_create((index, size), render_8bit)
+        return layers.flip(2) if rng.bernoulli(0.5) else layers
 
 
 class _TensorCache:
@@ -205,9 +194,8 @@ def _entries(folder: Path) -> list[StoredSample]:
 def _blended_sample(entry: StoredSample) -> Tensor:
     with _file_errors(entry, SCENE_FILE):
         scene = read_scene_of(entry)
-    background, mirror = (
-        _read_image(entry, name).permute(2, 0, 1) / 255 for name in ("background", "mirror")
-    )
+    names = "background", "mirror"
+    background, mirror = (_read_image(entry, name).permute(2, 0, 1) / 255 for name in names)
     photo, *layers = blended_layers(background, mirror, scene)
     compressed = Photo.open(encode_jpeg(photo, scene.camera_response.jpeg_quality)).pixels.copy()
     return torch.cat([torch.from_numpy(image) for image in (compressed, *map(to_uint8, layers))], dim=2)
@@ -216,10 +204,7 @@ def _blended_sample(entry: StoredSample) -> Tensor:
 def _read_image(entry: StoredSample, layer: str) -> Tensor:
     """Reads a layer of a sample, (H, W, 3) sRGB uint8."""
     name = f"{layer}.jpg"
-    with (
-        _file_errors(entry, name),
-        add_file_name_to_errors(f"{name} of sample {key(entry.index)} in {entry.path}"),
-    ):
+    with _file_errors(entry, name), add_file_name_to_errors(f"{name} of sample {entry.name} in {entry.path}"):
         return torch.from_numpy(Photo.open(entry.read(name)).pixels.copy())
 
 
@@ -229,7 +214,7 @@ def _file_errors(entry: StoredSample, name: str) -> Iterator[None]:
         yield
     except (OSError, KeyError) as error:
         raise RecipeError(
-            f"{name} of sample {key(entry.index)} in {entry.path} cannot be read",
+            f"{name} of sample {entry.name} in {entry.path} cannot be read",
             "expected a sample with five images and a scene",
             "delete the sample and render the dataset again",
         ) from error
@@ -243,17 +228,14 @@ def blend(transmission_encoded: Tensor, reflection_encoded: Tensor, alpha: float
 
 def blended(developed: DevelopedSample) -> DevelopedSample:
     """Returns the sample as an 8-bit mixture: T is the background, R is beta times the mirror image, and I is their blend."""
-    photo, transmission, reflection = blended_layers(
-        developed.background_encoded, developed.mirror_encoded, developed.scene
-    )
+    scene, background, mirror = developed.scene, developed.background_encoded, developed.mirror_encoded
+    photo, transmission, reflection = blended_layers(background, mirror, scene)
     return replace(
         developed, photo_encoded=photo, transmission_encoded=transmission, reflection_encoded=reflection
     )
 
 
-def blended_layers(
-    background_encoded: Tensor, mirror_encoded: Tensor, scene: Scene
-) -> tuple[Tensor, Tensor, Tensor]:
+def blended_layers(background: Tensor, mirror: Tensor, scene: Scene) -> tuple[Tensor, Tensor, Tensor]:
     """Returns I, T and R of an 8-bit mixture, each (3, H, W) in 0..1, from encoded background and mirror image.
 
     T is the background. R is the mirror image times beta. alpha is uniform in 0.8..1, beta is uniform in 0.4..1. Both depend on
@@ -261,7 +243,7 @@ def blended_layers(
     """
     rng = Random(f"blend/{scene.seed}/{scene.index}")  # noqa: S311  (not for secrets)
     alpha, beta = rng.uniform(*ALPHA), rng.uniform(*BETA)
-    background, mirror = _eight_bits(background_encoded), _eight_bits(mirror_encoded)
+    background, mirror = _eight_bits(background), _eight_bits(mirror)
     return blend(background, mirror, alpha, beta), background, _eight_bits(beta * mirror)
 
 

@@ -80,8 +80,7 @@ class SampleSequence:
 
     def check_sizes(self, recipe: LoraRecipe, size_divisor: int) -> list[PanelFit]:
         """Returns the panel sizes for the first rendered sample and for every pair. Training calls this first, so that
-        an unusable sample stops it before any step. Raises RecipeError or PhotoError if a file is damaged or missing,
-        or a sample is too small, see `fit_sample`."""
+        an unusable sample stops it before any step."""
         first = [TrainingSample(self._rendered.sample(0))] if self._rendered else []
         return [fit_sample(sample.layers, recipe, size_divisor) for sample in (*first, *self._pairs)]
 
@@ -105,8 +104,7 @@ class EncodedSampleLoader:
         self._encoded = lru_cache(CACHE_SIZE)(self._encode)
 
     def __call__(self, rng: SampleRng) -> EncodedSample:
-        """Draws the index of a sample, its crop and whether it is mirrored. Returns the encoded sample. Raises RecipeError or
-        PhotoError if a file of the sample is missing or damaged, or the sample is too small, see `fit_sample`."""
+        """Draws the index of a sample, its crop and whether it is mirrored. Returns the encoded sample."""
         number = self._samples.draw_index(rng)
         mirrored = self._recipe.flip and rng.bernoulli(0.5)
         crops = self._recipe.crops
@@ -158,8 +156,7 @@ def fit_sample(layers: Tensor, recipe: LoraRecipe, size_divisor: int) -> PanelFi
 
 def open_samples(recipe: LoraRecipe) -> SampleSequence:
     """Opens the rendered datasets and pairs of a recipe. Data with a share of 0 is not read. Raises RecipeError if a
-    folder is missing, empty or without reflections, or there are too few rendered samples; PhotoError if an image
-    cannot be read."""
+    folder is missing, empty or without reflections, or there are too few rendered samples."""
     data, rendered, datasets = recipe.data, recipe.data.rendered, None
     if rendered and data.pairs_share < 1 and data.rendered_share:
         datasets = RenderedDatasets(

@@ -29,12 +29,6 @@ from brewster.training.recipe import SQUARE_PHOTO_PX, LoraRecipe
 from brewster.training.streams import resolve_folders
 
 _TEMPLATE: Final = "model_card.md.jinja"
-_TAGS: Final = ("lora", "reflection-removal", "image-decomposition", "brewster")
-_PANELS: Final = {
-    "I": "the photo again (I)",
-    "T": "the scene behind the glass (T, the transmission)",
-    "R": "the mirrored scene (R, the reflection)",
-}
 _BENCHMARK_HEADING: Final = "## Benchmark scores"
 _SCORE_TITLES: Final = {
     "psnr_gain_db_": "PSNR gain over the input, {}, dB",
@@ -47,8 +41,7 @@ def write_card(
     folder: Path, recipe: LoraRecipe, scores: Mapping[str, float], backbone_class: type[Backbone]
 ) -> None:
     """Writes or replaces the model card in a folder that contains the LoRA and its prompt. `scores` is the last line of
-    the run's log. Raises ModelError if the prompt is missing, damaged, or of another backbone; OutputError if the
-    folder cannot be written."""
+    the run's log. Raises ModelError if the prompt is missing, damaged, or of another backbone."""
     prompt = load_prompt(folder / PROMPT_FILE, backbone_class.name).text
     text = card_text(recipe, scores=scores, backbone_class=backbone_class, prompt=prompt)
     write_atomically(folder / CARD_FILE, text.encode(), overwrite=True)
@@ -75,20 +68,10 @@ def card_text(
     )
     environment.filters |= {
         "json": json.dumps,  # JSON is valid YAML
-        "panel": _PANELS.__getitem__,
         "dataset": _dataset_description,
         "folder_name": _folder_name,
     }
-    about = {} if is_tiny else {"base_model": base, "base_model_relation": "adapter"}
-    licence = APACHE_2 if is_tiny else backbone_class.licence
     return environment.get_template(_TEMPLATE).render(
-        front_matter={
-            **about,
-            **licence.hub,
-            "library_name": "diffusers",
-            "pipeline_tag": "image-to-image",
-            "tags": [*_TAGS, *(["tiny"] if is_tiny else [])],
-        },
         recipe=recipe,
         backbone=backbone_class,
         is_tiny=is_tiny,
@@ -104,7 +87,7 @@ def card_text(
             _score_title(name): value for name, value in scores.items() if name not in {"step", "seconds"}
         },
         benchmark_heading=_BENCHMARK_HEADING,
-        licence=licence.title,
+        licence=APACHE_2 if is_tiny else backbone_class.licence,
     )
 
 

@@ -54,7 +54,7 @@ from brewster.training.lora.latents import (
     open_samples,
 )
 from brewster.training.lora.model_card import write_card
-from brewster.training.losses import check_finite, psnr_gain_db
+from brewster.training.losses import check_finite, psnr_gain_db, total
 from brewster.training.plots import sample_sheet
 from brewster.training.recipe import ENCODED_SUFFIX, LoraRecipe
 from brewster.training.streams import validation_pairs
@@ -74,10 +74,7 @@ class LoraTrainer:
     """The `Trainer` of a LoRA: a frozen backbone, a float32 LoRA on it, and AdamW.
 
     The constructor checks the data and the machine. The backbone is loaded later, at its first use, so that `initialize` can
-    load and release the text encoders before. `device` is "auto" for the GPU, or "cpu". Raises RecipeError or PhotoError if the
-    data is missing, damaged, too small, or without reflections; DeviceError if there is no GPU and `device` is not "cpu", the
-    memory is too small, or the optimiser is not available; DownloadError, ModelError or MissingExtra if the backbone is unknown,
-    or the disk is too small for its download.
+    load and release the text encoders before. `device` is "auto" for the GPU, or "cpu".
     """
 
     def __init__(self, recipe: LoraRecipe, device: str = "auto") -> None:
@@ -125,8 +122,7 @@ class LoraTrainer:
 
     @cached_property
     def backbone(self) -> Backbone:
-        """The frozen backbone with the LoRA. The first use loads it. Raises DownloadError, ModelError, DeviceError or
-        MissingExtra if the backbone cannot be loaded."""
+        """The frozen backbone with the LoRA. The first use loads it."""
         recipe = self.recipe
         backbone = load_backbone(recipe.backbone, device=self._device, quantization=recipe.quantization)
         names = ("rank", "alpha", "seed", "target_modules")
@@ -144,12 +140,10 @@ class LoraTrainer:
 
     @cached_property
     def _optimizer(self) -> torch.optim.Optimizer:
-        recipe = self.recipe
-        is_8_bit = recipe.optimizer == "adamw8bit"
-        create = importlib.import_module("bitsandbytes.optim").AdamW8bit if is_8_bit else torch.optim.AdamW
-        optimizer = create(self._parameters, lr=recipe.learning_rate, weight_decay=recipe.weight_decay)
-        assert isinstance(optimizer, torch.optim.Optimizer)
-        return optimizer
+        recipe, create = self.recipe, torch.optim.AdamW
+        if recipe.optimizer == "adamw8bit":
+            create = importlib.import_module("bitsandbytes.optim").AdamW8bit
+        return create(self._parameters, lr=recipe.learning_rate, weight_decay=recipe.weight_decay)
 
     @property
     def prompt(self) -> PromptEmbedding:
@@ -159,8 +153,7 @@ class LoraTrainer:
 
     def initialize(self) -> None:
         """Loads or encodes the prompt of the recipe, then loads the backbone. Only rank 0 loads the text encoders. It
-        releases them before the backbone is loaded. Raises DownloadError, ModelError, DeviceError or MissingExtra if a
-        text encoder, the prompt or the backbone cannot be loaded."""
+        releases them before the backbone is loaded."""
 
         def load() -> PromptEmbedding:
             name, backbone = self.recipe.prompt, self.recipe.backbone
@@ -186,20 +179,18 @@ class LoraTrainer:
 
     def training_step(self, step: int) -> dict[str, float]:
         """Runs one step of AdamW on one batch. Returns `loss` and the term of each panel, `loss_panel_NAME`. Raises
-        ModelError if the loss is NaN or infinite. The last checkpoint is still valid; DeviceError if the GPU is out of
-        memory. The message lists the values to lower; RecipeError or PhotoError if a sample is missing, damaged or too
-        small."""
+        ModelError if the loss is not finite, and DeviceError, with the values to lower, if the GPU is out of memory."""
         self._optimizer.zero_grad()
         parts: dict[str, Tensor] = {}
         with explain_out_of_memory(_MEMORY_CURE):
             for slot in range(distributed.rank(), self.recipe.batch_size, distributed.world_size()):
                 losses = self._losses(SampleRng(self.recipe.seed, step, slot))
                 scaled = {name: loss / self.recipe.batch_size for name, loss in losses.items()}
-                torch.stack(list(scaled.values())).sum().backward()  # type: ignore[no-untyped-call]
+                total(scaled).backward()  # type: ignore[no-untyped-call]
                 parts = {name: parts.get(name, 0) + loss.detach() for name, loss in scaled.items()}
         distributed.all_reduce_sum([each.grad for each in self._parameters if each.grad is not None])
         distributed.all_reduce_sum(list(parts.values()))
-        loss = check_finite(torch.stack(list(parts.values())).sum(), step)
+        loss = check_finite(total(parts), step)
         check_finite(nn.utils.clip_grad_norm_(self._parameters, _MAX_GRADIENT_NORM), step, "gradient")
         for group in self._optimizer.param_groups:
             group["lr"] = self.recipe.learning_rate * self.recipe.learning_rate_factor(step)
@@ -231,7 +222,7 @@ class LoraTrainer:
 
     def export(self, folder: Path) -> Path:
         """Writes LoRA, prompt, recipe and model card to the folder `lora` in `folder`, and returns its path. diffusers
-        can load the LoRA. Raises OutputError if the folder cannot be written."""
+        can load the LoRA."""
         lora_folder, recipe = folder / LORA_FOLDER, self.recipe
         base = Path(recipe.backbone)
         save_lora(
@@ -243,15 +234,15 @@ class LoraTrainer:
             quantization=recipe.quantization,
             target_modules=recipe.target_modules,
         )
-        text = json.dumps(self.recipe.model_dump(mode="json"), indent=2)
+        text = json.dumps(recipe.model_dump(mode="json"), indent=2)
         write_atomically(lora_folder / RECIPE_FILE, f"{text}\n".encode(), overwrite=True)
-        scores = read_log(folder)[-1:]
-        write_card(lora_folder, self.recipe, scores[0] if scores else {}, type(self.backbone))
+        scores = [{}, *read_log(folder)][-1]
+        write_card(lora_folder, recipe, scores, type(self.backbone))
         return lora_folder
 
     def separate(self, photo: Tensor, *, seed: int = 0) -> Mapping[str, Tensor]:
         """Generates the panels of a photo, (1, 3, h, w) in [-1, 1], in the same way as at inference. The photo has the
-        size of a panel. Raises DeviceError if the GPU is out of memory. The message lists the values to lower."""
+        size of a panel."""
         return DecompositionPipeline(self.backbone, self.prompt, self.recipe.task)(photo, seeds=[seed])
 
     def _losses(self, rng: SampleRng) -> dict[str, Tensor]:
@@ -264,18 +255,17 @@ class LoraTrainer:
         velocity = self.backbone.predict(noisy, condition, sigma, self.prompt, self.recipe.guidance)
         errors = (velocity - (start - encoded.composite).to(device)).square()
         weights: dict[str, float] = {
-            panel: self.recipe.panel_weights.get(panel, 1.0) for panel in self.recipe.panels
+            name: self.recipe.panel_weights.get(name, 1.0) for name in self.recipe.panels
         }
-        total, reliability = sum(weights.values()), {"R": encoded.reflection_weight}
+        whole, reliability = sum(weights.values()), {"R": encoded.reflection_weight}
         return {
-            f"panel_{name}": weights[name] / total * reliability.get(name, 1.0) * panel.mean()
+            f"panel_{name}": weights[name] / whole * reliability.get(name, 1.0) * panel.mean()
             for name, panel in split(errors, self.recipe.layout).items()
         }
 
     def _start_and_sigma(self, rng: SampleRng, encoded: EncodedSample) -> tuple[Tensor, Tensor]:
         """Returns the start of the path (noise, or the photo for one_step) and the time sigma: 1 at the start, 0 at the
-        composite. The distribution of times is logit-normal (Esser et al. 2024). Times are then shifted for the
-        resolution."""
+        composite. Times are logit-normal (Esser et al. 2024), then shifted for the resolution."""
         if encoded.start is not None:
             return encoded.start, torch.ones(1)
         recipe, grid = self.recipe, encoded.composite
