@@ -212,6 +212,13 @@ def test_a_dry_run_prints_the_planned_files_and_writes_nothing(run, tmp_path):
     assert list_files(tmp_path) == before
 
 
+def test_a_dry_run_reports_text_named_as_a_photo_as_a_real_run_does(run, tmp_path):
+    (tmp_path / "text.jpg").write_text("Hello, this is text")
+    errors = [run("text.jpg", *options)[2] for options in ([], ["--dry-run"])]
+    assert all("text.jpg: the file is text" in error for error in errors)
+    assert run("text.jpg", "--dry-run")[0] == 1
+
+
 @pytest.mark.parametrize("options", [[], ["--workers", "1"], ["--dry-run"], ["--dry-run", "--workers", "1"]])
 def test_rows_without_a_readable_photo_are_errors_with_their_number_also_in_a_dry_run(run, tmp_path, options):
     (tmp_path / "scans/folder").mkdir(parents=True)

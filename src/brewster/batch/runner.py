@@ -25,13 +25,14 @@ from brewster.batch.plan import (
 )
 from brewster.errors import BrewsterError, OutputError
 from brewster.files import exists, is_same_file, write_atomically
-from brewster.image_formats import format_of, is_video
+from brewster.image_formats import HEAD_BYTES, format_of, is_video
 from brewster.inference.layer_history import find_layer_of_another_photo
 from brewster.inference.predictor import ProgressCallback
 from brewster.inference.separation import Separation
 from brewster.inference.separator import Separator
 from brewster.options import Options
 from brewster.photo import Source
+from brewster.photo.decode import known_format
 from brewster.photo.in_memory import BinaryFile, WritableFile
 from brewster.remote_path import Location, RemotePath, check_readable, read_image
 
@@ -71,7 +72,7 @@ def separate_files(
         separator: the model. By default, it is loaded with `options` when the first photo needs it.
         overwrite: whether layers that exist are replaced instead of skipped.
         dry_run: if true, no file is written and no model is loaded. The results contain the paths of the missing layers. A
-            photo that does not exist, cannot be opened or is empty fails as in a real run. In an object store, this needs one request
+            photo that does not exist, cannot be opened, is empty or is no image fails as in a real run. In an object store, this needs one request
             for each photo.
         on_progress: see `BatchProgressCallback`.
 
@@ -182,11 +183,14 @@ def separate_task(
 
 
 def _check_sources(task: SeparationTask) -> None:
-    """Checks that the files of a task can be read. The frames of a video are not read."""
+    """Checks that the files of a task can be read and start like an image. The frames of a video are not read."""
     for source in task.burst.photos if task.burst else (task.source,):
         if isinstance(source, Location) and not (task.burst and is_video(source)):
             with row_in_errors(task.row):
                 check_readable(source)
+                if isinstance(source, Path):
+                    with source.open("rb") as file:
+                        known_format(file.read(HEAD_BYTES))
 
 
 def _missing_outputs(task: SeparationTask, *, overwrite: bool) -> dict[str, Location | WritableFile]:

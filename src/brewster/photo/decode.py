@@ -27,7 +27,7 @@ from brewster.errors import (
     video_error,
 )
 from brewster.files import DEFAULT_MAX_PIXELS
-from brewster.image_formats import FORMATS, VIDEO_SIGNATURE, format_of_content
+from brewster.image_formats import FORMATS, VIDEO_SIGNATURE, ImageFormat, format_of_content
 from brewster.photo import metadata
 from brewster.photo.colour import colour_space_of, convert_cmyk, has_only_tables
 from brewster.photo.file_info import Decoded, FileInfo, check_pixel_count, library_of
@@ -93,13 +93,19 @@ _FLOAT_READERS = {"exr": read_exr, "hdr": read_hdr}
 
 def _detect_format(data: bytes, max_pixels: int) -> tuple[bytes, str]:
     """Returns the data and the name of their format; of an OpenRaster file, those of its merged image."""
+    image_format = known_format(data)
+    if image_format.name == "ora":
+        return _merged_image(data, max_pixels), "png"
+    is_raw_tiff = image_format.name == "tiff" and is_raw(metadata.read_tags(data))
+    return data, "raw" if is_raw_tiff else image_format.name
+
+
+def known_format(data: bytes) -> ImageFormat:
+    """Returns the format of a file by its first `HEAD_BYTES` bytes. Raises PhotoError if they are not those of an image."""
     if not data:
         raise empty_file_error()
     if image_format := format_of_content(data):
-        if image_format.name == "ora":
-            return _merged_image(data, max_pixels), "png"
-        is_raw_tiff = image_format.name == "tiff" and is_raw(metadata.read_tags(data))
-        return data, "raw" if is_raw_tiff else image_format.name
+        return image_format
     if re.match(VIDEO_SIGNATURE, data, re.DOTALL):
         raise video_error("the file")
     is_text = data[:12].isascii() and data[:12].decode().isprintable()
