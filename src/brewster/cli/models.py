@@ -63,6 +63,10 @@ def list_models(*, as_json: bool) -> None:
             f"{needs['offloaded_memory_gib']:g} GiB offloaded{encoder}"
         )
         print_out(f"{'':33}{model.access}; huggingface.co/{model.hub_id}")
+    width, height = _PHOTO_SIZE
+    print_status(
+        f"memory: estimates for a photo of {width} x {height} pixels on an {PAPER_GPU.name}; --plan estimates others"
+    )
 
 
 def _resources(model: DiffusionModel) -> dict[str, Any]:

@@ -137,10 +137,10 @@ def find_model(name: str) -> ModelFile:
     if exported := _run_model(name):
         return ModelFile(path.resolve().name, exported, None, "unknown")
     check_is_converted(name)
-    close = difflib.get_close_matches(name, (*MODELS, *DIFFUSION_NAMES), n=1) if path.name == name else []
+    close = difflib.get_close_matches(name, (*MODELS, *DIFFUSION_MODELS), n=1) if path.name == name else []
     raise ModelError(
         f"there is no model {name!r}",
-        f"expected one of {', '.join((*MODELS, *DIFFUSION_NAMES))}, an .onnx file, the folder of a training run, or the folder or hub id of a LoRA",
+        f"expected one of {', '.join((*MODELS, *DIFFUSION_MODELS))}, an .onnx file, the folder of a training run, or the folder or hub id of a LoRA",
         f"did you mean {close[0]}?"
         if close
         else "check the path, or print all models with: brewster models list",
