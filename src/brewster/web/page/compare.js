@@ -167,7 +167,7 @@ class GlassCompare extends HTMLElement {
         this.#paintSide(context, "right", pane, placement, line, pane.width);
       } else this.#paintSide(context, side, pane, placement, 0, pane.width);
     }
-    this.#describe(isSlider, line);
+    this.#describe(isSlider, line, placement);
   }
 
   // Draws one image in a pane, from `from` to `to` of its width: the reduced image, the tiles above it, and the regions.
@@ -199,10 +199,12 @@ class GlassCompare extends HTMLElement {
     context.restore();
   }
 
-  #describe(isSlider, line) {
+  #describe(isSlider, line, { top, height }) {
     const isSide = this.#mode === "side";
     this.line.hidden = !isSlider;
     this.line.style.left = `${line}px`;
+    this.line.style.top = `${Math.max(0, top)}px`;
+    this.line.style.bottom = `${Math.max(0, this.clientHeight - top - height)}px`;
     this.line.setAttribute("aria-valuenow", Math.round(100 * this.#split));
     this.line.setAttribute("aria-valuetext", `${Math.round(100 * this.#split)} % photo`);
     const [first, second] = [this.querySelector(".tag.left"), this.querySelector(".tag.right")];
