@@ -17,7 +17,7 @@ import brewster
 from brewster.batch.plan import plan_bursts
 from brewster.burst import read_video, separate_burst
 from brewster.burst.fourier_search import find_translations
-from brewster.burst.joint_model import DEFAULT_WEIGHTS, JointModel, Rates, optimise, pixel_grid
+from brewster.burst.joint_model import JointModel, Rates, optimise, pixel_grid
 from brewster.burst.registration import frame_motions, motion_candidates
 from brewster.burst.separate import burst_report, measure_layers
 from brewster.burst.solver import LEVELS, Level, Solution, solve
@@ -82,7 +82,7 @@ def test_layers_with_known_motion_are_separated_to_30_db():
     start = JointModel.start(tensor, motions, torch.tensor([False]), 2)
     prior = torch.from_numpy(truth.transpose(2, 0, 1).astype(np.float32))
     model = optimise(
-        start, tensor, prior, 150, rates=Rates(homographies=0, splines=0, gains=0), weights=DEFAULT_WEIGHTS
+        start, tensor, prior, 150, rates=Rates(homographies=0, splines=0, gains=0), weights=LEVELS[-1].weights
     )
     layers = model.reference_layers(*tensor.shape[-2:])[:, 0].movedim(1, -1).numpy()
     assert psnr_db(layers[0][8:-8, 8:-8], truth[8:-8, 8:-8]) > 30

@@ -28,6 +28,8 @@ MARGIN: Final = 0.15
 OFFSET: Final = 0.003
 """Added to linear light below the square root, so that noise in the shadows counts less."""
 _CHARBONNIER_EPSILON: Final = 0.01
+_TRANSMISSION_GRADIENTS: Final = 0.03
+_REFLECTION_GRADIENTS: Final = 0.05
 _CLIPPED: Final = 0.98
 """Above this value, a pixel of a frame is clipped, and a brighter sum of the layers is no error."""
 _MIN_DENOMINATOR: Final = 0.1
@@ -44,16 +46,11 @@ _REFLECTION_RIGIDITY: Final = 2.0
 @final
 @dataclass(frozen=True)
 class Weights:
-    """The weights of the terms of the loss."""
+    """The weights of the terms of the loss that change from level to level."""
 
-    transmission_gradients: float = 0.03
-    reflection_gradients: float = 0.05
-    common_edges: float = 0.02
-    prior: float = 0.02
+    common_edges: float
+    prior: float
     """The pull of the low frequencies of T to those of the single-photo result."""
-
-
-DEFAULT_WEIGHTS: Final = Weights()
 
 
 @final
@@ -284,19 +281,16 @@ def _data_loss(model: JointModel, frames: Tensor, chunk: slice) -> Tensor:
 def _penalties(model: JointModel, frames: Tensor, prior: Tensor, weights: Weights) -> Tensor:
     """Returns the terms of the loss of each candidate that do not compare the frames with their prediction, (C,)."""
     terms = torch.zeros(len(model.is_locked))
-    for layer, weight in zip(
-        model.layers, (weights.transmission_gradients, weights.reflection_gradients), strict=True
-    ):
+    for layer, weight in zip(model.layers, (_TRANSMISSION_GRADIENTS, _REFLECTION_GRADIENTS), strict=True):
         x, y = _differences(layer)
         # The length of the gradient, not the sum of its components, which favours edges along the axes
         lengths = _smooth_root(x[..., :-1, :].square() + y[..., :-1].square())
         terms = terms + weight * lengths.mean((1, 2, 3))
     if weights.common_edges:
         terms = terms + weights.common_edges * _common_edges(*model.layers)
-    if weights.prior:
-        transmission = model.reference_layers(*frames.shape[-2:])[0]
-        low = _low_pass(_encode(transmission)) - _low_pass(_encode(prior))
-        terms = terms + weights.prior * low.abs().mean((1, 2, 3))
+    transmission = model.reference_layers(*frames.shape[-2:])[0]
+    low = _low_pass(_encode(transmission)) - _low_pass(_encode(prior))
+    terms = terms + weights.prior * low.abs().mean((1, 2, 3))
     terms = terms + _GAIN_PENALTY * model.log_gains.square().mean((1, 2))
     for splines, rigidity in zip(model.splines, (1.0, _REFLECTION_RIGIDITY), strict=True):
         cost = _SPLINE_SIZE * splines.square().mean((1, 2, 3, 4))

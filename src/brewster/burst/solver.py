@@ -13,10 +13,14 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional
 
-from brewster.burst.joint_model import DEFAULT_WEIGHTS, OFFSET, JointModel, Rates, Weights, optimise
+from brewster.burst.joint_model import OFFSET, JointModel, Rates, Weights, optimise
 from brewster.burst.registration import MotionCandidate
 
 Floats = NDArray[np.float32]
+_FOR_MOTION: Final = Weights(common_edges=0.02, prior=0.02)
+"""Two layers with edges at the same places explain too much of any motion."""
+_FOR_LAYERS: Final = Weights(common_edges=0.0, prior=0.005)
+"""With the motion known, a penalty of common edges, or a stronger prior, would shift light between the layers."""
 
 
 @final
@@ -28,10 +32,11 @@ class Level:
     steps: int
     spline_size: tuple[int, int] | None
     """Rows and columns of the splines; None: the motion is a homography."""
+    weights: Weights = _FOR_LAYERS
 
 
-COMPARED_PX: Final = 160
-"""The size at which the best candidate is compared with one layer; larger frames are optimised for the best candidate only."""
+_COMPARED: Final = 1
+"""The index of the level at which the best candidate is compared with one layer. The next ones optimise the best candidate only."""
 _MAX_RELATIVE_MOTION: Final = 0.2
 """As a share of the width. With a larger motion, the reflection becomes an offset of each frame, and explains all but edges."""
 _MOTION_SAMPLES: Final = (9, 12)
@@ -41,8 +46,9 @@ _MIN_NAMING: Final = 0.15
 _MAX_ENLARGEMENT: Final = 1.3
 """Levels that would enlarge the frames by more than this factor are left out."""
 LEVELS: Final = (
-    Level(80, 60, None),
-    Level(COMPARED_PX, 90, (4, 6)),
+    Level(80, 60, None, _FOR_MOTION),
+    Level(160, 90, (4, 6), _FOR_MOTION),
+    Level(160, 220, (4, 6)),  # enough steps for the brightness of large areas
     Level(320, 70, (6, 8)),
     Level(640, 35, (8, 12)),
 )
@@ -63,7 +69,7 @@ class Solution:
     naming: float
     """The share of the detail of T that the prior keeps, minus that of R: 0 if the single photo does not tell the layers apart."""
     one_layer_error: float
-    """The mean error of the frames if both layers move together: the data term of the loss at `COMPARED_PX`."""
+    """The mean error of the frames if both layers move together: the data term of the loss at 160 pixels."""
     two_layer_error: float
     """The same for the best candidate."""
     losses: dict[str, float]
@@ -77,7 +83,6 @@ def solve(
     candidates: Sequence[MotionCandidate],
     *,
     refine_prior: Callable[[Floats], Floats] | None = None,
-    weights: Weights = DEFAULT_WEIGHTS,
     levels: Sequence[Level] = LEVELS,
     on_progress: Callable[[float], None] = lambda _fraction: None,
 ) -> Solution:
@@ -89,7 +94,6 @@ def solve(
         prior: T of the reference frame from a single photo, (h, w, 3).
         candidates: guesses for the motions. One of them is locked.
         refine_prior: returns a better `prior`, given the measured share of R in the light of the reference frame, (h, w, 1).
-        weights: the weights of the loss.
         levels: the sizes of the frames.
         on_progress: called with the completed fraction.
     """
@@ -111,8 +115,8 @@ def solve(
         else:
             kept = (
                 _best_of_families(model, candidates)
-                if index == 1
-                else _best(model, with_locked=level.long_side_px <= COMPARED_PX)
+                if index <= _COMPARED
+                else _best(model, with_locked=False)
             )
             model, names = model.selected(kept), [names[i] for i in kept]
             model = model.resized(small, level.spline_size)
@@ -124,12 +128,12 @@ def solve(
             on_progress(done / sum(work))
 
         model = optimise(
-            model, small, small_refined[0], level.steps, rates=rates, weights=weights, on_step=on_step
+            model, small, small_refined[0], level.steps, rates=rates, weights=level.weights, on_step=on_step
         )
         losses |= dict(zip(names, model.losses.tolist(), strict=True))
-        if level.long_side_px <= COMPARED_PX:
+        if index <= _COMPARED:
             errors = _errors(model)
-        if level.long_side_px >= COMPARED_PX or level is levels[-1]:
+        if index >= _COMPARED or level is levels[-1]:
             kept = _best(model, with_locked=False)
             best = model.selected(kept)
             layers, naming = _named(best, small, small_prior[0])
