@@ -21,7 +21,8 @@ brewster train recipes/train/lora-tiny.toml -o "$out"
 # 3. Separate a photo, with the same tiling, colour handling and guided upsampling as for other models.
 brewster tests/pictures/mixture-coffee-rocket.jpg --model "$out/lora" --quality draft -o "$out/separated" --overwrite
 
-# 4. Evaluate the LoRA, the compact model, and the unprocessed input as baseline.
+# 4. Evaluate the LoRA, the compact model, and the unprocessed input as baseline. Two small images in draft quality test the
+#    evaluation, and say nothing about a method: docs/results.md has the scores of the compact model.
 brewster evaluate --benchmark "rendered=$out/sets/test" --model compact --model "lora=$out/lora" \
     --quality draft --metrics psnr,ssim -o "$out/evaluate"
 
