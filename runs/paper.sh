@@ -19,6 +19,8 @@ if [ "${1:-}" = --tiny ]; then tiny=true; shift; fi
 $tiny && default=$root/out/paper-tiny || default=$root/out/paper
 out=$(realpath -m "${1:-$default}")
 command -v brewster > /dev/null || export PATH="$PWD/.venv/bin:$PATH"
+install="python3 -m venv .venv && .venv/bin/pip install -c constraints.txt -e '.[render,train,diffusion,evaluate]'"
+command -v brewster > /dev/null || { echo "error: brewster is not installed; run: $install" >&2; exit 1; }
 brewster doctor --needs render,train,diffusion,evaluate
 if $tiny; then
     export BREWSTER_DATA="$out/data" OMP_NUM_THREADS=1 HF_HUB_OFFLINE=1

@@ -8,6 +8,8 @@ root="$(realpath "$(dirname "$0")/..")"
 out=$(realpath -m "${1:-$root/out/tiny}")
 cd "$root"
 command -v brewster > /dev/null || export PATH="$PWD/.venv/bin:$PATH"
+install="python3 -m venv .venv && .venv/bin/pip install -c constraints.txt -e '.[render,train,diffusion,evaluate]'"
+command -v brewster > /dev/null || { echo "error: brewster is not installed; run: $install" >&2; exit 1; }
 brewster doctor --needs render,train,diffusion,evaluate
 export BREWSTER_DATA="$out" OMP_NUM_THREADS=1 HF_HUB_OFFLINE=1
 

@@ -148,6 +148,22 @@ def test_the_paper_experiment_starts_nothing_if_folders_of_its_data_are_missing(
     assert process.stderr.startswith(f"error: {tmp_path} has no photos pairs/real; expected")
 
 
+@pytest.mark.parametrize("name", ["tiny.sh", "paper.sh", "first_gpu_day.sh"])
+def test_without_brewster_a_script_prints_the_command_that_installs_it(tmp_path, name):
+    shutil.copytree(RUNS, tmp_path / "runs")  # where there is no .venv
+    process = subprocess.run(
+        [tmp_path / "runs" / name],
+        cwd=tmp_path,
+        env={"PATH": "/usr/bin:/bin"},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert process.returncode == 1
+    assert "pip install -c constraints.txt -e '.[render,train,diffusion,evaluate]'" in process.stderr
+    assert not (tmp_path / "out").exists()
+
+
 def test_the_full_size_check_names_the_packages_that_are_not_installed(tmp_path):
     shutil.copytree(RUNS, tmp_path / "runs")  # where there is no .venv
     python = tmp_path / "bin" / "python3"
