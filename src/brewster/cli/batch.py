@@ -167,11 +167,15 @@ class BatchReport:
 
         given = {name: getattr(self.options, name) for name in ("strength", "quality", "additive")}
         expected = history_step(**given)
-        with suppress(ModelError):  # the model is unknown
-            if not zoo.is_diffusion_model(self.options.model):  # whose name is known only after loading
-                expected["model"] = zoo.find_model(self.options.model).name
         metadata = (recorded_parameters(Path(path), PROGRAM) for path in result.outputs.values())
         recorded = next((parameters for parameters in metadata if parameters), {})
+        with suppress(ModelError):  # the model is unknown
+            if not zoo.is_diffusion_model(self.options.model):
+                expected["model"] = zoo.find_model(self.options.model).name
+            elif (
+                recorded.get("model") in zoo.MODELS
+            ):  # the name of a diffusion model is known only after loading
+                expected["model"] = self.options.model
         different = {name for name, value in expected.items() if recorded.get(name, value) != value}
         return ", ".join(f"{name}={recorded[name]}" for name in expected if name in different)
 
