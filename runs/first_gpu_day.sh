@@ -17,6 +17,8 @@ if [ "${1:-}" = --tiny ]; then tiny=true; shift; fi
 $tiny && default=$root/out/first-gpu-day-tiny || default=$root/out/first-gpu-day
 out=$(realpath -m "${1:-$default}")
 command -v brewster > /dev/null || export PATH="$PWD/.venv/bin:$PATH"
+install="python3 -m venv .venv && .venv/bin/pip install -c constraints.txt -e '.[render,train,diffusion,evaluate]'"
+command -v brewster > /dev/null || { echo "error: brewster is not installed; run: $install" >&2; exit 1; }
 python="$(dirname "$(command -v brewster)")/python"
 [ -x "$python" ] || python=python3
 script() { PYTHONPATH="$root/src:$root/tests${PYTHONPATH:+:$PYTHONPATH}" "$python" "$root/runs/first_gpu_day.py" "$@"; }

@@ -12,5 +12,11 @@
 set -euo pipefail
 cd "$(dirname "$0")/.."
 if [ -x .venv/bin/python ]; then python=.venv/bin/python; else python=python3; fi
+missing=$("$python" -c 'import sys, importlib.util; print(*(name for name in sys.argv[1:] if not importlib.util.find_spec(name)))' \
+    torch diffusers peft accelerate safetensors torchao huggingface_hub)
+if [ -n "$missing" ]; then
+    echo "error: not installed: $missing; expected the extra diffusion; run: pip install -c constraints.txt -e '.[diffusion]'." >&2
+    exit 1
+fi
 PYTHONPATH="src${PYTHONPATH:+:$PYTHONPATH}" HF_HUB_OFFLINE=1 PYTHONUNBUFFERED=1 \
     exec "$python" runs/full_size_check.py --out "${OUT:-out/full_size}" "$@"

@@ -19,6 +19,8 @@ if [ "${1:-}" = --tiny ]; then tiny=true; shift; fi
 $tiny && default=$root/out/paper-tiny || default=$root/out/paper
 out=$(realpath -m "${1:-$default}")
 command -v brewster > /dev/null || export PATH="$PWD/.venv/bin:$PATH"
+install="python3 -m venv .venv && .venv/bin/pip install -c constraints.txt -e '.[render,train,diffusion,evaluate]'"
+command -v brewster > /dev/null || { echo "error: brewster is not installed; run: $install" >&2; exit 1; }
 brewster doctor --needs render,train,diffusion,evaluate
 if $tiny; then
     export BREWSTER_DATA="$out/data" OMP_NUM_THREADS=1 HF_HUB_OFFLINE=1
@@ -31,6 +33,14 @@ else
     : "${BREWSTER_DATA:?is not set; expected the folder of the data, with 20 GB free; export BREWSTER_DATA=/path/to/data}"
     BREWSTER_DATA="$(realpath "$BREWSTER_DATA")"
     export BREWSTER_DATA
+    missing=()
+    for folder in photos pairs/real pairs/nature real20 nature20 SIR2 real/dev/nature; do
+        [ -d "$BREWSTER_DATA/$folder" ] || missing+=("$folder")
+    done
+    if [ ${#missing[@]} -gt 0 ]; then
+        echo "error: $BREWSTER_DATA has no ${missing[*]}; expected the folders at the top of $0; add them." >&2
+        exit 1
+    fi
     size=640x480 test_count=40 suffix=""
     assets=(--maps "$BREWSTER_DATA/hdri" --photos "$BREWSTER_DATA/photos")
     syn=recipes/train/kontext.toml real=recipes/train/kontext-real.toml set=sets/paper count=1000

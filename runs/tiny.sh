@@ -8,6 +8,8 @@ root="$(realpath "$(dirname "$0")/..")"
 out=$(realpath -m "${1:-$root/out/tiny}")
 cd "$root"
 command -v brewster > /dev/null || export PATH="$PWD/.venv/bin:$PATH"
+install="python3 -m venv .venv && .venv/bin/pip install -c constraints.txt -e '.[render,train,diffusion,evaluate]'"
+command -v brewster > /dev/null || { echo "error: brewster is not installed; run: $install" >&2; exit 1; }
 brewster doctor --needs render,train,diffusion,evaluate
 export BREWSTER_DATA="$out" OMP_NUM_THREADS=1 HF_HUB_OFFLINE=1
 
@@ -21,7 +23,8 @@ brewster train recipes/train/lora-tiny.toml -o "$out"
 # 3. Separate a photo, with the same tiling, colour handling and guided upsampling as for other models.
 brewster tests/pictures/mixture-coffee-rocket.jpg --model "$out/lora" --quality draft -o "$out/separated" --overwrite
 
-# 4. Evaluate the LoRA, the compact model, and the unprocessed input as baseline.
+# 4. Evaluate the LoRA, the compact model, and the unprocessed input as baseline. Two small images in draft quality test the
+#    evaluation, and say nothing about a method: docs/results.md has the scores of the compact model.
 brewster evaluate --benchmark "rendered=$out/sets/test" --model compact --model "lora=$out/lora" \
     --quality draft --metrics psnr,ssim -o "$out/evaluate"
 

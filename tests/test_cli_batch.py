@@ -5,6 +5,7 @@ import os
 import re
 import sys
 from dataclasses import fields
+from pathlib import Path
 
 import numpy as np
 import OpenEXR
@@ -210,6 +211,31 @@ def test_a_dry_run_prints_the_planned_files_and_writes_nothing(run, tmp_path):
     planned = json_lines(run(".", "--dry-run", "--json")[1])
     assert [line["status"] for line in planned] == ["planned", "planned"]
     assert list_files(tmp_path) == before
+
+
+@pytest.mark.parametrize("options", [[], ["--dry-run"]])
+def test_a_folder_of_photos_that_cannot_be_written_to_is_one_error_and_no_photo_is_separated(
+    run, tmp_path, monkeypatch, options
+):
+    folder, make_folder = tmp_path / "card", Path.mkdir
+    folder.mkdir()
+    for seed, name in enumerate(("a", "b", "done")):
+        (folder / f"{name}.jpg").write_bytes(image_bytes(seed=seed))
+    assert run("card/done.jpg")[0] == 0
+
+    def mkdir(path, *args, **kwargs):
+        if path.parent == folder:
+            raise OSError(errno.EROFS, os.strerror(errno.EROFS))
+        make_folder(path, *args, **kwargs)
+
+    # root can write to any folder, so the read-only file system is simulated
+    monkeypatch.setattr(os, "access", lambda path, mode: Path(path) != folder)
+    monkeypatch.setattr(Path, "mkdir", mkdir)
+    code, out, err = run("card", "--json", *options, with_model=False)
+    assert code == 1
+    assert [line["status"] for line in json_lines(out)] == ["failed", "failed", "skipped"]
+    (line,) = error_lines(err)
+    assert line.startswith(f"error: 2 photos (card/a.jpg, card/b.jpg): {folder} was not written (Read-only")
 
 
 def test_a_dry_run_reports_text_named_as_a_photo_as_a_real_run_does(run, tmp_path):

@@ -47,6 +47,7 @@ def test_a_dry_run_scores_nothing(evaluate, tmp_path):
     code, out, err = evaluate("--dry-run", "--limit", 2)
     assert (code, out.decode().split()) == (0, ["real20/1", "real20/2"])
     assert "2 of 3 images are scored (--limit)" in err
+    assert "1 of 3 images is scored (--limit)" in evaluate("--dry-run", "--limit", 1)[2]
 
 
 def test_photos_without_ground_truth_are_listed_and_the_others_are_scored(evaluate, tmp_path):

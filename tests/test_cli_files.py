@@ -124,6 +124,13 @@ def test_a_hint_names_the_other_options_of_existing_layers(run, tmp_path):
     assert "model=pane" in run("a.jpg", "--strength", "0.5", "--model", "compact", with_model=False)[2]
 
 
+def test_a_hint_says_that_existing_layers_are_not_those_of_the_diffusion_model(run, tmp_path):
+    (tmp_path / "a.jpg").write_bytes(image_bytes())
+    run("a.jpg", with_model=False)
+    assert "model=compact" in run("a.jpg", "--model", "windowseat", with_model=False)[2]
+    assert "other options" not in run("a.jpg", with_model=False)[2]
+
+
 # --- contact sheets
 
 

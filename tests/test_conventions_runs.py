@@ -5,6 +5,7 @@ import json
 import os
 import re
 import runpy
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -23,6 +24,9 @@ from brewster.photo import Photo
 ROOT = Path(__file__).parents[1]
 RUNS = ROOT / "runs"
 BIN = Path(sys.executable).parent
+
+
+PAPER_FOLDERS = ("photos", "pairs/real", "pairs/nature", "real20", "nature20", "SIR2", "real/dev/nature")
 
 
 def run_script(name, *args, path=BIN, **variables):
@@ -98,7 +102,7 @@ def test_every_command_of_the_paper_experiment_is_valid(tmp_path):
     recorder = f"import json, sys\nopen({str(calls)!r}, 'a').write(json.dumps(sys.argv[1:]) + chr(10))\n"
     stub.write_text(f"#!{sys.executable}\n{recorder}")
     stub.chmod(0o755)
-    for folder in ("hdri", "photos", "out/evaluate"):
+    for folder in (*PAPER_FOLDERS, "hdri", "out/evaluate"):
         (tmp_path / folder).mkdir(parents=True)
     (tmp_path / "out" / "evaluate" / "table.tex").touch()
     run_script("paper.sh", tmp_path / "out", path=stub.parent, BREWSTER_DATA=str(tmp_path))
@@ -124,6 +128,58 @@ def test_every_command_of_the_paper_experiment_is_valid(tmp_path):
         study = read_study(ROOT / name)
         assert {str(tmp_path / folder) for folder in study.benchmarks.values()} <= checked
         assert set(study.metrics) <= set(protocol_config(check[check.index("--protocol") + 1]).metrics)
+
+
+def test_the_paper_experiment_starts_nothing_if_folders_of_its_data_are_missing(tmp_path):
+    stub = tmp_path / "bin" / "brewster"
+    stub.parent.mkdir()
+    stub.write_text('#!/bin/sh\n[ "$1" = doctor ] || exit 7\n')
+    stub.chmod(0o755)
+    for folder in PAPER_FOLDERS[2:]:
+        (tmp_path / folder).mkdir(parents=True)
+    process = subprocess.run(
+        [RUNS / "paper.sh", tmp_path / "out"],
+        env=os.environ | {"PATH": f"{stub.parent}:{os.environ['PATH']}", "BREWSTER_DATA": str(tmp_path)},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert process.returncode == 1
+    assert process.stderr.startswith(f"error: {tmp_path} has no photos pairs/real; expected")
+
+
+@pytest.mark.parametrize("name", ["tiny.sh", "paper.sh", "first_gpu_day.sh"])
+def test_without_brewster_a_script_prints_the_command_that_installs_it(tmp_path, name):
+    shutil.copytree(RUNS, tmp_path / "runs")  # where there is no .venv
+    process = subprocess.run(
+        [tmp_path / "runs" / name],
+        cwd=tmp_path,
+        env={"PATH": "/usr/bin:/bin"},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert process.returncode == 1
+    assert "pip install -c constraints.txt -e '.[render,train,diffusion,evaluate]'" in process.stderr
+    assert not (tmp_path / "out").exists()
+
+
+def test_the_full_size_check_names_the_packages_that_are_not_installed(tmp_path):
+    shutil.copytree(RUNS, tmp_path / "runs")  # where there is no .venv
+    python = tmp_path / "bin" / "python3"
+    python.parent.mkdir()
+    python.write_text(f'#!/bin/sh\nexec {sys._base_executable} -I -S "$@"\n')  # without any package
+    python.chmod(0o755)
+    process = subprocess.run(
+        [tmp_path / "runs" / "full_size_check.sh", "--tiny"],
+        env=os.environ | {"PATH": f"{python.parent}:{os.environ['PATH']}"},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert process.returncode == 1
+    assert process.stderr.startswith("error: not installed: torch diffusers peft ")
+    assert "pip install -c constraints.txt -e '.[diffusion]'" in process.stderr
 
 
 @pytest.mark.slow

@@ -217,6 +217,12 @@ def test_many_photos_need_a_thread_and_a_wrong_type_is_raised():
     assert list(SEPARATOR.many([])) == []
 
 
+@pytest.mark.parametrize("source", ["window.jpg", b"bytes of a file"])
+def test_a_single_path_is_not_read_as_many_photos(source):
+    with pytest.raises(TypeError, match=r"pass \[source\]"):
+        SEPARATOR.many(source)
+
+
 # --- custom models
 
 

@@ -48,6 +48,13 @@ def test_an_unknown_option_is_refused(function):
         function(strenght=0.5)
 
 
+def test_the_error_for_an_unknown_option_lists_exactly_the_options_that_the_function_takes():
+    for function, takes_strength in ((Separator.load, False), (partial(brewster.separate, b""), True)):
+        with pytest.raises(TypeError) as error:
+            function(strenght=0.5)
+        assert ("strength" in str(error.value).partition("expected")[2]) == takes_strength
+
+
 @pytest.mark.parametrize("function", [Separator.load, Separator.__call__, brewster.separate])
 def test_help_describes_every_parameter_once(function):
     text = inspect.getdoc(function)

@@ -38,6 +38,13 @@ def test_a_method_with_errors_shows_the_number_of_scored_images(results):
     assert "| 21.50, 19 of 20 " in to_markdown(results)
 
 
+def test_a_benchmark_of_one_image_is_in_the_singular(results):
+    results["selections"]["real20"]["cases"] = 1
+    for text in (to_markdown(results), to_terminal(results)):
+        assert "(1 image)" in text
+        assert "(1 images)" not in text
+
+
 def test_csv_has_a_line_for_every_mean_and_every_difference(results):
     rows = list(csv.DictReader(io.StringIO(to_csv(results))))
     assert len(rows) == 6 * (4 + 2)

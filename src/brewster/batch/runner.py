@@ -24,7 +24,7 @@ from brewster.batch.plan import (
     plan_files,
 )
 from brewster.errors import BrewsterError, OutputError
-from brewster.files import exists, is_same_file, write_atomically
+from brewster.files import check_output_folder, exists, is_same_file, write_atomically
 from brewster.image_formats import HEAD_BYTES, format_of, is_video
 from brewster.inference.layer_history import find_layer_of_another_photo
 from brewster.inference.predictor import ProgressCallback
@@ -110,6 +110,7 @@ def separate_tasks(
         try:
             check_outputs(task, photos)
             outputs = _missing_outputs(task, overwrite=overwrite)
+            _check_folders(outputs.values())
             if outputs and dry_run:
                 _check_sources(task)
         except BrewsterError as error:
@@ -180,6 +181,13 @@ def separate_task(
             target.write(encoded)
         result.outputs[layer] = display_name(target)
     result.seconds["encode"] = time.perf_counter() - started
+
+
+def _check_folders(outputs: Iterable[Location | WritableFile]) -> None:
+    """Checks that existing folders of the layers can be written to, so that no photo is separated in vain. Raises OutputError."""
+    for folder in {output.parent.absolute() for output in outputs if isinstance(output, Path)}:
+        if folder.is_dir() and not os.access(folder, os.W_OK):
+            check_output_folder(folder)  # raises the error with the reason
 
 
 def _check_sources(task: SeparationTask) -> None:

@@ -46,7 +46,10 @@ def spread(benchmark: Benchmark, limit: int) -> Benchmark:
     if count <= limit:
         return benchmark
     cases = tuple(benchmark.cases[index * count // limit] for index in range(limit))
-    remarks = (*benchmark.remarks, f"{limit} of {count} images are scored (--limit)")
+    remarks = (
+        *benchmark.remarks,
+        f"{limit} of {count} images {'is' if limit == 1 else 'are'} scored (--limit)",
+    )
     return replace(benchmark, cases=cases, remarks=remarks)
 
 

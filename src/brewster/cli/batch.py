@@ -45,7 +45,7 @@ class BatchReport:
     counts: Counter[str] = field(default_factory=Counter)
     _contact_sheet_rows: list[tuple[Path, list[Path]]] = field(default_factory=list)
     _errors: list[str] = field(default_factory=list)
-    _sources_by_missing_extra: dict[str, list[str]] = field(default_factory=lambda: defaultdict(list))
+    _sources_by_shared_error: dict[str, list[str]] = field(default_factory=lambda: defaultdict(list))
     _skipped: dict[str, tuple[int, str]] = field(default_factory=dict)
     """The number of skipped photos, and the last one, by the options of their layers that differ from those of this batch."""
     _index: IndexWriter | None = None
@@ -125,8 +125,8 @@ class BatchReport:
         if self._index:
             self._index.append(result)
         self.counts[result.status] += 1
-        if result.error and INSTALL_COMMAND in result.error:
-            self._sources_by_missing_extra[result.error].append(result.source)
+        if result.error and (INSTALL_COMMAND in result.error or _is_about_folder(result)):
+            self._sources_by_shared_error[result.error].append(result.source)
         elif result.error:
             has_source = result.error.startswith(f"{result.source} ") or f": {result.source} " in result.error
             self._errors.append(result.error if has_source else f"{result.source}: {result.error}")
@@ -167,16 +167,21 @@ class BatchReport:
 
         given = {name: getattr(self.options, name) for name in ("strength", "quality", "additive")}
         expected = history_step(**given)
-        with suppress(ModelError):  # the model is unknown
-            if not zoo.is_diffusion_model(self.options.model):  # whose name is known only after loading
-                expected["model"] = zoo.find_model(self.options.model).name
         metadata = (recorded_parameters(Path(path), PROGRAM) for path in result.outputs.values())
         recorded = next((parameters for parameters in metadata if parameters), {})
+        with suppress(ModelError):  # the model is unknown
+            if not zoo.is_diffusion_model(self.options.model):
+                expected["model"] = zoo.find_model(self.options.model).name
+            elif (
+                recorded.get("model") in zoo.MODELS
+            ):  # the name of a diffusion model is known only after loading
+                expected["model"] = self.options.model
         different = {name for name, value in expected.items() if recorded.get(name, value) != value}
         return ", ".join(f"{name}={recorded[name]}" for name in expected if name in different)
 
     def _print_summary(self) -> None:
-        """Prints the counts, the time and the errors. Photos that need the same missing extra share a message."""
+        """Prints the counts, the time and the errors. Photos that need the same missing extra, or in a folder that cannot be
+        written to, share a message."""
         for different_options, (number, source) in self._skipped.items():
             photos = source if number == 1 else counted(number, "photo")
             note = f", made with other options ({different_options})" if different_options else ""
@@ -190,8 +195,13 @@ class BatchReport:
             print_status(totals if self.dry_run else f"{totals} in {_duration(seconds)}{layers}")
         for message in self._errors:
             print_error(message)
-        for message, sources in self._sources_by_missing_extra.items():
+        for message, sources in self._sources_by_shared_error.items():
             print_error(f"{sources[0] if len(sources) == 1 else listed(sources, 'photo')}: {message}")
+
+
+def _is_about_folder(result: FileResult) -> bool:
+    """Whether the error is that the folder of the photo, where the layers belong, cannot be written to."""
+    return (result.error or "").startswith(f"{Path(result.source).parent.absolute()} was not written ")
 
 
 def _duration(seconds: float) -> str:

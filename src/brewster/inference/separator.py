@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Set
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import replace
@@ -98,10 +98,7 @@ class Separator:
             BrewsterError: the value of an option of a diffusion model is invalid.
             TypeError: there is no such option.
         """
-        if unknown := options.keys() - LoadOptions.__annotations__.keys():
-            raise TypeError(
-                f"there is no option {min(unknown)}; expected {', '.join(LoadOptions.__annotations__)}"
-            )
+        _reject_unknown(options.keys(), LoadOptions)
         changed = {name: value for name, value in options.items() if value != getattr(Options, name)}
         if is_diffusion_model(model):
             if options.get("fast_lora") and options.get("steps") is None:
@@ -163,7 +160,12 @@ class Separator:
 
         Raises:
             BrewsterError: `threads` is less than 1.
+            TypeError: the sources are a single path or the bytes of a single file.
         """
+        if isinstance(sources, str | bytes):  # its characters would be the sources
+            raise TypeError(
+                f"sources is a single {type(sources).__name__}; expected an iterable; pass [source]"
+            )
         if threads < 1:
             raise BrewsterError(f"threads is {threads}", "expected at least 1", "choose 1, 2 or more")
         return self._many(iter(sources), threads, options)
@@ -352,10 +354,16 @@ def separate(
         BrewsterError: an error of `Separator.load` or of a call of the `Separator`.
         TypeError: there is no such option.
     """
+    _reject_unknown(options.keys(), SeparateOptions)
     load_options: dict[str, Any] = dict(options)
     call = {name: load_options.pop(name) for name in _CALL_OPTIONS if name in load_options}
     separator = Separator.load(model, **load_options)
     return separator(source, mask=mask, hints=hints, encoding=encoding, **call)
+
+
+def _reject_unknown(names: Set[str], expected: type) -> None:
+    if unknown := names - expected.__annotations__.keys():
+        raise TypeError(f"there is no option {min(unknown)}; expected {', '.join(expected.__annotations__)}")
 
 
 def _without_hints(model_input: Floats) -> Floats:

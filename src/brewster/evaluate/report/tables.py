@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping
 from typing import Any, Final
 
+from brewster.errors import counted
 from brewster.evaluate.results import Results
 from brewster.tables import csv_table, markdown_table, plain_table
 
@@ -57,7 +58,7 @@ def to_terminal(results: Results, width: int = 100, *, intervals: bool = False) 
     that is too wide is continued below, and long names of methods are shortened. With `intervals`, each mean has its
     95 % interval."""
     parts = [
-        f"{selection['title']} ({selection['cases']} images)\n{_terminal_table(results, key, width, intervals)}"
+        f"{selection['title']} ({counted(selection['cases'], 'image')})\n{_terminal_table(results, key, width, intervals)}"
         for key, selection in results["selections"].items()
     ]
     return "\n\n".join(part for part in parts if part) + "\n"
@@ -134,7 +135,7 @@ def _details(results: Results, key: str) -> str:
         means = [f"{mean}, {count}" if count else mean for mean, count in cells]
         changes = [_difference_cell(results, metric, by_pair.get(pair)) for pair in pairs]
         rows.append([_heading(results, metric), *means, *changes])
-    return f"### {selection['title']} ({selection['cases']} images)\n\n{markdown_table(rows)}"
+    return f"### {selection['title']} ({counted(selection['cases'], 'image')})\n\n{markdown_table(rows)}"
 
 
 def _means(results: Results, metric: str, key: str, *, intervals: bool) -> Iterator[tuple[str, str]]:
