@@ -12,6 +12,7 @@ import pytest
 import torch
 
 from brewster.errors import DeviceError, DownloadError, MissingExtra, ModelError
+from brewster.inference import Separator
 from brewster.models.diffusion.backbones.loading import load_backbone
 from brewster.models.diffusion.backbones.registry import BACKBONES, tiny
 from brewster.models.diffusion.memory import check_machine, choose_placement, count_weights
@@ -66,6 +67,13 @@ def test_a_large_base_needs_a_gpu_unless_the_cpu_is_chosen(machine, tmp_path):
     tiny("kontext")[0].save(tmp_path / "kontext")
     for small in ("tiny:kontext", str(tmp_path / "kontext")):
         check_machine(small, KONTEXT, Placement("cpu"), requested="auto")
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="this machine has a GPU")
+@pytest.mark.parametrize("device", ["cuda", "rocm"])
+def test_a_gpu_that_torch_does_not_find_is_an_error_before_its_memory_is_read(device):
+    with pytest.raises(DeviceError, match=r"there is no CUDA device; .*on Windows"):
+        Separator.load("tiny:kontext", device=device)
 
 
 def place(name, memory_gib, free_gib=None, **options):

@@ -15,6 +15,7 @@ import torch
 
 from brewster.errors import BrewsterError, DeviceError, DownloadError
 from brewster.models.diffusion.backbones.backbone import Backbone
+from brewster.models.diffusion.backbones.loading import check_cuda
 from brewster.models.diffusion.backbones.registry import (
     build_on_meta,
     find_description,
@@ -55,7 +56,9 @@ def torch_device(device: str) -> str:
             f"expected one of {', '.join(_DEVICES)}",
             "use --device auto",
         )
-    return _DEVICES[device] or ("cuda" if torch.cuda.is_available() else "cpu")
+    name = _DEVICES[device] or ("cuda" if torch.cuda.is_available() else "cpu")
+    check_cuda(name)
+    return name
 
 
 def backbone_cost(source: str, backbone_class: type[Backbone]) -> BackboneCost:

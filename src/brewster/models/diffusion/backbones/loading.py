@@ -67,7 +67,7 @@ def load_backbone(
     .safetensors, whose weights replace those of the transformer, which are then not downloaded. It cannot be quantized
     again.
     """
-    _check_device(device)
+    check_cuda(device)
     is_tiny = source.startswith(TINY_PREFIX)
     if (quantization and (transformer_file or is_tiny)) or (transformer_file and is_tiny):
         raise ModelError(
@@ -129,7 +129,7 @@ def encode_prompt(source: str, text: str = PROMPT, *, device: str = "cpu") -> Pr
 
     Returns the embedding on the CPU, bfloat16; float32 for a tiny version.
     """
-    _check_device(device)
+    check_cuda(device)
     if source.startswith(TINY_PREFIX):
         seed = 0 if text == PROMPT else zlib.crc32(text.encode()) or 1  # the sum of "" is 0
         return replace(tiny(source.removeprefix(TINY_PREFIX), seed)[1], text=text)
@@ -270,7 +270,8 @@ def _device_map(device: str) -> dict[str, Any]:
     return {} if device == "cpu" else {"device_map": {"": device}}
 
 
-def _check_device(device: str) -> None:
+def check_cuda(device: str) -> None:
+    """Checks that torch finds a GPU if the device is one."""
     if device.startswith("cuda") and not torch.cuda.is_available():
         raise DeviceError(
             "there is no CUDA device",
