@@ -172,9 +172,8 @@ class BatchReport:
         with suppress(ModelError):  # the model is unknown
             if not zoo.is_diffusion_model(self.options.model):
                 expected["model"] = zoo.find_model(self.options.model).name
-            elif (
-                recorded.get("model") in zoo.MODELS
-            ):  # the name of a diffusion model is known only after loading
+            elif recorded.get("model") in zoo.MODELS:
+                # The name of a diffusion model is known only after loading, but it is none of these
                 expected["model"] = self.options.model
         different = {name for name, value in expected.items() if recorded.get(name, value) != value}
         return ", ".join(f"{name}={recorded[name]}" for name in expected if name in different)
