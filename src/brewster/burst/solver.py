@@ -19,8 +19,8 @@ from brewster.burst.registration import MotionCandidate
 Floats = NDArray[np.float32]
 _FOR_MOTION: Final = Weights(common_edges=0.02, prior=0.02)
 """Two layers with edges at the same places explain too much of any motion."""
-_FOR_LAYERS: Final = Weights(common_edges=0.0, prior=0.01)
-"""With the motion known, a penalty of common edges, or a stronger prior, would shift light between the layers."""
+_FOR_LAYERS: Final = Weights(common_edges=0.005, prior=0.01)
+"""With the motion known, a larger penalty of common edges, or a stronger prior, would shift light between the layers."""
 
 
 @final
