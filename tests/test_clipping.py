@@ -57,6 +57,16 @@ def test_a_half_removed_lamp_is_left_alone_in_all_channels(colour):
     assert separation.reflection.pixels.max() == 0
 
 
+def test_a_region_that_ends_within_a_veil_leaves_no_outline_there():
+    columns = np.linspace(-1, 1, 160, dtype=np.float32)
+    veil = 0.75 * np.exp(-12 * (columns[None, :, None] ** 2 + columns[:120, None, None] ** 2))
+    photo = np.repeat(0.05 + veil, 3, axis=2)
+    transmission = photo + keep_clipped_light(photo, predict(photo, 0.5 * photo)).change
+    assert transmission.max() > 0.9 * photo.max()
+    steps = [np.abs(np.diff(to_encoded(image), axis=1)).max() for image in (photo, transmission)]
+    assert steps[1] < 2 * steps[0]
+
+
 @pytest.mark.parametrize("colour", COLOURS.values(), ids=COLOURS)
 def test_a_bright_reflection_that_disappears_is_removed_whole(colour):
     photo = linear(lamp_photo(colour))

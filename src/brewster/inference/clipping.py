@@ -42,6 +42,10 @@ _SURROUNDINGS_PX: Final = (3, 8)
 _HALO_PX: Final = 3
 """A kept region is enlarged by the radius of the filter that smooths its edges (2 px), so that its own pixels are kept whole, and by one
 pixel, because reduced photos have darker pixels at the edges of a lamp."""
+_EDGE_RADIUS_PX: Final = 16
+_EDGE_EPSILON: Final = 1e-3
+_EDGE_GAIN: Final = 1.5
+"""Radius, regularisation and contrast of the guided filter for the edges of kept regions that are not clipped."""
 
 
 def keep_clipped_light(photo: Float32[Floats, "h w 3"], prediction: Prediction) -> Prediction:
@@ -51,23 +55,41 @@ def keep_clipped_light(photo: Float32[Floats, "h w 3"], prediction: Prediction) 
         photo: the photo at the largest input scale of the model, linear light in 0..1.
         prediction: the prediction at this input scale.
     """
-    transmission = np.clip(photo + prediction.change, 0, 1)
-    darkest, brightest = (
-        reduce(pick, np.moveaxis(to_encoded(photo), 2, 0)) for pick in (np.minimum, np.maximum)
-    )
+    transmission, encoded = np.clip(photo + prediction.change, 0, 1), to_encoded(photo)
+    darkest, brightest = (reduce(pick, np.moveaxis(encoded, 2, 0)) for pick in (np.minimum, np.maximum))
     is_changed = encoded_change(photo, transmission) >= _MIN_CHANGE
     is_kept = np.zeros(photo.shape[:2], np.bool_)
     for white, max_share in _WHITES:
         is_bright = (brightest > _CLIPPED) | (darkest > white)
         regions = label_regions(is_bright & is_changed)
         is_kept |= _is_half_removed(regions, photo, transmission, max_share)[_grow(regions, _HALO_PX)]
-    weight, override = 1 - box_mean(is_kept[..., None].astype(np.float32)), prediction.override
+    if not is_kept.any():
+        return prediction
+    guide = encoded.mean(axis=2, keepdims=True)
+    kept, is_clipped = is_kept[..., None].astype(np.float32), is_kept & (brightest > _CLIPPED)
+    clipped = _grow(is_clipped.astype(np.int32), _HALO_PX)[..., None].astype(np.float32)
+    weight, override = 1 - np.maximum(box_mean(clipped), _with_edges_of(guide, kept)), prediction.override
     return replace(
         prediction,
         change=prediction.change * weight,
         reflection=prediction.reflection * weight,
         override=override and replace(override, weight=override.weight * weight),
     )
+
+
+def _with_edges_of(guide: Floats, mask: Floats) -> Floats:
+    """Returns the mask in 0..1 as a local linear function of the guide, both (h, w, 1): the guided filter (He et al. 2013).
+
+    A region that ends within a bright veil, where the photo has no edge, ends gradually: before, one saw its outline.
+    """
+    radius = _EDGE_RADIUS_PX
+    mean = box_mean(guide, radius)
+    variance = box_mean(guide * guide, radius) - mean**2 + np.float32(_EDGE_EPSILON)
+    slope = (box_mean(guide * mask, radius) - mean * box_mean(mask, radius)) / variance
+    offset = box_mean(mask, radius) - slope * mean
+    filtered = box_mean(slope, radius) * guide + box_mean(offset, radius)
+    edged: Floats = np.clip(0.5 + _EDGE_GAIN * (filtered - np.float32(0.5)), 0, 1)
+    return edged
 
 
 def _is_half_removed(

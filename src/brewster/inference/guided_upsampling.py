@@ -177,12 +177,12 @@ def _interpolate(map_: Floats, lower: NDArray[np.intp], fraction: Floats, *, axi
     return high
 
 
-def box_mean(map_: Floats) -> Floats:
+def box_mean(map_: Floats, radius: int = _RADIUS) -> Floats:
     """Returns the means of a map (h, w, C) over square windows. Pixels outside the map have the value of the nearest pixel."""
     for axis in (0, 1):
         padding = [(0, 0)] * 3
-        padding[axis] = (_RADIUS, _RADIUS)
+        padding[axis] = (radius, radius)
         padded = np.pad(map_, padding, mode="edge")
-        shifted = [np.take(padded, range(i, i + map_.shape[axis]), axis=axis) for i in range(2 * _RADIUS + 1)]
+        shifted = [np.take(padded, range(i, i + map_.shape[axis]), axis=axis) for i in range(2 * radius + 1)]
         map_ = np.mean(shifted, axis=0, dtype=np.float32)
     return map_
