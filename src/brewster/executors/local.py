@@ -209,7 +209,8 @@ def _start_worker() -> None:
     # One processor for each worker. The ONNX backend reads this variable. If torch is already imported, the variable has no
     # effect on torch, and the runner limits its threads (see worker_setup.py).
     os.environ.setdefault("OMP_NUM_THREADS", "1")
-    exit_with_parent()  # otherwise this worker and a resumed run could work on the same task
+    # Otherwise this worker and a resumed run could work on the same task
+    threading.Thread(target=_exit_with_parent, daemon=True).start()
 
 
 _runner: Runner[Any] | None = None
@@ -222,12 +223,8 @@ def _run_task(create_runner: Callable[[], Runner[Any]], task: Task[Any]) -> list
     return _runner(task)
 
 
-def exit_with_parent() -> None:
-    """Makes this process exit when its parent process ends, even if the parent is killed."""
-
-    def wait() -> None:
-        if parent := parent_process():
-            parent.join()
-            os._exit(1)
-
-    threading.Thread(target=wait, daemon=True).start()
+def _exit_with_parent() -> None:
+    """Waits until the parent process ends, even if it is killed, and then ends this process."""
+    if parent := parent_process():
+        parent.join()
+        os._exit(1)
