@@ -168,11 +168,7 @@ def output_errors(path: Path) -> Iterator[None]:
 
 
 def _read(response: HTTPResponse, max_bytes: int | None = None) -> bytes:
-    """Returns the whole body, or at most `max_bytes` bytes of it.
-
-    `read1` returns the bytes that are already received. Therefore no received byte is lost if the connection breaks.
-    """
-    try:
+    try:  # read1 returns what is already received, so that no byte is lost if the connection breaks
         return response.read() if max_bytes is None else response.read1(max_bytes)
     except (OSError, HTTPException) as error:
         raise _RetryableError(error) from error

@@ -255,9 +255,7 @@ def _names(outputs: Mapping[str, Location | WritableFile]) -> dict[str, str]:
 
 
 def _check_layers(source: Location | BinaryFile, layers: Iterable[Location | WritableFile]) -> None:
-    """Checks that existing layers were made from this photo, or raises OutputError. Streams are not checked, because they can
-    be read only once. Files in an object store are not checked either: two more requests for each photo of an archive
-    would take hours."""
+    """Streams are not checked (they are read once), nor stores (two more requests for each photo)."""
     files = (path for path in layers if isinstance(path, Path))
     if isinstance(source, Path) and (layer := find_layer_of_another_photo(source, files)):
         raise OutputError(

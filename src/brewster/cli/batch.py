@@ -179,8 +179,7 @@ class BatchReport:
         return ", ".join(f"{name}={recorded[name]}" for name in expected if name in different)
 
     def _print_summary(self) -> None:
-        """Prints the counts, the time and the errors. Photos that need the same missing extra, or in a folder that cannot be
-        written to, share a message."""
+        """Prints the counts, the time and the errors. Photos with the same cause share a message."""
         for different_options, (number, source) in self._skipped.items():
             photos = source if number == 1 else counted(number, "photo")
             note = f", made with other options ({different_options})" if different_options else ""

@@ -21,9 +21,7 @@ ProgressUpdater = Callable[[float, str], None]
 
 @final
 class _DeferredInterrupts:
-    """Remembers a KeyboardInterrupt that Python has dropped, and raises it later. libvips calls Python to write its
-    log. If Ctrl-C is pressed during such a call, the KeyboardInterrupt cannot pass through the C code, so that
-    Python drops it. Without this class, the command continues after Ctrl-C."""
+    """Raises a KeyboardInterrupt that Python has dropped in a call from C code, as by libvips for its log."""
 
     def __init__(self) -> None:
         self._pending = False
@@ -75,9 +73,7 @@ def print_error(text: object) -> None:
 
 @final
 class _Output:
-    """Standard output, reserved for the results of the command. The output of libraries is redirected to standard
-    error. Libraries print in two ways, and each needs its own redirection. C code and child processes write to file
-    descriptor 1. Python code writes to `sys.stdout`, as OpenEXR does for a damaged file."""
+    """Standard output, for results only. Libraries write to it as C code and as `sys.stdout` (OpenEXR)."""
 
     def __init__(self) -> None:
         self._stream: TextIO | None = None

@@ -87,9 +87,7 @@ def _find_unavailable(
     config: EvaluationConfig,
     logged: Mapping[RowId, ScoreRow],
 ) -> dict[str, str]:
-    """Loads the weights of all metrics before the workers start. Returns column -> reason, for the columns without
-    weights. A metric is not tried if every row of an earlier run has it and no row is outdated. The files of the
-    cases are read only if every row has it."""
+    """Loads the weights of the metrics that an earlier run lacks, and returns why if this fails."""
 
     def is_outdated(case: Case) -> bool:
         try:

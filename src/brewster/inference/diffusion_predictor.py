@@ -107,11 +107,7 @@ class DiffusionPredictor(Predictor):
     def _predict_tile(
         self, tile: Floats, steps: int, on_step: Callable[[int, int], None]
     ) -> tuple[Floats, ...]:
-        """Returns five maps (h, w, 3) for a tile (h, w, 3).
-
-        In linear light, means over the samples: change, reflection and transmission. In sRGB-encoded units: the spread
-        of the transmission over the samples, and the reconstruction error.
-        """
+        """Means of change, reflection and T over the samples, spread of T, error: (h, w, 3) each."""
         height, width, _ = tile.shape
         enlarged_size = self._work.enlarged((width, height))
         if enlarged_size != (width, height):

@@ -64,10 +64,6 @@ def _float_template(photo: Photo) -> Photo:
 
 
 def _exact_sum_layers(photo: Floats, transmission: Floats) -> list[Floats]:
-    """Returns transmission and reflection whose float sum is bit-equal to the photo.
-
-    Both layers are at least 0 where the photo is not negative. At least one of the two differences is exact (Sterbenz 1974),
-    which makes the sum exact.
-    """
+    """The sum is exact, because at least one of the two differences is (Sterbenz 1974)."""
     reflection = photo - np.minimum(transmission, photo)
     return [photo - reflection, reflection]

@@ -156,10 +156,7 @@ def upsample_rows(map_: Floats, top: int, rows: int, size: tuple[int, int]) -> F
 
 
 def _positions(small: int, first: int, count: int, large: int) -> tuple[NDArray[np.intp], Floats]:
-    """Returns the positions, on an axis of length `small`, of `count` pixels of an axis of length `large`, starting at `first`.
-
-    Each position is split into its integer part and its fractional part.
-    """
+    """The integer and the fractional parts of positions on an axis of length `small`."""
     centres = (np.arange(first, first + count) + 0.5) * (small / large) - 0.5
     centres = np.clip(centres, 0, small - 1)
     lower = np.minimum(centres.astype(np.intp), max(small - 2, 0))

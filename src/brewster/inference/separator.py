@@ -310,8 +310,7 @@ class Separator:
     def _inputs(
         self, photo: Photo, quality: Quality, hints: Source | None
     ) -> tuple[list[Floats], np.float32]:
-        """Returns the inputs of the model in 0..1, smallest first, and the white level by which they are divided. If there are
-        hints, the inputs have two more channels."""
+        """Returns the inputs of the model, the smallest first, and the white level of the photo."""
         inputs = [photo.resized(*size) for size in self._predictor.input_sizes(photo.size, quality)]
         white = white_level(inputs[-1])
         inputs = [np.clip(scaled_input / white, 0, 1) for scaled_input in inputs]

@@ -224,11 +224,7 @@ def _body_too_long(policy: AccessPolicy) -> HTTPException:
 
 
 def _redirect_with_cookie(path: str, policy: AccessPolicy) -> Response:
-    """Returns the response that sets the cookie and then loads the address without the token.
-
-    The response is a page with a Refresh header instead of an HTTP redirect: browsers send a SameSite=strict cookie only
-    if the navigation starts on a page of this server.
-    """
+    """No HTTP redirect: the cookie is sent only if the navigation starts on a page of this server."""
     address = "/" + quote(path.lstrip("/"))
     response = HTMLResponse(_REDIRECT_PAGE.format(address), headers={"Refresh": f"0; url={address}"})
     response.set_cookie(policy.cookie_name, policy.token or "", httponly=True, samesite="strict")

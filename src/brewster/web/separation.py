@@ -227,8 +227,7 @@ class _SeparationRoutes:
     def _fit_burst(
         self, form: SeparationRequest, separator: Separator, on_progress: ProgressCallback
     ) -> FittedBurst:
-        """Measures the layers of the burst in the form, or returns those of the last request with the same photos and model, so
-        that a download after a preview does not measure the motion again."""
+        """Keeps the last burst, so that a download after a preview does not measure again."""
         from brewster.burst import fit_burst  # noqa: PLC0415  (imports torch)
 
         digests = tuple(hashlib.sha256(file).digest() for file in (*form.burst, form.hints or b""))
