@@ -26,13 +26,13 @@ from brewster.batch.plan import (
 from brewster.errors import BrewsterError, OutputError
 from brewster.files import check_output_folder, exists, is_same_file, write_atomically
 from brewster.image_formats import HEAD_BYTES, format_of, is_video
-from brewster.inference.layer_history import find_layer_of_another_photo
 from brewster.inference.predictor import ProgressCallback
 from brewster.inference.separation import Separation
 from brewster.inference.separator import Separator
 from brewster.options import Options
 from brewster.photo import Source
 from brewster.photo.decode import known_format
+from brewster.photo.history import find_layer_of_another_photo
 from brewster.photo.in_memory import BinaryFile, WritableFile
 from brewster.remote_path import Location, RemotePath, check_readable, read_image
 

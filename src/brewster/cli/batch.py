@@ -162,11 +162,10 @@ class BatchReport:
 
     def _different_options(self, result: FileResult) -> str:
         """Returns the options in the metadata of the existing layers that differ from the options of this batch."""
-        from brewster.inference.layer_history import history_step  # noqa: PLC0415
-        from brewster.photo.history import PROGRAM, recorded_parameters  # noqa: PLC0415
+        from brewster.photo.history import PROGRAM, recorded_parameters, separation_parameters  # noqa: PLC0415
 
         given = {name: getattr(self.options, name) for name in ("strength", "quality", "additive")}
-        expected = history_step(**given)
+        expected = separation_parameters(**given)
         metadata = (recorded_parameters(Path(path), PROGRAM) for path in result.outputs.values())
         recorded = next((parameters for parameters in metadata if parameters), {})
         with suppress(ModelError):  # the model is unknown

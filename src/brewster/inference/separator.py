@@ -27,7 +27,6 @@ from brewster.inference.assessment import Assessment, assess
 from brewster.inference.clipping import keep_clipped_light
 from brewster.inference.full_size import upsample_layers
 from brewster.inference.guided_upsampling import Floats, GuidedUpsampler
-from brewster.inference.layer_history import PHOTO, history_step, with_step
 from brewster.inference.onnx_backend import OnnxBackend
 from brewster.inference.predictor import MultiScalePredictor, Prediction, Predictor, ProgressCallback
 from brewster.inference.separation import Separation
@@ -35,6 +34,7 @@ from brewster.inference.tiles import Backend
 from brewster.models.zoo import find_model, is_diffusion_model
 from brewster.options import LoadOptions, Options, Quality, SeparateOptions
 from brewster.photo import Encoding, Hints, Mask, Photo, Source
+from brewster.photo.history import PHOTO, separation_parameters, with_layer_history
 
 _CALL_OPTIONS: Final = SeparateOptions.__annotations__.keys() - LoadOptions.__annotations__.keys()
 _PREDICTOR_OPTIONS: Final = ("steps", "ensemble_size", "no_guided_upsampling")
@@ -245,13 +245,13 @@ class Separator:
                 additive=additive,
                 on_progress=lambda done: on_progress(_NETWORK_SHARE + (1 - _NETWORK_SHARE) * done),
             )
-        step = self._recorded | history_step(strength=strength, quality=quality, additive=additive)
+        step = self._recorded | separation_parameters(strength=strength, quality=quality, additive=additive)
         step |= {"sha256": self.sha256[:12]} if self.sha256 else {}
         step |= {PHOTO: photo.file_info.digest} if photo.file_info.digest else {}
         return Separation(
             photo,
-            with_step(transmission, "transmission", step),
-            with_step(reflection, "reflection", step),
+            with_layer_history(transmission, "transmission", step),
+            with_layer_history(reflection, "reflection", step),
             prediction.confidence_map,
             residual,
             prediction.reconstruction_error,
