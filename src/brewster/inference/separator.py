@@ -235,7 +235,8 @@ class Separator:
             largest_input = _without_hints(inputs[-1])
         on_progress(0.0)
         with _timed(seconds, "network"):
-            prediction = self._predict(inputs, quality, lambda done: on_progress(_NETWORK_SHARE * done))
+            predicted = self._predictor(inputs, quality, lambda done: on_progress(_NETWORK_SHARE * done))
+            prediction = self._keep_clipped_light(largest_input, predicted)
         with _timed(seconds, "upsampling"):
             upsampler = _fit_upsampler(largest_input, prediction, strength, white)
             transmission, reflection, residual = upsample_layers(
@@ -280,15 +281,13 @@ class Separator:
         Options(quality=quality)  # checks the value
         inputs, white = self._inputs(photo, quality, hints)
         largest_input = _without_hints(inputs[-1])
-        prediction = self._predict(inputs, quality, on_progress)
+        prediction = self._keep_clipped_light(largest_input, self._predictor(inputs, quality, on_progress))
         upsampler = _fit_upsampler(largest_input, prediction, Options.strength, white)
         return upsampler, prediction, self._assess(largest_input, prediction)
 
-    def _predict(self, inputs: list[Floats], quality: Quality, on_progress: ProgressCallback) -> Prediction:
-        prediction = self._predictor(inputs, quality, on_progress)
-        if self._predictor.is_measured:
-            return prediction
-        return keep_clipped_light(_without_hints(inputs[-1]), prediction)
+    def _keep_clipped_light(self, largest_input: Floats, prediction: Prediction) -> Prediction:
+        is_measured = self._predictor.is_measured
+        return prediction if is_measured else keep_clipped_light(largest_input, prediction)
 
     def _assess(
         self,
@@ -340,14 +339,11 @@ def separate(
     """Separates one photo. For several photos, use `Separator.load` once and call the separator for each.
 
     Args:
-        source: a path, the bytes of a file, an open binary file, a PIL image, a `Photo`, or an array (see
-            `Photo.from_array`).
+        source: a path, the bytes of a file, an open binary file, a PIL image, a `Photo`, or an array.
         model: see `Separator.load`.
-        mask: see `Separator.__call__`.
-        hints: see `Separator.__call__`.
-        encoding: the encoding of an array, "srgb" or "linear"; by default, "srgb" for integers. For arrays only.
-        options: the keywords of `brewster.options.SeparateOptions`: strength, quality, additive and max_pixels (see
-            `Separator.__call__`), and those of `Separator.load`.
+        mask, hints, encoding: see `Separator.__call__`.
+        options: strength, quality, additive and max_pixels of `Separator.__call__`, and those of
+            `Separator.load`.
 
     Raises:
         BrewsterError: an error of `Separator.load` or of a call of the `Separator`.
