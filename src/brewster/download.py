@@ -54,12 +54,9 @@ class _RetryableError(Exception):
 @final
 @dataclass(frozen=True)
 class Downloader:
-    """Downloads over http and https with retries.
+    """Downloads over http and https: one attempt, and one after each of the delays.
 
-    Attributes:
-        retry_delays_s: the delay before each retry, in seconds. n delays give n + 1 attempts.
-        timeout_s: the longest time without received data, in seconds.
-        sleep: called with the delay in seconds; tests replace it.
+    `timeout_s` is the longest time without received data. Tests replace `sleep`, which gets the delay.
     """
 
     retry_delays_s: tuple[float, ...] = (1.0, 2.0, 4.0, 8.0)

@@ -60,11 +60,7 @@ class Executor(AbstractContextManager[Any], Protocol[ResultT]):
         """Starts a task, and returns its results."""
 
     def lost_reason(self, error: Exception) -> str:
-        """Returns how the worker was lost whose future has this exception.
-
-        Raises:
-            Exception: the exception that the runner raised; no worker was lost.
-        """
+        """Returns how the worker was lost, or raises the exception if it is that of the runner."""
 
 
 def run_tasks(
@@ -72,13 +68,9 @@ def run_tasks(
 ) -> Iterator[ResultT]:
     """Runs tasks until there are no more, and yields their results in the order in which the tasks end.
 
-    If a task is lost in all its attempts, each of its items is a task of its own, because one item may be the cause.
-
-    Args:
-        next_task: returns the next task, or None if there is no task before the next result.
-
-    Raises:
-        BrewsterError: raised by the runner.
+    `next_task` returns the next task, or None if there is none before the next result. If a task is lost in
+    all its attempts, each of its items is a task of its own, because one item may be the cause. Raises the
+    errors of the runner.
     """
     running: dict[Future[list[ResultT]], tuple[Task[ResultT], int]] = {}
     while True:

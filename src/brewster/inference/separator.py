@@ -85,13 +85,13 @@ class Separator:
         """Loads a model and returns its separator.
 
         Args:
-            model: a name from `brewster models list`, an .onnx file, the folder of a training run, or a LoRA's folder or hub id.
-            options: the keywords of `brewster.options.LoadOptions`: device ("auto" selects the fastest one), and for diffusion
-                models base_model, quantization, offload, transformer, fast_lora, guidance, timestep_shift, steps,
-                ensemble_size and no_guided_upsampling. `brewster separate --help` explains them.
+            model: a name from `brewster models list`, an .onnx file, the folder of a training run, or a
+                LoRA's folder or hub id.
+            options: those of `brewster.options.LoadOptions`: device ("auto" selects the fastest one), and for
+                diffusion models those that `brewster separate --help` explains.
 
         Raises:
-            ModelError: the model is unknown or damaged, or an option of diffusion models is set for another model.
+            ModelError: the model is unknown or damaged, or does not have an option that is set.
             DeviceError: the device is not available, or the model does not fit into its memory.
             DownloadError: a diffusion model cannot be downloaded, for example because access was not granted.
             MissingExtra: a diffusion model needs the extra `diffusion`.
@@ -150,13 +150,9 @@ class Separator:
     ) -> Iterator[Separation | BrewsterError]:
         """Separates many photos with several threads, and yields the results in the order of the sources.
 
-        If a photo cannot be separated, its result is the error, and the other photos are still separated. At most
-        `threads` + 1 photos are in memory, so that the sources can be an endless generator.
-
-        Args:
-            sources: photos, as for a call of the separator.
-            threads: the number of photos that are separated at the same time, at least 1.
-            options: the options of a call of the separator, such as `strength` and `quality`, for all photos.
+        If a photo cannot be separated, its result is the error, and the other photos are still separated. At
+        most `threads` + 1 photos are in memory, so that the sources can be an endless generator. The
+        `options` are those of a call of the separator, such as `strength`, for all photos.
 
         Raises:
             BrewsterError: `threads` is less than 1.

@@ -101,14 +101,13 @@ _RESERVED_ATTRIBUTES = {
 
 
 def write_exr_layers(layers: Mapping[str, Float32], header: Mapping[str, str]) -> bytes:
-    """Encodes images (H, W, 3) of equal size as the layers of one EXR, in half precision, with text attributes.
+    """Encodes images (H, W, 3) of equal size as the layers of one EXR, in half precision, with text
+    attributes.
 
     The red channel of the layer "photo" has the name "photo.R", as compositing programs expect ("Technical
     Introduction to OpenEXR", layers). Values are clipped to the range of half precision, -65504..65504.
-
-    Raises:
-        MissingExtra: OpenEXR is not installed.
-        UnsupportedPhoto: the name of an attribute is reserved by OpenEXR."""
+    Raises MissingExtra if OpenEXR is not installed, and UnsupportedPhoto if it reserves the name of an
+    attribute."""
     exr = library_of("exr")
     if reserved := _RESERVED_ATTRIBUTES & header.keys():
         raise UnsupportedPhoto(
@@ -133,11 +132,9 @@ def _exr_bytes(planes: Mapping[str, Float32], dtype: type[np.floating[Any]], hea
 
 
 def read_exr_layers(data: bytes) -> dict[str, Float32]:
-    """Returns the layers of an EXR by name, (H, W, 3) float32 each, sorted by name. Other channels are ignored.
-
-    Raises:
-        MissingExtra: OpenEXR is not installed.
-        UnreadablePhoto: the file is damaged, or has no layer with R, G and B."""
+    """Returns the layers of an EXR by name, (H, W, 3) float32 each, sorted by name, without other channels.
+    Raises MissingExtra if OpenEXR is not installed, and UnreadablePhoto if no layer has R, G and B, or it is
+    damaged."""
     channels = _exr_part(data, header_only=False).channels
     stems = sorted(name.removesuffix(".R") for name in channels if name.endswith(".R"))
     layers = {}

@@ -82,13 +82,12 @@ class SeparationRequest:
 
 
 async def read_form(request: Request, models: Sequence[str], max_pixels: int) -> SeparationRequest:
-    """Parses and validates the form of a request, in memory. `models` has the names of the models, the default first.
+    """Parses and validates the form of a request, in memory. `models` has the names of the models, the
+    default first.
 
-    Raises:
-        HTTPException: 415 if the body is not a form; 400 if the form is damaged; 422 if a field or a value is invalid.
-        BrewsterError: two options contradict each other.
-        UnsupportedPhoto: the name of the photo has the suffix of a video.
-        ClientDisconnect: the upload is incomplete.
+    Raises HTTPException 415 if the body is not a form, 400 if the form is damaged, and 422 if a field or a
+    value is invalid; BrewsterError if two options contradict each other; UnsupportedPhoto if the photo has
+    the name of a video; ClientDisconnect if the upload is incomplete.
     """
     if not request.headers.get("content-type", "").lower().startswith("multipart/form-data"):
         raise HTTPException(
