@@ -71,23 +71,21 @@ class BatchReport:
                 self._index = stack.enter_context(IndexWriter(location(self.output)))
             is_shown = not (self.quiet or self.as_json)
             update_progress = stack.enter_context(progress(self.count, shown=is_shown))
-
-            def on_progress(done: int, name: str, fraction: float) -> None:
-                interrupts.raise_pending()
-                update_progress(done + fraction, name)
-
             overwrite, dry_run = self.overwrite, self.dry_run
             if self.is_parallel:
                 executor = stack.enter_context(self._executor(workers, cluster))
                 results = separate_in_parallel(tasks, executor, overwrite=overwrite)
             else:
                 results = separate_tasks(
-                    tasks, self.options, overwrite=overwrite, dry_run=dry_run, on_progress=on_progress
+                    tasks,
+                    self.options,
+                    overwrite=overwrite,
+                    dry_run=dry_run,
+                    on_progress=lambda done, name, fraction: update_progress(done + fraction, name),
                 )
             for result in results:
                 self.add(result)
                 update_progress(self.counts.total(), result.source)
-                interrupts.raise_pending()
         return 1 if self.counts["failed"] else 0
 
     def _executor(self, workers: int | None, cluster: str | None) -> Executor[FileResult]:

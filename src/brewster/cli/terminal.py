@@ -139,10 +139,11 @@ def write_out(data: bytes) -> None:
 @contextmanager
 def progress(total: int, *, shown: bool, as_json: bool = False) -> Iterator[ProgressUpdater]:
     """Shows a progress bar if `shown` is true, standard error is a terminal, and no JSON is printed on the same terminal. Yields
-    the function that updates the bar. A single item has a percentage instead of the number of finished items."""
+    the function that updates the bar and raises a dropped KeyboardInterrupt. A single item has a percentage instead of the
+    number of finished items."""
     shares_terminal = as_json and standard_output.stream.isatty()
     if not (shown and sys.stderr.isatty()) or shares_terminal:
-        yield lambda _done, _text: None
+        yield lambda _done, _text: interrupts.raise_pending()
         return
     from rich import progress as rich_progress  # noqa: PLC0415
     from rich.console import Console  # noqa: PLC0415  (slow to import; only used on a terminal)
@@ -157,4 +158,9 @@ def progress(total: int, *, shown: bool, as_json: bool = False) -> Iterator[Prog
     console = Console(stderr=True)
     with rich_progress.Progress(*columns, console=console, redirect_stdout=False, transient=True) as bar:
         task = bar.add_task("", total=total)
-        yield lambda done, text: bar.update(task, completed=done, description=one_line(text))
+
+        def update(done: float, text: str) -> None:
+            interrupts.raise_pending()
+            bar.update(task, completed=done, description=one_line(text))
+
+        yield update

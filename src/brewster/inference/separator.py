@@ -227,8 +227,7 @@ class Separator:
         with _timed(seconds, "decode"):
             photo = Photo.open(source, encoding=encoding, max_pixels=max_pixels)
             weights = None if mask is None else Mask.open(mask, photo.size)
-            inputs, white = self._inputs(photo, quality, hints)
-            largest_input = _without_hints(inputs[-1])
+            inputs, largest_input, white = self._inputs(photo, quality, hints)
         on_progress(0.0)
         with _timed(seconds, "network"):
             predicted = self._predictor(inputs, quality, lambda done: on_progress(_NETWORK_SHARE * done))
@@ -275,8 +274,7 @@ class Separator:
             assessment.
         """
         Options(quality=quality)  # checks the value
-        inputs, white = self._inputs(photo, quality, hints)
-        largest_input = _without_hints(inputs[-1])
+        inputs, largest_input, white = self._inputs(photo, quality, hints)
         prediction = self._keep_clipped_light(largest_input, self._predictor(inputs, quality, on_progress))
         upsampler = _fit_upsampler(largest_input, prediction, Options.strength, white)
         return upsampler, prediction, self._assess(largest_input, prediction)
@@ -304,13 +302,13 @@ class Separator:
 
     def _inputs(
         self, photo: Photo, quality: Quality, hints: Source | None
-    ) -> tuple[list[Floats], np.float32]:
-        """Returns the inputs of the model, the smallest first, and the white level of the photo."""
+    ) -> tuple[list[Floats], Floats, np.float32]:
+        """The inputs of the model, smallest first, the largest one without hints, and the white level."""
         inputs = [photo.resized(*size) for size in self._predictor.input_sizes(photo.size, quality)]
         white = white_level(inputs[-1])
         inputs = [np.clip(scaled_input / white, 0, 1) for scaled_input in inputs]
         if hints is None:
-            return inputs, white
+            return inputs, inputs[-1], white
         if not self.takes_hints:
             raise MaskError(
                 f"hints were given to the model {self.name}, which takes none",
@@ -318,9 +316,8 @@ class Separator:
                 "leave the hints out, or choose another model",
             )
         painted = Hints.open(hints, photo.size)
-        return [
-            np.concatenate([image, painted.sampled(*image.shape[1::-1])], axis=2) for image in inputs
-        ], white
+        with_hints = [np.concatenate([each, painted.sampled(*each.shape[1::-1])], axis=2) for each in inputs]
+        return with_hints, inputs[-1], white
 
 
 def separate(
@@ -355,10 +352,6 @@ def separate(
 def _reject_unknown(names: Set[str], expected: type) -> None:
     if unknown := names - expected.__annotations__.keys():
         raise TypeError(f"there is no option {min(unknown)}; expected {', '.join(expected.__annotations__)}")
-
-
-def _without_hints(model_input: Floats) -> Floats:
-    return np.ascontiguousarray(model_input[..., :3])
 
 
 def _fit_upsampler(
