@@ -225,7 +225,6 @@ class Options:
 
 @cache
 def _validators() -> Mapping[str, TypeAdapter[Any]]:
-    """Returns the validator of each option."""
     from pydantic import Field, TypeAdapter  # noqa: PLC0415
 
     hints = get_type_hints(Options)

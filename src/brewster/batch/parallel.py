@@ -78,7 +78,6 @@ class SeparationRunner:
 
 
 def _is_finished(task: SeparationTask, has: Callable[[Location], bool]) -> bool:
-    """Whether all layers of the task exist."""
     return all(isinstance(target, Location) and has(target) for target in task.outputs.values())
 
 

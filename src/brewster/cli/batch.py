@@ -89,7 +89,6 @@ class BatchReport:
         return 1 if self.counts["failed"] else 0
 
     def _executor(self, workers: int | None, cluster: str | None) -> Executor[FileResult]:
-        """Returns the executor of a batch in several processes, or on a cluster."""
         from brewster.batch.parallel import SeparationRunner  # noqa: PLC0415
         from brewster.executors.local import ProcessExecutor  # noqa: PLC0415
 
@@ -195,7 +194,6 @@ class BatchReport:
 
 
 def _is_about_folder(result: FileResult) -> bool:
-    """Whether the error is that the folder of the photo, where the layers belong, cannot be written to."""
     return (result.error or "").startswith(f"{Path(result.source).parent.absolute()} was not written ")
 
 

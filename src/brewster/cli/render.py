@@ -192,7 +192,6 @@ class _RenderCommand:
     quiet: bool
 
     def render_again(self, scene: Path) -> None:
-        """Renders one sample again from its scene.toml."""
         from brewster.rendered.generation.workers import render_again  # noqa: PLC0415
 
         render_again(scene, self.out, (*self.maps, *self.photos), self.renderer)

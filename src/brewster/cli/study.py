@@ -238,7 +238,6 @@ def serve(
 
 
 def _open(folder: Path, *, read_only: bool = False) -> contextlib.closing[AnswerStore]:
-    """The answers of the study in a folder, for a `with` block."""
     from brewster.user_study.store import AnswerStore  # noqa: PLC0415  (imports pydantic)
     from brewster.user_study.study import read_study  # noqa: PLC0415
 

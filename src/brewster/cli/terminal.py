@@ -28,7 +28,6 @@ class _DeferredInterrupts:
 
     @contextmanager
     def captured(self) -> Iterator[None]:
-        """Within this block, remembers a KeyboardInterrupt that Python drops."""
         hook = sys.unraisablehook
 
         def capture(dropped: UnraisableHookArgs) -> None:
@@ -80,7 +79,6 @@ class _Output:
 
     @property
     def stream(self) -> TextIO:
-        """The stream to which results are written."""
         return self._stream or sys.stdout
 
     def redirect_descriptor(self) -> None:

@@ -135,14 +135,12 @@ class _TrainingPrinter:
         self._print(text if step else "", event="start", **event)
 
     def report(self, step: int, steps: int, metrics: Mapping[str, float]) -> None:
-        """Prints the metrics of a line of the log."""
         line = ", ".join(f"{name} {value:.4g}" for name, value in metrics.items())
         self._print(
             f"step {step} of {steps}: {line}", event="report", step=step, steps=steps, metrics=dict(metrics)
         )
 
     def end(self, model: Path) -> None:
-        """Prints the path of the trained model."""
         self._print(f"the model is in {model}", event="end", model=str(model))
 
     def _print(self, text: str, **event: object) -> None:

@@ -154,7 +154,6 @@ class _ReportImages:
     out: Path
 
     def thumbnails(self, cases: Iterable[Case]) -> Iterator[CaseThumbnails]:
-        """Yields the thumbnails of the cases that can be read."""
         for case in cases:
             try:
                 truth = GroundTruth.open(case, self.config)

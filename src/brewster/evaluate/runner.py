@@ -177,12 +177,10 @@ class _CaseScorer:
         ]
 
     def _earlier(self, row: ScoreRow) -> ScoreRow | None:
-        """Returns the row of an earlier run if its inputs have not changed."""
         old = self.logged.get(row.id)
         return old if old and old.score_key == row.score_key else None
 
     def _is_complete(self, row: ScoreRow) -> bool:
-        """Whether the row of an earlier run has all columns, and its inputs have not changed."""
         old = self._earlier(row)
         return old is not None and {*self.columns} <= {*old.columns}
 

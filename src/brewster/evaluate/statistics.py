@@ -62,7 +62,6 @@ def estimate(strata: Sequence[Stratum]) -> list[Estimate | None]:
 
 
 def _has_two_scenes(stratum: Stratum) -> list[bool]:
-    """Returns whether two scenes or more have a value, for each series."""
     names = np.array(stratum.scenes)
     return [len(set(names[is_valid])) > 1 for is_valid in np.isfinite(stratum.values).T]
 

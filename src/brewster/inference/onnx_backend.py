@@ -138,7 +138,6 @@ def _create_session(model: Path, data: bytes, device: str) -> ort.InferenceSessi
 
 
 def _candidates(device: str) -> list[str]:
-    """Returns the devices to try, in order of preference: all for "auto", otherwise only `device`."""
     available = available_devices()
     if device == "auto":
         return available

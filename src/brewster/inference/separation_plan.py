@@ -180,7 +180,6 @@ def _cure(
     *,
     is_single_file: bool,
 ) -> str:
-    """The first option with which the plan fits into the memory of the card."""
     others = sum(memory_gib.values()) - memory_gib["weights"]
     install = "" if has_bitsandbytes() else " after: pip install bitsandbytes"
     offload = (

@@ -125,7 +125,6 @@ class AccessMiddleware:
                 )(scope, exchange.receive, exchange.forward)
 
     def _refusal(self, scope: Scope, headers: Headers) -> Response | None:
-        """Returns the response that refuses a request, or None if the request is accepted."""
         policy, method = self.policy, scope["method"]
         if not policy.allows_host(headers.get("host", "")):
             return _error_response(
@@ -205,7 +204,6 @@ class _Exchange:
         await self._send({"type": "http.response.body", "body": b""})
 
     async def forward(self, message: Message) -> None:
-        """Sends a message without waiting for the rest of the body."""
         if message["type"] == "http.response.start":
             self.has_started = True
             headers = MutableHeaders(scope=message)

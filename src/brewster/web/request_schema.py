@@ -144,7 +144,6 @@ async def _build_request(form: FormData, options: Options) -> SeparationRequest:
 
 
 def _reference(form: FormData, count: int) -> int:
-    """Returns the index of the photo to separate, by default the middle one."""
     text = str(form.get(_REFERENCE) or count // 2 + 1)
     if not (text.isascii() and text.isdecimal() and len(text) < 3 and 1 <= int(text) <= count):
         raise HTTPException(

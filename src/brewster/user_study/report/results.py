@@ -74,7 +74,6 @@ def _dataset_title(dataset: str) -> str:
 
 
 def _group(study: Study, participants: Sequence[ParticipantAnswers]) -> dict[str, Any]:
-    """The results of a group of participants."""
     participants = [participant for participant in participants if participant.votes]
     summary = {
         "participants": len(participants),
