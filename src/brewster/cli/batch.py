@@ -122,7 +122,9 @@ class BatchReport:
         if self._index:
             self._index.append(result)
         self.counts[result.status] += 1
-        if result.error and (INSTALL_COMMAND in result.error or _is_about_folder(result)):
+        # The folder of the photos, where the layers belong, cannot be written to
+        about_folder = f"{Path(result.source).parent.absolute()} was not written "
+        if result.error and (INSTALL_COMMAND in result.error or result.error.startswith(about_folder)):
             self._sources_by_shared_error[result.error].append(result.source)
         elif result.error:
             has_source = result.error.startswith(f"{result.source} ") or f": {result.source} " in result.error
@@ -191,10 +193,6 @@ class BatchReport:
             print_error(message)
         for message, sources in self._sources_by_shared_error.items():
             print_error(f"{sources[0] if len(sources) == 1 else listed(sources, 'photo')}: {message}")
-
-
-def _is_about_folder(result: FileResult) -> bool:
-    return (result.error or "").startswith(f"{Path(result.source).parent.absolute()} was not written ")
 
 
 def _duration(seconds: float) -> str:
