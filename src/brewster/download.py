@@ -54,12 +54,9 @@ class _RetryableError(Exception):
 @final
 @dataclass(frozen=True)
 class Downloader:
-    """Downloads over http and https with retries.
+    """Downloads over http and https: one attempt, and one after each of the delays.
 
-    Attributes:
-        retry_delays_s: the delay before each retry, in seconds. n delays give n + 1 attempts.
-        timeout_s: the longest time without received data, in seconds.
-        sleep: called with the delay in seconds; tests replace it.
+    `timeout_s` is the longest time without received data. Tests replace `sleep`, which gets the delay.
     """
 
     retry_delays_s: tuple[float, ...] = (1.0, 2.0, 4.0, 8.0)
@@ -168,11 +165,7 @@ def output_errors(path: Path) -> Iterator[None]:
 
 
 def _read(response: HTTPResponse, max_bytes: int | None = None) -> bytes:
-    """Returns the whole body, or at most `max_bytes` bytes of it.
-
-    `read1` returns the bytes that are already received. Therefore no received byte is lost if the connection breaks.
-    """
-    try:
+    try:  # read1 returns what is already received, so that no byte is lost if the connection breaks
         return response.read() if max_bytes is None else response.read1(max_bytes)
     except (OSError, HTTPException) as error:
         raise _RetryableError(error) from error

@@ -63,13 +63,8 @@ _EXPECTED_KINDS: Final = {
 
 
 class BrewsterError(Exception):
-    """Base class of all brewster errors. The message has three parts, separated by semicolons.
-
-    Attributes:
-        happened: what happened, with the value.
-        expected: what was expected.
-        cure: what to do.
-    """
+    """Base class of all brewster errors. The message has three parts, separated by semicolons: what happened,
+    with the value; what was expected; and the cure, what to do."""
 
     def __init__(self, happened: str, expected: str, cure: str) -> None:
         super().__init__(happened, expected, cure)

@@ -13,6 +13,7 @@ import re
 import secrets
 import shutil
 import sys
+import unicodedata
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -340,6 +341,16 @@ def _output_error(path: Location, error: OSError) -> OutputError:
 def cache_folder() -> Path:
     """Returns the folder for downloads. It is in the cache folder that the operating system defines for the user."""
     return platformdirs.user_cache_path("brewster", appauthor=False)
+
+
+def is_image_file(path: Path) -> bool:
+    """Whether the path is that of a file that has an image suffix and is not hidden."""
+    return format_of(path) is not None and not path.name.startswith(".") and path.is_file()
+
+
+def normalised(name: str) -> str:
+    """Returns a name in Unicode form NFC; some file systems store an accented letter as two code points."""
+    return unicodedata.normalize("NFC", name)
 
 
 def natural_key(name: str) -> tuple[list[str | int], str]:

@@ -73,11 +73,9 @@ def _option(default: Any, description: str, **limits: int) -> Any:  # noqa: ANN4
 class Options:
     """The options of a separation.
 
-    The values are checked, and converted to the types of their fields. The path of a mask may be a text. A format may be
-    one of its suffixes, such as `jpg`.
-
-    Raises:
-        BrewsterError: a value is invalid; or `additive` is set, and the format does not store 32-bit floats.
+    The values are checked, and converted to the types of their fields. The path of a mask may be a text, and
+    a format may be one of its suffixes, such as `jpg`. Raises BrewsterError if a value is invalid, or
+    `additive` is set and the format does not store 32-bit floats.
     """
 
     layers: tuple[Layer, ...] = _option(
@@ -213,14 +211,11 @@ class Options:
         return self.format or source_format
 
     def suffix(self, layer: str, photo_suffix: str) -> str:
-        """Returns the suffix of a layer's file: the suffix of the photo if the format is the same, such as `.JPG`.
+        """Returns the suffix of a layer's file: that of the photo if the format is the same, such as `.JPG`.
 
-        If brewster does not write the format of the photo, the suffix is that of the format that replaces it: .tiff for RAW files,
-        .png for GIF and OpenRaster.
-
-        Args:
-            layer: the name of the layer.
-            photo_suffix: an image suffix, from `SeparationPaths.suffix`.
+        If brewster does not write the format of the photo, the suffix is that of the format that replaces it:
+        .tiff for RAW files, .png for GIF and OpenRaster. `photo_suffix` is an image suffix, from
+        `SeparationPaths.suffix`.
         """
         source_format = SUFFIXES[photo_suffix.lower()]
         format_name = self.format_name(layer, source_format.written_as)
@@ -230,7 +225,6 @@ class Options:
 
 @cache
 def _validators() -> Mapping[str, TypeAdapter[Any]]:
-    """Returns the validator of each option."""
     from pydantic import Field, TypeAdapter  # noqa: PLC0415
 
     hints = get_type_hints(Options)

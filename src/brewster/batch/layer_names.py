@@ -58,9 +58,7 @@ def name_layers(
 
 
 def _content_format(image: Location) -> ImageFormat | None:
-    """Returns the format of the content of an image whose name has no image suffix. The result is None for other
-    images, unknown formats, pipes (which can be read only once), and files in an object store: one request for each
-    photo of an archive would take hours."""
+    """Only of local files without an image suffix: for a store, the requests would take hours."""
     if format_of(image) or not isinstance(image, Path) or not os.path.isfile(image):  # noqa: PTH113  (is_file may raise)
         return None
     try:
@@ -71,9 +69,8 @@ def _content_format(image: Location) -> ImageFormat | None:
 
 
 def _naming_rank(image: Location) -> tuple[int, int, str]:
-    """Returns the key by which `name_layers` sorts the images: the first ones keep their short names. Images without an
-    image suffix are first, because they have only one name. Then images with short stems are first, because the full
-    name of `a.jpg` is the stem of `a.jpg.png`."""
+    """Images without an image suffix are first, then short stems: the full name of `a.jpg` is the
+    stem of `a.jpg.png`."""
     rank = _SUFFIX_RANKS.get(image.suffix.lower())
     return (0, 0, image.name) if rank is None else (len(image.stem), rank, image.name)
 

@@ -104,7 +104,6 @@ def _is_csv(manifest: Location) -> bool:
 
 
 def _csv_paths(manifest: Location, data: bytes) -> Iterator[tuple[ManifestRow, object]]:
-    """Yields each row, and the value of its column `path`."""
     try:
         file = io.StringIO(data.decode("utf-8-sig"), newline="")
         delimiter = _delimiter(file.readline())

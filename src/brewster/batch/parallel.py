@@ -78,13 +78,11 @@ class SeparationRunner:
 
 
 def _is_finished(task: SeparationTask, has: Callable[[Location], bool]) -> bool:
-    """Whether all layers of the task exist."""
     return all(isinstance(target, Location) and has(target) for target in task.outputs.values())
 
 
 def _file_finder() -> Callable[[Location], bool]:
-    """Returns a function that checks whether a file exists. It keeps the file names in the folder of the last call, because
-    one listing replaces thousands of requests to an object store."""
+    """Lists whole folders, because a listing replaces thousands of requests to an object store."""
 
     @lru_cache(maxsize=1)
     def names(folder: Location) -> set[str]:

@@ -109,15 +109,13 @@ def plan_files(
 ) -> list[SeparationTask]:
     """Finds the photos, and returns a task for each photo with the paths of its layers.
 
-    Args:
-        sources, output, options: see `separate_files`.
-        skipped: the list to which the files in the folders are appended that do not have the suffix of an image, such as videos.
-            They get no task. Hidden files are left out.
+    For the first three arguments, see `separate_files`. The files in the folders without the suffix of an
+    image, such as videos, get no task: they are appended to `skipped`, except hidden files.
 
     Raises:
         PhotoError: the sources contain no photo.
         ManifestError: a manifest is not a table, or a row of it is not a path.
-        OutputError: the layers of two photos would have the same path, or the output folder cannot be created or written to.
+        OutputError: two layers would have the same path, or the output folder cannot be written to.
     """
     given = [sources] if isinstance(sources, str | os.PathLike) else sources
     paths = [location(source) for source in given]

@@ -26,13 +26,13 @@ from brewster.batch.plan import (
 from brewster.errors import BrewsterError, OutputError
 from brewster.files import check_output_folder, exists, is_same_file, write_atomically
 from brewster.image_formats import HEAD_BYTES, format_of, is_video
-from brewster.inference.layer_history import find_layer_of_another_photo
 from brewster.inference.predictor import ProgressCallback
 from brewster.inference.separation import Separation
 from brewster.inference.separator import Separator
 from brewster.options import Options
 from brewster.photo import Source
 from brewster.photo.decode import known_format
+from brewster.photo.history import find_layer_of_another_photo
 from brewster.photo.in_memory import BinaryFile, WritableFile
 from brewster.remote_path import Location, RemotePath, check_readable, read_image
 
@@ -255,9 +255,7 @@ def _names(outputs: Mapping[str, Location | WritableFile]) -> dict[str, str]:
 
 
 def _check_layers(source: Location | BinaryFile, layers: Iterable[Location | WritableFile]) -> None:
-    """Checks that existing layers were made from this photo, or raises OutputError. Streams are not checked, because they can
-    be read only once. Files in an object store are not checked either: two more requests for each photo of an archive
-    would take hours."""
+    """Streams are not checked (they are read once), nor stores (two more requests for each photo)."""
     files = (path for path in layers if isinstance(path, Path))
     if isinstance(source, Path) and (layer := find_layer_of_another_photo(source, files)):
         raise OutputError(

@@ -37,7 +37,6 @@ class _DefaultCommandGroup(click.Group):
     """A click group that treats an unknown command as a photo."""
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
-        """Inserts `separate` in front of the arguments if the first argument is not a command."""
         if args and args[0] not in self.commands and args[0] not in _GROUP_OPTIONS:
             close = difflib.get_close_matches(args[0], self.commands, n=1, cutoff=0.7)
             is_misspelled = close and args[0].isalpha() and not Path(args[0]).exists()

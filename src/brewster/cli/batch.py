@@ -71,27 +71,24 @@ class BatchReport:
                 self._index = stack.enter_context(IndexWriter(location(self.output)))
             is_shown = not (self.quiet or self.as_json)
             update_progress = stack.enter_context(progress(self.count, shown=is_shown))
-
-            def on_progress(done: int, name: str, fraction: float) -> None:
-                interrupts.raise_pending()
-                update_progress(done + fraction, name)
-
             overwrite, dry_run = self.overwrite, self.dry_run
             if self.is_parallel:
                 executor = stack.enter_context(self._executor(workers, cluster))
                 results = separate_in_parallel(tasks, executor, overwrite=overwrite)
             else:
                 results = separate_tasks(
-                    tasks, self.options, overwrite=overwrite, dry_run=dry_run, on_progress=on_progress
+                    tasks,
+                    self.options,
+                    overwrite=overwrite,
+                    dry_run=dry_run,
+                    on_progress=lambda done, name, fraction: update_progress(done + fraction, name),
                 )
             for result in results:
                 self.add(result)
                 update_progress(self.counts.total(), result.source)
-                interrupts.raise_pending()
         return 1 if self.counts["failed"] else 0
 
     def _executor(self, workers: int | None, cluster: str | None) -> Executor[FileResult]:
-        """Returns the executor of a batch in several processes, or on a cluster."""
         from brewster.batch.parallel import SeparationRunner  # noqa: PLC0415
         from brewster.executors.local import ProcessExecutor  # noqa: PLC0415
 
@@ -125,7 +122,9 @@ class BatchReport:
         if self._index:
             self._index.append(result)
         self.counts[result.status] += 1
-        if result.error and (INSTALL_COMMAND in result.error or _is_about_folder(result)):
+        # The folder of the photos, where the layers belong, cannot be written to
+        about_folder = f"{Path(result.source).parent.absolute()} was not written "
+        if result.error and (INSTALL_COMMAND in result.error or result.error.startswith(about_folder)):
             self._sources_by_shared_error[result.error].append(result.source)
         elif result.error:
             has_source = result.error.startswith(f"{result.source} ") or f": {result.source} " in result.error
@@ -162,11 +161,10 @@ class BatchReport:
 
     def _different_options(self, result: FileResult) -> str:
         """Returns the options in the metadata of the existing layers that differ from the options of this batch."""
-        from brewster.inference.layer_history import history_step  # noqa: PLC0415
-        from brewster.photo.history import PROGRAM, recorded_parameters  # noqa: PLC0415
+        from brewster.photo.history import PROGRAM, recorded_parameters, separation_parameters  # noqa: PLC0415
 
         given = {name: getattr(self.options, name) for name in ("strength", "quality", "additive")}
-        expected = history_step(**given)
+        expected = separation_parameters(**given)
         metadata = (recorded_parameters(Path(path), PROGRAM) for path in result.outputs.values())
         recorded = next((parameters for parameters in metadata if parameters), {})
         with suppress(ModelError):  # the model is unknown
@@ -179,8 +177,7 @@ class BatchReport:
         return ", ".join(f"{name}={recorded[name]}" for name in expected if name in different)
 
     def _print_summary(self) -> None:
-        """Prints the counts, the time and the errors. Photos that need the same missing extra, or in a folder that cannot be
-        written to, share a message."""
+        """Prints the counts, the time and the errors. Photos with the same cause share a message."""
         for different_options, (number, source) in self._skipped.items():
             photos = source if number == 1 else counted(number, "photo")
             note = f", made with other options ({different_options})" if different_options else ""
@@ -196,11 +193,6 @@ class BatchReport:
             print_error(message)
         for message, sources in self._sources_by_shared_error.items():
             print_error(f"{sources[0] if len(sources) == 1 else listed(sources, 'photo')}: {message}")
-
-
-def _is_about_folder(result: FileResult) -> bool:
-    """Whether the error is that the folder of the photo, where the layers belong, cannot be written to."""
-    return (result.error or "").startswith(f"{Path(result.source).parent.absolute()} was not written ")
 
 
 def _duration(seconds: float) -> str:

@@ -22,7 +22,6 @@ if TYPE_CHECKING:
     from brewster.evaluate.config import EvaluationConfig
     from brewster.evaluate.methods import Method
     from brewster.evaluate.results import Results
-    from brewster.evaluate.score_log import ScoreRow
 
 
 _ENCODE_ERRORS: Final = "backslashreplace"
@@ -185,11 +184,6 @@ def evaluate(
         context.exit(0 if is_complete else 1)
     case_count = sum(len(part.cases) for part in parts)
     with progress(len(methods) * case_count, shown=not quiet) as update_progress:
-
-        def on_progress(done: int, _total: int, row: ScoreRow) -> None:
-            interrupts.raise_pending()
-            update_progress(done, f"{row.benchmark}/{row.case} {row.method}")
-
         results = evaluation.evaluate(
             parts,
             methods,
@@ -198,7 +192,9 @@ def evaluate(
             workers=workers or _default_workers(case_count),
             max_report_cases=pictures,
             intervals=intervals,
-            on_progress=on_progress,
+            on_progress=lambda done, _, row: update_progress(
+                done, f"{row.benchmark}/{row.case} {row.method}"
+            ),
         )
     if as_json:
         print_out(json.dumps(results))

@@ -288,7 +288,6 @@ def _read_card(folder: Path) -> str:
 
 
 def _update_scores(folder: Path, scores: Path) -> None:
-    """Replaces the benchmark tables in the model card of a LoRA folder."""
     require_extra("train", "writing a model card")
     from brewster.evaluate.report.tables import tables_to_markdown  # noqa: PLC0415  (imports torch)
     from brewster.training.lora.model_card import with_benchmark_tables  # noqa: PLC0415

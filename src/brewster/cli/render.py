@@ -16,7 +16,7 @@ from click.core import ParameterSource
 
 from brewster.cli.extras import require_extra
 from brewster.cli.parameters import EXISTING_FOLDER, FILE, QUIET, Number, flag, json_lines
-from brewster.cli.terminal import interrupts, print_error, print_out, print_status, progress, write_out
+from brewster.cli.terminal import print_error, print_out, print_status, progress, write_out
 
 if TYPE_CHECKING:
     from brewster.executors.local import Executor
@@ -192,7 +192,6 @@ class _RenderCommand:
     quiet: bool
 
     def render_again(self, scene: Path) -> None:
-        """Renders one sample again from its scene.toml."""
         from brewster.rendered.generation.workers import render_again  # noqa: PLC0415
 
         render_again(scene, self.out, (*self.maps, *self.photos), self.renderer)
@@ -217,7 +216,6 @@ class _RenderCommand:
                 elif result.status == "rendered" and not self.quiet:
                     print_status(f"sample {result.index} ({result.seconds:.1f} s)")
                 update_progress(counts.total(), f"sample {result.index}")
-                interrupts.raise_pending()
 
             indices = range(self.first * frames, (self.first + self.count) * frames)
             build(job, indices, self._executor(job), shards=self.shards, report=on_result)

@@ -72,7 +72,6 @@ class _FormatChoice(click.Choice[str]):
 def _complete_model(
     _context: click.Context, _param: click.Parameter, incomplete: str
 ) -> list[CompletionItem]:
-    """Completes the names of the registered models, and file names."""
     names = [name for name in (*zoo.MODELS, *zoo.DIFFUSION_NAMES) if name.startswith(incomplete)]
     return [*map(CompletionItem, names), CompletionItem(incomplete, type="file")]
 
@@ -257,7 +256,6 @@ def _print_plan(photos: tuple[str, ...], output: str | None, options: Options, g
 def _check_contact_sheet(
     path: Path, photos: tuple[str, ...], output: str | None, cluster: str | None
 ) -> None:
-    """Checks the arguments before any photo is separated."""
     if cluster:
         raise click.UsageError("--contact-sheet cannot be combined with --cluster.")
     if not ((row := format_of(path)) and row.is_writable):

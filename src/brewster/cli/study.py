@@ -212,9 +212,8 @@ def serve(
     Each answer is stored on the disk before it is acknowledged. After the server was stopped or killed, run the same
     command again to continue the study."""
     require_extra("web", "serving", without=frozenset({"matplotlib", "segno"}))
-    from brewster.user_study.access_token import load_or_create_token  # noqa: PLC0415
     from brewster.user_study.store import AnswerStore  # noqa: PLC0415
-    from brewster.user_study.study import read_study  # noqa: PLC0415
+    from brewster.user_study.study import load_or_create_token, read_study  # noqa: PLC0415
     from brewster.web import application as web  # noqa: PLC0415  (imports FastAPI)
     from brewster.web.middleware import AccessPolicy, is_loopback  # noqa: PLC0415
     from brewster.web.study import study_router  # noqa: PLC0415
@@ -239,7 +238,6 @@ def serve(
 
 
 def _open(folder: Path, *, read_only: bool = False) -> contextlib.closing[AnswerStore]:
-    """The answers of the study in a folder, for a `with` block."""
     from brewster.user_study.store import AnswerStore  # noqa: PLC0415  (imports pydantic)
     from brewster.user_study.study import read_study  # noqa: PLC0415
 

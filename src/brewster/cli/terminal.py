@@ -21,16 +21,13 @@ ProgressUpdater = Callable[[float, str], None]
 
 @final
 class _DeferredInterrupts:
-    """Remembers a KeyboardInterrupt that Python has dropped, and raises it later. libvips calls Python to write its
-    log. If Ctrl-C is pressed during such a call, the KeyboardInterrupt cannot pass through the C code, so that
-    Python drops it. Without this class, the command continues after Ctrl-C."""
+    """Raises a KeyboardInterrupt that Python has dropped in a call from C code, as by libvips for its log."""
 
     def __init__(self) -> None:
         self._pending = False
 
     @contextmanager
     def captured(self) -> Iterator[None]:
-        """Within this block, remembers a KeyboardInterrupt that Python drops."""
         hook = sys.unraisablehook
 
         def capture(dropped: UnraisableHookArgs) -> None:
@@ -75,16 +72,13 @@ def print_error(text: object) -> None:
 
 @final
 class _Output:
-    """Standard output, reserved for the results of the command. The output of libraries is redirected to standard
-    error. Libraries print in two ways, and each needs its own redirection. C code and child processes write to file
-    descriptor 1. Python code writes to `sys.stdout`, as OpenEXR does for a damaged file."""
+    """Standard output, for results only. Libraries write to it as C code and as `sys.stdout` (OpenEXR)."""
 
     def __init__(self) -> None:
         self._stream: TextIO | None = None
 
     @property
     def stream(self) -> TextIO:
-        """The stream to which results are written."""
         return self._stream or sys.stdout
 
     def redirect_descriptor(self) -> None:
@@ -143,10 +137,11 @@ def write_out(data: bytes) -> None:
 @contextmanager
 def progress(total: int, *, shown: bool, as_json: bool = False) -> Iterator[ProgressUpdater]:
     """Shows a progress bar if `shown` is true, standard error is a terminal, and no JSON is printed on the same terminal. Yields
-    the function that updates the bar. A single item has a percentage instead of the number of finished items."""
+    the function that updates the bar and raises a dropped KeyboardInterrupt. A single item has a percentage instead of the
+    number of finished items."""
     shares_terminal = as_json and standard_output.stream.isatty()
     if not (shown and sys.stderr.isatty()) or shares_terminal:
-        yield lambda _done, _text: None
+        yield lambda _done, _text: interrupts.raise_pending()
         return
     from rich import progress as rich_progress  # noqa: PLC0415
     from rich.console import Console  # noqa: PLC0415  (slow to import; only used on a terminal)
@@ -161,4 +156,9 @@ def progress(total: int, *, shown: bool, as_json: bool = False) -> Iterator[Prog
     console = Console(stderr=True)
     with rich_progress.Progress(*columns, console=console, redirect_stdout=False, transient=True) as bar:
         task = bar.add_task("", total=total)
-        yield lambda done, text: bar.update(task, completed=done, description=one_line(text))
+
+        def update(done: float, text: str) -> None:
+            interrupts.raise_pending()
+            bar.update(task, completed=done, description=one_line(text))
+
+        yield update

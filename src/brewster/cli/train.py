@@ -14,7 +14,7 @@ import click
 from brewster.cli.batch_plan import gpu_for_plan
 from brewster.cli.extras import require_extra
 from brewster.cli.parameters import FILE, QUIET, flag, gpu_name
-from brewster.cli.terminal import interrupts, print_out, print_status, progress
+from brewster.cli.terminal import print_out, print_status, progress
 from brewster.errors import OutputError, RecipeError
 
 if TYPE_CHECKING:
@@ -106,7 +106,6 @@ def train(
     with progress(parsed.steps, shown=not printer.quiet, as_json=as_json) as update_progress:
 
         def on_progress(step: int, steps: int, metrics: Mapping[str, float], is_logged: bool) -> None:
-            interrupts.raise_pending()
             update_progress(step, f"loss {metrics['loss']:.4f}")
             if is_logged:
                 printer.report(step, steps, metrics)
@@ -136,14 +135,12 @@ class _TrainingPrinter:
         self._print(text if step else "", event="start", **event)
 
     def report(self, step: int, steps: int, metrics: Mapping[str, float]) -> None:
-        """Prints the metrics of a line of the log."""
         line = ", ".join(f"{name} {value:.4g}" for name, value in metrics.items())
         self._print(
             f"step {step} of {steps}: {line}", event="report", step=step, steps=steps, metrics=dict(metrics)
         )
 
     def end(self, model: Path) -> None:
-        """Prints the path of the trained model."""
         self._print(f"the model is in {model}", event="end", model=str(model))
 
     def _print(self, text: str, **event: object) -> None:

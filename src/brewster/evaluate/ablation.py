@@ -127,9 +127,7 @@ def _train(recipe: CompactRecipe | LoraRecipe, folder: Path, on_step: loop.StepC
 
 
 def _plot(study: AblationStudy, numbers: Sequence[float], results: Results) -> bytes:
-    """Returns a PNG plot: PSNR, SSIM and LPIPS as functions of the value, or all metrics if these three have no scores.
-    There is one line for each benchmark and one for the average. The bands are the 95 % intervals. A line has no
-    point for a model without a score."""
+    """Plots PSNR, SSIM and LPIPS, or all metrics if these have no scores. The bands are 95 % intervals."""
     from matplotlib.figure import Figure  # noqa: PLC0415  (only needed for plots)
 
     measured = list(results["metrics"])

@@ -61,12 +61,6 @@ class EvaluationConfig:
         if self.short_side_px is not None and self.short_side_px < 1:
             happened = f"the size is {self.short_side_px} px"
             raise BrewsterError(happened, "expected a shorter side of 1 px or more", "choose a larger number")
-        if self.size_divisor < 1 or self.border < 0:
-            raise BrewsterError(
-                f"the sides are multiples of {self.size_divisor} px, and the border has {self.border} px",
-                "expected multiples of 1 px or more, and a border of 0 px or more",
-                "choose larger numbers",
-            )
 
     @property
     def resizes(self) -> bool:

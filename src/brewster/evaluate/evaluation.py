@@ -154,7 +154,6 @@ class _ReportImages:
     out: Path
 
     def thumbnails(self, cases: Iterable[Case]) -> Iterator[CaseThumbnails]:
-        """Yields the thumbnails of the cases that can be read."""
         for case in cases:
             try:
                 truth = GroundTruth.open(case, self.config)
@@ -169,8 +168,7 @@ class _ReportImages:
             yield to_thumbnails(truth, outputs, truth.region(self.config.thresholds[0]), link)
 
     def _link(self, case: Case, method: str, layer: str, photo: Photo) -> str:
-        """Returns the URL of a layer at full size, relative to the report. Writes a PNG file if a browser cannot open
-        its file. `method` is "" for the photo, transmission and reflection of the benchmark."""
+        """Writes a PNG file if a browser cannot open the file. `method` is "" for the benchmark."""
         path = self._file(case, method, layer)
         if path is None or path.suffix.lower() not in _BROWSER_SUFFIXES:
             name = f"{method}.{layer}.png" if method else f"{layer}.png"

@@ -8,7 +8,6 @@ from __future__ import annotations
 import gc
 import hashlib
 import time
-import unicodedata
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -20,8 +19,7 @@ import numpy as np
 
 from brewster.benchmarks.image_files import Case
 from brewster.errors import BrewsterError, PhotoError
-from brewster.files import walk, write_atomically
-from brewster.image_formats import SUFFIXES
+from brewster.files import is_image_file, normalised, walk, write_atomically
 from brewster.inference import Separator
 from brewster.models.zoo import find_model, is_diffusion_model
 from brewster.options import Device, Quality
@@ -61,29 +59,23 @@ class Method(Protocol):
     @property
     def name(self) -> str:
         """The name in tables and results."""
-        ...
 
     @property
     def exclusive(self) -> bool:
         """Whether the method needs the whole memory. Exclusive methods run after the others, one at a time."""
-        ...
 
     def about(self) -> dict[str, str]:
         """Returns a description for results.json. The first entry is the kind of method."""
-        ...
 
     def key(self, case: Case) -> str:
         """Returns a text that identifies all inputs of the prediction except the photo."""
-        ...
 
     def predict(self, case: Case, photo: Photo) -> MethodOutput:
         """Returns the predicted layers for the photo of a case. Raises BrewsterError if the method failed. Any other
         exception counts as a failure too."""
-        ...
 
     def cached(self, case: Case) -> MethodOutput | None:
         """Returns the stored prediction, or None if there is none."""
-        ...
 
 
 @final
@@ -285,32 +277,23 @@ class PredictionFolder:
         paths += [root / case.name / stem for stem in stems if stem.endswith(_STEM_SUFFIXES[layer])]
         if layer == "transmission":
             paths += [root / case.name]
-        return {file for path in paths for file in self._images.get(_normalised(path), ())}
+        return {file for path in paths for file in self._images.get(normalised(str(path)), ())}
 
     @cached_property
-    def _images(self) -> dict[Path, list[Path]]:
+    def _images(self) -> dict[str, list[Path]]:
         """path without suffix -> image files with this path."""
-        found: defaultdict[Path, list[Path]] = defaultdict(list)
-        for path in filter(_is_image, walk(self.folder, _is_image)):
-            found[_normalised(path.with_suffix(""))].append(path)
+        found: defaultdict[str, list[Path]] = defaultdict(list)
+        for path in filter(is_image_file, walk(self.folder, is_image_file)):
+            found[normalised(str(path.with_suffix("")))].append(path)
         return dict(found)
 
     @cached_property
     def _stems(self) -> dict[Path, list[str]]:
         """folder -> stems of its image files."""
         stems: defaultdict[Path, list[str]] = defaultdict(list)
-        for path in self._images:
+        for path in map(Path, self._images):
             stems[path.parent].append(path.name)
         return dict(stems)
-
-
-def _is_image(path: Path) -> bool:
-    return path.suffix.lower() in SUFFIXES and not path.name.startswith(".") and path.is_file()
-
-
-def _normalised(path: Path) -> Path:
-    """Returns the path in Unicode form NFC. Some file systems store an accented letter as two characters."""
-    return Path(unicodedata.normalize("NFC", str(path)))
 
 
 def _digest(data: Iterable[bytes]) -> str:

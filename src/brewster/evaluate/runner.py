@@ -8,12 +8,9 @@ from __future__ import annotations
 
 import hashlib
 import json
-import signal
 from collections.abc import Callable, Collection, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from concurrent.futures.process import BrokenProcessPool
 from dataclasses import asdict, dataclass, replace
-from multiprocessing import get_context
+from functools import partial
 from pathlib import Path
 from typing import Final, final
 
@@ -31,7 +28,7 @@ from brewster.evaluate.score_log import (
     read_score_rows,
 )
 from brewster.evaluate.scoring import CaseFiles, GroundTruth, Scorer
-from brewster.executors.local import exit_with_parent
+from brewster.executors.local import ProcessExecutor, SerialExecutor, run_tasks
 from brewster.worker_setup import single_torch_thread
 
 INPUTS_FOLDER: Final = "inputs"
@@ -62,20 +59,25 @@ def score(
     unavailable = _find_unavailable(cases, methods, config, logged)
     rows = dict[RowId, ScoreRow]()
 
-    def log_rows(case_rows: Sequence[ScoreRow]) -> None:
-        for row in case_rows:
-            rows[row.id] = row
-            if row != logged.get(row.id):
-                append_row(out / SCORES_FILE, row)
-                on_progress(len(rows), len(ids), row)
+    def run(names: list[str], workers: int) -> None:
+        tasks = iter([_Task(case, names) for case in cases])
+        is_serial = workers == 1
+        executor = SerialExecutor(create_scorer) if is_serial else ProcessExecutor(create_scorer, workers)
+        with executor:
+            for row in run_tasks(partial(next, tasks, None), executor):
+                rows[row.id] = row
+                if row != logged.get(row.id):
+                    append_row(out / SCORES_FILE, row)
+                    on_progress(len(rows), len(ids), row)
 
     columns = tuple(column for column in config.columns() if column not in unavailable)
-    scorer = _CaseScorer({method.name: method for method in methods}, config, columns, logged, out)
+    by_name = {method.name: method for method in methods}
+    create_scorer = partial(_CaseScorer, by_name, config, columns, logged, out)
     if together := [method.name for method in methods if not method.exclusive]:
-        _run_tasks([(case, together) for case in cases], scorer, log_rows, workers)
+        run(together, workers)
     for method in methods:
         if method.exclusive:
-            _run_tasks([(case, [method.name]) for case in cases], scorer, log_rows, workers=1)
+            run([method.name], 1)
     return [rows[row_id] for row_id in ids], unavailable
 
 
@@ -85,9 +87,7 @@ def _find_unavailable(
     config: EvaluationConfig,
     logged: Mapping[RowId, ScoreRow],
 ) -> dict[str, str]:
-    """Loads the weights of all metrics before the workers start. Returns column -> reason, for the columns without
-    weights. A metric is not tried if every row of an earlier run has it and no row is outdated. The files of the
-    cases are read only if every row has it."""
+    """Loads the weights of the metrics that an earlier run lacks, and returns why if this fails."""
 
     def is_outdated(case: Case) -> bool:
         try:
@@ -121,14 +121,29 @@ def _find_unavailable(
 # --- one case
 
 
-_Task = tuple[Case, Sequence[str]]
-"""A case, and the names of the methods to score on it."""
+@final
+@dataclass(frozen=True)
+class _Task:
+    """A case, and the names of the methods to score on it."""
+
+    case: Case
+    names: list[str]
+
+    def split(self) -> list[_Task]:
+        return [self]
+
+    def failed_results(self, reason: str) -> list[ScoreRow]:
+        raise BrewsterError(
+            f"a worker process died on {self.case.benchmark}/{self.case.name} ({reason})",
+            "expected it to finish (it was killed, or the memory was exhausted)",
+            "run again with fewer workers (the finished scores are saved)",
+        )
 
 
 @final
 @dataclass(frozen=True)
 class _CaseScorer:
-    """Scores the methods on one case. A worker process gets it once."""
+    """Scores the methods on one case, with one thread, so that the scores do not depend on the number of workers."""
 
     methods: Mapping[str, Method]
     config: EvaluationConfig
@@ -138,7 +153,10 @@ class _CaseScorer:
 
     def __call__(self, task: _Task) -> list[ScoreRow]:
         """Returns the rows of a case. Decodes its images only if a row of an earlier run cannot be reused."""
-        case, names = task
+        with single_torch_thread():
+            return self._rows(task.case, task.names)
+
+    def _rows(self, case: Case, names: list[str]) -> list[ScoreRow]:
         rows = [ScoreRow(case.benchmark, case.name, name, "", "") for name in names]
         try:
             files = CaseFiles.read(case)
@@ -159,12 +177,10 @@ class _CaseScorer:
         ]
 
     def _earlier(self, row: ScoreRow) -> ScoreRow | None:
-        """Returns the row of an earlier run if its inputs have not changed."""
         old = self.logged.get(row.id)
         return old if old and old.score_key == row.score_key else None
 
     def _is_complete(self, row: ScoreRow) -> bool:
-        """Whether the row of an earlier run has all columns, and its inputs have not changed."""
         old = self._earlier(row)
         return old is not None and {*self.columns} <= {*old.columns}
 
@@ -227,56 +243,3 @@ def get_prediction(truth: GroundTruth, method: Method, row: ScoreRow) -> MethodO
 
 def _digest(*parts: object) -> str:
     return hashlib.sha256(json.dumps(parts).encode()).hexdigest()[:32]
-
-
-# --- all cases
-
-
-def _run_tasks(
-    tasks: Sequence[_Task],
-    scorer: _CaseScorer,
-    on_rows: Callable[[Sequence[ScoreRow]], None],
-    workers: int,
-) -> None:
-    """Scores the cases in this process or in several worker processes. Calls `on_rows` after each case. Each process
-    computes metrics with one thread, so that the scores do not depend on the number of workers."""
-    if workers == 1:
-        with single_torch_thread():
-            for task in tasks:
-                on_rows(scorer(task))
-        return
-    pool = ProcessPoolExecutor(workers, get_context("spawn"), _initialize_worker, (scorer,))
-    futures = {pool.submit(_score_in_worker, task) for task in tasks}
-    try:
-        for future in as_completed(set(futures)):
-            futures.remove(future)
-            on_rows(future.result())
-    except BrokenProcessPool as error:
-        raise BrewsterError(
-            "a worker process died",
-            "expected it to finish (it was killed, or the memory was exhausted)",
-            "run again with fewer workers (the finished scores are saved)",
-        ) from error
-    except KeyboardInterrupt:
-        pool.shutdown(cancel_futures=True)
-        for future in futures:
-            if not future.cancelled() and not future.exception():
-                on_rows(future.result())
-        raise
-    finally:
-        pool.shutdown(cancel_futures=True)
-
-
-_scorers: list[_CaseScorer] = []  # empty, or with one element in a worker process
-
-
-def _initialize_worker(scorer: _CaseScorer) -> None:
-    # Only the parent process handles Ctrl-C, so that the workers can finish their current case.
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    exit_with_parent()
-    _scorers.append(scorer)
-
-
-def _score_in_worker(task: _Task) -> list[ScoreRow]:
-    with single_torch_thread():
-        return _scorers[0](task)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
@@ -17,7 +18,7 @@ from brewster.errors import PhotoError
 from brewster.evaluate.config import EvaluationConfig
 from brewster.evaluate.methods import MethodOutput
 from brewster.evaluate.registration import find_misregistration
-from brewster.metrics import CachedImage, Comparison, Image, Metric, Region
+from brewster.metrics import CachedImage, Comparison, Image, Region
 from brewster.photo import Photo
 
 _Array = TypeVar("_Array", bound=NDArray[Any])
@@ -148,20 +149,16 @@ class Scorer:
         if self._truth.case.rendered:
             comparisons["rendered"] = comparisons["transmission"]
         all_columns = self._config.columns()
-        return {
-            column: self._compute(column, all_columns[column], comparisons)
-            for column in (all_columns if columns is None else columns)
-            if all_columns[column].ground_truth in comparisons
-        }
-
-    def _compute(self, column: str, metric: Metric, comparisons: Mapping[str, Comparison]) -> float | None:
-        comparison = comparisons[metric.ground_truth]
-        if metric.area == "region":
-            comparison = replace(comparison, region=self._region(self._config.threshold(column)))
-        try:
-            return round(metric.score(comparison), _DIGITS)
-        except ValueError:  # the score is undefined
-            return None
+        scores: dict[str, float | None] = {}
+        for column in all_columns if columns is None else columns:
+            metric = all_columns[column]
+            if comparison := comparisons.get(metric.ground_truth):
+                if metric.area == "region":
+                    comparison = replace(comparison, region=self._region(self._config.threshold(column)))
+                scores[column] = None
+                with contextlib.suppress(ValueError):  # the score is undefined
+                    scores[column] = round(metric.score(comparison), _DIGITS)
+        return scores
 
     def _inside(self, image: _Array) -> _Array:
         """The part of an image or region that is scored. It has no pixels if the border covers the image."""

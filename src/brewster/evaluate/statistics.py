@@ -54,17 +54,14 @@ def estimate(strata: Sequence[Stratum]) -> list[Estimate | None]:
     resampled = [_resample(stratum) for stratum in strata]
     sums, counts = (np.sum([part[i] for part in resampled], axis=0) for i in range(2))
     values = np.concatenate([stratum.values for stratum in strata])
-    has_interval = np.any([_has_two_scenes(stratum) for stratum in strata], axis=0)
-    return [
-        _estimate(values[:, i], sums[:, i], counts[:, i], has_interval=bool(has_interval[i]))
+    has_interval = [
+        any(len({*np.array(part.scenes)[np.isfinite(part.values[:, i])]}) > 1 for part in strata)
         for i in range(values.shape[1])
     ]
-
-
-def _has_two_scenes(stratum: Stratum) -> list[bool]:
-    """Returns whether two scenes or more have a value, for each series."""
-    names = np.array(stratum.scenes)
-    return [len(set(names[is_valid])) > 1 for is_valid in np.isfinite(stratum.values).T]
+    return [
+        _estimate(values[:, i], sums[:, i], counts[:, i], has_interval=has_interval[i])
+        for i in range(values.shape[1])
+    ]
 
 
 def _resample(stratum: Stratum) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

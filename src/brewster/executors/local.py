@@ -60,11 +60,7 @@ class Executor(AbstractContextManager[Any], Protocol[ResultT]):
         """Starts a task, and returns its results."""
 
     def lost_reason(self, error: Exception) -> str:
-        """Returns how the worker was lost whose future has this exception.
-
-        Raises:
-            Exception: the exception that the runner raised; no worker was lost.
-        """
+        """Returns how the worker was lost, or raises the exception if it is that of the runner."""
 
 
 def run_tasks(
@@ -72,13 +68,9 @@ def run_tasks(
 ) -> Iterator[ResultT]:
     """Runs tasks until there are no more, and yields their results in the order in which the tasks end.
 
-    If a task is lost in all its attempts, each of its items is a task of its own, because one item may be the cause.
-
-    Args:
-        next_task: returns the next task, or None if there is no task before the next result.
-
-    Raises:
-        BrewsterError: raised by the runner.
+    `next_task` returns the next task, or None if there is none before the next result. If a task is lost in
+    all its attempts, each of its items is a task of its own, because one item may be the cause. Raises the
+    errors of the runner.
     """
     running: dict[Future[list[ResultT]], tuple[Task[ResultT], int]] = {}
     while True:
@@ -209,7 +201,8 @@ def _start_worker() -> None:
     # One processor for each worker. The ONNX backend reads this variable. If torch is already imported, the variable has no
     # effect on torch, and the runner limits its threads (see worker_setup.py).
     os.environ.setdefault("OMP_NUM_THREADS", "1")
-    exit_with_parent()  # otherwise this worker and a resumed run could work on the same task
+    # Otherwise this worker and a resumed run could work on the same task
+    threading.Thread(target=_exit_with_parent, daemon=True).start()
 
 
 _runner: Runner[Any] | None = None
@@ -222,12 +215,8 @@ def _run_task(create_runner: Callable[[], Runner[Any]], task: Task[Any]) -> list
     return _runner(task)
 
 
-def exit_with_parent() -> None:
-    """Makes this process exit when its parent process ends, even if the parent is killed."""
-
-    def wait() -> None:
-        if parent := parent_process():
-            parent.join()
-            os._exit(1)
-
-    threading.Thread(target=wait, daemon=True).start()
+def _exit_with_parent() -> None:
+    """Waits until the parent process ends, even if it is killed, and then ends this process."""
+    if parent := parent_process():
+        parent.join()
+        os._exit(1)

@@ -72,12 +72,11 @@ def assess(
     """Assesses a separation.
 
     Args:
-        photo: the photo in linear light.
-        transmission: the predicted transmission in linear light.
+        photo, transmission: the photo, and the predicted transmission, in linear light.
         confidence_map: the confidence of the prediction, 0..1.
-        reconstruction_error: mean of |generated input - input|, sRGB-encoded, or None if the model does not generate the input.
-        strength: the strength of the separation, 0..1, the same for all pixels or, with a mask, one for each pixel.
-        is_calibrated: whether the verdicts were fitted to the model. Otherwise the verdict is never "removed".
+        reconstruction_error: mean of |generated input - input|, sRGB-encoded, or None.
+        strength: the strength, 0..1, the same for all pixels or, with a mask, one for each pixel.
+        is_calibrated: whether the verdicts were fitted to the model. Otherwise none is "removed".
     """
     written = photo + np.float32(strength) * (transmission - photo)
     light = float(photo.sum(dtype=np.float64))

@@ -31,13 +31,12 @@ from brewster.srgb import to_encoded, to_linear
 
 @final
 class DiffusionPredictor(Predictor):
-    """Runs a `DecompositionPipeline` on one copy of the photo: as a whole, or in square tiles if the task has them.
+    """Runs a `DecompositionPipeline` on one copy of the photo: as a whole, or in square tiles if the task has
+    them.
 
-    Args:
-        pipeline: the model.
-        steps: see `DiffusionWork`.
-        ensemble_size: the number of samples with different seeds whose mean is the prediction; the mean has less invented detail.
-        no_guided_upsampling: whether the transmission is the generated panel, upsampled, without the detail of the photo.
+    The prediction is the mean of `ensemble_size` samples with different seeds, which has less invented
+    detail. With `no_guided_upsampling`, the transmission is the generated panel, without the detail of the
+    photo. For `steps`, see `DiffusionWork`.
     """
 
     def __init__(
@@ -107,11 +106,7 @@ class DiffusionPredictor(Predictor):
     def _predict_tile(
         self, tile: Floats, steps: int, on_step: Callable[[int, int], None]
     ) -> tuple[Floats, ...]:
-        """Returns five maps (h, w, 3) for a tile (h, w, 3).
-
-        In linear light, means over the samples: change, reflection and transmission. In sRGB-encoded units: the spread
-        of the transmission over the samples, and the reconstruction error.
-        """
+        """Means of change, reflection and T over the samples, spread of T, error: (h, w, 3) each."""
         height, width, _ = tile.shape
         enlarged_size = self._work.enlarged((width, height))
         if enlarged_size != (width, height):

@@ -10,7 +10,7 @@ from typing import Final
 
 import numpy as np
 
-from brewster.inference.guided_upsampling import Floats, GuidedUpsampler
+from brewster.inference.guided_upsampling import GuidedUpsampler
 from brewster.photo import Mask, Photo
 
 _WORKERS: Final = 2
@@ -37,7 +37,10 @@ def upsample_layers(
         layers = upsampler.apply(linear, rows.start, photo.size[1], strength_mask)
         stored = [template.stored_rows(layer, rows.start) for layer in layers]
         if additive:
-            stored = _exact_sum_layers(template.stored_rows(linear, rows.start), stored[0])
+            # At least one of the two differences is exact (Sterbenz 1974), which makes the sum exact.
+            whole = template.stored_rows(linear, rows.start)
+            remainder = whole - np.minimum(stored[0], whole)
+            stored = [whole - remainder, remainder]
         for canvas, layer in zip(canvases, stored, strict=True):
             canvas[rows] = layer
         return 0.0 if additive else float(np.abs(linear - layers[0] - layers[1]).sum(dtype=np.float64))
@@ -61,13 +64,3 @@ def _float_template(photo: Photo) -> Photo:
         alpha = alpha / np.float32(np.iinfo(alpha.dtype).max)
     black = np.broadcast_to(np.float32(0), photo.pixels.shape)
     return Photo(black, alpha, file_info)
-
-
-def _exact_sum_layers(photo: Floats, transmission: Floats) -> list[Floats]:
-    """Returns transmission and reflection whose float sum is bit-equal to the photo.
-
-    Both layers are at least 0 where the photo is not negative. At least one of the two differences is exact (Sterbenz 1974),
-    which makes the sum exact.
-    """
-    reflection = photo - np.minimum(transmission, photo)
-    return [photo - reflection, reflection]

@@ -94,15 +94,11 @@ class GuidedUpsampler:
         reflection: Floats | None,
         override: GeneratedOverride | None = None,
     ) -> GuidedUpsampler:
-        """Fits change and reflection as local linear functions of the photo.
+        """Fits `change` (transmission - photo) and the reflection as local linear functions of the photo.
 
-        Arrays are (h, w, 3) in linear light, at low resolution.
-
-        Args:
-            photo: the photo.
-            change: transmission - photo.
-            reflection: the reflection; None if it is photo - transmission.
-            override: a generated transmission, and the weight with which it replaces the fitted transmission.
+        Arrays are (h, w, 3) in linear light, at low resolution. Without a reflection, it is photo -
+        transmission. The `override` is a generated transmission with the weight with which it replaces the
+        fitted one.
         """
         mean = box_mean(photo)
         variance = box_mean(photo * photo) - mean**2 + _EPSILON
@@ -117,16 +113,13 @@ class GuidedUpsampler:
     def apply(
         self, photo: Floats, top: int, height: int, strength_mask: Floats | None = None
     ) -> tuple[Floats, Floats]:
-        """Returns transmission and reflection, each (n, W, 3), for n rows of the full photo.
+        """Returns transmission and reflection, each (n, W, 3), for n rows of the full photo of `height` rows.
 
-        Negative values of the photo (colours outside Rec.709) limit the transmission from below: it is at least
-        min(photo, 0). The reflection is limited to 0..max(photo, 0).
+        `photo` (n, W, 3) are these rows in linear light, from the row `top`. `strength_mask` (n, W, 1) in
+        0..1 scales the strength of each pixel; where it is 0, the transmission is the photo.
 
-        Args:
-            photo: the n rows of the photo, (n, W, 3) linear light.
-            top: the index of the first of these rows.
-            height: the number of rows of the full photo.
-            strength_mask: a factor of the strength for each pixel, (n, W, 1) in 0..1; where it is 0, the transmission is the photo.
+        Negative values of the photo (colours outside Rec.709) limit the transmission from below: it is at
+        least min(photo, 0). The reflection is limited to 0..max(photo, 0).
         """
         transmission = self.change.apply(photo, top, height)
         if self.override:
@@ -156,10 +149,7 @@ def upsample_rows(map_: Floats, top: int, rows: int, size: tuple[int, int]) -> F
 
 
 def _positions(small: int, first: int, count: int, large: int) -> tuple[NDArray[np.intp], Floats]:
-    """Returns the positions, on an axis of length `small`, of `count` pixels of an axis of length `large`, starting at `first`.
-
-    Each position is split into its integer part and its fractional part.
-    """
+    """The integer and the fractional parts of positions on an axis of length `small`."""
     centres = (np.arange(first, first + count) + 0.5) * (small / large) - 0.5
     centres = np.clip(centres, 0, small - 1)
     lower = np.minimum(centres.astype(np.intp), max(small - 2, 0))

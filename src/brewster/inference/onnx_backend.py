@@ -34,17 +34,13 @@ def available_devices() -> list[str]:
 
 @final
 class OnnxBackend:
-    """A `Backend` from an ONNX file with the input `photo` (1, 3, H, W) and the outputs `transmission` and `reflection`.
+    """A `Backend` from an ONNX file with the input `photo` (1, 3, H, W) and the outputs `transmission` and
+    `reflection`. Thread-safe.
 
-    `takes_hints` tells whether it has a second input `hints` (1, 2, H, W), see `brewster.photo.Hints`. Thread-safe.
-
-    Args:
-        model: the path of the .onnx file.
-        device: a name from `DEVICES`; "auto" selects the first device in order of preference that starts.
-
-    Raises:
-        ModelError: the file cannot be read, is not an ONNX model, or has other inputs and outputs.
-        DeviceError: the device is unknown, not available, or does not start.
+    `takes_hints` tells whether it has a second input `hints` (1, 2, H, W), see `brewster.photo.Hints`.
+    `device` is a name from `DEVICES`; "auto" selects the first one that starts, in order of preference.
+    Raises ModelError if the file cannot be read, is not an ONNX model, or has other inputs and outputs, and
+    DeviceError if the device is unknown, not available, or does not start.
     """
 
     def __init__(self, model: Path, device: str = "auto") -> None:
@@ -62,11 +58,9 @@ class OnnxBackend:
         )
 
     def __call__(self, tile: Image, hints: Hints | None = None) -> tuple[Image, Image]:
-        """Returns the transmission and the reflection of a tile. All three arrays are (H, W, 3), of any size, in linear light,
-        about 0..1. `hints` are (H, W, 2) in 0..1, for models that take hints.
-
-        Raises:
-            ModelError: the model fails on this tile.
+        """Returns the transmission and the reflection of a tile. All three arrays are (H, W, 3), of any size,
+        in linear light, about 0..1. `hints` are (H, W, 2) in 0..1. Raises ModelError if the model fails on
+        this tile.
         """
         height, width, _ = tile.shape
         margins = [(0, -side % _STRIDE_PX) for side in (height, width)]
@@ -144,7 +138,6 @@ def _create_session(model: Path, data: bytes, device: str) -> ort.InferenceSessi
 
 
 def _candidates(device: str) -> list[str]:
-    """Returns the devices to try, in order of preference: all for "auto", otherwise only `device`."""
     available = available_devices()
     if device == "auto":
         return available

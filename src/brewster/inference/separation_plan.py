@@ -157,8 +157,7 @@ def find_row(options: Options) -> DiffusionModel | None:
 
 
 def _find_model(options: Options) -> tuple[str, DecompositionTask, BackboneCost, Quantization | None, bool]:
-    """The hub id or folder of the base, the task, the cost, the trained quantization, and whether the prompt is stored. They are
-    those of the table, which needs no torch; or those of the model's files, or of another base."""
+    """Hub id or folder, task, cost, trained quantization, and whether the prompt is stored."""
     if row := find_row(options):
         cost = BACKBONE_COSTS[row.backbone]
         if options.model.startswith(TINY_PREFIX):
@@ -181,7 +180,6 @@ def _cure(
     *,
     is_single_file: bool,
 ) -> str:
-    """The first option with which the plan fits into the memory of the card."""
     others = sum(memory_gib.values()) - memory_gib["weights"]
     install = "" if has_bitsandbytes() else " after: pip install bitsandbytes"
     offload = (

@@ -27,7 +27,6 @@ from brewster.inference.assessment import Assessment, assess
 from brewster.inference.clipping import keep_clipped_light
 from brewster.inference.full_size import upsample_layers
 from brewster.inference.guided_upsampling import Floats, GuidedUpsampler
-from brewster.inference.layer_history import PHOTO, history_step, with_step
 from brewster.inference.onnx_backend import OnnxBackend
 from brewster.inference.predictor import MultiScalePredictor, Prediction, Predictor, ProgressCallback
 from brewster.inference.separation import Separation
@@ -35,6 +34,7 @@ from brewster.inference.tiles import Backend
 from brewster.models.zoo import find_model, is_diffusion_model
 from brewster.options import LoadOptions, Options, Quality, SeparateOptions
 from brewster.photo import Encoding, Hints, Mask, Photo, Source
+from brewster.photo.history import PHOTO, separation_parameters, with_layer_history
 
 _CALL_OPTIONS: Final = SeparateOptions.__annotations__.keys() - LoadOptions.__annotations__.keys()
 _PREDICTOR_OPTIONS: Final = ("steps", "ensemble_size", "no_guided_upsampling")
@@ -85,13 +85,13 @@ class Separator:
         """Loads a model and returns its separator.
 
         Args:
-            model: a name from `brewster models list`, an .onnx file, the folder of a training run, or a LoRA's folder or hub id.
-            options: the keywords of `brewster.options.LoadOptions`: device ("auto" selects the fastest one), and for diffusion
-                models base_model, quantization, offload, transformer, fast_lora, guidance, timestep_shift, steps,
-                ensemble_size and no_guided_upsampling. `brewster separate --help` explains them.
+            model: a name from `brewster models list`, an .onnx file, the folder of a training run, or a
+                LoRA's folder or hub id.
+            options: those of `brewster.options.LoadOptions`: device ("auto" selects the fastest one), and for
+                diffusion models those that `brewster separate --help` explains.
 
         Raises:
-            ModelError: the model is unknown or damaged, or an option of diffusion models is set for another model.
+            ModelError: the model is unknown or damaged, or does not have an option that is set.
             DeviceError: the device is not available, or the model does not fit into its memory.
             DownloadError: a diffusion model cannot be downloaded, for example because access was not granted.
             MissingExtra: a diffusion model needs the extra `diffusion`.
@@ -150,13 +150,9 @@ class Separator:
     ) -> Iterator[Separation | BrewsterError]:
         """Separates many photos with several threads, and yields the results in the order of the sources.
 
-        If a photo cannot be separated, its result is the error, and the other photos are still separated. At most
-        `threads` + 1 photos are in memory, so that the sources can be an endless generator.
-
-        Args:
-            sources: photos, as for a call of the separator.
-            threads: the number of photos that are separated at the same time, at least 1.
-            options: the options of a call of the separator, such as `strength` and `quality`, for all photos.
+        If a photo cannot be separated, its result is the error, and the other photos are still separated. At
+        most `threads` + 1 photos are in memory, so that the sources can be an endless generator. The
+        `options` are those of a call of the separator, such as `strength`, for all photos.
 
         Raises:
             BrewsterError: `threads` is less than 1.
@@ -231,11 +227,11 @@ class Separator:
         with _timed(seconds, "decode"):
             photo = Photo.open(source, encoding=encoding, max_pixels=max_pixels)
             weights = None if mask is None else Mask.open(mask, photo.size)
-            inputs, white = self._inputs(photo, quality, hints)
-            largest_input = _without_hints(inputs[-1])
+            inputs, largest_input, white = self._inputs(photo, quality, hints)
         on_progress(0.0)
         with _timed(seconds, "network"):
-            prediction = self._predict(inputs, quality, lambda done: on_progress(_NETWORK_SHARE * done))
+            predicted = self._predictor(inputs, quality, lambda done: on_progress(_NETWORK_SHARE * done))
+            prediction = self._keep_clipped_light(largest_input, predicted)
         with _timed(seconds, "upsampling"):
             upsampler = _fit_upsampler(largest_input, prediction, strength, white)
             transmission, reflection, residual = upsample_layers(
@@ -245,13 +241,13 @@ class Separator:
                 additive=additive,
                 on_progress=lambda done: on_progress(_NETWORK_SHARE + (1 - _NETWORK_SHARE) * done),
             )
-        step = self._recorded | history_step(strength=strength, quality=quality, additive=additive)
+        step = self._recorded | separation_parameters(strength=strength, quality=quality, additive=additive)
         step |= {"sha256": self.sha256[:12]} if self.sha256 else {}
         step |= {PHOTO: photo.file_info.digest} if photo.file_info.digest else {}
         return Separation(
             photo,
-            with_step(transmission, "transmission", step),
-            with_step(reflection, "reflection", step),
+            with_layer_history(transmission, "transmission", step),
+            with_layer_history(reflection, "reflection", step),
             prediction.confidence_map,
             residual,
             prediction.reconstruction_error,
@@ -278,17 +274,14 @@ class Separator:
             assessment.
         """
         Options(quality=quality)  # checks the value
-        inputs, white = self._inputs(photo, quality, hints)
-        largest_input = _without_hints(inputs[-1])
-        prediction = self._predict(inputs, quality, on_progress)
+        inputs, largest_input, white = self._inputs(photo, quality, hints)
+        prediction = self._keep_clipped_light(largest_input, self._predictor(inputs, quality, on_progress))
         upsampler = _fit_upsampler(largest_input, prediction, Options.strength, white)
         return upsampler, prediction, self._assess(largest_input, prediction)
 
-    def _predict(self, inputs: list[Floats], quality: Quality, on_progress: ProgressCallback) -> Prediction:
-        prediction = self._predictor(inputs, quality, on_progress)
-        if self._predictor.is_measured:
-            return prediction
-        return keep_clipped_light(_without_hints(inputs[-1]), prediction)
+    def _keep_clipped_light(self, largest_input: Floats, prediction: Prediction) -> Prediction:
+        is_measured = self._predictor.is_measured
+        return prediction if is_measured else keep_clipped_light(largest_input, prediction)
 
     def _assess(
         self,
@@ -309,14 +302,13 @@ class Separator:
 
     def _inputs(
         self, photo: Photo, quality: Quality, hints: Source | None
-    ) -> tuple[list[Floats], np.float32]:
-        """Returns the inputs of the model in 0..1, smallest first, and the white level by which they are divided. If there are
-        hints, the inputs have two more channels."""
+    ) -> tuple[list[Floats], Floats, np.float32]:
+        """The inputs of the model, smallest first, the largest one without hints, and the white level."""
         inputs = [photo.resized(*size) for size in self._predictor.input_sizes(photo.size, quality)]
         white = white_level(inputs[-1])
         inputs = [np.clip(scaled_input / white, 0, 1) for scaled_input in inputs]
         if hints is None:
-            return inputs, white
+            return inputs, inputs[-1], white
         if not self.takes_hints:
             raise MaskError(
                 f"hints were given to the model {self.name}, which takes none",
@@ -324,9 +316,8 @@ class Separator:
                 "leave the hints out, or choose another model",
             )
         painted = Hints.open(hints, photo.size)
-        return [
-            np.concatenate([image, painted.sampled(*image.shape[1::-1])], axis=2) for image in inputs
-        ], white
+        with_hints = [np.concatenate([each, painted.sampled(*each.shape[1::-1])], axis=2) for each in inputs]
+        return with_hints, inputs[-1], white
 
 
 def separate(
@@ -341,14 +332,11 @@ def separate(
     """Separates one photo. For several photos, use `Separator.load` once and call the separator for each.
 
     Args:
-        source: a path, the bytes of a file, an open binary file, a PIL image, a `Photo`, or an array (see
-            `Photo.from_array`).
+        source: a path, the bytes of a file, an open binary file, a PIL image, a `Photo`, or an array.
         model: see `Separator.load`.
-        mask: see `Separator.__call__`.
-        hints: see `Separator.__call__`.
-        encoding: the encoding of an array, "srgb" or "linear"; by default, "srgb" for integers. For arrays only.
-        options: the keywords of `brewster.options.SeparateOptions`: strength, quality, additive and max_pixels (see
-            `Separator.__call__`), and those of `Separator.load`.
+        mask, hints, encoding: see `Separator.__call__`.
+        options: strength, quality, additive and max_pixels of `Separator.__call__`, and those of
+            `Separator.load`.
 
     Raises:
         BrewsterError: an error of `Separator.load` or of a call of the `Separator`.
@@ -364,10 +352,6 @@ def separate(
 def _reject_unknown(names: Set[str], expected: type) -> None:
     if unknown := names - expected.__annotations__.keys():
         raise TypeError(f"there is no option {min(unknown)}; expected {', '.join(expected.__annotations__)}")
-
-
-def _without_hints(model_input: Floats) -> Floats:
-    return np.ascontiguousarray(model_input[..., :3])
 
 
 def _fit_upsampler(

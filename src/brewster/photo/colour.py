@@ -110,8 +110,7 @@ class ColourSpace:
         return stored
 
     def _curves(self, stored: Stored) -> tuple[ToneCurve, ...]:
-        """Returns the curve of each stored channel. Grey pixels use the green curve. In a grey profile all three curves
-        are the same. In an RGB profile they usually are."""
+        """Grey uses the green curve; in most profiles all three are the same."""
         return self.curves if stored.shape[-1] == 3 else (self.curves[1],)
 
 
@@ -161,8 +160,7 @@ def _encode_table(curve: ToneCurve, white: int) -> NDArray[Any]:
 
 
 def _apply_matrix(matrix: Matrix, channels: list[Float32]) -> list[Float32]:
-    """Multiplies the channels of each pixel by a matrix. BLAS is not used, because its rounding depends on the position
-    of a pixel in the strip."""
+    """Without BLAS, whose rounding depends on the position of a pixel in the strip."""
     red, green, blue = channels
     rows = np.array(matrix, np.float32)
     return [row[0] * red + row[1] * green + row[2] * blue for row in rows]
@@ -177,8 +175,7 @@ def _as_matrix(array: Float64) -> Matrix:
 
 
 def _to_d50(primaries: tuple[float, ...]) -> Float64:
-    """Returns the matrix from linear RGB with these chromaticities to XYZ under D50. The white point is adapted by the
-    Bradford transform (ICC.1:2022 annex E)."""
+    """The matrix from linear RGB to XYZ, adapted to D50 by the Bradford transform (ICC.1:2022 annex E)."""
     points = zip(primaries[::2], primaries[1::2], strict=True)
     xyz = np.array([[x / y, 1, (1 - x - y) / y] for x, y in points]).T
     white = xyz[:, 3]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
@@ -55,9 +54,8 @@ def write_contact_sheets(
         gaps = ([(0, 0), (0, width - image.shape[1]), (0, 0)] for image in images)
         padded = [np.pad(image, gap, constant_values=255) for image, gap in zip(images, gaps, strict=True)]
         sheet = path if number == 1 else path.with_stem(f"{path.stem}-{number}")
-        photo = Photo(np.concatenate(padded))
-        file_info = with_layer_history(photo.file_info, _LAYER, {})
-        data = replace(photo, file_info=file_info).encode(format_name_of(sheet))
+        photo = with_layer_history(Photo(np.concatenate(padded)), _LAYER, {})
+        data = photo.encode(format_name_of(sheet))
         write_atomically(sheet, data, overwrite=overwrite or is_contact_sheet(sheet))
         yield sheet
 

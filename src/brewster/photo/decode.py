@@ -165,8 +165,7 @@ def _unreadable_error(format_name: str, reason: str = "") -> PhotoError:
 
 
 def _check_supported(image: pyvips.Image, data: bytes, format_name: str, max_pixels: int) -> None:
-    """Checks the header of an image. Raises PhotoTooLarge if the image has more pixels than `max_pixels`, and
-    UnsupportedPhoto if the image is an animation, has several pages, or unsupported channels."""
+    """Raises PhotoTooLarge or UnsupportedPhoto by the header of an image."""
     check_pixel_count(image.width, image.height, max_pixels)
     if _has_frames(image, data, format_name):
         raise UnsupportedPhoto(
@@ -267,8 +266,7 @@ _ZIP_ERRORS = (
 
 
 def _merged_image(data: bytes, max_pixels: int) -> bytes:
-    """Returns the PNG of the merged image in an OpenRaster file (baseline 0.0.6). Raises PhotoError if the archive is damaged
-    or has no merged image, or the merged image is larger than any PNG of `max_pixels` pixels."""
+    """Returns the PNG of the merged image in an OpenRaster file (baseline 0.0.6)."""
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
             if archive.getinfo("mergedimage.png").file_size > (1 << 20) + 16 * max_pixels:
@@ -323,8 +321,7 @@ _TRANSPOSED = (5, 6, 7, 8)
 
 
 def _full_scale(array: Stored, bits: int) -> Stored:
-    """Scales 10- and 12-bit values to 16 bits, so that white is 65535. The libraries return such values in the upper
-    bits of 16-bit integers. The lower bits are filled with a copy of the upper bits."""
+    """Copies the upper bits of 10- and 12-bit values to the lower ones, so that white is 65535."""
     return array | array >> bits if bits in (10, 12) else array
 
 

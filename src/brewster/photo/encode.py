@@ -83,8 +83,7 @@ def _encode_vips(array: Stored, file_info: FileInfo, quality: int) -> bytes:
 
 
 def _save_options(file_info: FileInfo, dtype: np.dtype[Any], quality: int) -> dict[str, Any]:
-    """Returns the options of the libvips saver for a format. The chroma of a JPEG is subsampled only if that of the
-    source is; that of an AVIF never is. Lossy WebP has no format without chroma subsampling (RFC 6386)."""
+    """Chroma is subsampled in a JPEG as in its source, in AVIF never, in lossy WebP always (RFC 6386)."""
     match file_info.format_name:
         case "jpeg":
             mode = "on" if file_info.subsampling == "4:2:0" else "off"

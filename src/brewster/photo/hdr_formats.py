@@ -19,8 +19,7 @@ Float32 = NDArray[np.float32]
 
 
 def _valid_chromaticities(chromaticities: Sequence[float | str]) -> tuple[float, ...] | None:
-    """Returns chromaticities if red, green and blue form a triangle, otherwise None. Some programs write no
-    chromaticities, or zeros."""
+    """Returns None if they form no triangle: some programs write none, or zeros."""
     try:
         points = np.array(chromaticities, np.float64).reshape(4, 2)
     except ValueError:
@@ -102,14 +101,13 @@ _RESERVED_ATTRIBUTES = {
 
 
 def write_exr_layers(layers: Mapping[str, Float32], header: Mapping[str, str]) -> bytes:
-    """Encodes images (H, W, 3) of equal size as the layers of one EXR, in half precision, with text attributes.
+    """Encodes images (H, W, 3) of equal size as the layers of one EXR, in half precision, with text
+    attributes.
 
     The red channel of the layer "photo" has the name "photo.R", as compositing programs expect ("Technical
     Introduction to OpenEXR", layers). Values are clipped to the range of half precision, -65504..65504.
-
-    Raises:
-        MissingExtra: OpenEXR is not installed.
-        UnsupportedPhoto: the name of an attribute is reserved by OpenEXR."""
+    Raises MissingExtra if OpenEXR is not installed, and UnsupportedPhoto if it reserves the name of an
+    attribute."""
     exr = library_of("exr")
     if reserved := _RESERVED_ATTRIBUTES & header.keys():
         raise UnsupportedPhoto(
@@ -134,11 +132,9 @@ def _exr_bytes(planes: Mapping[str, Float32], dtype: type[np.floating[Any]], hea
 
 
 def read_exr_layers(data: bytes) -> dict[str, Float32]:
-    """Returns the layers of an EXR by name, (H, W, 3) float32 each, sorted by name. Other channels are ignored.
-
-    Raises:
-        MissingExtra: OpenEXR is not installed.
-        UnreadablePhoto: the file is damaged, or has no layer with R, G and B."""
+    """Returns the layers of an EXR by name, (H, W, 3) float32 each, sorted by name, without other channels.
+    Raises MissingExtra if OpenEXR is not installed, and UnreadablePhoto if no layer has R, G and B, or it is
+    damaged."""
     channels = _exr_part(data, header_only=False).channels
     stems = sorted(name.removesuffix(".R") for name in channels if name.endswith(".R"))
     layers = {}
@@ -206,8 +202,7 @@ def _product(first: str, second: str) -> str:
 
 
 def _scan_lines(body: bytes, width: int, height: int) -> NDArray[np.uint8]:
-    """Reads RGBE bytes (H, W, 4) from scan lines in one of three forms: run-length encoded, run-length encoded in the form of
-    Radiance 1.4 and earlier, or flat. Lines of 2**15 or more pixels have one of the last two forms."""
+    """Reads RGBE (H, W, 4): run-length encoded, or flat or in old runs (always if 2**15 px wide)."""
     is_run_length_encoded = width < 1 << 15 and body.startswith(b"\2\2" + width.to_bytes(2, "big"))
     try:
         if is_run_length_encoded:
@@ -225,8 +220,7 @@ def _scan_lines(body: bytes, width: int, height: int) -> NDArray[np.uint8]:
 
 
 def _decode_runs(body: bytes, width: int, height: int) -> bytes:
-    """Decodes run-length encoded lines. Each line has a header of 4 bytes, followed by runs (128 + length, value) and
-    literals (length, values...)."""
+    """A line has a header of 4 bytes, runs (128 + length, value) and literals (length, values...)."""
     planes, position = bytearray(), 0
     for line in range(height):
         position += 4
@@ -240,9 +234,7 @@ def _decode_runs(body: bytes, width: int, height: int) -> bytes:
 
 
 def _decode_old_runs(body: bytes, count: int) -> bytes:
-    """Decodes the run-length encoding of Radiance 1.4 and earlier to `count` pixels. The pixel (1, 1, 1, n) repeats the
-    pixel before it n times. If k such pixels follow each other, the last one has the weight 256**(k-1). Raises
-    ValueError if the runs do not have `count` pixels together."""
+    """Of Radiance 1.4: (1, 1, 1, n) repeats a pixel n times, the k-th in a row n * 256**(k-1) times."""
     pixels = np.frombuffer(body, np.uint8, len(body) // 4 * 4).reshape(-1, 4)
     is_run = (pixels[:, :3] == 1).all(axis=1)
     positions = np.arange(len(pixels))

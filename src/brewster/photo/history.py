@@ -13,18 +13,23 @@ import os
 import re
 import struct
 import zlib
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import BinaryIO, Final
+from typing import TYPE_CHECKING, BinaryIO, Final
 from xml.sax.saxutils import quoteattr
 
 import brewster
 from brewster.photo.file_info import FileInfo
 from brewster.photo.metadata import first_directory, png_chunks
 
+if TYPE_CHECKING:
+    from brewster.photo.photo import Photo
+
 PROGRAM: Final = "brewster"
 """The name under which the metadata of images record this program."""
+PHOTO: Final = "photo"
+"""The name of the parameter that identifies the photo of a layer: its `sampled_digest`."""
 _EXIF_SOFTWARE = 305
 _MAX_EXIF_BYTES = 65527  # a JPEG segment of 65533 bytes without the name of the block
 _SEARCHED_BYTES = 1 << 18
@@ -60,9 +65,15 @@ def with_history(file_info: FileInfo, software: str, parameters: Mapping[str, st
     return replace(file_info, xmp=packet, exif=exif, software=software)
 
 
-def with_layer_history(file_info: FileInfo, layer: str, parameters: Mapping[str, str]) -> FileInfo:
-    """Returns `with_history` of this program and its version. The first parameter is the name of the layer."""
-    return with_history(file_info, f"{PROGRAM} {brewster.__version__}", {"layer": layer, **parameters})
+def with_layer_history(photo: Photo, layer: str, parameters: Mapping[str, str]) -> Photo:
+    """Returns a layer with the history of this program and its version. The first parameter is the name of the layer."""
+    software, parameters = f"{PROGRAM} {brewster.__version__}", {"layer": layer, **parameters}
+    return replace(photo, file_info=with_history(photo.file_info, software, parameters))
+
+
+def separation_parameters(*, strength: float, quality: str, additive: bool) -> dict[str, str]:
+    """Returns the options of a separation as names and values for the metadata of its layers."""
+    return {"strength": f"{strength:g}", "quality": quality, "additive": "yes" if additive else "no"}
 
 
 def sampled_digest(file: BinaryIO) -> str:
@@ -93,6 +104,23 @@ def recorded_parameters(path: Path, program: str) -> dict[str, str] | None:
             return _last_parameters(head + file.read(), program)
     except OSError:
         return None
+
+
+def find_layer_of_another_photo(photo: Path, layers: Iterable[Path]) -> Path | None:
+    """Returns a layer that was made from another photo, or from another version of this photo. Otherwise returns None.
+
+    The first layer that records its photo decides, and the other layers are not read. A layer without this record is
+    accepted: it is from an earlier version of brewster, or its format has no XMP. None is returned if the photo cannot be read.
+    """
+    for layer in layers:
+        recorded = (recorded_parameters(layer, PROGRAM) or {}).get(PHOTO)
+        if recorded:
+            try:
+                with photo.open("rb") as file:
+                    return None if sampled_digest(file) == recorded else layer
+            except OSError:
+                return None
+    return None
 
 
 def _last_parameters(data: bytes, program: str) -> dict[str, str] | None:

@@ -157,8 +157,7 @@ def with_avif_exif(data: bytes, exif: bytes) -> bytes:
 
 
 def _item_location(data: bytes, item: bytes) -> int | None:
-    """Returns the position of the location of an item (base, count, offset, length) in an iloc box. Returns None if the
-    box does not have the layout that libheif writes."""
+    """Returns the position of a location in an iloc box, or None if the layout is not libheif's."""
     table = data.find(b"iloc")
     version, size_fields, index_fields = data[table + 4], data[table + 8], data[table + 9]
     if table < 0 or version > 1 or (size_fields, index_fields) != (0x44, 0x40):

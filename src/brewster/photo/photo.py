@@ -167,13 +167,11 @@ class Photo:
         return np.array(self.pixels, dtype=dtype, copy=copy)
 
     def to_pil(self) -> Any:  # noqa: ANN401  (Pillow is optional, so its types cannot be named)
-        """Returns a PIL image with the ICC profile and the EXIF of the photo: L, LA, RGB, RGBA, or I;16 for 16-bit
-        grey.
+        """Returns a PIL image with the ICC profile and the EXIF of the photo: L, LA, RGB, RGBA, or I;16 for
+        16-bit grey.
 
         Other 16-bit photos and floats are converted to 8 bits, because Pillow has no such colour images.
-
-        Raises:
-            MissingExtra: Pillow is not installed."""
+        Raises MissingExtra if Pillow is not installed."""
         has_16_bit_mode = self.pixels.dtype == np.uint16 and self.pixels.shape[2] == 1 and self.alpha is None
         stored = self if has_16_bit_mode else self.stored_as("png", 8)
         return pil_image(stored.pixels, stored.alpha, stored.file_info)
@@ -242,10 +240,7 @@ class Photo:
 
     def with_pixels(self, pixels: Stored) -> Photo:
         """Returns a copy of the photo with other stored pixels of the same shape and dtype. The array becomes
-        read-only.
-
-        Raises:
-            PhotoError: the pixels have another shape or dtype."""
+        read-only. Raises PhotoError for another shape or dtype."""
         if pixels.shape != self.pixels.shape or pixels.dtype != self.pixels.dtype:
             raise PhotoError(
                 f"the new pixels have the shape {pixels.shape} and the dtype {pixels.dtype}",

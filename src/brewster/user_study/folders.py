@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import unicodedata
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Final
 
 from brewster.errors import BrewsterError
-from brewster.files import natural_key
+from brewster.files import is_image_file, natural_key, normalised
 from brewster.image_formats import SUFFIXES
 from brewster.user_study.study import UNNAMED_DATASET
 
@@ -31,7 +30,7 @@ def find_pictures(folder: Path, datasets: Sequence[str] = ()) -> dict[Key, Path]
     if not folder.is_dir():
         raise BrewsterError(f"{folder} is not a folder", "expected a folder with pictures", "check the path")
     subfolders = {
-        _normalised(path.name): path for path in folder.iterdir() if path.is_dir() and path.name[0] != "."
+        normalised(path.name): path for path in folder.iterdir() if path.is_dir() and path.name[0] != "."
     }
     stems_by_dataset = {
         name: stems
@@ -75,7 +74,7 @@ def select_pictures(pictures: Mapping[Key, Path], names: Sequence[str], folder: 
     by_name = {"/".join(filter(None, key)): key for key in pictures}
     stems = {
         name: name.rpartition(".")[0] if f".{name.rpartition('.')[2]}".lower() in SUFFIXES else name
-        for name in map(_normalised, names)
+        for name in map(normalised, names)
     }
     keys = {name: by_name.get(name, by_name.get(stem)) for name, stem in stems.items()}
     if missing := [name for name, key in keys.items() if key is None]:
@@ -95,19 +94,10 @@ def shorten_list(items: Sequence[str]) -> str:
 
 def _list_pictures(folder: Path) -> dict[Path, str]:
     """The stems of the pictures in a folder, by path in natural order, without other layers of a photo with a transmission."""
-    pictures = {
-        path: _normalised(path.stem)
-        for path in folder.iterdir()
-        if path.suffix.lower() in SUFFIXES and not path.name.startswith(".") and path.is_file()
-    }
+    pictures = {path: normalised(path.stem) for path in folder.iterdir() if is_image_file(path)}
     separated = [
         stem.removesuffix(_TRANSMISSION) for stem in pictures.values() if stem.endswith(_TRANSMISSION)
     ]
     others = {f"{stem}{layer}" for stem in separated for layer in (".reflection", ".confidence")}
     stems = {path: stem.removesuffix(_TRANSMISSION) for path, stem in pictures.items() if stem not in others}
     return dict(sorted(stems.items(), key=lambda pair: (natural_key(pair[1]), pair[0])))
-
-
-def _normalised(name: str) -> str:
-    """The name in Unicode form NFC; some file systems store an accented letter as two code points."""
-    return unicodedata.normalize("NFC", name)

@@ -305,7 +305,6 @@ def _answered(database: sqlite3.Connection, participant: Participant) -> set[int
 
 
 def _row(participant: int, answer: ExportedAnswer) -> tuple[int, int, str, float, str, str]:
-    """The row of an answer in the tables answers and withdrawn."""
     seconds = min(answer.seconds, MAX_SECONDS)
     answered_at = answer.answered_at.astimezone(UTC).isoformat(timespec="seconds")
     conditions = _CONDITIONS.dump_json(answer.conditions).decode()

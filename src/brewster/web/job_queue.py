@@ -69,13 +69,8 @@ class SeparationJob:
 
 @final
 class JobQueue:
-    """Runs jobs of one event loop in worker threads.
-
-    Args:
-        workers: number of threads.
-        max_waiting: maximum number of waiting jobs; further jobs are refused.
-        timeout_seconds: maximum total time for which a job waits and runs.
-    """
+    """Runs jobs of one event loop in worker threads. A job waits and runs for at most `timeout_seconds`; if
+    `max_waiting` jobs wait, further ones are refused."""
 
     def __init__(self, *, workers: int = 1, max_waiting: int = 16, timeout_seconds: float = 300) -> None:
         self.workers, self.max_waiting, self.timeout_seconds = workers, max_waiting, timeout_seconds

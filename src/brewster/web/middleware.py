@@ -125,7 +125,6 @@ class AccessMiddleware:
                 )(scope, exchange.receive, exchange.forward)
 
     def _refusal(self, scope: Scope, headers: Headers) -> Response | None:
-        """Returns the response that refuses a request, or None if the request is accepted."""
         policy, method = self.policy, scope["method"]
         if not policy.allows_host(headers.get("host", "")):
             return _error_response(
@@ -205,7 +204,6 @@ class _Exchange:
         await self._send({"type": "http.response.body", "body": b""})
 
     async def forward(self, message: Message) -> None:
-        """Sends a message without waiting for the rest of the body."""
         if message["type"] == "http.response.start":
             self.has_started = True
             headers = MutableHeaders(scope=message)
@@ -224,11 +222,7 @@ def _body_too_long(policy: AccessPolicy) -> HTTPException:
 
 
 def _redirect_with_cookie(path: str, policy: AccessPolicy) -> Response:
-    """Returns the response that sets the cookie and then loads the address without the token.
-
-    The response is a page with a Refresh header instead of an HTTP redirect: browsers send a SameSite=strict cookie only
-    if the navigation starts on a page of this server.
-    """
+    """No HTTP redirect: the cookie is sent only if the navigation starts on a page of this server."""
     address = "/" + quote(path.lstrip("/"))
     response = HTMLResponse(_REDIRECT_PAGE.format(address), headers={"Refresh": f"0; url={address}"})
     response.set_cookie(policy.cookie_name, policy.token or "", httponly=True, samesite="strict")

@@ -31,12 +31,8 @@ class ModelRow(BaseModel):
 class ModelCache:
     """Models by name, the default first. Clients choose a model by name, never by path.
 
-    Args:
-        models: names or paths of models. They come before the models of the zoo.
-        device: the device for all models, as in `Separator.load`.
-
-    Raises:
-        ModelError: a model does not exist, or two models have the same name.
+    The given models, names or paths, come before those of the zoo. Raises ModelError if a model does not
+    exist, or two have the same name.
     """
 
     def __init__(self, models: Sequence[str] = (), *, device: Device = "auto") -> None:

@@ -50,18 +50,13 @@ def preview(
     on_progress: Callable[[float], None],
     hints: Source | None = None,
 ) -> bytes:
-    """Separates a photo for the page.
+    """Separates a photo for the page. Of the options, only `quality` is used. `hints` is an image file, see
+    `Separator`.
 
-    Of the options, only `quality` is used. `on_progress` is called with the completed fraction, 0 to 1. `hints` is an image file
-    with hints for the model, see the call of a `Separator`.
-
-    Returns:
-        One line of JSON, then the reduced photo (3 bytes for each pixel, sRGB), and then maps of little-endian 16-bit
-        values, row by row. The JSON has `width` and `height` of the reduced photo, `full` (width and height of the photo),
-        `verdict`, and for each map `name`, `width`, `height`, `channels`, and `range`, the values that 0 and 65535 stand for.
-
-    Raises:
-        BrewsterError: `Separator` cannot separate the photo.
+    Returns one line of JSON, then the reduced photo (3 bytes for each pixel, sRGB), and then maps of
+    little-endian 16-bit values, row by row. The JSON has `width` and `height` of the reduced photo, `full`
+    (width and height of the photo), `verdict`, and for each map `name`, `width`, `height`, `channels`, and
+    `range`, the values that 0 and 65535 stand for. Raises BrewsterError if the photo cannot be separated.
     """
     upsampler, prediction, assessment = separator.fit(
         photo, quality=options.quality, hints=hints, on_progress=on_progress
@@ -138,9 +133,7 @@ def photo_tile(photo: Photo, level: int, column: int, row: int) -> Photo | None:
 class PhotoCache:
     """The decoded photos of the last requests by key, for the tiles. Thread-safe.
 
-    Args:
-        max_bytes: the maximum size of all photos together. If it is exceeded, the least recently used photos are dropped.
-    """
+    If the photos together exceed `max_bytes`, the least recently used ones are dropped."""
 
     def __init__(self, max_bytes: int = 400_000_000) -> None:
         self.max_bytes, self._photos, self._lock = max_bytes, OrderedDict[str, Photo](), Lock()

@@ -82,13 +82,12 @@ class SeparationRequest:
 
 
 async def read_form(request: Request, models: Sequence[str], max_pixels: int) -> SeparationRequest:
-    """Parses and validates the form of a request, in memory. `models` has the names of the models, the default first.
+    """Parses and validates the form of a request, in memory. `models` has the names of the models, the
+    default first.
 
-    Raises:
-        HTTPException: 415 if the body is not a form; 400 if the form is damaged; 422 if a field or a value is invalid.
-        BrewsterError: two options contradict each other.
-        UnsupportedPhoto: the name of the photo has the suffix of a video.
-        ClientDisconnect: the upload is incomplete.
+    Raises HTTPException 415 if the body is not a form, 400 if the form is damaged, and 422 if a field or a
+    value is invalid; BrewsterError if two options contradict each other; UnsupportedPhoto if the photo has
+    the name of a video; ClientDisconnect if the upload is incomplete.
     """
     if not request.headers.get("content-type", "").lower().startswith("multipart/form-data"):
         raise HTTPException(
@@ -145,7 +144,6 @@ async def _build_request(form: FormData, options: Options) -> SeparationRequest:
 
 
 def _reference(form: FormData, count: int) -> int:
-    """Returns the index of the photo to separate, by default the middle one."""
     text = str(form.get(_REFERENCE) or count // 2 + 1)
     if not (text.isascii() and text.isdecimal() and len(text) < 3 and 1 <= int(text) <= count):
         raise HTTPException(

@@ -110,7 +110,6 @@ class _SeparationRoutes:
         self._last_burst: tuple[object, FittedBurst] | None = None
 
     async def _run(self, request: Request, job: str | None, handler: Handler) -> Response:
-        """Reserves a place in the queue, reads the form, and runs the handler in a worker thread."""
         with self._job_queue.reserve(job) as reserved_job:
             form = await read_form(request, self._model_cache.names, self._max_pixels)
             return await self._job_queue.run_job(reserved_job, partial(handler, form), request.receive)
@@ -166,7 +165,6 @@ class _SeparationRoutes:
         return Response(found.encode("png"), media_type="image/png", headers=_TILE_HEADERS)
 
     def _separate(self, form: SeparationRequest, on_progress: ProgressCallback) -> Response:
-        """Separates a photo or a burst. Returns one layer as an image file, or several layers as a zip."""
         started = time.perf_counter()
         options = form.options
         separator = self._model_cache.separator(options.model)
@@ -227,8 +225,7 @@ class _SeparationRoutes:
     def _fit_burst(
         self, form: SeparationRequest, separator: Separator, on_progress: ProgressCallback
     ) -> FittedBurst:
-        """Measures the layers of the burst in the form, or returns those of the last request with the same photos and model, so
-        that a download after a preview does not measure the motion again."""
+        """Keeps the last burst, so that a download after a preview does not measure again."""
         from brewster.burst import fit_burst  # noqa: PLC0415  (imports torch)
 
         digests = tuple(hashlib.sha256(file).digest() for file in (*form.burst, form.hints or b""))

@@ -35,12 +35,10 @@ _PRIVACY: Final = """<p>Your browser keeps your answers until you download them 
 def export_bundle(study: Study, store: AnswerStore, out: Path, *, participants: int) -> list[str]:
     """Writes the page, the pictures and the trials of new participants into the folder `out`.
 
-    The participants take the next places in the assignment of the study, as participants of the server do. Returns the token of
-    each. The personal link is the address of the folder, followed by `?p=TOKEN`.
-
-    Raises:
-        OutputError: `out` is not empty or cannot be written, or the answers cannot be written.
-        BrewsterError: a picture of the study is missing or changed.
+    The participants take the next places in the assignment of the study, as participants of the server do.
+    Returns the token of each: a personal link is the address of the folder, followed by `?p=TOKEN`. Raises
+    OutputError if `out` is not empty, or it or the answers cannot be written, and BrewsterError if a picture
+    of the study is missing or changed.
     """
     require_empty(out)
     study.verify_pictures()

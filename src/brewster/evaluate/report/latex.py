@@ -102,7 +102,6 @@ def _multicolumn(columns: int, text: str, *, is_last: bool) -> str:
 
 
 def _cells(results: Results, key: str, method: str, metrics: Iterable[str], intervals: bool) -> Iterator[str]:
-    """Yields the means with their marks and, on request, their intervals."""
     table = results["tables"][key]
     for metric in metrics:
         about, entry = results["metrics"][metric], table[method].get(metric)

@@ -74,7 +74,6 @@ def _dataset_title(dataset: str) -> str:
 
 
 def _group(study: Study, participants: Sequence[ParticipantAnswers]) -> dict[str, Any]:
-    """The results of a group of participants."""
     participants = [participant for participant in participants if participant.votes]
     summary = {
         "participants": len(participants),
@@ -155,8 +154,7 @@ def _tables(study: Study, counts: Floats, pictures: Floats, weights: Floats) -> 
 
 
 def _strengths(study: Study, counts: Floats, weights: Floats) -> dict[str, Any]:
-    """The strength of each method, with its interval. There is no interval if the likelihood of a resample has no
-    maximum, because a method only won or only lost. There is also none if all resamples are equal."""
+    """Without intervals if a resample has no maximum of the likelihood, or all are equal."""
     methods = study.description.methods
     # wins of each method against each other method, (participants, methods, methods); a tie is half a win
     wins = np.zeros((len(counts), len(methods), len(methods)))
