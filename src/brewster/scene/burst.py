@@ -69,11 +69,8 @@ def layer_motion(reference: Scene, frame: Scene) -> LayerMotion:
 
 
 class _Content:
-    """The content of one layer as the camera sees it. Vectors are (N, 3) in the glass frame, in mm.
-
-    The content in front of the glass is replaced by its mirror image behind the glass. Light from there reaches the camera
-    on a straight line. Light from behind the glass is shifted along the glass by the refraction in the panes.
-    """
+    """The content of one layer as the camera sees it: that in front of the glass is its mirror image behind the glass. Vectors
+    are (N, 3) in the glass frame, in mm."""
 
     def __init__(self, side: Side, glass: Glazing, *, is_behind: bool) -> None:
         self.to_glass = np.array(axes(glass.heading_deg, glass.pitch_deg))

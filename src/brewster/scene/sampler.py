@@ -254,10 +254,7 @@ def _draw_plane(recipe: SideRecipe, partial: _PartialScene, luminance: float, di
 def _visible_extent(
     partial: _PartialScene, distance_mm: float
 ) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Returns the ranges of x and y in mm that the view covers on a plane at this distance behind the glass.
-
-    A mirrored plane at the same distance in front of the glass covers the same ranges.
-    """
+    """Returns the ranges of x and y in mm that the view covers at this distance behind the glass, or mirrored in front of it."""
     x, y, z = partial.to_glass(partial.camera.position_mm)
     points = []
     for corner in partial.camera.corners():

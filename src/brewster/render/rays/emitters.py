@@ -256,10 +256,8 @@ class SideEmitters:
         return self._add_plane(light, rays), pdf
 
     def _dome_density_ratio(self, point: Tensor, direction: Tensor, distance: Tensor) -> Tensor:
-        """Returns the density per steradian at a ray's origin divided by that at the dome's centre, (N,).
-
-        The same area of the dome has the solid angle A / r^2 at the centre and A cos / distance^2 at the origin.
-        """
+        """Returns the density per steradian at a ray's origin divided by that at the dome's centre, (N,)."""
+        # The same area A of the dome has the solid angle A / r^2 at the centre and A cos / distance^2 at the origin.
         return (distance / self.radius_mm) ** 2 / dot(point, direction).clamp(min=1e-6)
 
     def _intersect_dome(self, rays: Rays) -> tuple[Tensor, Tensor]:
@@ -299,11 +297,7 @@ class SideEmitters:
 
 
 def _plane_emitter(plane: Plane, assets: Assets, is_behind: bool, device: Device) -> _PlaneEmitter:
-    """Converts a plane to the glass frame.
-
-    At heading 0 and pitch 0, the plane faces the glass. The heading rotates it about the y axis, and the pitch about its
-    horizontal axis.
-    """
+    """Converts a plane to the glass frame. At heading 0 and pitch 0, the plane faces the glass."""
     image = torch.from_numpy(assets.plane_radiance(plane)).to(device)
     facing = 1.0 if is_behind else -1.0
     mirrored = torch.tensor([facing, 1.0, facing], device=device)

@@ -79,20 +79,15 @@ def _by_polarisation(glazing: Glazing, cosine: Tensor) -> list[list[_SurfaceAndI
 
 
 def _slab(r: Tensor, a: Tensor | float) -> Throughput:
-    """Returns the transmittance and the reflectance of one pane, the sums of the paper's two series of light paths.
-
-    T = (1 - r)^2 a (1 + (r a)^2 + (r a)^4 + ...) and R = r + (1 - r)^2 r a^2 (1 + (r a)^2 + ...) are geometric series.
-    """
+    """Returns the sums of the paper's two series of light paths in one pane, which are geometric:
+    T = (1 - r)^2 a (1 + (r a)^2 + (r a)^4 + ...) and R = r + (1 - r)^2 r a^2 (1 + (r a)^2 + ...)."""
     transmittance = (1 - r) ** 2 * a / (1 - (r * a) ** 2)
     return Throughput(transmittance, r + transmittance * r * a)
 
 
 def _combine(layers: list[Throughput]) -> Throughput:
-    """Combines layers with the adding method (Stokes 1862): T = T1 T2 / (1 - R1 R2), R = R1 + T1^2 R2 / (1 - R1 R2).
-
-    The method requires that each layer has the same properties from both sides, as uniform panes do. The first layer is
-    the one nearest to the camera.
-    """
+    """Combines layers, the nearest first, each with the same properties from both sides, by the adding method (Stokes 1862):
+    T = T1 T2 / (1 - R1 R2), R = R1 + T1^2 R2 / (1 - R1 R2)."""
     *others, stack = layers
     for t, r in reversed(others):
         interreflection = 1 / (1 - r * stack.reflectance)
