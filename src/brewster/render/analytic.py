@@ -75,11 +75,8 @@ class _PreparedScene:
 
 def render(scene: Scene, assets: Assets, device: Device = "cpu") -> LinearSample:
     """Renders the five images of a scene (the paper's section "Data Generation") in float32, on `device`.
-
-    Raises:
-        RecipeError: the glass is framed or curved (only Mitsuba renders it), or a file is missing.
-        PhotoError: a file cannot be decoded, or is not an environment map.
-    """
+    Raises RecipeError if the glass is framed or curved (only Mitsuba renders it), or a file is missing;
+    PhotoError if a file cannot be decoded, or is not an environment map."""
     if not scene.glass.is_flat:
         raise RecipeError(
             "the glass is framed or curved",
@@ -131,7 +128,7 @@ def needs_monte_carlo(scene: Scene) -> bool:
 
 
 def _render_deterministic(prepared: _PreparedScene) -> list[Tensor]:
-    """Traces a regular grid of rays in each pixel, then applies the defocus blur: I, T, B, R and MR, (3, H, W) each."""
+    """Traces a regular grid of rays in each pixel, then blurs I, T, B, R and MR, (3, H, W) each, by defocus."""
     scene, camera = prepared.scene, prepared.scene.camera
     margin = margin_px(camera)
     width, height = camera.width + 2 * margin, camera.height + 2 * margin
@@ -150,7 +147,7 @@ def _render_deterministic(prepared: _PreparedScene) -> list[Tensor]:
 def _pinhole_rays(
     prepared: _PreparedScene, offset: tuple[float, float], margin: int, relative_footprint: float
 ) -> Iterator[tuple[Rays, slice]]:
-    """Yields rays through the point `offset` (0..1) of every pixel, in batches of rows, with the range of their pixels."""
+    """Yields rays through the point `offset` (0..1) of every pixel, in batches, with the range of the pixels."""
     camera = prepared.scene.camera
     width, height = camera.width + 2 * margin, camera.height + 2 * margin
     x = (torch.arange(width, device=prepared.origin.device) - margin + offset[0]) / camera.width * 2 - 1
@@ -225,8 +222,8 @@ def _trace_smooth(prepared: _PreparedScene, rays: Rays, _: SobolPoints | None = 
 def _shifted_orders(
     prepared: _PreparedScene, side: _PreparedSide, exiting: Rays, far: Tensor | None
 ) -> tuple[Tensor, Tensor]:
-    """Returns the light of all orders of a side with near content, and that of the orders in T or R, (3, N) each.
-    `exiting` are the rays after the glass, from its first surface; `far` is the light from infinity along them."""
+    """Returns the light of all orders of a side with near content, and that of the orders in T or R, (3, N).
+    `exiting` are the rays after the glass, from its first surface; `far` is their light from infinity."""
     glass, direction = prepared.scene.glass, exiting.direction
     cosine = direction[2].abs()
     shifts = in_plane_shifts_mm(glass, cosine)
@@ -253,7 +250,7 @@ def _in_plane_shift(order: ReflectionOrder, shifts: list[Tensor]) -> Tensor:
 
 
 def _group_orders(scene: Scene, emitters: SideEmitters, *, is_behind: bool) -> list[list[ReflectionOrder]]:
-    """Groups the orders of one side whose images are less than `_MERGE_DISTANCE_PX` apart, the brightest order first."""
+    """Groups the orders of one side with images less than `_MERGE_DISTANCE_PX` apart, the brightest first."""
     if not emitters.has_near_light:
         return []
     _, _, normal = axes(scene.glass.heading_deg, scene.glass.pitch_deg)

@@ -129,7 +129,7 @@ def luminance(colour: Tensor) -> float:
 
 
 def _exposure_ev(light: Tensor, target: float) -> float:
-    """Returns the exposure in stops at which the mean luminance of light (3, H, W), clipped at white, is `target`."""
+    """Returns the exposure in stops at which light (3, H, W), clipped at white, has this mean luminance."""
 
     def mean(ev: float) -> float:
         return luminance((light * math.exp2(ev)).clamp_(0, 1).mean((1, 2)))
@@ -149,7 +149,7 @@ def _exposure_ev(light: Tensor, target: float) -> float:
 
 
 def _white_balance_gains(photo: Tensor, response: CameraResponse) -> tuple[float, float, float]:
-    """Returns RGB gains that correct the illuminant's colour by the requested strength and keep its luminance."""
+    """Returns RGB gains that correct the illuminant's colour, by the requested strength, not its luminance."""
     if response.white_balance == "none":
         return 1.0, 1.0, 1.0
     exposed = (photo * math.exp2(_exposure_ev(photo, response.target_luminance))).clamp(0, 1)
@@ -170,14 +170,16 @@ def _grey_world(image: Tensor, valid: Tensor) -> Tensor:
 
 
 def _white_patch(image: Tensor, valid: Tensor) -> Tensor:
-    """Returns the 99th percentile of each channel: the brightest surface is white (E. H. Land, Sci. Am. 237, 1977)."""
+    """Returns the 99th percentile: the brightest surface is white (E. H. Land, Scientific American 237, 1977)."""
     values = image[:, valid]
     return values.kthvalue(math.ceil(0.99 * values.shape[1]), dim=1).values
 
 
 def _grey_edge(image: Tensor, valid: Tensor) -> Tensor:
-    """Returns the Minkowski norm of the edges: the average edge is grey (J. van de Weijer et al., IEEE TIP 16, 2007)."""
-    # Differences along both diagonals of 2 x 2 pixels (Roberts cross). Rendered light needs no smoothing before.
+    """Returns the Minkowski norm of the edges: the average edge is grey.
+
+    Source: J. van de Weijer et al., IEEE Trans. Image Proc. 16, 2007, who smooth the image first. Rendered
+    light has little noise. Differences are along both diagonals of 2 x 2 pixels (Roberts cross)."""
     first, second = image[:, 1:, 1:] - image[:, :-1, :-1], image[:, 1:, :-1] - image[:, :-1, 1:]
     all_valid = valid[1:, 1:] & valid[:-1, :-1] & valid[1:, :-1] & valid[:-1, 1:]
     edges = torch.hypot(first, second)[:, all_valid]
@@ -200,7 +202,7 @@ _ILLUMINANT_ESTIMATORS: Final[dict[str, Callable[[Tensor, Tensor], Tensor]]] = {
 
 
 def _add_noise(exposed: Tensor, scene: Scene) -> Tensor:
-    """Adds shot noise (variance proportional to light) and read noise (constant variance) to light (3, H, W)."""
+    """Adds shot noise (variance proportional to light) and read noise (constant variance) to light."""
     response = scene.camera_response
     if response.shot_noise == response.read_noise == 0:
         return exposed

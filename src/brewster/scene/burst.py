@@ -48,14 +48,9 @@ class LayerMotion:
 
 
 def layer_motion(reference: Scene, frame: Scene) -> LayerMotion:
-    """Computes where the points that `reference` shows are in another frame of the same burst.
-
-    Wedges, the roughness of glass and the aperture do not change the result.
-
-    Raises:
-        RecipeError: the scenes differ in glass, content or size of the image, the glass is framed or curved, or a picture
-            has no height_mm.
-    """
+    """Computes where the points that `reference` shows are in another frame of the same burst. Wedges, the
+    roughness of glass and the aperture do not change the result. Raises RecipeError if the scenes differ in
+    glass, content or size of the image, the glass is framed or curved, or a picture has no height_mm."""
     _check_same_burst(reference, frame)
     camera = reference.camera
     y, x = np.mgrid[: camera.height, : camera.width]
@@ -69,8 +64,8 @@ def layer_motion(reference: Scene, frame: Scene) -> LayerMotion:
 
 
 class _Content:
-    """The content of one layer as the camera sees it: that in front of the glass is its mirror image behind the glass. Vectors
-    are (N, 3) in the glass frame, in mm."""
+    """The content of one layer as the camera sees it: that in front of the glass is its mirror image behind
+    the glass. Vectors are (N, 3) in the glass frame, in mm."""
 
     def __init__(self, side: Side, glass: Glazing, *, is_behind: bool) -> None:
         self.to_glass = np.array(axes(glass.heading_deg, glass.pitch_deg))

@@ -56,11 +56,10 @@ def trace(
     surfaces. `polarised` traces each colour with the polarised variant, at several times the cost. In Mitsuba, light is
     unpolarised after a rough surface. `denoise` filters the result with Intel Open Image Denoise.
 
-    Raises:
-        MissingExtra: mitsuba cannot be imported, or `denoise` is set and mitsuba-oidn is not installed.
-        DeviceError: `polarised` is set, and Mitsuba works with no LLVM of this machine.
-        RecipeError: a wedge or lens has no thickness somewhere in the view, two surfaces meet, or a file is missing.
-        PhotoError: a file cannot be decoded, or is not an environment map.
+    Raises MissingExtra if mitsuba cannot be imported, or mitsuba-oidn for `denoise`; DeviceError if
+    `polarised` is set and Mitsuba works with no LLVM of this machine; RecipeError if a wedge or lens has no
+    thickness somewhere in the view, two surfaces meet, or a file is missing; PhotoError if a file cannot be
+    decoded, or is not an environment map.
     """
     mi = load()
     with _active_variant(mi, polarised=polarised):

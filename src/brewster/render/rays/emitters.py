@@ -257,7 +257,7 @@ class SideEmitters:
 
     def _dome_density_ratio(self, point: Tensor, direction: Tensor, distance: Tensor) -> Tensor:
         """Returns the density per steradian at a ray's origin divided by that at the dome's centre, (N,)."""
-        # The same area A of the dome has the solid angle A / r^2 at the centre and A cos / distance^2 at the origin.
+        # An area A of the dome has the solid angle A / r^2 at the centre and A cos / distance^2 at the origin.
         return (distance / self.radius_mm) ** 2 / dot(point, direction).clamp(min=1e-6)
 
     def _intersect_dome(self, rays: Rays) -> tuple[Tensor, Tensor]:

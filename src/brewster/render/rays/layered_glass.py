@@ -86,8 +86,8 @@ def _slab(r: Tensor, a: Tensor | float) -> Throughput:
 
 
 def _combine(layers: list[Throughput]) -> Throughput:
-    """Combines layers, the nearest first, each with the same properties from both sides, by the adding method (Stokes 1862):
-    T = T1 T2 / (1 - R1 R2), R = R1 + T1^2 R2 / (1 - R1 R2)."""
+    """Combines layers, the nearest first, each with the same properties from both sides, by the adding method
+    (Stokes 1862): T = T1 T2 / (1 - R1 R2), R = R1 + T1^2 R2 / (1 - R1 R2)."""
     *others, stack = layers
     for t, r in reversed(others):
         interreflection = 1 / (1 - r * stack.reflectance)

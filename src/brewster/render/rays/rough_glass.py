@@ -137,8 +137,8 @@ def trace_orders(
 
 
 def _mean_weight(path: _PathState, count: int) -> float:
-    """Returns the mean weight over both polarisations and all `count` rays. Rays that are not on the path have weight 0."""
-    # The weights of single rays are no measure, because total reflection at a microfacet gives some rays the weight 0 or 1.
+    """Returns the mean weight over both polarisations and all `count` rays, which is 0 off the path."""
+    # The weights of single rays are no measure: total reflection at a microfacet makes some of them 0 or 1.
     return float((path.s + path.p).sum()) / (6 * count)
 
 
@@ -232,8 +232,8 @@ def _interact(
 
 
 def _scattered_direction(wi: Tensor, facet: Tensor, cosine: Tensor, ratio: float | None) -> Tensor:
-    """Returns the directions after reflection or refraction at microfacets (Walter et al. 2007, eq. 39 and 40). `ratio` is the
-    refractive index on the side of `wi` divided by that on the other side; None for reflection."""
+    """Returns the directions after reflection or refraction at microfacets (Walter et al. 2007, eq. 39, 40).
+    `ratio` is the refractive index on the side of `wi` divided by the other one; None for reflection."""
     if ratio is None:
         return 2 * cosine * facet - wi
     # Under total reflection the result is arbitrary, and its weight is 0.
@@ -244,8 +244,8 @@ def _scattered_direction(wi: Tensor, facet: Tensor, cosine: Tensor, ratio: float
 def _facet_weights(
     interaction: _SurfaceInteraction, cosine: Tensor, reflectances: tuple[Tensor, Tensor], wo: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Returns BSDF times cosine divided by density, for s- and p-polarised light, (N,) each. `cosine` is dot(wi, facet)."""
-    # With visible normals and the separable Smith term, all but the Fresnel factor and G1(wo) cancels (Heitz 2018).
+    """Returns BSDF times cosine divided by density, for s- and p-polarised light, (N,) each. With visible normals
+    and the separable Smith term, all but the Fresnel factor and G1(wo) cancels (Heitz 2018)."""
     cosine_out = wo[2] if interaction.reflects else -wo[2]
     # Facets seen from behind have weight 0, and so do facets that scatter light to the wrong side of the surface.
     valid = (cosine_out > 0) & (cosine > 0)
@@ -271,8 +271,8 @@ def _exit_radiance(
     relative_footprint: float,
     light_uniforms: Tensor | None,
 ) -> Tensor:
-    """Returns the light of an order, (3, N): a microfacet sample, and with the random numbers `light_uniforms`, (N,), a light
-    sample. The balance heuristic weights each by its share of the sum of both densities (Veach 1997, eq. 9.8)."""
+    """Returns the light of an order, (3, N), from a microfacet sample and, with random numbers (N,), a light
+    sample. The balance heuristic weights them by their densities (Veach 1997, eq. 9.8)."""
     weight, rays = (path.s + path.p) / 2, Rays(path.origin, path.direction, relative_footprint)
     if light_uniforms is None:
         return weight * emitters.radiance(rays)
@@ -304,8 +304,8 @@ def _half_vector(interaction: _SurfaceInteraction, wo: Tensor) -> Tensor:
 
 
 def _scattering_pdf(interaction: _SurfaceInteraction, facet: Tensor, cosine: Tensor, wo: Tensor) -> Tensor:
-    """Returns the density of microfacet samples at `wo`, per steradian, (N,): that of the facet's normal times the Jacobian
-    of the half vector (Walter et al. 2007, eq. 14 and 17). `cosine` is dot(wi, facet)."""
+    """Returns the density of microfacet samples at `wo`, per steradian, (N,): that of the facet's normal
+    times the Jacobian of the half vector (Walter et al. 2007, eq. 14 and 17). `cosine` is dot(wi, facet)."""
     cosine_out = dot(wo, facet)
     normal_pdf = vndf_over_cosine(interaction.wi, facet, interaction.alpha)
     if interaction.reflects:
