@@ -12,7 +12,6 @@ import re
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from time import sleep
 from typing import Literal, final
 
 from brewster.download import Downloader, RemoteFile, file_digest, output_errors
@@ -22,8 +21,6 @@ from brewster.files import cache_folder, write_atomically
 SERVER = "https://api.polyhaven.com"
 _COLUMNS = ("file", "asset", "category", "resolution", "md5", "authors", "licence")  # of manifest.csv
 _SAFE_NAME = re.compile(r"[A-Za-z0-9][\w.-]{0,200}", re.ASCII)
-_RETRY_DELAYS_S = (1.0, 2.0, 4.0, 8.0)  # between five attempts
-_TIMEOUT_S = 30.0
 _MAX_CONSECUTIVE_FAILURES = 5
 
 
@@ -114,7 +111,7 @@ def _download_asset(
         if not _is_downloaded(target, remote):
             if request.dry_run:
                 return replace(result, status="planned")
-            _downloader().fetch(remote, target)
+            Downloader().fetch(remote, target)
             result = replace(result, status="downloaded")
     except DownloadError as error:
         return replace(result, status="failed", error=str(error))
@@ -152,7 +149,7 @@ def _find_remote_file(asset: str, request: DownloadRequest) -> RemoteFile | None
 
 
 def _fetch_json(url: str) -> dict[str, object]:
-    response = _downloader().read(url)
+    response = Downloader().read(url)
     try:
         parsed = json.loads(response)
     except (ValueError, RecursionError):
@@ -168,10 +165,6 @@ def _nested(tree: object, *keys: str) -> object:
     for key in keys:
         tree = tree.get(key) if isinstance(tree, dict) else None
     return tree
-
-
-def _downloader() -> Downloader:
-    return Downloader(_RETRY_DELAYS_S, _TIMEOUT_S, sleep)
 
 
 # --- files

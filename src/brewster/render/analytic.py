@@ -251,7 +251,7 @@ def _in_plane_shift(order: ReflectionOrder, shifts: list[Tensor]) -> Tensor:
 
 def _group_orders(scene: Scene, emitters: SideEmitters, *, is_behind: bool) -> list[list[ReflectionOrder]]:
     """Groups the orders of one side with images less than `_MERGE_DISTANCE_PX` apart, the brightest first."""
-    if not emitters.has_near_light:
+    if not emitters.has_dome and emitters.plane is None:  # all light is from infinity
         return []
     _, _, normal = axes(scene.glass.heading_deg, scene.glass.pitch_deg)
     # The images are farthest apart in the corner of the view with the largest angle of incidence.

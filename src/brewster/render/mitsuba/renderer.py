@@ -138,7 +138,10 @@ class _RunningEstimate:
             for builder in builders
         ]
         self._seed_key = scene.seed, scene.index, int(lit_from_behind), get_args(GlassMode).index(glass_mode)
-        self.samples_per_pass = _samples_per_pass(scene.camera.width * scene.camera.height, max_samples)
+        # 64, 16, 4 or 1 samples per pixel, because square numbers are stratified evenly.
+        pixels = scene.camera.width * scene.camera.height
+        limit = min(max_samples // _MIN_PASSES, _MAX_RAYS_PER_PASS // pixels)
+        self.samples_per_pass = next((samples for samples in (64, 16, 4) if samples <= limit), 1)
         self.pass_count = 0
         self._sum = np.zeros((scene.camera.height, scene.camera.width, 3))
         self._sum_of_squares = np.zeros(self._sum.shape[:2])
@@ -166,12 +169,6 @@ class _RunningEstimate:
         spread = self._sum_of_squares / self.pass_count - self.light.mean(axis=2) ** 2
         variance: NDArray[np.float64] = spread.clip(min=0) / (self.pass_count - 1)
         return variance
-
-
-def _samples_per_pass(pixel_count: int, max_samples: int) -> int:
-    """Returns 64, 16, 4 or 1 samples per pixel, as memory and `_MIN_PASSES` allow: square numbers are stratified evenly."""
-    limit = min(max_samples // _MIN_PASSES, _MAX_RAYS_PER_PASS // pixel_count)
-    return next((samples for samples in (64, 16, 4) if samples <= limit), 1)
 
 
 def _converge(estimates: Sequence[_RunningEstimate], noise_threshold: float, max_samples: int) -> None:

@@ -36,15 +36,11 @@ class MipmappedTexture:
 
     def __init__(self, texels: Tensor, *, wraps: bool) -> None:
         self.width, self.wraps = texels.shape[1], wraps
-        self._levels = [texels.permute(2, 0, 1)[None]]
+        self.texels = texels.permute(2, 0, 1)
+        self._levels = [self.texels[None]]
         while min(self._levels[-1].shape[2:]) > 8:
             self._levels.append(functional.avg_pool2d(self._levels[-1], 2))
         self._padded: dict[int, Tensor] = {}
-
-    @property
-    def texels(self) -> Tensor:
-        """The image at full resolution, (3, H, W)."""
-        return self._levels[0][0]
 
     def __call__(self, u: Tensor, v: Tensor, footprint: float) -> Tensor:
         """Returns values (3, N) at texture coordinates u and v, (N,) in 0..1.
@@ -154,11 +150,6 @@ class SideEmitters:
         self.plane_distance_mm = side.plane.distance_mm if side.plane else math.inf
         self.distance_mm = side.distance_mm
         self.has_dome = math.isfinite(self.radius_mm)  # a map at a finite radius, which causes parallax
-
-    @property
-    def has_near_light(self) -> bool:
-        """Whether any light of this side depends on the origin of a ray."""
-        return self.has_dome or self.plane is not None
 
     def texels_per_pixel(self) -> float:
         """Returns the footprint of a whole pixel in texels of the map or of the plane, whichever is larger."""
