@@ -16,7 +16,7 @@ from typing import Literal, final
 
 from brewster.download import Downloader, RemoteFile, file_digest, output_errors
 from brewster.errors import DownloadError, OutputError
-from brewster.files import cache_folder, write_atomically
+from brewster.files import write_atomically
 
 SERVER = "https://api.polyhaven.com"
 _COLUMNS = ("file", "asset", "category", "resolution", "md5", "authors", "licence")  # of manifest.csv
@@ -64,11 +64,6 @@ def stop_after_failures(results: Iterable[DownloadResult]) -> Iterator[DownloadR
                 "expected at least one successful download",
                 "see their errors, and run again to resume the downloads",
             )
-
-
-def maps_folder() -> Path:
-    """Returns the default folder for maps: brewster/maps in the cache folder of the user."""
-    return cache_folder() / "maps"
 
 
 def pull(request: DownloadRequest, out: Path) -> Iterator[DownloadResult]:

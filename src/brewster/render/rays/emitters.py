@@ -117,10 +117,6 @@ class CameraView:
         from_camera_mm = self.height_mm + distance_mm
         return self.pixel_rad * from_camera_mm + self.aperture_mm * abs(1 - from_camera_mm / self.focus_mm)
 
-    def footprint_rad(self) -> float:
-        """Returns the width of a pixel plus its circle of confusion at infinity, in radians."""
-        return self.pixel_rad + self.aperture_mm / self.focus_mm
-
 
 class SideEmitters:
     """The light sources of one side: an environment map or dome, and a plane in front of it; both are optional.
@@ -159,11 +155,10 @@ class SideEmitters:
         """Converts a footprint that is relative to a whole pixel's to texels of the map."""
         if self.envmap is None:
             return 0.0
-        angle = (
-            self._view.footprint_mm(self.radius_mm) / self.radius_mm
-            if self.has_dome
-            else self._view.footprint_rad()
-        )
+        view = self._view
+        angle = view.pixel_rad + view.aperture_mm / view.focus_mm
+        if self.has_dome:
+            angle = view.footprint_mm(self.radius_mm) / self.radius_mm
         return relative_footprint * angle * self.envmap.width / (2 * math.pi)
 
     def _plane_footprint(self, relative_footprint: float) -> float:

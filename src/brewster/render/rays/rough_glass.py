@@ -283,7 +283,10 @@ def _exit_radiance(
         emitters.sample_map(light_uniforms, relative_footprint), rays
     )
     wo = interaction.axes @ direction
-    facet = _half_vector(interaction, wo)
+    # The facets that scatter `wi` into `wo` have the half vector as normal (Walter et al. 2007, eq. 13 and 16).
+    half = -(interaction.index_in * interaction.wi + interaction.index_out * wo)
+    half = interaction.wi + wo if interaction.reflects else half
+    facet = normalize(half) * torch.sign(half[2])
     cosine = dot(interaction.wi, facet)
     reflectances = _reflectances(cosine, interaction.index_in, interaction.index_out)
     s, p = _facet_weights(interaction, cosine, reflectances, wo)
@@ -292,15 +295,6 @@ def _exit_radiance(
     # light_pdf / (light_pdf + facet_pdf): light_pdf cancels.
     ratio = facet_pdf / (light_pdf + facet_pdf).clamp(min=1e-20)
     return light + (interaction.before.s * s + interaction.before.p * p) / 2 * ratio * radiance
-
-
-def _half_vector(interaction: _SurfaceInteraction, wo: Tensor) -> Tensor:
-    """Returns the normals of the facets that scatter `wi` into `wo` (Walter et al. 2007, eq. 13 and 16)."""
-    if interaction.reflects:
-        half = interaction.wi + wo
-    else:
-        half = -(interaction.index_in * interaction.wi + interaction.index_out * wo)
-    return normalize(half) * torch.sign(half[2])
 
 
 def _scattering_pdf(interaction: _SurfaceInteraction, facet: Tensor, cosine: Tensor, wo: Tensor) -> Tensor:
