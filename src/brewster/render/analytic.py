@@ -128,7 +128,7 @@ def needs_monte_carlo(scene: Scene) -> bool:
 
 
 def _render_deterministic(prepared: _PreparedScene) -> list[Tensor]:
-    """Traces a regular grid of rays in each pixel, then blurs I, T, B, R and MR, (3, H, W) each, by defocus."""
+    """Traces a regular grid of rays in each pixel, then applies the defocus: I, T, B, R and MR, (3, H, W)."""
     scene, camera = prepared.scene, prepared.scene.camera
     margin = margin_px(camera)
     width, height = camera.width + 2 * margin, camera.height + 2 * margin
@@ -147,7 +147,7 @@ def _render_deterministic(prepared: _PreparedScene) -> list[Tensor]:
 def _pinhole_rays(
     prepared: _PreparedScene, offset: tuple[float, float], margin: int, relative_footprint: float
 ) -> Iterator[tuple[Rays, slice]]:
-    """Yields rays through the point `offset` (0..1) of every pixel, in batches, with the range of the pixels."""
+    """Yields rays through the point `offset` (0..1) of every pixel, in batches, with their range of pixels."""
     camera = prepared.scene.camera
     width, height = camera.width + 2 * margin, camera.height + 2 * margin
     x = (torch.arange(width, device=prepared.origin.device) - margin + offset[0]) / camera.width * 2 - 1

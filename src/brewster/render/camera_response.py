@@ -149,7 +149,7 @@ def _exposure_ev(light: Tensor, target: float) -> float:
 
 
 def _white_balance_gains(photo: Tensor, response: CameraResponse) -> tuple[float, float, float]:
-    """Returns RGB gains that correct the illuminant's colour, by the requested strength, not its luminance."""
+    """Returns RGB gains that correct the illuminant's colour by the requested strength, not its luminance."""
     if response.white_balance == "none":
         return 1.0, 1.0, 1.0
     exposed = (photo * math.exp2(_exposure_ev(photo, response.target_luminance))).clamp(0, 1)
@@ -170,7 +170,7 @@ def _grey_world(image: Tensor, valid: Tensor) -> Tensor:
 
 
 def _white_patch(image: Tensor, valid: Tensor) -> Tensor:
-    """Returns the 99th percentile: the brightest surface is white (E. H. Land, Scientific American 237, 1977)."""
+    """Returns the 99th percentile: the brightest surface is white (E. H. Land, Sci. American 237, 1977)."""
     values = image[:, valid]
     return values.kthvalue(math.ceil(0.99 * values.shape[1]), dim=1).values
 

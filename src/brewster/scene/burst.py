@@ -37,10 +37,8 @@ class LayerMotion:
     reflection: Float32
 
     def relative_px(self) -> float:
-        """Returns the median distance by which the layers move relative to each other, in px; NaN without content.
-
-        Glass without effect also has a relative motion, although its reflection is black.
-        """
+        """Returns the median distance by which the layers move relative to each other, in px; NaN without
+        content. Glass without effect also has a relative motion, although its reflection is black."""
         difference = self.reflection - self.transmission
         lengths = np.hypot(difference[..., 0], difference[..., 1])
         lengths = lengths[np.isfinite(lengths)]

@@ -37,10 +37,8 @@ _MIN_LIGHT_SAMPLING_WEIGHT: Final = 3e-3
 
 @dataclass(frozen=True)
 class Surface:
-    """One surface of a pane: its height on the z axis, its frame and its material.
-
-    The rows of `axes`, (3, 3), are the axes of the surface's frame. The last is its normal towards the camera.
-    """
+    """One surface of a pane: its height on the z axis, the axes of its frame as rows, (3, 3), of which the
+    last is its normal towards the camera, and its material."""
 
     height_mm: float
     axes: Tensor
@@ -71,10 +69,7 @@ class _PathState:
 
 @dataclass(frozen=True)
 class ExitingLight:
-    """The light of one order from one side, (3, N), and the indices of its rays, (N,).
-
-    `in_truncated_layers` is True if the paper's T or R contains it.
-    """
+    """The light of one order from one side, (3, N), the indices of its rays, (N,), and whether T or R has it."""
 
     is_transmitted: bool
     in_truncated_layers: bool
@@ -83,10 +78,8 @@ class ExitingLight:
 
 
 def surfaces(glass: Glazing, like: Tensor) -> list[Surface]:
-    """Returns the surfaces of a glazing in the glass frame, from the nearest to the camera to the farthest.
-
-    A wedge rotates the far surface of a pane. The tensors have the dtype and the device of `like`.
-    """
+    """Returns the surfaces of a glazing in the glass frame, from the nearest to the camera to the farthest,
+    with the dtype and the device of `like`."""
     stack, height_mm = [], 0.0
     for pane in glass.panes:
         absorption = like.new_tensor(pane.absorption_per_m)[:, None] / 1000
@@ -105,11 +98,8 @@ def surfaces(glass: Glazing, like: Tensor) -> list[Surface]:
 def trace_orders(
     glass: Glazing, rays: Rays, behind: SideEmitters, front: SideEmitters, sobol: SobolPoints
 ) -> Iterator[ExitingLight]:
-    """Traces the orders of the rays until no ray is left. Yields the light of each order that exits.
-
-    Each refraction scales radiance by the squared ratio of the refractive indices. Every path starts and ends in air, so
-    these factors cancel and are left out.
-    """
+    """Traces the orders of the rays until no ray is left. Yields the light of each order that exits."""
+    # Refraction scales radiance by the squared ratio of the refractive indices. These factors cancel in air.
     stack = surfaces(glass, rays.direction)
     count = rays.direction.shape[1]
     ones, indices = torch.ones_like(rays.direction), torch.arange(count, device=rays.direction.device)
@@ -244,8 +234,8 @@ def _scattered_direction(wi: Tensor, facet: Tensor, cosine: Tensor, ratio: float
 def _facet_weights(
     interaction: _SurfaceInteraction, cosine: Tensor, reflectances: tuple[Tensor, Tensor], wo: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Returns BSDF times cosine divided by density, for s- and p-polarised light, (N,) each. With visible normals
-    and the separable Smith term, all but the Fresnel factor and G1(wo) cancels (Heitz 2018)."""
+    """Returns BSDF times cosine divided by density, for s- and p-polarised light, (N,) each. With visible
+    normals and the separable Smith term, all but the Fresnel factor and G1(wo) cancels (Heitz 2018)."""
     cosine_out = wo[2] if interaction.reflects else -wo[2]
     # Facets seen from behind have weight 0, and so do facets that scatter light to the wrong side of the surface.
     valid = (cosine_out > 0) & (cosine > 0)
@@ -283,7 +273,7 @@ def _exit_radiance(
         emitters.sample_map(light_uniforms, relative_footprint), rays
     )
     wo = interaction.axes @ direction
-    # The facets that scatter `wi` into `wo` have the half vector as normal (Walter et al. 2007, eq. 13 and 16).
+    # The normals of the facets that scatter `wi` into `wo` (Walter et al. 2007, eq. 13 and 16)
     half = -(interaction.index_in * interaction.wi + interaction.index_out * wo)
     half = interaction.wi + wo if interaction.reflects else half
     facet = normalize(half) * torch.sign(half[2])
