@@ -69,10 +69,10 @@ def stop_after_failures(results: Iterable[DownloadResult]) -> Iterator[DownloadR
 def pull(request: DownloadRequest, out: Path) -> Iterator[DownloadResult]:
     """Downloads maps into a folder, in the order of their ids, and lists them in its manifest.csv. Yields a result for each.
 
-    A map that exists already is skipped. An asset without a suitable file is replaced by the next asset. A failed
-    download is not replaced, so that the next call downloads the same maps. Raises DownloadError if the list of the server
-    cannot be downloaded, or several assets in a row failed; OutputError if the folder cannot be written to, or contains the
-    manifest.csv of another program.
+    Existing maps are skipped. An asset without a suitable file is replaced by the next one, but not a failed
+    download, so that the next call downloads the same maps. Raises DownloadError if the list of the server
+    cannot be downloaded, or several assets in a row failed; OutputError if the folder cannot be written to,
+    or has the manifest.csv of another program.
     """
     _read_manifest(out)  # refuses the manifest of another program before any download
     yield from stop_after_failures(_download_assets(request, out))

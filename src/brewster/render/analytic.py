@@ -147,7 +147,7 @@ def _render_deterministic(prepared: _PreparedScene) -> list[Tensor]:
 def _pinhole_rays(
     prepared: _PreparedScene, offset: tuple[float, float], margin: int, relative_footprint: float
 ) -> Iterator[tuple[Rays, slice]]:
-    """Yields rays through the point `offset` (0..1) of every pixel, in batches, with their range of pixels."""
+    """Yields rays through the point `offset` (0..1) of every pixel, in batches, and their range of pixels."""
     camera = prepared.scene.camera
     width, height = camera.width + 2 * margin, camera.height + 2 * margin
     x = (torch.arange(width, device=prepared.origin.device) - margin + offset[0]) / camera.width * 2 - 1

@@ -110,8 +110,8 @@ def shard_name(block: int) -> str:
 
 
 def pack(out: Path, block: int) -> None:
-    """Moves the finished samples of a block from folders into its shard, whose samples stay there. Its members
-    are named as in WebDataset (000007.photo.jpg), and its bytes depend only on the samples."""
+    """Moves the finished samples of a block from folders into its shard, whose samples stay there. Its
+    members are named as in WebDataset (000007.photo.jpg), and its bytes depend only on the samples."""
     entries = list(read_block(out, block))
     if any(not entry.spans for entry in entries):
         with (

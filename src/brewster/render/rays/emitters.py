@@ -182,7 +182,7 @@ class SideEmitters:
     def sample_map(self, uniforms: Tensor, relative_footprint: float) -> LightSamples:
         """Draws points of the map with a density proportional to its luminance, for `towards`. `uniforms` are
         random numbers in [0, 1), (N,). `relative_footprint` must be the same in all calls."""
-        # From a table of stratified points: inverting the distribution for each ray takes several times as long.
+        # From a table of stratified points: to invert the distribution for each ray takes several times longer.
         if self._light_table is None:
             self._light_table = self._tabulate_light(relative_footprint)
         table, indices = self._light_table, (uniforms * _LIGHT_TABLE_SIZE).long()

@@ -69,7 +69,7 @@ class _PathState:
 
 @dataclass(frozen=True)
 class ExitingLight:
-    """The light of one order from one side, (3, N), the indices of its rays, (N,), and whether T or R has it."""
+    """The light of one order from one side, (3, N), the indices of its rays, (N,), and if T or R has it."""
 
     is_transmitted: bool
     in_truncated_layers: bool

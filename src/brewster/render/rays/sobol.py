@@ -26,7 +26,7 @@ class SobolPoints:
         self.start_sample(0, slice(0, pixel_count))
 
     def start_sample(self, number: int, pixels: slice) -> None:
-        """Selects sample `number`, from 0, of the pixels in the slice, and restarts at the first dimension."""
+        """Selects sample `number`, from 0, of these pixels, and restarts at the first dimension."""
         self._sample, self._pixels, self._next = number, pixels, 0
 
     def next_1d(self, subset: Tensor | None = None) -> Tensor:

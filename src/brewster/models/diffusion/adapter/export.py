@@ -44,10 +44,9 @@ def export_comfyui(folder: Path, target: Path) -> None:
 def export_merged(folder: Path, target: Path, base_model: str | None = None) -> None:
     """Adds the LoRA to the weights of its base, and writes the result as a folder in diffusers' layout, in bfloat16.
 
-    The sums are computed in float32 on the CPU. The folder also gets the encoded prompt and the task, but no text
-    encoders. It is for programs that cannot load a LoRA; `load_pipeline` opens it, too.
-
-    `base_model` is the folder or hub id of the base, if it has moved since training.
+    The sums are computed in float32 on the CPU. The folder also gets the encoded prompt and the task, but no
+    text encoders; it is for programs that cannot load a LoRA. `base_model` is the folder or hub id of a base
+    that has moved since training.
     """
     _check_target(target)
     state, metadata = read_lora(folder)
