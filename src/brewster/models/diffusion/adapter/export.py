@@ -17,9 +17,9 @@ from brewster.models.diffusion.adapter.lora import PREFIX, read_lora, read_promp
 from brewster.models.diffusion.adapter.lora_formats import DOWN_SUFFIX, UP_SUFFIX, adapted_layers
 from brewster.models.diffusion.backbones.backbone import Backbone
 from brewster.models.diffusion.backbones.loading import load_backbone
+from brewster.models.diffusion.backbones.registry import find_backbone
 from brewster.models.diffusion.hub_download import free_disk_bytes
 from brewster.models.diffusion.memory import check_free, count_weights, free_host_gib
-from brewster.models.diffusion.model_source import find_model_source
 from brewster.models.diffusion.prompt import PROMPT_FILE
 from brewster.models.diffusion.task import TASK_FILE, save_task
 from brewster.models.diffusion.tensors import write_tensors
@@ -44,15 +44,22 @@ def export_comfyui(folder: Path, target: Path) -> None:
 def export_merged(folder: Path, target: Path, base_model: str | None = None) -> None:
     """Adds the LoRA to the weights of its base, and writes the result as a folder in diffusers' layout, in bfloat16.
 
-    The sums are computed in float32 on the CPU. The folder also gets the encoded prompt and the task, but no
-    text encoders; it is for programs that cannot load a LoRA. `base_model` is the folder or hub id of a base
-    that has moved since training.
+    The sums are computed in float32 on the CPU. The folder also gets the encoded prompt and the task, but no text
+    encoders. It is for programs that cannot load a LoRA; `load_pipeline` opens it, too.
+
+    `base_model` is the folder or hub id of the base, if it has moved since training.
     """
     _check_target(target)
     state, metadata = read_lora(folder)
     prompt = read_prompt(folder, metadata)
-    source = find_model_source(str(folder), base_model)
-    base, backbone_class = source.base, source.backbone_class
+    base = base_model or metadata.base_model
+    backbone_class, _ = find_backbone(base)
+    if backbone_class.name != metadata.backbone:
+        raise ModelError(
+            f"{folder} is a LoRA of {metadata.backbone}",
+            f"expected a base of {metadata.backbone}, not of {backbone_class.name}",
+            "choose another base",
+        )
     needed = weights_gib(count_weights(base, backbone_class) + backbone_class.cost.vae_parameters, None)
     purpose = "for all weights in bfloat16"
     cure = "close other programs, or export on another machine"
