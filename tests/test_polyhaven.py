@@ -3,9 +3,11 @@
 import csv
 import hashlib
 import json
+from functools import partial
 
 import pytest
 
+from brewster.download import Downloader
 from brewster.environments import polyhaven
 from brewster.environments.polyhaven import DownloadRequest, pull
 from brewster.errors import DownloadError, OutputError
@@ -24,7 +26,7 @@ SIZE = 100_000
 def retry_delays(monkeypatch):
     """The delays before retries in seconds. They are recorded, and the test does not wait."""
     delays = []
-    monkeypatch.setattr(polyhaven, "sleep", delays.append)
+    monkeypatch.setattr(polyhaven, "Downloader", partial(Downloader, sleep=delays.append))
     return delays
 
 
@@ -200,7 +202,7 @@ def test_bytes_beyond_the_expected_size_are_dropped(haven, fetch, maps):
 
 
 def test_bytes_received_before_a_timeout_are_kept(haven, fetch, monkeypatch):
-    monkeypatch.setattr(polyhaven, "_TIMEOUT_S", 0.2)
+    monkeypatch.setattr(polyhaven, "Downloader", partial(polyhaven.Downloader, timeout_s=0.2))
     haven.faults["/file/a_room"] = ["stall"]
     assert statuses(fetch()) == [("a_room", "downloaded")]
     assert haven.ranges("a_room") == [None, "bytes=50000-"]

@@ -153,11 +153,6 @@ def _role_of(name: str) -> str:
     return next((role for role, names in ROLES.items() if normalised in names), "")
 
 
-def find_sets(folder: Path) -> list[Path]:
-    """Returns the subfolders that contain pairs, in natural order."""
-    return [path for path in list_folder(folder)[0] if {"photo", "transmission"} <= find_roles(path).keys()]
-
-
 def find_split(folder: Path) -> Path:
     """Returns the folder itself if it contains pairs, else its only subfolder with pairs, such as train, val or test.
     Raises PhotoError if several subfolders contain pairs."""

@@ -79,7 +79,8 @@ def _read_pairs(name: str, folder: Path) -> list[Benchmark]:
 
 def _read_sets(name: str, folder: Path) -> list[Benchmark]:
     """Reads a folder of pairs, or one benchmark for each subfolder with pairs."""
-    sets = [] if "photo" in pairing.find_roles(folder) else pairing.find_sets(folder)
+    folders = [] if "photo" in pairing.find_roles(folder) else pairing.list_folder(folder)[0]
+    sets = [path for path in folders if {"photo", "transmission"} <= pairing.find_roles(path).keys()]
     return [part for path in sets or [folder] for part in _read_pairs(name, path)]
 
 

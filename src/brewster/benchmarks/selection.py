@@ -46,11 +46,8 @@ def spread(benchmark: Benchmark, limit: int) -> Benchmark:
     if count <= limit:
         return benchmark
     cases = tuple(benchmark.cases[index * count // limit] for index in range(limit))
-    remarks = (
-        *benchmark.remarks,
-        f"{limit} of {count} images {'is' if limit == 1 else 'are'} scored (--limit)",
-    )
-    return replace(benchmark, cases=cases, remarks=remarks)
+    remark = f"{limit} of {count} images {'is' if limit == 1 else 'are'} scored (--limit)"
+    return replace(benchmark, cases=cases, remarks=(*benchmark.remarks, remark))
 
 
 def with_unique_names(benchmarks: Sequence[tuple[Benchmark, Path]]) -> list[Benchmark]:

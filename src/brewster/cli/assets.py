@@ -13,6 +13,7 @@ import click
 
 from brewster.cli.parameters import FILE, QUIET, Number, flag, json_lines
 from brewster.cli.terminal import one_line, print_error, print_status, progress, write_out
+from brewster.files import cache_folder
 
 if TYPE_CHECKING:
     from brewster.environments.polyhaven import DownloadResult
@@ -89,7 +90,7 @@ def pull(
         from brewster.environments import polyhaven  # noqa: PLC0415  (imports urllib)
 
         request = polyhaven.DownloadRequest(**options, dry_run=dry_run, server=server or polyhaven.SERVER)
-        fetched = polyhaven.pull(request, out or polyhaven.maps_folder())
+        fetched = polyhaven.pull(request, out or cache_folder() / "maps")
         results = _print_results(fetched, request.indoor + request.outdoor, as_json=as_json, quiet=quiet)
         for category, requested in (("indoor", request.indoor), ("outdoor", request.outdoor)):
             found = sum(result.category == category and result.status != "missing" for result in results)
@@ -111,7 +112,7 @@ def _pull_photos(
 
     table = training_photos.read_table()
     known = sum(bool(photo.origin) for photo in table)
-    folder = out or training_photos.photos_folder()
+    folder = out or cache_folder() / "photos"
     fetched = training_photos.pull(folder, server=server or training_photos.SERVER, dry_run=dry_run)
     results = _print_results(fetched, known, as_json=as_json, quiet=quiet)
     if not quiet:

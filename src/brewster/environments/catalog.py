@@ -32,13 +32,11 @@ def builtin_catalog() -> Catalog:
 def read_catalog(
     maps: Sequence[Path], pictures: Sequence[Path], exclude: Sequence[str] = ()
 ) -> tuple[Catalog, list[BrewsterError]]:
-    """Lists the maps and pictures in folders.
+    """Lists the maps and pictures in folders, by default the built-in ones, without those in `exclude`.
 
-    Maps are decoded and validated. Only the headers of pictures are read, so a picture with damaged pixels raises an
-    error only when it is used. A `manifest.csv` with the columns file and category contains the categories of maps. If
-    no folder of maps is given, the built-in maps are listed, and likewise for pictures. Files that match a pattern in
-    `exclude` are skipped. Returns the catalog, and an error for each file that cannot be used. Raises RecipeError if a folder
-    or its manifest cannot be read, or none of the files can be used.
+    Maps are decoded and validated; of pictures, only the headers are read. A `manifest.csv` with the columns
+    file and category contains the categories of maps. Returns the catalog, and an error for each file that
+    cannot be used. Raises RecipeError if a folder or its manifest cannot be read, or no file can be used.
     """
     refused: list[BrewsterError] = []
     catalog = Catalog(

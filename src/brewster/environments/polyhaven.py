@@ -12,18 +12,15 @@ import re
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from time import sleep
 from typing import Literal, final
 
 from brewster.download import Downloader, RemoteFile, file_digest, output_errors
 from brewster.errors import DownloadError, OutputError
-from brewster.files import cache_folder, write_atomically
+from brewster.files import write_atomically
 
 SERVER = "https://api.polyhaven.com"
 _COLUMNS = ("file", "asset", "category", "resolution", "md5", "authors", "licence")  # of manifest.csv
 _SAFE_NAME = re.compile(r"[A-Za-z0-9][\w.-]{0,200}", re.ASCII)
-_RETRY_DELAYS_S = (1.0, 2.0, 4.0, 8.0)  # between five attempts
-_TIMEOUT_S = 30.0
 _MAX_CONSECUTIVE_FAILURES = 5
 
 
@@ -69,18 +66,13 @@ def stop_after_failures(results: Iterable[DownloadResult]) -> Iterator[DownloadR
             )
 
 
-def maps_folder() -> Path:
-    """Returns the default folder for maps: brewster/maps in the cache folder of the user."""
-    return cache_folder() / "maps"
-
-
 def pull(request: DownloadRequest, out: Path) -> Iterator[DownloadResult]:
     """Downloads maps into a folder, in the order of their ids, and lists them in its manifest.csv. Yields a result for each.
 
-    A map that exists already is skipped. An asset without a suitable file is replaced by the next asset. A failed
-    download is not replaced, so that the next call downloads the same maps. Raises DownloadError if the list of the server
-    cannot be downloaded, or several assets in a row failed; OutputError if the folder cannot be written to, or contains the
-    manifest.csv of another program.
+    Existing maps are skipped. An asset without a suitable file is replaced by the next one, but not a failed
+    download, so that the next call downloads the same maps. Raises DownloadError if the list of the server
+    cannot be downloaded, or several assets in a row failed; OutputError if the folder cannot be written to,
+    or has the manifest.csv of another program.
     """
     _read_manifest(out)  # refuses the manifest of another program before any download
     yield from stop_after_failures(_download_assets(request, out))
@@ -114,7 +106,7 @@ def _download_asset(
         if not _is_downloaded(target, remote):
             if request.dry_run:
                 return replace(result, status="planned")
-            _downloader().fetch(remote, target)
+            Downloader().fetch(remote, target)
             result = replace(result, status="downloaded")
     except DownloadError as error:
         return replace(result, status="failed", error=str(error))
@@ -152,7 +144,7 @@ def _find_remote_file(asset: str, request: DownloadRequest) -> RemoteFile | None
 
 
 def _fetch_json(url: str) -> dict[str, object]:
-    response = _downloader().read(url)
+    response = Downloader().read(url)
     try:
         parsed = json.loads(response)
     except (ValueError, RecursionError):
@@ -168,10 +160,6 @@ def _nested(tree: object, *keys: str) -> object:
     for key in keys:
         tree = tree.get(key) if isinstance(tree, dict) else None
     return tree
-
-
-def _downloader() -> Downloader:
-    return Downloader(_RETRY_DELAYS_S, _TIMEOUT_S, sleep)
 
 
 # --- files

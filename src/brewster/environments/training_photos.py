@@ -1,6 +1,6 @@
 """The photographs on which the default model is trained: their licences and authors, and their download.
 
-    for result in pull(photos_folder()):
+    for result in pull(Path("photos")):
         print(result.status, result.file, result.url)
 
 `training_photos.csv` has a row for each photo. The origin is a file of a public repository at a fixed commit, or unknown.
@@ -24,7 +24,7 @@ import numpy as np
 from brewster.download import Downloader, output_errors
 from brewster.environments.polyhaven import DownloadResult, stop_after_failures
 from brewster.errors import BrewsterError, DownloadError
-from brewster.files import cache_folder, write_atomically
+from brewster.files import write_atomically
 from brewster.photo import Photo
 from brewster.srgb import REC709_LUMINANCE
 
@@ -60,11 +60,6 @@ def read_table() -> list[TrainingPhoto]:
     """Returns the rows of all training photos."""
     with TABLE.open(newline="", encoding="utf-8") as file:
         return [TrainingPhoto(**row) for row in csv.DictReader(file)]
-
-
-def photos_folder() -> Path:
-    """Returns the default folder for photos: brewster/photos in the cache folder of the user."""
-    return cache_folder() / "photos"
 
 
 def pull(out: Path, *, server: str = SERVER, dry_run: bool = False) -> Iterator[DownloadResult]:

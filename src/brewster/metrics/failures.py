@@ -68,7 +68,9 @@ def removed_white(prediction: Image, background: Image, photo: Image, reflection
     because it mistakes them for reflections. The errors are those of `removed_content`."""
     luminance = _Luminances.of(prediction, background, photo, reflection)
     condition = f"R < {NEGLIGIBLE_FRACTION:.0%} of I and white in B"
-    return luminance.removed_fraction(luminance.unreflected & _is_white(background), condition)
+    darkest, brightest = background.min(axis=2), background.max(axis=2)
+    is_white = (darkest > MIN_WHITE * 255) & (brightest - darkest < MAX_WHITE_DIFFERENCE * 255)
+    return luminance.removed_fraction(luminance.unreflected & is_white, condition)
 
 
 def kept_reflection(prediction: Image, background: Image, photo: Image, reflection: Image) -> float:
@@ -132,10 +134,3 @@ def _luminance(image: Image) -> Light:
 def _is_clipped(image: Image) -> Region:
     clipped: Region = image.max(axis=2) >= MIN_CLIPPED
     return clipped
-
-
-def _is_white(image: Image) -> Region:
-    darkest, brightest = image.min(axis=2), image.max(axis=2)
-    bright: Region = darkest > MIN_WHITE * 255
-    grey: Region = brightest - darkest < MAX_WHITE_DIFFERENCE * 255
-    return bright & grey

@@ -129,11 +129,10 @@ class Lpips:
         """Returns the five maps of the LPIPS distance between two images of equal size, given by their features. Its
         `mean` is the distance: 0 for equal images; lower is better.
 
-        The squared differences of the features are weighted by channel, averaged over each map, and summed over the
-        five maps. With a `region`, bool (H, W), each map is first upsampled to the size of the image (bilinear,
-        align_corners=False; `spatial=True` in `lpips`), and the sum of the maps is averaged over the region. A region
-        that is the whole image gives a slightly different value than no region, because upsampling changes the weight
-        of the border. Raises ValueError if the images differ in size."""
+        The squared differences of the features are weighted by channel, averaged over each map, and summed
+        over the five maps. With a `region`, bool (H, W), each map is first upsampled to the size of the image
+        (bilinear, align_corners=False; `spatial=True` in `lpips`), so that even a region of the whole image
+        gives a slightly different value. Raises ValueError if the images differ in size."""
         import torch  # noqa: PLC0415 - an extra
 
         if one.shape != other.shape:

@@ -40,12 +40,7 @@ TORCHVISION_ALEXNET: Final = RemoteFile(
 )
 
 
-def load_alexnet(
-    remote: RemoteFile = TORCHVISION_ALEXNET,
-    digest: str = ALEXNET_DIGEST,
-    *,
-    downloader: Downloader | None = None,
-) -> dict[str, Tensor]:
+def load_alexnet(remote: RemoteFile = TORCHVISION_ALEXNET, digest: str = ALEXNET_DIGEST) -> dict[str, Tensor]:
     """Returns AlexNet's ten tensors by name, float32: from the cache, from BREWSTER_DATA, or downloaded into the cache.
     Raises ModelError if the file is damaged, or contains other weights; DownloadError if there is no file, and the
     download fails; OutputError if the cache folder cannot be written."""
@@ -53,7 +48,7 @@ def load_alexnet(
     for path in (cached, *([Path(data) / "weights" / ALEXNET_FILE] if data else [])):
         if path.is_file():
             return read_alexnet(path, digest)
-    return _fetch(remote, digest, cached, downloader or Downloader())
+    return _fetch(remote, digest, cached)
 
 
 def read_alexnet(path: Path, digest: str = ALEXNET_DIGEST) -> dict[str, Tensor]:
@@ -86,9 +81,8 @@ def alexnet_digest(tensors: dict[str, Tensor]) -> str:
     return digest.hexdigest()
 
 
-def _fetch(remote: RemoteFile, digest: str, cached: Path, downloader: Downloader) -> dict[str, Tensor]:
-    """Downloads the whole network, stores ten of its tensors, 4 % of the file, in `cached`, and deletes the download. Before, prints
-    its size and licence on standard error, and how to avoid it."""
+def _fetch(remote: RemoteFile, digest: str, cached: Path) -> dict[str, Tensor]:
+    """Downloads the whole network, stores ten of its tensors (4 % of the file), and deletes the download."""
     import torch  # noqa: PLC0415 - an extra
 
     size = f"{remote.size / 2**20:.0f} MiB"
@@ -99,7 +93,7 @@ def _fetch(remote: RemoteFile, digest: str, cached: Path, downloader: Downloader
     sys.stderr.flush()
     download = cached.with_name(remote.url.rsplit("/", 1)[-1])
     try:
-        downloader.fetch(remote, download)
+        Downloader().fetch(remote, download)
     except DownloadError as error:
         raise DownloadError(
             f"AlexNet's weights for LPIPS ({size}) could not be downloaded: {error.happened}",

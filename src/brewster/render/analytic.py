@@ -43,9 +43,7 @@ _MAX_TABLE_REFLECTANCE = 0.08
 """Upper limit of the reflectance for which orders are enumerated. At grazing angles, the true reflectance leads to too many
 orders. The throughput of each order is exact; the last order of each side also gets the light of the omitted orders."""
 _CPU_BATCH_RAYS = 1 << 15  # small enough for the cache of a CPU
-_ROUGH_BATCH_RAYS = (
-    1 << 18
-)  # large, because most orders of rough glass have only a few of the rays of a batch
+_ROUGH_BATCH_RAYS = 1 << 18  # large, because most orders of rough glass have few of the rays of a batch
 _GPU_BATCH_RAYS = 1 << 20
 
 
@@ -77,11 +75,8 @@ class _PreparedScene:
 
 def render(scene: Scene, assets: Assets, device: Device = "cpu") -> LinearSample:
     """Renders the five images of a scene (the paper's section "Data Generation") in float32, on `device`.
-
-    Raises:
-        RecipeError: the glass is framed or curved (only Mitsuba renders it), or a file is missing.
-        PhotoError: a file cannot be decoded, or is not an environment map.
-    """
+    Raises RecipeError if the glass is framed or curved (only Mitsuba renders it), or a file is missing;
+    PhotoError if a file cannot be decoded, or is not an environment map."""
     if not scene.glass.is_flat:
         raise RecipeError(
             "the glass is framed or curved",
@@ -133,15 +128,12 @@ def needs_monte_carlo(scene: Scene) -> bool:
 
 
 def _render_deterministic(prepared: _PreparedScene) -> list[Tensor]:
-    """Traces a regular grid of rays in each pixel, then applies the defocus blur of the lens: I, T, B, R and MR, (3, H, W) each.
-
-    Along each side of a pixel there are ceil(3 * texels per pixel) rays, at most sqrt(samples_per_pixel). Textures are filtered
-    to the distance between the rays.
-    """
+    """Traces a regular grid of rays in each pixel, then applies the defocus: I, T, B, R and MR, (3, H, W)."""
     scene, camera = prepared.scene, prepared.scene.camera
     margin = margin_px(camera)
     width, height = camera.width + 2 * margin, camera.height + 2 * margin
     finest = max(side.emitters.texels_per_pixel() for side in (prepared.behind, prepared.front))
+    # Textures are filtered to the distance between the rays.
     rays_per_axis = min(max(1, math.ceil(3 * finest)), math.isqrt(scene.samples_per_pixel))
     total = torch.zeros(5, 3, width * height, device=prepared.origin.device)
     for row in range(rays_per_axis):
@@ -155,10 +147,7 @@ def _render_deterministic(prepared: _PreparedScene) -> list[Tensor]:
 def _pinhole_rays(
     prepared: _PreparedScene, offset: tuple[float, float], margin: int, relative_footprint: float
 ) -> Iterator[tuple[Rays, slice]]:
-    """Yields rays through one point of every pixel, in batches of image rows, with the range of their pixels.
-
-    `offset` is the point in the pixel, x and y in 0..1. The image is extended by `margin` pixels on every side.
-    """
+    """Yields rays through the point `offset` (0..1) of every pixel, in batches, and their range of pixels."""
     camera = prepared.scene.camera
     width, height = camera.width + 2 * margin, camera.height + 2 * margin
     x = (torch.arange(width, device=prepared.origin.device) - margin + offset[0]) / camera.width * 2 - 1
@@ -233,11 +222,8 @@ def _trace_smooth(prepared: _PreparedScene, rays: Rays, _: SobolPoints | None = 
 def _shifted_orders(
     prepared: _PreparedScene, side: _PreparedSide, exiting: Rays, far: Tensor | None
 ) -> tuple[Tensor, Tensor]:
-    """Looks up the light of a side with near content: once per group, at the exit point of the group's first order.
-
-    `exiting` holds the rays after the glass, with origins on the first surface; `far` is the light from infinity along them.
-    The results are the sum of all orders, and the sum of the orders in T or R, (3, N) each.
-    """
+    """Returns the light of all orders of a side with near content, and that of the orders in T or R, (3, N).
+    `exiting` are the rays after the glass, from its first surface; `far` is their light from infinity."""
     glass, direction = prepared.scene.glass, exiting.direction
     cosine = direction[2].abs()
     shifts = in_plane_shifts_mm(glass, cosine)
@@ -264,14 +250,11 @@ def _in_plane_shift(order: ReflectionOrder, shifts: list[Tensor]) -> Tensor:
 
 
 def _group_orders(scene: Scene, emitters: SideEmitters, *, is_behind: bool) -> list[list[ReflectionOrder]]:
-    """Groups the orders of one side whose images are less than `_MERGE_DISTANCE_PX` apart.
-
-    Distances are measured in the corner of the view with the largest angle of incidence, where they are greatest. Each group
-    has its brightest order first. The list is empty if the side has only light from infinity.
-    """
-    if not emitters.has_near_light:
+    """Groups the orders of one side with images less than `_MERGE_DISTANCE_PX` apart, the brightest first."""
+    if not emitters.has_dome and emitters.plane is None:  # all light is from infinity
         return []
     _, _, normal = axes(scene.glass.heading_deg, scene.glass.pitch_deg)
+    # The images are farthest apart in the corner of the view with the largest angle of incidence.
     cosine = torch.tensor(
         min(-dot(corner, normal) / math.hypot(*corner) for corner in scene.camera.corners())
     )

@@ -114,10 +114,7 @@ def with_jpeg(developed: DevelopedSample) -> DevelopedSample:
 
 
 def _tone_curve(linear: Tensor, contrast: float) -> Tensor:
-    """Encodes light: v + contrast * (smoothstep(v) - v), where v is the clipped light in sRGB encoding.
-
-    A contrast above 0 makes the curve steeper in the middle, a contrast below 0 flatter.
-    """
+    """Encodes light: v + contrast * (smoothstep(v) - v), where v is the clipped light in sRGB encoding."""
     encoded = to_encoded(linear.clamp(0, 1)).clamp(0, 1)
     smooth = encoded * encoded * (3 - 2 * encoded)
     return torch.lerp(encoded, smooth, contrast).clamp(0, 1) if contrast else encoded
@@ -132,20 +129,17 @@ def luminance(colour: Tensor) -> float:
 
 
 def _exposure_ev(light: Tensor, target: float) -> float:
-    """Returns the exposure in stops at which the mean luminance of light (3, H, W), clipped at white, is `target`.
-
-    The mean is a monotonic function of the exposure, so bisection finds the solution. If black pixels make the target
-    unreachable, the exposure makes nearly all other pixels white. For a black image, the result is 0.
-    """
+    """Returns the exposure in stops at which light (3, H, W), clipped at white, has this mean luminance."""
 
     def mean(ev: float) -> float:
         return luminance((light * math.exp2(ev)).clamp_(0, 1).mean((1, 2)))
 
     low, high = _EV_RANGE
+    # Black pixels can make the target unreachable; then nearly all other pixels become white.
     target = min(target, _MAX_TARGET_FRACTION * mean(high))
     if target <= 0:
         return 0.0
-    while high - low > 2e-4:
+    while high - low > 2e-4:  # bisection, because the mean is monotonic
         middle = (low + high) / 2
         low, high = (middle, high) if mean(middle) < target else (low, middle)
     return round((low + high) / 2, 3)
@@ -155,15 +149,11 @@ def _exposure_ev(light: Tensor, target: float) -> float:
 
 
 def _white_balance_gains(photo: Tensor, response: CameraResponse) -> tuple[float, float, float]:
-    """Returns RGB gains that correct the illuminant's colour by the requested strength and keep its luminance.
-
-    The colour is estimated on the exposed image. Pixels that clip in any channel are ignored, because clipping changes
-    their colour. If all pixels clip, all of them are used. All gains are 1 if the colour is nearly black.
-    """
+    """Returns RGB gains that correct the illuminant's colour by the requested strength, not its luminance."""
     if response.white_balance == "none":
         return 1.0, 1.0, 1.0
     exposed = (photo * math.exp2(_exposure_ev(photo, response.target_luminance))).clamp(0, 1)
-    valid = (exposed < 1).all(0)
+    valid = (exposed < 1).all(0)  # clipping changes the colour
     colour = _ILLUMINANT_ESTIMATORS[response.white_balance](exposed, valid if valid.any() else ~valid)
     brightness = luminance(colour)
     if brightness < 1e-9:
@@ -180,21 +170,16 @@ def _grey_world(image: Tensor, valid: Tensor) -> Tensor:
 
 
 def _white_patch(image: Tensor, valid: Tensor) -> Tensor:
-    """Returns the 99th percentile of each channel. White-patch assumes that the brightest surface is white.
-
-    The maximum is not used, so that single pixels do not matter. Source: E. H. Land, Scientific American 237, 1977.
-    """
+    """Returns the 99th percentile: the brightest surface is white (E. H. Land, Sci. American 237, 1977)."""
     values = image[:, valid]
     return values.kthvalue(math.ceil(0.99 * values.shape[1]), dim=1).values
 
 
 def _grey_edge(image: Tensor, valid: Tensor) -> Tensor:
-    """Returns the Minkowski norm of the edges. Grey-edge assumes that the average edge is grey.
+    """Returns the Minkowski norm of the edges: the average edge is grey.
 
-    Differences are taken along both diagonals of each block of 2 x 2 valid pixels (Roberts cross). The paper smooths the
-    image first. This step is left out, because rendered light has little noise.
-    Source: J. van de Weijer et al., IEEE Trans. Image Proc. 16, 2007.
-    """
+    Source: J. van de Weijer et al., IEEE Trans. Image Proc. 16, 2007, who smooth the image first. Rendered
+    light has little noise. Differences are along both diagonals of 2 x 2 pixels (Roberts cross)."""
     first, second = image[:, 1:, 1:] - image[:, :-1, :-1], image[:, 1:, :-1] - image[:, :-1, 1:]
     all_valid = valid[1:, 1:] & valid[:-1, :-1] & valid[1:, :-1] & valid[:-1, 1:]
     edges = torch.hypot(first, second)[:, all_valid]
@@ -217,16 +202,13 @@ _ILLUMINANT_ESTIMATORS: Final[dict[str, Callable[[Tensor, Tensor], Tensor]]] = {
 
 
 def _add_noise(exposed: Tensor, scene: Scene) -> Tensor:
-    """Adds shot noise (variance proportional to light) and read noise (constant variance) to light (3, H, W).
-
-    Both are nearly Gaussian, and so is their sum (A. Foi et al., IEEE Trans. Image Proc. 17, 2008). The noise depends
-    on the scene's seed and index, and on the frame of a burst.
-    """
+    """Adds shot noise (variance proportional to light) and read noise (constant variance) to light."""
     response = scene.camera_response
     if response.shot_noise == response.read_noise == 0:
         return exposed
     # torch's generator on the CPU uses only 32 bits of its seed, so seed and index are hashed into 32 bits.
     seed = int(np.random.SeedSequence(scene.noise_seeds).generate_state(1)[0])
     normal = torch.randn(exposed.shape, generator=Generator().manual_seed(seed)).to(exposed.device)
+    # Both are nearly Gaussian, and so is their sum (A. Foi et al., IEEE Trans. Image Proc. 17, 2008).
     variance = response.shot_noise**2 * exposed.clamp(0, 1) + response.read_noise**2
     return exposed + variance.sqrt() * normal

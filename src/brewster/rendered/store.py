@@ -110,11 +110,8 @@ def shard_name(block: int) -> str:
 
 
 def pack(out: Path, block: int) -> None:
-    """Moves the finished samples of a block from folders into its shard. Samples that are already in the shard stay there.
-
-    The names of the members follow the convention of WebDataset (000007.photo.jpg). The bytes of the shard depend only on
-    the samples.
-    """
+    """Moves the finished samples of a block from folders into its shard, whose samples stay there. Its
+    members are named as in WebDataset (000007.photo.jpg), and its bytes depend only on the samples."""
     entries = list(read_block(out, block))
     if any(not entry.spans for entry in entries):
         with (
@@ -173,10 +170,7 @@ def read_dataset(out: Path) -> Iterator[StoredSample]:
 
 
 def read_block(out: Path, block: int) -> Iterator[StoredSample]:
-    """Yields the finished samples of a block of a hundred indices in order.
-
-    If a sample has a folder and is in the shard, the shard is used.
-    """
+    """Yields the finished samples of a block of a hundred indices in order; the shard wins over a folder."""
     entries = {int(folder.name): StoredSample(int(folder.name), folder) for folder in _folders(out, block)}
     entries |= {entry.index: entry for entry in _members(out / shard_name(block))}
     yield from (entry for _, entry in sorted(entries.items()))

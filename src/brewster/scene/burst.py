@@ -37,10 +37,8 @@ class LayerMotion:
     reflection: Float32
 
     def relative_px(self) -> float:
-        """Returns the median distance by which the layers move relative to each other, in px; NaN without content.
-
-        Glass without effect also has a relative motion, although its reflection is black.
-        """
+        """Returns the median distance by which the layers move relative to each other, in px; NaN without
+        content. Glass without effect also has a relative motion, although its reflection is black."""
         difference = self.reflection - self.transmission
         lengths = np.hypot(difference[..., 0], difference[..., 1])
         lengths = lengths[np.isfinite(lengths)]
@@ -48,14 +46,9 @@ class LayerMotion:
 
 
 def layer_motion(reference: Scene, frame: Scene) -> LayerMotion:
-    """Computes where the points that `reference` shows are in another frame of the same burst.
-
-    Wedges, the roughness of glass and the aperture do not change the result.
-
-    Raises:
-        RecipeError: the scenes differ in glass, content or size of the image, the glass is framed or curved, or a picture
-            has no height_mm.
-    """
+    """Computes where the points that `reference` shows are in another frame of the same burst. Wedges, the
+    roughness of glass and the aperture do not change the result. Raises RecipeError if the scenes differ in
+    glass, content or size of the image, the glass is framed or curved, or a picture has no height_mm."""
     _check_same_burst(reference, frame)
     camera = reference.camera
     y, x = np.mgrid[: camera.height, : camera.width]
@@ -69,11 +62,8 @@ def layer_motion(reference: Scene, frame: Scene) -> LayerMotion:
 
 
 class _Content:
-    """The content of one layer as the camera sees it. Vectors are (N, 3) in the glass frame, in mm.
-
-    The content in front of the glass is replaced by its mirror image behind the glass. Light from there reaches the camera
-    on a straight line. Light from behind the glass is shifted along the glass by the refraction in the panes.
-    """
+    """The content of one layer as the camera sees it: that in front of the glass is its mirror image behind
+    the glass. Vectors are (N, 3) in the glass frame, in mm."""
 
     def __init__(self, side: Side, glass: Glazing, *, is_behind: bool) -> None:
         self.to_glass = np.array(axes(glass.heading_deg, glass.pitch_deg))

@@ -40,11 +40,8 @@ class Camera(FrozenModel):
         return (*rolled, back)
 
     def moved(self, offset_mm: Point, turn_deg: Point) -> Camera:
-        """Returns the camera at another position, with another orientation and the same lens.
-
-        `offset_mm` is the move to the right, up and back, `turn_deg` what is added to heading, pitch and roll. Raises
-        ValidationError if the pitch is then above 80 degrees.
-        """
+        """Returns the camera after a move to the right, up and back, and a turn of heading, pitch and roll.
+        Raises ValidationError if the pitch is then above 80 degrees."""
         moves = map(_scale, self.axes, offset_mm)
         values = {"position_mm": _add(self.position_mm, *moves)}
         angles = zip(("heading_deg", "pitch_deg", "roll_deg"), turn_deg, strict=True)

@@ -32,7 +32,6 @@ Setup = Literal["map|map", "map|plane", "plane|map"]
 """The kinds of content behind and in front of the glass (paper, figure on scene setups: HDR|HDR, HDR|LDR, LDR|HDR)."""
 
 _FOLDER: Final = Path(__file__).parent / "recipes"
-_REFERENCE: Final = "docs/recipes.md"
 RECIPES: Final = tuple(sorted(path.stem for path in _FOLDER.glob("*.toml")))
 """The names of the packaged recipes."""
 
@@ -251,18 +250,13 @@ class SceneRecipe(FrozenModel):
 
 
 def read_scene_recipe(name: str) -> SceneRecipe:
-    """Reads a packaged recipe by its name, or any recipe from a .toml file.
-
-    Raises:
-        RecipeError: the name is unknown, the file is missing or not TOML, or keys are missing, unknown or have
-            impossible values.
-    """
-    if name in RECIPES:
-        return read_toml(SceneRecipe, _FOLDER / f"{name}.toml", reference=_REFERENCE)
-    if not name.endswith(".toml"):
+    """Reads a packaged recipe by its name, or any recipe from a .toml file. Raises RecipeError if the name is
+    unknown, the file is missing or not TOML, or keys are missing, unknown or have impossible values."""
+    if name not in RECIPES and not name.endswith(".toml"):
         raise RecipeError(
             f"there is no recipe {name!r}",
             f"expected one of the packaged recipes {', '.join(RECIPES)}",
             "choose one of these names, or a .toml file",
         )
-    return read_toml(SceneRecipe, Path(name), reference=_REFERENCE)
+    path = _FOLDER / f"{name}.toml" if name in RECIPES else Path(name)
+    return read_toml(SceneRecipe, path, reference="docs/recipes.md")

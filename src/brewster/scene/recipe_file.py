@@ -28,11 +28,8 @@ _MAX_VALUE_LENGTH: Final = 60
 
 
 def read_toml(model: type[Model], path: Path, *, reference: str) -> Model:
-    """Reads and validates a TOML file. Error messages refer the user to `reference`.
-
-    Raises:
-        RecipeError: the file is missing or not TOML, or keys are missing, unknown or have impossible values.
-    """
+    """Reads and validates a TOML file. Error messages refer the user to `reference`. Raises RecipeError if
+    the file is missing or not TOML, or keys are missing, unknown or have impossible values."""
     try:
         values = tomllib.loads(path.read_text("utf-8"))
     except OSError as error:
@@ -45,11 +42,8 @@ def read_toml(model: type[Model], path: Path, *, reference: str) -> Model:
 
 
 def validated(model: type[Model], values: Mapping[str, Any], *, source: str, reference: str) -> Model:
-    """Returns the values as an instance of `model`. Error messages contain `source`, the origin of the values.
-
-    Raises:
-        RecipeError: keys are missing, unknown or have impossible values. The error has one message for each problem.
-    """
+    """Returns the values as an instance of `model`. Raises RecipeError if keys are missing, unknown or have
+    impossible values: one message for each problem, which names `source`, the origin of the values."""
     try:
         return model.model_validate(values)
     except ValidationError as error:
@@ -115,13 +109,10 @@ def _unknown_key(
 
 
 def similar_key(model: type[FrozenModel], path: Sequence[str | int]) -> str | None:
-    """Returns the known key that is most similar to an unknown key.
-
-    The result is a key of the same table with a similar name, else a key of another table with the same name, else None.
-    """
+    """Returns the most similar known key: one of the same table with a similar name, or of another table with
+    the same name."""
     *table, name = path
-    close = get_close_matches(str(name), choices(model, table), n=1)
-    if close:
+    if close := get_close_matches(str(name), choices(model, table), n=1):
         return _dotted([*table, close[0]])
     tables = list(recipe_tables(model))
     paths = [key.path for table in tables for key in table.keys] + [table.path for table in tables]
@@ -150,10 +141,8 @@ def _shortened(value: object) -> str:
 
 
 def commented_toml(recipe: FrozenModel) -> str:
-    """Returns the recipe as TOML with all keys, including those with default values. A comment describes each key.
-
-    An optional key that is not set is commented out. `read_toml` returns an equal recipe if it reads this text.
-    """
+    """Returns the recipe as TOML with all keys, each with a comment; keys that are not set are commented out.
+    `read_toml` returns an equal recipe if it reads this text."""
     values = recipe.model_dump(mode="json")
     lines: list[str] = []
     for table in recipe_tables(type(recipe)):

@@ -46,11 +46,9 @@ class Catalog(FrozenModel):
 
 
 def draw(recipe: SceneRecipe, catalog: Catalog, seed: int, index: int) -> Scene:
-    """Draws the scene with this index. An impossible scene, such as a view at a grazing angle, is drawn again.
-
-    Raises:
-        RecipeError: the catalog has no suitable maps or pictures, or all of 100 attempts gave an impossible scene.
-    """
+    """Draws the scene with this index. An impossible scene, such as a view at a grazing angle, is drawn
+    again. Raises RecipeError if the catalog has no suitable maps or pictures, or all of 100 attempts gave an
+    impossible scene."""
     number, frame = divmod(index, recipe.frames)
     return draw_frames(recipe, catalog, seed, number)[frame]
 
@@ -254,10 +252,8 @@ def _draw_plane(recipe: SideRecipe, partial: _PartialScene, luminance: float, di
 def _visible_extent(
     partial: _PartialScene, distance_mm: float
 ) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Returns the ranges of x and y in mm that the view covers on a plane at this distance behind the glass.
-
-    A mirrored plane at the same distance in front of the glass covers the same ranges.
-    """
+    """Returns the ranges of x and y in mm that the view covers at this distance behind the glass, or mirrored
+    in front of it."""
     x, y, z = partial.to_glass(partial.camera.position_mm)
     points = []
     for corner in partial.camera.corners():

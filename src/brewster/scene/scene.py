@@ -143,11 +143,8 @@ class Scene(FrozenModel):
 
 
 def read_scene(path: Path) -> Scene:
-    """Reads a scene file or the `scene.toml` of a sample. Its table `outcome` is ignored.
-
-    Raises:
-        RecipeError: the file is missing or not TOML, or its values are unknown or not possible.
-    """
+    """Reads a scene file or the `scene.toml` of a sample, without its table `outcome`. Raises RecipeError if
+    the file is missing or not TOML, or its values are unknown or not possible."""
     found = read_toml(_SceneFile, path, reference="brewster render --help")
     return Scene.model_validate(found.model_dump(exclude={"outcome"}))
 

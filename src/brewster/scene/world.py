@@ -85,11 +85,9 @@ class Side(FrozenModel):
 def at_equal_distance(behind: Side, front: Side) -> tuple[Side, Side]:
     """Moves the content behind the glass to the mirror image of the content in front, so that both layers move alike.
 
-    What only one side has, a map or a picture, is removed. The sides keep their textures and luminances. Returns the new
-    sides behind and in front of the glass.
-
-    Raises:
-        ValueError: one side has only a map, and the other has only a picture.
+    What only one side has, a map or a picture, is removed. The sides keep their textures and luminances.
+    Returns the new sides behind and in front of the glass. Raises ValueError if one side has only a map, and
+    the other only a picture.
     """
     near: dict[str, EnvironmentMap | Plane] = {}
     far: dict[str, EnvironmentMap | Plane] = {}

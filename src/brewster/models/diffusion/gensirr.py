@@ -34,8 +34,7 @@ def convert(checkpoint: Path, folder: Path, *, base_model: str = "kontext", shor
     """Reads the checkpoint and writes the folder. The weights keep their precision.
 
     `base_model` is "kontext", or "tiny:kontext" for tests. `short_side_px`, that of the input, is 768 or 512. Raises
-    ModelError if the file is not such a checkpoint, or its weights do not match the architecture of the base model;
-    OutputError if the folder cannot be written.
+    ModelError if the file is no such checkpoint; OutputError if the folder cannot be written.
     """
     if base_model.removeprefix(TINY_PREFIX) != Kontext.name:
         happened = f"the base model {base_model} was given for GenSIRR"

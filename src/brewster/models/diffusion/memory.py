@@ -125,13 +125,15 @@ def check_machine(
     if weights < _MIN_LARGE:
         return
     check_device(source, weights, placement.device, requested=requested)
-    if with_text_encoders:
-        encoders = weights_gib(backbone_class.cost.text_encoder_parameters, None)
-        _check_host_memory(source, encoders, "of host memory, because its text encoders are loaded there")
-    is_cpu = placement.device == "cpu"
-    if host := placement.host_gib(weights):
-        where = "of memory on cpu" if is_cpu else "of host memory, because it is offloaded"
-        _check_host_memory(source, host, where)
+    cost, is_cpu = backbone_class.cost, placement.device == "cpu"
+    encoders = with_text_encoders * cost.text_encoder_parameters
+    where = "of memory on cpu" if is_cpu else "of host memory, because it is offloaded"
+    for needed_gib, host_memory in (
+        (weights_gib(encoders, None), "of host memory, because its text encoders are loaded there"),
+        (placement.host_gib(weights), where),
+    ):
+        if needed_gib:
+            check_free(source, needed_gib + _HOST_OVERHEAD_GIB, free_host_gib(), host_memory, _SMALLER_MODEL)
     if not is_cpu:
         free = torch.cuda.mem_get_info(placement.device)[0] / GIB
         fitting = fitting_quantizations(weights, free - INFERENCE_OVERHEAD_GIB)
@@ -141,8 +143,6 @@ def check_machine(
         import_bitsandbytes()
     hub_id = hub_id_of(source)
     if not transformer_file and not Path(source).is_dir() and not is_transformer_cached(hub_id):
-        cost = backbone_class.cost
-        encoders = with_text_encoders * cost.text_encoder_parameters
         cache = Path(import_library("huggingface_hub.constants").HF_HUB_CACHE)
         needed = (weights + cost.vae_parameters + encoders) * _FILE_BYTES_PER_WEIGHT
         if needed > (free := free_disk_bytes(cache)):
@@ -166,10 +166,6 @@ def check_device(source: str, weights: int, device: str, *, requested: str) -> N
 def free_host_gib() -> float:
     """The free memory of this machine in GiB."""
     return float(import_library("psutil").virtual_memory().available) / GIB
-
-
-def _check_host_memory(source: str, needed_gib: float, where: str) -> None:
-    check_free(source, needed_gib + _HOST_OVERHEAD_GIB, free_host_gib(), where, _SMALLER_MODEL)
 
 
 def check_free(

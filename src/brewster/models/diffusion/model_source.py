@@ -109,11 +109,10 @@ class ModelSource:
 def find_model_source(
     model: str, base_model: str | None = None, *, allow_download: bool = True
 ) -> ModelSource:
-    """Looks up a model. Downloads the files of a LoRA. For a backbone it downloads the index, the task and the prompt.
+    """Looks up a model. Downloads the files of a LoRA, or the index, task and prompt of a backbone.
 
-    `model` and `base_model` are those of `load_pipeline`. Without `allow_download`, files that are not in the cache are not
-    downloaded. If the base is not in the cache then, its class is read from the LoRA's metadata. A WindowSeat that is not in the
-    cache gets its published task.
+    Without `allow_download`, nothing is downloaded: the class of a base that is not in the cache is read from
+    the metadata of the LoRA, and a WindowSeat that is not in the cache gets its published task.
     """
     if is_registered(model):
         _check_no_base(model, base_model)

@@ -85,13 +85,11 @@ def count_tokens(panel: tuple[int, int], layout: PanelLayout, size_divisor: int)
 
 
 def conditioning_image(photo: Float[Tensor, "n 3 h w"], layout: PanelLayout) -> Tensor:
-    """The conditioning image: the photo in panel I, and white space in the other panels.
+    """The conditioning image, (N, 3, H, W): the photo in panel I, and white space in the other panels.
 
     White space turns the task into inpainting, which "is not necessary, but it turns out easier to converge"
-    (Text-to-image Model Fine-tuning). Without white space, or if I is not among the generated panels, the photo alone
-    is the conditioning image (Experimental Setup: "control image"). It has 1/3 of the tokens of a composite of three
-    panels. Returns (N, 3, H, W). Its size is that of the composite if there is white space; otherwise it is the photo
-    itself.
+    (Text-to-image Model Fine-tuning). Without it, the photo alone is the conditioning image (Experimental
+    Setup: "control image"), with 1/3 of the tokens of three panels.
     """
     if not layout.has_white_space:
         return photo
@@ -131,10 +129,9 @@ def fit_panel(
 ) -> PanelFit:
     """The largest panel for a photo of this (width, height) whose composite has at most `max_composite_pixels` pixels.
 
-    Both sides are multiples of `size_divisor`. The short side is the largest that fits without enlarging the photo. The long
-    side is the multiple that is nearest to the photo's aspect ratio. The difference of at most half a multiple becomes padding,
-    so the photo is not stretched. Raises PhotoError if the photo has fewer than `size_divisor` pixels on a side, or its aspect
-    ratio is too extreme.
+    Both sides are multiples of `size_divisor`: the short side is the largest that fits without enlarging the
+    photo, the long side the nearest to the photo's aspect ratio, and padding fills the difference. Raises
+    PhotoError if a side of the photo is below `size_divisor`, or its aspect ratio is too extreme.
     """
     area, (short, long) = max_composite_pixels // len(layout.panels), sorted(size)
     upper_bound = math.isqrt(area * short // long + 1) + size_divisor

@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING, Final
 import torch
 from torch import Tensor
 
-from brewster.errors import ModelError
 from brewster.models.diffusion.backbones.backbone import Backbone
 from brewster.models.diffusion.offloading import explain_out_of_memory
 from brewster.models.diffusion.prompt import PromptEmbedding
@@ -51,13 +50,6 @@ def sample(
 
     Returns the composites in [-1, 1], float32, on the CPU. `.mean(0, keepdim=True)` averages them.
     """
-    for noun, number, default in (("steps", steps, STEPS), ("seeds", len(seeds), 1)):
-        if number < 1:
-            raise ModelError(
-                f"sampling was requested with {number} {noun}",
-                "expected at least 1",
-                f"use {default}, the default",
-            )
     done = itertools.count(1)
     images = []
     with explain_out_of_memory(_MEMORY_HINT):

@@ -56,11 +56,10 @@ def trace(
     surfaces. `polarised` traces each colour with the polarised variant, at several times the cost. In Mitsuba, light is
     unpolarised after a rough surface. `denoise` filters the result with Intel Open Image Denoise.
 
-    Raises:
-        MissingExtra: mitsuba cannot be imported, or `denoise` is set and mitsuba-oidn is not installed.
-        DeviceError: `polarised` is set, and Mitsuba works with no LLVM of this machine.
-        RecipeError: a wedge or lens has no thickness somewhere in the view, two surfaces meet, or a file is missing.
-        PhotoError: a file cannot be decoded, or is not an environment map.
+    Raises MissingExtra if mitsuba cannot be imported, or mitsuba-oidn for `denoise`; DeviceError if
+    `polarised` is set and Mitsuba works with no LLVM of this machine; RecipeError if a wedge or lens has no
+    thickness somewhere in the view, two surfaces meet, or a file is missing; PhotoError if a file cannot be
+    decoded, or is not an environment map.
     """
     mi = load()
     with _active_variant(mi, polarised=polarised):
@@ -139,7 +138,10 @@ class _RunningEstimate:
             for builder in builders
         ]
         self._seed_key = scene.seed, scene.index, int(lit_from_behind), get_args(GlassMode).index(glass_mode)
-        self.samples_per_pass = _samples_per_pass(scene.camera.width * scene.camera.height, max_samples)
+        # 64, 16, 4 or 1 samples per pixel, because square numbers are stratified evenly.
+        pixels = scene.camera.width * scene.camera.height
+        limit = min(max_samples // _MIN_PASSES, _MAX_RAYS_PER_PASS // pixels)
+        self.samples_per_pass = next((samples for samples in (64, 16, 4) if samples <= limit), 1)
         self.pass_count = 0
         self._sum = np.zeros((scene.camera.height, scene.camera.width, 3))
         self._sum_of_squares = np.zeros(self._sum.shape[:2])
@@ -167,12 +169,6 @@ class _RunningEstimate:
         spread = self._sum_of_squares / self.pass_count - self.light.mean(axis=2) ** 2
         variance: NDArray[np.float64] = spread.clip(min=0) / (self.pass_count - 1)
         return variance
-
-
-def _samples_per_pass(pixel_count: int, max_samples: int) -> int:
-    """Returns 64, 16, 4 or 1 samples per pixel, as memory and `_MIN_PASSES` allow: square numbers are stratified evenly."""
-    limit = min(max_samples // _MIN_PASSES, _MAX_RAYS_PER_PASS // pixel_count)
-    return next((samples for samples in (64, 16, 4) if samples <= limit), 1)
 
 
 def _converge(estimates: Sequence[_RunningEstimate], noise_threshold: float, max_samples: int) -> None:

@@ -285,11 +285,11 @@ class MitsubaSceneBuilder:
         return {"type": "envmap", "bitmap": bitmap, "to_world": self._transform(columns.T, (0, 0, 0))}
 
     def _dome(self, envmap: EnvironmentMap, is_behind: bool) -> Plugin:
-        """Returns a sphere around the glass that emits inwards. Mitsuba's longitude increases in the other direction,
-        so the map is mirrored. Mitsuba repeats the texture in both directions, so an additional row at each pole
-        prevents interpolation between the poles."""
+        """Returns a sphere around the glass that emits inwards."""
         height, width = self._map_size(envmap)
         u, v = (np.arange(width) + 0.5) / width, (np.arange(height) + 0.5) / height
+        # Mitsuba's longitude increases in the other direction, so the map is mirrored. The texture repeats,
+        # so an additional row at each pole prevents interpolation between the poles.
         texels = np.pad(self._texels(envmap, is_behind, u, v)[:, ::-1], ((1, 1), (0, 0), (0, 0)), "edge")
         to_inner_rows = np.array(((1, 0, 0), (0, height / (height + 2), 1 / (height + 2)), (0, 0, 1)))
         texture = self._bitmap(texels, wrap_mode="repeat", to_uv=self.mi.ScalarTransform3f(to_inner_rows))

@@ -36,21 +36,14 @@ class MipmappedTexture:
 
     def __init__(self, texels: Tensor, *, wraps: bool) -> None:
         self.width, self.wraps = texels.shape[1], wraps
-        self._levels = [texels.permute(2, 0, 1)[None]]
+        self.texels = texels.permute(2, 0, 1)
+        self._levels = [self.texels[None]]
         while min(self._levels[-1].shape[2:]) > 8:
             self._levels.append(functional.avg_pool2d(self._levels[-1], 2))
         self._padded: dict[int, Tensor] = {}
 
-    @property
-    def texels(self) -> Tensor:
-        """The image at full resolution, (3, H, W)."""
-        return self._levels[0][0]
-
     def __call__(self, u: Tensor, v: Tensor, footprint: float) -> Tensor:
-        """Returns values (3, N) at texture coordinates u and v, (N,) in 0..1.
-
-        `footprint` is in texels of the image at full resolution.
-        """
+        """Returns values (3, N) at texture coordinates u and v, (N,) in 0..1, for a footprint in texels."""
         level = min(math.ceil(math.log2(max(footprint / _MAX_TEXELS_PER_LOOKUP, 1.0))), len(self._levels) - 1)
         texels = self._levels[level]
         if self.wraps:  # each side has an additional column from the opposite side
@@ -78,11 +71,8 @@ class _PlaneEmitter:
 
 @dataclass(frozen=True)
 class Rays:
-    """Rays with origins and unit directions, (3, N) each.
-
-    `relative_footprint` is the width of each ray's footprint, relative to the footprint of a whole pixel (the pixel plus
-    its circle of confusion).
-    """
+    """Rays with origins and unit directions, (3, N) each, and the width of each ray's footprint, relative to
+    the footprint of a whole pixel (the pixel plus its circle of confusion)."""
 
     origin: Tensor
     direction: Tensor
@@ -91,10 +81,8 @@ class Rays:
 
 @dataclass(frozen=True)
 class LightSamples:
-    """Random points of a map, as unit directions from its centre in the glass frame, (3, N); the light there, (3, N).
-
-    `pdf` is the density of the points per steradian at the centre, (N,).
-    """
+    """Random points of a map, as unit directions from its centre in the glass frame, (3, N); the light there,
+    (3, N); and the density of the points per steradian at the centre, (N,)."""
 
     point: Tensor
     radiance: Tensor
@@ -103,10 +91,7 @@ class LightSamples:
 
 @dataclass(frozen=True)
 class CameraView:
-    """The values that determine the footprint of a pixel: height above the glass, angle of a pixel, and thin lens.
-
-    An aperture of 0 means that the lens does not widen the footprint.
-    """
+    """What determines the footprint of a pixel: height above the glass, angle of a pixel, and thin lens."""
 
     height_mm: float
     pixel_rad: float
@@ -114,16 +99,9 @@ class CameraView:
     focus_mm: float
 
     def footprint_mm(self, distance_mm: float) -> float:
-        """Returns the width of a pixel plus its circle of confusion in mm, at a distance from the glass (thin lens).
-
-        The width is pixel_rad * d + aperture * |1 - d / focus|, where d is the distance from the camera.
-        """
+        """Returns the width of a pixel plus its circle of confusion, in mm, at a distance from the glass."""
         from_camera_mm = self.height_mm + distance_mm
         return self.pixel_rad * from_camera_mm + self.aperture_mm * abs(1 - from_camera_mm / self.focus_mm)
-
-    def footprint_rad(self) -> float:
-        """Returns the width of a pixel plus its circle of confusion at infinity, in radians."""
-        return self.pixel_rad + self.aperture_mm / self.focus_mm
 
 
 class SideEmitters:
@@ -155,11 +133,6 @@ class SideEmitters:
         self.distance_mm = side.distance_mm
         self.has_dome = math.isfinite(self.radius_mm)  # a map at a finite radius, which causes parallax
 
-    @property
-    def has_near_light(self) -> bool:
-        """Whether any light of this side depends on the origin of a ray."""
-        return self.has_dome or self.plane is not None
-
     def texels_per_pixel(self) -> float:
         """Returns the footprint of a whole pixel in texels of the map or of the plane, whichever is larger."""
         return max(self._map_footprint(1.0), self._plane_footprint(1.0))
@@ -168,11 +141,10 @@ class SideEmitters:
         """Converts a footprint that is relative to a whole pixel's to texels of the map."""
         if self.envmap is None:
             return 0.0
-        angle = (
-            self._view.footprint_mm(self.radius_mm) / self.radius_mm
-            if self.has_dome
-            else self._view.footprint_rad()
-        )
+        view = self._view
+        angle = view.pixel_rad + view.aperture_mm / view.focus_mm
+        if self.has_dome:
+            angle = view.footprint_mm(self.radius_mm) / self.radius_mm
         return relative_footprint * angle * self.envmap.width / (2 * math.pi)
 
     def _plane_footprint(self, relative_footprint: float) -> float:
@@ -194,9 +166,7 @@ class SideEmitters:
 
     def add_near(self, far: Tensor | None, rays: Rays) -> Tensor:
         """Adds the light of the dome and the plane along rays to `far`, the result of `far_radiance`: (3, N).
-
-        Far light does not depend on origins, so rays with the same directions need only one call of `far_radiance`.
-        """
+        Rays with the same directions need only one call of `far_radiance`."""
         if self.has_dome:
             far, _ = self._lookup_map(self._intersect_dome(rays)[0], rays.relative_footprint)
         return self._add_plane(torch.zeros_like(rays.direction) if far is None else far, rays)
@@ -210,11 +180,9 @@ class SideEmitters:
         return self.envmap(u, v, self._map_footprint(relative_footprint)), (u, v)
 
     def sample_map(self, uniforms: Tensor, relative_footprint: float) -> LightSamples:
-        """Draws points of the map with a density proportional to its luminance, for `towards`.
-
-        `uniforms` are random numbers in [0, 1), (N,). They choose from a table of stratified points, because inverting the
-        distribution for each ray takes several times as long. `relative_footprint` must be the same in all calls.
-        """
+        """Draws points of the map with a density proportional to its luminance, for `towards`. `uniforms` are
+        random numbers in [0, 1), (N,). `relative_footprint` must be the same in all calls."""
+        # From a table of stratified points: to invert the distribution for each ray takes several times longer.
         if self._light_table is None:
             self._light_table = self._tabulate_light(relative_footprint)
         table, indices = self._light_table, (uniforms * _LIGHT_TABLE_SIZE).long()
@@ -232,9 +200,8 @@ class SideEmitters:
         return LightSamples(self._to_world.T @ direction, radiance, self._distribution.pdf(u, v))
 
     def towards(self, samples: LightSamples, rays: Rays) -> tuple[Tensor, Tensor, Tensor]:
-        """Returns the unit directions (3, N) from the origins of `rays` to points of the map, the light from there (3, N), and
-        the densities of the directions per steradian (N,).
-        """
+        """Returns the unit directions (3, N) from the origins of `rays` to points of the map, the light from
+        there (3, N), and the densities of the directions per steradian (N,)."""
         direction, pdf = samples.point, samples.pdf
         if self.has_dome:
             offset = samples.point * self.radius_mm - rays.origin
@@ -256,10 +223,8 @@ class SideEmitters:
         return self._add_plane(light, rays), pdf
 
     def _dome_density_ratio(self, point: Tensor, direction: Tensor, distance: Tensor) -> Tensor:
-        """Returns the density per steradian at a ray's origin divided by that at the dome's centre, (N,).
-
-        The same area of the dome has the solid angle A / r^2 at the centre and A cos / distance^2 at the origin.
-        """
+        """Returns the density per steradian at a ray's origin divided by that at the dome's centre, (N,)."""
+        # An area A of the dome has the solid angle A / r^2 at the centre, A cos / distance^2 at the origin.
         return (distance / self.radius_mm) ** 2 / dot(point, direction).clamp(min=1e-6)
 
     def _intersect_dome(self, rays: Rays) -> tuple[Tensor, Tensor]:
@@ -299,11 +264,7 @@ class SideEmitters:
 
 
 def _plane_emitter(plane: Plane, assets: Assets, is_behind: bool, device: Device) -> _PlaneEmitter:
-    """Converts a plane to the glass frame.
-
-    At heading 0 and pitch 0, the plane faces the glass. The heading rotates it about the y axis, and the pitch about its
-    horizontal axis.
-    """
+    """Converts a plane to the glass frame. At heading 0 and pitch 0, the plane faces the glass."""
     image = torch.from_numpy(assets.plane_radiance(plane)).to(device)
     facing = 1.0 if is_behind else -1.0
     mirrored = torch.tensor([facing, 1.0, facing], device=device)

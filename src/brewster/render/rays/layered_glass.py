@@ -30,10 +30,8 @@ def refracted_cosine(cosine: Tensor, index: float) -> Tensor:
 
 
 def fresnel(cosine: Tensor, index: float) -> tuple[Tensor, Tensor]:
-    """Returns the reflectance of one surface between air and glass for s- and p-polarised light (Fresnel's equations).
-
-    The reflectance from inside the glass, at the refracted angle, is the same (Stokes' relations).
-    """
+    """Returns the reflectance of one surface between air and glass for s- and p-polarised light (Fresnel's
+    equations). From inside the glass, at the refracted angle, it is the same (Stokes' relations)."""
     inside = refracted_cosine(cosine, index)
     s = (cosine - index * inside) / (cosine + index * inside)
     p = (index * cosine - inside) / (index * cosine + inside)
@@ -79,20 +77,15 @@ def _by_polarisation(glazing: Glazing, cosine: Tensor) -> list[list[_SurfaceAndI
 
 
 def _slab(r: Tensor, a: Tensor | float) -> Throughput:
-    """Returns the transmittance and the reflectance of one pane, the sums of the paper's two series of light paths.
-
-    T = (1 - r)^2 a (1 + (r a)^2 + (r a)^4 + ...) and R = r + (1 - r)^2 r a^2 (1 + (r a)^2 + ...) are geometric series.
-    """
+    """Returns the sums of the paper's two series of light paths in one pane, which are geometric:
+    T = (1 - r)^2 a (1 + (r a)^2 + (r a)^4 + ...) and R = r + (1 - r)^2 r a^2 (1 + (r a)^2 + ...)."""
     transmittance = (1 - r) ** 2 * a / (1 - (r * a) ** 2)
     return Throughput(transmittance, r + transmittance * r * a)
 
 
 def _combine(layers: list[Throughput]) -> Throughput:
-    """Combines layers with the adding method (Stokes 1862): T = T1 T2 / (1 - R1 R2), R = R1 + T1^2 R2 / (1 - R1 R2).
-
-    The method requires that each layer has the same properties from both sides, as uniform panes do. The first layer is
-    the one nearest to the camera.
-    """
+    """Combines layers, the nearest first, each with the same properties from both sides, by the adding method
+    (Stokes 1862): T = T1 T2 / (1 - R1 R2), R = R1 + T1^2 R2 / (1 - R1 R2)."""
     *others, stack = layers
     for t, r in reversed(others):
         interreflection = 1 / (1 - r * stack.reflectance)
@@ -140,11 +133,9 @@ class ReflectionOrder:
 
 @lru_cache(maxsize=256)
 def enumerate_orders(reflectances: tuple[float, ...]) -> tuple[ReflectionOrder, ...]:
-    """Returns the orders of N panes whose surfaces have these reflectances, from the brightest to the faintest.
-
-    The search is breadth-first. At each of the 2 N surfaces, a path is reflected and transmitted. Paths in the same state
-    are merged, because the number of separate paths grows exponentially with the number of reflections.
-    """
+    """Returns the orders of panes whose surfaces have these reflectances, the brightest first."""
+    # A breadth-first search: at each surface, a path is reflected and transmitted. Paths in the same state
+    # are merged, because the number of separate paths grows exponentially with the number of reflections.
     surfaces = 2 * len(reflectances)
     zeros = (0,) * len(reflectances), (0,) * len(reflectances), (0,) * (surfaces - 1)
     frontier: dict[_State, int] = {(0, True, *zeros): 1}
@@ -201,11 +192,8 @@ def _weight(counts: tuple[_Counts, _Counts] | list[_Counts], reflectances: tuple
 
 
 def order_throughputs(glazing: Glazing, cosine: Tensor, table: Sequence[ReflectionOrder]) -> list[Tensor]:
-    """Returns the throughput of each order, (3, ...) or (...).
-
-    For each side, the throughputs sum to `total_throughput`. The last order of a side also gets the light of all fainter
-    orders, so that no energy is lost.
-    """
+    """Returns the throughput of each order, (3, ...) or (...). For each side, they sum to `total_throughput`:
+    the last order of a side also gets the light of all fainter orders."""
     interiors = [
         _powers(internal_transmittance(pane, cosine)) if any(pane.absorption_per_m) else None
         for pane in glazing.panes
@@ -271,10 +259,7 @@ def _tangent(cosine: Tensor) -> Tensor:
 
 
 def ghost_distance_mm(pane: Pane, incidence_deg: float) -> float:
-    """Returns the distance between the mirror images in a pane's two surfaces, perpendicular to the view direction, in mm.
-
-    The distance is 2 t tan(theta_t) cos(theta_i), where t is the thickness, theta_i the angle of incidence and theta_t
-    the angle of refraction.
-    """
+    """Returns the distance in mm between the mirror images in a pane's two surfaces, perpendicular to the
+    view: 2 t tan(theta_t) cos(theta_i), with thickness t and the angles of refraction and incidence."""
     cosine = torch.tensor(math.cos(math.radians(incidence_deg)), dtype=torch.float64)
     return float(2 * pane.thickness_mm * _tangent(refracted_cosine(cosine, pane.refractive_index)) * cosine)

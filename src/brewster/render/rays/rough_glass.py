@@ -37,10 +37,8 @@ _MIN_LIGHT_SAMPLING_WEIGHT: Final = 3e-3
 
 @dataclass(frozen=True)
 class Surface:
-    """One surface of a pane: its height on the z axis, its frame and its material.
-
-    The rows of `axes`, (3, 3), are the axes of the surface's frame. The last is its normal towards the camera.
-    """
+    """One surface of a pane: its height on the z axis, the axes of its frame as rows, (3, 3), of which the
+    last is its normal towards the camera, and its material."""
 
     height_mm: float
     axes: Tensor
@@ -71,10 +69,7 @@ class _PathState:
 
 @dataclass(frozen=True)
 class ExitingLight:
-    """The light of one order from one side, (3, N), and the indices of its rays, (N,).
-
-    `in_truncated_layers` is True if the paper's T or R contains it.
-    """
+    """The light of one order from one side, (3, N), the indices of its rays, (N,), and if T or R has it."""
 
     is_transmitted: bool
     in_truncated_layers: bool
@@ -83,10 +78,8 @@ class ExitingLight:
 
 
 def surfaces(glass: Glazing, like: Tensor) -> list[Surface]:
-    """Returns the surfaces of a glazing in the glass frame, from the nearest to the camera to the farthest.
-
-    A wedge rotates the far surface of a pane. The tensors have the dtype and the device of `like`.
-    """
+    """Returns the surfaces of a glazing in the glass frame, from the nearest to the camera to the farthest,
+    with the dtype and the device of `like`."""
     stack, height_mm = [], 0.0
     for pane in glass.panes:
         absorption = like.new_tensor(pane.absorption_per_m)[:, None] / 1000
@@ -105,11 +98,8 @@ def surfaces(glass: Glazing, like: Tensor) -> list[Surface]:
 def trace_orders(
     glass: Glazing, rays: Rays, behind: SideEmitters, front: SideEmitters, sobol: SobolPoints
 ) -> Iterator[ExitingLight]:
-    """Traces the orders of the rays until no ray is left. Yields the light of each order that exits.
-
-    Each refraction scales radiance by the squared ratio of the refractive indices. Every path starts and ends in air, so
-    these factors cancel and are left out.
-    """
+    """Traces the orders of the rays until no ray is left. Yields the light of each order that exits."""
+    # Refraction scales radiance by the squared ratio of the refractive indices. These factors cancel in air.
     stack = surfaces(glass, rays.direction)
     count = rays.direction.shape[1]
     ones, indices = torch.ones_like(rays.direction), torch.arange(count, device=rays.direction.device)
@@ -137,10 +127,8 @@ def trace_orders(
 
 
 def _mean_weight(path: _PathState, count: int) -> float:
-    """Returns the mean weight over both polarisations and all `count` rays. Rays that are not on the path have weight 0.
-
-    The weights of single rays are no measure, because total reflection at a microfacet gives some rays the weight 0 or 1.
-    """
+    """Returns the mean weight over both polarisations and all `count` rays, which is 0 off the path."""
+    # The weights of single rays are no measure: total reflection at a microfacet makes some of them 0 or 1.
     return float((path.s + path.p).sum()) / (6 * count)
 
 
@@ -234,13 +222,11 @@ def _interact(
 
 
 def _scattered_direction(wi: Tensor, facet: Tensor, cosine: Tensor, ratio: float | None) -> Tensor:
-    """Returns the directions after reflection or refraction at microfacets (Walter et al. 2007, eq. 39 and 40).
-
-    `cosine` is dot(wi, facet). `ratio` is the refractive index on the side of `wi` divided by that on the other side; None
-    for reflection. Under total reflection there is no refracted direction. The result is then arbitrary and its weight is 0.
-    """
+    """Returns the directions after reflection or refraction at microfacets (Walter et al. 2007, eq. 39, 40).
+    `ratio` is the refractive index on the side of `wi` divided by the other one; None for reflection."""
     if ratio is None:
         return 2 * cosine * facet - wi
+    # Under total reflection the result is arbitrary, and its weight is 0.
     cosine_out = (1 - ratio**2 * (1 - cosine**2)).clamp(min=0).sqrt()
     return (ratio * cosine - cosine_out) * facet - ratio * wi
 
@@ -248,11 +234,8 @@ def _scattered_direction(wi: Tensor, facet: Tensor, cosine: Tensor, ratio: float
 def _facet_weights(
     interaction: _SurfaceInteraction, cosine: Tensor, reflectances: tuple[Tensor, Tensor], wo: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Returns BSDF times cosine divided by density, for s- and p-polarised light, (N,) each.
-
-    `cosine` is dot(wi, facet), `reflectances` are those of the facets, `wo` are the scattered directions. With visible normals and
-    the separable Smith term G1(wi) G1(wo), everything except the Fresnel factor and G1(wo) cancels (Heitz 2018).
-    """
+    """Returns BSDF times cosine divided by density, for s- and p-polarised light, (N,) each. With visible
+    normals and the separable Smith term, all but the Fresnel factor and G1(wo) cancels (Heitz 2018)."""
     cosine_out = wo[2] if interaction.reflects else -wo[2]
     # Facets seen from behind have weight 0, and so do facets that scatter light to the wrong side of the surface.
     valid = (cosine_out > 0) & (cosine > 0)
@@ -278,11 +261,8 @@ def _exit_radiance(
     relative_footprint: float,
     light_uniforms: Tensor | None,
 ) -> Tensor:
-    """Returns the light of an order, (3, N): a microfacet sample and a light sample, combined by the balance heuristic.
-
-    `light_uniforms` are random numbers for light samples, (N,); None if microfacet samples are sufficient. The heuristic
-    weights a sample by its density divided by the sum of both densities (Veach 1997, eq. 9.8).
-    """
+    """Returns the light of an order, (3, N), from a microfacet sample and, with random numbers (N,), a light
+    sample. The balance heuristic weights them by their densities (Veach 1997, eq. 9.8)."""
     weight, rays = (path.s + path.p) / 2, Rays(path.origin, path.direction, relative_footprint)
     if light_uniforms is None:
         return weight * emitters.radiance(rays)
@@ -293,7 +273,10 @@ def _exit_radiance(
         emitters.sample_map(light_uniforms, relative_footprint), rays
     )
     wo = interaction.axes @ direction
-    facet = _half_vector(interaction, wo)
+    # The normals of the facets that scatter `wi` into `wo` (Walter et al. 2007, eq. 13 and 16)
+    half = -(interaction.index_in * interaction.wi + interaction.index_out * wo)
+    half = interaction.wi + wo if interaction.reflects else half
+    facet = normalize(half) * torch.sign(half[2])
     cosine = dot(interaction.wi, facet)
     reflectances = _reflectances(cosine, interaction.index_in, interaction.index_out)
     s, p = _facet_weights(interaction, cosine, reflectances, wo)
@@ -304,20 +287,9 @@ def _exit_radiance(
     return light + (interaction.before.s * s + interaction.before.p * p) / 2 * ratio * radiance
 
 
-def _half_vector(interaction: _SurfaceInteraction, wo: Tensor) -> Tensor:
-    """Returns the normals of the facets that scatter `wi` into `wo` (Walter et al. 2007, eq. 13 and 16)."""
-    if interaction.reflects:
-        half = interaction.wi + wo
-    else:
-        half = -(interaction.index_in * interaction.wi + interaction.index_out * wo)
-    return normalize(half) * torch.sign(half[2])
-
-
 def _scattering_pdf(interaction: _SurfaceInteraction, facet: Tensor, cosine: Tensor, wo: Tensor) -> Tensor:
-    """Returns the density of microfacet samples at `wo`, per steradian, (N,). `cosine` is dot(wi, facet).
-
-    It is the density of the facet's normal times the Jacobian of the half vector (Walter et al. 2007, eq. 14 and 17).
-    """
+    """Returns the density of microfacet samples at `wo`, per steradian, (N,): that of the facet's normal
+    times the Jacobian of the half vector (Walter et al. 2007, eq. 14 and 17). `cosine` is dot(wi, facet)."""
     cosine_out = dot(wo, facet)
     normal_pdf = vndf_over_cosine(interaction.wi, facet, interaction.alpha)
     if interaction.reflects:

@@ -26,10 +26,7 @@ class SobolPoints:
         self.start_sample(0, slice(0, pixel_count))
 
     def start_sample(self, number: int, pixels: slice) -> None:
-        """Selects sample `number` of the pixels in the slice, and restarts at the first dimension.
-
-        `number` is in 0..`sample_count` - 1.
-        """
+        """Selects sample `number`, from 0, of these pixels, and restarts at the first dimension."""
         self._sample, self._pixels, self._next = number, pixels, 0
 
     def next_1d(self, subset: Tensor | None = None) -> Tensor:
@@ -47,11 +44,9 @@ class SobolPoints:
         return shifted - shifted.floor()
 
     def next_disc(self) -> Tensor:
-        """Returns a point on the unit disc for each selected pixel, (2, n), uniform by area.
-
-        The concentric map (Shirley and Chiu 1997) maps close points of the square to close points of the disc. This
-        keeps the low discrepancy of the sequence.
-        """
+        """Returns a point on the unit disc for each selected pixel, (2, n), uniform by area."""
+        # The concentric map (Shirley and Chiu 1997) maps close points of the square to close points of the
+        # disc, which keeps the low discrepancy of the sequence.
         x, y = self.next_2d() * 2 - 1
         x_is_larger = x.abs() > y.abs()
         radius = torch.where(x_is_larger, x, y)

@@ -194,7 +194,7 @@ def _exclusive_lock(out: Path) -> Iterator[None]:
         ) from error
     lock = filelock.FileLock(out / _LOCK_FILE, blocking=False, fallback_to_soft=False)
     try:
-        lock.acquire()
+        held = lock.acquire()
     except filelock.Timeout as error:
         raise OutputError(
             f"another run is writing to {out}",
@@ -207,10 +207,8 @@ def _exclusive_lock(out: Path) -> Iterator[None]:
             "expected a file system with locks, so that only one run writes to a dataset",
             "choose a folder on another file system",
         ) from error
-    try:
+    with held:
         yield
-    finally:
-        lock.release()
 
 
 def _check_record(job: RenderJob) -> None:

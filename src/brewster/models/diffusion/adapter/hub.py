@@ -9,13 +9,12 @@ Exactly four files are sent. Local paths in the recipe and in the LoRA's metadat
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import hashlib
 import json
 import re
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import Any, Final, final
@@ -126,16 +125,24 @@ def push(plan: UploadPlan, token: str | None = None) -> str:
         import_library("huggingface_hub.utils").disable_progress_bars()
     api = hub.HfApi(token=token, library_name="brewster")
     added = [hub.CommitOperationAdd(name, data) for name, data in plan.files.items()]
-    with _translate_push_errors(plan.repo_id):
-        api.create_repo(plan.repo_id, private=plan.is_private, exist_ok=True)
-        is_private = bool(api.model_info(plan.repo_id).private)
-        if plan.is_private != is_private:
-            raise DownloadError(
-                f"{plan.repo_id} exists already and is {'private' if is_private else 'public'}",
-                f"expected a {'private' if plan.is_private else 'public'} repository",
-                f"{'leave out' if is_private else 'pass'} --public, or choose another name, or change its settings",
-            )
-        commit = api.create_commit(plan.repo_id, added, commit_message=plan.message)
+    try:
+        with translate_hub_errors(plan.repo_id, "write"):
+            api.create_repo(plan.repo_id, private=plan.is_private, exist_ok=True)
+            is_private = bool(api.model_info(plan.repo_id).private)
+            if plan.is_private != is_private:
+                raise DownloadError(
+                    f"{plan.repo_id} exists already and is {'private' if is_private else 'public'}",
+                    f"expected a {'private' if plan.is_private else 'public'} repository",
+                    f"{'leave out' if is_private else 'pass'} --public, or choose another name, or change its settings",
+                )
+            commit = api.create_commit(plan.repo_id, added, commit_message=plan.message)
+    except json.JSONDecodeError as error:
+        happened = f"the server's response is not JSON ({error})"
+        cure = "check HF_ENDPOINT and your proxy settings"
+        raise DownloadError(happened, "expected a Hugging Face hub", cure) from error
+    except ValueError as error:  # huggingface_hub raises it if the hub rejects the front matter
+        happened = f"the hub refused {CARD_FILE}: {error}"
+        raise DownloadError(happened, "expected valid front matter", _CARD_HINT) from error
     return str(commit.commit_url)
 
 
@@ -198,18 +205,3 @@ def _refuse_home_folders(source: str, text: str) -> None:
             "expected no path of a home folder, because it is published",
             f"remove it from {source}",
         )
-
-
-@contextlib.contextmanager
-def _translate_push_errors(repo_id: str) -> Iterator[None]:
-    """Converts the exceptions of huggingface_hub to DownloadError."""
-    try:
-        with translate_hub_errors(repo_id, "write"):
-            yield
-    except json.JSONDecodeError as error:
-        happened = f"the server's response is not JSON ({error})"
-        cure = "check HF_ENDPOINT and your proxy settings"
-        raise DownloadError(happened, "expected a Hugging Face hub", cure) from error
-    except ValueError as error:  # huggingface_hub raises it if the hub rejects the front matter
-        happened = f"the hub refused {CARD_FILE}: {error}"
-        raise DownloadError(happened, "expected valid front matter", _CARD_HINT) from error

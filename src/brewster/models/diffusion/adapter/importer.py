@@ -47,11 +47,10 @@ def import_lora(
     alpha: int | None = None,
     device: str = "cpu",
 ) -> LoraMetadata:
-    """Reads the LoRA, encodes the prompt, and writes the folder.
+    """Reads the LoRA, encodes the prompt, and writes the folder. Returns the metadata of the written LoRA.
 
-    For `source`, see `find_weights_file`; for `base_model`, see `load_backbone`; for `alpha`, see `read_layers`.
-    `prompt` is a name in `PROMPTS`, or the text itself, which `device` encodes. `panels` are those that the LoRA
-    generates from the photo. Returns the metadata of the written LoRA.
+    For `source`, see `find_weights_file`; for `base_model`, `load_backbone`; for `alpha`, `read_layers`.
+    `prompt` is a name in `PROMPTS`, or the text itself, which `device` encodes. `panels` are its output.
     """
     task = DecompositionTask(PanelLayout(panels))
     base = build_on_meta(base_model)
@@ -70,10 +69,8 @@ def find_lora_file(source: str) -> Path:
 
 
 def read_layers(path: Path, base: Backbone, alpha: int | None = None) -> dict[str, Tensor]:
-    """The layers of the LoRA in a file, see `read_lora_layers`. The base must have no LoRA; it may be on the device "meta".
-
-    `alpha` is that of all layers, for a LoRA of peft without its adapter_config.json, which must have one.
-    """
+    """The layers of the LoRA in a file, see `read_lora_layers`. The base must have no LoRA. `alpha` is that
+    of all layers, for a LoRA of peft without its adapter_config.json."""
     tensors, metadata = read_tensors(path)
     scale = _scale(path, metadata)
     if alpha is not None:

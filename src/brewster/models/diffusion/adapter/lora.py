@@ -119,11 +119,9 @@ def add_lora(
 
 
 def attach_layers(backbone: Backbone, state: Mapping[str, Tensor], *, adapter: str = ADAPTER_NAME) -> None:
-    """Adds a LoRA with the weights of `read_lora_layers` to a backbone for inference. Each layer has its own rank.
-
-    A second LoRA, such as a few-step LoRA (Lightning, turbo), needs another name as `adapter`: both changes of the
-    weights are added. The weights are in the dtype in which the backbone computes, see `load_lora`.
-    """
+    """Adds a LoRA with the weights of `read_lora_layers` to a backbone for inference, each layer with its own
+    rank. A second LoRA, such as a few-step LoRA (Lightning, turbo), needs another name as `adapter`: both
+    changes are added."""
     others = [*(getattr(backbone.transformer, "peft_config", None) or ())]
     modules = dict(backbone.transformer.named_modules())
     for name in adapted_layers(state):
@@ -225,11 +223,7 @@ def read_prompt(folder: Path, metadata: LoraMetadata) -> PromptEmbedding:
 
 
 def load_lora(folder: Path, backbone: Backbone) -> tuple[LoraMetadata, PromptEmbedding]:
-    """Adds the LoRA of a folder to its backbone for inference.
-
-    The LoRA has the dtype in which the backbone computes, because a float32 LoRA would convert the activations of every
-    layer of a bf16 base twice. Returns the metadata of the LoRA, and its prompt.
-    """
+    """Adds the LoRA of a folder to its backbone for inference. Returns its metadata and its prompt."""
     state, metadata = read_lora(folder)
     prompt = read_prompt(folder, metadata)
     if metadata.imported:
@@ -242,6 +236,7 @@ def load_lora(folder: Path, backbone: Backbone) -> tuple[LoraMetadata, PromptEmb
 
 
 def _convert_for_inference(backbone: Backbone) -> None:
+    # A float32 LoRA would convert the activations of every layer of a bf16 base twice.
     for parameter in lora_parameters(backbone):
         parameter.data = parameter.data.to(backbone.dtype)
 

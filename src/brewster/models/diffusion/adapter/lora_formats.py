@@ -111,11 +111,9 @@ ScalingFunction = Callable[[str, int], float]
 def read_lora_layers(
     tensors: Mapping[str, Tensor], transformer: nn.Module, backbone: str, scale: ScalingFunction | None = None
 ) -> dict[str, Tensor]:
-    """The two matrices of each layer with the keys of `lora_state_dict`, float32, with the scale multiplied into B.
-
-    Only names and shapes of the transformer are read, so it may be on the device "meta". The scale alpha / rank is for files
-    without alphas; by default 1, as in diffusers, sd-scripts and ComfyUI.
-    """
+    """The two matrices of each layer with the keys of `lora_state_dict`, float32, with the scale multiplied
+    into B. The transformer may be on the device "meta". `scale` is for files without alphas; by default 1, as
+    in other programs."""
     targets = _layer_names(transformer, backbone)
     state: dict[str, Tensor] = {}
     for name, parts in _parse(tensors, backbone).items():

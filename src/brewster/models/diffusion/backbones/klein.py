@@ -23,10 +23,7 @@ _CONDITION_TIME: Final = 10
 
 @final
 class Klein(ClassifierFreeBackbone):
-    """FLUX.2 klein (Black Forest Labs 2026), the base model, with classifier-free guidance.
-
-    The distilled models of FLUX.2 klein can be loaded too; they ignore the guidance.
-    """
+    """FLUX.2 klein (Black Forest Labs 2026) with classifier-free guidance, ignored by distilled models."""
 
     name = "klein"
     hub_id = "black-forest-labs/FLUX.2-klein-base-4B"

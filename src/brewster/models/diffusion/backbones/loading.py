@@ -120,12 +120,10 @@ def load_backbone(
 
 
 def encode_prompt(source: str, text: str = PROMPT, *, device: str = "cpu") -> PromptEmbedding:
-    """Encodes a prompt with a backbone's text encoders, which are loaded only for this call.
-
-    For `source`, see `load_backbone`. A tiny version has no text encoder: its embedding is random, seeded by the text.
-
-    They are loaded in bfloat16, on `device` if its free memory suffices, otherwise on the CPU. Call this before
-    `load_backbone`: together with the base, most text encoders fit no consumer GPU.
+    """Encodes a prompt with a backbone's text encoders, which are loaded for this call only: in bfloat16, on
+    `device` if its free memory suffices, otherwise on the CPU. Call this before `load_backbone`: together
+    with the base, most of them fit no consumer GPU. A tiny version has none: its embedding is random, seeded
+    by the text.
 
     Returns the embedding on the CPU, bfloat16; float32 for a tiny version.
     """

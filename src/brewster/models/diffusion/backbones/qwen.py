@@ -21,10 +21,7 @@ _GREY_SIDE_PX: Final = 448
 @final
 class Qwen(ClassifierFreeBackbone):
     """Qwen-Image-Edit (Qwen team 2025), with classifier-free guidance that preserves the norm of each token.
-
-    The pipeline of diffusers resizes the conditioning image to one megapixel; this class does not. The text encoder
-    also takes the conditioning image. This class encodes the prompt once, with a uniform grey image instead.
-    """
+    Unlike in diffusers, the conditioning image is not resized, and the text encoder gets a grey image."""
 
     name = "qwen"
     hub_id = "Qwen/Qwen-Image-Edit"
