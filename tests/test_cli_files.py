@@ -152,6 +152,16 @@ def test_a_contact_sheet_has_a_row_for_each_photo(run, tmp_path):
     assert Photo.open(tmp_path / "sheet.png").size[1] == 272
 
 
+def test_a_contact_sheet_that_cannot_be_written_is_an_error_before_the_first_photo(
+    run_without_model, tmp_path
+):
+    (tmp_path / "a.jpg").write_bytes(image_bytes())
+    code, _, err = run_without_model("a.jpg", "--contact-sheet", "a.jpg/sheet.png")
+    assert code == 2
+    assert "--contact-sheet a.jpg/sheet.png: a.jpg was not written (Not a directory)" in err
+    assert len(list(tmp_path.iterdir())) == 1
+
+
 def test_a_contact_sheet_replaces_only_contact_sheets(run, tmp_path):
     for name in ("a.jpg", "other.jpg"):
         (tmp_path / name).write_bytes(image_bytes())
