@@ -224,10 +224,10 @@ def test_videos_are_counted_and_named(run, run_without_model, tmp_path):
         (tmp_path / name).write_bytes(b"\0\0\0\x18ftypisom" + bytes(100))
     code, _, err = run(".")
     assert code == 0
-    assert "2 videos (b.mp4, c.MOV) skipped" in err
+    assert "2 videos (b.mp4, c.MOV) skipped: use `brewster burst`" in err
     code, _, err = run("b.mp4")
     assert code == 1
-    assert error_lines(err)[0].startswith("error: b.mp4 is a video; expected a photo; extract single images")
+    assert error_lines(err)[0].startswith("error: b.mp4 is a video; expected a photo; use `brewster burst`")
     (tmp_path / "a.jpg").unlink()
     for layer in layer_files("a"):
         (tmp_path / layer).unlink()
