@@ -53,7 +53,7 @@ def test_a_photo_is_separated_over_a_socket():
     assert b"server:" not in response.lower().partition(b"\r\n\r\n")[0]
 
 
-@pytest.mark.parametrize("path", [b"/health", b"/", b"/page/style.css"])
+@pytest.mark.parametrize("path", [b"/health", b"/models", b"/openapi.json", b"/", b"/page/style.css"])
 def test_head_returns_the_headers_of_get_without_a_body(path):
     def response_to(method):
         head, _, body = raw_exchange(port, PLAIN.replace(b"GET /", method + b" " + path)).partition(END)

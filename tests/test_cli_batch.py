@@ -239,7 +239,7 @@ def test_a_folder_of_photos_that_cannot_be_written_to_is_one_error_and_no_photo_
 
 
 def test_a_dry_run_reports_text_named_as_a_photo_as_a_real_run_does(run, tmp_path):
-    (tmp_path / "text.jpg").write_text("Hello, this is text")
+    (tmp_path / "text.jpg").write_text("Hello,\n\tthis is text")
     errors = [run("text.jpg", *options)[2] for options in ([], ["--dry-run"])]
     assert all("text.jpg: the file is text" in error for error in errors)
     assert run("text.jpg", "--dry-run")[0] == 1

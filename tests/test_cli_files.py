@@ -152,6 +152,16 @@ def test_a_contact_sheet_has_a_row_for_each_photo(run, tmp_path):
     assert Photo.open(tmp_path / "sheet.png").size[1] == 272
 
 
+def test_a_contact_sheet_that_cannot_be_written_is_an_error_before_the_first_photo(
+    run_without_model, tmp_path
+):
+    (tmp_path / "a.jpg").write_bytes(image_bytes())
+    code, _, err = run_without_model("a.jpg", "--contact-sheet", "a.jpg/sheet.png")
+    assert code == 2
+    assert "--contact-sheet a.jpg/sheet.png: a.jpg was not written (Not a directory)" in err
+    assert len(list(tmp_path.iterdir())) == 1
+
+
 def test_a_contact_sheet_replaces_only_contact_sheets(run, tmp_path):
     for name in ("a.jpg", "other.jpg"):
         (tmp_path / name).write_bytes(image_bytes())
@@ -214,10 +224,10 @@ def test_videos_are_counted_and_named(run, run_without_model, tmp_path):
         (tmp_path / name).write_bytes(b"\0\0\0\x18ftypisom" + bytes(100))
     code, _, err = run(".")
     assert code == 0
-    assert "2 videos (b.mp4, c.MOV) skipped" in err
+    assert "2 videos (b.mp4, c.MOV) skipped: use `brewster burst`" in err
     code, _, err = run("b.mp4")
     assert code == 1
-    assert error_lines(err)[0].startswith("error: b.mp4 is a video; expected a photo; extract single images")
+    assert error_lines(err)[0].startswith("error: b.mp4 is a video; expected a photo; use `brewster burst`")
     (tmp_path / "a.jpg").unlink()
     for layer in layer_files("a"):
         (tmp_path / layer).unlink()

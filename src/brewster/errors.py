@@ -151,11 +151,14 @@ def counted(number: int, noun: str) -> str:
     return f"{number} {noun}{'' if number == 1 else 's'}"
 
 
+VIDEO_CURE: Final = (
+    "use `brewster burst` for a video of one window, or extract single images, for example with ffmpeg"
+)
+
+
 def video_error(name: str) -> UnsupportedPhoto:
     """Returns the error for a video. `name` is its path, or "the file" if the path is unknown."""
-    return UnsupportedPhoto(
-        f"{name} is a video", "expected a photo", "extract single images first, for example with ffmpeg"
-    )
+    return UnsupportedPhoto(f"{name} is a video", "expected a photo", VIDEO_CURE)
 
 
 def empty_file_error() -> UnreadablePhoto:

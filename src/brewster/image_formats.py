@@ -176,7 +176,7 @@ VIDEO_SUFFIXES: Final = frozenset(
         *(".mpg", ".mpeg", ".3gp", ".3g2", ".wmv", ".flv"),
     )
 )
-"""File name suffixes of videos, in lower case. brewster cannot read videos. It reports those that it skips."""
+"""File name suffixes of videos, in lower case. Only `brewster burst` reads videos; they are not photos."""
 
 VIDEO_SIGNATURE: Final = (
     rb"....(ftyp(iso[m2-9]|mp4[12]|mmp4|avc1|dash|f4v |qt  |M4V.|3g[p2].|MSNV|XAVC)|moov|mdat|wide)"

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Final, final
 import click
 
 from brewster.cli.terminal import print_status, write_out
-from brewster.errors import counted
+from brewster.errors import VIDEO_CURE, counted
 from brewster.files import LAYER_FORMATS, check_output_folder
 from brewster.image_formats import WRITABLE, ImageFormat, format_of, is_video
 from brewster.options import Options
@@ -42,7 +42,7 @@ def skipped_files(files: Sequence[Location]) -> Iterator[str]:
     """Yields a line about the videos, and a line about all other files without the suffix of an image."""
     others = [file for file in files if not is_video(file)]
     if videos := [file for file in files if is_video(file)]:
-        yield f"{listed(videos, 'video')} skipped: brewster separates photos; extract single images first, for example with ffmpeg"
+        yield f"{listed(videos, 'video')} skipped: {VIDEO_CURE}"
     if others:
         suffixes = Counter(file.suffix.lower() or "without a suffix" for file in others)
         counts = [f"{number} {suffix}" for suffix, number in suffixes.most_common()]

@@ -18,8 +18,8 @@ from brewster.cli.batch_plan import gpu_for_plan, is_single_output, local_path, 
 from brewster.cli.extras import require_extra
 from brewster.cli.parameters import FILE, OVERWRITE, QUIET, Number, flag, gpu_name, json_lines
 from brewster.cli.terminal import print_out, print_status, standard_output
-from brewster.errors import BrewsterError
-from brewster.files import absolute
+from brewster.errors import BrewsterError, OutputError
+from brewster.files import absolute, check_output_folder
 from brewster.image_formats import FormatName, canonical_format, format_of
 from brewster.models import zoo
 from brewster.options import Options
@@ -264,6 +264,12 @@ def _check_contact_sheet(
         raise click.UsageError(
             "--contact-sheet needs photos and layers that are files, not standard input or output."
         )
+    try:
+        check_output_folder(path.parent)
+    except OutputError as error:
+        raise click.UsageError(
+            f"--contact-sheet {path}: {error.happened}; {error.expected}; choose another folder."
+        ) from error
 
 
 def _without_contact_sheet(

@@ -13,7 +13,6 @@ import importlib.util
 import subprocess
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from difflib import get_close_matches
 from functools import cached_property
 from typing import Final, final
 
@@ -142,11 +141,10 @@ def find_gpu(name: str) -> GraphicsCard:
                 "expected an NVIDIA or AMD GPU, because diffusion models run on no other",
                 "use the model compact, which runs on any machine",
             )
-    matches = get_close_matches(number, known, n=1)
     raise DeviceError(
         f"there is no GPU {name!r} in the table",
-        f"expected one of {', '.join(CARDS)}",
-        f"did you mean {known[matches[0]].name}?" if matches else "choose the most similar GPU",
+        f"expected one of {', '.join(f'{card.name} ({card.memory_gib} GiB)' for card in CARDS.values())}",
+        "choose one with as much memory as yours",
     )
 
 

@@ -108,7 +108,7 @@ def known_format(data: bytes) -> ImageFormat:
         return image_format
     if re.match(VIDEO_SIGNATURE, data, re.DOTALL):
         raise video_error("the file")
-    is_text = data[:12].isascii() and data[:12].decode().isprintable()
+    is_text = re.fullmatch(rb"[\t\n\r -~]+", data[:12])
     raise UnreadablePhoto(
         f"the file is {'text' if is_text else 'of another kind'}, which is no known image format",
         f"expected one of {', '.join(FORMATS)}",

@@ -87,7 +87,6 @@ def page_response(name: str) -> Response:
 
 
 def _add_page(app: FastAPI, path: str, name: str) -> None:
-    # Unlike FastAPI.get, this method of Starlette also adds HEAD.
     app.add_route(path, lambda _: page_response(name), include_in_schema=False)
 
 

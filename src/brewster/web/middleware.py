@@ -26,7 +26,7 @@ from starlette.responses import HTMLResponse, JSONResponse, Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 LOOPBACK: Final = frozenset({"127.0.0.1", "localhost", "::1"})
-_SAFE_METHODS: Final = ("GET", "HEAD", "OPTIONS")
+_SAFE_METHODS: Final = ("GET", "OPTIONS")
 _DRAIN_SECONDS: Final = 10.0
 _MAX_LENGTH_DIGITS: Final = 18  # of the header Content-Length, because int() refuses very long numbers
 SECURITY_HEADERS: Final = {
@@ -111,6 +111,8 @@ class AccessMiddleware:
         if scope["type"] != "http":
             await self.app(scope, receive, send)
             return
+        if scope["method"] == "HEAD":
+            scope = {**scope, "method": "GET"}  # the server (uvicorn) leaves the body out
         exchange = _Exchange(self.policy, receive, send)
         try:
             response = self._refusal(scope, Headers(scope=scope)) or self.app

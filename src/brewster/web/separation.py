@@ -92,7 +92,6 @@ def separation_router(model_cache: ModelCache, job_queue: JobQueue, *, max_pixel
     router.get("/progress/{job}", responses={404: _ERROR})(routes.progress)
     router.get("/models")(routes.models)
     router.get("/health")(routes.health)
-    router.head("/health", include_in_schema=False)(routes.health)
     # only for the page
     router.post("/preview", include_in_schema=False)(routes.preview)
     router.post("/photo", include_in_schema=False)(routes.keep_photo)

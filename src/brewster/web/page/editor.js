@@ -1,10 +1,10 @@
-// Draws regions on <glass-compare> with a pointer or with the keyboard, and a tint: dark over the areas that are not separated, red and
-// green over hints. The tint is visible while the pointer or the keyboard cursor is on the photo.
+// Draws regions on <glass-compare> with a pointer or with the keyboard, and a tint: dark over the areas that are not separated, with a white
+// outline, and red and green over hints. The tint is visible while the pointer or the keyboard cursor is on the photo.
 
 import { hintCodes, maskCodes } from "./regions.js";
 
 const KEY_STEP = 0.01; // of the longer side of the photo; five times as much with Shift
-const TINT_OPACITY = 0.4;
+const TINT_OPACITY = 0.3;
 const TINT_MAX_PX = 800; // longer side of the image of the tint
 const MIN_STEP = 0.2; // minimum distance of the points of a stroke, as a fraction of the brush radius
 
@@ -115,11 +115,15 @@ export class RegionEditor {
     const context = this.#tint.getContext("2d");
     const image = context.createImageData(width, height);
     const mask = maskCodes(list, width, height);
+    const marks = maskCodes(list.map((region) => ({ ...region, value: region.value && 1 })), width, height); // at full strength
+    const isMarked = (i) => marks[i] > 127;
     const [red, green] = ["reflection", "scene"].map((kind) => hintCodes(list, kind, width, height));
     for (let i = 0; i < red.length; i++) {
       const hint = Math.max(red[i], green[i]);
       if (hint) image.data.set([red[i] >= green[i] ? 255 : 0, red[i] >= green[i] ? 0 : 200, 60], 4 * i);
       image.data[4 * i + 3] = TINT_OPACITY * Math.max(hint, mask ? 255 - mask[i] : 0);
+      const isEdge = marks && ((i % width && isMarked(i) !== isMarked(i - 1)) || (i >= width && isMarked(i) !== isMarked(i - width)));
+      if (isEdge) image.data.fill(255, 4 * i, 4 * i + 4);
     }
     context.putImageData(image, 0, 0);
   }
