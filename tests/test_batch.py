@@ -7,8 +7,7 @@ from pathlib import Path
 import pytest
 
 from brewster import Photo, Separator
-from brewster.batch import SeparationTask, plan_files, separate_files, separate_tasks
-from brewster.errors import OutputError, PhotoError
+from brewster.batch import SeparationTask, separate_files, separate_tasks
 from brewster.options import Options
 from cli_helpers import LAYERS, image_bytes, layer_files, list_files
 
@@ -44,15 +43,6 @@ def test_a_folder_is_mirrored_and_a_damaged_photo_does_not_stop_the_batch(photo_
     assert first.residual == pytest.approx(0, abs=0.01)
 
 
-def test_the_options_choose_layers_and_formats(tmp_path, separator):
-    (tmp_path / "a.jpg").write_bytes(image_bytes())
-    options = Options(layers=("transmission", "confidence"), format="tiff", strength=0)
-    list(separate_files([tmp_path / "a.jpg"], tmp_path / "out", options, separator))
-    assert list_files(tmp_path / "out") == ["a.confidence.png", "a.transmission.tiff"]
-    written, photo = Photo.open(tmp_path / "out/a.transmission.tiff"), Photo.open(tmp_path / "a.jpg")
-    assert (written.pixels == photo.pixels).all()
-
-
 def test_finished_photos_are_skipped_without_a_model_and_missing_layers_are_added(tmp_path, separator):
     (tmp_path / "a.jpg").write_bytes(image_bytes())
     list(separate_files(tmp_path, separator=separator))
@@ -66,17 +56,6 @@ def test_finished_photos_are_skipped_without_a_model_and_missing_layers_are_adde
     assert (tmp_path / "a.transmission.jpg").read_bytes() == b"existing file"
     list(separate_files(tmp_path, separator=separator, overwrite=True))
     assert Photo.open(tmp_path / "a.transmission.jpg").size == (60, 40)
-
-
-def test_names_and_sources_are_checked_before_the_first_photo_is_separated(tmp_path):
-    for name in ("x", "y", "empty"):
-        (tmp_path / name).mkdir()
-    for name in ("x", "y"):
-        (tmp_path / name / "a.jpg").write_bytes(image_bytes())
-    with pytest.raises(OutputError, match="would both be written"):
-        separate_files([tmp_path / "x/a.jpg", tmp_path / "y/a.jpg"], tmp_path / "out")
-    with pytest.raises(PhotoError, match="there is no photo in"):
-        plan_files(tmp_path / "empty")
 
 
 def test_a_photo_is_separated_when_its_result_is_requested(photo_folder, tmp_path, separator):

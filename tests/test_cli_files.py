@@ -16,8 +16,6 @@ from brewster.photo import contact_sheet
 from cli_helpers import error_lines, image_bytes, layer_files, list_files
 from picture_files import dng_file, mosaic
 
-# --- the names of photos
-
 
 @pytest.mark.parametrize("form", ["file://{}", "file://localhost{}", "'{}'", '"{}"', "'file://{}'"])
 def test_an_address_and_a_quoted_path_name_a_file(run, tmp_path, form):
@@ -60,9 +58,6 @@ def test_an_address_of_another_machine_is_refused(run, tmp_path, address, option
     assert list_files(tmp_path) == []
 
 
-# --- suffixes
-
-
 @pytest.mark.parametrize("name", ["notes", "notes.txt", "notes.jpg/"])
 @pytest.mark.parametrize("photos", [["a.jpg"], ["a.jpg", "b.jpg"], ["."]])
 def test_an_output_folder_that_is_a_file_is_refused(run_without_model, tmp_path, name, photos):
@@ -79,9 +74,6 @@ def test_a_folder_may_have_a_dot_in_its_name(run, tmp_path, name):
     (tmp_path / "a.jpg").write_bytes(image_bytes())
     assert run("a.jpg", "-o", name)[0] == 0
     assert list_files(tmp_path / name) == layer_files("a")
-
-
-# --- RAW files and videos
 
 
 def test_raw_files_without_the_extra_are_counted_and_named_once(run, tmp_path, monkeypatch):
@@ -112,9 +104,6 @@ def test_other_files_in_a_folder_are_counted_by_suffix_with_an_example(run, tmp_
     assert (tmp_path / "b/scan.transmission.jpg").is_file()
 
 
-# --- existing layers
-
-
 def test_a_hint_names_the_other_options_of_existing_layers(run, tmp_path):
     (tmp_path / "a.jpg").write_bytes(image_bytes())
     run("a.jpg", "--strength", "0.5")
@@ -122,16 +111,6 @@ def test_a_hint_names_the_other_options_of_existing_layers(run, tmp_path):
     assert "made with other options (strength=0.5) (--overwrite replaces them)" in err
     assert "other options" not in run("a.jpg", "--strength", "0.5")[2]
     assert "model=pane" in run("a.jpg", "--strength", "0.5", "--model", "compact", with_model=False)[2]
-
-
-def test_a_hint_says_that_existing_layers_are_not_those_of_the_diffusion_model(run, tmp_path):
-    (tmp_path / "a.jpg").write_bytes(image_bytes())
-    run("a.jpg", with_model=False)
-    assert "model=compact" in run("a.jpg", "--model", "windowseat", with_model=False)[2]
-    assert "other options" not in run("a.jpg", with_model=False)[2]
-
-
-# --- contact sheets
 
 
 def test_a_contact_sheet_has_a_row_for_each_photo(run, tmp_path):
@@ -171,9 +150,6 @@ def test_many_rows_give_several_sheets(tmp_path, monkeypatch):
     sheets = list(contact_sheet.write_contact_sheets(tmp_path / "s.jpg", rows, 10**6))
     assert [path.name for path in sheets] == ["s.jpg", "s-2.jpg", "s-3.jpg"]
     assert [Photo.open(path).size[1] // 272 for path in sheets] == [2, 2, 1]
-
-
-# --- shell completion
 
 
 def completions(*words):

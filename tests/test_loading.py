@@ -94,11 +94,3 @@ def test_a_file_without_one_of_the_weights_is_refused(name, bases, tmp_path):
     write_gguf(tmp_path / "part.gguf", weights)
     with pytest.raises(ModelError, match=rf"part\.gguf lacks weights of {name} \("):
         load_backbone(str(bases / name), transformer_file=tmp_path / "part.gguf")
-
-
-def test_a_damaged_file_and_a_second_quantization_are_refused(bases, tmp_path):
-    (tmp_path / "damaged.gguf").write_bytes(b"GGUF")
-    with pytest.raises(ModelError, match=r"damaged\.gguf cannot be loaded"):
-        load_backbone(str(bases / "kontext"), transformer_file=tmp_path / "damaged.gguf")
-    with pytest.raises(ModelError, match="the file has its own precision; leave quantization out"):
-        load_backbone(str(bases / "kontext"), transformer_file=tmp_path / "damaged.gguf", quantization="int8")

@@ -7,7 +7,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from brewster import Photo, Separator
-from brewster.errors import BrewsterError
 from brewster.inference import QUALITIES
 from brewster.inference.guided_upsampling import GeneratedOverride
 from brewster.inference.predictor import Prediction, Predictor
@@ -150,25 +149,6 @@ def test_every_kind_of_source_gives_the_same_transmission(separator, path):
     transmissions = [separator(source, quality="draft").transmission.pixels for source in sources]
     for transmission in transmissions:
         assert (transmission == transmissions[0]).all()
-
-
-@pytest.mark.parametrize("options", [{"strength": 1.5}, {"strength": -1}, {"quality": "best"}])
-def test_options_out_of_range_are_refused(options):
-    with pytest.raises(BrewsterError):
-        Separator(identity_backend)(Photo.from_array(random_image(4, 4), encoding="srgb"), **options)
-
-
-def test_every_quality_works_and_higher_quality_uses_larger_inputs():
-    assert list(QUALITIES) == ["draft", "standard"]
-    largest = {}
-    photo = Photo.from_array(random_image(900, 1200), encoding="srgb")
-    for quality in QUALITIES:
-        sizes = []
-        Separator(lambda tile, sizes=sizes: sizes.append(tile.size) or identity_backend(tile))(
-            photo, quality=quality
-        )
-        largest[quality] = max(sizes)
-    assert largest["draft"] < largest["standard"]
 
 
 @pytest.mark.slow
