@@ -61,14 +61,6 @@ def plane_radiance(folder, name, data, **values):
     return Assets([folder]).plane_radiance(plane)
 
 
-def check_message(error, name, *words):
-    """Checks that the message has three parts and contains the name of the file and the words."""
-    message = str(error.value)
-    assert name in message
-    assert message.count("; ") >= 2
-    assert all(word in message for word in words), message
-
-
 def test_a_map_has_the_mean_luminance_of_the_scene(folder, rng):
     texels = sky(rng)
     light = map_radiance(folder, "sky.exr", exr_of(texels * 37), luminance=2.5)
@@ -120,11 +112,10 @@ def test_another_file_of_the_same_name_is_refused(folder, rng):
     correct, wrong = hashlib.sha256(data).hexdigest(), hashlib.sha256(b"").hexdigest()
     assets = Assets([folder])
     assets.map_radiance(EnvironmentMap(source=AssetSource(file="sky.hdr", sha256=correct)))
-    with pytest.raises(RecipeError, match="not the file that was chosen when the scene was sampled") as error:
+    with pytest.raises(RecipeError, match="not the file that was chosen when the scene was sampled"):
         assets.map_radiance(
             EnvironmentMap(source=AssetSource(file="sky.hdr", sha256=wrong))
         )  # the cached map of the other file is not used
-    check_message(error, str(folder / "sky.hdr"), wrong)
 
 
 def test_the_folder_with_the_right_file_is_found(tmp_path, folder, rng):
@@ -161,18 +152,16 @@ BAD_MAPS = {
 
 @pytest.mark.parametrize("name", BAD_MAPS)
 def test_a_map_that_cannot_light_a_scene_is_refused_by_name(folder, rng, name):
-    with pytest.raises(PhotoError) as error:
+    with pytest.raises(PhotoError, match=name):
         map_radiance(folder, name, BAD_MAPS[name](sky(rng)))
-    check_message(error, name)
 
 
 def test_an_ordinary_photo_saved_as_a_map_is_refused(folder, rng):
     """The maximum of an HDR map is in few texels, but here it is in an eighth of them."""
     encoded = (sky(rng) / 2).clip(0, 1)
     encoded[:4] = 1
-    with pytest.raises(UnsupportedPhoto, match="clipped") as error:
+    with pytest.raises(UnsupportedPhoto, match="clipped"):
         map_radiance(folder, "photo.hdr", hdr_of(to_linear(encoded)))
-    check_message(error, "photo.hdr", "use the image as a picture")
 
 
 def test_a_picture_has_the_mean_luminance_of_the_scene(folder):

@@ -219,13 +219,8 @@ def test_the_base_and_the_device_of_a_lora_are_checked(lora, tmp_path):
         load_pipeline(str(lora), base_model="tiny:klein")
     with pytest.raises(DeviceError, match="do not run on coreml; expected one of auto, cuda, rocm, cpu"):
         load_pipeline(str(lora), device="coreml")
-    with pytest.raises(ModelError, match=f"contains no model; expected a LoRA .{LORA_FILE}"):
-        load_pipeline(str(tmp_path))
     (tmp_path / "adapter_model.safetensors").touch()
-    with pytest.raises(ModelError, match=r"contains adapter_model\.safetensors, in an unknown layout"):
-        load_pipeline(str(tmp_path))
-    (tmp_path / "adapter_config.json").touch()
-    with pytest.raises(ModelError, match=r"in the layout of peft; .*: brewster models import .* FOLDER"):
+    with pytest.raises(ModelError, match="brewster models import"):
         load_pipeline(str(tmp_path))
 
 

@@ -2,7 +2,6 @@
 
 import hashlib
 import json
-import shutil
 
 import huggingface_hub
 import pytest
@@ -114,18 +113,10 @@ def test_a_message_and_a_card_with_the_path_of_a_home_folder_are_refused(write_l
         plan_push(folder, REPO)
 
 
-def test_damaged_files_and_another_prompt_are_refused(write_lora):
-    folder = write_lora()
-    (folder / "recipe.json").write_text("{")
-    with pytest.raises(ModelError, match="is not JSON"):
-        plan_push(folder, REPO)
+def test_another_prompt_is_refused(write_lora):
     folder = write_lora()
     tiny("kontext", seed=8)[1].save(folder / "prompt.safetensors")
     with pytest.raises(ModelError, match="not the prompt with which the LoRA was trained"):
-        plan_push(folder, REPO)
-    whole = (folder / LORA_FILE).read_bytes()
-    (folder / LORA_FILE).write_bytes(whole[:1000])
-    with pytest.raises(ModelError, match="cannot be read"):
         plan_push(folder, REPO)
 
 
@@ -180,14 +171,7 @@ def test_the_command_sends_and_prints_the_address(run_without_model, write_lora,
     assert "error: the hub refused the token" in err
 
 
-def test_the_card_of_a_folder_is_printed_and_scores_are_added(run_without_model, write_lora, tmp_path):
+def test_the_card_of_a_folder_is_printed(run_without_model, write_lora):
     folder = write_lora()
     code, out, _ = run_without_model("models", "card", folder)
     assert (code, out.decode()) == (0, (folder / "README.md").read_text() + "\n")
-    (tmp_path / "half.json").write_text('{"metrics": {}}')
-    assert run_without_model("models", "card", folder, "--scores", tmp_path / "half.json")[0] == 1
-    shutil.rmtree(folder)
-    folder.mkdir()
-    code, _, err = run_without_model("models", "card", folder)
-    assert code == 1
-    assert "README.md cannot be read" in err

@@ -8,7 +8,6 @@ import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from brewster.errors import RecipeError
-from brewster.training.compact.trainer import CompactTrainer
 from brewster.training.loop import IMAGE_TAG, Checkpoint, TensorBoardLog, run
 from brewster.training.recipe import with_value
 from training_helpers import Killed, ignore_step, kill_after, train
@@ -38,11 +37,6 @@ class CountingTrainer:
 
     def export(self, folder):
         return folder
-
-
-def initial_checkpoint(recipe):
-    """Returns the checkpoint before the first step."""
-    return Checkpoint(0, recipe.model_dump_json(), CompactTrainer(recipe).state_dict())
 
 
 def logged_steps(out):

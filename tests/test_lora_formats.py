@@ -234,6 +234,15 @@ def test_a_lora_of_peft_without_its_settings_needs_its_alpha(prefix, tmp_path):
         read_layers(path, backbone, alpha=4)
 
 
+def test_the_alphas_of_a_file_win_over_the_settings_next_to_it(tmp_path):
+    name, path = f"{BLOCK}attn.to_q", tmp_path / "lora.safetensors"
+    pair = weights("qwen", original=False)[name]
+    save_file(kohya({name: pair}, alpha=3.0), path)
+    (tmp_path / "adapter_config.json").write_text(json.dumps({"lora_alpha": 8}))
+    found = read_layers(path, tiny("qwen", seed=1)[0])[f"{name}.lora_B.weight"]
+    torch.testing.assert_close(found, 3 / len(pair[0]) * pair[1])
+
+
 def test_rank_stabilised_loras_have_their_own_scale():
     assert scaling_from_config({"lora_alpha": 8, "use_rslora": True})("x", 4) == 4
     assert scaling_from_config({"lora_alpha": 8})("x", 4) == 2

@@ -13,7 +13,7 @@ import pytest
 
 from brewster.errors import DeviceError
 from brewster.executors import ray_cluster
-from brewster.executors.local import run_tasks
+from brewster.executors.local import ProcessExecutor, run_tasks
 from brewster.rendered.generation.job import RenderTask
 from brewster.rendered.generation.workers import TaskRunner
 from set_folders import hashes, render_set
@@ -68,6 +68,15 @@ def run_in_process(code, *args):
         check=False,
         timeout=300,
     )
+
+
+def test_ray_tries_a_task_as_often_as_a_pool_of_processes(monkeypatch):
+    options = {}
+    client = SimpleNamespace(init=lambda *_, **__: None, put=id, shutdown=lambda: None)
+    client.remote = lambda **given: options.update(given) or id
+    monkeypatch.setattr(ray_cluster, "_ray", lambda: client)
+    with ray_cluster.RayExecutor(partial(TaskRunner, None)) as executor:
+        assert executor.attempts * (options["max_retries"] + 1) == ProcessExecutor.attempts
 
 
 class UnpicklableError(Exception):

@@ -132,16 +132,10 @@ def test_guidance_without_an_empty_prompt_is_refused_with_a_hint(tiny_model):
     )
 
 
-@pytest.mark.parametrize(
-    "error",
-    [
-        MemoryError(),
-    ],
-)
-def test_out_of_memory_errors_say_what_to_reduce(tiny_model, monkeypatch, error):
+def test_out_of_memory_is_the_error_of_a_device(tiny_model, monkeypatch):
     def raise_error(*_, **__):
-        raise error
+        raise MemoryError
 
     monkeypatch.setattr(tiny_model[0], "predict", raise_error)
-    with pytest.raises(DeviceError, match="fewer bits"):
+    with pytest.raises(DeviceError):
         sample_with_brewster(tiny_model, image_8bit(*SIZE))
