@@ -201,23 +201,6 @@ def test_a_black_picture_is_dark_and_finite(folder):
     assert not light.any()
 
 
-def test_the_cache_has_a_maximum_size_and_keeps_the_most_recently_used_maps(folder, rng, monkeypatch):
-    one = sky(rng).nbytes
-    monkeypatch.setattr(assets_module, "_MAX_CACHE_BYTES", 2 * one)
-    opened = []
-    monkeypatch.setattr(Photo, "open", classmethod(lambda _cls, data: opened.append(data) or _original(data)))
-    for name in "abc":
-        (folder / f"{name}.hdr").write_bytes(hdr_of(sky(rng)))
-    assets = Assets([folder])
-
-    def read(name):
-        before = len(opened)
-        assets.map_radiance(EnvironmentMap(source=AssetSource(file=f"{name}.hdr")))
-        return len(opened) - before
-
-    assert [read(name) for name in "ababacacb"] == [1, 1, 0, 0, 0, 1, 0, 0, 1]
-
-
 def test_the_luminance_of_the_scene_does_not_change_the_cached_map(folder, rng):
     (folder / "a.hdr").write_bytes(hdr_of(sky(rng)))
     assets = Assets([folder])
@@ -226,6 +209,3 @@ def test_the_luminance_of_the_scene_does_not_change_the_cached_map(folder, rng):
         for value in (8, 0.5)
     )
     np.testing.assert_allclose(bright, 16 * dim, rtol=1e-6)
-
-
-_original = Photo.open

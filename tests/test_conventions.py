@@ -18,6 +18,7 @@ import brewster.inference
 import brewster.photo
 from brewster.cli import cli
 from brewster.inference.tiles import run_tiled
+from other_processes import finished
 
 ROOT = Path(__file__).parents[1]
 SOURCE = ROOT / "src" / "brewster"
@@ -35,21 +36,14 @@ def all_functions():
 
 
 def test_packages_import_only_from_lower_layers():
-    process = subprocess.run(
-        [Path(sys.executable).with_name("lint-imports")],
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    process = finished([Path(sys.executable).with_name("lint-imports")], cwd=ROOT)
     assert process.returncode == 0, process.stdout
 
 
 @pytest.mark.parametrize("command", [["-c", "import brewster"], ["-m", "brewster", "--help"]])
 def test_import_and_help_load_no_heavy_library(command):
-    process = subprocess.run(
-        [sys.executable, "-X", "importtime", *command], capture_output=True, text=True, check=True
-    )
+    process = finished([sys.executable, "-X", "importtime", *command])
+    assert process.returncode == 0
     imported = {line.split("|")[-1].strip().split(".")[0] for line in process.stderr.splitlines()}
     assert not imported & HEAVY_LIBRARIES
 
@@ -99,13 +93,10 @@ separator: brewster.Separator = brewster.Separator.load("compact")
 brewster.Separater.load("compact")
 brewster.separate()
 """)
-    process = subprocess.run(
+    process = finished(
         [Path(sys.executable).with_name("mypy"), "--follow-imports=silent", "--strict", "user.py"],
         cwd=tmp_path,
         env=os.environ | {"MYPYPATH": str(SOURCE.parent)},
-        capture_output=True,
-        text=True,
-        check=False,
     )
     errors = [line.partition("error: ")[2] for line in process.stdout.splitlines() if "error: " in line]
     assert len(errors) == 2, process.stdout

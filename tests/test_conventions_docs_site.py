@@ -1,11 +1,12 @@
 """The documentation site builds offline and without warnings, and contains every public name of the Python API."""
 
 import os
-import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+
+from other_processes import finished
 
 ROOT = Path(__file__).parents[1]
 
@@ -14,13 +15,10 @@ ROOT = Path(__file__).parents[1]
 def site(tmp_path_factory):
     """Builds the site. Returns its folder."""
     out = tmp_path_factory.mktemp("site")
-    process = subprocess.run(
+    process = finished(
         [sys.executable, "-m", "mkdocs", "build", "--strict", "--quiet", "--site-dir", str(out)],
         cwd=ROOT,
         env={**os.environ, "NO_MKDOCS_2_WARNING": "1"},
-        capture_output=True,
-        text=True,
-        check=False,
     )
     assert (process.returncode, process.stderr) == (0, "")
     return out

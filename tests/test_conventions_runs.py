@@ -20,6 +20,7 @@ from brewster.evaluate.ablation import read_study
 from brewster.evaluate.protocols import protocol_config
 from brewster.models.diffusion.adapter.hub import FILES
 from brewster.photo import Photo
+from other_processes import finished
 
 ROOT = Path(__file__).parents[1]
 RUNS = ROOT / "runs"
@@ -31,12 +32,9 @@ PAPER_FOLDERS = ("photos", "pairs/real", "pairs/nature", "real20", "nature20", "
 
 def run_script(script, *args, path=BIN, code=0, **variables):
     """Runs a script, by default of runs/, in its own process. Returns its output, or its messages if it must fail."""
-    process = subprocess.run(
+    process = finished(
         [RUNS / script, *map(str, args)],
         env=os.environ | {"PATH": f"{path}:{os.environ['PATH']}"} | variables,
-        capture_output=True,
-        text=True,
-        check=False,
     )
     assert process.returncode == code, process.stderr
     return process.stderr if code else process.stdout

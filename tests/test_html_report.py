@@ -1,7 +1,6 @@
 import base64
 import json
 import re
-import weakref
 from copy import deepcopy
 from dataclasses import replace
 from html.parser import HTMLParser
@@ -282,18 +281,3 @@ def test_cases_are_sorted_and_filtered_and_an_image_is_compared_with_another(chr
     assert not page.locator("dialog").is_visible()
     page.close()
     assert not failures
-
-
-def test_cases_are_read_and_freed_one_at_a_time(tmp_path):
-    alive = []
-
-    def cases():
-        for number in range(6):
-            assert sum(case() is not None for case in alive) <= 1  # the case that was just written
-            case = make_thumbnails(f"{number}")
-            alive.append(weakref.ref(case))
-            yield case
-            del case
-
-    write_report(results([*"012345"]), cases(), tmp_path / "report.html")
-    assert len(alive) == 6

@@ -5,15 +5,6 @@ import sys
 
 import pytest
 
-from brewster.errors import MissingExtra
-from brewster.models.diffusion.lazy_imports import import_library
-
-
-def test_a_missing_library_names_the_extra(monkeypatch):
-    monkeypatch.setitem(sys.modules, "peft", None)
-    with pytest.raises(MissingExtra, match=r"pip install -c constraints.txt -e '\.\[diffusion\]'"):
-        import_library("peft")
-
 
 def test_libraries_are_imported_when_a_model_is_built_and_print_nothing(tmp_path):
     code = f"""

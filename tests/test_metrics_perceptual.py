@@ -111,12 +111,6 @@ def test_the_channel_weights_are_the_published_ones():
     assert sums == "718a8b40b0d22f96192d34ab93c0db5c7943558ff6c2407f44812dce2f29b5f4"
 
 
-@pytest.mark.parametrize("size", [(30, 90), (90, 30)])
-def test_an_image_that_is_too_small_for_alexnet_is_refused(metric, size):
-    with pytest.raises(ValueError, match=f"at least 31x31 pixels, not {size[0]}x{size[1]}"):
-        metric.features(np.zeros((*size, 3), np.uint8))
-
-
 @pytest.fixture
 def server():
     with served() as files:

@@ -1,13 +1,12 @@
 """The choice of the LLVM that compiles Mitsuba's kernels; each import runs in a separate process."""
 
 import os
-import subprocess
 import sys
 
 import pytest
 
-from brewster.errors import MissingExtra
 from brewster.render.mitsuba import variant
+from other_processes import finished
 
 TRACING_PROGRAM = """
 import warnings
@@ -35,13 +34,7 @@ except DeviceError as error:
 def run_program(program, **variables):
     """Runs a Python program with additional environment variables. Returns the finished process."""
     folders = os.pathsep.join((os.path.dirname(__file__), os.environ.get("PYTHONPATH", "")))  # noqa: PTH120
-    return subprocess.run(
-        [sys.executable, "-c", program],
-        env={**os.environ, "PYTHONPATH": folders, **variables},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    return finished([sys.executable, "-c", program], env={**os.environ, "PYTHONPATH": folders, **variables})
 
 
 @pytest.mark.parametrize("name", ["/nonexistent", "libm.so.6"])
@@ -91,13 +84,6 @@ def test_known_good_llvm_versions_are_tried_first(tmp_path, monkeypatch):
         (tmp_path / name).touch()
     names = [path and path.rpartition("/")[2] for path in variant._candidates()]
     assert names == ["libLLVM.so.19.1", "libLLVM-18.so.1", "libLLVM.so.21.0", None]
-
-
-def test_a_missing_mitsuba_is_reported_with_its_install_command(monkeypatch):
-    variant.probe.cache_clear()
-    monkeypatch.setitem(sys.modules, "mitsuba", None)
-    with pytest.raises(MissingExtra, match=r"-e '\.\[render\]'"):
-        variant.load()
 
 
 def test_a_missing_libatomic_is_reported_with_its_install_command(mitsuba, tmp_path):

@@ -1,7 +1,6 @@
 """Rendering on a Ray cluster, also if a node is lost. Ray runs in separate processes, as tests may open no connections."""
 
 import os
-import subprocess
 import sys
 import threading
 from concurrent.futures import Future
@@ -16,6 +15,7 @@ from brewster.executors import ray_cluster
 from brewster.executors.local import ProcessExecutor, run_tasks
 from brewster.rendered.generation.job import RenderTask
 from brewster.rendered.generation.workers import TaskRunner
+from other_processes import finished
 from set_folders import hashes, render_set
 
 TESTS = Path(__file__).parent
@@ -60,14 +60,7 @@ def run_in_process(code, *args):
     """Runs code in a process. The nodes of Ray import the fake renderer from PYTHONPATH."""
     paths = os.pathsep.join([str(TESTS), os.environ.get("PYTHONPATH", "")])
     environment = {**os.environ, "PYTHONPATH": paths, "RAY_USAGE_STATS_ENABLED": "0"}
-    return subprocess.run(
-        [sys.executable, "-c", code, *map(str, args)],
-        env=environment,
-        capture_output=True,
-        text=True,
-        check=False,
-        timeout=300,
-    )
+    return finished([sys.executable, "-c", code, *map(str, args)], env=environment, timeout=300)
 
 
 def test_ray_tries_a_task_as_often_as_a_pool_of_processes(monkeypatch):

@@ -5,7 +5,7 @@ import torch
 from diffusers.pipelines.qwenimage import pipeline_qwenimage_edit
 from PIL import Image
 
-from brewster.errors import DeviceError, ModelError
+from brewster.errors import ModelError
 from brewster.models.diffusion.backbones.registry import BACKBONES, tiny
 from brewster.models.diffusion.prompt import PromptEmbedding
 from brewster.models.diffusion.sampling import sample
@@ -130,12 +130,3 @@ def test_guidance_without_an_empty_prompt_is_refused_with_a_hint(tiny_model):
     assert (
         sample_with_brewster((backbone, without_negative), image_8bit(*SIZE), guidance=1.0).isfinite().all()
     )
-
-
-def test_out_of_memory_is_the_error_of_a_device(tiny_model, monkeypatch):
-    def raise_error(*_, **__):
-        raise MemoryError
-
-    monkeypatch.setattr(tiny_model[0], "predict", raise_error)
-    with pytest.raises(DeviceError):
-        sample_with_brewster(tiny_model, image_8bit(*SIZE))

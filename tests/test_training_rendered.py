@@ -121,15 +121,6 @@ def test_samples_that_were_read_are_cached_within_the_memory_limit(folder, monke
         small(0, 20, 32)
 
 
-def test_a_cached_sample_is_rendered_once_per_size():
-    source = FakeOnline()
-    stream = CachedRendered(source, 3, seed=1)
-    for step in range(10):
-        stream(step, 4, 8)
-        stream(step, 4, 16)
-    assert sorted(source.rendered) == [(index, size) for index in range(3) for size in (8, 16)]
-
-
 def test_a_cached_sample_is_mirrored_at_random():
     batch = CachedRendered(FakeOnline(), 1, seed=1)(0, 16, 8)
     whole = FakeOnline().layers(0, 8)
