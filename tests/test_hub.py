@@ -113,6 +113,14 @@ def test_a_message_and_a_card_with_the_path_of_a_home_folder_are_refused(write_l
         plan_push(folder, REPO)
 
 
+@pytest.mark.parametrize("name", FILES)
+def test_a_missing_file_is_named(write_lora, name):
+    folder = write_lora()
+    (folder / name).unlink()
+    with pytest.raises(ModelError, match=name):
+        plan_push(folder, REPO)
+
+
 def test_another_prompt_is_refused(write_lora):
     folder = write_lora()
     tiny("kontext", seed=8)[1].save(folder / "prompt.safetensors")

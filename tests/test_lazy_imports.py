@@ -3,7 +3,38 @@
 import subprocess
 import sys
 
+import huggingface_hub
 import pytest
+from huggingface_hub import errors as hub_errors
+
+from brewster.errors import DownloadError
+from brewster.models.diffusion.backbones.loading import load_backbone
+
+
+def hub_error(error_class, status):
+    """An error as huggingface_hub raises it for this status."""
+    httpx = sys.modules[hub_errors.Response.__module__.split(".")[0]]
+    request = httpx.Request("GET", "https://huggingface.co/api/models/owner/name")
+    return error_class(f"{status} Client Error.", response=httpx.Response(status, request=request))
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        hub_error(hub_errors.GatedRepoError, 403),
+        hub_error(hub_errors.HfHubHTTPError, 503),
+        OSError(28, "No space left on device"),
+        hub_errors.LocalEntryNotFoundError("no network"),
+        hub_errors.OfflineModeIsEnabled("HF_HUB_OFFLINE"),
+    ],
+)
+def test_an_error_of_the_hub_is_an_error_of_the_download_that_names_the_model(monkeypatch, error):
+    def refuse(*_, **__):
+        raise error
+
+    monkeypatch.setattr(huggingface_hub, "snapshot_download", refuse)
+    with pytest.raises(DownloadError, match=r"black-forest-labs/FLUX\.1-Kontext-dev"):
+        load_backbone("kontext")
 
 
 def test_libraries_are_imported_when_a_model_is_built_and_print_nothing(tmp_path):
