@@ -7,7 +7,8 @@ from pathlib import Path
 import pytest
 
 from brewster import Photo, Separator
-from brewster.batch import SeparationTask, separate_files, separate_tasks
+from brewster.batch import SeparationTask, plan_files, separate_files, separate_tasks
+from brewster.errors import OutputError, PhotoError
 from brewster.options import Options
 from cli_helpers import LAYERS, image_bytes, layer_files, list_files
 
@@ -56,6 +57,17 @@ def test_finished_photos_are_skipped_without_a_model_and_missing_layers_are_adde
     assert (tmp_path / "a.transmission.jpg").read_bytes() == b"existing file"
     list(separate_files(tmp_path, separator=separator, overwrite=True))
     assert Photo.open(tmp_path / "a.transmission.jpg").size == (60, 40)
+
+
+def test_names_and_sources_are_checked_before_the_first_photo_is_separated(tmp_path):
+    for name in ("x", "y", "empty"):
+        (tmp_path / name).mkdir()
+    for name in ("x", "y"):
+        (tmp_path / name / "a.jpg").write_bytes(image_bytes())
+    with pytest.raises(OutputError, match="would both be written"):
+        separate_files([tmp_path / "x/a.jpg", tmp_path / "y/a.jpg"], tmp_path / "out")
+    with pytest.raises(PhotoError, match="there is no photo in"):
+        plan_files(tmp_path / "empty")
 
 
 def test_a_photo_is_separated_when_its_result_is_requested(photo_folder, tmp_path, separator):

@@ -121,6 +121,16 @@ def test_a_missing_file_is_named(write_lora, name):
         plan_push(folder, REPO)
 
 
+@pytest.mark.parametrize(
+    "front_matter", ["", "---\nlicense: mit\nlibrary_name: x\n---\n", "---\nlicense: [\n---\n"]
+)
+def test_a_card_without_valid_front_matter_is_refused(write_lora, front_matter):
+    folder = write_lora()
+    (folder / "README.md").write_text(f"{front_matter}# A card\n")
+    with pytest.raises(ModelError, match="front matter"):
+        plan_push(folder, REPO)
+
+
 def test_another_prompt_is_refused(write_lora):
     folder = write_lora()
     tiny("kontext", seed=8)[1].save(folder / "prompt.safetensors")

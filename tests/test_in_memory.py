@@ -106,6 +106,14 @@ def test_integers_are_srgb_encoded_by_default_and_floats_need_an_encoding():
         SEPARATOR(smooth() / 255)
 
 
+def test_channels_first_are_refused_with_the_way_out():
+    with pytest.raises(UnsupportedPhoto, match=r"array\.transpose\(1, 2, 0\)"):
+        SEPARATOR(smooth().transpose(2, 0, 1))
+    tensor = pytest.importorskip("torch").zeros(3, 4, 5)
+    with pytest.raises(TypeError, match=r"permute\(1, 2, 0\)"):
+        Photo.open(tensor)
+
+
 def test_the_quality_of_lossy_files_can_be_chosen():
     photo = Photo.open(file_of(np.random.default_rng(0).integers(0, 256, (64, 64, 3), np.uint8), "PNG"))
     for format_name in ("jpeg", "webp", "avif"):

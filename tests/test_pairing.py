@@ -14,6 +14,7 @@ from brewster.benchmarks.pairing import (
     ROLES,
     FolderListing,
     find_roles,
+    find_split,
     find_subsets,
     list_folder,
     natural_key,
@@ -104,6 +105,15 @@ def test_system_files_are_ignored_silently_and_other_files_with_a_remark(tmp_pat
     (remark,) = read_folders(tmp_path).remarks
     assert remark == "ignored blended/README.txt, transmission_layer/old and licence.md"
     assert names(read_folders(tmp_path)) == ["a"]
+
+
+def test_a_split_is_the_folder_itself_or_the_only_one_in_it(tmp_path):
+    repacked(tmp_path / "val", ["a"])
+    (tmp_path / "other").mkdir()
+    assert find_split(tmp_path) == find_split(tmp_path / "val") == tmp_path / "val"
+    repacked(tmp_path / "test", ["a"])
+    with pytest.raises(PhotoError, match=r"has pairs in the subfolders test and val; .*, for example .*test"):
+        find_split(tmp_path)
 
 
 def test_the_original_folders_of_sir2_give_one_group_per_shot(tmp_path):

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 from PIL import Image
 
-from brewster.errors import OutputError, UnreadablePhoto, UnsupportedPhoto
+from brewster.errors import OutputError, PhotoError, UnreadablePhoto, UnsupportedPhoto
 from brewster.image_formats import FORMATS
 from brewster.photo import FileInfo, Photo
 from picture_files import exif_block, file_of, pil, smooth
@@ -188,6 +188,20 @@ def test_a_file_with_a_general_brand_is_recognised_by_its_content(format_name, b
     again = Photo.open(data[:8] + brand + data[12:])
     assert again.file_info.format_name == format_name
     assert np.array_equal(again.pixels, Photo.open(data).pixels)
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.float32])
+def test_an_unknown_encoding_is_refused(dtype):
+    for create in (Photo.open, Photo.from_array):
+        with pytest.raises(PhotoError, match=r"'sRGB'; .*; pass encoding"):
+            create(smooth().astype(dtype), encoding="sRGB")
+
+
+def test_an_encoding_is_refused_for_sources_other_than_arrays():
+    data = file_of(smooth(), "PNG")
+    for source in (data, "a.png", pil(data), Photo.open(data)):
+        with pytest.raises(PhotoError, match="expected no encoding"):
+            Photo.open(source, encoding="srgb")
 
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.float64])

@@ -216,6 +216,17 @@ def test_after_five_failures_in_a_row_no_further_map_is_requested(haven, tmp_pat
     assert len(list(pull(DownloadRequest(server=haven.url), tmp_path))) == 9
 
 
+@pytest.mark.parametrize("body", [b"<html>", b"", b"\xff", b"[" * 100_000, b"[]", b"null"])
+def test_a_response_that_is_no_json_object_is_reported(haven, fetch, body):
+    haven.faults["/files/a_room"] = [body]
+    found = fetch(indoor=2)
+    assert statuses(found) == [("a_room", "failed"), ("atrium", "downloaded")]
+    assert "the response of http://" in found[0].error
+    haven.faults["/assets"] = [body]
+    with pytest.raises(DownloadError, match="the response of http://"):
+        fetch()
+
+
 def test_json_that_was_cut_is_requested_again(haven, fetch, monkeypatch):
     haven.assets |= {f"z{i}": {"tags": ["x" * 1000]} for i in range(99)}
     haven.faults["/assets"] = ["cut"]

@@ -7,6 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from brewster import Photo, Separator
+from brewster.errors import BrewsterError
 from brewster.inference import QUALITIES
 from brewster.inference.guided_upsampling import GeneratedOverride
 from brewster.inference.predictor import Prediction, Predictor
@@ -149,6 +150,12 @@ def test_every_kind_of_source_gives_the_same_transmission(separator, path):
     transmissions = [separator(source, quality="draft").transmission.pixels for source in sources]
     for transmission in transmissions:
         assert (transmission == transmissions[0]).all()
+
+
+@pytest.mark.parametrize("options", [{"strength": 1.5}, {"strength": -1}, {"quality": "best"}])
+def test_options_out_of_range_are_refused(options):
+    with pytest.raises(BrewsterError):
+        Separator(identity_backend)(Photo.from_array(random_image(4, 4), encoding="srgb"), **options)
 
 
 @pytest.mark.slow

@@ -1,6 +1,7 @@
 """Creating a study: pairing, errors, and names and files that do not reveal the method of a picture."""
 
 import hashlib
+import json
 import re
 
 import numpy as np
@@ -94,6 +95,19 @@ def test_all_problems_of_the_files_are_listed_at_once_and_nothing_is_written(tmp
     assert sorted(path.name for path in tmp_path.iterdir()) == ["RDNet", "inputs", "ours"]
 
 
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"datasets": ("wild",)}, "no dataset 'wild'"),
+        ({"pairs": 5}, "5 pairs .* at most 4"),
+        ({"catch_trials": 5}, "5 catch trials .* at most 4"),
+    ],
+)
+def test_options_beyond_the_available_pictures_are_refused(tmp_path, folders, options, message):
+    with pytest.raises(BrewsterError, match=message):
+        create_study(tmp_path / "study", *folders, **options)
+
+
 def test_a_study_is_never_overwritten(tmp_path, folders):
     create_study(tmp_path / "study", *folders)
     with pytest.raises(OutputError, match="is not empty"):
@@ -105,6 +119,21 @@ def test_a_changed_picture_is_detected(tmp_path):
     study.picture_file(study.description.comparisons[0].outputs[0]).write_bytes(b"other")
     with pytest.raises(BrewsterError, match="missing or changed"):
         study.verify_pictures()
+
+
+def test_an_invalid_description_is_refused_with_the_key_of_the_error(tmp_path):
+    with pytest.raises(BrewsterError, match="cannot be read"):
+        read_study(tmp_path)
+    study = make_study(tmp_path)
+    text = json.loads((study.folder / "study.json").read_text())
+    for change, message in (
+        ({"pairs": "many"}, "pairs is 'many'; expected an integer"),
+        ({"unknown": 1}, "there is no field unknown"),
+        ({"format": 1}, "format 1"),
+    ):
+        (study.folder / "study.json").write_text(json.dumps(text | change))
+        with pytest.raises(BrewsterError, match=message):
+            read_study(study.folder)
 
 
 def test_catch_pictures_are_clearly_degraded_outputs(tmp_path):

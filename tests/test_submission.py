@@ -9,6 +9,7 @@ import pytest
 from benchmark_folders import paint
 from brewster import Photo
 from brewster.benchmarks.registry import read_benchmark
+from brewster.errors import PhotoError
 from brewster.evaluate.methods import IdentityBaseline, PredictionFolder
 from brewster.evaluate.submission import export_ntire2026
 
@@ -49,3 +50,11 @@ def test_predictions_of_a_folder_are_packed(openrr, tmp_path):
     paths = export_ntire2026(openrr, PredictionFolder("theirs", tmp_path / "theirs"), tmp_path / "out")
     with zipfile.ZipFile(io.BytesIO(paths[0].read_bytes())) as archive:
         assert (abs(Photo.open(archive.read("7.jpg")).pixels.astype(int) - 77) <= 1).all()
+
+
+def test_a_missing_prediction_and_another_layout_are_errors(openrr, tmp_path):
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(PhotoError, match="no prediction for openrr"):
+        export_ntire2026(openrr, PredictionFolder("none", tmp_path / "empty"), tmp_path / "out")
+    with pytest.raises(PhotoError, match="no folder such as val_300_blended"):
+        export_ntire2026(tmp_path / "empty", IdentityBaseline(), tmp_path / "out")
