@@ -135,7 +135,7 @@ def subcommands(command):
         yield from subcommands(child)
 
 
-def test_every_message_has_three_parts_and_names_options_that_exist():
+def test_every_message_has_three_parts_and_names_options_and_commands_that_exist():
     """What happened, what was expected, and what to do. Tests of single errors assert the class and a key part."""
     errors = {name for name, value in vars(brewster.errors).items() if inspect.isclass(value)}
     options = {
@@ -152,8 +152,11 @@ def test_every_message_has_three_parts_and_names_options_that_exist():
         if isinstance(parts[0], ast.Starred):
             continue
         assert len(parts) >= 3, place
-        for option in re.findall(r"(?<![\w-])--[a-z]\w[\w-]*", ast.unparse(parts[1]) + ast.unparse(parts[2])):
+        advice = ast.unparse(parts[1]) + ast.unparse(parts[2])
+        for option in re.findall(r"(?<![\w-])--[a-z]\w[\w-]*", advice):
             assert option in options, f"{place}: {option}"
+        for group, command in re.findall(r"\bbrewster (models|study|assets) ([a-z]+)", advice):
+            assert command in cli.commands[group].commands, f"{place}: {command}"
 
 
 def test_signatures_stay_small():
