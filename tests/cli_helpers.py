@@ -13,22 +13,26 @@ from brewster import Photo
 LAYERS = ("transmission", "reflection")
 
 
-def write_pane(path):
-    """Writes an ONNX model whose transmission is 80 % and whose reflection is 20 % of the photo. Returns its path."""
-    shape = [1, 3, "height", "width"]
-    shares = {"transmission": 0.8, "reflection": 0.2}
-    graph = helper.make_graph(
-        [helper.make_node("Mul", ["photo", f"{name}_share"], [name]) for name in shares],
-        "pane",
-        [helper.make_tensor_value_info("photo", TensorProto.FLOAT, shape)],
-        [helper.make_tensor_value_info(name, TensorProto.FLOAT, shape) for name in shares],
-        [
-            helper.make_tensor(f"{name}_share", TensorProto.FLOAT, [], [share])
-            for name, share in shares.items()
-        ],
-    )
+def write_onnx(path, nodes, constants, **channels):
+    """Writes an ONNX model from `photo`, and other inputs with these channels, to the two layers. Returns its path."""
+
+    def image(name, count=3):
+        return helper.make_tensor_value_info(name, TensorProto.FLOAT, [1, count, "height", "width"])
+
+    inputs = [image("photo"), *(image(name, count) for name, count in channels.items())]
+    initializers = [onnx.numpy_helper.from_array(value, name) for name, value in constants.items()]
+    graph = helper.make_graph(nodes, path.stem, inputs, [image(name) for name in LAYERS], initializers)
     onnx.save(helper.make_model(graph, opset_imports=[helper.make_opsetid("", 18)], ir_version=10), path)
     return path
+
+
+def write_pane(path):
+    """Writes an ONNX model whose transmission is 80 % and whose reflection is 20 % of the photo. Returns its path."""
+    nodes = [helper.make_node("Mul", ["photo", f"{name}_share"], [name]) for name in LAYERS]
+    shares = {
+        f"{name}_share": np.array(share, np.float32) for name, share in zip(LAYERS, (0.8, 0.2), strict=True)
+    }
+    return write_onnx(path, nodes, shares)
 
 
 def image_bytes(width=60, height=40, format_name="jpeg", seed=1):

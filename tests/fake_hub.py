@@ -8,11 +8,10 @@ from file_server import on_loopback
 
 
 class Hub:
-    """The state of the hub: repositories, the valid token, and the errors to return (`refusals`: part of a path -> status)."""
+    """The state of the hub: repositories, the valid token, and the paths of all requests."""
 
     def __init__(self, url):
-        self.url, self.token, self.refusals, self.requests = url, "hf_right", {}, []
-        self.returns_html = False
+        self.url, self.token, self.requests = url, "hf_right", []
         self.repos, self.private, self.messages = {}, {}, []
 
     def create(self, body):
@@ -33,9 +32,6 @@ class Hub:
 
     def respond(self, path, body):
         """Returns the status and the JSON value of the response to a request."""
-        statuses = [status for part, status in self.refusals.items() if part in path]
-        if statuses:
-            return statuses[0], {"error": "refused"}
         if path == "/api/repos/create":
             return self.create(json.loads(body))
         if path == "/api/validate-yaml":
@@ -59,7 +55,7 @@ class _Handler(BaseHTTPRequestHandler):
         hub.requests.append(path)
         is_authorised = self.headers["Authorization"] == f"Bearer {hub.token}"
         status, value = hub.respond(path, body) if is_authorised else (401, {"error": "Invalid token"})
-        data = b"<html>" if hub.returns_html else json.dumps(value).encode()
+        data = json.dumps(value).encode()
         self.send_response(status)
         self.send_header("Content-Type", "application/json")
         self.send_header("Content-Length", str(len(data)))

@@ -21,6 +21,11 @@ def started(command, **kwargs):
             process.kill()
 
 
+def finished(command, **kwargs):
+    """Runs a process to its end; its output is text."""
+    return subprocess.run([*map(str, command)], capture_output=True, text=True, check=False, **kwargs)
+
+
 def _restore_sigint():
     signal.signal(signal.SIGINT, signal.SIG_DFL)
 

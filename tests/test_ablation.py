@@ -12,7 +12,7 @@ from PIL import Image
 
 from benchmark_folders import paint
 from brewster.benchmarks.registry import read_benchmark
-from brewster.errors import DownloadError, RecipeError
+from brewster.errors import DownloadError
 from brewster.evaluate import ablation as module
 from brewster.evaluate.ablation import ablate, read_study
 from brewster.metrics import METRICS
@@ -40,22 +40,6 @@ def test_a_study_changes_one_value_of_both_the_full_and_the_tiny_recipe(path):
         recipes = [with_value(base, study.key, value) for value in study.values]
         assert base in recipes
         assert len({recipe.model_dump_json() for recipe in recipes}) == len(study.values)
-
-
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("key = 'seed'\nvalues = [1, 2]\nbenchmarks = { real20 = 'x' }", "base"),
-        ("base = 'b'\nkey = 'seed'\nvalues = [1]\nbenchmarks = { real20 = 'x' }", "values"),
-        ("base = 'b'\nkey = 'seed'\nvalues = [1, 2]\nbenchmarks = {}", "benchmarks"),
-        ("base = 'b'\nkey = 'seed'\nvalue = 3", "there is no key value"),
-        ("base =", "TOML"),
-    ],
-)
-def test_a_study_with_missing_or_invalid_keys_is_an_error(text, message, tmp_path):
-    (tmp_path / "study.toml").write_text(text)
-    with pytest.raises(RecipeError, match=message):
-        read_study(tmp_path / "study.toml")
 
 
 @pytest.fixture

@@ -101,15 +101,6 @@ def test_a_broken_connection_stops_the_work():
     assert backend.tiles == 1
 
 
-@pytest.mark.parametrize(
-    "invalid_bytes", [b"\x16\x03\x01\x02\x00", b"GET / HTTP/9\r\n\r\n", b"\r\n\r\nnonsense\r\n\r\n"]
-)
-def test_a_request_that_is_not_http_is_refused(invalid_bytes):
-    with served_port(make_app()) as port:
-        assert status(raw_exchange(port, invalid_bytes + b"\r\n\r\n")) in (400, None)
-        assert status(raw_exchange(port, *post_request())) == 200
-
-
 SERVING = """
 from fastapi import APIRouter
 from brewster.web.application import create_app, serve
@@ -143,8 +134,6 @@ def test_a_port_in_use_is_an_error():
         with pytest.raises(OutputError, match=f"port {port} cannot be used"):
             listen("127.0.0.1", port)
 
-
-# --- idle clients and shutdown
 
 GET = b"GET /health HTTP/1.1\r\nHost: localhost\r\n\r\n"
 LONG_BYTES = 8_000_000

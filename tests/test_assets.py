@@ -8,7 +8,7 @@ import pytest
 
 from brewster.environments import assets as assets_module
 from brewster.environments.assets import Assets
-from brewster.errors import PhotoError, RecipeError, UnreadablePhoto, UnsupportedPhoto
+from brewster.errors import PhotoError, RecipeError, UnsupportedPhoto
 from brewster.photo import Photo
 from brewster.scene.world import AssetSource, EnvironmentMap, Plane
 from brewster.srgb import REC709_LUMINANCE, to_linear
@@ -61,17 +61,6 @@ def plane_radiance(folder, name, data, **values):
     return Assets([folder]).plane_radiance(plane)
 
 
-def check_message(error, name, *words):
-    """Checks that the message has three parts and contains the name of the file and the words."""
-    message = str(error.value)
-    assert name in message
-    assert message.count("; ") >= 2
-    assert all(word in message for word in words), message
-
-
-# --- maps
-
-
 def test_a_map_has_the_mean_luminance_of_the_scene(folder, rng):
     texels = sky(rng)
     light = map_radiance(folder, "sky.exr", exr_of(texels * 37), luminance=2.5)
@@ -117,26 +106,16 @@ def test_the_origin_and_licence_of_each_builtin_file_is_listed(folder):
     assert all(row["licence"] == "CC0 1.0" and row["origin"] for row in rows)
 
 
-# --- files that cannot be used
-
-
-def test_a_missing_file_is_named_with_the_folders_that_were_searched(folder):
-    with pytest.raises(RecipeError, match="was not found") as error:
-        Assets([folder]).map_radiance(EnvironmentMap(source=AssetSource(file="gone.hdr")))
-    check_message(error, "gone.hdr", str(folder), "--maps")
-
-
 def test_another_file_of_the_same_name_is_refused(folder, rng):
     data = hdr_of(sky(rng))
     (folder / "sky.hdr").write_bytes(data)
     correct, wrong = hashlib.sha256(data).hexdigest(), hashlib.sha256(b"").hexdigest()
     assets = Assets([folder])
     assets.map_radiance(EnvironmentMap(source=AssetSource(file="sky.hdr", sha256=correct)))
-    with pytest.raises(RecipeError, match="not the file that was chosen when the scene was sampled") as error:
+    with pytest.raises(RecipeError, match="not the file that was chosen when the scene was sampled"):
         assets.map_radiance(
             EnvironmentMap(source=AssetSource(file="sky.hdr", sha256=wrong))
         )  # the cached map of the other file is not used
-    check_message(error, str(folder / "sky.hdr"), wrong)
 
 
 def test_the_folder_with_the_right_file_is_found(tmp_path, folder, rng):
@@ -173,28 +152,16 @@ BAD_MAPS = {
 
 @pytest.mark.parametrize("name", BAD_MAPS)
 def test_a_map_that_cannot_light_a_scene_is_refused_by_name(folder, rng, name):
-    with pytest.raises(PhotoError) as error:
+    with pytest.raises(PhotoError, match=name):
         map_radiance(folder, name, BAD_MAPS[name](sky(rng)))
-    check_message(error, name)
-
-
-@pytest.mark.parametrize("data", [b"", b"<html>", file_of(smooth(), "JPEG")[:500]])
-def test_a_picture_that_cannot_be_read_is_refused_by_name(folder, data):
-    with pytest.raises(UnreadablePhoto) as error:
-        plane_radiance(folder, "photo.jpg", data)
-    check_message(error, "photo.jpg")
 
 
 def test_an_ordinary_photo_saved_as_a_map_is_refused(folder, rng):
     """The maximum of an HDR map is in few texels, but here it is in an eighth of them."""
     encoded = (sky(rng) / 2).clip(0, 1)
     encoded[:4] = 1
-    with pytest.raises(UnsupportedPhoto, match="clipped") as error:
+    with pytest.raises(UnsupportedPhoto, match="clipped"):
         map_radiance(folder, "photo.hdr", hdr_of(to_linear(encoded)))
-    check_message(error, "photo.hdr", "use the image as a picture")
-
-
-# --- pictures
 
 
 def test_a_picture_has_the_mean_luminance_of_the_scene(folder):
@@ -234,26 +201,6 @@ def test_a_black_picture_is_dark_and_finite(folder):
     assert not light.any()
 
 
-# --- memory
-
-
-def test_the_cache_has_a_maximum_size_and_keeps_the_most_recently_used_maps(folder, rng, monkeypatch):
-    one = sky(rng).nbytes
-    monkeypatch.setattr(assets_module, "_MAX_CACHE_BYTES", 2 * one)
-    opened = []
-    monkeypatch.setattr(Photo, "open", classmethod(lambda _cls, data: opened.append(data) or _original(data)))
-    for name in "abc":
-        (folder / f"{name}.hdr").write_bytes(hdr_of(sky(rng)))
-    assets = Assets([folder])
-
-    def read(name):
-        before = len(opened)
-        assets.map_radiance(EnvironmentMap(source=AssetSource(file=f"{name}.hdr")))
-        return len(opened) - before
-
-    assert [read(name) for name in "ababacacb"] == [1, 1, 0, 0, 0, 1, 0, 0, 1]
-
-
 def test_the_luminance_of_the_scene_does_not_change_the_cached_map(folder, rng):
     (folder / "a.hdr").write_bytes(hdr_of(sky(rng)))
     assets = Assets([folder])
@@ -262,6 +209,3 @@ def test_the_luminance_of_the_scene_does_not_change_the_cached_map(folder, rng):
         for value in (8, 0.5)
     )
     np.testing.assert_allclose(bright, 16 * dim, rtol=1e-6)
-
-
-_original = Photo.open

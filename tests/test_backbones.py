@@ -13,7 +13,7 @@ import transformers
 from tokenizers.pre_tokenizers import ByteLevel
 from torch.utils.flop_counter import FlopCounterMode
 
-from brewster.errors import DeviceError, ModelError
+from brewster.errors import ModelError
 from brewster.models.diffusion import lazy_imports
 from brewster.models.diffusion.adapter.lora import add_lora
 from brewster.models.diffusion.backbones import loading
@@ -182,22 +182,6 @@ def test_nf4_leaves_the_layers_in_full_precision_that_the_backbone_names(
     assert kept == (["transformer_blocks.0.img_mod.1"] if skipped else [])
 
 
-def test_nf4_needs_an_nvidia_gpu():
-    with pytest.raises(DeviceError, match="nf4 does not run on cpu; expected an NVIDIA GPU"):
-        load_backbone("kontext", quantization="nf4")
-
-
-def test_an_unknown_name_gets_a_suggestion():
-    with pytest.raises(ModelError, match="did you mean kontext"):
-        tiny("kontxt")
-
-
-@pytest.mark.skipif(torch.cuda.is_available(), reason="this machine has a GPU")
-def test_a_missing_gpu_is_reported_before_anything_is_loaded():
-    with pytest.raises(DeviceError, match="there is no CUDA device"):
-        load_backbone("/absent", device="cuda")
-
-
 @pytest.fixture(scope="module")
 def text_encoder_folders(tmp_path_factory):
     """Folders of tiny versions with text encoders, and tokenizers whose tokens are single bytes."""
@@ -255,31 +239,8 @@ def test_a_prompt_is_encoded_by_the_text_encoders_of_the_folder(text_encoder_fol
     assert not torch.equal(encode_prompt(str(text_encoder_folders / name), "a cat").embeds, prompt.embeds)
 
 
-def test_missing_text_encoders_are_named(tiny_folders, text_encoder_folders, tmp_path):
-    with pytest.raises(ModelError, match="has no text_encoder"):
-        encode_prompt(str(tiny_folders / "kontext"))
-    folder = shutil.copytree(text_encoder_folders / "klein", tmp_path / "klein")
-    shutil.rmtree(folder / "tokenizer")
-    with pytest.raises(ModelError, match="klein has no tokenizer"):
-        encode_prompt(str(folder))
-
-
-def test_a_path_that_does_not_exist_is_not_taken_for_a_hub_id():
-    with pytest.raises(ModelError, match=r"there is no folder ./nowhere/at/all"):
-        load_backbone("./nowhere/at/all")
-
-
 INDEX, CONFIG = "model_index.json", "transformer/config.json"
 WEIGHTS = "diffusion_pytorch_model.safetensors"
-
-
-@pytest.mark.parametrize(
-    "name", [INDEX, CONFIG, f"transformer/{WEIGHTS}", f"vae/{WEIGHTS}", "scheduler/scheduler_config.json"]
-)
-def test_a_missing_file_is_named(folder, name):
-    (folder / name).unlink()
-    with pytest.raises(ModelError, match=name.rsplit("/", 1)[-1]):
-        load_backbone(str(folder))
 
 
 @pytest.mark.parametrize(
@@ -290,14 +251,8 @@ def test_a_missing_file_is_named(folder, name):
             lambda data: b"",
             "transformer cannot be loaded.*download the model again",
         ),
-        (f"transformer/{WEIGHTS}", lambda data: data[:100], "transformer cannot be loaded"),
-        (f"transformer/{WEIGHTS}", lambda data: data[:-7], "transformer cannot be loaded"),
         (INDEX, lambda data: data.replace(b"FluxKontext", b"Other"), "contains a OtherPipeline"),
-        (INDEX, lambda data: b"{}", "has no _class_name"),
-        (INDEX, lambda data: b"{", "is not JSON"),
-        (INDEX, lambda data: b"[]", "contains no settings"),
         (CONFIG, lambda data: with_values(data, num_layers=3), "transformer"),
-        (CONFIG, lambda data: with_values(data, num_attention_heads=3), "transformer cannot be loaded"),
         (CONFIG, lambda data: data.replace(b"FluxT", b"QwenImageT"), "expected a FluxTransformer2DModel"),
     ],
 )
@@ -309,12 +264,3 @@ def test_a_damaged_or_other_file_is_refused(folder, name, change, message):
 
 def with_values(data, **values):
     return json.dumps(json.loads(data) | values).encode()
-
-
-def test_out_of_memory_while_loading_says_what_to_reduce(folder, monkeypatch):
-    def raise_error(*_, **__):
-        raise torch.OutOfMemoryError("CUDA out of memory.")
-
-    monkeypatch.setattr(loading, "_load_part", raise_error)
-    with pytest.raises(DeviceError, match='use quantization="int8", or a GPU with more memory'):
-        load_backbone(str(folder))

@@ -44,15 +44,6 @@ def test_a_folder_is_mirrored_and_a_damaged_photo_does_not_stop_the_batch(photo_
     assert first.residual == pytest.approx(0, abs=0.01)
 
 
-def test_the_options_choose_layers_and_formats(tmp_path, separator):
-    (tmp_path / "a.jpg").write_bytes(image_bytes())
-    options = Options(layers=("transmission", "confidence"), format="tiff", strength=0)
-    list(separate_files([tmp_path / "a.jpg"], tmp_path / "out", options, separator))
-    assert list_files(tmp_path / "out") == ["a.confidence.png", "a.transmission.tiff"]
-    written, photo = Photo.open(tmp_path / "out/a.transmission.tiff"), Photo.open(tmp_path / "a.jpg")
-    assert (written.pixels == photo.pixels).all()
-
-
 def test_finished_photos_are_skipped_without_a_model_and_missing_layers_are_added(tmp_path, separator):
     (tmp_path / "a.jpg").write_bytes(image_bytes())
     list(separate_files(tmp_path, separator=separator))

@@ -59,9 +59,6 @@ def mean_luminance(light):
     return float(light.double().clamp(0, 1).mean((1, 2)) @ torch.tensor(REC709_LUMINANCE).double())
 
 
-# --- exposure
-
-
 @some
 @given(PICTURES, st.floats(0.01, 1), st.sampled_from(["none", *BALANCES]))
 def test_the_mean_of_any_image_is_the_target_if_it_is_reachable(picture, target, balance):
@@ -80,9 +77,6 @@ def test_a_black_image_stays_black_and_is_not_exposed():
         assert developed.exposure_ev == developed.mirror_exposure_ev == developed.overexposed_fraction == 0
         assert developed.white_balance_gains == (1, 1, 1)
         assert not any(layer.any() for layer in developed.images().values())
-
-
-# --- all layers alike
 
 
 @some
@@ -114,8 +108,6 @@ def test_the_layers_of_a_photograph_add_up_where_nothing_clips(picture, share, b
     inside = exposed(sample.photo, developed) < 1
     torch.testing.assert_close((transmission + reflection)[inside], photo[inside], atol=1e-5, rtol=0)
 
-
-# --- white balance
 
 CAST = torch.tensor([1.4, 1.0, 0.6]).view(3, 1, 1)
 
@@ -178,9 +170,6 @@ def test_gains_are_between_a_third_and_three(picture, balance, strength):
     assert all(0.3333 <= gain <= 3 for gain in developed.white_balance_gains)
 
 
-# --- noise
-
-
 def flat(level, **response):
     return sample_of(torch.full((3, 200, 200), level), target_luminance=level, **response)
 
@@ -203,9 +192,6 @@ def test_noise_depends_on_seed_and_index():
     assert torch.equal(first, again)
     for other in (other_seed, other_index, swapped):
         assert abs(np.corrcoef(first.ravel(), other.ravel())[0, 1]) < 0.02
-
-
-# --- bytes
 
 
 @some

@@ -10,7 +10,6 @@ from brewster.environments.catalog import builtin_catalog, read_catalog
 from brewster.errors import PhotoTooLarge, RecipeError, UnreadablePhoto, UnsupportedPhoto
 from brewster.photo import Photo, read_size
 from brewster.photo import decode as decoding
-from brewster.scene.sampler import Catalog
 from picture_files import exif_block, file_of, smooth
 
 KINDS = ["JPEG", "PNG", "TIFF", "WEBP", "AVIF", "GIF"]
@@ -39,9 +38,6 @@ def photos(tmp_path):
     (folder / "turned.jpg").write_bytes(file_of(smooth(), "JPEG", exif=exif_block(6)))
     (folder / "note.txt").write_text("no picture")
     return folder
-
-
-# --- catalogs
 
 
 def test_without_folders_all_assets_are_built_in():
@@ -81,12 +77,6 @@ def test_a_manifest_gives_categories(maps, encoding):
     assert [asset.category for asset in catalog.maps] == ["indoor", "", ""]
 
 
-def test_a_manifest_that_is_no_text_is_an_error(maps):
-    (maps / "manifest.csv").write_bytes(b"file,category\na.hdr,caf\xe9\n")
-    with pytest.raises(RecipeError, match=r"manifest\.csv cannot be read .*; .*; "):
-        read_catalog([maps], [])
-
-
 @pytest.mark.parametrize("are_maps", [True, False])
 def test_an_empty_folder_is_an_error(tmp_path, are_maps):
     (tmp_path / ".hidden.jpg").write_bytes(file_of(smooth(), "JPEG"))
@@ -95,11 +85,6 @@ def test_an_empty_folder_is_an_error(tmp_path, are_maps):
     with pytest.raises(RecipeError, match=f"no {'maps' if are_maps else 'photos'} in .*; .*; ") as error:
         read_catalog(*folders)
     assert str(tmp_path) in str(error.value)
-
-
-def test_a_missing_folder_is_an_error(tmp_path):
-    with pytest.raises(RecipeError, match="gone cannot be read"):
-        read_catalog([tmp_path / "gone"], [])
 
 
 def test_unusable_files_are_skipped_and_reported(maps, photos, rng):
@@ -144,19 +129,6 @@ def test_if_two_files_have_the_same_name_the_first_folder_is_used(maps, tmp_path
         for folders in ((maps, other), (other, maps))
     }
     assert widths == {(maps, other): [32, 32, 32, 64], (other, maps): [64, 32, 32, 64]}
-
-
-def test_no_pixel_of_a_photo_is_decoded(photos, monkeypatch):
-    data = (photos / "wide.jpg").read_bytes()
-    (photos / "cut.jpg").write_bytes(data[:-100])
-    monkeypatch.setattr(decoding, "decode", lambda *_: pytest.fail("a photo was decoded"))
-    catalog, refused = read_catalog([], [photos])
-    assert isinstance(catalog, Catalog)
-    assert [asset.source.file for asset in catalog.pictures] == ["cut.jpg", "turned.jpg", "wide.jpg"]
-    assert not refused
-
-
-# --- the size of a picture
 
 
 @pytest.mark.parametrize("orientation", range(1, 9))

@@ -16,7 +16,6 @@ import pytest
 import brewster
 from brewster import Photo, batch, errors
 from brewster.cli import cli
-from brewster.cli.reference import reference
 from cli_helpers import image_bytes, list_files, run_process
 
 ROOT = Path(__file__).parents[1]
@@ -33,9 +32,6 @@ def is_error(value):
     return isinstance(value, type) and issubclass(value, Exception)
 
 
-# --- help and documentation
-
-
 def test_every_command_and_every_option_has_a_help_sentence():
     for path, command in commands():
         assert command.help, path
@@ -43,10 +39,6 @@ def test_every_command_and_every_option_has_a_help_sentence():
             assert option.help, f"{path} {option.name}"
             assert option.help[0].isupper(), option.help
             assert option.help.endswith("."), option.help
-
-
-def test_the_reference_in_the_docs_is_up_to_date():
-    assert (ROOT / "docs" / "reference.md").read_text() == reference(), "run make docs"
 
 
 def test_the_python_reference_has_a_meaning_for_every_public_name_and_for_no_other():
@@ -59,9 +51,6 @@ def test_the_python_reference_has_a_meaning_for_every_public_name_and_for_no_oth
     for name in rows:
         pkgutil.resolve_name(name if name.startswith("brewster.") else f"brewster:{name}")
     assert all(meaning.endswith(".") for meaning in rows.values()), rows
-
-
-# --- one photo
 
 
 def test_without_a_command_the_photo_is_separated_and_the_layers_are_next_to_it(run, tmp_path):
@@ -88,9 +77,6 @@ def test_additive_layers_are_floats_that_sum_to_the_photo(run, tmp_path, format_
     layers = [Photo.open(tmp_path / f"a.{layer}.{suffix}") for layer in ("transmission", "reflection")]
     assert all(layer.pixels.dtype == np.float32 for layer in layers)
     assert (layers[0].linear() + layers[1].linear() == Photo.open(tmp_path / "a.jpg").linear()).all()
-
-
-# --- standard input and output
 
 
 @pytest.mark.parametrize("format_name", ["jpeg", "png", "tiff", "webp"])
@@ -181,20 +167,12 @@ def test_help_goes_to_standard_output():
         assert process.stdout
 
 
-# --- usage
-
-
 @pytest.mark.parametrize(
     "arguments",
     [
         [],
         ["separate"],
         ["a.jpg", "--strength", "2"],
-        ["a.jpg", "--strength", "nan"],
-        ["a.jpg", "--guidance", "inf"],
-        ["a.jpg", "--quality", "best"],
-        ["a.jpg", "--layers", "background"],
-        ["a.jpg", "--layers", ""],
         ["a.jpg", "--device", "tpu"],
         ["a.jpg", "--max-pixels", "0"],
         ["a.jpg", "--sharpen"],
@@ -215,7 +193,6 @@ def test_help_goes_to_standard_output():
         ["a.jpg", "--index"],
         ["a.jpg", "--index", "-o", "-"],
         ["a.jpg", "--workers", "2", "-o", "b.jpg"],
-        ["modles"],
         ["models", "delete"],
     ],
     ids=" ".join,
@@ -257,9 +234,6 @@ def test_an_error_is_one_line_with_exit_code_1(run, run_without_model, tmp_path,
     assert message in err
 
 
-# --- progress
-
-
 def run_on_terminal(*args, folder):
     """Runs the command in its own process. Standard error is a pseudo terminal. Returns standard output and the text on the terminal."""
     controller, terminal = pty.openpty()
@@ -289,9 +263,6 @@ def test_a_terminal_shows_progress_and_standard_output_stays_clean(model, tmp_pa
     assert "\x1b[" in shown
     assert "/3" in shown
     assert "0.transmission.jpg" in shown
-
-
-# --- Python
 
 
 def test_public_names_exist_in_any_order_of_imports():

@@ -16,8 +16,6 @@ from brewster.photo import contact_sheet
 from cli_helpers import error_lines, image_bytes, layer_files, list_files
 from picture_files import dng_file, mosaic
 
-# --- the names of photos
-
 
 @pytest.mark.parametrize("form", ["file://{}", "file://localhost{}", "'{}'", '"{}"', "'file://{}'"])
 def test_an_address_and_a_quoted_path_name_a_file(run, tmp_path, form):
@@ -60,9 +58,6 @@ def test_an_address_of_another_machine_is_refused(run, tmp_path, address, option
     assert list_files(tmp_path) == []
 
 
-# --- suffixes
-
-
 @pytest.mark.parametrize("name", ["notes", "notes.txt", "notes.jpg/"])
 @pytest.mark.parametrize("photos", [["a.jpg"], ["a.jpg", "b.jpg"], ["."]])
 def test_an_output_folder_that_is_a_file_is_refused(run_without_model, tmp_path, name, photos):
@@ -79,9 +74,6 @@ def test_a_folder_may_have_a_dot_in_its_name(run, tmp_path, name):
     (tmp_path / "a.jpg").write_bytes(image_bytes())
     assert run("a.jpg", "-o", name)[0] == 0
     assert list_files(tmp_path / name) == layer_files("a")
-
-
-# --- RAW files and videos
 
 
 def test_raw_files_without_the_extra_are_counted_and_named_once(run, tmp_path, monkeypatch):
@@ -112,9 +104,6 @@ def test_other_files_in_a_folder_are_counted_by_suffix_with_an_example(run, tmp_
     assert (tmp_path / "b/scan.transmission.jpg").is_file()
 
 
-# --- existing layers
-
-
 def test_a_hint_names_the_other_options_of_existing_layers(run, tmp_path):
     (tmp_path / "a.jpg").write_bytes(image_bytes())
     run("a.jpg", "--strength", "0.5")
@@ -122,16 +111,6 @@ def test_a_hint_names_the_other_options_of_existing_layers(run, tmp_path):
     assert "made with other options (strength=0.5) (--overwrite replaces them)" in err
     assert "other options" not in run("a.jpg", "--strength", "0.5")[2]
     assert "model=pane" in run("a.jpg", "--strength", "0.5", "--model", "compact", with_model=False)[2]
-
-
-def test_a_hint_says_that_existing_layers_are_not_those_of_the_diffusion_model(run, tmp_path):
-    (tmp_path / "a.jpg").write_bytes(image_bytes())
-    run("a.jpg", with_model=False)
-    assert "model=compact" in run("a.jpg", "--model", "windowseat", with_model=False)[2]
-    assert "other options" not in run("a.jpg", with_model=False)[2]
-
-
-# --- contact sheets
 
 
 def test_a_contact_sheet_has_a_row_for_each_photo(run, tmp_path):
@@ -183,9 +162,6 @@ def test_many_rows_give_several_sheets(tmp_path, monkeypatch):
     assert [Photo.open(path).size[1] // 272 for path in sheets] == [2, 2, 1]
 
 
-# --- shell completion
-
-
 def completions(*words):
     """Returns the types and values that the shell offers for the last of these words."""
     *before, last = words
@@ -218,7 +194,7 @@ print(pyvips.Image.text("mmmm").width > 2 * pyvips.Image.text("iiii").width)
     assert "Fontconfig" not in done.stderr
 
 
-def test_videos_are_counted_and_named(run, run_without_model, tmp_path):
+def test_videos_are_counted_and_named(run, tmp_path):
     (tmp_path / "a.jpg").write_bytes(image_bytes())
     for name in ("b.mp4", "c.MOV"):
         (tmp_path / name).write_bytes(b"\0\0\0\x18ftypisom" + bytes(100))
@@ -228,9 +204,3 @@ def test_videos_are_counted_and_named(run, run_without_model, tmp_path):
     code, _, err = run("b.mp4")
     assert code == 1
     assert error_lines(err)[0].startswith("error: b.mp4 is a video; expected a photo; use `brewster burst`")
-    (tmp_path / "a.jpg").unlink()
-    for layer in layer_files("a"):
-        (tmp_path / layer).unlink()
-    assert "no photo in . (2 videos)" in run_without_model(".")[2]
-    (tmp_path / "c.MOV").rename(tmp_path / "notes")
-    assert "no photo in . (1 video, 1 other file)" in run_without_model(".")[2]

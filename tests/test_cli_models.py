@@ -16,8 +16,6 @@ from cli_helpers import image_bytes
 
 ROOT = Path(__file__).parents[1]
 
-# --- models
-
 
 @pytest.fixture
 def model_zoo(model, monkeypatch, tmp_path):
@@ -57,9 +55,6 @@ def test_damaged_models_are_found(run_without_model, model_zoo):
     assert err.startswith("error: ")
     code, out, _ = run_without_model("models", "verify", "--json")
     assert (code, [bool(row["error"]) for row in json.loads(out)]) == (1, [False, True])
-
-
-# --- doctor
 
 
 def test_the_doctor_checks_every_dependency():
@@ -105,9 +100,6 @@ def test_a_package_that_does_not_load_is_broken(run_without_model, model_zoo, mo
     assert (code, broken["status"]) == (1, "broken")
 
 
-# --- train
-
-
 def test_a_run_prints_its_progress_and_exports_a_model_that_separates(
     run_without_model, tmp_path, monkeypatch
 ):
@@ -139,10 +131,3 @@ def test_a_run_prints_its_progress_and_exports_a_model_that_separates(
     assert err.startswith("the run in out/tiny is complete at step 6 of 6, after 0.")
     photo = Photo.from_array(np.full((50, 70, 3), 128, np.uint8), encoding="srgb")
     assert Separator.load(str(run / "model.onnx"))(photo).transmission.size == (70, 50)
-
-
-def test_a_run_folder_that_cannot_be_created_is_an_error(run_without_model, tmp_path):
-    (tmp_path / "file").touch()
-    code, _, err = run_without_model("train", ROOT / "recipes" / "train" / "tiny.toml", "-o", "file/run")
-    assert code == 1
-    assert err.startswith("error: file/run cannot be created")

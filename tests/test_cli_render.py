@@ -62,15 +62,12 @@ def test_a_damaged_photo_is_excluded_and_reported(run_without_model, fake_render
     ("args", "message"),
     [
         ((), "Give one output folder"),
-        (("set", "-o", "other"), "Give one output folder"),
         (("set", "--size", "512"), "such as 512x384"),
         (("set", "--size", "8x8"), "from 16 to 16384"),
-        (("set", "--count", "-1"), "--count"),
         (("set", "--maps", "nowhere"), "--maps"),
         (("set", "--size", f"{'1' * 5000}x512"), "from 16 to 16384"),
         (("set", "--size", "\u0661\u0666x16"), "from 16 to 16384"),
         (("set", "--scene", "scene.toml", "--count", "3"), "--count is an option for datasets"),
-        (("set", "--scene", "scene.toml", "--json"), "--json is an option for datasets"),
     ],
 )
 def test_a_wrong_usage_is_explained(run_without_model, args, message):

@@ -1,15 +1,12 @@
 """The code base follows its rules: import order, fast imports, documented names, a correct README."""
 
 import ast
-import importlib
 import inspect
 import os
-import pkgutil
 import re
 import subprocess
 import sys
 from pathlib import Path
-from typing import get_type_hints
 
 import jaxtyping
 import numpy as np
@@ -21,7 +18,7 @@ import brewster.inference
 import brewster.photo
 from brewster.cli import cli
 from brewster.inference.tiles import run_tiled
-from brewster.options import Options, SeparateOptions
+from other_processes import finished
 
 ROOT = Path(__file__).parents[1]
 SOURCE = ROOT / "src" / "brewster"
@@ -39,21 +36,14 @@ def all_functions():
 
 
 def test_packages_import_only_from_lower_layers():
-    process = subprocess.run(
-        [Path(sys.executable).with_name("lint-imports")],
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    process = finished([Path(sys.executable).with_name("lint-imports")], cwd=ROOT)
     assert process.returncode == 0, process.stdout
 
 
 @pytest.mark.parametrize("command", [["-c", "import brewster"], ["-m", "brewster", "--help"]])
 def test_import_and_help_load_no_heavy_library(command):
-    process = subprocess.run(
-        [sys.executable, "-X", "importtime", *command], capture_output=True, text=True, check=True
-    )
+    process = finished([sys.executable, "-X", "importtime", *command])
+    assert process.returncode == 0
     imported = {line.split("|")[-1].strip().split(".")[0] for line in process.stderr.splitlines()}
     assert not imported & HEAVY_LIBRARIES
 
@@ -95,14 +85,6 @@ def test_a_module_imports_no_library_that_it_may_not_need(code, libraries):
     subprocess.run([sys.executable, "-c", check], check=True, capture_output=True)
 
 
-def test_the_signature_of_separate_shows_the_source_and_every_option():
-    signature = inspect.signature(brewster.separate)
-    assert signature == inspect.signature(brewster.inference.separate)
-    assert list(signature.parameters)[:3] == ["source", "model", "mask"]
-    keywords = {*signature.parameters, *get_type_hints(SeparateOptions)}
-    assert set(Options.__dataclass_fields__) - {"layers", "format"} <= keywords
-
-
 def test_type_checkers_accept_every_public_name_and_no_other(tmp_path):
     """A module's __getattr__ would make every misspelt name an `object`."""
     (tmp_path / "user.py").write_text("""import brewster
@@ -111,13 +93,10 @@ separator: brewster.Separator = brewster.Separator.load("compact")
 brewster.Separater.load("compact")
 brewster.separate()
 """)
-    process = subprocess.run(
+    process = finished(
         [Path(sys.executable).with_name("mypy"), "--follow-imports=silent", "--strict", "user.py"],
         cwd=tmp_path,
         env=os.environ | {"MYPYPATH": str(SOURCE.parent)},
-        capture_output=True,
-        text=True,
-        check=False,
     )
     errors = [line.partition("error: ")[2] for line in process.stdout.splitlines() if "error: " in line]
     assert len(errors) == 2, process.stdout
@@ -140,34 +119,6 @@ def test_every_public_name_is_exported_and_documented():
         assert name.startswith("__") or inspect.getdoc(value), name
 
 
-def test_every_module_and_every_public_function_has_a_docstring():
-    for module in pkgutil.walk_packages(brewster.__path__, "brewster."):
-        if not module.name.endswith("__main__"):
-            assert importlib.import_module(module.name).__doc__, module.name
-    undocumented = [
-        f"{path.name}:{node.name}"
-        for path, node in all_functions()
-        if not node.name.startswith("_") and not ast.get_docstring(node) and is_public(path, node)
-    ]
-    assert not undocumented
-
-
-def is_public(path, node):
-    """Whether the node is a function of the module or a method of a public class, not an inner function."""
-    tree = ast.parse(path.read_text())
-    public = [
-        *tree.body,
-        *(
-            child
-            for item in tree.body
-            if isinstance(item, ast.ClassDef) and item.name[0] != "_"
-            for child in item.body
-        ),
-    ]
-    public_functions = {(item.name, item.lineno) for item in public if isinstance(item, ast.FunctionDef)}
-    return (node.name, node.lineno) in public_functions and node.name not in {"forward"}
-
-
 def test_every_error_is_in_the_tree_of_the_docstring():
     tree = inspect.getdoc(brewster.errors)
     for name, value in vars(brewster.errors).items():
@@ -184,7 +135,7 @@ def subcommands(command):
         yield from subcommands(child)
 
 
-def test_every_message_has_three_parts_and_names_options_that_exist():
+def test_every_message_has_three_parts_and_names_options_and_commands_that_exist():
     """What happened, what was expected, and what to do. Tests of single errors assert the class and a key part."""
     errors = {name for name, value in vars(brewster.errors).items() if inspect.isclass(value)}
     options = {
@@ -201,8 +152,11 @@ def test_every_message_has_three_parts_and_names_options_that_exist():
         if isinstance(parts[0], ast.Starred):
             continue
         assert len(parts) >= 3, place
-        for option in re.findall(r"(?<![\w-])--[a-z]\w[\w-]*", ast.unparse(parts[1]) + ast.unparse(parts[2])):
+        advice = ast.unparse(parts[1]) + ast.unparse(parts[2])
+        for option in re.findall(r"(?<![\w-])--[a-z]\w[\w-]*", advice):
             assert option in options, f"{place}: {option}"
+        for group, command in re.findall(r"\bbrewster (models|study|assets) ([a-z]+)", advice):
+            assert command in cli.commands[group].commands, f"{place}: {command}"
 
 
 def test_signatures_stay_small():

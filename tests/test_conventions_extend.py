@@ -4,12 +4,13 @@ import ast
 import os
 import re
 import shutil
-import subprocess
 import sys
 import textwrap
 from pathlib import Path
 
 import pytest
+
+from other_processes import finished
 
 ROOT = Path(__file__).parents[1]
 FIRST_LINE = re.compile(r"# (?:new file )?(\S+)(?:, (among the imports|(?:in|before) [\w.]+))?\n")
@@ -82,12 +83,9 @@ def test_the_example_of_each_section_works(section, checkout):
         apply(block, checkout)
     kind, _, code = check.partition("\n")
     assert kind == "# try it"
-    process = subprocess.run(
+    process = finished(
         [sys.executable, "-c", code],
         cwd=checkout,
         env=os.environ | {"PYTHONPATH": str(checkout / "src"), "HF_HUB_OFFLINE": "1"},
-        capture_output=True,
-        text=True,
-        check=False,
     )
     assert process.returncode == 0, process.stderr

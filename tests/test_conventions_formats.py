@@ -9,9 +9,8 @@ import hashlib
 import re
 
 import numpy as np
-import onnx
 import pytest
-from onnx import TensorProto, helper
+from onnx import helper
 
 from brewster import Photo
 from brewster.benchmarks.image_files import Case
@@ -27,6 +26,7 @@ from brewster.render.camera_response import develop
 from brewster.rendered.store import SAMPLE_FORMAT
 from brewster.scene.recipe import read_scene_recipe
 from brewster.scene.sampler import draw
+from cli_helpers import write_onnx
 from picture_files import smooth
 from synthetic_scenes import ASSETS, make_scene, map_side, plane_side
 
@@ -107,23 +107,13 @@ def make_case(rendered=False):
 def asymmetric_model(tmp_path_factory):
     """A model that weights the pixels to the left and above, so that it predicts other layers for a flipped or shifted photo."""
     shares = {"transmission": 0.7, "reflection": 0.2}
-    kernels = {name: np.zeros((3, 1, 3, 3), np.float32) for name in shares}
-    for name, kernel in kernels.items():
-        kernel[:, 0, 1, 1], kernel[:, 0, 1, 0], kernel[:, 0, 0, 1] = shares[name], 0.1, 0.05
-    shape = [1, 3, "height", "width"]
-    graph = helper.make_graph(
-        [
-            helper.make_node("Conv", ["photo", f"{name}_kernel"], [name], group=3, pads=[1] * 4)
-            for name in shares
-        ],
-        "asymmetric",
-        [helper.make_tensor_value_info("photo", TensorProto.FLOAT, shape)],
-        [helper.make_tensor_value_info(name, TensorProto.FLOAT, shape) for name in shares],
-        [onnx.numpy_helper.from_array(kernels[name], f"{name}_kernel") for name in shares],
-    )
-    path = tmp_path_factory.mktemp("model") / "asymmetric.onnx"
-    onnx.save(helper.make_model(graph, opset_imports=[helper.make_opsetid("", 18)], ir_version=10), path)
-    return path
+    kernels = {f"{name}_kernel": np.zeros((3, 1, 3, 3), np.float32) for name in shares}
+    for kernel, share in zip(kernels.values(), shares.values(), strict=True):
+        kernel[:, 0, 1, 1], kernel[:, 0, 1, 0], kernel[:, 0, 0, 1] = share, 0.1, 0.05
+    nodes = [
+        helper.make_node("Conv", ["photo", name], [name[:-7]], group=3, pads=[1] * 4) for name in kernels
+    ]
+    return write_onnx(tmp_path_factory.mktemp("model") / "asymmetric.onnx", nodes, kernels)
 
 
 def test_a_changed_prediction_needs_a_new_prediction_format(asymmetric_model, tmp_path):

@@ -20,6 +20,7 @@ from brewster.evaluate.ablation import read_study
 from brewster.evaluate.protocols import protocol_config
 from brewster.models.diffusion.adapter.hub import FILES
 from brewster.photo import Photo
+from other_processes import finished
 
 ROOT = Path(__file__).parents[1]
 RUNS = ROOT / "runs"
@@ -29,17 +30,22 @@ BIN = Path(sys.executable).parent
 PAPER_FOLDERS = ("photos", "pairs/real", "pairs/nature", "real20", "nature20", "SIR2", "real/dev/nature")
 
 
-def run_script(name, *args, path=BIN, **variables):
-    """Runs a script of runs/ in its own process. Returns its output."""
-    process = subprocess.run(
-        [RUNS / name, *map(str, args)],
+def run_script(script, *args, path=BIN, code=0, **variables):
+    """Runs a script, by default of runs/, in its own process. Returns its output, or its messages if it must fail."""
+    process = finished(
+        [RUNS / script, *map(str, args)],
         env=os.environ | {"PATH": f"{path}:{os.environ['PATH']}"} | variables,
-        capture_output=True,
-        text=True,
-        check=False,
     )
-    assert process.returncode == 0, process.stderr
-    return process.stdout
+    assert process.returncode == code, process.stderr
+    return process.stderr if code else process.stdout
+
+
+def write_program(path, text):
+    """Writes a program. Returns its folder, for PATH."""
+    path.parent.mkdir()
+    path.write_text(text)
+    path.chmod(0o755)
+    return path.parent
 
 
 def rows_by_first_cell(table):
@@ -97,15 +103,13 @@ def test_without_a_gpu_the_full_size_check_prints_estimates(tmp_path):
 
 def test_every_command_of_the_paper_experiment_is_valid(tmp_path):
     """A stub records the arguments of each call. The command line then parses them, and runs nothing."""
-    calls, stub = tmp_path / "calls", tmp_path / "bin" / "brewster"
-    stub.parent.mkdir()
+    calls = tmp_path / "calls"
     recorder = f"import json, sys\nopen({str(calls)!r}, 'a').write(json.dumps(sys.argv[1:]) + chr(10))\n"
-    stub.write_text(f"#!{sys.executable}\n{recorder}")
-    stub.chmod(0o755)
+    stub = write_program(tmp_path / "bin" / "brewster", f"#!{sys.executable}\n{recorder}")
     for folder in (*PAPER_FOLDERS, "hdri", "out/evaluate"):
         (tmp_path / folder).mkdir(parents=True)
     (tmp_path / "out" / "evaluate" / "table.tex").touch()
-    run_script("paper.sh", tmp_path / "out", path=stub.parent, BREWSTER_DATA=str(tmp_path))
+    run_script("paper.sh", tmp_path / "out", path=stub, BREWSTER_DATA=str(tmp_path))
     commands = [json.loads(line) for line in calls.read_text().splitlines()]
     assert [arguments[0] for arguments in commands] == [
         "doctor", "assets", "render", "render", "train", "train", "evaluate", "train", "train",
@@ -131,55 +135,28 @@ def test_every_command_of_the_paper_experiment_is_valid(tmp_path):
 
 
 def test_the_paper_experiment_starts_nothing_if_folders_of_its_data_are_missing(tmp_path):
-    stub = tmp_path / "bin" / "brewster"
-    stub.parent.mkdir()
-    stub.write_text('#!/bin/sh\n[ "$1" = doctor ] || exit 7\n')
-    stub.chmod(0o755)
+    stub = write_program(tmp_path / "bin" / "brewster", '#!/bin/sh\n[ "$1" = doctor ] || exit 7\n')
     for folder in PAPER_FOLDERS[2:]:
         (tmp_path / folder).mkdir(parents=True)
-    process = subprocess.run(
-        [RUNS / "paper.sh", tmp_path / "out"],
-        env=os.environ | {"PATH": f"{stub.parent}:{os.environ['PATH']}", "BREWSTER_DATA": str(tmp_path)},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert process.returncode == 1
-    assert process.stderr.startswith(f"error: {tmp_path} has no photos pairs/real; expected")
+    error = run_script("paper.sh", tmp_path / "out", path=stub, code=1, BREWSTER_DATA=str(tmp_path))
+    assert error.startswith(f"error: {tmp_path} has no photos pairs/real; expected")
 
 
 @pytest.mark.parametrize("name", ["tiny.sh", "paper.sh", "first_gpu_day.sh"])
 def test_without_brewster_a_script_prints_the_command_that_installs_it(tmp_path, name):
     shutil.copytree(RUNS, tmp_path / "runs")  # where there is no .venv
-    process = subprocess.run(
-        [tmp_path / "runs" / name],
-        cwd=tmp_path,
-        env={"PATH": "/usr/bin:/bin"},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert process.returncode == 1
-    assert "pip install -c constraints.txt -e '.[render,train,diffusion,evaluate]'" in process.stderr
+    error = run_script(tmp_path / "runs" / name, code=1, PATH="/usr/bin:/bin")
+    assert "pip install -c constraints.txt -e '.[render,train,diffusion,evaluate]'" in error
     assert not (tmp_path / "out").exists()
 
 
 def test_the_full_size_check_names_the_packages_that_are_not_installed(tmp_path):
     shutil.copytree(RUNS, tmp_path / "runs")  # where there is no .venv
-    python = tmp_path / "bin" / "python3"
-    python.parent.mkdir()
-    python.write_text(f'#!/bin/sh\nexec {sys._base_executable} -I -S "$@"\n')  # without any package
-    python.chmod(0o755)
-    process = subprocess.run(
-        [tmp_path / "runs" / "full_size_check.sh", "--tiny"],
-        env=os.environ | {"PATH": f"{python.parent}:{os.environ['PATH']}"},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert process.returncode == 1
-    assert process.stderr.startswith("error: not installed: torch diffusers peft ")
-    assert "pip install -c constraints.txt -e '.[diffusion]'" in process.stderr
+    without_packages = f'#!/bin/sh\nexec {sys._base_executable} -I -S "$@"\n'
+    path = write_program(tmp_path / "bin" / "python3", without_packages)
+    error = run_script(tmp_path / "runs" / "full_size_check.sh", "--tiny", path=path, code=1)
+    assert error.startswith("error: not installed: torch diffusers peft ")
+    assert "pip install -c constraints.txt -e '.[diffusion]'" in error
 
 
 @pytest.mark.slow
@@ -226,19 +203,11 @@ def test_the_first_gpu_day_lists_all_that_is_missing_and_starts_nothing(tmp_path
     blended.mkdir(parents=True)
     for number in range(19):
         (blended / f"{number}.jpg").touch()
-    process = subprocess.run(
-        [RUNS / "first_gpu_day.sh", tmp_path / "out"],
-        env=os.environ
-        | {"PATH": f"{BIN}:/usr/bin:/bin", "BREWSTER_DATA": str(tmp_path), "HF_HUB_OFFLINE": "1", "HF_HOME": str(tmp_path)},
-        capture_output=True,
-        text=True,
-        check=False,
-    )  # fmt: skip
-    assert process.returncode == 1
-    assert f"20 photos in {blended} (found 19;" in process.stderr
-    assert f"20 photos in {tmp_path / 'nature20' / 'blended'} (found 0;" in process.stderr
-    assert "access to https://huggingface.co/black-forest-labs/FLUX.1-Kontext-dev" in process.stderr
-    assert "needs are not met; nothing was started" in process.stderr
+    folders = dict.fromkeys(("BREWSTER_DATA", "HF_HOME"), str(tmp_path))
+    error = run_script("first_gpu_day.sh", tmp_path / "out", code=1, HF_HUB_OFFLINE="1", **folders)
+    assert f"20 photos in {blended} (found 19;" in error
+    assert f"20 photos in {tmp_path / 'nature20' / 'blended'} (found 0;" in error
+    assert "access to https://huggingface.co/black-forest-labs/FLUX.1-Kontext-dev" in error
     assert not (tmp_path / "out").exists()
 
 

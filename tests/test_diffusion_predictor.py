@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from brewster import Photo, Separator
-from brewster.errors import DeviceError, DownloadError, ModelError, PhotoError
+from brewster.errors import DeviceError, DownloadError, ModelError
 from brewster.inference.assessment import RECONSTRUCTION_ERROR_LIMIT
 from brewster.inference.diffusion_predictor import DiffusionPredictor
 from brewster.models.diffusion.adapter.lora import LORA_FILE, add_lora, save_lora
@@ -139,11 +139,6 @@ def test_photos_of_any_shape_keep_their_size(width, height):
     np.testing.assert_allclose(result.transmission.linear(), 0.7 * result.photo.linear(), atol=0.02)
 
 
-def test_a_photo_that_is_smaller_than_a_token_is_refused_with_the_smallest_size():
-    with pytest.raises(PhotoError, match=r"15 x 40 pixels; expected at least 16 pixels"):
-        Separator(DiffusionPredictor(FakePipeline()))(smooth_photo(15, 40))
-
-
 def test_without_a_reflection_panel_the_reflection_is_what_was_removed():
     photo = smooth_photo(100, 80)
     result = Separator(DiffusionPredictor(FakePipeline(panels=("T",), max_composite_pixels=96 * 96)))(photo)
@@ -224,13 +219,8 @@ def test_the_base_and_the_device_of_a_lora_are_checked(lora, tmp_path):
         load_pipeline(str(lora), base_model="tiny:klein")
     with pytest.raises(DeviceError, match="do not run on coreml; expected one of auto, cuda, rocm, cpu"):
         load_pipeline(str(lora), device="coreml")
-    with pytest.raises(ModelError, match=f"contains no model; expected a LoRA .{LORA_FILE}"):
-        load_pipeline(str(tmp_path))
     (tmp_path / "adapter_model.safetensors").touch()
-    with pytest.raises(ModelError, match=r"contains adapter_model\.safetensors, in an unknown layout"):
-        load_pipeline(str(tmp_path))
-    (tmp_path / "adapter_config.json").touch()
-    with pytest.raises(ModelError, match=r"in the layout of peft; .*: brewster models import .* FOLDER"):
+    with pytest.raises(ModelError, match="brewster models import"):
         load_pipeline(str(tmp_path))
 
 
@@ -238,13 +228,8 @@ def test_the_base_and_the_device_of_a_lora_are_checked(lora, tmp_path):
     ("change", "message"),
     [
         ({"rank": "4"}, "metadata of the LoRA cannot be read"),
-        ({"alpha": 0}, "metadata of the LoRA cannot be read"),
-        ({"base_model": None}, "metadata of the LoRA cannot be read"),
-        ({"quantization": "int3"}, "metadata of the LoRA cannot be read"),
-        ({"prompt_sha256": None}, "metadata of the LoRA cannot be read"),
         ({"more": 1}, "has the unknown key more; .*; update brewster"),
         ({"task": {"objective": "two"}}, "metadata of the LoRA cannot be read"),
-        ({"task": {"max_composite_pixels": "18432"}}, "metadata of the LoRA cannot be read"),
         ({"task": {"layout": {"panels": ["I", "R"], "direction": "stacked"}}}, "expected a list with T"),
         ({"task": {"layout": {"panels": ["T", "T"], "direction": "stacked"}}}, "each once"),
     ],

@@ -1,7 +1,6 @@
 """Data-parallel training: the process group, sums over processes, and incomplete launches."""
 
 import os
-import subprocess
 import sys
 
 import accelerate
@@ -10,6 +9,7 @@ import torch
 
 from brewster.errors import DeviceError
 from brewster.training import distributed
+from other_processes import finished
 
 LAUNCHER_VARIABLES = {"RANK": "0", "LOCAL_RANK": "0", "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": "29555"}
 
@@ -25,12 +25,9 @@ def run_python(code, *launcher, **variables):
     environment = {
         name: value for name, value in os.environ.items() if name not in {"WORLD_SIZE", *LAUNCHER_VARIABLES}
     }
-    done = subprocess.run(
+    done = finished(
         [sys.executable, *launcher, *([] if launcher else ["-c"]), str(code)],
         env=environment | {"OMP_NUM_THREADS": "1"} | variables,
-        capture_output=True,
-        text=True,
-        check=False,
         timeout=300,
     )
     return done.stdout, done.stderr, done.returncode

@@ -1,12 +1,11 @@
 """Downloads from a server on this machine, and their errors. test_polyhaven.py has more tests."""
 
 import hashlib
-from pathlib import Path
 
 import pytest
 
 from brewster.download import Downloader, RemoteFile, file_digest
-from brewster.errors import DownloadError, OutputError
+from brewster.errors import DownloadError
 from file_server import served, unused_address
 
 pytestmark = pytest.mark.loopback
@@ -101,16 +100,3 @@ def test_only_http_urls_are_opened(downloader, url, delays):
     with pytest.raises(DownloadError, match="https://; check the URL"):
         downloader.read(url)
     assert delays == []
-
-
-def test_a_folder_that_cannot_be_created_is_an_error(downloader, remote, tmp_path):
-    (tmp_path / "file").write_bytes(b"")
-    with pytest.raises(OutputError, match="a writable folder"):
-        downloader.fetch(remote, tmp_path / "file" / "map")
-
-
-@pytest.mark.skipif(not Path("/dev/full").exists(), reason="only Linux has /dev/full")
-def test_a_full_disk_is_an_error(downloader, remote, tmp_path):
-    (tmp_path / "map.part").symlink_to("/dev/full")
-    with pytest.raises(OutputError, match=r"No space left .* free some space"):
-        downloader.fetch(remote, tmp_path / "map")

@@ -9,7 +9,25 @@ from typing import Annotated
 import pytest
 from pydantic import AfterValidator, AwareDatetime, BaseModel, ConfigDict, Field, ValidationError
 
-from brewster import errors
+from brewster import Separator, errors
+from brewster.batch import plan_files
+from brewster.benchmarks.registry import read_benchmark
+from brewster.environments.catalog import read_catalog
+from brewster.evaluate import ablation
+from brewster.evaluate.methods import PredictionFolder
+from brewster.inference.onnx_backend import OnnxBackend
+from brewster.models.diffusion.backbones.loading import load_backbone
+from brewster.models.diffusion.task import load_task
+from brewster.models.diffusion.tensors import read_tensors
+from brewster.rendered.generation.workers import render_again
+from brewster.scene.recipe import read_scene_recipe
+from brewster.scene.scene import read_scene
+from brewster.training.data.image_loading import read_pairs
+from brewster.training.data.rendered import RenderedDatasets
+from brewster.training.loop import Checkpoint
+from brewster.training.recipe import read_recipe
+from brewster.user_study import study
+from brewster.user_study.answer_file import read_answer_file
 
 ERROR_CLASSES = [value for value in vars(errors).values() if inspect.isclass(value)]
 
@@ -73,3 +91,38 @@ def test_an_unknown_type_of_error_is_named_and_a_long_value_is_shortened():
     error = errors.invalid_value({"type": "url_scheme", "loc": ("a", 0), "input": ["x" * 500]})
     assert error.happened == f"a.0 is ['{'x' * 38}"
     assert error.expected == "expected a valid value (url_scheme)"
+
+
+READERS = {
+    "ablation": ablation.read_study,
+    "answers of a study": read_answer_file,
+    "backbone": lambda path: load_backbone(str(path)),
+    "benchmark": lambda path: read_benchmark("pairs", path),
+    "checkpoint": Checkpoint.read,
+    "list of photos": lambda path: plan_files(path.with_suffix(".csv")),
+    "maps": lambda path: read_catalog([path], []),
+    "model": lambda path: Separator.load(str(path.with_suffix(".onnx"))),
+    "network": OnnxBackend,
+    "pairs for training": lambda path: read_pairs([path]),
+    "photos": lambda path: read_catalog([], [path]),
+    "predictions": lambda path: PredictionFolder("theirs", path).check_pairing([]),
+    "rendered benchmark": lambda path: read_benchmark("rendered", path),
+    "rendered dataset": lambda path: RenderedDatasets([path], seed=1),
+    "scene": read_scene,
+    "scene recipe": lambda path: read_scene_recipe(str(path.with_suffix(".toml"))),
+    "scene to render again": lambda path: render_again(path, path.with_name("out")),
+    "study": study.read_study,
+    "task of a model": load_task,
+    "tensors": read_tensors,
+    "training recipe": read_recipe,
+}
+
+
+@pytest.mark.parametrize("kind", READERS)
+def test_a_file_or_folder_that_is_missing_or_damaged_is_an_error_that_names_it(kind, tmp_path):
+    for name in ("missing", "damaged"):
+        with pytest.raises(errors.BrewsterError, match=name) as raised:
+            READERS[kind](tmp_path / name)
+        assert raised.value.cure
+        for suffix in ("", ".csv", ".onnx", ".toml"):
+            (tmp_path / "damaged").with_suffix(suffix).write_bytes(b"\xff damaged")

@@ -100,15 +100,6 @@ def test_a_case_with_an_unreadable_ground_truth_is_not_in_the_report(real20, met
     assert 'data-name="1"' in (tmp_path / "out" / "report.html").read_text()
 
 
-def test_each_image_is_decoded_once_for_the_scores(tmp_path, methods, real20, monkeypatch):
-    decoded, open_photo = [], Photo.open
-    monkeypatch.setattr(
-        Photo, "open", lambda source, **more: decoded.append(source) or open_photo(source, **more)
-    )
-    evaluate(real20, methods, QUICK, tmp_path / "out", max_report_cases=0)
-    assert sum(isinstance(source, bytes) for source in decoded) == 2 * (3 + 2)  # two layers of the model
-
-
 def test_a_deleted_prediction_is_computed_again_for_the_report(real20, methods, tmp_path):
     first = evaluate(real20, methods, QUICK, tmp_path / "out")
     page = (tmp_path / "out" / "report.html").read_bytes()

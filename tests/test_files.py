@@ -279,23 +279,6 @@ def test_files_are_written_on_file_systems_without_hard_links(tmp_path, monkeypa
     assert (tmp_path / "a.png").read_bytes() == b"whole"
 
 
-@pytest.mark.parametrize(
-    ("target", "word"),
-    [
-        ("folder", "expected a file"),
-        ("file/a.png", "expected a folder"),
-        ("file/below/a.png", "expected a folder"),
-        ("n" * 300, "shorter"),
-    ],
-)
-def test_impossible_targets_are_errors(tmp_path, target, word):
-    (tmp_path / "folder").mkdir()
-    (tmp_path / "file").write_bytes(b"")
-    with pytest.raises(OutputError, match=word) as raised:
-        write_atomically(tmp_path / target, b"layer")
-    assert "--overwrite" not in str(raised.value)
-
-
 def test_ctrl_c_just_after_the_rename_leaves_nothing_else(tmp_path, monkeypatch):
     """The interrupt comes before the hidden file is deleted, as on a machine with a high load."""
     discard, calls = files.discard, []

@@ -1,7 +1,6 @@
 """Rendering a dataset: resume, growth, shards, refused folders, and equal bytes in all cases."""
 
 import errno
-import fcntl
 import os
 import shutil
 import subprocess
@@ -211,13 +210,6 @@ def test_a_dataset_grows_across_versions_until_its_samples_change(four_samples, 
         render_set(tmp_path / "set")
 
 
-def test_a_damaged_record_is_reported(four_samples, tmp_path):
-    shutil.copytree(four_samples, tmp_path / "set")
-    (tmp_path / "set" / "set.toml").write_text("not toml")
-    with pytest.raises(OutputError, match=r"set\.toml cannot be read"):
-        render_set(tmp_path / "set")
-
-
 def test_a_folder_of_something_else_is_refused(tmp_path):
     (tmp_path / "holiday.jpg").touch()
     with pytest.raises(OutputError, match=r"holiday\.jpg, but no rendered dataset"):
@@ -239,13 +231,3 @@ def test_rendering_starts_without_the_module_fcntl():
     """Windows has no such module."""
     code = "import sys; sys.modules['fcntl'] = None; import brewster.rendered.generation.workers"
     subprocess.run([sys.executable, "-c", code], check=True)
-
-
-@pytest.mark.parametrize("number", [errno.ENOLCK, errno.ENOSYS])
-def test_a_file_system_without_locks_is_reported(four_samples, monkeypatch, number):
-    def refuse(file, operation):
-        raise OSError(number, os.strerror(number))
-
-    monkeypatch.setattr(fcntl, "flock", refuse)
-    with pytest.raises(OutputError, match="cannot be locked"):
-        render_set(four_samples)

@@ -1,7 +1,6 @@
 import base64
 import json
 import re
-import weakref
 from copy import deepcopy
 from dataclasses import replace
 from html.parser import HTMLParser
@@ -142,9 +141,6 @@ def pictures(page):
     return images
 
 
-# --- the page
-
-
 def test_the_page_does_not_load_other_files(page, tmp_path):
     made, source = page(), (tmp_path / "report.html").read_text()
     assert "http" not in re.sub(r"http-equiv", "", source)
@@ -172,9 +168,6 @@ def test_names_with_markup_are_escaped(page, name):
     assert set(made.scores()[0]) == {"input (unprocessed)", name}
 
 
-# --- numbers
-
-
 def test_the_best_mean_of_a_column_has_a_star(page):
     assert re.search(r"input \(unprocessed\)\s*20.00", page().text)
     assert re.search(r"★ best 21.50\s*20.00 to 23.00", page().text)
@@ -200,9 +193,6 @@ def test_errors_are_listed_at_the_top_and_at_their_case(page):
     assert "nature20/a, compact: no prediction" in made.text
     assert "Failed: no prediction" in made.text
     assert "compact, a" not in [has["alt"] for has in made.all("img")]
-
-
-# --- pictures
 
 
 @pytest.mark.parametrize(
@@ -261,9 +251,6 @@ def test_error_maps_are_embedded_losslessly(page, rng):
     assert (made["error of the photo, a"].pixels == error_map(photo, truth)).all()
 
 
-# --- sorting and comparing, in a browser that opens the file
-
-
 def test_cases_are_sorted_and_filtered_and_an_image_is_compared_with_another(chromium, tmp_path):
     given = results()
     scores = {"input (unprocessed)": 10.0, "compact": 11.0}
@@ -294,21 +281,3 @@ def test_cases_are_sorted_and_filtered_and_an_image_is_compared_with_another(chr
     assert not page.locator("dialog").is_visible()
     page.close()
     assert not failures
-
-
-# --- the file
-
-
-def test_cases_are_read_and_freed_one_at_a_time(tmp_path):
-    alive = []
-
-    def cases():
-        for number in range(6):
-            assert sum(case() is not None for case in alive) <= 1  # the case that was just written
-            case = make_thumbnails(f"{number}")
-            alive.append(weakref.ref(case))
-            yield case
-            del case
-
-    write_report(results([*"012345"]), cases(), tmp_path / "report.html")
-    assert len(alive) == 6

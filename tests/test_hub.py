@@ -2,7 +2,6 @@
 
 import hashlib
 import json
-import shutil
 
 import huggingface_hub
 import pytest
@@ -17,7 +16,6 @@ from brewster.models.diffusion.task import DecompositionTask
 from brewster.models.diffusion.tensors import read_metadata, read_tensors
 from brewster.training.lora.model_card import write_card
 from brewster.training.recipe import LoraRecipe
-from file_server import unused_address
 
 pytestmark = pytest.mark.loopback
 
@@ -119,48 +117,25 @@ def test_a_message_and_a_card_with_the_path_of_a_home_folder_are_refused(write_l
 def test_a_missing_file_is_named(write_lora, name):
     folder = write_lora()
     (folder / name).unlink()
-    with pytest.raises(ModelError, match=f"{name} cannot be read .*; expected a LoRA's folder, with"):
+    with pytest.raises(ModelError, match=name):
         plan_push(folder, REPO)
 
 
 @pytest.mark.parametrize(
-    ("card", "message"),
-    [
-        ("# No front matter\n", "has no base_model, library_name, license"),
-        ("---\nlicense: mit\nlibrary_name: diffusers\n---\n", "has no base_model"),
-        ("---\nlicense: [mit\n---\n", "is not YAML"),
-        ("---\n- mit\n---\n", "is not YAML"),
-    ],
+    "front_matter", ["", "---\nlicense: mit\nlibrary_name: x\n---\n", "---\nlicense: [\n---\n"]
 )
-def test_a_card_with_invalid_front_matter_is_refused(write_lora, card, message):
+def test_a_card_without_valid_front_matter_is_refused(write_lora, front_matter):
     folder = write_lora()
-    (folder / "README.md").write_text(card)
-    with pytest.raises(ModelError, match=message):
+    (folder / "README.md").write_text(f"{front_matter}# A card\n")
+    with pytest.raises(ModelError, match="front matter"):
         plan_push(folder, REPO)
 
 
-def test_damaged_files_and_another_prompt_are_refused(write_lora):
-    folder = write_lora()
-    (folder / "recipe.json").write_text("{")
-    with pytest.raises(ModelError, match="is not JSON"):
-        plan_push(folder, REPO)
+def test_another_prompt_is_refused(write_lora):
     folder = write_lora()
     tiny("kontext", seed=8)[1].save(folder / "prompt.safetensors")
     with pytest.raises(ModelError, match="not the prompt with which the LoRA was trained"):
         plan_push(folder, REPO)
-    whole = (folder / LORA_FILE).read_bytes()
-    (folder / LORA_FILE).write_bytes(whole[:1000])
-    with pytest.raises(ModelError, match="cannot be read"):
-        plan_push(folder, REPO)
-
-
-@pytest.mark.parametrize("name", ["name", "a/b/c", "a b/c", "", "-a/b"])
-def test_an_invalid_hub_id_is_refused(write_lora, name):
-    with pytest.raises(ModelError, match=r"is not a valid hub id .*; expected OWNER/NAME"):
-        plan_push(write_lora(), name)
-
-
-# --- sending
 
 
 def test_a_push_makes_a_private_repository_with_the_four_files_in_one_commit(write_lora, hub):
@@ -189,35 +164,6 @@ def test_without_a_token_no_request_is_made(write_lora, hub, monkeypatch):
     assert hub.requests == []
 
 
-@pytest.mark.parametrize(
-    ("path", "status", "message"),
-    [
-        ("repos/create", 403, "the hub refused the token for somebody/.* repositories of somebody"),
-        ("/commit/", 403, "the hub refused the token .* with write access"),
-        ("/commit/", 401, "the hub refused the token"),
-        ("/commit/", 500, "the hub returned HTTP 500 .*; try again later"),
-        ("validate-yaml", 400, r"the hub refused README\.md"),
-    ],
-)
-def test_refusals_of_the_hub_are_explained(write_lora, hub, path, status, message):
-    hub.refusals[path] = status
-    with pytest.raises(DownloadError, match=message):
-        push(plan_push(write_lora(), REPO))
-    assert hub.messages == []
-
-
-def test_a_missing_network_connection_is_explained(write_lora, monkeypatch):
-    monkeypatch.setattr(huggingface_hub.constants, "ENDPOINT", unused_address())
-    with pytest.raises(DownloadError, match=r"the connection failed .*; expected a network connection"):
-        push(plan_push(write_lora(), REPO), token="hf_right")
-    monkeypatch.setattr(huggingface_hub.constants, "HF_HUB_OFFLINE", True)
-    with pytest.raises(DownloadError, match="the hub cannot be reached"):
-        push(plan_push(write_lora(), REPO), token="hf_right")
-
-
-# --- the command
-
-
 def test_a_dry_run_of_the_command_prints_the_plan_and_sends_nothing(run_without_model, write_lora, hub):
     folder = write_lora()
     code, out, err = run_without_model("models", "push", folder, REPO, "--dry-run")
@@ -243,14 +189,7 @@ def test_the_command_sends_and_prints_the_address(run_without_model, write_lora,
     assert "error: the hub refused the token" in err
 
 
-def test_the_card_of_a_folder_is_printed_and_scores_are_added(run_without_model, write_lora, tmp_path):
+def test_the_card_of_a_folder_is_printed(run_without_model, write_lora):
     folder = write_lora()
     code, out, _ = run_without_model("models", "card", folder)
     assert (code, out.decode()) == (0, (folder / "README.md").read_text() + "\n")
-    (tmp_path / "half.json").write_text('{"metrics": {}}')
-    assert run_without_model("models", "card", folder, "--scores", tmp_path / "half.json")[0] == 1
-    shutil.rmtree(folder)
-    folder.mkdir()
-    code, _, err = run_without_model("models", "card", folder)
-    assert code == 1
-    assert "README.md cannot be read" in err

@@ -156,19 +156,3 @@ def test_progress_contains_the_place_in_the_queue_and_the_share():
 
     progress = asyncio.run(scenario(JobQueue(), [BlockingWork(), BlockingWork(), BlockingWork()]))
     assert progress == [("working", 0), ("waiting", 1), ("waiting", 2)]
-
-
-def test_two_jobs_cannot_have_the_same_name():
-    job_queue = JobQueue()
-    with job_queue.reserve("one"):
-        with pytest.raises(HTTPException, match="choose another name"), job_queue.reserve("one"):
-            pass
-        assert job_queue.job_count == 1
-    assert not job_queue.job_count
-
-
-def test_a_place_is_released_if_its_upload_fails():
-    job_queue = JobQueue()
-    with pytest.raises(OSError, match="cut"), job_queue.reserve():
-        raise OSError("cut")
-    assert not job_queue.job_count

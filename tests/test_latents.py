@@ -114,20 +114,6 @@ def test_each_sample_is_used_whole_and_in_the_number_of_crops_of_the_recipe(reci
         assert {each.composite.shape for each in encoded.values()} == {(1, 64, 1, 6)}
 
 
-def test_a_crop_depends_on_seed_sample_and_crop_number_alone(recipe, backbone):
-    def encode(number, crop, **changes):
-        lora_recipe = recipe(LARGE_PAIRS, crops=3, **changes)
-        return (
-            EncodedSampleLoader(open_samples(lora_recipe), backbone, lora_recipe)
-            ._encode(number, False, crop)
-            .composite
-        )
-
-    assert torch.equal(encode(1, 2), encode(1, 2, steps=9, flip=False))
-    for other in (encode(1, 1), encode(0, 2), encode(1, 2, seed=2), encode(1, 0)):
-        assert not torch.equal(encode(1, 2), other)
-
-
 @given(st.integers(16, 300), st.integers(16, 300), st.integers(1, 99), st.integers(0, 99))
 def test_a_crop_has_the_aspect_ratio_of_the_sample_and_is_never_smaller_than_the_panel(
     width, height, cells, seed

@@ -155,9 +155,6 @@ def test_absorption_follows_the_beer_lambert_law():
     )
 
 
-# --- orders, one by one
-
-
 def orders_of(panes, cosine):
     return enumerate_orders(
         tuple(float(sum(fresnel(float64(cosine), pane.refractive_index))) / 2 for pane in panes)
@@ -234,9 +231,6 @@ def test_in_double_glazing_the_papers_reflection_never_enters_the_last_pane():
     assert [order.in_truncated_layers for order in reflected[:4]] == [True, True, True, False]
     for order in reflected:
         assert order.in_truncated_layers == (order.transmissions[1] == 0)
-
-
-# --- ghosts
 
 
 def test_the_ghost_distance_matches_the_textbook_formula():

@@ -7,8 +7,7 @@ import pytest
 import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from brewster.errors import ModelError, RecipeError
-from brewster.training.compact.trainer import CompactTrainer
+from brewster.errors import RecipeError
 from brewster.training.loop import IMAGE_TAG, Checkpoint, TensorBoardLog, run
 from brewster.training.recipe import with_value
 from training_helpers import Killed, ignore_step, kill_after, train
@@ -38,11 +37,6 @@ class CountingTrainer:
 
     def export(self, folder):
         return folder
-
-
-def initial_checkpoint(recipe):
-    """Returns the checkpoint before the first step."""
-    return Checkpoint(0, recipe.model_dump_json(), CompactTrainer(recipe).state_dict())
 
 
 def logged_steps(out):
@@ -97,13 +91,6 @@ def test_a_run_resumes_after_a_key_was_added_to_the_recipe_schema(recipe, tmp_pa
     assert logged_steps(tmp_path) == [3, 6]
 
 
-def test_a_run_with_an_invalid_stored_recipe_is_not_resumed(recipe, tmp_path):
-    fresh = initial_checkpoint(recipe)
-    replace(fresh, recipe='{"unknown_key": 1}').write(tmp_path / "checkpoint.pt")
-    with pytest.raises(RecipeError, match="another recipe"):
-        train(recipe, tmp_path, ignore_step)
-
-
 def test_a_refused_resume_names_the_values_that_differ(recipe, tmp_path):
     run(CountingTrainer(recipe), tmp_path, ignore_step)
     other = with_value(with_value(recipe, "mix.veil", [0.0, 0.5]), "learning_rate", 0.01)
@@ -143,22 +130,6 @@ def test_a_checkpoint_is_written_every_checkpoint_every_steps_and_at_the_end(rec
 
     run(CountingTrainer(recipe.model_copy(update={"steps": 5, "checkpoint_every": 2})), tmp_path, record)
     assert steps == [0, 2, 2, 4, 5]
-
-
-def test_a_checkpoint_of_another_network_is_named(recipe, tmp_path):
-    other = replace(initial_checkpoint(recipe), state={"network": {}, "average": {}})
-    other.write(tmp_path / "checkpoint.pt")
-    with pytest.raises(ModelError, match=r"checkpoint\.pt contains another network; .* with -o"):
-        train(recipe, tmp_path, ignore_step)
-
-
-def test_a_damaged_checkpoint_is_named(tmp_path):
-    (tmp_path / "checkpoint.pt").write_bytes(b"not a checkpoint")
-    with pytest.raises(ModelError, match=r"checkpoint\.pt"):
-        Checkpoint.read(tmp_path / "checkpoint.pt")
-
-
-# --- TensorBoard
 
 
 def test_a_resumed_run_discards_events_of_later_steps(tmp_path):

@@ -7,7 +7,7 @@ import torch
 from safetensors.torch import save_file
 
 from brewster import Separator
-from brewster.errors import ModelError, RecipeError
+from brewster.errors import ModelError
 from brewster.models.diffusion.adapter.importer import import_lora, read_layers
 from brewster.models.diffusion.adapter.lora import LORA_FILE, load_lora, read_lora_metadata
 from brewster.models.diffusion.adapter.lora_formats import read_lora_layers, scaling_from_config
@@ -234,6 +234,15 @@ def test_a_lora_of_peft_without_its_settings_needs_its_alpha(prefix, tmp_path):
         read_layers(path, backbone, alpha=4)
 
 
+def test_the_alphas_of_a_file_win_over_the_settings_next_to_it(tmp_path):
+    name, path = f"{BLOCK}attn.to_q", tmp_path / "lora.safetensors"
+    pair = weights("qwen", original=False)[name]
+    save_file(kohya({name: pair}, alpha=3.0), path)
+    (tmp_path / "adapter_config.json").write_text(json.dumps({"lora_alpha": 8}))
+    found = read_layers(path, tiny("qwen", seed=1)[0])[f"{name}.lora_B.weight"]
+    torch.testing.assert_close(found, 3 / len(pair[0]) * pair[1])
+
+
 def test_rank_stabilised_loras_have_their_own_scale():
     assert scaling_from_config({"lora_alpha": 8, "use_rslora": True})("x", 4) == 4
     assert scaling_from_config({"lora_alpha": 8})("x", 4) == 2
@@ -294,13 +303,6 @@ def test_a_layer_that_occurs_twice_is_refused(first, second):
         tensors |= peft({name: pairs[QKV if name == QKV else TO_Q]}, prefix, adapter)
     with pytest.raises(ModelError, match=r"more than one LoRA for the layer .*to_q"):
         read_lora_layers(tensors, transformer, "kontext")
-
-
-def test_a_folder_must_contain_one_file_and_panels_need_t(tmp_path):
-    with pytest.raises(ModelError, match=r"contains no such file; expected one \.safetensors file"):
-        import_lora(str(tmp_path), tmp_path / "out", base_model="tiny:qwen", prompt="x", panels=("T",))
-    with pytest.raises(RecipeError, match="expected a list with T"):
-        import_lora(str(tmp_path), tmp_path / "out", base_model="tiny:qwen", prompt="x", panels=("R",))
 
 
 def test_a_lora_and_a_checkpoint_are_imported(run_without_model, tmp_path):

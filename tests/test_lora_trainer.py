@@ -2,7 +2,6 @@
 
 import json
 import os
-import subprocess
 import sys
 
 import numpy as np
@@ -25,6 +24,7 @@ from brewster.training.loop import Checkpoint, run
 from brewster.training.lora.trainer import LoraTrainer
 from brewster.training.recipe import LoraRecipe
 from brewster.training.trainers import open_trainer
+from other_processes import finished
 from set_folders import render_set
 from training_helpers import Killed, kill_after
 
@@ -162,12 +162,9 @@ ACCELERATE = ["accelerate.commands.launch", "--multi_gpu", "--num_processes", "2
 
 def run_two_processes(launcher, path, out):
     """Runs the command line under a launcher with two processes. Returns exit code and stderr."""
-    done = subprocess.run(
+    done = finished(
         [sys.executable, "-m", *launcher, "-m", "brewster", "train", str(path), "-o", str(out)],
         env=os.environ | {"OMP_NUM_THREADS": "1"},
-        capture_output=True,
-        text=True,
-        check=False,
         timeout=300,
     )
     return done.returncode, done.stderr

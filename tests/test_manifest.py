@@ -82,22 +82,6 @@ def test_the_column_path_decides_which_character_separates_the_values(tmp_path):
     manifest.write_text("path\na,b.jpg\n")
     with pytest.raises(ManifestError, match=r"line 2 of .* has more values"):
         plan_files(manifest)
-    manifest.write_text("")
-    with pytest.raises(ManifestError, match="has no columns; expected"):
-        plan_files(manifest)
-
-
-@pytest.mark.parametrize("suffix", [".csv", ".parquet"])
-def test_a_file_that_is_not_a_table_is_refused(tmp_path, suffix):
-    path = tmp_path / f"list{suffix}"
-    with pytest.raises(ManifestError, match="cannot be read"):
-        plan_files(path)
-    path.write_bytes(image_bytes())
-    with pytest.raises(ManifestError, match=r"is not a table \(.+; expected a CSV or Parquet table"):
-        plan_files(path)
-    write_manifest(path, "a.jpg", column="file")
-    with pytest.raises(ManifestError, match=r"has the columns .*'file'.*; name a column 'path'"):
-        plan_files(path)
 
 
 def test_rows_that_are_not_paths_below_the_manifest_are_refused(tmp_path):

@@ -53,9 +53,6 @@ def test_images_may_have_any_memory_layout(rng):
         assert ssim(a, b) == pytest.approx(ssim(a.copy(), b.copy()), abs=1e-12)
 
 
-# --- in a region
-
-
 @given(images, images, windows)
 def test_a_region_that_is_the_whole_image_changes_nothing(one, other, window):
     whole = np.ones(one.shape[:2], bool)
@@ -102,9 +99,6 @@ def test_a_region_at_the_border_has_no_ssim():
         ssim(image, image, region=region)
 
 
-# --- invalid input
-
-
 @pytest.mark.parametrize("metric", [psnr, ssim])
 @pytest.mark.parametrize(
     ("image", "why"),
@@ -131,9 +125,6 @@ def test_an_image_smaller_than_the_window_is_refused(window, side):
     assert ssim(*np.zeros((2, side, side, 3), np.uint8), window=window) == 1
 
 
-# --- linear light and channels
-
-
 def test_the_linear_rmse_is_the_rms_of_the_light(rng):
     prediction, truth = rng.integers(0, 256, (2, 9, 12, 3)).astype(np.uint8)
     light, true_light = (to_linear(image / 255) for image in (prediction, truth))
@@ -157,9 +148,6 @@ def test_the_psnr_of_channels_is_the_mean_of_three_psnrs(rng):
     assert psnr_of_channels(prediction, truth) == pytest.approx(expected)
     assert psnr_of_channels(prediction, truth) >= psnr(prediction, truth)
     assert psnr_of_channels(truth, truth) == float("inf")
-
-
-# --- the table
 
 
 def test_a_metric_is_found_by_name_and_a_typing_error_gets_a_suggestion():

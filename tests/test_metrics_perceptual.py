@@ -65,9 +65,6 @@ def make_pair(height, width):
     return photo, truth, region
 
 
-# --- values
-
-
 @pytest.mark.parametrize(
     ("size", "whole", "inside"),
     [
@@ -112,30 +109,6 @@ def test_the_channel_weights_are_the_published_ones():
         b"".join(weights.astype("<f4").tobytes() for weights in channel_weights)
     ).hexdigest()
     assert sums == "718a8b40b0d22f96192d34ab93c0db5c7943558ff6c2407f44812dce2f29b5f4"
-
-
-# --- invalid input
-
-
-@pytest.mark.parametrize("size", [(30, 90), (90, 30)])
-def test_an_image_that_is_too_small_for_alexnet_is_refused(metric, size):
-    with pytest.raises(ValueError, match=f"at least 31x31 pixels, not {size[0]}x{size[1]}"):
-        metric.features(np.zeros((*size, 3), np.uint8))
-
-
-def test_unequal_sizes_and_wrong_regions_are_refused(metric):
-    one, other = (metric.features(np.zeros((31, width, 3), np.uint8)) for width in (31, 32))
-    with pytest.raises(ValueError, match="differ in size"):
-        metric.difference(one, other).mean()
-    with pytest.raises(ValueError, match="empty"):
-        metric.difference(one, one).mean(region=np.zeros((31, 31), bool))
-    with pytest.raises(ValueError, match="must be bool"):
-        metric.difference(one, one).mean(region=np.ones((31, 32), bool))
-    with pytest.raises(ValueError, match="must be uint8"):
-        metric.features(np.zeros((31, 31, 3)))
-
-
-# --- search and download of the weights, with small tensors in place of those of AlexNet
 
 
 @pytest.fixture
@@ -207,13 +180,9 @@ def test_other_weights_in_the_downloaded_file_are_deleted(server, state, cache):
 @pytest.mark.parametrize(
     "damage",
     [
-        lambda body: b"",
         lambda body: b"not a weights file",
         lambda body: body[: len(body) // 2],
-        lambda body: body[:-30],
         lambda body: body.replace(b"features.0.weight", b"features.9.weight"),
-        lambda body: serialise([1, 2]),
-        lambda body: serialise(torch.zeros(3)),
         lambda body: serialise(dict.fromkeys(ALEXNET_TENSORS, "text")),
         lambda body: serialise({"model": Path("code")}),
     ],

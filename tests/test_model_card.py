@@ -67,8 +67,6 @@ def test_datasets_are_listed_with_their_scenes_and_without_local_paths(tmp_path,
     elsewhere = {"rendered": {"datasets": [str(tmp_path / "sets" / "paper")]}}
     assert "`paper` (3 samples" in card(data=elsewhere)
     assert str(tmp_path) not in card(data=elsewhere)
-    monkeypatch.setenv("BREWSTER_DATA", str(tmp_path / "sets"))
-    assert "of the samples: the first 1000 samples of `sets/paper`." in card()
 
 
 def test_benchmark_tables_replace_earlier_ones():

@@ -4,7 +4,6 @@ import huggingface_hub.constants
 import pytest
 
 from brewster.errors import DeviceError, DownloadError, ModelError
-from brewster.models.diffusion import pipeline
 from brewster.models.diffusion.model_source import find_model_source
 from brewster.models.diffusion.pipeline import load_pipeline
 from brewster.models.diffusion.task import windowseat_task
@@ -33,13 +32,6 @@ def hub(tmp_path, monkeypatch):
 
     monkeypatch.setattr(huggingface_hub, "snapshot_download", snapshot_download)
     return requests
-
-
-def test_each_file_of_a_model_is_requested_once(hub, monkeypatch):
-    monkeypatch.setattr(pipeline, "check_machine", lambda *_, **__: None)
-    load_pipeline("windowseat", device="cpu")
-    # The LoRA, the index of the base, and then its weights.
-    assert hub == [WINDOWSEAT, BASE, BASE]
 
 
 @pytest.mark.parametrize("transformer", [None, "someone/windowseat-gguf/model.gguf"])

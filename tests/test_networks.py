@@ -4,7 +4,6 @@ import pytest
 import torch
 from torch import nn
 
-from brewster.errors import RecipeError
 from brewster.inference.onnx_backend import OnnxBackend
 from brewster.models.compact import CompactNetwork
 from brewster.models.networks import DEFAULT_NETWORK, MAX_STRIDE, NETWORKS, NetworkEntry
@@ -61,9 +60,3 @@ def test_a_recipe_trains_and_exports_the_network_that_it_names(recipe, small_net
     photo = torch.rand(8, 20, 3).numpy()
     transmission, reflection = backend(photo)
     assert transmission.shape == reflection.shape == photo.shape
-
-
-def test_a_run_of_one_network_is_not_resumed_with_another(recipe, small_network, tmp_path):
-    train(recipe, tmp_path, ignore_step)
-    with pytest.raises(RecipeError, match=r"belongs to a run of another recipe: network was"):
-        train(with_value(recipe, "network", small_network), tmp_path, ignore_step)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from brewster.errors import DeviceError, ModelError
+from brewster.errors import DeviceError
 from brewster.inference import onnx_backend
 from brewster.inference.onnx_backend import OnnxBackend, available_devices
 from brewster.models.compact import LinearSeparator, with_imagenet_features
@@ -98,16 +98,3 @@ def test_a_device_that_does_not_start_is_an_error_and_auto_skips_it(model_file, 
     with pytest.raises(DeviceError, match="does not start"):
         OnnxBackend(model_file, "cuda")
     assert OnnxBackend(model_file, "auto").device == "cpu"
-
-
-def test_a_file_that_is_not_a_model_is_an_error(tmp_path):
-    (tmp_path / "text.onnx").write_text("hello")
-    with pytest.raises(ModelError, match=r"text\.onnx"):
-        OnnxBackend(tmp_path / "text.onnx")
-    with pytest.raises(ModelError, match=r"missing\.onnx"):
-        OnnxBackend(tmp_path / "missing.onnx")
-
-
-def test_a_model_that_fails_at_run_time_is_a_model_error(model_file):
-    with pytest.raises(ModelError, match="tile of 0x0"):
-        OnnxBackend(model_file, "cpu")(np.zeros((0, 0, 3), np.float32))

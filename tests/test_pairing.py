@@ -31,9 +31,6 @@ def names(found):
     return [group.name for group in found.groups]
 
 
-# --- a folder for each role
-
-
 @pytest.mark.parametrize(
     "roles",
     [
@@ -110,17 +107,6 @@ def test_system_files_are_ignored_silently_and_other_files_with_a_remark(tmp_pat
     assert names(read_folders(tmp_path)) == ["a"]
 
 
-def test_a_missing_or_empty_folder_of_a_role_is_an_error(tmp_path):
-    with pytest.raises(PhotoError, match=r"no subfolder for the photo; .*blended.*; "):
-        read_folders(tmp_path)
-    write(tmp_path, "blended/notes.txt")
-    with pytest.raises(PhotoError, match=r"blended contains no images; .*\.png.*; "):
-        read_folders(tmp_path)
-    write(tmp_path, "blended/a.png")
-    with pytest.raises(PhotoError, match=r"no subfolder for the transmission; "):
-        read_folders(tmp_path)
-
-
 def test_a_split_is_the_folder_itself_or_the_only_one_in_it(tmp_path):
     repacked(tmp_path / "val", ["a"])
     (tmp_path / "other").mkdir()
@@ -128,9 +114,6 @@ def test_a_split_is_the_folder_itself_or_the_only_one_in_it(tmp_path):
     repacked(tmp_path / "test", ["a"])
     with pytest.raises(PhotoError, match=r"has pairs in the subfolders test and val; .*, for example .*test"):
         find_split(tmp_path)
-
-
-# --- the original folders of SIR2
 
 
 def test_the_original_folders_of_sir2_give_one_group_per_shot(tmp_path):
@@ -211,9 +194,6 @@ def test_subsets_are_recognised_by_the_start_of_their_names(tmp_path):
         find_subsets(tmp_path)
 
 
-# --- both layouts
-
-
 @settings(max_examples=15)
 @given(order=st.randoms())
 def test_the_order_of_a_listing_does_not_matter(order):
@@ -237,9 +217,6 @@ def shuffled(items, order: random.Random):
 def test_natural_order_is_total_and_puts_2_before_10(texts, order):
     assert sorted(shuffled(texts, order), key=natural_key) == sorted(texts, key=natural_key)
     assert sorted(["a10", "a2", "10", "2", "a"], key=natural_key) == ["2", "10", "a", "a2", "a10"]
-
-
-# --- training
 
 
 def test_training_pairs_are_grouped_in_the_same_way(tmp_path):

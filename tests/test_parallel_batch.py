@@ -2,7 +2,6 @@
 
 import hashlib
 import os
-import re
 from functools import partial
 from pathlib import Path
 
@@ -202,11 +201,6 @@ def test_an_index_of_an_earlier_version_is_continued(tmp_path):
     table = parquet.read_table(tmp_path / INDEX_FILE)
     assert table.column_names == list(COLUMNS)
     assert table.column("path").to_pylist() == ["a.jpg", "b.jpg"]
-
-
-def test_the_documentation_has_every_column_of_the_index():
-    section = (TESTS.parent / "docs/archives.md").read_text().split("## The index")[1].split("\n## ")[0]
-    assert re.findall(r"^\| `(\w+)`", section, re.M) == list(COLUMNS)
 
 
 def test_another_file_with_the_name_of_the_index_is_never_replaced(tmp_path):

@@ -22,9 +22,6 @@ XMP = b'<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf tiff:Orientation="6" note="kept
 UPRIGHT_XMP = XMP.replace(b'"6"', b'"1"')
 
 
-# --- lossy files
-
-
 @pytest.mark.parametrize("quality", [1, 30, 75, 92, 100])
 @pytest.mark.parametrize(("subsampling", "name"), [(0, "4:4:4"), (1, "4:2:2"), (2, "4:2:0")])
 def test_jpeg_quality_and_chroma_are_no_worse_than_the_source(quality, subsampling, name):
@@ -89,9 +86,6 @@ def test_avif_keeps_10_and_12_bits_and_white(bits):
     assert photo.pixels.max() == 65535
     assert np.array_equal(photo.pixels >> (16 - bits), shifted >> (16 - bits))
     assert np.array_equal(Photo.open(photo.encode()).pixels, photo.pixels)
-
-
-# --- EXIF, profiles, XMP, resolution
 
 
 @pytest.mark.parametrize("orientation", range(1, 9))

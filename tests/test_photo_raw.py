@@ -109,9 +109,6 @@ def test_a_tiff_of_a_photo_is_not_raw():
     assert format_of(Path("a.NEF")) == FORMATS["raw"]
 
 
-# --- EXIF of other makers: the files are built here, because LibRaw is not needed for their tags
-
-
 def tiff_block(tags):
     exif = Image.Exif()
     exif.endian = "<"

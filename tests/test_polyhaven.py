@@ -99,9 +99,6 @@ def manifest(maps):
     return list(csv.DictReader((maps / "manifest.csv").read_text().splitlines()))
 
 
-# --- which maps
-
-
 def test_maps_are_downloaded_in_the_order_of_their_ids_and_indoor_maps_first(fetch, maps):
     found = fetch(indoor=2, outdoor=9)
     assert [(result.asset, result.category) for result in found] == [
@@ -149,13 +146,6 @@ def test_finished_maps_are_skipped_and_other_files_are_not_replaced(haven, fetch
     assert (maps / "a_room_4k.hdr").read_bytes() == other_file
 
 
-@pytest.mark.parametrize("authors", [{"\ud800": "All"}, {"a" * 200_000: "All"}, ["Ann"], {}])
-def test_authors_may_have_any_name(haven, fetch, authors):
-    haven.assets = {"a": INDOOR | {"authors": authors}, "b": INDOOR}
-    assert statuses(fetch(indoor=2)) == [("a", "downloaded"), ("b", "downloaded")]
-    assert statuses(fetch(indoor=2)) == [("a", "skipped"), ("b", "skipped")]
-
-
 def test_an_id_cannot_write_outside_the_folder(haven, fetch, tmp_path):
     haven.assets = {
         "../../escaped": INDOOR,
@@ -168,14 +158,6 @@ def test_an_id_cannot_write_outside_the_folder(haven, fetch, tmp_path):
     assert [result.status for result in found] == ["failed"] * 4 + ["downloaded"]
     assert list_files(tmp_path) == ["maps/a_room_4k.hdr", "maps/manifest.csv"]
     assert {path for path, *_ in haven.requests} == {"/assets", "/files/a_room", "/file/a_room"}
-
-
-# --- the connection
-
-
-def test_every_request_has_a_user_agent(haven, fetch):
-    fetch()
-    assert all(agent.startswith("brewster/") for agent in haven.agents)
 
 
 def test_a_server_that_ignores_the_range_starts_again(haven, fetch, maps):
@@ -274,18 +256,12 @@ def test_redirections_are_followed_to_http_urls_only(haven, fetch):
     assert [result.status for result in fetch(indoor=3)] == ["downloaded", "failed", "failed"]
 
 
-# --- the disk
-
-
 def test_a_manifest_of_another_program_is_refused_before_any_download(haven, fetch, maps):
     maps.mkdir()
     (maps / "manifest.csv").write_bytes(b"name,price\n\xff,1\n")
     with pytest.raises(OutputError, match="was not written by brewster"):
         fetch()
     assert haven.requests == []
-
-
-# --- the command
 
 
 @pytest.fixture

@@ -1,10 +1,8 @@
 """Qwen's prompt through the real pipeline of diffusers, with a tiny version of its text and image encoder."""
 
-import importlib.util
 import math
 
 import diffusers
-import huggingface_hub
 import numpy as np
 import pytest
 import torch
@@ -12,8 +10,6 @@ import transformers
 from tokenizers.pre_tokenizers import ByteLevel
 from transformers.models.qwen2_vl.image_processing_pil_qwen2_vl import Qwen2VLImageProcessorPil
 
-from brewster.errors import MissingExtra
-from brewster.models.diffusion.backbones.loading import encode_prompt
 from brewster.models.diffusion.backbones.qwen import Qwen
 from brewster.models.diffusion.backbones.registry import tiny
 from brewster.models.diffusion.prompt import PROMPT
@@ -121,10 +117,3 @@ def test_a_shift_of_three_gives_the_published_sigmas_of_few_step_loras(steps):
     published.set_timesteps(sigmas=np.linspace(1, 1 / steps, steps), mu=math.log(3))
     sigmas = tiny("qwen")[0].schedule(3072, steps, timestep_shift=3.0)
     torch.testing.assert_close(sigmas, published.sigmas, atol=1e-6, rtol=0)
-
-
-@pytest.mark.skipif(bool(importlib.util.find_spec("torchvision")), reason="torchvision is installed")
-def test_missing_torchvision_is_reported_before_any_download(monkeypatch):
-    monkeypatch.setattr(huggingface_hub, "snapshot_download", lambda *_, **__: pytest.fail("downloaded"))
-    with pytest.raises(MissingExtra, match=r"torchvision is not installed; .* pip install torchvision"):
-        encode_prompt("qwen")

@@ -1,8 +1,6 @@
 """Rendering on a Ray cluster, also if a node is lost. Ray runs in separate processes, as tests may open no connections."""
 
 import os
-import socket
-import subprocess
 import sys
 import threading
 from concurrent.futures import Future
@@ -12,11 +10,12 @@ from types import SimpleNamespace
 
 import pytest
 
-from brewster.errors import DeviceError, MissingExtra
+from brewster.errors import DeviceError
 from brewster.executors import ray_cluster
-from brewster.executors.local import run_tasks
+from brewster.executors.local import ProcessExecutor, run_tasks
 from brewster.rendered.generation.job import RenderTask
 from brewster.rendered.generation.workers import TaskRunner
+from other_processes import finished
 from set_folders import hashes, render_set
 
 TESTS = Path(__file__).parent
@@ -61,20 +60,16 @@ def run_in_process(code, *args):
     """Runs code in a process. The nodes of Ray import the fake renderer from PYTHONPATH."""
     paths = os.pathsep.join([str(TESTS), os.environ.get("PYTHONPATH", "")])
     environment = {**os.environ, "PYTHONPATH": paths, "RAY_USAGE_STATS_ENABLED": "0"}
-    return subprocess.run(
-        [sys.executable, "-c", code, *map(str, args)],
-        env=environment,
-        capture_output=True,
-        text=True,
-        check=False,
-        timeout=300,
-    )
+    return finished([sys.executable, "-c", code, *map(str, args)], env=environment, timeout=300)
 
 
-def test_without_ray_the_error_has_the_command_that_installs_it(tmp_path, monkeypatch):
-    monkeypatch.setitem(sys.modules, "ray", None)
-    with pytest.raises(MissingExtra, match=r"pip install -c constraints.txt -e '\.\[cluster\]'"):
-        render_set(tmp_path / "set", executor=ray_cluster.RayExecutor)
+def test_ray_tries_a_task_as_often_as_a_pool_of_processes(monkeypatch):
+    options = {}
+    client = SimpleNamespace(init=lambda *_, **__: None, put=id, shutdown=lambda: None)
+    client.remote = lambda **given: options.update(given) or id
+    monkeypatch.setattr(ray_cluster, "_ray", lambda: client)
+    with ray_cluster.RayExecutor(partial(TaskRunner, None)) as executor:
+        assert executor.attempts * (options["max_retries"] + 1) == ProcessExecutor.attempts
 
 
 class UnpicklableError(Exception):
@@ -147,15 +142,3 @@ def test_a_set_is_complete_and_has_the_same_bytes_if_a_node_is_lost(tmp_path):
     assert done.stdout.strip().endswith("40"), done.stderr
     render_set(tmp_path / "plain", count=40, renderer="slow")
     assert hashes(tmp_path / "set") == hashes(tmp_path / "plain")
-
-
-@pytest.mark.parametrize("address", ["127.0.0.1:1", "nowhere.invalid:6379"])
-def test_an_address_that_refuses_connections_is_reported(tmp_path, monkeypatch, address):
-    pytest.importorskip("ray")
-
-    def refuse(*_, **__):
-        raise ConnectionRefusedError("Connection refused")
-
-    monkeypatch.setattr(socket, "create_connection", refuse)
-    with pytest.raises(DeviceError, match=f"no cluster at {address}"):
-        render_set(tmp_path / "set", executor=partial(ray_cluster.RayExecutor, address=address))

@@ -31,12 +31,8 @@ def test_a_changed_value_leaves_the_rest_of_a_recipe_as_it_was():
 @pytest.mark.parametrize(
     ("key_path", "value", "message"),
     [
-        ("data.rendered.blend_spce", "linear", "no key data.rendered.blend_spce"),
-        ("data.rendered.blend_space.more", 1, "no key data.rendered.blend_space.more"),
-        ("", 1, "no key ; .*; see docs/recipes.md"),
         ("sparkle", 1, "no key sparkle; .*; see docs/recipes.md"),
         ("data.rendered.blend_space", "dark", "with data.rendered.blend_space = 'dark'"),
-        ("data.rendered.datasets", ["a"], r"datasets = \['a'\]"),
         ("data.pairs_share", 0.01, "pairs_share = 0.01: the values are inconsistent; .* gives 0 of 8"),
         ("steps", 0, "steps = 0: steps is 0; expected an integer, above 0; compare"),
     ],
@@ -72,15 +68,7 @@ def test_the_path_of_a_scene_recipe_is_relative_to_the_recipe(tmp_path):
     [
         (("seed = 1", "seed ="), "not TOML"),
         (("# A short run", "# Un test complété"), "not TOML .*utf-8"),
-        (
-            ("seed = 1", ""),
-            "seed is missing; expected an integer, at least 0, below 4294967296; add this key",
-        ),
-        (("seed = 1", "seed = -1"), "seed"),
-        (("steps = 6", "steps = 0"), "steps"),
         (("steps = 6", 'steps = 6\nnetwork = "lite3"'), 'network is "lite3"; expected one of the networks'),
-        (("weight_decay = 1e-4", "weight_decay = inf"), "weight_decay"),
-        (("[[0.0, 64], [0.5, 96]]", "[]"), "image_size_schedule"),
         (("[[0.0, 64], [0.5, 96]]", "[[0.1, 64]]"), "image_size_schedule is .*; .* start at 0"),
         (("[[0.0, 64], [0.5, 96]]", "[[0.0, 64], [0.0, 96]]"), "image_size_schedule is .*; .* increase"),
         (("[[0.0, 64], [0.5, 96]]", "[[0.0, 96], [0.5, 64]]"), "image_size_schedule is .*; .* increase"),
@@ -112,13 +100,9 @@ def test_the_path_of_a_scene_recipe_is_relative_to_the_recipe(tmp_path):
             ("[mix]", '[data.rendered]\nrecipe = "tiny"\nblend_space = "dark"\n[mix]'),
             r"data\.rendered\.blend_space",
         ),
-        (("[mix]", "[mix]\nsparkle = 1"), r"no key mix\.sparkle"),
-        (("[mix]", "[mix]\ncrop = [1, 0.45]"), r"mix\.crop is \[1, 0.45\]; expected low <= high"),
         (("[mix]", "[mix]\nreflection_ratio = [0, 2]"), r"mix\.reflection_ratio\.0 is 0; .* above 0"),
         (("[mix]", "[mix]\ngamma = [1.2, 0.8]"), r"mix\.gamma is .* expected low <= high"),
-        (("[mix]", "[mix]\nnoise = [0, nan]"), r"mix\.noise"),
         (("[mix]", "[mix]\nno_glass_probability = 1.5"), r"mix\.no_glass_probability"),
-        (("[mix]", "[mix]\nveil_probability = -0.1"), r"mix\.veil_probability"),
     ],
 )
 def test_a_wrong_recipe_is_refused_and_the_key_named(tmp_path, change, message):
@@ -152,19 +136,13 @@ def test_the_path_of_a_prompt_is_relative_to_the_recipe(tmp_path):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (("rank = 16", "rank = 0"), "rank is 0"),
-        (("rank = 16", "rnk = 16"), "no key rnk .*; did you mean rank"),
-        (("rank = 16", "image_size_schedule = [[0.0, 64]]"), "no key image_size_schedule"),
         (('"int8"', '"int3"'), 'quantization is "int3"; .*; did you mean "int8"'),
         (('"kontext"', '"tiny:kontext"'), "are inconsistent; expected no quantization: a tiny backbone"),
-        (('["I", "T", "R"]', '["I", "T", "Q"]'), r"panels\.2"),
         (('["I", "T", "R"]', '["I", "R"]'), "inconsistent; expected panels .* T, .*\\['I', 'R'\\]"),
         (('["I", "T", "R"]', '["T", "T"]'), "inconsistent; expected panels .* at most once"),
-        (("rank = 16", "panel_weights = { X = 1 }"), "panel_weights"),
         (("rank = 16", "panel_weights = { I = 0, T = 0, R = 0 }"), "inconsistent; expected a weight above 0"),
         (('datasets = ["sets/paper"]', 'recipe = "window"'), "inconsistent"),
         (("[data.rendered]", 'photos = ["p"]\n[data.rendered]\nshare = 0.5'), "inconsistent"),
-        (('objective = "flow"', 'objective = "two_step"'), 'objective is "two_step"; .*'),
     ],
 )
 def test_a_wrong_lora_recipe_is_refused_and_the_key_named(tmp_path, change, message):

@@ -7,9 +7,9 @@ import pytest
 from benchmark_folders import POSTCARD_SCENES, picture, postcard, repacked, sir2, wildscene, write
 from brewster.benchmarks import registry
 from brewster.benchmarks.image_files import Case, ImageFile
-from brewster.benchmarks.registry import BENCHMARKS, Benchmark, read_benchmark
+from brewster.benchmarks.registry import Benchmark, read_benchmark
 from brewster.benchmarks.selection import PAPER_SEED, paper_subset, with_unique_names
-from brewster.errors import PhotoError, UnreadablePhoto
+from brewster.errors import PhotoError
 from brewster.files import natural_key
 from brewster.photo import Photo
 from picture_files import exif_block, file_of, smooth
@@ -33,9 +33,6 @@ def only(name, folder) -> Benchmark:
 
 def names(cases):
     return [case.name for case in cases]
-
-
-# --- layouts
 
 
 @pytest.mark.parametrize("name", ["real20", "nature20"])
@@ -162,9 +159,6 @@ def test_an_incomplete_rendered_sample_is_excluded(tmp_path):
     assert read.excluded == ("000001 is incomplete: expected photo.jpg, background.jpg, reflection.jpg",)
 
 
-# --- excluded cases
-
-
 @pytest.mark.parametrize(
     ("size", "message"),
     [
@@ -202,27 +196,6 @@ def test_an_unreadable_image_is_excluded_and_named(tmp_path, role, label, bad, w
     assert why in read.excluded[0]
 
 
-# --- invalid folders
-
-
-@pytest.mark.parametrize("name", BENCHMARKS)
-def test_an_empty_or_missing_folder_or_a_file_is_an_error_in_three_parts(tmp_path, name):
-    (tmp_path / "empty").mkdir()
-    write(tmp_path, "a.png")
-    for path in ("empty", "gone", "a.png"):
-        with pytest.raises(PhotoError, match=rf"{path}.*; .*; .*\.$"):
-            read_benchmark(name, tmp_path / path)
-
-
-def test_a_damaged_shard_is_an_error(tmp_path):
-    write(tmp_path, "shard-000000.tar", data=b"no tar" * 200)
-    with pytest.raises(PhotoError, match=r"is not a rendered dataset \(.*\); .*; "):
-        read_benchmark("rendered", tmp_path)
-
-
-# --- files
-
-
 def test_a_file_or_a_span_of_it_is_read_and_can_be_pickled(tmp_path):
     write(tmp_path, "a.png")
     whole, span = ImageFile(tmp_path / "a.png"), ImageFile(tmp_path / "a.png", (1, 3))
@@ -231,23 +204,6 @@ def test_a_file_or_a_span_of_it_is_read_and_can_be_pickled(tmp_path):
     assert pickle.loads(pickle.dumps(span)) == span
     assert str(whole) == str(tmp_path / "a.png")
     assert str(span) == f"{tmp_path / 'a.png'} from byte 1"
-
-
-def test_a_file_that_is_missing_or_too_short_is_an_error_in_three_parts(tmp_path):
-    write(tmp_path, "a.png")
-    for file, why in (
-        (ImageFile(tmp_path / "b.png"), "b.png cannot be read .No such file"),
-        (ImageFile(tmp_path), "cannot be read .Is a directory"),
-        (
-            ImageFile(tmp_path / "a.png", (len(picture()) - 2, 5)),
-            "cannot be read .the file has only 2 of 5 bytes",
-        ),
-    ):
-        with pytest.raises(UnreadablePhoto, match=f"{why}.*; .*; .*"):
-            file.read()
-
-
-# --- the subsets of the paper
 
 
 def test_the_subset_of_the_paper_has_one_shot_of_each_scene(subsets):

@@ -10,7 +10,7 @@ import torch
 from pyarrow import parquet
 
 from brewster import Photo
-from brewster.errors import OutputError, RecipeError
+from brewster.errors import OutputError
 from brewster.photo import read_exr_layers
 from brewster.render.sample import SAMPLE_IMAGES, LinearSample
 from brewster.rendered import store
@@ -122,14 +122,6 @@ def test_a_sample_that_cannot_be_written_leaves_nothing(tmp_path):
     with pytest.raises(OutputError):
         store.write_folder(tmp_path / "000000", {"a": b"", "x" * 300: b""})
     assert [path.name for path in tmp_path.iterdir()] == ["file"]
-
-
-def test_a_damaged_scene_is_reported(four_samples, tmp_path):
-    shutil.copytree(four_samples, tmp_path / "set")
-    for text in ("no toml", "seed = 'seven'"):
-        (tmp_path / "set" / "000000" / store.SCENE_FILE).write_text(text)
-        with pytest.raises(RecipeError, match="000000"):
-            store.read_scene_of(next(store.read_dataset(tmp_path / "set")))
 
 
 def test_samples_beyond_a_million_keep_their_order(tmp_path):

@@ -63,9 +63,6 @@ def test_an_unusable_charset_is_a_damaged_form(charset):
     assert "UTF-8" in message
 
 
-# --- values
-
-
 def test_a_photo_alone_gets_the_default_options():
     request = parse()
     assert (request.photo, request.name) == (b"bytes", "a.jpg")
@@ -103,16 +100,10 @@ def test_an_empty_field_counts_as_omitted():
 @pytest.mark.parametrize(
     ("fields", "part"),
     [
-        ({"strength": "1.5"}, "strength is '1.5'"),
         ({"strength": "nan"}, "strength is 'nan'; expected a finite number; correct strength"),
-        ({"strength": "a lot"}, "strength is 'a lot'"),
-        ({"quality": "best"}, "quality is 'best'; expected 'draft' or 'standard'"),
-        ({"format": "gif"}, "format is 'gif'"),
         ({"layers": "transmission,glass"}, "layers is 'glass'"),
-        ({"layers": ""}, "layers is ''"),
         ({"additive": "perhaps"}, "additive is 'perhaps'"),
         ({"model": "../../etc/passwd"}, "choose compact or mine"),
-        ({"model": "/models/mine.onnx"}, "choose compact or mine"),
         ({"device": "cuda"}, "there is no field 'device'"),
         ({"max_pixels": "1"}, "there is no field 'max_pixels'"),
         ({"quality": "x" * 500}, "'" + "x" * 40 + "'"),
@@ -137,8 +128,6 @@ def test_contradicting_options_raise_the_error_of_options():
     ("data", "status"),
     [
         (body(("strength", b"1")), 422),
-        (body(("photo", b"not a file")), 422),
-        (body(("picture", b"bytes", "a.jpg")), 422),
         (body(("photo", b"one", "a.jpg"), ("photo", b"not a file")), 422),
         (body(("photo", b"one", "a.jpg"), ("mask", b"1", "m.png"), ("mask", b"2", "n.png")), 400),
         (body(*[("photo", b"", "a.jpg")] * 40), 400),
@@ -193,9 +182,6 @@ def test_the_schema_has_the_descriptions_and_limits_of_options():
         assert fields[name]["description"] == about[name].metadata["description"]
 
 
-# --- names
-
-
 @given(name=st.text())
 def test_a_safe_name_is_never_a_path_and_fits_every_file_system(name):
     safe = safe_name(name)
@@ -227,14 +213,9 @@ def test_layers_have_the_same_names_as_in_a_batch(stem, suffix, layer):
     ("name", "safe"),
     [
         ("../../etc/passwd", "passwd"),
-        ("C:\\photos\\a.png", "a.png"),
         ("a\r\nSet-Cookie: x.jpg", "a__Set-Cookie_ x.jpg"),
-        ("a\N{LINE SEPARATOR}b.jpg", "a_b.jpg"),
-        ("a\ud800.jpg", "a_.jpg"),
         ("", "photo"),
-        ("..", "photo"),
         ("folder/", "photo"),
-        ("\N{RIGHT-TO-LEFT OVERRIDE}gpj.exe", "_gpj.exe"),
         ("x" * 1000 + ".JPG", "x" * 237 + ".JPG"),
     ],
 )

@@ -8,8 +8,7 @@ import pytest
 from brewster.environments.catalog import builtin_catalog
 from brewster.errors import RecipeError
 from brewster.render.analytic import render
-from brewster.scene.recipe import RECIPES, SceneRecipe, read_scene_recipe
-from brewster.scene.recipe_file import validated
+from brewster.scene.recipe import RECIPES, read_scene_recipe
 from brewster.scene.sampler import Asset, Catalog, draw
 from brewster.scene.scene import Scene
 from brewster.scene.world import AssetSource
@@ -117,11 +116,6 @@ def test_categories_are_respected_and_a_map_without_one_fits_everywhere():
     assert drawn(asked, 0, catalog=plain).behind.map.source.file == "a.hdr"
 
 
-def test_a_recipe_of_pictures_needs_pictures():
-    with pytest.raises(RecipeError, match="the catalog has no pictures"):
-        drawn("vitrine", 0, catalog=Catalog(maps=BUILTIN.maps))
-
-
 def test_a_recipe_of_maps_needs_maps_that_are_sharp_enough():
     asked = changed("window", behind={"map_probability": 1.0, "plane_probability": 0.0})
     for catalog in (
@@ -136,7 +130,6 @@ def test_a_recipe_of_maps_needs_maps_that_are_sharp_enough():
     ("camera", "says"),
     [
         ({"incidence_deg": (88.0, 89.0)}, "gave no possible scene in 100 attempts; .* a corner of the view"),
-        ({"incidence_deg": (180.0, 180.0)}, "gave no possible scene in 100 attempts; expected the camera"),
         ({"fov_deg": (155.0, 160.0)}, "gave no possible scene in 100 attempts; expected a number below 150;"),
     ],
 )
@@ -211,11 +204,3 @@ def test_the_paper_recipe_has_the_glass_and_the_orders_of_the_paper(paper_scenes
     fields = [scene.camera.fov_deg for scene in paper_scenes]
     assert min(fields) < 25
     assert max(fields) > 85
-
-
-def test_setups_need_a_weight_above_zero():
-    values = read_scene_recipe(PAPER).model_dump(exclude_unset=True)
-    with pytest.raises(RecipeError, match="a weight above 0 for at least one of the setups"):
-        validated(SceneRecipe, values | {"setups": {"map|map": 0.0}}, source="x", reference="y")
-    with pytest.raises(RecipeError, match="setups"):
-        validated(SceneRecipe, values | {"setups": {"plane|plane": 1.0}}, source="x", reference="y")

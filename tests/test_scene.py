@@ -53,8 +53,6 @@ def test_the_outcome_of_a_scene_is_ignored(written):
 @pytest.mark.parametrize(
     ("text", "says"),
     [
-        ("[[glass.panes]]\nrefractive_index = 0.9", r"glass\.panes\.0\.refractive_index is 0.9"),
-        ("[glass]\ngap_mm = -1", r"glass\.gap_mm is -1; .*at least 0"),
         ("[[glass.panes]]\n[[glass.panes]]", "expected a gap_mm above 0 between several panes"),
         ("glass.radii_mm = [100, 100]", "expected one pane, .* and opening_mm"),
         ("[camera]\nfocus_mm = 1002\naperture_mm = 3", "the focus is 2 mm inside the glass"),
@@ -68,14 +66,6 @@ def test_the_outcome_of_a_scene_is_ignored(written):
             f"[front.map]\n{MAP}\nradius_mm = 3000\n[front.plane]\n{MAP}\ndistance_mm = 4000\nwidth_mm = 9",
             "distance_mm must be below radius_mm",
         ),
-        ("colour = 'red'", r"no key colour \(its value is \"red\"\)"),
-        ("camera.zoom = 2", r"no key camera\.zoom .*one of position_mm"),
-        ("camera.heading_deg = nan", r"camera\.heading_deg is nan; .*finite"),
-        ("camera.position_mm = [0, 0, nan]", r"camera\.position_mm\.2 is nan; .*finite"),
-        ("camera.focus_mm = inf", r"camera\.focus_mm is inf; .*finite"),
-        (f"[behind.map]\n{MAP}\nradius_mm = nan", r"behind\.map\.radius_mm is nan; "),
-        ("orders = 'some'", 'orders is "some"; .*one of "all", "truncated"'),
-        ("samples_per_pixel = 0", "samples_per_pixel is 0"),
         ("glass = [", "is not TOML"),
     ],
 )
@@ -89,36 +79,19 @@ def test_an_impossible_scene_is_refused_and_the_value_named(text, says, written)
 @pytest.mark.parametrize(
     ("text", "says"),
     [
-        ("glass.refractive_index = [1.6, 1.5]", r"glass\.refractive_index is \[1.6, 1.5\]"),
         (
             "glass.refractive_index = [0.9, 1.5]",
             "expected a refractive_index of at least 1, but it starts at",
         ),
         ("glass.gap_mm = [0, 1]\nglass.double_probability = 0.5", "expected a gap_mm above 0"),
-        ("glass.thickness_mm = [0, 1]", r"glass\.thickness_mm\.0 is 0; .*above 0"),
         ("glass.absorption_per_m = []", "at least one colour"),
-        ("camera.fov_deg = [nan, 50]", r"camera\.fov_deg"),
         ("camera_response.jpeg_quality = [97, 60]", r"camera_response\.jpeg_quality is \[97, 60\]"),
-        ("behind.map_probability = 1.5", r"behind\.map_probability is 1.5; .*from 0 to 1"),
-        ("colour = 'red'", "no key colour"),
     ],
 )
 def test_an_impossible_recipe_is_refused_and_the_value_named(text, says, written):
     path = written(f"name = 'mine'\nabout = ''\n{text}")
     with pytest.raises(RecipeError, match=says):
         read_scene_recipe(str(path))
-
-
-def test_files_that_are_missing_or_no_text_are_refused(tmp_path):
-    with pytest.raises(RecipeError, match=r"nowhere\.toml cannot be read"):
-        read_scene(tmp_path / "nowhere.toml")
-    with pytest.raises(RecipeError, match="cannot be read"):
-        read_scene(tmp_path)
-    (tmp_path / "picture.toml").write_bytes(b"\xff\xd8\xff")
-    with pytest.raises(RecipeError, match="is not TOML"):
-        read_scene(tmp_path / "picture.toml")
-    with pytest.raises(RecipeError, match=r"there is no recipe 'windw'"):
-        read_scene_recipe("windw")
 
 
 def test_framed_glass_is_accepted_at_any_angle_and_a_pinhole_camera_with_any_focus(written):

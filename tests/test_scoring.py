@@ -12,7 +12,7 @@ from brewster.evaluate import runner
 from brewster.evaluate.config import EvaluationConfig
 from brewster.evaluate.methods import IdentityBaseline, MethodOutput
 from brewster.evaluate.scoring import GroundTruth, Scorer
-from brewster.metrics import METRICS, Lpips, Metric
+from brewster.metrics import METRICS, Metric
 from set_folders import render_set
 
 
@@ -106,17 +106,6 @@ def test_a_metric_is_prepared_once_before_the_first_score(triplet, tmp_path, mon
     (again,), _ = runner.score(benchmarks, [IdentityBaseline()], config, tmp_path / "out")
     assert first.scores == again.scores == {"late": 1.0}
     assert order == ["prepared"]
-
-
-def test_lpips_features_are_computed_once_for_each_image(data, monkeypatch):
-    monkeypatch.setenv("BREWSTER_DATA", str(data))
-    seen, features = [], Lpips.features
-    monkeypatch.setattr(Lpips, "features", lambda self, picture: seen.append(1) or features(self, picture))
-    config = EvaluationConfig(metrics=("lpips", "lpips_region"), thresholds=(0.05, 0.1), short_side_px=96)
-    truth, scorer = open_case(data / "real/dev/nature", config, "nature20")
-    scorer.score(MethodOutput(truth.photo))
-    scorer.score(MethodOutput(truth.photo))
-    assert len(seen) == 3
 
 
 def test_the_border_is_not_scored(triplet):

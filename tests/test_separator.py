@@ -158,19 +158,6 @@ def test_options_out_of_range_are_refused(options):
         Separator(identity_backend)(Photo.from_array(random_image(4, 4), encoding="srgb"), **options)
 
 
-def test_every_quality_works_and_higher_quality_uses_larger_inputs():
-    assert list(QUALITIES) == ["draft", "standard"]
-    largest = {}
-    photo = Photo.from_array(random_image(900, 1200), encoding="srgb")
-    for quality in QUALITIES:
-        sizes = []
-        Separator(lambda tile, sizes=sizes: sizes.append(tile.size) or identity_backend(tile))(
-            photo, quality=quality
-        )
-        largest[quality] = max(sizes)
-    assert largest["draft"] < largest["standard"]
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("folder", ["nature", "real"])
 def test_the_shipped_model_beats_the_unprocessed_input_on_the_development_pairs(separator, data, folder):

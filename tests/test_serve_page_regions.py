@@ -3,12 +3,11 @@
 import math
 
 import numpy as np
-import onnx
 import pytest
-from onnx import TensorProto, helper
+from onnx import helper
 
 from brewster import Photo
-from cli_helpers import image_bytes
+from cli_helpers import image_bytes, write_onnx
 from page_helpers import canvas, downloaded, settle, upload
 from web_servers import serve_process
 
@@ -194,26 +193,14 @@ def test_regions_are_copied_to_photos_of_other_sizes_and_reset(page):
 @pytest.fixture
 def hint_page(chromium, tmp_path):
     """The page of a server whose model halves the light where the hint says reflection, and only there."""
-    model, shape = tmp_path / "hinted.onnx", [1, 3, "height", "width"]
     nodes = [
         helper.make_node("Slice", ["hints", "zero", "one", "one"], ["red"]),  # 0 to 1 of axis 1
         helper.make_node("Mul", ["red", "half"], ["share"]),
         helper.make_node("Mul", ["photo", "share"], ["reflection"]),
         helper.make_node("Sub", ["photo", "reflection"], ["transmission"]),
     ]
-    values = [
-        helper.make_tensor("zero", TensorProto.INT64, [1], [0]),
-        helper.make_tensor("one", TensorProto.INT64, [1], [1]),
-        helper.make_tensor("half", TensorProto.FLOAT, [], [0.5]),
-    ]
-    graph = helper.make_graph(
-        nodes, "hinted",
-        [helper.make_tensor_value_info("photo", TensorProto.FLOAT, shape),
-         helper.make_tensor_value_info("hints", TensorProto.FLOAT, [1, 2, "height", "width"])],
-        [helper.make_tensor_value_info(name, TensorProto.FLOAT, shape) for name in ("transmission", "reflection")],
-        values,
-    )  # fmt: skip
-    onnx.save(helper.make_model(graph, opset_imports=[helper.make_opsetid("", 18)], ir_version=10), model)
+    constants = {"zero": np.array([0]), "one": np.array([1]), "half": np.array(0.5, np.float32)}
+    model = write_onnx(tmp_path / "hinted.onnx", nodes, constants, hints=2)
     with serve_process("--model", model, "--token", "auto") as link:
         page = chromium.new_context(viewport={"width": 1100, "height": 760}, accept_downloads=True).new_page()
         page.goto(link)

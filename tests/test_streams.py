@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from brewster.environments.assets import Assets
-from brewster.errors import RecipeError, UnsupportedPhoto
+from brewster.errors import UnsupportedPhoto
 from brewster.photo import Photo
 from brewster.training.data.data_recipe import DataRecipe
 from brewster.training.data.image_loading import source_weights
@@ -52,26 +52,6 @@ def with_data(recipe, **data):
     return recipe.model_copy(update={"data": DataRecipe.model_validate(data)})
 
 
-@pytest.mark.parametrize("kind", ["photos", "maps", "pairs"])
-def test_a_folder_that_is_missing_or_without_images_is_named(recipe, root, kind):
-    for folder, message in (
-        ("empty", "(empty.* contains no images|no images in .*empty)"),
-        ("gone", r"gone.* cannot be read \(No such"),
-    ):
-        data = {"photos": ["photos"], "pairs_share": float(kind == "pairs"), kind: [folder]}
-        with pytest.raises(RecipeError, match=message):
-            open_stream(with_data(recipe, **data))
-
-
-def test_an_unset_data_folder_is_an_error(recipe, monkeypatch):
-    monkeypatch.delenv("BREWSTER_DATA", raising=False)
-    with pytest.raises(RecipeError, match="BREWSTER_DATA is not set; expected an existing folder"):
-        open_stream(with_data(recipe, photos=["photos"]))
-    monkeypatch.setenv("BREWSTER_DATA", "/no/such/folder")
-    with pytest.raises(RecipeError, match="BREWSTER_DATA is '/no/such/folder'; expected an existing folder"):
-        open_stream(with_data(recipe, photos=["photos"]))
-
-
 def test_datasets_have_a_path_in_the_data_folder_or_an_absolute_path(recipe, root):
     render_set(root / "set", count=3)
     below, absolute = (
@@ -114,12 +94,6 @@ def test_data_without_a_share_is_not_read(recipe, root):
         open_stream(with_data(recipe, photos=["photos"], **gone))(0, 2, 32),
         only(0, 2, 32),
     )
-
-
-def test_a_stream_without_data_names_the_values_to_raise(recipe):
-    stream = open_stream(with_value(recipe, "data.rendered.count", 0))
-    with pytest.raises(RecipeError, match=r"no training data.*; .*raise data\.rendered\.count"):
-        stream(0, 1, 32)
 
 
 def test_a_map_that_cannot_light_a_scene_is_refused_unless_it_is_excluded(recipe, root):

@@ -90,14 +90,8 @@ def test_all_problems_of_the_files_are_listed_at_once_and_nothing_is_written(tmp
     (methods["RDNet"] / "real/10.png").write_bytes(b"\x89PNG\r\n\x1a\n")
     with pytest.raises(BrewsterError) as caught:
         create_study(tmp_path / "study", inputs, methods)
-    for message in (
-        f"ours has no {methods['ours'] / 'real/2'}.*",
-        f"{methods['ours'] / 'nature/1.png'} has no input",
-        f"{methods['RDNet'] / 'real/1.png'} has 12x18 pixels, but its input has 24x18",
-        f"{methods['RDNet'] / 'real/10.png'}: ",
-        f"RDNet has no {methods['RDNet'] / 'nature/other'}.*",
-    ):
-        assert message in str(caught.value)
+    for place in ("ours/real/2", "ours/nature/1", "RDNet/real/1.png", "RDNet/real/10", "RDNet/nature/other"):
+        assert place in str(caught.value)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["RDNet", "inputs", "ours"]
 
 

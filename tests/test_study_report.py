@@ -58,9 +58,6 @@ def simulate_counts(rng, participants, studies, *, pairs=40, correlation=0.05):
     return rng.multinomial(pairs, probabilities)[:, :, None].astype(float)
 
 
-# --- the paper's Table 3
-
-
 def test_the_average_of_the_paper_weights_datasets_by_their_pictures():
     """For DSIT all rates match. For RDNet the loss rate and win + tie match; 0.76 points are in win instead of tie."""
     by_pictures, by_datasets = averages(np.array(TABLE_3["DSIT"][:5]), PICTURES)
@@ -80,9 +77,6 @@ def test_rates_have_a_row_for_each_dataset_and_three_averages():
     assert rows[2] == pytest.approx([0.45, 0.2125, 0.3375, 0.1125])
     assert rows[3] == pytest.approx([0.3, 0.225, 0.475, -0.175])
     assert rows[4] == pytest.approx([6 / 50, 12 / 50, 32 / 50, -26 / 50])
-
-
-# --- intervals
 
 
 def intervals(counts):
@@ -140,9 +134,6 @@ def test_the_p_value_of_unanimous_participants_is_that_of_all_exchanges():
     assert sign_flip_test(np.tile([2.0, 1, 2], (6, 1, 1, 1)), np.ones((1, 1))).min() == 1
 
 
-# --- strengths
-
-
 @pytest.mark.parametrize("methods", [2, 3, 5])
 def test_strengths_equal_those_of_choix(rng, methods):
     wins = rng.integers(1, 30, (methods, methods)) + rng.integers(0, 2, (methods, methods)) / 2
@@ -169,9 +160,6 @@ def test_strengths_converge_for_very_unequal_methods():
     assert np.diff(strength) == pytest.approx([-np.log(10_000)] * 2)
 
 
-# --- agreement
-
-
 def test_alpha_of_the_example_of_krippendorff_is_reproduced():
     """Krippendorff 2011, part C: four observers, twelve units, missing values; nominal alpha is 0.743."""
     observers = "123321412...", "1233224125.3", ".3332342251.", "12332441251."
@@ -186,9 +174,6 @@ def test_alpha_is_1_for_agreement_0_for_chance_and_none_where_undefined(rng):
     assert alpha(rng.multinomial(20, RATES, 2000).astype(float)) == pytest.approx(0, abs=0.01)
     assert alpha(np.array([[4.0, 0, 0], [5, 0, 0]])) is None
     assert alpha(np.array([[1.0, 0, 0], [0, 1, 0]])) is None
-
-
-# --- outcomes and exclusion
 
 
 @pytest.mark.parametrize(
@@ -319,9 +304,6 @@ def test_a_rule_that_excludes_everyone_still_gives_the_results_of_all(hundred_pa
     assert to_latex(results).startswith("% the rule excludes everyone")
     assert plot(results)[1:4] == b"PNG"
     assert "## All participants" in to_markdown(results)
-
-
-# --- names
 
 
 def make_study_with_names(tmp_path, datasets, methods):

@@ -102,13 +102,6 @@ def test_two_servers_and_many_threads_lose_no_answer_and_assign_each_number_once
     other.close()
 
 
-def test_a_file_that_is_not_a_database_is_an_error(tmp_path):
-    study = make_empty_study(tmp_path / "study")
-    study.answers_file.write_bytes(b"not a database, but long enough to be read as a header" * 20)
-    with pytest.raises(BrewsterError, match=r"answers\.sqlite cannot be used"):
-        AnswerStore(study)
-
-
 WRITER = """
 import sys
 from pathlib import Path
@@ -143,23 +136,6 @@ def test_acknowledged_answers_survive_kill_9_without_duplicates(tmp_path):
     assert all(trial in stored[number] for number, trial in acknowledged)
     # the last answer of each of the two writers may be unacknowledged
     assert sum(map(len, stored.values())) <= len(acknowledged) + 2
-
-
-def test_a_copy_after_kill_9_has_all_answers_and_the_file_alone_has_them_after_reopening(tmp_path):
-    write_study(tmp_path / "study", make_description())
-    writer = subprocess.Popen(
-        [sys.executable, "-c", WRITER, str(tmp_path / "study")], stdout=subprocess.PIPE, text=True
-    )
-    for _ in range(15):
-        writer.stdout.readline()
-    os.kill(writer.pid, signal.SIGKILL)
-    writer.communicate()
-    shutil.copytree(tmp_path / "study", tmp_path / "copy")
-    copied = answers_by_participant(AnswerStore(read_study(tmp_path / "copy"), read_only=True))
-    assert sum(map(len, copied.values())) >= 15
-    store = AnswerStore(read_study(tmp_path / "study"))
-    assert answers_by_participant(open_without_log(store.study, tmp_path / "alone")) == copied
-    store.close()
 
 
 def test_closing_a_store_moves_all_answers_into_the_file(store, tmp_path):

@@ -13,7 +13,6 @@ from brewster import Photo
 from brewster.cli import main
 from brewster.environments import training_photos
 from brewster.environments.training_photos import COLUMNS, difference_hash, pull, read_table
-from brewster.errors import DownloadError
 from brewster.models import zoo
 from file_server import loopback_only, served
 
@@ -85,15 +84,6 @@ def test_a_dry_run_requests_nothing_and_options_of_maps_are_refused(origins, tmp
     assert not origins.requests
     assert not out.exists()
     assert main(["assets", "pull", "photos", str(out), "--indoor", "3"]) == 2
-
-
-def test_a_server_without_photos_is_given_up_after_five(monkeypatch, origins, tmp_path):
-    rows = [photo._replace(file=f"{n}.webp") for n in range(9) for photo in read_table() if photo.origin]
-    monkeypatch.setattr(training_photos, "read_table", lambda: rows)
-    origins.bodies.clear()
-    with pytest.raises(DownloadError, match="5 downloads in a row failed"):
-        list(pull(tmp_path / "photos", server=origins.url))
-    assert len(origins.requests) == 5
 
 
 def test_the_table_has_a_licence_for_each_photo_and_a_hash_for_each_origin():

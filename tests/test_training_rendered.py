@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 import brewster.training.data.rendered as rendered_module
 from brewster.environments.assets import Assets
 from brewster.environments.catalog import builtin_catalog
-from brewster.errors import PhotoError, RecipeError
+from brewster.errors import RecipeError
 from brewster.photo import Photo
 from brewster.render.camera_response import encode_jpeg
 from brewster.rendered.store import read_dataset, read_scene_of
@@ -109,30 +109,6 @@ def test_a_count_above_the_number_of_samples_is_refused(folder):
         RenderedDatasets([folder], seed=1, count=4)
 
 
-def test_a_folder_that_is_missing_empty_or_not_a_dataset_is_named(tmp_path):
-    with pytest.raises(RecipeError, match=r"gone cannot be read \(No such"):
-        RenderedDatasets([tmp_path / "gone"], seed=1)
-    with pytest.raises(RecipeError, match=r"0 rendered samples; expected at least 1"):
-        RenderedDatasets([tmp_path], seed=1)
-    (tmp_path / "shard-000000.tar").write_bytes(b"no tar" * 200)
-    with pytest.raises(RecipeError, match="cannot be read"):
-        RenderedDatasets([tmp_path], seed=1)
-
-
-@pytest.mark.parametrize("name", ["mirror.jpg", "scene.toml"])
-def test_a_missing_file_is_named_with_its_sample(folder, name):
-    (folder / "000001" / name).unlink()
-    with pytest.raises(RecipeError, match=f"{name} of sample 000001 .*; .*; .* again"):
-        RenderedDatasets([folder], seed=1, blend_space="srgb").sample(1)
-
-
-def test_a_damaged_image_is_named_with_its_sample(folder):
-    photo = folder / "000001" / "photo.jpg"
-    photo.write_bytes(photo.read_bytes()[:200])
-    with pytest.raises(PhotoError, match=r"photo\.jpg of sample 000001"):
-        RenderedDatasets([folder], seed=1).sample(1)
-
-
 def test_samples_that_were_read_are_cached_within_the_memory_limit(folder, monkeypatch):
     large = RenderedDatasets([folder], seed=1)
     monkeypatch.setattr(rendered_module, "CACHE_BYTES", 16 * 24 * 9)
@@ -143,15 +119,6 @@ def test_samples_that_were_read_are_cached_within_the_memory_limit(folder, monke
     assert same(large(0, 20, 32), first[0])
     with pytest.raises(RecipeError):
         small(0, 20, 32)
-
-
-def test_a_cached_sample_is_rendered_once_per_size():
-    source = FakeOnline()
-    stream = CachedRendered(source, 3, seed=1)
-    for step in range(10):
-        stream(step, 4, 8)
-        stream(step, 4, 16)
-    assert sorted(source.rendered) == [(index, size) for index in range(3) for size in (8, 16)]
 
 
 def test_a_cached_sample_is_mirrored_at_random():
@@ -172,8 +139,6 @@ def test_a_full_cache_does_not_change_the_samples():
     assert len(source.rendered) > 4
 
 
-# --- the formula
-
 BYTES = st.integers(0, 255)
 
 
@@ -186,9 +151,6 @@ def test_a_blend_is_the_formula_in_eight_bits(t, r, alpha, beta):
     exact = alpha * t / 255 + beta * r / 255 - t * r / 255**2
     found = blend(constant_image(t), constant_image(r), alpha, beta)
     assert abs(found[0, 0, 0].item() - min(max(exact, 0), 1)) <= 0.5 / 255 + 1e-6
-
-
-# --- rendered during training
 
 
 @pytest.fixture(scope="module")

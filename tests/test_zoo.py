@@ -3,7 +3,7 @@ from dataclasses import replace
 import pytest
 
 from brewster.errors import ModelError
-from brewster.models.zoo import MODELS, find_model
+from brewster.models.zoo import MODELS
 
 
 def test_every_shipped_model_is_intact_small_enough_and_has_a_card():
@@ -14,20 +14,6 @@ def test_every_shipped_model_is_intact_small_enough_and_has_a_card():
         card = model.card()
         for heading in ("Licence", "Trained on", "Scores", "Where it fails"):
             assert heading in card, (model.name, heading)
-
-
-def test_a_misspelt_model_name_gets_a_suggestion():
-    with pytest.raises(ModelError, match="did you mean compact"):
-        find_model("compct")
-
-
-def test_a_file_of_weights_is_refused_with_the_folder_to_pass_and_the_command_that_converts_it(tmp_path):
-    file = tmp_path / "glass.safetensors"
-    with pytest.raises(ModelError, match=r"there is no model .*glass"):
-        find_model(str(file))
-    file.touch()
-    with pytest.raises(ModelError, match=f"is a file of weights; .*--model {tmp_path};"):
-        find_model(str(file))
 
 
 def test_a_damaged_file_is_refused(tmp_path):
