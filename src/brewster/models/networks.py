@@ -58,5 +58,11 @@ NETWORKS: Final[dict[str, NetworkEntry]] = {
         stride=32,
         takes_hints=True,
     ),
+    "lite2-refined": NetworkEntry(
+        _imported("brewster.models.compact:refined"),
+        _imported("brewster.models.compact:refined_with_imagenet_features"),
+        stride=32,
+        takes_hints=True,
+    ),
 }
 """The networks by name. The key `network` of a training recipe is such a name."""

@@ -88,17 +88,16 @@ class CompactTrainer:
         self.optimizer = torch.optim.AdamW(groups, weight_decay=recipe.weight_decay, fused=True)
 
     def initialize(self) -> None:
-        """Loads the weights of `init`, except those of `trained_part`, which start from zero. Raises ModelError if the model is
-        unknown or damaged, or contains another network."""
+        """Loads the weights of `init`. Those of `trained_part`, and those that the model lacks, keep their initial values. Raises
+        ModelError if the model is unknown or damaged, or contains another network."""
         if self.recipe.init is None:
             return
         weights, new = read_weights(find_model(self.recipe.init).path), self.recipe.trained_part
-        states = weights, self.network.state_dict()
-        shapes, expected = ({name: value.shape for name, value in state.items()} for state in states)
-        if shapes != expected:
+        expected = {name: value.shape for name, value in self.network.state_dict().items()}
+        if not weights or any(value.shape != expected.get(name) for name, value in weights.items()):
             raise ModelError(
                 f"{self.recipe.init} contains another network",
-                f"expected the network {self.recipe.network}",
+                f"expected the network {self.recipe.network}, or a part of it",
                 "correct init in the recipe",
             )
         kept = {name: value for name, value in weights.items() if not (new and name.startswith(new))}
