@@ -20,7 +20,7 @@ from brewster.burst.fourier_search import find_translations
 from brewster.burst.joint_model import JointModel, Rates, optimise, pixel_grid
 from brewster.burst.registration import frame_motions, motion_candidates
 from brewster.burst.separate import burst_report, measure_layers
-from brewster.burst.solver import LEVELS, Level, Solution, solve
+from brewster.burst.solver import LEVELS, Level, Solution, _edge_correlation, solve
 from brewster.burst.video import choose_frames
 from brewster.cli import main
 from brewster.errors import PhotoError, PhotoTooLarge, UnreadablePhoto
@@ -221,29 +221,40 @@ def solve_few(frames, prior, **options):
 
 
 @pytest.mark.parametrize(
-    ("explained", "motion", "verdict", "method"),
+    ("explained", "motion", "edge_correlation", "verdict", "method"),
     [
-        (0.0, 0.02, "reflection remains", "single photo"),
-        (0.0, 0.02, "little found", "unchanged"),
-        (0.5, 0.02, "little found", "burst"),
-        (0.5, 0.012, "little found", "unchanged"),
-        (0.5, 0.012, "reflection remains", "burst"),
-        (0.15, 0.02, "reflection remains", "single photo"),
-        (0.5, 0.004, "removed", "single photo"),  # too small a motion
-        (0.3, 0.2, "removed", "burst"),
-        (0.3, 0.2, "little found", "unchanged"),  # a large motion must explain more
+        (0.0, 0.02, 0.1, "reflection remains", "single photo"),
+        (0.0, 0.02, 0.1, "little found", "unchanged"),
+        (0.5, 0.02, 0.1, "little found", "burst"),
+        (0.5, 0.012, 0.1, "little found", "unchanged"),
+        (0.5, 0.012, 0.1, "reflection remains", "burst"),
+        (0.15, 0.02, 0.1, "reflection remains", "single photo"),
+        (0.5, 0.004, 0.1, "removed", "single photo"),  # too small a motion
+        (0.3, 0.2, 0.1, "removed", "burst"),
+        (0.3, 0.2, 0.1, "little found", "unchanged"),  # a large motion must explain more
+        (0.5, 0.02, 0.4, "removed", "single photo"),  # the second layer is a copy of the first
+        (0.5, 0.02, 0.4, "little found", "unchanged"),
     ],
 )
-def test_the_self_check_chooses_the_method(explained, motion, verdict, method):
+def test_the_self_check_chooses_the_method(explained, motion, edge_correlation, verdict, method):
     layer = np.ones((2, 2, 3), np.float32)
-    solution = Solution(layer, layer, layer[..., :1], motion, 0.5, 0.01, 0.01 * (1 - explained), {})
+    errors = 0.01, 0.01 * (1 - explained)
+    solution = Solution(layer, layer, layer[..., :1], motion, 0.5, edge_correlation, *errors, {})
     assert burst_report(solution, verdict, 5, (), 2).method == method
+
+
+def test_layers_with_the_same_edges_have_edge_correlation_and_independent_ones_have_not():
+    one, other = torch.rand(2, 3, 40, 60, generator=torch.Generator().manual_seed(1))[:, :, None]
+    for second, expected in ((0.3 * one, 1.0), (other, 0.0)):
+        layers = torch.stack([one, second])[:, :, 0]
+        assert _edge_correlation(layers) == pytest.approx(expected, abs=0.1)
+    assert _edge_correlation(torch.zeros(2, 3, 8, 8)) == 0  # no edges
 
 
 @pytest.mark.parametrize(("naming", "is_certain"), [(0.3, True), (0.01, False)])
 def test_the_message_says_if_the_layers_may_be_exchanged(naming, is_certain):
     layer = np.ones((2, 2, 3), np.float32)
-    solution = Solution(layer, layer, layer[..., :1], 0.03, naming, 0.02, 0.01, {})
+    solution = Solution(layer, layer, layer[..., :1], 0.03, naming, 0.1, 0.02, 0.01, {})
     assert ("each other's names" in burst_report(solution, "removed", 5, (), 2).message) is not is_certain
 
 

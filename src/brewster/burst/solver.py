@@ -68,6 +68,9 @@ class Solution:
     """The largest motion of R relative to T between two frames, as a share of the width of a frame."""
     naming: float
     """The share of the detail of T that the prior keeps, minus that of R: 0 if the single photo does not tell the layers apart."""
+    edge_correlation: float
+    """The correlation of the strengths of the edges of both layers, at 160 pixels: about 0 for two scenes, and more if a wrong motion
+    makes the second layer a copy of the first."""
     one_layer_error: float
     """The mean error of the frames if both layers move together: the data term of the loss at 160 pixels."""
     two_layer_error: float
@@ -105,6 +108,7 @@ def solve(
     motions = np.stack([[c.transmission for c in candidates], [c.reflection for c in candidates]])
     is_locked = torch.tensor([candidate.is_locked for candidate in candidates])
     model, names, errors = None, [candidate.name for candidate in candidates], (0.0, 0.0)
+    edge_correlation = 0.0
     refined = prior
     for index, level in enumerate(levels):
         small, small_prior, small_refined = (
@@ -137,6 +141,8 @@ def solve(
             kept = _best(model, with_locked=False)
             best = model.selected(kept)
             layers, naming = _named(best, small, small_prior[0])
+            if index <= _COMPARED + 1:
+                edge_correlation = _edge_correlation(layers)
             if naming < -_MIN_NAMING:  # the next level corrects the brightness of large areas
                 model, names = best.exchanged(), [names[i] for i in kept]
                 layers, naming = layers.flip(0), -naming
@@ -148,7 +154,7 @@ def solve(
         confidence = model.confidence(small)[0]
         motion = model.relative_motion(*small.shape[-2:])[0].item()
     transmission, reflection, confidence = (layer.movedim(0, -1).numpy() for layer in (*layers, confidence))
-    return Solution(transmission, reflection, confidence, motion, naming, *errors, losses)
+    return Solution(transmission, reflection, confidence, motion, naming, edge_correlation, *errors, losses)
 
 
 def _named(model: JointModel, frames: Tensor, prior: Tensor) -> tuple[Tensor, float]:
@@ -162,6 +168,13 @@ def _named(model: JointModel, frames: Tensor, prior: Tensor) -> tuple[Tensor, fl
     gram = details @ details.T
     transmission, reflection = torch.linalg.lstsq(gram[:2, :2] + 1e-6 * torch.eye(2), gram[:2, 2]).solution
     return layers, float(transmission - reflection)
+
+
+def _edge_correlation(layers: Tensor) -> float:
+    """Returns the correlation of the strengths of the edges of two layers (2, 3, h, w)."""
+    grey = (layers.mean(1) + OFFSET).sqrt()
+    strengths = torch.hypot(*torch.gradient(grey, dim=(1, 2)))
+    return float(torch.corrcoef(strengths.flatten(1))[0, 1].nan_to_num())
 
 
 def _reflection_share(layers: Tensor) -> Floats:

@@ -27,3 +27,5 @@ class BurstReport:
     1,000 pixels wide."""
     explained: float
     """The share of the errors of a model with one layer that the motion of a second layer explains, 0..1."""
+    edge_correlation: float
+    """The correlation of the edges of both layers, -1..1: about 0 for two scenes."""
