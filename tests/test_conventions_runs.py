@@ -143,8 +143,9 @@ def test_the_paper_experiment_starts_nothing_if_folders_of_its_data_are_missing(
 
 
 @pytest.mark.parametrize("name", ["tiny.sh", "paper.sh", "first_gpu_day.sh"])
-def test_without_brewster_a_script_prints_the_command_that_installs_it(tmp_path, name):
-    shutil.copytree(RUNS, tmp_path / "runs")  # where there is no .venv
+def test_without_brewster_a_script_prints_the_command_that_installs_it(tmp_path, monkeypatch, name):
+    shutil.copytree(RUNS, tmp_path / "runs")
+    monkeypatch.chdir(tmp_path)  # where there is no .venv
     error = run_script(tmp_path / "runs" / name, code=1, PATH="/usr/bin:/bin")
     assert "pip install -c constraints.txt -e '.[render,train,diffusion,evaluate]'" in error
     assert not (tmp_path / "out").exists()

@@ -334,7 +334,9 @@ def separate(
     Args:
         source: a path, the bytes of a file, an open binary file, a PIL image, a `Photo`, or an array.
         model: see `Separator.load`.
-        mask, hints, encoding: see `Separator.__call__`.
+        mask: see `Separator.__call__`.
+        hints: see `Separator.__call__`.
+        encoding: see `Separator.__call__`.
         options: strength, quality, additive and max_pixels of `Separator.__call__`, and those of
             `Separator.load`.
 
