@@ -1,5 +1,7 @@
 """The table of compact networks: what the trainer and the exported file require of a row."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 from torch import nn
@@ -60,3 +62,25 @@ def test_a_recipe_trains_and_exports_the_network_that_it_names(recipe, small_net
     photo = torch.rand(8, 20, 3).numpy()
     transmission, reflection = backend(photo)
     assert transmission.shape == reflection.shape == photo.shape
+
+
+def test_a_run_that_starts_from_a_model_needs_no_pretrained_weights(recipe, monkeypatch):
+    def missing():
+        raise AssertionError
+
+    monkeypatch.setitem(NETWORKS, DEFAULT_NETWORK, replace(NETWORKS[DEFAULT_NETWORK], pretrained=missing))
+    trainer = CompactTrainer(with_value(recipe, "init", "compact"))
+    trainer.initialize()
+    assert (
+        trainer.network.encoder.stem.conv.weight.abs().max() > 1
+    )  # those of the model: random ones are smaller
+
+
+def test_a_network_with_a_refiner_starts_from_a_model_without_one(recipe):
+    trainer = CompactTrainer(with_value(with_value(recipe, "init", "compact"), "network", "lite2-refined"))
+    trainer.initialize()
+    refined, photo = trainer.ema_network(), torch.rand(1, 3, 64, 64)
+    plain = CompactTrainer(with_value(recipe, "init", "compact"))
+    plain.initialize()
+    with torch.no_grad():
+        torch.testing.assert_close(refined(photo), plain.ema_network()(photo))

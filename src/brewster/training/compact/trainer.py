@@ -73,7 +73,7 @@ class CompactTrainer:
         self._data_pool = _single_thread_pool(self._data_workers)
         self._prefetched: dict[int, Future[TrainingBatch]] = {}
         torch.manual_seed(recipe.seed)
-        network = self._entry.pretrained()
+        network = self._entry.build() if recipe.init else self._entry.pretrained()
         self.network = network.to(self.device, memory_format=torch.channels_last)  # type: ignore[call-overload]
         self._reset_ema()
         encoder, others = list[nn.Parameter](), list[nn.Parameter]()
