@@ -288,21 +288,18 @@ def burst_report(
     needed = _MIN_EXPLAINED_IF_DOUBTED if is_doubted and motion >= _LARGE_MOTION_PX else _MIN_EXPLAINED
     method: Literal["burst", "single photo", "unchanged"] = "single photo"
     is_copy = solution is not None and solution.edge_correlation > _MAX_EDGE_CORRELATION
+    has_two_layers = explained >= needed and not is_copy
     advice = "Move the camera 5 to 10 cm sideways between the photos."
     if solution is None:
         message = "No other photo shows the same scene as the reference photo."
-    elif (
-        explained >= needed
-        and motion >= (_USEFUL_MOTION_PX if is_doubted else _MIN_MOTION_PX)
-        and not is_copy
-    ):
+    elif has_two_layers and motion >= (_USEFUL_MOTION_PX if is_doubted else _MIN_MOTION_PX):
         method, message = "burst", f"The layers moved {motion:.0f} px apart in a photo of 1,000 px."
         if solution.naming < _MIN_CERTAIN_NAMING:
             message += " They may have each other's names, because the reference photo alone does not tell them apart."
     elif is_doubted:
         method = "unchanged"
         message = "Little reflection was found, in the motion and in the reference photo. If there is one, separate this photo alone."
-    elif explained < needed or is_copy:
+    elif not has_two_layers:
         message = f"No relative motion of two layers was found. {advice}"
     else:
         message = f"The layers moved {motion:.0f} px apart; about {_USEFUL_MOTION_PX} are needed. {advice}"
