@@ -10,6 +10,7 @@ from brewster.models.compact import (
     CompactNetwork,
     LinearSeparator,
     Refiner,
+    _Tone,
     with_imagenet_features,
 )
 from brewster.srgb import to_encoded, to_linear
@@ -88,6 +89,40 @@ def test_the_gradients_of_a_refiner_are_finite():
     torch.nn.init.normal_(network.refiner.head.weight)
     network(torch.rand(1, 3, 64, 64).round()).square().sum().backward()
     assert all(parameter.grad.isfinite().all() for parameter in network.refiner.parameters())
+
+
+def random_features(width):
+    return [
+        torch.rand(1, channels, 8 * 2**level, width * 2**level)
+        for level, channels in enumerate((352, 224, 128, 64))
+    ][::-1]
+
+
+def test_a_new_tone_changes_nothing_and_a_trained_one_removes_more_then_multiplies_then_adds():
+    tone, features = _Tone(), random_features(12)
+    photo, transmission = torch.rand(2, 1, 3, 256, 384)
+    assert torch.equal(tone(photo, transmission, features), transmission)
+    with torch.no_grad():
+        tone.head.bias.copy_(torch.tensor([math.log(1.2)] * 3 + [0.05] * 3 + [0.5]))
+    expected = (transmission + 0.5 * (transmission - photo)) * 1.2 + 0.05
+    torch.testing.assert_close(tone(photo, transmission, features), expected)
+
+
+def test_the_tone_of_each_cell_depends_on_the_whole_photo():
+    tone, features = _Tone(), random_features(40)
+    torch.nn.init.normal_(tone.head.weight)
+    transmission = torch.full((1, 3, 256, 1280), 0.5)
+    before = tone(transmission, transmission, features)
+    features[-1][..., 0] = torch.rand(1, 352, 8)
+    change = (tone(transmission, transmission, features) - before).abs()
+    assert change[..., -32:].min() > 1e-6
+
+
+def test_the_gradients_of_a_tone_are_finite():
+    network = CompactNetwork()
+    torch.nn.init.normal_(network.tone.head.weight)
+    network(torch.rand(1, 3, 64, 64).round()).square().sum().backward()
+    assert all(parameter.grad.isfinite().all() for parameter in network.tone.parameters())
 
 
 @pytest.mark.parametrize(("name", "label"), [("coffee", 967), ("chelsea", 285)])

@@ -135,6 +135,18 @@ def test_training_only_the_hints_changes_no_photo_without_hints(recipe):
     assert not torch.allclose(after(photo, hints), before, atol=1e-4)
 
 
+def test_training_only_the_tone_changes_no_reflection(recipe):
+    trainer = CompactTrainer(recipe.model_copy(update={"init": "compact", "trained_part": "tone."}))
+    trainer.initialize()
+    photo = torch.rand(1, 3, 64, 64)
+    before = trainer.ema_network()(photo)
+    for step in range(3):
+        trainer.training_step(step)
+    after = trainer.ema_network()(photo)
+    assert torch.equal(after[:, 3:], before[:, 3:])
+    assert not torch.allclose(after[:, :3], before[:, :3], atol=1e-4)
+
+
 def test_exported_weights_are_the_mean_of_the_trained_and_the_initial_ones(recipe):
     recipe = with_value(with_value(recipe, "init", "compact"), "init_share", 0.25)
     trainer = CompactTrainer(recipe)

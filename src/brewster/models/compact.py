@@ -44,6 +44,9 @@ _REFINER_STRIDE: Final = 4
 _CORRECTION_SCALE: Final = 0.5
 """The refiner's output is multiplied by this: its last convolution sums 576 normalised features, so that one step of AdamW changes
 the maps by up to 0.1."""
+_TONE_WIDTH: Final = 96
+_TONE_BLOCKS: Final = 3
+_TONE_HEADS: Final = 4
 _LARGEST_GAIN: Final = 1.5
 """The limit of |log gain|: the gain is in 0.22..4.5. Without a limit, one unusual batch made a training run diverge."""
 
@@ -170,6 +173,57 @@ def _gated_blocks(level: int) -> nn.Sequential:
 
 
 @final
+class _AttentionBlock(nn.Module):
+    """A transformer block (Vaswani et al. 2017) over the cells of an image. A depthwise convolution tells them their neighbours."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.neighbours = nn.Conv2d(width, width, 3, padding=1, groups=width)
+        self.attend = nn.Conv2d(width, 3 * width, 1)
+        self.project = nn.Conv2d(width, width, 1)
+        self.expand = nn.Conv2d(width, 2 * width, 1)
+        self.contract = nn.Conv2d(2 * width, width, 1)
+
+    def forward(self, x: Tensor) -> Tensor:
+        x = x + _in_float32(self.neighbours, x)
+        heads = (
+            part.unflatten(1, (_TONE_HEADS, -1)).flatten(3).transpose(2, 3)
+            for part in self.attend(_normalized(x)).chunk(3, dim=1)
+        )
+        attended = functional.scaled_dot_product_attention(*heads).transpose(2, 3)
+        x = x + self.project(attended.reshape(x.shape))
+        return x + self.contract(functional.gelu(self.expand(_normalized(x))))  # type: ignore[no-any-return]
+
+
+@final
+class _Tone(nn.Module):
+    """Corrects the brightness of large areas of the transmission, in cells of 32 px that see the whole photo.
+
+    The convolutions see a part of the photo only, and most of the error is in areas larger than that.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.join = nn.Conv2d(sum(_FEATURE_WIDTHS[1:]), _TONE_WIDTH, 1)
+        self.blocks = nn.Sequential(*(_AttentionBlock(_TONE_WIDTH) for _ in range(_TONE_BLOCKS)))
+        self.head = nn.Conv2d(_TONE_WIDTH, 7, 1)
+        nn.init.zeros_(self.head.weight)  # untrained, it changes nothing
+        nn.init.zeros_(self.head.bias)  # type: ignore[arg-type]
+
+    def forward(self, photo: Tensor, transmission: Tensor, features: Sequence[Tensor]) -> Tensor:
+        """Returns the corrected transmission. Images are encoded, (N, 3, H, W); the features have strides 4 to 32."""
+        cells = [
+            _normalized(functional.avg_pool2d(feature, 2 ** (len(features) - 1 - level)))
+            for level, feature in enumerate(features)
+        ]
+        maps = _in_float32(self.head, self.blocks(self.join(torch.cat(cells, dim=1))))
+        maps = functional.interpolate(maps, photo.shape[2:], mode="bilinear")
+        log_gain, offset, excess = maps[:, :3], maps[:, 3:6], maps[:, 6:]
+        gain = log_gain.clamp(-_LARGEST_GAIN, _LARGEST_GAIN).exp()
+        return (transmission + excess * (transmission - photo)) * gain + offset
+
+
+@final
 class Refiner(nn.Module):
     """Corrects the maps of `CompactNetwork`: a U-Net of dense convolutions at strides 4 to 32.
 
@@ -246,6 +300,7 @@ class CompactNetwork(nn.Module):
         for convolution in self.hints:
             nn.init.zeros_(convolution.weight)  # type: ignore[arg-type]
             nn.init.zeros_(convolution.bias)  # type: ignore[arg-type]
+        self.tone = _Tone()
 
     def forward(
         self, photo_encoded: Float[Tensor, "n 3 h w"], hints: Float[Tensor, "n 2 h w"] | None = None
@@ -261,10 +316,11 @@ class CompactNetwork(nn.Module):
         x = functional.interpolate(x, scale_factor=2.0, mode="bilinear")
         maps = _in_float32(self.head, _leaky(_in_float32(self.join, torch.cat([x, normal], dim=1))))
         layers = self._layers(photo_encoded, maps)
-        if self.refiner is None:
-            return layers
-        images = torch.cat([photo_encoded, layers], dim=1)
-        return self._layers(photo_encoded, maps + self.refiner(images, features))
+        if self.refiner:
+            images = torch.cat([photo_encoded, layers], dim=1)
+            layers = self._layers(photo_encoded, maps + self.refiner(images, features))
+        transmission, reflection = layers.chunk(2, dim=1)
+        return torch.cat([self.tone(photo_encoded, transmission, features), reflection], dim=1)
 
     def _layers(self, photo_encoded: Tensor, maps: Tensor) -> Tensor:
         """Returns the encoded layers (N, 6, H, W) that follow from the maps (N, 12, H, W)."""

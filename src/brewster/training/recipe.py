@@ -143,9 +143,9 @@ class CompactRecipe(TrainingRecipe):
     contains this network. Not set: ImageNet features."""
     init_share: Share = 0.0
     """Share of the weights of `init` in the exported weights, which are a mean of the two (Wortsman et al., CVPR 2022)."""
-    trained_part: Literal["", "hints."] = ""
+    trained_part: Literal["", "hints.", "tone."] = ""
     """The part of the network that is trained, from zero if `init` is set. hints.: only the weights of the hints, so that photos without
-    hints give the same layers as before. Empty: all weights."""
+    hints give the same layers as before. tone.: only those that correct large areas of the transmission. Empty: all weights."""
     mix: MixRecipe = MixRecipe()
 
     @model_validator(mode="after")
