@@ -33,7 +33,7 @@ _WHITES: Final = ((0.93, 1.0), (0.78, 0.05))
 that of the photo. A wide area that is not clipped is a wall or a veil rather than a lamp."""
 _MIN_CHANGE: Final = 0.02
 """Smaller predicted changes, sRGB-encoded, are not visible. Without them, a reflection in front of a white wall is its own region."""
-_MAX_CONTRAST: Final = 0.35
+_MAX_CONTRAST: Final = 0.28
 """A region disappears in the prediction if it keeps at most this fraction of its contrast to its surroundings, in linear light."""
 _MIN_CONTRAST: Final = 0.02
 """A region with less contrast in the photo, in linear light, has no surroundings in which it could disappear."""

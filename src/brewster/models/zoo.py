@@ -54,7 +54,7 @@ MODELS: Final = {
         ModelFile(
             "compact",
             _WEIGHTS / "compact.onnx",
-            "4d6f9ba60f811c26ce7fb7b034c3a6b45a20be9283574887d5debe00abf983a7",
+            "462a3ed676bd9654115f2eb0370a86a0120681cb5544c7c23fbbc3317c693b0f",
             "Apache-2.0",
         ),
     )
