@@ -84,11 +84,13 @@ def test_a_new_refiner_changes_nothing_and_a_trained_one_corrects_each_map():
         assert (corrected - before).abs().max() > 0.005
 
 
-def test_the_gradients_of_a_refiner_are_finite():
+@pytest.mark.parametrize("name", ["refiner", "tone"])
+def test_the_gradients_of_a_correction_are_finite(name):
     network = CompactNetwork(Refiner())
-    torch.nn.init.normal_(network.refiner.head.weight)
+    correction = getattr(network, name)
+    torch.nn.init.normal_(correction.head.weight)
     network(torch.rand(1, 3, 64, 64).round()).square().sum().backward()
-    assert all(parameter.grad.isfinite().all() for parameter in network.refiner.parameters())
+    assert all(parameter.grad.isfinite().all() for parameter in correction.parameters())
 
 
 def random_features(width):
@@ -101,28 +103,34 @@ def random_features(width):
 def test_a_new_tone_changes_nothing_and_a_trained_one_removes_more_then_multiplies_then_adds():
     tone, features = _Tone(), random_features(12)
     photo, transmission = torch.rand(2, 1, 3, 256, 384)
-    assert torch.equal(tone(photo, transmission, features), transmission)
+    assert torch.equal(tone(photo, transmission, tone.cells(features)), transmission)
     with torch.no_grad():
         tone.head.bias.copy_(torch.tensor([math.log(1.2)] * 3 + [0.05] * 3 + [0.5]))
     expected = (transmission + 0.5 * (transmission - photo)) * 1.2 + 0.05
-    torch.testing.assert_close(tone(photo, transmission, features), expected)
+    torch.testing.assert_close(tone(photo, transmission, tone.cells(features)), expected)
 
 
 def test_the_tone_of_each_cell_depends_on_the_whole_photo():
     tone, features = _Tone(), random_features(40)
     torch.nn.init.normal_(tone.head.weight)
     transmission = torch.full((1, 3, 256, 1280), 0.5)
-    before = tone(transmission, transmission, features)
+    before = tone(transmission, transmission, tone.cells(features))
     features[-1][..., 0] = torch.rand(1, 352, 8)
-    change = (tone(transmission, transmission, features) - before).abs()
-    assert change[..., -32:].min() > 1e-6
+    change = (tone(transmission, transmission, tone.cells(features)) - before).abs()
+    assert change[..., -32:].mean() > 1e-5
 
 
-def test_the_gradients_of_a_tone_are_finite():
-    network = CompactNetwork()
+def test_a_hint_changes_the_tone_of_the_whole_photo():
+    network, photo = CompactNetwork(), torch.rand(1, 3, 256, 320)
     torch.nn.init.normal_(network.tone.head.weight)
-    network(torch.rand(1, 3, 64, 64).round()).square().sum().backward()
-    assert all(parameter.grad.isfinite().all() for parameter in network.tone.parameters())
+    before, hints = network(photo), torch.zeros(1, 2, 256, 320)
+    hints[:, 0, :32, :32] = 1
+    assert torch.equal(network(photo, hints), before)  # untrained
+    torch.nn.init.normal_(network.hints[-1].weight)
+    assert torch.equal(network(photo, torch.zeros_like(hints)), before)
+    change = (network(photo, hints) - before).abs()
+    assert change[:, :3, -32:, -32:].mean() > 1e-5
+    assert change[:, 3:].max() == 0
 
 
 @pytest.mark.parametrize(("name", "label"), [("coffee", 967), ("chelsea", 285)])

