@@ -54,7 +54,7 @@ MODELS: Final = {
         ModelFile(
             "compact",
             _WEIGHTS / "compact.onnx",
-            "462a3ed676bd9654115f2eb0370a86a0120681cb5544c7c23fbbc3317c693b0f",
+            "ba269ef6e5a94771df36c0e3a27e3532eee4f815f938ba5cc14b292ba0829812",
             "Apache-2.0",
         ),
     )
