@@ -111,16 +111,18 @@ def test_a_new_tone_changes_nothing_and_a_trained_one_removes_more_then_multipli
 
 
 def test_the_tone_of_each_cell_depends_on_the_whole_photo():
+    torch.manual_seed(0)
     tone, features = _Tone(), random_features(40)
     torch.nn.init.normal_(tone.head.weight)
     transmission = torch.full((1, 3, 256, 1280), 0.5)
     before = tone(transmission, transmission, tone.cells(features))
     features[-1][..., 0] = torch.rand(1, 352, 8)
     change = (tone(transmission, transmission, tone.cells(features)) - before).abs()
-    assert change[..., -32:].mean() > 1e-5
+    assert change[..., -32:].min() > 1e-6
 
 
 def test_a_hint_changes_the_tone_of_the_whole_photo():
+    torch.manual_seed(0)
     network, photo = CompactNetwork(), torch.rand(1, 3, 256, 320)
     torch.nn.init.normal_(network.tone.head.weight)
     before, hints = network(photo), torch.zeros(1, 2, 256, 320)
@@ -129,7 +131,7 @@ def test_a_hint_changes_the_tone_of_the_whole_photo():
     torch.nn.init.normal_(network.hints[-1].weight)
     assert torch.equal(network(photo, torch.zeros_like(hints)), before)
     change = (network(photo, hints) - before).abs()
-    assert change[:, :3, -32:, -32:].mean() > 1e-5
+    assert change[:, :3, -32:, -32:].min() > 1e-6
     assert change[:, 3:].max() == 0
 
 

@@ -329,7 +329,7 @@ class CompactNetwork(nn.Module):
             images = torch.cat([photo_encoded, layers], dim=1)
             layers = self._layers(photo_encoded, maps + self.refiner(images, features))
         transmission, reflection = layers.chunk(2, dim=1)
-        cells = self._with_hints(self.tone.cells(features), hints, len(_HINT_STRIDES) - 1)
+        cells = self._with_hints(self.tone.cells(features), hints, -1)
         return torch.cat([self.tone(photo_encoded, transmission, cells), reflection], dim=1)
 
     def _layers(self, photo_encoded: Tensor, maps: Tensor) -> Tensor:
