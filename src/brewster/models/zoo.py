@@ -54,7 +54,7 @@ MODELS: Final = {
         ModelFile(
             "compact",
             _WEIGHTS / "compact.onnx",
-            "ba269ef6e5a94771df36c0e3a27e3532eee4f815f938ba5cc14b292ba0829812",
+            "bb9c90aab19b58023aea3157204faaa6e8bac4f3a18eb76c6e9f10109ed82709",
             "Apache-2.0",
         ),
     )
