@@ -86,6 +86,19 @@ def test_each_region_has_its_own_decision():
     np.testing.assert_array_equal(kept[16:28, 60:74], (transmission - photo)[16:28, 60:74])
 
 
+def test_hints_for_reflection_release_the_region_that_they_touch_and_those_for_the_scene_do_not():
+    pixels = lamp_photo(size=(64, 96))
+    other = np.s_[16:28, 60:74]
+    pixels[other] = 255
+    photo = linear(pixels)
+    hints = np.zeros((64, 96, 2), np.float32)
+    hints[20:22, 22:30, 0] = hints[20:22, 62:70, 1] = 1
+    prediction = predict(photo, 0.5 * photo)
+    kept = keep_clipped_light(np.concatenate([photo, hints], axis=2), prediction).change
+    np.testing.assert_array_equal(kept[LAMP], prediction.change[LAMP])
+    assert (kept[other] == 0).all()
+
+
 @settings(deadline=None)
 @given(st.floats(0, 1), st.integers(0, 2**32 - 1), st.sampled_from(list(COLOURS.values())))
 def test_a_bright_region_is_changed_in_all_of_its_pixels_or_in_none(keeps, seed, colour):

@@ -92,6 +92,23 @@ def test_hints_reach_the_model_at_every_scale_and_in_place_together_with_a_mask(
     assert (without == 120).all()
 
 
+def test_a_lamp_that_is_marked_as_reflection_is_removed_although_the_model_removes_half_of_it():
+    photo = np.full((200, 240, 3), 60, np.uint8)
+    photo[80:110, 100:140] = 255
+    hints = np.zeros_like(photo)
+    hints[80:110, 100:140] = RED
+
+    def half(tile, hints=None):
+        is_lamp = tile.max(axis=2, keepdims=True) > 0.9
+        return np.where(is_lamp, 0.5 * tile, tile), np.where(is_lamp, 0.5 * tile, 0)
+
+    half.takes_hints = True
+    separator = Separator(half)
+    marked = separator(photo, encoding="srgb", hints=hints).transmission.pixels
+    assert marked[90:100, 110:130].max() < 200
+    np.testing.assert_array_equal(separator(photo, encoding="srgb").transmission.pixels, photo)
+
+
 def test_a_model_without_hints_refuses_them():
     with pytest.raises(MaskError, match="takes none"):
         Separator(lambda tile: (tile, 0 * tile))(

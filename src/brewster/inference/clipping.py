@@ -49,13 +49,15 @@ _EDGE_GAIN: Final = 1.5
 """Radius, regularisation and contrast of the guided filter for the edges of kept regions that are not clipped."""
 
 
-def keep_clipped_light(photo: Float32[Floats, "h w 3"], prediction: Prediction) -> Prediction:
-    """Returns the prediction without the changes of bright regions that it does not remove whole.
+def keep_clipped_light(model_input: Float32[Floats, "h w c"], prediction: Prediction) -> Prediction:
+    """Returns the prediction without the changes of bright regions that it does not remove whole, but for those that a person marked
+    as reflection.
 
     Args:
-        photo: the photo at the largest input scale of the model, linear light in 0..1.
+        model_input: the largest input of the model, (h, w, 3) or (h, w, 5), see `Predictor`.
         prediction: the prediction at this input scale.
     """
+    photo, is_marked = model_input[..., :3], (model_input[..., 3:4] > 0.5).any(axis=2)
     transmission, encoded = np.clip(photo + prediction.change, 0, 1), to_encoded(photo)
     darkest, brightest = (reduce(pick, np.moveaxis(encoded, 2, 0)) for pick in (np.minimum, np.maximum))
     is_changed = encoded_change(photo, transmission) >= _MIN_CHANGE
@@ -63,7 +65,9 @@ def keep_clipped_light(photo: Float32[Floats, "h w 3"], prediction: Prediction) 
     for white, max_share in _WHITES:
         is_bright = (brightest > _CLIPPED) | (darkest > white)
         regions = label_regions(is_bright & is_changed)
-        is_kept |= _is_half_removed(regions, photo, transmission, max_share)[_grow(regions, _HALO_PX)]
+        is_half_removed = _is_half_removed(regions, photo, transmission, max_share)
+        is_half_removed[regions[is_marked]] = False
+        is_kept |= is_half_removed[_grow(regions, _HALO_PX)]
     if not is_kept.any():
         return prediction
     guide = encoded.mean(axis=2, keepdims=True)

@@ -227,11 +227,12 @@ class Separator:
         with _timed(seconds, "decode"):
             photo = Photo.open(source, encoding=encoding, max_pixels=max_pixels)
             weights = None if mask is None else Mask.open(mask, photo.size)
-            inputs, largest_input, white = self._inputs(photo, quality, hints)
+            inputs, white = self._inputs(photo, quality, hints)
         on_progress(0.0)
         with _timed(seconds, "network"):
             predicted = self._predictor(inputs, quality, lambda done: on_progress(_NETWORK_SHARE * done))
-            prediction = self._keep_clipped_light(largest_input, predicted)
+            prediction = self._keep_clipped_light(inputs[-1], predicted)
+            largest_input = inputs[-1][..., :3]
         with _timed(seconds, "upsampling"):
             upsampler = _fit_upsampler(largest_input, prediction, strength, white)
             transmission, reflection, residual = upsample_layers(
@@ -274,14 +275,14 @@ class Separator:
             assessment.
         """
         Options(quality=quality)  # checks the value
-        inputs, largest_input, white = self._inputs(photo, quality, hints)
-        prediction = self._keep_clipped_light(largest_input, self._predictor(inputs, quality, on_progress))
+        inputs, white = self._inputs(photo, quality, hints)
+        prediction = self._keep_clipped_light(inputs[-1], self._predictor(inputs, quality, on_progress))
+        largest_input = inputs[-1][..., :3]
         upsampler = _fit_upsampler(largest_input, prediction, Options.strength, white)
         return upsampler, prediction, self._assess(largest_input, prediction)
 
-    def _keep_clipped_light(self, largest_input: Floats, prediction: Prediction) -> Prediction:
-        is_measured = self._predictor.is_measured
-        return prediction if is_measured else keep_clipped_light(largest_input, prediction)
+    def _keep_clipped_light(self, model_input: Floats, prediction: Prediction) -> Prediction:
+        return prediction if self._predictor.is_measured else keep_clipped_light(model_input, prediction)
 
     def _assess(
         self,
@@ -302,13 +303,13 @@ class Separator:
 
     def _inputs(
         self, photo: Photo, quality: Quality, hints: Source | None
-    ) -> tuple[list[Floats], Floats, np.float32]:
-        """The inputs of the model, smallest first, the largest one without hints, and the white level."""
+    ) -> tuple[list[Floats], np.float32]:
+        """The inputs of the model, smallest first, and the white level."""
         inputs = [photo.resized(*size) for size in self._predictor.input_sizes(photo.size, quality)]
         white = white_level(inputs[-1])
         inputs = [np.clip(scaled_input / white, 0, 1) for scaled_input in inputs]
         if hints is None:
-            return inputs, inputs[-1], white
+            return inputs, white
         if not self.takes_hints:
             raise MaskError(
                 f"hints were given to the model {self.name}, which takes none",
@@ -316,8 +317,7 @@ class Separator:
                 "leave the hints out, or choose another model",
             )
         painted = Hints.open(hints, photo.size)
-        with_hints = [np.concatenate([each, painted.sampled(*each.shape[1::-1])], axis=2) for each in inputs]
-        return with_hints, inputs[-1], white
+        return [np.concatenate([each, painted.sampled(*each.shape[1::-1])], axis=2) for each in inputs], white
 
 
 def separate(
