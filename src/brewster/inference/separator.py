@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Iterable, Iterator, Set
+from collections.abc import Iterable, Iterator, Sequence, Set
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import replace
@@ -230,8 +230,7 @@ class Separator:
             inputs, white = self._inputs(photo, quality, hints)
         on_progress(0.0)
         with _timed(seconds, "network"):
-            predicted = self._predictor(inputs, quality, lambda done: on_progress(_NETWORK_SHARE * done))
-            prediction = self._keep_clipped_light(inputs[-1], predicted)
+            prediction = self._predict(inputs, quality, lambda done: on_progress(_NETWORK_SHARE * done))
             largest_input = inputs[-1][..., :3]
         with _timed(seconds, "upsampling"):
             upsampler = _fit_upsampler(largest_input, prediction, strength, white)
@@ -276,13 +275,15 @@ class Separator:
         """
         Options(quality=quality)  # checks the value
         inputs, white = self._inputs(photo, quality, hints)
-        prediction = self._keep_clipped_light(inputs[-1], self._predictor(inputs, quality, on_progress))
-        largest_input = inputs[-1][..., :3]
+        prediction, largest_input = self._predict(inputs, quality, on_progress), inputs[-1][..., :3]
         upsampler = _fit_upsampler(largest_input, prediction, Options.strength, white)
         return upsampler, prediction, self._assess(largest_input, prediction)
 
-    def _keep_clipped_light(self, model_input: Floats, prediction: Prediction) -> Prediction:
-        return prediction if self._predictor.is_measured else keep_clipped_light(model_input, prediction)
+    def _predict(
+        self, inputs: Sequence[Floats], quality: Quality, on_progress: ProgressCallback
+    ) -> Prediction:
+        prediction = self._predictor(inputs, quality, on_progress)
+        return prediction if self._predictor.is_measured else keep_clipped_light(inputs[-1], prediction)
 
     def _assess(
         self,
