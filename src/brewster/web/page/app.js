@@ -240,12 +240,11 @@ async function show() {
   paint();
 }
 
-// Returns the tiles of a photo. If the server has dropped the photo, the photo is sent again, only once for all tiles.
+// Returns the tiles of a photo.
 function tilesOf(photo, preview) {
-  let sending = null;
   const context = { signal: new AbortController().signal, onProgress() {} };
   return new TileSet(preview, photo.key, {
-    resend: () => (sending ??= send("photo", photo.file, {}, context).finally(() => (sending = null))),
+    resend: () => send("photo", photo.file, {}, context),
     drawPhoto: (canvas, layers) => draw(canvas, layers, "photo"),
     drawRight(canvas, layers, part) {
       const [width, height] = preview.full.map((side) => side / 2 ** part.level);

@@ -11,8 +11,9 @@ export class TileSet {
   #tiles = new Map(); // address -> tile; the most recently used tile is the last
   #isClosed = false;
   #isScheduled = false;
+  #resent = null; // the promise of the last `resend()`
 
-  // `preview`: the result of `readPreview`; `key`: the key of the photo on the server; `resend()`: sends the photo again if the server
+  // `preview`: the result of `readPreview`; `key`: the key of the photo on the server; `resend()`: sends the photo again, once for all tiles, if the server
   // has dropped it; `drawPhoto(canvas, layers)`: draws the photo; `drawRight(canvas, layers, part)`: draws the layer that is compared;
   // `onChange()`: called when a tile has arrived.
   constructor(preview, key, { resend, drawPhoto, drawRight, onChange }) {
@@ -88,10 +89,12 @@ export class TileSet {
   }
 
   async #load(tile, address, level, column, row) {
+    const resentBefore = this.#resent;
     try {
       let response = await fetch(`tile/${this.key}/${address}`);
       if (response.status === 404) {
-        await this.resend();
+        if (this.#resent === resentBefore) this.#resent = this.resend();
+        await this.#resent;
         response = await fetch(`tile/${this.key}/${address}`);
       }
       if (!response.ok) throw new Error(`status ${response.status}`);
