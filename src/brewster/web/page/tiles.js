@@ -13,9 +13,9 @@ export class TileSet {
   #isScheduled = false;
   #resent = null; // the promise of the last `resend()`
 
-  // `preview`: the result of `readPreview`; `key`: the key of the photo on the server; `resend()`: sends the photo again, once for all tiles, if the server
-  // has dropped it; `drawPhoto(canvas, layers)`: draws the photo; `drawRight(canvas, layers, part)`: draws the layer that is compared;
-  // `onChange()`: called when a tile has arrived.
+  // `preview`: the result of `readPreview`; `key`: the key of the photo on the server; `resend()`: sends the photo again, once for all
+  // tiles, if the server has dropped it; `drawPhoto(canvas, layers)`: draws the photo; `drawRight(canvas, layers, part)`: draws the layer
+  // that is compared; `onChange()`: called when a tile has arrived.
   constructor(preview, key, { resend, drawPhoto, drawRight, onChange }) {
     Object.assign(this, { preview, key, resend, drawPhoto, drawRight, onChange });
   }
