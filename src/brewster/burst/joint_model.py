@@ -75,7 +75,9 @@ class JointModel:
     """(C,): the part of `losses` that compares the frames with their prediction."""
 
     @classmethod
-    def start(cls, frames: Tensor, motions: Tensor, is_locked: Tensor, reference: int) -> JointModel:
+    def start(
+        cls, frames: Tensor, motions: Tensor, is_locked: Tensor, reference: int, density: float
+    ) -> JointModel:
         """Returns a model with first images: T is the second darkest of the frames aligned with its motion, R a part of the darkest.
 
         Args:
@@ -83,9 +85,10 @@ class JointModel:
             motions: (2, C, K, 3, 3), frame to reference, of T and R.
             is_locked: (C,), whether R moves with T.
             reference: the index of the reference frame.
+            density: the number of pixels of the canvases per pixel of the frames, along each axis.
         """
         _, count, frame_count = motions.shape[:3]
-        height, width = _canvas_size(frames)
+        height, width = _canvas_size(frames, density)
         canvas = pixel_grid(height, width) * (1 + 2 * MARGIN)
         to_frames = torch.linalg.inv(motions)
         layers = torch.empty(2, count, 3, height, width)
@@ -124,9 +127,9 @@ class JointModel:
         )
         return replace(self, layers=layers, homographies=homographies, splines=splines)
 
-    def resized(self, frames: Tensor, spline_size: tuple[int, int] | None) -> JointModel:
-        """Returns the model for larger frames (K, 3, h, w) and finer splines."""
-        layers = _resize(self.layers, _canvas_size(frames), align_corners=False)
+    def resized(self, frames: Tensor, density: float, spline_size: tuple[int, int] | None) -> JointModel:
+        """Returns the model for larger frames (K, 3, h, w), with `density` pixels per pixel of a frame, and finer splines."""
+        layers = _resize(self.layers, _canvas_size(frames, density), align_corners=False)
         splines = _resize(self.splines, spline_size, align_corners=True) if spline_size else self.splines
         return replace(self, layers=layers, splines=splines)
 
@@ -281,10 +284,11 @@ def _data_loss(model: JointModel, frames: Tensor, chunk: slice) -> Tensor:
 def _penalties(model: JointModel, frames: Tensor, prior: Tensor, weights: Weights) -> Tensor:
     """Returns the terms of the loss of each candidate that do not compare the frames with their prediction, (C,)."""
     terms = torch.zeros(len(model.is_locked))
+    density = model.layers.shape[-1] / (frames.shape[-1] * (1 + 2 * MARGIN))
     for layer, weight in zip(model.layers, (_TRANSMISSION_GRADIENTS, _REFLECTION_GRADIENTS), strict=True):
         x, y = _differences(layer)
         # The length of the gradient, not the sum of its components, which favours edges along the axes
-        lengths = _smooth_root(x[..., :-1, :].square() + y[..., :-1].square())
+        lengths = _smooth_root(density**2 * (x[..., :-1, :].square() + y[..., :-1].square()))
         terms = terms + weight * lengths.mean((1, 2, 3))
     if weights.common_edges:
         terms = terms + weights.common_edges * _common_edges(*model.layers)
@@ -336,8 +340,8 @@ def _project(homographies: Tensor, grid: Tensor) -> Tensor:
     return points.reshape(*homographies.shape[:-1], *grid.shape)
 
 
-def _canvas_size(frames: Tensor) -> tuple[int, int]:
-    height, width = (round(length * (1 + 2 * MARGIN)) for length in frames.shape[-2:])
+def _canvas_size(frames: Tensor, density: float) -> tuple[int, int]:
+    height, width = (round(length * (1 + 2 * MARGIN) * density) for length in frames.shape[-2:])
     return height, width
 
 

@@ -17,7 +17,7 @@ from brewster.burst.joint_model import OFFSET, JointModel, Rates, Weights, optim
 from brewster.burst.registration import MotionCandidate
 
 Floats = NDArray[np.float32]
-_FOR_MOTION: Final = Weights(common_edges=0.02, prior=0.02)
+_FOR_MOTION: Final = Weights(common_edges=0.01, prior=0.02)
 """Two layers with edges at the same places explain too much of any motion."""
 _FOR_LAYERS: Final = Weights(common_edges=0.005, prior=0.01)
 """With the motion known, a larger penalty of common edges, or a stronger prior, would shift light between the layers."""
@@ -33,10 +33,14 @@ class Level:
     spline_size: tuple[int, int] | None
     """Rows and columns of the splines; None: the motion is a homography."""
     weights: Weights = _FOR_LAYERS
+    density: float = 1.0
+    """Pixels of the layers per pixel of a frame, along each axis."""
 
 
 _COMPARED: Final = 1
 """The index of the level at which the best candidate is compared with one layer. The next ones optimise the best candidate only."""
+_NAMED: Final = 2
+"""The index of the level at which the layers are exchanged if they have each other's names."""
 _MAX_RELATIVE_MOTION: Final = 0.2
 """As a share of the width. With a larger motion, the reflection becomes an offset of each frame, and explains all but edges."""
 _MOTION_SAMPLES: Final = (9, 12)
@@ -46,10 +50,13 @@ _MIN_NAMING: Final = 0.09
 is T: so it was for 23 of 24 simulated bursts, and for none of two with more."""
 _MAX_ENLARGEMENT: Final = 1.3
 """Levels that would enlarge the frames by more than this factor are left out."""
+_DENSITY: Final = 1.5
+"""Of the levels that find the motion. With 1, interpolation blurs T differently in each frame, and a copy of T that is moved by a pixel explains
+this better than the true reflection explains its light."""
 LEVELS: Final = (
-    Level(80, 60, None, _FOR_MOTION),
-    Level(160, 90, (4, 6), _FOR_MOTION),
-    Level(160, 220, (4, 6)),  # enough steps for the brightness of large areas
+    Level(80, 60, None, _FOR_MOTION, _DENSITY),
+    Level(160, 90, (4, 6), _FOR_MOTION, _DENSITY),
+    Level(160, 220, (4, 6), density=_DENSITY),  # enough steps for the brightness of large areas
     Level(320, 70, (6, 8)),
     Level(640, 35, (8, 12)),
 )
@@ -68,7 +75,7 @@ class Solution:
     relative_motion: float
     """The largest motion of R relative to T between two frames, as a share of the width of a frame."""
     naming: float
-    """The share of the detail of T that the prior keeps, minus that of R: 0 if the single photo does not tell the layers apart."""
+    """The share of the detail of T that the prior keeps, minus that of R, at 160 pixels: 0 if the single photo does not tell the layers apart."""
     edge_correlation: float
     """The correlation of the strengths of the edges of both layers, at 160 pixels: about 0 for two scenes, and more if a wrong motion
     makes the second layer a copy of the first."""
@@ -109,14 +116,16 @@ def solve(
     motions = np.stack([[c.transmission for c in candidates], [c.reflection for c in candidates]])
     is_locked = torch.tensor([candidate.is_locked for candidate in candidates])
     model, names, errors = None, [candidate.name for candidate in candidates], (0.0, 0.0)
-    edge_correlation = 0.0
+    edge_correlation = naming = 0.0
     refined = prior
     for index, level in enumerate(levels):
         small, small_prior, small_refined = (
             _packed(images, level.long_side_px) for images in (frames, [prior], [refined])
         )
         if model is None:
-            model = JointModel.start(small, torch.from_numpy(motions).float(), is_locked, reference)
+            model = JointModel.start(
+                small, torch.from_numpy(motions).float(), is_locked, reference, level.density
+            )
         else:
             kept = (
                 _best_of_families(model, candidates)
@@ -124,7 +133,7 @@ def solve(
                 else _best(model, with_locked=False)
             )
             model, names = model.selected(kept), [names[i] for i in kept]
-            model = model.resized(small, level.spline_size)
+            model = model.resized(small, level.density, level.spline_size)
         rates = Rates().scaled(min(1.0, 80 / level.long_side_px)) if index else Rates(splines=0)
 
         def on_step(level: Level = level) -> None:
@@ -141,12 +150,12 @@ def solve(
         if index >= _COMPARED or level is levels[-1]:
             kept = _best(model, with_locked=False)
             best = model.selected(kept)
-            layers, naming = _named(best, small, small_prior[0])
-            if index <= _COMPARED + 1:
-                edge_correlation = _edge_correlation(layers)
-            if naming < -_MIN_NAMING:  # the next level corrects the brightness of large areas
-                model, names = best.exchanged(), [names[i] for i in kept]
-                layers, naming = layers.flip(0), -naming
+            layers, detail = _named(best, small, small_prior[0])
+            if index == min(_NAMED, len(levels) - 1):
+                edge_correlation, naming = _edge_correlation(layers), detail
+                if naming < -_MIN_NAMING:  # the next levels correct the brightness of large areas
+                    model, names = best.exchanged(), [names[i] for i in kept]
+                    layers, naming = layers.flip(0), -naming
             if refine_prior and level is not levels[-1]:
                 refined = refine_prior(_reflection_share(layers))
     assert model
