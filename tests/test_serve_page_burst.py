@@ -69,7 +69,7 @@ def test_a_text_file_and_a_tiff_have_the_right_button_and_thumbnail(open_page):
     upload(page, ("notes.txt", b"some text"), ("a.tiff", tiff))
     assert page.locator("#discard").get_attribute("class") == "main"
     assert page.locator("#retry").get_attribute("class") == "quiet"
-    page.wait_for_function("document.querySelectorAll('#photos img')[1].naturalWidth === 90")
+    page.wait_for_function("() => document.querySelectorAll('#photos img')[1].naturalWidth === 90")
 
 
 @pytest.mark.parametrize("layers", [("confidence",), ("transmission", "confidence")])
