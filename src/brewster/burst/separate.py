@@ -45,10 +45,10 @@ _MIN_EXPLAINED_IF_DOUBTED: Final = 0.4
 """If the single photo shows little reflection, a larger motion must explain more: what only one frame shows explains everything there."""
 _USEFUL_MOTION_PX: Final = 16
 _MAX_EDGE_CORRELATION: Final = 0.2
-"""If the edges of both layers correlate more, they are not two scenes. Of 49 simulated bursts above the other limits, it refuses seven of the
-eleven that lost more than 0.1 dB, and six that gained 0 to 4 dB."""
+"""If the edges of both layers correlate more, they are not two scenes. Of 48 simulated bursts above the other limits, it refuses three, with
+-2.5, -0.1 and +3.3 dB."""
 _MIN_CERTAIN_NAMING: Final = 0.08
-"""Of six simulated bursts below, two had exchanged layers; of four above, none."""
+"""Of 15 simulated bursts below, two had exchanged layers; of 30 above, one."""
 _HINTED_SHARE: Final = 0.3
 _HINTED_AREA: Final = 0.2
 """Where the measured reflection has more of the light, the model gets a hint, but in no larger area: its hints were trained on a tenth."""

@@ -40,7 +40,7 @@ class Level:
 _COMPARED: Final = 1
 """The index of the level at which the best candidate is compared with one layer. The next ones optimise the best candidate only."""
 _NAMED: Final = 2
-"""The index of the level at which the layers are exchanged if they have each other's names."""
+"""The index of the level at which names and edges are judged, and the layers exchanged if they have each other's names."""
 _MAX_RELATIVE_MOTION: Final = 0.2
 """As a share of the width. With a larger motion, the reflection becomes an offset of each frame, and explains all but edges."""
 _MOTION_SAMPLES: Final = (9, 12)
