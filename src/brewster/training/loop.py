@@ -7,21 +7,20 @@ with more steps: from then on, its learning rates and image sizes are those of t
 
 from __future__ import annotations
 
-import importlib.util
 import io
 import json
 import pickle
 import time
 from collections.abc import Callable, Mapping
-from contextlib import closing
+from contextlib import nullcontext
 from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, Protocol, final
+from typing import Any, Final, Protocol
 
 import torch
 from pydantic import ValidationError
 from torch import Tensor
+from torch.utils.tensorboard import SummaryWriter
 
 from brewster.errors import ModelError, RecipeError
 from brewster.files import write_atomically
@@ -31,10 +30,6 @@ from brewster.srgb import to_linear
 from brewster.training.distributed import is_main_process
 from brewster.training.plots import plot_log
 from brewster.training.recipe import TrainingRecipe
-
-if TYPE_CHECKING:
-    from jaxtyping import Float
-    from torch.utils.tensorboard import SummaryWriter
 
 StepCallback = Callable[[int, int, Mapping[str, float], bool], None]
 """Called after every step with (step, steps, metrics, logged); `logged` is true if the metrics were written to the log."""
@@ -46,8 +41,6 @@ CHECKPOINT_FILE: Final = "checkpoint.pt"
 LOG_FILE: Final = "log.jsonl"
 SAMPLES_FILE: Final = "samples.png"
 CURVES_FILE: Final = "results.png"
-IMAGE_TAG: Final = "samples"
-"""The name of the images in TensorBoard."""
 _START_FRESH: Final = "delete it to start again, or choose another folder with -o"
 _CHECKPOINT_ERRORS: Final = (
     OSError, RuntimeError, TypeError, ValueError, LookupError, EOFError, pickle.UnpicklingError,
@@ -89,39 +82,6 @@ class Checkpoint:
                 "expected a checkpoint written by brewster train",
                 _START_FRESH,
             ) from error
-
-
-@final
-class TensorBoardLog:
-    """Writes TensorBoard events, in addition to the log: `tensorboard --logdir OUT`. A no-op without tensorboard.
-
-    Events of an interrupted run after `completed_steps` are discarded.
-    """
-
-    def __init__(self, folder: Path, completed_steps: int) -> None:
-        self._folder, self._completed_steps = folder, completed_steps
-
-    def log(self, step: int, metrics: Mapping[str, float], image_encoded: Float[Tensor, "h w 3"]) -> None:
-        """Writes each metric as a scalar, and the image, sRGB-encoded in 0..1."""
-        if self._writer:
-            for name, value in metrics.items():
-                self._writer.add_scalar(name, value, step)
-            self._writer.add_image(IMAGE_TAG, image_encoded.clamp(0, 1), step, dataformats="HWC")
-            self._writer.flush()
-
-    def close(self) -> None:
-        """Closes the event file, if one was opened."""
-        if "_writer" in vars(self) and self._writer:
-            self._writer.close()
-
-    @cached_property
-    def _writer(self) -> SummaryWriter | None:
-        """The writer, or None without tensorboard. It creates its file, so a completed run that is resumed must not open it."""
-        if not importlib.util.find_spec("tensorboard"):
-            return None
-        from torch.utils.tensorboard import SummaryWriter  # noqa: PLC0415  (imports tensorboard)
-
-        return SummaryWriter(self._folder, purge_step=self._completed_steps + 1)
 
 
 class Trainer(Protocol):
@@ -181,13 +141,14 @@ def run(
             write_atomically(log, "".join(f"{line}\n" for line in valid).encode(), overwrite=True)
     on_start(completed_steps, recipe.steps, seconds_before)
     started, steps = time.monotonic() - seconds_before, 0 if recipe.data.is_empty else recipe.steps
-    with closing(TensorBoardLog(out, completed_steps)) as event_log:
+    has_events = is_main_process() and completed_steps < steps  # a writer creates a file
+    with SummaryWriter(out, purge_step=completed_steps + 1) if has_events else nullcontext() as events:
         for step in range(completed_steps + 1, 1 + steps):
             metrics, is_last = trainer.training_step(step - 1), step == recipe.steps
             reports = is_last or step % recipe.report_every == 0
             logged = reports and is_main_process()
             scores, image = trainer.validate() if reports else ({}, None)
-            if logged and image is not None:
+            if logged and events and image is not None:
                 metrics |= scores | {"seconds": time.monotonic() - started}
                 line = {name: round(value, 5) for name, value in {"step": step, **metrics}.items()}
                 with log.open("a") as stream:
@@ -195,7 +156,10 @@ def run(
                 linear = to_linear(image.clamp(0, 1)).numpy()
                 Photo.from_array(linear, encoding="linear").save(out / SAMPLES_FILE, depth=8, overwrite=True)
                 write_atomically(out / CURVES_FILE, plot_log(read_log(out)), overwrite=True)
-                event_log.log(step, metrics, image)
+                for name, value in metrics.items():
+                    events.add_scalar(name, value, step)
+                events.add_image("samples", image.clamp(0, 1), step, dataformats="HWC")
+                events.flush()
             if is_main_process() and (is_last or step % recipe.checkpoint_every == 0):
                 seconds = time.monotonic() - started
                 checkpoint = Checkpoint(step, recipe.model_dump_json(), trainer.state_dict(), seconds)
