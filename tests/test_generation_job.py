@@ -83,7 +83,7 @@ def test_shards_are_packed_as_they_become_complete_and_grow_with_the_dataset(tmp
 
     class RecordingExecutor(SerialExecutor):
         def start(self, task):
-            folders_at_submit[task.kind, task.indices[0]] = sorted(path.name for path in out.glob("0*"))
+            folders_at_submit[task.kind, task.index] = sorted(path.name for path in out.glob("0*"))
             return super().start(task)
 
     out = tmp_path / "set"

@@ -79,26 +79,17 @@ class UnpicklableError(Exception):
 
 
 def results_if(error):
-    """Runs a task of two items, whose future has the error at first."""
+    """Runs a task whose future has the error."""
     executor = ray_cluster.RayExecutor(partial(TaskRunner, None))
     executor._ray = SimpleNamespace(
         exceptions=pytest.importorskip("ray").exceptions, cluster_resources=lambda: {"CPU": 1}
     )
     executor._run_id = executor._create_runner_ref = None
-    started = []
-
-    def remote(_run, _runner, task):
-        started.append(task.indices)
-        future = Future()
-        if len(started) == 1:
-            future.set_exception(error)
-        else:
-            future.set_result([task.indices])
-        return SimpleNamespace(future=lambda: future)
-
-    executor._run_task = SimpleNamespace(remote=remote)
-    tasks = iter([RenderTask("render", (1, 2))])
-    return sorted(run_tasks(lambda: next(tasks, None), executor))
+    future = Future()
+    future.set_exception(error)
+    executor._run_task = SimpleNamespace(remote=lambda *_: SimpleNamespace(future=lambda: future))
+    tasks = iter([RenderTask("render", 1)])
+    return list(run_tasks(lambda: next(tasks, None), executor))
 
 
 @pytest.mark.parametrize(
@@ -121,10 +112,12 @@ def test_an_exception_of_the_runner_that_cannot_be_pickled_is_raised():
 
 
 @pytest.mark.parametrize("are_arguments_lost", [False, True])
-def test_the_items_of_a_lost_task_are_tried_again_one_by_one(are_arguments_lost):
+def test_a_task_that_is_lost_after_all_attempts_of_ray_fails(are_arguments_lost):
     errors = pytest.importorskip("ray").exceptions
     lost = errors.ObjectLostError("00", None, "") if are_arguments_lost else errors.WorkerCrashedError()
-    assert results_if(errors.RayTaskError("run", "", lost) if are_arguments_lost else lost) == [(1,), (2,)]
+    (result,) = results_if(errors.RayTaskError("run", "", lost) if are_arguments_lost else lost)
+    assert (result.index, result.status, result.kind) == (1, "failed", "WorkerLost")
+    assert "was lost 3 times" in result.error
 
 
 @pytest.mark.slow

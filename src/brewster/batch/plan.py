@@ -53,10 +53,6 @@ class SeparationTask:
         """The path of the photo as the caller passed it, or `-` for a stream."""
         return display_name(self.source)
 
-    def split(self) -> list[SeparationTask]:
-        """Returns a list with only this task, which cannot be split. See `brewster.executors.Task`."""
-        return [self]
-
     def failed_results(self, reason: str) -> list[FileResult]:
         """Returns the result of a photo that no worker could separate."""
         cure = "use fewer workers for each node, or a smaller photo"

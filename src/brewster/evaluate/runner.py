@@ -129,9 +129,6 @@ class _Task:
     case: Case
     names: list[str]
 
-    def split(self) -> list[_Task]:
-        return [self]
-
     def failed_results(self, reason: str) -> list[ScoreRow]:
         raise BrewsterError(
             f"a worker process died on {self.case.benchmark}/{self.case.name} ({reason})",

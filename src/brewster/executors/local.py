@@ -13,13 +13,13 @@ import os
 import signal
 import sys
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import AbstractContextManager, contextmanager
 from multiprocessing import active_children, get_context, parent_process, resource_tracker
 from multiprocessing.process import BaseProcess
-from typing import Any, Final, Protocol, Self, TypeVar, final
+from typing import Any, Final, Protocol, TypeVar, final
 
 ResultT = TypeVar("ResultT")
 
@@ -28,10 +28,7 @@ MAX_ATTEMPTS: Final = 3
 
 
 class Task(Protocol[ResultT]):
-    """One or more items that one worker processes. A task must be picklable."""
-
-    def split(self) -> Sequence[Self]:
-        """Returns a task for each item."""
+    """What one worker processes at a time. A task must be picklable."""
 
     def failed_results(self, reason: str) -> list[ResultT]:
         """Returns the results of a task that no worker could finish."""
@@ -48,8 +45,6 @@ class Executor(AbstractContextManager[Any], Protocol[ResultT]):
     results are lost.
     """
 
-    chunk_size: int = 1
-    """Number of items per task."""
     attempts: int = 1
     """How often `run_tasks` starts a task whose worker is lost."""
 
@@ -68,9 +63,7 @@ def run_tasks(
 ) -> Iterator[ResultT]:
     """Runs tasks until there are no more, and yields their results in the order in which the tasks end.
 
-    `next_task` returns the next task, or None if there is none before the next result. If a task is lost in
-    all its attempts, each of its items is a task of its own, because one item may be the cause. Raises the
-    errors of the runner.
+    `next_task` returns the next task, or None if there is none before the next result. Raises the errors of the runner.
     """
     running: dict[Future[list[ResultT]], tuple[Task[ResultT], int]] = {}
     while True:
@@ -84,11 +77,8 @@ def run_tasks(
                 results = future.result()
             except Exception as error:  # noqa: BLE001  (raised again if no worker was lost)
                 reason, results = executor.lost_reason(error), []
-                parts = [task] if attempt < executor.attempts else task.split()
-                if attempt < executor.attempts or len(parts) > 1:
-                    running |= {
-                        executor.start(part): (part, attempt % executor.attempts + 1) for part in parts
-                    }
+                if attempt < executor.attempts:
+                    running[executor.start(task)] = task, attempt + 1
                 else:
                     results = task.failed_results(reason)
             yield from results

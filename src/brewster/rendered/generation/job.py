@@ -63,25 +63,20 @@ class RenderJob:
 @final
 @dataclass(frozen=True)
 class RenderTask:
-    """A task for a worker: to render samples ("render"), or to pack blocks of a hundred samples into shards ("pack").
+    """A task for a worker: to render a sample ("render"), or to pack a block of a hundred samples into a shard ("pack").
 
-    `indices` are the indices of the samples or of the blocks.
+    `index` is that of the sample, or of the first sample of the block.
     """
 
     kind: Literal["render", "pack"]
-    indices: tuple[int, ...]
-
-    def split(self) -> list[RenderTask]:
-        """Returns a task for each index."""
-        return [RenderTask(self.kind, (index,)) for index in self.indices]
+    index: int
 
     def failed_results(self, reason: str) -> list[RenderResult]:
-        """Returns a failed result for each index of a task that no worker could finish."""
+        """Returns the failed result of a task that no worker could finish."""
         error = (
             f"{reason}; expected a sample that fits into memory; use fewer --workers, or a smaller --size."
         )
-        size = 1 if self.kind == "render" else store.SHARD_SIZE
-        return [RenderResult(n * size, "failed", error=error, kind="WorkerLost") for n in self.indices]
+        return [RenderResult(self.index, "failed", error=error, kind="WorkerLost")]
 
 
 @final
@@ -120,7 +115,7 @@ def build(
         store.remove_partial_files(job.out)
         try:
             with executor:
-                schedule = _Schedule(job.out, indices, executor.chunk_size, shards=shards, report=report)
+                schedule = _Schedule(job.out, indices, shards=shards, report=report)
                 for result in run_tasks(schedule.next, executor):
                     schedule.record_result(result)
         finally:
@@ -132,11 +127,8 @@ def build(
 class _Schedule:
     """Schedules tasks block by block: missing samples to render, and blocks without missing samples to pack."""
 
-    def __init__(
-        self, out: Path, indices: range, chunk_size: int, *, shards: bool, report: ResultCallback
-    ) -> None:
-        self._out, self._indices, self._chunk_size = out, indices, chunk_size
-        self._shards, self._report = shards, report
+    def __init__(self, out: Path, indices: range, *, shards: bool, report: ResultCallback) -> None:
+        self._out, self._indices, self._shards, self._report = out, indices, shards, report
         self._blocks_to_pack: deque[int] = deque()
         self._remaining: dict[int, int] = {}
         """For each block, the number of samples that must be rendered before the block is packed."""
@@ -145,7 +137,7 @@ class _Schedule:
     def next(self) -> RenderTask | None:
         """Returns the next task. Returns None after the last task, and if no task can start before the next result."""
         if self._blocks_to_pack:
-            return RenderTask("pack", (self._blocks_to_pack.popleft(),))
+            return RenderTask("pack", self._blocks_to_pack.popleft() * store.SHARD_SIZE)
         return next(self._render_tasks, None)
 
     def record_result(self, result: RenderResult) -> None:
@@ -169,12 +161,11 @@ class _Schedule:
             if self._shards and missing:
                 self._remaining[block] = len(missing)
             elif self._shards and store.has_folders(self._out, block):
-                yield RenderTask("pack", (block,))
+                yield RenderTask("pack", block * size)
             for index in in_block:
                 if index in existing:
                     self._report(RenderResult(index, "skipped"))
-            for first in range(0, len(missing), self._chunk_size):
-                yield RenderTask("render", tuple(missing[first : first + self._chunk_size]))
+            yield from (RenderTask("render", index) for index in missing)
 
 
 # --- the lock and the record of a dataset: a dataset has one job, and only one run at a time writes to it

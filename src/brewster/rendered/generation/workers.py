@@ -10,7 +10,6 @@ import importlib
 import time
 import tomllib
 from collections.abc import Callable, Sequence
-from functools import partial
 from pathlib import Path
 from typing import Final, final
 
@@ -40,28 +39,26 @@ class TaskRunner:
         self._job, self._assets = job, Assets(job.folders)
 
     def __call__(self, task: RenderTask) -> list[RenderResult]:
-        """Runs a task. Returns the results of all samples. A task that packs samples returns only failed results. Raises
-        FATAL_ERRORS."""
+        """Runs a task. Returns its result, or nothing if a block was packed. Raises FATAL_ERRORS."""
+        is_render = task.kind == "render"
         with single_torch_thread():
-            if task.kind == "render":
-                return [self._attempt(index, partial(self._render, index)) for index in task.indices]
-            results = (
-                self._attempt(block * store.SHARD_SIZE, partial(store.pack, self._job.out, block))
-                for block in task.indices
-            )
-            return [result for result in results if result.error]
+            result = self._attempt(task.index, self._render if is_render else self._pack)
+        return [result] if is_render or result.error else []
+
+    def _pack(self, index: int) -> None:
+        store.pack(self._job.out, index // store.SHARD_SIZE)
 
     def _render(self, index: int) -> None:
         folder = self._job.out / store.key(index)
-        if not folder.is_dir():  # a worker that died may have rendered some samples of the task
+        if not folder.is_dir():  # a worker that died, or that is only slow, may have rendered it
             scene = draw(self._job.recipe, self._job.catalog, self._job.seed, index)
             sample = find_renderer(self._job.renderer)(scene, self._assets)
             store.write_folder(folder, store.encode_sample(sample, self._job.renderer))
 
-    def _attempt(self, index: int, work: Callable[[], None]) -> RenderResult:
+    def _attempt(self, index: int, work: Callable[[int], None]) -> RenderResult:
         started = time.perf_counter()
         try:
-            work()
+            work(index)
             return RenderResult(index, "rendered", time.perf_counter() - started)
         except FATAL_ERRORS:
             raise
