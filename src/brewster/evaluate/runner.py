@@ -97,25 +97,18 @@ def _find_unavailable(
         rows = (_empty_row(files, method, config, logged) for method in methods)
         return any(logged[row.id].score_key != row.score_key for row in rows)
 
-    columns: dict[Callable[[], object], list[str]] = {}
-    for column, metric in config.columns().items():
-        if metric.prepare:
-            columns.setdefault(metric.prepare, []).append(column)
+    prepare = {column: metric.prepare for column, metric in config.columns().items() if metric.prepare}
     earlier = [logged.get((case.benchmark, case.name, method.name)) for case in cases for method in methods]
-    missing = {
-        prepare: names
-        for prepare, names in columns.items()
-        if not all(row and {*names} <= {*row.columns} for row in earlier)
-    }
-    if missing != columns and any(map(is_outdated, cases)):
-        missing = columns
-    reasons: dict[str, str] = {}
-    for prepare, names in missing.items():
+    are_scored = all(row and prepare.keys() <= {*row.columns} for row in earlier)
+    if not prepare or (are_scored and not any(map(is_outdated, cases))):
+        return {}
+    reasons = dict[Callable[[], object], str]()
+    for load in {*prepare.values()}:
         try:
-            prepare()
+            load()
         except BrewsterError as error:
-            reasons |= dict.fromkeys(names, str(error))
-    return {column: reasons[column] for column in config.columns() if column in reasons}
+            reasons[load] = str(error)
+    return {column: reasons[load] for column, load in prepare.items() if load in reasons}
 
 
 # --- one case
