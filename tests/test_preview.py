@@ -13,7 +13,7 @@ from brewster.inference import Separator
 from brewster.inference.guided_upsampling import upsample_rows
 from brewster.options import Options
 from brewster.srgb import to_encoded, to_linear
-from brewster.web.preview import MAX_PREVIEW_PIXELS, TILE_PX, PhotoCache, photo_tile, preview
+from brewster.web.preview import MAX_PREVIEW_PIXELS, TILE_PX, photo_tile, preview
 from cli_helpers import image_bytes
 from picture_files import exif_block, file_of, smooth
 from web_servers import form, make_app, pane, request
@@ -174,18 +174,6 @@ def test_the_tiles_of_level_zero_are_the_pixels_of_the_photo_and_others_are_mean
 @pytest.mark.parametrize("address", [(0, 3, 0), (0, 0, 2), (0, -1, 0), (-1, 0, 0), (9, 0, 0), (60, 0, 0)])
 def test_there_are_no_tiles_outside_the_photo(address):
     assert photo_tile(Photo.open(image_bytes(1100, 700, "png")), *address) is None
-
-
-def test_the_cache_drops_the_photos_that_were_not_used_for_the_longest_time():
-    photos = {name: Photo(np.zeros((10, 10, 3), np.uint8)) for name in "abc"}
-    cache = PhotoCache(max_bytes=600)
-    cache.put("a", photos["a"])
-    cache.put("b", photos["b"])
-    assert cache.get("a") is photos["a"]
-    cache.put("c", photos["c"])
-    assert (cache.get("a"), cache.get("b"), cache.get("c")) == (photos["a"], None, photos["c"])
-    cache.put("large", large := Photo(np.zeros((100, 100, 3), np.uint8)))
-    assert (cache.get("c"), cache.get("large")) == (None, large)
 
 
 def test_tiles_are_served_until_the_photo_is_dropped_and_again_after_it_was_sent_again():

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-from collections import OrderedDict
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -11,6 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from brewster.cache import ByteLimitedCache
 from brewster.errors import BrewsterError, RecipeError, UnsupportedPhoto
 from brewster.photo import Photo
 from brewster.scene.world import AssetSource, EnvironmentMap, Plane
@@ -35,7 +35,7 @@ class Assets:
 
     def __init__(self, folders: Sequence[Path] = ()) -> None:
         self._folders = (*folders, BUILTIN_MAPS, BUILTIN_PHOTOS)
-        self._cache: OrderedDict[tuple[str, str, str], Float32] = OrderedDict()
+        self._cache = ByteLimitedCache[Float32](_MAX_CACHE_BYTES)
 
     def map_radiance(self, environment: EnvironmentMap) -> Float32:
         """Returns the radiance of a lat-long map, (H, 2 H, 3), scaled to the mean luminance in the scene.
@@ -59,13 +59,7 @@ class Assets:
         return light
 
     def _cached(self, kind: str, source: AssetSource, read: Callable[[AssetSource], Float32]) -> Float32:
-        key = (kind, source.file, source.sha256)
-        if key not in self._cache:
-            self._cache[key] = read(source)
-            while len(self._cache) > 1 and sum(a.nbytes for a in self._cache.values()) > _MAX_CACHE_BYTES:
-                self._cache.popitem(last=False)
-        self._cache.move_to_end(key)
-        return self._cache[key]
+        return self._cache.get_or_create((kind, source.file, source.sha256), lambda: read(source))
 
     def _read_map(self, source: AssetSource) -> Float32:
         light: Float32 = np.maximum(check_map(self._open(source).linear(), source.file), np.float32(0))

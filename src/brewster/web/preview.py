@@ -24,10 +24,8 @@ from __future__ import annotations
 
 import json
 import math
-from collections import OrderedDict
 from collections.abc import Callable
-from threading import Lock
-from typing import Final, final
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -127,34 +125,6 @@ def photo_tile(photo: Photo, level: int, column: int, row: int) -> Photo | None:
         sums = np.add.reduceat(linear, starts, axis=axis)
         linear = np.divide(sums, counts.reshape((-1, 1, 1) if axis == 0 else (1, -1, 1)), dtype=np.float32)
     return Photo(_to_srgb_bytes(linear))
-
-
-@final
-class PhotoCache:
-    """The decoded photos of the last requests by key, for the tiles. Thread-safe.
-
-    If the photos together exceed `max_bytes`, the least recently used ones are dropped."""
-
-    def __init__(self, max_bytes: int = 400_000_000) -> None:
-        self.max_bytes, self._photos, self._lock = max_bytes, OrderedDict[str, Photo](), Lock()
-
-    def put(self, key: str, photo: Photo) -> None:
-        """Stores a photo. This photo is kept even if it alone exceeds `max_bytes`."""
-        with self._lock:
-            self._photos[key] = photo
-            self._photos.move_to_end(key)
-            while (
-                len(self._photos) > 1
-                and sum(each.pixels.nbytes for each in self._photos.values()) > self.max_bytes
-            ):
-                self._photos.popitem(last=False)
-
-    def get(self, key: str) -> Photo | None:
-        """Returns the photo with this key, or None if it was dropped."""
-        with self._lock:
-            if key in self._photos:
-                self._photos.move_to_end(key)
-            return self._photos.get(key)
 
 
 def _to_srgb_bytes(linear: NDArray[np.float32]) -> NDArray[np.uint8]:

@@ -23,6 +23,7 @@ from starlette.exceptions import HTTPException
 from starlette.responses import Response
 
 import brewster
+from brewster.cache import ByteLimitedCache
 from brewster.image_formats import SUFFIXES
 from brewster.inference import Separator
 from brewster.inference.burst_report import BurstReport
@@ -31,7 +32,7 @@ from brewster.photo import Photo, Source
 from brewster.photo.open_raster import zip_images
 from brewster.web.job_queue import JobProgress, JobQueue
 from brewster.web.model_cache import ModelCache, ModelRow
-from brewster.web.preview import PhotoCache, photo_tile, preview
+from brewster.web.preview import photo_tile, preview
 from brewster.web.request_schema import SeparationRequest, form_schema, read_form
 
 if TYPE_CHECKING:
@@ -39,6 +40,7 @@ if TYPE_CHECKING:
 
 _GZIP_LEVEL: Final = 1  # higher levels save little more and take several times longer
 _TILE_HEADERS: Final = {"Cache-Control": "private, max-age=3600"}
+_MAX_CACHE_BYTES: Final = 400_000_000  # of the decoded photos of the last requests, for the tiles
 
 
 @final
@@ -105,7 +107,7 @@ class _SeparationRoutes:
 
     def __init__(self, model_cache: ModelCache, job_queue: JobQueue, max_pixels: int) -> None:
         self._model_cache, self._job_queue, self._max_pixels = model_cache, job_queue, max_pixels
-        self._photos = PhotoCache()
+        self._photos = ByteLimitedCache[Photo](_MAX_CACHE_BYTES, lambda photo: photo.pixels.nbytes)
         self._last_burst: tuple[object, FittedBurst] | None = None
 
     async def _run(self, request: Request, job: str | None, handler: Handler) -> Response:
@@ -246,8 +248,9 @@ class _SeparationRoutes:
     def _open_photo(self, form: SeparationRequest) -> tuple[Photo, dict[str, str]]:
         """Returns the decoded photo, and the headers with its key and its size. The photo is stored in the cache for the tiles."""
         key = hashlib.sha256(form.photo).hexdigest()
-        photo = self._photos.get(key) or Photo.open(form.photo, max_pixels=form.options.max_pixels)
-        self._photos.put(key, photo)
+        photo = self._photos.get_or_create(
+            key, lambda: Photo.open(form.photo, max_pixels=form.options.max_pixels)
+        )
         return photo, {"Brewster-Photo": key, "Brewster-Size": "{}x{}".format(*photo.size)}
 
 

@@ -13,7 +13,7 @@ image of a rendered sample, so that the mixture shows the same two scenes as the
 from __future__ import annotations
 
 import tarfile
-from collections.abc import Callable, Hashable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -24,6 +24,7 @@ from typing import Final
 import torch
 from torch import Tensor
 
+from brewster.cache import ByteLimitedCache
 from brewster.environments.assets import Assets, add_file_name_to_errors
 from brewster.errors import RecipeError
 from brewster.photo import Photo
@@ -40,8 +41,8 @@ from brewster.training.data.mixtures import TrainingBatch, random_crop
 from brewster.training.data.sample_rng import SampleRng
 
 CACHE_BYTES: Final = 1 << 30
-"""Memory for cached samples, 9 bytes per pixel: 600 samples of 512x384, 1,800 of 256x256 or 7,200 of 128x128. When it is full,
-the oldest samples are dropped. When such a sample is drawn again, it is read or rendered again, with the same result."""
+"""Memory for cached samples, 9 bytes per pixel: 600 samples of 512x384, 1,800 of 256x256 or 7,200 of 128x128.
+When it is full, the least recently used samples are dropped, and read or rendered again, with the same result."""
 ALPHA: Final = (0.8, 1.0)
 BETA: Final = (0.4, 1.0)
 
@@ -72,7 +73,7 @@ class RenderedDatasets:
             )
         self._entries = entries[:count]
         self._seed, self._crop, self._target, self._blend_space = seed, crop, target, blend_space
-        self._cache = _TensorCache(CACHE_BYTES)
+        self._cache = ByteLimitedCache[Tensor](CACHE_BYTES)
 
     def __len__(self) -> int:
         return len(self._entries)
@@ -142,7 +143,8 @@ class CachedRendered:
     def __init__(
         self, source: OnlineRendered, count: int, *, seed: int, max_bytes: int = CACHE_BYTES
     ) -> None:
-        self._source, self._count, self._seed, self._cache = source, count, seed, _TensorCache(max_bytes)
+        self._source, self._count, self._seed = source, count, seed
+        self._cache = ByteLimitedCache[Tensor](max_bytes)
 
     def __call__(self, step: int, count: int, size: int) -> TrainingBatch:
         """Returns the batch of a step (see `Stream`)."""
@@ -157,27 +159,6 @@ class CachedRendered:
 
         layers = self._cache.get_or_create((index, size), render_8bit)
         return layers.flip(2) if rng.bernoulli(0.5) else layers
-
-
-class _TensorCache:
-    """A thread-safe cache of tensors with a limit in bytes. The oldest tensors are dropped first."""
-
-    def __init__(self, max_bytes: int) -> None:
-        self._tensors: dict[Hashable, Tensor] = {}
-        self._bytes, self._max_bytes, self._lock = 0, max_bytes, Lock()
-
-    def get_or_create(self, name: Hashable, create: Callable[[], Tensor]) -> Tensor:
-        found = self._tensors.get(name)
-        if found is not None:
-            return found
-        created = create()
-        with self._lock:
-            if name not in self._tensors:  # another thread may have inserted it
-                self._tensors[name] = created
-                self._bytes += created.nbytes
-            while self._bytes > self._max_bytes:
-                self._bytes -= self._tensors.pop(next(iter(self._tensors))).nbytes
-        return created
 
 
 def _entries(folder: Path) -> list[StoredSample]:
