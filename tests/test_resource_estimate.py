@@ -24,7 +24,7 @@ def klein():
 
 
 def test_klein_fits_the_papers_gpu_with_the_known_sizes(klein):
-    assert klein.panel == (512, 512)
+    assert "512 x 512 each" in klein.table()
     assert klein.generated_tokens == klein.condition_tokens == 3 * 32 * 32
     assert klein.cost.parameters == pytest.approx(3.88e9, rel=0.01)
     assert klein.memory_gib["backbone"] == pytest.approx(7.2, abs=0.1)

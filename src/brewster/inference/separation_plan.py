@@ -49,13 +49,10 @@ _COPY_GB_PER_SECOND: Final = 10.0
 @final
 @dataclass(frozen=True, kw_only=True)
 class SeparationPlan(CostEstimate):
-    """The estimated resources of the separation of one photo. `panels` are the (width, height) of the panels of each tile in px,
-    and `passes` is the number of passes of the transformer."""
+    """The estimated resources of the separation of one photo."""
 
     hub_id: str
     placement: Placement
-    panels: tuple[tuple[int, int], ...]
-    passes: int
 
     @cached_property
     def is_downloaded(self) -> bool:
@@ -122,8 +119,6 @@ def plan_separation(options: Options, size: tuple[int, int], card: GraphicsCard)
         card=card,
         cost=cost,
         placement=placement,
-        panels=tuple(panels),
-        passes=passes,
         tflop=tflop,
         seconds=seconds,
         memory_gib=memory,

@@ -45,9 +45,8 @@ pass, because the frozen backbone has no weight gradients."""
 @final
 @dataclass(frozen=True, kw_only=True)
 class ResourceEstimate(CostEstimate):
-    """The estimated resources of a training step of a recipe. `panel` is (width, height) in px."""
+    """The estimated resources of a training step of a recipe."""
 
-    panel: tuple[int, int]
     generated_tokens: int
     condition_tokens: int
     lora_parameters: int
@@ -58,8 +57,8 @@ def estimate_resources(recipe: LoraRecipe, card: GraphicsCard) -> ResourceEstima
     the table of backbones, its configuration files are downloaded. Raises DownloadError or ModelError if the backbone
     is unknown or damaged, or its configuration cannot be downloaded; MissingExtra if diffusers is not installed."""
     backbone = build_on_meta(recipe.backbone, dtype=torch.bfloat16)
-    width, height = panel = recipe.task.fit(SQUARE_PHOTO_PX, backbone.size_divisor).panel
-    generated_tokens, condition_tokens = count_tokens(panel, recipe.layout, backbone.size_divisor)
+    width, height = recipe.task.fit(SQUARE_PHOTO_PX, backbone.size_divisor).panel
+    generated_tokens, condition_tokens = count_tokens((width, height), recipe.layout, backbone.size_divisor)
     cost = backbone_cost(recipe.backbone, type(backbone))
     layers = map(backbone.transformer.get_submodule, select_target_modules(backbone, recipe.target_modules))
     lora_parameters = sum(recipe.rank * (layer.in_features + layer.out_features) for layer in layers)
@@ -88,7 +87,6 @@ def estimate_resources(recipe: LoraRecipe, card: GraphicsCard) -> ResourceEstima
         name=recipe.backbone,
         card=card,
         cost=cost,
-        panel=panel,
         generated_tokens=generated_tokens,
         condition_tokens=condition_tokens,
         lora_parameters=lora_parameters,
