@@ -71,13 +71,6 @@ def test_the_number_of_participants_is_limited(store):
     assert store.count_participants() == 2
 
 
-@pytest.mark.parametrize(("trial", "choice"), [(-1, "left"), (10, "left"), (0, "both")])
-def test_an_answer_to_an_unknown_trial_is_refused(store, trial, choice):
-    participant = store.participant(store.admit())
-    with pytest.raises(BrewsterError, match="was answered with"):
-        store.record_answer(participant, trial, choice, seconds=1)
-
-
 def test_impossible_times_are_clipped(store):
     participant = store.participant(store.admit())
     store.record_answer(participant, 0, "left", seconds=-5)

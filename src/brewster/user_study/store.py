@@ -23,7 +23,7 @@ from pydantic import TypeAdapter
 
 from brewster.errors import BrewsterError, OutputError
 from brewster.user_study.answer_file import AnswerFile, ExportedAnswer, ViewingConditions
-from brewster.user_study.assignment import CHOICES, Choice, Trial, draw_practice, draw_trials
+from brewster.user_study.assignment import Choice, Trial, draw_practice, draw_trials
 from brewster.user_study.study import ANSWERS_FILE, Study
 
 MAX_SECONDS: Final = 3600.0
@@ -187,14 +187,7 @@ class AnswerStore:
     ) -> Choice:
         """Store an answer, unless the trial already has one. The answer is synced to the disk on return. `trial` is the
         index of the trial, from 0. `seconds` is how long the pictures were shown, clipped to 0..MAX_SECONDS. Returns
-        the stored choice, which is that of the first answer. Raises BrewsterError if the trial or the choice does
-        not exist, and OutputError if the database cannot be written."""
-        if not 0 <= trial < len(participant.trials) or choice not in CHOICES:
-            raise BrewsterError(
-                f"trial {trial} was answered with {choice!r}",
-                f"expected a trial from 0 to {len(participant.trials) - 1} and one of the choices {', '.join(CHOICES)}",
-                "load the page again",
-            )
+        the stored choice, which is that of the first answer. Raises OutputError if the database cannot be written."""
         answer = ExportedAnswer(trial, choice, max(seconds, 0.0), datetime.now(UTC), conditions)
         row = _row(participant.number, answer)
         with self._transaction("IMMEDIATE") as database:
