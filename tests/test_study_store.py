@@ -132,19 +132,13 @@ def test_acknowledged_answers_survive_kill_9_without_duplicates(tmp_path):
 
 
 def test_closing_a_store_moves_all_answers_into_the_file(store, tmp_path):
-    other = AnswerStore(store.study)
     participant = store.participant(store.admit())
     store.record_answer(participant, 0, "left", seconds=2)
     store.close()
-    assert len(answers_by_participant(open_without_log(store.study, tmp_path / "alone"))[0]) == 1
-    other.close()
-
-
-def open_without_log(study, folder):
-    """The answers of a copy of answers.sqlite without its log."""
-    folder.mkdir()
-    shutil.copy(study.answers_file, folder)
-    return AnswerStore(replace(study, folder=folder))
+    (tmp_path / "alone").mkdir()
+    shutil.copy(store.study.answers_file, tmp_path / "alone")  # without its log
+    alone = AnswerStore(replace(store.study, folder=tmp_path / "alone"))
+    assert len(answers_by_participant(alone)[0]) == 1
 
 
 def test_a_reader_creates_no_database_and_sees_new_answers(store):

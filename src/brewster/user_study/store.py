@@ -12,7 +12,7 @@ import os
 import secrets
 import sqlite3
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -82,7 +82,7 @@ class AnswerStore:
 
     def __init__(self, study: Study, *, read_only: bool = False) -> None:
         self.study = study
-        self._lock, self._read_only = Lock(), read_only
+        self._lock = Lock()
         with self._database_errors():
             self._database = sqlite3.connect(
                 _read_only_uri(study.answers_file) if read_only else study.answers_file,
@@ -94,21 +94,13 @@ class AnswerStore:
             if not read_only:
                 self._database.execute("PRAGMA journal_mode = WAL")
                 self._database.execute("PRAGMA synchronous = FULL")
-                self._checkpoint()
             if not read_only or not study.answers_file.exists():
                 self._database.executescript(_SCHEMA)
 
     def close(self) -> None:
-        """Close the database, after moving all answers from the log into the main file."""
+        """Close the database. If no other process uses it, SQLite moves all answers from the log into the main file."""
         with self._lock:
-            if not self._read_only:
-                with suppress(sqlite3.Error):  # for example a full disk; the answers then stay in the log
-                    self._checkpoint()
             self._database.close()
-
-    def _checkpoint(self) -> None:
-        """Move the content of the write-ahead log into the main file; a killed server leaves answers in the log."""
-        self._database.execute("PRAGMA wal_checkpoint(TRUNCATE)").fetchall()
 
     def count_participants(self) -> int:
         """The number of admitted participants."""
