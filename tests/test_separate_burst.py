@@ -168,7 +168,7 @@ def test_the_order_of_the_photos_does_not_matter():
             solution, _ = measure_layers(chosen, reference, frames[1] * np.float32(0.8))
         results.append(solution)
     assert np.allclose(results[0].transmission, results[1].transmission, atol=1e-5)
-    assert results[0].losses == pytest.approx(results[1].losses, rel=1e-4)
+    assert results[0].two_layer_error == pytest.approx(results[1].two_layer_error, rel=1e-4)
 
 
 def test_a_burst_without_reflection_stays_as_it_is():
@@ -266,7 +266,7 @@ def solve_few(frames, prior, **options):
 def test_the_self_check_chooses_the_method(explained, motion, edge_correlation, verdict, method):
     layer = np.ones((2, 2, 3), np.float32)
     errors = 0.01, 0.01 * (1 - explained)
-    solution = Solution(layer, layer, layer[..., :1], motion, 0.5, edge_correlation, *errors, {})
+    solution = Solution(layer, layer, layer[..., :1], motion, 0.5, edge_correlation, *errors)
     assert burst_report(solution, verdict, 5, (), 2).method == method
 
 
@@ -281,7 +281,7 @@ def test_layers_with_the_same_edges_have_edge_correlation_and_independent_ones_h
 @pytest.mark.parametrize(("naming", "is_certain"), [(0.3, True), (0.01, False)])
 def test_the_message_says_if_the_layers_may_be_exchanged(naming, is_certain):
     layer = np.ones((2, 2, 3), np.float32)
-    solution = Solution(layer, layer, layer[..., :1], 0.03, naming, 0.1, 0.02, 0.01, {})
+    solution = Solution(layer, layer, layer[..., :1], 0.03, naming, 0.1, 0.02, 0.01)
     assert ("each other's names" in burst_report(solution, "removed", 5, (), 2).message) is not is_certain
 
 

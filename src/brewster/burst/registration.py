@@ -21,9 +21,6 @@ from brewster.srgb import to_encoded
 Floats = NDArray[np.float32]
 Matrices = NDArray[np.float64]
 
-ONE_LAYER: Final = "one layer"
-"""The name of the candidate whose layers move together. The other candidates are compared with it."""
-
 _FEATURES: Final = 4000
 _RATIO: Final = 0.85
 _INLIER_PX: Final = 2.0
@@ -44,7 +41,6 @@ _MIN_FRAMES_FOR_LARGE_SHIFTS: Final = 4
 class MotionCandidate:
     """A guess for the motion of both layers."""
 
-    name: str
     family: str
     """How it was found: candidates of one family compete first with each other."""
     transmission: Matrices
@@ -140,12 +136,11 @@ def motion_candidates(
             [_translation(x * t, y * t) @ matrix for t, matrix in zip(times, transmission, strict=True)]
         )
 
-    candidates = {ONE_LAYER: transmission}
+    candidates = [("one layer", transmission)]
     aligned = [_aligned(frame, matrix) for frame, matrix in zip(frames, transmission, strict=True)]
-    for rank, offsets in enumerate(find_translations(aligned, reference)):
-        candidates[f"Fourier {rank + 1}"] = np.stack(
-            [matrix @ _translation(*offset) for matrix, offset in zip(transmission, offsets, strict=True)]
-        )
+    for offsets in find_translations(aligned, reference):
+        found = [matrix @ _translation(*offset) for matrix, offset in zip(transmission, offsets, strict=True)]
+        candidates.append(("Fourier", np.stack(found)))
     second = [
         _second_motion(found, matrix, (height, width))
         for found, matrix in zip(motions, transmission, strict=True)
@@ -157,13 +152,10 @@ def motion_candidates(
     ]
     if slopes:
         path = line(*np.median(slopes, axis=0))
-        candidates["second homography"] = np.stack(
-            [path[k] if matrix is None else matrix for k, matrix in enumerate(second)]
-        )
-        candidates["second homography, line"] = path
+        homographies = [path[k] if matrix is None else matrix for k, matrix in enumerate(second)]
+        candidates += ("second homography", np.stack(homographies)), ("second homography", path)
     for share in _SHIFTS if len(frames) >= _MIN_FRAMES_FOR_LARGE_SHIFTS else _SHIFTS[:-1]:
-        for sign in (-1, 1):
-            candidates[f"shift {sign * share:+.1%}"] = line(sign * share * width, 0.0)
+        candidates += (("shift", line(sign * share * width, 0.0)) for sign in (-1, 1))
     scale = np.array([[2 / width, 0, 1 / width - 1], [0, 2 / height, 1 / height - 1], [0, 0, 1]])
 
     def normalised(matrices: Matrices) -> Matrices:
@@ -171,10 +163,8 @@ def motion_candidates(
         return inverse / inverse[:, 2:, 2:]
 
     return [
-        MotionCandidate(
-            name, name.split()[0], normalised(transmission), normalised(reflection), name == ONE_LAYER
-        )
-        for name, reflection in candidates.items()
+        MotionCandidate(family, normalised(transmission), normalised(reflection), is_locked=number == 0)
+        for number, (family, reflection) in enumerate(candidates)
     ]
 
 

@@ -83,8 +83,6 @@ class Solution:
     """The mean error of the frames if both layers move together: the data term of the loss at 160 pixels."""
     two_layer_error: float
     """The same for the best candidate."""
-    losses: dict[str, float]
-    """The loss of each candidate, by name, at the last level that optimised it."""
 
 
 def solve(
@@ -108,14 +106,13 @@ def solve(
         levels: the sizes of the frames.
         on_progress: called with the completed fraction.
     """
-    losses: dict[str, float] = {}
     largest = _MAX_ENLARGEMENT * max(frames[0].shape)
     levels = [level for level in levels if level.long_side_px <= largest] or levels[:1]
     work = [level.steps * level.long_side_px for level in levels]
     done = 0.0
     motions = np.stack([[c.transmission for c in candidates], [c.reflection for c in candidates]])
     is_locked = torch.tensor([candidate.is_locked for candidate in candidates])
-    model, names, errors = None, [candidate.name for candidate in candidates], (0.0, 0.0)
+    model, errors = None, (0.0, 0.0)
     edge_correlation = naming = 0.0
     refined = prior
     for index, level in enumerate(levels):
@@ -132,8 +129,7 @@ def solve(
                 if index <= _COMPARED
                 else _best(model, with_locked=False)
             )
-            model, names = model.selected(kept), [names[i] for i in kept]
-            model = model.resized(small, level.density, level.spline_size)
+            model = model.selected(kept).resized(small, level.density, level.spline_size)
         rates = Rates().scaled(min(1.0, 80 / level.long_side_px)) if index else Rates(splines=0)
 
         def on_step(level: Level = level) -> None:
@@ -144,18 +140,15 @@ def solve(
         model = optimise(
             model, small, small_refined[0], level.steps, rates=rates, weights=level.weights, on_step=on_step
         )
-        losses |= dict(zip(names, model.losses.tolist(), strict=True))
         if index <= _COMPARED:
             errors = _errors(model)
         if index >= _COMPARED or level is levels[-1]:
-            kept = _best(model, with_locked=False)
-            best = model.selected(kept)
+            best = model.selected(_best(model, with_locked=False))
             layers, detail = _named(best, small, small_prior[0])
             if index == min(_NAMED, len(levels) - 1):
                 edge_correlation, naming = _edge_correlation(layers), detail
                 if naming < -_MIN_NAMING:  # the next levels correct the brightness of large areas
-                    model, names = best.exchanged(), [names[i] for i in kept]
-                    layers, naming = layers.flip(0), -naming
+                    model, layers, naming = best.exchanged(), layers.flip(0), -naming
             if refine_prior and level is not levels[-1]:
                 refined = refine_prior(_reflection_share(layers))
     assert model
@@ -164,7 +157,7 @@ def solve(
         confidence = model.confidence(small)[0]
         motion = model.relative_motion(*small.shape[-2:])[0].item()
     transmission, reflection, confidence = (layer.movedim(0, -1).numpy() for layer in (*layers, confidence))
-    return Solution(transmission, reflection, confidence, motion, naming, edge_correlation, *errors, losses)
+    return Solution(transmission, reflection, confidence, motion, naming, edge_correlation, *errors)
 
 
 def _named(model: JointModel, frames: Tensor, prior: Tensor) -> tuple[Tensor, float]:
