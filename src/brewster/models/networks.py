@@ -29,14 +29,12 @@ class NetworkEntry:
     """Returns the network with random weights; needs no file."""
     pretrained: Callable[[], nn.Module]
     """Returns the network from which training starts: its encoder has pretrained weights. May raise MissingExtra."""
-    stride: int
-    """Height and width of the input must be multiples of this; it must divide MAX_STRIDE."""
     takes_hints: bool = False
     """Whether the network has a second input: hints of a person (N, 2, H, W), see `brewster.training.data.hints`."""
 
 
 MAX_STRIDE: Final = 32
-"""In inference, tiles are padded to multiples of this. The sides of training images are multiples of this."""
+"""The sides of the inputs of a network are multiples of this. In inference, tiles are padded."""
 
 DEFAULT_NETWORK: Final = "lite2-unet"
 
@@ -55,13 +53,11 @@ NETWORKS: Final[dict[str, NetworkEntry]] = {
     DEFAULT_NETWORK: NetworkEntry(
         _imported("brewster.models.compact:CompactNetwork"),
         _imported("brewster.models.compact:with_imagenet_features"),
-        stride=32,
         takes_hints=True,
     ),
     "lite2-refined": NetworkEntry(
         _imported("brewster.models.compact:refined"),
         _imported("brewster.models.compact:refined_with_imagenet_features"),
-        stride=32,
         takes_hints=True,
     ),
 }

@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from brewster.errors import ModelError
 from brewster.files import write_atomically
 from brewster.models.compact import LinearSeparator
-from brewster.models.networks import NetworkEntry
+from brewster.models.networks import MAX_STRIDE, NetworkEntry
 
 _OPSET = 18
 _PREFIX = "network."
@@ -29,13 +29,13 @@ _MIN_HALF_SIZE = 16
 def export_onnx(network: nn.Module, path: Path, entry: NetworkEntry) -> None:
     """Writes the network as an ONNX file: input `photo`, outputs `transmission` and `reflection`.
 
-    Input and outputs are linear light, (1, 3, H, W), with H and W multiples of the stride. Networks that take hints have a
+    Input and outputs are linear light, (1, 3, H, W), with H and W multiples of MAX_STRIDE. Networks that take hints have a
     second input `hints`, (1, 2, H, W). The weights are stored in half precision, which halves the size of the file. The network
     still computes in float32. Raises OutputError if the file cannot be written.
     """
     height, width = (torch.export.Dim(name, min=1, max=256) for name in ("rows", "columns"))
-    stride, names = entry.stride, ["photo", "hints"][: 1 + entry.takes_hints]
-    examples = [torch.rand(1, channels, 4 * stride, 5 * stride) for channels in (3, 2)]
+    names = ["photo", "hints"][: 1 + entry.takes_hints]
+    examples = [torch.rand(1, channels, 4 * MAX_STRIDE, 5 * MAX_STRIDE) for channels in (3, 2)]
     logger = logging.getLogger("torch.onnx")
     level = logger.level
     # torchvision is missing (it is not needed), the exporter calls deprecated functions, and photo and hints have the same size.
@@ -48,7 +48,7 @@ def export_onnx(network: nn.Module, path: Path, entry: NetworkEntry) -> None:
             tuple(examples[: len(names)]),
             input_names=names,
             output_names=["transmission", "reflection"],
-            dynamic_shapes={name: {2: stride * height, 3: stride * width} for name in names},
+            dynamic_shapes={name: {2: MAX_STRIDE * height, 3: MAX_STRIDE * width} for name in names},
             opset_version=_OPSET,
             dynamo=True,
             verbose=False,

@@ -19,7 +19,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from brewster.errors import ModelError
-from brewster.models.networks import NETWORKS
+from brewster.models.networks import MAX_STRIDE, NETWORKS
 from brewster.models.zoo import MODEL_FILE, find_model
 from brewster.training.compact.export import export_onnx, read_weights
 from brewster.training.data.hints import simulate_hints
@@ -61,10 +61,7 @@ class CompactTrainer:
         self.stream = stream or open_stream(recipe, self.device)
         self._uses_bfloat16 = recipe.precision == "auto" and _has_bfloat16(self.device)
         self._validation_pairs: ValidationPairs = {
-            name: [
-                (_resize(photo, self._entry.stride), _resize(truth, self._entry.stride))
-                for photo, truth in pairs
-            ]
+            name: [(_resize(photo), _resize(truth)) for photo, truth in pairs]
             for name, pairs in validation_pairs(recipe.data).items()
         } | _held_out_pairs(recipe)
         self._data_workers = 1 if self.device.type == "cpu" else os.cpu_count() or 1
@@ -281,10 +278,10 @@ def _held_out_pairs(recipe: CompactRecipe) -> dict[str, list[tuple[Tensor, Tenso
     return found
 
 
-def _resize(image: Tensor, stride: int) -> Tensor:
-    """Resizes uint8 (H, W, 3) to float (1, 3, h, w) in 0..1. h and w are multiples of `stride`, the larger is about 384 px."""
+def _resize(image: Tensor) -> Tensor:
+    """Resizes uint8 (H, W, 3) to float (1, 3, h, w) in 0..1. h and w are multiples of MAX_STRIDE, the larger is about 384 px."""
     height, width, _ = image.shape
     scale = _VALIDATION_SIDE_PX / max(height, width)
-    size = [max(1, round(side * scale / stride)) * stride for side in (height, width)]
+    size = [max(1, round(side * scale / MAX_STRIDE)) * MAX_STRIDE for side in (height, width)]
     planes = image.permute(2, 0, 1)[None] / 255
     return functional.interpolate(planes, size, mode="bilinear", antialias=True)
