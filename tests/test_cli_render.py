@@ -26,7 +26,7 @@ def test_a_dataset_is_rendered_with_preview_and_each_scene_can_be_rendered_again
     assert "2 rendered" in err
     assert {path.name for path in (tmp_path / "set" / "000001").iterdir()} == set(store.SAMPLE_FILES)
     assert Photo.open(tmp_path / "set" / "000001" / "photo.jpg").size == (48, 32)
-    assert Photo.open(tmp_path / "set" / "preview.png").size == (800, 240)
+    assert Photo.open(tmp_path / "set" / "preview.png").size == (272, 72)
     assert parquet.read_table(tmp_path / "set" / "index.parquet")["orders"].to_pylist() == ["truncated"] * 2
     for index in ("000000", "000001"):
         assert (

@@ -149,13 +149,13 @@ def test_the_index_has_a_row_with_the_parameters_of_each_sample(four_samples, mo
 def test_the_contact_sheet_has_a_row_for_each_sample_in_two_columns(four_samples, tmp_path):
     shutil.copytree(four_samples, tmp_path / "set")
     preview.write_preview(tmp_path / "set")
-    assert Photo.open(tmp_path / "set" / preview.PREVIEW_FILE).size == (5 * 160, 4 * 120)
+    assert Photo.open(tmp_path / "set" / preview.PREVIEW_FILE).size == (152, 4 * 20)
     for index in range(4, 23):
         shutil.copytree(four_samples / "000000", tmp_path / "set" / store.key(index))
     preview.write_preview(tmp_path / "set")
     sheet = Photo.open(io.BytesIO((tmp_path / "set" / preview.PREVIEW_FILE).read_bytes()).getvalue())
-    assert sheet.size == (2 * 5 * 160, 20 * 120)
-    assert (sheet.pixels[-120:, 800:] == 255).all()
+    assert sheet.size == (2 * 152 + 8, 20 * 20)
+    assert (sheet.pixels[-20:, 152:] == 255).all()
 
 
 def test_an_empty_set_has_an_empty_index_and_no_sheet(tmp_path):

@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 import tomllib
+from collections.abc import Sequence
 from itertools import islice
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from torch.nn import functional
 
 from brewster.files import atomic_path, write_atomically
 from brewster.photo import Photo
+from brewster.photo.contact_sheet import side_by_side
 from brewster.render.sample import SAMPLE_IMAGES
 from brewster.rendered.store import SCENE_FILE, STATISTICS, StoredSample, read_dataset
 
@@ -99,34 +99,23 @@ def _lookup(table: Any, path: list[str]) -> Any:  # noqa: ANN401  (any value of 
 
 # --- the contact sheet
 
-_CELL: Final = (120, 160)
+_ROW_PX: Final = 120
+_GAP_PX: Final = 4
 _SHEET_ROWS, _SHEET_COLUMNS = 20, 2
-_WHITE: Final = 255
 
 
 def write_preview(out: Path) -> None:
     """Writes preview.png with the first 40 samples, in two columns. Each sample is a row of five images."""
     entries = list(islice(read_dataset(out), _SHEET_ROWS * _SHEET_COLUMNS))
     if entries:
-        columns, (height, width) = -(-len(entries) // _SHEET_ROWS), _CELL
-        rows, row_width = min(len(entries), _SHEET_ROWS), width * len(SAMPLE_IMAGES)
-        sheet = np.full((rows * height, columns * row_width, 3), _WHITE, np.uint8)
-        for number, entry in enumerate(entries):
-            column, row = divmod(number, _SHEET_ROWS)
-            images = [_cell(entry.read(f"{layer}.jpg")) for layer in SAMPLE_IMAGES]
-            left, top = column * row_width, row * height
-            sheet[top : top + height, left : left + row_width] = np.concatenate(images, axis=1)
-        data = Photo.from_array(sheet, encoding="srgb").encode("png")
+        rows = [_sheet_row(entries[first::_SHEET_ROWS]) for first in range(min(len(entries), _SHEET_ROWS))]
+        width = max(row.shape[1] for row in rows)
+        gaps = ([(0, _GAP_PX), (0, width - row.shape[1]), (0, 0)] for row in rows)
+        padded = [np.pad(row, gap, constant_values=255) for row, gap in zip(rows, gaps, strict=True)]
+        data = Photo.from_array(np.concatenate(padded), encoding="srgb").encode("png")
         write_atomically(out / PREVIEW_FILE, data, overwrite=True)
 
 
-def _cell(data: bytes) -> NDArray[np.uint8]:
-    """Scales an image down, and centres it in a white cell (120, 160, 3)."""
-    pixels = torch.from_numpy(Photo.open(data).pixels.copy()).permute(2, 0, 1)[None].float()
-    scale = min((cell - 4) / side for cell, side in zip(_CELL, pixels.shape[2:], strict=True))
-    height, width = (max(1, round(side * scale)) for side in pixels.shape[2:])
-    small = functional.interpolate(pixels, (height, width), mode="area")[0].permute(1, 2, 0).round()
-    cell = np.full((*_CELL, 3), _WHITE, np.uint8)
-    top, left = (_CELL[0] - height) // 2, (_CELL[1] - width) // 2
-    cell[top : top + height, left : left + width] = small.byte().numpy()
-    return cell
+def _sheet_row(entries: Sequence[StoredSample]) -> NDArray[np.uint8]:
+    images = [Photo.open(entry.read(f"{layer}.jpg")) for entry in entries for layer in SAMPLE_IMAGES]
+    return side_by_side(images, min(_ROW_PX, max(image.size[1] for image in images)))
