@@ -234,7 +234,8 @@ PLANE_POSITIONS = st.fixed_dictionaries(
     {
         "distance_mm": st.floats(100, 3000),
         "offset": st.tuples(st.floats(-0.4, 0.4), st.floats(-0.4, 0.4)),
-        "angles_deg": st.tuples(st.floats(-40, 40), st.floats(-20, 20)),  # with the camera, no plane is seen edge-on
+        # with the camera, no plane is seen edge-on
+        "angles_deg": st.tuples(st.floats(-40, 40), st.floats(-20, 20)),
         "glass_deg": st.tuples(st.floats(-180, 180), st.floats(-20, 20)),
         "camera_deg": st.tuples(st.floats(-30, 30), st.floats(-10, 10)),
         "is_behind": st.booleans(),
