@@ -96,6 +96,7 @@ def test_invalid_benchmarks_metrics_and_methods_give_a_clear_error(
     [
         (),
         ("--benchmark", "pairs"),
+        ("--benchmark", "real20=pairs", "--model", "compact", "--burst"),
         ("--benchmark", "real20=pairs", "--size", "big"),
         ("--benchmark", "real20=pairs", "--region-threshold", "a,b"),
         ("--benchmark", "real20=pairs", "--predictions", "theirs"),

@@ -111,6 +111,8 @@ def test_a_hint_names_the_other_options_of_existing_layers(run, tmp_path):
     assert "made with other options (strength=0.5) (--overwrite replaces them)" in err
     assert "other options" not in run("a.jpg", "--strength", "0.5")[2]
     assert "model=pane" in run("a.jpg", "--strength", "0.5", "--model", "compact", with_model=False)[2]
+    (tmp_path / "mask.png").write_bytes(image_bytes())
+    assert "(mask=no)" in run("a.jpg", "--strength", "0.5", "--mask", "mask.png")[2]
 
 
 def test_a_contact_sheet_has_a_row_for_each_photo(run, tmp_path):

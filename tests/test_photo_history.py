@@ -44,6 +44,9 @@ def test_a_layer_records_the_program_and_the_options(format_name, tmp_path):
         "strength": "0.5",
         "quality": "draft",
         "additive": "no",
+        "burst": "no",
+        "hints": "no",
+        "mask": "no",
         "sha256": "f" * 12,
         "photo": sampled_digest(io.BytesIO(photo)),
     }

@@ -23,7 +23,7 @@ from brewster.burst.separate import burst_report, measure_layers
 from brewster.burst.solver import LEVELS, Level, Solution, _edge_correlation, solve
 from brewster.burst.video import choose_frames
 from brewster.cli import main
-from brewster.errors import PhotoError, PhotoTooLarge, UnreadablePhoto
+from brewster.errors import BrewsterError, PhotoError, PhotoTooLarge, UnreadablePhoto
 from brewster.srgb import to_encoded, to_linear
 from simulated_bursts import read_photo, simulate_burst
 
@@ -157,7 +157,7 @@ def test_a_burst_is_separated_by_its_motion(small_burst, burst_files):
 
 
 def test_the_order_of_the_photos_does_not_matter():
-    burst = simulate_burst(*linear_pictures((110, 84)), relative_px=10, frames=3, size=(96, 72))
+    burst = simulate_burst(*linear_pictures((144, 110)), relative_px=10, frames=3, size=(128, 96))
     frames = [to_linear(frame / 255).astype(np.float32) for frame in burst.frames]
     solve_few = partial(solve, levels=(Level(48, 5, None),))
     results = []
@@ -173,7 +173,7 @@ def test_the_order_of_the_photos_does_not_matter():
 
 def test_a_burst_without_reflection_stays_as_it_is():
     burst = simulate_burst(
-        *linear_pictures((140, 106)), frames=3, parallax_px=2, common_px=8, strength=0, size=(120, 90)
+        *linear_pictures((150, 114)), frames=3, parallax_px=2, common_px=8, strength=0, size=(128, 96)
     )
     photos = [brewster.Photo.from_array(frame, encoding="srgb") for frame in burst.frames]
     result = separate_burst(photos)
@@ -336,6 +336,17 @@ def test_an_unreadable_photo_is_named_by_its_number(burst_files):
         separate_burst([*burst_files[:2], burst_files[2].read_bytes()[:200], burst_files[3]], reference=0)
 
 
+def test_a_path_is_no_list_of_photos(burst_files):
+    with pytest.raises(TypeError, match="single str"):
+        separate_burst(str(burst_files[0]))
+
+
+def test_the_motion_of_tiny_photos_is_not_measured(small_burst):
+    burst = separate_burst([np.ascontiguousarray(frame[:72, :96]) for frame in small_burst.frames]).burst
+    assert (burst.method, burst.left_out) == ("single photo", ())
+    assert "too small" in burst.message
+
+
 def write_video(path, frames):
     with av.open(str(path), "w") as container:
         stream = container.add_stream("mpeg4", rate=10)
@@ -357,6 +368,8 @@ def test_frames_of_a_video_are_chosen_along_its_path(tmp_path):
     assert max(offsets[i] for i in nearest) - min(offsets[i] for i in nearest) >= 20
     with pytest.raises(PhotoTooLarge):
         read_video(tmp_path / "a.mp4", 5, max_pixels=100)
+    with pytest.raises(BrewsterError):
+        read_video(tmp_path / "a.mp4", 1)
 
 
 @given(st.lists(st.tuples(st.floats(0, 0.1), st.floats(0, 1)), min_size=1, max_size=60), st.integers(2, 15))
@@ -390,6 +403,34 @@ def test_each_folder_and_video_is_one_burst_and_named_photos_are_one(tmp_path, b
     assert (task.source, len(task.burst.photos)) == (burst_files[0], 5)
     with pytest.raises(PhotoError):
         plan_bursts(burst_files, reference=5)
+
+
+def test_named_photos_of_several_folders_are_one_burst_and_the_reference_counts_repeated_ones(tmp_path):
+    photos = [tmp_path / name for name in ("a/photo.png", "a/photo.png", "b/photo.png", "c/photo.png")]
+    for photo in photos:
+        photo.parent.mkdir(exist_ok=True)
+        photo.write_bytes(b"")
+    (task,) = plan_bursts(photos, tmp_path / "out", reference=2)
+    assert (task.source, task.burst.photos, task.burst.reference) == (photos[2], tuple(photos), 2)
+    named, whole = plan_bursts([photos[0], tmp_path], tmp_path / "out")[:2]
+    assert (named.burst.photos, whole.burst.photos) == ((photos[0],), (photos[2],))
+
+
+def test_a_dry_run_refuses_what_cannot_be_a_burst(tmp_path, burst_files, capfd):
+    (tmp_path / "alone.png").write_bytes(burst_files[0].read_bytes())
+    code, out = run_burst(capfd, tmp_path / "alone.png", "--json", "--dry-run")
+    assert (code, json.loads(out)["status"]) == (1, "failed")
+
+
+def test_a_burst_after_a_single_photo_names_the_other_options(tmp_path, burst_files, few_steps, capfd):
+    output = ["-o", str(tmp_path / "out")]
+    main([str(burst_files[2]), *output])
+    capfd.readouterr()
+    main(["burst", *map(str, burst_files), *output])
+    assert "skipped, because all layers exist, made with other options (burst=no)" in capfd.readouterr().err
+    main(["burst", *map(str, burst_files), *output, "--overwrite"])
+    main([str(burst_files[2]), *output])
+    assert "burst=yes" in capfd.readouterr().err
 
 
 def test_the_command_writes_the_layers_and_the_report(tmp_path, burst_files, few_steps, capfd):

@@ -81,7 +81,7 @@ def test_strength_is_linear_between_the_photo_and_the_full_separation():
     photo = Photo.from_array(np.full((40, 40, 3), 0.5, np.float32), encoding="linear")
     light = [
         Separator(glass_backend)(photo, strength=strength).transmission.linear().mean()
-        for strength in (0, 0.5, 1)
+        for strength in (0, "0.5", 1)  # as a text, as `Options` takes it
     ]
     np.testing.assert_allclose(light, [0.5, 0.4375, 0.375], atol=0.003)
 

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterable, Iterator, Mapping, Sequence, Sized
+from dataclasses import dataclass, field
 from typing import Final, Literal, final
 
 from brewster.batch.layer_names import name_layers
 from brewster.batch.manifest import ManifestRow, is_manifest, read_manifest
 from brewster.errors import PhotoError, counted
-from brewster.files import check_output_folder, images_in
+from brewster.files import absolute, check_output_folder, images_in
 from brewster.image_formats import SUFFIXES, is_video
 from brewster.inference.assessment import Assessment
 from brewster.inference.burst_report import BurstReport
@@ -118,19 +118,34 @@ def plan_files(
     folder = None if output is None else location(output)
     skipped = [] if skipped is None else skipped
     rows: dict[Location, ManifestRow] = {}
-
-    def images() -> Iterator[tuple[Location, Location]]:
-        for source in paths:
-            if not is_manifest(source):
-                yield from images_in(source, folder, skipped=skipped)
-                continue
-            for row, image, image_folder in read_manifest(source, folder):
-                rows.setdefault(image, row)
-                yield image, image_folder
-
+    images = _images(paths, folder, skipped, rows)
     tasks = [
-        SeparationTask(image, outputs, rows.get(image)) for image, outputs in name_layers(images(), options)
+        SeparationTask(image, outputs, rows.get(image)) for image, outputs in name_layers(images, options)
     ]
+    _check_found(tasks, paths, skipped, folder)
+    return tasks
+
+
+def _images(
+    paths: Iterable[Location],
+    folder: Location | None,
+    skipped: list[Location],
+    rows: dict[Location, ManifestRow],
+) -> Iterator[tuple[Location, Location]]:
+    """Yields the photos with the folders of their layers. Enters the rows of manifests into `rows`."""
+    for path in paths:
+        if not is_manifest(path):
+            yield from images_in(path, folder, skipped=skipped)
+            continue
+        for row, image, image_folder in read_manifest(path, folder):
+            rows.setdefault(image, row)
+            yield image, image_folder
+
+
+def _check_found(
+    tasks: Sized, paths: Sequence[Location], skipped: Sequence[Location], folder: Location | None
+) -> None:
+    """Checks that there is a task, and that the output folder can be written to. Raises PhotoError and OutputError."""
     if not tasks:
         videos = sum(map(is_video, skipped))
         counts = (("video", videos), ("other file", len(skipped) - videos))
@@ -142,7 +157,6 @@ def plan_files(
         )
     if folder is not None:
         check_output_folder(folder)
-    return tasks
 
 
 def plan_bursts(
@@ -160,15 +174,23 @@ def plan_bursts(
     one; `frames` is the number of frames that are chosen from a video. Raises PhotoError if there is no photo, or none
     with the index `reference`, and OutputError as `plan_files`."""
     given = [location(source) for source in sources]
-    groups: dict[object, list[SeparationTask]] = {}
-    for task in plan_files(map(str, given), output, options):
-        source = task.source
-        assert isinstance(source, Location)
-        group = source if is_video(source) else "given" if source in given else source.parent
-        groups.setdefault(group, []).append(task)
-    bursts = []
-    for tasks in groups.values():
-        photos = tuple(task.source for task in tasks if isinstance(task.source, Location))
+    folder = None if output is None else location(output)
+    skipped: list[Location] = []
+    rows: dict[Location, ManifestRow] = {}
+    groups: dict[object, list[tuple[Location, Location]]] = {}
+    seen = set[str]()
+    for source in given:
+        for image, image_folder in _images([source], folder, skipped, rows):
+            group = image if is_video(image) else "given" if image == source else image.parent
+            if (
+                group == "given" or absolute(image) not in seen
+            ):  # a number of --reference counts what was given
+                groups.setdefault(group, []).append((image, image_folder))
+            seen.add(absolute(image))
+    _check_found(groups, given, skipped, folder)
+    bursts, named = {}, []
+    for images in groups.values():
+        photos = tuple(image for image, _ in images)
         shows_video = is_video(photos[0])
         index = len(photos) // 2 if reference is None or shows_video else reference
         if not 0 <= index < len(photos):
@@ -177,8 +199,12 @@ def plan_bursts(
                 f"expected a number from 1 to {len(photos)}",
                 "correct --reference (in Python reference, which begins at 0), or leave it out for the middle photo",
             )
-        bursts.append(replace(tasks[index], burst=Burst(photos, reference if shows_video else index, frames)))
-    return bursts
+        bursts[absolute(photos[index])] = Burst(photos, reference if shows_video else index, frames)
+        named.append(images[index])
+    return [
+        SeparationTask(image, outputs, rows.get(image), bursts[absolute(image)])
+        for image, outputs in name_layers(named, options)
+    ]
 
 
 def display_name(source_or_target: object) -> str:

@@ -191,7 +191,12 @@ def _check_folders(outputs: Iterable[Location | WritableFile]) -> None:
 
 
 def _check_sources(task: SeparationTask) -> None:
-    """Checks that the files of a task can be read and start like an image. The frames of a video are not read."""
+    """Checks that the files of a task can be read and start like an image, and are neither too few nor too many for a burst. The
+    frames of a video are not read."""
+    if task.burst and not is_video(task.burst.photos[0]):
+        from brewster.burst.separate import check_photo_count  # noqa: PLC0415  (imports torch)
+
+        check_photo_count(len(task.burst.photos))
     for source in task.burst.photos if task.burst else (task.source,):
         if isinstance(source, Location) and not (task.burst and is_video(source)):
             with row_in_errors(task.row):

@@ -36,6 +36,8 @@ from brewster.worker_setup import single_torch_thread
 
 _WORKING_PX: Final = 1000
 """The long side of the frames from which the motion is estimated."""
+_MIN_SIDE_PX: Final = 124
+"""The levels of the solver that compare and name the layers need this long side."""
 _MIN_MOTION_PX: Final = 10.0
 """The smallest relative motion that separates the layers, in pixels of a photo that is 1,000 pixels wide."""
 _MIN_EXPLAINED: Final = 0.2
@@ -134,6 +136,11 @@ def fit_burst(
     on_progress: ProgressCallback = lambda _fraction: None,
 ) -> FittedBurst:
     """Measures the layers of a burst, but does not compute them at full size. See `separate_burst`."""
+    if isinstance(photos, str | bytes):  # its characters would be the photos
+        raise TypeError(
+            f"photos is a single {type(photos).__name__}; expected a list of photos; for a video, pass read_video(path, frames)"
+        )
+    check_photo_count(len(photos))
     reference = _checked_reference(len(photos), reference)
     started = time.perf_counter()
     photo = _open(photos, reference, max_pixels)
@@ -161,7 +168,7 @@ def fit_burst(
         )
     elif report.method == "unchanged":
         separator = Separator(lambda tile: (tile, np.zeros_like(tile)), name=name, method="unchanged")
-    return FittedBurst(photo, separator, hints, report, seconds)
+    return FittedBurst(photo, separator.for_burst(), hints, report, seconds)
 
 
 def measure_layers(
@@ -182,8 +189,11 @@ def measure_layers(
         on_progress: called with the completed fraction, 0 to 1.
 
     Returns:
-        The solution, or None if no other frame shows the scene of the reference frame; and the indices of the frames that do not.
+        The solution, or None if no other frame shows the scene of the reference frame or the frames are too small; and the indices of
+        the frames that do not show it.
     """
+    if max(frames[reference].shape) < _MIN_SIDE_PX:
+        return None, ()
     with single_torch_thread(), _single_opencv_thread():
         motions = frame_motions(frames, reference, prior)
         used = path_order(frames, motions)
@@ -210,13 +220,19 @@ def prior_with_hints(separator: Separator, frame: Floats, reflection_share: Floa
     return _applied(upsampler.apply, frame)
 
 
-def _checked_reference(count: int, reference: int | None) -> int:
+def check_photo_count(count: int) -> None:
+    """Checks that a burst can have this many photos. Raises PhotoError."""
     if not 2 <= count <= MAX_BURST_PHOTOS:
         raise PhotoError(
             f"a burst has {counted(count, 'photo')}",
             f"expected 2 to {MAX_BURST_PHOTOS} photos of one window",
-            "separate a single photo with brewster.separate, or select some of the photos",
+            "separate a single photo alone (brewster PHOTO, in Python brewster.separate)"
+            if count < 2
+            else "select some of the photos",
         )
+
+
+def _checked_reference(count: int, reference: int | None) -> int:
     reference = count // 2 if reference is None else reference
     if not 0 <= reference < count:
         raise PhotoError(
@@ -292,6 +308,8 @@ def burst_report(
     advice = "Move the camera 5 to 10 cm sideways between the photos."
     if solution is None:
         message = "No other photo shows the same scene as the reference photo."
+        if not left_out:
+            message = f"Photos with less than {_MIN_SIDE_PX} pixels are too small to show the motion."
     elif has_two_layers and motion >= (_USEFUL_MOTION_PX if is_doubted else _MIN_MOTION_PX):
         method, message = "burst", f"The layers moved {motion:.0f} px apart in a photo of 1,000 px."
         if solution.naming < _MIN_CERTAIN_NAMING:

@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from brewster.errors import PhotoTooLarge, UnreadablePhoto
+from brewster.errors import BrewsterError, PhotoTooLarge, UnreadablePhoto
 from brewster.files import DEFAULT_MAX_PIXELS
 from brewster.photo import Photo
 
@@ -46,7 +46,12 @@ def read_video(
     Raises:
         UnreadablePhoto: the file is not a video, is damaged, or has fewer than 2 frames.
         PhotoTooLarge: the frames have more than `max_pixels` pixels.
+        BrewsterError: `frames` is less than 2.
     """
+    if frames < 2:
+        raise BrewsterError(
+            f"frames is {frames}", "expected at least 2, because one frame shows no motion", "choose 3 to 9"
+        )
     positions, sharpness = [0.0], []
     previous = None
     for frame in _decoded(path, max_pixels):

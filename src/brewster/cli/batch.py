@@ -48,6 +48,7 @@ class BatchReport:
     _sources_by_shared_error: dict[str, list[str]] = field(default_factory=lambda: defaultdict(list))
     _skipped: dict[str, tuple[int, str]] = field(default_factory=dict)
     """The number of skipped photos, and the last one, by the options of their layers that differ from those of this batch."""
+    _are_bursts: bool = False
     _index: IndexWriter | None = None
     _started: float = field(default_factory=time.perf_counter)
 
@@ -63,6 +64,7 @@ class BatchReport:
         from brewster.batch import separate_tasks  # noqa: PLC0415  (imports ONNX Runtime and pyvips)
         from brewster.batch.parallel import separate_in_parallel  # noqa: PLC0415
 
+        self._are_bursts = any(task.burst for task in tasks)
         with ExitStack() as stack:
             stack.push(self._finish)
             if has_index and self.output and not self.dry_run:
@@ -163,8 +165,13 @@ class BatchReport:
         """Returns the options in the metadata of the existing layers that differ from the options of this batch."""
         from brewster.photo.history import PROGRAM, recorded_parameters, separation_parameters  # noqa: PLC0415
 
-        given = {name: getattr(self.options, name) for name in ("strength", "quality", "additive")}
-        expected = separation_parameters(**given)
+        names = ("strength", "quality", "additive", "mask", "hints")
+        expected = separation_parameters(**{name: getattr(self.options, name) for name in names})
+        expected["burst"] = "yes" if self._are_bursts else "no"
+        if (
+            self._are_bursts
+        ):  # layers of a burst are measured without the hints, which are for its single photo
+            del expected["hints"]
         metadata = (recorded_parameters(Path(path), PROGRAM) for path in result.outputs.values())
         recorded = next((parameters for parameters in metadata if parameters), {})
         with suppress(ModelError):  # the model is unknown

@@ -48,7 +48,7 @@ def skipped_files(files: Sequence[Location]) -> Iterator[str]:
         counts = [f"{number} {suffix}" for suffix, number in suffixes.most_common()]
         yield (
             f"{counted(len(others), 'other file')} skipped ({_shortened(counts)}), for example {others[0]}: "
-            "expected the suffix of an image; if such a file is a photo, pass its own path, or convert it"
+            "expected the suffix of an image; convert photos of other formats, or pass the path of an image whose suffix is another"
         )
 
 

@@ -170,6 +170,8 @@ def evaluate(
 
     export_folder = openrr_folder(benchmarks, has_method=bool(models or predictions)) if export else None
     config, parts = _config(**settings), _read_benchmarks(benchmarks, limit)
+    if burst and not (models and any(case.frames for part in parts for case in part.cases)):
+        raise click.UsageError("--burst needs a --model and a benchmark with bursts, such as bursts=FOLDER.")
     named = [(name or model_name(model), model, False) for name, model in models]
     named += [(f"{name} burst", model, True) for name, model, _ in named if burst]
     methods: list[Method] = [IdentityBaseline()]

@@ -16,6 +16,7 @@ from collections import deque
 from collections.abc import Iterable, Iterator, Sequence, Set
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
+from copy import copy
 from dataclasses import replace
 from itertools import islice
 from typing import Any, Final, Unpack, final
@@ -72,13 +73,19 @@ class Separator:
             )
         self._predictor = model if isinstance(model, Predictor) else MultiScalePredictor(model)
         self.name, self.sha256, self.device = f"{method} with {name}" if method else name, sha256, device
-        self._recorded = {"model": name, **({"method": method} if method else {})}
+        self._recorded = {"model": name, "burst": "no", **({"method": method} if method else {})}
         self.takes_hints = self._predictor.takes_hints
         self._is_calibrated = is_calibrated
 
     def __repr__(self) -> str:
         """Returns `Separator(compact, cpu)`."""
         return f"Separator({self.name}, {self.device})"
+
+    def for_burst(self) -> Separator:
+        """Returns a copy whose layers record that they were made from a burst."""
+        separator = copy(self)
+        separator._recorded = self._recorded | {"burst": "yes"}
+        return separator
 
     @classmethod
     def load(cls, model: str = Options.model, **options: Unpack[LoadOptions]) -> Separator:
@@ -222,7 +229,7 @@ class Separator:
                 the model takes no hints.
             BrewsterError: strength is not a number from 0 to 1, or quality is unknown.
         """
-        Options(strength=strength, quality=quality)  # checks the values
+        strength = Options(strength=strength, quality=quality).strength  # checks and converts the values
         seconds: dict[str, float] = {}
         with _timed(seconds, "decode"):
             photo = Photo.open(source, encoding=encoding, max_pixels=max_pixels)
@@ -241,7 +248,9 @@ class Separator:
                 additive=additive,
                 on_progress=lambda done: on_progress(_NETWORK_SHARE + (1 - _NETWORK_SHARE) * done),
             )
-        step = self._recorded | separation_parameters(strength=strength, quality=quality, additive=additive)
+        step = self._recorded | separation_parameters(
+            strength=strength, quality=quality, additive=additive, mask=mask, hints=hints
+        )
         step |= {"sha256": self.sha256[:12]} if self.sha256 else {}
         step |= {PHOTO: photo.file_info.digest} if photo.file_info.digest else {}
         return Separation(

@@ -71,9 +71,13 @@ def with_layer_history(photo: Photo, layer: str, parameters: Mapping[str, str]) 
     return replace(photo, file_info=with_history(photo.file_info, software, parameters))
 
 
-def separation_parameters(*, strength: float, quality: str, additive: bool) -> dict[str, str]:
+def separation_parameters(
+    *, strength: float, quality: str, additive: bool, mask: object, hints: object
+) -> dict[str, str]:
     """Returns the options of a separation as names and values for the metadata of its layers."""
-    return {"strength": f"{strength:g}", "quality": quality, "additive": "yes" if additive else "no"}
+    given = {"additive": additive, "mask": mask is not None, "hints": hints is not None}
+    flags = {name: "yes" if value else "no" for name, value in given.items()}
+    return {"strength": f"{strength:g}", "quality": quality} | flags
 
 
 def sampled_digest(file: BinaryIO) -> str:

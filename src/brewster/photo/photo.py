@@ -365,6 +365,6 @@ def _read_source(source: object) -> bytes:
     is_tensor = hasattr(source, "permute")
     advice = "a tensor (C, H, W) as tensor.permute(1, 2, 0).cpu().numpy()" if is_tensor else "one of these"
     raise TypeError(
-        f"the source of a photo is a {type(source).__name__}{mode}; expected a path, the bytes of a file, an open binary file, "
+        f"the source of a photo is of type {type(source).__name__}{mode}; expected a path, the bytes of a file, an open binary file, "
         f"a numpy array, a PIL image or a Photo; pass {advice}"
     )
