@@ -26,6 +26,7 @@ from brewster.batch.plan import (
 from brewster.errors import BrewsterError, OutputError
 from brewster.files import check_output_folder, exists, is_same_file, write_atomically
 from brewster.image_formats import HEAD_BYTES, format_of, is_video
+from brewster.inference.burst_report import check_photo_count
 from brewster.inference.predictor import ProgressCallback
 from brewster.inference.separation import Separation
 from brewster.inference.separator import Separator
@@ -194,8 +195,6 @@ def _check_sources(task: SeparationTask) -> None:
     """Checks that the files of a task can be read and start like an image, and are neither too few nor too many for a burst. The
     frames of a video are not read."""
     if task.burst and not is_video(task.burst.photos[0]):
-        from brewster.burst.separate import check_photo_count  # noqa: PLC0415  (imports torch)
-
         check_photo_count(len(task.burst.photos))
     for source in task.burst.photos if task.burst else (task.source,):
         if isinstance(source, Location) and not (task.burst and is_video(source)):

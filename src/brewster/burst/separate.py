@@ -23,14 +23,14 @@ import numpy as np
 
 from brewster.burst.registration import frame_motions, motion_candidates, path_order
 from brewster.burst.solver import Floats, Solution, solve
-from brewster.errors import PhotoError, counted
+from brewster.errors import PhotoError
 from brewster.inference.assessment import Verdict
-from brewster.inference.burst_report import BurstReport
+from brewster.inference.burst_report import BurstReport, check_photo_count
 from brewster.inference.guided_upsampling import GeneratedOverride
 from brewster.inference.predictor import Prediction, Predictor, ProgressCallback
 from brewster.inference.separation import Separation
 from brewster.inference.separator import Separator, white_level
-from brewster.options import MAX_BURST_PHOTOS, Options, Quality
+from brewster.options import Options, Quality
 from brewster.photo import Photo, Source
 from brewster.worker_setup import single_torch_thread
 
@@ -192,14 +192,14 @@ def measure_layers(
         The solution, or None if no other frame shows the scene of the reference frame or the frames are too small; and the indices of
         the frames that do not show it.
     """
-    if max(frames[reference].shape) < _MIN_SIDE_PX:
-        return None, ()
     with single_torch_thread(), _single_opencv_thread():
         motions = frame_motions(frames, reference, prior)
         used = path_order(frames, motions)
         left_out = tuple(k for k, found in enumerate(motions) if not found)
         if len(used) < 2:
             return None, left_out
+        if max(frames[reference].shape) < _MIN_SIDE_PX:
+            return None, ()
         chosen, middle = [frames[k] for k in used], used.index(reference)
         candidates = motion_candidates(chosen, middle, [motions[k] for k in used])
         solution = solve(
@@ -218,18 +218,6 @@ def prior_with_hints(separator: Separator, frame: Floats, reflection_share: Floa
         Photo.from_array(frame, encoding="linear"), hints=hints if is_reflection.any() else None
     )
     return _applied(upsampler.apply, frame)
-
-
-def check_photo_count(count: int) -> None:
-    """Checks that a burst can have this many photos. Raises PhotoError."""
-    if not 2 <= count <= MAX_BURST_PHOTOS:
-        raise PhotoError(
-            f"a burst has {counted(count, 'photo')}",
-            f"expected 2 to {MAX_BURST_PHOTOS} photos of one window",
-            "separate a single photo alone (brewster PHOTO, in Python brewster.separate)"
-            if count < 2
-            else "select some of the photos",
-        )
 
 
 def _checked_reference(count: int, reference: int | None) -> int:

@@ -5,6 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal, final
 
+from brewster.errors import PhotoError, counted
+from brewster.options import MAX_BURST_PHOTOS
+
 
 @final
 @dataclass(frozen=True)
@@ -29,3 +32,15 @@ class BurstReport:
     """The share of the errors of a model with one layer that the motion of a second layer explains, 0..1."""
     edge_correlation: float
     """The correlation of the edges of both layers, -1..1: about 0 for two scenes."""
+
+
+def check_photo_count(count: int) -> None:
+    """Checks that a burst can have this many photos. Raises PhotoError."""
+    if not 2 <= count <= MAX_BURST_PHOTOS:
+        raise PhotoError(
+            f"a burst has {counted(count, 'photo')}",
+            f"expected 2 to {MAX_BURST_PHOTOS} photos of one window",
+            "separate a single photo alone (brewster PHOTO, in Python brewster.separate)"
+            if count < 2
+            else "select some of the photos",
+        )
