@@ -28,7 +28,9 @@ def test_photos_of_one_size_can_be_one_burst_that_is_downloaded_and_split_again(
     assert not page.locator("#burst").is_visible()
     page.get_by_label("Strength", exact=True).fill("0.5")
     name, data = downloaded(page, page.get_by_role("button", name="Download transmission").click)
-    assert (name, data) == ("2.transmission.png", run("-", "--strength", 0.5, stdin=PHOTOS[1][1])[1])
+    alone = Photo.open(run("-", "--strength", 0.5, stdin=PHOTOS[1][1])[1])
+    assert name == "2.transmission.png"
+    assert (Photo.open(data).pixels == alone.pixels).all()
     page.get_by_role("button", name="Remove 2.png").click()
     page.get_by_role("button", name="Undo removal").click()
     page.get_by_role("button", name="Separate the photos one by one").click()
