@@ -182,9 +182,8 @@ def plan_bursts(
     for source in given:
         for image, image_folder in _images([source], folder, skipped, rows):
             group = image if is_video(image) else "given" if image == source else image.parent
-            if (
-                group == "given" or absolute(image) not in seen
-            ):  # a number of --reference counts what was given
+            # Repeated names stay, because --reference counts them
+            if group == "given" or absolute(image) not in seen:
                 groups.setdefault(group, []).append((image, image_folder))
             seen.add(absolute(image))
     _check_found(groups, given, skipped, folder)
