@@ -22,7 +22,7 @@ import cv2
 import numpy as np
 
 from brewster.burst.registration import frame_motions, motion_candidates, path_order
-from brewster.burst.solver import Floats, Solution, solve
+from brewster.burst.solver import MIN_SIDE_PX, Floats, Solution, solve
 from brewster.errors import PhotoError
 from brewster.inference.assessment import Verdict
 from brewster.inference.burst_report import BurstReport, check_photo_count
@@ -36,8 +36,6 @@ from brewster.worker_setup import single_torch_thread
 
 _WORKING_PX: Final = 1000
 """The long side of the frames from which the motion is estimated."""
-_MIN_SIDE_PX: Final = 124
-"""The levels of the solver that compare and name the layers need this long side."""
 _MIN_MOTION_PX: Final = 10.0
 """The smallest relative motion that separates the layers, in pixels of a photo that is 1,000 pixels wide."""
 _MIN_EXPLAINED: Final = 0.2
@@ -198,7 +196,7 @@ def measure_layers(
         left_out = tuple(k for k, found in enumerate(motions) if not found)
         if len(used) < 2:
             return None, left_out
-        if max(frames[reference].shape) < _MIN_SIDE_PX:
+        if max(frames[reference].shape) < MIN_SIDE_PX:
             return None, ()
         chosen, middle = [frames[k] for k in used], used.index(reference)
         candidates = motion_candidates(chosen, middle, [motions[k] for k in used])
@@ -297,7 +295,7 @@ def burst_report(
     if solution is None:
         message = "No other photo shows the same scene as the reference photo."
         if not left_out:
-            message = f"Photos with less than {_MIN_SIDE_PX} pixels are too small to show the motion."
+            message = f"Photos with less than {MIN_SIDE_PX} pixels are too small to show the motion."
     elif has_two_layers and motion >= (_USEFUL_MOTION_PX if is_doubted else _MIN_MOTION_PX):
         method, message = "burst", f"The layers moved {motion:.0f} px apart in a photo of 1,000 px."
         if solution.naming < _MIN_CERTAIN_NAMING:

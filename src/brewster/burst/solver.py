@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Final, final
@@ -60,6 +61,8 @@ LEVELS: Final = (
     Level(320, 70, (6, 8)),
     Level(640, 35, (8, 12)),
 )
+MIN_SIDE_PX: Final = math.ceil(LEVELS[_NAMED].long_side_px / _MAX_ENLARGEMENT)
+"""The smallest long side of frames that have the levels at which candidates are compared and named: without these, wrong motions win."""
 
 
 @final

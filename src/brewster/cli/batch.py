@@ -168,10 +168,8 @@ class BatchReport:
         names = ("strength", "quality", "additive", "mask", "hints")
         expected = separation_parameters(**{name: getattr(self.options, name) for name in names})
         expected["burst"] = "yes" if self._are_bursts else "no"
-        if self._are_bursts:
-            del expected[
-                "hints"
-            ]  # they are for its single photo: the layers of a burst are measured without them
+        if self._are_bursts:  # measured without the hints, which are for the single photo
+            del expected["hints"]
         metadata = (recorded_parameters(Path(path), PROGRAM) for path in result.outputs.values())
         recorded = next((parameters for parameters in metadata if parameters), {})
         with suppress(ModelError):  # the model is unknown
