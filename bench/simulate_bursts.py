@@ -1,10 +1,11 @@
 """Makes bursts with ground truth from pairs of photos, for quantity: what motion the calibration of `brewster burst` needs.
 
     .venv/bin/python bench/simulate_bursts.py out/simulated 60        # photos of $BREWSTER_DATA that no network was trained on
+    .venv/bin/python bench/simulate_bursts.py out/circles 60 circle
     .venv/bin/python bench/burst.py out/simulated 320
 
 Each burst has five photos of 640 x 480 pixels: photo = T + R in linear light, with noise, exposure and JPEG of its own. The camera moves
-along a line with a tremble. T moves by a homography and, with the parallax of a smooth depth, differently in each place; R moves by
+along a line, or a circle of the same diameter, with a tremble. T moves by a homography and, with the parallax of a smooth depth, differently in each place; R moves by
 another distance. One burst in eight has no reflection, one in eight the same motion for both layers, one in eight a still camera.
 The folder has the layout `bursts` (docs/evaluation.md), and motions.csv has the true motions in pixels of a photo 1,000 pixels wide.
 """
@@ -53,8 +54,8 @@ def view(layer, shift, rotation, depth, parallax):
     )
 
 
-def simulate(rng, paths):
-    """The photos, the layers of the middle one, and the true motions."""
+def simulate(rng, paths, path):
+    """The photos, the layers of the middle one, and the true motions. `path` is "line" or "circle"."""
     transmission, reflection = read_layer(rng, paths), read_layer(rng, paths)
     case = rng.choice(
         ["moved", "no reflection", "equal distances", "still camera"], p=[5 / 8, 1 / 8, 1 / 8, 1 / 8]
@@ -72,15 +73,21 @@ def simulate(rng, paths):
     camera = rng.uniform(8, 60) * pixel * rng.choice([-1, 1]) * (case != "still camera")
     parallax = rng.uniform(0, 8) * pixel * (case != "still camera")
     angle = rng.normal(0, 0.15)
-    direction = np.array([np.cos(angle), np.sin(angle)])
-    positions = np.linspace(-0.5, 0.5, FRAMES) + rng.normal(0, 0.04, FRAMES)
+    turn = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
+    jitter = rng.normal(0, 0.04, FRAMES)
+    around = 2 * np.pi * np.arange(FRAMES) / FRAMES
+    if path == "line":
+        places = np.stack([np.linspace(-0.5, 0.5, FRAMES) + jitter, np.zeros(FRAMES)], 1) @ turn
+    else:
+        places = np.stack([np.cos(around) / 2 + jitter, np.sin(around) / 2], 1) @ turn
+    length = np.linalg.norm(places[:, None] - places, axis=-1).max()
     light = 0.8 / max(np.quantile(transmission, 0.98), 0.2)
     photos, middle = [], None
-    for position in positions:
+    for place in places:
         tremble, rotation = rng.normal(0, 1.5, 2) * pixel, rng.normal(0, 0.003)
         layers = [
-            light * view(transmission, camera * position * direction + tremble, rotation, depth, parallax * position * direction),
-            light * view(reflection, (camera + relative) * position * direction + tremble, rotation, depth, (0, 0)),
+            light * view(transmission, camera * place + tremble, rotation, depth, parallax * place),
+            light * view(reflection, (camera + relative) * place + tremble, rotation, depth, (0, 0)),
         ]  # fmt: skip
         middle = layers if len(photos) == FRAMES // 2 else middle
         total = sum(layers) * np.exp(rng.normal(0, 0.03))
@@ -88,9 +95,9 @@ def simulate(rng, paths):
         photos.append(np.clip(total, 0, 1))
     truth = (
         case,
-        relative / pixel * np.ptp(positions),
-        camera / pixel * np.ptp(positions),
-        parallax / pixel * np.ptp(positions),
+        relative / pixel * length,
+        camera / pixel * length,
+        parallax / pixel * length,
     )
     return photos, middle, truth
 
@@ -100,7 +107,7 @@ def save(image, path, quality=None):
     Photo.from_array(pixels, encoding="srgb").save(path, quality=quality)
 
 
-def main(folder, count):
+def main(folder, count, path):
     photos_folder = Path(os.environ["BREWSTER_DATA"], "photos/permissive")
     paths = sorted(path for pattern in HELD_OUT for path in photos_folder.glob(pattern))
     folder.mkdir(parents=True, exist_ok=True)
@@ -109,7 +116,7 @@ def main(folder, count):
         table.writerow(("burst", "case", "relative_motion_px", "camera_motion_px", "parallax_px"))
         for number in range(count):
             rng = np.random.default_rng((31, number))
-            photos, (transmission, reflection), (case, *motions) = simulate(rng, paths)
+            photos, (transmission, reflection), (case, *motions) = simulate(rng, paths, path)
             burst = folder / f"{number:03}"
             burst.mkdir()
             for k, photo in enumerate(photos, 1):
@@ -121,4 +128,4 @@ def main(folder, count):
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]), int(sys.argv[2]))
+    main(Path(sys.argv[1]), int(sys.argv[2]), *sys.argv[3:] or ["line"])

@@ -24,13 +24,16 @@ _MAX_TRANSLATION: Final = 0.1
 """The largest translation at the end of the path, as a share of the width."""
 _GRID: Final = 14
 _STARTS: Final = 3
+_LARGE: Final = 0.05
+"""The largest frequency of large structures, in periods per pixel."""
 _REFINEMENT_STEPS: Final = 60
 
 
 def find_translations(aligned: Sequence[Floats], reference: int) -> list[NDArray[np.float64]]:
     """Returns the translations (K, 2) in pixels of the second layer, from the reference frame to each frame; the best are first.
 
-    First the path is a line with constant speed, on a grid of its ends. Then each frame of the best ends moves freely.
+    First the frames lie along a line with constant speed, or in a plane as their differences suggest, on a grid of sizes and directions.
+    Then each frame of the best of these paths moves freely.
 
     Args:
         aligned: the frames, (h, w, 3) linear light, aligned with the first layer.
@@ -38,30 +41,36 @@ def find_translations(aligned: Sequence[Floats], reference: int) -> list[NDArray
     """
     spectra, frequencies, weights = _spectra(aligned)
     times = torch.arange(len(aligned), dtype=torch.float32) - reference
-    times = times / times.abs().max()
+    line, plane = torch.stack([times, 0 * times], 1), _plane(spectra, frequencies, reference)
+    mirrored = plane * torch.tensor([1, -1])  # differences do not tell left from right
     lengths = torch.logspace(-1, math.log10(_MAX_TRANSLATION * _WIDTH_PX), _GRID)
     ends = torch.cat([-lengths.flip(0), torch.zeros(1), lengths])
-    grid = torch.cartesian_prod(ends, ends)
-    x_turns, y_turns = (
-        torch.exp(-1j * torch.einsum("e,k,n->ekn", ends, times, axis)) for axis in frequencies.T
-    )
-    costs = torch.cat([_costs(spectra, weights, reference, x_turn * y_turns) for x_turn in x_turns])
-    costs[(grid == 0).all(1)] = torch.inf
+    grid = torch.cartesian_prod(ends, ends)[..., None, None]
+    costs, paths = [], []
+    for places in (line, plane, mirrored):
+        along = places / (places.norm(dim=1).max() + 1e-9)
+        across = along.flip(1) * torch.tensor([-1, 1])
+        along_turns, across_turns = (
+            torch.exp(-1j * ends[:, None, None] * (axis @ frequencies.T)) for axis in (along, across)
+        )
+        costs += [_costs(spectra, weights, reference, turn * across_turns) for turn in along_turns]
+        paths.append(grid[:, 0] * along + grid[:, 1] * across)
     chosen: list[Tensor] = []
-    for index in costs.argsort().tolist():  # the best ends that are not neighbours
-        if all((grid[index] - other).norm() > 0.3 * other.norm() + 0.5 for other in chosen):
-            chosen.append(grid[index])
+    for path in torch.cat(paths)[torch.cat(costs).argsort()]:  # the best ones that are not neighbours
+        is_still = not path.any()
+        if not is_still and all((path - other).norm() > 0.3 * other.norm() + 0.5 for other in chosen):
+            chosen.append(path)
         if len(chosen) == _STARTS:
             break
-    offsets = (torch.stack(chosen)[:, None] * times[None, :, None]).requires_grad_()
+    offsets = torch.stack(chosen).requires_grad_()
     optimiser = torch.optim.Adam([offsets], lr=0.1)
     for _ in range(_REFINEMENT_STEPS):
         optimiser.zero_grad()
-        costs = _costs(spectra, weights, reference, torch.exp(-1j * (offsets @ frequencies.T)))
-        costs.sum().backward()  # type: ignore[no-untyped-call]
+        refined_costs = _costs(spectra, weights, reference, torch.exp(-1j * (offsets @ frequencies.T)))
+        refined_costs.sum().backward()  # type: ignore[no-untyped-call]
         optimiser.step()
     found = offsets.detach() - offsets.detach()[:, reference : reference + 1]
-    order = costs.argsort()
+    order = refined_costs.argsort()
     if not torch.isfinite(found).all():  # the frames are equal
         return []
     return list(found[order].double().numpy() * (aligned[0].shape[1] / _WIDTH_PX))
@@ -82,6 +91,18 @@ def _spectra(aligned: Sequence[Floats]) -> tuple[Tensor, Tensor, Tensor]:
     selected = torch.from_numpy(spectra[:, kept]).to(torch.complex64)
     energy = (selected - selected.mean(0)).abs().square().sum(0)
     return selected, torch.from_numpy(frequencies).float(), (energy + energy.median()) ** -0.75
+
+
+def _plane(spectra: Tensor, frequencies: Tensor, reference: int) -> Tensor:
+    """Returns the places of the frames relative to the reference frame, (K, 2) in any unit, rotated or mirrored at will.
+
+    Classical multidimensional scaling: of large structures, the change from frame to frame is proportional to the motion.
+    """
+    large = spectra[:, frequencies.norm(dim=1) < 2 * math.pi * _LARGE]
+    centred = large - large.mean(0)
+    values, vectors = torch.linalg.eigh((centred @ centred.mH).real)
+    places: Tensor = vectors[:, -2:] * values[-2:].clamp(min=0).sqrt()
+    return places - places[reference]
 
 
 def _costs(spectra: Tensor, weights: Tensor, reference: int, phases: Tensor) -> Tensor:

@@ -1,4 +1,4 @@
-"""Separates a burst: several photos of one window, with the camera moved sideways between them.
+"""Separates a burst: several photos of one window, with the camera moved between them.
 
     separation = separate_burst(["a.jpg", "b.jpg", "c.jpg"])
     separation.transmission.save("clear.jpg")
@@ -262,7 +262,7 @@ def _working_frames(photos: Sequence[Source], reference: int, photo: Photo, max_
         raise PhotoError(
             f"the {len(frames)} photos of the burst are the same",
             "expected photos of one window from different places",
-            "move the camera 5 to 10 cm sideways between the photos, or separate one of them alone",
+            "move the camera by 5 to 10 cm between the photos, or separate one of them alone",
         )
     white = white_level(frames[reference])
     return [np.clip(frame / white, 0, 1) for frame in frames]
@@ -291,7 +291,7 @@ def burst_report(
     method: Literal["burst", "single photo", "unchanged"] = "single photo"
     is_copy = solution is not None and solution.edge_correlation > _MAX_EDGE_CORRELATION
     has_two_layers = explained >= needed and not is_copy
-    advice = "Move the camera 5 to 10 cm sideways between the photos."
+    advice = "Move the camera by 5 to 10 cm between the photos."
     if solution is None:
         message = "No other photo shows the same scene as the reference photo."
         if not left_out:
