@@ -127,13 +127,24 @@ def test_the_reflection_of_a_locked_candidate_moves_with_the_transmission():
     assert model.relative_motion(8, 12).tolist() == pytest.approx([0, 0.15], abs=1e-3)
 
 
-@pytest.mark.parametrize("end", [(6.0, 0.0), (-9.0, 2.0)])
-def test_the_fourier_search_finds_the_translation_of_the_second_layer(end):
+TIMES = np.array([-1, -0.5, 0, 0.5, 1])
+AROUND = 2 * np.pi * TIMES * 0.4
+
+
+@pytest.mark.parametrize(
+    "path",
+    [
+        np.outer(TIMES, (6, 0)),
+        np.outer(TIMES, (-9, 2)),
+        8 * np.stack([np.cos(AROUND) - 1, np.sin(AROUND)], 1),
+        7 * np.array([[1, 1], [-1, 1], [0, 0], [-1, -1], [1, -1]]),
+    ],
+)
+def test_the_fourier_search_finds_the_translation_of_the_second_layer(path):
     transmission, reflection = linear_pictures((300, 200))
-    times = np.array([-1, -0.5, 0, 0.5, 1])
-    moved = [np.roll(reflection, np.rint((t * end[1], t * end[0])).astype(int), (0, 1)) for t in times]
+    moved = [np.roll(reflection, np.rint(offset[::-1]).astype(int), (0, 1)) for offset in path]
     found = find_translations([0.6 * transmission + 0.4 * layer for layer in moved], 2)[0]
-    assert np.abs(found - np.rint(times[:, None] * end)).max() < 1
+    assert np.abs(found - np.rint(path)).max() < 1
 
 
 def test_unrelated_photos_have_no_motion_and_equal_ones_do_not_move():
