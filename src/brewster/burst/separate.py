@@ -291,7 +291,7 @@ def burst_report(
     method: Literal["burst", "single photo", "unchanged"] = "single photo"
     is_copy = solution is not None and solution.edge_correlation > _MAX_EDGE_CORRELATION
     has_two_layers = explained >= needed and not is_copy
-    advice = "Move the camera by 5 to 10 cm between the photos."
+    advice = "Move the camera by 5 to 10 cm between the photos, best along a circle."
     if solution is None:
         message = "No other photo shows the same scene as the reference photo."
         if not left_out:
