@@ -5,8 +5,9 @@
     .venv/bin/python bench/burst.py out/simulated 320
 
 Each burst has five photos of 640 x 480 pixels: photo = T + R in linear light, with noise, exposure and JPEG of its own. The camera moves
-along a line, or a circle of the same diameter, with a tremble. T moves by a homography and, with the parallax of a smooth depth, differently in each place; R moves by
-another distance. One burst in eight has no reflection, one in eight the same motion for both layers, one in eight a still camera.
+along a line, or a circle of the same diameter, with a tremble. T moves by a homography and, with the parallax of a smooth depth,
+differently in each place; R moves by another distance. One burst in eight has no reflection, one in eight the same motion for both
+layers, one in eight a still camera.
 The folder has the layout `bursts` (docs/evaluation.md), and motions.csv has the true motions in pixels of a photo 1,000 pixels wide.
 """
 
@@ -74,12 +75,10 @@ def simulate(rng, paths, path):
     parallax = rng.uniform(0, 8) * pixel * (case != "still camera")
     angle = rng.normal(0, 0.15)
     turn = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
-    jitter = rng.normal(0, 0.04, FRAMES)
     around = 2 * np.pi * np.arange(FRAMES) / FRAMES
-    if path == "line":
-        places = np.stack([np.linspace(-0.5, 0.5, FRAMES) + jitter, np.zeros(FRAMES)], 1) @ turn
-    else:
-        places = np.stack([np.cos(around) / 2 + jitter, np.sin(around) / 2], 1) @ turn
+    line = np.linspace(-0.5, 0.5, FRAMES), np.zeros(FRAMES)
+    along, across = {"line": line, "circle": (np.cos(around) / 2, np.sin(around) / 2)}[path]
+    places = np.stack([along + rng.normal(0, 0.04, FRAMES), across], 1) @ turn
     length = np.linalg.norm(places[:, None] - places, axis=-1).max()
     light = 0.8 / max(np.quantile(transmission, 0.98), 0.2)
     photos, middle = [], None
@@ -93,13 +92,7 @@ def simulate(rng, paths, path):
         total = sum(layers) * np.exp(rng.normal(0, 0.03))
         total = total + rng.normal(0, 1, total.shape) * np.sqrt(1e-5 + 2e-4 * total)
         photos.append(np.clip(total, 0, 1))
-    truth = (
-        case,
-        relative / pixel * length,
-        camera / pixel * length,
-        parallax / pixel * length,
-    )
-    return photos, middle, truth
+    return photos, middle, (case, *(motion / pixel * length for motion in (relative, camera, parallax)))
 
 
 def save(image, path, quality=None):
