@@ -152,7 +152,7 @@ def test_a_phone_reads_the_link_from_the_qr_code(lan):
     halves = {" ": (0, 0), "▀": (1, 0), "▄": (0, 1), "█": (1, 1)}  # a module is light where a block is
     modules = [[halves[block][half] for block in row] for row in rows for half in (0, 1)]
     image = np.kron(np.array(modules, np.uint8) * 255, np.ones((8, 8), np.uint8))
-    assert cv2.QRCodeDetector().detectAndDecode(image)[0] == link
+    assert cv2.QRCodeDetectorAruco().detectAndDecode(image)[0] == link
 
 
 def test_a_phone_opens_the_link_once_and_separates_a_photo(lan, chromium):
