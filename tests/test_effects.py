@@ -39,6 +39,17 @@ def test_every_mask_is_between_zero_and_one(slot, name):
     assert 0 <= mask.min() <= mask.max() <= 1
 
 
+@given(st.integers(0, 10**6))
+def test_haze_reduces_the_contrast_and_adds_light_to_black(slot):
+    stripes = torch.tensor([0.0, 1.0]).repeat(24).expand(3, 48, 48)
+    black, white = effects.haze(SampleRng(1, 3, slot), stripes).unflatten(2, (24, 2)).unbind(3)
+    contrast = white - black
+    assert black.min() >= 0
+    assert black.mean() > 0
+    assert contrast.min() > 0
+    assert contrast.mean() < 1
+
+
 def test_a_ghost_keeps_the_mean_of_a_flat_image():
     flat = torch.full((3, 32, 32), 0.3)
     torch.testing.assert_close(effects.ghost(SampleRng(1, 0, 0), flat, 0.7, 5.0), flat)

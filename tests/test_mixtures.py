@@ -95,6 +95,7 @@ def test_light_adds_up_in_linear_light_and_a_veil_is_uniform(photos, share):
         ({"ghost_probability": 1.0}, (False, True)),
         ({"reflection_contrast": (1.6, 1.6)}, (False, True)),
         ({"shadow_probability": 1.0}, (True, None)),
+        ({"haze_probability": 1.0}, (True, None)),
         ({"highlight_boost": (5.0, 5.0)}, (True, None)),
         ({"augmentation_probability": 1.0}, (True, True)),
     ],

@@ -149,6 +149,8 @@ class MixRecipe(FrozenModel):
     """White parts of a photo are multiplied by up to 1 + this value, because their true luminance was clipped."""
     shadow_probability: Share = 0.15
     """Probability of a hard shadow on the background."""
+    haze_probability: Share = 0.0
+    """Probability of haze in the background. Without such samples, a network predicts that haze is reflection."""
     background_blur_probability: Share = 0.08
     """Probability of a background that is out of focus. Without such samples, a network predicts that all blur is reflection."""
     background_blur_sigma_px: LogRange = (0.5, 3.0)

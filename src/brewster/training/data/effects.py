@@ -1,4 +1,4 @@
-"""Optical effects of mixtures: defocus, ghost images, lamps, signs, shadows, windows, and JPEG.
+"""Optical effects of mixtures: defocus, ghost images, lamps, signs, shadows, haze, windows, and JPEG.
 
 Images are (3, H, W) in linear light, unless their names end in `encoded`. Masks are (1, size, size) in 0..1. All random numbers
 come from the `SampleRng` argument.
@@ -133,6 +133,21 @@ def shadow(rng: SampleRng, size: int) -> Mask:
     lit = torch.sigmoid(rng.log_uniform((10, 2 * size)) * lit)
     darkest = rng.uniform((0.08, 0.5))
     return darkest + (1 - darkest) * lit
+
+
+def haze(rng: SampleRng, image: Image) -> Image:
+    """Adds the light that the air scatters, (3, size, size): the more, the farther the scene is (Koschmieder 1924).
+
+    The distance grows towards a horizon, as on a plane, with smooth random deviations.
+    """
+    size = image.shape[-1]
+    rows, _ = _pixels(size)
+    below = (rows / size - rng.uniform((0.1, 0.7))).clamp(min=0)
+    distance = 1 / (below / 0.15 + rng.uniform((0.05, 0.3)))
+    distance = (distance / distance.max() + 0.25 * _noise(rng, size, 2 + rng.randint(4))).clamp(0, 1)
+    passed = torch.exp(-rng.log_uniform((0.2, 2.5)) * distance)
+    colour = torch.tensor([0.92, 1.0, 1.1])[:, None, None] ** rng.uniform((-0.5, 2))
+    return image * passed + rng.log_uniform((0.5, 1.8)) * image.mean() * colour * (1 - passed)
 
 
 def jpeg(encoded: Image, quality: int) -> Image:

@@ -125,6 +125,8 @@ class Mixtures:
             view = effects.blur(view, sigma_px, disc=rng.bernoulli(0.5))
         if rng.bernoulli(recipe.shadow_probability):
             view = view * effects.shadow(rng, size)
+        if recipe.haze_probability and rng.bernoulli(recipe.haze_probability):  # 0 draws no number
+            view = effects.haze(rng, view)
         view = view / _mean_without_highlights(view)
         # Lamps and signs are as frequent behind the glass as in it: a network must not learn that they are reflections.
         if rng.bernoulli(recipe.sign_probability):
