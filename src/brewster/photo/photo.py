@@ -257,6 +257,8 @@ class Photo:
 
     def resized(self, width: int, height: int) -> Float32:
         """Returns the photo resized by area averaging: linear light, (height, width, 3) float32."""
+        if self.size == (width, height):
+            return self.linear()
         out = np.empty((height, width, 3), np.float32)
         full_height = self.size[1]
         for row in range(height):
