@@ -137,6 +137,16 @@ def test_a_photo_is_never_overwritten_by_its_own_layer(run, tmp_path, link):
     assert (tmp_path / "a.jpg").read_bytes() == data
 
 
+@pytest.mark.parametrize("option", ["--mask", "--hints"])
+def test_the_mask_and_the_hints_are_never_overwritten(run, tmp_path, option):
+    (tmp_path / "a.jpg").write_bytes(image_bytes())
+    painted = image_bytes(format_name="png")
+    (tmp_path / "painted.png").write_bytes(painted)
+    code, _, err = run("a.jpg", option, "painted.png", "-o", "painted.png", "--overwrite")
+    assert (code, (tmp_path / "painted.png").read_bytes()) == (1, painted)
+    assert "never overwritten" in error_lines(err)[0]
+
+
 @pytest.mark.parametrize("options", [[], ["--dry-run"], ["--workers", 1, "-o", "."]])
 def test_a_model_that_does_not_exist_is_an_error_even_if_all_layers_exist(run, tmp_path, options):
     (tmp_path / "a.jpg").write_bytes(image_bytes())

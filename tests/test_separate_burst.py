@@ -15,7 +15,7 @@ from PIL import Image
 
 import brewster
 from brewster.batch.plan import plan_bursts
-from brewster.burst import read_video, separate_burst
+from brewster.burst import BurstReport, read_video, separate_burst
 from brewster.burst.fourier_search import find_translations
 from brewster.burst.joint_model import JointModel, Rates, optimise, pixel_grid
 from brewster.burst.registration import frame_motions, motion_candidates
@@ -440,8 +440,58 @@ def test_a_burst_after_a_single_photo_names_the_other_options(tmp_path, burst_fi
     main(["burst", *map(str, burst_files), *output])
     assert "skipped, because all layers exist, made with other options (burst=no)" in capfd.readouterr().err
     main(["burst", *map(str, burst_files), *output, "--overwrite"])
-    main([str(burst_files[2]), *output])
-    assert "burst=yes" in capfd.readouterr().err
+    for other in ([burst_files[2]], ["burst", *burst_files[1:4]]):
+        capfd.readouterr()
+        main([*map(str, other), *output])
+        assert "(burst=5 photos)" in capfd.readouterr().err
+
+
+@pytest.mark.parametrize("method", ["burst", "single photo", "unchanged"])
+def test_the_layers_record_hints_whatever_the_motion_shows(
+    tmp_path, burst_files, few_steps, monkeypatch, capfd, method
+):
+    report = BurstReport(method, "", 5, (), 2, 0.0, 0.0, 0.0)
+    monkeypatch.setattr("brewster.burst.separate.burst_report", lambda *_: report)
+    Image.new("RGB", (128, 96), "red").save(tmp_path / "hints.png")
+    command = ["burst", *map(str, burst_files), "-o", str(tmp_path / "out")]
+    assert main([*command, "--hints", str(tmp_path / "hints.png")]) == 0
+    main(command)
+    assert "made with other options (hints=yes)" in capfd.readouterr().err
+
+
+@pytest.mark.parametrize("name", ["2.png", "link.png", "mask.png"])
+def test_no_photo_of_a_burst_is_overwritten_and_no_mask(tmp_path, burst_files, name):
+    for file in burst_files[:3]:
+        (tmp_path / file.name).write_bytes(file.read_bytes())
+    (tmp_path / "link.png").hardlink_to(tmp_path / "0.png")
+    Image.new("L", (128, 96), 255).save(tmp_path / "mask.png")
+    before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+    photos = [str(tmp_path / file.name) for file in burst_files[:3]]
+    options = ["--mask", str(tmp_path / "mask.png"), "-o", str(tmp_path / name), "--overwrite"]
+    for dry_run in ([], ["--dry-run"]):
+        assert main(["burst", *photos, *options, *dry_run]) == 1
+    assert before == {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+
+
+@pytest.mark.parametrize("content", [b"", b"only text in this file", None])
+def test_a_dry_run_and_a_real_run_name_the_bad_photo_of_a_burst(tmp_path, burst_files, capfd, content):
+    bad = tmp_path / "bad.png"
+    if content is not None:
+        bad.write_bytes(content)
+    messages = []
+    for dry_run in ([], ["--dry-run"]):
+        assert (
+            main(["burst", *map(str, burst_files[:2]), str(bad), "-o", str(tmp_path / "out"), *dry_run]) == 1
+        )
+        messages.append(capfd.readouterr().err)
+    assert messages[0] == messages[1]
+    assert f"photo 3 of the burst ({bad})" in messages[0]
+
+
+def test_a_dry_run_finds_that_a_video_is_missing_or_has_too_few_frames(tmp_path):
+    assert main(["burst", str(tmp_path / "no.mp4"), "--dry-run"]) == 1
+    with pytest.raises(PhotoError, match="expected a number from 1 to 7"):
+        plan_bursts([tmp_path / "no.mp4"], reference=7, frames=7)
 
 
 def test_the_command_writes_the_layers_and_the_report(tmp_path, burst_files, few_steps, capfd):

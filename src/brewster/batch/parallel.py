@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import final
 
 from brewster.batch.plan import FileResult, SeparationTask
-from brewster.batch.runner import check_outputs, real_paths, separate_tasks, skipped_result
+from brewster.batch.runner import check_outputs, input_paths, separate_tasks, skipped_result
 from brewster.errors import OutputError
 from brewster.executors.local import Executor, run_tasks
 from brewster.files import exists
@@ -29,9 +29,9 @@ def separate_in_parallel(
     enters the context of the executor, which runs a `SeparationRunner` in its workers; both need the same `overwrite`.
     Raises OutputError if a layer would replace a photo of the archive, or a node cannot reach the output folder, and
     ModelError or DeviceError."""
-    photos, has = real_paths(task.source for task in tasks), _file_finder()
+    inputs, has = input_paths(tasks), _file_finder()
     for task in tasks:  # a worker cannot check this, because it does not get the paths of all photos
-        check_outputs(task, photos)
+        check_outputs(task, inputs)
     finished: list[FileResult] = []
 
     def unfinished() -> Iterator[SeparationTask]:

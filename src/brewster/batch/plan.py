@@ -30,9 +30,19 @@ class Burst:
     photos: tuple[Location, ...]
     """The photos in the order in which they were taken, or one video."""
     reference: int | None
-    """The index of the photo that is separated; None for the middle frame of a video."""
+    """The index of the photo that is separated; None for the middle one."""
     frames: int
     """The number of frames that are chosen from a video."""
+
+    @property
+    def is_from_video(self) -> bool:
+        """Whether the photos are the frames of a video."""
+        return is_video(self.photos[0])
+
+    @property
+    def photo_count(self) -> int:
+        """The number of photos, or of frames that are chosen from a video."""
+        return self.frames if self.is_from_video else len(self.photos)
 
 
 @final
@@ -52,6 +62,11 @@ class SeparationTask:
     def name(self) -> str:
         """The path of the photo as the caller passed it, or `-` for a stream."""
         return display_name(self.source)
+
+    @property
+    def inputs(self) -> tuple[Location | BinaryFile, ...]:
+        """The files of the photos: those of the burst, or the photo."""
+        return self.burst.photos if self.burst else (self.source,)
 
     def failed_results(self, reason: str) -> list[FileResult]:
         """Returns the result of a photo that no worker could separate."""
@@ -190,15 +205,15 @@ def plan_bursts(
     bursts, named = {}, []
     for images in groups.values():
         photos = tuple(image for image, _ in images)
-        shows_video = is_video(photos[0])
-        index = len(photos) // 2 if reference is None or shows_video else reference
-        if not 0 <= index < len(photos):
+        burst = Burst(photos, reference, frames)
+        if reference is not None and not 0 <= reference < burst.photo_count:
             raise PhotoError(
-                f"photo {index + 1} is the reference of a burst of {counted(len(photos), 'photo')} ({photos[0]})",
-                f"expected a number from 1 to {len(photos)}",
+                f"photo {reference + 1} is the reference of a burst of {counted(burst.photo_count, 'photo')} ({photos[0]})",
+                f"expected a number from 1 to {burst.photo_count}",
                 "correct --reference (in Python reference, which begins at 0), or leave it out for the middle photo",
             )
-        bursts[absolute(photos[index])] = Burst(photos, reference if shows_video else index, frames)
+        index = len(photos) // 2 if reference is None or burst.is_from_video else reference
+        bursts[absolute(photos[index])] = burst
         named.append(images[index])
     return [
         SeparationTask(image, outputs, rows.get(image), bursts[absolute(image)])

@@ -25,7 +25,7 @@ from brewster.batch.plan import (
 )
 from brewster.errors import BrewsterError, OutputError
 from brewster.files import check_output_folder, exists, is_same_file, write_atomically
-from brewster.image_formats import HEAD_BYTES, format_of, is_video
+from brewster.image_formats import HEAD_BYTES, format_of
 from brewster.inference.burst_report import check_photo_count
 from brewster.inference.predictor import ProgressCallback
 from brewster.inference.separation import Separation
@@ -104,16 +104,16 @@ def separate_tasks(
     on_progress: BatchProgressCallback = lambda _done, _name, _fraction: None,
 ) -> Iterator[FileResult]:
     """Separates the photos of the tasks. For the other arguments, results and errors, see `separate_files`."""
-    photos, unexpected = real_paths(task.source for task in tasks), None
+    inputs, unexpected = input_paths(tasks, options), None
     for done, task in enumerate(tasks):
         on_progress(done, task.name, 0.0)
         result = FileResult(task.name)
         try:
-            check_outputs(task, photos)
+            check_outputs(task, inputs)
             outputs = _missing_outputs(task, overwrite=overwrite)
             _check_folders(outputs.values())
-            if outputs and dry_run:
-                _check_sources(task)
+            if task.burst or (outputs and dry_run):
+                _check_inputs(task)
         except BrewsterError as error:
             yield result.failed(error)
             continue
@@ -156,7 +156,7 @@ def separate_task(
     be read or separated, or a layer cannot be written."""
     result.model, result.model_sha256, result.device = separator.name, separator.sha256, separator.device
     with row_in_errors(task.row):
-        if task.burst and isinstance(task.source, Path) and is_video(task.source):
+        if task.burst and task.burst.is_from_video and isinstance(task.source, Path):
             photo: Path | bytes = task.source
         else:
             photo = read_content(task.source)
@@ -191,18 +191,27 @@ def _check_folders(outputs: Iterable[Location | WritableFile]) -> None:
             check_output_folder(folder)  # raises the error with the reason
 
 
-def _check_sources(task: SeparationTask) -> None:
+def _check_inputs(task: SeparationTask) -> None:
     """Checks that the files of a task can be read and start like an image, and are neither too few nor too many for a burst. The
     frames of a video are not read."""
-    if task.burst and not is_video(task.burst.photos[0]):
-        check_photo_count(len(task.burst.photos))
-    for source in task.burst.photos if task.burst else (task.source,):
-        if isinstance(source, Location) and not (task.burst and is_video(source)):
+    for number, file in enumerate(task.inputs, 1):
+        try:
             with row_in_errors(task.row):
-                check_readable(source)
-                if isinstance(source, Path):
-                    with source.open("rb") as file:
-                        known_format(file.read(HEAD_BYTES))
+                _check_input(file, is_video=bool(task.burst and task.burst.is_from_video))
+        except BrewsterError as error:
+            if len(task.inputs) > 1:
+                error.happened = f"photo {number} of the burst ({file}): {error.happened}"
+            raise
+    if task.burst:
+        check_photo_count(task.burst.photo_count)
+
+
+def _check_input(file: Location | BinaryFile, *, is_video: bool) -> None:
+    if isinstance(file, Location):
+        check_readable(file, is_video=is_video)
+    if isinstance(file, Path) and file.is_file() and not is_video:  # a pipe can be opened only once
+        with file.open("rb") as opened:
+            known_format(opened.read(HEAD_BYTES))
 
 
 def _missing_outputs(task: SeparationTask, *, overwrite: bool) -> dict[str, Location | WritableFile]:
@@ -218,11 +227,13 @@ def _separate_burst(
 ) -> Separation:
     from brewster.burst import read_video, separate_burst  # noqa: PLC0415  (imports torch)
 
-    photos: Sequence[Source] = [read_content(photo) for photo in burst.photos if not is_video(photo)]
-    if not photos:
+    photos: Sequence[Source]
+    if burst.is_from_video:
         photos = read_video(Path(burst.photos[0]), burst.frames, max_pixels=options.max_pixels)
+    else:
+        photos = [read_content(photo) for photo in burst.photos]
     return separate_burst(
-        [*photos],
+        photos,
         reference=burst.reference,
         separator=separator,
         on_progress=on_progress,
@@ -230,17 +241,22 @@ def _separate_burst(
     )
 
 
-def check_outputs(task: SeparationTask, photos: Set[str]) -> None:
-    """Checks that no layer would replace a photo of the batch. `photos` are their paths, from `real_paths`. Raises
-    OutputError if a layer has the path of a photo, or is a hard link to the photo of the task."""
+def input_paths(tasks: Iterable[SeparationTask], options: Options = _DEFAULT_OPTIONS) -> frozenset[str]:
+    """Returns the paths of all photos of the tasks, and of the mask and the hints, as `real_paths`."""
+    return real_paths([options.mask, options.hints]).union(*(real_paths(task.inputs) for task in tasks))
+
+
+def check_outputs(task: SeparationTask, inputs: Set[str]) -> None:
+    """Checks that no layer would replace one of the `inputs` of the batch, from `input_paths`. Raises OutputError if a layer has
+    the path of an input, or is a hard link to a photo of the task."""
     for target in task.outputs.values():
         if not isinstance(target, Location):
             continue
-        is_own_photo = isinstance(task.source, Location) and is_same_file(target, task.source)
-        if is_own_photo or photos & real_paths([target]):
+        is_own_photo = any(is_same_file(target, file) for file in task.inputs if isinstance(file, Location))
+        if is_own_photo or inputs & real_paths([target]):
             raise OutputError(
-                f"{target} is itself a photo of the batch",
-                "expected another path, because photos of the batch are never overwritten",
+                f"{target} is itself a photo of the batch, or its mask or hints",
+                "expected another path, because these are never overwritten",
                 "choose another name or folder",
             )
 

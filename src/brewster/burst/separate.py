@@ -156,9 +156,9 @@ def fit_burst(
     )
     seconds["motion"] = time.perf_counter() - started
     report = burst_report(solution, single.verdict, len(photos), left_out, reference)
+    name, has_hints = separator.name, hints is not None
     if report.method != "single photo":
         hints = None
-    name = separator.name
     if solution and report.method == "burst":
         sha256, device = separator.sha256, separator.device
         separator = Separator(
@@ -166,7 +166,8 @@ def fit_burst(
         )
     elif report.method == "unchanged":
         separator = Separator(lambda tile: (tile, np.zeros_like(tile)), name=name, method="unchanged")
-    return FittedBurst(photo, separator.for_burst(), hints, report, seconds)
+    separator = separator.for_burst(len(photos), has_hints=has_hints)
+    return FittedBurst(photo, separator, hints, report, seconds)
 
 
 def measure_layers(

@@ -48,7 +48,7 @@ class BatchReport:
     _sources_by_shared_error: dict[str, list[str]] = field(default_factory=lambda: defaultdict(list))
     _skipped: dict[str, tuple[int, str]] = field(default_factory=dict)
     """The number of skipped photos, and the last one, by the options of their layers that differ from those of this batch."""
-    _are_bursts: bool = False
+    _burst_sizes: dict[str, str] = field(default_factory=dict)
     _index: IndexWriter | None = None
     _started: float = field(default_factory=time.perf_counter)
 
@@ -64,7 +64,7 @@ class BatchReport:
         from brewster.batch import separate_tasks  # noqa: PLC0415  (imports ONNX Runtime and pyvips)
         from brewster.batch.parallel import separate_in_parallel  # noqa: PLC0415
 
-        self._are_bursts = any(task.burst for task in tasks)
+        self._burst_sizes = {task.name: f"{task.burst.photo_count} photos" for task in tasks if task.burst}
         with ExitStack() as stack:
             stack.push(self._finish)
             if has_index and self.output and not self.dry_run:
@@ -167,9 +167,7 @@ class BatchReport:
 
         names = ("strength", "quality", "additive", "mask", "hints")
         expected = separation_parameters(**{name: getattr(self.options, name) for name in names})
-        expected["burst"] = "yes" if self._are_bursts else "no"
-        if self._are_bursts:  # measured without the hints, which are for the single photo
-            del expected["hints"]
+        expected["burst"] = self._burst_sizes.get(result.source, "no")
         metadata = (recorded_parameters(Path(path), PROGRAM) for path in result.outputs.values())
         recorded = next((parameters for parameters in metadata if parameters), {})
         with suppress(ModelError):  # the model is unknown

@@ -62,7 +62,7 @@ def append_row(path: Path, row: ScoreRow) -> None:
         raise OutputError(
             f"{path} was not written ({error.strerror or error})",
             "expected a writable output folder",
-            "free disk space or choose another folder with -o, and run again (the finished scores are saved)",
+            "free disk space or choose another folder with -o, and run again (scores that were saved are not computed again)",
         ) from error
 
 

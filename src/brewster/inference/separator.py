@@ -81,10 +81,13 @@ class Separator:
         """Returns `Separator(compact, cpu)`."""
         return f"Separator({self.name}, {self.device})"
 
-    def for_burst(self) -> Separator:
-        """Returns a copy whose layers record that they were made from a burst."""
+    def for_burst(self, photo_count: int, *, has_hints: bool) -> Separator:
+        """Returns a copy whose layers record that they were made from a burst of this many photos, and whether with hints."""
         separator = copy(self)
-        separator._recorded = self._recorded | {"burst": "yes"}
+        separator._recorded = self._recorded | {
+            "burst": f"{photo_count} photos",
+            "hints": "yes" if has_hints else "no",
+        }
         return separator
 
     @classmethod
@@ -248,9 +251,10 @@ class Separator:
                 additive=additive,
                 on_progress=lambda done: on_progress(_NETWORK_SHARE + (1 - _NETWORK_SHARE) * done),
             )
-        step = self._recorded | separation_parameters(
+        parameters = separation_parameters(
             strength=strength, quality=quality, additive=additive, mask=mask, hints=hints
         )
+        step = parameters | self._recorded
         step |= {"sha256": self.sha256[:12]} if self.sha256 else {}
         step |= {PHOTO: photo.file_info.digest} if photo.file_info.digest else {}
         return Separation(
