@@ -164,41 +164,35 @@ def read_image(path: Location) -> bytes:
         check_not_video(path)
         return path.read_bytes()
     with _opened(path) as file:
+        check_not_video(path)
         return file.read()
 
 
-def check_readable(path: Location, *, is_video: bool = False) -> None:
-    """Checks that an image file exists, can be opened and is not empty. Raises the errors of `read_image`, but does not read more.
-    `is_video` expects a video instead.
+def check_readable(path: Location) -> None:
+    """Checks that a file exists, can be opened and is not empty. Raises UnreadablePhoto if not.
 
     Pipes are not checked, because they can be opened only once.
     """
     if isinstance(path, RemotePath):
-        if not is_video:
-            check_not_video(path)
         path.check_readable()
         return
     is_pipe = os.path.exists(path) and not os.path.isfile(path) and not os.path.isdir(path)  # noqa: PTH110, PTH112, PTH113
     if not is_pipe:
-        with _opened(path, is_video=is_video) as file:
+        with _opened(path) as file:
             if not file.read(1):
                 raise empty_file_error()
 
 
 @contextlib.contextmanager
-def _opened(path: Path, *, is_video: bool = False) -> Iterator[BinaryIO]:
+def _opened(path: Path) -> Iterator[BinaryIO]:
     try:
         with path.open("rb") as file:
-            if not is_video:
-                check_not_video(path)
             yield file
     except OSError as error:
         is_folder = os.path.isdir(path)  # noqa: PTH112  (Path.is_dir raises without permission)
         reason = "it is a folder" if is_folder else error.strerror or str(error)
         raise UnreadablePhoto(
-            f"{path} cannot be read ({reason})",
-            f"expected {'a video' if is_video else 'an image file'}",
-            "check its name and permissions",
+            f"{path} cannot be read ({reason})", "expected an image file", "check its name and permissions"
         ) from error
 
 

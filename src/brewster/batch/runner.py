@@ -35,7 +35,7 @@ from brewster.photo import Source
 from brewster.photo.decode import known_format
 from brewster.photo.history import find_layer_of_another_photo
 from brewster.photo.in_memory import BinaryFile, WritableFile
-from brewster.remote_path import Location, RemotePath, check_readable, read_image
+from brewster.remote_path import Location, RemotePath, check_not_video, check_readable, read_image
 
 BatchProgressCallback = Callable[[int, str, float], None]
 """Called with the number of finished files, the name of the current file, and its completed fraction, 0 to 1.
@@ -208,8 +208,11 @@ def _check_inputs(task: SeparationTask) -> None:
 
 def _check_input(file: Location | BinaryFile, *, is_video: bool) -> None:
     if isinstance(file, Location):
-        check_readable(file, is_video=is_video)
-    if isinstance(file, Path) and file.is_file() and not is_video:  # a pipe can be opened only once
+        check_readable(file)
+        if is_video:
+            return
+        check_not_video(file)
+    if isinstance(file, Path) and file.is_file():  # a pipe can be opened only once
         with file.open("rb") as opened:
             known_format(opened.read(HEAD_BYTES))
 
@@ -291,6 +294,7 @@ def read_content(source: Location | BinaryFile) -> Path | bytes:
     if the file has the suffix of a video."""
     if isinstance(source, Path):
         check_readable(source)
+        check_not_video(source)
         return source
     return read_image(source) if isinstance(source, RemotePath) else source.read()
 
