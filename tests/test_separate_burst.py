@@ -519,8 +519,11 @@ def test_the_command_reports_bursts_that_cannot_be_separated(tmp_path, burst_fil
 def test_the_command_separates_a_video(tmp_path, small_burst, few_steps, capfd):
     video = tmp_path / "window.mp4"
     write_video(video, small_burst.frames)
-    code, out = run_burst(capfd, video, "-o", tmp_path / "out", "--json", "--format", "png")
+    command = ("-o", tmp_path / "out", "--format", "png")
+    code, out = run_burst(capfd, video, *command, "--json")
     assert (code, json.loads(out)["burst"]["frames"]) == (0, len(small_burst.frames))
+    main(["burst", str(video), *map(str, command)])
+    assert "skipped, because all layers exist (" in capfd.readouterr().err
     assert {path.name for path in (tmp_path / "out").iterdir()} == {
         f"window.mp4.{layer}.png" for layer in ("transmission", "reflection")
     }

@@ -246,7 +246,8 @@ def _separate_burst(
 
 def input_paths(tasks: Iterable[SeparationTask], options: Options = _DEFAULT_OPTIONS) -> frozenset[str]:
     """Returns the paths of all photos of the tasks, and of the mask and the hints, as `real_paths`."""
-    return real_paths([options.mask, options.hints]).union(*(real_paths(task.inputs) for task in tasks))
+    photos = (file for task in tasks for file in task.inputs)
+    return real_paths(photos) | real_paths([options.mask, options.hints])
 
 
 def check_outputs(task: SeparationTask, inputs: Set[str]) -> None:

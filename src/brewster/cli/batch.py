@@ -22,6 +22,7 @@ from brewster.remote_path import location
 if TYPE_CHECKING:
     from brewster.batch import FileResult, SeparationTask
     from brewster.batch.index import IndexWriter
+    from brewster.batch.plan import Burst
     from brewster.executors.local import Executor
 
 
@@ -48,7 +49,7 @@ class BatchReport:
     _sources_by_shared_error: dict[str, list[str]] = field(default_factory=lambda: defaultdict(list))
     _skipped: dict[str, tuple[int, str]] = field(default_factory=dict)
     """The number of skipped photos, and the last one, by the options of their layers that differ from those of this batch."""
-    _burst_sizes: dict[str, str] = field(default_factory=dict)
+    _bursts: dict[str, Burst] = field(default_factory=dict)
     _index: IndexWriter | None = None
     _started: float = field(default_factory=time.perf_counter)
 
@@ -64,7 +65,7 @@ class BatchReport:
         from brewster.batch import separate_tasks  # noqa: PLC0415  (imports ONNX Runtime and pyvips)
         from brewster.batch.parallel import separate_in_parallel  # noqa: PLC0415
 
-        self._burst_sizes = {task.name: f"{task.burst.photo_count} photos" for task in tasks if task.burst}
+        self._bursts = {task.name: task.burst for task in tasks if task.burst}
         with ExitStack() as stack:
             stack.push(self._finish)
             if has_index and self.output and not self.dry_run:
@@ -167,7 +168,8 @@ class BatchReport:
 
         names = ("strength", "quality", "additive", "mask", "hints")
         expected = separation_parameters(**{name: getattr(self.options, name) for name in names})
-        expected["burst"] = self._burst_sizes.get(result.source, "no")
+        burst = self._bursts.get(result.source)
+        expected["burst"] = f"{burst.photo_count} photos" if burst else "no"
         metadata = (recorded_parameters(Path(path), PROGRAM) for path in result.outputs.values())
         recorded = next((parameters for parameters in metadata if parameters), {})
         with suppress(ModelError):  # the model is unknown
@@ -176,6 +178,8 @@ class BatchReport:
             elif recorded.get("model") in zoo.MODELS:
                 # The name of a diffusion model is known only after loading, but it is none of these
                 expected["model"] = self.options.model
+        if burst and burst.is_from_video and recorded.get("burst", "no") != "no":
+            del expected["burst"]  # a short video has fewer frames than --frames
         different = {name for name, value in expected.items() if recorded.get(name, value) != value}
         return ", ".join(f"{name}={recorded[name]}" for name in expected if name in different)
 
