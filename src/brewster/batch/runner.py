@@ -26,7 +26,7 @@ from brewster.batch.plan import (
 from brewster.errors import BrewsterError, OutputError
 from brewster.files import check_output_folder, exists, is_same_file, write_atomically
 from brewster.image_formats import HEAD_BYTES, format_of
-from brewster.inference.burst_report import check_photo_count
+from brewster.inference.burst_report import burst_photo_name, check_photo_count
 from brewster.inference.predictor import ProgressCallback
 from brewster.inference.separation import Separation
 from brewster.inference.separator import Separator
@@ -194,13 +194,13 @@ def _check_folders(outputs: Iterable[Location | WritableFile]) -> None:
 def _check_inputs(task: SeparationTask) -> None:
     """Checks that the files of a task can be read and start like an image, and are neither too few nor too many for a burst. The
     frames of a video are not read."""
-    for number, file in enumerate(task.inputs, 1):
+    for index, file in enumerate(task.inputs):
         try:
             with row_in_errors(task.row):
                 _check_input(file, is_video=bool(task.burst and task.burst.is_from_video))
         except BrewsterError as error:
             if len(task.inputs) > 1:
-                error.happened = f"photo {number} of the burst ({file}): {error.happened}"
+                error.happened = f"{burst_photo_name(task.inputs, index)}: {error.happened}"
             raise
     if task.burst:
         check_photo_count(task.burst.photo_count)

@@ -10,7 +10,6 @@ a prediction of a model is. If the motion does not separate the layers, the resu
 
 from __future__ import annotations
 
-import os
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -25,7 +24,7 @@ from brewster.burst.registration import frame_motions, motion_candidates, path_o
 from brewster.burst.solver import MIN_SIDE_PX, Floats, Solution, solve
 from brewster.errors import PhotoError
 from brewster.inference.assessment import Verdict
-from brewster.inference.burst_report import BurstReport, check_photo_count
+from brewster.inference.burst_report import BurstReport, burst_photo_name, check_photo_count
 from brewster.inference.guided_upsampling import GeneratedOverride
 from brewster.inference.predictor import Prediction, Predictor, ProgressCallback
 from brewster.inference.separation import Separation
@@ -235,14 +234,8 @@ def _open(photos: Sequence[Source], index: int, max_pixels: int) -> Photo:
     try:
         return Photo.open(photos[index], max_pixels=max_pixels)
     except PhotoError as error:
-        happened = f"{_name(photos, index)}: {error.happened}"
+        happened = f"{burst_photo_name(photos, index)}: {error.happened}"
         raise type(error)(happened, error.expected, error.cure) from error
-
-
-def _name(photos: Sequence[Source], index: int) -> str:
-    photo = photos[index]
-    path = f" ({os.fspath(photo)})" if isinstance(photo, str | os.PathLike) else ""
-    return f"photo {index + 1} of the burst{path}"
 
 
 def _working_frames(photos: Sequence[Source], reference: int, photo: Photo, max_pixels: int) -> list[Floats]:
@@ -254,8 +247,8 @@ def _working_frames(photos: Sequence[Source], reference: int, photo: Photo, max_
         frame = photo if k == reference else _open(photos, k, max_pixels)
         if frame.size != photo.size:
             raise PhotoError(
-                f"{_name(photos, k)} has {frame.size[0]} x {frame.size[1]} pixels",
-                f"expected {photo.size[0]} x {photo.size[1]}, as {_name(photos, reference)}",
+                f"{burst_photo_name(photos, k)} has {frame.size[0]} x {frame.size[1]} pixels",
+                f"expected {photo.size[0]} x {photo.size[1]}, as {burst_photo_name(photos, reference)}",
                 "leave one of them out, or pass photos that were taken with the same camera, orientation and zoom",
             )
         frames.append(frame.resized(width, height))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal, final
 
@@ -32,6 +34,13 @@ class BurstReport:
     """The share of the errors of a model with one layer that the motion of a second layer explains, 0..1."""
     edge_correlation: float
     """The correlation of the edges of both layers, -1..1: about 0 for two scenes."""
+
+
+def burst_photo_name(photos: Sequence[object], index: int) -> str:
+    """Returns the number of a photo for messages, and its path if it has one: `photo 3 of the burst (c.jpg)`."""
+    photo = photos[index]
+    path = f" ({os.fspath(photo)})" if isinstance(photo, str | os.PathLike) else ""
+    return f"photo {index + 1} of the burst{path}"
 
 
 def check_photo_count(count: int) -> None:
