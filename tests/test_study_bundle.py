@@ -95,6 +95,19 @@ def test_imported_answers_are_stored_once(study, store, answers, tmp_path):
     assert stored[1].withdrawn == ("similar",)
 
 
+def test_an_answer_of_an_earlier_file_that_was_withdrawn_is_replaced(study, store, answers, tmp_path):
+    (token,) = export_bundle(study, store, tmp_path / "bundle", participants=1)
+    store.import_answers(read_answer_file(answers(token, ["left", "left"])))
+    withdrawn = [{"trial": 1, "choice": "left", "seconds": 4.5, "answered_at": ANSWERED_AT}]
+    later = answers(token, ["left", "right"], withdrawn=withdrawn)
+    assert [store.import_answers(read_answer_file(later)) for _ in range(2)] == [1, 0]
+    ((_, stored),) = store.all_answers()
+    assert [(answer.choice, answer.withdrawn) for answer in stored.values()] == [
+        ("left", ()),
+        ("right", ("left",)),
+    ]
+
+
 @pytest.mark.parametrize(
     ("changes", "message"),
     [

@@ -47,6 +47,11 @@ def test_the_number_of_participants_equals_a_manual_calculation():
     assert (analysis.win, analysis.lose) == pytest.approx((0.425, 0.325))
 
 
+def test_a_study_without_losses_is_possible():
+    for tie in np.arange(1, 100) / 100:
+        assert required_participants(difference=round(1 - tie, 2), tie=tie).lose == 0
+
+
 @pytest.mark.parametrize(("difference", "tie"), [(0, 0.2), (-0.1, 0.2), (0.9, 0.2), (0.1, 1)])
 def test_impossible_rates_are_refused(difference, tie):
     with pytest.raises(BrewsterError, match="a difference above 0"):

@@ -161,7 +161,7 @@ def create(
 
 def _read_text(path: Path) -> str:
     try:
-        return path.read_text("utf-8").strip()
+        return path.read_text("utf-8-sig").strip()
     except (OSError, UnicodeDecodeError) as error:
         raise BrewsterError(
             f"{path} cannot be read ({error})", "expected plain text in UTF-8", "save the file as UTF-8"
@@ -365,7 +365,7 @@ def export_study(folder: Path, *, out: Path, participants: int, url: str | None)
 def import_answers(context: click.Context, folder: Path, files: tuple[Path, ...]) -> None:
     """Add the answers in files that participants of `brewster study export` have sent.
 
-    A file can be imported again: answers that the study already has are kept. An invalid file is reported, the others are imported,
+    A file can be imported again: answers that the study already has are kept, unless the participant withdrew them. An invalid file is reported, the others are imported,
     and the exit code is 1."""
     from brewster.user_study.answer_file import read_answer_file  # noqa: PLC0415  (imports pydantic)
 
@@ -377,7 +377,7 @@ def import_answers(context: click.Context, folder: Path, files: tuple[Path, ...]
                 count = store.import_answers(answer_file)
             except BrewsterError as error:
                 failed = True
-                print_error(str(error))
+                print_error(str(error) if str(path) in str(error) else f"{path}: {error}")
             else:
                 print_status(f"{path}: {count} new answers of {len(answer_file.answers)}")
     context.exit(1 if failed else 0)

@@ -191,7 +191,7 @@ class AnswerStore:
 
     def import_answers(self, answer_file: AnswerFile) -> int:
         """Store the answers of a participant of a static bundle in one transaction. An answer that is stored already is
-        kept. Returns the number of answers that were not stored before. Raises BrewsterError if the participant or a
+        kept, unless it was withdrawn. Returns the number of answers that were not stored before. Raises BrewsterError if the participant or a
         trial does not exist in this study, and OutputError if the database cannot be written."""
         participant = self.participant(answer_file.participant, exported=True)
         if participant is None:
@@ -217,6 +217,12 @@ class AnswerStore:
                 "INSERT INTO withdrawn SELECT ?1, ?2, ?3, ?4, ?5, ?6 WHERE NOT EXISTS (SELECT 1 FROM withdrawn "
                 "WHERE participant = ?1 AND trial = ?2 AND choice = ?3 AND answered_at = ?5)",
                 [_row(number, answer) for answer in answer_file.withdrawn],
+            )
+            # An earlier file of this participant may have answers that were withdrawn afterwards.
+            database.execute(
+                "DELETE FROM answers WHERE participant = ? AND (participant, trial, choice, answered_at) IN "
+                "(SELECT participant, trial, choice, answered_at FROM withdrawn)",
+                (number,),
             )
             answers = [_row(number, answer) for answer in answer_file.answers]
             return database.executemany(_INSERT_ANSWER, answers).rowcount
