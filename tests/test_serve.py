@@ -3,6 +3,7 @@
 import ipaddress
 import json
 import re
+import shutil
 import socket
 import urllib.error
 import urllib.request
@@ -15,6 +16,7 @@ import pytest
 from brewster import Photo
 from brewster.errors import OutputError
 from brewster.web.application import lan_address
+from brewster.web.model_cache import ModelCache
 from cli_helpers import image_bytes
 from file_server import loopback_only
 from page_helpers import canvas, upload
@@ -113,6 +115,13 @@ def test_models_that_are_missing_or_share_a_name_are_refused_at_the_start(
     assert code == 1
     assert "have the same name compact" in err
     assert not served_apps
+
+
+def test_a_model_in_the_current_folder_has_the_name_of_the_folder(tmp_path, monkeypatch, model):
+    (tmp_path / "glass").mkdir()
+    shutil.copy(model, tmp_path / "glass" / "model.onnx")
+    monkeypatch.chdir(tmp_path / "glass")
+    assert ModelCache(["."]).names[0] == "glass"
 
 
 @pytest.fixture

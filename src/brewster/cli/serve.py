@@ -151,7 +151,7 @@ def serve(
     from brewster.web.model_cache import ModelCache  # noqa: PLC0415
     from brewster.web.separation import separation_router  # noqa: PLC0415
 
-    if lan and is_loopback(host):
+    if lan and (is_loopback(host) or host in ("0.0.0.0", "::")):  # noqa: S104  (a phone needs one address)
         host = web.lan_address()
     _limit_arenas()
     if verbose:

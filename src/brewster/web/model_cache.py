@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Sequence
-from pathlib import Path
 from threading import Lock
 from typing import final
 
@@ -38,7 +37,7 @@ class ModelCache:
     def __init__(self, models: Sequence[str] = (), *, device: Device = "auto") -> None:
         self._sources: dict[str, str] = {}
         for source in dict.fromkeys((*models, *zoo.MODELS)):
-            name = Path(source).name if zoo.is_diffusion_model(source) else zoo.find_model(source).name
+            name = zoo.model_name(source)
             if name in self._sources:
                 raise ModelError(
                     f"{source} and {self._sources[name]} have the same name {name}",

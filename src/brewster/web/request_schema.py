@@ -226,7 +226,7 @@ def _options(form: FormData, models: Sequence[str], max_pixels: int) -> Options:
     values_by_name: dict[str, Any] = {name: values[-1] for name, values in texts.items() if values[-1]}
     if "format" in values_by_name:
         values_by_name["format"] = canonical_format(values_by_name["format"])
-    if "layers" in texts:
+    if "layers" in values_by_name:
         # Each layer once, in the order of the command line. Unknown names come last, and the validation refuses them.
         layers = ",".join(texts["layers"]).split(",")
         values_by_name["layers"] = [

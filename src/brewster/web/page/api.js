@@ -30,9 +30,10 @@ export async function send(path, file, options, { signal, onProgress }) {
       return { blob: request.response, fileName: fileNameOf(request), header: (name) => request.getResponseHeader(name) };
     }
     if (request.status === 0) throw await connectionError();
-    if (request.status !== 503 || tries === MAX_RETRIES) throw await serverError(request, files[0]);
+    const retryAfter = request.getResponseHeader("Retry-After"); // of a full queue; errors of the device have none
+    if (retryAfter === null || tries === MAX_RETRIES) throw await serverError(request, files[0]);
     onProgress({ phase: "waiting", ahead: 0 });
-    await sleep(1000 * Number(request.getResponseHeader("Retry-After") ?? 5), signal);
+    await sleep(1000 * Number(retryAfter), signal);
   }
 }
 

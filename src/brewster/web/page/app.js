@@ -87,8 +87,8 @@ const room = () => Math.max(0, MAX_PHOTOS - queue.photos.length);
 function add(found) {
   const photos = found.files.map((file) => queue.add(file));
   for (const photo of photos) insert(photo);
-  askForBurst(photos);
   if (!found.files.length && !found.others && !found.surplus) return;
+  askForBurst(photos);
   announce(describeAdded(found));
   if (found.others || found.surplus) showNote(describeAdded(found));
   if (!found.files.length) return refresh();
@@ -396,8 +396,10 @@ byId("copy").addEventListener("click", (event) => {
   for (const photo of queue.photos) {
     if (photo === queue.current) continue;
     change(photo, { strength });
-    tools.copy(regions, photo.regions);
+    photo.regions.copyFrom(regions);
+    queue.applyHints(photo);
   }
+  refresh();
   announce("The settings were copied to all photos.");
 });
 byId("reset").addEventListener("click", () => {

@@ -9,7 +9,7 @@ const REPORT_NAME = "brewster-report.txt";
 // Requests layers of a photo at full size. Returns the result of `send`.
 async function requestLayers(photo, layers, { takesHints, ...settings }, context) {
   const mask = await maskFile(photo.regions.list, ...photo.size);
-  const hints = takesHints ? await hintsFile(photo.regions.list, ...photo.size) : null;
+  const hints = takesHints && !photo.burst ? await hintsFile(photo.regions.list, ...photo.size) : null;
   return send("separate", photo.burst ?? photo.file, { layers, strength: photo.strength, mask, hints, ...settings }, context);
 }
 

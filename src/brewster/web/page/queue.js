@@ -47,9 +47,10 @@ export class SeparationQueue {
     return photo.size !== undefined && !photo.burst && this.hintModels.has(this.settings().model);
   }
 
-  // Separates a photo again after a change of its hints. The old result is shown until then.
+  // Separates a photo again after a change of its hints. The old result is shown until then. The first separation of a photo
+  // compares them at its end.
   applyHints(photo) {
-    if (this.hasCurrentMaps(photo) || photo.state === "failed") return;
+    if (this.hasCurrentMaps(photo) || (photo.state !== "done" && !photo.isUpdating)) return;
     this.#supersede(photo);
     Object.assign(photo, { state: "waiting", isUpdating: true });
     this.startNext();

@@ -13,12 +13,8 @@ const PNG_SIGNATURE = [0x89, 0x50, 0x4e, 0x47, 0x0d, 0x0a, 0x1a, 0x0a];
 
 // The regions of a photo with their history.
 export class Regions {
-  #states;
-  #at;
-
-  constructor(regions = []) {
-    [this.#states, this.#at] = [[regions], 0];
-  }
+  #states = [[]];
+  #at = 0;
 
   get list() {
     return this.#states[this.#at];

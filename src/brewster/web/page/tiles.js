@@ -104,7 +104,10 @@ export class TileSet {
       const area = { left: tile.part.left * step, top: tile.part.top * step, stepX: step, stepY: step };
       tile.layers = new Layers(this.preview, codes, width, height, area);
     } catch {
-      setTimeout(() => this.#tiles.delete(address), 3000); // after this, the tile is requested again
+      setTimeout(() => {
+        this.#tiles.delete(address);
+        if (!this.#isClosed) this.onChange(); // the tile is requested again if it is still visible
+      }, 3000);
     }
     tile.isLoading = false;
     if (!this.#isClosed) this.onChange();

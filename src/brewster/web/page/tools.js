@@ -1,7 +1,6 @@
 // The controls for regions: the tool, its brush size, feather and strength, and undo and redo.
 
 import { RegionEditor } from "./editor.js";
-import { Regions } from "./regions.js";
 
 const byId = (id) => document.getElementById(id);
 const chosen = (name) => document.querySelector(`input[name=${name}]:checked`).value;
@@ -52,9 +51,10 @@ export function createTools({ onEdit, onPaint, saveMask, announce }) {
     byId("tool-description").textContent = DESCRIPTIONS[kind];
     const { regions } = editor;
     const hasRegions = Boolean(regions?.list.length);
+    const hasMask = Boolean(regions?.list.some(({ hint }) => !hint));
     for (const id of ["brush-size", "feather", "region-strength"]) byId(`${id}-amount`).textContent = `${Math.round(100 * number(id))} %`;
     byId("region-actions").hidden = kind === "move" && !hasRegions && !regions?.canUndo && !regions?.canRedo;
-    const enabled = { undo: regions?.canUndo, redo: regions?.canRedo, "clear-regions": hasRegions, "save-mask": hasRegions };
+    const enabled = { undo: regions?.canUndo, redo: regions?.canRedo, "clear-regions": hasRegions, "save-mask": hasMask };
     for (const [id, isEnabled] of Object.entries(enabled)) byId(id).setAttribute("aria-disabled", !isEnabled);
   }
 
@@ -94,8 +94,6 @@ export function createTools({ onEdit, onPaint, saveMask, announce }) {
       Object.assign(editor, { regions, size });
       update();
     },
-    // Applies the regions of one photo to another, or removes them.
-    copy: (from, to) => to.copyFrom(from ?? new Regions()),
     update,
   };
 }
