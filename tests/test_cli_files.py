@@ -13,6 +13,7 @@ from click.shell_completion import ShellComplete
 from brewster import Photo
 from brewster.cli import batch_plan, cli
 from brewster.photo import contact_sheet
+from brewster.remote_path import location
 from cli_helpers import error_lines, image_bytes, layer_files, list_files
 from picture_files import dng_file, mosaic
 
@@ -155,6 +156,23 @@ def test_a_contact_sheet_replaces_only_contact_sheets(run, tmp_path):
     assert contact_sheet.is_contact_sheet(tmp_path / "other.jpg")
 
 
+def test_a_contact_sheet_never_replaces_the_mask(run, tmp_path):
+    (tmp_path / "a.jpg").write_bytes(image_bytes())
+    mask = image_bytes(format_name="png")
+    (tmp_path / "mask.png").write_bytes(mask)
+    options = ("--mask", "mask.png", "--contact-sheet", "mask.png", "--overwrite")
+    assert run("a.jpg", "-o", "out", *options)[0] == 2
+    assert (tmp_path / "mask.png").read_bytes() == mask
+
+
+def test_a_contact_sheet_shows_photos_and_layers_of_an_object_store(run, tmp_path):
+    folder = location(f"memory://{tmp_path.name}")
+    (folder / "a.jpg").write_bytes(image_bytes())
+    code, _, err = run(str(folder), "-o", str(folder / "out"), "--contact-sheet", "sheet.png")
+    assert code == 0, err
+    assert Photo.open(tmp_path / "sheet.png").size[1] == 272
+
+
 def test_many_rows_give_several_sheets(tmp_path, monkeypatch):
     monkeypatch.setattr(contact_sheet, "_MAX_ROWS", 2)
     (tmp_path / "<a&>.jpg").write_bytes(image_bytes())
@@ -184,6 +202,7 @@ def test_on_a_system_without_fonts_the_captions_of_a_contact_sheet_have_letters(
 import pyvips
 from pathlib import Path
 from brewster.photo import contact_sheet
+from brewster.remote_path import location
 contact_sheet._SYSTEM_FONTS = Path("/nonexistent")
 list(contact_sheet.write_contact_sheets(Path("unused.jpg"), [], 1))
 print(pyvips.Image.text("mmmm").width > 2 * pyvips.Image.text("iiii").width)

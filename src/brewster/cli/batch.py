@@ -17,7 +17,7 @@ from brewster.cli.terminal import interrupts, one_line, print_error, print_statu
 from brewster.errors import INSTALL_COMMAND, ModelError, counted
 from brewster.models import zoo
 from brewster.options import Options
-from brewster.remote_path import location
+from brewster.remote_path import Location, location
 
 if TYPE_CHECKING:
     from brewster.batch import FileResult, SeparationTask
@@ -44,7 +44,7 @@ class BatchReport:
     is_parallel: bool = False
     contact_sheet: Path | None = None
     counts: Counter[str] = field(default_factory=Counter)
-    _contact_sheet_rows: list[tuple[Path, list[Path]]] = field(default_factory=list)
+    _contact_sheet_rows: list[tuple[Location, list[Location]]] = field(default_factory=list)
     _errors: list[str] = field(default_factory=list)
     _sources_by_shared_error: dict[str, list[str]] = field(default_factory=lambda: defaultdict(list))
     _skipped: dict[str, tuple[int, str]] = field(default_factory=dict)
@@ -133,7 +133,9 @@ class BatchReport:
             has_source = result.error.startswith(f"{result.source} ") or f": {result.source} " in result.error
             self._errors.append(result.error if has_source else f"{result.source}: {result.error}")
         elif self.contact_sheet and "-" not in (result.source, *result.outputs.values()):
-            self._contact_sheet_rows.append((Path(result.source), [*map(Path, result.outputs.values())]))
+            self._contact_sheet_rows.append(
+                (location(result.source), [*map(location, result.outputs.values())])
+            )
         self._print(result)
 
     def _print(self, result: FileResult) -> None:

@@ -82,7 +82,7 @@ def _plan(
         )
     is_image = is_single_output((), output)
     if not is_image:
-        check_output(photos, output)
+        check_output(photos[:1], output)
     tasks = plan_bursts(photos, None if is_image else output, options, reference=reference, frames=frames)
     if not is_image:
         return tasks

@@ -211,7 +211,7 @@ def _diffusion() -> Iterator[Check]:
     """Checks what diffusion models may need in addition to the extra `diffusion`."""
     if _version("diffusers") is None:
         return
-    from brewster.models.diffusion.hub_download import has_hub_token  # noqa: PLC0415  (imports torch)
+    from brewster.models.diffusion.hub_download import has_hub_token  # noqa: PLC0415  (imports pydantic)
 
     problem = "not installed; needed for nf4 and 8-bit AdamW on NVIDIA GPUs"
     yield _optional("bitsandbytes", _version("bitsandbytes"), problem, "pip install bitsandbytes")

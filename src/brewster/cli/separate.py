@@ -197,6 +197,13 @@ def separate(
             output and absolute(location(output)),
         )
         contact_sheet = contact_sheet and contact_sheet.absolute()
+        is_name = options.model in (*zoo.MODELS, *zoo.DIFFUSION_NAMES) or not os.path.exists(options.model)  # noqa: PTH110
+        options = dataclasses.replace(
+            options,
+            mask=options.mask and options.mask.absolute(),
+            hints=options.hints and options.hints.absolute(),
+            model=options.model if is_name else os.path.abspath(options.model),  # noqa: PTH100
+        )
     # An unknown name is an error, even if no photo needs the model. Nothing is loaded.
     zoo.model_name(options.model)
     skipped: list[Location] = []
@@ -207,7 +214,7 @@ def separate(
         _reject_shared_output(photos, output, as_json=as_json)
     if contact_sheet:
         _check_contact_sheet(contact_sheet, photos, output, cluster)
-        tasks = _without_contact_sheet(tasks, contact_sheet, overwrite=overwrite)
+        tasks = _without_contact_sheet(tasks, contact_sheet, options, overwrite=overwrite)
     report = BatchReport(
         options,
         output,
@@ -273,20 +280,20 @@ def _check_contact_sheet(
 
 
 def _without_contact_sheet(
-    tasks: list[SeparationTask], path: Path, *, overwrite: bool
+    tasks: list[SeparationTask], path: Path, options: Options, *, overwrite: bool
 ) -> list[SeparationTask]:
     """Returns the tasks without the contact sheets of earlier runs, which may be in the folder of the photos."""
-    from brewster.batch.runner import real_paths  # noqa: PLC0415
+    from brewster.batch.runner import input_paths, real_paths  # noqa: PLC0415
     from brewster.photo.contact_sheet import is_contact_sheet  # noqa: PLC0415
 
     def is_sheet(source: object) -> bool:
         return isinstance(source, Path) and source.stem.startswith(path.stem) and is_contact_sheet(source)
 
     tasks = [task for task in tasks if not is_sheet(task.source)]
-    files = real_paths(file for task in tasks for file in (task.source, *task.outputs.values()))
-    if os.path.realpath(path) in files:
+    layers = (file for task in tasks for file in task.outputs.values())
+    if os.path.realpath(path) in input_paths(tasks, options) | real_paths(layers):
         raise click.UsageError(
-            f"--contact-sheet {path} is a photo or a layer of the batch; choose another name."
+            f"--contact-sheet {path} is a photo or a layer of the batch, or its mask or hints; choose another name."
         )
     if path.exists() and not overwrite and not is_contact_sheet(path):
         raise click.UsageError(

@@ -16,6 +16,7 @@ from brewster.files import write_atomically
 from brewster.photo.file_info import format_name_of
 from brewster.photo.history import PROGRAM, recorded_parameters, with_layer_history
 from brewster.photo.photo import Photo
+from brewster.remote_path import Location
 
 _ROW_PX = 240
 _LABEL_PX = 24
@@ -36,7 +37,11 @@ def is_contact_sheet(path: Path) -> bool:
 
 
 def write_contact_sheets(
-    path: Path, rows: Sequence[tuple[Path, Sequence[Path]]], max_pixels: int, *, overwrite: bool = False
+    path: Path,
+    rows: Sequence[tuple[Location, Sequence[Location]]],
+    max_pixels: int,
+    *,
+    overwrite: bool = False,
 ) -> Iterator[Path]:
     """Writes the rows to `path`, and yields the path of each sheet. A sheet has at most 200 rows; further ones have a
     number: `sheet.jpg`, `sheet-2.jpg` and so on. A contact sheet of an earlier run is replaced; with `overwrite`, other
