@@ -1,5 +1,6 @@
 import hashlib
 import io
+import os
 from pathlib import Path
 
 import numpy as np
@@ -104,6 +105,20 @@ def test_unusable_files_are_skipped_and_reported(maps, photos, rng):
     for path, error in zip(paths, refused, strict=True):
         assert str(path) in str(error)
         assert str(error).count("; ") >= 2
+
+
+def test_a_name_that_is_not_text_is_refused(maps, photos):
+    (photos / "wide.jpg").rename(photos / os.fsdecode(b"\xff.jpg"))
+    catalog, (error,) = read_catalog([maps], [photos])
+    assert [asset.source.file for asset in catalog.pictures] == ["turned.jpg"]
+    assert r"\udcff.jpg" in str(error)
+    catalog.model_dump_json()
+
+
+def test_an_unusable_map_is_no_reason_for_a_folder_without_photos(maps, tmp_path):
+    (maps / "cut.hdr").write_bytes(b"")
+    with pytest.raises(RecipeError, match=r"no photos in .*; choose another folder"):
+        read_catalog([maps], [tmp_path / "maps"])
 
 
 def test_the_order_of_the_file_system_does_not_matter(maps, photos, monkeypatch):

@@ -203,6 +203,14 @@ def test_an_index_of_an_earlier_version_is_continued(tmp_path):
     assert table.column("path").to_pylist() == ["a.jpg", "b.jpg"]
 
 
+def test_a_path_that_is_not_text_is_stored_with_escapes(tmp_path):
+    for _ in range(2):
+        with IndexWriter(tmp_path) as index:
+            index.append(FileResult(os.fsdecode(b"\xff.jpg"), error=os.fsdecode(b"\xff.jpg is damaged")))
+    table = parquet.read_table(tmp_path / INDEX_FILE)
+    assert table.column("path").to_pylist() == [r"\udcff.jpg"]
+
+
 def test_another_file_with_the_name_of_the_index_is_never_replaced(tmp_path):
     (tmp_path / INDEX_FILE).write_bytes(b"something else")
     with pytest.raises(OutputError, match=r"index\.parquet is not an index"):

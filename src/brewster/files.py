@@ -283,6 +283,11 @@ def is_same_file(path: Location, other: Location) -> bool:
         return False
 
 
+def is_unicode(name: str) -> bool:
+    """Whether a file name is text. Other bytes become surrogates in it (PEP 383), which neither JSON nor TOML can contain."""
+    return not re.search("[\ud800-\udfff]", name)
+
+
 def exists(path: Location) -> bool:
     """Whether a file, a folder or a link exists at the path."""
     return path.exists() if isinstance(path, RemotePath) else os.path.lexists(path)

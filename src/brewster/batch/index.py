@@ -100,7 +100,7 @@ class IndexWriter:
         arrow, columns = self._arrow, {}
         for name, (kind, value) in COLUMNS.items():
             type_ = arrow.list_(arrow.string()) if kind == "strings" else getattr(arrow, kind)()
-            columns[name] = arrow.array([value(row) for row in self._rows], type_)
+            columns[name] = arrow.array([_as_unicode(value(row)) for row in self._rows], type_)
         name = f"{self._run}-{self._part_count:06d}.parquet"
         self._write(self._parts_folder / name, arrow.table(columns))
         self._part_count += 1
@@ -123,3 +123,10 @@ class IndexWriter:
                 "expected no such file, or the index of an earlier run",
                 "move it to another folder, or choose another output folder",
             ) from error
+
+
+def _as_unicode(value: object) -> object:
+    """Returns a value whose text can be stored: bytes of file names that are not UTF-8 are written as escapes."""
+    if isinstance(value, list):
+        return [_as_unicode(item) for item in value]
+    return value.encode(errors="backslashreplace").decode() if isinstance(value, str) else value

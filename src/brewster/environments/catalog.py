@@ -17,6 +17,7 @@ from brewster.environments.assets import (
     read_bytes,
 )
 from brewster.errors import BrewsterError, RecipeError
+from brewster.files import is_unicode
 from brewster.image_formats import format_of
 from brewster.photo import Photo, read_size
 from brewster.scene.sampler import Asset, Catalog
@@ -38,18 +39,15 @@ def read_catalog(
     file and category contains the categories of maps. Returns the catalog, and an error for each file that
     cannot be used. Raises RecipeError if a folder or its manifest cannot be read, or no file can be used.
     """
-    refused: list[BrewsterError] = []
-    catalog = Catalog(
-        maps=_read_folders(maps or [BUILTIN_MAPS], exclude, refused, are_maps=True),
-        pictures=_read_folders(pictures or [BUILTIN_PHOTOS], exclude, refused, are_maps=False),
-    )
-    return catalog, refused
+    found_maps, refused_maps = _read_folders(maps or [BUILTIN_MAPS], exclude, are_maps=True)
+    found, refused = _read_folders(pictures or [BUILTIN_PHOTOS], exclude, are_maps=False)
+    return Catalog(maps=found_maps, pictures=found), refused_maps + refused
 
 
 def _read_folders(
-    folders: Sequence[Path], exclude: Sequence[str], refused: list[BrewsterError], *, are_maps: bool
-) -> tuple[Asset, ...]:
-    found: dict[str, Asset] = {}
+    folders: Sequence[Path], exclude: Sequence[str], *, are_maps: bool
+) -> tuple[tuple[Asset, ...], list[BrewsterError]]:
+    found, refused = dict[str, Asset](), list[BrewsterError]()
     for folder in folders:
         categories = _read_categories(folder)
         for path in _list_files(folder, are_maps):
@@ -65,10 +63,14 @@ def _read_folders(
             "expected lat-long .hdr or .exr files" if are_maps else "expected image files",
             str(refused[0]) if refused else "choose another folder",
         )
-    return tuple(found[name] for name in sorted(found))
+    return tuple(found[name] for name in sorted(found)), refused
 
 
 def _read_asset(path: Path, category: str, is_map: bool) -> Asset:
+    if not is_unicode(path.name):
+        raise RecipeError(
+            f"the name of {str(path)!r} is not text", "expected a name in UTF-8", "rename the file"
+        )
     data = read_bytes(path)
     with add_file_name_to_errors(str(path)):
         pixels = check_map(Photo.open(data).linear(), str(path)) if is_map else None

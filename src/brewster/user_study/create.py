@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 import brewster
 from brewster.errors import BrewsterError, OutputError, PhotoError, counted
-from brewster.files import atomic_path, write_atomically
+from brewster.files import atomic_path, is_unicode, write_atomically
 from brewster.photo import Photo
 from brewster.user_study.folders import Key, find_pictures, select_pictures, shorten_list
 from brewster.user_study.study import (
@@ -138,6 +138,11 @@ def _pair_pictures(
     for name, paths in outputs.items():
         problems += [f"{name} has no {methods[name].joinpath(*key)}.*" for key in photos if key not in paths]
         problems += [f"{paths[key]} has no input in {inputs / key[0]}" for key in paths if key not in photos]
+    problems += [
+        f"the name of {str(path)!r} is not UTF-8"
+        for key, path in photos.items()
+        if not is_unicode("/".join(key))
+    ]
     problems += _file_problems(photos, outputs)
     if problems:
         raise BrewsterError(
