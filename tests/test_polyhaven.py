@@ -259,7 +259,7 @@ def test_redirections_are_followed_to_http_urls_only(haven, fetch):
 def test_a_manifest_of_another_program_is_refused_before_any_download(haven, fetch, maps):
     maps.mkdir()
     (maps / "manifest.csv").write_bytes(b"name,price\n\xff,1\n")
-    with pytest.raises(OutputError, match="was not written by brewster"):
+    with pytest.raises(OutputError, match="is another table"):
         fetch()
     assert haven.requests == []
 

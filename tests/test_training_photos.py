@@ -13,6 +13,7 @@ from brewster import Photo
 from brewster.cli import main
 from brewster.environments import training_photos
 from brewster.environments.training_photos import COLUMNS, difference_hash, pull, read_table
+from brewster.errors import DownloadError, OutputError
 from brewster.models import zoo
 from file_server import loopback_only, served
 
@@ -75,6 +76,28 @@ def test_another_photo_or_a_missing_one_is_reported_and_the_others_are_kept(orig
     assert "one.webp: me/photos@0123456789ab:p/one.png shows another photo" in err
     assert "two.webp" in err
     assert {file.name for file in out.iterdir()} == {"a three.webp", "manifest.csv"}
+
+
+def test_a_deleted_repository_does_not_stop_the_others(origins, tmp_path):
+    rows = list(csv.reader((tmp_path / "table.csv").open(newline="")))
+    gone = [[f"{k}.webp", *rows[2][1:6], f"me/gone@0123456789ab:{k}.png", rows[2][7]] for k in range(6)]
+    with (tmp_path / "table.csv").open("w", newline="") as file:
+        csv.writer(file).writerows([rows[0], *gone, *rows[1:]])
+    out = tmp_path / "photos"
+    statuses = []
+    with pytest.raises(DownloadError, match="5 downloads in a row failed"):
+        statuses += (result.status for result in pull(out, server=origins.url))
+    assert statuses.count("downloaded") == 3
+    with (out / "manifest.csv").open(newline="") as file:
+        assert [row["file"] for row in csv.DictReader(file)] == ["one.webp", "two.webp", "a three.webp"]
+
+
+def test_another_table_in_the_folder_is_kept(origins, tmp_path):
+    (tmp_path / "manifest.csv").write_text("file,asset,category\n")
+    with pytest.raises(OutputError, match=r"manifest\.csv is another table"):
+        list(pull(tmp_path, server=origins.url))
+    assert (tmp_path / "manifest.csv").read_text() == "file,asset,category\n"
+    assert not origins.requests
 
 
 def test_a_dry_run_requests_nothing_and_options_of_maps_are_refused(origins, tmp_path, capfd):

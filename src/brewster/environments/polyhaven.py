@@ -9,7 +9,7 @@ import csv
 import io
 import json
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal, final
@@ -72,9 +72,9 @@ def pull(request: DownloadRequest, out: Path) -> Iterator[DownloadResult]:
     Existing maps are skipped. An asset without a suitable file is replaced by the next one, but not a failed
     download, so that the next call downloads the same maps. Raises DownloadError if the list of the server
     cannot be downloaded, or several assets in a row failed; OutputError if the folder cannot be written to,
-    or has the manifest.csv of another program.
+    or has another manifest.csv.
     """
-    _read_manifest(out)  # refuses the manifest of another program before any download
+    read_manifest(out)  # refuses another table before any download
     yield from stop_after_failures(_download_assets(request, out))
 
 
@@ -174,24 +174,21 @@ def _is_downloaded(target: Path, remote: RemoteFile) -> bool:
     return exists
 
 
-def _read_manifest(out: Path) -> list[dict[str, str]]:
-    """Returns the rows of the manifest whose files exist."""
+def read_manifest(out: Path, columns: Sequence[str] = _COLUMNS) -> list[dict[str, str]]:
+    """Returns the rows of the manifest whose files exist. Raises OutputError if it has other columns, or cannot be read."""
     path = out / "manifest.csv"
     with output_errors(path):
-        text = path.read_text("utf-8", errors="replace") if path.exists() else ",".join(_COLUMNS)
+        text = path.read_text("utf-8", errors="replace") if path.exists() else ",".join(columns)
         rows = csv.DictReader(io.StringIO(text, newline=""))
-        if tuple(rows.fieldnames or ()) != _COLUMNS:
-            expected, cure = (
-                f"expected a table with the columns {','.join(_COLUMNS)}",
-                "choose another folder",
-            )
-            raise OutputError(f"{path} was not written by brewster", expected, cure)
+        if tuple(rows.fieldnames or ()) != tuple(columns):
+            expected, cure = f"expected a table with the columns {','.join(columns)}", "choose another folder"
+            raise OutputError(f"{path} is another table", expected, cure)
         return [row for row in rows if (out / row["file"]).is_file()]
 
 
 def _add_to_manifest(out: Path, row: dict[str, str]) -> None:
     """Adds a map to the manifest, or replaces its row. The file is replaced atomically, so that it is always complete."""
-    rows = _read_manifest(out)
+    rows = read_manifest(out)
     if row not in rows:
         rows = [other for other in rows if other["file"] != row["file"]]
         text = io.StringIO()

@@ -13,8 +13,10 @@ from __future__ import annotations
 
 import csv
 import io
+from collections import defaultdict
 from collections.abc import Iterator
 from dataclasses import replace
+from itertools import zip_longest
 from pathlib import Path
 from typing import Final, NamedTuple
 from urllib.parse import quote
@@ -22,7 +24,7 @@ from urllib.parse import quote
 import numpy as np
 
 from brewster.download import Downloader, output_errors
-from brewster.environments.polyhaven import DownloadResult, stop_after_failures
+from brewster.environments.polyhaven import DownloadResult, read_manifest, stop_after_failures
 from brewster.errors import BrewsterError, DownloadError
 from brewster.files import write_atomically
 from brewster.photo import Photo
@@ -66,21 +68,26 @@ def pull(out: Path, *, server: str = SERVER, dry_run: bool = False) -> Iterator[
     """Downloads the photos with a known origin, reduces them to their size in training, and lists them in manifest.csv.
 
     Existing photos are skipped. Yields a result for each photo with an origin. Raises DownloadError if several photos in a
-    row failed; OutputError if the folder cannot be written to.
+    row failed; OutputError if the folder cannot be written to, or has another manifest.csv.
     """
+    read_manifest(out, COLUMNS)  # refuses another table before any download
     downloader = None if dry_run else Downloader()
     photos = [photo for photo in read_table() if photo.origin]
-    finished = []
-    results = (_pull_photo(photo, out, server, downloader) for photo in photos)
-    for photo, result in zip(photos, stop_after_failures(results), strict=True):
-        yield result
-        finished += [] if result.error or dry_run else [photo]
-    if finished:
-        text = io.StringIO()
-        table = csv.writer(text, lineterminator="\n")
-        table.writerows([COLUMNS, *finished])
-        with output_errors(out / "manifest.csv"):
-            write_atomically(out / "manifest.csv", text.getvalue().encode(), overwrite=True)
+    by_repository = defaultdict[str, list[TrainingPhoto]](list)
+    for photo in photos:
+        by_repository[photo.origin.partition("@")[0]].append(photo)
+    # One photo of each repository after the other: a deleted repository must not look like a broken connection.
+    order = [photo for row in zip_longest(*by_repository.values()) for photo in row if photo]
+    try:
+        yield from stop_after_failures(_pull_photo(photo, out, server, downloader) for photo in order)
+    finally:
+        present = [photo for photo in photos if (out / photo.file).exists()]
+        if present and not dry_run:
+            text = io.StringIO()
+            table = csv.writer(text, lineterminator="\n")
+            table.writerows([COLUMNS, *present])
+            with output_errors(out / "manifest.csv"):
+                write_atomically(out / "manifest.csv", text.getvalue().encode(), overwrite=True)
 
 
 def _pull_photo(
