@@ -55,6 +55,17 @@ def render_image(scene, side, glass_mode, samples=64):
         return np.array(mitsuba.render(mitsuba.load_dict(mi_scene), spp=samples))
 
 
+def test_a_pane_given_twice_is_two_panes():
+    pane, mitsuba = Pane(), variant.load()
+    counts = []
+    for panes in ((pane, pane.model_copy()), (pane, pane)):
+        scene = a_scene(glass=Glazing(panes=panes, gap_mm=12))
+        with renderer._active_variant(mitsuba, polarised=False):
+            builder = MitsubaSceneBuilder(mitsuba, scene, ASSETS)
+            counts.append(len(builder.scene_dict(lit_from_behind=False, glass_mode="truncated_reflection")))
+    assert counts[0] == counts[1]
+
+
 def at(heading_deg, distance_mm=500.0):
     """Values of a camera that looks at the glass from this heading, at the same height."""
     heading = math.radians(heading_deg)

@@ -134,8 +134,9 @@ class MitsubaSceneBuilder:
         height, max_half_size = 0.0, (self._half_extent_mm, self._half_extent_mm)
         opening = self._glass.opening_mm
         half_size = (opening[0] / 2, opening[1] / 2) if opening else max_half_size
-        for pane in self._glass.panes:
-            is_entered, material = self._material(pane, glass_mode)
+        for number, pane in enumerate(self._glass.panes, start=1):
+            is_last = number == len(self._glass.panes)
+            is_entered, material = self._material(pane, glass_mode, is_last=is_last)
             yield self._rectangle(np.eye(3), (0, 0, height), half_size, material)
             if not is_entered:
                 return
@@ -155,14 +156,14 @@ class MitsubaSceneBuilder:
         columns = -across, np.array((0, 1, 0)), np.array((-sine, 0, -cosine))
         return self._rectangle(columns, middle, ((high - low) / 2, extent), material)
 
-    def _material(self, pane: Pane, glass_mode: GlassMode) -> tuple[bool, Plugin]:
+    def _material(self, pane: Pane, glass_mode: GlassMode, *, is_last: bool) -> tuple[bool, Plugin]:
         """Returns whether light enters the pane, and the materials of its surfaces and its interior."""
         if glass_mode == "mirror":
             return False, {"bsdf": {"type": "conductor", "material": "none"}}
         kind, rough = "", {}
         if pane.roughness and pane.refractive_index > 1:
             kind, rough = "rough", {"alpha": pane.roughness, "distribution": "ggx"}
-        if glass_mode == "truncated_reflection" and pane is self._glass.panes[-1]:
+        if glass_mode == "truncated_reflection" and is_last:
             # A conductor with k = 0 has the reflectance of glass, and Mitsuba traces no transmitted rays.
             index = {"type": "spectrum", "value": pane.refractive_index}
             return False, {"bsdf": {"type": kind + "conductor", "eta": index, "k": 0.0, **rough}}
@@ -197,7 +198,7 @@ class MitsubaSceneBuilder:
     def _lens(self, near_mm: float, far_mm: float, glass_mode: GlassMode) -> Iterator[object]:
         """Yields two spherical surfaces as fine meshes with interpolated normals, and the black sides of the frame."""
         pane = self._glass.panes[0]
-        is_entered, material = self._material(pane, glass_mode)
+        is_entered, material = self._material(pane, glass_mode, is_last=True)
         near, far = self._sphere(near_mm, 0.0), self._sphere(far_mm, -pane.thickness_mm)
         depth = near[0][..., 2] - far[0][..., 2]
         if depth.min() <= 0:
@@ -333,12 +334,12 @@ def sample_bilinear(texels: Floats, u: Doubles, v: Doubles) -> Floats:
 
 def _check_wedges(glass: Glazing, across: Doubles) -> None:
     """Checks that wedged panes have thickness and do not touch at these x coordinates (n,) on the first surface."""
-    for number, pane in enumerate(glass.panes):
+    for number, pane in enumerate(glass.panes, start=1):
         added_mm = across * math.tan(math.radians(pane.wedge_deg))
-        gap_mm = math.inf if pane is glass.panes[-1] else glass.gap_mm
+        gap_mm = math.inf if number == len(glass.panes) else glass.gap_mm
         if (pane.thickness_mm + added_mm).min() <= 0 or (gap_mm - added_mm).min() <= 0:
             raise RecipeError(
-                f"the wedge of {pane.wedge_deg:g} degrees makes pane {number + 1} meet another surface",
+                f"the wedge of {pane.wedge_deg:g} degrees makes pane {number} meet another surface",
                 "expected surfaces that do not meet in the view",
                 "reduce wedge_deg, or increase thickness_mm and gap_mm",
             )
