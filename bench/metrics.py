@@ -52,11 +52,11 @@ def measure_lpips(prediction: np.ndarray, truth: np.ndarray) -> None:
     metric, reference = Lpips.load(), ReferenceLpips()
     truth_features = metric.features(truth)
     first_ms, reference_ms = median_ms(
-        lambda: metric.distance(metric.features(prediction), metric.features(truth)),
+        lambda: metric.difference(metric.features(prediction), metric.features(truth)).mean(),
         lambda: reference(prediction, truth),
     )
-    (further_ms,) = median_ms(lambda: metric.distance(metric.features(prediction), truth_features))
-    ours = metric.distance(metric.features(prediction), truth_features)
+    (further_ms,) = median_ms(lambda: metric.difference(metric.features(prediction), truth_features).mean())
+    ours = float(metric.difference(metric.features(prediction), truth_features).mean())
     difference = abs(ours - reference(prediction, truth))
     print(
         f"LPIPS of 540x400: {first_ms:.0f} ms, each further prediction {further_ms:.0f} ms; the operations of the lpips "

@@ -16,6 +16,7 @@ import os
 import tempfile
 import time
 from collections import defaultdict
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -71,7 +72,8 @@ def render_reference(scene: Scene, assets: Assets) -> LinearSample:
         update={"width": 4 * scene.camera.width, "height": 4 * scene.camera.height}
     )
     fine = render(scene.model_copy(update={"camera": camera}), assets)
-    return fine.map(lambda image: avg_pool2d(image[None], 4)[0])
+    coarse = {name: avg_pool2d(image[None], 4)[0] for name, image in fine.images().items()}
+    return replace(fine, **coarse)
 
 
 def measure_mitsuba(
