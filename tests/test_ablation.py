@@ -12,7 +12,7 @@ from PIL import Image
 
 from benchmark_folders import paint
 from brewster.benchmarks.registry import read_benchmark
-from brewster.errors import DownloadError
+from brewster.errors import BrewsterError, DownloadError
 from brewster.evaluate import ablation as module
 from brewster.evaluate.ablation import ablate, read_study
 from brewster.metrics import METRICS
@@ -96,6 +96,21 @@ def test_missing_weights_of_a_metric_are_reported_before_training(pairs, data, t
     monkeypatch.setitem(METRICS, "lpips", replace(METRICS["lpips"], prepare=refuse))
     with pytest.raises(DownloadError, match="LPIPS has no weights"):
         ablate(read_study(RECIPES / "size.toml"), pairs, tmp_path / "out")
+
+
+def test_labels_that_cannot_name_methods_are_refused_before_training(without_training, pairs, tmp_path):
+    study = read_study(RECIPES / "size.toml").model_copy(update={"key": "prompt", "values": ["a/b", "a b"]})
+    with pytest.raises(BrewsterError, match="2 methods have the name 'prompt a b'"):
+        ablate(study, pairs, tmp_path / "out")
+    assert not without_training
+
+
+def test_two_benchmarks_of_folders_with_one_name_are_renamed(pairs, tmp_path, monkeypatch):
+    monkeypatch.setenv("BREWSTER_DATA", str(tmp_path))
+    shutil.copytree(tmp_path / "real20", tmp_path / "other" / "real20")
+    benchmarks = {"real20": Path("real20"), "pairs": Path("other/real20")}
+    study = read_study(RECIPES / "size.toml").model_copy(update={"benchmarks": benchmarks})
+    assert len({part.name for part in study.open_benchmarks()}) == 2
 
 
 def test_values_that_are_not_numbers_are_not_plotted(without_training, pairs, data, tmp_path, monkeypatch):

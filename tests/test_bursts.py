@@ -134,6 +134,13 @@ def test_an_incomplete_rendered_burst_is_excluded(two_bursts, tmp_path):
     assert all("incomplete" in reason for reason in benchmark.excluded)
 
 
+def test_a_sample_without_its_scene_is_an_error(two_bursts, tmp_path):
+    shutil.copytree(two_bursts, tmp_path / "set")
+    (tmp_path / "set" / "000003" / "scene.toml").unlink()
+    with pytest.raises(RecipeError, match=r"the scene of .*000003 is missing"):
+        read_benchmark("bursts", tmp_path / "set")
+
+
 def photographed(root, numbers=(1, 2, 3), truths=(2,)):
     write(root, *(f"frame{number}.jpg" for number in numbers))
     return write(root, *(f"{role}{number}.png" for role in ROLES[1:] for number in truths))
@@ -142,12 +149,13 @@ def photographed(root, numbers=(1, 2, 3), truths=(2,)):
 def test_photographed_bursts_have_the_middle_frame_as_photo(tmp_path):
     photographed(tmp_path / "stone", (1, 2, 3, 4, 10), truths=(1, 3))
     photographed(tmp_path / "toy")
+    photographed(tmp_path / "20240115")  # a date, and no rendered sample
     (tmp_path / "xue").mkdir()
     (benchmark,) = read_benchmark("bursts", tmp_path)
     assert [(case.name, case.relative_path) for case in benchmark.cases] == [
-        ("stone", "stone/frame3"), ("toy", "toy/frame2"),
+        ("20240115", "20240115/frame2"), ("stone", "stone/frame3"), ("toy", "toy/frame2"),
     ]  # fmt: skip
-    stone = benchmark.cases[0]
+    stone = benchmark.cases[1]
     assert [file.path.stem for file in stone.frames] == ["frame1", "frame2", "frame3", "frame4", "frame10"]
     assert (stone.ground_truth.path.stem, stone.reflection.path.stem) == ("transmission3", "reflection3")
     assert benchmark.remarks == ("xue has no frames",)

@@ -1,9 +1,11 @@
 """A complete evaluation: reads folders and writes the output files."""
 
 import json
+import os
 import re
 from dataclasses import replace
 from functools import partial
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -100,13 +102,22 @@ def test_a_case_with_an_unreadable_ground_truth_is_not_in_the_report(real20, met
     assert 'data-name="1"' in (tmp_path / "out" / "report.html").read_text()
 
 
-def test_a_deleted_prediction_is_computed_again_for_the_report(real20, methods, tmp_path):
+@pytest.mark.parametrize("change", [Path.unlink, lambda path: path.write_bytes(path.read_bytes()[:100])])
+def test_a_deleted_or_damaged_prediction_is_computed_again_for_the_report(real20, methods, tmp_path, change):
     first = evaluate(real20, methods, QUICK, tmp_path / "out")
     page = (tmp_path / "out" / "report.html").read_bytes()
     for stored in (tmp_path / "stored").rglob("1.*.png"):
-        stored.unlink()
+        change(stored)
     assert evaluate(real20, methods, QUICK, tmp_path / "out") == first
     assert (tmp_path / "out" / "report.html").read_bytes() == page
+
+
+def test_a_photo_whose_name_is_not_text_is_in_the_report(tmp_path):
+    name = os.fsdecode(b"\xff")
+    for layer, noise in (("blended", 20), ("transmission", 0)):
+        paint(tmp_path / "pairs" / layer / f"{name}.png", 1, noise=noise)
+    evaluate(read_benchmark("pairs", tmp_path / "pairs"), [IdentityBaseline()], QUICK, tmp_path / "out")
+    assert "/blended/%FF.png" in (tmp_path / "out" / "report.html").read_text()
 
 
 def test_a_folder_with_the_ground_truth_gives_a_remark(real20, tmp_path):

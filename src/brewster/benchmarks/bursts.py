@@ -16,7 +16,7 @@ from brewster.benchmarks.pairing import FolderListing, image_files, list_folder
 from brewster.errors import PhotoError
 
 _ROLE: Final = re.compile(r"(frame|transmission|reflection)[-_ ]?([0-9]+)", re.IGNORECASE)
-_RENDERED: Final = re.compile(r"[0-9]{6,}|shard-[0-9]{6,}\.tar|set\.toml")
+_RENDERED: Final = re.compile(r"shard-[0-9]{6,}\.tar|set\.toml")
 _LAYERS: Final = ("transmission", "reflection")
 _LAYER_FILES: Final = ("photo.jpg", "transmission.jpg", "reflection.jpg")
 
@@ -27,7 +27,7 @@ def find_bursts(folder: Path, benchmark: str) -> tuple[list[Case], FolderListing
     single photos, or a scene file is damaged; MissingExtra if torch is not installed, which brewster needs to read
     rendered datasets."""
     folders, files = list_folder(folder)
-    if any(_RENDERED.fullmatch(path.name) for path in (*folders, *files)):
+    if any(_RENDERED.fullmatch(path.name) for path in files) or any(map(_is_sample, folders)):
         return _rendered_bursts(folder, benchmark)
     bursts, remarks, excluded = [], [], []
     for path in [folder, *folders]:
@@ -45,6 +45,10 @@ def find_bursts(folder: Path, benchmark: str) -> tuple[list[Case], FolderListing
             "give the path of the parent folder of the bursts",
         )
     return bursts, FolderListing(folder, remarks=remarks, excluded=excluded)
+
+
+def _is_sample(folder: Path) -> bool:
+    return bool(re.fullmatch("[0-9]{6,}", folder.name)) and (folder / "scene.toml").is_file()
 
 
 _Roles = Mapping[str, Mapping[int, list[Path]]]

@@ -85,7 +85,11 @@ def _read_sets(name: str, folder: Path) -> list[Benchmark]:
 
 
 def _read_split(name: str, folder: Path) -> list[Benchmark]:
-    complete = [roles for roles in pairing.find_numbered_splits(folder).values() if "transmission" in roles]
+    complete = [
+        roles
+        for name, roles in pairing.find_numbered_splits(folder).items()
+        if "transmission" in roles and not name.startswith("train")
+    ]
     found = (folder, complete[0]) if len(complete) == 1 else (pairing.find_split(folder),)
     return [_from_listing(name, folder, pairing.read_folders(*found))]
 

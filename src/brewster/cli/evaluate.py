@@ -112,7 +112,7 @@ def _size(text: str) -> int | str:
 @click.option(
     "--workers",
     type=Number(1),
-    help="The number of processes that compute scores; by default one for each processor, or fewer if there are fewer than 50 images.",
+    help="The number of processes that compute scores; by default one for each 25 images, but at most one for each processor.",
 )
 @click.option(
     "--limit",
@@ -206,7 +206,7 @@ def evaluate(
             f"the results are in {out}; {out / evaluation.REPORT_FILE} shows the images, and tables.md has intervals and differences"
         )
     if export_folder:
-        _export(export_folder, methods[1:], out / "export")  # without the baseline
+        _export(export_folder, methods[1:], out / "export", quiet=quiet)  # without the baseline
     context.exit(0 if print_failures(results, quiet=quiet) and is_complete else 1)
 
 
@@ -247,14 +247,15 @@ def _print_cases(benchmarks: Sequence[Benchmark], methods: Sequence[Method]) -> 
         print_status(f"method: {method.name}")
 
 
-def _export(folder: Path, methods: Sequence[Method], out: Path) -> None:
+def _export(folder: Path, methods: Sequence[Method], out: Path, *, quiet: bool) -> None:
     from brewster.evaluate.submission import export_ntire2026  # noqa: PLC0415
 
     for method in methods:
         for path in export_ntire2026(
             folder, method, out / method.name, on_progress=lambda _: interrupts.raise_pending()
         ):
-            print_status(f"wrote {path}")
+            if not quiet:
+                print_status(f"wrote {path}")
 
 
 def print_remarks(benchmarks: Sequence[Benchmark], *, quiet: bool) -> bool:
@@ -286,11 +287,11 @@ def print_failures(results: Results, *, quiet: bool) -> bool:
 
     for remark in () if quiet else remarks(results):
         print_status(remark)
-    for name in results["unmeasured"]:
+    for name in () if quiet else results["unmeasured"]:
         print_status(f"{name} was not computed: no image has the ground truth that it needs")
     for metrics in unavailable_metrics(results):
         print_error(f"not computed: {metrics}")
-    if results["unavailable"]:
+    if results["unavailable"] and not quiet:
         print_status(
             "run the same command again to add the missing metrics; all other scores are kept in scores.jsonl"
         )

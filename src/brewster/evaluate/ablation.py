@@ -14,8 +14,9 @@ from typing import Annotated, Any, Final, final
 from pydantic import AfterValidator, Field
 
 from brewster.benchmarks.registry import Benchmark, read_benchmark
+from brewster.benchmarks.selection import with_unique_names
 from brewster.evaluate.config import PAPER_METRICS, EvaluationConfig
-from brewster.evaluate.evaluation import evaluate
+from brewster.evaluate.evaluation import check, evaluate
 from brewster.evaluate.methods import IdentityBaseline, ModelMethod
 from brewster.evaluate.results import AVERAGE, Results
 from brewster.files import write_atomically
@@ -71,9 +72,10 @@ class AblationStudy(FrozenModel):
         """Reads the benchmarks of the study. Raises RecipeError if BREWSTER_DATA is not a folder, and PhotoError if a
         benchmark cannot be read."""
         root = data_folder()
-        return [
-            part for name, folder in self.benchmarks.items() for part in read_benchmark(name, root / folder)
-        ]
+        folders = [(name, root / folder) for name, folder in self.benchmarks.items()]
+        return with_unique_names(
+            [(part, folder) for name, folder in folders for part in read_benchmark(name, folder)]
+        )
 
 
 def read_study(path: Path) -> AblationStudy:
@@ -96,8 +98,11 @@ def ablate(
     results are those of `evaluate`; the model of each value is a method. Raises RecipeError if the base recipe, the
     key or a value is invalid, or data is missing, and BrewsterError as training and `evaluate` do."""
     config = EvaluationConfig(metrics=study.metrics)
+    # A wrong name or a download must not fail after hours of training.
+    labels = map(study.label, study.values)
+    check(benchmarks, [IdentityBaseline(), *(ModelMethod(label, "", out) for label in labels)], config)
     for metric in config.columns().values():
-        if metric.prepare:  # loads weights: a download must not fail after hours of training
+        if metric.prepare:
             metric.prepare()
     base = read_recipe(study.base)
     recipes = {study.label(value): with_value(base, study.key, value) for value in study.values}

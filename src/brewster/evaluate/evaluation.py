@@ -178,7 +178,7 @@ class _ReportImages:
             relative = os.path.relpath(path, self.out)
         except ValueError:  # on Windows, a path on another drive
             return path.resolve().as_uri()
-        return quote(relative.replace(os.sep, "/"))
+        return quote(os.fsencode(relative.replace(os.sep, "/")))
 
     def _file(self, case: Case, method: str, layer: str) -> Path | None:
         if method:

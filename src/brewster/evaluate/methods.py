@@ -163,11 +163,11 @@ class ModelMethod:
         return replace(MethodOutput.decode(data), seconds=seconds)
 
     def cached(self, case: Case) -> MethodOutput | None:
-        """Returns the stored layers, or None if there are none. Raises PhotoError if one cannot be read."""
-        files = self.files(case)
-        if not all(path.is_file() for path in files.values()):
+        """Returns the stored layers, or None if one is missing or damaged."""
+        try:
+            return MethodOutput.decode({layer: read_image(path) for layer, path in self.files(case).items()})
+        except PhotoError:
             return None
-        return MethodOutput.decode({layer: read_image(path) for layer, path in files.items()})
 
     @cached_property
     def _sha256(self) -> str:

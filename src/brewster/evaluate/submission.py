@@ -44,7 +44,7 @@ def export_ntire2026(
 ) -> list[Path]:
     """Predicts all photos of the folders val_*_blended and test_*_blended of OpenRR-5k, writes a zip file for each, and
     returns their paths. The README of OpenRR-5k asks for val_300_output.zip and test_100_output.zip with images only,
-    and its evaluate.py reads files "*.jpg" with the names of the photos. Stored predictions of "val" are used again.
+    and its evaluate.py reads files "*.jpg" with the names of the photos.
     Raises PhotoError if the folder has another layout or a photo cannot be read; BrewsterError if the method fails on a
     photo; OutputError."""
     splits = {
@@ -75,8 +75,7 @@ def _prediction(split: str, photos: Path, path: Path, method: Method) -> bytes:
     benchmark = _BENCHMARK if split.startswith("val") else f"{_BENCHMARK}-{split}"
     file = ImageFile(path)
     case = Case(benchmark, path.stem, path.stem, f"{photos.name}/{path.stem}", file, file)
-    stored = method.cached(case) if split.startswith("val") else None
-    output = stored or method.predict(case, Photo.open(file.read()))
+    output = method.predict(case, Photo.open(file.read()))
     pixels = Photo.from_array(output.transmission.srgb_8bit(), encoding="srgb")
     info = replace(pixels.file_info, jpeg_quality=_JPEG_QUALITY, subsampling="4:4:4")
     return replace(pixels, file_info=info).encode("jpeg")

@@ -180,8 +180,10 @@ def read_scene_of(entry: StoredSample) -> Scene:
     """Reads the scene of a sample. Raises RecipeError if the scene file is damaged."""
     try:
         table = tomllib.loads(entry.read(SCENE_FILE).decode())
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise RecipeError(f"the scene of {entry.path} is not TOML", "expected a scene file", _CURE) from error
+    except (OSError, KeyError, tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise RecipeError(
+            f"the scene of {entry.path} is missing or not TOML", "expected a scene file", _CURE
+        ) from error
     values = {name: table[name] for name in table if name != "outcome"}
     return validated(Scene, values, source=f"the scene of {entry.path}", reference="brewster render --help")
 
