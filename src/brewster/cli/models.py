@@ -16,7 +16,7 @@ from brewster.errors import BrewsterError, ModelError
 from brewster.files import write_atomically
 from brewster.models import zoo
 from brewster.models.diffusion_models import DIFFUSION_MODELS, DiffusionModel
-from brewster.models.diffusion_resources import PAPER_GPU
+from brewster.models.diffusion_resources import BACKBONE_COSTS, PAPER_GPU
 from brewster.options import Options
 
 if TYPE_CHECKING:
@@ -94,7 +94,7 @@ def _resources(model: DiffusionModel) -> dict[str, Any]:
     "--base-model",
     metavar="MODEL",
     default="kontext",
-    help=f"The base for which the model was trained: {', '.join(zoo.BACKBONE_CLASSES)}, a folder or a hub id.",
+    help=f"The base for which the model was trained: {', '.join(BACKBONE_COSTS)}, a folder or a hub id.",
 )
 @click.option(
     "--prompt",

@@ -61,13 +61,6 @@ MODELS: Final = {
 }
 
 
-BACKBONE_CLASSES: Final = {
-    "kontext": "brewster.models.diffusion.backbones.kontext:Kontext",
-    "klein": "brewster.models.diffusion.backbones.klein:Klein",
-    "qwen": "brewster.models.diffusion.backbones.qwen:Qwen",
-}
-"""Diffusion models: name -> import path of the `Backbone` class. The path is text, because the import needs torch."""
-
 MODEL_FILE: Final = "model.onnx"
 """The name of the exported model in the folder of a training run."""
 DIFFUSION_NAMES: Final = [name for name, model in DIFFUSION_MODELS.items() if model.is_opened_by_name]

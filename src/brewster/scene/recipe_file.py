@@ -99,7 +99,7 @@ def _unknown_key(
 ) -> RecipeError:
     table = path[:-1]
     owner = f"[{_dotted(table)}]" if table else "the recipe"
-    close = similar_key(model, path)
+    close = _similar_key(model, path)
     known = "" if close else f", one of {', '.join(choices(model, table))}"
     return RecipeError(
         f"{source}: there is no key {_dotted(path)} (its value is {_shortened(value)})",
@@ -108,7 +108,7 @@ def _unknown_key(
     )
 
 
-def similar_key(model: type[FrozenModel], path: Sequence[str | int]) -> str | None:
+def _similar_key(model: type[FrozenModel], path: Sequence[str | int]) -> str | None:
     """Returns the most similar known key: one of the same table with a similar name, or of another table with
     the same name."""
     *table, name = path

@@ -28,7 +28,7 @@ from brewster.models.diffusion.task import (
 from brewster.models.networks import DEFAULT_NETWORK, MAX_STRIDE, NETWORKS
 from brewster.models.zoo import TINY_PREFIX
 from brewster.options import Quantization
-from brewster.scene.recipe_file import read_toml, similar_key, validated
+from brewster.scene.recipe_file import read_toml, validated
 from brewster.scene.values import (
     FrozenModel,
     KeyNote,
@@ -297,9 +297,9 @@ def read_recipe(path: Path) -> CompactRecipe | LoraRecipe:
     recipe = _read_unresolved(path)
     changes: dict[str, Any] = {}
     if isinstance(recipe, CompactRecipe) and recipe.init and recipe.init.endswith(".onnx"):
-        changes["init"] = str(path.parent / recipe.init)
+        changes["init"] = str(path.parent.resolve() / recipe.init)
     if isinstance(recipe, LoraRecipe) and recipe.prompt.endswith(ENCODED_SUFFIX):
-        changes["prompt"] = str(path.parent / recipe.prompt)
+        changes["prompt"] = str(path.parent.resolve() / recipe.prompt)
     rendered = recipe.data.rendered
     if rendered and rendered.recipe and rendered.recipe.endswith(".toml"):
         found = rendered.model_copy(update={"recipe": str(path.parent.resolve() / rendered.recipe)})
@@ -335,21 +335,14 @@ def with_value(recipe: AnyRecipe, key_path: str, value: object) -> AnyRecipe:
     or the value is not allowed for it.
     """
     values = table = recipe.model_dump(exclude_unset=True)
-    path = key_path.split(".")
-    owner: object = recipe
-    for name in path:
-        # The keys of an optional table exist only if it is set.
-        if name not in getattr(type(owner), "model_fields", ()):
-            suggestion = similar_key(type(recipe), path)
-            raise RecipeError(
-                f"the recipe has no key {key_path}",
-                "expected a key with its tables, such as data.pairs_share",
-                f"did you mean {suggestion}?" if suggestion else f"see {_REFERENCE}",
-            )
-        owner = getattr(owner, name)
-    for name in path[:-1]:
-        table = table.setdefault(name, {})
-    table[path[-1]] = value
+    *tables, key = key_path.split(".")
+    for name in tables:
+        if not isinstance(
+            table.get(name), dict
+        ):  # a table that is not set, or no table: `validated` refuses it
+            table[name] = {}
+        table = table[name]
+    table[key] = value
     source = f"the recipe with {key_path} = {value!r}"
     return validated(type(recipe), values, source=source, reference=_REFERENCE)
 

@@ -16,7 +16,6 @@ from torch import Tensor
 
 from brewster.environments.assets import Assets
 from brewster.environments.catalog import read_catalog
-from brewster.errors import RecipeError
 from brewster.scene.recipe import read_scene_recipe
 from brewster.training.data.data_recipe import DataRecipe, MixRecipe
 from brewster.training.data.image_loading import read_maps, read_pairs, read_photos, source_weights
@@ -25,7 +24,6 @@ from brewster.training.data.mixtures import (
     Mixtures,
     Pairs,
     Stream,
-    TrainingBatch,
 )
 from brewster.training.data.rendered import CachedRendered, OnlineRendered, RenderedDatasets
 from brewster.training.recipe import CompactRecipe, data_folder
@@ -92,9 +90,8 @@ def _interleave(share: float, first: Callable[[], Stream], second: Callable[[], 
 
 
 def _open_mixtures(recipe: CompactRecipe) -> Stream:
+    """Opens mixtures. If the recipe has no data, the stream has no photos and is never called (see `loop.run`)."""
     data = recipe.data
-    if data.is_empty:
-        return _empty_stream
     folders = resolve_folders(data.photos)
     return Mixtures(
         read_photos(folders, data.excluded_files),
@@ -135,14 +132,6 @@ def _open_rendered(recipe: CompactRecipe, device: torch.device | str) -> Stream:
         blend_space=rendered.blend_space,
     )
     return online if rendered.count is None else CachedRendered(online, rendered.count, seed=seed)
-
-
-def _empty_stream(step: int, count: int, size: int) -> TrainingBatch:  # noqa: ARG001  (a Stream)
-    raise RecipeError(
-        "the recipe has no training data: every share or count is 0",
-        "expected a share above 0, and a count of rendered samples above 0",
-        "raise data.rendered.count, data.rendered.share or data.pairs_share",
-    )
 
 
 def resolve_folders(folders: Sequence[Path]) -> list[Path]:

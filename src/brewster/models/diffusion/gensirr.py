@@ -22,6 +22,7 @@ from brewster.models.diffusion.backbones.kontext import Kontext
 from brewster.models.diffusion.backbones.registry import build_on_meta
 from brewster.models.diffusion.prompt import PROMPT_FILE, PromptEmbedding
 from brewster.models.diffusion.task import TASK_FILE, gensirr_task, save_task
+from brewster.models.diffusion.tensors import check_new
 from brewster.models.zoo import TINY_PREFIX
 
 _PREFIX: Final = "net_g."
@@ -36,6 +37,7 @@ def convert(checkpoint: Path, folder: Path, *, base_model: str = "kontext", shor
     `base_model` is "kontext", or "tiny:kontext" for tests. `short_side_px`, that of the input, is 768 or 512. Raises
     ModelError if the file is no such checkpoint; OutputError if the folder cannot be written.
     """
+    check_new(folder)
     if base_model.removeprefix(TINY_PREFIX) != Kontext.name:
         happened = f"the base model {base_model} was given for GenSIRR"
         raise ModelError(happened, f"expected {Kontext.name}", "leave the base model out")

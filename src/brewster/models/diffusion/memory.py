@@ -21,6 +21,7 @@ from brewster.models.diffusion.backbones.registry import (
     find_description,
     hub_id_of,
     is_registered,
+    local_folder,
 )
 from brewster.models.diffusion.hub_download import free_disk_bytes, is_transformer_cached
 from brewster.models.diffusion.lazy_imports import import_bitsandbytes, import_library
@@ -142,7 +143,7 @@ def check_machine(
     if placement.quantization == "nf4" and not is_cpu:
         import_bitsandbytes()
     hub_id = hub_id_of(source)
-    if not transformer_file and not Path(source).is_dir() and not is_transformer_cached(hub_id):
+    if not transformer_file and not local_folder(source) and not is_transformer_cached(hub_id):
         cache = Path(import_library("huggingface_hub.constants").HF_HUB_CACHE)
         needed = (weights + cost.vae_parameters + encoders) * _FILE_BYTES_PER_WEIGHT
         if needed > (free := free_disk_bytes(cache)):

@@ -20,10 +20,9 @@ from brewster.models.diffusion.backbones.backbone import Backbone
 from brewster.models.diffusion.backbones.registry import (
     DESCRIPTION_FILES,
     INDEX_FILE,
-    find_backbone,
     find_backbone_class,
-    find_description,
     is_registered,
+    local_folder,
     read_index,
 )
 from brewster.models.diffusion.hub_download import (
@@ -91,8 +90,8 @@ class ModelSource:
         """Returns the digests of the LoRA, its settings and its prompt, and that of the base. A base on the hub is
         identified by its name. A base in a folder is identified by the names, sizes, and first and last MiB of its
         files, because reading them completely takes a minute."""
-        base, folder = self.base, Path(self.base)
-        if not is_registered(base) and folder.is_dir():
+        base = self.base
+        if folder := local_folder(base):
             digest = hashlib.sha256()
             for path in sorted(path for path in folder.rglob("*") if path.is_file()):
                 digest.update(f"{path.relative_to(folder)} {path.stat().st_size}\0".encode())
@@ -126,7 +125,7 @@ def find_model_source(
         return _published_source(model, base_model)
     if layout := next((each for each in LAYOUTS if (folder / each.weights).is_file()), None):
         metadata = layout.read_metadata(folder)
-        base, backbone_class = _find_base(model, metadata, base_model, allow_download=allow_download)
+        base, backbone_class = lora.find_base(model, metadata, base_model, allow_download=allow_download)
         quantization = metadata.quantization
         return ModelSource(base, backbone_class, metadata.task, quantization, True, folder, layout, metadata)
     if not (folder / INDEX_FILE).is_file():
@@ -166,29 +165,6 @@ def _published_source(model: str, base_model: str | None) -> ModelSource:
         )
     base, task = base_model or row.base_model, named_task(model)
     return ModelSource(base, windowseat.BACKBONE, task, row.quantization, has_prompt=True)
-
-
-def _find_base(
-    model: str, metadata: LoraMetadata, base_model: str | None, *, allow_download: bool
-) -> tuple[str, type[Backbone]]:
-    base = base_model or metadata.base_model
-    is_path = Path(base).is_absolute() or base.startswith((".", "~"))
-    if base_model is None and is_path and not Path(base).is_dir():
-        raise ModelError(
-            f"the base model of {model} was {base}, which does not exist",
-            f"expected a {metadata.backbone} in diffusers' layout",
-            "pass its folder or hub id with --base-model",
-        )
-    if not allow_download and not find_description(base):
-        return base, find_backbone_class(metadata.backbone)
-    backbone_class, _ = find_backbone(base)  # checked before the download, which may take an hour
-    if backbone_class.name != metadata.backbone:
-        raise ModelError(
-            f"{model} is a LoRA of {metadata.backbone}",
-            f"expected a base model of {metadata.backbone}, not of {backbone_class.name}",
-            "choose another base model",
-        )
-    return base, backbone_class
 
 
 def _check_no_base(model: str, base_model: str | None) -> None:

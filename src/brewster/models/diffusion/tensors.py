@@ -7,12 +7,20 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from brewster.errors import ModelError
+from brewster.errors import ModelError, OutputError
 from brewster.files import write_atomically
 from brewster.models.diffusion.lazy_imports import import_library
 
 if TYPE_CHECKING:
     from torch import Tensor
+
+
+def check_new(target: Path) -> None:
+    """Checks that nothing exists at this path, because a model is never overwritten. Raises OutputError."""
+    if target.exists():
+        raise OutputError(
+            f"{target} exists already", "expected a new file or folder", "choose another target"
+        )
 
 
 def write_tensors(path: Path, tensors: Mapping[str, Tensor], metadata: Mapping[str, str]) -> None:

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from brewster.benchmarks.pairing import ImageGroup, read_folders
+from brewster.environments.assets import add_file_name_to_errors
 from brewster.errors import PhotoError, RecipeError
 from brewster.image_formats import SUFFIXES
 from brewster.photo import Photo
@@ -34,12 +35,18 @@ def read_photos(
     """Reads every photo of the folders: uint8 sRGB (H, W, 3), longest side at most 1,024 px, sorted by path.
 
     `exclude` and `only` are patterns of file names, as in `fnmatch`. Raises RecipeError if a folder cannot be read, or none of
-    them contains a photo.
+    them contains a photo that matches; PhotoError if a photo cannot be read.
     """
     photos = []
     for path in _list_images(folders, _PHOTOS, exclude, only):
-        encoded = to_encoded(np.clip(_downscaled(Photo.open(path), _PHOTO_SIDE_PX), 0, 1))
+        encoded = to_encoded(np.clip(_downscaled(_open(path), _PHOTO_SIDE_PX), 0, 1))
         photos.append(torch.from_numpy(np.rint(encoded * 255).astype(np.uint8)))
+    if folders and not photos:
+        raise RecipeError(
+            f"no photo in {', '.join(map(str, folders))} matches the patterns",
+            f"expected names that match one of {[*only]} and none of {[*exclude]}",
+            "correct exclude and held_out in the recipe",
+        )
     return photos
 
 
@@ -57,10 +64,11 @@ def source_weights(folders: Sequence[Path], exclude: Sequence[str] = ()) -> list
 def read_maps(
     folders: Sequence[Path], exclude: Sequence[str] = (), only: Sequence[str] = ("*",)
 ) -> list[Tensor]:
-    """Reads every lat-long map of the folders, as `read_photos`: float16 (3, H, 2 H), at most 512 px high, linear light."""
+    """Reads every lat-long map of the folders, as `read_photos`: float16 (3, H, 2 H), at most 512 px high, linear light. It is
+    no error if none matches."""
     maps = []
     for path in _list_images(folders, _MAPS, exclude, only):
-        linear = np.clip(_downscaled(Photo.open(path), 2 * _MAP_HEIGHT_PX), 0, _MAX_FLOAT16)
+        linear = np.clip(_downscaled(_open(path), 2 * _MAP_HEIGHT_PX), 0, _MAX_FLOAT16)
         maps.append(torch.from_numpy(linear.astype(np.float16)).permute(2, 0, 1).contiguous())
     return maps
 
@@ -73,13 +81,18 @@ def read_pairs(folders: Sequence[Path], max_pairs: int | None = None) -> list[tu
     """
     pairs = []
     for folder in folders:
-        groups = _image_groups(folder)
+        groups = image_groups(folder)
         count = min(len(groups), max_pairs or len(groups))
-        pairs += [_read_pair(groups[number * len(groups) // count]) for number in range(count)]
+        for number in range(count):
+            group = groups[number * len(groups) // count]
+            photo, transmission = read_aligned(group.photo, group.transmission)
+            pairs.append((photo, transmission))
     return pairs
 
 
-def _image_groups(folder: Path) -> list[ImageGroup]:
+def image_groups(folder: Path) -> list[ImageGroup]:
+    """Returns the groups of a folder, sorted by the path of the photo. Raises RecipeError if the folder cannot be read or is
+    empty, or a photo has no transmission with its name."""
     try:
         found = read_folders(folder)
     except PhotoError as error:
@@ -97,17 +110,22 @@ def _image_groups(folder: Path) -> list[ImageGroup]:
     return sorted(found.groups, key=lambda group: group.photo)
 
 
-def _read_pair(group: ImageGroup) -> tuple[Tensor, Tensor]:
-    photo, transmission = (
-        torch.from_numpy(Photo.open(path).srgb_8bit().copy()) for path in (group.photo, group.transmission)
-    )
-    if photo.shape != transmission.shape:
-        raise RecipeError(
-            f"{group.photo} and {group.transmission} differ in size",
-            "expected pairs that are aligned pixel by pixel",
-            "crop one to the size of the other",
-        )
-    return photo, transmission
+def read_aligned(*paths: Path) -> list[Tensor]:
+    """Reads images of one size, uint8 sRGB (H, W, 3). Raises RecipeError if their sizes differ, PhotoError as `read_photos`."""
+    images = [torch.from_numpy(_open(path).srgb_8bit().copy()) for path in paths]
+    for path, image in zip(paths, images, strict=True):
+        if image.shape != images[0].shape:
+            raise RecipeError(
+                f"{paths[0]} and {path} differ in size",
+                "expected images that are aligned pixel by pixel",
+                "crop one to the size of the other",
+            )
+    return images
+
+
+def _open(path: Path) -> Photo:
+    with add_file_name_to_errors(str(path)):
+        return Photo.open(path)
 
 
 def _downscaled(photo: Photo, max_side_px: int) -> NDArray[np.float32]:
@@ -129,18 +147,14 @@ def _list_images(
                 "expected a folder with images",
                 _FOLDER_CURE,
             ) from error
-    found = sorted(
-        path
-        for path in paths
-        if path.suffix.lower() in suffixes and _matches(path, only) and not _matches(path, exclude)
-    )
-    if folders and not found:
+    images = sorted(path for path in paths if path.suffix.lower() in suffixes)
+    if folders and not images:
         raise RecipeError(
             f"no images in {', '.join(map(str, folders))}",
             f"expected files ending in {', '.join(sorted(suffixes))}",
             _FOLDER_CURE,
         )
-    return found
+    return [path for path in images if _matches(path, only) and not _matches(path, exclude)]
 
 
 def _matches(path: Path, patterns: Sequence[str]) -> bool:

@@ -18,14 +18,13 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from brewster.benchmarks.pairing import ImageGroup, read_folders
+from brewster.benchmarks.pairing import ImageGroup
 from brewster.errors import RecipeError
 from brewster.models.diffusion.backbones.backbone import Backbone
 from brewster.models.diffusion.panels import PanelFit, compose, conditioning_image
 from brewster.models.diffusion.pipeline import one_step_start
-from brewster.photo import Photo
 from brewster.srgb import to_encoded, to_linear
-from brewster.training.data.image_loading import read_pairs
+from brewster.training.data.image_loading import image_groups, read_aligned
 from brewster.training.data.rendered import RenderedDatasets
 from brewster.training.data.sample_rng import SampleRng
 from brewster.training.recipe import LoraRecipe
@@ -168,8 +167,7 @@ def open_samples(recipe: LoraRecipe) -> SampleSequence:
         )
     samples = []
     for folder in resolve_folders(data.pairs) if data.pairs_share else []:
-        pairs = read_pairs([folder])
-        groups = sorted(read_folders(folder).groups, key=lambda group: group.photo)
+        groups = image_groups(folder)
         missing = [group.name for group in groups if group.reflection is None]
         if missing and "R" in recipe.panels and recipe.reflections == "given":
             raise RecipeError(
@@ -177,24 +175,16 @@ def open_samples(recipe: LoraRecipe) -> SampleSequence:
                 "expected a reflection for each photo, because R is a panel",
                 'add a folder reflection_layer, set reflections = "difference", or leave R out of panels',
             )
-        weight = recipe.derived_reflection_weight
-        samples += [_read_sample(group, *pair, weight) for group, pair in zip(groups, pairs, strict=True)]
+        samples += [_read_sample(group, recipe.derived_reflection_weight) for group in groups]
     return SampleSequence(datasets, samples, data.pairs_share)
 
 
-def _read_sample(
-    group: ImageGroup, photo: Tensor, transmission: Tensor, derived_weight: float
-) -> TrainingSample:
+def _read_sample(group: ImageGroup, derived_weight: float) -> TrainingSample:
     if group.reflection is None:
+        photo, transmission = read_aligned(group.photo, group.transmission)
         return TrainingSample(layers_from_pair(photo, transmission), derived_weight)
-    reflection = torch.from_numpy(Photo.open(group.reflection).srgb_8bit().copy())
-    if reflection.shape != photo.shape:
-        raise RecipeError(
-            f"{group.photo} and {group.reflection} differ in size",
-            "expected layers that are aligned pixel by pixel",
-            "crop one to the size of the other",
-        )
-    return TrainingSample(torch.cat([photo, transmission, reflection], dim=2))
+    layers = read_aligned(group.photo, group.transmission, group.reflection)
+    return TrainingSample(torch.cat(layers, dim=2))
 
 
 def layers_from_pair(photo: Tensor, transmission: Tensor) -> Tensor:

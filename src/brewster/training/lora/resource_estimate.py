@@ -10,13 +10,12 @@ The layers of the LoRA are counted on a backbone without storage (torch's device
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Final, final
 
 import torch
 
 from brewster.models.diffusion.adapter.lora import select_target_modules
-from brewster.models.diffusion.backbones.registry import build_on_meta
+from brewster.models.diffusion.backbones.registry import build_on_meta, local_folder
 from brewster.models.diffusion.memory import backbone_cost
 from brewster.models.diffusion.panels import count_tokens
 from brewster.models.diffusion_resources import (
@@ -63,14 +62,15 @@ def estimate_resources(recipe: LoraRecipe, card: GraphicsCard) -> ResourceEstima
     layers = map(backbone.transformer.get_submodule, select_target_modules(backbone, recipe.target_modules))
     lora_parameters = sum(recipe.rank * (layer.in_features + layer.out_features) for layer in layers)
     tokens = generated_tokens + condition_tokens
+    passes = cost.predictions_per_step if recipe.guidance > 1 else 1
     memory = {
         "backbone": weights_gib(cost.parameters, recipe.quantization),
         "VAE": 2 * cost.vae_parameters / GIB,
         "LoRA and AdamW": lora_parameters * _BYTES_PER_LORA_WEIGHT[recipe.optimizer] / GIB,
-        "activations": cost.activation_bytes(tokens, kept_blocks=cost.blocks) / GIB,
+        "activations": passes * cost.activation_bytes(tokens, kept_blocks=cost.blocks) / GIB,
         "rest": _OVERHEAD_GIB,
     }
-    tflop = _FORWARD_PASSES_PER_STEP * recipe.batch_size * cost.forward_tflop(tokens)
+    tflop = _FORWARD_PASSES_PER_STEP * recipe.batch_size * passes * cost.forward_tflop(tokens)
     seconds = tflop / (EFFICIENCY * card.tflops)
     # A tiny version has random weights and no text encoders.
     is_tiny = recipe.backbone.startswith(TINY_PREFIX)
@@ -96,7 +96,7 @@ def estimate_resources(recipe: LoraRecipe, card: GraphicsCard) -> ResourceEstima
         tflop=tflop,
         seconds=seconds,
         downloaded_weights=cost.parameters,
-        is_local=is_tiny or Path(recipe.backbone).is_dir(),
+        is_local=is_tiny or local_folder(recipe.backbone) is not None,
         cure=cure,
         model_rows={
             "backbone": f"{recipe.backbone}, {cost.parameters / 1e9:.2f} billion parameters",

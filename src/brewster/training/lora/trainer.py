@@ -35,7 +35,7 @@ from brewster.models.diffusion.adapter.lora import (
 )
 from brewster.models.diffusion.backbones.backbone import Backbone
 from brewster.models.diffusion.backbones.loading import encode_prompt, load_backbone
-from brewster.models.diffusion.backbones.registry import find_backbone
+from brewster.models.diffusion.backbones.registry import find_backbone, local_folder
 from brewster.models.diffusion.memory import check_machine
 from brewster.models.diffusion.offloading import explain_out_of_memory
 from brewster.models.diffusion.panels import split
@@ -224,13 +224,12 @@ class LoraTrainer:
         """Writes LoRA, prompt, recipe and model card to the folder `lora` in `folder`, and returns its path. diffusers
         can load the LoRA."""
         lora_folder, recipe = folder / LORA_FOLDER, self.recipe
-        base = Path(recipe.backbone)
         save_lora(
             lora_folder,
             self.backbone,
             self.prompt,
             recipe.task,
-            base_model=str(base.resolve()) if base.is_dir() else recipe.backbone,
+            base_model=str(local_folder(recipe.backbone) or recipe.backbone),
             quantization=recipe.quantization,
             target_modules=recipe.target_modules,
         )

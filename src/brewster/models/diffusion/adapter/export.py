@@ -10,25 +10,24 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
-from brewster.errors import ModelError, OutputError
-from brewster.models.diffusion.adapter.lora import PREFIX, read_lora, read_prompt
-from brewster.models.diffusion.adapter.lora_formats import DOWN_SUFFIX, UP_SUFFIX, adapted_layers
+from brewster.errors import OutputError
+from brewster.models.diffusion.adapter.lora import PREFIX, find_base, read_lora, read_prompt
+from brewster.models.diffusion.adapter.lora_formats import DOWN_SUFFIX, UP_SUFFIX, adapted_layers, check_shape
 from brewster.models.diffusion.backbones.backbone import Backbone
 from brewster.models.diffusion.backbones.loading import load_backbone
-from brewster.models.diffusion.backbones.registry import find_backbone
 from brewster.models.diffusion.hub_download import free_disk_bytes
 from brewster.models.diffusion.memory import check_free, count_weights, free_host_gib
 from brewster.models.diffusion.prompt import PROMPT_FILE
 from brewster.models.diffusion.task import TASK_FILE, save_task
-from brewster.models.diffusion.tensors import write_tensors
+from brewster.models.diffusion.tensors import check_new, write_tensors
 from brewster.models.diffusion_resources import GIB, weights_gib
 
 
 def export_comfyui(folder: Path, target: Path) -> None:
     """Writes the LoRA as one file with the keys that ComfyUI reads: those of diffusers, and alpha for each layer."""
-    _check_target(target)
+    check_new(target)
     state, metadata = read_lora(folder)
     tensors = {PREFIX + name: tensor for name, tensor in state.items()}
     # safetensors refuses tensors that share memory, so each layer gets its own. An imported layer has alpha = rank.
@@ -49,17 +48,10 @@ def export_merged(folder: Path, target: Path, base_model: str | None = None) -> 
 
     `base_model` is the folder or hub id of the base, if it has moved since training.
     """
-    _check_target(target)
+    check_new(target)
     state, metadata = read_lora(folder)
     prompt = read_prompt(folder, metadata)
-    base = base_model or metadata.base_model
-    backbone_class, _ = find_backbone(base)
-    if backbone_class.name != metadata.backbone:
-        raise ModelError(
-            f"{folder} is a LoRA of {metadata.backbone}",
-            f"expected a base of {metadata.backbone}, not of {backbone_class.name}",
-            "choose another base",
-        )
+    base, backbone_class = find_base(str(folder), metadata, base_model)
     needed = weights_gib(count_weights(base, backbone_class) + backbone_class.cost.vae_parameters, None)
     purpose = "for all weights in bfloat16"
     cure = "close other programs, or export on another machine"
@@ -76,22 +68,9 @@ def export_merged(folder: Path, target: Path, base_model: str | None = None) -> 
 @torch.no_grad()
 def merge(backbone: Backbone, state: Mapping[str, Tensor], scale: float) -> None:
     """Replaces the weight W of each adapted layer by W + scale B A (Hu et al. 2021). `state` is that of `lora_state_dict`."""
-    modules = backbone.transformer.named_modules()
-    layers = {name for name, module in modules if isinstance(module, nn.Linear)}
+    modules = dict(backbone.transformer.named_modules())
     for layer in adapted_layers(state):
-        if layer not in layers:
-            raise ModelError(
-                f"the base has no layer {layer}",
-                "expected the base with which the LoRA was trained",
-                "choose another base",
-            )
-        weight = backbone.transformer.get_submodule(layer).weight
-        change = scale * state[layer + UP_SUFFIX].float() @ state[layer + DOWN_SUFFIX].float()
+        down, up = state[layer + DOWN_SUFFIX], state[layer + UP_SUFFIX]
+        check_shape(layer, down, up, modules.get(layer))
+        weight, change = modules[layer].weight, scale * up.float() @ down.float()
         weight.copy_(weight.float() + change.to(weight.device))
-
-
-def _check_target(target: Path) -> None:
-    if target.exists():
-        raise OutputError(
-            f"{target} exists already", "expected a new file or folder", "choose another target"
-        )

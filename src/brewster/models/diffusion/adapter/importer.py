@@ -26,12 +26,12 @@ from brewster.models.diffusion.adapter.lora_formats import (
 )
 from brewster.models.diffusion.backbones.backbone import Backbone
 from brewster.models.diffusion.backbones.loading import encode_prompt
-from brewster.models.diffusion.backbones.registry import build_on_meta
+from brewster.models.diffusion.backbones.registry import build_on_meta, local_folder
 from brewster.models.diffusion.hub_download import find_weights_file
 from brewster.models.diffusion.panels import Panel, PanelLayout
 from brewster.models.diffusion.prompt import PROMPTS
 from brewster.models.diffusion.task import DecompositionTask
-from brewster.models.diffusion.tensors import read_json, read_tensors
+from brewster.models.diffusion.tensors import check_new, read_json, read_tensors
 
 PEFT_CONFIG_FILE: Final = "adapter_config.json"
 """The file with peft's settings of a LoRA, next to its weights."""
@@ -52,13 +52,15 @@ def import_lora(
     For `source`, see `find_weights_file`; for `base_model`, `load_backbone`; for `alpha`, `read_layers`.
     `prompt` is a name in `PROMPTS`, or the text itself, which `device` encodes. `panels` are its output.
     """
+    check_new(folder)
     task = DecompositionTask(PanelLayout(panels))
     base = build_on_meta(base_model)
     state = read_layers(find_lora_file(source), base, alpha)
     settings = layer_settings(state)
     embedding = encode_prompt(base_model, PROMPTS.get(prompt, prompt), device=device)
     rank = settings["r"]
-    written = LoraMetadata(base.name, base_model, None, rank, rank, task, embedding.sha256, imported=True)
+    source_of_base = str(local_folder(base_model) or base_model)
+    written = LoraMetadata(base.name, source_of_base, None, rank, rank, task, embedding.sha256, imported=True)
     write_lora(folder, state, settings, embedding, written)
     return written
 

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import contextlib
 import difflib
-import pkgutil
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Final
@@ -20,17 +19,18 @@ from torch import nn
 
 from brewster.errors import ModelError
 from brewster.models.diffusion.backbones.backbone import Architecture, Backbone
+from brewster.models.diffusion.backbones.klein import Klein
+from brewster.models.diffusion.backbones.kontext import Kontext
+from brewster.models.diffusion.backbones.qwen import Qwen
 from brewster.models.diffusion.hub_download import cached_model_folder, resolve_model_folder
 from brewster.models.diffusion.lazy_imports import diffusers_class, suppress_log_messages
 from brewster.models.diffusion.offloading import explain_out_of_memory
 from brewster.models.diffusion.prompt import PromptEmbedding
 from brewster.models.diffusion.tensors import read_json
-from brewster.models.zoo import BACKBONE_CLASSES, TINY_PREFIX
+from brewster.models.zoo import TINY_PREFIX
 
-BACKBONES: Final[dict[str, type[Backbone]]] = {
-    name: pkgutil.resolve_name(path) for name, path in BACKBONE_CLASSES.items()
-}
-"""name -> Backbone class, for the models in `zoo.BACKBONE_CLASSES`. The class has hub id, licence and architecture."""
+BACKBONES: Final[dict[str, type[Backbone]]] = {"kontext": Kontext, "klein": Klein, "qwen": Qwen}
+"""name -> Backbone class, which has the hub id, the licence and the architecture."""
 
 INDEX_FILE: Final = "model_index.json"
 CONFIG_FILES: Final = {
@@ -142,6 +142,11 @@ def find_backbone_class(name: str) -> type[Backbone]:
 def is_registered(source: str) -> bool:
     """Whether the source of a backbone is a name in the table, or "tiny:" and a name, and not a folder or a hub id."""
     return source in BACKBONES or source.startswith(TINY_PREFIX)
+
+
+def local_folder(source: str) -> Path | None:
+    """The folder of a backbone on this machine, or None for a name in the table, a tiny version or a hub id."""
+    return Path(source).resolve() if Path(source).is_dir() and not is_registered(source) else None
 
 
 def hub_id_of(source: str) -> str:
