@@ -28,11 +28,8 @@ def simulate_burst(
     parallax_px=0.0,
     common_px=8.0,
     strength=0.35,
-    blur_px=0.0,
     noise=0.004,
-    jpeg_quality=92,
     size=(1000, 750),
-    seed=0,
 ):
     """Returns a burst.
 
@@ -44,9 +41,7 @@ def simulate_burst(
         common_px: the motion of both layers.
         strength: the factor of the reflection; 0 is a scene without reflection.
     """
-    rng = np.random.default_rng(seed)
-    if blur_px:
-        reflection = cv2.GaussianBlur(reflection, (0, 0), blur_px)
+    rng = np.random.default_rng(0)
     width, height = size
     left, top = ((big - small) // 2 for big, small in zip(transmission.shape[1::-1], size, strict=True))
     y, x = np.mgrid[0:height, 0:width].astype(np.float32)
@@ -86,15 +81,15 @@ def simulate_burst(
         if k == reference:
             truth = layers
     exposure = 1 / max(1.0, np.percentile(sums[reference], 99.5))
-    encoded = [_photograph(exposure * light, rng, noise, jpeg_quality) for light in sums]
+    encoded = [_photograph(exposure * light, rng, noise) for light in sums]
     return SimulatedBurst(encoded, exposure * truth[0], exposure * truth[1])
 
 
-def _photograph(light, rng, noise, jpeg_quality):
+def _photograph(light, rng, noise):
     noisy = light + rng.normal(size=light.shape) * noise * np.sqrt(0.15 + np.maximum(light, 0))
     encoded = np.rint(255 * to_encoded(np.clip(noisy, 0, 1))).astype(np.uint8)
     file = io.BytesIO()
-    Image.fromarray(encoded).save(file, "JPEG", quality=jpeg_quality, subsampling=0)
+    Image.fromarray(encoded).save(file, "JPEG", quality=92, subsampling=0)
     return np.asarray(Image.open(file))
 
 

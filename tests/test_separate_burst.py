@@ -14,16 +14,17 @@ from hypothesis import strategies as st
 from PIL import Image
 
 import brewster
+from brewster import Photo, Separator
 from brewster.batch.plan import plan_bursts
 from brewster.burst import BurstReport, read_video, separate_burst
 from brewster.burst.fourier_search import find_translations
 from brewster.burst.joint_model import JointModel, Rates, optimise, pixel_grid
 from brewster.burst.registration import frame_motions, motion_candidates
-from brewster.burst.separate import burst_report, measure_layers
+from brewster.burst.separate import burst_report, fit_burst, measure_layers
 from brewster.burst.solver import LEVELS, Level, Solution, _edge_correlation, solve
 from brewster.burst.video import choose_frames
-from brewster.cli import main
 from brewster.errors import BrewsterError, PhotoError, PhotoTooLarge, UnreadablePhoto
+from brewster.remote_path import location
 from brewster.srgb import to_encoded, to_linear
 from simulated_bursts import read_photo, simulate_burst
 
@@ -38,12 +39,6 @@ def linear_pictures(size):
 def few_steps(monkeypatch):
     """For tests that do not measure the separation."""
     monkeypatch.setattr("brewster.burst.separate.solve", partial(solve, levels=(Level(48, 2, None),)))
-
-
-def run_burst(capfd, *args):
-    """Runs the command, and returns the exit code and the standard output."""
-    code = main(["burst", *map(str, args)])
-    return code, capfd.readouterr().out
 
 
 @pytest.fixture(scope="module")
@@ -82,7 +77,7 @@ def test_layers_with_known_motion_are_separated_whatever_the_prior(is_prior_true
     tensor = torch.from_numpy(frames.transpose(0, 3, 1, 2).astype(np.float32))
     start = JointModel.start(tensor, motions, torch.tensor([False]), 2, 1.0)
     prior = torch.from_numpy((truth if is_prior_true else frames[2]).transpose(2, 0, 1).astype(np.float32))
-    rates = Rates(homographies=0, splines=0, gains=0)
+    rates = Rates(homographies=0, splines=0, log_gains=0)
     model = optimise(start, tensor, prior, 300, rates=rates, weights=LEVELS[-1].weights)
     layers = model.reference_layers(*tensor.shape[-2:])[:, 0].movedim(1, -1).numpy()
     assert psnr_db(layers[0][8:-8, 8:-8], truth[8:-8, 8:-8]) > least_db
@@ -167,17 +162,14 @@ def test_a_burst_is_separated_by_its_motion(small_burst, burst_files):
     assert result.transmission.size == result.reflection.size == result.photo.size
 
 
-def test_the_order_of_the_photos_does_not_matter():
+def test_the_order_of_the_photos_does_not_matter(monkeypatch):
     burst = simulate_burst(*linear_pictures((144, 110)), relative_px=10, frames=3, size=(128, 96))
     frames = [to_linear(frame / 255).astype(np.float32) for frame in burst.frames]
-    solve_few = partial(solve, levels=(Level(48, 5, None),))
+    monkeypatch.setattr("brewster.burst.separate.solve", partial(solve, levels=(Level(48, 5, None),)))
     results = []
     for shuffled in ([0, 1, 2], [2, 0, 1]):
         chosen, reference = [frames[k] for k in shuffled], shuffled.index(1)
-        with pytest.MonkeyPatch.context() as patch:
-            patch.setattr("brewster.burst.separate.solve", solve_few)
-            solution, _ = measure_layers(chosen, reference, frames[1] * np.float32(0.8))
-        results.append(solution)
+        results.append(measure_layers(chosen, reference, frames[1] * np.float32(0.8))[0])
     assert np.allclose(results[0].transmission, results[1].transmission, atol=1e-5)
     assert results[0].two_layer_error == pytest.approx(results[1].two_layer_error, rel=1e-4)
 
@@ -383,6 +375,37 @@ def test_frames_of_a_video_are_chosen_along_its_path(tmp_path):
         read_video(tmp_path / "a.mp4", 1)
 
 
+def test_a_video_whose_time_begins_late_is_read_completely(tmp_path, small_burst):
+    with av.open(str(tmp_path / "a.mts"), "w", format="mpegts") as container:
+        stream = container.add_stream("mpeg2video", rate=25)
+        stream.width, stream.height, stream.pix_fmt = 128, 96, "yuv420p"
+        for number, frame in enumerate(small_burst.frames):
+            video_frame = av.VideoFrame.from_ndarray(frame, format="rgb24")
+            video_frame.pts = 25 * 60 + number
+            container.mux(stream.encode(video_frame))
+        container.mux(stream.encode())
+    assert len(read_video(tmp_path / "a.mts", 5)) == 5
+
+
+def test_the_prior_of_a_burst_does_not_depend_on_the_exposure(monkeypatch):
+    scene, _ = linear_pictures((128, 96))
+    frames = [np.roll(scene, shift, axis=1).astype(np.float32) for shift in (0, 3)]
+    priors = []
+
+    def keep_prior(_frames, _reference, prior, **_):
+        priors.append(prior)
+        return None, ()
+
+    monkeypatch.setattr("brewster.burst.separate.measure_layers", keep_prior)
+    separator = Separator(lambda tile: (np.maximum(tile - 0.1, 0), np.full_like(tile, 0.1)))
+    for gain in (1.5, 6):
+        photos = [
+            Photo.from_array(np.float32(gain) * frame / scene.max(), encoding="linear") for frame in frames
+        ]
+        fit_burst(photos, separator=separator)
+    np.testing.assert_allclose(*priors, atol=2e-3)
+
+
 @given(st.lists(st.tuples(st.floats(0, 0.1), st.floats(0, 1)), min_size=1, max_size=60), st.integers(2, 15))
 def test_chosen_frames_are_distinct_and_ordered(steps, count):
     moves, sharpness = np.array(steps).T
@@ -427,111 +450,107 @@ def test_named_photos_of_several_folders_are_one_burst_and_the_reference_counts_
     assert (named.burst.photos, whole.burst.photos) == ((photos[0],), (photos[2],))
 
 
-def test_a_dry_run_refuses_what_cannot_be_a_burst(tmp_path, burst_files, capfd):
+def test_a_dry_run_refuses_what_cannot_be_a_burst(run_without_model, tmp_path, burst_files):
     (tmp_path / "alone.png").write_bytes(burst_files[0].read_bytes())
-    code, out = run_burst(capfd, tmp_path / "alone.png", "--json", "--dry-run")
+    code, out, _ = run_without_model("burst", "alone.png", "--json", "--dry-run")
     assert (code, json.loads(out)["status"]) == (1, "failed")
 
 
-def test_a_burst_after_a_single_photo_names_the_other_options(tmp_path, burst_files, few_steps, capfd):
-    output = ["-o", str(tmp_path / "out")]
-    main([str(burst_files[2]), *output])
-    capfd.readouterr()
-    main(["burst", *map(str, burst_files), *output])
-    assert "skipped, because all layers exist, made with other options (burst=no)" in capfd.readouterr().err
-    main(["burst", *map(str, burst_files), *output, "--overwrite"])
+def test_a_burst_after_a_single_photo_names_the_other_options(run_without_model, burst_files, few_steps):
+    burst = ("burst", *burst_files, "-o", "out")
+    run_without_model(burst_files[2], "-o", "out")
+    err = run_without_model(*burst)[2]
+    assert "skipped, because all layers exist, made with other options (burst=no)" in err
+    run_without_model(*burst, "--overwrite")
     for other in ([burst_files[2]], ["burst", *burst_files[1:4]]):
-        capfd.readouterr()
-        main([*map(str, other), *output])
-        assert "(burst=5 photos)" in capfd.readouterr().err
+        assert "(burst=5 photos)" in run_without_model(*other, "-o", "out")[2]
 
 
 @pytest.mark.parametrize("method", ["burst", "single photo", "unchanged"])
 def test_the_layers_record_hints_whatever_the_motion_shows(
-    tmp_path, burst_files, few_steps, monkeypatch, capfd, method
+    run_without_model, tmp_path, burst_files, few_steps, monkeypatch, method
 ):
     report = BurstReport(method, "", 5, (), 2, 0.0, 0.0, 0.0)
     monkeypatch.setattr("brewster.burst.separate.burst_report", lambda *_: report)
     Image.new("RGB", (128, 96), "red").save(tmp_path / "hints.png")
-    command = ["burst", *map(str, burst_files), "-o", str(tmp_path / "out")]
-    assert main([*command, "--hints", str(tmp_path / "hints.png")]) == 0
-    main(command)
-    assert "made with other options (hints=yes)" in capfd.readouterr().err
+    command = ("burst", *burst_files, "-o", "out")
+    assert run_without_model(*command, "--hints", "hints.png")[0] == 0
+    assert "made with other options (hints=yes)" in run_without_model(*command)[2]
 
 
 @pytest.mark.parametrize("name", ["2.png", "link.png", "mask.png"])
-def test_no_photo_of_a_burst_is_overwritten_and_no_mask(tmp_path, burst_files, name):
+def test_no_photo_of_a_burst_is_overwritten_and_no_mask(run_without_model, tmp_path, burst_files, name):
     for file in burst_files[:3]:
         (tmp_path / file.name).write_bytes(file.read_bytes())
     (tmp_path / "link.png").hardlink_to(tmp_path / "0.png")
     Image.new("L", (128, 96), 255).save(tmp_path / "mask.png")
     before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
-    photos = [str(tmp_path / file.name) for file in burst_files[:3]]
-    options = ["--mask", str(tmp_path / "mask.png"), "-o", str(tmp_path / name), "--overwrite"]
+    photos = [tmp_path / file.name for file in burst_files[:3]]
+    options = ("--mask", tmp_path / "mask.png", "-o", tmp_path / name, "--overwrite")
     for dry_run in ([], ["--dry-run"]):
-        assert main(["burst", *photos, *options, *dry_run]) == 1
+        assert run_without_model("burst", *photos, *options, *dry_run)[0] == 1
     assert before == {path.name: path.read_bytes() for path in tmp_path.iterdir()}
 
 
 @pytest.mark.parametrize("content", [b"", b"only text in this file", None])
-def test_a_dry_run_and_a_real_run_name_the_bad_photo_of_a_burst(tmp_path, burst_files, capfd, content):
+def test_a_dry_run_and_a_real_run_name_the_bad_photo_of_a_burst(
+    run_without_model, tmp_path, burst_files, content
+):
     bad = tmp_path / "bad.png"
     if content is not None:
         bad.write_bytes(content)
     messages = []
     for dry_run in ([], ["--dry-run"]):
-        assert (
-            main(["burst", *map(str, burst_files[:2]), str(bad), "-o", str(tmp_path / "out"), *dry_run]) == 1
-        )
-        messages.append(capfd.readouterr().err)
+        code, _, err = run_without_model("burst", *burst_files[:2], bad, "-o", "out", *dry_run)
+        assert code == 1
+        messages.append(err)
     assert messages[0] == messages[1]
     assert f"photo 3 of the burst ({bad})" in messages[0]
 
 
-def test_a_dry_run_finds_that_a_video_is_missing_or_has_too_few_frames(tmp_path):
-    assert main(["burst", str(tmp_path / "no.mp4"), "--dry-run"]) == 1
+def test_a_dry_run_finds_that_a_video_is_missing_or_has_too_few_frames(run_without_model, tmp_path):
+    assert run_without_model("burst", "no.mp4", "--dry-run")[0] == 1
     with pytest.raises(PhotoError, match="expected a number from 1 to 7"):
         plan_bursts([tmp_path / "no.mp4"], reference=7, frames=7)
 
 
-def test_the_command_writes_the_layers_and_the_report(tmp_path, burst_files, few_steps, capfd):
-    arguments = (*burst_files, "-o", tmp_path / "out", "--json", "--reference", "2")
-    code, out = run_burst(capfd, *arguments)
+def test_a_video_in_an_object_store_is_refused_also_in_a_dry_run(run_without_model):
+    location("memory://window.mp4").write_bytes(b"\0\0\0\x18ftypisom")
+    for dry_run in ([], ["--dry-run"]):
+        code, _, err = run_without_model("burst", "memory://window.mp4", "-o", "out", *dry_run)
+        assert code == 1
+        assert "download the video first" in err
+
+
+def test_the_command_writes_the_layers_and_the_report(run_without_model, tmp_path, burst_files, few_steps):
+    command = ("burst", *burst_files, "-o", "out", "--json", "--reference", "2")
+    code, out, _ = run_without_model(*command)
     report = json.loads(out)
     assert (code, report["status"], report["burst"]["reference"]) == (0, "separated", 1)
     assert {path.name for path in (tmp_path / "out").iterdir()} == {"1.transmission.png", "1.reflection.png"}
-    assert json.loads(run_burst(capfd, *arguments)[1])["status"] == "skipped"
+    _, out, err = run_without_model(*command)
+    assert json.loads(out)["status"] == "skipped"
+    assert "skipped, because all layers exist (" in err  # not "made with other options"
 
 
-def test_the_command_reports_bursts_that_cannot_be_separated(tmp_path, burst_files, capfd):
+def test_the_command_reports_bursts_that_cannot_be_separated(run_without_model, tmp_path, burst_files):
     bad = tmp_path / "bursts/bad"
     bad.mkdir(parents=True)
     (bad / "alone.png").write_bytes(burst_files[0].read_bytes())
-    video = tmp_path / "window.mp4"
-    video.write_bytes(b"cut")
-    code, out = run_burst(capfd, tmp_path / "bursts", video, "-o", tmp_path / "out", "--json")
+    (tmp_path / "window.mp4").write_bytes(b"cut")
+    code, out, _ = run_without_model("burst", "bursts", "window.mp4", "-o", "out", "--json")
     reports = [json.loads(line) for line in out.splitlines()]
     assert (code, [report["status"] for report in reports]) == (1, ["failed", "failed"])
     assert "1 photo" in reports[0]["error"]
     assert "window.mp4 cannot be read as a video" in reports[1]["error"]
 
 
-def test_the_command_separates_a_video(tmp_path, small_burst, few_steps, capfd):
-    video = tmp_path / "window.mp4"
-    write_video(video, small_burst.frames)
-    command = ("-o", tmp_path / "out", "--format", "png")
-    code, out = run_burst(capfd, video, *command, "--json")
+def test_the_command_separates_a_video(run_without_model, tmp_path, small_burst, few_steps):
+    write_video(tmp_path / "window.mp4", small_burst.frames)
+    command = ("burst", "window.mp4", "-o", "out", "--format", "png")
+    code, out, _ = run_without_model(*command, "--json")
     assert (code, json.loads(out)["burst"]["frames"]) == (0, len(small_burst.frames))
-    main(["burst", str(video), *map(str, command)])
-    assert "skipped, because all layers exist (" in capfd.readouterr().err
+    assert "skipped, because all layers exist (" in run_without_model(*command)[2]
     assert {path.name for path in (tmp_path / "out").iterdir()} == {
         f"window.mp4.{layer}.png" for layer in ("transmission", "reflection")
     }
-
-
-def test_layers_of_the_same_command_were_not_made_with_other_options(tmp_path, burst_files, few_steps, capfd):
-    for _ in range(2):
-        main(["burst", *map(str, burst_files), "-o", str(tmp_path / "out")])
-    message = capfd.readouterr().err
-    assert "skipped" in message
-    assert "other options" not in message

@@ -13,8 +13,8 @@ influence each other. In the spirit of neural spline fields (Chugunov et al. 202
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
-from typing import Final, final
+from dataclasses import asdict, dataclass, replace
+from typing import Any, Final, final
 
 import torch
 from torch import Tensor
@@ -206,11 +206,11 @@ class Rates:
     layers: float = 0.012
     homographies: float = 0.003
     splines: float = 0.001
-    gains: float = 0.003
+    log_gains: float = 0.003
 
     def scaled(self, factor: float) -> Rates:
         """Returns rates with slower motion: its unit is the frame, so that it must be finer for larger frames."""
-        return Rates(self.layers, self.homographies * factor, self.splines * factor, self.gains)
+        return Rates(self.layers, self.homographies * factor, self.splines * factor, self.log_gains)
 
 
 def optimise(
@@ -234,19 +234,13 @@ def optimise(
         weights: the weights of the loss.
         on_step: called after each step.
     """
-    groups = [
-        (model.layers, rates.layers), (model.homographies, rates.homographies), (model.splines, rates.splines),
-        (model.log_gains, rates.gains),
-    ]  # fmt: skip
-    parameters = [tensor.detach().clone().requires_grad_(rate > 0) for tensor, rate in groups]
-    layers, homographies, splines, log_gains = parameters
-    current = replace(model, layers=layers, homographies=homographies, splines=splines, log_gains=log_gains)
+    parameters: dict[str, Any] = {
+        name: getattr(model, name).detach().clone().requires_grad_(rate > 0)
+        for name, rate in asdict(rates).items()
+    }
+    current = replace(model, **parameters)
     optimiser = torch.optim.Adam(
-        [
-            {"params": [parameter], "lr": rate}
-            for parameter, (_, rate) in zip(parameters, groups, strict=True)
-            if rate
-        ],
+        [{"params": [parameters[name]], "lr": rate} for name, rate in asdict(rates).items() if rate],
         betas=(0.9, 0.99),
     )
     base_rates = [group["lr"] for group in optimiser.param_groups]
@@ -266,11 +260,8 @@ def optimise(
             data_losses += data_loss.detach()
         optimiser.step()
         on_step()
-    layers, homographies, splines, log_gains = (parameter.detach() for parameter in parameters)
-    return replace(
-        model, layers=layers, homographies=homographies, splines=splines, log_gains=log_gains,
-        losses=penalty.detach() + data_losses, data_losses=data_losses,
-    )  # fmt: skip
+    found = {name: parameter.detach() for name, parameter in parameters.items()}
+    return replace(model, **found, losses=penalty.detach() + data_losses, data_losses=data_losses)
 
 
 def _data_loss(model: JointModel, frames: Tensor, chunk: slice) -> Tensor:
@@ -278,7 +269,7 @@ def _data_loss(model: JointModel, frames: Tensor, chunk: slice) -> Tensor:
     height, width = frames.shape[-2:]
     rendered, gains = model.render(height, width, chunk)
     errors = data_errors(rendered.sum(0) * gains, frames[chunk])
-    return charbonnier(errors).sum((1, 2, 3, 4)) / frames.numel()
+    return _smooth_root(errors.square()).sum((1, 2, 3, 4)) / frames.numel()
 
 
 def _penalties(model: JointModel, frames: Tensor, prior: Tensor, weights: Weights) -> Tensor:
@@ -314,12 +305,8 @@ def data_errors(predicted: Tensor, frames: Tensor) -> Tensor:
     return torch.where((frames > _CLIPPED) & (errors > 0), 0.0, errors)
 
 
-def charbonnier(values: Tensor) -> Tensor:
-    """Returns a smooth absolute value."""
-    return _smooth_root(values.square())
-
-
 def _smooth_root(squares: Tensor) -> Tensor:
+    """Returns the root of a sum of squares, smooth at 0 (Charbonnier)."""
     return (squares + _CHARBONNIER_EPSILON**2).sqrt() - _CHARBONNIER_EPSILON
 
 

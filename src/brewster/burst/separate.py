@@ -22,7 +22,7 @@ import numpy as np
 
 from brewster.burst.registration import frame_motions, motion_candidates, path_order
 from brewster.burst.solver import MIN_SIDE_PX, Floats, Solution, solve
-from brewster.errors import PhotoError
+from brewster.errors import PhotoError, error_prefix
 from brewster.inference.assessment import Verdict
 from brewster.inference.burst_report import BurstReport, burst_photo_name, check_photo_count
 from brewster.inference.guided_upsampling import GeneratedOverride
@@ -141,15 +141,15 @@ def fit_burst(
     reference = _checked_reference(len(photos), reference)
     started = time.perf_counter()
     photo = _open(photos, reference, max_pixels)
-    frames = _working_frames(photos, reference, photo, max_pixels)
+    frames, white = _working_frames(photos, reference, photo, max_pixels)
     seconds = {"frames": time.perf_counter() - started}
     separator = separator or Separator.load()
     started = time.perf_counter()
     upsampler, _, single = separator.fit(photo, quality=quality, hints=hints)
-    prior = _applied(upsampler.apply, frames[reference])
+    prior = _applied(upsampler.apply, white * frames[reference]) / white
     refine_prior = None
     if separator.takes_hints and hints is None:  # a person knows better than the measured layers
-        refine_prior = partial(prior_with_hints, separator, frames[reference])
+        refine_prior = partial(prior_with_hints, separator, frames[reference], quality=quality)
     solution, left_out = measure_layers(
         frames, reference, prior, refine_prior=refine_prior, on_progress=on_progress
     )
@@ -206,15 +206,16 @@ def measure_layers(
         return solution, left_out
 
 
-def prior_with_hints(separator: Separator, frame: Floats, reflection_share: Floats) -> Floats:
+def prior_with_hints(
+    separator: Separator, frame: Floats, reflection_share: Floats, quality: Quality = Options.quality
+) -> Floats:
     """Returns T of the working frame, predicted with hints where the measured share (h, w, 1) of the reflection is large."""
     share = cv2.resize(reflection_share, frame.shape[1::-1])
     is_reflection = share > max(_HINTED_SHARE, np.quantile(share, 1 - _HINTED_AREA))
     hints = np.zeros(frame.shape, np.uint8)
     hints[is_reflection, 0] = 255
-    upsampler, _, _ = separator.fit(
-        Photo.from_array(frame, encoding="linear"), hints=hints if is_reflection.any() else None
-    )
+    photo = Photo.from_array(frame, encoding="linear")
+    upsampler, _, _ = separator.fit(photo, quality=quality, hints=hints if is_reflection.any() else None)
     return _applied(upsampler.apply, frame)
 
 
@@ -231,15 +232,15 @@ def _checked_reference(count: int, reference: int | None) -> int:
 
 def _open(photos: Sequence[Source], index: int, max_pixels: int) -> Photo:
     """Opens a photo of the burst. An error names its number."""
-    try:
+    with error_prefix(burst_photo_name(photos, index)):
         return Photo.open(photos[index], max_pixels=max_pixels)
-    except PhotoError as error:
-        happened = f"{burst_photo_name(photos, index)}: {error.happened}"
-        raise type(error)(happened, error.expected, error.cure) from error
 
 
-def _working_frames(photos: Sequence[Source], reference: int, photo: Photo, max_pixels: int) -> list[Floats]:
-    """Returns the photos at the working size, in linear light of 0..1. One photo at a time is in memory at full size."""
+def _working_frames(
+    photos: Sequence[Source], reference: int, photo: Photo, max_pixels: int
+) -> tuple[list[Floats], np.float32]:
+    """Returns the photos at the working size, in linear light divided by its white level, 0..1, and this level. One photo at a
+    time is in memory at full size."""
     scale = min(1.0, _WORKING_PX / max(photo.size))
     width, height = (max(8, round(length * scale)) for length in photo.size)
     frames = []
@@ -258,8 +259,8 @@ def _working_frames(photos: Sequence[Source], reference: int, photo: Photo, max_
             "expected photos of one window from different places",
             "move the camera by 5 to 10 cm between the photos, or separate one of them alone",
         )
-    white = white_level(frames[reference])
-    return [np.clip(frame / white, 0, 1) for frame in frames]
+    white = np.float32(white_level(frames[reference]))
+    return [np.clip(frame / white, 0, 1) for frame in frames], white
 
 
 def _applied(apply: Callable[[Floats, int, int], tuple[Floats, Floats]], frame: Floats) -> Floats:

@@ -127,11 +127,7 @@ def solve(
                 small, torch.from_numpy(motions).float(), is_locked, reference, level.density
             )
         else:
-            kept = (
-                _best_of_families(model, candidates)
-                if index <= _COMPARED
-                else _best(model, with_locked=False)
-            )
+            kept = _best_of_families(model, candidates) if index <= _COMPARED else [_best(model)]
             model = model.selected(kept).resized(small, level.density, level.spline_size)
         rates = Rates().scaled(min(1.0, 80 / level.long_side_px)) if index else Rates(splines=0)
 
@@ -144,9 +140,10 @@ def solve(
             model, small, small_refined[0], level.steps, rates=rates, weights=level.weights, on_step=on_step
         )
         if index <= _COMPARED:
-            errors = _errors(model)
+            losses = model.data_losses.tolist()
+            errors = losses[model.is_locked.tolist().index(True)], losses[_best(model)]
         if index >= _COMPARED or level is levels[-1]:
-            best = model.selected(_best(model, with_locked=False))
+            best = model.selected([_best(model)])
             layers, detail = _named(best, small, small_prior[0])
             if index == min(_NAMED, len(levels) - 1):
                 edge_correlation, naming = _edge_correlation(layers), detail
@@ -155,7 +152,7 @@ def solve(
             if refine_prior and level is not levels[-1]:
                 refined = refine_prior(_reflection_share(layers))
     assert model
-    model = model.selected(_best(model, with_locked=False))
+    model = model.selected([_best(model)])
     with torch.no_grad():
         confidence = model.confidence(small)[0]
         motion = model.relative_motion(*small.shape[-2:])[0].item()
@@ -202,11 +199,11 @@ def _best_of_families(model: JointModel, candidates: Sequence[MotionCandidate]) 
     return [min(family, key=losses.__getitem__) for family in families.values()]
 
 
-def _best(model: JointModel, *, with_locked: bool) -> list[int]:
-    """Returns the index of the best candidate with two layers, and that of the locked one."""
-    locked, losses = model.is_locked.tolist(), _selection_losses(model)
-    best = min((i for i, is_locked in enumerate(locked) if not is_locked), key=losses.__getitem__)
-    return [best, locked.index(True)] if with_locked else [best]
+def _best(model: JointModel) -> int:
+    """Returns the index of the best candidate with two layers."""
+    losses = _selection_losses(model)
+    unlocked = (i for i, is_locked in enumerate(model.is_locked.tolist()) if not is_locked)
+    return min(unlocked, key=losses.__getitem__)
 
 
 def _selection_losses(model: JointModel) -> list[float]:
@@ -215,12 +212,6 @@ def _selection_losses(model: JointModel) -> list[float]:
         is_implausible = model.relative_motion(*_MOTION_SAMPLES) > _MAX_RELATIVE_MOTION
     losses: list[float] = (model.losses + is_implausible).tolist()
     return losses
-
-
-def _errors(model: JointModel) -> tuple[float, float]:
-    """Returns the data losses of the locked candidate and of the best other one."""
-    best, locked = _best(model, with_locked=True)
-    return float(model.data_losses[locked]), float(model.data_losses[best])
 
 
 def resized(image: Floats, long_side_px: int) -> Floats:

@@ -109,8 +109,9 @@ def _decoded(path: str | os.PathLike[str], max_pixels: int) -> Iterator[av.Video
                     "raise the limit with --max-pixels (in Python max_pixels)",
                 )
             with contextlib.suppress(av.FFmpegError):  # a video that was cut off ends here
+                start = float((stream.start_time or 0) * (stream.time_base or 0))
                 for frame in container.decode(stream):
-                    if (frame.time or 0) > _MAX_SECONDS:
+                    if (frame.time or start) - start > _MAX_SECONDS:
                         return
                     yield frame
     except (av.FFmpegError, OSError) as error:
