@@ -1,11 +1,13 @@
 """Batches with damaged photos and unusable outputs: no partial files, no lost files, and all other photos are separated."""
 
 import errno
+import hashlib
 import os
 import re
 import sys
 from dataclasses import fields
 from pathlib import Path
+from threading import Thread
 
 import numpy as np
 import OpenEXR
@@ -97,6 +99,17 @@ def test_any_file_name_works_and_each_error_is_one_line(run, tmp_path):
     assert {line["source"] for line in json_lines(out)} == {f"{name}.jpg" for name in (*names, "bad\nname")}
     assert len(error_lines(err)) == 1
     assert r"bad\nname.jpg" in error_lines(err)[0]
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="Windows has no named pipes in folders")
+def test_a_photo_from_a_pipe_is_read_once(run, tmp_path):
+    os.mkfifo(tmp_path / "pipe.jpg")
+    writer = Thread(target=(tmp_path / "pipe.jpg").write_bytes, args=[image_bytes()])
+    writer.start()
+    code, out, err = run("pipe.jpg", "-o", "out", "--json")
+    writer.join()
+    assert code == 0, err
+    assert json_lines(out)[0]["photo_sha256"] == hashlib.sha256(image_bytes()).hexdigest()
 
 
 def test_a_full_disk_leaves_no_partial_file_and_the_next_photo_is_tried(run, tmp_path, monkeypatch):

@@ -15,7 +15,6 @@ from brewster.benchmarks.registry import read_benchmark
 from brewster.environments.catalog import read_catalog
 from brewster.evaluate import ablation
 from brewster.evaluate.methods import PredictionFolder
-from brewster.inference.onnx_backend import OnnxBackend
 from brewster.models.diffusion.backbones.loading import load_backbone
 from brewster.models.diffusion.task import load_task
 from brewster.models.diffusion.tensors import read_tensors
@@ -102,7 +101,6 @@ READERS = {
     "list of photos": lambda path: plan_files(path.with_suffix(".csv")),
     "maps": lambda path: read_catalog([path], []),
     "model": lambda path: Separator.load(str(path.with_suffix(".onnx"))),
-    "network": OnnxBackend,
     "pairs for training": lambda path: read_pairs([path]),
     "photos": lambda path: read_catalog([], [path]),
     "predictions": lambda path: PredictionFolder("theirs", path).check_pairing([]),

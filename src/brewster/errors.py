@@ -22,10 +22,11 @@ of pydantic into such a message.
 
 from __future__ import annotations
 
+from contextlib import contextmanager
 from typing import TYPE_CHECKING, Final
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Iterator, Mapping
     from typing import Any
 
 _MAX_VALUE_LENGTH: Final = 40
@@ -77,9 +78,16 @@ class BrewsterError(Exception):
         """Returns the message as a list with one item for each problem. Only a RecipeError has several."""
         return [str(self)]
 
-    def __reduce__(self) -> tuple[type[BrewsterError], tuple[object, ...]]:
-        """Pickles the attributes instead of `args`, because a caller may have changed them after the error was created."""
-        return type(self), (self.happened, self.expected, self.cure)
+
+@contextmanager
+def error_prefix(name: object | None) -> Iterator[None]:
+    """Adds what an error is about, such as a file or a row, to the errors in the block, unless the message contains it."""
+    try:
+        yield
+    except BrewsterError as error:
+        if name is not None and str(name) not in str(error):
+            error.happened = f"{name}: {error.happened}"
+        raise
 
 
 class PhotoError(BrewsterError):
@@ -135,10 +143,6 @@ class RecipeError(BrewsterError):
     def messages(self) -> list[str]:
         """Returns one message for each problem of the recipe."""
         return [super().__str__(), *(message for other in self.others for message in other.messages())]
-
-    def __reduce__(self) -> tuple[type[BrewsterError], tuple[object, ...]]:
-        """Pickles the attributes instead of `args`, as the base class does."""
-        return type(self), (self.happened, self.expected, self.cure, self.others)
 
 
 class DownloadError(BrewsterError):

@@ -16,10 +16,10 @@ import importlib
 import io
 import posixpath
 from collections.abc import Iterator
-from contextlib import contextmanager
+from pathlib import Path
 from typing import Any, Final, NamedTuple, final
 
-from brewster.errors import BrewsterError, ManifestError, MissingExtra, UnreadablePhoto
+from brewster.errors import ManifestError, MissingExtra, UnreadablePhoto, error_prefix
 from brewster.remote_path import Location, RemotePath, location
 
 COLUMN: Final = "path"
@@ -40,17 +40,6 @@ class ManifestRow(NamedTuple):
         """Returns `line 3 of scans.csv` or `row 3 of scans.parquet`."""
         unit = "line" if _is_csv(self.manifest) else "row"
         return f"{unit} {self.number} of {self.manifest}"
-
-
-@contextmanager
-def row_in_errors(row: ManifestRow | None) -> Iterator[None]:
-    """Adds the row that lists a photo, if there is one, to the errors about this photo in the block."""
-    try:
-        yield
-    except BrewsterError as error:
-        if row:
-            error.happened = f"{row}: {error.happened}"
-        raise
 
 
 def is_manifest(source: Location) -> bool:
@@ -85,18 +74,18 @@ def _photo(row: ManifestRow, text: object) -> tuple[Location, tuple[str, ...]]:
     """Returns the photo of a row, and the parts of the folder for its layers below the output folder."""
     if not isinstance(text, str) or not text.strip():
         raise ManifestError(f"{row} has the path {text!r}", "expected the path of a photo", "correct the row")
-    with row_in_errors(row):
+    with error_prefix(row):
         photo = location(text)
+    normal = posixpath.normpath(photo.as_posix())
     if isinstance(photo, RemotePath) or photo.is_absolute():
-        return photo, photo.parent.parts[1:]
-    relative = posixpath.normpath(photo.as_posix())
-    if relative.startswith("../"):
+        return photo, Path(normal).parent.parts[1:]
+    if normal.startswith("../"):
         raise ManifestError(
             f"{row} has the path {text}, which is outside the folder of the manifest",
             "expected a relative path below this folder, an absolute path, or a URL",
             "move the manifest, or write absolute paths",
         )
-    return row.manifest.parent / relative, tuple(relative.split("/")[:-1])
+    return row.manifest.parent / normal, tuple(normal.split("/")[:-1])
 
 
 def _is_csv(manifest: Location) -> bool:

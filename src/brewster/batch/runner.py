@@ -15,7 +15,6 @@ from functools import partial
 from pathlib import Path
 from typing import Final
 
-from brewster.batch.manifest import row_in_errors
 from brewster.batch.plan import (
     Burst,
     FileResult,
@@ -23,7 +22,7 @@ from brewster.batch.plan import (
     display_name,
     plan_files,
 )
-from brewster.errors import BrewsterError, OutputError
+from brewster.errors import BrewsterError, OutputError, UnreadablePhoto, error_prefix
 from brewster.files import check_output_folder, exists, is_same_file, write_atomically
 from brewster.image_formats import HEAD_BYTES, format_of
 from brewster.inference.burst_report import burst_photo_name, check_photo_count
@@ -155,7 +154,7 @@ def separate_task(
     """Separates one photo, writes its layers, and enters both into the result. Raises BrewsterError if the photo cannot
     be read or separated, or a layer cannot be written."""
     result.model, result.model_sha256, result.device = separator.name, separator.sha256, separator.device
-    with row_in_errors(task.row):
+    with error_prefix(task.row):
         if task.burst and task.burst.is_from_video and isinstance(task.source, Path):
             photo: Path | bytes = task.source
         else:
@@ -195,13 +194,9 @@ def _check_inputs(task: SeparationTask) -> None:
     """Checks that the files of a task can be read and start like an image, and are neither too few nor too many for a burst. The
     frames of a video are not read."""
     for index, file in enumerate(task.inputs):
-        try:
-            with row_in_errors(task.row):
-                _check_input(file, is_video=bool(task.burst and task.burst.is_from_video))
-        except BrewsterError as error:
-            if len(task.inputs) > 1:
-                error.happened = f"{burst_photo_name(task.inputs, index)}: {error.happened}"
-            raise
+        name = burst_photo_name(task.inputs, index) if len(task.inputs) > 1 else None
+        with error_prefix(name), error_prefix(task.row):
+            _check_input(file, is_video=bool(task.burst and task.burst.is_from_video))
     if task.burst:
         check_photo_count(task.burst.photo_count)
 
@@ -209,6 +204,9 @@ def _check_inputs(task: SeparationTask) -> None:
 def _check_input(file: Location | BinaryFile, *, is_video: bool) -> None:
     if isinstance(file, Location):
         check_readable(file)
+        if is_video and isinstance(file, RemotePath):
+            happened = f"{file} is a video in an object store"
+            raise UnreadablePhoto(happened, "expected a video on this machine", "download the video first")
         if is_video:
             return
         check_not_video(file)
@@ -296,7 +294,7 @@ def read_content(source: Location | BinaryFile) -> Path | bytes:
     if isinstance(source, Path):
         check_readable(source)
         check_not_video(source)
-        return source
+        return source if source.is_file() else read_image(source)  # a pipe can be read only once
     return read_image(source) if isinstance(source, RemotePath) else source.read()
 
 
@@ -304,7 +302,7 @@ def _sha256(photo: Path | bytes) -> str | None:
     try:
         with io.BytesIO(photo) if isinstance(photo, bytes) else photo.open("rb") as file:
             return hashlib.file_digest(file, "sha256").hexdigest()
-    except OSError:  # the separator opens the photo later, and reports the error
+    except OSError:  # the photo was deleted or moved after it was read
         return None
 
 

@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from brewster.cache import ByteLimitedCache
-from brewster.errors import BrewsterError, RecipeError, UnsupportedPhoto
+from brewster.errors import RecipeError, UnsupportedPhoto, error_prefix
 from brewster.photo import Photo
 from brewster.scene.world import AssetSource, EnvironmentMap, Plane
 from brewster.srgb import REC709_LUMINANCE
@@ -67,7 +66,7 @@ class Assets:
         return light
 
     def _open(self, source: AssetSource) -> Photo:
-        with add_file_name_to_errors(source.file):
+        with error_prefix(source.file):
             return Photo.open(self._bytes(source))
 
     def _bytes(self, source: AssetSource) -> bytes:
@@ -88,17 +87,6 @@ class Assets:
             "expected the file that was chosen when the scene was sampled",
             "choose its folder with --maps or --photos",
         )
-
-
-@contextmanager
-def add_file_name_to_errors(name: str) -> Iterator[None]:
-    """Adds the name of the file to errors raised within this block, unless the error contains the name."""
-    try:
-        yield
-    except BrewsterError as error:
-        if name not in str(error):
-            error.happened = f"{name}: {error.happened}"
-        raise
 
 
 def read_bytes(path: Path) -> bytes:

@@ -12,11 +12,10 @@ from pathlib import Path
 from brewster.environments.assets import (
     BUILTIN_MAPS,
     BUILTIN_PHOTOS,
-    add_file_name_to_errors,
     check_map,
     read_bytes,
 )
-from brewster.errors import BrewsterError, RecipeError
+from brewster.errors import BrewsterError, RecipeError, error_prefix
 from brewster.files import is_unicode
 from brewster.image_formats import format_of
 from brewster.photo import Photo, read_size
@@ -72,7 +71,7 @@ def _read_asset(path: Path, category: str, is_map: bool) -> Asset:
             f"the name of {str(path)!r} is not text", "expected a name in UTF-8", "rename the file"
         )
     data = read_bytes(path)
-    with add_file_name_to_errors(str(path)):
+    with error_prefix(path):
         pixels = check_map(Photo.open(data).linear(), str(path)) if is_map else None
         width, height = read_size(data) if pixels is None else pixels.shape[1::-1]
     source = AssetSource(file=path.name, sha256=hashlib.sha256(data).hexdigest())

@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from brewster.benchmarks.pairing import ImageGroup, read_folders
-from brewster.environments.assets import add_file_name_to_errors
-from brewster.errors import PhotoError, RecipeError
+from brewster.errors import PhotoError, RecipeError, error_prefix
 from brewster.image_formats import SUFFIXES
 from brewster.photo import Photo
 from brewster.srgb import to_encoded
@@ -124,7 +123,7 @@ def read_aligned(*paths: Path) -> list[Tensor]:
 
 
 def _open(path: Path) -> Photo:
-    with add_file_name_to_errors(str(path)):
+    with error_prefix(path):
         return Photo.open(path)
 
 

@@ -25,8 +25,8 @@ import torch
 from torch import Tensor
 
 from brewster.cache import ByteLimitedCache
-from brewster.environments.assets import Assets, add_file_name_to_errors
-from brewster.errors import RecipeError
+from brewster.environments.assets import Assets
+from brewster.errors import RecipeError, error_prefix
 from brewster.photo import Photo
 from brewster.render.analytic import render
 from brewster.render.camera_response import DevelopedSample, develop, encode_jpeg, to_uint8, with_jpeg
@@ -185,7 +185,7 @@ def _blended_sample(entry: StoredSample) -> Tensor:
 def _read_image(entry: StoredSample, layer: str) -> Tensor:
     """Reads a layer of a sample, (H, W, 3) sRGB uint8."""
     name = f"{layer}.jpg"
-    with _file_errors(entry, name), add_file_name_to_errors(f"{name} of sample {entry.name} in {entry.path}"):
+    with _file_errors(entry, name), error_prefix(f"{name} of sample {entry.name} in {entry.path}"):
         return torch.from_numpy(Photo.open(entry.read(name)).pixels.copy())
 
 
