@@ -4,15 +4,9 @@ import re
 from pathlib import Path
 
 from brewster import image_formats
-from brewster.image_formats import FORMATS, SUFFIXES
+from brewster.image_formats import SUFFIXES
 
 PAGE = Path(image_formats.__file__).parent / "web" / "page" / "index.html"
-
-
-def test_exactly_the_formats_of_libvips_have_a_name_there():
-    for row in FORMATS.values():
-        uses_libvips = row.library == "libvips"
-        assert (row.vips_name is not None) == uses_libvips
 
 
 def test_the_page_accepts_every_suffix_of_an_image():

@@ -121,6 +121,13 @@ def test_a_mask_that_cannot_be_used_is_refused(photo, mask, message):
     assert message in str(raised.value)
 
 
+def test_a_mask_may_have_as_many_pixels_as_its_photo(photo, monkeypatch, tmp_path):
+    monkeypatch.setitem(Photo.open.__func__.__kwdefaults__, "max_pixels", 1)
+    monkeypatch.setattr("brewster.photo.mask.DEFAULT_MAX_PIXELS", 1)
+    Photo.from_array(np.full(photo.size[::-1], 255, np.uint8), encoding="srgb").save(tmp_path / "mask.png")
+    Separator(glass_backend)(photo, mask=tmp_path / "mask.png")
+
+
 def test_grey_stored_as_opaque_colours_is_a_mask():
     assert (Mask.open(rgba(255), SIZE).rows(0, 40) == 1).all()
 

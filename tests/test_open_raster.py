@@ -73,6 +73,14 @@ def test_the_layers_add_up_to_the_photo_and_the_lower_layer_is_the_transmission(
     assert read_size(data) == photo.size
 
 
+def test_additive_layers_of_a_float_photo_with_a_profile_have_its_colours():
+    photo = Photo(np.float32(1 / 255) * smooth(), None, FileInfo("tiff", icc=P3))
+    separation = SEPARATOR(photo, additive=True)
+    lower = Photo.open(opened(separation.layered.encode()).read("data/transmission.png"))
+    in_gamut = ((lower.pixels > 0) & (lower.pixels < 65535)).all(axis=2)
+    assert np.abs(lower.linear() - separation.transmission.linear())[in_gamut].max() < 0.01
+
+
 def test_a_transmission_brighter_than_the_photo_is_the_photo():
     data = Separator(lambda tile: (np.minimum(1.5 * tile, 1), 0 * tile))(
         smooth(), encoding="srgb"

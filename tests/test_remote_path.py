@@ -4,6 +4,7 @@ import os
 import pickle
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from brewster import Photo
@@ -57,6 +58,12 @@ def test_a_file_of_another_machine_is_refused(url):
     host = url.split("/")[2]
     with pytest.raises(BrewsterError, match=f"is a file on the machine {host}; expected a file on this"):
         location(url)
+
+
+def test_a_photo_is_saved_to_the_url_of_an_object_store():
+    photo = Photo.from_array(np.full((4, 5, 3), 90, np.uint8), encoding="srgb")
+    photo.save("memory://saved/a.png")
+    assert Photo.open("memory://saved/a.png").size == (5, 4)
 
 
 def test_a_file_in_a_store_is_written_once():

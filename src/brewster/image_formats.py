@@ -26,8 +26,8 @@ class ImageFormat:
     signature: bytes
     """A regular expression for the first bytes of a file. Most RAW files begin like a TIFF file; their tags identify them."""
     library: Literal["libvips", "OpenEXR", "pillow-heif", "rawpy", "built-in"] = "libvips"
-    vips_name: str | None = None
-    """The name of the format in the functions of libvips."""
+    vips_name: str = ""
+    """The name of the format in the functions of libvips, if it is another one."""
     extra: str | None = None
     """The extra of brewster that installs the library, or None if the library is installed without an extra."""
     bit_depths: tuple[int, ...] = ()
@@ -62,7 +62,6 @@ _ROWS: Final = (
         suffixes=(".jpg", ".jpeg", ".jpe", ".jfif"),
         mime_type="image/jpeg",
         signature=rb"\xff\xd8\xff",
-        vips_name="jpeg",
         bit_depths=(8,),
         has_alpha=False,
         is_stored_rotated=True,
@@ -72,7 +71,6 @@ _ROWS: Final = (
         suffixes=(".png",),
         mime_type="image/png",
         signature=rb"\x89PNG\r\n\x1a\n",
-        vips_name="png",
         bit_depths=(8, 16),
         has_cicp=True,
         is_stored_rotated=True,
@@ -91,7 +89,6 @@ _ROWS: Final = (
         suffixes=(".tiff", ".tif"),
         mime_type="image/tiff",
         signature=rb"II[*+]\0|MM\0[*+]",
-        vips_name="tiff",
         bit_depths=(8, 16, 32),
         has_float32=True,
         is_stored_rotated=True,
@@ -101,7 +98,6 @@ _ROWS: Final = (
         suffixes=(".webp",),
         mime_type="image/webp",
         signature=rb"RIFF....WEBP",
-        vips_name="webp",
         bit_depths=(8,),
         is_stored_rotated=True,
     ),
@@ -157,7 +153,6 @@ _ROWS: Final = (
         suffixes=(".gif",),
         mime_type="image/gif",
         signature=rb"GIF8[79]a",
-        vips_name="gif",
     ),
 )
 

@@ -19,10 +19,11 @@ from numpy.typing import NDArray
 from brewster.inference.assessment import encoded_change
 from brewster.inference.guided_upsampling import Floats, box_mean
 from brewster.inference.predictor import Prediction
+from brewster.photo.mask import label_regions
 from brewster.srgb import to_encoded
 
 if TYPE_CHECKING:
-    from jaxtyping import Bool, Float32, Int
+    from jaxtyping import Bool, Float32
 
 Labels = NDArray[np.int32]
 
@@ -120,29 +121,6 @@ def _is_half_removed(
     is_half_removed &= areas <= max_share * regions.size
     is_half_removed[0] = False
     return is_half_removed
-
-
-def label_regions(mask: Bool[NDArray[np.bool_], "h w"]) -> Int[Labels, "h w"]:
-    """Returns the number of the connected region of each pixel, from 1; 0 outside the mask. Edges connect, corners do not.
-
-    Each pixel points to a pixel of its region with a smaller index, until all point to the first one (Shiloach and Vishkin 1982).
-    """
-    index = np.arange(mask.size, dtype=np.int32).reshape(mask.shape)
-    root = index.ravel().copy()
-    beside, below = mask[:, 1:] & mask[:, :-1], mask[1:] & mask[:-1]
-    one = np.concatenate((index[:, 1:][beside], index[1:][below]))
-    other = np.concatenate((index[:, :-1][beside], index[:-1][below]))
-    while one.size:
-        np.minimum.at(root, np.maximum(root[one], root[other]), np.minimum(root[one], root[other]))
-        while (root != (root := root[root])).any():
-            pass
-        is_open = root[one] != root[other]
-        one, other = one[is_open], other[is_open]
-    is_first = mask.ravel() & (root == index.ravel())
-    labels: Labels = np.where(
-        mask, np.cumsum(is_first, dtype=np.int32)[root].reshape(mask.shape), np.int32(0)
-    )
-    return labels
 
 
 def _grow(regions: Labels, radius: int) -> Labels:

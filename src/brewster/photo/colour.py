@@ -254,7 +254,7 @@ def _parse_curve(tag: bytes) -> ToneCurve:
 
 _MATRIX_TAGS = {b"rXYZ", b"gXYZ", b"bXYZ", b"rTRC", b"gTRC", b"bTRC"}
 _TABLE_TAGS = {b"A2B0", b"A2B1"}
-_VIPS_FORMATS = {"uint8": ("uchar", "rgb", 8), "uint16": ("ushort", "rgb16", 16)}
+_VIPS_FORMATS = {"uint8": ("rgb", 8), "uint16": ("rgb16", 16)}
 
 
 def has_only_tables(icc: bytes | None) -> bool:
@@ -309,11 +309,8 @@ _PROBE_COLOURS = np.stack(np.meshgrid(_PROBE_LEVELS, _PROBE_LEVELS, _PROBE_LEVEL
 
 
 def _convert(pixels: NDArray[Any], icc: bytes) -> NDArray[Any]:
-    height, width, channels = pixels.shape
-    band_format, interpretation, depth = _VIPS_FORMATS[pixels.dtype.name]
-    contiguous = np.ascontiguousarray(pixels)
-    image = pyvips.Image.new_from_memory(contiguous.data, width, height, channels, band_format)
-    image = image.copy(interpretation=interpretation)
+    interpretation, depth = _VIPS_FORMATS[pixels.dtype.name]
+    image = pyvips.Image.new_from_array(pixels, interpretation=interpretation)
     image.set_type(pyvips.GValue.blob_type, "icc-profile-data", icc)
     converted = image.icc_transform("p3", embedded=True, intent="relative", depth=depth)
     return np.frombuffer(converted.write_to_memory(), pixels.dtype).reshape(pixels.shape)

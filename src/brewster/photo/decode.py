@@ -140,7 +140,7 @@ def _decode_vips(data: bytes, format_name: str, max_pixels: int) -> Decoded:
 
 def _open_vips(data: bytes, format_name: str, max_pixels: int) -> pyvips.Image:
     """Opens an image and checks its header. libvips decodes the pixels later."""
-    load = getattr(pyvips.Image, f"{FORMATS[format_name].vips_name}load_buffer")
+    load = getattr(pyvips.Image, f"{FORMATS[format_name].vips_name or format_name}load_buffer")
     try:
         image = load(data, access="sequential", fail_on=_FAIL_ON.get(format_name, "truncated"))
         _check_supported(image, data, format_name, max_pixels)

@@ -58,11 +58,9 @@ def encode(pixels: Stored, alpha: Stored | None, file_info: FileInfo, quality: i
 def _encode_vips(array: Stored, file_info: FileInfo, quality: int) -> bytes:
     height, width, channels = array.shape
     across, down = file_info.resolution_px_per_mm or _DEFAULT_RESOLUTION
-    contiguous = np.ascontiguousarray(array)
-    band_format = {"uint8": "uchar", "uint16": "ushort", "float32": "float"}[array.dtype.name]
-    image = pyvips.Image.new_from_memory(contiguous.data, width, height, channels, band_format)
     spaces = {"uint8": ("b-w", "srgb"), "uint16": ("grey16", "rgb16")}.get(array.dtype.name, ("b-w", "scrgb"))
-    image = image.copy(interpretation=spaces[channels >= 3], xres=across, yres=down)
+    image = pyvips.Image.new_from_array(array, interpretation=spaces[channels >= 3])
+    image = image.copy(xres=across, yres=down)
     image.set_type(pyvips.GValue.gstr_type, "resolution-unit", "in")
     blobs = {"icc-profile-data": file_info.icc, "xmp-data": file_info.xmp, "iptc-data": file_info.iptc}
     if file_info.format_name == "avif":
@@ -71,7 +69,8 @@ def _encode_vips(array: Stored, file_info: FileInfo, quality: int) -> bytes:
         if blob is not None:
             image.set_type(pyvips.GValue.blob_type, name, blob)
     keep = _KEPT_AVIF_METADATA if file_info.format_name == "avif" else _KEPT_METADATA
-    save = getattr(image, f"{FORMATS[file_info.format_name].vips_name}save_buffer")
+    vips_name = FORMATS[file_info.format_name].vips_name or file_info.format_name
+    save = getattr(image, f"{vips_name}save_buffer")
     try:
         return bytes(save(keep=keep, **_save_options(file_info, array.dtype, quality)))
     except pyvips.Error as error:

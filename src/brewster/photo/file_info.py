@@ -5,13 +5,13 @@ from __future__ import annotations
 import importlib
 from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 from numpy.typing import NDArray
 
 from brewster.errors import MissingExtra, PhotoTooLarge, UnsupportedPhoto
 from brewster.image_formats import FORMATS, WRITABLE, format_of
+from brewster.remote_path import Location
 
 
 @dataclass(frozen=True)
@@ -83,7 +83,7 @@ def check_pixel_count(width: int, height: int, max_pixels: int) -> None:
         )
 
 
-def format_name_of(path: Path) -> str:
+def format_name_of(path: Location) -> str:
     """Returns the name of the format for the suffix of a file name. Raises UnsupportedPhoto if brewster does not write files
     with this suffix."""
     image_format = format_of(path)

@@ -7,14 +7,17 @@ The stored values are weights, not light, so they are not converted by a transfe
 
 from __future__ import annotations
 
+import math
 import os
 from dataclasses import dataclass
 from typing import Any, final
 
 import numpy as np
+import pyvips
 from numpy.typing import NDArray
 
 from brewster.errors import MaskError, PhotoError
+from brewster.files import DEFAULT_MAX_PIXELS
 from brewster.photo.in_memory import WHITE_LEVELS
 from brewster.photo.photo import Float32, Photo, Source, Stored
 
@@ -87,7 +90,7 @@ def open_painted(source: Source, size: tuple[int, int], name: str) -> Photo:
             # Integers with the encoding "srgb" and floats with the encoding "linear" are stored unchanged.
             photo = Photo.from_array(array, encoding="linear" if array.dtype.kind == "f" else "srgb")
         else:
-            photo = Photo.open(source)
+            photo = Photo.open(source, max_pixels=max(DEFAULT_MAX_PIXELS, math.prod(size)))
     except PhotoError as error:
         raise MaskError(f"{name} cannot be read: {error.happened}", error.expected, error.cure) from error
     if photo.size != size:
@@ -97,3 +100,11 @@ def open_painted(source: Source, size: tuple[int, int], name: str) -> Photo:
             "resize the image, or leave it out for this photo",
         )
     return photo
+
+
+def label_regions(mask: NDArray[np.bool_]) -> NDArray[np.int32]:
+    """Returns a number for the connected region of each pixel of a mask (H, W), in the order of rows, and 0 outside the mask. Edges
+    connect, corners do not. Numbers may be missing, because the regions outside are counted, too."""
+    numbers = pyvips.Image.new_from_array(mask).labelregions().numpy()
+    labels: NDArray[np.int32] = np.where(mask, numbers + 1, 0)
+    return labels

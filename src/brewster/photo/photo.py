@@ -322,7 +322,7 @@ class Photo:
         if isinstance(target, WritableFile):
             target.write(self.encode(format, depth=depth, quality=quality))
             return
-        path = Path(target)
+        path = location(target)
         data = self.encode(format or format_name_of(path), depth=depth, quality=quality)
         write_atomically(path, data, overwrite=overwrite)
 
