@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from brewster.errors import DeviceError
+from brewster.errors import DeviceError, ModelError
 from brewster.inference import onnx_backend
 from brewster.inference.onnx_backend import OnnxBackend, available_devices
 from brewster.models.compact import LinearSeparator, with_imagenet_features
@@ -95,6 +95,17 @@ def test_a_device_that_does_not_start_is_an_error_and_auto_skips_it(model_file, 
     monkeypatch.setattr(
         onnx_backend.ort.InferenceSession, "get_providers", lambda self: ["CPUExecutionProvider"]
     )
+    with pytest.raises(DeviceError, match="does not start"):
+        OnnxBackend(model_file, "cuda")
+    assert OnnxBackend(model_file, "auto").device == "cpu"
+    create = onnx_backend._create_session
+
+    def fail_on_the_gpu(model, data, device):
+        if device == "cuda":
+            raise ModelError("the provider failed", "expected a GPU", "install a driver")
+        return create(model, data, device)
+
+    monkeypatch.setattr(onnx_backend, "_create_session", fail_on_the_gpu)
     with pytest.raises(DeviceError, match="does not start"):
         OnnxBackend(model_file, "cuda")
     assert OnnxBackend(model_file, "auto").device == "cpu"

@@ -3,7 +3,7 @@ from dataclasses import replace
 import pytest
 
 from brewster.errors import ModelError
-from brewster.models.zoo import MODELS
+from brewster.models.zoo import MODELS, ModelFile
 
 
 def test_every_shipped_model_is_intact_small_enough_and_has_a_card():
@@ -14,6 +14,11 @@ def test_every_shipped_model_is_intact_small_enough_and_has_a_card():
         card = model.card()
         for heading in ("Licence", "Trained on", "Scores", "Where it fails"):
             assert heading in card, (model.name, heading)
+
+
+def test_a_file_that_cannot_be_read_is_refused(tmp_path):
+    with pytest.raises(ModelError, match="cannot be read"):
+        ModelFile("pane", tmp_path, None, "unknown").verify()
 
 
 def test_a_damaged_file_is_refused(tmp_path):

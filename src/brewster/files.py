@@ -293,13 +293,19 @@ def exists(path: Location) -> bool:
     return path.exists() if isinstance(path, RemotePath) else os.path.lexists(path)
 
 
+_NO_HARD_LINKS = {
+    errno.EPERM, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOSYS, errno.EMLINK,
+    errno.EINVAL,  # on Windows, FAT and exFAT
+}  # fmt: skip
+
+
 def _publish(part: Path, path: Path, overwrite: bool) -> None:
     if not overwrite:
         try:
             # unlike a rename, a link never replaces a file that another process has just written
             os.link(part, path)
         except OSError as error:  # a file system without hard links (FAT)
-            if error.errno not in (errno.EPERM, errno.ENOTSUP, errno.ENOSYS, errno.EMLINK):
+            if error.errno not in _NO_HARD_LINKS:
                 raise
         else:
             return

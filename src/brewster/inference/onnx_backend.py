@@ -39,14 +39,20 @@ class OnnxBackend:
 
     `takes_hints` tells whether it has a second input `hints` (1, 2, H, W), see `brewster.photo.Hints`.
     `device` is a name from `DEVICES`; "auto" selects the first one that starts, in order of preference.
-    Raises ModelError if the file cannot be read, is not an ONNX model, or has other inputs and outputs, and
+    Raises ModelError if the file is not an ONNX model, or has other inputs and outputs, and
     DeviceError if the device is unknown, not available, or does not start.
     """
 
     def __init__(self, model: Path, device: str = "auto") -> None:
-        data = _read_model(model)
+        data, failure = model.read_bytes(), None
         for candidate in _candidates(device):
-            session = _create_session(model, data, candidate)
+            try:
+                session = _create_session(model, data, candidate)
+            except ModelError as error:  # a GPU without a driver or memory; on the CPU, a damaged model
+                if candidate == "cpu":
+                    raise
+                failure = error
+                continue
             if session.get_providers()[0] == _PROVIDERS[candidate][0]:
                 self.device, self._session = candidate, session
                 self._check_names(model)
@@ -55,7 +61,7 @@ class OnnxBackend:
             f"device {device} is installed but does not start",
             "expected a driver and libraries that match ONNX Runtime",
             "install them, or use --device auto or cpu",
-        )
+        ) from failure
 
     def __call__(self, tile: Image, hints: Hints | None = None) -> tuple[Image, Image]:
         """Returns the transmission and the reflection of a tile. All three arrays are (H, W, 3), of any size,
@@ -106,17 +112,6 @@ class OnnxBackend:
 
 def _first_line(error: Exception) -> str:
     return str(error).splitlines()[0][:120] if str(error) else type(error).__name__
-
-
-def _read_model(model: Path) -> bytes:
-    try:
-        return model.read_bytes()
-    except OSError as error:
-        raise ModelError(
-            f"{model} cannot be read ({error.strerror})",
-            "expected a model file",
-            "choose one from brewster models list",
-        ) from error
 
 
 def _create_session(model: Path, data: bytes, device: str) -> ort.InferenceSession:

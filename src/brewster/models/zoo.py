@@ -27,11 +27,14 @@ class ModelFile:
 
     def verify(self) -> str:
         """Checks that the file has its expected digest, and returns its SHA-256."""
-        if not self.path.is_file():
+        try:
+            digest = hashlib.sha256(self.path.read_bytes()).hexdigest()
+        except OSError as error:
             raise ModelError(
-                f"{self.path} is missing", f"expected the file of model {self.name}", "reinstall brewster"
-            )
-        digest = hashlib.sha256(self.path.read_bytes()).hexdigest()
+                f"{self.path} cannot be read ({error.strerror})",
+                f"expected the file of model {self.name}",
+                "check its permissions, or reinstall brewster",
+            ) from error
         if self.sha256 not in (None, digest):
             raise ModelError(
                 f"{self.path} has SHA-256 {digest[:12]}...",
