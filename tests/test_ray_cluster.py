@@ -84,7 +84,7 @@ def results_if(error):
     executor._ray = SimpleNamespace(
         exceptions=pytest.importorskip("ray").exceptions, cluster_resources=lambda: {"CPU": 1}
     )
-    executor._run_id = executor._create_runner_ref = None
+    executor._create_runner_ref = None
     future = Future()
     future.set_exception(error)
     executor._run_task = SimpleNamespace(remote=lambda *_: SimpleNamespace(future=lambda: future))

@@ -137,7 +137,7 @@ class ProcessExecutor(Executor[ResultT]):
             new = None if self._idle else ProcessPoolExecutor(1, get_context("spawn"), _start_worker)
             pool = new or self._idle.pop()
             try:
-                future = pool.submit(_run_task, self._create_runner, task)
+                future = pool.submit(run_in_worker, self._create_runner, task)
             except BrokenProcessPool:  # the process died while it was idle
                 self._processes.pop(pool)
                 return self.start(task)
@@ -199,7 +199,8 @@ _runner: Runner[Any] | None = None
 """The runner of a worker, which is created for its first task."""
 
 
-def _run_task(create_runner: Callable[[], Runner[Any]], task: Task[Any]) -> list[Any]:
+def run_in_worker(create_runner: Callable[[], Runner[Any]], task: Task[Any]) -> list[Any]:
+    """Runs a task in this process with its runner, which is created for the first task and kept: a model is read once."""
     global _runner  # noqa: PLW0603  (a worker process has one runner)
     _runner = _runner or create_runner()
     return _runner(task)

@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import importlib
 import os
-import secrets
 import socket
 from collections.abc import Callable
 from concurrent.futures import Future
 from types import ModuleType
-from typing import Any, Final, Self, final
+from typing import Final, Self, final
 
 from brewster.errors import DeviceError, MissingExtra
-from brewster.executors.local import MAX_ATTEMPTS, Executor, ResultT, Runner, Task
+from brewster.executors.local import MAX_ATTEMPTS, Executor, ResultT, Runner, Task, run_in_worker
 
 LOCAL: Final = "local"
 _CONNECT_TIMEOUT_S: Final = 10.0
@@ -40,7 +39,7 @@ class RayExecutor(Executor[ResultT]):
 
     def start(self, task: Task[ResultT]) -> Future[list[ResultT]]:
         """Sends a task to the cluster."""
-        submitted = self._run_task.remote(self._run_id, self._create_runner_ref, task)
+        submitted = self._run_task.remote(self._create_runner_ref, task)
         future: Future[list[ResultT]] = submitted.future()
         return future
 
@@ -73,8 +72,7 @@ class RayExecutor(Executor[ResultT]):
                 "expected a running Ray cluster as HOST:PORT, or local",
                 "start a cluster: ray start --head",
             ) from error
-        self._run_task = self._ray.remote(max_retries=MAX_ATTEMPTS - 1, num_cpus=1)(_run_task)
-        self._run_id = secrets.token_hex(8)
+        self._run_task = self._ray.remote(max_retries=MAX_ATTEMPTS - 1, num_cpus=1)(run_in_worker)
         self._create_runner_ref = self._ray.put(self._create_runner)
         return self
 
@@ -93,14 +91,3 @@ def _ray() -> ModuleType:
     # Ray prints lost processes on standard output, which is reserved for --json. There is no option to prevent this.
     importlib.import_module("ray._private.worker")._worker_logs_enabled = False  # type: ignore[attr-defined]
     return ray
-
-
-_runners: dict[str, Runner[Any]] = {}
-"""The runner of this process, by the id of the run. It is reused for the next tasks, so that a model is read once."""
-
-
-def _run_task(run_id: str, create_runner: Callable[[], Runner[Any]], task: Task[Any]) -> list[Any]:
-    if run_id not in _runners:
-        _runners.clear()
-        _runners[run_id] = create_runner()
-    return _runners[run_id](task)
