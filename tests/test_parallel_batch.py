@@ -2,6 +2,7 @@
 
 import hashlib
 import os
+from contextlib import closing
 from functools import partial
 from pathlib import Path
 
@@ -20,7 +21,6 @@ from brewster.options import Options
 from brewster.remote_path import location
 from cli_helpers import image_bytes, json_lines, layer_files, list_files, run_process
 
-TESTS = Path(__file__).parent
 NAMES = ("a.jpg", "b/c.jpg", "b/d.jpg")
 
 
@@ -185,7 +185,7 @@ def test_rows_survive_a_killed_run_and_a_store_that_fails_for_a_while(store, mon
 
 def test_a_skipped_photo_replaces_the_row_of_a_failure_only(tmp_path):
     for status in ("failed", "skipped", "separated", "skipped"):
-        with IndexWriter(tmp_path / "out") as index:
+        with closing(IndexWriter(tmp_path / "out")) as index:
             index.append(FileResult("a.jpg", status, photo_sha256=status))
         seen = read_index(tmp_path)["a.jpg"]
         assert seen["photo_sha256"] == seen["status"]
@@ -196,7 +196,7 @@ def test_a_skipped_photo_replaces_the_row_of_a_failure_only(tmp_path):
 def test_an_index_of_an_earlier_version_is_continued(tmp_path):
     old = pyarrow.table({"path": ["a.jpg"], "status": ["separated"], "dropped": [1]})
     parquet.write_table(old, tmp_path / INDEX_FILE)
-    with IndexWriter(tmp_path) as index:
+    with closing(IndexWriter(tmp_path)) as index:
         index.append(FileResult("b.jpg"))
     table = parquet.read_table(tmp_path / INDEX_FILE)
     assert table.column_names == list(COLUMNS)
@@ -205,7 +205,7 @@ def test_an_index_of_an_earlier_version_is_continued(tmp_path):
 
 def test_a_path_that_is_not_text_is_stored_with_escapes(tmp_path):
     for _ in range(2):
-        with IndexWriter(tmp_path) as index:
+        with closing(IndexWriter(tmp_path)) as index:
             index.append(FileResult(os.fsdecode(b"\xff.jpg"), error=os.fsdecode(b"\xff.jpg is damaged")))
     table = parquet.read_table(tmp_path / INDEX_FILE)
     assert table.column("path").to_pylist() == [r"\udcff.jpg"]

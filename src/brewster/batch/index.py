@@ -11,7 +11,7 @@ import importlib
 import io
 import time
 from collections.abc import Callable
-from typing import Any, Final, Self, final
+from typing import Any, Final, final
 
 from brewster.batch.manifest import import_parquet
 from brewster.batch.plan import FileResult
@@ -42,7 +42,7 @@ COLUMNS: Final[dict[str, tuple[str, Callable[[FileResult], object]]]] = {
 
 @final
 class IndexWriter:
-    """Writes the index of an output folder. A context manager: all rows are merged into index.parquet when it exits.
+    """Writes the index of an output folder. `close` merges all rows into index.parquet.
     Raises OutputError if the folder cannot be written to, or has another file named index.parquet, and MissingExtra
     if pyarrow is not installed."""
 
@@ -88,12 +88,6 @@ class IndexWriter:
             part.unlink()
         with contextlib.suppress(OSError):  # the folder contains parts of another run
             self._parts_folder.rmdir()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
     def _write_part(self) -> None:
         self._written_at = time.monotonic()

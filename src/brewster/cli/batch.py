@@ -6,7 +6,7 @@ import json
 import time
 from collections import Counter, defaultdict
 from collections.abc import Sequence
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack, closing, suppress
 from dataclasses import KW_ONLY, asdict, dataclass, field
 from functools import partial
 from pathlib import Path
@@ -71,7 +71,7 @@ class BatchReport:
             if has_index and self.output and not self.dry_run:
                 from brewster.batch.index import IndexWriter  # noqa: PLC0415
 
-                self._index = stack.enter_context(IndexWriter(location(self.output)))
+                self._index = stack.enter_context(closing(IndexWriter(location(self.output))))
             is_shown = not (self.quiet or self.as_json)
             update_progress = stack.enter_context(progress(self.count, shown=is_shown))
             overwrite, dry_run = self.overwrite, self.dry_run
