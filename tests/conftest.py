@@ -1,10 +1,11 @@
-"""Shared fixtures. Each test runs offline and with one thread (otherwise, the threads of parallel tests compete for the cores)."""
+"""Shared fixtures. Each test runs offline, without a GPU, and with one thread (otherwise, the threads of parallel tests compete for the cores)."""
 
 import io
 import os
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 os.environ.setdefault("VIPS_CONCURRENCY", "1")
+os.environ["CUDA_VISIBLE_DEVICES"] = ""
 
 import shutil
 import socket
@@ -138,21 +139,33 @@ def page_link(model):
 
 
 @pytest.fixture
-def open_page(chromium, page_link):
-    """Opens the page; an error in its scripts, or a request to another server, fails the test."""
-    contexts, failures, requested = [], [], []
+def new_page(chromium):
+    """Creates an empty page in its own context; an error in its scripts fails the test."""
+    contexts, errors = [], []
+
+    def new_page(**kwargs):
+        contexts.append(chromium.new_context(**kwargs))
+        contexts[-1].set_default_timeout(BROWSER_TIMEOUT_MS)
+        page = contexts[-1].new_page()
+        page.on("pageerror", lambda error: errors.append(str(error)))
+        return page
+
+    yield new_page
+    for context in contexts:
+        context.close()
+    assert not errors
+
+
+@pytest.fixture
+def open_page(new_page, page_link):
+    """Opens the page; a violation of its security policy, or a request to another server, fails the test."""
+    violations, requested = [], []
 
     def open_page(**kwargs):
-        context = chromium.new_context(
-            **{"viewport": {"width": 1100, "height": 760}, "accept_downloads": True, **kwargs}
-        )
-        contexts.append(context)
-        context.set_default_timeout(BROWSER_TIMEOUT_MS)
-        page = context.new_page()
-        page.on("pageerror", lambda error: failures.append(str(error)))
+        page = new_page(**{"viewport": {"width": 1100, "height": 760}, "accept_downloads": True, **kwargs})
         page.on(
             "console",
-            lambda message: failures.append(message.text) if "Content Security" in message.text else None,
+            lambda message: violations.append(message.text) if "Content Security" in message.text else None,
         )
         page.on("request", lambda request: requested.append(request.url))
         page.goto(page_link)
@@ -161,9 +174,7 @@ def open_page(chromium, page_link):
         return page
 
     yield open_page
-    for context in contexts:
-        context.close()
-    assert not failures
+    assert not violations
     here = page_link.partition("?")[0]
     assert [url for url in requested if not url.startswith((here, "blob:"))] == []
 

@@ -81,9 +81,11 @@ def on_loopback(handler, content):
         server.content = content(f"http://127.0.0.1:{server.server_port}")
         thread = Thread(target=server.serve_forever, kwargs={"poll_interval": 0.01})
         thread.start()
-        yield server.content
-        server.shutdown()
-        thread.join()
+        try:
+            yield server.content
+        finally:
+            server.shutdown()
+            thread.join()
 
 
 def served():

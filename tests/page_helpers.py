@@ -37,5 +37,9 @@ def difference(one, other):
     return np.abs(one.astype(int) - other.astype(int))
 
 
+def names_in_list(page):
+    return page.locator("#photos .name").all_inner_texts()
+
+
 def share(page):
     return int(page.get_by_role("slider", name="Line").get_attribute("aria-valuenow"))

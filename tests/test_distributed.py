@@ -5,7 +5,6 @@ import sys
 
 import accelerate
 import pytest
-import torch
 
 from brewster.errors import DeviceError
 from brewster.training import distributed
@@ -47,7 +46,6 @@ print(distributed.world_size(), distributed.rank(), distributed.is_main_process(
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(torch.cuda.is_available(), reason="two processes need two GPUs, if there is a GPU")
 def test_two_processes_have_ranks_and_sum_each_tensor(tmp_path):
     (tmp_path / "two.py").write_text(
         """

@@ -28,11 +28,15 @@ SAMPLED = (
     struct.pack(">4s4xI", b"curv", 1024) + (np.linspace(0, 1, 1024) ** 1.8 * 65535).astype(">u2").tobytes()
 )
 NOISE_8BIT = np.random.default_rng(1).integers(0, 256, (8, 8, 3), np.uint8)
-SRGB_PARA = struct.pack(">4s4xHH", b"para", 3, 0) + struct.pack(
-    ">5i", *(round(65536 * x) for x in (2.4, 1 / 1.055, 0.055 / 1.055, 1 / 12.92, 0.04045))
-)
 ADOBE = ((0.60974, 0.31111, 0.01947), (0.20528, 0.62567, 0.06087), (0.14919, 0.06322, 0.74457))
+REC709 = ((0.43607, 0.22249, 0.01392), (0.38515, 0.71687, 0.09708), (0.14307, 0.06061, 0.71410))
 PRO = ((0.79767, 0.28804, 0.0), (0.13519, 0.71188, 0.0), (0.03134, 0.00009, 0.82491))
+
+
+def parametric(function, *parameters):
+    """Returns a tone curve as a tag of parametricCurveType."""
+    numbers = [round(65536 * value) for value in parameters]
+    return struct.pack(f">4s4xHH{len(numbers)}i", b"para", function, 0, *numbers)
 
 
 def profile(curve, colourants):
@@ -183,9 +187,7 @@ def test_only_changed_pixels_change():
     [
         bytes(pyvips.Image.profile_load("srgb")),
         ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes(),
-        profile(
-            SRGB_PARA, ((0.43607, 0.22249, 0.01392), (0.38515, 0.71687, 0.09708), (0.14307, 0.06061, 0.71410))
-        ),
+        profile(parametric(3, 2.4, 1 / 1.055, 0.055 / 1.055, 1 / 12.92, 0.04045), REC709),
     ],
 )
 def test_a_profile_that_equals_srgb_is_recognised(icc):
@@ -242,9 +244,7 @@ def test_chromaticities_are_converted_to_rec709_and_white_stays_white():
 @pytest.mark.parametrize(("function", "count"), [(0, 1), (1, 3), (2, 4), (3, 5), (4, 7)])
 def test_all_parametric_functions_of_icc_agree_with_littlecms(function, count):
     numbers = (2.2, 0.9, 0.1, 0.0 if function == 2 else 0.08, 0.05, 0.0, 0.0)[:count]
-    curve = struct.pack(">4s4xHH", b"para", function, 0)
-    curve += struct.pack(f">{count}i", *(round(65536 * number) for number in numbers))
-    test_profile = profile(curve, ADOBE)
+    test_profile = profile(parametric(function, *numbers), ADOBE)
     pixels = np.repeat(np.arange(256, dtype=np.uint8)[None, :, None], 3, axis=2)
     expected = littlecms(
         pixels, ImageCms.ImageCmsProfile(io.BytesIO(test_profile)), ImageCms.createProfile("sRGB")
@@ -255,8 +255,7 @@ def test_all_parametric_functions_of_icc_agree_with_littlecms(function, count):
 
 def light_by_lut(pixels):
     """Returns the linear Rec.709 light of pixels with the LUT profile, by its formula."""
-    rec709 = np.array(((0.43607, 0.22249, 0.01392), (0.38515, 0.71687, 0.09708), (0.14307, 0.06061, 0.71410)))
-    return (pixels / np.iinfo(pixels.dtype).max) ** 1.8 @ np.array(LUT_PRIMARIES) @ np.linalg.inv(rec709)
+    return (pixels / np.iinfo(pixels.dtype).max) ** 1.8 @ np.array(LUT_PRIMARIES) @ np.linalg.inv(REC709)
 
 
 @pytest.mark.parametrize(
@@ -311,12 +310,6 @@ def test_a_lut_profile_is_refused_for_grey_and_for_floats(dtype, channels):
 def test_profiles_without_curves_and_matrix_are_refused(icc):
     with pytest.raises(UnsupportedPhoto, match="curves and a matrix"):
         colour_space_of(icc, None, is_float=False)
-
-
-def parametric(function, *parameters):
-    """Returns a tone curve as a tag of parametricCurveType."""
-    numbers = [round(65536 * value) for value in parameters]
-    return struct.pack(f">4s4xHH{len(numbers)}i", b"para", function, 0, *numbers)
 
 
 @pytest.mark.parametrize(

@@ -7,11 +7,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import pyvips
 
 from brewster import Photo
 from brewster.inference import Separator
 from brewster.inference.guided_upsampling import upsample_rows
 from brewster.options import Options
+from brewster.photo import FileInfo
 from brewster.srgb import to_encoded, to_linear
 from brewster.web.preview import MAX_PREVIEW_PIXELS, TILE_PX, photo_tile, preview
 from cli_helpers import image_bytes
@@ -133,10 +135,6 @@ def test_a_rotated_photo_is_shown_upright_and_a_grey_one_grey():
 
 
 def test_a_wide_gamut_photo_is_shown_in_srgb():
-    import pyvips  # noqa: PLC0415
-
-    from brewster.photo.file_info import FileInfo  # noqa: PLC0415
-
     p3 = Photo(
         np.full((20, 30, 3), (230, 60, 60), np.uint8), None, FileInfo(icc=pyvips.Image.profile_load("p3"))
     )

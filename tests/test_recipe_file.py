@@ -21,18 +21,15 @@ SCENES = sorted(_FOLDER.glob("render/*.toml"))
 TRAINING = sorted(path for path in _FOLDER.glob("**/*.toml") if path not in SCENES)
 
 
-@pytest.fixture
-def problems(tmp_path):
-    def problems(text, read=lambda path: read_toml(SceneRecipe, path, reference="docs/recipes.md")):
-        (tmp_path / "mine.toml").write_text(text)
-        with pytest.raises(RecipeError) as caught:
-            read(tmp_path / "mine.toml")
-        return str(caught.value).replace(f"{tmp_path}/", "").splitlines()
-
-    return problems
+def refused(path, text):
+    """The error for a scene recipe with this text."""
+    path.write_text(text)
+    with pytest.raises(RecipeError) as caught:
+        read_toml(SceneRecipe, path, reference="docs/recipes.md")
+    return caught.value
 
 
-def test_all_problems_are_reported_at_once_with_file_key_value_and_what_is_allowed(problems):
+def test_all_problems_are_reported_at_once_with_file_key_value_and_what_is_allowed(tmp_path):
     text = """
 name = "mine"
 samples_per_pixel = 0
@@ -44,7 +41,7 @@ map_probabilty = 0.5
 [camera_respons]
 contrast = [0, 1]
 """
-    found = problems(text)
+    found = str(refused(tmp_path / "mine.toml", text)).replace(f"{tmp_path}/", "").splitlines()
     assert found[1] == (
         "mine.toml: samples_per_pixel is 0; expected an integer, above 0; compare with docs/recipes.md."
     )
@@ -57,12 +54,10 @@ contrast = [0, 1]
     assert found[4].endswith("did you mean behind.map_probability?")
 
 
-def test_an_error_with_several_problems_can_be_pickled(problems, tmp_path):
-    (tmp_path / "mine.toml").write_text("")
-    with pytest.raises(RecipeError) as caught:
-        read_toml(SceneRecipe, tmp_path / "mine.toml", reference="docs/recipes.md")
-    assert str(pickle.loads(pickle.dumps(caught.value))) == str(caught.value)
-    assert len(caught.value.messages()) == 2
+def test_an_error_with_several_problems_can_be_pickled(tmp_path):
+    error = refused(tmp_path / "mine.toml", "")
+    assert str(pickle.loads(pickle.dumps(error))) == str(error)
+    assert len(error.messages()) == 2
 
 
 @pytest.mark.parametrize("name", [*RECIPES, *map(str, SCENES)])

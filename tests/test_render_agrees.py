@@ -1,15 +1,14 @@
 """Compares the analytic renderer with Mitsuba's scalar variant, which runs wherever Mitsuba can be imported."""
 
-import warnings
-
 import pytest
 import torch
 
-from brewster.errors import MissingExtra
 from brewster.render.analytic import render
 from brewster.render.mitsuba import renderer
 from brewster.render.mitsuba.variant import VariantProbe
 from synthetic_scenes import ASSETS, camera_towards_glass, make_scene, plane_side
+
+pytestmark = pytest.mark.filterwarnings("ignore:no LLVM works:RuntimeWarning")
 
 SCENE = make_scene(
     camera=camera_towards_glass(25, 5, width=16, height=16, fov_deg=12),
@@ -22,23 +21,14 @@ RUNS = 4
 
 
 @pytest.fixture(scope="module")
-def traced_layers():
+def traced_layers(mitsuba):
     """Independent images of every layer, (RUNS, 3, H, W) each; their standard deviation estimates the noise."""
     seeds = [SCENE.model_copy(update={"seed": seed}) for seed in range(RUNS)]
-    with (
-        pytest.MonkeyPatch.context() as patch,
-        warnings.catch_warnings(
-            action="ignore", category=RuntimeWarning
-        ),  # the warning about LLVM, which this test does not need
-    ):
+    with pytest.MonkeyPatch.context() as patch:
         patch.setattr(renderer, "probe", lambda: VariantProbe("scalar_rgb"))
-        try:
-            samples = [
-                renderer.trace(scene, ASSETS, noise_threshold=0.02, max_samples=512).images()
-                for scene in seeds
-            ]
-        except MissingExtra as error:
-            pytest.skip(f"Mitsuba cannot be used: {error}")
+        samples = [
+            renderer.trace(scene, ASSETS, noise_threshold=0.02, max_samples=512).images() for scene in seeds
+        ]
     return {name: torch.stack([sample[name] for sample in samples]).double() for name in samples[0]}
 
 

@@ -1,6 +1,5 @@
 """Rendered sets on disk: the files of a sample, folders and shards, the index, and the contact sheet."""
 
-import io
 import shutil
 import tarfile
 
@@ -153,7 +152,7 @@ def test_the_contact_sheet_has_a_row_for_each_sample_in_two_columns(four_samples
     for index in range(4, 23):
         shutil.copytree(four_samples / "000000", tmp_path / "set" / store.key(index))
     preview.write_preview(tmp_path / "set")
-    sheet = Photo.open(io.BytesIO((tmp_path / "set" / preview.PREVIEW_FILE).read_bytes()).getvalue())
+    sheet = Photo.open(tmp_path / "set" / preview.PREVIEW_FILE)
     assert sheet.size == (2 * 152 + 8, 20 * 20)
     assert (sheet.pixels[-20:, 152:] == 255).all()
 

@@ -2,7 +2,6 @@
 
 import json
 import os
-import subprocess
 import sys
 import time
 from dataclasses import replace
@@ -19,7 +18,7 @@ from brewster.evaluate import runner
 from brewster.evaluate.config import EvaluationConfig
 from brewster.evaluate.methods import IdentityBaseline, MethodOutput, ModelMethod
 from brewster.evaluate.score_log import SCORES_FILE
-from other_processes import children, is_alive, wait_for
+from other_processes import children, is_alive, started, wait_for
 
 QUICK = EvaluationConfig(metrics=("psnr", "ssim"))
 NAMES = ["1", "2", "3"]
@@ -193,7 +192,7 @@ if __name__ == "__main__":
     score(parts, [EndlessMethod("started")], QUICK, folder / "out", workers=2)
 """
     (tmp_path / "run.py").write_text(code)
-    with subprocess.Popen(
+    with started(
         [sys.executable, tmp_path / "run.py"],
         cwd=tmp_path,
         env={**os.environ, "PYTHONPATH": os.pathsep.join([str(Path(__file__).parent), *sys.path])},

@@ -18,17 +18,8 @@ from brewster.errors import OutputError
 from brewster.web.application import lan_address
 from brewster.web.model_cache import ModelCache
 from cli_helpers import image_bytes
-from file_server import loopback_only
 from page_helpers import canvas, upload
 from web_servers import form, serve_process
-
-
-@pytest.fixture
-def reachable(monkeypatch):
-    """Allows connections to this machine, for the address that the server prints."""
-    monkeypatch.undo()
-    loopback_only(monkeypatch)
-    return socket
 
 
 def get(url, **headers):
@@ -39,7 +30,8 @@ def get(url, **headers):
         return error.code, error.read()
 
 
-def test_the_command_serves_requests_until_it_is_interrupted(reachable, model):
+@pytest.mark.loopback
+def test_the_command_serves_requests_until_it_is_interrupted(model):
     with serve_process("--model", model, "--token", "auto") as link:
         url, token = re.fullmatch(r"(http://127\.0\.0\.1:\d+/)\?token=([\w-]{16,})", link).groups()
         assert get(f"{url}health")[0] == 401
@@ -49,8 +41,9 @@ def test_the_command_serves_requests_until_it_is_interrupted(reachable, model):
         assert get(link)[0] == 200
 
 
+@pytest.mark.loopback
 @pytest.mark.parametrize("options", [[], ["--verbose"]])
-def test_the_message_of_a_library_is_only_in_the_log(reachable, model, tmp_path, options):
+def test_the_message_of_a_library_is_only_in_the_log(model, tmp_path, options):
     half = image_bytes(600, 400)[:20_000]
     with (tmp_path / "log").open("w") as log, serve_process("--model", model, *options, stderr=log) as link:
         response = httpx.post(f"{link}separate", **form(half))
@@ -164,21 +157,19 @@ def test_a_phone_reads_the_link_from_the_qr_code(lan):
     assert cv2.QRCodeDetectorAruco().detectAndDecode(image)[0] == link
 
 
-def test_a_phone_opens_the_link_once_and_separates_a_photo(lan, chromium):
+def test_a_phone_opens_the_link_once_and_separates_a_photo(lan, new_page):
     link, _ = lan
-    context = chromium.new_context(viewport={"width": 390, "height": 844}, has_touch=True, is_mobile=True)
-    page = context.new_page()
+    page = new_page(viewport={"width": 390, "height": 844}, has_touch=True, is_mobile=True)
     page.goto(link)
     page.wait_for_selector("#model option", state="attached")
     assert page.evaluate("[isSecureContext, document.cookie, location.search]") == [False, "", ""]
     page.reload()  # without the token in the address
     photo = image_bytes(60, 40, "png")
     upload(page, ("window.png", photo))
-    (cookie,) = context.cookies()
+    (cookie,) = page.context.cookies()
     assert (cookie["httpOnly"], cookie["sameSite"]) == (True, "Strict")
     assert (canvas(page, "left") == Photo.open(photo).pixels).all()
     assert page.locator("li.done").count() == 1
-    context.close()
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,6 @@ from urllib.parse import quote
 
 import numpy as np
 import pytest
-from PIL import Image
 
 from brewster import Photo
 from brewster.burst import separate_burst
@@ -18,17 +17,12 @@ from brewster.burst.separate import measure_layers
 from brewster.burst.solver import Level, solve
 from brewster.inference import Separator
 from cli_helpers import image_bytes
+from picture_files import file_of
 from simulated_bursts import read_photo, simulate_burst
 from test_preview import Maps
 from web_servers import make_app, pane, request
 
 PICTURES = sorted((Path(__file__).parent / "pictures").glob("*.jpg"))
-
-
-def png(pixels):
-    file = io.BytesIO()
-    Image.fromarray(pixels).save(file, "PNG")
-    return file.getvalue()
 
 
 @pytest.fixture(scope="module")
@@ -38,7 +32,7 @@ def photos():
     burst = simulate_burst(
         *layers, frames=3, relative_px=12, common_px=3, strength=0.4, noise=0, size=(120, 90)
     )
-    return [png(frame) for frame in burst.frames]
+    return [file_of(frame, "PNG") for frame in burst.frames]
 
 
 @pytest.fixture
@@ -58,10 +52,10 @@ def send(path, photos, app=None, mask=None, **fields):
 def test_a_burst_with_a_mask_returns_the_layers_of_the_python_function(photos):
     mask = np.zeros((90, 120), np.uint8)
     mask[:, 60:] = 255
-    response = send("/separate", photos, mask=png(mask), reference="3", strength="0.7")
+    response = send("/separate", photos, mask=file_of(mask, "PNG"), reference="3", strength="0.7")
     assert response.status_code == 200, response.text
     expected = separate_burst(
-        photos, reference=2, separator=Separator(pane, name="pane"), strength=0.7, mask=png(mask)
+        photos, reference=2, separator=Separator(pane, name="pane"), strength=0.7, mask=file_of(mask, "PNG")
     )
     with zipfile.ZipFile(io.BytesIO(response.content)) as archive:
         made = {name: Photo.open(archive.read(name)).pixels for name in archive.namelist()}

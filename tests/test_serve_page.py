@@ -149,17 +149,6 @@ def test_the_confidence_is_shown_as_colours_over_the_grey_photo_with_a_legend(op
     assert middle @ [2, 7, 1] > unknown @ [2, 7, 1] + 100  # the order is visible without colours
 
 
-def row(page):
-    """The pixels of the middle row of the view, without the line and its handle."""
-    settle(page)
-    value = page.evaluate("""() => {
-        const canvas = document.querySelector("glass-compare canvas");
-        const y = Math.round(canvas.height / 2);
-        return Array.from(canvas.getContext("2d").getImageData(0, y, canvas.width, 1).data);
-    }""")
-    return np.array(value).reshape(-1, 4)[:, 0]
-
-
 def test_a_file_that_is_not_a_photo_shows_an_error_and_can_be_retried_or_removed(open_page):
     page = open_page()
     upload(page, ("holiday.jpg", b"not a picture"), ("window.png", image_bytes(90, 60, "png")))

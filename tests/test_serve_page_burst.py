@@ -7,13 +7,9 @@ import pytest
 
 from brewster import Photo
 from cli_helpers import image_bytes
-from page_helpers import downloaded, upload
+from page_helpers import downloaded, names_in_list, upload
 
 PHOTOS = [(f"{number}.png", image_bytes(90, 60, "png", number)) for number in (1, 2, 3)]
-
-
-def names(page):
-    return page.locator("#photos .name").all_inner_texts()
 
 
 def test_photos_of_one_size_can_be_one_burst_that_is_downloaded_and_split_again(open_page, run):
@@ -24,7 +20,7 @@ def test_photos_of_one_size_can_be_one_burst_that_is_downloaded_and_split_again(
     page.get_by_role("button", name="Yes, one window").click()
     page.wait_for_selector("li.done")
     page.get_by_text("No other photo shows the same scene").wait_for()
-    assert names(page) == ["3 \N{MULTIPLICATION SIGN} 2.png"]
+    assert names_in_list(page) == ["3 \N{MULTIPLICATION SIGN} 2.png"]
     assert not page.locator("#burst").is_visible()
     page.get_by_label("Strength", exact=True).fill("0.5")
     name, data = downloaded(page, page.get_by_role("button", name="Download transmission").click)
@@ -35,14 +31,14 @@ def test_photos_of_one_size_can_be_one_burst_that_is_downloaded_and_split_again(
     page.get_by_role("button", name="Undo removal").click()
     page.get_by_role("button", name="Separate the photos one by one").click()
     page.wait_for_selector("li.done >> nth=2")
-    assert names(page) == ["1.png", "2.png", "3.png"]
+    assert names_in_list(page) == ["1.png", "2.png", "3.png"]
 
 
 def test_photos_of_two_sizes_and_the_answer_no_leave_the_list_as_it_is(open_page):
     page = open_page()
     upload(page, *PHOTOS[:2])
     page.get_by_role("button", name="No", exact=True).click()
-    assert names(page) == ["1.png", "2.png"]
+    assert names_in_list(page) == ["1.png", "2.png"]
     upload(page, ("a.png", image_bytes(80, 60, "png")), ("b.png", image_bytes(60, 80, "png")))
     assert not page.locator("#burst").is_visible()
 

@@ -3,11 +3,7 @@
 import pytest
 
 from cli_helpers import image_bytes
-from page_helpers import downloaded, upload
-
-
-def names_in_list(page):
-    return page.locator("#photos .name").all_inner_texts()
+from page_helpers import downloaded, names_in_list, upload
 
 
 def drop(page, *paths):

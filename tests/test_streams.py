@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 import torch
 
-from brewster.environments.assets import Assets
 from brewster.errors import UnsupportedPhoto
 from brewster.photo import Photo
 from brewster.training.data.data_recipe import DataRecipe
@@ -22,19 +21,6 @@ TINY = Path(__file__).parents[1] / "recipes/ablations/tiny.toml"
 @pytest.fixture
 def recipe():
     return read_recipe(TINY)
-
-
-@pytest.fixture(scope="module")
-def assets():
-    return Assets()
-
-
-@pytest.fixture
-def builtin(assets, monkeypatch):
-    """Built-in environments, which all tests share, without a data folder."""
-    monkeypatch.setattr("brewster.training.streams.Assets", lambda folders: assets)
-    monkeypatch.delenv("BREWSTER_DATA", raising=False)
-    return assets
 
 
 @pytest.fixture
@@ -63,8 +49,8 @@ def test_datasets_have_a_path_in_the_data_folder_or_an_absolute_path(recipe, roo
     assert same(below(3, 2, 32), absolute(3, 2, 32))
 
 
-def test_orders_and_seed_of_a_recipe_reach_the_scenes(recipe, builtin):
-    endless = with_value(recipe, "data.rendered.count", None)
+def test_orders_and_seed_of_a_recipe_reach_the_scenes(rendered_recipe):
+    endless = with_value(rendered_recipe, "data.rendered.count", None)
     whole, paper, other = (
         open_stream(with_value(endless, f"data.rendered.{name}", value))(0, 1, 32)
         for name, value in (("orders", "all"), ("orders", "truncated"), ("seed", 2))

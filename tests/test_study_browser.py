@@ -45,26 +45,6 @@ def url(store):
         yield f"http://127.0.0.1:{port}/"
 
 
-@pytest.fixture
-def open_page(chromium):
-    """Opens the page of a participant; an error in its scripts fails the test."""
-    contexts, errors = [], []
-
-    def open_page(url, **kwargs):
-        context = chromium.new_context(**kwargs)
-        contexts.append(context)
-        context.set_default_timeout(120_000)  # for slow machines
-        page = context.new_page()
-        page.on("pageerror", lambda error: errors.append(error))  # noqa: PLW0108  (playwright marks its handlers)
-        page.goto(url)
-        return page
-
-    yield open_page
-    for context in contexts:
-        context.close()
-    assert not errors
-
-
 def press(page, key):
     """Presses a key after the time in which the page ignores answers."""
     page.wait_for_selector(READY)
@@ -81,8 +61,9 @@ def begin(page):
     page.wait_for_selector(READY)
 
 
-def test_the_whole_study_works_with_the_keyboard_only(open_page, url, store):
-    page = open_page(url)
+def test_the_whole_study_works_with_the_keyboard_only(new_page, url, store):
+    page = new_page()
+    page.goto(url)
     page.wait_for_selector("#invitation:not([hidden])")
     for key in ("Tab", "Tab", "Space", "Tab", "Enter"):  # the first is the link to the privacy page
         page.keyboard.press(key)
@@ -101,8 +82,9 @@ def test_the_whole_study_works_with_the_keyboard_only(open_page, url, store):
     assert (shown.theme, shown.pointer, shown.view, shown.switches) == ("light", "fine", "all", 0)
 
 
-def test_the_pictures_of_the_trial_are_shown_on_their_sides_and_have_names(open_page, url, store):
-    page = open_page(url, viewport={"width": 1280, "height": 800})
+def test_the_pictures_of_the_trial_are_shown_on_their_sides_and_have_names(new_page, url, store):
+    page = new_page(viewport={"width": 1280, "height": 800})
+    page.goto(url)
     begin(page)
     ((participant, _),) = store.all_answers()
     page.wait_for_timeout(300)  # the fade-in of the pictures
@@ -119,8 +101,9 @@ def test_the_pictures_of_the_trial_are_shown_on_their_sides_and_have_names(open_
     assert page.get_by_role("heading", level=1).all_inner_texts() == ["Which result looks better?"]
 
 
-def test_the_last_answer_can_be_undone_also_after_the_last_trial(open_page, url, store):
-    page = open_page(url)
+def test_the_last_answer_can_be_undone_also_after_the_last_trial(new_page, url, store):
+    page = new_page()
+    page.goto(url)
     begin(page)
     undo = page.get_by_role("button", name="Undo the last answer")
     expect(undo).to_be_hidden()
@@ -142,8 +125,9 @@ def test_the_last_answer_can_be_undone_also_after_the_last_trial(open_page, url,
     assert (answers[0].choice, answers[0].withdrawn) == ("right", ("left",))
 
 
-def test_an_answer_without_acknowledgement_is_sent_again(open_page, url, store):
-    page = open_page(url)
+def test_an_answer_without_acknowledgement_is_sent_again(new_page, url, store):
+    page = new_page()
+    page.goto(url)
     begin(page)
     posts = []
 
@@ -165,10 +149,11 @@ def test_an_answer_without_acknowledgement_is_sent_again(open_page, url, store):
     assert len(posts) == 2
 
 
-def test_a_phone_shows_everything_without_horizontal_scrolling_and_accepts_touch(open_page, url, store):
-    page = open_page(
-        url, viewport={"width": 390, "height": 844}, has_touch=True, is_mobile=True, color_scheme="dark"
+def test_a_phone_shows_everything_without_horizontal_scrolling_and_accepts_touch(new_page, url, store):
+    page = new_page(
+        viewport={"width": 390, "height": 844}, has_touch=True, is_mobile=True, color_scheme="dark"
     )
+    page.goto(url)
     begin(page)
     assert page.evaluate("document.documentElement.scrollWidth") == 390
     buttons = [

@@ -1,10 +1,9 @@
 """A study as static files: export, answers in a browser, import, report."""
 
-import functools
 import json
-import threading
-from contextlib import closing, contextmanager
-from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
+from contextlib import closing
+from functools import partial
+from http.server import SimpleHTTPRequestHandler
 
 import pytest
 
@@ -12,6 +11,7 @@ from brewster.errors import BrewsterError
 from brewster.user_study.answer_file import read_answer_file
 from brewster.user_study.store import AnswerStore
 from brewster.web.study_bundle import export_bundle
+from file_server import on_loopback
 from small_studies import make_study
 
 pytestmark = pytest.mark.loopback
@@ -49,14 +49,9 @@ def answers(tmp_path):
     return write
 
 
-@contextmanager
 def served_folder(folder):
-    handler = functools.partial(SimpleHTTPRequestHandler, directory=str(folder))
-    handler.log_message = lambda *_: None
-    with ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
-        threading.Thread(target=server.serve_forever, daemon=True).start()
-        yield f"http://127.0.0.1:{server.server_port}/"
-        server.shutdown()
+    """Serves the files of a folder; yields its URL."""
+    return on_loopback(partial(SimpleHTTPRequestHandler, directory=str(folder)), lambda url: f"{url}/")
 
 
 def test_a_bundle_names_no_method_and_no_correct_choice(study, store, tmp_path):
@@ -149,15 +144,12 @@ def test_the_commands_export_links_and_import_files(run_without_model, study, an
     assert [row["answers"] for row in json.loads(out)["rows"]] == [0, 1]
 
 
-def test_a_participant_answers_in_a_browser_and_the_file_is_imported(study, store, chromium, tmp_path):
+def test_a_participant_answers_in_a_browser_and_the_file_is_imported(study, store, new_page, tmp_path):
     from playwright.sync_api import expect  # noqa: PLC0415
 
     (token,) = export_bundle(study, store, tmp_path / "bundle", participants=1)
-    errors = []
-    with served_folder(tmp_path / "bundle") as url, closing(chromium.new_context()) as context:
-        context.set_default_timeout(120_000)  # for slow machines
-        page = context.new_page()
-        page.on("pageerror", lambda error: errors.append(error))  # noqa: PLW0108  (playwright marks its handlers)
+    page = new_page()
+    with served_folder(tmp_path / "bundle") as url:
         page.goto(f"{url}?p=0000000000000000")
         page.get_by_text(
             "The link with ?p=0000000000000000 is unknown. Expected the complete link"
@@ -191,7 +183,6 @@ def test_a_participant_answers_in_a_browser_and_the_file_is_imported(study, stor
         waiting.value.save_as(path)
         page.goto(f"{url}privacy.html")
         expect(page.get_by_text("Your browser keeps your answers")).to_be_visible()
-    assert not errors
     assert path.name == f"answers-{token[:8]}.json"
     assert store.import_answers(read_answer_file(path)) == 5
     ((_, stored),) = store.all_answers()

@@ -15,15 +15,11 @@ from brewster.environments import training_photos
 from brewster.environments.training_photos import COLUMNS, difference_hash, pull, read_table
 from brewster.errors import DownloadError, OutputError
 from brewster.models import zoo
-from file_server import loopback_only, served
+from file_server import served
+
+pytestmark = pytest.mark.loopback
 
 ROOT = Path(__file__).parents[1]
-
-
-@pytest.fixture(autouse=True)
-def _network_off(monkeypatch):
-    """Allows connections to this machine only. In other tests, no connection is allowed."""
-    loopback_only(monkeypatch)
 
 
 @pytest.fixture
