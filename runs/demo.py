@@ -9,9 +9,10 @@ from pathlib import Path
 
 import numpy as np
 
-from brewster import Photo, Separation, Separator
+from brewster import Photo, Separator
 from brewster.batch import SeparationTask, plan_files
 from brewster.errors import BrewsterError
+from brewster.photo.contact_sheet import side_by_side
 
 OUT = Path("out/demo")
 ROW_PX = 240
@@ -29,9 +30,11 @@ def main(source: Path) -> int:
             print(f"error: {task.name}: {error}", file=sys.stderr)
     if rows:
         width = max(row.shape[1] for row in rows)
-        padded = [np.pad(row, [(0, 8), (0, width - row.shape[1]), (0, 0)], constant_values=1) for row in rows]
+        padded = [
+            np.pad(row, [(0, 8), (0, width - row.shape[1]), (0, 0)], constant_values=255) for row in rows
+        ]
         sheet = OUT / "sheet.png"
-        Photo.from_array(np.concatenate(padded), encoding="linear").save(sheet, depth=8, overwrite=True)
+        Photo.from_array(np.concatenate(padded), encoding="srgb").save(sheet, overwrite=True)
         print(f"photo | transmission | reflection, side by side: {sheet}")
     return 1 if failures or not rows else 0
 
@@ -44,14 +47,7 @@ def separate(separator: Separator, task: SeparationTask) -> np.ndarray:
         getattr(result, layer).save(target, overwrite=True)
     print(f"{task.name}: {time.perf_counter() - started:.2f} s")
     print(*(f"  {target}" for target in task.outputs.values()), sep="\n")
-    return side_by_side(result)
-
-
-def side_by_side(result: Separation) -> np.ndarray:
-    width, height = result.photo.size
-    size = max(1, round(width * ROW_PX / height)), ROW_PX
-    photos = (result.photo, result.transmission, result.reflection)
-    return np.concatenate([np.clip(photo.resized(*size), 0, 1) for photo in photos], axis=1)
+    return side_by_side((result.photo, result.transmission, result.reflection), ROW_PX)
 
 
 if __name__ == "__main__":

@@ -152,7 +152,7 @@ class DownloadError(BrewsterError):
 
 def counted(number: int, noun: str) -> str:
     """Returns a number with its noun: `1 video` or `2 videos`."""
-    return f"{number} {noun}{'' if number == 1 else 's'}"
+    return f"{number:,} {noun}{'' if number == 1 else 's'}"
 
 
 VIDEO_CURE: Final = (

@@ -76,14 +76,13 @@ __all__ = [
 
 
 def _psnr(comparison: Comparison) -> float:
-    if comparison.region is None:
-        return min(psnr_of_counts(comparison.shared(_pair_counts)), IDENTICAL_DB)
-    prediction, truth = comparison.prediction.pixels, comparison.truth.pixels
-    return min(psnr(prediction, truth, region=comparison.region), IDENTICAL_DB)
+    counts = comparison.shared(_pair_counts) if comparison.region is None else _pair_counts(comparison)
+    return min(psnr_of_counts(counts), IDENTICAL_DB)
 
 
 def _pair_counts(comparison: Comparison) -> PairCounts:
-    return count_pairs(comparison.prediction.pixels, comparison.truth.pixels)
+    prediction, truth = comparison.prediction.pixels, comparison.truth.pixels
+    return count_pairs(prediction, truth, region=comparison.region)
 
 
 def _uniform_map(comparison: Comparison) -> NDArray[np.float64]:

@@ -11,15 +11,13 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from brewster.metrics.windows import Image, check_images
+from brewster.metrics.windows import Image, check_count, check_images
 
 MIN_CLIPPED: Final = 250
 MAX_LOST: Final = 240
 """An 8-bit value of a channel is clipped from MIN_CLIPPED, and lost if the prediction is below MAX_LOST."""
 MIN_NEAR_WHITE: Final = 200
 """A pixel is near white if all its 8-bit channels are above this value."""
-MIN_COUNT: Final = 64
-"""A score over fewer values is too noisy to report."""
 
 
 def lost_clipped(prediction: Image, truth: Image, photo: Image) -> float:
@@ -30,7 +28,7 @@ def lost_clipped(prediction: Image, truth: Image, photo: Image) -> float:
     Raises ValueError if the images are not uint8 (H, W, 3) or differ in shape, or fewer than 64 values are clipped."""
     check_images(prediction, truth, photo)
     is_clipped = np.minimum(photo, truth) >= MIN_CLIPPED
-    _check_count(int(is_clipped.sum()), f"channel values are at least {MIN_CLIPPED}")
+    check_count(int(is_clipped.sum()), f"channel values of photo and truth are at least {MIN_CLIPPED}")
     return float((prediction[is_clipped] < MAX_LOST).mean())
 
 
@@ -53,13 +51,8 @@ def near_white_cast(prediction: Image, truth: Image, photo: Image) -> float:
 def _near_white_losses(prediction: Image, truth: Image, photo: Image) -> NDArray[np.float64]:
     check_images(prediction, truth, photo)
     is_near_white = (np.minimum(photo, truth) > MIN_NEAR_WHITE).all(axis=2)
-    _check_count(int(is_near_white.sum()), f"pixels are above {MIN_NEAR_WHITE} in all channels")
+    check_count(int(is_near_white.sum()), f"pixels of both are above {MIN_NEAR_WHITE} in all channels")
     losses: NDArray[np.float64] = np.mean(
         truth[is_near_white].astype(np.int16) - prediction[is_near_white], axis=0
     )
     return losses
-
-
-def _check_count(count: int, condition: str) -> None:
-    if count < MIN_COUNT:
-        raise ValueError(f"{count} {condition} of photo and truth; a score needs at least {MIN_COUNT}")

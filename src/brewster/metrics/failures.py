@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Final, final
 import numpy as np
 from numpy.typing import NDArray
 
-from brewster.metrics.windows import Image, Region, check_images
+from brewster.metrics.windows import MIN_COUNT, Image, Region, check_count, check_images
 from brewster.srgb import REC709_LUMINANCE, to_linear
 
 if TYPE_CHECKING:
@@ -43,9 +43,6 @@ BLACK_LUMINANCE: Final = 0.01
 
 MIN_CLIPPED: Final = 254
 """A channel with at least this 8-bit value may be clipped, so its true value is unknown."""
-
-MIN_PIXELS: Final = 64
-"""A score or gain over fewer pixels is too noisy to report."""
 
 _LINEAR: Final = to_linear(np.arange(256) / 255)
 
@@ -104,11 +101,11 @@ class _Luminances:
         p, b, i, r = map(_luminance, (prediction, background, photo, reflection))
         unreflected = r < NEGLIGIBLE_FRACTION * i
         comparable_background = unreflected & (b >= BLACK_LUMINANCE) & ~_is_clipped(background)
-        condition = f"R < {NEGLIGIBLE_FRACTION:.0%} of I and B neither black nor clipped"
-        _require_pixels(comparable_background, condition)
+        condition = f"pixels have R < {NEGLIGIBLE_FRACTION:.0%} of I and B neither black nor clipped"
+        check_count(int(comparable_background.sum()), condition)
         comparable = comparable_background & (p >= BLACK_LUMINANCE) & ~_is_clipped(prediction)
         # The median is used, because content that is missing in less than half of the pixels must not change the gain.
-        gain = np.median(b[comparable] / p[comparable]) if comparable.sum() >= MIN_PIXELS else 1.0
+        gain = np.median(b[comparable] / p[comparable]) if comparable.sum() >= MIN_COUNT else 1.0
         return cls(p * float(gain), b, i, r, unreflected)
 
     def removed_fraction(self, mask: Region, condition: str) -> float:
@@ -117,13 +114,8 @@ class _Luminances:
 
 
 def _fraction(part: Light, whole: Light, mask: Region, condition: str) -> float:
-    _require_pixels(mask, condition)
+    check_count(int(mask.sum()), f"pixels have {condition}")
     return float(part[mask].sum() / whole[mask].sum())
-
-
-def _require_pixels(mask: Region, condition: str) -> None:
-    if (count := np.count_nonzero(mask)) < MIN_PIXELS:
-        raise ValueError(f"{count} pixels have {condition}; a score needs at least {MIN_PIXELS}")
 
 
 def _luminance(image: Image) -> Light:

@@ -37,28 +37,25 @@ def psnr(prediction: Image, truth: Image, *, region: Region | None = None) -> fl
 
     The mean squared error is over the three channels of all pixels, or of the pixels in `region`, bool (H, W). Raises
     ValueError if the images are not uint8 (H, W, 3) or differ in shape, or the region is empty or of another shape."""
-    if region is None:
-        return psnr_of_counts(count_pairs(prediction, truth))
-    windows.check_images(prediction, truth)
-    difference = prediction.astype(np.int32) - truth
-    return _to_decibels(windows.mean_inside(difference * difference, region))
+    return psnr_of_counts(count_pairs(prediction, truth, region=region))
 
 
 def psnr_of_counts(counts: PairCounts) -> float:
-    """The PSNR in dB over all pixels, from the counts of `count_pairs`; infinity for equal images."""
-    return _to_decibels(float(_SQUARED_ERRORS @ counts / counts.sum()))
-
-
-def _to_decibels(mse: float) -> float:
+    """The PSNR in dB, from the counts of `count_pairs`; infinity for equal images."""
+    mse = float(_SQUARED_ERRORS @ counts / counts.sum())
     return float(10 * np.log10(255**2 / mse)) if mse else float("inf")
 
 
-def count_pairs(prediction: Image, truth: Image) -> PairCounts:
+def count_pairs(prediction: Image, truth: Image, *, region: Region | None = None) -> PairCounts:
     """Counts the pairs of 8-bit values at the same position: the joint histogram of two images, over all channels.
-    Every mean over all pixels of a function of two values follows from it, and it is faster than the function of
-    each pixel. The counts are int64 (65536,). The index is 256 times the value of the prediction, plus that of the
-    ground truth. Raises ValueError if the images are not uint8 (H, W, 3) or differ in shape."""
+    Every mean over all pixels, or over those in `region`, of a function of two values follows from it, and it is
+    faster than the function of each pixel. The counts are int64 (65536,). The index is 256 times the value of the
+    prediction, plus that of the ground truth. Raises ValueError as `psnr`."""
     windows.check_images(prediction, truth)
+    if region is not None:
+        windows.check_region(region, prediction.shape[:2])
+        inside = np.flatnonzero(region)
+        prediction, truth = (image.reshape(-1, 3)[inside] for image in (prediction, truth))
     pairs = prediction.astype(np.intp)
     pairs *= 256
     pairs += truth
@@ -83,15 +80,11 @@ def linear_rmse(prediction: Image, truth: Image, *, region: Region | None = None
     L is the inverse of the sRGB curve (IEC 61966-2-1). The mean is over the three channels of all pixels, or of the
     pixels in `region`, bool (H, W). This error is proportional to the light that is wrong; errors of encoded values are
     not. Lower is better. Raises ValueError as `psnr`."""
-    if region is None:
-        return linear_rmse_of_counts(count_pairs(prediction, truth))
-    windows.check_images(prediction, truth)
-    difference = _LINEAR[prediction] - _LINEAR[truth]
-    return float(windows.mean_inside(difference * difference, region) ** 0.5)
+    return linear_rmse_of_counts(count_pairs(prediction, truth, region=region))
 
 
 def linear_rmse_of_counts(counts: PairCounts) -> float:
-    """The error of `linear_rmse` over all pixels, from the counts of `count_pairs`."""
+    """The error of `linear_rmse`, from the counts of `count_pairs`."""
     return float((_LINEAR_SQUARED_ERRORS @ counts / counts.sum()) ** 0.5)
 
 

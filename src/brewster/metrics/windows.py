@@ -17,6 +17,9 @@ else:
 
 _Values = TypeVar("_Values", bound=NDArray[Any])
 
+MIN_COUNT: Final = 64
+"""A score over fewer values is too noisy to report."""
+
 BOX_SIDE: Final = 7
 """The side of the uniform window, in pixels."""
 
@@ -46,6 +49,12 @@ def check_region(region: Region, shape: tuple[int, int]) -> None:
         raise ValueError(f"the region must be bool {shape}, not {region.dtype} {region.shape}")
     if not region.any():
         raise ValueError("the region is empty; a metric needs at least one pixel")
+
+
+def check_count(count: int, condition: str) -> None:
+    """Raises ValueError if a score is over fewer than 64 values. `condition` describes them: "pixels are white"."""
+    if count < MIN_COUNT:
+        raise ValueError(f"{count} {condition}; a score needs at least {MIN_COUNT}")
 
 
 def mean_inside(values: NDArray[Any], region: Region) -> float:

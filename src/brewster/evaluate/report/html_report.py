@@ -10,6 +10,7 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, Final
 
+from brewster.errors import counted
 from brewster.evaluate.methods import BASELINE
 from brewster.evaluate.report.images import COLOUR_MAP, MAX_ERROR, MAX_SIDE_PX, CaseThumbnails
 from brewster.evaluate.report.tables import is_complete, ranking, remarks, unavailable_metrics
@@ -28,7 +29,7 @@ def write_report(results: Results, cases: Iterable[CaseThumbnails], path: Path) 
     environment = jinja2.Environment(
         loader=jinja2.FileSystemLoader(_FOLDER), autoescape=True, trim_blocks=True, lstrip_blocks=True
     )
-    environment.filters |= {"has": _has, "number": _number, "count": _count, "verdict": _verdict}
+    environment.filters |= {"has": _has, "number": _number, "count": counted, "verdict": _verdict}
     entries = {(entry["benchmark"], entry["name"]): entry for entry in results["cases"]}
 
     def best_mean(table: Mapping[str, Any], method: str, key: str) -> str | None:
@@ -69,8 +70,8 @@ def _notes(results: Results) -> list[tuple[str, list[str]]]:
         for image in images
         for error in image["errors"].items()
     ]
-    counts, total = Counter(method for _, method, _ in errors), _count(len(images), "image")
-    counted = ", ".join(f"{method} on {count} of {total}" for method, count in counts.items())
+    counts, total = Counter(method for _, method, _ in errors), counted(len(images), "image")
+    failed = ", ".join(f"{method} on {count} of {total}" for method, count in counts.items())
     excluded, all_remarks = (
         [f"{benchmark['title']}: {text}" for benchmark in benchmarks for text in benchmark[kind]]
         for kind in ("excluded", "remarks")
@@ -78,10 +79,10 @@ def _notes(results: Results) -> list[tuple[str, list[str]]]:
     all_remarks += remarks(results)
     cure = "Metrics that were not computed. Correct the cause, then run the evaluation again to add them."
     return [
-        (f"Failed: {counted}", [f"{name}, {method}: {error}" for name, method, error in errors]),
+        (f"Failed: {failed}", [f"{name}, {method}: {error}" for name, method, error in errors]),
         (cure, unavailable_metrics(results)),
-        (_count(len(excluded), "file excluded"), excluded),
-        (_count(len(all_remarks), "remark"), all_remarks),
+        (f"{counted(len(excluded), 'file')} excluded", excluded),
+        (counted(len(all_remarks), "remark"), all_remarks),
     ]
 
 
@@ -94,12 +95,6 @@ def _differences(results: Results, *, is_baseline: bool) -> dict[str, dict[str, 
                 pair = row["method"] if is_baseline else f"{row['method']} minus {row['reference']}"
                 tables.setdefault(name, {}).setdefault(pair, {})[row["metric"]] = row
     return tables
-
-
-def _count(number: int, noun: str) -> str:
-    """Returns a number and its noun. The first word of the noun has the plural."""
-    first, *rest = noun.split()
-    return " ".join([f"{number:,}", first if number == 1 else f"{first}s", *rest])
 
 
 def _has(rows: Iterable[Mapping[str, float | None]], metric: str) -> bool:
