@@ -34,11 +34,10 @@ def test_a_participant_gets_the_assigned_trials_and_continues_where_they_stopped
     tokens = [store.admit() for _ in range(3)]
     participant = store.participant(tokens[2])
     assert participant.trials == draw_trials(store.study.description, 2)
-    assert store.next_trial(participant) == 0
     for trial in range(len(participant.trials)):
-        assert store.next_trial(participant) == trial
+        assert store.next_and_last_trial(participant) == (trial, trial - 1 if trial else None)
         store.record_answer(participant, trial, "similar", seconds=2)
-    assert store.next_trial(participant) is None
+    assert store.next_and_last_trial(participant) == (None, len(participant.trials) - 1)
 
 
 def test_the_first_answer_is_final(store):

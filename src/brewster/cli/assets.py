@@ -85,7 +85,16 @@ def pull(
         for name in options:
             if context.get_parameter_source(name) is click.core.ParameterSource.COMMANDLINE:
                 raise click.UsageError(f"--{name} is for maps; photos have none.")
-        results = _pull_photos(out, server, dry_run=dry_run, as_json=as_json, quiet=quiet)
+        from brewster.environments import training_photos  # noqa: PLC0415  (imports pyvips)
+
+        table = training_photos.read_table()
+        known, folder = sum(bool(photo.origin) for photo in table), out or cache_folder() / "photos"
+        fetched = training_photos.pull(folder, server=server or training_photos.SERVER, dry_run=dry_run)
+        results = _print_results(fetched, known, as_json=as_json, quiet=quiet)
+        if not quiet:
+            print_status(
+                f"{len(table) - known} of the {len(table)} photos are left out, because their origin is not known"
+            )
     else:
         from brewster.environments import polyhaven  # noqa: PLC0415  (imports urllib)
 
@@ -103,23 +112,6 @@ def pull(
             # The terms of service of Poly Haven require these words.
             print_status("powered by Poly Haven, polyhaven.com")
     context.exit(1 if any(result.error for result in results) else 0)
-
-
-def _pull_photos(
-    out: Path | None, server: str | None, *, dry_run: bool, as_json: bool, quiet: bool
-) -> list[DownloadResult]:
-    from brewster.environments import training_photos  # noqa: PLC0415  (imports pyvips)
-
-    table = training_photos.read_table()
-    known = sum(bool(photo.origin) for photo in table)
-    folder = out or cache_folder() / "photos"
-    fetched = training_photos.pull(folder, server=server or training_photos.SERVER, dry_run=dry_run)
-    results = _print_results(fetched, known, as_json=as_json, quiet=quiet)
-    if not quiet:
-        print_status(
-            f"{len(table) - known} of the {len(table)} photos are left out, because their origin is not known"
-        )
-    return results
 
 
 def _print_results(

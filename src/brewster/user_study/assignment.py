@@ -12,12 +12,11 @@ import itertools
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 from random import Random
-from typing import Final, Literal, final
+from typing import Literal, final
 
 from brewster.user_study.study import CatchTrial, StudyDescription
 
 Choice = Literal["left", "similar", "right"]
-CHOICES: Final[tuple[Choice, ...]] = ("left", "similar", "right")
 
 
 @final

@@ -139,16 +139,12 @@ class AnswerStore:
             ).fetchone()
         return row and _participant(*row)
 
-    def next_trial(self, participant: Participant) -> int | None:
-        """The index of the first trial without an answer, or None if all trials have one."""
+    def next_and_last_trial(self, participant: Participant) -> tuple[int | None, int | None]:
+        """The index of the first trial without an answer, and that of the last trial with one; None if there is none."""
         with self._transaction() as database:
             answered = _answered(database, participant)
-        return next((trial for trial in range(len(participant.trials)) if trial not in answered), None)
-
-    def last_trial(self, participant: Participant) -> int | None:
-        """The index of the last trial with an answer, or None if there is no answer."""
-        with self._transaction() as database:
-            return max(_answered(database, participant), default=None)
+        remaining = (trial for trial in range(len(participant.trials)) if trial not in answered)
+        return next(remaining, None), max(answered, default=None)
 
     def withdraw_answer(self, participant: Participant, trial: int) -> None:
         """Withdraw the answer to the last answered trial, so that the trial can be answered again. The answer is kept.

@@ -223,7 +223,7 @@ class _StudyRoutes:
         return participant
 
     def _next(self, participant: Participant) -> TrialResponse:
-        trial, last = self.store.next_trial(participant), self.store.last_trial(participant)
+        trial, last = self.store.next_and_last_trial(participant)
         response = TrialResponse(trial=trial, trials=len(participant.trials), last=last)
         if trial is not None:
             photo = self.study.picture(participant.trials[trial].photo)
