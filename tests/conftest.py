@@ -210,7 +210,6 @@ def recipe(tmp_path, monkeypatch, rng):
     from brewster.training.recipe import read_recipe  # noqa: PLC0415  (imports torch)
 
     folder = tmp_path / "data" / "photos" / "permissive"
-    folder.mkdir(parents=True)
     for index in range(3):
         picture = np.kron(rng.integers(0, 256, (5, 7, 3)), np.ones((20, 20, 1))).astype(np.uint8)
         Photo.from_array(picture, encoding="srgb").save(folder / f"{index}.png")

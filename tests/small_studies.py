@@ -58,7 +58,6 @@ def write_pictures(
     rng = np.random.default_rng(seed)
     for name in names:
         path = folder / f"{name}{suffix}"
-        path.parent.mkdir(parents=True, exist_ok=True)
         picture = np.kron(rng.integers(0, 256, (3, 4, 3)), np.ones((size[1] // 3, size[0] // 4, 1)))
         Photo.from_array(picture.astype(np.uint8), encoding="srgb").save(path, overwrite=True)
     return folder

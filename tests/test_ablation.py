@@ -24,8 +24,6 @@ STUDIES = [
     for path in sorted(RECIPES.glob("*.toml"))
     if "base" in tomllib.loads(path.read_text()) and not path.stem.endswith("-tiny")
 ]
-
-
 """The studies of the compact model. runs/paper.sh --tiny runs the tiny variants of those of the diffusion model."""
 
 
@@ -59,17 +57,15 @@ def without_training(monkeypatch, model):
 
 
 @pytest.fixture
-def pairs(tmp_path):
+def pairs(tmp_path, data, monkeypatch):
+    monkeypatch.setenv("BREWSTER_DATA", str(data))
     for name in ("1", "2"):
         paint(tmp_path / "real20" / "blended" / f"{name}.png", int(name), size=(96, 80), noise=20)
         paint(tmp_path / "real20" / "transmission" / f"{name}.png", int(name), size=(96, 80))
     return read_benchmark("real20", tmp_path / "real20")
 
 
-def test_values_are_compared_with_the_first_and_numbers_are_plotted(
-    without_training, pairs, data, tmp_path, monkeypatch
-):
-    monkeypatch.setenv("BREWSTER_DATA", str(data))
+def test_values_are_compared_with_the_first_and_numbers_are_plotted(without_training, pairs, tmp_path):
     calls = []
     study = read_study(RECIPES / "size.toml")
     results = ablate(study, pairs, tmp_path / "out", on_progress=lambda *values: calls.append(values))
@@ -84,7 +80,7 @@ def test_values_are_compared_with_the_first_and_numbers_are_plotted(
     assert 0.005 < (plot < 128).mean() < 0.5
 
 
-def test_missing_weights_of_a_metric_are_reported_before_training(pairs, data, tmp_path, monkeypatch):
+def test_missing_weights_of_a_metric_are_reported_before_training(pairs, tmp_path, monkeypatch):
     def refuse():
         raise DownloadError("LPIPS has no weights", "expected a network connection", "connect")
 
@@ -92,7 +88,6 @@ def test_missing_weights_of_a_metric_are_reported_before_training(pairs, data, t
         raise AssertionError("training started without the weights of LPIPS")
 
     monkeypatch.setattr(module, "_train", train)
-    monkeypatch.setenv("BREWSTER_DATA", str(data))
     monkeypatch.setitem(METRICS, "lpips", replace(METRICS["lpips"], prepare=refuse))
     with pytest.raises(DownloadError, match="LPIPS has no weights"):
         ablate(read_study(RECIPES / "size.toml"), pairs, tmp_path / "out")
@@ -113,15 +108,13 @@ def test_two_benchmarks_of_folders_with_one_name_are_renamed(pairs, tmp_path, mo
     assert len({part.name for part in study.open_benchmarks()}) == 2
 
 
-def test_values_that_are_not_numbers_are_not_plotted(without_training, pairs, data, tmp_path, monkeypatch):
-    monkeypatch.setenv("BREWSTER_DATA", str(data))
+def test_values_that_are_not_numbers_are_not_plotted(without_training, pairs, tmp_path):
     ablate(read_study(RECIPES / "blend-space.toml"), pairs, tmp_path / "out")
     assert not (tmp_path / "out" / "plot.png").exists()
     assert (tmp_path / "out" / "blend_space-srgb" / "model.onnx").is_file()
 
 
-def test_prompts_are_compared_on_a_backbone_without_training(pairs, data, tmp_path, monkeypatch):
-    monkeypatch.setenv("BREWSTER_DATA", str(data))
+def test_prompts_are_compared_on_a_backbone_without_training(pairs, tmp_path):
     study = read_study(RECIPES / "prompt.toml").model_copy(update={"base": RECIPES / "no-lora-tiny.toml"})
     results = ablate(study, pairs, tmp_path / "out")
     assert list(results["methods"]) == [

@@ -26,7 +26,6 @@ from synthetic_scenes import (
     pixel_directions,
     plane_side,
     random_scenes,
-    smooth_map,
 )
 
 without_shrinking = settings(phases=[Phase.explicit, Phase.generate], deadline=None, database=None)
@@ -358,10 +357,7 @@ def test_framed_and_curved_glass_is_refused_with_a_hint_to_mitsuba(glass):
 
 def test_a_dome_and_a_map_at_infinity_agree_when_the_dome_is_large():
     far, dome = (
-        render(
-            make_scene(camera=camera_towards_glass(20), behind=map_side("soft", radius_mm=radius)),
-            SyntheticAssets(soft=smooth_map(64)),
-        )
+        render(make_scene(camera=camera_towards_glass(20), behind=map_side("soft", radius_mm=radius)), ASSETS)
         for radius in (math.inf, 1e7)
     )
     torch.testing.assert_close(far.transmission, dome.transmission, rtol=1e-3, atol=0)

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+from benchmark_folders import write
 from brewster import Photo, Separator
 from brewster.batch import SeparationTask, plan_files, separate_files, separate_tasks
 from brewster.errors import OutputError, PhotoError
@@ -21,11 +22,8 @@ def separator():
 @pytest.fixture
 def photo_folder(tmp_path):
     """A folder with a photo, a damaged file, and a subfolder with a photo."""
-    (tmp_path / "in" / "c").mkdir(parents=True)
-    for name in ("a.jpg", "c/d.jpg"):
-        (tmp_path / "in" / name).write_bytes(image_bytes())
-    (tmp_path / "in" / "b.jpg").write_bytes(b"not an image")
-    return tmp_path / "in"
+    write(tmp_path / "in", "a.jpg", "c/d.jpg", data=image_bytes())
+    return write(tmp_path / "in", "b.jpg", data=b"not an image")
 
 
 def test_a_folder_is_mirrored_and_a_damaged_photo_does_not_stop_the_batch(photo_folder, tmp_path, separator):
@@ -60,10 +58,8 @@ def test_finished_photos_are_skipped_without_a_model_and_missing_layers_are_adde
 
 
 def test_names_and_sources_are_checked_before_the_first_photo_is_separated(tmp_path):
-    for name in ("x", "y", "empty"):
-        (tmp_path / name).mkdir()
-    for name in ("x", "y"):
-        (tmp_path / name / "a.jpg").write_bytes(image_bytes())
+    (tmp_path / "empty").mkdir()
+    write(tmp_path, "x/a.jpg", "y/a.jpg", data=image_bytes())
     with pytest.raises(OutputError, match="would both be written"):
         separate_files([tmp_path / "x/a.jpg", tmp_path / "y/a.jpg"], tmp_path / "out")
     with pytest.raises(PhotoError, match="there is no photo in"):

@@ -14,6 +14,7 @@ import OpenEXR
 import pytest
 import pyvips
 
+from benchmark_folders import write
 from brewster.batch import FileResult
 from brewster.inference import Separator
 from cli_helpers import LAYERS, error_lines, image_bytes, json_lines, layer_files, list_files
@@ -69,8 +70,7 @@ def test_damaged_photos_are_named_at_the_end_and_the_others_are_separated(run, t
 
 
 def test_a_photo_that_does_not_fit_into_memory_does_not_stop_the_others(run, tmp_path, monkeypatch):
-    for name in ("a", "b"):
-        (tmp_path / f"{name}.jpg").write_bytes(image_bytes())
+    write(tmp_path, "a.jpg", "b.jpg", data=image_bytes())
     separate = Separator.__call__
 
     def run_out_of_memory(self, source, **options):
@@ -90,8 +90,7 @@ FILE_NAMES = ["with space", "Schöne Fenster é", "two\nlines", "[bold]red", "-d
 
 def test_any_file_name_works_and_each_error_is_one_line(run, tmp_path):
     names = [os.fsdecode(name) for name in FILE_NAMES]
-    for name in names:
-        (tmp_path / f"{name}.jpg").write_bytes(image_bytes())
+    write(tmp_path, *(f"{name}.jpg" for name in names), data=image_bytes())
     (tmp_path / "bad\nname.jpg").write_bytes(b"")
     code, out, err = run(".", "-o", "out", "--json")
     assert code == 1
@@ -114,8 +113,7 @@ def test_a_photo_from_a_pipe_is_read_once(run, tmp_path):
 
 def test_a_full_disk_leaves_no_partial_file_and_the_next_photo_is_tried(run, tmp_path, monkeypatch):
     """fsync reports the full disk; it is the last call at which the kernel can report it."""
-    for name in ("a", "b"):
-        (tmp_path / f"{name}.jpg").write_bytes(image_bytes())
+    write(tmp_path, "a.jpg", "b.jpg", data=image_bytes())
     fsync, calls = os.fsync, []
 
     def fail_at_the_second_call(file):
@@ -209,8 +207,7 @@ def test_the_same_photo_gives_the_same_bytes_twice(run, tmp_path):
 
 
 def test_a_dry_run_prints_the_planned_files_and_writes_nothing(run, tmp_path):
-    (tmp_path / "a.jpg").write_bytes(image_bytes())
-    (tmp_path / "b.jpg").write_bytes(image_bytes())
+    write(tmp_path, "a.jpg", "b.jpg", data=image_bytes())
     (tmp_path / "a.reflection.jpg").write_bytes(b"")
     (tmp_path / "broken.onnx").write_bytes(b"")
     before = list_files(tmp_path)
@@ -257,8 +254,7 @@ def test_a_dry_run_reports_text_named_as_a_photo_as_a_real_run_does(run, tmp_pat
 @pytest.mark.parametrize("options", [[], ["--workers", "1"], ["--dry-run"], ["--dry-run", "--workers", "1"]])
 def test_rows_without_a_readable_photo_are_errors_with_their_number_also_in_a_dry_run(run, tmp_path, options):
     (tmp_path / "scans/folder").mkdir(parents=True)
-    for name in ("a.jpg", "clip.mp4"):
-        (tmp_path / "scans" / name).write_bytes(image_bytes())
+    write(tmp_path / "scans", "a.jpg", "clip.mp4", data=image_bytes())
     (tmp_path / "list.csv").write_text("path\nscans/a.jpg\nscans/none.jpg\nscans/folder\nscans/clip.mp4\n")
     code, out, err = run("list.csv", "-o", "out", "--json", *options)
     statuses = [line["status"] for line in json_lines(out)]
@@ -278,8 +274,7 @@ def test_an_output_folder_that_cannot_be_created_is_an_error_before_the_first_ph
 ):
     if output == "/proc/out" and sys.platform != "linux":
         pytest.skip("only Linux has this folder, in which nobody can create a folder")
-    for name in ("a.jpg", "b.jpg", "file"):
-        (tmp_path / name).write_bytes(image_bytes())
+    write(tmp_path, "a.jpg", "b.jpg", "file", data=image_bytes())
     code, out, err = run("a.jpg", "b.jpg", "-o", output, "--json", *options)
     (message,) = error_lines(err)
     assert (code, out) == (1, b"")
@@ -323,8 +318,7 @@ def test_a_photo_above_the_pixel_limit_is_rejected_and_one_at_the_limit_is_not(r
 
 
 def test_a_batch_ends_with_a_summary(run, tmp_path):
-    for name in ("a", "b", "c"):
-        (tmp_path / f"{name}.jpg").write_bytes(image_bytes())
+    write(tmp_path, "a.jpg", "b.jpg", "c.jpg", data=image_bytes())
     run("a.jpg")
     (tmp_path / "b.jpg").write_bytes(b"")
     pattern = r"^1 separated, 1 skipped, 1 failed in \d+\.\d s; the layers are (.*)$"

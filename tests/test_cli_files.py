@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from click.shell_completion import ShellComplete
 
+from benchmark_folders import write
 from brewster import Photo
 from brewster.cli import batch_plan, cli
 from brewster.photo import contact_sheet
@@ -62,8 +63,7 @@ def test_an_address_of_another_machine_is_refused(run, tmp_path, address, option
 @pytest.mark.parametrize("name", ["notes", "notes.txt", "notes.jpg/"])
 @pytest.mark.parametrize("photos", [["a.jpg"], ["a.jpg", "b.jpg"], ["."]])
 def test_an_output_folder_that_is_a_file_is_refused(run_without_model, tmp_path, name, photos):
-    for file in ("a.jpg", "b.jpg", name.strip("/")):
-        (tmp_path / file).write_bytes(image_bytes())
+    write(tmp_path, "a.jpg", "b.jpg", name.strip("/"), data=image_bytes())
     code, _, err = run_without_model(*photos, "-o", name, "--overwrite")
     assert code == 2
     message = " ".join(err.split())
@@ -92,9 +92,7 @@ def test_raw_files_without_the_extra_are_counted_and_named_once(run, tmp_path, m
 
 def test_other_files_in_a_folder_are_counted_by_suffix_with_an_example(run, tmp_path):
     names = ("a.jpg", "a.mask.png", "b/scan", "b/x.BMP", "b/y.bmp", "notes.txt", ".hidden", ".folder/c.bmp")
-    for name in names:
-        (tmp_path / name).parent.mkdir(exist_ok=True)
-        (tmp_path / name).write_bytes(image_bytes())
+    write(tmp_path, *names, data=image_bytes())
     for _ in range(2):  # layers are not counted
         code, _, err = run(".")
         assert code == 0
@@ -117,8 +115,7 @@ def test_a_hint_names_the_other_options_of_existing_layers(run, tmp_path):
 
 
 def test_a_contact_sheet_has_a_row_for_each_photo(run, tmp_path):
-    for name in ("a", "b"):
-        (tmp_path / f"{name}.jpg").write_bytes(image_bytes())
+    write(tmp_path, "a.jpg", "b.jpg", data=image_bytes())
     (tmp_path / "c.jpg").write_bytes(b"")
     code, _, err = run("a.jpg", "b.jpg", "c.jpg", "--contact-sheet", "sheet.png")
     assert code == 1
@@ -145,8 +142,7 @@ def test_a_contact_sheet_that_cannot_be_written_is_an_error_before_the_first_pho
 
 
 def test_a_contact_sheet_replaces_only_contact_sheets(run, tmp_path):
-    for name in ("a.jpg", "other.jpg"):
-        (tmp_path / name).write_bytes(image_bytes())
+    write(tmp_path, "a.jpg", "other.jpg", data=image_bytes())
     before = [(tmp_path / name).read_bytes() for name in ("a.jpg", "other.jpg")]
     for sheet in ("a.jpg", "a.transmission.jpg", "other.jpg"):
         code, _, err = run("a.jpg", "--contact-sheet", sheet)

@@ -1,6 +1,7 @@
 """The commands models, doctor and train."""
 
 import json
+import shutil
 import tomllib
 from pathlib import Path
 
@@ -12,7 +13,6 @@ from brewster.cli import doctor, extras
 from brewster.cli.extras import CORE, EXTRAS
 from brewster.models import zoo
 from brewster.models.diffusion_models import DIFFUSION_MODELS
-from cli_helpers import image_bytes
 
 ROOT = Path(__file__).parents[1]
 
@@ -20,10 +20,11 @@ ROOT = Path(__file__).parents[1]
 @pytest.fixture
 def model_zoo(model, monkeypatch, tmp_path):
     """A model zoo with an intact model and a damaged one."""
-    intact = zoo.ModelFile("compact", model, zoo.ModelFile("", model, None, "").verify(), "Apache-2.0")
+    copy = Path(shutil.copy(model, tmp_path.parent / f"{tmp_path.name}-intact.onnx"))
+    intact = zoo.ModelFile("compact", copy, zoo.ModelFile("", copy, None, "").verify(), "Apache-2.0")
     damaged_file = tmp_path.parent / f"{tmp_path.name}.onnx"
     damaged_file.write_bytes(b"truncated")
-    model.with_suffix(".md").write_text("# pane\nIt fails on photos taken at night.\n")
+    copy.with_suffix(".md").write_text("# pane\nIt fails on photos taken at night.\n")
     damaged = zoo.ModelFile("research", damaged_file, "0" * 64, "CC-BY-NC-4.0")
     monkeypatch.setattr(zoo, "MODELS", {"compact": intact, "research": damaged})
 
@@ -40,9 +41,13 @@ def test_models_are_listed_with_licence_and_damage(run_without_model, model_zoo)
     assert [row["name"] for row in rows[2:]] == list(DIFFUSION_MODELS)
 
 
-def test_a_model_has_a_card_and_a_path(run_without_model, model_zoo, model):
+def test_a_model_has_a_card_and_a_path(run_without_model, model_zoo):
     assert run_without_model("models", "card") == (0, b"# pane\nIt fails on photos taken at night.\n\n", "")
-    assert run_without_model("models", "path", "compact") == (0, f"{model}\n".encode(), "")
+    assert run_without_model("models", "path", "compact") == (
+        0,
+        f"{zoo.MODELS['compact'].path}\n".encode(),
+        "",
+    )
     assert run_without_model("models", "path", "research")[0] == 1
     assert run_without_model("models", "card", "nonsense")[0] == 1
 
@@ -100,16 +105,9 @@ def test_a_package_that_does_not_load_is_broken(run_without_model, model_zoo, mo
     assert (code, broken["status"]) == (1, "broken")
 
 
-def test_a_run_prints_its_progress_and_exports_a_model_that_separates(
-    run_without_model, tmp_path, monkeypatch
-):
-    folder = tmp_path / "data" / "photos" / "permissive"
-    folder.mkdir(parents=True)
-    for index in range(3):
-        (folder / f"{index}.png").write_bytes(image_bytes(120, 90, "png", seed=index))
-    monkeypatch.setenv("BREWSTER_DATA", str(tmp_path / "data"))
-    recipe = ROOT / "recipes" / "train" / "tiny.toml"
-    code, out, err = run_without_model("train", recipe, "--json")
+def test_a_run_prints_its_progress_and_exports_a_model_that_separates(recipe, run_without_model, tmp_path):
+    path = ROOT / "recipes" / "train" / "tiny.toml"
+    code, out, err = run_without_model("train", path, "--json")
     assert code == 0
     events = [json.loads(line) for line in out.splitlines()]
     assert [(event["event"], event.get("step")) for event in events] == [
@@ -126,7 +124,7 @@ def test_a_run_prints_its_progress_and_exports_a_model_that_separates(
     names = {path.name for path in run.iterdir()}
     file_names = {name for name in names if not name.startswith("events.out.tfevents.")}  # of TensorBoard
     assert file_names == {"checkpoint.pt", "log.jsonl", "model.onnx", "results.png", "samples.png"}
-    _, out, err = run_without_model("train", recipe)
+    _, out, err = run_without_model("train", path)
     assert out == b""
     assert err.startswith("the run in out/tiny is complete at step 6 of 6, after 0.")
     photo = Photo.from_array(np.full((50, 70, 3), 128, np.uint8), encoding="srgb")

@@ -1,20 +1,14 @@
 """The command `brewster render`."""
 
-from pathlib import Path
-
 import pytest
 from pyarrow import parquet
 
+from benchmark_folders import write
 from brewster import Photo
 from brewster.rendered import store
 from brewster.rendered.generation import workers
-from cli_helpers import error_lines, json_lines
+from cli_helpers import error_lines, image_bytes, json_lines
 from set_folders import hashes
-
-
-@pytest.fixture
-def fake_renderer(monkeypatch):
-    monkeypatch.setitem(workers.RENDERERS, "analytic", "fake_renderer:render")
 
 
 def test_a_dataset_is_rendered_with_preview_and_each_scene_can_be_rendered_again(run_without_model, tmp_path):
@@ -46,11 +40,10 @@ def test_a_sample_that_fails_is_reported_and_the_exit_code_is_one(run_without_mo
     ]
 
 
-def test_a_damaged_photo_is_excluded_and_reported(run_without_model, fake_renderer, tmp_path):
-    (tmp_path / "photos").mkdir()
-    (tmp_path / "photos" / "broken.jpg").write_bytes(b"not an image")
-    grey = Photo.open(next((Path(__file__).parent / "pictures").glob("mixture*.jpg")))
-    grey.save(tmp_path / "photos" / "fine.jpg")
+def test_a_damaged_photo_is_excluded_and_reported(run_without_model, monkeypatch, tmp_path):
+    monkeypatch.setitem(workers.RENDERERS, "analytic", "fake_renderer:render")
+    write(tmp_path / "photos", "broken.jpg", data=b"not an image")
+    write(tmp_path / "photos", "fine.jpg", data=image_bytes())
     code, _, err = run_without_model(
         "render", "set", "--recipe", "tiny", "--count", 1, "--workers", 0, "--photos", "photos"
     )

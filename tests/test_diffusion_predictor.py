@@ -7,6 +7,8 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import torch
+from torch.nn import functional
 
 from brewster import Photo, Separator
 from brewster.errors import DeviceError, DownloadError, ModelError
@@ -45,18 +47,12 @@ class FakePipeline:
         return (2 * (to_encoded(light) + self.tint) - 1).clamp(-1, 1).expand(count, -1, -1, -1)
 
 
-def smooth_photo(width, height, seed=1):
+def smooth_photo(width, height):
     """Returns a photo of smooth colours that are neither near black nor near white."""
-    coarse = np.random.default_rng(seed).uniform(0.15, 0.6, (4, 5, 3)).astype(np.float32)
-    rows, columns = np.linspace(0, 2.99, height), np.linspace(0, 3.99, width)
-    image = coarse[rows.astype(int)][:, columns.astype(int)]
-    for axis, positions in ((0, rows), (1, columns)):
-        fraction = (positions % 1).reshape([-1 if i == axis else 1 for i in range(3)]).astype(np.float32)
-        later = coarse[np.minimum(rows.astype(int) + (axis == 0), 3)][
-            :, np.minimum(columns.astype(int) + (axis == 1), 4)
-        ]
-        image = image * (1 - fraction) + later * fraction
-    return Photo.from_array(image.astype(np.float32), encoding="linear")
+    coarse = torch.from_numpy(np.random.default_rng(1).uniform(0.15, 0.6, (4, 5, 3)).astype(np.float32))
+    planes = coarse.permute(2, 0, 1)[None]
+    image = functional.interpolate(planes, (height, width), mode="bilinear", align_corners=True)[0]
+    return Photo.from_array(image.permute(1, 2, 0).contiguous().numpy(), encoding="linear")
 
 
 @pytest.fixture(scope="module")

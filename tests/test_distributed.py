@@ -1,6 +1,5 @@
 """Data-parallel training: the process group, sums over processes, and incomplete launches."""
 
-import os
 import sys
 
 import accelerate
@@ -19,19 +18,6 @@ def _not_launched(monkeypatch):
         monkeypatch.delenv(name, raising=False)
 
 
-def run_python(code, *launcher, **variables):
-    """Runs Python code, with or without a launcher. Returns stdout, stderr and exit code."""
-    environment = {
-        name: value for name, value in os.environ.items() if name not in {"WORLD_SIZE", *LAUNCHER_VARIABLES}
-    }
-    done = finished(
-        [sys.executable, *launcher, *([] if launcher else ["-c"]), str(code)],
-        env=environment | {"OMP_NUM_THREADS": "1"} | variables,
-        timeout=300,
-    )
-    return done.stdout, done.stderr, done.returncode
-
-
 def test_one_process_is_the_main_process_and_needs_no_accelerate():
     code = """
 import sys, torch
@@ -42,7 +28,8 @@ alone = torch.ones(3)
 distributed.all_reduce_sum([alone])
 print(distributed.world_size(), distributed.rank(), distributed.is_main_process(), alone.tolist())
 """
-    assert run_python(code) == ("1 0 True [1.0, 1.0, 1.0]\n", "", 0)
+    done = finished([sys.executable, "-c", code])
+    assert (done.stdout, done.stderr, done.returncode) == ("1 0 True [1.0, 1.0, 1.0]\n", "", 0)
 
 
 @pytest.mark.slow
@@ -61,8 +48,8 @@ pathlib.Path(__file__).with_name(f"rank {distributed.rank()}").touch()
 """
     )
     torchrun = ["-m", "torch.distributed.run", "--standalone", "--nproc_per_node", "2"]
-    _, stderr, code = run_python(tmp_path / "two.py", *torchrun)
-    assert code == 0, stderr
+    done = finished([sys.executable, *torchrun, tmp_path / "two.py"], timeout=300)
+    assert done.returncode == 0, done.stderr
     assert sorted(path.name for path in tmp_path.glob("rank *")) == ["rank 0", "rank 1"]
 
 
@@ -84,6 +71,6 @@ def test_missing_processes_are_reported(monkeypatch):
 def test_a_launcher_that_started_only_one_of_several_processes_is_reported(tmp_path):
     (tmp_path / "one.py").write_text("from brewster.training import distributed\ndistributed.initialize()\n")
     launch = ["-m", "accelerate.commands.launch", "--cpu", "--num_processes", "2"]
-    _, stderr, code = run_python(tmp_path / "one.py", *launch)
-    assert code == 1
-    assert "accelerate launch started one process instead of several" in stderr
+    done = finished([sys.executable, *launch, tmp_path / "one.py"])
+    assert done.returncode == 1
+    assert "accelerate launch started one process instead of several" in done.stderr

@@ -1,5 +1,7 @@
 """Hints: what a person paints, and how it reaches the network."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
@@ -8,11 +10,11 @@ from PIL import Image
 from brewster.errors import MaskError
 from brewster.inference.separator import Separator
 from brewster.photo import Hints
-from brewster.srgb import to_linear
 from brewster.training.data.hints import simulate_hints
 from brewster.training.data.mixtures import TrainingBatch
 
 RED, GREEN = (255, 0, 0), (0, 255, 0)
+PHOTO = Path(__file__).parent / "pictures" / "mixture-coffee-rocket.jpg"
 
 
 def painted(width=40, height=30, background=(0, 0, 0)):
@@ -51,7 +53,7 @@ def test_an_image_without_paint_or_of_another_size_is_an_error(image):
 
 
 def test_strokes_may_be_painted_over_a_copy_of_the_photo():
-    photo = np.asarray(Image.open("tests/pictures/mixture-coffee-rocket.jpg").convert("RGB"))
+    photo = np.asarray(Image.open(PHOTO).convert("RGB"))
     image = photo.copy()
     image[:40, :50] = RED
     values = Hints.open(image, photo.shape[1::-1]).values
@@ -141,11 +143,10 @@ def test_simulated_hints_lie_mostly_where_they_are_true_and_half_of_the_samples_
     reflection_hint, scene_hint = hints.sum(dim=0)
     assert reflection_hint[:, :64].sum() > 5 * reflection_hint[:, 64:].sum()
     assert scene_hint[:, 64:].sum() > 5 * scene_hint[:, :64].sum()
-    assert to_linear(batch.reflection_encoded).max() > 0
 
 
 def test_the_shipped_model_removes_more_under_a_hint_and_nothing_far_from_it():
-    photo = np.asarray(Image.open("tests/pictures/mixture-coffee-rocket.jpg").convert("RGB"))
+    photo = np.asarray(Image.open(PHOTO).convert("RGB"))
     image = np.zeros_like(photo)
     rows, columns = slice(0, photo.shape[0] // 2), slice(0, photo.shape[1] // 4)
     image[rows, columns] = RED

@@ -60,16 +60,12 @@ def hub(monkeypatch, tmp_path):
         yield hub
 
 
-def contents(plan):
-    return dict(plan.files)
-
-
 def test_the_plan_has_the_four_files_unchanged(write_lora):
     folder = write_lora()
     (folder / "notes.txt").write_text("mine")
     plan = plan_push(folder, REPO)
     assert list(plan.files) == sorted(FILES, key=FILES.index)
-    assert contents(plan) == {name: (folder / name).read_bytes() for name in FILES}
+    assert plan.files == {name: (folder / name).read_bytes() for name in FILES}
     assert plan.is_private
     assert plan.message == "LoRA of black-forest-labs/FLUX.1-Kontext-dev, rank 2"
     assert plan.remarks[1:] == ["not sent: notes.txt"]
@@ -85,7 +81,7 @@ def test_local_paths_are_replaced_in_uploaded_files_and_the_lora_still_loads(
     folder = write_lora(str(base), str(sets))
     before = {name: (folder / name).read_bytes() for name in FILES}
     plan = plan_push(folder, REPO)
-    sent = contents(plan)
+    sent = plan.files
     assert all(str(tmp_path).encode() not in data for data in sent.values())
     recipe = json.loads(sent["recipe.json"])
     assert recipe["data"]["rendered"]["datasets"] == ["window"]
@@ -141,7 +137,7 @@ def test_another_prompt_is_refused(write_lora):
 def test_a_push_makes_a_private_repository_with_the_four_files_in_one_commit(write_lora, hub):
     plan = plan_push(write_lora(), REPO, message="First try")
     assert push(plan) == f"{hub.url}/{REPO}/commit/1"
-    assert hub.repos == {REPO: contents(plan)}
+    assert hub.repos == {REPO: plan.files}
     assert hub.private == {REPO: True}
     assert hub.messages == ["First try"]
     assert ModelCard(hub.repos[REPO]["README.md"].decode()).data.license == "other"

@@ -46,11 +46,9 @@ def root(tmp_path_factory):
     ):
         for number, role in enumerate(roles):
             pixels = torch.full((40, 60, 3), 200 - 70 * number, dtype=torch.uint8)
-            (root / folder / role).mkdir(parents=True)
             Photo.from_array(pixels.numpy(), encoding="srgb").save(root / folder / role / "a.png")
     noise = np.random.default_rng(1)
     for role in ("blended", "transmission", "reflection"):
-        (root / "large" / role).mkdir(parents=True)
         for name in "abc":
             pixels = noise.integers(0, 256, (32, 48, 3), dtype=np.uint8)
             Photo.from_array(pixels, encoding="srgb").save(root / "large" / role / f"{name}.png")

@@ -35,11 +35,6 @@ def tiny_model(request):
     return tiny(request.param, seed=1)
 
 
-@pytest.fixture
-def kontext():
-    return tiny("kontext", seed=1)
-
-
 def add_trained_lora(backbone, *, alpha=16, rank=4):
     """Adds a LoRA with nonzero B matrices, as after training."""
     add_lora(backbone, rank=rank, alpha=alpha, seed=2)
@@ -83,8 +78,8 @@ def test_a_new_lora_changes_no_prediction_and_only_its_parameters_are_trained(ti
     assert bool(without_gradient) == (backbone.name == "qwen")
 
 
-def test_the_seed_determines_the_lora_and_the_global_random_state_is_unchanged(kontext):
-    backbone, _ = kontext
+def test_the_seed_determines_the_lora_and_the_global_random_state_is_unchanged():
+    backbone, _ = tiny("kontext", seed=1)
     states = []
     for seed in (7, 7, 8):
         rng = torch.get_rng_state()
@@ -97,15 +92,10 @@ def test_the_seed_determines_the_lora_and_the_global_random_state_is_unchanged(k
     assert not torch.equal(states[0][name], states[2][name])
 
 
-@pytest.fixture
-def bf16_kontext():
+def test_a_lora_is_loaded_in_the_dtype_of_its_base(tmp_path):
     family = BACKBONES["kontext"]
     backbone = build("kontext", family.tiny, seed=1, dtype=torch.bfloat16)
-    return backbone, family.random_prompt(backbone.transformer, 1)
-
-
-def test_a_lora_is_loaded_in_the_dtype_of_its_base(bf16_kontext, tmp_path):
-    backbone, prompt = bf16_kontext
+    prompt = family.random_prompt(backbone.transformer, 1)
     plain = velocity(backbone, prompt)
     expected = velocity(add_trained_lora(backbone), prompt)
     save_lora(tmp_path, backbone, prompt, DecompositionTask())
@@ -115,8 +105,8 @@ def test_a_lora_is_loaded_in_the_dtype_of_its_base(bf16_kontext, tmp_path):
     assert (velocity(backbone, prompt) - expected).std() < 0.2 * (expected - plain).std()
 
 
-def test_targets_select_layers_by_their_names_and_are_stored(kontext, tmp_path):
-    backbone, prompt = kontext
+def test_targets_select_layers_by_their_names_and_are_stored(tmp_path):
+    backbone, prompt = tiny("kontext", seed=1)
     targets = ["*.attn.to_?", "single_transformer_blocks.0.*"]
     add_lora(backbone, rank=2, target_modules=targets)
     adapted = {name.rsplit(".lora_", 1)[0] for name in lora_state_dict(backbone)}
@@ -154,9 +144,9 @@ def test_a_saved_lora_gives_the_same_prediction_reloaded_and_in_diffusers(tiny_m
 
 
 @pytest.fixture
-def saved(kontext, tmp_path):
+def saved(tmp_path):
     """The folder of a LoRA of a tiny Kontext."""
-    backbone, prompt = kontext
+    backbone, prompt = tiny("kontext", seed=1)
     save_lora(tmp_path, add_trained_lora(backbone), prompt, DecompositionTask())
     return tmp_path
 
@@ -227,8 +217,8 @@ def test_an_exported_lora_gives_the_same_prediction_merged_and_from_the_file_for
     assert "exists already" in err
 
 
-def test_memory_and_disk_are_checked_before_the_base_of_an_export_is_loaded(kontext, tmp_path, monkeypatch):
-    backbone, prompt = kontext
+def test_memory_and_disk_are_checked_before_the_base_of_an_export_is_loaded(tmp_path, monkeypatch):
+    backbone, prompt = tiny("kontext", seed=1)
     add_lora(backbone)
     save_lora(tmp_path / "lora", backbone, prompt, DecompositionTask(), base_model="tiny:kontext")
     free = {"memory": 25, "disk": 25}

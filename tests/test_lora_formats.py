@@ -36,14 +36,9 @@ QWEN = {name: [name] for name in (f"{BLOCK}attn.to_q", f"{BLOCK}attn.to_add_out"
 ORIGINAL = {"kontext": KONTEXT, "klein": KLEIN, "qwen": QWEN}
 
 
-class Fused:
+def fused(layers):
     """A linear layer of the original code, which has the rows of several layers in diffusers."""
-
-    def __init__(self, layers):
-        self.in_features, self.out_features = (
-            layers[0].in_features,
-            sum(layer.out_features for layer in layers),
-        )
+    return torch.nn.Linear(layers[0].in_features, sum(layer.out_features for layer in layers), device="meta")
 
 
 def weights(name, *, original):
@@ -55,7 +50,7 @@ def weights(name, *, original):
         else {target: [target] for parts in ORIGINAL[name].values() for target in parts}
     )
     return {
-        key: random_pair(Fused([layers[part] for part in parts]), 2 + index % 2, generator)
+        key: random_pair(fused([layers[part] for part in parts]), 2 + index % 2, generator)
         for index, (key, parts) in enumerate(table.items())
     }
 
@@ -159,7 +154,7 @@ def test_a_layer_of_several_is_split_by_rows_and_the_top_level_layer_is_not_mist
     single = "single_transformer_blocks.0."
     parts = [f"{single}attn.to_q", f"{single}attn.to_k", f"{single}attn.to_v", f"{single}proj_mlp"]
     pairs = {
-        "single_blocks.0.linear1": random_pair(Fused([layers[part] for part in parts]), 2, generator),
+        "single_blocks.0.linear1": random_pair(fused([layers[part] for part in parts]), 2, generator),
         "final_layer.linear": random_pair(layers["proj_out"], 5, generator),
         "final_layer.adaLN_modulation.1": random_pair(layers["norm_out.linear"], 2, generator),
     }

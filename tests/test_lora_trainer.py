@@ -1,7 +1,6 @@
 """Training of LoRAs on tiny versions: checkpoints, exported files, and errors."""
 
 import json
-import os
 import sys
 
 import numpy as np
@@ -160,16 +159,6 @@ TORCHRUN = ["torch.distributed.run", "--standalone", "--nproc_per_node", "2"]
 ACCELERATE = ["accelerate.commands.launch", "--multi_gpu", "--num_processes", "2", "--main_process_port", "0"]
 
 
-def run_two_processes(launcher, path, out):
-    """Runs the command line under a launcher with two processes. Returns exit code and stderr."""
-    done = finished(
-        [sys.executable, "-m", *launcher, "-m", "brewster", "train", str(path), "-o", str(out)],
-        env=os.environ | {"OMP_NUM_THREADS": "1"},
-        timeout=300,
-    )
-    return done.returncode, done.stderr
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("launcher", [TORCHRUN, ACCELERATE], ids=["torchrun", "accelerate launch"])
 def test_two_processes_train_the_lora_of_one_process_with_the_whole_batch(
@@ -177,9 +166,10 @@ def test_two_processes_train_the_lora_of_one_process_with_the_whole_batch(
 ):
     monkeypatch.undo()  # the two processes also validate all samples
     (tmp_path / "recipe.toml").write_text(tomli_w.dumps(recipe().model_dump(mode="json", exclude_none=True)))
-    code, stderr = run_two_processes(launcher, tmp_path / "recipe.toml", tmp_path / "two")
-    assert code == 0, stderr
-    assert stderr.count("step 6 of 6") == 1
+    arguments = ["-m", "brewster", "train", tmp_path / "recipe.toml", "-o", tmp_path / "two"]
+    done = finished([sys.executable, "-m", *launcher, *arguments], timeout=300)
+    assert done.returncode == 0, done.stderr
+    assert done.stderr.count("step 6 of 6") == 1
     alone = train(recipe(), tmp_path / "one").export(tmp_path / "one")
     ends = [read_tensors(place / LORA_FILE)[0] for place in (alone, tmp_path / "two" / "lora")]
     for name, tensor in ends[0].items():

@@ -51,7 +51,6 @@ def scenes(seed, count, shape, strength):
 def write_pairs(folder, layers):
     """Writes the scenes as a folder of real pairs with reflections."""
     for name, role in FOLDERS.items():
-        (folder / role).mkdir(parents=True)
         for number, image in enumerate(layers[name]):
             pixels = ((image + 1) * 127.5).round().byte().permute(1, 2, 0).numpy()
             Photo.from_array(np.ascontiguousarray(pixels), encoding="srgb").save(
