@@ -161,7 +161,7 @@ def test_a_contact_sheet_never_replaces_the_mask(run, tmp_path):
     assert (tmp_path / "mask.png").read_bytes() == mask
 
 
-def test_a_contact_sheet_shows_photos_and_layers_of_an_object_store(run, tmp_path):
+def test_a_contact_sheet_shows_photos_and_layers_of_an_object_store(run, tmp_path, store):
     folder = location(f"memory://{tmp_path.name}")
     (folder / "a.jpg").write_bytes(image_bytes())
     code, _, err = run(str(folder), "-o", str(folder / "out"), "--contact-sheet", "sheet.png")
@@ -198,7 +198,6 @@ def test_on_a_system_without_fonts_the_captions_of_a_contact_sheet_have_letters(
 import pyvips
 from pathlib import Path
 from brewster.photo import contact_sheet
-from brewster.remote_path import location
 contact_sheet._SYSTEM_FONTS = Path("/nonexistent")
 list(contact_sheet.write_contact_sheets(Path("unused.jpg"), [], 1))
 print(pyvips.Image.text("mmmm").width > 2 * pyvips.Image.text("iiii").width)

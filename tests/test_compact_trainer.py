@@ -2,10 +2,12 @@ import copy
 import math
 from contextlib import contextmanager
 
+import numpy as np
 import pytest
 import torch
 
-from brewster.errors import ModelError
+from brewster import Photo
+from brewster.errors import ModelError, PhotoError, RecipeError
 from brewster.training.compact.trainer import CompactTrainer, validate
 from brewster.training.losses import separation_loss
 from brewster.training.recipe import with_value
@@ -162,6 +164,23 @@ def test_a_run_does_not_start_from_a_model_of_another_network(recipe, model):
         CompactTrainer(with_value(recipe, "init", str(model))).initialize()
     with pytest.raises(ModelError, match=r"gone\.onnx"):
         CompactTrainer(with_value(recipe, "init", "gone.onnx")).initialize()
+
+
+def test_held_out_may_match_no_map_but_a_photo(recipe, tmp_path):
+    (tmp_path / "data" / "hdri").mkdir()
+    Photo.from_array(np.ones((16, 32, 3), np.float32), encoding="linear").save(
+        tmp_path / "data/hdri/room.hdr"
+    )
+    recipe = with_value(recipe, "data.maps", ["hdri"])
+    held_out_mixtures(with_value(recipe, "data.held_out", ["2.png"]))(0, 3, 64)
+    with pytest.raises(RecipeError, match="no photo in .* matches"):
+        held_out_mixtures(with_value(recipe, "data.held_out", ["room*"]))
+
+
+def test_a_damaged_photo_for_training_is_named(recipe, tmp_path):
+    (tmp_path / "data" / "photos" / "permissive" / "1.png").write_bytes(b"")
+    with pytest.raises(PhotoError, match=r"1\.png: the file is empty"):
+        open_stream(recipe)
 
 
 def test_held_out_mixtures_do_not_depend_on_seed_and_distributions_of_the_recipe(recipe):

@@ -314,6 +314,8 @@ def test_a_lora_and_a_checkpoint_are_imported(run_without_model, tmp_path):
     written, _ = read_tensors(tmp_path / "imported" / LORA_FILE)
     assert torch.equal(written[f"transformer.{BLOCK}attn.to_q.lora_B.weight"], 4 / 2 * matrices[1])
     assert read_lora_metadata(tmp_path / "imported").task.layout.panels == ("T", "R")
+    code, _, err = run_without_model(*arguments, "--prompt", "another", "--panels", "T", "--alpha", "4")
+    assert (code, "imported exists already" in err) == (1, True)
     (tmp_path / "model.pt").write_bytes(b"nothing")
     code, _, err = run_without_model("models", "import", "model.pt", "out")
     assert (code, err.startswith("error: model.pt cannot be read")) == (1, True)

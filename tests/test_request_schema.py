@@ -94,7 +94,7 @@ def test_a_format_may_be_named_by_its_suffix_as_on_the_command_line(text, name):
 
 
 def test_an_empty_field_counts_as_omitted():
-    assert parse(format="", strength="", model="").options == Options(max_pixels=1000)
+    assert parse(format="", strength="", model="", layers="").options == Options(max_pixels=1000)
 
 
 @pytest.mark.parametrize(

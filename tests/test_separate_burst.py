@@ -514,7 +514,12 @@ def test_a_dry_run_finds_that_a_video_is_missing_or_has_too_few_frames(run_witho
         plan_bursts([tmp_path / "no.mp4"], reference=7, frames=7)
 
 
-def test_a_video_in_an_object_store_is_refused_also_in_a_dry_run(run_without_model):
+def test_a_suffix_that_cannot_be_written_is_refused(run_without_model, burst_files):
+    code, _, err = run_without_model("burst", *burst_files, "-o", "clear.bmp")
+    assert (code, "brewster writes no format with this suffix" in err) == (2, True)
+
+
+def test_a_video_in_an_object_store_is_refused_also_in_a_dry_run(run_without_model, store):
     location("memory://window.mp4").write_bytes(b"\0\0\0\x18ftypisom")
     for dry_run in ([], ["--dry-run"]):
         code, _, err = run_without_model("burst", "memory://window.mp4", "-o", "out", *dry_run)

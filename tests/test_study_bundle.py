@@ -90,9 +90,17 @@ def test_imported_answers_are_stored_once(study, store, answers, tmp_path):
     assert stored[1].withdrawn == ("similar",)
 
 
+def test_an_answer_that_was_withdrawn_is_not_imported_from_an_earlier_file(study, store, answers, tmp_path):
+    (token,) = export_bundle(study, store, tmp_path / "bundle", participants=1)
+    withdrawn = [{"trial": 1, "choice": "left", "seconds": 4.5, "answered_at": ANSWERED_AT}]
+    store.import_answers(read_answer_file(answers(token, ["left"], withdrawn=withdrawn)))
+    assert store.import_answers(read_answer_file(answers(token, ["left", "left"]))) == 0
+
+
 def test_an_answer_of_an_earlier_file_that_was_withdrawn_is_replaced(study, store, answers, tmp_path):
     (token,) = export_bundle(study, store, tmp_path / "bundle", participants=1)
-    store.import_answers(read_answer_file(answers(token, ["left", "left"])))
+    earlier = read_answer_file(answers(token, ["left", "left"]))
+    store.import_answers(earlier)
     withdrawn = [{"trial": 1, "choice": "left", "seconds": 4.5, "answered_at": ANSWERED_AT}]
     later = answers(token, ["left", "right"], withdrawn=withdrawn)
     assert [store.import_answers(read_answer_file(later)) for _ in range(2)] == [1, 0]
@@ -140,6 +148,8 @@ def test_the_commands_export_links_and_import_files(run_without_model, study, an
     assert code == 1
     assert "bad.json is not a valid file of answers" in err
     assert "answers.json: 1 new answers of 1" in err
+    answers("nobody", ["left"])
+    assert "error: answers.json: " in run_without_model("study", "import", "study", path.name)[2]
     code, out, _ = run_without_model("study", "progress", "study", "--json")
     assert [row["answers"] for row in json.loads(out)["rows"]] == [0, 1]
 

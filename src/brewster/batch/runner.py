@@ -154,14 +154,11 @@ def separate_task(
     """Separates one photo, writes its layers, and enters both into the result. Raises BrewsterError if the photo cannot
     be read or separated, or a layer cannot be written."""
     result.model, result.model_sha256, result.device = separator.name, separator.sha256, separator.device
-    with error_prefix(task.row):
-        if task.burst and task.burst.is_from_video and isinstance(task.source, Path):
-            photo: Path | bytes = task.source
-        else:
-            photo = read_content(task.source)
     if task.burst:
-        separation = _separate_burst(task.burst, separator, options, on_progress)
+        photo, separation = _separate_burst(task.burst, separator, options, on_progress)
     else:
+        with error_prefix(task.row):
+            photo = read_content(task.source)
         separation = separator(photo, on_progress=on_progress, **options.call_options())
     result.photo_sha256, result.burst = _sha256(photo), separation.burst
     result.seconds, result.residual = dict(separation.seconds), separation.residual
@@ -225,21 +222,27 @@ def _missing_outputs(task: SeparationTask, *, overwrite: bool) -> dict[str, Loca
 
 def _separate_burst(
     burst: Burst, separator: Separator, options: Options, on_progress: Callable[[float], None]
-) -> Separation:
+) -> tuple[Path | bytes, Separation]:
+    """Returns the file of the reference photo, or the video, and the separation."""
     from brewster.burst import read_video, separate_burst  # noqa: PLC0415  (imports torch)
 
     photos: Sequence[Source]
     if burst.is_from_video:
-        photos = read_video(Path(burst.photos[0]), burst.frames, max_pixels=options.max_pixels)
+        video = Path(burst.photos[0])
+        file: Path | bytes = video
+        photos = read_video(video, burst.frames, max_pixels=options.max_pixels)
     else:
-        photos = [read_content(photo) for photo in burst.photos]
-    return separate_burst(
+        contents = [read_content(photo) for photo in burst.photos]
+        file = contents[len(contents) // 2 if burst.reference is None else burst.reference]
+        photos = contents
+    separation = separate_burst(
         photos,
         reference=burst.reference,
         separator=separator,
         on_progress=on_progress,
         **options.call_options(),
     )
+    return file, separation
 
 
 def input_paths(tasks: Iterable[SeparationTask], options: Options = _DEFAULT_OPTIONS) -> frozenset[str]:

@@ -197,12 +197,16 @@ def separate(
             output and absolute(location(output)),
         )
         contact_sheet = contact_sheet and contact_sheet.absolute()
-        is_name = options.model in (*zoo.MODELS, *zoo.DIFFUSION_NAMES) or not os.path.exists(options.model)  # noqa: PTH110
+        names = {*zoo.MODELS, *zoo.DIFFUSION_NAMES, None}
+        models = {
+            name: getattr(options, name) for name in ("model", "base_model", "transformer", "fast_lora")
+        }
+        files = {name: path for name, path in models.items() if path not in names and os.path.exists(path)}  # noqa: PTH110
         options = dataclasses.replace(
             options,
             mask=options.mask and options.mask.absolute(),
             hints=options.hints and options.hints.absolute(),
-            model=options.model if is_name else os.path.abspath(options.model),  # noqa: PTH100
+            **{name: os.path.abspath(path) for name, path in files.items()},  # noqa: PTH100
         )
     # An unknown name is an error, even if no photo needs the model. Nothing is loaded.
     zoo.model_name(options.model)

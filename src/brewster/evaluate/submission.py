@@ -10,7 +10,7 @@ from typing import Final
 from brewster.benchmarks.image_files import Case, ImageFile
 from brewster.benchmarks.pairing import find_numbered_splits, image_files
 from brewster.errors import BrewsterError, PhotoError
-from brewster.evaluate.methods import Method
+from brewster.evaluate.methods import Method, ModelMethod
 from brewster.files import write_atomically
 from brewster.photo import Photo
 from brewster.photo.open_raster import zip_images
@@ -58,6 +58,11 @@ def export_ntire2026(
             "expected the folders val_300_blended and test_100_blended of OpenRR-5k",
             "give the path of their parent folder with --benchmark openrr=FOLDER",
         )
+
+    if isinstance(
+        method, ModelMethod
+    ):  # the scored predictions may have another size or quality, and stay as they are
+        method = replace(method, folder=out / "predictions")
 
     def predictions(split: str, photos: Path) -> Iterator[tuple[str, bytes]]:
         for path in image_files(photos)[0]:

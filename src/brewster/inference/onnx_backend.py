@@ -40,28 +40,28 @@ class OnnxBackend:
     `takes_hints` tells whether it has a second input `hints` (1, 2, H, W), see `brewster.photo.Hints`.
     `device` is a name from `DEVICES`; "auto" selects the first one that starts, in order of preference.
     Raises ModelError if the file is not an ONNX model, or has other inputs and outputs, and
-    DeviceError if the device is unknown, not available, or does not start.
+    DeviceError if the device is unknown, not available, or does not start with this model.
     """
 
     def __init__(self, model: Path, device: str = "auto") -> None:
-        data, failure = model.read_bytes(), None
+        data, reason = model.read_bytes(), ""
         for candidate in _candidates(device):
             try:
                 session = _create_session(model, data, candidate)
             except ModelError as error:  # a GPU without a driver or memory; on the CPU, a damaged model
                 if candidate == "cpu":
                     raise
-                failure = error
+                reason = f": {error.happened}"
                 continue
             if session.get_providers()[0] == _PROVIDERS[candidate][0]:
                 self.device, self._session = candidate, session
                 self._check_names(model)
                 return
         raise DeviceError(
-            f"device {device} is installed but does not start",
+            f"device {device} is installed but does not start{reason}",
             "expected a driver and libraries that match ONNX Runtime",
             "install them, or use --device auto or cpu",
-        ) from failure
+        )
 
     def __call__(self, tile: Image, hints: Hints | None = None) -> tuple[Image, Image]:
         """Returns the transmission and the reflection of a tile. All three arrays are (H, W, 3), of any size,

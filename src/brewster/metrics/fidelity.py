@@ -112,7 +112,9 @@ def mean_ssim(values: NDArray[np.float64], *, region: Region | None = None) -> f
         raise ValueError(
             f"all pixels of the region are within {border} pixels of the border, where SSIM has no value"
         )
-    return float(windows.mean_inside(values, inside))
+    # Sum over the channels first, because indexing (H, W, 3) with a mask of pixels takes ten times as long.
+    sums = values[..., 0] + values[..., 1] + values[..., 2]
+    return float(np.sum(sums[inside], dtype=np.float64) / (3 * np.count_nonzero(inside)))
 
 
 def ssim_map(prediction: Image, truth: Image, *, window: Window = "uniform") -> NDArray[np.float64]:

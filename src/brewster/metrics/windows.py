@@ -57,14 +57,6 @@ def check_count(count: int, condition: str) -> None:
         raise ValueError(f"{count} {condition}; a score needs at least {MIN_COUNT}")
 
 
-def mean_inside(values: NDArray[Any], region: Region) -> float:
-    """Returns the mean of the values (H, W, 3) in a region, bool (H, W). Raises ValueError as `check_region` does."""
-    check_region(region, values.shape[:2])
-    # Sum over the channels first, because indexing (H, W, 3) with a mask of pixels takes ten times as long.
-    sums = values[..., 0] + values[..., 1] + values[..., 2]
-    return float(np.sum(sums[region], dtype=np.float64) / (3 * np.count_nonzero(region)))
-
-
 def box_sums(values: _Values) -> _Values:
     """Returns sums over all complete 7x7 windows, (H - 6, W - 6, ...). Integer sums are exact if the dtype can hold them."""
     sums_of_2 = values[:-1] + values[1:]

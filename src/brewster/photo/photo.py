@@ -305,10 +305,10 @@ class Photo:
         quality: int | None = None,
         overwrite: bool = False,
     ) -> None:
-        """Writes the photo to a path atomically, or to an open binary file such as an `io.BytesIO`.
+        """Writes the photo to a path or an object store atomically, or to an open binary file such as an `io.BytesIO`.
 
         Args:
-            target: a path, or a file opened for writing in binary mode.
+            target: a path, the URL of an object store, or a file opened for writing in binary mode.
             format: the format, such as "png" or "jpg"; by default, the format of the path's suffix or, for an open file, the format
                 of the photo's file.
             depth: bits per channel; see `encode`.

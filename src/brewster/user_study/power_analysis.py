@@ -46,7 +46,7 @@ def required_participants(
         difference: the win rate minus the lose rate, 0 to 1; `tie` is the rate of "similar", 0 to 1.
         pairs: number of pairs of these two methods that a participant sees.
         power: the probability of detecting the difference if it exists; `level`, if it does not exist."""
-    win, lose = (1 - tie + difference) / 2, round((1 - tie - difference) / 2, 12)
+    win, lose = (1 - tie + difference) / 2, round((1 - tie - difference) / 2, 12) + 0.0
     if not (0 < difference <= 1 and 0 <= tie < 1 and lose >= 0):
         raise BrewsterError(
             f"a difference of {difference:g} with a tie rate of {tie:g} means {win:.0%} wins and {lose:.0%} losses",

@@ -221,7 +221,11 @@ class AnswerStore:
                 (number,),
             )
             answers = [_row(number, answer) for answer in answer_file.answers]
-            return database.executemany(_INSERT_ANSWER, answers).rowcount
+            return database.executemany(
+                "INSERT OR IGNORE INTO answers SELECT ?1, ?2, ?3, ?4, ?5, ?6 WHERE NOT EXISTS (SELECT 1 FROM withdrawn "
+                "WHERE participant = ?1 AND trial = ?2 AND choice = ?3 AND answered_at = ?5)",
+                answers,
+            ).rowcount
 
     def all_answers(self) -> Iterator[tuple[Participant, dict[int, StoredAnswer]]]:
         """Yield every participant, in order of number, and a dict of the answers by trial, which may be empty."""

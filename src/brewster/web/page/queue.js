@@ -78,7 +78,7 @@ export class SeparationQueue {
 
   cancel(photo) {
     if (photo.controller) photo.controller.abort();
-    else photo.state = "failed";
+    else Object.assign(photo, { state: "failed", isUpdating: false });
     this.onChange(photo);
   }
 
