@@ -173,7 +173,7 @@ def test_held_out_may_match_no_map_but_a_photo(recipe, tmp_path):
     )
     recipe = with_value(recipe, "data.maps", ["hdri"])
     held_out_mixtures(with_value(recipe, "data.held_out", ["2.png"]))(0, 3, 64)
-    with pytest.raises(RecipeError, match="no photo in .* matches"):
+    with pytest.raises(RecipeError, match=r"no photo in .* matches"):
         held_out_mixtures(with_value(recipe, "data.held_out", ["room*"]))
 
 
