@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from benchmark_folders import paint
+from benchmark_folders import paint, write
 from brewster.benchmarks.registry import read_benchmark
 from brewster.errors import BrewsterError, DownloadError
 from brewster.evaluate import ablation as module
@@ -57,14 +57,19 @@ def without_training(monkeypatch, model):
 
 
 @pytest.fixture
-def pairs(tmp_path, data, monkeypatch):
+def lpips_weights(data, monkeypatch):
     monkeypatch.setenv("BREWSTER_DATA", str(data))
+
+
+@pytest.fixture
+def pairs(tmp_path):
     for name in ("1", "2"):
         paint(tmp_path / "real20" / "blended" / f"{name}.png", int(name), size=(96, 80), noise=20)
         paint(tmp_path / "real20" / "transmission" / f"{name}.png", int(name), size=(96, 80))
     return read_benchmark("real20", tmp_path / "real20")
 
 
+@pytest.mark.usefixtures("lpips_weights")
 def test_values_are_compared_with_the_first_and_numbers_are_plotted(without_training, pairs, tmp_path):
     calls = []
     study = read_study(RECIPES / "size.toml")
@@ -93,27 +98,32 @@ def test_missing_weights_of_a_metric_are_reported_before_training(pairs, tmp_pat
         ablate(read_study(RECIPES / "size.toml"), pairs, tmp_path / "out")
 
 
-def test_labels_that_cannot_name_methods_are_refused_before_training(without_training, pairs, tmp_path):
+def test_labels_that_cannot_name_methods_are_refused_before_training(pairs, tmp_path, monkeypatch):
+    trained = []
+    monkeypatch.setattr(module, "_train", lambda *recipe: trained.append(recipe) or Path("trained.onnx"))
     study = read_study(RECIPES / "size.toml").model_copy(update={"key": "prompt", "values": ["a/b", "a b"]})
     with pytest.raises(BrewsterError, match="2 methods have the name 'prompt a b'"):
         ablate(study, pairs, tmp_path / "out")
-    assert not without_training
+    assert not trained
 
 
-def test_two_benchmarks_of_folders_with_one_name_are_renamed(pairs, tmp_path, monkeypatch):
+def test_two_benchmarks_of_folders_with_one_name_are_renamed(tmp_path, monkeypatch):
     monkeypatch.setenv("BREWSTER_DATA", str(tmp_path))
-    shutil.copytree(tmp_path / "real20", tmp_path / "other" / "real20")
-    benchmarks = {"real20": Path("real20"), "pairs": Path("other/real20")}
+    write(tmp_path / "real" / "dev", "blended/1.png", "transmission/1.png")
+    write(tmp_path / "bursts" / "dev" / "stone", "frame1.jpg", "frame2.jpg", "transmission2.jpg")
+    benchmarks = {"pairs": Path("real/dev"), "bursts": Path("bursts/dev")}
     study = read_study(RECIPES / "size.toml").model_copy(update={"benchmarks": benchmarks})
     assert len({part.name for part in study.open_benchmarks()}) == 2
 
 
+@pytest.mark.usefixtures("lpips_weights")
 def test_values_that_are_not_numbers_are_not_plotted(without_training, pairs, tmp_path):
     ablate(read_study(RECIPES / "blend-space.toml"), pairs, tmp_path / "out")
     assert not (tmp_path / "out" / "plot.png").exists()
     assert (tmp_path / "out" / "blend_space-srgb" / "model.onnx").is_file()
 
 
+@pytest.mark.usefixtures("lpips_weights")
 def test_prompts_are_compared_on_a_backbone_without_training(pairs, tmp_path):
     study = read_study(RECIPES / "prompt.toml").model_copy(update={"base": RECIPES / "no-lora-tiny.toml"})
     results = ablate(study, pairs, tmp_path / "out")
