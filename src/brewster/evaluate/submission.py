@@ -59,9 +59,8 @@ def export_ntire2026(
             "give the path of their parent folder with --benchmark openrr=FOLDER",
         )
 
-    if isinstance(
-        method, ModelMethod
-    ):  # the scored predictions may have another size or quality, and stay as they are
+    # The scored predictions may have another size or quality, and stay as they are.
+    if isinstance(method, ModelMethod):
         method = replace(method, folder=out / "predictions")
 
     def predictions(split: str, photos: Path) -> Iterator[tuple[str, bytes]]:
