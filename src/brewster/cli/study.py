@@ -16,7 +16,7 @@ from brewster.cli.extras import require_extra
 from brewster.cli.parameters import FOLDER, JSON, Fraction, Number, flag, named_value, options, output_folder
 from brewster.cli.serve import AUTO, address_options, print_link
 from brewster.cli.terminal import print_error, print_out, print_status, progress, write_out
-from brewster.errors import BrewsterError, counted
+from brewster.errors import BrewsterError, counted, error_prefix
 
 if TYPE_CHECKING:
     from brewster.user_study.store import AnswerStore
@@ -373,11 +373,12 @@ def import_answers(context: click.Context, folder: Path, files: tuple[Path, ...]
     with _open(folder) as store:
         for path in files:
             try:
-                answer_file = read_answer_file(path)
-                count = store.import_answers(answer_file)
+                with error_prefix(path):
+                    answer_file = read_answer_file(path)
+                    count = store.import_answers(answer_file)
             except BrewsterError as error:
                 failed = True
-                print_error(str(error) if str(path) in str(error) else f"{path}: {error}")
+                print_error(str(error))
             else:
                 print_status(f"{path}: {count} new answers of {len(answer_file.answers)}")
     context.exit(1 if failed else 0)

@@ -337,9 +337,8 @@ def with_value(recipe: AnyRecipe, key_path: str, value: object) -> AnyRecipe:
     values = table = recipe.model_dump(exclude_unset=True)
     *tables, key = key_path.split(".")
     for name in tables:
-        if not isinstance(
-            table.get(name), dict
-        ):  # a table that is not set, or no table: `validated` refuses it
+        # A table that is not set, or a value that is no table: `validated` refuses what cannot be.
+        if not isinstance(table.get(name), dict):
             table[name] = {}
         table = table[name]
     table[key] = value
