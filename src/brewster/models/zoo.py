@@ -57,7 +57,7 @@ MODELS: Final = {
         ModelFile(
             "compact",
             _WEIGHTS / "compact.onnx",
-            "bb9c90aab19b58023aea3157204faaa6e8bac4f3a18eb76c6e9f10109ed82709",
+            "9254d71dbcb592c33060aa8bb223f6e16d184393f1e575b7e5c40eb8b0a04a01",
             "Apache-2.0",
         ),
     )
