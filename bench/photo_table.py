@@ -25,7 +25,7 @@ SECTION = """\
 ## Photographs
 
 `training_photos.csv` in `brewster.environments` lists {count:,} photos with source, licence, author and origin, as far as they are known.
-The weights of version 2 were trained on 1,330 of them, those of the hints on all that are not held out. The numbers of photos, by licence and source:
+The weights of version 2 were trained on 1,330 of them, those of tone and hints on all that are not held out. The numbers of photos, by licence and source:
 
 {lines}
 
