@@ -80,6 +80,7 @@ def test_only_a_shipped_model_is_calibrated(tmp_path):
     photo = Path(__file__).parent / "pictures/mixture-chelsea-astronaut.jpg"
     verdicts = [Separator.load(str(model))(photo).assessment.verdict for model in ("compact", own)]
     assert verdicts == ["removed", "partly removed"]
+    assert Separator.load()(photo, quality="draft").assessment.verdict == "partly removed"
 
 
 def test_a_model_without_confidence_has_partly_removed_a_reflection():

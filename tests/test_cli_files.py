@@ -109,6 +109,10 @@ def test_a_hint_names_the_other_options_of_existing_layers(run, tmp_path):
     err = run("a.jpg")[2]
     assert "made with other options (strength=0.5) (--overwrite replaces them)" in err
     assert "other options" not in run("a.jpg", "--strength", "0.5")[2]
+    Photo.from_array(np.full((40, 60, 3), 128, np.uint8), encoding="srgb").save(tmp_path / "mask.png")
+    run("a.jpg", "--mask", "mask.png", "--overwrite")
+    assert "perhaps made with another mask or other hints" in run("a.jpg", "--mask", "mask.png")[2]
+    run("a.jpg", "--strength", "0.5", "--overwrite")
     assert "model=pane" in run("a.jpg", "--strength", "0.5", "--model", "compact", with_model=False)[2]
     (tmp_path / "mask.png").write_bytes(image_bytes())
     assert "(mask=no)" in run("a.jpg", "--strength", "0.5", "--mask", "mask.png")[2]

@@ -190,6 +190,8 @@ class BatchReport:
         for different_options, (number, source) in self._skipped.items():
             photos = source if number == 1 else counted(number, "photo")
             note = f", made with other options ({different_options})" if different_options else ""
+            if not note and (self.options.mask or self.options.hints):
+                note = ", perhaps made with another mask or other hints"
             print_status(f"{photos}: skipped, because all layers exist{note} (--overwrite replaces them)")
         if self.counts.total() > 1 and not self.quiet:
             order = ("separated", "planned", "skipped", "failed")

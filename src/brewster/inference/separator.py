@@ -264,7 +264,7 @@ class Separator:
             prediction.confidence_map,
             residual,
             prediction.reconstruction_error,
-            self._assess(largest_input, prediction, strength, weights),
+            self._assess(largest_input, prediction, quality, strength, weights),
             self.name,
             self.sha256,
             self.device,
@@ -290,7 +290,7 @@ class Separator:
         inputs, white = self._inputs(photo, quality, hints)
         prediction, largest_input = self._predict(inputs, quality, on_progress), inputs[-1][..., :3]
         upsampler = _fit_upsampler(largest_input, prediction, Options.strength, white)
-        return upsampler, prediction, self._assess(largest_input, prediction)
+        return upsampler, prediction, self._assess(largest_input, prediction, quality)
 
     def _predict(
         self, inputs: Sequence[Floats], quality: Quality, on_progress: ProgressCallback
@@ -302,6 +302,7 @@ class Separator:
         self,
         largest_input: Floats,
         prediction: Prediction,
+        quality: Quality,
         strength: float = Options.strength,
         mask: Mask | None = None,
     ) -> Assessment:
@@ -312,7 +313,8 @@ class Separator:
             prediction.confidence_map,
             prediction.reconstruction_error,
             float(strength) if mask is None else np.float32(strength) * mask.sampled(width, height),
-            is_calibrated=self._is_calibrated,
+            # the outputs of one scale differ less, which the limits were not fitted to
+            is_calibrated=self._is_calibrated and quality == "standard",
         )
 
     def _inputs(
