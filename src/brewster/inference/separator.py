@@ -313,8 +313,7 @@ class Separator:
             prediction.confidence_map,
             prediction.reconstruction_error,
             float(strength) if mask is None else np.float32(strength) * mask.sampled(width, height),
-            # the outputs of one scale differ less, which the limits were not fitted to
-            is_calibrated=self._is_calibrated and quality == "standard",
+            is_calibrated=self._is_calibrated and quality == "standard",  # the limits are fitted to it
         )
 
     def _inputs(
