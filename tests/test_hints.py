@@ -153,5 +153,6 @@ def test_the_shipped_model_removes_more_under_a_hint_and_hardly_anything_far_fro
     separator = Separator.load()
     plain, hinted = (separator(photo, hints=hints).transmission.linear() for hints in (None, image))
     assert hinted[rows, columns].mean() < 0.95 * plain[rows, columns].mean()
-    change = np.abs(hinted - plain)
-    assert change[:, photo.shape[1] // 2 :].mean() < 0.1 * change[rows, columns].mean()
+    far, change = slice(photo.shape[1] // 2, None), np.abs(hinted - plain)
+    assert change[:, far].mean() < 0.1 * change[rows, columns].mean()
+    np.testing.assert_allclose(hinted[:, far], plain[:, far], atol=0.035)

@@ -76,7 +76,7 @@ def assess(
         confidence_map: the confidence of the prediction, 0..1.
         reconstruction_error: mean of |generated input - input|, sRGB-encoded, or None.
         strength: the strength, 0..1, the same for all pixels or, with a mask, one for each pixel.
-        is_calibrated: whether the verdicts were fitted to the model. Otherwise none is "removed".
+        is_calibrated: whether the verdicts were fitted to the model at this quality. Otherwise none is "removed".
     """
     written = photo + np.float32(strength) * (transmission - photo)
     light = float(photo.sum(dtype=np.float64))

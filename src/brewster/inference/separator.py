@@ -53,7 +53,7 @@ class Separator:
         sha256: the digest of the model file, for `Separation.sha256`.
         device: the device that runs the model, for `Separation.device`.
         is_calibrated: whether the verdicts were fitted to this model (bench/verdict.py), as for the shipped models. The verdict
-            of another model is never "removed".
+            of another model, or at another quality than "standard", is never "removed".
     """
 
     def __init__(
@@ -313,7 +313,7 @@ class Separator:
             prediction.confidence_map,
             prediction.reconstruction_error,
             float(strength) if mask is None else np.float32(strength) * mask.sampled(width, height),
-            is_calibrated=self._is_calibrated and quality == "standard",  # the limits are fitted to it
+            is_calibrated=self._is_calibrated and quality == "standard",
         )
 
     def _inputs(
