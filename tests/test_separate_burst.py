@@ -8,7 +8,6 @@ import av
 import cv2
 import numpy as np
 import pytest
-import torch
 from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
@@ -18,7 +17,8 @@ from brewster import Photo, Separator
 from brewster.batch.plan import plan_bursts
 from brewster.burst import BurstReport, read_video, separate_burst
 from brewster.burst.fourier_search import find_translations
-from brewster.burst.joint_model import JointModel, Rates, optimise, pixel_grid
+from brewster.burst.joint_model import JointModel, pixel_grid, with_fourth_channel
+from brewster.burst.optimiser import Rates, optimise
 from brewster.burst.registration import frame_motions, motion_candidates
 from brewster.burst.separate import burst_report, fit_burst, measure_layers
 from brewster.burst.solver import LEVELS, Level, Solution, _edge_correlation, solve
@@ -72,14 +72,14 @@ def test_layers_with_known_motion_are_separated_whatever_the_prior(is_prior_true
     shifts = [-8, -4, 0, 4, 8]
     frames = np.stack([transmission + np.roll(reflection, shift, 1) for shift in shifts])[:, :, 16:-16]
     truth = transmission[:, 16:-16]
-    motions = torch.eye(3).repeat(2, 1, 5, 1, 1)
-    motions[1, 0, :, 0, 2] = -torch.tensor(shifts) * 2 / frames.shape[2]
-    tensor = torch.from_numpy(frames.transpose(0, 3, 1, 2).astype(np.float32))
-    start = JointModel.start(tensor, motions, torch.tensor([False]), 2, 1.0)
-    prior = torch.from_numpy((truth if is_prior_true else frames[2]).transpose(2, 0, 1).astype(np.float32))
+    motions = np.tile(np.eye(3), (1, 2, 5, 1, 1))
+    motions[0, 1, :, 0, 2] = -np.array(shifts) * 2 / frames.shape[2]
+    padded = with_fourth_channel(frames)
+    start = JointModel.start(padded, motions, np.array([False]), 2, 1.0)
+    prior = with_fourth_channel(truth if is_prior_true else frames[2])
     rates = Rates(homographies=0, splines=0, log_gains=0)
-    model = optimise(start, tensor, prior, 300, rates=rates, weights=LEVELS[-1].weights)
-    layers = model.reference_layers(*tensor.shape[-2:])[:, 0].movedim(1, -1).numpy()
+    model = optimise(start, padded, prior, 300, rates=rates, weights=LEVELS[-1].weights)
+    layers = model.reference_layers(*truth.shape[:2])
     assert psnr_db(layers[0][8:-8, 8:-8], truth[8:-8, 8:-8]) > least_db
     assert model.losses[0] < 0.01
 
@@ -97,28 +97,31 @@ def test_a_copy_of_a_fine_texture_explains_less_than_the_true_reflection():
 
     frames = [0.7 * view(texture, shift) + 0.1 * view(reflection, 3 * shift) for shift in shifts]
     small = np.stack([cv2.resize(frame, (160, 120), interpolation=cv2.INTER_AREA) for frame in frames])
-    tensor = torch.from_numpy(small.transpose(0, 3, 1, 2).astype(np.float32))
-    motions = torch.eye(3).repeat(2, 2, 5, 1, 1)
-    motions[:, :, :, 0, 2] = torch.from_numpy(shifts / 320)
-    motions[1, 0, :, 0, 2] *= 3
-    motions[1, 1, :, 0, 2] += torch.from_numpy(np.sign(shifts) / 160)
-    start = JointModel.start(tensor, motions, torch.tensor([False, False]), 2, level.density)
+    padded = with_fourth_channel(small)
+    motions = np.tile(np.eye(3), (2, 2, 5, 1, 1))
+    motions[:, :, :, 0, 2] = shifts / 320
+    motions[0, 1, :, 0, 2] *= 3
+    motions[1, 1, :, 0, 2] += np.sign(shifts) / 160
+    start = JointModel.start(padded, motions, np.array([False, False]), 2, level.density)
     rates = Rates().scaled(0.5)
-    start = start.resized(tensor, level.density, level.spline_size)
-    model = optimise(start, tensor, tensor[2], level.steps, rates=rates, weights=level.weights)
+    start = start.resized(padded, level.density, level.spline_size)
+    model = optimise(start, padded, padded[2], level.steps, rates=rates, weights=level.weights)
     true, copy = model.losses.tolist()
     assert true < 0.95 * copy
     assert model.relative_motion(*small.shape[1:3]).tolist()[0] == pytest.approx(24 / 640, rel=0.1)
 
 
 def test_the_reflection_of_a_locked_candidate_moves_with_the_transmission():
-    motions = torch.eye(3).repeat(2, 2, 3, 1, 1)
-    motions[1, :, 0, 0, 2] = 0.3
-    model = JointModel.start(torch.rand(3, 3, 8, 12), motions, torch.tensor([True, False]), 1, 1.0)
-    positions = model.positions(8, 12)
-    assert torch.equal(positions[0, 0], positions[1, 0])
-    assert not torch.equal(positions[0, 1], positions[1, 1])
-    assert torch.allclose(positions[:, :, 1], pixel_grid(8, 12))  # the reference frame does not move
+    motions = np.tile(np.eye(3), (2, 2, 3, 1, 1))
+    motions[:, 1, 0, 0, 2] = 0.3
+    frames = np.random.default_rng(1).random((3, 8, 12, 4), np.float32)
+    model = JointModel.start(frames, motions, np.array([True, False]), 1, 1.0)
+    first = np.array([[model.positions(n, layer, 0, 8, 12) for layer in (0, 1)] for n in (0, 1)])
+    assert np.array_equal(*first[0])
+    assert not np.array_equal(*first[1])
+    assert np.allclose(
+        model.positions(1, 1, 1, 8, 12), pixel_grid(8, 12)
+    )  # the reference frame does not move
     assert model.relative_motion(8, 12).tolist() == pytest.approx([0, 0.15], abs=1e-3)
 
 
@@ -274,11 +277,11 @@ def test_the_self_check_chooses_the_method(explained, motion, edge_correlation, 
 
 
 def test_layers_with_the_same_edges_have_edge_correlation_and_independent_ones_have_not():
-    one, other = torch.rand(2, 3, 40, 60, generator=torch.Generator().manual_seed(1))[:, :, None]
+    one, other = np.random.default_rng(1).random((2, 40, 60, 3))
     for second, expected in ((0.3 * one, 1.0), (other, 0.0)):
-        layers = torch.stack([one, second])[:, :, 0]
+        layers = np.stack([one, second])
         assert _edge_correlation(layers) == pytest.approx(expected, abs=0.1)
-    assert _edge_correlation(torch.zeros(2, 3, 8, 8)) == 0  # no edges
+    assert _edge_correlation(np.zeros((2, 8, 8, 3))) == 0  # no edges
 
 
 @pytest.mark.parametrize(("naming", "is_certain"), [(0.3, True), (0.01, False)])

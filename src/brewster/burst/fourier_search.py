@@ -7,17 +7,16 @@ it leaves unexplained is the cost of d_k.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from typing import Final
 
 import cv2
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 Floats = NDArray[np.float32]
+Doubles = NDArray[np.float64]
+Spectra = NDArray[np.complex64]
 
 _WIDTH_PX: Final = 250
 _MAX_TRANSLATION: Final = 0.1
@@ -27,6 +26,8 @@ _STARTS: Final = 3
 _LARGE: Final = 0.05
 """The largest frequency of large structures, in periods per pixel."""
 _REFINEMENT_STEPS: Final = 60
+_RATE: Final = 0.1
+"""The step of the refinement, in pixels."""
 
 
 def find_translations(aligned: Sequence[Floats], reference: int) -> list[NDArray[np.float64]]:
@@ -39,45 +40,55 @@ def find_translations(aligned: Sequence[Floats], reference: int) -> list[NDArray
         aligned: the frames, (h, w, 3) linear light, aligned with the first layer.
         reference: the index of the reference frame.
     """
-    spectra, frequencies, weights = _spectra(aligned)
-    times = torch.arange(len(aligned), dtype=torch.float32) - reference
-    line, plane = torch.stack([times, 0 * times], 1), _plane(spectra, frequencies, reference)
-    mirrored = plane * torch.tensor([1, -1])  # differences do not tell left from right
-    lengths = torch.logspace(-1, math.log10(_MAX_TRANSLATION * _WIDTH_PX), _GRID)
-    ends = torch.cat([-lengths.flip(0), torch.zeros(1), lengths])
-    grid = torch.cartesian_prod(ends, ends)[..., None, None]
+    spectra, frequencies = _spectra(aligned)
+    energy = np.square(np.abs(spectra - spectra.mean(0))).sum(0)
+    if not energy.any():  # the frames are equal
+        return []
+    weights = (energy + np.median(energy) + 1e-12) ** -0.75  # whitens the changes
+    times = np.arange(len(aligned), dtype=float) - reference
+    line, plane = np.stack([times, 0 * times], 1), _plane(spectra, frequencies, reference)
+    mirrored = plane * [1, -1]  # differences do not tell left from right
+    lengths = np.geomspace(0.1, _MAX_TRANSLATION * _WIDTH_PX, _GRID)
+    ends = np.concatenate([-lengths[::-1], [0], lengths])
     costs, paths = [], []
     for places in (line, plane, mirrored):
-        along = places / (places.norm(dim=1).max() + 1e-9)
-        across = along.flip(1) * torch.tensor([-1, 1])
+        along = places / (np.linalg.norm(places, axis=1).max() + 1e-9)
+        across = along[:, ::-1] * [-1, 1]
         along_turns, across_turns = (
-            torch.exp(-1j * ends[:, None, None] * (axis @ frequencies.T)) for axis in (along, across)
+            _turns(ends[:, None, None] * axis, frequencies) for axis in (along, across)
         )
         costs += [_costs(spectra, weights, reference, turn * across_turns) for turn in along_turns]
-        paths.append(grid[:, 0] * along + grid[:, 1] * across)
-    chosen: list[Tensor] = []
-    for path in torch.cat(paths)[torch.cat(costs).argsort()]:  # the best ones that are not neighbours
-        is_still = not path.any()
-        if not is_still and all((path - other).norm() > 0.3 * other.norm() + 0.5 for other in chosen):
+        paths.append(ends[:, None, None, None] * along + ends[:, None, None] * across)
+    chosen: list[Doubles] = []
+    grid = np.concatenate(paths).reshape(-1, len(aligned), 2)
+    for path in grid[np.concatenate(costs).argsort()]:  # the best ones that are not neighbours
+        norms = [(np.linalg.norm(path - other), np.linalg.norm(other)) for other in chosen]
+        if path.any() and all(distance > 0.3 * length + 0.5 for distance, length in norms):
             chosen.append(path)
         if len(chosen) == _STARTS:
             break
-    offsets = torch.stack(chosen).requires_grad_()
-    optimiser = torch.optim.Adam([offsets], lr=0.1)
-    for _ in range(_REFINEMENT_STEPS):
-        optimiser.zero_grad()
-        refined_costs = _costs(spectra, weights, reference, torch.exp(-1j * (offsets @ frequencies.T)))
-        refined_costs.sum().backward()  # type: ignore[no-untyped-call]
-        optimiser.step()
-    found = offsets.detach() - offsets.detach()[:, reference : reference + 1]
-    order = refined_costs.argsort()
-    if not torch.isfinite(found).all():  # the frames are equal
-        return []
-    return list(found[order].double().numpy() * (aligned[0].shape[1] / _WIDTH_PX))
+    refined = [_refined(spectra, frequencies, weights, reference, path) for path in chosen]
+    refined.sort(key=lambda found: found[1])
+    return [offsets * (aligned[0].shape[1] / _WIDTH_PX) for offsets, _ in refined]
 
 
-def _spectra(aligned: Sequence[Floats]) -> tuple[Tensor, Tensor, Tensor]:
-    """Returns the spectra (K, n), their angular frequencies (n, 2) and weights (n,) that whiten the changes."""
+def _refined(
+    spectra: Spectra, frequencies: Floats, weights: Floats, reference: int, path: Doubles
+) -> tuple[Doubles, float]:
+    """Returns the translations after steps of Adam, in which each frame but the reference frame moves freely, and their cost."""
+    offsets, first, second = path.copy(), np.zeros_like(path), np.zeros_like(path)
+    for step in range(1, _REFINEMENT_STEPS + 1):
+        turns = _turns(offsets, frequencies)
+        explained, slopes = _explained(spectra, reference, turns, with_slopes=True)
+        gradient = -np.stack([slopes @ (weights * axis) for axis in frequencies.T], 1)
+        first += 0.1 * (gradient - first)
+        second += 0.001 * (gradient**2 - second)
+        offsets -= _RATE * first / (1 - 0.9**step) / (np.sqrt(second / (1 - 0.999**step)) + 1e-8)
+    return offsets - offsets[reference], -float(weights @ explained)
+
+
+def _spectra(aligned: Sequence[Floats]) -> tuple[Spectra, Floats]:
+    """Returns the spectra (K, n) and their angular frequencies (n, 2)."""
     height = round(_WIDTH_PX * aligned[0].shape[0] / aligned[0].shape[1])
     grey = np.stack(
         [cv2.resize(frame.mean(-1), (_WIDTH_PX, height), interpolation=cv2.INTER_AREA) for frame in aligned]
@@ -88,33 +99,51 @@ def _spectra(aligned: Sequence[Floats]) -> tuple[Tensor, Tensor, Tensor]:
     radius = np.hypot(x, y)
     kept = (radius > 2.5 / _WIDTH_PX) & (radius < 0.25) & (x >= 0)
     frequencies = 2 * np.pi * np.stack([x[kept], y[kept]], -1)
-    selected = torch.from_numpy(spectra[:, kept]).to(torch.complex64)
-    energy = (selected - selected.mean(0)).abs().square().sum(0)
-    return selected, torch.from_numpy(frequencies).float(), (energy + energy.median()) ** -0.75
+    return spectra[:, kept].astype(np.complex64), frequencies.astype(np.float32)
 
 
-def _plane(spectra: Tensor, frequencies: Tensor, reference: int) -> Tensor:
+def _plane(spectra: Spectra, frequencies: Floats, reference: int) -> Doubles:
     """Returns the places of the frames relative to the reference frame, (K, 2) in any unit, rotated or mirrored at will.
 
     Classical multidimensional scaling: of large structures, the change from frame to frame is proportional to the motion.
     """
-    large = spectra[:, frequencies.norm(dim=1) < 2 * math.pi * _LARGE]
+    large = spectra[:, np.linalg.norm(frequencies, axis=1) < 2 * np.pi * _LARGE].astype(complex)
     centred = large - large.mean(0)
-    values, vectors = torch.linalg.eigh((centred @ centred.mH).real)
-    places: Tensor = vectors[:, -2:] * values[-2:].clamp(min=0).sqrt()
-    return places - places[reference]
+    values, vectors = np.linalg.eigh((centred @ centred.conj().T).real)
+    places = vectors[:, -2:] * np.sqrt(np.maximum(values[-2:], 0))
+    relative: Doubles = places - places[reference]
+    return relative
 
 
-def _costs(spectra: Tensor, weights: Tensor, reference: int, phases: Tensor) -> Tensor:
-    """Returns the share of the change that translations leave unexplained, (C,), from their phase factors (C, K, n)."""
-    others = [k for k in range(len(spectra)) if k != reference]
+def _turns(offsets: Doubles, frequencies: Floats) -> Spectra:
+    """Returns the phase factors (..., n) of translations (..., 2)."""
+    turns: Spectra = np.exp(np.complex64(-1j) * (offsets.astype(np.float32) @ frequencies.T))
+    return turns
+
+
+def _explained(
+    spectra: Spectra, reference: int, turns: Spectra, *, with_slopes: bool = False
+) -> tuple[Floats, Floats]:
+    """Returns the energy of the change that the best R with these turns (..., K, n) explains, (..., n); and its derivatives by the
+    phases (K, n), if asked for."""
+    others = np.arange(len(spectra)) != reference
     # The noise of the reference frame is in all differences: subtracting a share of their mean makes it independent
-    share = 1 - 1 / np.sqrt(len(spectra))
+    share = np.float32(1 - 1 / np.sqrt(len(spectra)))
     changes = spectra[others] - spectra[reference]
     changes = changes - share * changes.mean(0)
-    turns = phases[:, others] - phases[:, reference : reference + 1]
-    turns = turns - share * turns.mean(1, keepdim=True)
-    explained = (turns.conj() * changes).sum(1).abs().square() / (turns.abs().square().sum(1) + 1e-3)
-    total = changes.abs().square().sum(0)
-    unexplained: Tensor = (weights * (total - explained)).sum(1) / (weights * total).sum()
-    return unexplained
+    moved = turns[..., others, :] - turns[..., reference, None, :]
+    moved = moved - share * moved.mean(-2, keepdims=True)
+    product = (moved.conj() * changes).sum(-2)
+    energy = np.square(np.abs(moved)).sum(-2) + np.float32(1e-3)
+    explained = np.square(np.abs(product)) / energy
+    slopes = np.zeros(spectra.shape, np.float32)
+    if with_slopes:
+        forces = (product.conj() * changes - explained * moved) / energy
+        forces = forces - share * forces.mean(0)
+        slopes[others] = -2 * (turns[others].conj() * forces).imag
+    return explained, slopes
+
+
+def _costs(spectra: Spectra, weights: Floats, reference: int, turns: Spectra) -> Floats:
+    """Returns what translations leave unexplained, without a constant, (C,), from their phase factors (C, K, n)."""
+    return -_explained(spectra, reference, turns)[0] @ weights

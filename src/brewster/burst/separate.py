@@ -20,8 +20,9 @@ from typing import Any, Final, Literal, final
 import cv2
 import numpy as np
 
+from brewster.burst.joint_model import Floats
 from brewster.burst.registration import frame_motions, motion_candidates, path_order
-from brewster.burst.solver import MIN_SIDE_PX, Floats, Solution, solve
+from brewster.burst.solver import MIN_SIDE_PX, Solution, solve
 from brewster.errors import PhotoError, error_prefix
 from brewster.inference.assessment import Verdict
 from brewster.inference.burst_report import BurstReport, burst_photo_name, check_photo_count
@@ -31,7 +32,6 @@ from brewster.inference.separation import Separation
 from brewster.inference.separator import Separator, white_level
 from brewster.options import Options, Quality
 from brewster.photo import Photo, Source
-from brewster.worker_setup import single_torch_thread
 
 _WORKING_PX: Final = 1000
 """The long side of the frames from which the motion is estimated."""
@@ -190,7 +190,7 @@ def measure_layers(
         The solution, or None if no other frame shows the scene of the reference frame or the frames are too small; and the indices of
         the frames that do not show it.
     """
-    with single_torch_thread(), _single_opencv_thread():
+    with _single_opencv_thread():
         motions = frame_motions(frames, reference, prior)
         used = path_order(frames, motions)
         left_out = tuple(k for k, found in enumerate(motions) if not found)

@@ -9,15 +9,12 @@ from typing import Final, final
 
 import cv2
 import numpy as np
-import torch
-from numpy.typing import NDArray
-from torch import Tensor
-from torch.nn import functional
 
-from brewster.burst.joint_model import OFFSET, JointModel, Rates, Weights, optimise
+from brewster.burst.joint_model import Doubles, Floats, JointModel, with_fourth_channel
+from brewster.burst.kernels import OFFSET
+from brewster.burst.optimiser import Rates, Weights, optimise
 from brewster.burst.registration import MotionCandidate
 
-Floats = NDArray[np.float32]
 _FOR_MOTION: Final = Weights(common_edges=0.01, prior=0.02)
 """Two layers with edges at the same places explain too much of any motion."""
 _FOR_LAYERS: Final = Weights(common_edges=0.005, prior=0.01)
@@ -113,8 +110,8 @@ def solve(
     levels = [level for level in levels if level.long_side_px <= largest] or levels[:1]
     work = [level.steps * level.long_side_px for level in levels]
     done = 0.0
-    motions = np.stack([[c.transmission for c in candidates], [c.reflection for c in candidates]])
-    is_locked = torch.tensor([candidate.is_locked for candidate in candidates])
+    motions = np.array([[c.transmission, c.reflection] for c in candidates])
+    is_locked = np.array([candidate.is_locked for candidate in candidates])
     model, errors = None, (0.0, 0.0)
     edge_correlation = naming = 0.0
     refined = prior
@@ -123,9 +120,7 @@ def solve(
             _packed(images, level.long_side_px) for images in (frames, [prior], [refined])
         )
         if model is None:
-            model = JointModel.start(
-                small, torch.from_numpy(motions).float(), is_locked, reference, level.density
-            )
+            model = JointModel.start(small, motions, is_locked, reference, level.density)
         else:
             kept = _best_of_families(model, candidates) if index <= _COMPARED else [_best(model)]
             model = model.selected(kept).resized(small, level.density, level.spline_size)
@@ -140,50 +135,59 @@ def solve(
             model, small, small_refined[0], level.steps, rates=rates, weights=level.weights, on_step=on_step
         )
         if index <= _COMPARED:
-            losses = model.data_losses.tolist()
-            errors = losses[model.is_locked.tolist().index(True)], losses[_best(model)]
+            losses = model.data_losses
+            errors = float(losses[model.is_locked.argmax()]), float(losses[_best(model)])
         if index >= _COMPARED or level is levels[-1]:
             best = model.selected([_best(model)])
             layers, detail = _named(best, small, small_prior[0])
             if index == min(_NAMED, len(levels) - 1):
                 edge_correlation, naming = _edge_correlation(layers), detail
                 if naming < -_MIN_NAMING:  # the next levels correct the brightness of large areas
-                    model, layers, naming = best.exchanged(), layers.flip(0), -naming
+                    model, layers, naming = best.exchanged(), layers[::-1], -naming
             if refine_prior and level is not levels[-1]:
                 refined = refine_prior(_reflection_share(layers))
     assert model
     model = model.selected([_best(model)])
-    with torch.no_grad():
-        confidence = model.confidence(small)[0]
-        motion = model.relative_motion(*small.shape[-2:])[0].item()
-    transmission, reflection, confidence = (layer.movedim(0, -1).numpy() for layer in (*layers, confidence))
-    return Solution(transmission, reflection, confidence, motion, naming, edge_correlation, *errors)
+    confidence = model.confidence(small)
+    motion = float(model.relative_motion(*_MOTION_SAMPLES)[0])
+    return Solution(layers[0], layers[1], confidence, motion, naming, edge_correlation, *errors)
 
 
-def _named(model: JointModel, frames: Tensor, prior: Tensor) -> tuple[Tensor, float]:
-    """Returns the layers of the reference frame, (2, 3, h, w), and the share of T in the prior's detail minus that of R."""
-    with torch.no_grad():
-        layers = model.reference_layers(*frames.shape[-2:])[:, 0]
-    images = torch.cat([layers, prior[None]])
-    blurred = functional.avg_pool2d(images, _DETAIL_PX, 1, _DETAIL_PX // 2, count_include_pad=False)
+def _named(model: JointModel, frames: Floats, prior: Floats) -> tuple[Floats, float]:
+    """Returns the layers of the reference frame, (2, h, w, 3), and the share of T in the prior's detail minus that of R."""
+    layers = model.reference_layers(*frames.shape[1:3])
+    images = [*layers, prior[..., :3]]
     # The noise of light is proportional to its square root
-    details = ((images - blurred) / (frames[model.reference] + OFFSET).sqrt()).flatten(1)
+    noise = np.sqrt(frames[model.reference, ..., :3] + OFFSET)
+    details = np.stack([((image - _blurred(image)) / noise).ravel() for image in images]).astype(np.float64)
     gram = details @ details.T
-    transmission, reflection = torch.linalg.lstsq(gram[:2, :2] + 1e-6 * torch.eye(2), gram[:2, 2]).solution
+    transmission, reflection = np.linalg.lstsq(gram[:2, :2] + 1e-6 * np.eye(2), gram[:2, 2])[0]
     return layers, float(transmission - reflection)
 
 
-def _edge_correlation(layers: Tensor) -> float:
-    """Returns the correlation of the strengths of the edges of two layers (2, 3, h, w)."""
-    grey = (layers.mean(1) + OFFSET).sqrt()
-    strengths = torch.hypot(*torch.gradient(grey, dim=(1, 2)))
-    return float(torch.corrcoef(strengths.flatten(1))[0, 1].nan_to_num())
+def _blurred(image: Floats) -> Floats:
+    """Returns the mean of the image in boxes of 9 px, at the borders of the part inside."""
+    size = _DETAIL_PX, _DETAIL_PX
+    total = cv2.boxFilter(image, -1, size, normalize=False, borderType=cv2.BORDER_CONSTANT)
+    count = cv2.boxFilter(np.ones_like(image), -1, size, normalize=False, borderType=cv2.BORDER_CONSTANT)
+    blurred: Floats = total / count
+    return blurred
 
 
-def _reflection_share(layers: Tensor) -> Floats:
-    """Returns the share of R in the light of both layers (2, 3, h, w), without noise: (h, w, 1) in 0..1."""
-    transmission, reflection = functional.avg_pool2d(layers.mean(1), _DETAIL_PX, 1, _DETAIL_PX // 2)
-    share: Floats = (reflection / (transmission + reflection + 1e-3))[..., None].numpy()
+def _edge_correlation(layers: Floats) -> float:
+    """Returns the correlation of the strengths of the edges of two layers (2, h, w, 3)."""
+    grey = np.sqrt(layers.mean(-1) + OFFSET)
+    strengths = np.hypot(*np.gradient(grey, axis=(1, 2))).reshape(2, -1)
+    return float(np.nan_to_num(np.corrcoef(strengths)[0, 1])) if strengths.std(1).all() else 0.0
+
+
+def _reflection_share(layers: Floats) -> Floats:
+    """Returns the share of R in the light of both layers (2, h, w, 3), without noise: (h, w, 1) in 0..1."""
+    transmission, reflection = (
+        cv2.boxFilter(layer.mean(-1), -1, (_DETAIL_PX, _DETAIL_PX), borderType=cv2.BORDER_CONSTANT)
+        for layer in layers
+    )
+    share: Floats = (reflection / (transmission + reflection + 1e-3))[..., None]
     return share
 
 
@@ -202,16 +206,12 @@ def _best_of_families(model: JointModel, candidates: Sequence[MotionCandidate]) 
 def _best(model: JointModel) -> int:
     """Returns the index of the best candidate with two layers."""
     losses = _selection_losses(model)
-    unlocked = (i for i, is_locked in enumerate(model.is_locked.tolist()) if not is_locked)
-    return min(unlocked, key=losses.__getitem__)
+    return int(np.where(model.is_locked, np.inf, losses).argmin())
 
 
-def _selection_losses(model: JointModel) -> list[float]:
+def _selection_losses(model: JointModel) -> Doubles:
     """Returns the losses, larger by 1 for implausible motions."""
-    with torch.no_grad():
-        is_implausible = model.relative_motion(*_MOTION_SAMPLES) > _MAX_RELATIVE_MOTION
-    losses: list[float] = (model.losses + is_implausible).tolist()
-    return losses
+    return model.losses + (model.relative_motion(*_MOTION_SAMPLES) > _MAX_RELATIVE_MOTION)
 
 
 def resized(image: Floats, long_side_px: int) -> Floats:
@@ -224,7 +224,6 @@ def resized(image: Floats, long_side_px: int) -> Floats:
     return small
 
 
-def _packed(images: Sequence[Floats], long_side_px: int) -> Tensor:
-    """Returns resized images as a tensor (K, 3, h, w)."""
-    small = np.stack([resized(image, long_side_px) for image in images])
-    return torch.from_numpy(np.ascontiguousarray(small.transpose(0, 3, 1, 2), dtype=np.float32))
+def _packed(images: Sequence[Floats], long_side_px: int) -> Floats:
+    """Returns resized images, (K, h, w, 4)."""
+    return with_fourth_channel(np.stack([resized(image, long_side_px) for image in images]))

@@ -1,0 +1,521 @@
+"""The arithmetic of the joint optimisation, compiled by numba: samples of the layers, and the terms of the loss with their gradients.
+
+A pixel has four channels, the last of which is 0, so that it fills a vector register. A kernel works on the items `begin` to `end` and
+holds no lock, so that threads share the items. The rows of a frame are cut into parts, and each part adds its gradients to a canvas of
+its own: no two threads write the same value, and the sums do not depend on the number of threads.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, Final
+
+import numba
+import numpy as np
+from numba import njit
+
+MARGIN: Final = 0.15
+"""The canvases extend beyond each edge of the reference frame by this share of its size."""
+OFFSET: Final = np.float32(0.003)
+"""Added to linear light below the square root, so that noise in the shadows counts less."""
+CLIPPED: Final = np.float32(0.98)
+"""Above this value, a pixel of a frame is clipped, and a brighter sum of the layers is no error."""
+CHARBONNIER: Final = np.float32(0.01)
+"""Errors below are squared, larger ones are absolute."""
+
+_F = np.float32
+_U = np.uint64
+_ZERO, _HALF, _ONE, _TWO, _QUARTER, _THIRD = (_F(value) for value in (0, 0.5, 1, 2, 0.25, 1 / 3))
+_1, _2, _3, _4, _5, _6, _7 = (_U(value) for value in range(1, 8))
+_CANVAS: Final = _F(1 / (1 + 2 * MARGIN))
+MIN_DENOMINATOR: Final = _F(0.1)
+"""Of a projection: points at infinity would be outside of every canvas."""
+_CLIPPED_ROOT: Final = _F(np.sqrt(CLIPPED + OFFSET))
+_EPSILON: Final = CHARBONNIER
+_EPSILON_SQUARED: Final = CHARBONNIER * CHARBONNIER
+_BETA1, _BETA2, _ADAM_EPSILON = _F(0.9), _F(0.99), _F(1e-8)
+
+numba.config.SLP_VECTORIZE = 1  # type: ignore[attr-defined]  # off by default; without it, the arithmetic of the four channels stays scalar
+_OPTIONS: Final[dict[str, Any]] = {
+    "fastmath": {"reassoc", "contract", "arcp", "nsz"}, "error_model": "numpy", "nogil": True
+}  # fmt: skip
+
+
+def _kernel(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Compiles a function without the interpreter's lock, once for all processes if the folder of the cache can be written."""
+    try:
+        compiled: Callable[..., Any] = njit(cache=True, **_OPTIONS)(function)
+    except RuntimeError:  # no folder for the cache
+        compiled = njit(**_OPTIONS)(function)
+    return compiled
+
+
+@_kernel
+def sample(canvas, x, y, out):
+    """Writes bilinear samples of a canvas (H, W, 4) to out (h, w, 4). x, y (h, w): in pixels of the canvas, 0 is the first centre."""
+    height, width, _ = canvas.shape
+    for i in range(x.shape[0]):
+        for j in range(x.shape[1]):
+            u, v = min(max(x[i, j], _ZERO), _F(width - 1)), min(max(y[i, j], _ZERO), _F(height - 1))
+            left, top = min(int(u), width - 2), min(int(v), height - 2)
+            a, b = u - _F(left), v - _F(top)
+            for c in range(4):
+                upper = canvas[top, left, c] + a * (canvas[top, left + 1, c] - canvas[top, left, c])
+                lower = canvas[top + 1, left, c] + a * (
+                    canvas[top + 1, left + 1, c] - canvas[top + 1, left, c]
+                )
+                out[i, j, c] = upper + b * (lower - upper)
+
+
+@_kernel
+def collect(values, x, y, out):
+    """Adds values (h, w) to the four pixels of out (H, W, 2) around each position, and their weights. The adjoint of `sample`."""
+    height, width, _ = out.shape
+    for i in range(x.shape[0]):
+        for j in range(x.shape[1]):
+            left, top = int(np.floor(x[i, j])), int(np.floor(y[i, j]))
+            a, b = x[i, j] - _F(left), y[i, j] - _F(top)
+            for row, column, weight in (
+                (top, left, (_ONE - a) * (_ONE - b)),
+                (top, left + 1, a * (_ONE - b)),
+                (top + 1, left, (_ONE - a) * b),
+                (top + 1, left + 1, a * b),
+            ):
+                if 0 <= row < height and 0 <= column < width:
+                    out[row, column, 0] += weight * values[i, j]
+                    out[row, column, 1] += weight
+
+
+@_kernel
+def data_term(
+    begin, end, light, target, homographies, splines, rows, columns, spans, gains, extra, reference, parts, scatter, touched, out
+):  # fmt: skip
+    """The data term of C candidates, and its gradients. An item is one of `parts` strips of rows of a candidate.
+
+    Args:
+        begin, end: the items.
+        light: (C, 2, H, W, 4), the layers.
+        target: (K, h, w, 4), the square roots of the frames.
+        homographies, splines: (C, 2, K, 8) and (C, 2, K, 2, r, c), frame to reference.
+        rows, columns: (h, r) and (c, w), the weights of the knots of the splines.
+        spans: (c, 2), where the weights of a column of knots are not 0.
+        gains: (C, K, 4).
+        extra: (C, h, w, 4), added to the gradient of T in the reference frame.
+        reference: the index of the frame whose motion and gain are fixed.
+        parts: the number of strips of a candidate.
+        scatter: (C * parts, 2, H * W * 4) of zeros, gets the gradient of `light` in the rows `touched` (C * parts, 2, 2).
+        out: (C * parts, K, 4 + 2 * (8 + 2 r c)), gets the loss, and the gradients of three gains and, for T and R, of homography and
+            spline.
+    """
+    _, _, canvas_height, canvas_width, _ = light.shape
+    frame_count, height, width, _ = target.shape
+    knot_rows, knot_columns = rows.shape[1], columns.shape[0]
+    motion_size = 8 + 2 * knot_rows * knot_columns
+    scale, stride = _F(0.5 / (frame_count * height * width * 3)), _U(canvas_width * 4)
+    corners = np.empty((2, width), np.int32)
+    points = np.empty((2, 9, width), np.float32)
+    knots = np.empty((2, knot_columns), np.float32)
+    total, gradient, gain = np.empty((3, 4 * width), np.float32)
+    slopes = np.empty((2, 2, 4 * width), np.float32)
+    for item in range(begin, end):
+        candidate, part = item // parts, item % parts
+        for layer in range(2):
+            touched[item, layer, 0], touched[item, layer, 1] = canvas_height, 0
+        for k in range(frame_count):
+            sums = out[item, k]
+            sums[:] = 0
+            for x in range(width):
+                for c in range(4):
+                    gain[4 * x + c] = gains[candidate, k, c]
+            for y in range(height * part // parts, height * (part + 1) // parts):
+                down = _F((y + 0.5) * 2 / height - 1)
+                for layer in range(2):
+                    for j in range(knot_columns):
+                        for axis in range(2):
+                            value = _ZERO
+                            for i in range(knot_rows):
+                                value += rows[y, i] * splines[candidate, layer, k, axis, i, j]
+                            knots[axis, j] = value
+                    low, high = _row_positions(
+                        homographies[candidate, layer, k], down, knots, columns, spans, canvas_height, canvas_width,
+                        corners[layer], points[layer],
+                    )  # fmt: skip
+                    touched[item, layer, 0] = min(touched[item, layer, 0], low)
+                    touched[item, layer, 1] = max(touched[item, layer, 1], high)
+                    _gather(
+                        light[candidate, layer].reshape(-1), stride, corners[layer], points[layer], layer == 1, total, slopes[layer]
+                    )  # fmt: skip
+                goal = target[k, y].reshape(-1)
+                loss = _ZERO
+                for x in range(4 * width):
+                    root = np.sqrt(total[x] * gain[x] + OFFSET)
+                    error = root - goal[x]
+                    error = _ZERO if (goal[x] > _CLIPPED_ROOT) & (error > _ZERO) else error
+                    length = np.sqrt(error * error + _EPSILON_SQUARED)
+                    gradient[x] = scale * gain[x] * error / (length * root)
+                    loss += length - _EPSILON
+                sums[0] += loss
+                if k != reference:
+                    red, green, blue = _ZERO, _ZERO, _ZERO
+                    for x in range(width):
+                        red += gradient[4 * x] * total[4 * x]
+                        green += gradient[4 * x + 1] * total[4 * x + 1]
+                        blue += gradient[4 * x + 2] * total[4 * x + 2]
+                    sums[1] += red
+                    sums[2] += green
+                    sums[3] += blue
+                    for layer in range(2):
+                        first = 4 + layer * motion_size
+                        _row_motion(
+                            points[layer], slopes[layer], gradient, down, rows[y], columns, spans, sums[first : first + motion_size]
+                        )  # fmt: skip
+                _scatter(scatter[item, 1], stride, corners[1], points[1], gradient)
+                if k == reference:
+                    more = extra[candidate, y].reshape(-1)
+                    for x in range(4 * width):
+                        gradient[x] += more[x]
+                _scatter(scatter[item, 0], stride, corners[0], points[0], gradient)
+
+
+@_kernel
+def _row_positions(homography, down, knots, columns, spans, canvas_height, canvas_width, corner, points):
+    """Computes where a row of a frame samples a canvas, and returns the first row of the canvas and the one after the last.
+
+    Writes to `corner` the offset of the pixel above and to the left, and to the rows of `points`: the fractions from there (0, 1), the
+    pixels of the canvas per unit of motion (2, 3; 0 at the border), and of the projection 1 / denominator, x and y (4, 5, 6).
+    """
+    width = len(corner)
+    a, b, step_x, step_y, inverse, px, py, offset_x, offset_y = points
+    offset_x[:] = _ZERO
+    offset_y[:] = _ZERO
+    for j in range(knots.shape[1]):
+        kx, ky = knots[0, j], knots[1, j]
+        if kx != _ZERO or ky != _ZERO:
+            for x in range(spans[j, 0], spans[j, 1]):
+                offset_x[x] += kx * columns[j, x]
+                offset_y[x] += ky * columns[j, x]
+    h0, h3, h6 = homography[0], homography[3], homography[6]
+    c0, c1, c2 = (
+        homography[1] * down + homography[2],
+        homography[4] * down + homography[5],
+        homography[7] * down + _ONE,
+    )
+    pixel, last_x, last_y = _F(2.0 / width), _F(canvas_width - 1), _F(canvas_height - 1)
+    scale_x, scale_y = _F(canvas_width * 0.5) * _CANVAS, _F(canvas_height * 0.5) * _CANVAS
+    middle_x, middle_y = _F((canvas_width - 1) * 0.5), _F((canvas_height - 1) * 0.5)
+    # Several short loops: LLVM vectorises only those that write to few arrays
+    for x in range(width):
+        across = (_F(np.int32(x)) + _HALF) * pixel - _ONE
+        q = _ONE / max(c2 + h6 * across, MIN_DENOMINATOR)
+        inverse[x], px[x], py[x] = q, (c0 + h0 * across) * q, (c1 + h3 * across) * q
+    for x in range(width):
+        value = (px[x] + offset_x[x]) * scale_x + middle_x
+        step_x[x] = scale_x if (value > _ZERO) & (value < last_x) else _ZERO
+        a[x] = min(max(value, _ZERO), last_x)
+    for x in range(width):
+        value = (py[x] + offset_y[x]) * scale_y + middle_y
+        step_y[x] = scale_y if (value > _ZERO) & (value < last_y) else _ZERO
+        b[x] = min(max(value, _ZERO), last_y)
+    lowest, highest = last_y, _ZERO
+    for x in range(width):
+        lowest, highest = min(lowest, b[x]), max(highest, b[x])
+    left_limit, top_limit, stride = (
+        np.int32(canvas_width - 2),
+        np.int32(canvas_height - 2),
+        np.int32(canvas_width * 4),
+    )
+    for x in range(width):
+        left, top = min(np.int32(a[x]), left_limit), min(np.int32(b[x]), top_limit)
+        corner[x] = np.int32(np.int32(top * stride) + np.int32(left << np.int32(2)))
+        a[x] -= _F(left)
+        b[x] -= _F(top)
+    return int(lowest), min(int(highest) + 2, canvas_height)
+
+
+@_kernel
+def _gather(canvas, stride, corner, points, is_added, total, slopes):
+    """Writes bilinear samples of a row, or adds them, to `total`, and their derivatives along x and y to `slopes`."""
+    dx, dy = slopes
+    for x in range(len(corner)):
+        i, a, b, z = _U(corner[x]), points[0, x], points[1, x], _U(x) * _4
+        j = i + stride
+        p0, p1, p2, p3 = canvas[i], canvas[i + _1], canvas[i + _2], canvas[i + _3]
+        q0, q1, q2, q3 = canvas[i + _4], canvas[i + _5], canvas[i + _6], canvas[i + _7]
+        r0, r1, r2, r3 = canvas[j], canvas[j + _1], canvas[j + _2], canvas[j + _3]
+        s0, s1, s2, s3 = canvas[j + _4], canvas[j + _5], canvas[j + _6], canvas[j + _7]
+        u0, u1, u2, u3 = q0 - p0, q1 - p1, q2 - p2, q3 - p3
+        v0, v1, v2, v3 = s0 - r0, s1 - r1, s2 - r2, s3 - r3
+        p0, p1, p2, p3 = p0 + a * u0, p1 + a * u1, p2 + a * u2, p3 + a * u3
+        r0, r1, r2, r3 = r0 + a * v0 - p0, r1 + a * v1 - p1, r2 + a * v2 - p2, r3 + a * v3 - p3
+        dy[z], dy[z + _1], dy[z + _2], dy[z + _3] = r0, r1, r2, r3
+        u0, u1, u2, u3 = u0 + b * (v0 - u0), u1 + b * (v1 - u1), u2 + b * (v2 - u2), u3 + b * (v3 - u3)
+        dx[z], dx[z + _1], dx[z + _2], dx[z + _3] = u0, u1, u2, u3
+        p0, p1, p2, p3 = p0 + b * r0, p1 + b * r1, p2 + b * r2, p3 + b * r3
+        if is_added:
+            p0, p1, p2, p3 = p0 + total[z], p1 + total[z + _1], p2 + total[z + _2], p3 + total[z + _3]
+        total[z], total[z + _1], total[z + _2], total[z + _3] = p0, p1, p2, p3
+
+
+@_kernel
+def _scatter(canvas, stride, corner, points, gradient):
+    """The adjoint of `_gather`."""
+    for x in range(len(corner)):
+        i, a, b, z = _U(corner[x]), points[0, x], points[1, x], _U(x) * _4
+        j = i + stride
+        g0, g1, g2, g3 = gradient[z], gradient[z + _1], gradient[z + _2], gradient[z + _3]
+        l0, l1, l2, l3 = b * g0, b * g1, b * g2, b * g3
+        g0, g1, g2, g3 = g0 - l0, g1 - l1, g2 - l2, g3 - l3
+        q0, q1, q2, q3 = a * g0, a * g1, a * g2, a * g3
+        s0, s1, s2, s3 = a * l0, a * l1, a * l2, a * l3
+        p0, p1, p2, p3 = (
+            canvas[i] + g0 - q0,
+            canvas[i + _1] + g1 - q1,
+            canvas[i + _2] + g2 - q2,
+            canvas[i + _3] + g3 - q3,
+        )
+        canvas[i], canvas[i + _1], canvas[i + _2], canvas[i + _3] = p0, p1, p2, p3
+        q0, q1, q2, q3 = canvas[i + _4] + q0, canvas[i + _5] + q1, canvas[i + _6] + q2, canvas[i + _7] + q3
+        canvas[i + _4], canvas[i + _5], canvas[i + _6], canvas[i + _7] = q0, q1, q2, q3
+        p0, p1, p2, p3 = (
+            canvas[j] + l0 - s0,
+            canvas[j + _1] + l1 - s1,
+            canvas[j + _2] + l2 - s2,
+            canvas[j + _3] + l3 - s3,
+        )
+        canvas[j], canvas[j + _1], canvas[j + _2], canvas[j + _3] = p0, p1, p2, p3
+        q0, q1, q2, q3 = canvas[j + _4] + s0, canvas[j + _5] + s1, canvas[j + _6] + s2, canvas[j + _7] + s3
+        canvas[j + _4], canvas[j + _5], canvas[j + _6], canvas[j + _7] = q0, q1, q2, q3
+
+
+@_kernel
+def _row_motion(points, slopes, gradient, down, row, columns, spans, out):
+    """Adds the gradient of a homography and a spline that comes from a row of a frame."""
+    width = points.shape[1]
+    knot_columns, knot_rows = len(columns), len(row)
+    step_x, step_y, inverse, px, py = points[2], points[3], points[4], points[5], points[6]
+    dx, dy = slopes
+    for x in range(width):
+        step_x[x] *= (
+            dx[4 * x] * gradient[4 * x]
+            + dx[4 * x + 1] * gradient[4 * x + 1]
+            + dx[4 * x + 2] * gradient[4 * x + 2]
+        )
+    for x in range(width):
+        step_y[x] *= (
+            dy[4 * x] * gradient[4 * x]
+            + dy[4 * x + 1] * gradient[4 * x + 1]
+            + dy[4 * x + 2] * gradient[4 * x + 2]
+        )
+    t0, t1, t2, t3, t4, t5 = _ZERO, _ZERO, _ZERO, _ZERO, _ZERO, _ZERO
+    pixel = _F(2.0 / width)
+    for x in range(width):
+        across = (_F(np.int32(x)) + _HALF) * pixel - _ONE
+        gx, gy = step_x[x] * inverse[x], step_y[x] * inverse[x]
+        gz = -(gx * px[x] + gy * py[x])
+        t0 += gx * across
+        t1 += gx
+        t2 += gy * across
+        t3 += gy
+        t4 += gz * across
+        t5 += gz
+    out[0] += t0
+    out[1] += t1 * down
+    out[2] += t1
+    out[3] += t2
+    out[4] += t3 * down
+    out[5] += t3
+    out[6] += t4
+    out[7] += t5 * down
+    for j in range(knot_columns):
+        gx, gy = _ZERO, _ZERO
+        for x in range(spans[j, 0], spans[j, 1]):
+            gx += step_x[x] * columns[j, x]
+            gy += step_y[x] * columns[j, x]
+        for i in range(knot_rows):
+            out[8 + i * knot_columns + j] += row[i] * gx
+            out[8 + (knot_rows + i) * knot_columns + j] += row[i] * gy
+
+
+@_kernel
+def gradient_lengths(begin, end, layers, squared_density, weights, parts, gradient, losses):
+    """Writes the gradient of the mean lengths of the gradients of the layers, and the losses (C * 2 * parts). An item is a strip of a layer.
+
+    The length of the gradient, not the sum of its components, which favours edges along the axes. layers, gradient: (C, 2, H, W, 4).
+    """
+    _, _, height, width, _ = layers.shape
+    size = (width - 1) * 4
+    for item in range(begin, end):
+        candidate, layer, part = item // (2 * parts), item // parts % 2, item % parts
+        first, last = height * part // parts, height * (part + 1) // parts
+        weight = weights[layer] / (3 * (height - 1) * (width - 1))
+        factor = _F(weight) * squared_density
+        above, across, down = np.zeros((3, size + 4), np.float32)
+        total = 0.0
+        for y in range(max(first - 1, 0), last):
+            here = layers[candidate, layer, y].reshape(-1)
+            if y < height - 1:
+                below = layers[candidate, layer, y + 1].reshape(-1)
+                loss = _ZERO
+                for x in range(size):
+                    dx, dy = here[x + 4] - here[x], below[x] - here[x]
+                    length = np.sqrt(squared_density * (dx * dx + dy * dy) + _EPSILON_SQUARED)
+                    loss += length - _EPSILON
+                    across[x], down[x] = factor * dx / length, factor * dy / length
+                total += loss if y >= first else _ZERO
+            else:
+                across[:] = _ZERO
+                down[:] = _ZERO
+            if y >= first:
+                out = gradient[candidate, layer, y].reshape(-1)
+                for x in range(4):
+                    out[x] = above[x] - across[x] - down[x]
+                for x in range(4, size):
+                    out[x] = above[x] - across[x] - down[x] + across[x - 4]
+                for x in range(size, size + 4):
+                    out[x] = across[x - 4]
+            above[:] = down
+        losses[item] = total * weight
+
+
+@_kernel
+def halved(begin, end, images, out):
+    """Writes the means of 2 x 2 pixels of images (C, 2, H, W, 4). An item is a row of `out`."""
+    _, _, height, width, _ = out.shape
+    for item in range(begin, end):
+        candidate, layer, y = item // (2 * height), item // height % 2, item % height
+        for x in range(width):
+            for c in range(4):
+                square = images[candidate, layer, 2 * y : 2 * y + 2, 2 * x : 2 * x + 2, c]
+                out[candidate, layer, y, x, c] = _QUARTER * (
+                    square[0, 0] + square[0, 1] + square[1, 0] + square[1, 1]
+                )
+
+
+@_kernel
+def edge_strengths(begin, end, images, parts, across, down, sums):
+    """Writes the mean absolute differences of the channels along x (C, 2, H, W) and y, 0 at the last, and their sums (C, parts, 2, 2)."""
+    _, _, height, width, _ = images.shape
+    for item in range(begin, end):
+        candidate, part = item // parts, item % parts
+        for layer in range(2):
+            sum_x, sum_y = 0.0, 0.0
+            for y in range(height * part // parts, height * (part + 1) // parts):
+                here = images[candidate, layer, y].reshape(-1)
+                sum_x += _differences(here, here[4:], across[candidate, layer, y], width - 1)
+                if y < height - 1:
+                    below = images[candidate, layer, y + 1].reshape(-1)
+                    sum_y += _differences(here, below, down[candidate, layer, y], width)
+            sums[candidate, part, 0, layer], sums[candidate, part, 1, layer] = sum_x, sum_y
+
+
+@_kernel
+def _differences(first, second, out, count):
+    total = _ZERO
+    for x in range(count):
+        out[x] = _THIRD * (
+            abs(second[4 * x] - first[4 * x])
+            + abs(second[4 * x + 1] - first[4 * x + 1])
+            + abs(second[4 * x + 2] - first[4 * x + 2])
+        )
+        total += out[x]
+    return total
+
+
+@_kernel
+def edge_products(begin, end, parts, scales, across, down, losses):
+    """Replaces the strengths of edges by the gradient of the mean product of tanh(scale * strength) of both layers.
+
+    across, down: (C, 2, H, W), from `edge_strengths`. scales: (C, 2, 2), axis and layer. losses: (C * parts). The scales are constants.
+    """
+    _, _, height, width = across.shape
+    for item in range(begin, end):
+        candidate, part = item // parts, item % parts
+        loss = 0.0
+        for y in range(height * part // parts, height * (part + 1) // parts):
+            for axis, strengths, count, size in (
+                (0, across, width - 1, height * (width - 1)),
+                (1, down, width if y < height - 1 else 0, (height - 1) * width),
+            ):
+                first, second = strengths[candidate, 0, y], strengths[candidate, 1, y]
+                scale0, scale1, weight = (
+                    scales[candidate, axis, 0],
+                    scales[candidate, axis, 1],
+                    _F(1 / (6.0 * size)),
+                )
+                total = _ZERO
+                for x in range(count):
+                    a, b = _tanh(first[x] * scale0), _tanh(second[x] * scale1)
+                    total += a * b
+                    first[x] = (_ONE - a * a) * b * scale0 * weight
+                    second[x] = (_ONE - b * b) * a * scale1 * weight
+                loss += total * weight
+        losses[item] = loss
+
+
+@_kernel
+def _tanh(x):
+    """An approximation for x >= 0, within 1e-4, which is vectorised: the continued fraction of Lambert."""
+    x = min(x, _F(4.97))
+    s = x * x
+    return (
+        x
+        * (_F(135135) + s * (_F(17325) + s * (_F(378) + s)))
+        / (_F(135135) + s * (_F(62370) + s * (_F(3150) + s * _F(28))))
+    )
+
+
+@_kernel
+def edge_gradient(begin, end, images, across, down, weight, coarse, gradient):
+    """Adds to the gradient (C, 2, H, W, 4) that of the edges, and a quarter of that of the halved images. An item is a row of a layer.
+
+    across, down: (C, 2, H, W), the gradients of the strengths. coarse: the gradient of the halved images, or one without rows.
+    """
+    _, _, height, width, _ = images.shape
+    for item in range(begin, end):
+        candidate, layer, y = item // (2 * height), item // height % 2, item % height
+        here, out = images[candidate, layer, y], gradient[candidate, layer, y]
+        factor = _F(weight) * _THIRD
+        for x in range(width - 1):
+            step = factor * across[candidate, layer, y, x]
+            for c in range(4):
+                signed = step * _F(np.sign(here[x + 1, c] - here[x, c]))
+                out[x + 1, c] += signed
+                out[x, c] -= signed
+        for other, row in ((y + 1, y), (y - 1, y - 1)):
+            if 0 <= other < height:
+                there, steps = images[candidate, layer, other], down[candidate, layer, row]
+                for x in range(width):
+                    for c in range(4):
+                        out[x, c] += factor * steps[x] * _F(np.sign(here[x, c] - there[x, c]))
+        if y // 2 < coarse.shape[2]:
+            for x in range(coarse.shape[3]):
+                for c in range(4):
+                    value = _QUARTER * coarse[candidate, layer, y // 2, x, c]
+                    out[2 * x, c] += value
+                    out[2 * x + 1, c] += value
+
+
+@_kernel
+def layer_step(begin, end, layers, light, gradient, scatter, touched, parts, first, second, rate, correction):
+    """Takes a step of Adam, and empties `scatter` for the next one. An item is a row of a layer.
+
+    layers: (C, 2, H, W, 4), square roots of `light`. gradient: of the penalties; that of the data term is in `scatter`. first, second: the
+    moments. rate: with the correction of the first moment. correction: of the root of the second moment.
+    """
+    _, _, height, width, _ = layers.shape
+    for item in range(begin, end):
+        candidate, layer, y = item // (2 * height), item // height % 2, item % height
+        g, p = gradient[candidate, layer, y].reshape(-1), layers[candidate, layer, y].reshape(-1)
+        s = light[candidate, layer, y].reshape(-1)
+        m, v = first[candidate, layer, y].reshape(-1), second[candidate, layer, y].reshape(-1)
+        for strip in range(candidate * parts, (candidate + 1) * parts):
+            if touched[strip, layer, 0] <= y < touched[strip, layer, 1]:
+                found = scatter[strip, layer, y * width * 4 : (y + 1) * width * 4]
+                for x in range(4 * width):
+                    g[x] += _TWO * p[x] * found[x]
+                    found[x] = _ZERO
+        for x in range(4 * width):
+            m[x] = _BETA1 * m[x] + (_ONE - _BETA1) * g[x]
+            v[x] = _BETA2 * v[x] + (_ONE - _BETA2) * g[x] * g[x]
+            value = p[x] - rate * m[x] / (np.sqrt(v[x]) * correction + _ADAM_EPSILON)
+            p[x], s[x] = value, value * value

@@ -1,0 +1,297 @@
+"""Optimises both layers, their motions and the gains of the frames jointly, with Adam and exact gradients (kernels.py).
+
+Adam treats each parameter separately, so that candidates do not influence each other.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import Any, Final, final
+
+import cv2
+import numpy as np
+
+from brewster.burst import kernels
+from brewster.burst.joint_model import Doubles, Floats, JointModel, bicubic_weights, pixel_grid, to_pixels
+from brewster.burst.kernels import MARGIN, OFFSET
+
+_GRADIENTS: Final = np.array([0.03, 0.05])
+"""The costs of the gradients of T and R."""
+_GAIN_PENALTY: Final = 0.5
+_SPLINE_CURVATURE: Final = 5.0
+_SPLINE_SIZE: Final = 1.0
+_RIGIDITY: Final = (1.0, 2.0)
+"""The costs of the splines of T and R."""
+_EDGE_SCALES: Final = 3
+_PARTS: Final = 8
+"""The strips of rows of a few candidates. Of many candidates, each is one part."""
+_FEW_CANDIDATES: Final = 3
+_LOW_PASS: Final = 9, 4
+"""The width of the box, and the distance of boxes, in which the prior is compared."""
+_BETA1, _BETA2 = 0.9, 0.99
+
+
+@final
+@dataclass(frozen=True)
+class Weights:
+    """The weights of the terms of the loss that change from level to level."""
+
+    common_edges: float
+    prior: float
+    """The pull of the low frequencies of T to those of the single-photo result."""
+
+
+@final
+@dataclass(frozen=True)
+class Rates:
+    """The learning rates of an optimisation. 0 keeps the values."""
+
+    layers: float = 0.012
+    homographies: float = 0.003
+    splines: float = 0.001
+    log_gains: float = 0.003
+
+    def scaled(self, factor: float) -> Rates:
+        """Returns rates with slower motion: its unit is the frame, so that it must be finer for larger frames."""
+        return Rates(self.layers, self.homographies * factor, self.splines * factor, self.log_gains)
+
+
+def optimise(
+    model: JointModel,
+    frames: Floats,
+    prior: Floats,
+    steps: int,
+    *,
+    rates: Rates,
+    weights: Weights,
+    on_step: Callable[[], None] = lambda: None,
+) -> JointModel:
+    """Returns the model after some steps of Adam. The result does not depend on the number of threads.
+
+    Args:
+        model: the start; its canvases fit the size of the frames.
+        frames: (K, h, w, 4) linear light.
+        prior: T of the reference frame from a single photo, (h, w, 4).
+        steps: the number of steps. The rates fall over the last 40 %; those of the motion rise during the first ten.
+        rates: the learning rates.
+        weights: the weights of the loss.
+        on_step: called after each step. An exception raised in it stops the work.
+    """
+    loss = _Loss(model, frames, prior, weights)
+    moving = (
+        _Adam(loss.model.homographies, rates.homographies),
+        _Adam(loss.model.splines, rates.splines),
+        _Adam(loss.model.log_gains, rates.log_gains),
+    )
+    for step in range(1, steps + 1):
+        decay = min(1.0, 0.2 + 0.8 * (steps - step + 1) / (0.4 * steps))
+        penalties, data_losses, gradients = loss.gradients()
+        loss.step_layers(rates.layers * decay, step)
+        for parameters, gradient in zip(moving, gradients, strict=True):
+            parameters.step(gradient, decay * min(1.0, (step - 1) / 10), step)
+        on_step()
+    return replace(loss.model, losses=penalties + data_losses, data_losses=data_losses)
+
+
+@final
+class _Adam:
+    """Steps of Adam, in place, for parameters other than the layers."""
+
+    def __init__(self, values: Doubles, rate: float) -> None:
+        self._values, self._rate = values, rate
+        self._first, self._second = np.zeros_like(values), np.zeros_like(values)
+
+    def step(self, gradient: Doubles, factor: float, step: int) -> None:
+        """Takes a step, the first of which has number 1, with `factor` times the rate."""
+        self._first += (1 - _BETA1) * (gradient - self._first)
+        self._second += (1 - _BETA2) * (gradient**2 - self._second)
+        root = np.sqrt(self._second / (1 - _BETA2**step)) + 1e-8
+        self._values -= self._rate * factor / (1 - _BETA1**step) * self._first / root
+
+
+@final
+class _Loss:
+    """The loss of all candidates and its gradients, with the arrays that are used in each step.
+
+    Its model has arrays of its own, which change.
+    """
+
+    def __init__(self, model: JointModel, frames: Floats, prior: Floats, weights: Weights) -> None:
+        self.model = replace(
+            model,
+            layers=model.layers.copy(),
+            homographies=model.homographies.copy(),
+            splines=model.splines.copy(),
+            log_gains=model.log_gains.copy(),
+        )
+        layers, splines = self.model.layers, self.model.splines
+        self._weights = weights
+        count, _, canvas_height, canvas_width, _ = layers.shape
+        frame_count, height, width, _ = frames.shape
+        self._parts = _PARTS if count <= _FEW_CANDIDATES else 1
+        self._light, self._target = np.square(layers), np.sqrt(frames + OFFSET)
+        self._target[..., 3] = np.sqrt(OFFSET)
+        self._moments = np.zeros_like(layers), np.zeros_like(layers)
+        self._squared_density = np.float32((canvas_width / (width * (1 + 2 * MARGIN))) ** 2)
+        self._low_prior = _low_pass(np.sqrt(prior + OFFSET))
+        self._pyramid = [layers]
+        for _ in range(_EDGE_SCALES - 1):
+            h, w = (length // 2 for length in self._pyramid[-1].shape[2:4])
+            self._pyramid.append(np.zeros((count, 2, h, w, 4), np.float32))
+        self._gradients = [np.zeros_like(images) for images in self._pyramid]
+        self._edges = [np.zeros((2, *images.shape[:-1]), np.float32) for images in self._pyramid]
+        self._places = to_pixels(pixel_grid(height, width) / (1 + 2 * MARGIN), layers.shape[2:4])
+        rows, columns = (
+            bicubic_weights(*sizes) for sizes in zip((height, width), splines.shape[-2:], strict=True)
+        )
+        self._rows, self._columns = rows.astype(np.float32), np.ascontiguousarray(columns.T, np.float32)
+        used = [np.flatnonzero(column) for column in self._columns]
+        self._spans = np.array([(index[0], index[-1] + 1) for index in used])
+        strips = count * self._parts
+        self._scatter = np.zeros((strips, 2, canvas_height * canvas_width * 4), np.float32)
+        self._touched = np.zeros((strips, 2, 2), np.int64)
+        self._found = np.zeros((strips, frame_count, 4 + 2 * (8 + splines[0, 0, 0].size)))
+
+    def gradients(self) -> tuple[Doubles, Doubles, tuple[Doubles, Doubles, Doubles]]:
+        """Returns the penalties (C,) and the data term (C,), and the gradients of homographies, splines and gains.
+
+        The gradient of the layers stays in the arrays of this object.
+        """
+        model = self.model
+        penalties = self._layer_penalties()
+        prior_penalties, extra = self._prior_penalties()
+        data_losses, gains, motion = self._data_term(extra)
+        homographies, splines = np.split(motion, [8], axis=-1)
+        splines = splines.reshape(model.splines.shape)
+        for layer, rigidity in enumerate(_RIGIDITY):
+            cost, gradient = _spline_penalties(model.splines[:, layer])
+            penalties += rigidity * cost
+            splines[:, layer] += rigidity * gradient
+        penalties += prior_penalties + _GAIN_PENALTY * np.square(model.log_gains).mean((1, 2))
+        gains += 2 * _GAIN_PENALTY * model.log_gains / model.log_gains[0].size
+        return penalties, data_losses, (homographies, splines, gains)
+
+    def step_layers(self, rate: float, step: int) -> None:
+        """Takes a step of Adam, the first of which has number 1."""
+        rate, correction = rate / (1 - _BETA1**step), 1 / np.sqrt(1 - _BETA2**step)
+        layers = self.model.layers
+        _run(
+            kernels.layer_step, layers.shape[0] * 2 * layers.shape[2], layers, self._light, self._gradients[0],
+            self._scatter, self._touched, self._parts, *self._moments, np.float32(rate), np.float32(correction),
+        )  # fmt: skip
+
+    def _layer_penalties(self) -> Doubles:
+        """Returns the costs of gradients and of edges at the same places in both layers, at three scales (Zhang et al. 2018): (C,)."""
+        count, parts = len(self.model.layers), self._parts
+        losses = np.zeros(count * 2 * parts)
+        _run(
+            kernels.gradient_lengths, len(losses), self.model.layers, self._squared_density, _GRADIENTS, parts,
+            self._gradients[0], losses,
+        )  # fmt: skip
+        penalties: Doubles = losses.reshape(count, -1).sum(1)
+        weight = self._weights.common_edges
+        if not weight:
+            return penalties
+        for fine, coarse in zip(self._pyramid, self._pyramid[1:], strict=False):
+            _run(kernels.halved, count * 2 * coarse.shape[2], fine, coarse)
+        none = np.zeros((count, 2, 0, 0, 4), np.float32)
+        for scale in reversed(range(_EDGE_SCALES)):
+            images, (across, down), gradient = (
+                self._pyramid[scale],
+                self._edges[scale],
+                self._gradients[scale],
+            )
+            height, width = images.shape[2:4]
+            sums, losses = np.zeros((count, parts, 2, 2)), np.zeros(count * parts)
+            _run(kernels.edge_strengths, count * parts, images, parts, across, down, sums)
+            sizes = np.array([height * (width - 1), (height - 1) * width])[:, None]
+            scales = (1 / (2 * sums.sum(1) / sizes + 1e-4)).astype(np.float32)
+            _run(kernels.edge_products, count * parts, parts, scales, across, down, losses)
+            penalties += weight * losses.reshape(count, parts).sum(1)
+            coarse = self._gradients[scale + 1] if scale + 1 < _EDGE_SCALES else none
+            if scale:
+                gradient[:] = 0
+            _run(kernels.edge_gradient, count * 2 * height, images, across, down, weight, coarse, gradient)
+        return penalties
+
+    def _prior_penalties(self) -> tuple[Doubles, Floats]:
+        """Returns the differences of the smooth light of T from that of the prior (C,), and their gradients in the reference frame."""
+        size, step = _LOW_PASS
+        height, width = self._target.shape[1:3]
+        penalties, extra = [], []
+        for candidate in range(len(self._light)):
+            encoded = np.empty((height, width, 4), np.float32)
+            kernels.sample(self._light[candidate, 0], *self._places, encoded)
+            encoded = np.sqrt(encoded + OFFSET)
+            difference = (_low_pass(encoded) - self._low_prior)[..., :3]
+            penalties.append(self._weights.prior * np.abs(difference).mean())
+            spread = np.zeros_like(encoded)
+            spread[::step, ::step, :3] = np.sign(difference) * (self._weights.prior / difference.size)
+            box = cv2.boxFilter(spread, -1, (size, size), borderType=cv2.BORDER_CONSTANT)
+            extra.append(box * 0.5 / encoded)
+        return np.array(penalties), np.stack(extra)
+
+    def _data_term(self, extra: Floats) -> tuple[Doubles, Doubles, Doubles]:
+        """Returns the data term (C,), and the gradients of the gains (C, K, 3) and of the motion (C, 2, K, 8 + ...)."""
+        model = self.model
+        homographies, splines, gains = model.fixed_motion()
+        count, frame_count, _ = gains.shape
+        _run(
+            kernels.data_term, len(self._scatter), self._light, self._target, homographies.astype(np.float32),
+            splines.astype(np.float32), self._rows, self._columns, self._spans,
+            np.pad(gains, ((0, 0), (0, 0), (0, 1))).astype(np.float32), extra, model.reference, self._parts,
+            self._scatter, self._touched, self._found,
+        )  # fmt: skip
+        found = self._found.reshape(count, self._parts, frame_count, -1).sum(1)
+        motion = found[..., 4:].reshape(count, frame_count, 2, -1).swapaxes(1, 2).copy()
+        motion[model.is_locked, 0] += motion[model.is_locked, 1]
+        motion[model.is_locked, 1] = 0
+        return found[..., 0].sum(1) / self._target[..., :3].size, found[..., 1:4].copy(), motion
+
+
+def _spline_penalties(splines: Doubles) -> tuple[Doubles, Doubles]:
+    """Returns the costs of size and curvature of splines (C, K, 2, r, c), (C,), and their gradients."""
+    axes = (1, 2, 3, 4)
+    cost = _SPLINE_SIZE * np.square(splines).mean(axes)
+    gradient = 2 * _SPLINE_SIZE * splines / splines[0].size
+    if min(splines.shape[-2:]) > 2:
+        for axis in (-1, -2):
+            bend = np.diff(splines, 2, axis)
+            cost = cost + _SPLINE_CURVATURE * np.square(bend).mean(axes)
+            force = np.moveaxis(2 * _SPLINE_CURVATURE * bend / bend[0].size, axis, -1)
+            target = np.moveaxis(gradient, axis, -1)
+            target[..., :-2] += force
+            target[..., 1:-1] -= 2 * force
+            target[..., 2:] += force
+    return cost, gradient
+
+
+def _low_pass(image: Floats) -> Floats:
+    size, step = _LOW_PASS
+    low: Floats = cv2.boxFilter(image, -1, (size, size), borderType=cv2.BORDER_CONSTANT)[::step, ::step]
+    return low
+
+
+def _thread_count() -> int:
+    """Returns the number of threads of the kernels: that of ONNX Runtime, or one for each processor of this process."""
+    wanted = os.environ.get("OMP_NUM_THREADS", "")
+    if wanted.isdigit() and int(wanted):
+        return int(wanted)
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+_THREADS: Final = _thread_count()
+_POOL: Final = ThreadPoolExecutor(_THREADS, "brewster-burst")
+
+
+def _run(kernel: Callable[..., Any], count: int, *arguments: object) -> None:
+    """Runs the items 0 to `count` of a kernel in threads."""
+    ends = [count * thread // _THREADS for thread in range(_THREADS + 1)]
+    others = [_POOL.submit(kernel, begin, end, *arguments) for begin, end in pairwise(ends[1:])]
+    kernel(0, ends[1], *arguments)
+    for other in others:
+        other.result()
