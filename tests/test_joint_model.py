@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch.nn import functional
 
-from brewster.burst import optimiser
+from brewster.burst import threads
 from brewster.burst.joint_model import JointModel, bicubic_weights, with_fourth_channel
 from brewster.burst.optimiser import Rates, Weights, _Loss, optimise
 
@@ -96,9 +96,9 @@ def test_common_edges_cost_what_automatic_differentiation_says(candidates):
 @pytest.mark.parametrize("candidates", [2, 5])
 def test_the_number_of_threads_changes_no_bit(monkeypatch, candidates):
     found = []
-    for threads in (1, 3):
-        monkeypatch.setattr(optimiser, "_THREADS", threads)
-        monkeypatch.setattr(optimiser, "_POOL", ThreadPoolExecutor(threads))
+    for count in (1, 3):
+        monkeypatch.setattr(threads, "THREADS", count)
+        monkeypatch.setattr(threads, "POOL", ThreadPoolExecutor(count))
         model, frames, prior = moved_model(np.random.default_rng(1), candidates)
         model = optimise(model, frames, prior, 4, rates=Rates(), weights=WEIGHTS)
         found.append((model.layers, model.homographies, model.splines, model.log_gains, model.losses))

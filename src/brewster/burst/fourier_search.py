@@ -14,6 +14,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from brewster.burst.threads import POOL
+
 Floats = NDArray[np.float32]
 Doubles = NDArray[np.float64]
 Spectra = NDArray[np.complex64]
@@ -50,14 +52,20 @@ def find_translations(aligned: Sequence[Floats], reference: int) -> list[NDArray
     mirrored = plane * [1, -1]  # differences do not tell left from right
     lengths = np.geomspace(0.1, _MAX_TRANSLATION * _WIDTH_PX, _GRID)
     ends = np.concatenate([-lengths[::-1], [0], lengths])
-    costs, paths = [], []
+    costs: list[Floats] = []
+    paths = []
     for places in (line, plane, mirrored):
         along = places / (np.linalg.norm(places, axis=1).max() + 1e-9)
         across = along[:, ::-1] * [-1, 1]
         along_turns, across_turns = (
             _turns(ends[:, None, None] * axis, frequencies) for axis in (along, across)
         )
-        costs += [_costs(spectra, weights, reference, turn * across_turns) for turn in along_turns]
+
+        def costs_of_row(turn: Spectra, across_turns: Spectra = across_turns) -> Floats:
+            costs: Floats = -_explained(spectra, reference, turn * across_turns)[0] @ weights
+            return costs
+
+        costs += POOL.map(costs_of_row, along_turns)
         paths.append(ends[:, None, None, None] * along + ends[:, None, None] * across)
     chosen: list[Doubles] = []
     grid = np.concatenate(paths).reshape(-1, len(aligned), 2)
@@ -67,9 +75,11 @@ def find_translations(aligned: Sequence[Floats], reference: int) -> list[NDArray
             chosen.append(path)
         if len(chosen) == _STARTS:
             break
-    refined = [_refined(spectra, frequencies, weights, reference, path) for path in chosen]
-    refined.sort(key=lambda found: found[1])
-    return [offsets * (aligned[0].shape[1] / _WIDTH_PX) for offsets, _ in refined]
+    refined = POOL.map(lambda path: _refined(spectra, frequencies, weights, reference, path), chosen)
+    return [
+        offsets * (aligned[0].shape[1] / _WIDTH_PX)
+        for offsets, _ in sorted(refined, key=lambda found: found[1])
+    ]
 
 
 def _refined(
@@ -142,8 +152,3 @@ def _explained(
         forces = forces - share * forces.mean(0)
         slopes[others] = -2 * (turns[others].conj() * forces).imag
     return explained, slopes
-
-
-def _costs(spectra: Spectra, weights: Floats, reference: int, turns: Spectra) -> Floats:
-    """Returns what translations leave unexplained, without a constant, (C,), from their phase factors (C, K, n)."""
-    return -_explained(spectra, reference, turns)[0] @ weights

@@ -5,12 +5,9 @@ Adam treats each parameter separately, so that candidates do not influence each 
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from itertools import pairwise
-from typing import Any, Final, final
+from typing import Final, final
 
 import cv2
 import numpy as np
@@ -18,6 +15,7 @@ import numpy as np
 from brewster.burst import kernels
 from brewster.burst.joint_model import Doubles, Floats, JointModel, bicubic_weights, pixel_grid, to_pixels
 from brewster.burst.kernels import MARGIN, OFFSET
+from brewster.burst.threads import run_items
 
 _GRADIENTS: Final = np.array([0.03, 0.05])
 """The costs of the gradients of T and R."""
@@ -179,7 +177,7 @@ class _Loss:
         """Takes a step of Adam, the first of which has number 1."""
         rate, correction = rate / (1 - _BETA1**step), 1 / np.sqrt(1 - _BETA2**step)
         layers = self.model.layers
-        _run(
+        run_items(
             kernels.layer_step, layers.shape[0] * 2 * layers.shape[2], layers, self._light, self._gradients[0],
             self._scatter, self._touched, self._parts, *self._moments, np.float32(rate), np.float32(correction),
         )  # fmt: skip
@@ -188,7 +186,7 @@ class _Loss:
         """Returns the costs of gradients and of edges at the same places in both layers, at three scales (Zhang et al. 2018): (C,)."""
         count, parts = len(self.model.layers), self._parts
         losses = np.zeros(count * 2 * parts)
-        _run(
+        run_items(
             kernels.gradient_lengths, len(losses), self.model.layers, self._squared_density, _GRADIENTS, parts,
             self._gradients[0], losses,
         )  # fmt: skip
@@ -197,7 +195,7 @@ class _Loss:
         if not weight:
             return penalties
         for fine, coarse in zip(self._pyramid, self._pyramid[1:], strict=False):
-            _run(kernels.halved, count * 2 * coarse.shape[2], fine, coarse)
+            run_items(kernels.halved, count * 2 * coarse.shape[2], fine, coarse)
         none = np.zeros((count, 2, 0, 0, 4), np.float32)
         for scale in reversed(range(_EDGE_SCALES)):
             images, (across, down), gradient = (
@@ -207,15 +205,17 @@ class _Loss:
             )
             height, width = images.shape[2:4]
             sums, losses = np.zeros((count, parts, 2, 2)), np.zeros(count * parts)
-            _run(kernels.edge_strengths, count * parts, images, parts, across, down, sums)
+            run_items(kernels.edge_strengths, count * parts, images, parts, across, down, sums)
             sizes = np.array([height * (width - 1), (height - 1) * width])[:, None]
             scales = (1 / (2 * sums.sum(1) / sizes + 1e-4)).astype(np.float32)
-            _run(kernels.edge_products, count * parts, parts, scales, across, down, losses)
+            run_items(kernels.edge_products, count * parts, parts, scales, across, down, losses)
             penalties += weight * losses.reshape(count, parts).sum(1)
             coarse = self._gradients[scale + 1] if scale + 1 < _EDGE_SCALES else none
             if scale:
                 gradient[:] = 0
-            _run(kernels.edge_gradient, count * 2 * height, images, across, down, weight, coarse, gradient)
+            run_items(
+                kernels.edge_gradient, count * 2 * height, images, across, down, weight, coarse, gradient
+            )
         return penalties
 
     def _prior_penalties(self) -> tuple[Doubles, Floats]:
@@ -240,7 +240,7 @@ class _Loss:
         model = self.model
         homographies, splines, gains = model.fixed_motion()
         count, frame_count, _ = gains.shape
-        _run(
+        run_items(
             kernels.data_term, len(self._scatter), self._light, self._target, homographies.astype(np.float32),
             splines.astype(np.float32), self._rows, self._columns, self._spans,
             np.pad(gains, ((0, 0), (0, 0), (0, 1))).astype(np.float32), extra, model.reference, self._parts,
@@ -274,24 +274,3 @@ def _low_pass(image: Floats) -> Floats:
     size, step = _LOW_PASS
     low: Floats = cv2.boxFilter(image, -1, (size, size), borderType=cv2.BORDER_CONSTANT)[::step, ::step]
     return low
-
-
-def _thread_count() -> int:
-    """Returns the number of threads of the kernels: that of ONNX Runtime, or one for each processor of this process."""
-    wanted = os.environ.get("OMP_NUM_THREADS", "")
-    if wanted.isdigit() and int(wanted):
-        return int(wanted)
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
-_THREADS: Final = _thread_count()
-_POOL: Final = ThreadPoolExecutor(_THREADS, "brewster-burst")
-
-
-def _run(kernel: Callable[..., Any], count: int, *arguments: object) -> None:
-    """Runs the items 0 to `count` of a kernel in threads."""
-    ends = [count * thread // _THREADS for thread in range(_THREADS + 1)]
-    others = [_POOL.submit(kernel, begin, end, *arguments) for begin, end in pairwise(ends[1:])]
-    kernel(0, ends[1], *arguments)
-    for other in others:
-        other.result()

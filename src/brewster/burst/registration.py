@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brewster.burst.fourier_search import find_translations
+from brewster.burst.threads import POOL
 from brewster.srgb import to_encoded
 
 Floats = NDArray[np.float32]
@@ -49,6 +50,8 @@ class MotionCandidate:
     """Whether both layers are one: the reflection keeps the motion of the transmission. The only one of its family."""
 
 
+Features = tuple[Floats, Floats]
+"""The places (n, 2) and descriptors (n, 128) of the features of a frame."""
 Motions = list[tuple[Matrices, float]]
 """The motions of one frame: homographies from the reference frame in pixels, and how likely each is the motion of T."""
 
@@ -65,14 +68,14 @@ def frame_motions(frames: Sequence[Floats], reference: int, prior: Floats) -> li
         prior: T of the reference frame from a single photo. It decides which of several motions is that of T.
     """
     share = _transmission_share(frames[reference], prior)
-    detector = cv2.SIFT.create(nfeatures=_FEATURES, contrastThreshold=0.008)
-    features = [detector.detectAndCompute(_detail_8bit(frame), None) for frame in frames]
-    return [
-        [(np.eye(3), 1.0)]
-        if k == reference
-        else _fitted_motions(_matches(features[reference], feature), share)
-        for k, feature in enumerate(features)
-    ]
+    features = list(POOL.map(_features, frames))
+
+    def motions(k: int) -> Motions:
+        if k == reference:
+            return [(np.eye(3), 1.0)]
+        return _fitted_motions(_matches(features[reference], features[k]), share)
+
+    return list(POOL.map(motions, range(len(frames))))
 
 
 def path_order(frames: Sequence[Floats], motions: Sequence[Motions]) -> list[int]:
@@ -168,6 +171,14 @@ def motion_candidates(
     ]
 
 
+def _features(frame: Floats) -> Features:
+    detector = cv2.SIFT.create(nfeatures=_FEATURES, contrastThreshold=0.008)
+    keypoints, descriptors = detector.detectAndCompute(_detail_8bit(frame), None)
+    if descriptors is None:
+        return np.zeros((0, 2), np.float32), np.zeros((0, 128), np.float32)
+    return np.array(cv2.KeyPoint.convert(keypoints), np.float32), np.array(descriptors, np.float32)
+
+
 def _likeliest(motions: Motions) -> Matrices:
     """Returns the motion that is most likely that of T."""
     return max(motions, key=lambda motion: motion[1])[0]
@@ -219,16 +230,20 @@ def _fit(matches: Floats) -> tuple[Matrices | None, NDArray[np.bool_]]:
     return matrix, inliers.ravel().astype(bool)
 
 
-def _matches(
-    first: tuple[Sequence[cv2.KeyPoint], Floats | None], second: tuple[Sequence[cv2.KeyPoint], Floats | None]
-) -> Floats:
-    """Returns matching points (n, 4): x, y in the first frame, and x, y in the second."""
-    if first[1] is None or second[1] is None or len(second[0]) < 2:
+def _matches(first: Features, second: Features) -> Floats:
+    """Returns matching points (n, 4): x, y in the first frame, and x, y in the second. A match is clearly nearer than the next best."""
+    points, descriptors = first
+    others, other_descriptors = second
+    if len(points) < 1 or len(others) < 2:
         return np.zeros((0, 4), np.float32)
-    pairs = cv2.BFMatcher().knnMatch(first[1], second[1], k=2)
-    good = [best for best, other in pairs if best.distance < _RATIO * other.distance]
-    points = [first[0][match.queryIdx].pt + second[0][match.trainIdx].pt for match in good]
-    return np.array(points, np.float32).reshape(-1, 4)
+    distances = np.square(other_descriptors).sum(1) - 2 * (descriptors @ other_descriptors.T)
+    best = distances.argmin(1)
+    rows = np.arange(len(points))
+    nearest = distances[rows, best].copy()
+    distances[rows, best] = np.inf
+    lengths = np.square(descriptors).sum(1)
+    good = nearest + lengths < _RATIO**2 * (distances.min(1) + lengths)
+    return np.concatenate([points[good], others[best[good]]], 1)
 
 
 def _second_motion(motions: Motions, transmission: Matrices, size: tuple[int, int]) -> Matrices | None:

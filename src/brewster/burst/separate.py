@@ -11,8 +11,7 @@ a prediction of a model is. If the motion does not separate the layers, the resu
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, Final, Literal, final
@@ -23,6 +22,7 @@ import numpy as np
 from brewster.burst.joint_model import Floats
 from brewster.burst.registration import frame_motions, motion_candidates, path_order
 from brewster.burst.solver import MIN_SIDE_PX, Solution, solve
+from brewster.burst.threads import single_opencv_thread
 from brewster.errors import PhotoError, error_prefix
 from brewster.inference.assessment import Verdict
 from brewster.inference.burst_report import BurstReport, burst_photo_name, check_photo_count
@@ -190,7 +190,7 @@ def measure_layers(
         The solution, or None if no other frame shows the scene of the reference frame or the frames are too small; and the indices of
         the frames that do not show it.
     """
-    with _single_opencv_thread():
+    with single_opencv_thread():
         motions = frame_motions(frames, reference, prior)
         used = path_order(frames, motions)
         left_out = tuple(k for k, found in enumerate(motions) if not found)
@@ -346,14 +346,3 @@ class _FixedPredictor(Predictor):
         # At full size, edges of a strong reflection would remain in the transmission: there it takes no detail of the photo
         override = GeneratedOverride.weighted_by_detail(solution.transmission, solution.reflection)
         return Prediction(transmission - photo, np.minimum(reflection, photo), solution.confidence, override)
-
-
-@contextmanager
-def _single_opencv_thread() -> Iterator[None]:
-    """Limits OpenCV to one thread in the block, because threads of two libraries slow each other down."""
-    previous_count = cv2.getNumThreads()
-    cv2.setNumThreads(1)
-    try:
-        yield
-    finally:
-        cv2.setNumThreads(previous_count)

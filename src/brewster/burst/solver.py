@@ -33,12 +33,10 @@ class Level:
     weights: Weights = _FOR_LAYERS
     density: float = 1.0
     """Pixels of the layers per pixel of a frame, along each axis."""
+    kept: int = 1
+    """How many candidates of each family are kept after this level of the search."""
 
 
-_COMPARED: Final = 1
-"""The index of the level at which the best candidate is compared with one layer. The next ones optimise the best candidate only."""
-_NAMED: Final = 2
-"""The index of the level at which names and edges are judged, and the layers exchanged if they have each other's names."""
 _MAX_RELATIVE_MOTION: Final = 0.2
 """As a share of the width. With a larger motion, the reflection becomes an offset of each frame, and explains all but edges."""
 _MOTION_SAMPLES: Final = (9, 12)
@@ -51,14 +49,19 @@ _MAX_ENLARGEMENT: Final = 1.3
 _DENSITY: Final = 1.5
 """Of the levels that find the motion. With 1, interpolation blurs T differently in each frame, and a copy of T that is moved by a pixel explains
 this better than the true reflection explains its light."""
+SEARCH: Final = (
+    Level(80, 20, None, _FOR_MOTION, _DENSITY, kept=2),
+    Level(80, 20, None, _FOR_MOTION, _DENSITY),
+    Level(160, 45, (4, 6), _FOR_MOTION, _DENSITY),
+)
+"""The levels that find the motion, with many candidates."""
 LEVELS: Final = (
-    Level(80, 60, None, _FOR_MOTION, _DENSITY),
-    Level(160, 90, (4, 6), _FOR_MOTION, _DENSITY),
-    Level(160, 220, (4, 6), density=_DENSITY),  # enough steps for the brightness of large areas
+    Level(160, 110, (4, 6), density=_DENSITY),  # enough steps for the brightness of large areas
     Level(320, 70, (6, 8)),
     Level(640, 35, (8, 12)),
 )
-MIN_SIDE_PX: Final = math.ceil(LEVELS[_NAMED].long_side_px / _MAX_ENLARGEMENT)
+"""The levels of the best candidate."""
+MIN_SIDE_PX: Final = math.ceil(LEVELS[0].long_side_px / _MAX_ENLARGEMENT)
 """The smallest long side of frames that have the levels at which candidates are compared and named: without these, wrong motions win."""
 
 
@@ -92,6 +95,7 @@ def solve(
     candidates: Sequence[MotionCandidate],
     *,
     refine_prior: Callable[[Floats], Floats] | None = None,
+    search: Sequence[Level] = SEARCH,
     levels: Sequence[Level] = LEVELS,
     on_progress: Callable[[float], None] = lambda _fraction: None,
 ) -> Solution:
@@ -103,54 +107,64 @@ def solve(
         prior: T of the reference frame from a single photo, (h, w, 3).
         candidates: guesses for the motions. One of them is locked.
         refine_prior: returns a better `prior`, given the measured share of R in the light of the reference frame, (h, w, 1).
-        levels: the sizes of the frames.
+        search: the levels that compare the candidates.
+        levels: the levels of the best candidate.
         on_progress: called with the completed fraction.
     """
     largest = _MAX_ENLARGEMENT * max(frames[0].shape)
-    levels = [level for level in levels if level.long_side_px <= largest] or levels[:1]
-    work = [level.steps * level.long_side_px for level in levels]
+    search, levels = (
+        [level for level in some if level.long_side_px <= largest] or some[:1] for some in (search, levels)
+    )
+    total = sum(level.steps * level.long_side_px for level in (*search, *levels))
     done = 0.0
-    motions = np.array([[c.transmission, c.reflection] for c in candidates])
-    is_locked = np.array([candidate.is_locked for candidate in candidates])
-    model, errors = None, (0.0, 0.0)
+
+    def optimised(model: JointModel, level: Level, frames: Floats, prior: Floats) -> JointModel:
+        def on_step() -> None:
+            nonlocal done
+            done += level.long_side_px / total
+            on_progress(done)
+
+        rates = Rates().scaled(min(1.0, 80 / level.long_side_px)) if level.spline_size else Rates(splines=0)
+        return optimise(
+            model, frames, prior, level.steps, rates=rates, weights=level.weights, on_step=on_step
+        )
+
+    families = [candidate.family for candidate in candidates]
+    model = None
+    for level in search:
+        small, small_prior = _packed(frames, level.long_side_px), _packed([prior], level.long_side_px)[0]
+        if model is None:
+            motions = np.array([[c.transmission, c.reflection] for c in candidates])
+            is_locked = np.array([candidate.is_locked for candidate in candidates])
+            model = JointModel.start(small, motions, is_locked, reference, level.density)
+        model = optimised(model.resized(small, level.density, level.spline_size), level, small, small_prior)
+        kept = _best_of_families(model, families, level.kept)
+        model, families = model.selected(kept), [families[candidate] for candidate in kept]
+    assert model
+    one_layer, best = int(model.is_locked.argmax()), _best(model)
+    errors = float(model.data_losses[one_layer]), float(model.data_losses[best])
+    model = model.selected([best])
     edge_correlation = naming = 0.0
     refined = prior
-    for index, level in enumerate(levels):
+    for level in levels:
+        if level in levels[:2]:
+            layers, naming = _named(model, small, small_prior)
+            edge_correlation = _edge_correlation(layers)
+            is_exchanged = naming < -_MIN_NAMING
+            if is_exchanged:  # the next levels correct the brightness of large areas
+                model, layers, naming = model.exchanged(), layers[::-1], -naming
+            if refine_prior and (is_exchanged or level is levels[0]):
+                refined = refine_prior(_reflection_share(layers))
         small, small_prior, small_refined = (
             _packed(images, level.long_side_px) for images in (frames, [prior], [refined])
         )
-        if model is None:
-            model = JointModel.start(small, motions, is_locked, reference, level.density)
-        else:
-            kept = _best_of_families(model, candidates) if index <= _COMPARED else [_best(model)]
-            model = model.selected(kept).resized(small, level.density, level.spline_size)
-        rates = Rates().scaled(min(1.0, 80 / level.long_side_px)) if index else Rates(splines=0)
-
-        def on_step(level: Level = level) -> None:
-            nonlocal done
-            done += level.long_side_px
-            on_progress(done / sum(work))
-
-        model = optimise(
-            model, small, small_refined[0], level.steps, rates=rates, weights=level.weights, on_step=on_step
+        model = optimised(
+            model.resized(small, level.density, level.spline_size), level, small, small_refined[0]
         )
-        if index <= _COMPARED:
-            losses = model.data_losses
-            errors = float(losses[model.is_locked.argmax()]), float(losses[_best(model)])
-        if index >= _COMPARED or level is levels[-1]:
-            best = model.selected([_best(model)])
-            layers, detail = _named(best, small, small_prior[0])
-            if index == min(_NAMED, len(levels) - 1):
-                edge_correlation, naming = _edge_correlation(layers), detail
-                if naming < -_MIN_NAMING:  # the next levels correct the brightness of large areas
-                    model, layers, naming = best.exchanged(), layers[::-1], -naming
-            if refine_prior and level is not levels[-1]:
-                refined = refine_prior(_reflection_share(layers))
-    assert model
-    model = model.selected([_best(model)])
-    confidence = model.confidence(small)
+        small_prior = small_prior[0]
+    layers = model.reference_layers(*small.shape[1:3])
     motion = float(model.relative_motion(*_MOTION_SAMPLES)[0])
-    return Solution(layers[0], layers[1], confidence, motion, naming, edge_correlation, *errors)
+    return Solution(layers[0], layers[1], model.confidence(small), motion, naming, edge_correlation, *errors)
 
 
 def _named(model: JointModel, frames: Floats, prior: Floats) -> tuple[Floats, float]:
@@ -191,16 +205,14 @@ def _reflection_share(layers: Floats) -> Floats:
     return share
 
 
-def _best_of_families(model: JointModel, candidates: Sequence[MotionCandidate]) -> list[int]:
-    """Returns the index of the best candidate of each family.
+def _best_of_families(model: JointModel, families: Sequence[str], count: int) -> list[int]:
+    """Returns the indices of the best candidates of each family.
 
     On very small frames, a wrong motion may be better than a true motion of a pixel. Therefore none of the families is left out.
     """
-    families: dict[str, list[int]] = {}
-    for i, candidate in enumerate(candidates):
-        families.setdefault(candidate.family, []).append(i)
     losses = _selection_losses(model)
-    return [min(family, key=losses.__getitem__) for family in families.values()]
+    order = sorted(range(len(families)), key=losses.__getitem__)
+    return [i for n, i in enumerate(order) if sum(families[j] == families[i] for j in order[:n]) < count]
 
 
 def _best(model: JointModel) -> int:
