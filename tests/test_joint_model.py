@@ -19,6 +19,7 @@ from brewster.burst.optimiser import Rates, Weights, _Loss, optimise
 
 WEIGHTS = Weights(common_edges=0.05, prior=0.1)
 NO_EDGES = Weights(common_edges=0, prior=0.1)
+ONLY_DATA = Weights(common_edges=0, prior=0, opacity=0.1)
 
 
 def smooth(rng, *shape):
@@ -27,10 +28,11 @@ def smooth(rng, *shape):
     return np.stack([cv2.GaussianBlur(image, (0, 0), 1.5) for image in noise])
 
 
-def moved_model(rng, candidates=2, size=(24, 32), density=1.3):
+def moved_model(rng, candidates=2, layers=2, size=(24, 32), density=1.3):
     """A model with motion, splines and gains, some frames and a prior; its last candidate is locked."""
     frames = with_fourth_channel(smooth(rng, 3, *size, 3))
-    motions = np.tile(np.eye(3), (candidates, 2, 3, 1, 1)) + rng.normal(0, 0.02, (candidates, 2, 3, 3, 3))
+    motions = np.tile(np.eye(3), (candidates, layers, 3, 1, 1))
+    motions += rng.normal(0, 0.02, motions.shape)
     is_locked = np.arange(candidates) == candidates - 1
     model = JointModel.start(frames, motions, is_locked, 1, density).resized(frames, density, (3, 4))
     model.layers[..., :3] += rng.normal(0, 0.05, model.layers[..., :3].shape)
@@ -42,24 +44,32 @@ def moved_model(rng, candidates=2, size=(24, 32), density=1.3):
 def loss_and_gradients(model, frames, prior, weights=NO_EDGES):
     loss = _Loss(model, frames, prior, weights)
     penalties, data_losses, (homographies, splines, log_gains) = loss.gradients()
-    count, _, height, width, _ = model.layers.shape
-    scattered = loss._scatter.reshape(count, -1, 2, height, width, 4).sum(1)
+    count, layer_count, height, width, _ = model.layers.shape
+    scattered = loss._scatter.reshape(count, -1, layer_count, height, width, 4).sum(1)
     layers = loss._gradients[0] + 2 * model.layers * scattered
     found = {"layers": layers, "homographies": homographies, "splines": splines, "log_gains": log_gains}
     return penalties + data_losses, found
 
 
-@given(seed=st.integers(0, 99), name=st.sampled_from(["layers", "homographies", "splines", "log_gains"]))
-@settings(max_examples=12, deadline=None)
-def test_the_gradients_are_those_of_finite_differences(seed, name):
+@given(
+    seed=st.integers(0, 99),
+    name=st.sampled_from(["layers", "homographies", "splines", "log_gains"]),
+    layers=st.integers(2, 3),
+    is_opaque=st.booleans(),
+)
+@settings(max_examples=20, deadline=None)
+def test_the_gradients_are_those_of_finite_differences(seed, name, layers, is_opaque):
     rng = np.random.default_rng(seed)
-    model, frames, prior = moved_model(rng)
-    _, gradients = loss_and_gradients(model, frames, prior)
+    model, frames, prior = moved_model(rng, layers=layers)
+    if is_opaque:
+        model.layers[:, 1, ..., 3] = rng.uniform(0.2, 0.8, model.layers.shape[2:4])
+    weights = ONLY_DATA if is_opaque else NO_EDGES  # the prior does not change the opacity
+    _, gradients = loss_and_gradients(model, frames, prior, weights)
     direction = gradients[name] / np.linalg.norm(gradients[name])
     losses, values = [], getattr(model, name).copy()
     for step in (-1, 1):
         getattr(model, name)[:] = values + step * 3e-3 * direction
-        losses.append(loss_and_gradients(model, frames, prior)[0])
+        losses.append(loss_and_gradients(model, frames, prior, weights)[0])
     expected = (gradients[name] * direction).reshape(len(values), -1).sum(1)
     assert (losses[1] - losses[0]) / 6e-3 == pytest.approx(
         expected, rel=0.1, abs=0.02 * float(expected.max())

@@ -28,6 +28,7 @@ Doubles = NDArray[np.float64]
 
 _ERROR_AT_1_E: Final = 0.05
 """The mean error of the frames, as a difference of square roots of light, at which the confidence is 1/e."""
+_FIRST_OPACITY: Final = 0.04
 _BICUBIC: Final = -0.75
 """The parameter of bicubic interpolation that OpenCV has, too."""
 
@@ -35,14 +36,14 @@ _BICUBIC: Final = -0.75
 @final
 @dataclass(frozen=True)
 class JointModel:
-    """C candidates for the layers of K frames. The second axis of `layers`, `homographies` and `splines` is T, R."""
+    """C candidates for the L layers of K frames."""
 
     layers: Floats
-    """(C, 2, H, W, 4): square roots of linear light. The last channel is 0, see kernels.py."""
+    """(C, L, H, W, 4): square roots of linear light. The last channel is 0, but in the second layer the root of its opacity."""
     homographies: Doubles
-    """(C, 2, K, 8), frame to reference."""
+    """(C, L, K, 8), frame to reference."""
     splines: Doubles
-    """(C, 2, K, 2, rows, columns), the offsets that are added to the homographies."""
+    """(C, L, K, 2, rows, columns), the offsets that are added to the homographies."""
     log_gains: Doubles
     """(C, K, 3)"""
     is_locked: NDArray[np.bool_]
@@ -61,16 +62,16 @@ class JointModel:
 
         Args:
             frames: (K, h, w, 4) linear light.
-            motions: (C, 2, K, 3, 3), frame to reference, of T and R.
+            motions: (C, L, K, 3, 3), frame to reference, of T and R.
             is_locked: (C,), whether R moves with T.
             reference: the index of the reference frame.
             density: the number of pixels of the canvases per pixel of the frames, along each axis.
         """
-        count, _, frame_count = motions.shape[:3]
+        count, layer_count, frame_count = motions.shape[:3]
         canvas = pixel_grid(*_canvas_size(frames, density)) * (1 + 2 * MARGIN)
-        layers = np.zeros((count, 2, *canvas.shape[1:], 4), np.float32)
+        layers = np.zeros((count, layer_count, *canvas.shape[1:], 4), np.float32)
         for candidate in range(count):
-            for layer in range(2):
+            for layer in range(layer_count):
                 aligned = np.empty((frame_count, *layers.shape[2:]), np.float32)
                 is_outside = np.empty(aligned.shape[:-1], bool)
                 for k, matrix in enumerate(np.linalg.inv(motions[candidate, layer])):
@@ -83,7 +84,7 @@ class JointModel:
                 layers[candidate, layer] = np.sqrt(np.maximum(image, 4e-3 if layer else 1e-4))
         layers[..., 3] = 0
         homographies = motions.reshape(*motions.shape[:3], 9)[..., :8] / motions[..., 2, 2, None]
-        splines = np.zeros((count, 2, frame_count, 2, 2, 2))
+        splines = np.zeros((count, layer_count, frame_count, 2, 2, 2))
         losses = np.full(count, np.inf)
         log_gains = np.zeros((count, frame_count, 3))
         return cls(layers, homographies, splines, log_gains, is_locked, reference, losses, losses)
@@ -97,13 +98,17 @@ class JointModel:
         )  # fmt: skip
 
     def exchanged(self) -> JointModel:
-        """Returns a model with T and R exchanged."""
-        return replace(
-            self,
-            layers=self.layers[:, ::-1].copy(),
-            homographies=self.homographies[:, ::-1].copy(),
-            splines=self.splines[:, ::-1].copy(),
-        )
+        """Returns a model with T and R exchanged, both transparent."""
+        layers = self.layers[:, ::-1].copy()
+        layers[..., 3] = 0
+        homographies, splines = self.homographies[:, ::-1].copy(), self.splines[:, ::-1].copy()
+        return replace(self, layers=layers, homographies=homographies, splines=splines)
+
+    def with_opacity(self) -> JointModel:
+        """Returns a model whose second layers are slightly opaque, so that optimisation can make them opaque or transparent."""
+        layers = self.layers.copy()
+        layers[:, 1, ..., 3] = _FIRST_OPACITY**0.5
+        return replace(self, layers=layers)
 
     def resized(self, frames: Floats, density: float, spline_size: tuple[int, int] | None) -> JointModel:
         """Returns the model for larger frames (K, h, w, 4), with `density` pixels per pixel of a frame, and finer splines."""
@@ -128,7 +133,7 @@ class JointModel:
             self.log_gains.copy(),
         )
         for motion in (homographies, splines):
-            motion[self.is_locked, 1] = motion[self.is_locked, 0]
+            motion[self.is_locked, -1] = motion[self.is_locked, 0]
         homographies[:, :, self.reference] = identity
         splines[:, :, self.reference] = 0
         log_gains[:, self.reference] = 0
@@ -144,18 +149,17 @@ class JointModel:
         moved: Doubles = _project(homographies[candidate, layer, frame], pixel_grid(height, width)) + offsets
         return moved
 
-    def rendered(self, candidate: int, layer: int, frame: int, height: int, width: int) -> Floats:
-        """Returns a layer as a frame shows it, without the gain of the frame: (h, w, 4) linear light."""
-        canvas = np.square(self.layers[candidate, layer])
-        positions = self.positions(candidate, layer, frame, height, width) / (1 + 2 * MARGIN)
-        out = np.empty((height, width, 4), np.float32)
-        kernels.sample(canvas, *to_pixels(positions, canvas.shape), out)
-        return out
+    def frame_layers(self, frame: int, height: int, width: int, candidate: int = 0) -> Floats:
+        """Returns T and R as a frame shows them, without its gain: (2, h, w, 3) linear light. An opaque part of the second layer belongs to T."""
+        samples = np.empty((self.layers.shape[1], height, width, 4), np.float32)
+        for layer, canvas in enumerate(np.square(self.layers[candidate])):
+            positions = self.positions(candidate, layer, frame, height, width) / (1 + 2 * MARGIN)
+            kernels.sample(canvas, *to_pixels(positions, canvas.shape), samples[layer])
+        return compose(samples)
 
-    def reference_layers(self, height: int, width: int, candidate: int = 0) -> Floats:
-        """Returns both layers of the reference frame: (2, h, w, 3) linear light."""
-        layers = [self.rendered(candidate, layer, self.reference, height, width) for layer in range(2)]
-        return np.stack(layers)[..., :3]
+    def reference_layers(self, height: int, width: int) -> Floats:
+        """Returns T and R of the reference frame for the first candidate: (2, h, w, 3) linear light."""
+        return self.frame_layers(self.reference, height, width)
 
     def relative_motion(self, height: int, width: int) -> Doubles:
         """Returns the largest mean motion of R relative to T between two frames, as a share of the width, (C,)."""
@@ -164,7 +168,7 @@ class JointModel:
         for candidate in range(len(self.layers)):
             transmission, reflection = (
                 np.stack([self.positions(candidate, layer, k, height, width).mean((1, 2)) for k in range(len(self.log_gains[0]))])
-                for layer in range(2)
+                for layer in (0, -1)
             )  # fmt: skip
             offsets = (reflection - transmission) * scale
             largest.append(np.linalg.norm(offsets[:, None] - offsets, axis=-1).max())
@@ -179,12 +183,19 @@ class JointModel:
         collected = np.zeros((height, width, 2), np.float32)
         gains = self.fixed_motion()[2][0]
         for k, frame in enumerate(frames):
-            total = sum(self.rendered(0, layer, k, height, width)[..., :3] for layer in range(2))
+            total = self.frame_layers(k, height, width).sum(0)
             errors = np.abs(data_errors(total * gains[k].astype(np.float32), frame[..., :3])).mean(-1)
             x, y = to_pixels(self.positions(0, 0, k, height, width), (height, width))
             kernels.collect(errors, x, y, collected)
         confidence: Floats = np.exp(-collected[..., :1] / (collected[..., 1:] + 1e-3) / _ERROR_AT_1_E)
         return confidence
+
+
+def compose(samples: Floats) -> Floats:
+    """Returns T and R (2, h, w, 3) from samples of the layers at one place, (L, h, w, 4)."""
+    opacity = np.minimum(samples[1, ..., 3:], 1)
+    transmission = samples[0, ..., :3] * (1 - opacity) + samples[1, ..., :3] * opacity
+    return np.stack([transmission, samples[1, ..., :3] * (1 - opacity) + samples[2:, ..., :3].sum(0)])
 
 
 def data_errors(predicted: Floats, frames: Floats) -> Floats:

@@ -90,36 +90,39 @@ def collect(values, x, y, out):
 def data_term(
     begin, end, light, target, homographies, splines, rows, columns, spans, gains, extra, reference, parts, scatter, touched, out
 ):  # fmt: skip
-    """The data term of C candidates, and its gradients. An item is one of `parts` strips of rows of a candidate.
+    """The data term of C candidates with L layers, and its gradients. An item is one of `parts` strips of rows of a candidate.
+
+    The last channel of the second layer is its opacity: it hides that share of the first layer.
 
     Args:
         begin, end: the items.
-        light: (C, 2, H, W, 4), the layers.
+        light: (C, L, H, W, 4), the layers.
         target: (K, h, w, 4), the square roots of the frames.
-        homographies, splines: (C, 2, K, 8) and (C, 2, K, 2, r, c), frame to reference.
+        homographies, splines: (C, L, K, 8) and (C, L, K, 2, r, c), frame to reference.
         rows, columns: (h, r) and (c, w), the weights of the knots of the splines.
         spans: (c, 2), where the weights of a column of knots are not 0.
         gains: (C, K, 4).
         extra: (C, h, w, 4), added to the gradient of T in the reference frame.
         reference: the index of the frame whose motion and gain are fixed.
         parts: the number of strips of a candidate.
-        scatter: (C * parts, 2, H * W * 4) of zeros, gets the gradient of `light` in the rows `touched` (C * parts, 2, 2).
-        out: (C * parts, K, 4 + 2 * (8 + 2 r c)), gets the loss, and the gradients of three gains and, for T and R, of homography and
+        scatter: (C * parts, L, H * W * 4) of zeros, gets the gradient of `light` in the rows `touched` (C * parts, L, 2).
+        out: (C * parts, K, 4 + L * (8 + 2 r c)), gets the loss, and the gradients of three gains and, for each layer, of homography and
             spline.
     """
-    _, _, canvas_height, canvas_width, _ = light.shape
+    _, layer_count, canvas_height, canvas_width, _ = light.shape
     frame_count, height, width, _ = target.shape
     knot_rows, knot_columns = rows.shape[1], columns.shape[0]
     motion_size = 8 + 2 * knot_rows * knot_columns
     scale, stride = _F(0.5 / (frame_count * height * width * 3)), _U(canvas_width * 4)
-    corners = np.empty((2, width), np.int32)
-    points = np.empty((2, 9, width), np.float32)
+    corners = np.empty((layer_count, width), np.int32)
+    points = np.empty((layer_count, 9, width), np.float32)
     knots = np.empty((2, knot_columns), np.float32)
-    total, gradient, gain = np.empty((3, 4 * width), np.float32)
-    slopes = np.empty((2, 2, 4 * width), np.float32)
+    total, gain = np.empty((2, 4 * width), np.float32)
+    samples, gradients = np.empty((2, layer_count, 4 * width), np.float32)
+    slopes = np.empty((layer_count, 2, 4 * width), np.float32)
     for item in range(begin, end):
         candidate, part = item // parts, item % parts
-        for layer in range(2):
+        for layer in range(layer_count):
             touched[item, layer, 0], touched[item, layer, 1] = canvas_height, 0
         for k in range(frame_count):
             sums = out[item, k]
@@ -129,7 +132,7 @@ def data_term(
                     gain[4 * x + c] = gains[candidate, k, c]
             for y in range(height * part // parts, height * (part + 1) // parts):
                 down = _F((y + 0.5) * 2 / height - 1)
-                for layer in range(2):
+                for layer in range(layer_count):
                     for j in range(knot_columns):
                         for axis in range(2):
                             value = _ZERO
@@ -143,38 +146,68 @@ def data_term(
                     touched[item, layer, 0] = min(touched[item, layer, 0], low)
                     touched[item, layer, 1] = max(touched[item, layer, 1], high)
                     _gather(
-                        light[candidate, layer].reshape(-1), stride, corners[layer], points[layer], layer == 1, total, slopes[layer]
+                        light[candidate, layer].reshape(-1), stride, corners[layer], points[layer], samples[layer], slopes[layer]
                     )  # fmt: skip
-                goal = target[k, y].reshape(-1)
-                loss = _ZERO
-                for x in range(4 * width):
-                    root = np.sqrt(total[x] * gain[x] + OFFSET)
-                    error = root - goal[x]
-                    error = _ZERO if (goal[x] > _CLIPPED_ROOT) & (error > _ZERO) else error
-                    length = np.sqrt(error * error + _EPSILON_SQUARED)
-                    gradient[x] = scale * gain[x] * error / (length * root)
-                    loss += length - _EPSILON
-                sums[0] += loss
+                _compose(samples, total)
+                sums[0] += _errors(total, gain, target[k, y].reshape(-1), scale, gradients[0])
                 if k != reference:
-                    red, green, blue = _ZERO, _ZERO, _ZERO
                     for x in range(width):
-                        red += gradient[4 * x] * total[4 * x]
-                        green += gradient[4 * x + 1] * total[4 * x + 1]
-                        blue += gradient[4 * x + 2] * total[4 * x + 2]
-                    sums[1] += red
-                    sums[2] += green
-                    sums[3] += blue
-                    for layer in range(2):
+                        for c in range(3):
+                            sums[1 + c] += gradients[0, 4 * x + c] * total[4 * x + c]
+                    _share_gradient(samples, gradients)
+                    for layer in range(layer_count):
                         first = 4 + layer * motion_size
                         _row_motion(
-                            points[layer], slopes[layer], gradient, down, rows[y], columns, spans, sums[first : first + motion_size]
+                            points[layer], slopes[layer], gradients[layer], down, rows[y], columns, spans,
+                            sums[first : first + motion_size],
                         )  # fmt: skip
-                _scatter(scatter[item, 1], stride, corners[1], points[1], gradient)
-                if k == reference:
+                else:
+                    _share_gradient(samples, gradients)
                     more = extra[candidate, y].reshape(-1)
                     for x in range(4 * width):
-                        gradient[x] += more[x]
-                _scatter(scatter[item, 0], stride, corners[0], points[0], gradient)
+                        gradients[0, x] += more[x]
+                for layer in range(layer_count):
+                    _scatter(scatter[item, layer], stride, corners[layer], points[layer], gradients[layer])
+
+
+@_kernel
+def _compose(samples, total):
+    """Writes the light of a row: the sum of the layers, of which the second one hides a share of the first one."""
+    for x in range(samples.shape[1] // 4):
+        visible = _ONE - min(samples[1, 4 * x + 3], _ONE)
+        for c in range(4):
+            total[4 * x + c] = samples[0, 4 * x + c] * visible + samples[1, 4 * x + c]
+    for layer in range(2, len(samples)):
+        for x in range(len(total)):
+            total[x] += samples[layer, x]
+
+
+@_kernel
+def _errors(total, gain, goal, scale, gradient):
+    """Returns the loss of a row, and writes its gradient with respect to `total`."""
+    loss = _ZERO
+    for x in range(len(total)):
+        root = np.sqrt(total[x] * gain[x] + OFFSET)
+        error = root - goal[x]
+        error = _ZERO if (goal[x] > _CLIPPED_ROOT) & (error > _ZERO) else error
+        length = np.sqrt(error * error + _EPSILON_SQUARED)
+        gradient[x] = scale * gain[x] * error / (length * root)
+        loss += length - _EPSILON
+    return loss
+
+
+@_kernel
+def _share_gradient(samples, gradients):
+    """The adjoint of `_compose`: gradients[0] is that of the sum at first, and that of the first layer at last."""
+    for layer in range(1, len(samples)):
+        for x in range(gradients.shape[1]):
+            gradients[layer, x] = gradients[0, x]
+    for x in range(gradients.shape[1] // 4):
+        opacity, hidden = samples[1, 4 * x + 3], _ZERO
+        for c in range(3):
+            hidden += gradients[0, 4 * x + c] * samples[0, 4 * x + c]
+            gradients[0, 4 * x + c] *= _ONE - min(opacity, _ONE)
+        gradients[1, 4 * x + 3] = -hidden if opacity < _ONE else _ZERO
 
 
 @_kernel
@@ -233,8 +266,8 @@ def _row_positions(homography, down, knots, columns, spans, canvas_height, canva
 
 
 @_kernel
-def _gather(canvas, stride, corner, points, is_added, total, slopes):
-    """Writes bilinear samples of a row, or adds them, to `total`, and their derivatives along x and y to `slopes`."""
+def _gather(canvas, stride, corner, points, samples, slopes):
+    """Writes bilinear samples of a row, and their derivatives along x and y to `slopes`."""
     dx, dy = slopes
     for x in range(len(corner)):
         i, a, b, z = _U(corner[x]), points[0, x], points[1, x], _U(x) * _4
@@ -251,9 +284,7 @@ def _gather(canvas, stride, corner, points, is_added, total, slopes):
         u0, u1, u2, u3 = u0 + b * (v0 - u0), u1 + b * (v1 - u1), u2 + b * (v2 - u2), u3 + b * (v3 - u3)
         dx[z], dx[z + _1], dx[z + _2], dx[z + _3] = u0, u1, u2, u3
         p0, p1, p2, p3 = p0 + b * r0, p1 + b * r1, p2 + b * r2, p3 + b * r3
-        if is_added:
-            p0, p1, p2, p3 = p0 + total[z], p1 + total[z + _1], p2 + total[z + _2], p3 + total[z + _3]
-        total[z], total[z + _1], total[z + _2], total[z + _3] = p0, p1, p2, p3
+        samples[z], samples[z + _1], samples[z + _2], samples[z + _3] = p0, p1, p2, p3
 
 
 @_kernel
@@ -294,18 +325,14 @@ def _row_motion(points, slopes, gradient, down, row, columns, spans, out):
     knot_columns, knot_rows = len(columns), len(row)
     step_x, step_y, inverse, px, py = points[2], points[3], points[4], points[5], points[6]
     dx, dy = slopes
-    for x in range(width):
-        step_x[x] *= (
-            dx[4 * x] * gradient[4 * x]
-            + dx[4 * x + 1] * gradient[4 * x + 1]
-            + dx[4 * x + 2] * gradient[4 * x + 2]
-        )
-    for x in range(width):
-        step_y[x] *= (
-            dy[4 * x] * gradient[4 * x]
-            + dy[4 * x + 1] * gradient[4 * x + 1]
-            + dy[4 * x + 2] * gradient[4 * x + 2]
-        )
+    for slope, step in ((dx, step_x), (dy, step_y)):
+        for x in range(width):
+            step[x] *= (
+                slope[4 * x] * gradient[4 * x]
+                + slope[4 * x + 1] * gradient[4 * x + 1]
+                + slope[4 * x + 2] * gradient[4 * x + 2]
+                + slope[4 * x + 3] * gradient[4 * x + 3]
+            )
     t0, t1, t2, t3, t4, t5 = _ZERO, _ZERO, _ZERO, _ZERO, _ZERO, _ZERO
     pixel = _F(2.0 / width)
     for x in range(width):
@@ -338,14 +365,14 @@ def _row_motion(points, slopes, gradient, down, row, columns, spans, out):
 
 @_kernel
 def gradient_lengths(begin, end, layers, squared_density, weights, parts, gradient, losses):
-    """Writes the gradient of the mean lengths of the gradients of the layers, and the losses (C * 2 * parts). An item is a strip of a layer.
+    """Writes the gradient of the mean lengths of the gradients of the layers, and the losses (C * L * parts). An item is a strip of a layer.
 
-    The length of the gradient, not the sum of its components, which favours edges along the axes. layers, gradient: (C, 2, H, W, 4).
+    The length of the gradient, not the sum of its components, which favours edges along the axes. layers, gradient: (C, L, H, W, 4).
     """
-    _, _, height, width, _ = layers.shape
+    _, layer_count, height, width, _ = layers.shape
     size = (width - 1) * 4
     for item in range(begin, end):
-        candidate, layer, part = item // (2 * parts), item // parts % 2, item % parts
+        candidate, layer, part = item // (layer_count * parts), item // parts % layer_count, item % parts
         first, last = height * part // parts, height * (part + 1) // parts
         weight = weights[layer] / (3 * (height - 1) * (width - 1))
         factor = _F(weight) * squared_density
@@ -379,13 +406,15 @@ def gradient_lengths(begin, end, layers, squared_density, weights, parts, gradie
 
 @_kernel
 def halved(begin, end, images, out):
-    """Writes the means of 2 x 2 pixels of images (C, 2, H, W, 4). An item is a row of `out`."""
+    """Writes the means of 2 x 2 pixels of the first and the last layer (C, L, H, W, 4) to out (C, 2, ...). An item is a row of `out`."""
     _, _, height, width, _ = out.shape
     for item in range(begin, end):
         candidate, layer, y = item // (2 * height), item // height % 2, item % height
         for x in range(width):
             for c in range(4):
-                square = images[candidate, layer, 2 * y : 2 * y + 2, 2 * x : 2 * x + 2, c]
+                square = images[
+                    candidate, layer * (images.shape[1] - 1), 2 * y : 2 * y + 2, 2 * x : 2 * x + 2, c
+                ]
                 out[candidate, layer, y, x, c] = _QUARTER * (
                     square[0, 0] + square[0, 1] + square[1, 0] + square[1, 1]
                 )
@@ -393,17 +422,20 @@ def halved(begin, end, images, out):
 
 @_kernel
 def edge_strengths(begin, end, images, parts, across, down, sums):
-    """Writes the mean absolute differences of the channels along x (C, 2, H, W) and y, 0 at the last, and their sums (C, parts, 2, 2)."""
-    _, _, height, width, _ = images.shape
+    """Writes the mean absolute differences of the channels along x (C, 2, H, W) and y, 0 at the last, and their sums (C, parts, 2, 2).
+
+    They are those of the first and the last layer of images (C, L, H, W, 4).
+    """
+    _, layer_count, height, width, _ = images.shape
     for item in range(begin, end):
         candidate, part = item // parts, item % parts
         for layer in range(2):
             sum_x, sum_y = 0.0, 0.0
             for y in range(height * part // parts, height * (part + 1) // parts):
-                here = images[candidate, layer, y].reshape(-1)
+                here = images[candidate, layer * (layer_count - 1), y].reshape(-1)
                 sum_x += _differences(here, here[4:], across[candidate, layer, y], width - 1)
                 if y < height - 1:
-                    below = images[candidate, layer, y + 1].reshape(-1)
+                    below = images[candidate, layer * (layer_count - 1), y + 1].reshape(-1)
                     sum_y += _differences(here, below, down[candidate, layer, y], width)
             sums[candidate, part, 0, layer], sums[candidate, part, 1, layer] = sum_x, sum_y
 
@@ -466,30 +498,32 @@ def _tanh(x):
 
 @_kernel
 def edge_gradient(begin, end, images, across, down, weight, coarse, gradient):
-    """Adds to the gradient (C, 2, H, W, 4) that of the edges, and a quarter of that of the halved images. An item is a row of a layer.
+    """Adds to the gradient that of the edges, and a quarter of that of the halved images. An item is a row of the first or the last layer.
 
-    across, down: (C, 2, H, W), the gradients of the strengths. coarse: the gradient of the halved images, or one without rows.
+    images, gradient: (C, L, H, W, 4). across, down: (C, 2, H, W), the gradients of the strengths. coarse: the gradient of the halved images
+    (C, 2, H // 2, W // 2, 4), or one without rows.
     """
-    _, _, height, width, _ = images.shape
+    _, layer_count, height, width, _ = images.shape
     for item in range(begin, end):
         candidate, layer, y = item // (2 * height), item // height % 2, item % height
-        here, out = images[candidate, layer, y], gradient[candidate, layer, y]
+        which = layer * (layer_count - 1)
+        here, out = images[candidate, which, y], gradient[candidate, which, y]
         factor = _F(weight) * _THIRD
         for x in range(width - 1):
             step = factor * across[candidate, layer, y, x]
-            for c in range(4):
+            for c in range(3):
                 signed = step * _F(np.sign(here[x + 1, c] - here[x, c]))
                 out[x + 1, c] += signed
                 out[x, c] -= signed
         for other, row in ((y + 1, y), (y - 1, y - 1)):
             if 0 <= other < height:
-                there, steps = images[candidate, layer, other], down[candidate, layer, row]
+                there, steps = images[candidate, which, other], down[candidate, layer, row]
                 for x in range(width):
-                    for c in range(4):
+                    for c in range(3):
                         out[x, c] += factor * steps[x] * _F(np.sign(here[x, c] - there[x, c]))
         if y // 2 < coarse.shape[2]:
             for x in range(coarse.shape[3]):
-                for c in range(4):
+                for c in range(3):
                     value = _QUARTER * coarse[candidate, layer, y // 2, x, c]
                     out[2 * x, c] += value
                     out[2 * x + 1, c] += value
@@ -499,12 +533,12 @@ def edge_gradient(begin, end, images, across, down, weight, coarse, gradient):
 def layer_step(begin, end, layers, light, gradient, scatter, touched, parts, first, second, rate, correction):
     """Takes a step of Adam, and empties `scatter` for the next one. An item is a row of a layer.
 
-    layers: (C, 2, H, W, 4), square roots of `light`. gradient: of the penalties; that of the data term is in `scatter`. first, second: the
+    layers: (C, L, H, W, 4), square roots of `light`. gradient: of the penalties; that of the data term is in `scatter`. first, second: the
     moments. rate: with the correction of the first moment. correction: of the root of the second moment.
     """
-    _, _, height, width, _ = layers.shape
+    _, layer_count, height, width, _ = layers.shape
     for item in range(begin, end):
-        candidate, layer, y = item // (2 * height), item // height % 2, item % height
+        candidate, layer, y = item // (layer_count * height), item // height % layer_count, item % height
         g, p = gradient[candidate, layer, y].reshape(-1), layers[candidate, layer, y].reshape(-1)
         s = light[candidate, layer, y].reshape(-1)
         m, v = first[candidate, layer, y].reshape(-1), second[candidate, layer, y].reshape(-1)

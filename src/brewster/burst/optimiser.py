@@ -13,17 +13,26 @@ import cv2
 import numpy as np
 
 from brewster.burst import kernels
-from brewster.burst.joint_model import Doubles, Floats, JointModel, bicubic_weights, pixel_grid, to_pixels
+from brewster.burst.joint_model import (
+    Doubles,
+    Floats,
+    JointModel,
+    bicubic_weights,
+    compose,
+    pixel_grid,
+    to_pixels,
+    with_fourth_channel,
+)
 from brewster.burst.kernels import MARGIN, OFFSET
 from brewster.burst.threads import run_items
 
-_GRADIENTS: Final = np.array([0.03, 0.05])
-"""The costs of the gradients of T and R."""
+_GRADIENTS: Final = np.array([0.03, 0.05, 0.05])
+"""The costs of the gradients of the layers."""
 _GAIN_PENALTY: Final = 0.5
 _SPLINE_CURVATURE: Final = 5.0
 _SPLINE_SIZE: Final = 1.0
-_RIGIDITY: Final = (1.0, 2.0)
-"""The costs of the splines of T and R."""
+_RIGIDITY: Final = (1.0, 2.0, 2.0)
+"""The costs of the splines of the layers."""
 _EDGE_SCALES: Final = 3
 _PARTS: Final = 8
 """The strips of rows of a few candidates. Of many candidates, each is one part."""
@@ -41,6 +50,8 @@ class Weights:
     common_edges: float
     prior: float
     """The pull of the low frequencies of T to those of the single-photo result."""
+    opacity: float = 0.0
+    """The cost of the mean opacity of the second layer."""
 
 
 @final
@@ -128,7 +139,7 @@ class _Loss:
         )
         layers, splines = self.model.layers, self.model.splines
         self._weights = weights
-        count, _, canvas_height, canvas_width, _ = layers.shape
+        count, layer_count, canvas_height, canvas_width, _ = layers.shape
         frame_count, height, width, _ = frames.shape
         self._parts = _PARTS if count <= _FEW_CANDIDATES else 1
         self._light, self._target = np.square(layers), np.sqrt(frames + OFFSET)
@@ -141,7 +152,7 @@ class _Loss:
             h, w = (length // 2 for length in self._pyramid[-1].shape[2:4])
             self._pyramid.append(np.zeros((count, 2, h, w, 4), np.float32))
         self._gradients = [np.zeros_like(images) for images in self._pyramid]
-        self._edges = [np.zeros((2, *images.shape[:-1]), np.float32) for images in self._pyramid]
+        self._edges = [np.zeros((2, count, 2, *images.shape[2:4]), np.float32) for images in self._pyramid]
         self._places = to_pixels(pixel_grid(height, width) / (1 + 2 * MARGIN), layers.shape[2:4])
         rows, columns = (
             bicubic_weights(*sizes) for sizes in zip((height, width), splines.shape[-2:], strict=True)
@@ -150,9 +161,9 @@ class _Loss:
         used = [np.flatnonzero(column) for column in self._columns]
         self._spans = np.array([(index[0], index[-1] + 1) for index in used])
         strips = count * self._parts
-        self._scatter = np.zeros((strips, 2, canvas_height * canvas_width * 4), np.float32)
-        self._touched = np.zeros((strips, 2, 2), np.int64)
-        self._found = np.zeros((strips, frame_count, 4 + 2 * (8 + splines[0, 0, 0].size)))
+        self._scatter = np.zeros((strips, layer_count, canvas_height * canvas_width * 4), np.float32)
+        self._touched = np.zeros((strips, layer_count, 2), np.int64)
+        self._found = np.zeros((strips, frame_count, 4 + layer_count * (8 + splines[0, 0, 0].size)))
 
     def gradients(self) -> tuple[Doubles, Doubles, tuple[Doubles, Doubles, Doubles]]:
         """Returns the penalties (C,) and the data term (C,), and the gradients of homographies, splines and gains.
@@ -165,7 +176,7 @@ class _Loss:
         data_losses, gains, motion = self._data_term(extra)
         homographies, splines = np.split(motion, [8], axis=-1)
         splines = splines.reshape(model.splines.shape)
-        for layer, rigidity in enumerate(_RIGIDITY):
+        for layer, rigidity in enumerate(_RIGIDITY[: model.splines.shape[1]]):
             cost, gradient = _spline_penalties(model.splines[:, layer])
             penalties += rigidity * cost
             splines[:, layer] += rigidity * gradient
@@ -178,19 +189,22 @@ class _Loss:
         rate, correction = rate / (1 - _BETA1**step), 1 / np.sqrt(1 - _BETA2**step)
         layers = self.model.layers
         run_items(
-            kernels.layer_step, layers.shape[0] * 2 * layers.shape[2], layers, self._light, self._gradients[0],
+            kernels.layer_step, layers.shape[0] * layers.shape[1] * layers.shape[2], layers, self._light, self._gradients[0],
             self._scatter, self._touched, self._parts, *self._moments, np.float32(rate), np.float32(correction),
         )  # fmt: skip
 
     def _layer_penalties(self) -> Doubles:
         """Returns the costs of gradients and of edges at the same places in both layers, at three scales (Zhang et al. 2018): (C,)."""
         count, parts = len(self.model.layers), self._parts
-        losses = np.zeros(count * 2 * parts)
+        losses = np.zeros(count * self.model.layers.shape[1] * parts)
         run_items(
             kernels.gradient_lengths, len(losses), self.model.layers, self._squared_density, _GRADIENTS, parts,
             self._gradients[0], losses,
         )  # fmt: skip
         penalties: Doubles = losses.reshape(count, -1).sum(1)
+        roots = self.model.layers[:, 1, ..., 3]
+        penalties += self._weights.opacity * np.square(roots).mean((1, 2))
+        self._gradients[0][:, 1, ..., 3] += roots * np.float32(2 * self._weights.opacity / roots[0].size)
         weight = self._weights.common_edges
         if not weight:
             return penalties
@@ -224,15 +238,16 @@ class _Loss:
         height, width = self._target.shape[1:3]
         penalties, extra = [], []
         for candidate in range(len(self._light)):
-            encoded = np.empty((height, width, 4), np.float32)
-            kernels.sample(self._light[candidate, 0], *self._places, encoded)
-            encoded = np.sqrt(encoded + OFFSET)
+            samples = np.empty((2, height, width, 4), np.float32)
+            for layer in range(2):
+                kernels.sample(self._light[candidate, layer], *self._places, samples[layer])
+            encoded = np.sqrt(with_fourth_channel(compose(samples)[0]) + OFFSET)
             difference = (_low_pass(encoded) - self._low_prior)[..., :3]
             penalties.append(self._weights.prior * np.abs(difference).mean())
             spread = np.zeros_like(encoded)
             spread[::step, ::step, :3] = np.sign(difference) * (self._weights.prior / difference.size)
             box = cv2.boxFilter(spread, -1, (size, size), borderType=cv2.BORDER_CONSTANT)
-            extra.append(box * 0.5 / encoded)
+            extra.append(box * 0.5 / encoded * np.maximum(1 - samples[1, ..., 3:], 0))
         return np.array(penalties), np.stack(extra)
 
     def _data_term(self, extra: Floats) -> tuple[Doubles, Doubles, Doubles]:
@@ -247,9 +262,9 @@ class _Loss:
             self._scatter, self._touched, self._found,
         )  # fmt: skip
         found = self._found.reshape(count, self._parts, frame_count, -1).sum(1)
-        motion = found[..., 4:].reshape(count, frame_count, 2, -1).swapaxes(1, 2).copy()
-        motion[model.is_locked, 0] += motion[model.is_locked, 1]
-        motion[model.is_locked, 1] = 0
+        motion = found[..., 4:].reshape(count, frame_count, homographies.shape[1], -1).swapaxes(1, 2).copy()
+        motion[model.is_locked, 0] += motion[model.is_locked, -1]
+        motion[model.is_locked, -1] = 0
         return found[..., 0].sum(1) / self._target[..., :3].size, found[..., 1:4].copy(), motion
 
 
