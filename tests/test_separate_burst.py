@@ -21,7 +21,7 @@ from brewster.burst.joint_model import JointModel, pixel_grid, with_fourth_chann
 from brewster.burst.optimiser import Rates, optimise
 from brewster.burst.registration import frame_motions, motion_candidates
 from brewster.burst.separate import burst_report, fit_burst, measure_layers
-from brewster.burst.solver import LEVELS, Level, Solution, _edge_correlation, solve
+from brewster.burst.solver import LEVELS, SEARCH, Level, Solution, _edge_correlation, solve
 from brewster.burst.video import choose_frames
 from brewster.errors import BrewsterError, PhotoError, PhotoTooLarge, UnreadablePhoto
 from brewster.remote_path import location
@@ -86,7 +86,7 @@ def test_layers_with_known_motion_are_separated_whatever_the_prior(is_prior_true
 
 def test_a_copy_of_a_fine_texture_explains_less_than_the_true_reflection():
     """Interpolation blurs between the pixels of a canvas. A second layer must not explain that with a copy of T that is moved by a pixel."""
-    level = LEVELS[1]
+    level = SEARCH[-1]
     texture, reflection = np.random.default_rng(3).random((480, 800, 3)), linear_pictures((800, 480))[1]
     texture = cv2.GaussianBlur(texture.astype(np.float32), (0, 0), 2)
     texture = (0.5 + 0.2 * (texture - texture.mean()) / texture.std()).clip(0, 1)

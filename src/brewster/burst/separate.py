@@ -25,7 +25,7 @@ from brewster.burst.solver import MIN_SIDE_PX, Solution, solve
 from brewster.burst.threads import single_opencv_thread
 from brewster.errors import PhotoError, error_prefix
 from brewster.inference.assessment import Verdict
-from brewster.inference.burst_report import BurstReport, burst_photo_name, check_photo_count
+from brewster.inference.burst_report import BurstMethod, BurstReport, burst_photo_name, check_photo_count
 from brewster.inference.guided_upsampling import GeneratedOverride
 from brewster.inference.predictor import Prediction, Predictor, ProgressCallback
 from brewster.inference.separation import Separation
@@ -58,15 +58,68 @@ _DETAIL_LIMITS: Final = (0.5, 2.0)
 @final
 @dataclass(frozen=True)
 class FittedBurst:
-    """The reference photo of a burst, and the separator that separates it with the measured layers."""
+    """The reference photo of a burst, and its measured layers."""
 
     photo: Photo
-    separator: Separator
-    hints: Source | None
-    """The hints of the person, if the separator is that of the single photo."""
     report: BurstReport
     seconds: dict[str, float]
     """The time of each step."""
+    _solution: Solution | None
+    _single: Separator
+    """Of the single photo."""
+    _hints: Source | None
+
+    def chosen(self, method: BurstMethod, *, swap: bool) -> FittedBurst:
+        """Returns the burst with another method, or with exchanged layers. Raises PhotoError if there are no measured layers to use."""
+        report = self.report
+        if method == "single":
+            report = replace(
+                report,
+                method="single photo",
+                message="The reference photo was separated alone, as requested.",
+            )
+        elif method == "motion" and report.method != "burst":
+            if not report.is_measured:
+                raise PhotoError(
+                    f"no layers were measured: {report.message}",
+                    "expected photos that show the motion",
+                    "use the method auto or single",
+                )
+            report = replace(
+                report,
+                method="burst",
+                message=f"The measured layers are used, as requested. {report.message}",
+            )
+        if swap and report.method == "burst":
+            report = replace(report, is_swapped=True, are_names_certain=True)
+        return replace(self, report=report)
+
+    @property
+    def hints(self) -> Source | None:
+        """The hints of the person, if the separator is that of the single photo."""
+        return self._hints if self.report.method == "single photo" else None
+
+    @property
+    def separator(self) -> Separator:
+        """The separator that separates the photo by the method of the report."""
+        separator = self._single
+        if self.report.method != "single photo":
+            predictor = _FixedPredictor(self._layers()) if self.report.method == "burst" else _unchanged
+            separator = Separator(
+                predictor,
+                name=separator.name,
+                method=self.report.method,
+                sha256=separator.sha256,
+                device=separator.device,
+            )
+        count = self.report.frames + len(self.report.left_out)
+        return separator.for_burst(
+            count, has_hints=self._hints is not None, is_swapped=self.report.is_swapped
+        )
+
+    def _layers(self) -> Solution:
+        assert self._solution
+        return self._solution.swapped() if self.report.is_swapped else self._solution
 
     def separate(self, on_progress: ProgressCallback, **options: Any) -> Separation:  # noqa: ANN401
         """Computes the layers at full size. `options` are those of the call of a `Separator`, without hints."""
@@ -79,6 +132,8 @@ def separate_burst(
     *,
     reference: int | None = None,
     separator: Separator | None = None,
+    method: BurstMethod = "auto",
+    swap: bool = False,
     strength: float = Options.strength,
     quality: Quality = Options.quality,
     mask: Source | None = Options.mask,
@@ -94,6 +149,9 @@ def separate_burst(
         reference: the index of the photo to separate, by default the middle one.
         separator: separates the single photo. Its result is the start, and the result if the motion is not enough. By default, the
             compact model.
+        method: "auto" separates by the motion of the layers if the measurement agrees with the photos; "motion" does so in any
+            case; "single" separates the photo alone.
+        swap: whether the measured layers are exchanged: which of them is behind the glass is not always certain.
         strength, quality, mask, hints, additive, max_pixels: see the call of a `Separator`. The hints are for the single photo.
         on_progress: called with the completed fraction, 0 to 1. An exception raised in it stops the work.
 
@@ -101,7 +159,8 @@ def separate_burst(
         The separation of the reference photo. `burst` reports the method and the reason.
 
     Raises:
-        PhotoError: there are fewer than 2 or more than 15 photos, their sizes differ, or one of them cannot be read.
+        PhotoError: there are fewer than 2 or more than 15 photos, their sizes differ, or one of them cannot be read; or the method is
+            "motion" and the layers cannot be measured.
         BrewsterError: see the call of a `Separator`.
     """
     fitted = fit_burst(
@@ -111,9 +170,10 @@ def separate_burst(
         quality=quality,
         hints=hints,
         max_pixels=max_pixels,
+        is_measured=method != "single",
         on_progress=lambda done: on_progress(0.9 * done),
     )
-    return fitted.separate(
+    return fitted.chosen(method, swap=swap).separate(
         lambda done: on_progress(0.9 + 0.1 * done),
         strength=strength,
         quality=quality,
@@ -130,9 +190,10 @@ def fit_burst(
     quality: Quality = Options.quality,
     hints: Source | None = Options.hints,
     max_pixels: int = Options.max_pixels,
+    is_measured: bool = True,
     on_progress: ProgressCallback = lambda _fraction: None,
 ) -> FittedBurst:
-    """Measures the layers of a burst, but does not compute them at full size. See `separate_burst`."""
+    """Measures the layers of a burst if `is_measured`, but does not compute them at full size. See `separate_burst`."""
     if isinstance(photos, str | bytes):  # its characters would be the photos
         raise TypeError(
             f"photos is a single {type(photos).__name__}; expected a list of photos; for a video, pass read_video(path, frames)"
@@ -150,23 +211,14 @@ def fit_burst(
     refine_prior = None
     if separator.takes_hints and hints is None:  # a person knows better than the measured layers
         refine_prior = partial(prior_with_hints, separator, frames[reference], quality=quality)
-    solution, left_out = measure_layers(
-        frames, reference, prior, refine_prior=refine_prior, on_progress=on_progress
+    solution, left_out = (
+        measure_layers(frames, reference, prior, refine_prior=refine_prior, on_progress=on_progress)
+        if is_measured
+        else (None, ())
     )
     seconds["motion"] = time.perf_counter() - started
     report = burst_report(solution, single.verdict, len(photos), left_out, reference)
-    name, has_hints = separator.name, hints is not None
-    if report.method != "single photo":
-        hints = None
-    if solution and report.method == "burst":
-        sha256, device = separator.sha256, separator.device
-        separator = Separator(
-            _FixedPredictor(solution), name=name, method="burst", sha256=sha256, device=device
-        )
-    elif report.method == "unchanged":
-        separator = Separator(lambda tile: (tile, np.zeros_like(tile)), name=name, method="unchanged")
-    separator = separator.for_burst(len(photos), has_hints=has_hints)
-    return FittedBurst(photo, separator, hints, report, seconds)
+    return FittedBurst(photo, report, seconds, solution, separator, hints)
 
 
 def measure_layers(
@@ -314,7 +366,13 @@ def burst_report(
         round(motion, 2),
         round(explained, 4),
         round(solution.edge_correlation, 4) if solution else 0.0,
+        solution is not None,
+        solution is None or solution.naming >= _MIN_CERTAIN_NAMING,
     )
+
+
+def _unchanged(tile: Floats) -> tuple[Floats, Floats]:
+    return tile, np.zeros_like(tile)
 
 
 @final

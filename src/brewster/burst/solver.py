@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final, final
 
 import cv2
@@ -86,6 +86,10 @@ class Solution:
     """The mean error of the frames if both layers move together: the data term of the loss at 160 pixels."""
     two_layer_error: float
     """The same for the best candidate."""
+
+    def swapped(self) -> Solution:
+        """Returns the solution with both layers exchanged."""
+        return replace(self, transmission=self.reflection, reflection=self.transmission, naming=-self.naming)
 
 
 def solve(

@@ -24,7 +24,7 @@ EXTRAS: Final = {
     "diffusion": (
         "accelerate", "diffusers", "gguf", "huggingface_hub", "peft", "safetensors", "torch", "torchao", "transformers",
     ),
-    "burst": ("av", "opencv-python-headless", "torch"),
+    "burst": ("av", "numba", "opencv-python-headless"),
     "web": ("fastapi", "matplotlib", "python-multipart", "segno", "uvicorn"),
 }  # fmt: skip
 """Extra -> its packages."""

@@ -10,6 +10,10 @@ from typing import Literal, final
 from brewster.errors import PhotoError, counted
 from brewster.options import MAX_BURST_PHOTOS
 
+BurstMethod = Literal["auto", "motion", "single"]
+"""How a burst is to be separated. auto: by the motion of the layers if the measurement agrees with the photos. motion: by the motion in
+any case. single: the reference photo alone."""
+
 
 @final
 @dataclass(frozen=True)
@@ -34,6 +38,12 @@ class BurstReport:
     """The share of the errors of a model with one layer that the motion of a second layer explains, 0..1."""
     edge_correlation: float
     """The correlation of the edges of both layers, -1..1: about 0 for two scenes."""
+    is_measured: bool = False
+    """Whether there are measured layers, which the method "motion" uses in any case."""
+    are_names_certain: bool = True
+    """Whether it is certain which of the measured layers is behind the glass."""
+    is_swapped: bool = False
+    """Whether the measured layers were exchanged on request."""
 
 
 def burst_photo_name(photos: Sequence[object], index: int) -> str:
