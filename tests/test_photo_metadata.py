@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import ImageOps
 
-from brewster.photo import FileInfo, Photo, metadata
+from brewster.photo import FileInfo, Photo, metadata, tiff_tags
 from picture_files import exif_block, file_of, pil, smooth
 
 quick = settings(max_examples=25, deadline=None, database=None)
@@ -158,7 +158,7 @@ def test_xmp_orientation_is_reset_with_that_of_exif():
 @given(st.binary(max_size=60), st.sampled_from([b"II*\0", b"MM\0*", b""]), st.integers(0, 70))
 def test_damaged_exif_does_not_prevent_reading_and_writing(garbage, byte_order, offset):
     exif = byte_order + struct.pack("<I", offset) + garbage
-    photo = Photo.open(metadata.with_png_exif(file_of(smooth(4, 4), "PNG"), exif))
+    photo = Photo.open(metadata.with_png_chunks(file_of(smooth(4, 4), "PNG"), FileInfo(exif=exif)))
     for format_name in ("png", "tiff", "jpeg"):
         assert Photo.open(photo.encode(format_name)).size == photo.size
 
@@ -187,7 +187,7 @@ def test_upright_exif_resets_the_orientation_unlinks_the_thumbnail_and_keeps_all
     block = (
         mark + struct.pack(f"{order}IH", 8, 1) + entry + struct.pack(f"{order}I", 26) + b"second directory"
     )
-    upright = metadata.upright_exif(block)
+    upright = tiff_tags.upright_exif(block, (1, 1))
     assert upright[:18] == block[:18]
     assert struct.unpack_from(f"{order}HHI", upright, 18) == (1, 0, 0)
     assert upright[26:] == block[26:]

@@ -10,7 +10,7 @@ from PIL import Image
 
 from brewster.errors import PhotoTooLarge, UnreadablePhoto
 from brewster.image_formats import FORMATS, format_of
-from brewster.photo import Photo, decode, metadata, raw, read_size
+from brewster.photo import Photo, decode, metadata, raw, read_size, tiff_tags
 from brewster.photo.colour import colour_space_of
 from picture_files import CAMERA_NEUTRAL, dng_file, exif_block, file_of, mosaic, pil, smooth
 
@@ -49,7 +49,9 @@ def test_what_is_neutral_for_the_camera_is_neutral_in_the_photo():
 
 
 def test_a_raw_file_gives_sixteen_bit_tiff_with_the_tags_of_the_camera():
-    data = metadata.with_tiff_exif(dng_file(mosaic()), exif_block(1).removeprefix(b"Exif\0\0"))
+    data = tiff_tags.with_tags(
+        dng_file(mosaic()), tiff_tags.read_tags(exif_block(1).removeprefix(b"Exif\0\0"))
+    )
     photo = Photo.open(data)
     assert (photo.file_info.format_name, photo.file_info.bits, photo.pixels.dtype) == ("tiff", 16, np.uint16)
     image = pil(photo.encode())
@@ -66,7 +68,7 @@ def test_a_raw_file_is_upright(orientation):
     turns = {1: 0, 3: 2, 6: 3, 8: 1}[orientation]
     assert np.array_equal(turned.pixels, np.rot90(upright.pixels, turns))
     assert turned.size == read_size(dng_file(mosaic(), orientation))
-    assert metadata.orientation_of(turned.file_info.exif) == 1
+    assert tiff_tags.orientation_of(turned.file_info.exif) == 1
 
 
 @pytest.mark.parametrize("fraction", [0.05, 0.5, 0.95])
@@ -123,7 +125,7 @@ def box(name, content):
 def test_the_tags_of_a_cr3_are_those_of_its_boxes():
     boxes = box(b"CMT1", tiff_block({271: "Sextant"})) + box(b"CMT2", tiff_block({33434: 0.5}))
     data = box(b"ftyp", b"crx \0\0\0\1") + box(b"moov", box(b"uuid", bytes(16) + boxes))
-    tags = metadata.read_tags(raw._exif(data))
+    tags = tiff_tags.read_tags(raw._exif(data))
     assert tags[271][2] == b"Sextant\0"
     assert 33434 in tags[34665]
 
@@ -131,7 +133,7 @@ def test_the_tags_of_a_cr3_are_those_of_its_boxes():
 def test_the_tags_of_a_raf_are_those_of_its_jpeg():
     preview = file_of(smooth(), "JPEG", exif=exif_block())
     header = (b"FUJIFILMCCD-RAW " + bytes(68) + struct.pack(">II", 160, len(preview))).ljust(160, b"\0")
-    tags = metadata.read_tags(raw._exif(header + preview))
+    tags = tiff_tags.read_tags(raw._exif(header + preview))
     assert tags[271][2] == b"Sextant\0"
     assert 33434 in tags[34665]
 
@@ -139,7 +141,7 @@ def test_the_tags_of_a_raf_are_those_of_its_jpeg():
 @pytest.mark.parametrize("magic", [b"IIRO", b"IIU\0", b"MMOR"])
 def test_the_tags_of_an_orf_and_of_an_rw2_are_those_of_a_tiff(magic):
     block = exif_block().removeprefix(b"Exif\0\0") if magic[:2] == b"MM" else tiff_block({271: "Sextant"})
-    assert metadata.read_tags(raw._exif(magic + block[4:]))[271][2] == b"Sextant\0"
+    assert tiff_tags.read_tags(raw._exif(magic + block[4:]))[271][2] == b"Sextant\0"
 
 
 @pytest.mark.parametrize("is_installed", [True, False])

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from brewster.errors import PhotoError, PhotoTooLarge, UnreadablePhoto, UnsupportedPhoto
-from brewster.photo import Photo, metadata
+from brewster.photo import Photo, tiff_tags
 
 NOISE = np.random.default_rng(0).integers(0, 256, (40, 64, 3), np.uint8)
 
@@ -72,7 +72,7 @@ def test_a_tiff_shorter_than_its_header_is_refused(size):
 def test_a_tiff_with_missing_tiles_is_refused():
     data = tiff_of(NOISE, tile=True, tile_width=16, tile_height=16)
     assert np.array_equal(Photo.open(data).pixels, NOISE)
-    last = metadata.numbers(metadata.read_tags(data), 324)[-1]
+    last = tiff_tags.numbers(tiff_tags.read_tags(data), 324)[-1]
     missing_tile = data.replace(struct.pack("<I", last), struct.pack("<I", last + len(data)))
     assert_refused(missing_tile, UnreadablePhoto, "pixels are missing")
 
@@ -169,7 +169,7 @@ def test_five_channels_and_more_are_refused(bands):
 
 @pytest.mark.parametrize("kind", [np.uint32, np.float64])
 def test_unsupported_dtypes_are_refused(kind):
-    assert_refused(tiff_of(np.zeros((4, 4, 3), kind)), PhotoError, "3 channels of|common variant")
+    assert_refused(tiff_of(np.zeros((4, 4, 3), kind)), PhotoError, "the tiff has (32-bit unsigned integers|64-bit floats); expected .*32-bit floats")
 
 
 def test_a_raw_file_is_never_read_as_its_preview():

@@ -12,6 +12,7 @@ Colours outside Display P3 are clipped."""
 from __future__ import annotations
 
 import struct
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
@@ -22,7 +23,7 @@ from numpy.typing import NDArray
 
 from brewster import srgb
 from brewster.errors import UnsupportedPhoto
-from brewster.photo.file_info import FileInfo
+from brewster.photo.file_info import FileInfo, with_notes
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
@@ -126,7 +127,7 @@ def colour_space_of(icc: bytes | None, primaries: tuple[float, ...] | None, is_f
     if icc is not None:
         return _profile_space(icc)
     if primaries is not None and not np.allclose(primaries, REC709_CHROMATICITIES, atol=1e-4):
-        return ColourSpace((ToneCurve(),) * 3, _to_rec709(_to_d50(primaries)))
+        return ColourSpace((ToneCurve(),) * 3, _to_rec709(to_d50(primaries)))
     return LINEAR_REC709 if is_float else SRGB
 
 
@@ -174,7 +175,19 @@ def _as_matrix(array: Float64) -> Matrix:
     return tuple((float(row[0]), float(row[1]), float(row[2])) for row in array)
 
 
-def _to_d50(primaries: tuple[float, ...]) -> Float64:
+def valid_chromaticities(chromaticities: Sequence[float | str]) -> tuple[float, ...] | None:
+    """Returns x and y of red, green, blue and white, or None if they form no triangle: some programs write none, or zeros."""
+    try:
+        points = np.array(chromaticities, np.float64).reshape(4, 2)
+    except ValueError:
+        return None
+    red, green, blue, _ = points
+    area = np.linalg.det([green - red, blue - red])
+    is_gamut = np.isfinite(points).all() and points[:, 1].all() and abs(area) > 1e-6
+    return tuple(points.ravel().tolist()) if is_gamut else None
+
+
+def to_d50(primaries: tuple[float, ...]) -> Float64:
     """The matrix from linear RGB to XYZ, adapted to D50 by the Bradford transform (ICC.1:2022 annex E)."""
     points = zip(primaries[::2], primaries[1::2], strict=True)
     xyz = np.array([[x / y, 1, (1 - x - y) / y] for x, y in points]).T
@@ -184,8 +197,8 @@ def _to_d50(primaries: tuple[float, ...]) -> Float64:
     return np.asarray(np.linalg.inv(_BRADFORD) @ gains @ _BRADFORD @ to_xyz)
 
 
-def _to_rec709(to_d50: Float64) -> Matrix:
-    return _as_matrix(np.linalg.inv(_to_d50(REC709_CHROMATICITIES)) @ to_d50)
+def _to_rec709(matrix: Float64) -> Matrix:
+    return _as_matrix(np.linalg.inv(to_d50(REC709_CHROMATICITIES)) @ matrix)
 
 
 def _profile_space(icc: bytes) -> ColourSpace:
@@ -194,9 +207,9 @@ def _profile_space(icc: bytes) -> ColourSpace:
         if icc[16:20] == b"GRAY":
             return _snap_to_srgb(ColourSpace((_parse_curve(tags[b"kTRC"]),) * 3))
         points = [struct.unpack_from(">3i", tags[name], 8) for name in (b"rXYZ", b"gXYZ", b"bXYZ")]
-        to_d50 = np.array(points).T / 65536
+        matrix = np.array(points).T / 65536
         red, green, blue = (_parse_curve(tags[name]) for name in (b"rTRC", b"gTRC", b"bTRC"))
-        space = _snap_to_srgb(ColourSpace((red, green, blue), _to_rec709(to_d50)))
+        space = _snap_to_srgb(ColourSpace((red, green, blue), _to_rec709(matrix)))
         _inverse(space.matrix or _as_matrix(np.eye(3)))
     except (KeyError, ValueError, struct.error, np.linalg.LinAlgError) as error:
         raise UnsupportedPhoto(
@@ -300,7 +313,7 @@ def convert_cmyk(image: pyvips.Image, file_info: FileInfo) -> tuple[pyvips.Image
     given = {"embedded": is_cmyk, "input_profile": "cmyk", "intent": "relative", "depth": depth}
     converted = image.icc_transform("p3", **given)
     note = f"its CMYK colours were converted to RGB (Display P3) with {profile}"
-    return converted, replace(file_info, icc=bytes(pyvips.Image.profile_load("p3")), note=note)
+    return converted, with_notes(replace(file_info, icc=bytes(pyvips.Image.profile_load("p3"))), note)
 
 
 _PROBE_LEVELS = np.arange(0, 256, 51).astype(np.uint8)

@@ -28,11 +28,12 @@ from brewster.errors import (
 )
 from brewster.files import DEFAULT_MAX_PIXELS
 from brewster.image_formats import FORMATS, VIDEO_SIGNATURE, ImageFormat, format_of_content
-from brewster.photo import metadata
+from brewster.photo import metadata, tiff_tags, xmp
 from brewster.photo.colour import colour_space_of, convert_cmyk, has_only_tables
-from brewster.photo.file_info import Decoded, FileInfo, check_pixel_count, library_of
+from brewster.photo.colour_description import profile_of
+from brewster.photo.file_info import Decoded, FileInfo, check_pixel_count, library_of, with_notes
 from brewster.photo.hdr_formats import read_exr, read_hdr
-from brewster.photo.raw import is_raw, read_raw, read_raw_size
+from brewster.photo.raw import read_raw, read_raw_size
 
 pyvips.cache_set_max(0)  # each image is read once, so the operation cache of libvips has no use
 logging.getLogger("pyvips").addHandler(logging.NullHandler())  # warnings of libvips become brewster errors
@@ -75,12 +76,10 @@ def read_size(data: bytes) -> tuple[int, int]:
         heif = _open_heic(data, DEFAULT_MAX_PIXELS)
         _check_profile(_heic_profile(heif, data), is_float=False)
         return heif.size[0], heif.size[1]
-    image = _open_vips(data, format_name, DEFAULT_MAX_PIXELS)
-    icc = image.get("icc-profile-data") if image.get_typeof("icc-profile-data") else None
+    image, tags = _open_vips(data, format_name, DEFAULT_MAX_PIXELS)
     if image.interpretation != _CMYK:
-        _check_profile(icc or _profile_of(data, format_name), is_float=image.format == "float")
-    sides = int(image.width), int(image.height)
-    return sides[::-1] if _orientation(image, format_name) in _TRANSPOSED else sides
+        _check_profile(_profile(image, data, format_name, tags), is_float=image.format == "float")
+    return _upright_size(image, _orientation(image, data, format_name))
 
 
 def _check_profile(icc: bytes | None, *, is_float: bool) -> None:
@@ -96,7 +95,7 @@ def _detect_format(data: bytes, max_pixels: int) -> tuple[bytes, str]:
     image_format = known_format(data)
     if image_format.name == "ora":
         return _merged_image(data, max_pixels), "png"
-    is_raw_tiff = image_format.name == "tiff" and is_raw(metadata.read_tags(data))
+    is_raw_tiff = image_format.name == "tiff" and tiff_tags.is_raw(data)
     return data, "raw" if is_raw_tiff else image_format.name
 
 
@@ -126,33 +125,72 @@ _DTYPES = {"uchar": np.uint8, "ushort": np.uint16, "float": np.float32}
 
 
 def _decode_vips(data: bytes, format_name: str, max_pixels: int) -> Decoded:
-    image = _open_vips(data, format_name, max_pixels)
+    image, tags = _open_vips(data, format_name, max_pixels)
+    orientation = _orientation(image, data, format_name)
     try:
-        file_info = _file_info(image, data, format_name)
+        file_info = _file_info(image, data, format_name, tags)
         if image.interpretation == _CMYK:
             image, file_info = convert_cmyk(image, file_info)
         array = np.frombuffer(image.write_to_memory(), _DTYPES[image.format])
     except pyvips.Error as error:
-        raise _unreadable_error(format_name) from error
+        raise _vips_error(format_name, error, tags) from error
     array = _full_scale(array.reshape(image.height, image.width, image.bands), file_info.bits)
-    return split_alpha(apply_orientation(array, _orientation(image, format_name)), file_info)
+    decoded = split_alpha(apply_orientation(array, orientation), file_info)
+    is_premultiplied = format_name == "avif" and b"prem" in metadata.box(data, b"iref")
+    return _with_straight_alpha(decoded) if is_premultiplied else decoded
 
 
-def _open_vips(data: bytes, format_name: str, max_pixels: int) -> pyvips.Image:
-    """Opens an image and checks its header. libvips decodes the pixels later."""
+def _open_vips(data: bytes, format_name: str, max_pixels: int) -> tuple[pyvips.Image, tiff_tags.Tags]:
+    """Opens an image and checks its header. libvips decodes the pixels later. Returns the tags of a TIFF, too."""
     load = getattr(pyvips.Image, f"{FORMATS[format_name].vips_name or format_name}load_buffer")
+    pages = tiff_tags.full_pages(data) if format_name == "tiff" else [tiff_tags.Page({}, {})]
+    if len(pages) > 1:
+        raise _frames_error(format_name)
+    options, tags = pages[0] if pages else tiff_tags.Page({}, {})
+    if format_name == "tiff":
+        _check_tiff(tags)
     try:
-        image = load(data, access="sequential", fail_on=_FAIL_ON.get(format_name, "truncated"))
+        image = load(data, access="sequential", fail_on=_FAIL_ON.get(format_name, "truncated"), **options)
         _check_supported(image, data, format_name, max_pixels)
     except pyvips.Error as error:
-        raise _unreadable_error(format_name) from error
-    return image
+        raise _vips_error(format_name, error, tags) from error
+    if format_name == "tiff" and not tiff_tags.has_all_pixels(tags, len(data)):
+        raise _unreadable_error("tiff", "pixels are missing")  # libvips reads missing tiles as black
+    return image, tags
 
 
-def _orientation(image: pyvips.Image, format_name: str) -> int:
+def _orientation(image: pyvips.Image, data: bytes, format_name: str) -> int:
     """Returns the EXIF orientation that must still be applied; 1 if libvips has applied it."""
+    if format_name == "png":  # libvips reads no metadata after the pixels
+        return tiff_tags.orientation_of(dict(metadata.png_chunks(data)).get(b"eXIf", b""))
     must_be_applied = FORMATS[format_name].is_stored_rotated and image.get_typeof("orientation")
     return int(image.get("orientation")) if must_be_applied else 1
+
+
+def _upright_size(image: pyvips.Image, orientation: int) -> tuple[int, int]:
+    sides = int(image.width), int(image.height)
+    return sides[::-1] if orientation in _TRANSPOSED else sides
+
+
+def _vips_error(format_name: str, error: pyvips.Error, tags: tiff_tags.Tags) -> PhotoError:
+    """Returns the error for a file that libvips cannot read: it is damaged, or of a kind that is not supported."""
+    compression = tiff_tags.number_of(tags, 259, 1)
+    kind = ""
+    if compression in tiff_tags.COMPRESSION_NAMES or (tags and compression not in _COMPRESSIONS):
+        kind = f"is compressed with {tiff_tags.COMPRESSION_NAMES.get(compression, f'method {compression}')}"
+    elif found := re.search(
+        r"[^\n:]*(?:unsupported|not supported|not implemented|not configured)[^\n]*",
+        str(error),
+        re.IGNORECASE,
+    ):
+        kind = f"is of a kind that the decoder does not support ({found[0].strip()})"
+    if not kind:
+        return _unreadable_error(format_name)
+    return UnsupportedPhoto(
+        f"the {format_name} {kind}, which brewster does not support",
+        "expected a common variant of the format",
+        "convert the image, for example to PNG",
+    )
 
 
 def _unreadable_error(format_name: str, reason: str = "") -> PhotoError:
@@ -164,15 +202,30 @@ def _unreadable_error(format_name: str, reason: str = "") -> PhotoError:
     )
 
 
+def _check_tiff(tags: tiff_tags.Tags) -> None:
+    """Raises UnsupportedPhoto for pixels that libvips reads with an error, or with other values."""
+    bits, kind = (tiff_tags.number_of(tags, tag, 1) for tag in (258, 339))
+    photometric = tiff_tags.number_of(tags, 262, 2)
+    found = ""
+    if (kind, bits) not in _TIFF_SAMPLES:
+        found = f"{bits}-bit {_SAMPLE_KINDS.get(kind, 'values of another kind')}"
+    elif photometric > 6:
+        found = (
+            f"{_PHOTOMETRIC_NAMES.get(photometric, 'another kind')} (PhotometricInterpretation {photometric})"
+        )
+    if found:
+        raise UnsupportedPhoto(
+            f"the tiff has {found}",
+            "expected grey, RGB or CMYK of 8- or 16-bit integers or 32-bit floats",
+            "convert the image to one of these",
+        )
+
+
 def _check_supported(image: pyvips.Image, data: bytes, format_name: str, max_pixels: int) -> None:
     """Raises PhotoTooLarge or UnsupportedPhoto by the header of an image."""
     check_pixel_count(image.width, image.height, max_pixels)
     if _has_frames(image, data, format_name):
-        raise UnsupportedPhoto(
-            f"the {format_name} is an animation or has several pages",
-            "expected a single image",
-            "extract the frames first, for example with ffmpeg or vips",
-        )
+        raise _frames_error(format_name)
     interpretations = {1: _GREY, 2: _GREY, 3: _RGB, 4: (*_RGB, _CMYK)}.get(image.bands, ())
     if image.interpretation not in interpretations or image.format not in _DTYPES:
         raise UnsupportedPhoto(
@@ -180,8 +233,14 @@ def _check_supported(image: pyvips.Image, data: bytes, format_name: str, max_pix
             "expected grey or RGB, with or without alpha, or CMYK, of 8 or 16 bits or 32-bit floats",
             "convert the image to one of these",
         )
-    if format_name == "tiff" and metadata.pixel_data_end(metadata.read_tags(data)) > len(data):
-        raise _unreadable_error("tiff", "pixels are missing")  # libvips reads missing tiles as black
+
+
+def _frames_error(format_name: str) -> UnsupportedPhoto:
+    return UnsupportedPhoto(
+        f"the {format_name} is an animation or has several pages",
+        "expected a single image",
+        "extract the frames first, for example with ffmpeg or vips",
+    )
 
 
 def _has_frames(image: pyvips.Image, data: bytes, format_name: str) -> bool:
@@ -189,56 +248,76 @@ def _has_frames(image: pyvips.Image, data: bytes, format_name: str) -> bool:
         return b"acTL" in dict(metadata.png_chunks(data))  # libvips reads the first frame without an error
     if format_name == "avif":
         return data[8:12] == b"avis"  # libvips counts thumbnails as pages
-    return bool(image.get_typeof("n-pages")) and image.get("n-pages") > 1
+    has_pages = format_name != "tiff" and bool(image.get_typeof("n-pages"))
+    return has_pages and image.get("n-pages") > 1
 
 
-def _file_info(image: pyvips.Image, data: bytes, format_name: str) -> FileInfo:
-    names = ("icc-profile-data", "exif-data", "xmp-data", "iptc-data")
-    icc, exif, xmp, iptc = (image.get(name) if image.get_typeof(name) else None for name in names)
+def _blob(image: pyvips.Image, name: str) -> bytes | None:
+    return image.get(f"{name}-data") if image.get_typeof(f"{name}-data") else None
+
+
+def _profile(image: pyvips.Image, data: bytes, format_name: str, tags: tiff_tags.Tags) -> bytes | None:
+    is_grey = image.interpretation in _GREY
+    return profile_of(data, format_name, _blob(image, "icc-profile"), is_grey=is_grey, tags=tags)
+
+
+def _file_info(image: pyvips.Image, data: bytes, format_name: str, tags: tiff_tags.Tags) -> FileInfo:
     bits = {"float": 32, "uchar": 8}.get(image.format, 16)
     has_resolution = (image.xres, image.yres) != (1.0, 1.0)
     file_info = FileInfo(
         format_name=FORMATS[format_name].written_as,
         bits=image.get("bits-per-sample") if format_name == "avif" else bits,
-        icc=icc or _profile_of(data, format_name),
-        exif=metadata.upright_exif(exif) if exif else None,
-        xmp=metadata.upright_xmp(xmp) if xmp else None,
-        iptc=iptc,
+        icc=_profile(image, data, format_name, tags),
         resolution_px_per_mm=(image.xres, image.yres) if has_resolution else None,
     )
+    exif, packets = _blob(image, "exif"), [packet for packet in (_blob(image, "xmp"),) if packet]
     match format_name:
         case "jpeg":
             subsampling = metadata.jpeg_subsampling(data)
-            quality = _jpeg_quality(data, bands=3 if subsampling else 1)
-            return replace(file_info, subsampling=subsampling, jpeg_quality=quality)
+            file_info = replace(
+                file_info,
+                subsampling=subsampling,
+                jpeg_quality=_jpeg_quality(data, bands=3 if subsampling else 1),
+                image_resources=metadata.jpeg_image_resources(data),
+                texts=tuple(metadata.jpeg_comments(data)),
+            )
+            packets = metadata.read_xmp(data)
+        case "png":
+            file_info = replace(file_info, texts=tuple(metadata.png_texts(data)))
+            exif, packets = dict(metadata.png_chunks(data)).get(b"eXIf"), metadata.read_xmp(data)
         case "tiff":
-            tags = metadata.read_tags(data)
-            compression = _COMPRESSIONS.get(metadata.number_of(tags, 259, 1), "deflate")
-            return replace(file_info, compression=compression, exif=metadata.tiff_exif(tags))
+            compression = _COMPRESSIONS.get(tiff_tags.number_of(tags, 259, 1), "deflate")
+            resources, packet = metadata.tiff_image_resources(tags), tiff_tags.value_of(tags, 700)
+            file_info = replace(file_info, compression=compression, image_resources=resources)
+            exif, packets = tiff_tags.tiff_exif(tags), [packet] if packet else []
         case "webp":
-            return replace(file_info, lossless=b"VP8L" in metadata.webp_chunks(data))
+            file_info = replace(file_info, lossless=b"VP8L" in metadata.webp_chunks(data))
         case "avif":
             codes = metadata.cicp(data)  # only a lossless AVIF stores RGB: matrix code 0, the identity
-            return replace(file_info, lossless=codes is not None and codes[2] == 0)
-    return file_info
+            file_info = replace(file_info, lossless=codes is not None and codes[2] == 0)
+    return _with_exif_and_xmp(
+        file_info, data, exif, packets, _upright_size(image, _orientation(image, data, format_name))
+    )
 
 
-_SRGB_TRANSFERS = (1, 2, 6, 13, 14, 15)  # BT.709, unspecified, BT.601, sRGB, BT.2020 of 10 and 12 bits
+def _with_exif_and_xmp(
+    file_info: FileInfo, data: bytes, exif: bytes | None, packets: list[bytes], size: tuple[int, int]
+) -> FileInfo:
+    """Returns the metadata with EXIF and XMP for the upright image of this (width, height), and with a note on what is lost."""
+    packet, lost = xmp.layer_xmp(packets, size)
+    lost += [name for mark, name in _LOST_PARTS.items() if name not in lost and mark in data]
+    notes = [f"its {name} is not kept" for name in lost]
+    exif = tiff_tags.upright_exif(exif, size) if exif else None
+    return with_notes(replace(file_info, exif=exif, xmp=packet), *notes)
 
 
-def _profile_of(data: bytes, format_name: str) -> bytes | None:
-    """Returns the ICC profile for the code points (ITU-T H.273) of a file. Returns Display P3 if the primaries are
-    those of Display P3; otherwise None, which means sRGB. Raises UnsupportedPhoto if the file has other primaries,
-    or a transfer function unlike that of sRGB: for example linear (8), or PQ (16) or HLG (18) of HDR video."""
-    codes = metadata.cicp(data) if FORMATS[format_name].has_cicp else None
-    primaries, transfer = codes[:2] if codes else (1, 13)
-    if transfer not in _SRGB_TRANSFERS or primaries not in (1, 2, 5, 6, 12):
-        raise UnsupportedPhoto(
-            f"the {format_name} has the primaries {primaries} and the transfer function {transfer} of ITU-T H.273",
-            "expected those of sRGB or Display P3, or an ICC profile",
-            "export the image with one of these",
-        )
-    return bytes(pyvips.Image.profile_load("p3")) if primaries == 12 else None
+_LOST_PARTS = {
+    b"urn:iso:std:iso:ts:21496:-1": xmp.GAIN_MAP,
+    b"urn:com:apple:photo:2020:aux:hdrgainmap": xmp.GAIN_MAP,
+    b"tmap": xmp.GAIN_MAP,
+    b"MotionPhoto_Data": xmp.FILM,
+}
+"""Bytes of files with other parts than the image, and the names of these parts."""
 
 
 def _jpeg_quality(data: bytes, bands: int) -> int:
@@ -253,6 +332,22 @@ def _jpeg_quality(data: bytes, bands: int) -> int:
     return min(bisect.bisect_left(range(1, 101), True, key=is_fine) + 1, 100)
 
 
+_SAMPLE_KINDS = {
+    1: "unsigned integers",
+    2: "signed integers",
+    3: "floats",
+    5: "complex integers",
+    6: "complex floats",
+}
+_TIFF_SAMPLES = {(1, 1), (1, 2), (1, 4), (1, 8), (4, 8), (1, 16), (3, 16), (3, 32)}
+"""The kinds and bits of samples that libvips reads; kind 4 is unspecified."""
+_PHOTOMETRIC_NAMES = {
+    8: "CIELAB colours",
+    9: "ICCLAB colours",
+    10: "ITULAB colours",
+    32844: "LogL",
+    32845: "LogLuv",
+}
 _COMPRESSIONS = {
     1: "none", 5: "lzw", 7: "jpeg", 8: "deflate", 32946: "deflate", 32773: "packbits", 50000: "zstd",
 }  # fmt: skip
@@ -295,7 +390,7 @@ def _open_heic(data: bytes, max_pixels: int) -> Any:  # noqa: ANN401  (pillow-he
 
 
 def _heic_profile(heif: Any, data: bytes) -> bytes | None:  # noqa: ANN401
-    return heif.info.get("icc_profile") or _profile_of(data, "heic")
+    return profile_of(data, "heic", heif.info.get("icc_profile"), is_grey=False, tags={})
 
 
 def _decode_heic(data: bytes, max_pixels: int) -> Decoded:
@@ -304,15 +399,12 @@ def _decode_heic(data: bytes, max_pixels: int) -> Decoded:
         array = np.array(heif)
     except _HEIC_ERRORS as error:
         raise _unreadable_error("heic") from error
-    exif, xmp = heif.info.get("exif"), heif.info.get("xmp")
-    file_info = FileInfo(
-        format_name="heic",
-        bits=heif.info.get("bit_depth", 8),
-        icc=_heic_profile(heif, data),
-        exif=metadata.upright_exif(exif) if exif else None,
-        xmp=metadata.upright_xmp(xmp) if xmp else None,
-    )
-    return split_alpha(_full_scale(array.reshape(*array.shape[:2], -1), file_info.bits), file_info)
+    packet = heif.info.get("xmp")
+    file_info = FileInfo("heic", heif.info.get("bit_depth", 8), icc=_heic_profile(heif, data))
+    packets = [packet] if packet else []
+    file_info = _with_exif_and_xmp(file_info, data, heif.info.get("exif"), packets, heif.size)
+    decoded = split_alpha(_full_scale(array.reshape(*array.shape[:2], -1), file_info.bits), file_info)
+    return _with_straight_alpha(decoded) if "a" in heif.mode else decoded
 
 
 # --- arrays
@@ -323,6 +415,16 @@ _TRANSPOSED = (5, 6, 7, 8)
 def _full_scale(array: Stored, bits: int) -> Stored:
     """Copies the upper bits of 10- and 12-bit values to the lower ones, so that white is 65535."""
     return array | array >> bits if bits in (10, 12) else array
+
+
+def _with_straight_alpha(image: Decoded) -> Decoded:
+    """Divides colours by alpha. The colours of transparent pixels stay."""
+    if image.alpha is None:
+        return image
+    white = np.iinfo(image.pixels.dtype).max
+    divisor = np.where(image.alpha > 0, image.alpha, white)[..., None].astype(np.float64)
+    straight = np.rint(np.minimum(image.pixels * (white / divisor), white)).astype(image.pixels.dtype)
+    return replace(image, pixels=straight)
 
 
 def apply_orientation(array: Stored, orientation: int) -> Stored:

@@ -12,15 +12,15 @@ from numpy.typing import NDArray
 
 from brewster.errors import UnsupportedPhoto
 from brewster.image_formats import FORMATS, WRITABLE
-from brewster.photo import metadata
+from brewster.photo import metadata, tiff_tags
 from brewster.photo.file_info import Decoded, FileInfo, library_of
 from brewster.photo.hdr_formats import write_exr, write_hdr
 
 Stored = NDArray[Any]
 
-_KEPT_METADATA = 2 | 4 | 8  # libvips flags for XMP, IPTC and ICC; EXIF is inserted unchanged afterwards
-# For AVIF, libvips also writes the EXIF item, whose content is replaced afterwards.
-_KEPT_AVIF_METADATA = _KEPT_METADATA | 1
+_KEPT_METADATA = {"avif": 1 | 2 | 8, "webp": 2 | 8}
+"""What libvips writes: EXIF (1), XMP (2) and ICC (8), by default only ICC. The other blocks are inserted unchanged afterwards, and the
+EXIF of an AVIF is replaced."""
 _DEFAULT_QUALITIES = {"jpeg": 95, "webp": 95, "avif": 90, "heic": 90}
 """Of the lossy formats. For a JPEG, only if the quality of the source is unknown. The scale of AV1 and HEVC is another one."""
 _DEFAULT_RESOLUTION = (72 / 25.4, 72 / 25.4)
@@ -52,7 +52,7 @@ def encode(pixels: Stored, alpha: Stored | None, file_info: FileInfo, quality: i
     array = pixels if alpha is None else np.concatenate([pixels, alpha[..., None]], axis=2)
     if file_info.format_name == "heic":
         return _encode_heic(array, file_info, quality)
-    return _with_exif(_encode_vips(array, file_info, quality), array, file_info)
+    return _with_metadata(_encode_vips(array, file_info, quality), array, file_info)
 
 
 def _encode_vips(array: Stored, file_info: FileInfo, quality: int) -> bytes:
@@ -62,13 +62,11 @@ def _encode_vips(array: Stored, file_info: FileInfo, quality: int) -> bytes:
     image = pyvips.Image.new_from_array(array, interpretation=spaces[channels >= 3])
     image = image.copy(xres=across, yres=down)
     image.set_type(pyvips.GValue.gstr_type, "resolution-unit", "in")
-    blobs = {"icc-profile-data": file_info.icc, "xmp-data": file_info.xmp, "iptc-data": file_info.iptc}
-    if file_info.format_name == "avif":
-        blobs["exif-data"] = file_info.exif
+    blobs = {"icc-profile-data": file_info.icc, "xmp-data": file_info.xmp, "exif-data": file_info.exif}
     for name, blob in blobs.items():
         if blob is not None:
             image.set_type(pyvips.GValue.blob_type, name, blob)
-    keep = _KEPT_AVIF_METADATA if file_info.format_name == "avif" else _KEPT_METADATA
+    keep = _KEPT_METADATA.get(file_info.format_name, 8)
     vips_name = FORMATS[file_info.format_name].vips_name or file_info.format_name
     save = getattr(image, f"{vips_name}save_buffer")
     try:
@@ -102,22 +100,23 @@ def _save_options(file_info: FileInfo, dtype: np.dtype[Any], quality: int) -> di
     return {"compression": compression, "predictor": predictor, "Q": 95, "resunit": "inch"}
 
 
-def _with_exif(data: bytes, array: Stored, file_info: FileInfo) -> bytes:
-    if file_info.format_name == "jpeg":
-        per_mm = file_info.resolution_px_per_mm
-        per_inch = per_mm and (25.4 * per_mm[0], 25.4 * per_mm[1])
-        return metadata.with_jpeg_head(data, file_info.exif, per_inch)
+def _with_metadata(data: bytes, array: Stored, file_info: FileInfo) -> bytes:
+    match file_info.format_name:
+        case "jpeg":
+            per_mm = file_info.resolution_px_per_mm
+            per_inch = per_mm and (25.4 * per_mm[0], 25.4 * per_mm[1])
+            return metadata.with_jpeg_head(data, file_info, per_inch)
+        case "png":
+            return metadata.with_png_chunks(data, file_info)
+        case "tiff":
+            tags = metadata.tiff_tags_of(file_info)
+            return tiff_tags.with_tags(data, tags) if tags else data
     if file_info.exif is None:
         return data
-    match file_info.format_name:
-        case "png":
-            return metadata.with_png_exif(data, file_info.exif)
-        case "webp":
-            size = (array.shape[1], array.shape[0])
-            return metadata.with_webp_exif(data, file_info.exif, size, has_alpha=array.shape[2] in (2, 4))
-        case "avif":
-            return metadata.with_avif_exif(data, file_info.exif)
-    return metadata.with_tiff_exif(data, file_info.exif)
+    if file_info.format_name == "avif":
+        return metadata.with_avif_exif(data, file_info.exif)
+    size = (array.shape[1], array.shape[0])
+    return metadata.with_webp_exif(data, file_info.exif, size, has_alpha=array.shape[2] in (2, 4))
 
 
 def _encode_heic(array: Stored, file_info: FileInfo, quality: int) -> bytes:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from numpy.typing import NDArray
@@ -26,7 +26,10 @@ class FileInfo:
     exif: bytes | None = None
     """The EXIF block without the leading `Exif\\0\\0`. Its orientation is set to 1."""
     xmp: bytes | None = None
-    iptc: bytes | None = None
+    image_resources: bytes | None = None
+    """The image resources of Photoshop, such as the IPTC block, without thumbnails."""
+    texts: tuple[bytes, ...] = ()
+    """The chunks with texts of a PNG, or the comment segments of a JPEG."""
     resolution_px_per_mm: tuple[float, float] | None = None
     """Horizontal and vertical resolution."""
     jpeg_quality: int | None = None
@@ -56,6 +59,11 @@ class Decoded:
     pixels: NDArray[Any]
     alpha: NDArray[Any] | None
     file_info: FileInfo
+
+
+def with_notes(file_info: FileInfo, *notes: str) -> FileInfo:
+    """Adds notes on what changed when the file was read."""
+    return replace(file_info, note="; ".join(filter(None, (file_info.note, *notes))) or None)
 
 
 def library_of(format_name: str) -> Any:  # noqa: ANN401  (these libraries have no types)

@@ -6,28 +6,17 @@ from __future__ import annotations
 
 import io
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from brewster.errors import UnreadablePhoto, UnsupportedPhoto
+from brewster.photo.colour import valid_chromaticities
 from brewster.photo.file_info import Decoded, FileInfo, check_pixel_count, library_of
 
 Float32 = NDArray[np.float32]
-
-
-def _valid_chromaticities(chromaticities: Sequence[float | str]) -> tuple[float, ...] | None:
-    """Returns None if they form no triangle: some programs write none, or zeros."""
-    try:
-        points = np.array(chromaticities, np.float64).reshape(4, 2)
-    except ValueError:
-        return None
-    red, green, blue, _ = points
-    area = np.linalg.det([green - red, blue - red])
-    is_gamut = np.isfinite(points).all() and points[:, 1].all() and abs(area) > 1e-6
-    return tuple(points.ravel().tolist()) if is_gamut else None
 
 
 # --- OpenEXR
@@ -67,11 +56,13 @@ def _exr_pixels(channels: dict[str, NDArray[Any]], header: dict[str, Any]) -> De
         )
     is_half = all(channels[name].dtype == np.float16 for name in names)
     attributes = {key: value for key, value in header.items() if key not in ("channels", "tiles", "type")}
-    primaries = _valid_chromaticities(header.get("chromaticities", ()))
+    primaries = valid_chromaticities(header.get("chromaticities", ()))
+    alpha = channels["A"].astype(np.float32) if "A" in channels else None
+    pixels = np.stack([channels[name].astype(np.float32) for name in names], axis=2)
+    if alpha is not None:  # colours are multiplied by alpha ("Technical Introduction to OpenEXR")
+        pixels /= np.where(alpha > 0, alpha, 1)[..., None]
     return Decoded(
-        np.stack([channels[name].astype(np.float32) for name in names], axis=2),
-        channels["A"].astype(np.float32) if "A" in channels else None,
-        FileInfo("exr", 16 if is_half else 32, primaries=primaries, header=attributes),
+        pixels, alpha, FileInfo("exr", 16 if is_half else 32, primaries=primaries, header=attributes)
     )
 
 
@@ -79,9 +70,11 @@ def write_exr(image: Decoded) -> bytes:
     """Encodes an EXR in half (16 `bits`) or single precision (32 `bits`), with the attributes of the source."""
     exr = library_of("exr")
     names = "RGB" if image.pixels.shape[2] == 3 else "Y"
-    planes = {name: image.pixels[..., i] for i, name in enumerate(names)}
-    if image.alpha is not None:
-        planes["A"] = image.alpha
+    alpha = image.alpha
+    pixels = image.pixels if alpha is None else image.pixels * np.where(alpha > 0, alpha, 1)[..., None]
+    planes = {name: pixels[..., i] for i, name in enumerate(names)}
+    if alpha is not None:
+        planes["A"] = alpha
     header = {
         "compression": exr.ZIP_COMPRESSION,
         **(image.file_info.header or {}),
@@ -184,7 +177,7 @@ def read_hdr(data: bytes, max_pixels: int) -> Decoded:
         key, equals_sign, value = line.partition("=")
         if equals_sign and not line.startswith("FORMAT"):
             header[key] = _product(header[key], value) if key in _FACTORS and key in header else value
-    primaries = _valid_chromaticities(header.get("PRIMARIES", "").split())
+    primaries = valid_chromaticities(header.get("PRIMARIES", "").split())
     file_info = FileInfo("hdr", bits=32, header=header, primaries=primaries)
     rgbe = _scan_lines(body, width, height)
     exponent = rgbe[..., 3].astype(np.int32)

@@ -6,22 +6,23 @@ stEvt:*)."""
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
 import html
 import os
 import re
 import struct
-import zlib
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
+from mmap import ACCESS_READ, mmap
 from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO, Final
 from xml.sax.saxutils import quoteattr
 
 import brewster
 from brewster.photo.file_info import FileInfo
-from brewster.photo.metadata import first_directory, png_chunks
+from brewster.photo.metadata import read_xmp
+from brewster.photo.tiff_tags import first_directory
+from brewster.photo.xmp import RDF_END
 
 if TYPE_CHECKING:
     from brewster.photo.photo import Photo
@@ -39,7 +40,7 @@ _PACKET = """<?xpacket begin="\ufeff" id="W5M0MpCehiHzreSzNTczkc9d"?>
 <rdf:Description rdf:about="" xmlns:xmp="http://ns.adobe.com/xap/1.0/" xmp:CreatorTool={software}/>
 </rdf:RDF></x:xmpmeta>
 <?xpacket end="w"?>"""
-_HISTORY = """<rdf:Description rdf:about={about} xmlns:xmpMM="http://ns.adobe.com/xap/1.0/mm/"><xmpMM:History><rdf:Seq>
+_HISTORY = """<rdf:Description xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#" rdf:about={about} xmlns:xmpMM="http://ns.adobe.com/xap/1.0/mm/"><xmpMM:History><rdf:Seq>
 {entry}</rdf:Seq></xmpMM:History></rdf:Description>
 """
 _ENTRY = (
@@ -53,11 +54,14 @@ def with_history(file_info: FileInfo, software: str, parameters: Mapping[str, st
     options by name. Names and values contain neither "; " nor "="."""
     text = "; ".join(f"{name}={value}" for name, value in parameters.items())
     entry = _ENTRY.format(software=quoteattr(software), parameters=quoteattr(text)).encode()
-    packet = file_info.xmp or _PACKET.format(software=quoteattr(software)).encode()
+    packet = file_info.xmp or b""
+    if not RDF_END.search(packet):  # there is none, or it is damaged
+        packet = _PACKET.format(software=quoteattr(software)).encode()
     exif = file_info.exif and _with_exif_software(file_info.exif, software)
-    if history := re.search(rb"<xmpMM:History>.*?(?=</rdf:Seq>)", packet, re.DOTALL):
+    if history := re.search(rb"<xmpMM:History>(?:(?!</xmpMM:History>).)*(?=</rdf:Seq>)", packet, re.DOTALL):
         packet = packet[: history.end()] + entry + packet[history.end() :]
-    elif (end := packet.rfind(b"</rdf:RDF>")) >= 0:  # a block without an RDF element stays unchanged
+    else:
+        end = [*RDF_END.finditer(packet)][-1].start()
         # all descriptions are of the same resource
         about = re.search(rb"""rdf:about=("[^"]*"|'[^']*')""", packet)
         block = _HISTORY.encode().replace(b"{about}", about[1] if about else b'""').replace(b"{entry}", entry)
@@ -97,16 +101,12 @@ def sampled_digest(file: BinaryIO) -> str:
 
 def recorded_parameters(path: Path, program: str) -> dict[str, str] | None:
     """Returns the parameters of the last step of a program in the history of a file, or None if there is no such step.
-    Only the first 256 KiB are read, and the last 256 KiB if the first contain no such step: all writers put the
-    metadata there."""
+    Of an AVIF, HEIC or contact sheet, only the first and the last 256 KiB are read: all writers put the metadata there."""
     try:
-        with path.open("rb") as file:
-            head = file.read(_SEARCHED_BYTES)
-            if (found := _last_parameters(head, program)) is not None:
-                return found
-            file.seek(max(path.stat().st_size - _SEARCHED_BYTES, len(head)))
-            return _last_parameters(head + file.read(), program)
-    except OSError:
+        with path.open("rb") as file, mmap(file.fileno(), 0, access=ACCESS_READ) as data:
+            packets = read_xmp(data) or [data[:_SEARCHED_BYTES], data[max(len(data) - _SEARCHED_BYTES, 0) :]]
+            return _last_parameters(b"".join(packets), program)
+    except (OSError, ValueError):  # the file is empty
         return None
 
 
@@ -128,14 +128,6 @@ def find_layer_of_another_photo(photo: Path, layers: Iterable[Path]) -> Path | N
 
 
 def _last_parameters(data: bytes, program: str) -> dict[str, str] | None:
-    if data.startswith(b"\x89PNG"):
-        # libvips writes the XMP block as compressed text (PNG 11.3.3.3, zTXt). Other programs write it uncompressed (iTXt), as
-        # the XMP specification, part 3, requires.
-        for kind, chunk in png_chunks(data):
-            keyword, _, text = chunk.partition(b"\0")
-            if kind == b"zTXt" and keyword == b"XML:com.adobe.xmp":
-                with contextlib.suppress(zlib.error):
-                    data += zlib.decompress(text[1:])
     agent = re.escape(program.encode())
     found = re.findall(rb'stEvt:softwareAgent="' + agent + rb' [^"]*" stEvt:parameters="([^"]*)"', data)
     if not found:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from brewster import srgb
 from brewster.errors import MissingExtra, PhotoError, UnsupportedPhoto
 from brewster.image_formats import WRITABLE
-from brewster.photo import metadata
+from brewster.photo import tiff_tags
 from brewster.photo.decode import apply_orientation, split_alpha
 from brewster.photo.file_info import Decoded, FileInfo
 
@@ -138,13 +138,14 @@ def decode_pil(image: Any) -> Decoded:  # noqa: ANN401  (Pillow is optional, so 
     array = np.asarray(image).reshape(image.height, image.width, -1)
     if image.mode == "I;16" and transparency is not None:  # Pillow has no mode for 16-bit grey with alpha
         array = np.concatenate([array, np.where(array == transparency, 0, 65535).astype(array.dtype)], axis=2)
+    array = apply_orientation(array, tiff_tags.orientation_of(exif or b""))
     file_info = FileInfo(
         format_name=format_name if format_name in WRITABLE else "png",
         bits=16 if image.mode == "I;16" else 8,
         icc=icc or None,
-        exif=metadata.upright_exif(exif) if exif else None,
+        exif=tiff_tags.upright_exif(exif, (array.shape[1], array.shape[0])) if exif else None,
     )
-    return split_alpha(apply_orientation(array, metadata.orientation_of(exif or b"")), file_info)
+    return split_alpha(array, file_info)
 
 
 def pil_image(pixels: Stored, alpha: Stored | None, file_info: FileInfo) -> Any:  # noqa: ANN401

@@ -1,27 +1,29 @@
-"""Reads and writes metadata as bytes: JPEG tables, EXIF, PNG and WebP chunks.
-
-libvips writes EXIF with libexif, which drops unknown tags, and libvips ignores EXIF in TIFF files. This module copies
-the EXIF block of the source with all its tags; only the orientation and the thumbnail change. A block begins at its
-TIFF header, without the "Exif\\0\\0" of JPEG."""
+"""Reads and writes metadata as bytes: JPEG segments, PNG and WebP chunks, AVIF items, and the image resources of Photoshop."""
 
 from __future__ import annotations
 
+import contextlib
 import re
 import struct
 import zlib
 from collections.abc import Iterator
+from mmap import mmap
 
 from brewster.errors import UnsupportedPhoto
+from brewster.photo.file_info import FileInfo
+from brewster.photo.tiff_tags import EXIF_NAME, Tags, camera_tags, read_tags, value_of
+from brewster.photo.xmp import guid_of, split_xmp
 
 # --- JPEG (ITU-T T.81 annex B)
 
-_EXIF_NAME = b"Exif\0\0"
-_APP0, _APP1, _DQT, _SOS = 0xE0, 0xE1, 0xDB, 0xDA
+_APP0, _APP1, _APP13, _DQT, _SOS, _COM = 0xE0, 0xE1, 0xED, 0xDB, 0xDA, 0xFE
+_XMP_NAME, _EXTENDED_XMP_NAME = b"http://ns.adobe.com/xap/1.0/\0", b"http://ns.adobe.com/xmp/extension/\0"
+_RESOURCES_NAME = b"Photoshop 3.0\0"
 _FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 _MAX_SEGMENT_PAYLOAD = 65533  # bytes
 
 
-def jpeg_segments(data: bytes) -> Iterator[tuple[int, int, bytes]]:
+def jpeg_segments(data: bytes | mmap) -> Iterator[tuple[int, int, bytes]]:
     """Yields the marker, the position and the payload of each segment before the pixel data."""
     position = 2
     while position + 4 <= len(data) and data[position] == 0xFF:
@@ -37,8 +39,31 @@ def jpeg_segments(data: bytes) -> Iterator[tuple[int, int, bytes]]:
 
 def jpeg_exif(data: bytes) -> bytes:
     """Returns the EXIF block of a JPEG, or no bytes if there is no block."""
-    blocks = (payload for marker, _, payload in jpeg_segments(data) if marker == _APP1)
-    return next((block[len(_EXIF_NAME) :] for block in blocks if block.startswith(_EXIF_NAME)), b"")
+    return next(iter(_named_segments(data, _APP1, EXIF_NAME)), b"")
+
+
+def jpeg_comments(data: bytes) -> list[bytes]:
+    """Returns the segments of the comments of a JPEG."""
+    return [_segment(_COM, payload) for marker, _, payload in jpeg_segments(data) if marker == _COM]
+
+
+def _named_segments(data: bytes | mmap, marker: int, name: bytes) -> list[bytes]:
+    """Returns the content of the segments that begin with a name."""
+    found = (payload for kind, _, payload in jpeg_segments(data) if kind == marker)
+    return [payload[len(name) :] for payload in found if payload.startswith(name)]
+
+
+def _jpeg_xmp(data: bytes | mmap) -> list[bytes]:
+    """Returns the XMP packet of a JPEG, and the extended packet to which it refers if all of it is in the file."""
+    packets = _named_segments(data, _APP1, _XMP_NAME)[:1]
+    parts: dict[int, bytes] = {}
+    size = 0
+    for payload in _named_segments(data, _APP1, _EXTENDED_XMP_NAME) if packets else ():
+        if payload[:32] in packets[0]:  # the digest of the extended packet
+            size, position = struct.unpack_from(">II", payload.ljust(40, b"\0"), 32)
+            parts[position] = payload[40:]
+    extended = b"".join(part for _, part in sorted(parts.items()))
+    return [*packets, extended] if extended and len(extended) == size else packets
 
 
 def jpeg_quantization_sums(data: bytes) -> dict[int, int]:
@@ -64,16 +89,30 @@ def jpeg_subsampling(data: bytes) -> str | None:
     return None
 
 
-def with_jpeg_head(data: bytes, exif: bytes | None, dots_per_inch: tuple[float, float] | None) -> bytes:
-    """Inserts a JFIF segment with the resolution, and an EXIF segment, into a JPEG without these segments. Raises
+def with_jpeg_head(data: bytes, file_info: FileInfo, dots_per_inch: tuple[float, float] | None) -> bytes:
+    """Inserts segments with the resolution (JFIF), EXIF, XMP, image resources and comments into a JPEG without them. Raises
     UnsupportedPhoto if the EXIF block is larger than a segment, 64 KiB."""
-    head = b""
+    head = []
     if dots_per_inch is not None:
         across, down = (min(max(round(dots), 1), 65535) for dots in dots_per_inch)
-        head += _segment(_APP0, b"JFIF\0" + struct.pack(">HBHHBB", 0x0101, 1, across, down, 0, 0))
-    if exif is not None:
-        head += _segment(_APP1, _EXIF_NAME + exif)
-    return b"".join((data[:2], head, data[2:]))
+        head.append(_segment(_APP0, b"JFIF\0" + struct.pack(">HBHHBB", 0x0101, 1, across, down, 0, 0)))
+    if file_info.exif is not None:
+        head.append(_segment(_APP1, EXIF_NAME + file_info.exif))
+    main, extended = split_xmp(file_info.xmp or b"", _MAX_SEGMENT_PAYLOAD - len(_XMP_NAME))
+    if main:
+        head.append(_segment(_APP1, _XMP_NAME + main))
+    name = _EXTENDED_XMP_NAME + guid_of(extended).encode()
+    for position, part in _parts(extended, _MAX_SEGMENT_PAYLOAD - len(name) - 8):
+        head.append(_segment(_APP1, name + struct.pack(">II", len(extended), position) + part))
+    resources = _parts(file_info.image_resources or b"", _MAX_SEGMENT_PAYLOAD - len(_RESOURCES_NAME))
+    head += [_segment(_APP13, _RESOURCES_NAME + part) for _, part in resources]
+    head += [text for text in file_info.texts if text.startswith(bytes((0xFF, _COM)))]
+    return b"".join((data[:2], *head, data[2:]))
+
+
+def _parts(data: bytes, size: int) -> list[tuple[int, bytes]]:
+    """Returns parts of at most `size` bytes with their positions."""
+    return [(position, data[position : position + size]) for position in range(0, len(data), size)]
 
 
 def _segment(marker: int, payload: bytes) -> bytes:
@@ -86,27 +125,119 @@ def _segment(marker: int, payload: bytes) -> bytes:
     return struct.pack(">BBH", 0xFF, marker, len(payload) + 2) + payload
 
 
+# --- Image resources of Photoshop (Adobe Photoshop File Formats Specification); number 1028 is the IPTC block
+
+_IPTC = 1028
+_THUMBNAILS = (1033, 1036)  # they show the input
+
+
+def jpeg_image_resources(data: bytes) -> bytes | None:
+    """Returns the image resources of a JPEG, without thumbnails."""
+    return _serialise_resources(_resources(b"".join(_named_segments(data, _APP13, _RESOURCES_NAME))))
+
+
+def tiff_image_resources(tags: Tags) -> bytes | None:
+    """Returns the image resources of a TIFF, without thumbnails. The IPTC block is that of its own tag, if there is one."""
+    resources = _resources(value_of(tags, 34377) or b"")
+    if iptc := value_of(tags, 33723):
+        if iptc[:1] != b"\x1c" and iptc[3:4] == b"\x1c":  # written as integers in the other byte order
+            iptc = b"".join(iptc[i : i + 4][::-1] for i in range(0, len(iptc), 4))
+        resources[_IPTC] = bytes(2), iptc[: _iptc_size(iptc)]
+    return _serialise_resources(resources)
+
+
+def _iptc_size(iptc: bytes) -> int:
+    """Returns the size without the padding to whole integers. A data set has the marker 1C, two numbers and its size."""
+    position = 0
+    while iptc[position : position + 1] == b"\x1c" and position + 5 <= len(iptc):
+        position += 5 + int.from_bytes(iptc[position + 3 : position + 5], "big")
+    return position if 0 < position <= len(iptc) else len(iptc)
+
+
+def tiff_tags_of(file_info: FileInfo) -> Tags:
+    """Returns the tags of a TIFF for EXIF, XMP, the image resources and IPTC."""
+    resources = _resources(file_info.image_resources or b"")
+    _, iptc = resources.pop(_IPTC, (b"", b""))
+    blocks = {700: (1, file_info.xmp), 33723: (7, iptc), 34377: (1, _serialise_resources(resources))}
+    tags = camera_tags(read_tags(file_info.exif)) if file_info.exif else {}
+    return tags | {tag: (kind, len(block), block) for tag, (kind, block) in blocks.items() if block}
+
+
+def _resources(block: bytes) -> dict[int, tuple[bytes, bytes]]:
+    """Returns the name and the content of each image resource by its number."""
+    found, position = {}, 0
+    while block[position : position + 4] == b"8BIM" and position + 12 <= len(block):
+        name_end = position + 6 + (block[position + 6] + 2) // 2 * 2
+        start = name_end + 4
+        size = int.from_bytes(block[name_end:start], "big")
+        number = int.from_bytes(block[position + 4 : position + 6], "big")
+        found[number] = block[position + 6 : name_end], block[start : start + size]
+        position = start + size + size % 2
+    return found
+
+
+def _serialise_resources(resources: dict[int, tuple[bytes, bytes]]) -> bytes | None:
+    rows = [
+        b"8BIM"
+        + struct.pack(">H", number)
+        + name
+        + struct.pack(">I", len(content))
+        + content
+        + bytes(len(content) % 2)
+        for number, (name, content) in resources.items()
+        if number not in _THUMBNAILS
+    ]
+    return b"".join(rows) or None
+
+
 # --- PNG and WebP chunks
 
+_TEXT_CHUNKS = (b"tEXt", b"zTXt", b"iTXt")
+_PNG_XMP_NAME = b"XML:com.adobe.xmp\0"
 
-def png_chunks(data: bytes) -> Iterator[tuple[bytes, bytes]]:
-    """Yields the name and the content of each chunk of a PNG before its pixel data."""
+
+def png_chunks(data: bytes | mmap) -> Iterator[tuple[bytes, bytes]]:
+    """Yields the name and the content of each chunk of a PNG except its pixel data."""
     position = 8
-    while position + 8 <= len(data) and data[position + 4 : position + 8] != b"IDAT":
-        size = int.from_bytes(data[position : position + 4], "big")
-        yield data[position + 4 : position + 8], data[position + 8 : position + 8 + size]
+    while position + 8 <= len(data):
+        size, name = int.from_bytes(data[position : position + 4], "big"), data[position + 4 : position + 8]
+        if name != b"IDAT":
+            yield name, data[position + 8 : position + 8 + size]
         position += 12 + size
 
 
-def with_png_exif(data: bytes, exif: bytes) -> bytes:
-    """Inserts an eXIf chunk into a PNG after its header chunk."""
+def png_texts(data: bytes) -> list[bytes]:
+    """Returns the chunks with texts of a PNG, except XMP."""
+    texts = ((name, content) for name, content in png_chunks(data) if name in _TEXT_CHUNKS)
+    return [_chunk(name, content) for name, content in texts if not content.startswith(_PNG_XMP_NAME)]
+
+
+def _png_xmp(data: bytes | mmap) -> list[bytes]:
+    """The XMP specification, part 3, requires uncompressed text (iTXt); libvips writes compressed text (zTXt)."""
+    for name, content in png_chunks(data):
+        if name in _TEXT_CHUNKS and content.startswith(_PNG_XMP_NAME):
+            text = content[len(_PNG_XMP_NAME) :]
+            is_compressed = name == b"zTXt" or text[:1] == b"\1"
+            text = {b"tEXt": text, b"zTXt": text[1:]}.get(name) or text[2:].split(b"\0", 2)[-1]
+            with contextlib.suppress(zlib.error):
+                return [zlib.decompress(text) if is_compressed else text]
+    return []
+
+
+def with_png_chunks(data: bytes, file_info: FileInfo) -> bytes:
+    """Inserts chunks with EXIF, XMP and texts into a PNG after its header chunk."""
     position = 8 + 12 + 13  # signature, and the header chunk: 12 bytes and 13 bytes of data
-    chunk = b"eXIf" + exif
-    sized = struct.pack(">I", len(exif)) + chunk + struct.pack(">I", zlib.crc32(chunk))
-    return b"".join((data[:position], sized, data[position:]))
+    exif = [_chunk(b"eXIf", file_info.exif)] if file_info.exif else []
+    xmp = [_chunk(b"iTXt", _PNG_XMP_NAME + bytes(4) + file_info.xmp)] if file_info.xmp else []
+    texts = [text for text in file_info.texts if text[4:8] in _TEXT_CHUNKS]
+    return b"".join((data[:position], *exif, *xmp, *texts, data[position:]))
 
 
-def webp_chunks(data: bytes) -> dict[bytes, bytes]:
+def _chunk(name: bytes, content: bytes) -> bytes:
+    return struct.pack(">I", len(content)) + name + content + struct.pack(">I", zlib.crc32(name + content))
+
+
+def webp_chunks(data: bytes | mmap) -> dict[bytes, bytes]:
     """Returns the chunks of a WebP by name."""
     found, position = {}, 12
     while position + 8 <= len(data):
@@ -130,17 +261,33 @@ def with_webp_exif(data: bytes, exif: bytes, size: tuple[int, int], has_alpha: b
     return b"RIFF" + struct.pack("<I", len(body) + 4) + b"WEBP" + body
 
 
-def cicp(data: bytes) -> tuple[int, int, int] | None:
-    """Returns the code points (CICP, ITU-T H.273) of primaries, transfer function and matrix of an AVIF, HEIC or PNG.
-    Returns None for a file without code points."""
+def read_xmp(data: bytes | mmap) -> list[bytes]:
+    """Returns the XMP packet of a JPEG, PNG, WebP or TIFF of one page, if there is one, and the extended packet of a JPEG."""
+    if data[:2] == b"\xff\xd8":
+        return _jpeg_xmp(data)
+    if data[:4] == b"\x89PNG":
+        return _png_xmp(data)
+    packet = webp_chunks(data).get(b"XMP ") if data[:4] == b"RIFF" else value_of(read_tags(data), 700)
+    return [packet] if packet else []
+
+
+def cicp(data: bytes) -> tuple[int, int, int, bool] | None:
+    """Returns the code points (CICP, ITU-T H.273) of primaries, transfer function and matrix of an AVIF, HEIC or PNG, and
+    whether the values use the full range. Returns None for a file without code points."""
     if data.startswith(b"\x89PNG"):
         chunk = dict(png_chunks(data)).get(b"cICP", b"")
-        return (chunk[0], chunk[1], chunk[2]) if len(chunk) >= 3 else None
-    found = re.search(rb"colrnclx(.{6})", data[: 1 << 16], re.DOTALL)
-    return struct.unpack(">3H", found[1]) if found else None
+        return (chunk[0], chunk[1], chunk[2], chunk[3] == 1) if len(chunk) >= 4 else None
+    found = re.search(rb"colrnclx(.{6})(.)", data[: 1 << 16], re.DOTALL)
+    return (*struct.unpack(">3H", found[1]), found[2][0] >= 128) if found else None
 
 
-# --- AVIF items (ISO/IEC 14496-12 8.11)
+# --- Boxes of AVIF and HEIC (ISO/IEC 14496-12)
+
+
+def box(data: bytes, name: bytes) -> bytes:
+    """Returns the content of the first box with this name in the first MiB, or no bytes."""
+    found = re.search(rb"(....)" + name, data[: 1 << 20], re.DOTALL)
+    return data[found.end() : found.start() + int.from_bytes(found[1], "big")] if found else b""
 
 
 def with_avif_exif(data: bytes, exif: bytes) -> bytes:
@@ -170,142 +317,3 @@ def _item_location(data: bytes, item: bytes) -> int | None:
             return row if count == 1 else None
         position = row + 6 + 8 * count
     return None
-
-
-# --- EXIF and TIFF directories (TIFF 6.0 section 2, CIPA DC-008)
-
-Tags = dict[int, "tuple[int, int, bytes] | Tags"]
-"""The tags of a directory by number. An entry is (type, count, little-endian value), or the directory for a pointer tag."""
-
-_POINTER_TAGS = (34665, 34853, 40965)  # Exif, GPS, interoperability
-_CAMERA_TAGS = (270, 271, 272, 305, 306, 315, 33432, 34665, 34853)
-"""Camera, date, author, copyright, and the pointers to Exif and GPS."""
-_ORIENTATION = 274
-_BYTE_ORDERS = {b"II*\0": "<", b"MM\0*": ">"}
-_TIFF_HEADER_BYTES = 8  # byte order, the number 42, and the position of the first directory
-_TYPE_BYTES = {1: 1, 2: 1, 3: 2, 4: 4, 5: 4, 6: 1, 7: 1, 8: 2, 9: 4, 10: 4, 11: 4, 12: 8, 13: 4}
-_RATIONAL_TYPES = (5, 10)  # two numbers: numerator and denominator
-
-
-def read_tags(data: bytes) -> Tags:
-    """Returns the first directory of a TIFF or EXIF block with its subdirectories, or an empty dict for other data."""
-    byte_order = _BYTE_ORDERS.get(data[:4])
-    if byte_order is None or len(data) < _TIFF_HEADER_BYTES:
-        return {}
-    return _directory(data, byte_order, struct.unpack_from(byte_order + "I", data, 4)[0], _POINTER_TAGS)
-
-
-def _directory(data: bytes, byte_order: str, position: int, pointers: tuple[int, ...]) -> Tags:
-    if position + 2 > len(data):
-        return {}
-    (count,) = struct.unpack_from(byte_order + "H", data, position)
-    tags: Tags = {}
-    for row in range(position + 2, min(position + 2 + 12 * count, len(data) - 11), 12):
-        tag, kind, number = struct.unpack_from(byte_order + "HHI", data, row)
-        width = _TYPE_BYTES.get(kind, 0)
-        size = width * number * (2 if kind in _RATIONAL_TYPES else 1)
-        (offset,) = struct.unpack_from(byte_order + "I", data, row + 8)
-        start = row + 8 if size <= 4 else offset
-        if tag in pointers:
-            tags[tag] = _directory(data, byte_order, offset, tuple(p for p in pointers if p != tag))
-        elif width and start + size <= len(data):
-            value = data[start : start + size]
-            if byte_order == ">":
-                value = b"".join(value[i : i + width][::-1] for i in range(0, size, width))
-            tags[tag] = (kind, number, value)
-    return tags
-
-
-def number_of(tags: Tags, tag: int, default: int) -> int:
-    """Returns the first integer of a tag, or the default."""
-    return next(iter(numbers(tags, tag)), default)
-
-
-def pixel_data_end(tags: Tags) -> int:
-    """Returns the end position of the last strip or tile of a TIFF, or 0 if its tags contain no positions."""
-    parts = ((numbers(tags, starts), numbers(tags, sizes)) for starts, sizes in ((273, 279), (324, 325)))
-    return max((start + size for part in parts for start, size in zip(*part, strict=False)), default=0)
-
-
-def numbers(tags: Tags, tag: int) -> list[int]:
-    """Returns the integers of a tag, or an empty list if the tag is missing."""
-    entry = tags.get(tag)
-    if not isinstance(entry, tuple) or entry[0] not in (1, 3, 4):
-        return []
-    width = _TYPE_BYTES[entry[0]]
-    return [int.from_bytes(entry[2][i : i + width], "little") for i in range(0, len(entry[2]), width)]
-
-
-def orientation_of(exif: bytes) -> int:
-    """Returns the orientation 1..8 of an EXIF block, or 1 if the block has no orientation."""
-    orientation = number_of(read_tags(exif.removeprefix(_EXIF_NAME)), _ORIENTATION, 1)
-    return orientation if 1 <= orientation <= 8 else 1
-
-
-def _serialize_directory(tags: Tags, position: int) -> tuple[bytes, int]:
-    """Returns the bytes of a directory at `position` in a little-endian file, and the position of its entries."""
-    values, rows = b"", b""
-    for tag, entry in sorted(tags.items(), key=lambda item: item[0]):
-        if isinstance(entry, dict):
-            subdirectory, offset = _serialize_directory(entry, position + len(values))
-            values, entry = values + subdirectory, (4, 1, struct.pack("<I", offset))  # noqa: PLW2901
-        kind, count, value = entry
-        if len(value) > 4:
-            value_or_offset = struct.pack("<I", position + len(values))
-            values += value + bytes(len(value) % 2)
-        else:
-            value_or_offset = value.ljust(4, b"\0")
-        rows += struct.pack("<HHI", tag, kind, count) + value_or_offset
-    return values + struct.pack("<H", len(tags)) + rows + bytes(4), position + len(values)
-
-
-def tiff_exif(tags: Tags) -> bytes | None:
-    """Returns an EXIF block with the camera tags of a TIFF, or None if there are no such tags."""
-    camera: Tags = {tag: entry for tag, entry in tags.items() if tag in _CAMERA_TAGS}
-    if not camera:
-        return None
-    camera[_ORIENTATION] = (3, 1, b"\x01\0")
-    body, first = _serialize_directory(camera, 8)
-    return b"II*\0" + struct.pack("<I", first) + body
-
-
-def with_tiff_exif(data: bytes, exif: bytes) -> bytes:
-    """Adds the camera tags of an EXIF block to a little-endian TIFF of one page, in a new directory at the end of the file."""
-    tags = read_tags(data)
-    tags.update((tag, entry) for tag, entry in read_tags(exif).items() if tag in _CAMERA_TAGS)
-    start = len(data) + len(data) % 2
-    body, first = _serialize_directory(tags, start)
-    return b"".join((data[:4], struct.pack("<I", first), data[8:], bytes(len(data) % 2), body))
-
-
-def first_directory(exif: bytes) -> tuple[str, int, int]:
-    """Returns the byte order of an EXIF block for `struct`, and the start and the end of the rows of its first
-    directory. Without a directory, all values are empty or 0."""
-    byte_order = _BYTE_ORDERS.get(exif[:4])
-    if byte_order is None or len(exif) < 10:
-        return "", 0, 0
-    (position,) = struct.unpack_from(byte_order + "I", exif, 4)
-    (count,) = struct.unpack_from(byte_order + "H", exif, position) if position + 2 <= len(exif) else (0,)
-    return byte_order, position + 2, position + 2 + 12 * count
-
-
-def upright_exif(exif: bytes) -> bytes:
-    """Returns an EXIF block with orientation 1 and without the thumbnail. The result begins at the TIFF header. The
-    thumbnail shows the input before rotation and separation, so the pointer to its directory is set to 0. All other
-    bytes are unchanged."""
-    exif = exif.removeprefix(_EXIF_NAME)
-    block = bytearray(exif)
-    byte_order, first_row, next_directory = first_directory(exif)
-    for row in range(first_row, min(next_directory, len(block) - 11), 12):
-        tag, kind = struct.unpack_from(byte_order + "HH", block, row)
-        if tag == _ORIENTATION:
-            kind_format, values = ("I", (1,)) if kind == 4 else ("HH", (1, 0))
-            struct.pack_into(byte_order + kind_format, block, row + 8, *values)
-    if first_row and next_directory + 4 <= len(block):
-        struct.pack_into(byte_order + "I", block, next_directory, 0)
-    return bytes(block)
-
-
-def upright_xmp(xmp: bytes) -> bytes:
-    """Returns an XMP block with tiff:Orientation set to 1. All other bytes are unchanged."""
-    return re.sub(rb"""(tiff:Orientation(?:=["']|>))[1-8]""", rb"\g<1>1", xmp)

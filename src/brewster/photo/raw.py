@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import importlib.util
 import io
-import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -17,9 +16,9 @@ import numpy as np
 import pyvips
 from numpy.typing import NDArray
 
-from brewster.errors import UnreadablePhoto, install_command
+from brewster.errors import UnreadablePhoto, UnsupportedPhoto, install_command
 from brewster.image_formats import FORMATS
-from brewster.photo import metadata
+from brewster.photo import metadata, tiff_tags
 from brewster.photo.colour import colour_space_of
 from brewster.photo.file_info import FileInfo, check_pixel_count, library_of
 
@@ -28,34 +27,29 @@ _EXIF_TAG, _GPS_TAG = 34665, 34853
 _DAMAGED = "the RAW file cannot be read completely"
 
 
-def is_raw(tags: metadata.Tags) -> bool:
-    """Returns whether the first directory of a TIFF is that of a RAW file. A DNG has the tag DNGVersion (50706). Other
-    RAW files begin with a reduced image (NewSubfileType, bit 0), or with colour filter array data
-    (PhotometricInterpretation 32803)."""
-    is_reduced = metadata.number_of(tags, 254, 0) & 1 == 1
-    return 50706 in tags or is_reduced or metadata.number_of(tags, 262, 0) == 32803
-
-
 def read_raw(data: bytes, max_pixels: int) -> tuple[NDArray[np.uint16], FileInfo]:
     """Returns the pixels (H, W, 1|3) in Display P3, upright, and the metadata of a RAW file. Raises the errors of
     `read_raw_size`."""
     with _opened(data) as raw:
-        _upright_size(raw, max_pixels)  # checks the limit before the pixels are decoded
+        rows, columns = _upright_crop(raw, data, max_pixels)  # checks the limit before the pixels are decoded
         options = {"use_camera_wb": True, "no_auto_bright": True, "gamma": (1, 1), "output_bps": 16}
         linear = raw.postprocess(**options, output_color=library_of("raw").ColorSpace.P3D65)
     icc = bytes(pyvips.Image.profile_load("p3"))
     curve = colour_space_of(icc, None, is_float=False).curves[1]
     encoded = np.rint(65535 * np.clip(curve.encode(np.arange(65536) / 65535), 0, 1)).astype(np.uint16)
-    file_info = FileInfo(FORMATS["raw"].written_as, bits=16, icc=icc, exif=_exif(data))
-    return encoded[linear.reshape(*linear.shape[:2], -1)], file_info
+    linear = linear[rows, columns].reshape(rows.stop - rows.start, columns.stop - columns.start, -1)
+    exif = _exif(data)
+    exif = exif and tiff_tags.upright_exif(exif, (linear.shape[1], linear.shape[0]))
+    return encoded[linear], FileInfo(FORMATS["raw"].written_as, bits=16, icc=icc, exif=exif)
 
 
 def read_raw_size(data: bytes, max_pixels: int) -> tuple[int, int]:
     """Returns (width, height) of the upright image of a RAW file. Raises MissingExtra if rawpy is not installed;
     PhotoTooLarge if the image has more pixels than `max_pixels`; UnreadablePhoto if the file is damaged, or LibRaw
-    does not support the camera."""
+    does not support the camera; UnsupportedPhoto if LibRaw does not support the compression of a DNG."""
     with _opened(data) as raw:
-        return _upright_size(raw, max_pixels)
+        rows, columns = _upright_crop(raw, data, max_pixels)
+        return columns.stop - columns.start, rows.stop - rows.start
 
 
 def with_raw_suffix(error: UnreadablePhoto, suffix: str) -> UnreadablePhoto:
@@ -79,19 +73,34 @@ def _opened(data: bytes) -> Iterator[Any]:
         with rawpy.imread(io.BytesIO(data)) as raw:
             yield raw
     except rawpy.LibRawError as error:
+        version = f"LibRaw {'.'.join(map(str, rawpy.libraw_version))}"
+        if unsupported := tiff_tags.compressions(data) & tiff_tags.COMPRESSION_NAMES.keys():
+            raise UnsupportedPhoto(
+                f"this DNG is compressed with {tiff_tags.COMPRESSION_NAMES[min(unsupported)]}, which {version} does not support",
+                "expected a DNG without compression, or with that of JPEG",
+                "convert the file to such a DNG or to TIFF, for example with Adobe DNG Converter",
+            ) from error
         raise UnreadablePhoto(
             _DAMAGED,
-            f"expected a complete RAW file of a camera that LibRaw {'.'.join(map(str, rawpy.libraw_version))} supports",
+            f"expected a complete RAW file of a camera that {version} supports",
             "copy the file again from the camera, or convert it to DNG or TIFF",
         ) from error
 
 
-def _upright_size(raw: Any, max_pixels: int) -> tuple[int, int]:  # noqa: ANN401  (rawpy has no types)
+def _upright_crop(raw: Any, data: bytes, max_pixels: int) -> tuple[slice, slice]:  # noqa: ANN401  (rawpy has no types)
+    """Returns the rows and columns of the upright image that a photo has: all, or those of the default crop of a DNG."""
     sizes = raw.sizes
-    is_transposed = sizes.flip in (4, 5, 6, 7)  # LibRaw's code: bit 2 swaps rows and columns
-    width, height = (sizes.iheight, sizes.iwidth) if is_transposed else (sizes.iwidth, sizes.iheight)
+    height, width = sizes.iheight, sizes.iwidth
     check_pixel_count(width, height, max_pixels)
-    return width, height
+    rows, columns = slice(0, height), slice(0, width)
+    if crop := tiff_tags.default_crop(data):
+        left, top, crop_width, crop_height = crop
+        if crop_width and crop_height and left + crop_width <= width and top + crop_height <= height:
+            rows, columns = slice(top, top + crop_height), slice(left, left + crop_width)
+    # LibRaw's code for the orientation: bit 0 mirrors columns, bit 1 mirrors rows, and then bit 2 swaps them
+    columns = slice(width - columns.stop, width - columns.start) if sizes.flip & 1 else columns
+    rows = slice(height - rows.stop, height - rows.start) if sizes.flip & 2 else rows
+    return (columns, rows) if sizes.flip & 4 else (rows, columns)
 
 
 # --- EXIF
@@ -100,22 +109,16 @@ def _upright_size(raw: Any, max_pixels: int) -> tuple[int, int]:  # noqa: ANN401
 def _exif(data: bytes) -> bytes | None:
     """Returns the camera tags of a RAW file as an EXIF block, without the maker note, because its offsets become invalid."""
     if data[4:8] == b"ftyp":  # CR3: one TIFF block for each directory, each in a separate box
-        blocks = {name: _box(data, name) for name in (b"CMT1", b"CMT2", b"CMT4")}
-        tags = metadata.read_tags(blocks[b"CMT1"])
+        blocks = {name: metadata.box(data, name) for name in (b"CMT1", b"CMT2", b"CMT4")}
+        tags = tiff_tags.read_tags(blocks[b"CMT1"])
         subdirectories = {_EXIF_TAG: blocks[b"CMT2"], _GPS_TAG: blocks[b"CMT4"]}
-        tags |= {tag: metadata.read_tags(block) for tag, block in subdirectories.items() if block}
+        tags |= {tag: tiff_tags.read_tags(block) for tag, block in subdirectories.items() if block}
     elif data.startswith(b"FUJIFILM"):  # RAF: the position of a JPEG with EXIF is in the header
         start, size = (int.from_bytes(data[at : at + 4], "big") for at in (84, 88))
-        tags = metadata.read_tags(metadata.jpeg_exif(data[start : start + size]))
+        tags = tiff_tags.read_tags(metadata.jpeg_exif(data[start : start + size]))
     else:  # ORF and RW2 have another number than 42 after the byte order
-        tags = metadata.read_tags(data[:2] + (b"*\0" if data[:2] == b"II" else b"\0*") + data[4:])
+        tags = tiff_tags.read_tags(data[:2] + (b"*\0" if data[:2] == b"II" else b"\0*") + data[4:])
     exif = tags.get(_EXIF_TAG)
     if isinstance(exif, dict):
         exif.pop(_MAKER_NOTE, None)
-    return metadata.tiff_exif(tags)
-
-
-def _box(data: bytes, name: bytes) -> bytes:
-    """Returns the content of the first box with this name (ISO/IEC 14496-12 4.2), or no bytes."""
-    found = re.search(rb"(....)" + name, data[: 1 << 20], re.DOTALL)
-    return data[found.end() : found.start() + int.from_bytes(found[1], "big")] if found else b""
+    return tiff_tags.tiff_exif(tags)
