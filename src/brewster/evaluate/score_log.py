@@ -10,7 +10,7 @@ from typing import Final, final
 from brewster.errors import OutputError
 
 SCORES_FILE: Final = "scores.jsonl"
-SCORE_FORMAT_VERSION: Final = 4
+SCORE_FORMAT_VERSION: Final = 5
 """Increase this version when the scores of a prediction or the fields of `ScoreRow` change. Rows of other versions are
 scored again. test_conventions_formats checks the scores."""
 

@@ -111,7 +111,7 @@ def _lpips_features_of_black(shape: tuple[int, ...]) -> Features:
 
 
 IDENTICAL_DB: Final = 100.0
-"""The PSNR that METRICS reports for identical images. Their true PSNR is infinite, which makes means infinite, too."""
+"""The PSNR that METRICS reports for identical images and channels. Their true PSNR is infinite, which makes means infinite, too."""
 
 _PSNR: Final = "10 log10(255^2 / MSE) over the three channels of 8-bit sRGB"
 _SSIM: Final = "per RGB channel of 8-bit sRGB, K1 0.01, K2 0.03, range 255"
@@ -207,7 +207,7 @@ _ROWS: Final = (
     _RMSE_ROW,
     _row("niqe", "NIQE", 2, _NIQE, lambda c: niqe(c.prediction.pixels)),
     _row("psnr_channels", "PSNR (channel mean)", 2, _CHANNELS,
-        lambda c: min(psnr_of_channels(c.prediction.pixels, c.truth.pixels), IDENTICAL_DB)),
+        lambda c: psnr_of_channels(c.prediction.pixels, c.truth.pixels, limit_db=IDENTICAL_DB)),
     _row("ssim_clipped", "SSIM (clipped)", 3, "As SSIM (Gaussian), but negative local values count as 0, as in the package pyiqa.",
         lambda c: mean_ssim(np.maximum(c.shared(_gaussian_map), 0))),
     _of_photo("lost_clipped", "Lost clipped light", 3, _CLIPPED, lost_clipped),

@@ -62,16 +62,17 @@ def count_pairs(prediction: Image, truth: Image, *, region: Region | None = None
     return np.bincount(pairs.ravel(), minlength=256 * 256)
 
 
-def psnr_of_channels(prediction: Image, truth: Image) -> float:
+def psnr_of_channels(prediction: Image, truth: Image, *, limit_db: float = np.inf) -> float:
     """Returns the mean of the PSNR of red, green and blue, as the code of ERRNet (util/index.py) and XReflection
     computes it.
 
-    The value is never below that of `psnr`, which uses one mean squared error over all channels. It is in dB, and
-    infinity if a channel is equal in both images. Higher is better. Raises ValueError as `psnr`."""
+    The value is never below that of `psnr`, which uses one mean squared error over all channels. It is in dB. A channel that is
+    equal in both images counts as `limit_db`. Higher is better. Raises ValueError as `psnr`."""
     windows.check_images(prediction, truth)
     difference = prediction.astype(np.int32) - truth
     mse = (difference * difference).mean(axis=(0, 1))
-    return float(np.mean(10 * np.log10(255**2 / mse))) if mse.all() else float("inf")
+    with np.errstate(divide="ignore"):
+        return float(np.minimum(10 * np.log10(255**2 / mse), limit_db).mean())
 
 
 def linear_rmse(prediction: Image, truth: Image, *, region: Region | None = None) -> float:
