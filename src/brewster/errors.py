@@ -8,6 +8,7 @@
     |   `-- MaskError          a mask or hints cannot be read, or do not fit their photo
     |-- ManifestError          a list of photos is not a table of paths
     |-- OutputError            an output file cannot be written, for example because it already exists
+    |   `-- DiskFull           the disk, or its quota, has no space left
     |-- ModelError             a model is unknown, damaged, or has the wrong inputs
     |-- DeviceError            the requested device is not available or has too little memory; or a cluster, a process group
     |                          or LLVM is missing
@@ -116,6 +117,10 @@ class MaskError(PhotoError):
 
 class OutputError(BrewsterError):
     """An output file cannot be written: it already exists, is read-only or is the input file, or the disk is full."""
+
+
+class DiskFull(OutputError):
+    """An output file cannot be written, because the disk, or its quota, has no space left. A batch stops."""
 
 
 class ModelError(BrewsterError):

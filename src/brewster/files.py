@@ -12,6 +12,7 @@ import os
 import re
 import secrets
 import shutil
+import stat
 import sys
 import unicodedata
 from collections.abc import Callable, Iterable, Iterator
@@ -20,7 +21,7 @@ from pathlib import Path
 
 import platformdirs
 
-from brewster.errors import OutputError
+from brewster.errors import DiskFull, OutputError
 from brewster.image_formats import FORMATS, ImageFormat, format_of
 from brewster.remote_path import Location, RemotePath
 
@@ -75,9 +76,9 @@ def images_in(
     Layers are written next to their image, or below `output_folder`, which mirrors the tree of an input folder.
 
     In folders, hidden files, layers that brewster has written, and masks next to their image (`a.mask.png` next to `a.jpg`)
-    are ignored. All other files without the suffix of an image, such as videos, are appended to `skipped`. A folder that is
-    reached through several links is visited once, so that link loops end. A file given by name is always included. If it
-    is not an image, opening it raises the error.
+    are ignored. All other files without the suffix of an image, such as videos, are appended to `skipped`, and so are pipes,
+    sockets and devices. A folder that is reached through several links is visited once, so that link loops end. A file given by
+    name is always included. If it is not an image, opening it raises the error.
     """
     for image in _image_files(source, [] if skipped is None else skipped):
         if output_folder is None or image == source:
@@ -205,7 +206,7 @@ def _sync(path: Path) -> None:
 
 def _image_files(source: Location, skipped: list[Location]) -> Iterator[Location]:
     def is_included(path: Location) -> bool:
-        if format_of(path) is None and not path.name.startswith("."):
+        if (format_of(path) is None or _is_special(path)) and not path.name.startswith("."):
             skipped.append(path)
         return _is_input(path)
 
@@ -224,7 +225,8 @@ def _image_files(source: Location, skipped: list[Location]) -> Iterator[Location
 def walk(
     folder: Path, is_included: Callable[[Path], bool], visited: set[tuple[int, int]] | None = None
 ) -> Iterator[Path]:
-    """Yields the files below a folder for which `is_included` is True, in a stable order. Hidden folders are skipped.
+    """Yields the files below a folder for which `is_included` is True, in a stable order. Hidden folders are skipped, and so are
+    pipes, sockets and devices.
 
     Links are followed. Each folder is visited once, so that link loops end: `visited` contains the device and the number of
     those that were visited before. If a folder cannot be read, its path is yielded.
@@ -243,8 +245,23 @@ def walk(
         if _is_folder(entry):
             if not entry.name.startswith("."):
                 yield from walk(entry, is_included, visited)
-        elif is_included(entry):
+        elif is_included(entry) and not _is_special(entry):
             yield entry
+
+
+def folder_entries(folder: Path) -> list[Path]:
+    """Returns the folders and the regular files in a folder, sorted. Pipes, sockets and devices are left out, because reading one
+    can wait forever; broken links are included, because opening them raises the error. Raises OSError."""
+    return sorted(entry for entry in folder.iterdir() if not _is_special(entry))
+
+
+def _is_special(path: Location) -> bool:
+    """Whether a path is that of a pipe, a socket or a device."""
+    try:
+        mode = path.stat().st_mode if isinstance(path, Path) else stat.S_IFREG
+    except OSError:
+        return False
+    return not (stat.S_ISREG(mode) or stat.S_ISDIR(mode))
 
 
 def absolute(path: Location) -> str:
@@ -346,7 +363,8 @@ def _output_error(path: Location, error: OSError) -> OutputError:
         limit = f"{_MAX_WINDOWS_PATH} characters, the limit of Windows by default"
         expected = f"expected a path of fewer than {limit}"
         cure = "choose a shorter folder with -o, or enable long paths in the settings of Windows"
-    return OutputError(f"{path} was not written ({error.strerror or error})", expected, cure)
+    kind = DiskFull if error.errno in (errno.ENOSPC, errno.EDQUOT) else OutputError
+    return kind(f"{path} was not written ({error.strerror or error})", expected, cure)
 
 
 def cache_folder() -> Path:

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Final, final
 
 from brewster.errors import PhotoError
-from brewster.files import natural_key
+from brewster.files import folder_entries, natural_key
 from brewster.image_formats import SUFFIXES
 
 ROLES: Final[dict[str, tuple[str, ...]]] = {
@@ -116,7 +116,7 @@ def list_folder(folder: Path) -> tuple[list[Path], list[Path]]:
     """Returns the folders and the files in a folder, in natural order, without hidden files and system files."""
     kinds: tuple[list[Path], list[Path]] = ([], [])
     try:
-        for path in sorted(folder.iterdir(), key=lambda path: natural_key(path.name)):
+        for path in sorted(folder_entries(folder), key=lambda path: natural_key(path.name)):
             if path.name[0] != "." and path.name.lower() not in _SYSTEM_FILES:
                 kinds[not path.is_dir()].append(path)
     except OSError as error:

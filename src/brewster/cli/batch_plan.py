@@ -40,7 +40,12 @@ def local_path(text: str) -> str:
 
 def skipped_files(files: Sequence[Location]) -> Iterator[str]:
     """Yields a line about the videos, and a line about all other files without the suffix of an image."""
-    others = [file for file in files if not is_video(file)]
+    others = [file for file in files if not is_video(file) and not format_of(file)]
+    if special := [file for file in files if format_of(file)]:
+        yield (
+            f"{listed(special, 'special file')} skipped: expected regular files, not pipes, sockets or devices; "
+            "pass a pipe by its name"
+        )
     if videos := [file for file in files if is_video(file)]:
         yield f"{listed(videos, 'video')} skipped: {VIDEO_CURE}"
     if others:

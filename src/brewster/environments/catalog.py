@@ -16,7 +16,7 @@ from brewster.environments.assets import (
     read_bytes,
 )
 from brewster.errors import BrewsterError, RecipeError, error_prefix
-from brewster.files import is_unicode
+from brewster.files import folder_entries, is_unicode
 from brewster.image_formats import format_of
 from brewster.photo import Photo, read_size
 from brewster.scene.sampler import Asset, Catalog
@@ -80,7 +80,7 @@ def _read_asset(path: Path, category: str, is_map: bool) -> Asset:
 
 def _list_files(folder: Path, are_maps: bool) -> Iterator[Path]:
     try:
-        entries = sorted(folder.iterdir())
+        entries = folder_entries(folder)
     except OSError as error:
         raise RecipeError(
             f"{folder} cannot be read ({error.strerror})",
@@ -95,6 +95,8 @@ def _list_files(folder: Path, are_maps: bool) -> Iterator[Path]:
 
 def _read_categories(folder: Path) -> dict[str, str]:
     try:
+        if folder / "manifest.csv" not in folder_entries(folder):
+            return {}
         with (folder / "manifest.csv").open(newline="", encoding="utf-8-sig") as file:
             return {row["file"]: row.get("category") or "" for row in csv.DictReader(file) if row.get("file")}
     except OSError:

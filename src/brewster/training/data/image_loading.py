@@ -15,6 +15,7 @@ from torch import Tensor
 
 from brewster.benchmarks.pairing import ImageGroup, read_folders
 from brewster.errors import PhotoError, RecipeError, error_prefix
+from brewster.files import folder_entries
 from brewster.image_formats import SUFFIXES
 from brewster.photo import Photo
 from brewster.srgb import to_encoded
@@ -139,7 +140,7 @@ def _list_images(
     paths: list[Path] = []
     for folder in folders:
         try:
-            paths += folder.iterdir()
+            paths += folder_entries(folder)
         except OSError as error:
             raise RecipeError(
                 f"{folder} cannot be read ({error.strerror})",
