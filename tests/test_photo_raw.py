@@ -10,7 +10,7 @@ from PIL import Image
 
 from brewster.errors import PhotoTooLarge, UnreadablePhoto
 from brewster.image_formats import FORMATS, format_of
-from brewster.photo import Photo, decode, metadata, raw, read_size, tiff_tags
+from brewster.photo import Photo, decode, raw, read_size, tiff_tags
 from brewster.photo.colour import colour_space_of
 from picture_files import CAMERA_NEUTRAL, dng_file, exif_block, file_of, mosaic, pil, smooth
 

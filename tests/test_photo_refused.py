@@ -169,7 +169,11 @@ def test_five_channels_and_more_are_refused(bands):
 
 @pytest.mark.parametrize("kind", [np.uint32, np.float64])
 def test_unsupported_dtypes_are_refused(kind):
-    assert_refused(tiff_of(np.zeros((4, 4, 3), kind)), PhotoError, "the tiff has (32-bit unsigned integers|64-bit floats); expected .*32-bit floats")
+    assert_refused(
+        tiff_of(np.zeros((4, 4, 3), kind)),
+        PhotoError,
+        "the tiff has (32-bit unsigned integers|64-bit floats); expected .*32-bit floats",
+    )
 
 
 def test_a_raw_file_is_never_read_as_its_preview():

@@ -40,6 +40,8 @@ class ImageFormat:
     """Whether the pixels are linear light by definition, without an ICC profile."""
     has_alpha: bool = True
     """Whether an alpha channel can be written."""
+    keeps: tuple[str, ...] = ("icc", "exif", "xmp")
+    """The metadata of a photo that its layers in this format have: names of fields of `brewster.photo.FileInfo`."""
     has_cicp: bool = False
     """Whether a file can have code points for its colour space (ITU-T H.273) instead of an ICC profile."""
     is_stored_rotated: bool = False
@@ -64,6 +66,7 @@ _ROWS: Final = (
         signature=rb"\xff\xd8\xff",
         bit_depths=(8,),
         has_alpha=False,
+        keeps=("icc", "exif", "xmp", "image_resources", "texts"),
         is_stored_rotated=True,
     ),
     ImageFormat(
@@ -72,6 +75,7 @@ _ROWS: Final = (
         mime_type="image/png",
         signature=rb"\x89PNG\r\n\x1a\n",
         bit_depths=(8, 16),
+        keeps=("icc", "exif", "xmp", "texts"),
         has_cicp=True,
         is_stored_rotated=True,
     ),
@@ -90,6 +94,7 @@ _ROWS: Final = (
         mime_type="image/tiff",
         signature=rb"II[*+]\0|MM\0[*+]",
         bit_depths=(8, 16, 32),
+        keeps=("icc", "exif", "xmp", "image_resources"),
         has_float32=True,
         is_stored_rotated=True,
     ),
@@ -128,6 +133,7 @@ _ROWS: Final = (
         library="OpenEXR",
         extra="exr",
         bit_depths=(16, 32),
+        keeps=(),
         has_float32=True,
         is_linear=True,
     ),
@@ -138,6 +144,7 @@ _ROWS: Final = (
         signature=rb"#\?(RADIANCE|RGBE)",
         library="built-in",
         bit_depths=(32,),
+        keeps=(),
         is_linear=True,
         has_alpha=False,
     ),

@@ -1,4 +1,4 @@
-"""The index of an archive: a Parquet table with one row for each photo, index.parquet in the output folder.
+"""The index of an archive: a Parquet table with one row for each photo, index.parquet in the output folder; and a CSV report of a run.
 
 About every 30 seconds, rows are written to small tables in the folder .brewster-index. At the end of the run, they are
 merged into index.parquet, together with the rows of earlier runs. A killed run loses only the rows after its last small
@@ -7,10 +7,12 @@ table."""
 from __future__ import annotations
 
 import contextlib
+import csv
 import importlib
 import io
 import time
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any, Final, final
 
 from brewster.batch.manifest import import_parquet
@@ -31,13 +33,26 @@ COLUMNS: Final[dict[str, tuple[str, Callable[[FileResult], object]]]] = {
     "verdict": ("string", lambda result: result.assessment and result.assessment.verdict),
     "confidence": ("float64", lambda result: result.assessment and result.assessment.confidence),
     "removed_light": ("float64", lambda result: result.assessment and result.assessment.removed_light),
+    "changed_area": ("float64", lambda result: result.assessment and result.assessment.changed_area),
     "residual": ("float64", lambda result: result.residual),
     "seconds": ("float64", lambda result: sum(result.seconds.values()) if result.seconds else None),
     "model_sha256": ("string", lambda result: result.model_sha256),
     "outputs": ("strings", lambda result: list(result.outputs.values())),
+    "note": ("string", lambda result: result.note),
     "error": ("string", lambda result: result.error),
 }
 """Name of a column -> its type, and the function that returns its value for a result."""
+
+REPORT_COLUMNS: Final = (
+    "path",
+    "verdict",
+    "removed_light",
+    "changed_area",
+    "seconds",
+    "status",
+    "note",
+    "error",
+)
 
 
 @final
@@ -117,6 +132,36 @@ class IndexWriter:
                 "expected no such file, or the index of an earlier run",
                 "move it to another folder, or choose another output folder",
             ) from error
+
+
+@final
+class CsvReport:
+    """A CSV table with a row for each photo of a run. `close` writes it, also after an error."""
+
+    def __init__(self, path: Path) -> None:
+        self._path, self._text = path, io.StringIO(newline="")
+        self._rows = csv.writer(self._text, lineterminator="\n")
+        self._rows.writerow(REPORT_COLUMNS)
+
+    def append(self, result: FileResult) -> None:
+        """Adds the row of a result."""
+        values = (COLUMNS[name][1](result) for name in REPORT_COLUMNS)
+        self._rows.writerow(
+            f"{value:.4f}" if isinstance(value, float) else _as_unicode(value) for value in values
+        )
+
+    def close(self) -> None:
+        """Writes the table. An earlier report is replaced. Raises OutputError."""
+        write_atomically(self._path, self._text.getvalue().encode(), overwrite=True)
+
+
+def is_report(path: Path) -> bool:
+    """Returns whether a file is a report of an earlier run, by its first line."""
+    try:
+        with path.open(encoding="utf-8", errors="replace") as file:
+            return file.readline().strip() == ",".join(REPORT_COLUMNS)
+    except OSError:
+        return False
 
 
 def _as_unicode(value: object) -> object:

@@ -28,7 +28,7 @@ def separate_in_parallel(
     """Separates the photos of the tasks, and yields the results in the order in which workers finish them. The caller
     enters the context of the executor, which runs a `SeparationRunner` in its workers; both need the same `overwrite`.
     Raises OutputError if a layer would replace a photo of the archive, or a node cannot reach the output folder, and
-    ModelError or DeviceError."""
+    ModelError, DeviceError or DiskFull."""
     inputs, has = input_paths(tasks), _file_finder()
     for task in tasks:  # a worker cannot check this, because it does not get the paths of all photos
         check_outputs(task, inputs)
@@ -68,9 +68,9 @@ class SeparationRunner:
 
     def __call__(self, task: SeparationTask) -> list[FileResult]:
         """Separates one photo. If the photo fails, its result has the status "failed". Raises ModelError, DeviceError
-        or MissingExtra if the model cannot be loaded."""
+        or MissingExtra if the model cannot be loaded, and DiskFull."""
         self._separator = self._separator or Separator.load(**self._options.load_options())
-        result = next(separate_tasks([task], self._options, self._separator, overwrite=self._overwrite))
+        (result,) = separate_tasks([task], self._options, self._separator, overwrite=self._overwrite)
         if result.error and not self._overwrite and _is_finished(task, exists):
             # This worker was slow, and another worker got the same task and has already written the layers.
             result = skipped_result(task)

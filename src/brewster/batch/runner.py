@@ -22,16 +22,17 @@ from brewster.batch.plan import (
     display_name,
     plan_files,
 )
-from brewster.errors import BrewsterError, OutputError, UnreadablePhoto, error_prefix
-from brewster.files import check_output_folder, exists, is_same_file, write_atomically
+from brewster.errors import BrewsterError, DiskFull, OutputError, UnreadablePhoto, error_prefix
+from brewster.files import LAYER_FORMATS, check_output_folder, exists, is_same_file, write_atomically
 from brewster.image_formats import HEAD_BYTES, format_of
 from brewster.inference.burst_report import burst_photo_name, check_photo_count
 from brewster.inference.predictor import ProgressCallback
 from brewster.inference.separation import Separation
 from brewster.inference.separator import Separator
 from brewster.options import Options
-from brewster.photo import Source
+from brewster.photo import Photo, Source
 from brewster.photo.decode import known_format
+from brewster.photo.file_info import lost_metadata, with_notes
 from brewster.photo.history import find_layer_of_another_photo
 from brewster.photo.in_memory import BinaryFile, WritableFile
 from brewster.remote_path import Location, RemotePath, check_not_video, check_readable, read_image
@@ -72,8 +73,8 @@ def separate_files(
         separator: the model. By default, it is loaded with `options` when the first photo needs it.
         overwrite: whether layers that exist are replaced instead of skipped.
         dry_run: if true, no file is written and no model is loaded. The results contain the paths of the missing layers. A
-            photo that does not exist, cannot be opened, is empty or is no image fails as in a real run. In an object store, this needs one request
-            for each photo.
+            photo that cannot be read completely, or is of an unsupported kind, fails as in a real run. In an object store, only the
+            existence of a photo is checked, with one request.
         on_progress: see `BatchProgressCallback`.
 
     Returns:
@@ -85,6 +86,7 @@ def separate_files(
         OutputError: the layers of two photos would have the same path, or the output folder cannot be created or written to.
         ModelError: the model does not exist or is damaged (raised during iteration).
         DeviceError: the requested device is not available (raised during iteration).
+        DiskFull: the disk is full (raised after the result of the photo whose layers could not be written).
         Exception: an unexpected exception, which is a bug in brewster. The result of its photo has the status `failed`, and
             the first such exception is raised again after the last photo."""
     tasks = plan_files(sources, output, options)
@@ -112,7 +114,7 @@ def separate_tasks(
             outputs = _missing_outputs(task, overwrite=overwrite)
             _check_folders(outputs.values())
             if task.burst or (outputs and dry_run):
-                _check_inputs(task)
+                _check_inputs(task, options.max_pixels if dry_run else None)
         except BrewsterError as error:
             yield result.failed(error)
             continue
@@ -127,6 +129,10 @@ def separate_tasks(
             missing, progress = replace(task, outputs=outputs), partial(on_progress, done, task.name)
             separate_task(missing, options, separator, result, overwrite=overwrite, on_progress=progress)
             result.outputs = _names(task.outputs)  # also the layers that existed before
+        except DiskFull as error:  # the next photos would fail, too
+            yield result.failed(error)
+            with error_prefix(task.name):
+                raise
         except BrewsterError as error:
             result.failed(error)
         except MemoryError:
@@ -162,21 +168,25 @@ def separate_task(
         separation = separator(photo, on_progress=on_progress, **options.call_options())
     result.photo_sha256, result.burst = _sha256(photo), separation.burst
     result.seconds, result.residual = dict(separation.seconds), separation.residual
-    result.assessment, result.note = separation.assessment, separation.photo.file_info.note
+    result.assessment, photo_info = separation.assessment, separation.photo.file_info
     result.reconstruction_error = separation.reconstruction_error
     result.reflection_is_derived = separation.reflection_is_derived
-    started = time.perf_counter()
+    started, notes = time.perf_counter(), dict[str, None]()
     for layer, target in task.outputs.items():
         target_format = format_of(target) if isinstance(target, Location) else None
-        source_format = separation.photo.file_info.format_name
-        format_name = target_format.name if target_format else options.format_name(layer, source_format)
+        format_name = (
+            target_format.name if target_format else options.format_name(layer, photo_info.format_name)
+        )
         encoded = getattr(separation, layer).encode(format_name)
+        if layer not in LAYER_FORMATS and (lost := lost_metadata(photo_info, format_name)):
+            notes[lost] = None
         on_progress(1.0)
         if isinstance(target, Location):
             write_atomically(target, encoded, overwrite=overwrite)
         else:
             target.write(encoded)
         result.outputs[layer] = display_name(target)
+    result.note = with_notes(photo_info, *notes).note
     result.seconds["encode"] = time.perf_counter() - started
 
 
@@ -187,18 +197,18 @@ def _check_folders(outputs: Iterable[Location | WritableFile]) -> None:
             check_output_folder(folder)  # raises the error with the reason
 
 
-def _check_inputs(task: SeparationTask) -> None:
-    """Checks that the files of a task can be read and start like an image, and are neither too few nor too many for a burst. The
-    frames of a video are not read."""
+def _check_inputs(task: SeparationTask, max_pixels: int | None) -> None:
+    """Checks that the files of a task can be read and start like an image, and are neither too few nor too many for a burst. With
+    `max_pixels`, local photos are decoded. The frames of a video are not read."""
     for index, file in enumerate(task.inputs):
         name = burst_photo_name(task.inputs, index) if len(task.inputs) > 1 else None
         with error_prefix(name), error_prefix(task.row):
-            _check_input(file, is_video=bool(task.burst and task.burst.is_from_video))
+            _check_input(file, max_pixels, is_video=bool(task.burst and task.burst.is_from_video))
     if task.burst:
         check_photo_count(task.burst.photo_count)
 
 
-def _check_input(file: Location | BinaryFile, *, is_video: bool) -> None:
+def _check_input(file: Location | BinaryFile, max_pixels: int | None, *, is_video: bool) -> None:
     if isinstance(file, Location):
         check_readable(file)
         if is_video and isinstance(file, RemotePath):
@@ -207,7 +217,11 @@ def _check_input(file: Location | BinaryFile, *, is_video: bool) -> None:
         if is_video:
             return
         check_not_video(file)
-    if isinstance(file, Path) and file.is_file():  # a pipe can be opened only once
+    if not isinstance(file, Path) or not file.is_file():  # a pipe can be opened only once
+        return
+    if max_pixels:
+        Photo.open(file, max_pixels=max_pixels)
+    else:
         with file.open("rb") as opened:
             known_format(opened.read(HEAD_BYTES))
 

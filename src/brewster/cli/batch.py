@@ -10,18 +10,18 @@ from contextlib import ExitStack, closing, suppress
 from dataclasses import KW_ONLY, asdict, dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, final
+from typing import TYPE_CHECKING, final, get_args
 
 from brewster.cli.batch_plan import listed
 from brewster.cli.terminal import interrupts, one_line, print_error, print_status, progress, write_out
-from brewster.errors import INSTALL_COMMAND, ModelError, counted
+from brewster.errors import INSTALL_COMMAND, DiskFull, ModelError, counted
 from brewster.models import zoo
 from brewster.options import Options
 from brewster.remote_path import Location, location
 
 if TYPE_CHECKING:
     from brewster.batch import FileResult, SeparationTask
-    from brewster.batch.index import IndexWriter
+    from brewster.batch.index import CsvReport, IndexWriter
     from brewster.batch.plan import Burst
     from brewster.executors.local import Executor
 
@@ -43,14 +43,16 @@ class BatchReport:
     overwrite: bool
     is_parallel: bool = False
     contact_sheet: Path | None = None
+    report: Path | None = None
     counts: Counter[str] = field(default_factory=Counter)
+    _verdicts: Counter[str] = field(default_factory=Counter)
     _contact_sheet_rows: list[tuple[Location, list[Location]]] = field(default_factory=list)
     _errors: list[str] = field(default_factory=list)
     _sources_by_shared_error: dict[str, list[str]] = field(default_factory=lambda: defaultdict(list))
     _skipped: dict[str, tuple[int, str]] = field(default_factory=dict)
     """The number of skipped photos, and the last one, by the options of their layers that differ from those of this batch."""
     _bursts: dict[str, Burst] = field(default_factory=dict)
-    _index: IndexWriter | None = None
+    _tables: list[IndexWriter | CsvReport] = field(default_factory=list)
     _started: float = field(default_factory=time.perf_counter)
 
     def run(
@@ -71,7 +73,11 @@ class BatchReport:
             if has_index and self.output and not self.dry_run:
                 from brewster.batch.index import IndexWriter  # noqa: PLC0415
 
-                self._index = stack.enter_context(closing(IndexWriter(location(self.output))))
+                self._tables.append(stack.enter_context(closing(IndexWriter(location(self.output)))))
+            if self.report and not self.dry_run:
+                from brewster.batch.index import CsvReport  # noqa: PLC0415
+
+                self._tables.append(stack.enter_context(closing(CsvReport(self.report))))
             is_shown = not (self.quiet or self.as_json)
             update_progress = stack.enter_context(progress(self.count, shown=is_shown))
             overwrite, dry_run = self.overwrite, self.dry_run
@@ -103,8 +109,17 @@ class BatchReport:
 
         return RayExecutor(create_runner, cluster, workers)
 
-    def _finish(self, kind: type[BaseException] | None, *_: object) -> None:
-        """Writes the contact sheet of the photos whose layers are files if there was no error, and prints the summary."""
+    def _finish(self, kind: type[BaseException] | None, error: BaseException | None, _: object) -> None:
+        """Writes the contact sheet of the photos whose layers are files if there was no error, and prints the summary. A full disk
+        is one error, with the numbers of the photos that are finished and left."""
+        if isinstance(error, DiskFull):
+            finished = self.counts["separated"] + self.counts["skipped"]
+            shown = [each.happened for each in (error, error.__context__) if isinstance(each, DiskFull)]
+            self._errors = [text for text in self._errors if not any(each in text for each in shown)]
+            error.cure = (
+                "free some space, and run the same command again: "
+                f"{finished:,} of {counted(self.count, 'photo')} are finished, {self.count - finished:,} are left"
+            )
         try:
             if kind is None and self.contact_sheet and not self.dry_run:
                 from brewster.photo.contact_sheet import write_contact_sheets  # noqa: PLC0415
@@ -115,16 +130,18 @@ class BatchReport:
                     if not self.quiet:
                         print_status(f"contact sheet: {sheet}")
         finally:
-            if self.counts.total() == self.count:
+            if self.counts.total() == self.count or isinstance(error, DiskFull):
                 self._print_summary()
 
     def add(self, result: FileResult) -> None:
         """Counts a result, and prints its line: JSON on standard output, or a status line on standard error."""
         if result.error:
             interrupts.raise_pending()  # a Ctrl-C that Python dropped may have caused the error
-        if self._index:
-            self._index.append(result)
+        for table in self._tables:
+            table.append(result)
         self.counts[result.status] += 1
+        if result.assessment:
+            self._verdicts[result.assessment.verdict] += 1
         # The folder of the photos, where the layers belong, cannot be written to
         about_folder = f"{Path(result.source).parent.absolute()} was not written "
         if result.error and (INSTALL_COMMAND in result.error or result.error.startswith(about_folder)):
@@ -200,6 +217,13 @@ class BatchReport:
             layers = f"; the layers are {folder}" if self.counts.keys() & {"separated", "skipped"} else ""
             seconds = time.perf_counter() - self._started
             print_status(totals if self.dry_run else f"{totals} in {_duration(seconds)}{layers}")
+        if self._verdicts.total() > 1 and not self.quiet:
+            from brewster.inference.assessment import Verdict  # noqa: PLC0415
+
+            verdicts = (
+                f"{self._verdicts[name]:,} {name}" for name in get_args(Verdict) if self._verdicts[name]
+            )
+            print_status(f"{', '.join(verdicts)}: list them with --json or --report FILE.csv")
         for message in self._errors:
             print_error(message)
         for message, sources in self._sources_by_shared_error.items():

@@ -135,6 +135,12 @@ def _param_type(hint: object, field: dataclasses.Field[Any]) -> click.ParamType[
     help="Also write an overview of all photos and their layers to this image file. An overview of an earlier run is replaced.",
 )
 @click.option(
+    "--report",
+    metavar="FILE.csv",
+    type=FILE,
+    help="Also write a table with a row for each photo: verdict, removed light, changed area, seconds, status and error. A report of an earlier run is replaced.",
+)
+@click.option(
     "--workers",
     type=Number(1),
     help="The number of processes that separate photos, each with one thread; with --cluster local, the number of processors.",
@@ -163,6 +169,7 @@ def separate(
     dry_run: bool,
     overwrite: bool,
     contact_sheet: Path | None,
+    report: Path | None,
     workers: int | None,
     cluster: str | None,
     index: bool,
@@ -219,7 +226,9 @@ def separate(
     if contact_sheet:
         _check_contact_sheet(contact_sheet, photos, output, cluster)
         tasks = _without_contact_sheet(tasks, contact_sheet, options, overwrite=overwrite)
-    report = BatchReport(
+    if report:
+        _check_report(report, overwrite=overwrite)
+    batch = BatchReport(
         options,
         output,
         len(tasks),
@@ -228,9 +237,10 @@ def separate(
         quiet=quiet,
         is_parallel=bool(workers or cluster) and not dry_run,
         contact_sheet=contact_sheet,
+        report=report,
         overwrite=overwrite,
     )
-    context.exit(report.run(tasks, workers=workers, cluster=cluster, has_index=bool(index or cluster)))
+    context.exit(batch.run(tasks, workers=workers, cluster=cluster, has_index=bool(index or cluster)))
 
 
 def parse_options(context: click.Context, values: dict[str, Any], *, single_output: bool) -> Options:
@@ -264,6 +274,27 @@ def _print_plan(photos: tuple[str, ...], output: str | None, options: Options, g
     estimate.check_fits()
 
 
+def _check_report(path: Path, *, overwrite: bool) -> None:
+    from brewster.batch.index import is_report  # noqa: PLC0415
+
+    if path.suffix.lower() != ".csv":
+        raise click.UsageError(f"--report must be a file such as report.csv, not {path}.")
+    if os.path.lexists(path) and not overwrite and not is_report(path):
+        raise click.UsageError(
+            f"--report {path} exists and is not a report; choose another name, or pass --overwrite."
+        )
+    _check_parent("--report", path)
+
+
+def _check_parent(option: str, path: Path) -> None:
+    try:
+        check_output_folder(path.parent)
+    except OutputError as error:
+        raise click.UsageError(
+            f"{option} {path}: {error.happened}; {error.expected}; choose another folder."
+        ) from error
+
+
 def _check_contact_sheet(
     path: Path, photos: tuple[str, ...], output: str | None, cluster: str | None
 ) -> None:
@@ -275,12 +306,7 @@ def _check_contact_sheet(
         raise click.UsageError(
             "--contact-sheet needs photos and layers that are files, not standard input or output."
         )
-    try:
-        check_output_folder(path.parent)
-    except OutputError as error:
-        raise click.UsageError(
-            f"--contact-sheet {path}: {error.happened}; {error.expected}; choose another folder."
-        ) from error
+    _check_parent("--contact-sheet", path)
 
 
 def _without_contact_sheet(

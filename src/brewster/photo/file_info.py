@@ -66,6 +66,18 @@ def with_notes(file_info: FileInfo, *notes: str) -> FileInfo:
     return replace(file_info, note="; ".join(filter(None, (file_info.note, *notes))) or None)
 
 
+_BLOCK_NAMES = {"exif": "EXIF", "xmp": "XMP", "image_resources": "IPTC", "texts": "texts"}
+
+
+def lost_metadata(file_info: FileInfo, format_name: str) -> str | None:
+    """Returns a note on the metadata of a photo that its layers in this format do not have, or None."""
+    keeps = {*FORMATS[format_name].keeps}
+    if format_name != file_info.format_name:
+        keeps.discard("texts")  # comments of JPEG and chunks of PNG are not converted
+    lost = [name for field, name in _BLOCK_NAMES.items() if getattr(file_info, field) and field not in keeps]
+    return f"its {', '.join(lost)} cannot be kept in {format_name}" if lost else None
+
+
 def library_of(format_name: str) -> Any:  # noqa: ANN401  (these libraries have no types)
     """Imports and returns the library that reads and writes a format. An extra of brewster installs it. Raises MissingExtra if
     the library is not installed."""

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brewster.errors import MaskError
+from brewster.photo.colour import LINEAR_REC709, SRGB
 from brewster.photo.in_memory import WHITE_LEVELS
 from brewster.photo.mask import open_painted, sampled
 from brewster.photo.photo import Float32, Source
@@ -32,7 +33,8 @@ class Hints:
 
     @classmethod
     def open(cls, source: Source, size: tuple[int, int]) -> Self:
-        """Opens hints for a photo. Black, white, grey and transparent pixels are no hint.
+        """Opens hints for a photo. Black, white, grey and transparent pixels are no hint. Red and green are those of sRGB; an image
+        with another profile is converted.
 
         Args:
             source: a path, the bytes of a file, a PIL image, or an array (H, W, 3) of uint8, uint16, or floats in 0..1.
@@ -43,11 +45,13 @@ class Hints:
         """
         name = f"the hints {source}" if isinstance(source, str | os.PathLike) else "the hints"
         photo = open_painted(source, size, name)
+        has_own_colours = photo.colour_space() not in (SRGB, LINEAR_REC709)
+        pixels = photo.srgb_8bit() if has_own_colours else photo.pixels
         alpha = 1.0 if photo.alpha is None else photo.alpha / WHITE_LEVELS[photo.alpha.dtype.name]
-        scale = 255 * alpha / WHITE_LEVELS[photo.pixels.dtype.name]
-        red, green, blue = np.moveaxis(
-            np.broadcast_to(photo.pixels, (*photo.pixels.shape[:2], 3)), 2, 0
-        ).astype(np.float32)
+        scale = 255 * alpha / WHITE_LEVELS[pixels.dtype.name]
+        red, green, blue = np.moveaxis(np.broadcast_to(pixels, (*pixels.shape[:2], 3)), 2, 0).astype(
+            np.float32
+        )
         values = np.stack([red - np.maximum(green, blue), green - np.maximum(red, blue)], axis=2)
         # The strokes may be painted over a copy of the photo, whose colours are not as pure
         is_pure = values >= _MIN_PURITY * np.stack([red, green], axis=2)

@@ -33,7 +33,6 @@ PHOTO: Final = "photo"
 """The name of the parameter that identifies the photo of a layer: its `sampled_digest`."""
 _EXIF_SOFTWARE = 305
 _MAX_EXIF_BYTES = 65527  # a JPEG segment of 65533 bytes without the name of the block
-_SEARCHED_BYTES = 1 << 18
 _SAMPLE_BYTES = 1 << 16
 _PACKET = """<?xpacket begin="\ufeff" id="W5M0MpCehiHzreSzNTczkc9d"?>
 <x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#">
@@ -100,11 +99,11 @@ def sampled_digest(file: BinaryIO) -> str:
 
 
 def recorded_parameters(path: Path, program: str) -> dict[str, str] | None:
-    """Returns the parameters of the last step of a program in the history of a file, or None if there is no such step.
-    Of an AVIF, HEIC or contact sheet, only the first and the last 256 KiB are read: all writers put the metadata there."""
+    """Returns the parameters of the last step of a program in the history of a file, or None if there is no such step. Of large
+    files, only the metadata are read, except of AVIF and HEIC."""
     try:
         with path.open("rb") as file, mmap(file.fileno(), 0, access=ACCESS_READ) as data:
-            packets = read_xmp(data) or [data[:_SEARCHED_BYTES], data[max(len(data) - _SEARCHED_BYTES, 0) :]]
+            packets = [data[:]] if data[4:8] == b"ftyp" else read_xmp(data)
             return _last_parameters(b"".join(packets), program)
     except (OSError, ValueError):  # the file is empty
         return None

@@ -15,11 +15,18 @@ from numpy.typing import NDArray
 
 from brewster.errors import PhotoError, UnreadablePhoto, UnsupportedPhoto
 from brewster.files import DEFAULT_MAX_PIXELS, write_atomically
-from brewster.image_formats import FORMATS, canonical_format, format_of
+from brewster.image_formats import FORMATS, canonical_format, format_of, format_of_content
 from brewster.photo.colour import SRGB, ColourSpace, colour_space_of, convert_to_display_p3, has_only_tables
 from brewster.photo.decode import decode
 from brewster.photo.encode import encode
-from brewster.photo.file_info import Decoded, FileInfo, check_pixel_count, depth_for, format_name_of
+from brewster.photo.file_info import (
+    Decoded,
+    FileInfo,
+    check_pixel_count,
+    depth_for,
+    format_name_of,
+    with_notes,
+)
 from brewster.photo.history import sampled_digest
 from brewster.photo.in_memory import (
     WHITE_LEVELS,
@@ -32,7 +39,7 @@ from brewster.photo.in_memory import (
     pil_image,
 )
 from brewster.photo.raw import with_raw_suffix
-from brewster.remote_path import location, read_image
+from brewster.remote_path import Location, location, read_image
 
 Float32 = NDArray[np.float32]
 Stored = NDArray[Any]
@@ -116,6 +123,8 @@ class Photo:
                 raise with_raw_suffix(error, path.suffix) from error
             raise
         file_info = replace(decoded.file_info, digest=sampled_digest(io.BytesIO(data)))
+        if isinstance(source, str | os.PathLike):
+            file_info = with_notes(file_info, *_misleading_suffix(location(source), data))
         return cls._from_decoded(replace(decoded, file_info=file_info))
 
     @classmethod
@@ -353,6 +362,14 @@ def _rescaled(values: Stored, dtype: np.dtype[Any]) -> Stored:
     if values.dtype.kind == "f":
         return np.rint(values.clip(0, 1) * np.float32(new_white)).astype(dtype)
     return ((values.astype(np.uint32) * new_white + white // 2) // white).astype(dtype)
+
+
+def _misleading_suffix(path: Location, data: bytes) -> Iterator[str]:
+    """Yields a note if the suffix of a file is that of another format than its content."""
+    named, content = format_of(path), format_of_content(data)
+    pair = {row.name for row in (named, content) if row}
+    if len(pair) == 2 and pair not in ({"raw", "tiff"}, {"heic", "avif"}) and named and content:
+        yield f"its content is {content.name.upper()}, not {named.name.upper()} as its suffix {path.suffix} says"
 
 
 def _read_source(source: object) -> bytes:
