@@ -36,8 +36,9 @@ XYZ_TO_CAMERA = ((0.9, -0.3, -0.1), (-0.5, 1.4, 0.1), (-0.1, 0.2, 0.7))
 CAMERA_NEUTRAL = (0.5, 1.0, 0.7)
 
 
-def dng_file(mosaic: np.ndarray, orientation: int = 1) -> bytes:
-    """Returns a DNG with this colour filter array, (H, W) uint16, in the pattern RGGB. Its camera is a Sextant One."""
+def dng_file(mosaic: np.ndarray, orientation: int = 1, *more_tags: tuple) -> bytes:
+    """Returns a DNG with this colour filter array, (H, W) uint16, in the pattern RGGB. Its camera is a Sextant One. A tag is
+    (number, type, count, value)."""
     import tifffile  # noqa: PLC0415  (few tests need it)
 
     def rationals(values):
@@ -57,6 +58,7 @@ def dng_file(mosaic: np.ndarray, orientation: int = 1) -> bytes:
         (271, 2, 0, "Sextant", True),
         (272, 2, 0, "One", True),
         (274, 3, 1, orientation, True),
+        *((*tag, True) for tag in more_tags),
     ]
     file = io.BytesIO()
     tifffile.imwrite(file, mosaic, photometric=32803, extratags=tags, metadata=None, rowsperstrip=32)

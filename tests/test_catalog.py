@@ -60,6 +60,15 @@ def test_a_folder_replaces_the_builtin_assets(maps, photos):
     assert not refused + more
 
 
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="Windows has no named pipes in folders")
+def test_pipes_in_folders_of_maps_and_photos_are_not_opened(maps, photos):
+    expected = read_catalog([maps], [photos])
+    for path in (maps / "pipe.hdr", maps / "manifest.csv", photos / "pipe.jpg"):
+        path.unlink(missing_ok=True)
+        os.mkfifo(path)
+    assert read_catalog([maps], [photos]) == expected
+
+
 def test_an_asset_has_the_upright_size_and_the_sha256_of_its_file(maps, photos):
     catalog, _ = read_catalog([maps], [photos])
     assert {(asset.width, asset.height) for asset in catalog.maps} == {(32, 16)}

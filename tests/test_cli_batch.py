@@ -1,9 +1,11 @@
 """Batches with damaged photos and unusable outputs: no partial files, no lost files, and all other photos are separated."""
 
+import csv
 import errno
 import hashlib
 import os
 import re
+import socket
 import sys
 from dataclasses import fields
 from pathlib import Path
@@ -13,9 +15,11 @@ import numpy as np
 import OpenEXR
 import pytest
 import pyvips
+import tifffile
 
 from benchmark_folders import write
 from brewster.batch import FileResult
+from brewster.errors import DiskFull
 from brewster.inference import Separator
 from cli_helpers import LAYERS, error_lines, image_bytes, json_lines, layer_files, list_files
 
@@ -111,25 +115,143 @@ def test_a_photo_from_a_pipe_is_read_once(run, tmp_path):
     assert json_lines(out)[0]["photo_sha256"] == hashlib.sha256(image_bytes()).hexdigest()
 
 
-def test_a_full_disk_leaves_no_partial_file_and_the_next_photo_is_tried(run, tmp_path, monkeypatch):
+@pytest.mark.parametrize("more", [(), ("--index",), ("--report", "r.csv")])
+def test_a_full_disk_stops_the_batch_with_one_error_and_leaves_no_partial_file(
+    run, tmp_path, monkeypatch, more
+):
     """fsync reports the full disk; it is the last call at which the kernel can report it."""
-    write(tmp_path, "a.jpg", "b.jpg", data=image_bytes())
+    write(tmp_path, "a.jpg", "b.jpg", "c.jpg", "d.jpg", data=image_bytes())
+    assert run("a.jpg", "-o", "out")[0] == 0
     fsync, calls = os.fsync, []
 
     def fail_at_the_second_call(file):
         calls.append(file)
-        if len(calls) == 2:
+        if len(calls) >= (3 if "--index" in more else 2):  # an index begins with a file
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         fsync(file)
 
     monkeypatch.setattr(os, "fsync", fail_at_the_second_call)
-    code, out, err = run(".", "-o", "out", "--json")
+    code, out, err = run(".", "-o", "out", "--json", *more)
     assert code == 1
-    assert error_lines(err)[0].startswith(
-        "error: a.jpg: out/a.reflection.jpg was not written (No space left on device)"
+    (error,) = error_lines(err)
+    assert "b.reflection.jpg was not written (No space left on device)" in error
+    assert "1 of 4 photos are finished, 3 are left" in error
+    written = {*layer_files("a"), "b.transmission.jpg"}
+    assert {name for name in list_files(tmp_path / "out") if name.endswith(".jpg")} == written
+    results = json_lines(out)
+    assert [result["status"] for result in results] == ["skipped", "failed"]
+    assert [*results[1]["outputs"]] == ["transmission"]
+
+
+@pytest.mark.parametrize("quiet", [(), ("--quiet",)])
+def test_a_full_disk_stops_a_batch_in_several_processes(run, tmp_path, monkeypatch, quiet):
+    write(tmp_path, *(f"{number}.jpg" for number in range(4)), data=image_bytes())
+    error = DiskFull("out/0.transmission.jpg was not written", "expected space", "free some space")
+
+    def stop(task, *_, **__):
+        yield FileResult("0.jpg", "skipped")
+        raise error
+
+    monkeypatch.setattr("brewster.batch.parallel.separate_in_parallel", stop)
+    code, _, err = run(".", "-o", "out", "--workers", "2", *quiet)
+    assert code == 1
+    (line,) = error_lines(err)
+    assert "1 of 4 photos are finished, 3 are left" in line
+
+
+def special_files(folder):
+    """Creates a pipe, a link to a device and a socket with the suffix of an image. Returns the socket."""
+    os.mkfifo(folder / "pipe.jpg")
+    (folder / "device.jpg").symlink_to("/dev/zero")
+    unix = socket.socket(socket.AF_UNIX)
+    unix.bind(str(folder / "socket.jpg"))
+    return unix
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="Windows has no named pipes in folders")
+@pytest.mark.parametrize("more", [(), ("--dry-run",), ("--workers", "2")], ids=str)
+def test_pipes_sockets_and_devices_in_a_folder_are_skipped_and_named(run, tmp_path, monkeypatch, more):
+    folder = tmp_path / "in"
+    folder.mkdir()
+    monkeypatch.chdir(folder)  # the path of a socket must be short
+    with special_files(Path()):
+        (folder / "a.jpg").write_bytes(image_bytes())
+        monkeypatch.chdir(tmp_path)
+        code, _, err = run("in", "-o", "out", *more)
+    assert code == 0
+    (line,) = [line for line in err.splitlines() if "skipped: expected regular files" in line]
+    assert "3 special files" in line
+    assert all(name in line for name in ("pipe.jpg", "device.jpg", "socket.jpg"))
+    assert (
+        not (tmp_path / "out").exists()
+        if "--dry-run" in more
+        else list_files(tmp_path / "out") == layer_files("a")
     )
-    assert list_files(tmp_path / "out") == ["a.transmission.jpg", *layer_files("b")]
-    assert json_lines(out)[0]["outputs"] == {"transmission": "out/a.transmission.jpg"}
+
+
+def test_the_report_has_a_row_for_each_photo_and_the_summary_counts_the_verdicts(run, tmp_path):
+    write(tmp_path, "in/a.jpg", "in/b, c.jpg", data=image_bytes())
+    (tmp_path / "in" / "half.jpg").write_bytes(truncated_jpeg())
+    (tmp_path / "in" / "png.jpg").write_bytes(image_bytes(format_name="png"))
+    code, out, err = run("in", "-o", "out", "--report", "out/report.csv", "--json")
+    assert code == 1
+    with (tmp_path / "out" / "report.csv").open(newline="") as file:
+        rows = {row["path"]: row for row in csv.DictReader(file)}
+    results = {result["source"]: result for result in json_lines(out)}
+    assert rows.keys() == results.keys() == {f"in/{name}.jpg" for name in ("a", "b, c", "half", "png")}
+    for name, row in rows.items():
+        result = results[name]
+        assessment = result["assessment"] or {}
+        assert (row["status"], row["error"], row["note"]) == (
+            result["status"],
+            result["error"] or "",
+            result["note"] or "",
+        )
+        assert row["verdict"] == assessment.get("verdict", "")
+        for number in ("removed_light", "changed_area"):
+            assert row[number] == (f"{assessment[number]:.4f}" if assessment else "")
+        assert bool(row["seconds"]) == bool(result["seconds"])
+    assert "its content is PNG, not JPEG" in rows["in/png.jpg"]["note"]
+    verdict = results["in/a.jpg"]["assessment"]["verdict"]
+    assert f"3 {verdict}: list them with" in err
+    assert (
+        run("in", "-o", "out", "--report", "out/report.csv")[0] == 1
+    )  # the report of an earlier run is replaced
+    assert (tmp_path / "out" / "report.csv").read_text().count("skipped") == 3
+    (tmp_path / "mine.csv").write_text("path\n")
+    for path in ("mine.csv", "report.txt", "in/a.jpg/r.csv"):
+        code, _, err = run("in", "-o", "out", "--report", path)
+        assert (code, "--report" in err) == (2, True)
+    assert (tmp_path / "mine.csv").read_text() == "path\n"
+
+
+def test_a_dry_run_finds_the_photos_that_a_real_run_cannot_separate(run, tmp_path):
+    black = np.zeros((8, 8, 3), np.uint8)
+    folder = tmp_path / "in"
+    folder.mkdir()
+    files = {
+        "a.jpg": image_bytes(),
+        "cut.jpg": truncated_jpeg(),
+        "cut.png": image_bytes(600, 400, "png")[:5000],
+        "frames.gif": animation(".gif"),
+        "five.tiff": five_channel_tiff(),
+        "pages.tif": b"",
+    }
+    for name, data in files.items():
+        (folder / name).write_bytes(data)
+    tifffile.imwrite(folder / "pages.tif", np.stack([black, black]), photometric="rgb")
+    code, out, _ = run("in", "-o", "out", "--dry-run", "--json")
+    assert code == 1
+    planned = {result["source"]: (result["status"], result["error"]) for result in json_lines(out)}
+    assert not (tmp_path / "out").exists()
+    real = {
+        result["source"]: (result["status"], result["error"])
+        for result in json_lines(run("in", "-o", "out", "--json")[1])
+    }
+    assert planned.pop("in/a.jpg")[0] == "planned"
+    assert real.pop("in/a.jpg")[0] == "separated"
+    assert planned == real
+    assert {status for status, _ in planned.values()} == {"failed"}
 
 
 @pytest.mark.parametrize("link", ["same", "symlink", "hardlink"])

@@ -88,6 +88,21 @@ def test_without_an_image_suffix_the_format_of_the_content_names_the_layers(tmp_
 
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="Windows has no named pipes in folders")
+def test_every_list_of_a_folder_has_regular_files_only_and_broken_links(tmp_path):
+    touch(tmp_path, "a.jpg", "x/b.jpg")
+    os.mkfifo(tmp_path / "pipe.jpg")
+    (tmp_path / "device.jpg").symlink_to("/dev/zero")
+    (tmp_path / "broken.jpg").symlink_to("nothing")
+    (tmp_path / "link.jpg").symlink_to("a.jpg")
+    regular = ["a.jpg", "broken.jpg", "link.jpg"]
+    assert [path.name for path in files.folder_entries(tmp_path)] == [*regular, "x"]
+    assert [path.name for path in files.walk(tmp_path, lambda _: True)] == [*regular, "b.jpg"]
+    skipped: list[files.Location] = []
+    assert [image.name for image, _ in images_in(tmp_path, skipped=skipped)] == [*regular, "b.jpg"]
+    assert [path.name for path in skipped] == ["device.jpg", "pipe.jpg"]
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="Windows has no named pipes in folders")
 def test_a_pipe_is_not_read_to_name_its_layers(tmp_path):
     os.mkfifo(tmp_path / "photo")  # reading a pipe without a writer would wait forever
     assert transmissions(tmp_path / "photo") == {"photo": "photo.transmission.png"}

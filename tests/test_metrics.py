@@ -9,6 +9,7 @@ from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
 from brewster.errors import BrewsterError
 from brewster.metrics import METRICS, Metric, find_metric, linear_rmse, psnr, psnr_of_channels, ssim
+from brewster.metrics.metric import CachedImage, Comparison
 from brewster.srgb import to_linear
 
 GAUSSIAN = {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False, "data_range": 255}
@@ -148,6 +149,16 @@ def test_the_psnr_of_channels_is_the_mean_of_three_psnrs(rng):
     assert psnr_of_channels(prediction, truth) == pytest.approx(expected)
     assert psnr_of_channels(prediction, truth) >= psnr(prediction, truth)
     assert psnr_of_channels(truth, truth) == float("inf")
+
+
+def test_a_prediction_that_is_wrong_in_one_channel_only_is_not_perfect(rng):
+    truth = rng.integers(0, 200, (9, 12, 3)).astype(np.uint8)
+    prediction = truth.copy()
+    prediction[..., 1] += 10
+    case = Comparison(CachedImage(prediction), CachedImage(truth), truth)
+    one_channel = 10 * np.log10(255**2 / 100)
+    assert METRICS["psnr_channels"].score(case) == pytest.approx((100 + 100 + one_channel) / 3)
+    assert METRICS["psnr_channels"].score(Comparison(CachedImage(truth), CachedImage(truth), truth)) == 100
 
 
 def test_a_metric_is_found_by_name_and_a_typing_error_gets_a_suggestion():

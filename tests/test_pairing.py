@@ -1,5 +1,6 @@
 """Images are grouped by file name only. All other files are reported."""
 
+import os
 import random
 import tempfile
 import unicodedata
@@ -48,6 +49,13 @@ def test_roles_are_recognised_by_the_names_of_their_folders(tmp_path, roles):
     for group in found.groups:
         pictures = (group.photo, group.transmission, group.reflection)
         assert pictures == tuple(tmp_path / role / f"{group.name}.png" for role in roles)
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="Windows has no named pipes in folders")
+def test_a_pipe_in_a_folder_of_pairs_is_not_listed(tmp_path):
+    (tmp_path / "a.jpg").touch()
+    os.mkfifo(tmp_path / "b.jpg")
+    assert list_folder(tmp_path) == ([], [tmp_path / "a.jpg"])
 
 
 def test_no_folder_name_belongs_to_two_roles():

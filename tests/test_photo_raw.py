@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from brewster.errors import PhotoTooLarge, UnreadablePhoto
+from brewster.errors import PhotoTooLarge, UnreadablePhoto, UnsupportedPhoto
 from brewster.image_formats import FORMATS, format_of
 from brewster.photo import Photo, decode, raw, read_size, tiff_tags
 from brewster.photo.colour import colour_space_of
@@ -69,6 +69,43 @@ def test_a_raw_file_is_upright(orientation):
     assert np.array_equal(turned.pixels, np.rot90(upright.pixels, turns))
     assert turned.size == read_size(dng_file(mosaic(), orientation))
     assert tiff_tags.orientation_of(turned.file_info.exif) == 1
+
+
+CROPS = [
+    ((50719, 4, 2, (20, 10)), (50720, 4, 2, (80, 60))),
+    ((50719, 5, 2, (40, 2, 10, 1)), (50720, 5, 2, (80, 1, 60, 1))),
+]
+
+
+@pytest.mark.parametrize("crop", CROPS, ids=["integers", "fractions"])
+@pytest.mark.parametrize("orientation", [1, 3, 6, 8])
+def test_the_default_crop_of_a_dng_is_applied(crop, orientation):
+    whole = Photo.open(dng_file(mosaic())).pixels
+    data = dng_file(mosaic(), orientation, *crop)
+    photo = Photo.open(data)
+    turns = {1: 0, 3: 2, 6: 3, 8: 1}[orientation]
+    assert np.array_equal(photo.pixels, np.rot90(whole[10:70, 20:100], turns))
+    assert read_size(data) == photo.size
+
+
+def test_the_default_crop_is_within_the_active_area():
+    active = (50829, 4, 4, (4, 8, 92, 124))  # top, left, bottom, right
+    inside = Photo.open(dng_file(mosaic(), 1, active))
+    assert inside.size == (116, 88)
+    assert np.array_equal(
+        Photo.open(dng_file(mosaic(), 1, active, *CROPS[0])).pixels, inside.pixels[10:70, 20:100]
+    )
+
+
+def test_a_default_crop_outside_the_image_is_ignored():
+    tags = (50719, 4, 2, (100, 10)), (50720, 4, 2, (80, 60))
+    assert Photo.open(dng_file(mosaic(), 1, *tags)).size == (128, 96)
+
+
+def test_a_dng_with_a_compression_that_libraw_does_not_support_is_named(data):
+    message = r"^this DNG is compressed with JPEG XL, which LibRaw .* does not support"
+    with pytest.raises(UnsupportedPhoto, match=message):
+        Photo.open(data / "field" / "jpeg-xl.dng")
 
 
 @pytest.mark.parametrize("fraction", [0.05, 0.5, 0.95])

@@ -114,8 +114,11 @@ class BatchReport:
         is one error, with the numbers of the photos that are finished and left."""
         if isinstance(error, DiskFull):
             finished = self.counts["separated"] + self.counts["skipped"]
-            shown = [each.happened for each in (error, error.__context__) if isinstance(each, DiskFull)]
-            self._errors = [text for text in self._errors if not any(each in text for each in shown)]
+            cause = error.__context__  # a table of this batch cannot be written, either
+            while cause:
+                error.happened = cause.happened if isinstance(cause, DiskFull) else error.happened
+                cause = cause.__context__
+            self._errors = [text for text in self._errors if error.happened not in text]
             error.cure = (
                 "free some space, and run the same command again: "
                 f"{finished:,} of {counted(self.count, 'photo')} are finished, {self.count - finished:,} are left"

@@ -42,15 +42,16 @@ def layer_xmp(packets: Sequence[bytes], size: tuple[int, int]) -> tuple[bytes | 
         return None, []
     main = _upright(_as_utf8(packets[0]), size)
     lost = _lost_parts(b"".join(packets))
-    if b"HasExtendedXMP" in main and len(packets) == 1:
+    extensions = [parsed for packet in packets[1:] if (parsed := _parse(_as_utf8(packet)))]
+    if b"HasExtendedXMP" in main and not extensions:
         lost.append("extended XMP, which is missing or damaged")
     if RDF_END.search(main) and len(packets) == 1 and not _PROMISE_WORDS.search(main):
         return main, lost
     document = _parse(main) if RDF_END.search(main) else None
     if document is None:
         return None if _PROMISE_WORDS.search(main) else main, [*lost, "XMP, which is damaged"]
-    for packet in packets[1:]:
-        _merge(document, _parse(_as_utf8(packet)))
+    for extension in extensions:
+        _merge(document, extension)
     for element in [*document.getElementsByTagName("*")]:
         for attribute in _attributes(element):
             is_declaration = attribute.namespaceURI == _XMLNS
@@ -144,9 +145,9 @@ def _attributes(element: Element) -> list[Attr]:
     return [*element.attributes.values()]
 
 
-def _merge(document: Document, extension: Document | None) -> None:
+def _merge(document: Document, extension: Document) -> None:
     """Adds the descriptions of an extended packet to the main packet, with the prefixes that they use."""
-    for description in _descriptions(extension) if extension else ():
+    for description in _descriptions(extension):
         copy = document.importNode(description, deep=True)
         parent = description.parentNode
         while parent and parent.attributes:

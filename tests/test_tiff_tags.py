@@ -1,0 +1,131 @@
+"""The images of a TIFF: pages, thumbnails, pyramids, missing pixels, and kinds of pixels that are not supported."""
+
+from __future__ import annotations
+
+import io
+import struct
+
+import numpy as np
+import pytest
+import tifffile
+
+from brewster.errors import UnreadablePhoto, UnsupportedPhoto
+from brewster.photo import Photo, read_size
+from brewster.photo.tiff_tags import full_pages, is_raw, read_tags
+from picture_files import dng_file, mosaic, smooth
+
+FULL, SMALL = smooth(), smooth()[::4, ::4]
+CAMERA = [(271, 2, 0, "Sextant", True)]
+
+
+def tiff_of(*pages, byte_order="<", is_big=False):
+    """Returns a TIFF with pages (array, NewSubfileType or None for no tag)."""
+    file = io.BytesIO()
+    with tifffile.TiffWriter(file, byteorder=byte_order, bigtiff=is_big) as writer:
+        for number, (array, kind) in enumerate(pages):
+            options = {"subfiletype": kind} if kind is not None else {}
+            extra = CAMERA if number == 0 else []
+            writer.write(array, photometric="rgb", metadata=None, extratags=extra, **options)
+    return file.getvalue()
+
+
+@pytest.mark.parametrize("byte_order", "<>")
+@pytest.mark.parametrize("is_big", [False, True])
+@pytest.mark.parametrize(
+    "pages",
+    [
+        [(FULL, 0), (SMALL, 1)],
+        [(SMALL, 1), (FULL, 0)],
+        [(SMALL, 1), (FULL, None)],
+        [(FULL, None), (FULL[::2, ::2], 1), (SMALL, 1)],
+        [(SMALL, 1), (FULL, 0), (FULL[::2, ::2], 1)],
+    ],
+    ids=["main first", "thumbnail first", "no type", "pyramid", "in the middle"],
+)
+def test_a_tiff_with_thumbnails_is_a_photo_of_one_page(pages, byte_order, is_big):
+    data = tiff_of(*pages, byte_order=byte_order, is_big=is_big)
+    photo = Photo.open(data)
+    assert np.array_equal(photo.pixels, FULL)
+    assert read_size(data) == photo.size
+    assert read_tags(photo.encode())[271][2] == b"Sextant\0"
+
+
+@pytest.mark.parametrize("pages", [[(FULL, 0), (FULL, 0)], [(FULL, 2), (SMALL, 1), (FULL, 2)]])
+def test_several_pages_are_refused_also_next_to_a_thumbnail(pages):
+    with pytest.raises(UnsupportedPhoto, match="several pages"):
+        Photo.open(tiff_of(*pages))
+    with pytest.raises(UnsupportedPhoto, match="several pages"):
+        read_size(tiff_of(*pages))
+
+
+def with_sub_directories(first, kind, *subs):
+    file = io.BytesIO()
+    with tifffile.TiffWriter(file) as writer:
+        writer.write(first, photometric="rgb", subfiletype=kind, subifds=len(subs), metadata=None)
+        for array, sub_kind in subs:
+            writer.write(array, photometric="rgb", subfiletype=sub_kind, metadata=None)
+    return file.getvalue()
+
+
+def test_subdirectories_with_thumbnails_are_ignored_and_one_with_the_full_image_is_read():
+    for data in (
+        with_sub_directories(FULL, 0, (SMALL, 1)),
+        with_sub_directories(SMALL, 1, (FULL[::2, ::2], 1), (FULL, 0)),
+    ):
+        assert np.array_equal(Photo.open(data).pixels, FULL)
+
+
+def test_raw_files_are_recognised_by_their_version_or_the_data_of_their_sensor():
+    assert is_raw(dng_file(mosaic()))
+    assert is_raw(tiff_of((SMALL, 1)))  # only a preview
+    file = io.BytesIO()
+    with tifffile.TiffWriter(file) as writer:
+        writer.write(SMALL, photometric="rgb", subfiletype=1, subifds=1, metadata=None)
+        writer.write(mosaic(), photometric=32803, subfiletype=0, metadata=None)
+    assert is_raw(file.getvalue())
+    assert not is_raw(tiff_of((SMALL, 1), (FULL, 0)))
+    assert not is_raw(b"MM\0*")
+
+
+def test_a_loop_of_directories_ends():
+    data = bytearray(tiff_of((FULL, 0)))
+    (first,) = struct.unpack_from("<I", data, 4)
+    (count,) = struct.unpack_from("<H", data, first)
+    struct.pack_into("<I", data, first + 2 + 12 * count, first)
+    assert len(full_pages(bytes(data))) == 1
+
+
+@pytest.mark.parametrize("byte_order", "<>")
+@pytest.mark.parametrize("is_big", [False, True])
+@pytest.mark.parametrize(
+    "layout", [{"tile": (16, 16)}, {"rowsperstrip": 8}, {"tile": (16, 16), "compression": "deflate"}]
+)
+def test_missing_pixels_are_found_in_every_kind_of_tiff(byte_order, is_big, layout):
+    file = io.BytesIO()
+    noise = np.random.default_rng(0).integers(0, 256, (96, 96, 3), np.uint8)
+    tifffile.imwrite(
+        file, noise, photometric="rgb", byteorder=byte_order, bigtiff=is_big, metadata=None, **layout
+    )
+    data = file.getvalue()
+    assert np.array_equal(Photo.open(data).pixels, noise)
+    with pytest.raises(UnreadablePhoto, match="read completely"):
+        Photo.open(data[: int(0.7 * len(data))])
+
+
+@pytest.mark.parametrize(
+    ("array", "options", "message"),
+    [
+        (FULL.astype(np.float64), {}, "64-bit floats"),
+        (FULL.astype(np.uint32), {}, "32-bit unsigned integers"),
+        (FULL.astype(np.int16), {}, "16-bit signed integers"),
+        (FULL.astype(np.complex64), {}, "complex floats"),
+        (FULL, {"photometric": "cielab"}, "CIELAB colours"),
+        (FULL, {"compression": "lzma"}, "compressed with LZMA"),
+    ],
+)
+def test_kinds_of_pixels_that_are_not_supported_are_named_and_not_called_damaged(array, options, message):
+    file = io.BytesIO()
+    tifffile.imwrite(file, array, **{"photometric": "rgb", "metadata": None} | options)
+    with pytest.raises(UnsupportedPhoto, match=message) as raised:
+        Photo.open(file.getvalue())
+    assert "copy" not in raised.value.cure
