@@ -128,12 +128,12 @@ def _decode_vips(data: bytes, format_name: str, max_pixels: int) -> Decoded:
     image, tags = _open_vips(data, format_name, max_pixels)
     orientation = _orientation(image, data, format_name)
     try:
-        file_info = _file_info(image, data, format_name, tags)
+        file_info = _file_info(image, data, format_name, tags, _upright_size(image, orientation))
         if image.interpretation == _CMYK:
             image, file_info = convert_cmyk(image, file_info)
         array = np.frombuffer(image.write_to_memory(), _DTYPES[image.format])
     except pyvips.Error as error:
-        raise _vips_error(format_name, error, tags) from error
+        raise _library_error(format_name, error, tags) from error
     array = _full_scale(array.reshape(image.height, image.width, image.bands), file_info.bits)
     decoded = split_alpha(apply_orientation(array, orientation), file_info)
     is_premultiplied = format_name == "avif" and b"prem" in metadata.box(data, b"iref")
@@ -153,7 +153,7 @@ def _open_vips(data: bytes, format_name: str, max_pixels: int) -> tuple[pyvips.I
         image = load(data, access="sequential", fail_on=_FAIL_ON.get(format_name, "truncated"), **options)
         _check_supported(image, data, format_name, max_pixels)
     except pyvips.Error as error:
-        raise _vips_error(format_name, error, tags) from error
+        raise _library_error(format_name, error, tags) from error
     if format_name == "tiff" and not tiff_tags.has_all_pixels(tags, len(data)):
         raise _unreadable_error("tiff", "pixels are missing")  # libvips reads missing tiles as black
     return image, tags
@@ -172,22 +172,20 @@ def _upright_size(image: pyvips.Image, orientation: int) -> tuple[int, int]:
     return sides[::-1] if orientation in _TRANSPOSED else sides
 
 
-def _vips_error(format_name: str, error: pyvips.Error, tags: tiff_tags.Tags) -> PhotoError:
-    """Returns the error for a file that libvips cannot read: it is damaged, or of a kind that is not supported."""
-    compression = tiff_tags.number_of(tags, 259, 1)
-    kind = ""
-    if compression in tiff_tags.COMPRESSION_NAMES or (tags and compression not in _COMPRESSIONS):
-        kind = f"is compressed with {tiff_tags.COMPRESSION_NAMES.get(compression, f'method {compression}')}"
-    elif found := re.search(
-        r"[^\n:]*(?:unsupported|not supported|not implemented|not configured)[^\n]*",
-        str(error),
-        re.IGNORECASE,
-    ):
-        kind = f"is of a kind that the decoder does not support ({found[0].strip()})"
-    if not kind:
+_UNSUPPORTED = re.compile(
+    r"unsupported (?!marker)|not supported|not implemented|not configured", re.IGNORECASE
+)
+
+
+def _library_error(format_name: str, error: Exception, tags: tiff_tags.Tags) -> PhotoError:
+    """Returns the error for a file that a library cannot read: it is damaged, or of a kind that is not supported."""
+    reason = next((line for line in str(error).splitlines() if _UNSUPPORTED.search(line)), None)
+    if not reason:
         return _unreadable_error(format_name)
+    compression = tiff_tags.COMPRESSION_NAMES.get(tiff_tags.number_of(tags, 259, 1))
+    kind = f"compressed with {compression}, which" if compression else "of a kind that"
     return UnsupportedPhoto(
-        f"the {format_name} {kind}, which brewster does not support",
+        f"the {format_name} is {kind} brewster does not support ({reason.rpartition(': ')[2].strip()})",
         "expected a common variant of the format",
         "convert the image, for example to PNG",
     )
@@ -261,7 +259,9 @@ def _profile(image: pyvips.Image, data: bytes, format_name: str, tags: tiff_tags
     return profile_of(data, format_name, _blob(image, "icc-profile"), is_grey=is_grey, tags=tags)
 
 
-def _file_info(image: pyvips.Image, data: bytes, format_name: str, tags: tiff_tags.Tags) -> FileInfo:
+def _file_info(
+    image: pyvips.Image, data: bytes, format_name: str, tags: tiff_tags.Tags, size: tuple[int, int]
+) -> FileInfo:
     bits = {"float": 32, "uchar": 8}.get(image.format, 16)
     has_resolution = (image.xres, image.yres) != (1.0, 1.0)
     file_info = FileInfo(
@@ -295,9 +295,7 @@ def _file_info(image: pyvips.Image, data: bytes, format_name: str, tags: tiff_ta
         case "avif":
             codes = metadata.cicp(data)  # only a lossless AVIF stores RGB: matrix code 0, the identity
             file_info = replace(file_info, lossless=codes is not None and codes[2] == 0)
-    return _with_exif_and_xmp(
-        file_info, data, exif, packets, _upright_size(image, _orientation(image, data, format_name))
-    )
+    return _with_exif_and_xmp(file_info, data, exif, packets, size)
 
 
 def _with_exif_and_xmp(
@@ -305,8 +303,10 @@ def _with_exif_and_xmp(
 ) -> FileInfo:
     """Returns the metadata with EXIF and XMP for the upright image of this (width, height), and with a note on what is lost."""
     packet, lost = xmp.layer_xmp(packets, size)
-    lost += [name for mark, name in _LOST_PARTS.items() if name not in lost and mark in data]
-    notes = [f"its {name} is not kept" for name in lost]
+    if file_info.format_name in ("jpeg", "heic", "avif"):
+        lost += [name for mark, name in _LOST_PARTS.items() if mark in data]
+        lost += [xmp.GAIN_MAP] if b"tmap" in metadata.box(data, b"iinf") else []
+    notes = [f"its {name} is not kept" for name in dict.fromkeys(lost)]
     exif = tiff_tags.upright_exif(exif, size) if exif else None
     return with_notes(replace(file_info, exif=exif, xmp=packet), *notes)
 
@@ -314,7 +314,7 @@ def _with_exif_and_xmp(
 _LOST_PARTS = {
     b"urn:iso:std:iso:ts:21496:-1": xmp.GAIN_MAP,
     b"urn:com:apple:photo:2020:aux:hdrgainmap": xmp.GAIN_MAP,
-    b"tmap": xmp.GAIN_MAP,
+    b"ns.adobe.com/hdr-gain-map/": xmp.GAIN_MAP,
     b"MotionPhoto_Data": xmp.FILM,
 }
 """Bytes of files with other parts than the image, and the names of these parts."""
@@ -385,7 +385,7 @@ def _open_heic(data: bytes, max_pixels: int) -> Any:  # noqa: ANN401  (pillow-he
             raise _unreadable_error("heic", "no image in the file can be decoded")
         check_pixel_count(heif.size[0], heif.size[1], max_pixels)
     except _HEIC_ERRORS as error:
-        raise _unreadable_error("heic") from error
+        raise _library_error("heic", error, {}) from error
     return heif
 
 
@@ -398,7 +398,7 @@ def _decode_heic(data: bytes, max_pixels: int) -> Decoded:
     try:
         array = np.array(heif)
     except _HEIC_ERRORS as error:
-        raise _unreadable_error("heic") from error
+        raise _library_error("heic", error, {}) from error
     packet = heif.info.get("xmp")
     file_info = FileInfo("heic", heif.info.get("bit_depth", 8), icc=_heic_profile(heif, data))
     packets = [packet] if packet else []

@@ -286,8 +286,8 @@ def cicp(data: bytes) -> tuple[int, int, int, bool] | None:
 
 def box(data: bytes, name: bytes) -> bytes:
     """Returns the content of the first box with this name in the first MiB, or no bytes."""
-    found = re.search(rb"(....)" + name, data[: 1 << 20], re.DOTALL)
-    return data[found.end() : found.start() + int.from_bytes(found[1], "big")] if found else b""
+    at = data.find(name, 4, 1 << 20)
+    return data[at + 4 : at - 4 + int.from_bytes(data[at - 4 : at], "big")] if at > 0 else b""
 
 
 def with_avif_exif(data: bytes, exif: bytes) -> bytes:
