@@ -18,9 +18,11 @@ import pyvips
 import tifffile
 
 from benchmark_folders import write
+from brewster import Photo
 from brewster.batch import FileResult
 from brewster.errors import DiskFull
 from brewster.inference import Separator
+from brewster.photo import FileInfo
 from cli_helpers import LAYERS, error_lines, image_bytes, json_lines, layer_files, list_files
 
 
@@ -135,7 +137,7 @@ def test_a_full_disk_stops_the_batch_with_one_error_and_leaves_no_partial_file(
     assert code == 1
     (error,) = error_lines(err)
     assert "b.reflection.jpg was not written (No space left on device)" in error
-    assert "1 of 4 photos are finished, 3 are left" in error
+    assert "1 of 4 photos are finished, 3 left" in error
     written = {*layer_files("a"), "b.transmission.jpg"}
     assert {name for name in list_files(tmp_path / "out") if name.endswith(".jpg")} == written
     results = json_lines(out)
@@ -156,7 +158,7 @@ def test_a_full_disk_stops_a_batch_in_several_processes(run, tmp_path, monkeypat
     code, _, err = run(".", "-o", "out", "--workers", "2", *quiet)
     assert code == 1
     (line,) = error_lines(err)
-    assert "1 of 4 photos are finished, 3 are left" in line
+    assert "1 of 4 photos are finished, 3 left" in line
 
 
 def special_files(folder):
@@ -223,6 +225,21 @@ def test_the_report_has_a_row_for_each_photo_and_the_summary_counts_the_verdicts
         code, _, err = run("in", "-o", "out", "--report", path)
         assert (code, "--report" in err) == (2, True)
     assert (tmp_path / "mine.csv").read_text() == "path\n"
+
+
+def test_metadata_that_the_format_of_the_layers_cannot_keep_are_noted(run, tmp_path):
+    photo = Photo.from_array(np.zeros((20, 30, 3), np.uint8))
+    texts = Photo(
+        photo.pixels,
+        None,
+        FileInfo("jpeg", image_resources=b"8BIM\4\4\0\0\0\0\0\2ab", exif=b"II*\0\x08\0\0\0\0\0"),
+    )
+    (tmp_path / "a.jpg").write_bytes(texts.encode())
+    (kept,) = json_lines(run("a.jpg", "-o", "kept", "--json")[1])
+    (lost,) = json_lines(run("a.jpg", "-o", "lost", "--json", "--format", "png")[1])
+    (linear,) = json_lines(run("a.jpg", "-o", "linear", "--json", "--format", "exr")[1])
+    assert [kept["note"], lost["note"]] == [None, "its IPTC cannot be kept in png"]
+    assert linear["note"] == "its EXIF, IPTC cannot be kept in exr"
 
 
 def test_a_dry_run_finds_the_photos_that_a_real_run_cannot_separate(run, tmp_path):

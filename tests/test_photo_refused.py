@@ -64,6 +64,15 @@ def test_a_truncated_image_is_refused(kind, options, fraction):
     assert_refused(data[: int(len(data) * fraction)], UnreadablePhoto, OWN_MESSAGE)
 
 
+@pytest.mark.parametrize(("offset", "value", "reason"), [(4, 12, "precision 12"), (1, 0xC5, "SOF type 0xc5")])
+def test_kinds_of_jpeg_that_are_not_supported_are_not_called_damaged(offset, value, reason):
+    data = bytearray(file_of("JPEG"))
+    data[data.index(b"\xff\xc0") + offset] = value
+    assert_refused(
+        bytes(data), UnsupportedPhoto, f"^the jpeg is of a kind that brewster does not support .*{reason}"
+    )
+
+
 @pytest.mark.parametrize("size", [4, 7])
 def test_a_tiff_shorter_than_its_header_is_refused(size):
     assert_refused(b"II*\0\x08\0\0"[:size], UnreadablePhoto, "read completely")

@@ -121,7 +121,7 @@ class BatchReport:
             self._errors = [text for text in self._errors if error.happened not in text]
             error.cure = (
                 "free some space, and run the same command again: "
-                f"{finished:,} of {counted(self.count, 'photo')} are finished, {self.count - finished:,} are left"
+                f"{finished:,} of {counted(self.count, 'photo')} are finished, {self.count - finished:,} left"
             )
         try:
             if kind is None and self.contact_sheet and not self.dry_run:
@@ -143,7 +143,7 @@ class BatchReport:
         for table in self._tables:
             table.append(result)
         self.counts[result.status] += 1
-        if result.assessment:
+        if result.assessment and result.status == "separated":
             self._verdicts[result.assessment.verdict] += 1
         # The folder of the photos, where the layers belong, cannot be written to
         about_folder = f"{Path(result.source).parent.absolute()} was not written "
