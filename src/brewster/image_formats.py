@@ -42,8 +42,6 @@ class ImageFormat:
     """Whether an alpha channel can be written."""
     keeps: tuple[str, ...] = ("icc", "exif", "xmp")
     """The metadata of a photo that its layers in this format have: names of fields of `brewster.photo.FileInfo`."""
-    has_cicp: bool = False
-    """Whether a file can have code points for its colour space (ITU-T H.273) instead of an ICC profile."""
     is_stored_rotated: bool = False
     """Whether the library returns pixels without applying the EXIF orientation."""
 
@@ -76,7 +74,6 @@ _ROWS: Final = (
         signature=rb"\x89PNG\r\n\x1a\n",
         bit_depths=(8, 16),
         keeps=("icc", "exif", "xmp", "texts"),
-        has_cicp=True,
         is_stored_rotated=True,
     ),
     ImageFormat(
@@ -113,7 +110,6 @@ _ROWS: Final = (
         signature=rb"....ftyp(avif|avis)",
         vips_name="heif",
         bit_depths=(8, 10, 12),
-        has_cicp=True,
     ),
     ImageFormat(
         name="heic",
@@ -123,7 +119,6 @@ _ROWS: Final = (
         library="pillow-heif",
         extra="heic",  # not in the core, because of the patents on HEVC
         bit_depths=(8, 10),
-        has_cicp=True,
     ),
     ImageFormat(
         name="exr",

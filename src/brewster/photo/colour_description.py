@@ -11,7 +11,6 @@ import numpy as np
 import pyvips
 
 from brewster.errors import UnsupportedPhoto
-from brewster.image_formats import FORMATS
 from brewster.photo import metadata
 from brewster.photo.colour import REC709_CHROMATICITIES, to_d50, valid_chromaticities
 from brewster.photo.tiff_tags import Tags, numbers, rationals
@@ -28,7 +27,7 @@ def profile_of(
 ) -> bytes | None:
     """Returns the ICC profile for the pixels of a file, or None for sRGB. `icc` is the embedded profile, and `tags` are those
     of a TIFF. Raises UnsupportedPhoto for a description that is not supported."""
-    codes = metadata.cicp(data) if FORMATS[format_name].has_cicp else None
+    codes = metadata.cicp(data)
     if format_name == "png":  # the order of PNG, third edition, 4.3: cICP, iCCP, sRGB, gAMA and cHRM
         chunks = dict(metadata.png_chunks(data))
         if codes:

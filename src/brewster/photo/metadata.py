@@ -277,7 +277,8 @@ def cicp(data: bytes) -> tuple[int, int, int, bool] | None:
     if data.startswith(b"\x89PNG"):
         chunk = dict(png_chunks(data)).get(b"cICP", b"")
         return (chunk[0], chunk[1], chunk[2], chunk[3] == 1) if len(chunk) >= 4 else None
-    found = re.search(rb"colrnclx(.{6})(.)", data[: 1 << 16], re.DOTALL)
+    head = data[: 1 << 16] if data[4:8] == b"ftyp" else b""
+    found = re.search(rb"colrnclx(.{6})(.)", head, re.DOTALL)
     return (*struct.unpack(">3H", found[1]), found[2][0] >= 128) if found else None
 
 
