@@ -148,7 +148,7 @@ def _open_vips(data: bytes, format_name: str, max_pixels: int) -> tuple[pyvips.I
         raise _frames_error(format_name)
     options, tags = pages[0] if pages else tiff_tags.Page({}, {})
     if format_name == "tiff":
-        _check_tiff(tags)
+        tiff_tags.check_pixels(tags)
     try:
         image = load(data, access="sequential", fail_on=_FAIL_ON.get(format_name, "truncated"), **options)
         _check_supported(image, data, format_name, max_pixels)
@@ -198,25 +198,6 @@ def _unreadable_error(format_name: str, reason: str = "") -> PhotoError:
         "expected a complete file in a common variant of the format",
         "copy the file again from its source, or convert it",
     )
-
-
-def _check_tiff(tags: tiff_tags.Tags) -> None:
-    """Raises UnsupportedPhoto for pixels that libvips reads with an error, or with other values."""
-    bits, kind = (tiff_tags.number_of(tags, tag, 1) for tag in (258, 339))
-    photometric = tiff_tags.number_of(tags, 262, 2)
-    found = ""
-    if (kind, bits) not in _TIFF_SAMPLES:
-        found = f"{bits}-bit {_SAMPLE_KINDS.get(kind, 'values of another kind')}"
-    elif photometric > 6:
-        found = (
-            f"{_PHOTOMETRIC_NAMES.get(photometric, 'another kind')} (PhotometricInterpretation {photometric})"
-        )
-    if found:
-        raise UnsupportedPhoto(
-            f"the tiff has {found}",
-            "expected grey, RGB or CMYK of 8- or 16-bit integers or 32-bit floats",
-            "convert the image to one of these",
-        )
 
 
 def _check_supported(image: pyvips.Image, data: bytes, format_name: str, max_pixels: int) -> None:
@@ -332,22 +313,6 @@ def _jpeg_quality(data: bytes, bands: int) -> int:
     return min(bisect.bisect_left(range(1, 101), True, key=is_fine) + 1, 100)
 
 
-_SAMPLE_KINDS = {
-    1: "unsigned integers",
-    2: "signed integers",
-    3: "floats",
-    5: "complex integers",
-    6: "complex floats",
-}
-_TIFF_SAMPLES = {(1, 1), (1, 2), (1, 4), (1, 8), (4, 8), (1, 16), (3, 16), (3, 32)}
-"""The kinds and bits of samples that libvips reads; kind 4 is unspecified."""
-_PHOTOMETRIC_NAMES = {
-    8: "CIELAB colours",
-    9: "ICCLAB colours",
-    10: "ITULAB colours",
-    32844: "LogL",
-    32845: "LogLuv",
-}
 _COMPRESSIONS = {
     1: "none", 5: "lzw", 7: "jpeg", 8: "deflate", 32946: "deflate", 32773: "packbits", 50000: "zstd",
 }  # fmt: skip

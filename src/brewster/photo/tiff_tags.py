@@ -11,6 +11,8 @@ from collections.abc import Iterator, Mapping
 from mmap import mmap
 from typing import Final, NamedTuple
 
+from brewster.errors import UnsupportedPhoto
+
 Tags = dict[int, "tuple[int, int, bytes] | Tags"]
 """The tags of a directory by number. An entry is (type, count, little-endian value), or the directory for a pointer tag."""
 
@@ -232,6 +234,33 @@ def _is_reduced(tags: Tags) -> bool:
 def _has_sensor_data(tags: Tags) -> bool:
     """A colour filter array, or linear RAW."""
     return number_of(tags, _PHOTOMETRIC, 0) in (32803, 34892)
+
+
+_SAMPLE_KINDS = {
+    1: "unsigned integers",
+    2: "signed integers",
+    3: "floats",
+    5: "complex integers",
+    6: "complex floats",
+}
+_SUPPORTED_SAMPLES = {(1, 1), (1, 2), (1, 4), (1, 8), (4, 8), (1, 16), (3, 16), (3, 32)}
+"""The kinds and bits of samples; kind 4 is unspecified."""
+_COLOUR_NAMES = {8: "CIELAB", 9: "ICCLAB", 10: "ITULAB", 32844: "LogL", 32845: "LogLuv"}
+
+
+def check_pixels(tags: Tags) -> None:
+    """Raises UnsupportedPhoto for pixels that libvips reads with an error, or with other values."""
+    bits, kind, colours = (
+        number_of(tags, tag, default) for tag, default in ((258, 1), (339, 1), (_PHOTOMETRIC, 2))
+    )
+    if (kind, bits) in _SUPPORTED_SAMPLES and colours <= 6:
+        return
+    samples = f"{bits}-bit {_SAMPLE_KINDS.get(kind, 'values of another kind')}"
+    raise UnsupportedPhoto(
+        f"the tiff has {samples if colours <= 6 else _COLOUR_NAMES.get(colours, f'other ({colours})') + ' colours'}",
+        "expected grey, RGB or CMYK of 8- or 16-bit integers or 32-bit floats",
+        "convert the image to one of these",
+    )
 
 
 def has_all_pixels(tags: Tags, size: int) -> bool:
