@@ -47,13 +47,9 @@ def _code_point_profile(
     the file has other primaries, a transfer function unlike that of sRGB (for example linear (8), or PQ (16) or HLG (18) of HDR
     video), values that are not RGB, or only a narrow range of them."""
     if transfer not in _SRGB_TRANSFERS or primaries not in (1, 2, 5, 6, 12) or matrix or not is_full:
-        details = (
-            ""
-            if is_full and not matrix
-            else f", the matrix {matrix} and the {'full' if is_full else 'narrow'} range"
-        )
+        values = f", with the matrix {matrix} and the {'full' if is_full else 'narrow'} range"
         raise UnsupportedPhoto(
-            f"the {format_name} has the primaries {primaries} and the transfer function {transfer}{details} of ITU-T H.273",
+            f"the {format_name} has the primaries {primaries} and the transfer function {transfer} of ITU-T H.273 (cICP){values}",
             "expected those of sRGB or Display P3 in the full range, or an ICC profile",
             "export the image with one of these",
         )
