@@ -232,7 +232,7 @@ def test_metadata_that_the_format_of_the_layers_cannot_keep_are_noted(run, tmp_p
     texts = Photo(
         photo.pixels,
         None,
-        FileInfo("jpeg", image_resources=b"8BIM\4\4\0\0\0\0\0\2ab", exif=b"II*\0\x08\0\0\0\0\0"),
+        FileInfo("jpeg", iptc=b"8BIM\4\4\0\0\0\0\0\2ab", exif=b"II*\0\x08\0\0\0\0\0"),
     )
     (tmp_path / "a.jpg").write_bytes(texts.encode())
     (kept,) = json_lines(run("a.jpg", "-o", "kept", "--json")[1])

@@ -67,7 +67,7 @@ WRITTEN = {
         "GPS:GPSLatitudeRef": "North",
     },
     "xmp": {"XMP-xmp:Rating": 4, "XMP-dc:Subject": ["glass", "window"], "XMP-dc:Creator": ["A. Person"]},
-    "image_resources": {
+    "iptc": {
         "IPTC:Keywords": [f"keyword{number}" for number in range(12)],
         "IPTC:CopyrightNotice": "(c) A. Person",
         "Photoshop:URL": "https://example.org/1",
@@ -109,7 +109,7 @@ def test_the_table_in_the_documentation_is_that_of_the_formats():
         "icc": "colour profile",
         "exif": "EXIF",
         "xmp": "XMP",
-        "image_resources": "IPTC",
+        "iptc": "IPTC",
         "texts": "texts",
     }
     text = (DOCS / "files.md").read_text()
@@ -125,9 +125,9 @@ def test_the_table_in_the_documentation_is_that_of_the_formats():
 
 @pytest.mark.parametrize("format_name", WRITABLE)
 def test_what_a_format_cannot_keep_is_named(format_name):
-    info = FileInfo("png", exif=b"1", xmp=b"1", image_resources=b"1", texts=(b"1",))
+    info = FileInfo("png", exif=b"1", xmp=b"1", iptc=b"1", texts=(b"1",))
     note = lost_metadata(info, format_name) or ""
-    names = {"exif": "EXIF", "xmp": "XMP", "image_resources": "IPTC", "texts": "texts"}
+    names = {"exif": "EXIF", "xmp": "XMP", "iptc": "IPTC", "texts": "texts"}
     for field, name in names.items():
         is_kept = field in WRITABLE[format_name].keeps and (field != "texts" or format_name == "png")
         assert (name in note) is not is_kept
@@ -174,8 +174,8 @@ def test_the_iptc_of_a_jpeg_is_kept_in_a_jpeg_and_a_tiff_without_the_thumbnail_o
 
 def test_image_resources_larger_than_a_segment_are_kept():
     resources = resource(1028, IPTC) + resource(2000, bytes(150_000))
-    jpeg = Photo(smooth(), None, FileInfo("jpeg", image_resources=resources)).encode()
-    assert Photo.open(jpeg).file_info.image_resources == resources
+    jpeg = Photo(smooth(), None, FileInfo("jpeg", iptc=resources)).encode()
+    assert Photo.open(jpeg).file_info.iptc == resources
 
 
 # --- XMP

@@ -64,7 +64,7 @@ _ROWS: Final = (
         signature=rb"\xff\xd8\xff",
         bit_depths=(8,),
         has_alpha=False,
-        keeps=("icc", "exif", "xmp", "image_resources", "texts"),
+        keeps=("icc", "exif", "xmp", "iptc", "texts"),
         is_stored_rotated=True,
     ),
     ImageFormat(
@@ -91,7 +91,7 @@ _ROWS: Final = (
         mime_type="image/tiff",
         signature=rb"II[*+]\0|MM\0[*+]",
         bit_depths=(8, 16, 32),
-        keeps=("icc", "exif", "xmp", "image_resources"),
+        keeps=("icc", "exif", "xmp", "iptc"),
         has_float32=True,
         is_stored_rotated=True,
     ),

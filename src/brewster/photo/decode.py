@@ -259,7 +259,7 @@ def _file_info(
                 file_info,
                 subsampling=subsampling,
                 jpeg_quality=_jpeg_quality(data, bands=3 if subsampling else 1),
-                image_resources=metadata.jpeg_image_resources(data),
+                iptc=metadata.jpeg_image_resources(data),
                 texts=tuple(metadata.jpeg_comments(data)),
             )
             packets = metadata.read_xmp(data)
@@ -269,7 +269,7 @@ def _file_info(
         case "tiff":
             compression = _COMPRESSIONS.get(tiff_tags.number_of(tags, 259, 1), "deflate")
             resources, packet = metadata.tiff_image_resources(tags), tiff_tags.value_of(tags, 700)
-            file_info = replace(file_info, compression=compression, image_resources=resources)
+            file_info = replace(file_info, compression=compression, iptc=resources)
             exif, packets = tiff_tags.tiff_exif(tags), [packet] if packet else []
         case "webp":
             file_info = replace(file_info, lossless=b"VP8L" in metadata.webp_chunks(data))

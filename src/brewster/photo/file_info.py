@@ -26,8 +26,8 @@ class FileInfo:
     exif: bytes | None = None
     """The EXIF block without the leading `Exif\\0\\0`. Its orientation is set to 1."""
     xmp: bytes | None = None
-    image_resources: bytes | None = None
-    """The image resources of Photoshop, such as the IPTC block, without thumbnails."""
+    iptc: bytes | None = None
+    """The IPTC block with the other image resources of Photoshop, without thumbnails."""
     texts: tuple[bytes, ...] = ()
     """The chunks with texts of a PNG, or the comment segments of a JPEG."""
     resolution_px_per_mm: tuple[float, float] | None = None
@@ -66,7 +66,7 @@ def with_notes(file_info: FileInfo, *notes: str) -> FileInfo:
     return replace(file_info, note="; ".join(filter(None, (file_info.note, *notes))) or None)
 
 
-_BLOCK_NAMES = {"exif": "EXIF", "xmp": "XMP", "image_resources": "IPTC", "texts": "texts"}
+_BLOCK_NAMES = {"exif": "EXIF", "xmp": "XMP", "iptc": "IPTC", "texts": "texts"}
 
 
 def lost_metadata(file_info: FileInfo, format_name: str) -> str | None:

@@ -104,7 +104,7 @@ def with_jpeg_head(data: bytes, file_info: FileInfo, dots_per_inch: tuple[float,
     name = _EXTENDED_XMP_NAME + guid_of(extended).encode()
     for position, part in _parts(extended, _MAX_SEGMENT_PAYLOAD - len(name) - 8):
         head.append(_segment(_APP1, name + struct.pack(">II", len(extended), position) + part))
-    resources = _parts(file_info.image_resources or b"", _MAX_SEGMENT_PAYLOAD - len(_RESOURCES_NAME))
+    resources = _parts(file_info.iptc or b"", _MAX_SEGMENT_PAYLOAD - len(_RESOURCES_NAME))
     head += [_segment(_APP13, _RESOURCES_NAME + part) for _, part in resources]
     head += [text for text in file_info.texts if text.startswith(bytes((0xFF, _COM)))]
     return b"".join((data[:2], *head, data[2:]))
@@ -156,7 +156,7 @@ def _iptc_size(iptc: bytes) -> int:
 
 def tiff_tags_of(file_info: FileInfo) -> Tags:
     """Returns the tags of a TIFF for EXIF, XMP, the image resources and IPTC."""
-    resources = _resources(file_info.image_resources or b"")
+    resources = _resources(file_info.iptc or b"")
     _, iptc = resources.pop(_IPTC, (b"", b""))
     blocks = {700: (1, file_info.xmp), 33723: (7, iptc), 34377: (1, _serialise_resources(resources))}
     tags = camera_tags(read_tags(file_info.exif)) if file_info.exif else {}
