@@ -68,11 +68,11 @@ def test_the_gradients_are_those_of_finite_differences(seed, name, layers, is_op
     direction = gradients[name] / np.linalg.norm(gradients[name])
     losses, values = [], getattr(model, name).copy()
     for step in (-1, 1):
-        getattr(model, name)[:] = values + step * 3e-3 * direction
+        getattr(model, name)[:] = values + step * 1e-3 * direction
         losses.append(loss_and_gradients(model, frames, prior, weights)[0])
     expected = (gradients[name] * direction).reshape(len(values), -1).sum(1)
-    assert (losses[1] - losses[0]) / 6e-3 == pytest.approx(
-        expected, rel=0.1, abs=0.02 * float(expected.max())
+    assert (losses[1] - losses[0]) / 2e-3 == pytest.approx(
+        expected, rel=0.1, abs=0.05 * float(expected.max())
     )
 
 

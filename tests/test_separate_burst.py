@@ -38,7 +38,8 @@ def linear_pictures(size):
 @pytest.fixture
 def few_steps(monkeypatch):
     """For tests that do not measure the separation."""
-    monkeypatch.setattr("brewster.burst.separate.solve", partial(solve, levels=(Level(48, 2, None),)))
+    few = (Level(48, 2, None),)
+    monkeypatch.setattr("brewster.burst.separate.solve", partial(solve, search=few, levels=few))
 
 
 @pytest.fixture(scope="module")
@@ -453,6 +454,38 @@ def test_named_photos_of_several_folders_are_one_burst_and_the_reference_counts_
     assert (named.burst.photos, whole.burst.photos) == ((photos[0],), (photos[2],))
 
 
+def test_measured_layers_can_be_forced_exchanged_and_left_aside(small_burst, few_steps):
+    photos = [Photo.from_array(frame, encoding="srgb") for frame in small_burst.frames]
+    fitted = fit_burst(photos)
+    assert fitted.report.method != "burst"  # after so few steps
+    forced, swapped, single = (
+        fitted.chosen(method, swap=swap).separate(lambda _: None)
+        for method, swap in (("motion", False), ("motion", True), ("single", True))
+    )
+    assert (forced.burst.method, swapped.burst.method, single.burst.method) == (
+        "burst",
+        "burst",
+        "single photo",
+    )
+    assert (forced.burst.is_swapped, swapped.burst.is_swapped, single.burst.is_swapped) == (
+        False,
+        True,
+        False,
+    )
+    levels = [layer.linear().mean() for layer in (*forced, *reversed([*swapped]))]
+    assert levels[:2] == pytest.approx(levels[2:], rel=0.2)
+    assert np.array_equal(single.transmission.pixels, brewster.separate(photos[2]).transmission.pixels)
+
+
+def test_the_method_single_measures_nothing_and_motion_needs_a_measurement(small_burst, monkeypatch):
+    monkeypatch.setattr("brewster.burst.separate.measure_layers", lambda *_, **__: pytest.fail("measured"))
+    photos = [Photo.from_array(frame, encoding="srgb") for frame in small_burst.frames]
+    assert separate_burst(photos, method="single").burst.method == "single photo"
+    monkeypatch.setattr("brewster.burst.separate.measure_layers", lambda *_, **__: (None, (0,)))
+    with pytest.raises(PhotoError, match="no layers were measured"):
+        separate_burst(photos, method="motion")
+
+
 def test_a_dry_run_refuses_what_cannot_be_a_burst(run_without_model, tmp_path, burst_files):
     (tmp_path / "alone.png").write_bytes(burst_files[0].read_bytes())
     code, out, _ = run_without_model("burst", "alone.png", "--json", "--dry-run")
@@ -539,6 +572,10 @@ def test_the_command_writes_the_layers_and_the_report(run_without_model, tmp_pat
     _, out, err = run_without_model(*command)
     assert json.loads(out)["status"] == "skipped"
     assert "skipped, because all layers exist (" in err  # not "made with other options"
+    _, _, err = run_without_model(*command, "--method", "motion", "--swap")
+    assert "requested=auto, swapped=no" in err
+    code, out, _ = run_without_model(*command, "--method", "motion", "--swap", "--overwrite")
+    assert json.loads(out)["burst"]["is_swapped"]
 
 
 def test_the_command_reports_bursts_that_cannot_be_separated(run_without_model, tmp_path, burst_files):

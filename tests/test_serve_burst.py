@@ -27,10 +27,10 @@ PICTURES = sorted((Path(__file__).parent / "pictures").glob("*.jpg"))
 
 @pytest.fixture(scope="module")
 def photos():
-    """Three photos of 120 x 90 pixels, in which the reflection moves by 12 pixels."""
+    """Three photos of 128 x 96 pixels, in which the reflection moves by 12 pixels."""
     layers = [np.clip(read_photo(path, (160, 120)), 0, 1) for path in (PICTURES[2], PICTURES[1])]
     burst = simulate_burst(
-        *layers, frames=3, relative_px=12, common_px=3, strength=0.4, noise=0, size=(120, 90)
+        *layers, frames=3, relative_px=12, common_px=3, strength=0.4, noise=0, size=(128, 96)
     )
     return [file_of(frame, "PNG") for frame in burst.frames]
 
@@ -38,7 +38,8 @@ def photos():
 @pytest.fixture
 def few_steps(monkeypatch):
     """For tests that do not measure the separation."""
-    monkeypatch.setattr("brewster.burst.separate.solve", partial(solve, levels=(Level(48, 20, None),)))
+    few = (Level(48, 20, None),)
+    monkeypatch.setattr("brewster.burst.separate.solve", partial(solve, search=few, levels=few))
 
 
 def send(path, photos, app=None, mask=None, **fields):
@@ -50,7 +51,7 @@ def send(path, photos, app=None, mask=None, **fields):
 
 @pytest.mark.usefixtures("few_steps")
 def test_a_burst_with_a_mask_returns_the_layers_of_the_python_function(photos):
-    mask = np.zeros((90, 120), np.uint8)
+    mask = np.zeros((96, 128), np.uint8)
     mask[:, 60:] = 255
     response = send("/separate", photos, mask=file_of(mask, "PNG"), reference="3", strength="0.7")
     assert response.status_code == 200, response.text
@@ -82,7 +83,7 @@ def test_the_preview_of_a_burst_shows_the_layers_of_the_download(photos):
 
 @pytest.mark.usefixtures("few_steps")
 def test_a_download_after_a_preview_measures_the_motion_only_for_other_photos_or_another_reference(
-    photos, monkeypatch
+    photos, monkeypatch, few_steps
 ):
     measured = []
 
@@ -97,8 +98,14 @@ def test_a_download_after_a_preview_measures_the_motion_only_for_other_photos_or
         send("/separate", photos, app, layers="transmission", strength="0.5", reference=number).content
         for number in ("2", "1", "1")
     )
+    forced, swapped = (
+        send("/separate", photos, app, layers="transmission", reference="1", method="motion", swap=swap)
+        for swap in ("no", "yes")
+    )
     assert measured == [1, 0]
     assert one != other == same
+    assert forced.headers["Brewster-Burst-Measured"] == "yes"
+    assert forced.content != swapped.content
     send("/separate", photos[:2], app, layers="transmission", reference="1")
     assert measured == [1, 0, 0]
 

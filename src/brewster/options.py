@@ -31,6 +31,11 @@ Offload = Literal["auto", "none", "layers"]
 """Whether the weights of a diffusion model are kept in host memory and copied to the GPU layer by layer."""
 
 
+BurstMethod = Literal["auto", "motion", "single"]
+"""How a burst is to be separated. auto: by the motion of the layers if the measurement agrees with the photos. motion: by the motion in
+any case. single: the reference photo alone."""
+
+
 class LoadOptions(TypedDict, total=False):
     """The keywords of `Separator.load`; for their meaning and defaults, see `Options`. All but the device are for diffusion models."""
 
@@ -66,6 +71,28 @@ _CALL_OPTIONS: Final = ("strength", "quality", "mask", "hints", "additive", "max
 
 def _option(default: Any, description: str, **limits: int) -> Any:  # noqa: ANN401  (a field of any type)
     return field(default=default, metadata={"description": description, **limits})
+
+
+@final
+@dataclass(frozen=True)
+class BurstOptions:
+    """The options of a burst, besides those of a separation. pydantic validates those of a request."""
+
+    reference: int | None = _option(
+        None,
+        "The photo of a burst to separate: 1 is the first one; by default, the middle one.",
+        ge=1,
+        le=MAX_BURST_PHOTOS,
+    )
+    method: BurstMethod = _option(
+        "auto",
+        "auto separates a burst by the motion of the layers if the measurement agrees with the photos; motion in any case; "
+        "single separates the reference photo alone.",
+    )
+    swap: bool = _option(
+        False,
+        "Exchange the measured layers of a burst: which of them is behind the glass is not always certain.",
+    )
 
 
 @final

@@ -14,7 +14,7 @@ from brewster.files import absolute, check_output_folder, images_in
 from brewster.image_formats import SUFFIXES, is_video
 from brewster.inference.assessment import Assessment
 from brewster.inference.burst_report import BurstReport
-from brewster.options import DEFAULT_FRAMES, Options
+from brewster.options import DEFAULT_FRAMES, BurstMethod, Options
 from brewster.photo.in_memory import BinaryFile, WritableFile
 from brewster.remote_path import Location, location
 
@@ -33,6 +33,9 @@ class Burst:
     """The index of the photo that is separated; None for the middle one."""
     frames: int
     """The number of frames that are chosen from a video."""
+    method: BurstMethod = "auto"
+    swap: bool = False
+    """Whether the measured layers are exchanged."""
 
     @property
     def is_from_video(self) -> bool:
@@ -181,12 +184,14 @@ def plan_bursts(
     *,
     reference: int | None = None,
     frames: int = DEFAULT_FRAMES,
+    method: BurstMethod = "auto",
+    swap: bool = False,
 ) -> list[SeparationTask]:
     """Groups photos into bursts, and returns a task for each burst with the paths of the layers of its reference photo.
 
     The photos that are given by name are one burst, in their order, and so are the photos of each folder, in the order
     of their names, and each video. `reference` is the index of the reference photo in each burst, by default the middle
-    one; `frames` is the number of frames that are chosen from a video. Raises PhotoError if there is no photo, or none
+    one; `frames` is the number of frames that are chosen from a video; for `method` and `swap`, see `brewster.separate_burst`. Raises PhotoError if there is no photo, or none
     with the index `reference`, and OutputError as `plan_files`."""
     given = [location(source) for source in sources]
     folder = None if output is None else location(output)
@@ -205,7 +210,7 @@ def plan_bursts(
     bursts, named = {}, []
     for images in groups.values():
         photos = tuple(image for image, _ in images)
-        burst = Burst(photos, reference, frames)
+        burst = Burst(photos, reference, frames, method, swap)
         if reference is not None and not 0 <= reference < burst.photo_count:
             raise PhotoError(
                 f"photo {reference + 1} is the reference of a burst of {counted(burst.photo_count, 'photo')} ({photos[0]})",

@@ -238,7 +238,7 @@ def _separate_burst(
     burst: Burst, separator: Separator, options: Options, on_progress: Callable[[float], None]
 ) -> tuple[Path | bytes, Separation]:
     """Returns the file of the reference photo, or the video, and the separation."""
-    from brewster.burst import read_video, separate_burst  # noqa: PLC0415  (imports torch)
+    from brewster.burst import read_video, separate_burst  # noqa: PLC0415  (imports numba)
 
     photos: Sequence[Source]
     if burst.is_from_video:
@@ -253,6 +253,8 @@ def _separate_burst(
         photos,
         reference=burst.reference,
         separator=separator,
+        method=burst.method,
+        swap=burst.swap,
         on_progress=on_progress,
         **options.call_options(),
     )

@@ -28,7 +28,6 @@ Doubles = NDArray[np.float64]
 
 _ERROR_AT_1_E: Final = 0.05
 """The mean error of the frames, as a difference of square roots of light, at which the confidence is 1/e."""
-_FIRST_OPACITY: Final = 0.04
 _BICUBIC: Final = -0.75
 """The parameter of bicubic interpolation that OpenCV has, too."""
 
@@ -104,10 +103,16 @@ class JointModel:
         homographies, splines = self.homographies[:, ::-1].copy(), self.splines[:, ::-1].copy()
         return replace(self, layers=layers, homographies=homographies, splines=splines)
 
-    def with_opacity(self) -> JointModel:
-        """Returns a model whose second layers are slightly opaque, so that optimisation can make them opaque or transparent."""
+    def with_opacity(self, mask: NDArray[np.bool_], elsewhere: float = 0.02) -> JointModel:
+        """Returns a model whose second layers are opaque where a mask (h, w) of the reference frame is set, and hardly elsewhere.
+
+        A layer with an opacity of 0 stays transparent; any other opacity changes with the optimisation.
+        """
+        height, width = self.layers.shape[2:4]
+        x, y = to_pixels(pixel_grid(height, width) * (1 + 2 * MARGIN), mask.shape)
+        opacity = cv2.remap(mask.astype(np.float32), x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         layers = self.layers.copy()
-        layers[:, 1, ..., 3] = _FIRST_OPACITY**0.5
+        layers[:, 1, ..., 3] = np.sqrt(np.maximum(opacity, elsewhere))
         return replace(self, layers=layers)
 
     def resized(self, frames: Floats, density: float, spline_size: tuple[int, int] | None) -> JointModel:
@@ -149,17 +154,34 @@ class JointModel:
         moved: Doubles = _project(homographies[candidate, layer, frame], pixel_grid(height, width)) + offsets
         return moved
 
-    def frame_layers(self, frame: int, height: int, width: int, candidate: int = 0) -> Floats:
-        """Returns T and R as a frame shows them, without its gain: (2, h, w, 3) linear light. An opaque part of the second layer belongs to T."""
-        samples = np.empty((self.layers.shape[1], height, width, 4), np.float32)
-        for layer, canvas in enumerate(np.square(self.layers[candidate])):
-            positions = self.positions(candidate, layer, frame, height, width) / (1 + 2 * MARGIN)
-            kernels.sample(canvas, *to_pixels(positions, canvas.shape), samples[layer])
-        return compose(samples)
+    def frame_layers(self, frame: int, height: int, width: int) -> Floats:
+        """Returns T and R of the first candidate as a frame shows them, without its gain: (2, h, w, 3) linear light.
+
+        An opaque part of the second layer belongs to T.
+        """
+        return compose(self._samples(frame, height, width))
 
     def reference_layers(self, height: int, width: int) -> Floats:
         """Returns T and R of the reference frame for the first candidate: (2, h, w, 3) linear light."""
         return self.frame_layers(self.reference, height, width)
+
+    def reference_opacity(self, height: int, width: int) -> Floats:
+        """Returns the opacity of the second layer of the first candidate in the reference frame, (h, w) in 0..1."""
+        return np.minimum(self._samples(self.reference, height, width)[1, ..., 3], 1)
+
+    def object_share(self, height: int, width: int) -> float:
+        """Returns the share of the light of the second layer, in the reference frame, that belongs to opaque objects."""
+        second = self._samples(self.reference, height, width)[1]
+        light = second[..., :3].mean(-1)
+        return float((light * np.minimum(second[..., 3], 1)).sum() / (light.sum() + 1e-9))
+
+    def _samples(self, frame: int, height: int, width: int) -> Floats:
+        """Returns the layers of the first candidate at the places that a frame shows, (L, h, w, 4)."""
+        samples = np.empty((self.layers.shape[1], height, width, 4), np.float32)
+        for layer, canvas in enumerate(np.square(self.layers[0])):
+            positions = self.positions(0, layer, frame, height, width) / (1 + 2 * MARGIN)
+            kernels.sample(canvas, *to_pixels(positions, canvas.shape), samples[layer])
+        return samples
 
     def relative_motion(self, height: int, width: int) -> Doubles:
         """Returns the largest mean motion of R relative to T between two frames, as a share of the width, (C,)."""
@@ -175,20 +197,22 @@ class JointModel:
         return np.array(largest)
 
     def confidence(self, frames: Floats) -> Floats:
-        """Returns how well the frames agree with their prediction by the first candidate at each pixel of the reference frame, (h, w, 1) in 0..1.
+        """Returns how well the frames agree with their prediction by the first candidate at each pixel of the reference frame, (h, w, 1) in 0..1."""
+        confidence: Floats = np.exp(-self.collected_errors(frames, layer=0) / _ERROR_AT_1_E)[..., None]
+        return confidence
 
-        The mean errors of the frames (K, h, w, 4) are collected on the canvas of T, in the opposite direction of the rendering.
-        """
+    def collected_errors(self, frames: Floats, layer: int) -> Floats:
+        """Returns the mean absolute errors of the frames (K, h, w, 4) for the first candidate, moved to the reference frame as a layer: (h, w)."""
         _, height, width, _ = frames.shape
         collected = np.zeros((height, width, 2), np.float32)
         gains = self.fixed_motion()[2][0]
         for k, frame in enumerate(frames):
             total = self.frame_layers(k, height, width).sum(0)
             errors = np.abs(data_errors(total * gains[k].astype(np.float32), frame[..., :3])).mean(-1)
-            x, y = to_pixels(self.positions(0, 0, k, height, width), (height, width))
+            x, y = to_pixels(self.positions(0, layer, k, height, width), (height, width))
             kernels.collect(errors, x, y, collected)
-        confidence: Floats = np.exp(-collected[..., :1] / (collected[..., 1:] + 1e-3) / _ERROR_AT_1_E)
-        return confidence
+        mean_errors: Floats = collected[..., 0] / (collected[..., 1] + 1e-3)
+        return mean_errors
 
 
 def compose(samples: Floats) -> Floats:

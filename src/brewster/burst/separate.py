@@ -25,12 +25,12 @@ from brewster.burst.solver import MIN_SIDE_PX, Solution, solve
 from brewster.burst.threads import single_opencv_thread
 from brewster.errors import PhotoError, error_prefix
 from brewster.inference.assessment import Verdict
-from brewster.inference.burst_report import BurstMethod, BurstReport, burst_photo_name, check_photo_count
+from brewster.inference.burst_report import BurstReport, burst_photo_name, check_photo_count
 from brewster.inference.guided_upsampling import GeneratedOverride
 from brewster.inference.predictor import Prediction, Predictor, ProgressCallback
 from brewster.inference.separation import Separation
 from brewster.inference.separator import Separator, white_level
-from brewster.options import Options, Quality
+from brewster.options import BurstMethod, Options, Quality
 from brewster.photo import Photo, Source
 
 _WORKING_PX: Final = 1000
@@ -48,6 +48,8 @@ _MAX_EDGE_CORRELATION: Final = 0.2
 -2.5, -0.1 and +3.3 dB."""
 _MIN_CERTAIN_NAMING: Final = 0.08
 """Of 15 simulated bursts below, two had exchanged layers; of 30 above, one."""
+_MAX_OBJECT_SHARE: Final = 0.6
+"""If opaque objects have more of the light of the second layer, it is no reflection."""
 _HINTED_SHARE: Final = 0.3
 _HINTED_AREA: Final = 0.2
 """Where the measured reflection has more of the light, the model gets a hint, but in no larger area: its hints were trained on a tenth."""
@@ -68,6 +70,7 @@ class FittedBurst:
     _single: Separator
     """Of the single photo."""
     _hints: Source | None
+    _requested: BurstMethod = "auto"
 
     def chosen(self, method: BurstMethod, *, swap: bool) -> FittedBurst:
         """Returns the burst with another method, or with exchanged layers. Raises PhotoError if there are no measured layers to use."""
@@ -92,7 +95,7 @@ class FittedBurst:
             )
         if swap and report.method == "burst":
             report = replace(report, is_swapped=True, are_names_certain=True)
-        return replace(self, report=report)
+        return replace(self, report=report, _requested=method)
 
     @property
     def hints(self) -> Source | None:
@@ -114,7 +117,10 @@ class FittedBurst:
             )
         count = self.report.frames + len(self.report.left_out)
         return separator.for_burst(
-            count, has_hints=self._hints is not None, is_swapped=self.report.is_swapped
+            count,
+            hints="yes" if self._hints is not None else "no",
+            requested=self._requested,
+            swapped="yes" if self.report.is_swapped else "no",
         )
 
     def _layers(self) -> Solution:
@@ -338,11 +344,14 @@ def burst_report(
     method: Literal["burst", "single photo", "unchanged"] = "single photo"
     is_copy = solution is not None and solution.edge_correlation > _MAX_EDGE_CORRELATION
     has_two_layers = explained >= needed and not is_copy
+    is_scene = solution is not None and solution.object_share > _MAX_OBJECT_SHARE
     advice = "Move the camera by 5 to 10 cm between the photos, best along a circle."
     if solution is None:
         message = "No other photo shows the same scene as the reference photo."
         if not left_out:
             message = f"Photos with less than {MIN_SIDE_PX} pixels are too small to show the motion."
+    elif has_two_layers and is_scene:
+        message = "Objects behind the glass move differently from the wall behind them, and hide the motion of the reflection."
     elif has_two_layers and motion >= (_USEFUL_MOTION_PX if is_doubted else _MIN_MOTION_PX):
         method, message = "burst", f"The layers moved {motion:.0f} px apart in a photo of 1,000 px."
         if solution.naming < _MIN_CERTAIN_NAMING:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Final, final
 
 import cv2
@@ -12,6 +13,8 @@ import numpy as np
 
 from brewster.burst.joint_model import Doubles, Floats, JointModel, with_fourth_channel
 from brewster.burst.kernels import OFFSET
+from brewster.burst.objects import STEPS as OBJECT_STEPS
+from brewster.burst.objects import with_objects
 from brewster.burst.optimiser import Rates, Weights, optimise
 from brewster.burst.registration import MotionCandidate
 
@@ -35,6 +38,13 @@ class Level:
     """Pixels of the layers per pixel of a frame, along each axis."""
     kept: int = 1
     """How many candidates of each family are kept after this level of the search."""
+
+    @property
+    def rates(self) -> Rates:
+        """The learning rates: the motion is slower in larger frames."""
+        if not self.spline_size:
+            return Rates(splines=0)
+        return Rates().scaled(min(1.0, 80 / self.long_side_px))
 
 
 _MAX_RELATIVE_MOTION: Final = 0.2
@@ -86,6 +96,8 @@ class Solution:
     """The mean error of the frames if both layers move together: the data term of the loss at 160 pixels."""
     two_layer_error: float
     """The same for the best candidate."""
+    object_share: float = 0.0
+    """The share of the light of the second layer that belongs to opaque objects, which are in the transmission."""
 
     def swapped(self) -> Solution:
         """Returns the solution with both layers exchanged."""
@@ -119,19 +131,27 @@ def solve(
     search, levels = (
         [level for level in some if level.long_side_px <= largest] or some[:1] for some in (search, levels)
     )
-    total = sum(level.steps * level.long_side_px for level in (*search, *levels))
+    total = (
+        sum(level.steps * level.long_side_px for level in (*search, *levels))
+        + OBJECT_STEPS * levels[0].long_side_px
+    )
     done = 0.0
 
     def optimised(model: JointModel, level: Level, frames: Floats, prior: Floats) -> JointModel:
-        def on_step() -> None:
-            nonlocal done
-            done += level.long_side_px / total
-            on_progress(done)
-
-        rates = Rates().scaled(min(1.0, 80 / level.long_side_px)) if level.spline_size else Rates(splines=0)
         return optimise(
-            model, frames, prior, level.steps, rates=rates, weights=level.weights, on_step=on_step
+            model,
+            frames,
+            prior,
+            level.steps,
+            rates=level.rates,
+            weights=level.weights,
+            on_step=partial(on_step, level),
         )
+
+    def on_step(level: Level) -> None:
+        nonlocal done
+        done += level.long_side_px / total
+        on_progress(min(done, 1.0))
 
     families = [candidate.family for candidate in candidates]
     model = None
@@ -148,31 +168,39 @@ def solve(
     one_layer, best = int(model.is_locked.argmax()), _best(model)
     errors = float(model.data_losses[one_layer]), float(model.data_losses[best])
     model = model.selected([best])
-    edge_correlation = naming = 0.0
-    refined = prior
+    model, layers, naming = _with_names(model, small, small_prior)
+    edge_correlation = _edge_correlation(layers)
+    refined = refine_prior(_reflection_share(layers)) if refine_prior else prior
     for level in levels:
-        if level in levels[:2]:
-            layers, naming = _named(model, small, small_prior)
-            edge_correlation = _edge_correlation(layers)
-            is_exchanged = naming < -_MIN_NAMING
-            if is_exchanged:  # the next levels correct the brightness of large areas
-                model, layers, naming = model.exchanged(), layers[::-1], -naming
-            if refine_prior and (is_exchanged or level is levels[0]):
-                refined = refine_prior(_reflection_share(layers))
         small, small_prior, small_refined = (
             _packed(images, level.long_side_px) for images in (frames, [prior], [refined])
         )
         model = optimised(
             model.resized(small, level.density, level.spline_size), level, small, small_refined[0]
         )
-        small_prior = small_prior[0]
+        if level is levels[0]:
+            named, layers, naming = _with_names(model, small, small_prior[0])
+            edge_correlation = _edge_correlation(layers)
+            if refine_prior and named is not model:  # the next levels correct the brightness of large areas
+                refined = refine_prior(_reflection_share(layers))
+            model = with_objects(
+                named,
+                small,
+                small_refined[0],
+                rates=level.rates,
+                weights=level.weights,
+                on_step=partial(on_step, level),
+            )
     layers = model.reference_layers(*small.shape[1:3])
-    motion = float(model.relative_motion(*_MOTION_SAMPLES)[0])
-    return Solution(layers[0], layers[1], model.confidence(small), motion, naming, edge_correlation, *errors)
+    motion, share = float(model.relative_motion(*_MOTION_SAMPLES)[0]), model.object_share(*small.shape[1:3])
+    return Solution(
+        layers[0], layers[1], model.confidence(small), motion, naming, edge_correlation, *errors, share
+    )
 
 
-def _named(model: JointModel, frames: Floats, prior: Floats) -> tuple[Floats, float]:
-    """Returns the layers of the reference frame, (2, h, w, 3), and the share of T in the prior's detail minus that of R."""
+def _with_names(model: JointModel, frames: Floats, prior: Floats) -> tuple[JointModel, Floats, float]:
+    """Returns the model with exchanged layers if they have each other's names, the layers of the reference frame, (2, h, w, 3), and the
+    share of T in the prior's detail minus that of R."""
     layers = model.reference_layers(*frames.shape[1:3])
     images = [*layers, prior[..., :3]]
     # The noise of light is proportional to its square root
@@ -180,7 +208,10 @@ def _named(model: JointModel, frames: Floats, prior: Floats) -> tuple[Floats, fl
     details = np.stack([((image - _blurred(image)) / noise).ravel() for image in images]).astype(np.float64)
     gram = details @ details.T
     transmission, reflection = np.linalg.lstsq(gram[:2, :2] + 1e-6 * np.eye(2), gram[:2, 2])[0]
-    return layers, float(transmission - reflection)
+    naming = float(transmission - reflection)
+    if naming < -_MIN_NAMING:
+        return model.exchanged(), layers[::-1], -naming
+    return model, layers, naming
 
 
 def _blurred(image: Floats) -> Floats:

@@ -192,6 +192,7 @@ class BatchReport:
         expected = separation_parameters(**{name: getattr(self.options, name) for name in names})
         burst = self._bursts.get(result.source)
         expected["burst"] = f"{burst.photo_count} photos" if burst else "no"
+        expected |= {"requested": burst.method, "swapped": "yes" if burst.swap else "no"} if burst else {}
         metadata = (recorded_parameters(Path(path), PROGRAM) for path in result.outputs.values())
         recorded = next((parameters for parameters in metadata if parameters), {})
         with suppress(ModelError):  # the model is unknown

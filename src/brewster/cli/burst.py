@@ -13,7 +13,7 @@ from brewster.cli.extras import require_extra
 from brewster.cli.parameters import OVERWRITE, QUIET, Number, flag, json_lines
 from brewster.cli.separate import parse_options, with_options
 from brewster.models import zoo
-from brewster.options import DEFAULT_FRAMES, MAX_BURST_PHOTOS, Options
+from brewster.options import DEFAULT_FRAMES, MAX_BURST_PHOTOS, BurstMethod, BurstOptions, Options
 
 if TYPE_CHECKING:
     from brewster.batch import SeparationTask
@@ -29,17 +29,13 @@ if TYPE_CHECKING:
     help="Where to write the layers: a folder, or an image file for a single layer.",
 )
 @click.option(
-    "--reference",
-    type=Number(1),
-    help="The photo to separate: 1 is the first one; by default, the middle one.",
-)
-@click.option(
     "--frames",
     type=Number(2, MAX_BURST_PHOTOS),
     default=DEFAULT_FRAMES,
     help="The number of frames to choose from a video.",
 )
-@with_options
+@with_options(BurstOptions)
+@with_options(Options)
 @json_lines("burst")
 @QUIET
 @flag("--dry-run", help="Print the planned files. Write nothing.")
@@ -53,6 +49,8 @@ def burst(
     output: str | None,
     reference: int | None,
     frames: int,
+    method: BurstMethod,
+    swap: bool,
     **values: Any,  # noqa: ANN401  (those of Options, and the flags of BatchReport)
 ) -> None:
     """Separate several photos of one window by the motion of the layers.
@@ -67,12 +65,18 @@ def burst(
     options = parse_options(context, values, single_output=is_single_output((), output))
     zoo.model_name(options.model)
     require_extra("burst", "a burst")
-    tasks = _plan(photos, output, options, reference=reference and reference - 1, frames=frames)
+    burst_options = {
+        "reference": reference and reference - 1,
+        "frames": frames,
+        "method": method,
+        "swap": swap,
+    }
+    tasks = _plan(photos, output, options, burst_options)
     context.exit(BatchReport(options, output, len(tasks), **values).run(tasks))
 
 
 def _plan(
-    photos: tuple[str, ...], output: str | None, options: Options, *, reference: int | None, frames: int
+    photos: tuple[str, ...], output: str | None, options: Options, burst_options: dict[str, Any]
 ) -> list[SeparationTask]:
     from brewster.batch.plan import plan_bursts  # noqa: PLC0415  (imports ONNX Runtime and pyvips)
 
@@ -83,7 +87,7 @@ def _plan(
     is_image = is_single_output((), output)
     if not is_image:
         check_output(photos[:1], output)
-    tasks = plan_bursts(photos, None if is_image else output, options, reference=reference, frames=frames)
+    tasks = plan_bursts(photos, None if is_image else output, options, **burst_options)
     if not is_image:
         return tasks
     if len(tasks) > 1:

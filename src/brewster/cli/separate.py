@@ -22,7 +22,7 @@ from brewster.errors import BrewsterError, OutputError
 from brewster.files import absolute, check_output_folder
 from brewster.image_formats import FormatName, canonical_format, format_of
 from brewster.models import zoo
-from brewster.options import Options
+from brewster.options import BurstOptions, Options
 from brewster.remote_path import Location, location
 
 if TYPE_CHECKING:
@@ -76,12 +76,16 @@ def _complete_model(
     return [*map(CompletionItem, names), CompletionItem(incomplete, type="file")]
 
 
-def with_options(command: _Command) -> _Command:
-    """Adds one option for each field of `Options` to a command."""
-    hints = get_type_hints(Options)
-    for field in reversed(dataclasses.fields(Options)):
-        command = _option(field, hints[field.name])(command)
-    return command
+def with_options(settings: type[Options] | type[BurstOptions]) -> Callable[[_Command], _Command]:
+    """Adds one option for each field of `settings` to a command."""
+
+    def decorate(command: _Command) -> _Command:
+        hints = get_type_hints(settings)
+        for field in reversed(dataclasses.fields(settings)):
+            command = _option(field, hints[field.name])(command)
+        return command
+
+    return decorate
 
 
 def _option(field: dataclasses.Field[Any], hint: object) -> Callable[[_Command], _Command]:
@@ -123,7 +127,7 @@ def _param_type(hint: object, field: dataclasses.Field[Any]) -> click.ParamType[
     type=click.Path(),
     help="Where to write the layers: a folder, an image file for a single layer, or - for standard output.",
 )
-@with_options
+@with_options(Options)
 @json_lines("photo")
 @QUIET
 @flag("--dry-run", help="Print the planned files, and the photos that cannot be opened. Write nothing.")

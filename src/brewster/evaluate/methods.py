@@ -146,7 +146,7 @@ class ModelMethod:
         separator = _separators[key]
         started = time.perf_counter()
         if self.burst and case.frames:
-            from brewster.burst import separate_burst  # noqa: PLC0415  (imports torch)
+            from brewster.burst import separate_burst  # noqa: PLC0415  (imports numba)
 
             frames = [Photo.open(file.read()) for file in case.frames]
             for i, frame in enumerate(frames):
@@ -173,7 +173,7 @@ class ModelMethod:
     def _sha256(self) -> str:
         if not self.exclusive:
             return find_model(self.model).verify()
-        from brewster.models.diffusion.pipeline import fingerprint  # noqa: PLC0415  (imports torch)
+        from brewster.models.diffusion.pipeline import fingerprint  # noqa: PLC0415  (imports numba)
 
         return fingerprint(self.model, device=self.device)
 

@@ -10,10 +10,6 @@ from typing import Literal, final
 from brewster.errors import PhotoError, counted
 from brewster.options import MAX_BURST_PHOTOS
 
-BurstMethod = Literal["auto", "motion", "single"]
-"""How a burst is to be separated. auto: by the motion of the layers if the measurement agrees with the photos. motion: by the motion in
-any case. single: the reference photo alone."""
-
 
 @final
 @dataclass(frozen=True)

@@ -81,14 +81,10 @@ class Separator:
         """Returns `Separator(compact, cpu)`."""
         return f"Separator({self.name}, {self.device})"
 
-    def for_burst(self, photo_count: int, *, has_hints: bool, is_swapped: bool = False) -> Separator:
-        """Returns a copy whose layers record that they were made from a burst of this many photos, and whether with hints or exchanged."""
+    def for_burst(self, photo_count: int, **recorded: str) -> Separator:
+        """Returns a copy whose layers record that they were made from a burst of this many photos, and other parameters."""
         separator = copy(self)
-        separator._recorded = self._recorded | {
-            "burst": f"{photo_count} photos",
-            "hints": "yes" if has_hints else "no",
-            **({"swapped": "yes"} if is_swapped else {}),
-        }
+        separator._recorded = self._recorded | {"burst": f"{photo_count} photos"} | recorded
         return separator
 
     @classmethod

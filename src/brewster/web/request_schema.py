@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import unicodedata
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any, Final, final
 
@@ -18,16 +18,17 @@ from starlette.requests import Request
 from brewster.errors import invalid_value
 from brewster.files import OUTPUT_LAYERS, SeparationPaths
 from brewster.image_formats import FORMATS, canonical_format, format_of
-from brewster.options import MAX_BURST_PHOTOS, Options
+from brewster.options import MAX_BURST_PHOTOS, BurstOptions, Options
 from brewster.remote_path import check_not_video
 
 FIELDS: Final = ("layers", "strength", "quality", "format", "additive", "model")
 """The options that a client may set as text. The server sets the other options."""
 _FILES: Final = ("photo", "mask", "hints")
-_REFERENCE: Final = "reference"
 _MAX_FILES: Final = 32
 """Larger than the number of photos of a burst, which `brewster.burst` checks with a better message."""
 _OPTIONS: Final = TypeAdapter(Options)
+_BURST_OPTIONS: Final = TypeAdapter(BurstOptions)
+_BURST_FIELDS: Final = tuple(field.name for field in fields(BurstOptions))
 _REQUEST_PARTS: Final = ("query", "path", "body")
 _MAX_NAME_BYTES: Final = 255 - len(".transmission.jpeg")
 """Maximum length of a name without its suffix. The names of all layers then fit into the 255 bytes of usual file systems."""
@@ -45,12 +46,6 @@ _PHOTOS_SCHEMA: Final = {
     "maxItems": MAX_BURST_PHOTOS,
     "description": f"The photo, or 2 to {MAX_BURST_PHOTOS} photos of one window (a burst), in the order in which they were taken.",
 }
-_REFERENCE_SCHEMA: Final = {
-    "type": "integer",
-    "minimum": 1,
-    "maximum": MAX_BURST_PHOTOS,
-    "description": "The photo of a burst to separate: 1 is the first one; by default, the middle one.",
-}
 
 
 @final
@@ -67,8 +62,12 @@ class SeparationRequest:
     hints: bytes | None = None
     burst: tuple[bytes, ...] = ()
     """All photos of a burst, in the order of the form; empty for a single photo."""
-    reference: int = 0
-    """The index of `photo` in the burst."""
+    burst_options: BurstOptions = field(default_factory=BurstOptions)
+
+    @property
+    def reference(self) -> int:
+        """The index of `photo` in the burst."""
+        return (self.burst_options.reference or len(self.burst) // 2 + 1) - 1
 
     def target(self, layer: str, format_name: str) -> str:
         """Returns the file name of a layer, the same as on the command line. `format_name` is the format of the photo."""
@@ -125,32 +124,36 @@ async def _build_request(form: FormData, options: Options) -> SeparationRequest:
             422, "the form contains no photo; expected an image file; send it in the field photo"
         )
     painted: dict[str, bytes | None] = {}
-    for field in _FILES[1:]:
-        upload = form.get(field)
+    for name in _FILES[1:]:
+        upload = form.get(name)
         if upload is not None and not isinstance(upload, UploadFile):
             raise HTTPException(
-                422, f"the field {field} contains no file; expected an image file; send the {field} as a file"
+                422, f"the field {name} contains no file; expected an image file; send the {name} as a file"
             )
-        painted[field] = await upload.read() if upload else None
+        painted[name] = await upload.read() if upload else None
     names = [safe_name(photo.filename or "") for photo in photos]
     for name in names:
         check_not_video(Path(name))
     contents = [await photo.read() for photo in photos]
-    reference = _reference(form, len(photos))
+    burst_options = _burst_options(form)
+    number = burst_options.reference or len(photos) // 2 + 1
+    if number > len(photos):
+        raise HTTPException(
+            422,
+            f"reference is {number}; expected the number of a photo, 1 to {len(photos)}; correct reference",
+        )
     burst = tuple(contents) if len(contents) > 1 else ()
     return SeparationRequest(
-        contents[reference], names[reference], options, **painted, burst=burst, reference=reference
+        contents[number - 1], names[number - 1], options, **painted, burst=burst, burst_options=burst_options
     )
 
 
-def _reference(form: FormData, count: int) -> int:
-    text = str(form.get(_REFERENCE) or count // 2 + 1)
-    if not (text.isascii() and text.isdecimal() and len(text) < 3 and 1 <= int(text) <= count):
-        raise HTTPException(
-            422,
-            f"{_REFERENCE} is {text[:40]!r}; expected the number of a photo, 1 to {count}; correct {_REFERENCE}",
-        )
-    return int(text) - 1
+def _burst_options(form: FormData) -> BurstOptions:
+    values = {name: str(form[name]) for name in _BURST_FIELDS if form.get(name)}
+    try:
+        return _BURST_OPTIONS.validate_python(values)
+    except ValidationError as error:
+        raise HTTPException(422, validation_message(error.errors())) from error
 
 
 @final
@@ -162,15 +165,14 @@ class _InMemoryParser(MultiPartParser):
 
 def form_schema(models: Sequence[str]) -> dict[str, Any]:
     """Returns the JSON schema of the form, for the OpenAPI document."""
-    known = _OPTIONS.json_schema()["properties"]
+    known = _OPTIONS.json_schema()["properties"] | _BURST_OPTIONS.json_schema()["properties"]
     painted = {name: {**_PHOTO_SCHEMA, "description": known[name]["description"]} for name in _FILES[1:]}
     fields = {
         "photo": _PHOTOS_SCHEMA,
-        _REFERENCE: _REFERENCE_SCHEMA,
         **painted,
-        **{name: known[name] for name in FIELDS},
+        **{name: known[name] for name in (*_BURST_FIELDS, *FIELDS)},
     }
-    for name in FIELDS:
+    for name in (*_BURST_FIELDS, *FIELDS):
         if "anyOf" in known[name]:  # a form has no null: an optional field is left out instead
             (not_null,) = (choice for choice in known[name]["anyOf"] if choice["type"] != "null")
             fields[name] = {"description": known[name]["description"], **not_null}
@@ -215,13 +217,13 @@ def _options(form: FormData, models: Sequence[str], max_pixels: int) -> Options:
     texts = {
         name: [str(value) for value in form.getlist(name)]
         for name in form
-        if name not in (*_FILES, _REFERENCE)
+        if name not in (*_FILES, *_BURST_FIELDS)
     }
     unknown = [name for name in texts if name not in FIELDS]
     if unknown:
         raise HTTPException(
             422,
-            f"there is no field {unknown[0][:40]!r}; expected {', '.join((*_FILES, _REFERENCE, *FIELDS))}; correct the name",
+            f"there is no field {unknown[0][:40]!r}; expected {', '.join((*_FILES, *_BURST_FIELDS, *FIELDS))}; correct the name",
         )
     values_by_name: dict[str, Any] = {name: values[-1] for name, values in texts.items() if values[-1]}
     if "format" in values_by_name:

@@ -227,23 +227,24 @@ class _SeparationRoutes:
         self, form: SeparationRequest, separator: Separator, on_progress: ProgressCallback
     ) -> FittedBurst:
         """Keeps the last burst, so that a download after a preview does not measure again."""
-        from brewster.burst import fit_burst  # noqa: PLC0415  (imports torch)
+        from brewster.burst import fit_burst  # noqa: PLC0415  (imports numba)
 
         digests = tuple(hashlib.sha256(file).digest() for file in (*form.burst, form.hints or b""))
         key, last = (digests, form.reference, form.options.quality, separator), self._last_burst
         if last and last[0] == key:
-            return last[1]
-        fitted = fit_burst(
-            form.burst,
-            reference=form.reference,
-            separator=separator,
-            quality=form.options.quality,
-            hints=form.hints,
-            max_pixels=form.options.max_pixels,
-            on_progress=on_progress,
-        )
-        self._last_burst = key, fitted
-        return fitted
+            fitted = last[1]
+        else:
+            fitted = fit_burst(
+                form.burst,
+                reference=form.reference,
+                separator=separator,
+                quality=form.options.quality,
+                hints=form.hints,
+                max_pixels=form.options.max_pixels,
+                on_progress=on_progress,
+            )
+            self._last_burst = key, fitted
+        return fitted.chosen(form.burst_options.method, swap=form.burst_options.swap)
 
     def _open_photo(self, form: SeparationRequest) -> tuple[Photo, dict[str, str]]:
         """Returns the decoded photo, and the headers with its key and its size. The photo is stored in the cache for the tiles."""
@@ -255,7 +256,12 @@ class _SeparationRoutes:
 
 
 def _burst_headers(report: BurstReport) -> dict[str, str]:
-    return {"Brewster-Burst": report.method, "Brewster-Burst-Message": report.message}
+    return {
+        "Brewster-Burst": report.method,
+        "Brewster-Burst-Message": report.message,
+        "Brewster-Burst-Measured": "yes" if report.is_measured else "no",
+        "Brewster-Burst-Names": "certain" if report.are_names_certain else "unsure",
+    }
 
 
 def _content_disposition(name: str) -> str:
