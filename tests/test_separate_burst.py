@@ -265,7 +265,8 @@ def solve_few(frames, prior, **options):
         (0.15, 0.02, 0.1, "reflection remains", "single photo"),
         (0.5, 0.004, 0.1, "removed", "single photo"),  # too small a motion
         (0.3, 0.2, 0.1, "removed", "burst"),
-        (0.3, 0.2, 0.1, "little found", "unchanged"),  # a large motion must explain more
+        (0.3, 0.2, 0.1, "little found", "burst"),  # the measurement counts, not the single photo
+        (0.5, 0.2, 0.4, "removed", "burst"),  # too large a motion for a copy
         (0.5, 0.02, 0.4, "removed", "single photo"),  # the second layer is a copy of the first
         (0.5, 0.02, 0.4, "little found", "unchanged"),
     ],

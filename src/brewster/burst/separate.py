@@ -39,13 +39,12 @@ _MIN_MOTION_PX: Final = 10.0
 """The smallest relative motion that separates the layers, in pixels of a photo that is 1,000 pixels wide."""
 _MIN_EXPLAINED: Final = 0.2
 """The smallest share of the errors of one layer that a second motion must explain."""
-_LARGE_MOTION_PX: Final = 60.0
-_MIN_EXPLAINED_IF_DOUBTED: Final = 0.4
-"""If the single photo shows little reflection, a larger motion must explain more: what only one frame shows explains everything there."""
 _USEFUL_MOTION_PX: Final = 16
 _MAX_EDGE_CORRELATION: Final = 0.2
 """If the edges of both layers correlate more, they are not two scenes. Of 48 simulated bursts above the other limits, it refuses three, with
 -2.5, -0.1 and +3.3 dB."""
+_MAX_COPY_MOTION_PX: Final = 30.0
+"""With a larger motion, the second layer is no copy of the first, whatever the edges."""
 _MIN_CERTAIN_NAMING: Final = 0.08
 """Of 15 simulated bursts below, two had exchanged layers; of 30 above, one."""
 _MAX_OBJECT_SHARE: Final = 0.6
@@ -340,10 +339,13 @@ def burst_report(
         max(0.0, 1 - solution.two_layer_error / (solution.one_layer_error + 1e-9)) if solution else 0.0
     )
     is_doubted = verdict == "little found"
-    needed = _MIN_EXPLAINED_IF_DOUBTED if is_doubted and motion >= _LARGE_MOTION_PX else _MIN_EXPLAINED
     method: Literal["burst", "single photo", "unchanged"] = "single photo"
-    is_copy = solution is not None and solution.edge_correlation > _MAX_EDGE_CORRELATION
-    has_two_layers = explained >= needed and not is_copy
+    is_copy = (
+        solution is not None
+        and motion < _MAX_COPY_MOTION_PX
+        and solution.edge_correlation > _MAX_EDGE_CORRELATION
+    )
+    has_two_layers = explained >= _MIN_EXPLAINED and not is_copy
     is_scene = solution is not None and solution.object_share > _MAX_OBJECT_SHARE
     advice = "Move the camera by 5 to 10 cm between the photos, best along a circle."
     if solution is None:
@@ -355,7 +357,7 @@ def burst_report(
     elif has_two_layers and motion >= (_USEFUL_MOTION_PX if is_doubted else _MIN_MOTION_PX):
         method, message = "burst", f"The layers moved {motion:.0f} px apart in a photo of 1,000 px."
         if solution.naming < _MIN_CERTAIN_NAMING:
-            message += " They may have each other's names, because the reference photo alone does not tell them apart."
+            message += " They may have each other's names: then exchange them with the option swap."
     elif is_doubted:
         method = "unchanged"
         message = "Little reflection was found, in the motion and in the reference photo. If there is one, separate this photo alone."
@@ -363,6 +365,8 @@ def burst_report(
         message = f"No relative motion of two layers was found. {advice}"
     else:
         message = f"The layers moved {motion:.0f} px apart; about {_USEFUL_MOTION_PX} are needed. {advice}"
+    if solution and method != "burst":
+        message += ' The method "motion" uses the measured layers anyway.'
     if left_out:
         names = ", ".join(str(k + 1) for k in left_out)
         message += f" Left out, because they do not show the same scene as the reference photo: {names}."
