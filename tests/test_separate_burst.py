@@ -16,13 +16,13 @@ import brewster
 from brewster import Photo, Separator
 from brewster.batch.plan import plan_bursts
 from brewster.burst import BurstReport, read_video, separate_burst
+from brewster.burst.film import choose_frames
 from brewster.burst.fourier_search import find_translations
 from brewster.burst.joint_model import JointModel, pixel_grid, with_fourth_channel
 from brewster.burst.optimiser import Rates, optimise
 from brewster.burst.registration import frame_motions, motion_candidates
 from brewster.burst.separate import burst_report, fit_burst, measure_layers
 from brewster.burst.solver import LEVELS, SEARCH, Level, Solution, _edge_correlation, solve
-from brewster.burst.video import choose_frames
 from brewster.errors import BrewsterError, PhotoError, PhotoTooLarge, UnreadablePhoto
 from brewster.remote_path import location
 from brewster.srgb import to_encoded, to_linear

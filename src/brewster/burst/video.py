@@ -1,6 +1,6 @@
-"""Chooses the frames of a burst from a video: sharp ones, at equal distances along the path of the camera.
+"""Reads the frames of a burst from a video file.
 
-The video is decoded twice: first for small copies of its frames, which give motion and sharpness, then for the chosen frames.
+The video is decoded twice: first for small copies of its frames, from which `film` chooses, then for the chosen frames.
 Therefore the memory does not depend on the length of the video.
 """
 
@@ -9,25 +9,28 @@ from __future__ import annotations
 import contextlib
 import os
 from collections.abc import Iterator
-from itertools import pairwise
+from dataclasses import replace
 from typing import Final
 
 import av
-import cv2
 import numpy as np
+from av.stream import Disposition
 from numpy.typing import NDArray
 
-from brewster.errors import BrewsterError, PhotoTooLarge, UnreadablePhoto
+from brewster.burst.film import choose, measure_film
+from brewster.burst.video_colour import HDR_NAMES, displayed_size, to_picture
+from brewster.errors import BrewsterError, PhotoTooLarge, UnreadablePhoto, counted
 from brewster.files import DEFAULT_MAX_PIXELS
 from brewster.photo import Photo
+from brewster.photo.file_info import with_notes
 
-Bytes = NDArray[np.uint8]
-
-_MAX_SECONDS: Final = 20.0
+_MAX_SECONDS: Final = 20
 """Only the beginning of a video is read: a camera move for a burst takes 2 to 5 seconds."""
+_FRAMES_PER_SECOND: Final = 30
+"""The largest number of frames that are compared. Slow motion has up to 240."""
+_MAX_DECODED: Final = 6000
+"""For videos with wrong times: 20 seconds at 300 frames per second."""
 _THUMBNAIL_PX: Final = 240
-_MAX_PATH: Final = 0.3
-"""The frames are chosen from a part of the path of this length, as a share of the width: they must overlap."""
 
 
 def read_video(
@@ -35,8 +38,9 @@ def read_video(
 ) -> list[Photo]:
     """Returns frames of a video, in the order of time, for `separate_burst`.
 
-    The frames have equal distances along the path of the camera. Of the frames near each place, the sharpest one is taken. A video
-    with fewer frames is returned whole. Only the first 20 seconds are used.
+    The frames are 8-bit sRGB, as a player shows them: upright, with square pixels; HDR is converted. They are from the longest part
+    that shows one scene with one zoom, and have equal distances along the path of the camera. Of the frames near each place, the
+    sharpest one is taken. A video with fewer frames is returned whole. Only the first 20 seconds are used.
 
     Args:
         path: the file.
@@ -52,75 +56,87 @@ def read_video(
         raise BrewsterError(
             f"frames is {frames}", "expected at least 2, because one frame shows no motion", "choose 3 to 9"
         )
-    positions, sharpness = [0.0], []
-    previous = None
-    for frame in _decoded(path, max_pixels):
-        height = max(16, round(_THUMBNAIL_PX * frame.height / frame.width))
-        grey = frame.to_ndarray(width=_THUMBNAIL_PX, height=height, format="gray").astype(np.float32)
-        sharpness.append(float(cv2.Laplacian(grey, cv2.CV_32F).var()))
-        if previous is not None:
-            (x, y), _ = cv2.phaseCorrelate(
-                previous, grey, cv2.createHanningWindow(grey.shape[::-1], cv2.CV_32F)
-            )
-            positions.append(positions[-1] + float(np.hypot(x, y)) / _THUMBNAIL_PX)
-        previous = grey
-    if len(sharpness) < 2:
-        raise _unreadable(path, f"{len(sharpness)} frames can be decoded")
-    chosen = choose_frames(np.array(positions), np.array(sharpness), frames)
-    pictures = (_rotated(frame) for index, frame in enumerate(_decoded(path, max_pixels)) if index in chosen)
-    return [Photo.from_array(picture, encoding="srgb") for picture in pictures]
+    film = measure_film(_thumbnail(frame) for frame, _ in _decoded(path, max_pixels))
+    if len(film.positions) < 2:
+        raise _unreadable(path, f"{counted(len(film.positions), 'frame')} can be decoded")
+    chosen = choose(film, frames)
+    photos = []
+    for index, (frame, stream) in enumerate(_decoded(path, max_pixels)):
+        if index in chosen:
+            context = stream.codec_context
+            picture = to_picture(frame, _pixel_aspect(stream), context.color_trc, context.color_primaries)
+            photo = Photo.from_array(picture, encoding="srgb")
+            if name := HDR_NAMES.get(context.color_trc):
+                note = f"the HDR video ({name}) was converted to SDR"
+                photo = replace(photo, file_info=with_notes(photo.file_info, note))
+            photos.append(photo)
+        if index >= chosen[-1]:
+            break
+    return photos
 
 
-def choose_frames(positions: NDArray[np.float64], sharpness: NDArray[np.float64], count: int) -> list[int]:
-    """Returns the indices of `count` frames, or of all frames if there are fewer.
-
-    Args:
-        positions: the length of the camera's path up to each frame, as a share of the width.
-        sharpness: the variance of the Laplacian of each frame.
-        count: the number of frames.
-    """
-    if len(positions) <= count:
-        return list(range(len(positions)))
-    length = positions[-1]
-    half = min(length, _MAX_PATH) / 2
-    places = np.linspace(length / 2 - half, length / 2 + half, count)
-    # A camera that stands still gives many frames at one place: they are ordered by time
-    path = positions + np.linspace(0, 1e-3, len(positions))
-    borders = np.searchsorted(path, [-1, *((places[1:] + places[:-1]) / 2), length + 1])
-    groups = [range(first, max(first + 1, last)) for first, last in pairwise(borders)]
-    chosen = {
-        max((i for i in group if i < len(path)), key=sharpness.__getitem__, default=0) for group in groups
-    }
-    missing = [i for i in np.linspace(0, len(path) - 1, count).round().astype(int) if i not in chosen]
-    return sorted([*chosen, *missing[: count - len(chosen)]])
+def _thumbnail(frame: av.VideoFrame) -> NDArray[np.uint8]:
+    height = min(4 * _THUMBNAIL_PX, max(16, round(_THUMBNAIL_PX * frame.height / frame.width)))
+    return frame.to_ndarray(width=_THUMBNAIL_PX, height=height, format="gray").astype(np.uint8)
 
 
-def _decoded(path: str | os.PathLike[str], max_pixels: int) -> Iterator[av.VideoFrame]:
-    """Yields the frames of the first seconds, up to the first damaged one."""
+def _decoded(path: str | os.PathLike[str], max_pixels: int) -> Iterator[tuple[av.VideoFrame, av.VideoStream]]:
+    """Yields the frames of the first seconds with their stream, up to the first damaged one, at most 30 for each second.
+
+    If the size changes, only the frames of the first size are yielded."""
     try:
         with av.open(os.fspath(path)) as container:
-            if not container.streams.video:
-                raise _unreadable(path, "it has no video stream")
-            stream = container.streams.video[0]
-            if stream.width * stream.height > max_pixels:
-                raise PhotoTooLarge(
-                    f"the frames of {path} have {stream.width} x {stream.height} pixels",
-                    f"expected at most {max_pixels} pixels",
-                    "raise the limit with --max-pixels (in Python max_pixels)",
-                )
+            stream = _video_stream(path, container)
+            _check_size(path, displayed_size(stream.width, stream.height, _pixel_aspect(stream)), max_pixels)
+            size = None
+            yielded = 0
             with contextlib.suppress(av.FFmpegError):  # a video that was cut off ends here
-                start = float((stream.start_time or 0) * (stream.time_base or 0))
-                for frame in container.decode(stream):
-                    if (frame.time or start) - start > _MAX_SECONDS:
+                for index, (seconds, frame) in enumerate(_timed(container, stream)):
+                    if seconds > _MAX_SECONDS or index >= _MAX_DECODED:
                         return
-                    yield frame
+                    size = size or (frame.width, frame.height)
+                    is_due = yielded <= _FRAMES_PER_SECOND * seconds + 0.5
+                    if is_due and (frame.width, frame.height) == size:
+                        _check_size(path, displayed_size(*size, _pixel_aspect(stream)), max_pixels)
+                        yielded += 1
+                        yield frame, stream
     except (av.FFmpegError, OSError) as error:
         raise _unreadable(path, str(error)) from error
 
 
-def _rotated(frame: av.VideoFrame) -> Bytes:
-    """Returns the picture as the player shows it."""
-    return np.ascontiguousarray(np.rot90(frame.to_ndarray(format="rgb24"), round(frame.rotation / 90)))
+def _video_stream(path: str | os.PathLike[str], container: av.container.InputContainer) -> av.VideoStream:
+    """Returns the first stream that is a film. The cover picture of an audio file is a video stream, too."""
+    streams = [s for s in container.streams.video if not s.disposition & Disposition.attached_pic]
+    if not streams:
+        raise _unreadable(path, "it has no video stream")
+    if not getattr(streams[0], "codec_context", None):
+        raise _unreadable(path, "its codec is unknown, or it is encrypted")
+    return streams[0]
+
+
+def _timed(
+    container: av.container.InputContainer, stream: av.VideoStream
+) -> Iterator[tuple[float, av.VideoFrame]]:
+    """Yields the frames with their time in seconds, which begins at 0."""
+    start = None
+    for index, frame in enumerate(container.decode(stream)):
+        time = index / float(stream.average_rate or _FRAMES_PER_SECOND) if frame.time is None else frame.time
+        start = time if start is None else start
+        yield time - start, frame
+
+
+def _pixel_aspect(stream: av.VideoStream) -> float:
+    """Returns the width of a pixel divided by its height."""
+    return float(stream.sample_aspect_ratio or 1)
+
+
+def _check_size(path: str | os.PathLike[str], size: tuple[int, int], max_pixels: int) -> None:
+    if size[0] * size[1] > max_pixels:
+        raise PhotoTooLarge(
+            f"the frames of {path} have {size[0]} x {size[1]} pixels",
+            f"expected at most {max_pixels} pixels",
+            "raise the limit with --max-pixels (in Python max_pixels)",
+        )
 
 
 def _unreadable(path: str | os.PathLike[str], reason: str) -> UnreadablePhoto:

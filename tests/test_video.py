@@ -1,0 +1,297 @@
+"""Videos of a window: colours, orientation, damaged and unusual files, and the choice of the frames."""
+
+from fractions import Fraction
+from pathlib import Path
+
+import av
+import cv2
+import numpy as np
+import pytest
+
+from brewster.burst import read_video
+from brewster.burst.film import best_part, choose, measure_film
+from brewster.burst.video import _decoded
+from brewster.burst.video_colour import to_picture
+from brewster.errors import PhotoTooLarge, UnreadablePhoto
+
+PICTURES = sorted((Path(__file__).parent / "pictures").glob("*.jpg"))
+PATCHES = ((200, 30, 30), (30, 180, 40), (40, 60, 200), (128, 128, 128))
+
+
+@pytest.fixture(scope="module")
+def pictures():
+    return [
+        cv2.resize(cv2.imread(str(path)), (480, 360), interpolation=cv2.INTER_AREA) for path in PICTURES[:3]
+    ]
+
+
+def film_of(picture, count, size=(240, 180), step=2):
+    """The frames of a camera that moves to the right."""
+    return [
+        np.ascontiguousarray(picture[60 : 60 + size[1], step * i : step * i + size[0]]) for i in range(count)
+    ]
+
+
+def write_video(path, frames, *, codec="mpeg4", rate=30, times=None, pixel_format="yuv420p", aspect=None):
+    """Writes frames. `times` are in units of 1 / rate."""
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream(codec, rate=rate)
+        stream.height, stream.width = frames[0].shape[:2]
+        stream.pix_fmt, stream.bit_rate = pixel_format, 4_000_000
+        if aspect:
+            stream.codec_context.sample_aspect_ratio = aspect
+        for number, frame in enumerate(frames):
+            picture = av.VideoFrame.from_ndarray(frame, format="rgb24")
+            picture.pts, picture.time_base = (times[number] if times else number), Fraction(1, rate)
+            container.mux(stream.encode(picture))
+        container.mux(stream.encode())
+    return path
+
+
+def ycbcr_frame(code, kr, kb, matrix, *, is_full=False, size=(64, 64)):
+    """A uniform 10-bit frame with the R'G'B' values `code`, 0 to 1."""
+    red, green, blue = code
+    luma = kr * red + (1 - kr - kb) * green + kb * blue
+    chroma = ((blue - luma) / 2 / (1 - kb), (red - luma) / 2 / (1 - kr))
+    scales = (0, 1023, 1023) if is_full else (64, 876, 896)
+    values = [scales[0] + scales[1] * luma, *(512 + scales[2] * c for c in chroma)]
+    width, height = size
+    planes = [
+        np.full(n, round(v))
+        for n, v in zip((1, 1 / 4, 1 / 4), values, strict=True)
+        for n in [int(n * width * height)]
+    ]
+    frame = av.VideoFrame.from_ndarray(
+        np.concatenate(planes).astype(np.uint16).reshape(height * 3 // 2, width), format="yuv420p10le"
+    )
+    frame.colorspace, frame.color_range = matrix, 2 if is_full else 1
+    return frame
+
+
+BT601, BT709, BT2020 = (0.299, 0.114), (0.2126, 0.0722), (0.2627, 0.0593)
+
+
+def corner_patches(picture):
+    return [picture[y, x].astype(int) for y, x in ((30, 30), (30, -30), (-30, 30), (-30, -30))]
+
+
+@pytest.mark.parametrize(
+    ("name", "size", "order"),
+    [
+        ("hlg-10bit", (400, 300), (0, 1, 2, 3)),
+        ("mirrored-display-matrix", (400, 300), (1, 0, 3, 2)),
+        ("pixel-aspect-2-1", (800, 300), (0, 1, 2, 3)),
+    ],
+)
+def test_the_videos_from_the_field_have_the_right_colours_and_sizes(data, name, size, order):
+    photo = read_video(data / f"field/{name}.mp4", 3)[0]
+    assert (photo.size, photo.pixels.dtype) == (size, np.uint8)
+    assert (photo.file_info.note == "the HDR video (HLG) was converted to SDR") == (name == "hlg-10bit")
+    np.testing.assert_allclose(corner_patches(photo.pixels), [PATCHES[i] for i in order], atol=4)
+
+
+@pytest.mark.parametrize(("transfer", "code"), [(18, 0.75), (16, 0.5806)])
+def test_the_reference_white_of_hdr_is_nearly_white_and_brighter_light_is_not_clipped(transfer, code):
+    levels = [
+        to_picture(ycbcr_frame((value,) * 3, *BT2020, 9), 1, transfer, 9)[0, 0].tolist()
+        for value in (0, code, code + 0.1, 1)
+    ]
+    assert all(len(set(level)) == 1 for level in levels)
+    black, white, brighter, peak = (level[0] for level in levels)
+    assert (black, 240 <= white < brighter <= peak <= 255) == (0, True)
+
+
+def test_hlg_and_pq_of_the_same_light_look_the_same():
+    # A grey of 50 cd/m2, by the formulas of BT.2100 and a display of 1000 cd/m2
+    scene = (50 / 1000) ** (1 / 1.2)
+    hlg = np.sqrt(3 * scene) if scene <= 1 / 12 else 0.17883277 * np.log(12 * scene - 0.28466892) + 0.55991073
+    power = (50 / 10_000) ** (2610 / 16384)
+    pq = ((0.8359375 + 18.8515625 * power) / (1 + 18.6875 * power)) ** 78.84375
+    for code, transfer in ((hlg, 18), (pq, 16)):
+        level = to_picture(ycbcr_frame((code,) * 3, *BT2020, 9), 1, transfer, 9)[0, 0]
+        np.testing.assert_allclose(level, 255 * (50 / 203) ** (1 / 2.4), atol=1)
+
+
+@pytest.mark.parametrize("is_full", [False, True])
+@pytest.mark.parametrize(
+    ("weights", "matrix", "size"),
+    [
+        (BT709, 1, (64, 64)),
+        (BT601, 6, (1280, 720)),
+        (BT601, 2, (64, 64)),  # untagged
+        (BT709, 2, (1280, 720)),
+        (BT2020, 9, (64, 64)),
+    ],
+)
+def test_the_matrix_and_the_range_of_a_video_are_honoured(weights, matrix, size, is_full):
+    code = np.array(PATCHES[0]) / 255
+    frame = ycbcr_frame(code, *weights, matrix, is_full=is_full, size=size)
+    np.testing.assert_allclose(to_picture(frame, 1, 1, 1)[5, 5], PATCHES[0], atol=2)
+
+
+def test_display_p3_is_converted_to_srgb():
+    # Display P3 (0.8, 0.4, 0.3) in sRGB, from the matrices of SMPTE EG 432-1 and IEC 61966-2-1
+    frame = ycbcr_frame((0.8, 0.4, 0.3), *BT709, 1)
+    np.testing.assert_allclose(to_picture(frame, 1, 13, 12)[5, 5], (217, 97, 69), atol=3)
+
+
+def test_pixels_become_square(tmp_path, pictures):
+    for aspect, size in ((Fraction(4, 3), (320, 180)), (Fraction(1, 2), (240, 360))):
+        write_video(tmp_path / "a.mp4", film_of(pictures[0], 3), aspect=aspect)
+        assert read_video(tmp_path / "a.mp4", 2)[0].size == size
+    with pytest.raises(PhotoTooLarge, match="240 x 360"):
+        read_video(tmp_path / "a.mp4", 2, max_pixels=240 * 200)
+
+
+def test_slow_motion_and_long_videos_are_read_to_the_20th_second_with_30_frames_each(tmp_path, pictures):
+    frame = film_of(pictures[0], 1, (64, 48))
+    write_video(tmp_path / "slow.mp4", frame * 480, rate=240)
+    assert len(list(_decoded(tmp_path / "slow.mp4", 10**6))) == pytest.approx(60, abs=2)
+    # One frame in a second, for a minute
+    write_video(tmp_path / "long.mp4", frame * 60, times=range(0, 1800, 30))
+    assert len(list(_decoded(tmp_path / "long.mp4", 10**6))) == 21
+
+
+def test_a_video_with_a_variable_rate_and_odd_sizes_is_read(tmp_path, pictures):
+    frames = film_of(pictures[0], 12, (241, 179))
+    write_video(
+        tmp_path / "a.mkv",
+        frames,
+        codec="ffv1",
+        times=[0, 1, 2, 9, 10, 11, 30, 31, 32, 33, 90, 91],
+        pixel_format="bgr0",
+    )
+    photos = read_video(tmp_path / "a.mkv", 5)
+    assert [photo.size for photo in photos] == [(241, 179)] * 5
+    assert any(np.array_equal(photos[0].pixels, frame) for frame in frames)  # full range, no matrix
+
+
+def test_a_video_that_ends_in_the_middle_of_a_frame_is_used_up_to_there(tmp_path, pictures):
+    write_video(tmp_path / "a.mpg", film_of(pictures[0], 20), codec="mpeg2video")
+    content = (tmp_path / "a.mpg").read_bytes()
+    (tmp_path / "a.mpg").write_bytes(content[: len(content) // 2])
+    assert len(read_video(tmp_path / "a.mpg", 4)) == 4
+
+
+def write_audio(path, cover=None):
+    """Writes a second of silence, with a cover picture if it is not None."""
+    with av.open(str(path), "w") as container:
+        sound = container.add_stream(
+            "pcm_s16le" if path.suffix == ".wav" else "flac", rate=8000, layout="mono"
+        )
+        picture = None
+        if cover is not None:
+            picture = container.add_stream("png", rate=1)
+            picture.height, picture.width, picture.pix_fmt = *cover.shape[:2], "rgb24"
+            picture.disposition = av.stream.Disposition.attached_pic
+        samples = av.AudioFrame.from_ndarray(np.zeros((1, 8000), np.int16), format="s16", layout="mono")
+        samples.sample_rate = 8000
+        if picture:
+            container.mux(picture.encode(av.VideoFrame.from_ndarray(cover, format="rgb24")))
+            container.mux(picture.encode())
+        container.mux(sound.encode(samples))
+        container.mux(sound.encode())
+
+
+@pytest.mark.parametrize("has_cover", [False, True])
+def test_an_audio_file_is_refused_also_with_a_cover_picture(tmp_path, pictures, has_cover):
+    path = tmp_path / ("a.flac" if has_cover else "a.wav")
+    write_audio(path, pictures[0] if has_cover else None)
+    with pytest.raises(UnreadablePhoto, match="it has no video stream"):
+        read_video(path, 5)
+
+
+@pytest.mark.parametrize("content", [bytes(100_000), b"no video\n" * 1000])
+def test_zeros_and_text_are_refused(tmp_path, content):
+    (tmp_path / "a.mp4").write_bytes(content)
+    with pytest.raises(UnreadablePhoto, match="cannot be read as a video"):
+        read_video(tmp_path / "a.mp4", 5)
+
+
+def test_an_unknown_codec_and_a_video_of_one_frame_are_refused(tmp_path, pictures):
+    path = write_video(tmp_path / "a.mkv", film_of(pictures[0], 3), codec="ffv1", pixel_format="bgr0")
+    path.write_bytes(path.read_bytes().replace(b"V_FFV1", b"V_XXX1").replace(b"FFV1", b"XXX1"))
+    with pytest.raises(UnreadablePhoto, match="its codec is unknown"):
+        read_video(path, 5)
+    write_video(tmp_path / "a.mp4", film_of(pictures[0], 1))
+    with pytest.raises(UnreadablePhoto, match="1 frame can be decoded"):
+        read_video(tmp_path / "a.mp4", 5)
+
+
+def test_an_animated_gif_and_a_video_with_alpha_are_read(tmp_path, pictures):
+    frames = film_of(pictures[0], 6)
+    write_video(tmp_path / "a.gif", frames, codec="gif", rate=10, pixel_format="rgb8")
+    assert [photo.size for photo in read_video(tmp_path / "a.gif", 5)] == [(240, 180)] * 5
+    write_video(tmp_path / "a.mov", frames, codec="png", pixel_format="rgba")
+    assert np.array_equal(read_video(tmp_path / "a.mov", 6)[0].pixels, frames[0])
+
+
+def test_only_frames_of_the_first_size_are_used(tmp_path, pictures):
+    contents = [
+        write_video(
+            tmp_path / f"{size[0]}.mpg", film_of(pictures[0], 8, size), codec="mpeg2video"
+        ).read_bytes()
+        for size in ((240, 180), (160, 96))
+    ]
+    (tmp_path / "a.mpg").write_bytes(b"".join(contents))
+    assert {photo.size for photo in read_video(tmp_path / "a.mpg", 15)} == {(240, 180)}
+
+
+def test_a_film_that_stands_still_gives_equal_frames(tmp_path, pictures):
+    write_video(tmp_path / "a.mp4", film_of(pictures[0], 1) * 20)
+    assert len(read_video(tmp_path / "a.mp4", 5)) == 5
+
+
+def grey(frames):
+    return [cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY) for frame in frames]
+
+
+def test_the_longest_scene_is_chosen_and_a_covered_lens_is_left_out(pictures):
+    hand = list(np.random.default_rng(0).normal(20, 1, (10, 180, 240, 3)).clip(0, 255).astype(np.uint8))
+    first, second = film_of(pictures[0], 15), film_of(pictures[1], 40)
+    film = measure_film(grey([*hand, *first, *second]))
+    assert best_part(film, 5) == slice(25, 65)
+    assert min(choose(film, 5)) >= 25
+    assert best_part(measure_film(grey([*hand, *second])), 5) == slice(10, 50)
+    assert best_part(measure_film(grey([*hand[:4], *first[:4]])), 7) == slice(0, 8)  # too short: all frames
+
+
+def test_a_strong_reflection_that_moves_otherwise_does_not_cut_the_film(pictures):
+    frames = []
+    for angle in np.linspace(0, 2 * np.pi, 60):
+        x, y = 20 * np.cos(angle), 20 * np.sin(angle)
+        layers = (
+            cv2.warpAffine(picture, np.float32([[1, 0, -60 + dx], [0, 1, -60 + dy]]), (240, 180))
+            for picture, dx, dy in ((pictures[0], x, y), (pictures[2], -1.5 * x, -1.5 * y))
+        )
+        frames.append(cv2.addWeighted(next(layers), 0.5, next(layers), 0.5, 0))
+    assert best_part(measure_film(grey(frames)), 7) == slice(0, 60)
+
+
+def zoomed(frame, factor):
+    matrix = cv2.getRotationMatrix2D((120, 90), 0, factor)
+    return cv2.warpAffine(frame, matrix, (240, 180), borderMode=cv2.BORDER_REFLECT)
+
+
+def test_frames_during_a_zoom_are_left_out(pictures):
+    frames = film_of(pictures[0], 80)
+    factors = [1.0] * 20 + [1.015**i for i in range(1, 21)] + [1.015**20] * 40
+    film = measure_film(grey(map(zoomed, frames, factors)))
+    assert min(choose(film, 5)) >= 37
+
+
+@pytest.mark.parametrize("visible", [range(20, 40, 3), range(28, 31)])
+def test_frames_without_a_passing_person_are_preferred(pictures, visible):
+    frames = film_of(pictures[0], 60)
+    for number in visible:
+        left = 10 * (number - 20)
+        cv2.rectangle(frames[number], (left, 40), (left + 60, 180), (20, 200, 230), -1)
+    chosen = choose(measure_film(grey(frames)), 7)
+    assert len(chosen) == 7
+    assert not set(chosen) & set(visible)
+
+
+@pytest.mark.parametrize("count", [5, 7])
+def test_a_video_with_few_frames_is_returned_whole(data, count):
+    for path in sorted((data / "bursts").glob("*/*.mp4")):
+        assert len(read_video(path, count)) == 5
