@@ -103,16 +103,16 @@ class JointModel:
         homographies, splines = self.homographies[:, ::-1].copy(), self.splines[:, ::-1].copy()
         return replace(self, layers=layers, homographies=homographies, splines=splines)
 
-    def with_opacity(self, mask: NDArray[np.bool_], elsewhere: float = 0.02) -> JointModel:
-        """Returns a model whose second layers are opaque where a mask (h, w) of the reference frame is set, and hardly elsewhere.
+    def with_opacity(self, opacity: Floats, elsewhere: float = 0.02) -> JointModel:
+        """Returns a model whose second layers have this opacity (h, w) in the reference frame, and at least that of `elsewhere`.
 
-        A layer with an opacity of 0 stays transparent; any other opacity changes with the optimisation.
+        The optimisation does not change an opacity of 0, nor one above 1, which counts as 1.
         """
         height, width = self.layers.shape[2:4]
-        x, y = to_pixels(pixel_grid(height, width) * (1 + 2 * MARGIN), mask.shape)
-        opacity = cv2.remap(mask.astype(np.float32), x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        x, y = to_pixels(pixel_grid(height, width) * (1 + 2 * MARGIN), opacity.shape)
+        on_canvas = cv2.remap(opacity, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         layers = self.layers.copy()
-        layers[:, 1, ..., 3] = np.sqrt(np.maximum(opacity, elsewhere))
+        layers[:, 1, ..., 3] = np.sqrt(np.maximum(on_canvas, elsewhere))
         return replace(self, layers=layers)
 
     def resized(self, frames: Floats, density: float, spline_size: tuple[int, int] | None) -> JointModel:

@@ -28,6 +28,8 @@ _CLEAR_ERROR: Final = 0.85
 bursts with objects, 23 of 26 such regions were objects; in five real bursts without objects there is none."""
 _LIKELY_OPACITY: Final = 0.4
 """In a burst with an object, other regions with more than this opacity are parts of objects, too."""
+_FIXED_OPACITY: Final = 1.5
+"""Of objects: above 1, so that the next levels do not change it."""
 _SMOOTHING_PX: Final = 2
 _RING_PX: Final = 9
 
@@ -58,7 +60,13 @@ def with_objects(
     if not regions:
         return model
     opaque = optimise(
-        model.with_opacity(is_dominant), frames, prior, STEPS, rates=rates, weights=weights, on_step=on_step
+        model.with_opacity(is_dominant.astype(np.float32)),
+        frames,
+        prior,
+        STEPS,
+        rates=rates,
+        weights=weights,
+        on_step=on_step,
     )
     opacity = opaque.reference_opacity(*size)
     errors, errors_if_opaque = (some.collected_errors(frames, layer=1) for some in (model, opaque))
@@ -72,9 +80,8 @@ def with_objects(
     if not any(is_clear(region) for region in regions):
         return model
     objects = np.any([region for region in regions if opacity[region].mean() > _LIKELY_OPACITY], 0)
-    return opaque.with_opacity(
-        cv2.dilate(objects.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0, elsewhere=0
-    )
+    mask = cv2.dilate(objects.astype(np.float32), np.ones((3, 3), np.uint8))
+    return opaque.with_opacity(_FIXED_OPACITY * mask, elsewhere=0)
 
 
 def _regions(mask: NDArray[np.bool_]) -> list[NDArray[np.bool_]]:

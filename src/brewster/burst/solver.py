@@ -168,9 +168,9 @@ def solve(
     one_layer, best = int(model.is_locked.argmax()), _best(model)
     errors = float(model.data_losses[one_layer]), float(model.data_losses[best])
     model = model.selected([best])
-    model, layers, naming = _with_names(model, small, small_prior)
-    edge_correlation = _edge_correlation(layers)
-    refined = refine_prior(_reflection_share(layers)) if refine_prior else prior
+    refined = prior
+    if refine_prior:
+        refined = refine_prior(_reflection_share(model.reference_layers(*small.shape[1:3])))
     for level in levels:
         small, small_prior, small_refined = (
             _packed(images, level.long_side_px) for images in (frames, [prior], [refined])
