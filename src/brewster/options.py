@@ -86,8 +86,8 @@ class BurstOptions:
     )
     method: BurstMethod = _option(
         "auto",
-        "auto separates a burst by the motion of the layers if the measurement agrees with the photos; motion in any case; "
-        "single separates the reference photo alone.",
+        "How to separate a burst: auto by the motion of the layers if the measurement agrees with the photos, motion by it in any case, "
+        "single the reference photo alone.",
     )
     swap: bool = _option(
         False,
