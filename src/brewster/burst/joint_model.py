@@ -224,10 +224,9 @@ def compose(samples: Floats) -> Floats:
 
 def data_errors(predicted: Floats, frames: Floats) -> Floats:
     """Returns the differences of square roots of light. Where a frame is clipped, a brighter prediction is no error."""
-    errors = np.sqrt(predicted + OFFSET) - np.sqrt(frames + OFFSET)
+    errors: Floats = np.sqrt(predicted + OFFSET) - np.sqrt(frames + OFFSET)
     errors[(frames > CLIPPED) & (errors > 0)] = 0
-    found: Floats = errors
-    return found
+    return errors
 
 
 def with_fourth_channel(images: Floats) -> Floats:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import unicodedata
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, Final, final
 
@@ -67,7 +67,7 @@ class SeparationRequest:
     @property
     def reference(self) -> int:
         """The index of `photo` in the burst."""
-        return (self.burst_options.reference or len(self.burst) // 2 + 1) - 1
+        return (self.burst_options.reference or 1) - 1
 
     def target(self, layer: str, format_name: str) -> str:
         """Returns the file name of a layer, the same as on the command line. `format_name` is the format of the photo."""
@@ -142,6 +142,7 @@ async def _build_request(form: FormData, options: Options) -> SeparationRequest:
             422,
             f"reference is {number}; expected the number of a photo, 1 to {len(photos)}; correct reference",
         )
+    burst_options = replace(burst_options, reference=number)
     burst = tuple(contents) if len(contents) > 1 else ()
     return SeparationRequest(
         contents[number - 1], names[number - 1], options, **painted, burst=burst, burst_options=burst_options
