@@ -12,14 +12,16 @@ import numpy as np
 import pytest
 
 from brewster import Photo
-from brewster.burst import separate_burst
+from brewster.burst import fit_burst, read_video, separate_burst
 from brewster.burst.separate import measure_layers
 from brewster.burst.solver import Level, solve
 from brewster.inference import Separator
+from brewster.web.job_queue import JobCancelled
 from cli_helpers import image_bytes
 from picture_files import file_of
 from simulated_bursts import read_photo, simulate_burst
 from test_preview import Maps
+from test_video import film_of, write_audio, write_video
 from web_servers import make_app, pane, request
 
 PICTURES = sorted((Path(__file__).parent / "pictures").glob("*.jpg"))
@@ -40,6 +42,18 @@ def few_steps(monkeypatch):
     """For tests that do not measure the separation."""
     few = (Level(48, 20, None),)
     monkeypatch.setattr("brewster.burst.separate.solve", partial(solve, search=few, levels=few))
+
+
+@pytest.fixture(scope="module")
+def film(tmp_path_factory):
+    """A film of 12 frames of 240 x 180 pixels."""
+    picture = (255 * np.clip(read_photo(PICTURES[0], (480, 360)), 0, 1)).astype(np.uint8)
+    return write_video(tmp_path_factory.mktemp("film") / "window.mp4", film_of(picture, 12, step=6))
+
+
+def send_film(path, film, app=None, name="window.mp4", **fields):
+    content = film if isinstance(film, bytes) else film.read_bytes()
+    return request(app or make_app(), "POST", path, files=[("photo", (name, content))], data=fields)
 
 
 def send(path, photos, app=None, mask=None, **fields):
@@ -108,6 +122,80 @@ def test_a_download_after_a_preview_measures_the_motion_only_for_other_photos_or
     assert forced.content != swapped.content
     send("/separate", photos[:2], app, layers="transmission", reference="1")
     assert measured == [1, 0, 0]
+
+
+@pytest.mark.usefixtures("few_steps")
+def test_a_film_gives_the_layers_of_its_middle_frame_and_is_measured_once_for_both_orders(film, monkeypatch):
+    app, measured = make_app(), []
+    monkeypatch.setattr(
+        "brewster.burst.separate.measure_layers",
+        lambda *args, **keywords: measured.append(1) or measure_layers(*args, **keywords),
+    )
+    preview = send_film("/preview", film, app)
+    frames = read_video(film, 7)
+    tile = request(app, "GET", f"/tile/{preview.headers['Brewster-Photo']}/0/0/0")
+    assert (Photo.open(tile.content).pixels == frames[3].pixels).all()
+    made = [
+        send_film("/separate", film, app, layers="transmission", method="motion", swap=swap)
+        for swap in ("no", "yes")
+    ]
+    expected = separate_burst(
+        frames, separator=Separator(pane, name="pane"), method="motion", swap=True
+    ).transmission
+    assert (Photo.open(made[1].content).pixels == expected.pixels).all()
+    assert made[0].content != made[1].content
+    assert measured == [1, 1]  # the second time by the line above
+    assert 'filename="window.mp4.transmission.png"' in made[0].headers["Content-Disposition"]
+    other = make_app()  # a server that has dropped the photo
+    key = send_film("/photo", film, other).headers["Brewster-Photo"]
+    assert key == preview.headers["Brewster-Photo"]
+    assert request(other, "GET", f"/tile/{key}/0/0/0").content == tile.content
+
+
+def test_a_film_without_a_suffix_is_recognised_and_a_film_among_photos_is_refused(film, photos):
+    assert send_film("/photo", film, name="upload").headers["Brewster-Size"] == "240x180"
+    response = send("/separate", [photos[0], film.read_bytes()])
+    assert response.status_code == 422
+    assert "send the video alone" in response.json()["error"]
+
+
+def test_videos_that_cannot_be_used_are_refused_with_a_reason(film, tmp_path):
+    cut = film.read_bytes()[:600]
+    write_audio(tmp_path / "sound.wav")
+    sound = (tmp_path / "sound.wav").read_bytes()
+    for content, reason in ((cut, "cannot be read as a video"), (sound, "it has no video stream")):
+        response = send_film("/preview", content)
+        assert (response.status_code, response.json()["kind"]) == (422, "UnreadablePhoto")
+        assert reason in response.json()["error"]
+    response = send_film("/preview", film, make_app(max_pixels=10_000))
+    assert response.status_code == 413
+
+
+class HintedPane:
+    """A model that takes hints, and counts its runs."""
+
+    takes_hints, runs = True, 0
+
+    def __call__(self, tile, _hints=None):
+        self.runs += 1
+        return pane(tile)
+
+
+@pytest.mark.usefixtures("few_steps")
+@pytest.mark.parametrize("run", [1, 2, 3])
+def test_a_burst_stops_after_each_run_of_the_model(photos, run):
+    """The model runs twice for the photo, and then twice with the hints of the measured layers."""
+    model, separator_calls = HintedPane(), []
+
+    def stop(fraction):
+        separator_calls.append(fraction)
+        if model.runs == run:
+            raise JobCancelled
+
+    with pytest.raises(JobCancelled):
+        fit_burst(photos, separator=Separator(model), on_progress=stop)
+    assert model.runs == run
+    assert separator_calls == sorted(separator_calls)
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,7 @@ it leaves unexplained is the cost of d_k.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Final
 
 import cv2
@@ -32,7 +32,9 @@ _RATE: Final = 0.1
 """The step of the refinement, in pixels."""
 
 
-def find_translations(aligned: Sequence[Floats], reference: int) -> list[NDArray[np.float64]]:
+def find_translations(
+    aligned: Sequence[Floats], reference: int, on_step: Callable[[], None] = lambda: None
+) -> list[NDArray[np.float64]]:
     """Returns the translations (K, 2) in pixels of the second layer, from the reference frame to each frame; the best are first.
 
     First the frames lie along a line with constant speed, or in a plane as their differences suggest, on a grid of sizes and directions.
@@ -41,6 +43,7 @@ def find_translations(aligned: Sequence[Floats], reference: int) -> list[NDArray
     Args:
         aligned: the frames, (h, w, 3) linear light, aligned with the first layer.
         reference: the index of the reference frame.
+        on_step: see `motion_candidates`.
     """
     spectra, frequencies = _spectra(aligned)
     energy = np.square(np.abs(spectra - spectra.mean(0))).sum(0)
@@ -65,7 +68,9 @@ def find_translations(aligned: Sequence[Floats], reference: int) -> list[NDArray
             costs: Floats = -_explained(spectra, reference, turn * across_turns)[0] @ weights
             return costs
 
-        costs += POOL.map(costs_of_row, along_turns)
+        for row in POOL.map(costs_of_row, along_turns):
+            costs.append(row)
+            on_step()
         paths.append(ends[:, None, None, None] * along + ends[:, None, None] * across)
     chosen: list[Doubles] = []
     grid = np.concatenate(paths).reshape(-1, len(aligned), 2)
@@ -75,7 +80,10 @@ def find_translations(aligned: Sequence[Floats], reference: int) -> list[NDArray
             chosen.append(path)
         if len(chosen) == _STARTS:
             break
-    refined = POOL.map(lambda path: _refined(spectra, frequencies, weights, reference, path), chosen)
+    refined = []
+    for found in POOL.map(lambda path: _refined(spectra, frequencies, weights, reference, path), chosen):
+        refined.append(found)
+        on_step()
     return [
         offsets * (aligned[0].shape[1] / _WIDTH_PX)
         for offsets, _ in sorted(refined, key=lambda found: found[1])

@@ -6,7 +6,7 @@ All motions are (K, 3, 3) homographies in normalised coordinates, from a frame t
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from typing import Final, final
@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from brewster.burst.fourier_search import find_translations
 from brewster.burst.threads import POOL
+from brewster.inference.predictor import ProgressCallback
 from brewster.srgb import to_encoded
 
 Floats = NDArray[np.float32]
@@ -56,7 +57,12 @@ Motions = list[tuple[Matrices, float]]
 """The motions of one frame: homographies from the reference frame in pixels, and how likely each is the motion of T."""
 
 
-def frame_motions(frames: Sequence[Floats], reference: int, prior: Floats) -> list[Motions]:
+def frame_motions(
+    frames: Sequence[Floats],
+    reference: int,
+    prior: Floats,
+    on_progress: ProgressCallback = lambda _fraction: None,
+) -> list[Motions]:
     """Returns the motions of each frame: those with the most matches first, and none for a frame of another scene.
 
     A homography is fitted to the matches with MAGSAC, its matches are removed, and the next one is fitted to the rest.
@@ -66,16 +72,24 @@ def frame_motions(frames: Sequence[Floats], reference: int, prior: Floats) -> li
         frames: (h, w, 3) linear light.
         reference: the index of the reference frame.
         prior: T of the reference frame from a single photo. It decides which of several motions is that of T.
+        on_progress: called with the completed fraction, 0 to 1. An exception raised in it stops the work.
     """
     share = _transmission_share(frames[reference], prior)
-    features = list(POOL.map(_features, frames))
+    features = []
+    for places in POOL.map(_features, frames):
+        features.append(places)
+        on_progress(0.5 * len(features) / len(frames))
 
     def motions(k: int) -> Motions:
         if k == reference:
             return [(np.eye(3), 1.0)]
         return _fitted_motions(_matches(features[reference], features[k]), share)
 
-    return list(POOL.map(motions, range(len(frames))))
+    found_motions = []
+    for found in POOL.map(motions, range(len(frames))):
+        found_motions.append(found)
+        on_progress(0.5 + 0.5 * len(found_motions) / len(frames))
+    return found_motions
 
 
 def path_order(frames: Sequence[Floats], motions: Sequence[Motions]) -> list[int]:
@@ -119,7 +133,10 @@ def _shortened(path: list[int], distances: Matrices) -> list[int]:
 
 
 def motion_candidates(
-    frames: Sequence[Floats], reference: int, motions: Sequence[Motions]
+    frames: Sequence[Floats],
+    reference: int,
+    motions: Sequence[Motions],
+    on_step: Callable[[], None] = lambda: None,
 ) -> list[MotionCandidate]:
     """Returns candidates for the motion of both layers. The first one is locked: both layers are one.
 
@@ -127,6 +144,7 @@ def motion_candidates(
         frames: (h, w, 3) linear light, in the order of `path_order`.
         reference: the index of the reference frame.
         motions: the motions of each frame, from `frame_motions`; each frame has at least one.
+        on_step: called several times a second. An exception raised in it stops the work.
     """
     height, width = frames[0].shape[:2]
     transmission = np.stack([_likeliest(found) for found in motions])
@@ -141,7 +159,7 @@ def motion_candidates(
 
     candidates = [("one layer", transmission)]
     aligned = [_aligned(frame, matrix) for frame, matrix in zip(frames, transmission, strict=True)]
-    for offsets in find_translations(aligned, reference):
+    for offsets in find_translations(aligned, reference, on_step):
         found = [matrix @ _translation(*offset) for matrix, offset in zip(transmission, offsets, strict=True)]
         candidates.append(("Fourier", np.stack(found)))
     second = [

@@ -13,7 +13,6 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Any, Final, Literal, final
 
 import cv2
@@ -29,7 +28,7 @@ from brewster.inference.burst_report import BurstReport, burst_photo_name, check
 from brewster.inference.guided_upsampling import GeneratedOverride
 from brewster.inference.predictor import Prediction, Predictor, ProgressCallback
 from brewster.inference.separation import Separation
-from brewster.inference.separator import Separator, white_level
+from brewster.inference.separator import Separator, timed, white_level
 from brewster.options import BurstMethod, Options, Quality
 from brewster.photo import Photo, Source
 
@@ -129,7 +128,8 @@ class FittedBurst:
     def separate(self, on_progress: ProgressCallback, **options: Any) -> Separation:  # noqa: ANN401
         """Computes the layers at full size. `options` are those of the call of a `Separator`, without hints."""
         separation = self.separator(self.photo, hints=self.hints, on_progress=on_progress, **options)
-        return replace(separation, burst=self.report, seconds=self.seconds | separation.seconds)
+        seconds = {name: self.seconds.get(name, 0.0) + spent for name, spent in separation.seconds.items()}
+        return replace(separation, burst=self.report, seconds=self.seconds | seconds)
 
 
 def separate_burst(
@@ -205,25 +205,49 @@ def fit_burst(
         )
     check_photo_count(len(photos))
     reference = _checked_reference(len(photos), reference)
-    started = time.perf_counter()
-    photo = _open(photos, reference, max_pixels)
-    frames, white = _working_frames(photos, reference, photo, max_pixels)
-    seconds = {"frames": time.perf_counter() - started}
     separator = separator or Separator.load()
-    started = time.perf_counter()
-    upsampler, _, single = separator.fit(photo, quality=quality, hints=hints)
-    prior = _applied(upsampler.apply, white * frames[reference]) / white
-    refine_prior = None
-    if separator.takes_hints and hints is None:  # a person knows better than the measured layers
-        refine_prior = partial(prior_with_hints, separator, frames[reference], quality=quality)
-    solution, left_out = (
-        measure_layers(frames, reference, prior, refine_prior=refine_prior, on_progress=on_progress)
-        if is_measured
-        else (None, ())
+    started, done, seconds = time.perf_counter(), 0.0, dict[str, float]()
+
+    def report(fraction: float) -> None:
+        """The network runs twice; the second time, the progress stands still, but the work can be stopped."""
+        nonlocal done
+        done = max(done, fraction)
+        on_progress(done)
+
+    def refine_prior(reflection_share: Floats) -> Floats:
+        with timed(seconds, "network"):
+            return prior_with_hints(
+                separator, frames[reference], reflection_share, quality, lambda _part: report(0)
+            )
+
+    with timed(seconds, "frames"):
+        photo = _open(photos, reference, max_pixels)
+        frames, white = _working_frames(
+            photos, reference, photo, max_pixels, lambda part: report(0.02 * part)
+        )
+    with timed(seconds, "network"):
+        upsampler, _, single = separator.fit(
+            photo, quality=quality, hints=hints, on_progress=lambda part: report(0.02 + 0.06 * part)
+        )
+        prior = _applied(upsampler.apply, white * frames[reference]) / white
+    report(0.08)
+    solution: Solution | None = None
+    left_out: tuple[int, ...] = ()
+    if is_measured:
+        # Without hints of a person, who knows better than the measured layers
+        refine = refine_prior if separator.takes_hints and hints is None else None
+        solution, left_out = measure_layers(
+            frames, reference, prior, refine_prior=refine, on_progress=lambda part: report(0.08 + 0.92 * part)
+        )
+    seconds["motion"] = time.perf_counter() - started - sum(seconds.values())
+    return FittedBurst(
+        photo,
+        burst_report(solution, single.verdict, len(photos), left_out, reference),
+        seconds,
+        solution,
+        separator,
+        hints,
     )
-    seconds["motion"] = time.perf_counter() - started
-    report = burst_report(solution, single.verdict, len(photos), left_out, reference)
-    return FittedBurst(photo, report, seconds, solution, separator, hints)
 
 
 def measure_layers(
@@ -248,7 +272,7 @@ def measure_layers(
         the frames that do not show it.
     """
     with single_opencv_thread():
-        motions = frame_motions(frames, reference, prior)
+        motions = frame_motions(frames, reference, prior, lambda part: on_progress(0.07 * part))
         used = path_order(frames, motions)
         left_out = tuple(k for k, found in enumerate(motions) if not found)
         if len(used) < 2:
@@ -256,15 +280,24 @@ def measure_layers(
         if max(frames[reference].shape) < MIN_SIDE_PX:
             return None, ()
         chosen, middle = [frames[k] for k in used], used.index(reference)
-        candidates = motion_candidates(chosen, middle, [motions[k] for k in used])
+        candidates = motion_candidates(chosen, middle, [motions[k] for k in used], lambda: on_progress(0.07))
         solution = solve(
-            chosen, middle, prior, candidates, refine_prior=refine_prior, on_progress=on_progress
+            chosen,
+            middle,
+            prior,
+            candidates,
+            refine_prior=refine_prior,
+            on_progress=lambda part: on_progress(0.1 + 0.9 * part),
         )
         return solution, left_out
 
 
 def prior_with_hints(
-    separator: Separator, frame: Floats, reflection_share: Floats, quality: Quality = Options.quality
+    separator: Separator,
+    frame: Floats,
+    reflection_share: Floats,
+    quality: Quality = Options.quality,
+    on_progress: ProgressCallback = lambda _fraction: None,
 ) -> Floats:
     """Returns T of the working frame, predicted with hints where the measured share (h, w, 1) of the reflection is large."""
     share = cv2.resize(reflection_share, frame.shape[1::-1])
@@ -272,7 +305,12 @@ def prior_with_hints(
     hints = np.zeros(frame.shape, np.uint8)
     hints[is_reflection, 0] = 255
     photo = Photo.from_array(frame, encoding="linear")
-    upsampler, _, _ = separator.fit(photo, quality=quality, hints=hints if is_reflection.any() else None)
+    upsampler, _, _ = separator.fit(
+        photo,
+        quality=quality,
+        hints=hints if is_reflection.any() else None,
+        on_progress=on_progress,
+    )
     return _applied(upsampler.apply, frame)
 
 
@@ -294,7 +332,11 @@ def _open(photos: Sequence[Source], index: int, max_pixels: int) -> Photo:
 
 
 def _working_frames(
-    photos: Sequence[Source], reference: int, photo: Photo, max_pixels: int
+    photos: Sequence[Source],
+    reference: int,
+    photo: Photo,
+    max_pixels: int,
+    on_progress: ProgressCallback,
 ) -> tuple[list[Floats], np.float32]:
     """Returns the photos at the working size, in linear light divided by its white level, 0..1, and this level. One photo at a
     time is in memory at full size."""
@@ -302,6 +344,7 @@ def _working_frames(
     width, height = (max(8, round(length * scale)) for length in photo.size)
     frames = []
     for k in range(len(photos)):
+        on_progress(k / len(photos))
         frame = photo if k == reference else _open(photos, k, max_pixels)
         if frame.size != photo.size:
             raise PhotoError(

@@ -7,6 +7,7 @@ Therefore the memory does not depend on the length of the video.
 from __future__ import annotations
 
 import contextlib
+import io
 import os
 from collections.abc import Iterator
 from dataclasses import replace
@@ -21,9 +22,12 @@ from brewster.burst.film import choose, measure_film
 from brewster.burst.video_colour import HDR_NAMES, displayed_size, to_picture
 from brewster.errors import BrewsterError, PhotoTooLarge, UnreadablePhoto, counted
 from brewster.files import DEFAULT_MAX_PIXELS
+from brewster.inference.predictor import ProgressCallback
 from brewster.photo import Photo
 from brewster.photo.file_info import with_notes
 
+VideoFile = str | os.PathLike[str] | bytes
+"""The path of a video, or its bytes."""
 _MAX_SECONDS: Final = 20
 """Only the beginning of a video is read: a camera move for a burst takes 2 to 5 seconds."""
 _FRAMES_PER_SECOND: Final = 30
@@ -34,7 +38,11 @@ _THUMBNAIL_PX: Final = 240
 
 
 def read_video(
-    path: str | os.PathLike[str], frames: int, *, max_pixels: int = DEFAULT_MAX_PIXELS
+    path: VideoFile,
+    frames: int,
+    *,
+    max_pixels: int = DEFAULT_MAX_PIXELS,
+    on_progress: ProgressCallback = lambda _fraction: None,
 ) -> list[Photo]:
     """Returns frames of a video, in the order of time, for `separate_burst`.
 
@@ -43,9 +51,10 @@ def read_video(
     sharpest one is taken. A video with fewer frames is returned whole. Only the first 20 seconds are used.
 
     Args:
-        path: the file.
+        path: the path of the file, or its bytes.
         frames: the number of frames.
         max_pixels: videos with larger frames are refused.
+        on_progress: called with the completed fraction, 0 to 1, for each frame. An exception raised in it stops the work.
 
     Raises:
         UnreadablePhoto: the file is not a video, is damaged, or has fewer than 2 frames.
@@ -56,12 +65,19 @@ def read_video(
         raise BrewsterError(
             f"frames is {frames}", "expected at least 2, because one frame shows no motion", "choose 3 to 9"
         )
-    film = measure_film(_thumbnail(frame) for frame, _ in _decoded(path, max_pixels))
+
+    def thumbnails() -> Iterator[NDArray[np.uint8]]:
+        for index, (frame, _) in enumerate(_decoded(path, max_pixels)):
+            on_progress(0.5 * min(1, index / (_MAX_SECONDS * _FRAMES_PER_SECOND)))
+            yield _thumbnail(frame)
+
+    film = measure_film(thumbnails())
     if len(film.positions) < 2:
         raise _unreadable(path, f"{counted(len(film.positions), 'frame')} can be decoded")
     chosen = choose(film, frames)
     photos = []
     for index, (frame, stream) in enumerate(_decoded(path, max_pixels)):
+        on_progress(0.5 + 0.5 * index / chosen[-1])
         if index in chosen:
             context = stream.codec_context
             picture = to_picture(frame, _pixel_aspect(stream), context.color_trc, context.color_primaries)
@@ -80,12 +96,13 @@ def _thumbnail(frame: av.VideoFrame) -> NDArray[np.uint8]:
     return frame.to_ndarray(width=_THUMBNAIL_PX, height=height, format="gray").astype(np.uint8)
 
 
-def _decoded(path: str | os.PathLike[str], max_pixels: int) -> Iterator[tuple[av.VideoFrame, av.VideoStream]]:
+def _decoded(path: VideoFile, max_pixels: int) -> Iterator[tuple[av.VideoFrame, av.VideoStream]]:
     """Yields the frames of the first seconds with their stream, up to the first damaged one, at most 30 for each second.
 
     If the size changes, only the frames of the first size are yielded."""
     try:
-        with av.open(os.fspath(path)) as container:
+        file = io.BytesIO(path) if isinstance(path, bytes) else os.fspath(path)
+        with av.open(file, "r") as container:
             stream = _video_stream(path, container)
             _check_size(path, displayed_size(stream.width, stream.height, _pixel_aspect(stream)), max_pixels)
             size = None
@@ -104,7 +121,7 @@ def _decoded(path: str | os.PathLike[str], max_pixels: int) -> Iterator[tuple[av
         raise _unreadable(path, str(error)) from error
 
 
-def _video_stream(path: str | os.PathLike[str], container: av.container.InputContainer) -> av.VideoStream:
+def _video_stream(path: VideoFile, container: av.container.InputContainer) -> av.VideoStream:
     """Returns the first stream that is a film. The cover picture of an audio file is a video stream, too."""
     streams = [s for s in container.streams.video if not s.disposition & Disposition.attached_pic]
     if not streams:
@@ -130,18 +147,22 @@ def _pixel_aspect(stream: av.VideoStream) -> float:
     return float(stream.sample_aspect_ratio or 1)
 
 
-def _check_size(path: str | os.PathLike[str], size: tuple[int, int], max_pixels: int) -> None:
+def _check_size(path: VideoFile, size: tuple[int, int], max_pixels: int) -> None:
     if size[0] * size[1] > max_pixels:
         raise PhotoTooLarge(
-            f"the frames of {path} have {size[0]} x {size[1]} pixels",
+            f"the frames of {_name(path)} have {size[0]} x {size[1]} pixels",
             f"expected at most {max_pixels} pixels",
             "raise the limit with --max-pixels (in Python max_pixels)",
         )
 
 
-def _unreadable(path: str | os.PathLike[str], reason: str) -> UnreadablePhoto:
+def _name(path: VideoFile) -> str:
+    return "the video" if isinstance(path, bytes) else os.fspath(path)
+
+
+def _unreadable(path: VideoFile, reason: str) -> UnreadablePhoto:
     return UnreadablePhoto(
-        f"{os.fspath(path)} cannot be read as a video ({reason})",
+        f"{_name(path)} cannot be read as a video ({reason})",
         "expected a video with at least 2 frames",
         "copy or record the video again, or pass photos",
     )

@@ -231,15 +231,15 @@ class Separator:
         """
         strength = Options(strength=strength, quality=quality).strength  # checks and converts the values
         seconds: dict[str, float] = {}
-        with _timed(seconds, "decode"):
+        with timed(seconds, "decode"):
             photo = Photo.open(source, encoding=encoding, max_pixels=max_pixels)
             weights = None if mask is None else Mask.open(mask, photo.size)
             inputs, white = self._inputs(photo, quality, hints)
         on_progress(0.0)
-        with _timed(seconds, "network"):
+        with timed(seconds, "network"):
             prediction = self._predict(inputs, quality, lambda done: on_progress(_NETWORK_SHARE * done))
             largest_input = inputs[-1][..., :3]
-        with _timed(seconds, "upsampling"):
+        with timed(seconds, "upsampling"):
             upsampler = _fit_upsampler(largest_input, prediction, strength, white)
             transmission, reflection, residual = upsample_layers(
                 photo,
@@ -380,10 +380,11 @@ def _fit_upsampler(
 
 
 @contextmanager
-def _timed(seconds: dict[str, float], name: str) -> Iterator[None]:
+def timed(seconds: dict[str, float], name: str) -> Iterator[None]:
+    """Adds the wall time of the block to `seconds[name]`."""
     started = time.perf_counter()
     yield
-    seconds[name] = time.perf_counter() - started
+    seconds[name] = seconds.get(name, 0.0) + time.perf_counter() - started
 
 
 def white_level(light: Floats) -> np.float32:

@@ -17,9 +17,8 @@ from starlette.requests import Request
 
 from brewster.errors import invalid_value
 from brewster.files import OUTPUT_LAYERS, SeparationPaths
-from brewster.image_formats import FORMATS, canonical_format, format_of
+from brewster.image_formats import FORMATS, VIDEO_SIGNATURE, canonical_format, format_of, is_video
 from brewster.options import MAX_BURST_PHOTOS, BurstOptions, Options
-from brewster.remote_path import check_not_video
 
 FIELDS: Final = ("layers", "strength", "quality", "format", "additive", "model")
 """The options that a client may set as text. The server sets the other options."""
@@ -44,30 +43,32 @@ _PHOTOS_SCHEMA: Final = {
     "items": _PHOTO_SCHEMA,
     "minItems": 1,
     "maxItems": MAX_BURST_PHOTOS,
-    "description": f"The photo, or 2 to {MAX_BURST_PHOTOS} photos of one window (a burst), in the order in which they were taken.",
+    "description": f"The photo, or a burst: 2 to {MAX_BURST_PHOTOS} photos of one window in the order in which they were taken, or a video of it.",
 }
 
 
 @final
 @dataclass(frozen=True)
 class SeparationRequest:
-    """The uploaded photo, or the photos of a burst, and the options."""
+    """The uploaded photo, or the photos or the video of a burst, and the options."""
 
     photo: bytes
-    """The photo to separate: the reference photo of a burst."""
+    """The photo to separate: the reference photo of a burst, or the video."""
     name: str
     """The file name of the photo, as returned by `safe_name`."""
     options: Options
     mask: bytes | None = None
     hints: bytes | None = None
     burst: tuple[bytes, ...] = ()
-    """All photos of a burst, in the order of the form; empty for a single photo."""
+    """All photos of a burst, in the order of the form; the video; or empty for a single photo."""
+    is_video: bool = False
     burst_options: BurstOptions = field(default_factory=BurstOptions)
 
     @property
-    def reference(self) -> int:
-        """The index of `photo` in the burst."""
-        return (self.burst_options.reference or 1) - 1
+    def reference(self) -> int | None:
+        """The index of the photo to separate in the burst, or None for the middle one."""
+        number = self.burst_options.reference
+        return number and number - 1
 
     def target(self, layer: str, format_name: str) -> str:
         """Returns the file name of a layer, the same as on the command line. `format_name` is the format of the photo."""
@@ -85,8 +86,7 @@ async def read_form(request: Request, models: Sequence[str], max_pixels: int) ->
     default first.
 
     Raises HTTPException 415 if the body is not a form, 400 if the form is damaged, and 422 if a field or a
-    value is invalid; BrewsterError if two options contradict each other; UnsupportedPhoto if the photo has
-    the name of a video; ClientDisconnect if the upload is incomplete.
+    value is invalid; BrewsterError if two options contradict each other; ClientDisconnect if the upload is incomplete.
     """
     if not request.headers.get("content-type", "").lower().startswith("multipart/form-data"):
         raise HTTPException(
@@ -123,7 +123,7 @@ async def _build_request(form: FormData, options: Options) -> SeparationRequest:
         raise HTTPException(
             422, "the form contains no photo; expected an image file; send it in the field photo"
         )
-    painted: dict[str, bytes | None] = {}
+    painted: dict[str, Any] = {}
     for name in _FILES[1:]:
         upload = form.get(name)
         if upload is not None and not isinstance(upload, UploadFile):
@@ -132,10 +132,23 @@ async def _build_request(form: FormData, options: Options) -> SeparationRequest:
             )
         painted[name] = await upload.read() if upload else None
     names = [safe_name(photo.filename or "") for photo in photos]
-    for name in names:
-        check_not_video(Path(name))
     contents = [await photo.read() for photo in photos]
     burst_options = _burst_options(form)
+    if any(map(_is_video, names, contents)):
+        if len(photos) > 1:
+            raise HTTPException(
+                422,
+                f"the form contains a video among {len(photos)} files; expected one video, or photos; send the video alone",
+            )
+        return SeparationRequest(
+            contents[0],
+            names[0],
+            options,
+            **painted,
+            burst=(contents[0],),
+            is_video=True,
+            burst_options=burst_options,
+        )
     number = burst_options.reference or len(photos) // 2 + 1
     if number > len(photos):
         raise HTTPException(
@@ -147,6 +160,10 @@ async def _build_request(form: FormData, options: Options) -> SeparationRequest:
     return SeparationRequest(
         contents[number - 1], names[number - 1], options, **painted, burst=burst, burst_options=burst_options
     )
+
+
+def _is_video(name: str, content: bytes) -> bool:
+    return is_video(Path(name)) or re.match(VIDEO_SIGNATURE, content, re.DOTALL) is not None
 
 
 def _burst_options(form: FormData) -> BurstOptions:

@@ -1,6 +1,6 @@
 """The HTTP API that separates photos.
 
-    POST /separate    a form with the photo and the options      GET /progress/{job}    the progress of a request
+    POST /separate    a form with the photo, or a burst, and the options      GET /progress/{job}    the progress of a request
     GET /models       the available models                       GET /health            the state of the server
 
 The server fetches nothing by URL and writes nothing to the disk.
@@ -11,7 +11,7 @@ from __future__ import annotations
 import gzip
 import hashlib
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, final
@@ -28,6 +28,7 @@ from brewster.image_formats import SUFFIXES
 from brewster.inference import Separator
 from brewster.inference.burst_report import BurstReport
 from brewster.inference.predictor import ProgressCallback
+from brewster.options import DEFAULT_FRAMES
 from brewster.photo import Photo, Source
 from brewster.photo.open_raster import zip_images
 from brewster.web.job_queue import JobProgress, JobQueue
@@ -41,6 +42,10 @@ if TYPE_CHECKING:
 _GZIP_LEVEL: Final = 1  # higher levels save little more and take several times longer
 _TILE_HEADERS: Final = {"Cache-Control": "private, max-age=3600"}
 _MAX_CACHE_BYTES: Final = 400_000_000  # of the decoded photos of the last requests, for the tiles
+_MAX_BURST_BYTES: Final = 200_000_000  # of the last measured bursts
+_VIDEO_SHARE: Final = 0.1
+"""Estimated time of reading a video divided by that of its measurement, for the progress."""
+_LAYER_BYTES: Final = 12_000_000  # of the measured layers of a burst
 
 
 @final
@@ -103,12 +108,14 @@ def separation_router(model_cache: ModelCache, job_queue: JobQueue, *, max_pixel
 
 @final
 class _SeparationRoutes:
-    """The handlers of the routes, the photos of the last previews, and the layers of the last burst."""
+    """The handlers of the routes, the photos of the last previews, and the layers of the last bursts."""
 
     def __init__(self, model_cache: ModelCache, job_queue: JobQueue, max_pixels: int) -> None:
         self._model_cache, self._job_queue, self._max_pixels = model_cache, job_queue, max_pixels
         self._photos = ByteLimitedCache[Photo](_MAX_CACHE_BYTES, lambda photo: photo.pixels.nbytes)
-        self._last_burst: tuple[object, FittedBurst] | None = None
+        self._bursts: ByteLimitedCache[FittedBurst] = ByteLimitedCache(
+            _MAX_BURST_BYTES, lambda burst: burst.photo.pixels.nbytes + _LAYER_BYTES
+        )
 
     async def _run(self, request: Request, job: str | None, handler: Handler) -> Response:
         with self._job_queue.reserve(job) as reserved_job:
@@ -207,52 +214,76 @@ class _SeparationRoutes:
         return Response(data, headers=headers, media_type=media_type)
 
     def _preview(self, form: SeparationRequest, on_progress: ProgressCallback) -> Response:
-        photo, headers = self._open_photo(form)
         separator = self._model_cache.separator(form.options.model)
         hints: Source | None = form.hints
-        if separator.takes_hints:
-            headers["Brewster-Takes-Hints"] = "yes"
+        takes_hints, start, burst_headers = separator.takes_hints, 0.0, dict[str, str]()
         if form.burst:
-            fitted = self._fit_burst(form, separator, lambda done: on_progress(0.9 * done))
-            headers |= _burst_headers(fitted.report)
+            start = 0.9
+            fitted = self._fit_burst(form, separator, lambda done: on_progress(start * done))
+            burst_headers = _burst_headers(fitted.report)
             separator, hints = fitted.separator, fitted.hints
-        start = 0.9 if form.burst else 0.0
+        photo, headers = self._open_photo(form)
         maps = preview(
             separator, photo, form.options, lambda done: on_progress(start + (1 - start) * done), hints
         )
+        headers |= burst_headers | ({"Brewster-Takes-Hints": "yes"} if takes_hints else {})
         data = gzip.compress(maps, _GZIP_LEVEL, mtime=0)
         return Response(data, headers=headers, media_type="application/gzip")
 
     def _fit_burst(
         self, form: SeparationRequest, separator: Separator, on_progress: ProgressCallback
     ) -> FittedBurst:
-        """Keeps the last burst, so that a download after a preview does not measure again."""
+        """Keeps the last bursts, so that a download or an exchange of the layers after a preview does not measure again."""
         from brewster.burst import fit_burst  # noqa: PLC0415  (imports numba)
 
-        digests = tuple(hashlib.sha256(file).digest() for file in (*form.burst, form.hints or b""))
-        key, last = (digests, form.reference, form.options.quality, separator), self._last_burst
-        if last and last[0] == key:
-            fitted = last[1]
-        else:
-            fitted = fit_burst(
-                form.burst,
+        def fit() -> FittedBurst:
+            start = _VIDEO_SHARE if form.is_video else 0.0
+            return fit_burst(
+                _photos(form, lambda done: on_progress(start * done)),
                 reference=form.reference,
                 separator=separator,
                 quality=form.options.quality,
                 hints=form.hints,
                 max_pixels=form.options.max_pixels,
-                on_progress=on_progress,
+                on_progress=lambda done: on_progress(start + (1 - start) * done),
             )
-            self._last_burst = key, fitted
+
+        digests = tuple(hashlib.sha256(file).digest() for file in (*form.burst, form.hints or b""))
+        key = digests, form.reference, form.options.quality, separator
+        fitted = self._bursts.get_or_create(key, fit)
+        self._photos.get_or_create(_photo_key(form), lambda: fitted.photo)
         return fitted.chosen(form.burst_options.method, swap=form.burst_options.swap)
 
     def _open_photo(self, form: SeparationRequest) -> tuple[Photo, dict[str, str]]:
         """Returns the decoded photo, and the headers with its key and its size. The photo is stored in the cache for the tiles."""
-        key = hashlib.sha256(form.photo).hexdigest()
-        photo = self._photos.get_or_create(
-            key, lambda: Photo.open(form.photo, max_pixels=form.options.max_pixels)
-        )
+
+        def decode() -> Photo:
+            if not form.is_video:
+                return Photo.open(form.photo, max_pixels=form.options.max_pixels)
+            photos = _photos(form)
+            frame = photos[len(photos) // 2 if form.reference is None else form.reference]
+            return Photo.open(frame)
+
+        key = _photo_key(form)
+        photo = self._photos.get_or_create(key, decode)
         return photo, {"Brewster-Photo": key, "Brewster-Size": "{}x{}".format(*photo.size)}
+
+
+def _photo_key(form: SeparationRequest) -> str:
+    """Returns the name of the photo in the addresses of its tiles."""
+    frame = f"frame {form.reference}".encode() if form.is_video else b""
+    return hashlib.sha256(form.photo + frame).hexdigest()
+
+
+def _photos(
+    form: SeparationRequest, on_progress: ProgressCallback = lambda _fraction: None
+) -> Sequence[Source]:
+    """Returns the photos of a burst: those of the form, or frames of its video."""
+    if not form.is_video:
+        return form.burst
+    from brewster.burst import read_video  # noqa: PLC0415  (imports numba)
+
+    return read_video(form.photo, DEFAULT_FRAMES, max_pixels=form.options.max_pixels, on_progress=on_progress)
 
 
 def _burst_headers(report: BurstReport) -> dict[str, str]:
