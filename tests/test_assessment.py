@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from brewster import Photo, Separator
-from brewster.inference.assessment import Verdict, assess
+from brewster.inference.assessment import Verdict, assess, next_step
 from brewster.models.zoo import MODELS
 
 SIZE = (24, 32)
@@ -43,6 +43,16 @@ def test_half_of_the_light_removed_from_a_quarter_of_the_photo_is_measured():
 
 def test_light_that_was_added_is_not_removed_light():
     assert assess(grey(0.2), grey(0.3), certain()).removed_light == 0
+
+
+@pytest.mark.parametrize("takes_hints", [False, True])
+@pytest.mark.parametrize("verdict", get_args(Verdict))
+def test_a_next_step_is_named_exactly_where_little_was_removed(verdict, takes_hints):
+    step = next_step(verdict, takes_hints=takes_hints)
+    assert (step is not None) == (verdict in ("little found", "reflection remains"))
+    if step:
+        assert "film" in step
+        assert ("hints" in step) == takes_hints
 
 
 @pytest.mark.parametrize(("error", "is_doubtful"), [(None, False), (0.05, False), (0.07, True)])

@@ -22,6 +22,7 @@ from brewster import Photo
 from brewster.batch import FileResult
 from brewster.errors import DiskFull
 from brewster.inference import Separator
+from brewster.inference.assessment import next_step
 from brewster.photo import FileInfo
 from cli_helpers import LAYERS, error_lines, image_bytes, json_lines, layer_files, list_files
 
@@ -210,6 +211,9 @@ def test_the_report_has_a_row_for_each_photo_and_the_summary_counts_the_verdicts
             result["note"] or "",
         )
         assert row["verdict"] == assessment.get("verdict", "")
+        step = assessment and next_step(assessment["verdict"], takes_hints=False)
+        assert result["next_step"] == (step or None)
+        assert not step or f"{assessment['verdict']}: {step}" in err
         for number in ("removed_light", "changed_area"):
             assert row[number] == (f"{assessment[number]:.4f}" if assessment else "")
         assert bool(row["seconds"]) == bool(result["seconds"])

@@ -102,6 +102,7 @@ class FileResult:
     reconstruction_error: float | None = None
     assessment: Assessment | None = None
     reflection_is_derived: bool = False
+    next_step: str | None = None
     burst: BurstReport | None = None
     note: str | None = None
     """What changed when the photo was read, such as a conversion of CMYK colours, or None."""

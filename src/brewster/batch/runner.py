@@ -170,7 +170,7 @@ def separate_task(
     result.seconds, result.residual = dict(separation.seconds), separation.residual
     result.assessment, photo_info = separation.assessment, separation.photo.file_info
     result.reconstruction_error = separation.reconstruction_error
-    result.reflection_is_derived = separation.reflection_is_derived
+    result.reflection_is_derived, result.next_step = separation.reflection_is_derived, separation.next_step
     started, notes = time.perf_counter(), dict[str, None]()
     for layer, target in task.outputs.items():
         target_format = format_of(target) if isinstance(target, Location) else None

@@ -129,7 +129,7 @@ class FittedBurst:
         """Computes the layers at full size. `options` are those of the call of a `Separator`, without hints."""
         separation = self.separator(self.photo, hints=self.hints, on_progress=on_progress, **options)
         seconds = {name: self.seconds.get(name, 0.0) + spent for name, spent in separation.seconds.items()}
-        return replace(separation, burst=self.report, seconds=self.seconds | seconds)
+        return replace(separation, burst=self.report, next_step=None, seconds=self.seconds | seconds)
 
 
 def separate_burst(

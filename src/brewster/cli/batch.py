@@ -46,6 +46,8 @@ class BatchReport:
     report: Path | None = None
     counts: Counter[str] = field(default_factory=Counter)
     _verdicts: Counter[str] = field(default_factory=Counter)
+    _next_steps: dict[str, str] = field(default_factory=dict)
+    """By verdict."""
     _contact_sheet_rows: list[tuple[Location, list[Location]]] = field(default_factory=list)
     _errors: list[str] = field(default_factory=list)
     _sources_by_shared_error: dict[str, list[str]] = field(default_factory=lambda: defaultdict(list))
@@ -145,6 +147,8 @@ class BatchReport:
         self.counts[result.status] += 1
         if result.assessment and result.status == "separated":
             self._verdicts[result.assessment.verdict] += 1
+            if result.next_step:
+                self._next_steps[result.assessment.verdict] = result.next_step
         # The folder of the photos, where the layers belong, cannot be written to
         about_folder = f"{Path(result.source).parent.absolute()} was not written "
         if result.error and (INSTALL_COMMAND in result.error or result.error.startswith(about_folder)):
@@ -228,6 +232,8 @@ class BatchReport:
                 f"{self._verdicts[name]:,} {name}" for name in get_args(Verdict) if self._verdicts[name]
             )
             print_status(f"{', '.join(verdicts)}: list them with --json or --report FILE.csv")
+        for verdict, step in self._next_steps.items() if not self.quiet else ():
+            print_status(f"{verdict}: {step}")
         for message in self._errors:
             print_error(message)
         for message, sources in self._sources_by_shared_error.items():

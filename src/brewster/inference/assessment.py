@@ -38,6 +38,7 @@ _AGREEMENTS: Final[tuple[tuple[float, Verdict], ...]] = (
     (0.7, "reflection remains"),
 )
 """The smallest agreement of each verdict: the mean change divided by the mean spread of the outputs. bench/verdict.py fits them."""
+_FILM: Final = "film the window for three seconds while moving the camera in a circle"
 _UNKNOWN_CONFIDENCE: Final = 1e-6
 """Lower confidences count as this one, so that the spread is finite."""
 
@@ -102,6 +103,16 @@ def assess(
     if verdict == "removed" and not is_calibrated:
         verdict = "partly removed"
     return Assessment(verdict, removed_light, changed_area, confidence)
+
+
+def next_step(verdict: Verdict, *, takes_hints: bool) -> str | None:
+    """Returns what may help with a single photo, or None. `takes_hints` tells whether the model takes hints."""
+    hints = ", or mark the reflection with hints" if takes_hints else ""
+    if verdict == "little found":
+        return f"If you see a reflection, {_FILM}{hints}."
+    if verdict == "reflection remains":
+        return f"To remove more, {_FILM}{hints}, or use a larger model."
+    return None
 
 
 def encoded_change(photo: Floats, transmission: Floats) -> Floats:

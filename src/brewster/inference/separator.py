@@ -24,7 +24,7 @@ from typing import Any, Final, Unpack, final
 import numpy as np
 
 from brewster.errors import BrewsterError, MaskError, MissingExtra, ModelError
-from brewster.inference.assessment import Assessment, assess
+from brewster.inference.assessment import Assessment, assess, next_step
 from brewster.inference.clipping import keep_clipped_light
 from brewster.inference.full_size import upsample_layers
 from brewster.inference.guided_upsampling import Floats, GuidedUpsampler
@@ -254,6 +254,7 @@ class Separator:
         step = parameters | self._recorded
         step |= {"sha256": self.sha256[:12]} if self.sha256 else {}
         step |= {PHOTO: photo.file_info.digest} if photo.file_info.digest else {}
+        assessment = self._assess(largest_input, prediction, quality, strength, weights)
         return Separation(
             photo,
             with_layer_history(transmission, "transmission", step),
@@ -261,12 +262,13 @@ class Separator:
             prediction.confidence_map,
             residual,
             prediction.reconstruction_error,
-            self._assess(largest_input, prediction, quality, strength, weights),
+            assessment,
             self.name,
             self.sha256,
             self.device,
             seconds,
             prediction.reflection_is_derived,
+            next_step(assessment.verdict, takes_hints=self.takes_hints and hints is None),
         )
 
     def fit(

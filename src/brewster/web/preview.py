@@ -31,6 +31,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brewster.inference import Separator
+from brewster.inference.assessment import next_step
 from brewster.options import Options
 from brewster.photo import Photo, Source
 from brewster.srgb import REC709_LUMINANCE, to_encoded
@@ -53,7 +54,7 @@ def preview(
 
     Returns one line of JSON, then the reduced photo (3 bytes for each pixel, sRGB), and then maps of
     little-endian 16-bit values, row by row. The JSON has `width` and `height` of the reduced photo, `full`
-    (width and height of the photo), `verdict`, and for each map `name`, `width`, `height`, `channels`, and
+    (width and height of the photo), `verdict`, `next_step`, and for each map `name`, `width`, `height`, `channels`, and
     `range`, the values that 0 and 65535 stand for. Raises BrewsterError if the photo cannot be separated.
     """
     upsampler, prediction, assessment = separator.fit(
@@ -86,6 +87,7 @@ def preview(
         "height": height,
         "full": photo.size,
         "verdict": assessment.verdict,
+        "next_step": next_step(assessment.verdict, takes_hints=separator.takes_hints and hints is None),
         "maps": [
             {
                 "name": name,

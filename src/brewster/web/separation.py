@@ -204,6 +204,8 @@ class _SeparationRoutes:
             "Brewster-Verdict": separation.assessment.verdict,
             "Brewster-Seconds": f"{time.perf_counter() - started:.4f}",
         }
+        if separation.next_step:
+            headers["Brewster-Next-Step"] = separation.next_step
         if separation.burst:
             headers |= _burst_headers(separation.burst)
         if separation.reflection_is_derived:
