@@ -58,7 +58,7 @@ class Maps:
 
 
 def maps_of(photo, backend=pane, **options):
-    return Maps(preview(Separator(backend), Photo.open(photo), Options(**options), lambda _: None))
+    return Maps(preview(Separator(backend), Photo.open(photo), Options(**options), lambda _: None)[0])
 
 
 @pytest.fixture(scope="module")
@@ -68,7 +68,7 @@ def compact_separator():
 
 @pytest.fixture(scope="module")
 def mixture(compact_separator):
-    return Maps(preview(compact_separator, Photo.open(MIXTURE), Options(quality="draft"), lambda _: None))
+    return Maps(preview(compact_separator, Photo.open(MIXTURE), Options(quality="draft"), lambda _: None)[0])
 
 
 @pytest.mark.parametrize("strength", [0, 0.25, 0.5, 1])
@@ -106,7 +106,7 @@ def test_layers_that_are_clipped_at_full_strength_are_correct_below_it(strength)
 def test_the_preview_of_a_large_photo_matches_its_reduced_separation(compact_separator):
     pixels = np.kron(Photo.open(MIXTURE).pixels, np.ones((4, 4, 1), np.uint8))
     photo = Photo.from_array(pixels, encoding="srgb")
-    maps = Maps(preview(compact_separator, photo, Options(quality="draft"), lambda _: None))
+    maps = Maps(preview(compact_separator, photo, Options(quality="draft"), lambda _: None)[0])
     assert maps.head["full"] == list(photo.size)
     assert maps.head["width"] * maps.head["height"] == pytest.approx(MAX_PREVIEW_PIXELS, rel=0.01)
     whole = compact_separator(photo, quality="draft").transmission

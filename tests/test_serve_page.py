@@ -111,9 +111,15 @@ def test_a_phone_shows_everything_without_horizontal_scrolling(open_page):
     long = "a very long name of a photo taken through a window " * 3
     upload(page, *((f"{number} {long}.png", image_bytes(300, 200, "png", number)) for number in range(4)))
     assert page.evaluate("document.documentElement.scrollWidth") == 390
-    for control in page.locator("button:visible, select:visible").all():
-        box = control.bounding_box()
-        assert box["height"] >= 36 or box["width"] >= 36, control.inner_text()
+    for tool in ("move", "protect"):
+        page.locator(f"input[name=tool][value={tool}]").check()
+        for control in page.locator("button:visible, select:visible, input:visible").all():
+            box = control.bounding_box()
+            if control.get_attribute("type") == "checkbox":  # its label is the target
+                box = control.locator("..").bounding_box()
+            assert min(box["height"], box["width"]) >= 43.5, control.evaluate("one => one.outerHTML")
+    page.locator("input[name=tool][value=move]").check()
+    page.evaluate("scrollTo(0, 0)")
     before = share(page)
     stage = page.locator("glass-compare").bounding_box()
     finger = page.context.new_cdp_session(page)
@@ -214,7 +220,7 @@ def test_a_photo_that_fails_is_left_out_of_the_zip_and_its_error_is_shown(open_p
     page = open_page()
     photos = ((f"{name}.png", image_bytes(90, 60, "png", seed)) for seed, name in enumerate("abc"))
     upload(page, *photos, ("none.png", b"no photo"))
-    assert page.locator("#summary").inner_text() == "4 photos: 3 done, 1 failed"
+    assert page.locator("#summary").inner_text() == "4 photos: 3 partly removed, 1 failed"
 
     def refuse(route):
         if b'"b.png"' in route.request.post_data_buffer:
@@ -229,7 +235,7 @@ def test_a_photo_that_fails_is_left_out_of_the_zip_and_its_error_is_shown(open_p
     assert [name[0] for name in names] == ["a", "a", "c", "c"]
     text = archive.read(report).decode()
     assert "2 done, 2 failed" in text
-    assert "a.png -> a.transmission.png, a.reflection.png (strength 100 %)" in text
+    assert "a.png -> a.transmission.png, a.reflection.png (partly removed, strength 100 %)" in text
     assert "b.png: failed. Its layers cannot be written." in text
     assert "none.png: failed. This file is not a photo, or it is damaged." in text
     alert = page.locator("#export-error")

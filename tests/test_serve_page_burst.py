@@ -2,29 +2,51 @@
 
 import io
 import zipfile
+from pathlib import Path
 
+import numpy as np
 import pytest
 
 from brewster import Photo
+from brewster.burst import read_video
 from cli_helpers import image_bytes
-from page_helpers import downloaded, names_in_list, upload
+from page_helpers import canvas, difference, downloaded, names_in_list, settle, upload
+from picture_files import file_of
+from simulated_bursts import read_photo, simulate_burst
+from test_video import write_video
 
-PHOTOS = [(f"{number}.png", image_bytes(90, 60, "png", number)) for number in (1, 2, 3)]
+PICTURES = sorted((Path(__file__).parent / "pictures").glob("*.jpg"))
+
+PICTURE = Photo.open(Path(__file__).parent / "pictures" / "mixture-coffee-rocket.jpg").pixels
+SCENE = [
+    (f"{number}.png", file_of(np.ascontiguousarray(PICTURE[100:160, at : at + 90]), "PNG"))
+    for number, at in enumerate((100, 104, 108), 1)
+]
+"""Photos of one scene, which are too small to show a motion, so that the burst gives the result of the middle photo."""
+PHOTOS = [
+    (f"{number}.png", file_of((255 * read_photo(path, (90, 60)).clip(0, 1)).astype(np.uint8), "PNG"))
+    for number, path in enumerate(PICTURES[:3], 1)
+]
+"""Unrelated photos of one size."""
 
 
-def test_photos_of_one_size_can_be_one_burst_that_is_downloaded_and_split_again(open_page, run):
-    """The photos are unrelated, so that the burst reports this and gives the result of the middle photo."""
-    page = open_page()
-    upload(page, *PHOTOS)
+def as_burst(page):
+    upload(page, *SCENE)
     page.get_by_role("heading", name="Are these photos of one window?").wait_for()
     page.get_by_role("button", name="Yes, one window").click()
     page.wait_for_selector("li.done")
-    page.get_by_text("No other photo shows the same scene").wait_for()
+
+
+def test_photos_of_one_scene_can_be_one_burst_that_is_downloaded_and_split_again(open_page, run):
+    page = open_page()
+    as_burst(page)
+    page.get_by_text("too small to show the motion").wait_for()
     assert names_in_list(page) == ["3 \N{MULTIPLICATION SIGN} 2.png"]
     assert not page.locator("#burst").is_visible()
+    assert page.locator("li .state").inner_text() == "single photo"
     page.get_by_label("Strength", exact=True).fill("0.5")
     name, data = downloaded(page, page.get_by_role("button", name="Download transmission").click)
-    alone = Photo.open(run("-", "--strength", 0.5, stdin=PHOTOS[1][1])[1])
+    alone = Photo.open(run("-", "--strength", 0.5, stdin=SCENE[1][1])[1])
     assert name == "2.transmission.png"
     assert (Photo.open(data).pixels == alone.pixels).all()
     page.get_by_role("button", name="Remove 2.png").click()
@@ -34,13 +56,121 @@ def test_photos_of_one_size_can_be_one_burst_that_is_downloaded_and_split_again(
     assert names_in_list(page) == ["1.png", "2.png", "3.png"]
 
 
-def test_photos_of_two_sizes_and_the_answer_no_leave_the_list_as_it_is(open_page):
+def test_unrelated_photos_photos_of_two_sizes_and_the_answer_no_leave_the_list_as_it_is(open_page):
     page = open_page()
-    upload(page, *PHOTOS[:2])
+    upload(page, *SCENE[:2])
     page.get_by_role("button", name="No", exact=True).click()
     assert names_in_list(page) == ["1.png", "2.png"]
+    with page.expect_response("**/related") as compared:
+        upload(page, *PHOTOS)
+    assert compared.value.json() == {"are_related": False}
     upload(page, ("a.png", image_bytes(80, 60, "png")), ("b.png", image_bytes(60, 80, "png")))
+    settle(page)
     assert not page.locator("#burst").is_visible()
+
+
+@pytest.fixture(scope="module")
+def film(tmp_path_factory):
+    """A film of a window, 240 x 180 pixels, whose reflection moves by 30 pixels."""
+    layers = [np.clip(read_photo(path, (320, 240)), 0, 1) for path in (PICTURES[2], PICTURES[1])]
+    burst = simulate_burst(
+        *layers, frames=5, relative_px=30, common_px=6, strength=0.4, noise=0, size=(240, 180)
+    )
+    return write_video(tmp_path_factory.mktemp("film") / "window.mp4", burst.frames)
+
+
+def test_a_film_is_separated_swapped_undone_and_downloaded_with_its_verdict_in_the_zip(open_page, film):
+    page = open_page()
+    upload(page, (film.name, film.read_bytes()))
+    photos = read_video(film, 7)
+    assert (canvas(page, "left") == photos[2].pixels).all()
+    assert page.locator("li .state").inner_text() == "open question"
+    page.get_by_role("button", name="The first picture").click()
+    assert page.locator("li .state").inner_text() == "by motion"
+    settle(page)
+    before = canvas(page, "right")
+    page.get_by_role("button", name="Swap").click()
+    page.wait_for_function("() => !document.querySelector('#update-bar').checkVisibility()")
+    settle(page)
+    assert np.median(difference(canvas(page, "right"), before)) > 10
+    page.keyboard.press("Control+z")
+    page.wait_for_function("() => !document.querySelector('#update-bar').checkVisibility()")
+    settle(page)
+    assert (canvas(page, "right") == before).all()
+    page.keyboard.press("Control+y")
+    page.wait_for_function("() => !document.querySelector('#update-bar').checkVisibility()")
+    _, data = downloaded(page, page.get_by_role("button", name="Download all").click)
+    with zipfile.ZipFile(io.BytesIO(data)) as archive:
+        made = Photo.open(archive.read("window.mp4.transmission.png"))
+        report = archive.read("brewster-report.txt").decode()
+    shown = canvas(page, "right")
+    assert np.quantile(difference(made.pixels, shown), 0.99) <= 2
+    assert "(by motion, strength 100 %, layers exchanged). The layers moved" in report
+
+
+def with_headers(page, **headers):
+    """Replaces headers of the previews of a burst, and returns the list of their forms."""
+    forms = []
+
+    def replace(route):
+        forms.append(route.request.post_data_buffer)
+        response = route.fetch()
+        names = {f"brewster-{name.replace('_', '-')}": value for name, value in headers.items()}
+        route.fulfill(response=response, headers=response.headers | names)
+
+    page.route("**/preview?*", replace)
+    return forms
+
+
+def field(form, name):
+    return form.split(f'name="{name}"\r\n\r\n'.encode())[1].split(b"\r\n")[0].decode()
+
+
+@pytest.mark.parametrize(("choice", "swap"), [("The first picture", "no"), ("The second picture", "yes")])
+def test_the_user_is_asked_which_layer_is_behind_the_glass_if_it_is_unsure(open_page, choice, swap):
+    page = open_page()
+    forms = with_headers(page, burst="burst", burst_names="unsure", burst_measured="yes")
+    as_burst(page)
+    assert page.get_by_role("heading", name="Which one is behind the glass?").is_visible()
+    assert page.locator("li .state").inner_text() == "open question"
+    page.get_by_role("button", name=choice).click()
+    page.wait_for_selector("#naming", state="hidden")
+    assert page.evaluate("document.activeElement.tagName") == "GLASS-COMPARE"
+    page.wait_for_selector("li.done")
+    assert field(forms[-1], "swap") == swap
+    page.get_by_role("button", name="Undo", exact=True).click()
+    page.wait_for_selector("#naming", state="visible")
+
+
+def test_refused_layers_are_shown_on_request_and_the_automatic_result_again(open_page):
+    page = open_page()
+    forms = with_headers(page, burst="single photo", burst_measured="yes")
+    as_burst(page)
+    page.unroute("**/preview?*")
+    forms = with_headers(page, burst="burst", burst_measured="yes")
+    page.route("**/preview?*", lambda route: (forms.append(route.request.post_data_buffer), route.abort()))
+    page.get_by_role("button", name="Use the measured layers anyway").click()
+    page.wait_for_selector("li.failed")
+    assert field(forms[-1], "method") == "motion"
+
+
+def test_a_single_photo_of_which_little_was_removed_names_the_next_step_on_the_picture(open_page):
+    page = open_page(has_touch=True)
+    with_headers(page, verdict="little found", next_step="Film it.")
+    upload(page, PHOTOS[0])
+    assert "Film it." in page.locator("#verdict").inner_text()
+    with page.expect_file_chooser() as choosing:
+        page.locator("#film-next").click()
+    assert choosing.value.element.get_attribute("capture") == "environment"
+    assert page.locator("li .state").inner_text() == "little found"
+
+
+def test_a_video_that_cannot_be_read_is_explained(open_page):
+    page = open_page()
+    upload(page, ("cut.mp4", b"\0\0\0\x18ftypmp42"))
+    alert = page.get_by_role("alert")
+    assert "This video cannot be read" in alert.inner_text()
+    assert page.locator("#discard").get_attribute("class") == "main"
 
 
 @pytest.mark.parametrize("mode", ["Slider", "Side by side"])
@@ -73,8 +203,7 @@ def test_a_text_file_and_a_tiff_have_the_right_button_and_thumbnail(open_page):
 @pytest.mark.parametrize("layers", [("confidence",), ("transmission", "confidence")])
 def test_the_zip_of_a_burst_and_a_photo_contains_the_chosen_layers(open_page, layers):
     page = open_page()
-    upload(page, *PHOTOS[:2])
-    page.get_by_role("button", name="Yes, one window").click()
+    as_burst(page)
     upload(page, ("a.png", image_bytes(80, 60, "png")))
     for layer in ("transmission", "reflection", "confidence"):
         page.locator(f"input[name=zip][value={layer}]").set_checked(layer in layers)

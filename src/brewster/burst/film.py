@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Final, final
@@ -66,6 +66,11 @@ def measure_film(thumbnails: Iterable[NDArray[np.uint8]]) -> Film:
     return Film(*np.array(rows, np.float64).reshape(-1, 7).T)
 
 
+def show_one_scene(thumbnails: Sequence[NDArray[np.uint8]]) -> bool:
+    """Returns whether each of the grey thumbnails, (h, w) of one size, shows the scene of the one before."""
+    return bool(_is_same_scene(measure_film(thumbnails))[1:].all())
+
+
 def choose(film: Film, count: int) -> list[int]:
     """Returns the indices of `count` frames of the best part of a film, or of all frames if there are fewer.
 
@@ -87,13 +92,17 @@ def best_part(film: Film, count: int) -> slice:
     # A few wrong measurements are no zoom: the median of nine
     padded = np.pad(film.zoom, 4, mode="edge")
     zoom = np.median(np.lib.stride_tricks.sliding_window_view(padded, 9), axis=1)
-    begins = (film.response < _MIN_RESPONSE) & (film.correlation < _MIN_CORRELATION)
+    begins = ~_is_same_scene(film)
     begins |= np.abs(zoom) > _MAX_ZOOM
     # A covered frame is a part of its own
     begins |= covered | np.append(False, covered[:-1])
     borders = [0, *(np.flatnonzero(begins[1:]) + 1).tolist(), len(begins)]
     first, last = max(pairwise(borders), key=lambda part: part[1] - part[0])
     return slice(first, last) if last - first >= count else slice(0, len(begins))
+
+
+def _is_same_scene(film: Film) -> NDArray[np.bool_]:
+    return (film.response >= _MIN_RESPONSE) | (film.correlation >= _MIN_CORRELATION)
 
 
 def choose_frames(positions: Floats, sharpness: Floats, count: int) -> list[int]:

@@ -78,6 +78,7 @@ class FittedBurst:
                 report,
                 method="single photo",
                 message="The reference photo was separated alone, as requested.",
+                next_step=None,
             )
         elif method == "motion" and report.method != "burst":
             if not report.is_measured:
@@ -90,9 +91,10 @@ class FittedBurst:
                 report,
                 method="burst",
                 message=f"The measured layers are used, as requested. {report.message}",
+                next_step=None,
             )
         if swap and report.method == "burst":
-            report = replace(report, is_swapped=True, are_names_certain=True)
+            report = replace(report, is_swapped=True, are_names_certain=True, next_step=None)
         return replace(self, report=report, _requested=method)
 
     @property
@@ -129,7 +131,9 @@ class FittedBurst:
         """Computes the layers at full size. `options` are those of the call of a `Separator`, without hints."""
         separation = self.separator(self.photo, hints=self.hints, on_progress=on_progress, **options)
         seconds = {name: self.seconds.get(name, 0.0) + spent for name, spent in separation.seconds.items()}
-        return replace(separation, burst=self.report, next_step=None, seconds=self.seconds | seconds)
+        return replace(
+            separation, burst=self.report, next_step=self.report.next_step, seconds=self.seconds | seconds
+        )
 
 
 def separate_burst(
@@ -383,6 +387,7 @@ def burst_report(
     )
     is_doubted = verdict == "little found"
     method: Literal["burst", "single photo", "unchanged"] = "single photo"
+    next_step: str | None = None
     is_copy = (
         solution is not None
         and motion < _MAX_COPY_MOTION_PX
@@ -400,7 +405,7 @@ def burst_report(
     elif has_two_layers and motion >= (_USEFUL_MOTION_PX if is_doubted else _MIN_MOTION_PX):
         method, message = "burst", f"The layers moved {motion:.0f} px apart in a photo of 1,000 px."
         if solution.naming < _MIN_CERTAIN_NAMING:
-            message += " They may have each other's names: then exchange them with the option swap."
+            next_step = "The layers may have each other's names: then exchange them with the option swap."
     elif is_doubted:
         method = "unchanged"
         message = "Little reflection was found, in the motion and in the reference photo. If there is one, separate this photo alone."
@@ -409,7 +414,7 @@ def burst_report(
     else:
         message = f"The layers moved {motion:.0f} px apart; about {_USEFUL_MOTION_PX} are needed. {advice}"
     if solution and method != "burst":
-        message += ' The method "motion" uses the measured layers anyway.'
+        next_step = 'The method "motion" uses the measured layers anyway.'
     if left_out:
         names = ", ".join(str(k + 1) for k in left_out)
         message += f" Left out, because they do not show the same scene as the reference photo: {names}."
@@ -422,6 +427,7 @@ def burst_report(
         round(motion, 2),
         round(explained, 4),
         round(solution.edge_correlation, 4) if solution else 0.0,
+        next_step,
         solution is not None,
         solution is None or solution.naming >= _MIN_CERTAIN_NAMING,
     )

@@ -147,7 +147,7 @@ class BatchReport:
         self.counts[result.status] += 1
         if result.assessment and result.status == "separated":
             self._verdicts[result.assessment.verdict] += 1
-            if result.next_step:
+            if result.next_step and not result.burst:
                 self._next_steps[result.assessment.verdict] = result.next_step
         # The folder of the photos, where the layers belong, cannot be written to
         about_folder = f"{Path(result.source).parent.absolute()} was not written "
@@ -186,7 +186,9 @@ class BatchReport:
             if result.note:
                 print_status(f"  {result.note}")
             if result.burst:
-                print_status(f"  {result.burst.method}: {result.burst.message}")
+                print_status(
+                    f"  {result.burst.method}: {result.burst.message} {result.next_step or ''}".rstrip()
+                )
 
     def _different_options(self, result: FileResult) -> str:
         """Returns the options in the metadata of the existing layers that differ from the options of this batch."""

@@ -20,7 +20,7 @@ class BurstReport:
     """burst: by the motion of the layers. single photo: by the model alone, because the motion does not separate the layers.
     unchanged: no reflection was found."""
     message: str
-    """The reason for the method, and what to change in the next burst."""
+    """The reason for the method, and what to change in the next burst. See also `next_step`."""
     frames: int
     """The number of photos that were used."""
     left_out: tuple[int, ...]
@@ -34,6 +34,8 @@ class BurstReport:
     """The share of the errors of a model with one layer that the motion of a second layer explains, 0..1."""
     edge_correlation: float
     """The correlation of the edges of both layers, -1..1: about 0 for two scenes."""
+    next_step: str | None = None
+    """The option that shows the other result, or None."""
     is_measured: bool = False
     """Whether there are measured layers, which the method "motion" uses in any case."""
     are_names_certain: bool = True

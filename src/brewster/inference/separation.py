@@ -42,7 +42,7 @@ class Separation:
     reflection_is_derived: bool = False
     """Whether the reflection is photo - transmission in linear light, because the model predicts no reflection."""
     next_step: str | None = None
-    """What may help with a photo of which little was removed; None for other photos and for a burst, whose report has it."""
+    """What may help if little was removed, or which option shows the other result of a burst; or None."""
     burst: BurstReport | None = None
     """How a burst was separated; None for a single photo."""
 

@@ -124,7 +124,7 @@ class Photo:
             raise
         file_info = replace(decoded.file_info, digest=sampled_digest(io.BytesIO(data)))
         if isinstance(source, str | os.PathLike):
-            file_info = with_notes(file_info, *_misleading_suffix(location(source), data))
+            file_info = with_notes(file_info, *misleading_suffix(location(source), data))
         return cls._from_decoded(replace(decoded, file_info=file_info))
 
     @classmethod
@@ -364,7 +364,7 @@ def _rescaled(values: Stored, dtype: np.dtype[Any]) -> Stored:
     return ((values.astype(np.uint32) * new_white + white // 2) // white).astype(dtype)
 
 
-def _misleading_suffix(path: Location, data: bytes) -> Iterator[str]:
+def misleading_suffix(path: Location, data: bytes) -> Iterator[str]:
     """Yields a note if the suffix of a file is that of another format than its content."""
     named, content = format_of(path), format_of_content(data)
     pair = {row.name for row in (named, content) if row}

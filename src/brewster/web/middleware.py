@@ -31,7 +31,7 @@ _DRAIN_SECONDS: Final = 10.0
 _MAX_LENGTH_DIGITS: Final = 18  # of the header Content-Length, because int() refuses very long numbers
 SECURITY_HEADERS: Final = {
     "Content-Security-Policy": (
-        "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' blob: data:; "
+        "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' blob: data:; media-src blob:; "
         "connect-src 'self'; form-action 'self'; base-uri 'none'; frame-ancestors 'none'"
     ),
     "Cache-Control": "no-store",

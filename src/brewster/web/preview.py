@@ -31,7 +31,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brewster.inference import Separator
-from brewster.inference.assessment import next_step
+from brewster.inference.assessment import Assessment
 from brewster.options import Options
 from brewster.photo import Photo, Source
 from brewster.srgb import REC709_LUMINANCE, to_encoded
@@ -48,13 +48,13 @@ def preview(
     options: Options,
     on_progress: Callable[[float], None],
     hints: Source | None = None,
-) -> bytes:
+) -> tuple[bytes, Assessment]:
     """Separates a photo for the page. Of the options, only `quality` is used. `hints` is an image file, see
     `Separator`.
 
-    Returns one line of JSON, then the reduced photo (3 bytes for each pixel, sRGB), and then maps of
+    Returns the assessment, and the preview: one line of JSON, then the reduced photo (3 bytes for each pixel, sRGB), and then maps of
     little-endian 16-bit values, row by row. The JSON has `width` and `height` of the reduced photo, `full`
-    (width and height of the photo), `verdict`, `next_step`, and for each map `name`, `width`, `height`, `channels`, and
+    (width and height of the photo), and for each map `name`, `width`, `height`, `channels`, and
     `range`, the values that 0 and 65535 stand for. Raises BrewsterError if the photo cannot be separated.
     """
     upsampler, prediction, assessment = separator.fit(
@@ -86,8 +86,6 @@ def preview(
         "width": width,
         "height": height,
         "full": photo.size,
-        "verdict": assessment.verdict,
-        "next_step": next_step(assessment.verdict, takes_hints=separator.takes_hints and hints is None),
         "maps": [
             {
                 "name": name,
@@ -105,7 +103,7 @@ def preview(
         scaled = (map_ - np.float32(lows[name])) / np.float32(highs[name] - lows[name])
         coefficients.append(np.rint(65535 * scaled).astype(np.dtype("<u2"), copy=False).tobytes())
     on_progress(1.0)
-    return b"".join((json.dumps(head).encode(), b"\n", codes.tobytes(), *coefficients))
+    return b"".join((json.dumps(head).encode(), b"\n", codes.tobytes(), *coefficients)), assessment
 
 
 def photo_tile(photo: Photo, level: int, column: int, row: int) -> Photo | None:

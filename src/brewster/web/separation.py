@@ -8,6 +8,7 @@ The server fetches nothing by URL and writes nothing to the disk.
 
 from __future__ import annotations
 
+import asyncio
 import gzip
 import hashlib
 import time
@@ -17,6 +18,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, final
 from urllib.parse import quote
 
+import numpy as np
 from fastapi import APIRouter, Query, Request
 from pydantic import BaseModel
 from starlette.exceptions import HTTPException
@@ -26,11 +28,14 @@ import brewster
 from brewster.cache import ByteLimitedCache
 from brewster.image_formats import SUFFIXES
 from brewster.inference import Separator
+from brewster.inference.assessment import Assessment, next_step
 from brewster.inference.burst_report import BurstReport
 from brewster.inference.predictor import ProgressCallback
 from brewster.options import DEFAULT_FRAMES
 from brewster.photo import Photo, Source
+from brewster.photo.file_info import with_notes
 from brewster.photo.open_raster import zip_images
+from brewster.photo.photo import misleading_suffix
 from brewster.web.job_queue import JobProgress, JobQueue
 from brewster.web.model_cache import ModelCache, ModelRow
 from brewster.web.preview import photo_tile, preview
@@ -100,6 +105,7 @@ def separation_router(model_cache: ModelCache, job_queue: JobQueue, *, max_pixel
     router.get("/models")(routes.models)
     router.get("/health")(routes.health)
     # only for the page
+    router.post("/related", include_in_schema=False)(routes.related)
     router.post("/preview", include_in_schema=False)(routes.preview)
     router.post("/photo", include_in_schema=False)(routes.keep_photo)
     router.get("/tile/{key}/{level}/{column}/{row}", include_in_schema=False)(routes.tile)
@@ -160,6 +166,11 @@ class _SeparationRoutes:
             request, job, lambda form, _progress: Response(headers=self._open_photo(form)[1])
         )
 
+    async def related(self, request: Request) -> dict[str, bool]:
+        """Returns whether all photos of the form, which are thumbnails of one size, show one scene."""
+        form = await read_form(request, self._model_cache.names, self._max_pixels)
+        return {"are_related": await asyncio.to_thread(_show_one_scene, form)}
+
     def tile(self, key: str, level: int, column: int, row: int) -> Response:
         """Returns a tile of a photo that the server keeps."""
         photo = self._photos.get(key)
@@ -201,13 +212,11 @@ class _SeparationRoutes:
             "Brewster-SHA256": separation.sha256 or "",
             "Brewster-Device": separation.device,
             "Brewster-Residual": f"{separation.residual:.6f}",
-            "Brewster-Verdict": separation.assessment.verdict,
             "Brewster-Seconds": f"{time.perf_counter() - started:.4f}",
         }
-        if separation.next_step:
-            headers["Brewster-Next-Step"] = separation.next_step
-        if separation.burst:
-            headers |= _burst_headers(separation.burst)
+        headers |= _result_headers(
+            form, separation.photo, separation.assessment, separation.next_step, separation.burst
+        )
         if separation.reflection_is_derived:
             headers["Brewster-Reflection"] = "derived"
         if separation.reconstruction_error is not None:
@@ -218,17 +227,18 @@ class _SeparationRoutes:
     def _preview(self, form: SeparationRequest, on_progress: ProgressCallback) -> Response:
         separator = self._model_cache.separator(form.options.model)
         hints: Source | None = form.hints
-        takes_hints, start, burst_headers = separator.takes_hints, 0.0, dict[str, str]()
+        takes_hints, start, report = separator.takes_hints, 0.0, None
         if form.burst:
             start = 0.9
             fitted = self._fit_burst(form, separator, lambda done: on_progress(start * done))
-            burst_headers = _burst_headers(fitted.report)
-            separator, hints = fitted.separator, fitted.hints
+            separator, hints, report = fitted.separator, fitted.hints, fitted.report
         photo, headers = self._open_photo(form)
-        maps = preview(
+        maps, assessment = preview(
             separator, photo, form.options, lambda done: on_progress(start + (1 - start) * done), hints
         )
-        headers |= burst_headers | ({"Brewster-Takes-Hints": "yes"} if takes_hints else {})
+        step = next_step(assessment.verdict, takes_hints=takes_hints and hints is None)
+        headers |= {"Brewster-Takes-Hints": "yes"} if takes_hints else {}
+        headers |= _result_headers(form, photo, assessment, report.next_step if report else step, report)
         data = gzip.compress(maps, _GZIP_LEVEL, mtime=0)
         return Response(data, headers=headers, media_type="application/gzip")
 
@@ -271,6 +281,13 @@ class _SeparationRoutes:
         return photo, {"Brewster-Photo": key, "Brewster-Size": "{}x{}".format(*photo.size)}
 
 
+def _show_one_scene(form: SeparationRequest) -> bool:
+    from brewster.burst.film import show_one_scene  # noqa: PLC0415  (imports OpenCV)
+
+    photos = (Photo.open(file, max_pixels=form.options.max_pixels) for file in form.burst)
+    return show_one_scene([photo.pixels.mean(axis=2).astype(np.uint8) for photo in photos])
+
+
 def _photo_key(form: SeparationRequest) -> str:
     """Returns the name of the photo in the addresses of its tiles."""
     frame = f"frame {form.reference}".encode() if form.is_video else b""
@@ -288,13 +305,29 @@ def _photos(
     return read_video(form.photo, DEFAULT_FRAMES, max_pixels=form.options.max_pixels, on_progress=on_progress)
 
 
-def _burst_headers(report: BurstReport) -> dict[str, str]:
-    return {
-        "Brewster-Burst": report.method,
-        "Brewster-Burst-Message": report.message,
-        "Brewster-Burst-Measured": "yes" if report.is_measured else "no",
-        "Brewster-Burst-Names": "certain" if report.are_names_certain else "unsure",
-    }
+def _result_headers(
+    form: SeparationRequest,
+    photo: Photo,
+    assessment: Assessment,
+    next_step: str | None,
+    report: BurstReport | None,
+) -> dict[str, str]:
+    headers: dict[str, str] = {"Brewster-Verdict": assessment.verdict}
+    note = photo.file_info.note
+    if not form.is_video:
+        note = with_notes(photo.file_info, *misleading_suffix(Path(form.name), form.photo)).note
+    if note:
+        headers["Brewster-Note"] = quote(note)
+    if next_step:
+        headers["Brewster-Next-Step"] = next_step
+    if report:
+        headers |= {
+            "Brewster-Burst": report.method,
+            "Brewster-Burst-Message": report.message,
+            "Brewster-Burst-Measured": "yes" if report.is_measured else "no",
+            "Brewster-Burst-Names": "certain" if report.are_names_certain else "unsure",
+        }
+    return headers
 
 
 def _content_disposition(name: str) -> str:

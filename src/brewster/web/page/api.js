@@ -1,20 +1,25 @@
 // The client of the HTTP API. A failed request throws an Error whose message can be shown to the user; `details` is the
 // message of the server, and `isFinal` whether the same request would fail again.
 
+import { isVideo } from "./drop.js";
+
 const POLL_MS = 300;
+const MIN_SHARE = 0.1; // the completed fraction from which the time left is estimated
 const MAX_RETRIES = 60; // maximum number of repetitions of a request while the queue of the server is full
 
 // The explanation of an error of the server, by its kind. The message of the server is shown below the explanation.
 const MEANINGS = {
   UnreadablePhoto: "This file is not a photo, or it is damaged.",
+  UnreadableVideo: "This video cannot be read: it is damaged, has no picture, or has only one.",
   UnsupportedPhoto: "This kind of image cannot be separated.",
   PhotoTooLarge: "This photo has more pixels than the server accepts.",
   MissingExtra: "The server cannot do this, because a part of brewster is not installed.",
 };
 
-// Sends a photo, or an array with the photos of a burst, with options to a path. Returns {blob, fileName, header(name)}. Before it returns, it calls `onProgress` repeatedly
-// with {phase: "upload" | "download", loaded, total} in bytes, {phase: "waiting", ahead} or {phase: "working", share}, where `ahead`
-// is the number of photos before this photo, and `share` is the completed fraction.
+// Sends a photo, a film, or an array with the photos of a burst, with options to a path. Returns {blob, fileName, header(name)}. Before
+// it returns, it calls `onProgress` repeatedly with {phase: "upload" | "download", loaded, total} in bytes, {phase: "waiting", ahead} or
+// {phase: "working", share, secondsLeft}, where `ahead` is the number of photos before this photo, `share` is the completed fraction, and
+// `secondsLeft` is null at the beginning.
 export async function send(path, file, options, { signal, onProgress }) {
   const form = new FormData();
   for (const [name, value] of Object.entries(options)) {
@@ -70,11 +75,18 @@ function post(url, job, form, signal, onProgress) {
 
 function pollProgress(job, onProgress) {
   let timer = setTimeout(poll, POLL_MS);
+  let started = null;
   async function poll() {
     const response = await fetch(`progress/${job}`).catch(() => null);
     const progress = timer && response?.ok ? await response.json() : null;
     // Nothing is reported after stop(), because a late report overwrites a later phase.
-    if (timer && progress) onProgress({ phase: progress.state, ahead: progress.ahead, share: progress.share });
+    if (timer && progress) {
+      const { state: phase, ahead, share } = progress;
+      if (phase === "working") started ??= performance.now();
+      const seconds = (performance.now() - started) / 1000;
+      const secondsLeft = share >= MIN_SHARE && seconds > 1 ? (seconds / share) * (1 - share) : null;
+      onProgress({ phase, ahead, share, secondsLeft });
+    }
     if (timer) timer = setTimeout(poll, POLL_MS);
   }
   return {
@@ -100,8 +112,7 @@ async function connectionError() {
 async function serverError(request, file) {
   const body = await request.response.text().then(JSON.parse).catch(() => ({}));
   const message = sentence(body.error ?? `the server returned status ${request.status}`);
-  const isVideo = ["UnreadablePhoto", "UnsupportedPhoto"].includes(body.kind) && file.type.startsWith("video/");
-  const meaning = isVideo ? "This is a video. Only photos can be separated." : MEANINGS[body.kind];
+  const meaning = MEANINGS[body.kind === "UnreadablePhoto" && isVideo(file) ? "UnreadableVideo" : body.kind];
   return Object.assign(new Error(meaning ?? message), { details: meaning ? message : "", isFinal: body.kind in MEANINGS });
 }
 

@@ -7,9 +7,10 @@ import { exportAll, exportLayer, save } from "./export.js";
 import { Layers, draw, readPreview } from "./light.js";
 import { SeparationQueue } from "./queue.js";
 import { maskCodes, maskFile } from "./regions.js";
-import { createThumbnail, fraction, haveOneSize, progressText, setBar, showDecoded, showFile, statusText, summarise, updateThumbnail, watchScrolling } from "./filmstrip.js";
+import { createThumbnail, fraction, progressText, setBar, showDecoded, showFile, showOneScene, statusText, summarise, updateThumbnail, watchScrolling } from "./filmstrip.js";
 import { TileSet } from "./tiles.js";
 import { createTools } from "./tools.js";
+import { describeVerdict, isNamingOpen, verdictOf } from "./verdict.js";
 
 const LAYER_DESCRIPTIONS = {
   transmission: "The scene behind the glass.",
@@ -34,7 +35,7 @@ const chosen = (name) => document.querySelector(`input[name=${name}]:checked`).v
 const settings = () => ({ quality: chosen("quality"), model: byId("model").value });
 const queue = new SeparationQueue(settings, { onChange: refresh, onEnd: finish });
 const exportSettings = () => ({ ...settings(), takesHints: queue.hintModels.has(byId("model").value) });
-const tools = createTools({ onEdit, onPaint: () => compare.paint(), saveMask, announce });
+const tools = createTools({ onEdit: () => onEdit(), onPaint: () => compare.paint(), saveMask, announce });
 compare.editor = tools.editor;
 
 function applySettings() {
@@ -43,22 +44,26 @@ function applySettings() {
   show();
 }
 
-// Changes the settings of a photo. Its files must then be downloaded again.
-function change(photo, values) {
-  Object.assign(photo, values, { isSaved: false });
-  if (photo === queue.current) byId("strength").value = photo.strength;
+// Applies the edits of a photo. Its files must then be downloaded again.
+function onEdit(photo = queue.current) {
+  photo.isSaved = false;
+  queue.applyEdits(photo);
+  if (photo !== queue.current) return;
+  byId("strength").value = photo.edits.strength;
+  tools.update();
+  paint();
+  refresh();
 }
 
-function onEdit() {
-  change(queue.current, {});
-  queue.applyHints(queue.current);
-  paint();
+function edit(values) {
+  queue.current.edits.change(values);
+  onEdit();
 }
 
 async function saveMask() {
-  const { file, regions, size } = queue.current;
+  const { file, edits, size } = queue.current;
   const stem = isImage(file.name) ? file.name.replace(/\.[^.]*$/, "") : file.name;
-  save(`${stem}.mask.png`, await maskFile(regions.list, ...size));
+  save(`${stem}.mask.png`, await maskFile(edits.list, ...size));
 }
 
 // Repeats the request until the server responds, because no photo can be separated before.
@@ -100,11 +105,11 @@ function add(found) {
   queue.startNext();
 }
 
-// Asks whether the photos are a burst, if they have one size.
+// Asks whether the photos are a burst, if they show one scene.
 async function askForBurst(photos) {
   candidates = photos;
   byId("burst").hidden = true;
-  const isPossible = photos.length > 1 && photos.length <= MAX_BURST_PHOTOS && (await haveOneSize(photos));
+  const isPossible = photos.length > 1 && photos.length <= MAX_BURST_PHOTOS && !photos.some(({ isBurst }) => isBurst) && (await showOneScene(photos));
   if (!isPossible || candidates !== photos || !photos.every((photo) => queue.photos.includes(photo))) return;
   byId("burst").hidden = false;
   announce(byId("burst-question").textContent);
@@ -182,7 +187,7 @@ async function addExample() {
 
 function finish(photo) {
   if (photo.state === "done") showDecoded(photo);
-  if (photo.state === "done") announceResult(`${photo.file.name} is separated`);
+  if (photo.state === "done") announceResult(`${photo.file.name} is separated: ${verdictOf(photo)}`);
   if (photo.error) announceResult(`${photo.file.name} failed`);
   if (photo === queue.current) show();
 }
@@ -202,7 +207,7 @@ function select(photo) {
   if (photo) {
     photo.thumbnail.querySelector(".pick").setAttribute("aria-current", "true");
     photo.thumbnail.scrollIntoView({ block: "nearest", inline: "nearest" });
-    byId("strength").value = photo.strength;
+    byId("strength").value = photo.edits.strength;
     showFile(byId("thumbnail"), photo.file);
     compare.reset();
     paint();
@@ -235,7 +240,7 @@ async function show() {
   compare.fullSize = preview.full;
   if (preview.full[0] > preview.width) compare.tiles = tilesOf(photo, preview);
   tools.offerHints(queue.takesHints(photo));
-  if (!isUpdate) tools.show(photo.regions, preview.full); // a region that is being drawn goes on
+  if (!isUpdate) tools.show(photo.edits, preview.full); // a region that is being drawn goes on
   refresh();
   paint();
 }
@@ -248,7 +253,7 @@ function tilesOf(photo, preview) {
     drawPhoto: (canvas, layers) => draw(canvas, layers, "photo"),
     drawRight(canvas, layers, part) {
       const [width, height] = preview.full.map((side) => side / 2 ** part.level);
-      draw(canvas, layers, chosen("view"), photo.strength, maskCodes(photo.regions.list, width, height, part));
+      draw(canvas, layers, chosen("view"), photo.edits.strength, maskCodes(photo.edits.list, width, height, part));
     },
     onChange: () => compare.paint(),
   });
@@ -256,7 +261,7 @@ function tilesOf(photo, preview) {
 
 // Returns the mask of the regions at the size of the reduced photo.
 function currentMask() {
-  const { list } = queue.current.regions;
+  const { list } = queue.current.edits;
   const { width, height } = shown.preview;
   if (shown.mask.list !== list) shown.mask = { list, codes: maskCodes(list, width, height) };
   return shown.mask.codes;
@@ -272,8 +277,8 @@ function paint() {
   requestAnimationFrame(() => {
     isPaintScheduled = false;
     if (!shown) return;
-    draw(compare.right, shown.layers, chosen("view"), queue.current.strength, currentMask());
-    compare.version = `${chosen("view")} ${queue.current.strength} ${JSON.stringify(queue.current.regions.list)}`;
+    draw(compare.right, shown.layers, chosen("view"), queue.current.edits.strength, currentMask());
+    compare.version = `${chosen("view")} ${JSON.stringify(queue.current.edits.now)}`;
     compare.show(queue.current.file.name, chosen("view"));
   });
 }
@@ -305,8 +310,32 @@ function refresh(photo = null) {
   byId("discard").className = current.error?.isFinal ? "main" : "quiet";
   byId("error-details").hidden = !current.error?.details;
   byId("error-message").textContent = current.error?.details ?? "";
-  byId("facts").textContent = current.isUpdating ? statusText(current) : isReady ? `${describePreview(shown.preview)} ${current.message}` : "";
+  byId("facts").textContent = isReady ? [`${current.size.join(" × ")} pixels.`, current.result.note && `Note: ${current.result.note}.`].filter(Boolean).join(" ") : "";
   byId("split").hidden = !current.burst;
+  showVerdict(current, isReady);
+}
+
+// Shows the verdict below the picture, with what the user can do about it; and the question which of the measured layers is behind the glass.
+function showVerdict(photo, isReady) {
+  const { result, isUpdating } = photo;
+  byId("verdict").hidden = !isReady;
+  const isOpen = isReady && !isUpdating && isNamingOpen(photo);
+  if (isOpen && byId("naming").hidden) {
+    for (const layer of ["transmission", "reflection"]) draw(byId(`name-${layer}`).querySelector("canvas"), shown.layers, layer, 1);
+    announce(byId("naming-question").textContent);
+  }
+  byId("naming").hidden = !isOpen;
+  if (!isReady) return;
+  const { title, text } = describeVerdict(photo);
+  byId("verdict-title").textContent = isUpdating ? statusText(photo) : title;
+  byId("verdict-text").textContent = isUpdating ? "" : text;
+  byId("update-bar").hidden = !isUpdating;
+  setBar(byId("update-bar"), fraction(photo.progress));
+  const isForced = photo.edits.now.method === "motion";
+  byId("swap").hidden = result.method !== "burst";
+  byId("measured").hidden = !isForced && !(result.isMeasured && result.method !== "burst");
+  byId("measured").textContent = isForced ? "Show the automatic result" : "Use the measured layers anyway";
+  byId("film-next").hidden = photo.isBurst || !result.nextStep;
 }
 
 // Uses aria-disabled, because a button with the attribute `disabled` loses the focus.
@@ -315,18 +344,6 @@ function enable(id, isEnabled) {
 }
 
 const isEnabled = (button) => button.getAttribute("aria-disabled") !== "true";
-
-const VERDICTS = {
-  removed: "A reflection was found and removed.",
-  "partly removed": "A reflection was found and partly removed.",
-  "reflection remains": "A reflection was found, but most of it remains.",
-  "little found": "Little reflection was found.",
-  doubtful: "The layers may be wrong. Check them.",
-};
-
-function describePreview({ full, verdict }) {
-  return `${full.join(" × ")} pixels. ${VERDICTS[verdict]}`;
-}
 
 // --- downloads
 
@@ -380,35 +397,40 @@ byId("choose").addEventListener("click", () => byId("files").click());
 byId("add").addEventListener("click", () => byId("files").click());
 byId("choose-folder").addEventListener("click", () => byId("folder").click());
 byId("example").addEventListener("click", addExample);
-for (const id of ["files", "folder"]) {
+for (const id of ["film", "film-next"]) byId(id).addEventListener("click", () => byId("camera").click());
+for (const id of ["files", "folder", "camera"]) {
   byId(id).addEventListener("change", () => {
     add(readList(byId(id).files, isImage, room(), id === "folder"));
     byId(id).value = "";
   });
 }
 byId("strength").addEventListener("input", () => {
-  change(queue.current, { strength: Number(byId("strength").value) });
-  paint();
+  queue.current.edits.adjust({ strength: Number(byId("strength").value) });
+  onEdit();
 });
+byId("strength").addEventListener("change", () => queue.current.edits.settle());
 byId("copy").addEventListener("click", (event) => {
   if (!isEnabled(event.currentTarget)) return;
-  const { strength, regions } = queue.current;
+  const { strength, list } = queue.current.edits;
   for (const photo of queue.photos) {
     if (photo === queue.current) continue;
-    change(photo, { strength });
-    photo.regions.copyFrom(regions);
-    queue.applyHints(photo);
+    photo.edits.change({ strength, list });
+    onEdit(photo);
   }
   refresh();
   announce("The settings were copied to all photos.");
 });
-byId("reset").addEventListener("click", () => {
-  change(queue.current, { strength: 1 });
-  queue.current.regions.clear();
-  queue.applyHints(queue.current);
-  tools.update();
-  paint();
-});
+byId("reset").addEventListener("click", () => edit({ strength: 1, list: [] }));
+byId("swap").addEventListener("click", () => edit({ swap: !queue.current.edits.now.swap }));
+byId("measured").addEventListener("click", () => edit({ method: queue.current.edits.now.method === "motion" ? "auto" : "motion" }));
+byId("name-transmission").addEventListener("click", () => answerNaming(false));
+byId("name-reflection").addEventListener("click", () => answerNaming(true));
+
+function answerNaming(swap) {
+  edit({ swap });
+  compare.focus();
+}
+
 for (const input of document.querySelectorAll("input[name=mode]")) {
   input.addEventListener("change", () => (compare.mode = chosen("mode")));
 }

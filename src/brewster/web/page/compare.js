@@ -301,8 +301,8 @@ class GlassCompare extends HTMLElement {
     if (this.#pointers.delete(event.pointerId) && this.#dragged === "region") this.editor.cancel();
   }
 
-  _pointerleave() {
-    if (this.editor?.isActive && !this.#pointers.size) this.editor.hover(null);
+  _pointerleave(event) {
+    if (this.editor?.isActive && !this.#pointers.size) this.editor.hover(null, event.pointerType !== "mouse");
   }
 
   _wheel(event) {

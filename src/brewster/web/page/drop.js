@@ -45,6 +45,10 @@ async function childrenOf(folder) {
   }
 }
 
+const VIDEO_SUFFIX = /\.(mp4|m4v|mov|avi|mkv|webm|mts|m2ts|mpg|mpeg|3gp|3g2|wmv|flv)$/i;
+
+export const isVideo = ({ name, type }) => type.startsWith("video/") || VIDEO_SUFFIX.test(name);
+
 const toFile = (entry) => (entry instanceof File ? entry : new Promise((resolve, reject) => entry.file(resolve, reject)));
 
 // Returns one sentence about the files that were added and left out.

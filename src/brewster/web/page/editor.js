@@ -1,5 +1,6 @@
 // Draws regions on <glass-compare> with a pointer or with the keyboard, and a tint: dark over the areas that are not separated, with a white
-// outline, and red and green over hints. The tint is visible while the pointer or the keyboard cursor is on the photo.
+// outline, and red and green over hints. The tint is visible while the pointer or the keyboard cursor is on the photo; a finger that is
+// lifted leaves it visible.
 
 import { hintCodes, maskCodes } from "./regions.js";
 
@@ -12,6 +13,7 @@ export class RegionEditor {
   isActive = false;
   #drawn = null; // the region that is being drawn
   #cursor = null; // position of the pointer or of the keyboard cursor, in fractions of the longer side
+  #isTintVisible = true;
   #tint = document.createElement("canvas");
   #tintKey = null; // the regions and the size of the tint, as text
 
@@ -19,13 +21,13 @@ export class RegionEditor {
   // has changed, `onAdd(region)` with each finished region, and `announce(text)` to tell screen readers what happened.
   constructor({ tool, onChange, onAdd, announce }) {
     Object.assign(this, { tool, onChange, onAdd, announce });
-    this.regions = null; // the Regions of the current photo
+    this.edits = null; // the Edits of the current photo
     this.size = [1, 1]; // width and height of the photo
   }
 
   // All regions, including the region that is being drawn.
   get list() {
-    const list = this.regions?.list ?? [];
+    const list = this.edits?.list ?? [];
     return this.#drawn ? [...list, this.#drawn] : list;
   }
 
@@ -59,8 +61,10 @@ export class RegionEditor {
     this.onChange();
   }
 
-  hover(point) {
+  // Moves the cursor, or hides it if `point` is null.
+  hover(point, isTintVisible = true) {
     this.#cursor = point;
+    this.#isTintVisible = isTintVisible;
     this.onChange();
   }
 
@@ -85,9 +89,10 @@ export class RegionEditor {
 
   // Draws the tint and the cursor above an image at `origin` with `size`, in screen pixels.
   paint(context, origin, size) {
-    if (!this.isActive || !this.#cursor) return;
+    if (!this.isActive) return;
     this.#updateTint();
-    if (this.list.length) context.drawImage(this.#tint, origin.x, origin.y, size.width, size.height);
+    if (this.list.length && (this.#cursor || this.#isTintVisible)) context.drawImage(this.#tint, origin.x, origin.y, size.width, size.height);
+    if (!this.#cursor) return;
     const longer = Math.max(size.width, size.height);
     const [x, y] = [origin.x + this.#cursor[0] * longer, origin.y + this.#cursor[1] * longer];
     const { shape, radius } = this.tool();

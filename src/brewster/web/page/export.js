@@ -1,16 +1,20 @@
 // Downloads at full size, with the same files as on the command line, and the report in the zip of all photos.
 
 import { send } from "./api.js";
+import { burstOptions } from "./queue.js";
 import { hintsFile, maskFile } from "./regions.js";
+import { verdictOf } from "./verdict.js";
 import { createZip, crc32, readZip, withUniqueNames } from "./zip.js";
 
 const REPORT_NAME = "brewster-report.txt";
 
 // Requests layers of a photo at full size. Returns the result of `send`.
 async function requestLayers(photo, layers, { takesHints, ...settings }, context) {
-  const mask = await maskFile(photo.regions.list, ...photo.size);
-  const hints = takesHints && !photo.burst ? await hintsFile(photo.regions.list, ...photo.size) : null;
-  return send("separate", photo.burst ?? photo.file, { layers, strength: photo.strength, mask, hints, ...settings }, context);
+  const { list, strength } = photo.edits;
+  const mask = await maskFile(list, ...photo.size);
+  const hints = takesHints && !photo.isBurst ? await hintsFile(list, ...photo.size) : null;
+  const options = { layers, strength, mask, hints, ...settings, ...burstOptions(photo) };
+  return send("separate", photo.burst ?? photo.file, options, context);
 }
 
 // Creates one layer of a photo. Returns {name, blob, problem, saved}, where `saved` are the photos whose results the file contains.
@@ -52,9 +56,13 @@ const problemOf = ({ error }) => (error ? `${error.message} ${error.details ?? "
 function describeResults(results, files, { model, quality }) {
   const names = files.map(({ name }) => name);
   const lines = results.map(({ photo, files: own, error }) => {
-    const strength = `strength ${Math.round(100 * photo.strength)} %${photo.regions.list.length ? ", with regions" : ""}`;
-    if (own.length) return `${photo.file.name} -> ${names.splice(0, own.length).join(", ")} (${strength})`;
-    return `${photo.file.name}: ${error ? `failed. ${error}` : "not separated yet"}`;
+    if (!own.length) return `${photo.file.name}: ${error ? `failed. ${error}` : "not separated yet"}`;
+    const { list, strength, swap } = photo.edits.now;
+    const facts = [verdictOf(photo), `strength ${Math.round(100 * strength)} %`];
+    if (list.length) facts.push("with regions");
+    if (swap) facts.push("layers exchanged");
+    const message = photo.result.message ? `. ${photo.result.message}` : "";
+    return `${photo.file.name} -> ${names.splice(0, own.length).join(", ")} (${facts.join(", ")})${message}`;
   });
   const done = results.filter((result) => result.files.length).length;
   const counts = `${done} done, ${results.filter(({ error }) => error).length} failed`;

@@ -1,7 +1,8 @@
 // The photos of the page and their separation. The current photo is separated first.
 
 import { send } from "./api.js";
-import { Regions, hintsFile } from "./regions.js";
+import { isVideo } from "./drop.js";
+import { Edits, hintsFile } from "./regions.js";
 
 const MAX_CONCURRENT = 2; // one photo is separated while the next photo is uploaded
 
@@ -17,9 +18,10 @@ export class SeparationQueue {
     Object.assign(this, { settings, onChange, onEnd });
   }
 
-  // Adds a photo. `burst` are the files of all photos of one window, if `file` is the middle one of a burst.
+  // Adds a photo, or a film. `burst` are the files of all photos of one window, if `file` is the middle one of a burst.
   add(file, burst = null) {
-    const photo = { file, burst, state: "waiting", progress: null, error: null, strength: 1, regions: new Regions(), controller: null, isSaved: false };
+    const isBurst = burst !== null || isVideo(file);
+    const photo = { file, burst, isBurst, state: "waiting", progress: null, error: null, edits: new Edits(), controller: null, isSaved: false };
     this.photos.push(photo);
     return photo;
   }
@@ -44,12 +46,12 @@ export class SeparationQueue {
   }
 
   takesHints(photo) {
-    return photo.size !== undefined && !photo.burst && this.hintModels.has(this.settings().model);
+    return photo.size !== undefined && !photo.isBurst && this.hintModels.has(this.settings().model);
   }
 
-  // Separates a photo again after a change of its hints. The old result is shown until then. The first separation of a photo
-  // compares them at its end.
-  applyHints(photo) {
+  // Separates a photo again after a change of its hints, its method or the order of its layers. The old result is shown until then.
+  // The first separation of a photo compares them at its end.
+  applyEdits(photo) {
     if (this.hasCurrentMaps(photo) || (photo.state !== "done" && !photo.isUpdating)) return;
     this.#supersede(photo);
     Object.assign(photo, { state: "waiting", isUpdating: true });
@@ -57,8 +59,9 @@ export class SeparationQueue {
   }
 
   #mapSettings(photo) {
-    const marks = this.takesHints(photo) ? photo.regions.list.filter(({ hint, value }) => hint || value === null) : [];
-    return JSON.stringify([this.settings(), marks.some(({ hint }) => hint) ? marks : []]);
+    const { list, method, swap } = photo.edits.now;
+    const marks = this.takesHints(photo) ? list.filter(({ hint, value }) => hint || value === null) : [];
+    return JSON.stringify([this.settings(), marks.some(({ hint }) => hint) ? marks : [], method, swap === true]);
   }
 
   // Call this after a change of the settings. A photo is separated again unless its maps were computed with the new settings.
@@ -108,11 +111,20 @@ export class SeparationQueue {
       this.onChange(photo);
     };
     try {
-      const hints = this.takesHints(photo) ? await hintsFile(photo.regions.list, ...photo.size) : null;
-      const { blob, header } = await send("preview", photo.burst ?? photo.file, { ...requestSettings, hints }, { signal, onProgress });
+      const hints = this.takesHints(photo) ? await hintsFile(photo.edits.list, ...photo.size) : null;
+      const options = { ...requestSettings, ...burstOptions(photo), hints };
+      const { blob, header } = await send("preview", photo.burst ?? photo.file, options, { signal, onProgress });
       if (header("Brewster-Takes-Hints")) this.hintModels.add(requestSettings.model);
       photo.preview = blob;
-      photo.message = header("Brewster-Burst-Message") ?? "";
+      photo.result = {
+        verdict: header("Brewster-Verdict"),
+        nextStep: header("Brewster-Next-Step"),
+        note: header("Brewster-Note") && decodeURIComponent(header("Brewster-Note")),
+        method: header("Brewster-Burst"), // of a burst: "burst", "single photo" or "unchanged"
+        message: header("Brewster-Burst-Message"),
+        isMeasured: header("Brewster-Burst-Measured") === "yes",
+        areNamesCertain: header("Brewster-Burst-Names") !== "unsure",
+      };
       photo.key = header("Brewster-Photo"); // the key of the photo on the server, for its tiles
       photo.size = header("Brewster-Size").split("x").map(Number);
       Object.assign(photo, { state: "done", mapSettings, isSaved: false });
@@ -130,4 +142,10 @@ export class SeparationQueue {
     this.onEnd(photo);
     this.startNext();
   }
+}
+
+// Returns the options of a burst for a request, which are empty for a single photo.
+export function burstOptions({ isBurst, edits }) {
+  const { method, swap } = edits.now;
+  return isBurst ? { method, swap: swap ? "yes" : "no" } : {};
 }

@@ -11,13 +11,23 @@ import { crc32 } from "./zip.js";
 const BAND_ROWS = 256; // number of rows of a mask that are computed at once for a file
 const PNG_SIGNATURE = [0x89, 0x50, 0x4e, 0x47, 0x0d, 0x0a, 0x1a, 0x0a];
 
-// The regions of a photo with their history.
-export class Regions {
-  #states = [[]];
+// The edits of a photo with their history: its regions, `list`; its strength, 0 to 1; and for a burst the method, "auto" or "motion",
+// and whether the layers are exchanged, `swap`: null until the user has decided.
+export class Edits {
+  #states = [{ list: [], strength: 1, method: "auto", swap: null }];
   #at = 0;
+  #isAdjusting = false;
+
+  get now() {
+    return this.#states[this.#at];
+  }
 
   get list() {
-    return this.#states[this.#at];
+    return this.now.list;
+  }
+
+  get strength() {
+    return this.now.strength;
   }
 
   get canUndo() {
@@ -29,29 +39,33 @@ export class Regions {
   }
 
   add(region) {
-    this.#push([...this.list, region]);
+    this.change({ list: [...this.list, region] });
   }
 
-  clear() {
-    if (this.list.length) this.#push([]);
+  change(values) {
+    this.#states = [...this.#states.slice(0, this.#at + 1), { ...this.now, ...values }];
+    this.#at = this.#states.length - 1;
+    this.#isAdjusting = false;
+  }
+
+  // Changes values continuously: until `settle()`, all changes are one step of the history.
+  adjust(values) {
+    if (this.#isAdjusting) this.undo();
+    this.change(values);
+    this.#isAdjusting = true;
+  }
+
+  settle() {
+    this.#isAdjusting = false;
   }
 
   undo() {
     this.#at = Math.max(0, this.#at - 1);
+    this.#isAdjusting = false;
   }
 
   redo() {
     this.#at = Math.min(this.#states.length - 1, this.#at + 1);
-  }
-
-  // Replaces all regions by those of another photo.
-  copyFrom(other) {
-    this.#push(other.list);
-  }
-
-  #push(state) {
-    this.#states = [...this.#states.slice(0, this.#at + 1), state];
-    this.#at = this.#states.length - 1;
   }
 }
 

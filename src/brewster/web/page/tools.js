@@ -30,38 +30,38 @@ export function createTools({ onEdit, onPaint, saveMask, announce }) {
     tool,
     announce,
     onChange: onPaint,
-    onAdd: (region) => edit((regions) => regions.add(region)),
+    onAdd: (region) => edit((edits) => edits.add(region)),
   });
 
   function edit(work) {
-    if (!editor.regions) return;
-    work(editor.regions);
-    update();
-    const count = editor.regions.list.length;
-    announce(count === 1 ? "1 mark" : `${count || "No"} marks`);
+    if (!editor.edits) return;
+    const { list } = editor.edits;
+    work(editor.edits);
+    const count = editor.edits.list.length;
+    if (list !== editor.edits.list) announce(count === 1 ? "1 mark" : `${count || "No"} marks`);
     onEdit();
   }
 
   function update() {
     const kind = chosen("tool");
-    editor.isActive = kind !== "move" && editor.regions !== null;
+    editor.isActive = kind !== "move" && editor.edits !== null;
     byId("tool-options").hidden = kind === "move";
     byId("region-strength-field").hidden = kind !== "here";
     byId("brush-size-field").hidden = chosen("shape") !== "brush";
     byId("tool-description").textContent = DESCRIPTIONS[kind];
-    const { regions } = editor;
-    const hasRegions = Boolean(regions?.list.length);
-    const hasMask = Boolean(regions?.list.some(({ hint }) => !hint));
+    const { edits } = editor;
+    const hasRegions = Boolean(edits?.list.length);
+    const hasMask = Boolean(edits?.list.some(({ hint }) => !hint));
     for (const id of ["brush-size", "feather", "region-strength"]) byId(`${id}-amount`).textContent = `${Math.round(100 * number(id))} %`;
-    byId("region-actions").hidden = kind === "move" && !hasRegions && !regions?.canUndo && !regions?.canRedo;
-    const enabled = { undo: regions?.canUndo, redo: regions?.canRedo, "clear-regions": hasRegions, "save-mask": hasMask };
+    byId("region-actions").hidden = kind === "move" && !hasRegions && !edits?.canUndo && !edits?.canRedo;
+    const enabled = { undo: edits?.canUndo, redo: edits?.canRedo, "clear-regions": hasRegions, "save-mask": hasMask };
     for (const [id, isEnabled] of Object.entries(enabled)) byId(id).setAttribute("aria-disabled", !isEnabled);
   }
 
   const actions = {
-    undo: () => edit((regions) => regions.undo()),
-    redo: () => edit((regions) => regions.redo()),
-    "clear-regions": () => edit((regions) => regions.clear()),
+    undo: () => edit((edits) => edits.undo()),
+    redo: () => edit((edits) => edits.redo()),
+    "clear-regions": () => edit((edits) => edits.change({ list: [] })),
     "save-mask": saveMask,
   };
   for (const [id, act] of Object.entries(actions)) {
@@ -71,7 +71,7 @@ export function createTools({ onEdit, onPaint, saveMask, announce }) {
     input.addEventListener("input", () => (update(), onPaint()));
   }
   document.addEventListener("keydown", (event) => {
-    if (!(event.ctrlKey || event.metaKey) || event.altKey || !editor.regions) return;
+    if (!(event.ctrlKey || event.metaKey) || event.altKey || !editor.edits) return;
     const key = event.key.toLowerCase();
     if (key === "z") actions[event.shiftKey ? "redo" : "undo"]();
     else if (key === "y") actions.redo();
@@ -88,10 +88,10 @@ export function createTools({ onEdit, onPaint, saveMask, announce }) {
       if (!isOffered && HINTS.includes(chosen("tool"))) document.querySelector("input[name=tool][value=move]").checked = true;
       update();
     },
-    // Shows the regions of a photo of `size` (width, height), or no regions if `regions` is null.
-    show(regions, size = [1, 1]) {
+    // Shows the regions of a photo of `size` (width, height), or no regions if `edits` is null.
+    show(edits, size = [1, 1]) {
       editor.cancel();
-      Object.assign(editor, { regions, size });
+      Object.assign(editor, { edits, size });
       update();
     },
     update,

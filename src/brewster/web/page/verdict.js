@@ -1,0 +1,31 @@
+// The verdict of a separation in words: short for the list, the summary and the report, and long for the picture.
+
+// The short verdicts in the order of the summary. The first five are those of single photos, the others those of bursts.
+export const VERDICTS = ["removed", "partly removed", "reflection remains", "little found", "doubtful", "by motion", "open question", "single photo", "unchanged"];
+
+const TITLES = {
+  removed: "A reflection was found and removed.",
+  "partly removed": "A reflection was found and partly removed.",
+  "reflection remains": "A reflection was found, but most of it remains.",
+  "little found": "Little reflection was found.",
+  doubtful: "The layers may be wrong. Check them.",
+  "by motion": "The layers were separated by their motion.",
+  "open question": "The layers were separated by their motion.",
+  "single photo": "One picture was separated alone.",
+  unchanged: "The picture stays as it is.",
+};
+
+// Whether the user must decide which of the two measured layers is behind the glass.
+export const isNamingOpen = ({ result, edits }) => result.method === "burst" && !result.areNamesCertain && edits.now.swap === null;
+
+// Returns the short verdict of a photo that is done.
+export function verdictOf(photo) {
+  if (photo.result.method === "burst") return isNamingOpen(photo) ? "open question" : "by motion";
+  return photo.result.method ?? photo.result.verdict;
+}
+
+// Returns a sentence about the result, and a second one with the reason or with the next step.
+export function describeVerdict(photo) {
+  const { message, nextStep } = photo.result;
+  return { title: TITLES[verdictOf(photo)], text: message ?? nextStep ?? "" };
+}
