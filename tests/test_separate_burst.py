@@ -20,7 +20,7 @@ from brewster.burst.film import choose_frames
 from brewster.burst.fourier_search import find_translations
 from brewster.burst.joint_model import JointModel, pixel_grid, with_fourth_channel
 from brewster.burst.optimiser import Rates, optimise
-from brewster.burst.registration import frame_motions, motion_candidates
+from brewster.burst.registration import layer_tracks, motion_candidates
 from brewster.burst.separate import burst_report, fit_burst, measure_layers
 from brewster.burst.solver import LEVELS, SEARCH, Level, Solution, _edge_correlation, solve
 from brewster.errors import BrewsterError, PhotoError, PhotoTooLarge, UnreadablePhoto
@@ -148,11 +148,29 @@ def test_the_fourier_search_finds_the_translation_of_the_second_layer(path):
 
 def test_unrelated_photos_have_no_motion_and_equal_ones_do_not_move():
     first, second = linear_pictures((400, 300))
-    motions = frame_motions([first, first, second], 0, first)
-    assert not motions[2]
-    candidates = motion_candidates([first, first], 0, motions[:2])
+    tracks = layer_tracks([first, first, second], 0, first)
+    assert [track.found for track in tracks] == [[0, 1]]
+    candidates = motion_candidates([first, first], 0, [tracks[0].reordered([0, 1])])
     assert candidates[0].is_locked
     assert np.allclose(candidates[0].transmission, np.eye(3), atol=1e-3)
+
+
+def test_a_track_follows_one_layer_even_where_the_other_one_has_more_matches():
+    pictures = linear_pictures((460, 340))
+    paths = np.array([[0, 0], [6, 2], [14, -3]]), np.array([[0, 0], [-9, 4], [-20, 6]])
+    shares = [(0.5, 0.5), (0.3, 0.7), (0.7, 0.3)]
+    frames = [
+        sum(
+            share * cv2.warpAffine(picture, np.float32([[1, 0, x - 30], [0, 1, y - 20]]), (400, 300))
+            for picture, share, (x, y) in zip(pictures, share_of_each, places, strict=True)
+        ).astype(np.float32)
+        for share_of_each, places in zip(shares, zip(*paths, strict=True), strict=True)
+    ]
+    tracks = layer_tracks(frames, 0, frames[0] * np.float32(0.9))[:2]
+    found = [[track.motions[k][:2, 2] for k in range(3)] for track in tracks]
+    errors = [[np.abs(np.array(motion) - path).max() for path in paths] for motion in found]
+    assert sorted(int(np.argmin(error)) for error in errors) == [0, 1]
+    assert max(min(error) for error in errors) < 1
 
 
 def test_a_burst_is_separated_by_its_motion(small_burst, burst_files):
@@ -250,8 +268,8 @@ def solve_at_80(frames, prior):
 
 
 def solve_few(frames, prior, **options):
-    motions = frame_motions(frames, 2, frames[2] / 2)
-    return solve(frames, 2, prior, motion_candidates(frames, 2, motions), **options)
+    tracks = layer_tracks(frames, 2, frames[2] / 2)
+    return solve(frames, 2, prior, motion_candidates(frames, 2, tracks), **options)
 
 
 @pytest.mark.parametrize(

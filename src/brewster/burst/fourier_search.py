@@ -7,7 +7,7 @@ it leaves unexplained is the cost of d_k.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Final
 
 import cv2
@@ -72,22 +72,26 @@ def find_translations(
             costs.append(row)
             on_step()
         paths.append(ends[:, None, None, None] * along + ends[:, None, None] * across)
-    chosen: list[Doubles] = []
     grid = np.concatenate(paths).reshape(-1, len(aligned), 2)
-    for path in grid[np.concatenate(costs).argsort()]:  # the best ones that are not neighbours
-        norms = [(np.linalg.norm(path - other), np.linalg.norm(other)) for other in chosen]
-        if path.any() and all(distance > 0.3 * length + 0.5 for distance, length in norms):
-            chosen.append(path)
-        if len(chosen) == _STARTS:
-            break
+    chosen = _different((path for path in grid[np.concatenate(costs).argsort()] if path.any()), _STARTS)
     refined = []
     for found in POOL.map(lambda path: _refined(spectra, frequencies, weights, reference, path), chosen):
         refined.append(found)
         on_step()
-    return [
-        offsets * (aligned[0].shape[1] / _WIDTH_PX)
-        for offsets, _ in sorted(refined, key=lambda found: found[1])
-    ]
+    best = _different((path for path, _ in sorted(refined, key=lambda found: found[1])), _STARTS)
+    return [path * (aligned[0].shape[1] / _WIDTH_PX) for path in best]
+
+
+def _different(paths: Iterable[Doubles], count: int) -> list[Doubles]:
+    """Returns the first paths (K, 2) that are not neighbours of earlier ones."""
+    chosen: list[Doubles] = []
+    for path in paths:
+        norms = [(np.linalg.norm(path - other), np.linalg.norm(other)) for other in chosen]
+        if all(distance > 0.3 * length + 0.5 for distance, length in norms):
+            chosen.append(path)
+        if len(chosen) == count:
+            break
+    return chosen
 
 
 def _refined(

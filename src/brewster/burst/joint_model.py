@@ -38,7 +38,8 @@ class JointModel:
     """C candidates for the L layers of K frames."""
 
     layers: Floats
-    """(C, L, H, W, 4): square roots of linear light. The last channel is 0, but in the second layer the root of its opacity."""
+    """(C, L, H, W, 4): square roots of linear light. Of three layers, the second one has opaque objects in front of the first, and in its
+    last channel the root of the opacity. The reflection is last."""
     homographies: Doubles
     """(C, L, K, 8), frame to reference."""
     splines: Doubles
@@ -96,10 +97,21 @@ class JointModel:
             self.is_locked[chosen], self.reference, self.losses[chosen], self.data_losses[chosen],
         )  # fmt: skip
 
+    @classmethod
+    def stacked(cls, models: Sequence[JointModel]) -> JointModel:
+        """Returns a model with the candidates of all models, which have layers and splines of one size."""
+
+        def together(name: str) -> Any:  # noqa: ANN401
+            return np.concatenate([getattr(model, name) for model in models])
+
+        return cls(
+            together("layers"), together("homographies"), together("splines"), together("log_gains"),
+            together("is_locked"), models[0].reference, together("losses"), together("data_losses"),
+        )  # fmt: skip
+
     def exchanged(self) -> JointModel:
-        """Returns a model with T and R exchanged, both transparent."""
+        """Returns a model with its two layers exchanged."""
         layers = self.layers[:, ::-1].copy()
-        layers[..., 3] = 0
         homographies, splines = self.homographies[:, ::-1].copy(), self.splines[:, ::-1].copy()
         return replace(self, layers=layers, homographies=homographies, splines=splines)
 
@@ -155,10 +167,7 @@ class JointModel:
         return moved
 
     def frame_layers(self, frame: int, height: int, width: int) -> Floats:
-        """Returns T and R of the first candidate as a frame shows them, without its gain: (2, h, w, 3) linear light.
-
-        An opaque part of the second layer belongs to T.
-        """
+        """Returns T and R of the first candidate as a frame shows them, without its gain: (2, h, w, 3) linear light."""
         return compose(self._samples(frame, height, width))
 
     def reference_layers(self, height: int, width: int) -> Floats:
@@ -168,12 +177,6 @@ class JointModel:
     def reference_opacity(self, height: int, width: int) -> Floats:
         """Returns the opacity of the second layer of the first candidate in the reference frame, (h, w) in 0..1."""
         return np.minimum(self._samples(self.reference, height, width)[1, ..., 3], 1)
-
-    def object_share(self, height: int, width: int) -> float:
-        """Returns the share of the light of the second layer, in the reference frame, that belongs to opaque objects."""
-        second = self._samples(self.reference, height, width)[1]
-        light = second[..., :3].mean(-1)
-        return float((light * np.minimum(second[..., 3], 1)).sum() / (light.sum() + 1e-9))
 
     def _samples(self, frame: int, height: int, width: int) -> Floats:
         """Returns the layers of the first candidate at the places that a frame shows, (L, h, w, 4)."""
@@ -216,10 +219,10 @@ class JointModel:
 
 
 def compose(samples: Floats) -> Floats:
-    """Returns T and R (2, h, w, 3) from samples of the layers at one place, (L, h, w, 4)."""
-    opacity = np.minimum(samples[1, ..., 3:], 1)
-    transmission = samples[0, ..., :3] * (1 - opacity) + samples[1, ..., :3] * opacity
-    return np.stack([transmission, samples[1, ..., :3] * (1 - opacity) + samples[2:, ..., :3].sum(0)])
+    """Returns T and R (2, h, w, 3) from samples of the layers at one place, (L, h, w, 4). Objects belong to T."""
+    visible = 1 - np.minimum(samples[1, ..., 3:], 1)
+    transmission = samples[0, ..., :3] * visible + samples[1:-1, ..., :3].sum(0)
+    return np.stack([transmission, samples[-1, ..., :3]])
 
 
 def data_errors(predicted: Floats, frames: Floats) -> Floats:

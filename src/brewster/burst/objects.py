@@ -1,31 +1,39 @@
-"""Opaque objects between the glass and the wall, which move like a second layer: the measurement gives them back to the transmission.
+"""Opaque objects between the glass and the wall, which move like a layer of their own and belong to the transmission.
 
 A reflection adds its light to the transmission; an object hides it. Where the second layer has most of the light, the optimisation
 starts again as if it were opaque. Where the photos show the transmission through it, it becomes transparent; where they show that
 the transmission is hidden, most clearly at the edges that move over the wall, it stays opaque, and the photos are explained better.
+These regions become the layer of the objects, and the reflection is a third layer, whose motion is looked for again.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Final
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from brewster.burst.joint_model import Floats, JointModel
+from brewster.burst.joint_model import Doubles, Floats, JointModel
 from brewster.burst.optimiser import Rates, Weights, optimise
 
-STEPS: Final = 120
+OPACITY_STEPS: Final = 120
+SEARCH_STEPS: Final = 40
+"""Of all candidates for the motion of the reflection."""
+FINAL_STEPS: Final = 70
+"""Of the best ones."""
+_KEPT: Final = 2
 _MIN_AREA: Final = 0.004
 """Smaller regions are ignored, as shares of the frame."""
 _DOMINANT: Final = 0.55
 """The share of the second layer in the light of a region that may be an object."""
-_CLEAR_OPACITY: Final = 0.6
-_CLEAR_ERROR: Final = 0.85
-"""A region is an object if its mean opacity is larger than the one, and the error in and around it falls below this share. On 32 simulated
-bursts with objects, 23 of 26 such regions were objects; in five real bursts without objects there is none."""
+_MAX_AREA: Final = 0.6
+"""If all regions together are larger, they are the wall."""
+_CLEAR_OPACITY: Final = 0.7
+_CLEAR_ERROR: Final = 0.95
+"""A region is an object if its mean opacity is larger than the one, and the error in and around it falls below this share."""
 _LIKELY_OPACITY: Final = 0.4
 """In a burst with an object, other regions with more than this opacity are parts of objects, too."""
 _FIXED_OPACITY: Final = 1.5
@@ -38,38 +46,71 @@ def with_objects(
     model: JointModel,
     frames: Floats,
     prior: Floats,
+    motions: Sequence[Doubles],
     *,
+    density: float,
     rates: Rates,
     weights: Weights,
     on_step: Callable[[], None] = lambda: None,
-) -> JointModel:
-    """Returns the model with the objects of its second layer opaque, or the same model if there are none.
+) -> tuple[JointModel, float] | None:
+    """Returns a model of three layers, the wall, the objects and the reflection, and the data term of the same without a reflection;
+    None if there are no objects.
 
     Args:
         model: a single candidate with two transparent layers, after its optimisation.
         frames: (K, h, w, 4) linear light.
         prior: T of the reference frame from a single photo, (h, w, 4).
+        motions: candidates for the motion of the reflection, each (K, 3, 3), frame to reference. That of the objects is another one.
+        density: see `JointModel.start`.
         rates, weights, on_step: see `optimise`.
     """
+
+    def optimised(model: JointModel, steps: int) -> JointModel:
+        return optimise(model, frames, prior, steps, rates=rates, weights=weights, on_step=on_step)
+
+    chosen = _opaque_objects(
+        [model, model.exchanged()], frames, lambda opaque: optimised(opaque, OPACITY_STEPS)
+    )
+    if chosen is None:
+        return None
+    dark = _dark_layers(frames, motions, model.reference, density)
+    searched = optimised(_with_reflections(*chosen, dark, motions), SEARCH_STEPS)
+    best = searched.losses[1:].argsort()[:_KEPT] + 1
+    final = optimised(searched.selected([0, *best]), FINAL_STEPS)
+    return final.selected([int(final.losses[1:].argmin()) + 1]), float(final.data_losses[0])
+
+
+def _opaque_objects(
+    models: Sequence[JointModel], frames: Floats, optimised: Callable[[JointModel], JointModel]
+) -> tuple[JointModel, JointModel] | None:
+    """Returns the best model with nothing but opaque objects in its second layer, and the one of which it was made; None if there are
+    no objects."""
     size = frames.shape[1:3]
-    transmission, reflection = (
-        cv2.GaussianBlur(layer.mean(-1), (0, 0), _SMOOTHING_PX) for layer in model.reference_layers(*size)
-    )
-    is_dominant = reflection > _DOMINANT * (transmission + reflection + 1e-3)
-    regions = _regions(is_dominant)
-    if not regions:
-        return model
-    opaque = optimise(
-        model.with_opacity(is_dominant.astype(np.float32)),
-        frames,
-        prior,
-        STEPS,
-        rates=rates,
-        weights=weights,
-        on_step=on_step,
-    )
-    opacity = opaque.reference_opacity(*size)
-    errors, errors_if_opaque = (some.collected_errors(frames, layer=1) for some in (model, opaque))
+    tried = []
+    for model in models:
+        transmission, reflection = (
+            cv2.GaussianBlur(layer.mean(-1), (0, 0), _SMOOTHING_PX) for layer in model.reference_layers(*size)
+        )
+        is_dominant = reflection > _DOMINANT * (transmission + reflection + 1e-3)
+        regions = _regions(is_dominant)
+        if 0 < np.sum(regions) <= _MAX_AREA * is_dominant.size:
+            tried.append((model, regions, model.with_opacity(is_dominant.astype(np.float32))))
+    if not tried:
+        return None
+    together = optimised(JointModel.stacked([start for _, _, start in tried]))
+    best = int(together.losses.argmin())
+    model, regions, _ = tried[best]
+    opaque = together.selected([best])
+    mask = _object_mask(model, opaque, frames, regions)
+    return None if mask is None else (opaque.with_opacity(_FIXED_OPACITY * mask, elsewhere=0), model)
+
+
+def _object_mask(
+    transparent: JointModel, opaque: JointModel, frames: Floats, regions: Sequence[NDArray[np.bool_]]
+) -> Floats | None:
+    """Returns 1 in the regions that are objects, and 0 elsewhere, (h, w); None if there are none."""
+    opacity = opaque.reference_opacity(*frames.shape[1:3])
+    errors, errors_if_opaque = (model.collected_errors(frames, layer=1) for model in (transparent, opaque))
     around = np.ones((_RING_PX, _RING_PX), np.uint8)
 
     def is_clear(region: NDArray[np.bool_]) -> bool:
@@ -78,10 +119,42 @@ def with_objects(
         return bool(is_better and opacity[region].mean() > _CLEAR_OPACITY)
 
     if not any(is_clear(region) for region in regions):
-        return model
+        return None
     objects = np.any([region for region in regions if opacity[region].mean() > _LIKELY_OPACITY], 0)
-    mask = cv2.dilate(objects.astype(np.float32), np.ones((3, 3), np.uint8))
-    return opaque.with_opacity(_FIXED_OPACITY * mask, elsewhere=0)
+    mask: Floats = cv2.dilate(objects.astype(np.float32), np.ones((3, 3), np.uint8))
+    return mask
+
+
+def _dark_layers(frames: Floats, motions: Sequence[Doubles], reference: int, density: float) -> Floats:
+    """Returns the start of a reflection for each of the motions, (n, H, W, 4): see `JointModel.start`."""
+    pairs = np.array([[motion, motion] for motion in motions]).reshape(-1, 2, len(frames), 3, 3)
+    return JointModel.start(frames, pairs, np.zeros(len(pairs), bool), reference, density).layers[:, 1]
+
+
+def _with_reflections(
+    objects: JointModel, additive: JointModel, dark: Floats, motions: Sequence[Doubles]
+) -> JointModel:
+    """Returns candidates with a third layer: none (black), what `additive` has outside of the objects, and a dark one for each of the motions."""
+    is_opaque = objects.layers[0, 1, ..., 3:] > 0
+    first = objects.layers[0].copy()
+    first[1] *= is_opaque
+    rest = np.where(is_opaque, 0, additive.layers[0, 1])
+    thirds = [np.zeros_like(rest), rest, *dark]
+    count = len(thirds)
+    homographies, splines = (
+        np.repeat(each[:, [0, 1, 1]], count, 0) for each in (objects.homographies, objects.splines)
+    )
+    for candidate, motion in enumerate(motions, 2):
+        homographies[candidate, 2] = (motion / motion[:, 2:, 2:]).reshape(-1, 9)[:, :8]
+        splines[candidate, 2] = 0
+    return replace(
+        objects,
+        layers=np.stack([np.stack([*first, third]) for third in thirds]),
+        homographies=homographies,
+        splines=splines,
+        log_gains=np.repeat(objects.log_gains, count, 0),
+        is_locked=np.zeros(count, bool),
+    )
 
 
 def _regions(mask: NDArray[np.bool_]) -> list[NDArray[np.bool_]]:

@@ -238,8 +238,8 @@ class _Loss:
         height, width = self._target.shape[1:3]
         penalties, extra = [], []
         for candidate in range(len(self._light)):
-            samples = np.empty((2, height, width, 4), np.float32)
-            for layer in range(2):
+            samples = np.empty((len(self._light[candidate]), height, width, 4), np.float32)
+            for layer in range(len(samples)):
                 kernels.sample(self._light[candidate, layer], *self._places, samples[layer])
             encoded = np.sqrt(with_fourth_channel(compose(samples)[0]) + OFFSET)
             difference = (_low_pass(encoded) - self._low_prior)[..., :3]

@@ -6,7 +6,7 @@ All motions are (K, 3, 3) homographies in normalised coordinates, from a frame t
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from typing import Final, final
@@ -26,10 +26,12 @@ Matrices = NDArray[np.float64]
 _FEATURES: Final = 4000
 _RATIO: Final = 0.85
 _INLIER_PX: Final = 2.0
+_REMOVED_PX: Final = 3.0
+"""Matches that are nearer to the motion of a layer do not belong to the next layers."""
 _MIN_MATCHES: Final = 12
-_MAX_MOTIONS: Final = 4
-_MIN_DIFFERENCE: Final = 0.007
-"""Two motions of a frame are different if they differ by this share of the frame's width."""
+_MIN_SHARED: Final = 8
+"""The number of features of a layer that must be found in a frame."""
+_MAX_TRACKS: Final = 4
 _SHIFTS: Final = (0.015, 0.045, 0.08)
 """Sideways shifts of the reflection at the end of the path, as shares of the width: a safety net for the other candidates."""
 _ORDER_PX: Final = 80
@@ -53,20 +55,55 @@ class MotionCandidate:
 
 Features = tuple[Floats, Floats]
 """The places (n, 2) and descriptors (n, 128) of the features of a frame."""
-Motions = list[tuple[Matrices, float]]
-"""The motions of one frame: homographies from the reference frame in pixels, and how likely each is the motion of T."""
+Fit = tuple[Matrices, NDArray[np.bool_]]
+"""A homography, and which matches follow it, (n,)."""
 
 
-def frame_motions(
+@final
+@dataclass(frozen=True)
+class Matches:
+    """Features of the reference frame that were found in another frame."""
+
+    features: NDArray[np.int64]
+    """(n,): their indices in the reference frame."""
+    points: Floats
+    """(n, 4): x, y in the reference frame, and x, y in the other frame."""
+
+    def selected(self, mask: NDArray[np.bool_]) -> Matches:
+        """Returns the matches with True in the mask (n,)."""
+        return Matches(self.features[mask], self.points[mask])
+
+
+@final
+@dataclass(frozen=True)
+class Track:
+    """The motion of one layer in the frames of a burst. Its features in the reference frame move together in all of them."""
+
+    motions: Sequence[Matrices | None]
+    """For each frame, the homography from the reference frame in pixels; None where the layer was not found."""
+    likelihood: float
+    """That the layer is T: the number of matches, each with the share of T in the detail around it."""
+
+    @property
+    def found(self) -> list[int]:
+        """The indices of the frames in which the layer was found."""
+        return [k for k, matrix in enumerate(self.motions) if matrix is not None]
+
+    def reordered(self, frames: Sequence[int]) -> Track:
+        """Returns the track in a burst of these frames."""
+        return Track([self.motions[k] for k in frames], self.likelihood)
+
+
+def layer_tracks(
     frames: Sequence[Floats],
     reference: int,
     prior: Floats,
     on_progress: ProgressCallback = lambda _fraction: None,
-) -> list[Motions]:
-    """Returns the motions of each frame: those with the most matches first, and none for a frame of another scene.
+) -> list[Track]:
+    """Returns the motions of the layers that features show: the one that is most likely T is first.
 
-    A homography is fitted to the matches with MAGSAC, its matches are removed, and the next one is fitted to the rest.
-    The likelihood is the number of matches times the mean share of T in the detail at these matches.
+    A layer begins with the homography that has the most matches of all frames (MAGSAC); its features are then looked for in the other
+    frames, and its matches are removed.
 
     Args:
         frames: (h, w, 3) linear light.
@@ -79,20 +116,61 @@ def frame_motions(
     for places in POOL.map(_features, frames):
         features.append(places)
         on_progress(0.5 * len(features) / len(frames))
+    others = [k for k in range(len(frames)) if k != reference]
+    found = POOL.map(lambda k: _matches(features[reference], features[k]), others)
+    matches = dict(zip(others, found, strict=True))
+    tracks: list[Track] = []
+    while len(tracks) < _MAX_TRACKS:
+        on_progress(0.6 + 0.4 * len(tracks) / _MAX_TRACKS)
+        motions = _next_track(matches, len(features[reference][0]), share.shape)
+        if not motions:
+            break
+        likelihood = 0.0
+        for k, matrix in motions.items():
+            distances = _distances(matrix, matches[k].points)
+            x, y = matches[k].points[distances < _INLIER_PX, :2].astype(int).T
+            likelihood += float(share[y, x].sum())
+            matches[k] = matches[k].selected(distances > _REMOVED_PX)
+        motions[reference] = np.eye(3)
+        tracks.append(Track([motions.get(k) for k in range(len(frames))], likelihood))
+    return sorted(tracks, key=lambda track: -track.likelihood)
 
-    def motions(k: int) -> Motions:
-        if k == reference:
-            return [(np.eye(3), 1.0)]
-        return _fitted_motions(_matches(features[reference], features[k]), share)
 
-    found_motions = []
-    for found in POOL.map(motions, range(len(frames))):
-        found_motions.append(found)
-        on_progress(0.5 + 0.5 * len(found_motions) / len(frames))
-    return found_motions
+def _next_track(matches: Mapping[int, Matches], count: int, size: tuple[int, ...]) -> dict[int, Matrices]:
+    """Returns the motions of the next layer, by frame. `count` is the number of features in the reference frame."""
+    own = POOL.map(lambda k: _camera_motion(matches[k].points, size, _MIN_MATCHES), matches)
+    fits = {k: fit for k, fit in zip(matches, own, strict=True) if fit}
+    is_member = np.zeros(count, bool)
+    motions: dict[int, Matrices] = {}
+    remaining = dict(matches) if fits else {}
+    while remaining:
+        shared = {k: is_member[there.features] for k, there in remaining.items()}
+        if motions:
+            k = max(remaining, key=lambda k: int(shared[k].sum()))
+        else:
+            k = max(fits, key=lambda k: int(fits[k][1].sum()))
+        here = remaining.pop(k)
+        fit = _extended(here.points, shared[k], size) or fits.get(k)
+        if fit:
+            motions[k] = fit[0]
+            is_member[here.features[fit[1]]] = True
+    return motions
 
 
-def path_order(frames: Sequence[Floats], motions: Sequence[Motions]) -> list[int]:
+def _extended(points: Floats, shared: NDArray[np.bool_], size: tuple[int, ...]) -> Fit | None:
+    """Returns the motion of the matches of a layer, which most of them follow, and all matches that follow it."""
+    fit = _camera_motion(points[shared], size, max(_MIN_SHARED, shared.sum() // 2))
+    if fit is None:
+        return None
+    matrix = fit[0]
+    for _ in range(2):
+        near = _distances(matrix, points) < _INLIER_PX
+        better = _camera_motion(points[near], size, _MIN_MATCHES)
+        matrix = better[0] if better else matrix
+    return matrix, _distances(matrix, points) < _INLIER_PX
+
+
+def path_order(frames: Sequence[Floats], tracks: Sequence[Track]) -> list[int]:
     """Returns the indices of the frames that show the scene, in their order along the path of the camera.
 
     After the alignment with T, only R moves: the further apart two frames were taken, the more they differ. The first coordinate of
@@ -100,13 +178,18 @@ def path_order(frames: Sequence[Floats], motions: Sequence[Motions]) -> list[int
 
     Args:
         frames: (h, w, 3) linear light.
-        motions: the motions of each frame, from `frame_motions`; none for a frame of another scene.
+        tracks: the motions of the layers, from `layer_tracks`; none of them has a motion for a frame of another scene.
     """
-    used = [k for k, found in enumerate(motions) if found]
+    transmission = [_likeliest(tracks, k) for k in range(len(frames))]
+    used = [k for k, matrix in enumerate(transmission) if matrix is not None]
     height, width = frames[0].shape[:2]
     size = _ORDER_PX, max(8, _ORDER_PX * height // width)
     inner = slice(height // 12, -height // 12), slice(width // 12, -width // 12)
-    aligned = [_aligned(frames[k], _likeliest(motions[k]))[inner] for k in used]
+    aligned = [
+        _aligned(frame, matrix)[inner]
+        for frame, matrix in zip(frames, transmission, strict=True)
+        if matrix is not None
+    ]
     small = [np.sqrt(cv2.resize(frame, size, interpolation=cv2.INTER_AREA) + 0.01) for frame in aligned]
     details = np.stack([image - cv2.GaussianBlur(image, (0, 0), _ORDER_PX / 10) for image in small])
     centred = (details - details.mean(0)).reshape(len(used), -1).astype(np.float64)
@@ -135,7 +218,7 @@ def _shortened(path: list[int], distances: Matrices) -> list[int]:
 def motion_candidates(
     frames: Sequence[Floats],
     reference: int,
-    motions: Sequence[Motions],
+    tracks: Sequence[Track],
     on_step: Callable[[], None] = lambda: None,
 ) -> list[MotionCandidate]:
     """Returns candidates for the motion of both layers. The first one is locked: both layers are one.
@@ -143,11 +226,12 @@ def motion_candidates(
     Args:
         frames: (h, w, 3) linear light, in the order of `path_order`.
         reference: the index of the reference frame.
-        motions: the motions of each frame, from `frame_motions`; each frame has at least one.
+        tracks: the motions of the layers, from `layer_tracks`; each frame has at least one.
         on_step: called several times a second. An exception raised in it stops the work.
     """
     height, width = frames[0].shape[:2]
-    transmission = np.stack([_likeliest(found) for found in motions])
+    found = [_likeliest(tracks, k) for k in range(len(frames))]
+    transmission = np.stack([matrix for matrix in found if matrix is not None])
     times = np.arange(len(frames)) - reference
     times = times / np.abs(times).max()
 
@@ -157,26 +241,26 @@ def motion_candidates(
             [_translation(x * t, y * t) @ matrix for t, matrix in zip(times, transmission, strict=True)]
         )
 
-    candidates = [("one layer", transmission)]
+    def filled(track: Track) -> Matrices:
+        """Where a layer was not found, it moves along a line relative to the transmission."""
+        slopes = [
+            (_centre(matrix, (height, width)) - _centre(transmission[k], (height, width))) / times[k]
+            for k, matrix in enumerate(track.motions)
+            if matrix is not None and k != reference
+        ]
+        path = line(*np.median(slopes, axis=0))
+        return np.stack([path[k] if matrix is None else matrix for k, matrix in enumerate(track.motions)])
+
+    half = len(frames) // 2
+    others = [filled(track) for track in tracks[1:] if len(track.found) > half][:2]
+    pairs = [("one layer", transmission, transmission)]
+    pairs += (("features", first, second) for first, second in combinations([transmission, *others], 2))
     aligned = [_aligned(frame, matrix) for frame, matrix in zip(frames, transmission, strict=True)]
     for offsets in find_translations(aligned, reference, on_step):
-        found = [matrix @ _translation(*offset) for matrix, offset in zip(transmission, offsets, strict=True)]
-        candidates.append(("Fourier", np.stack(found)))
-    second = [
-        _second_motion(found, matrix, (height, width))
-        for found, matrix in zip(motions, transmission, strict=True)
-    ]
-    slopes = [
-        (_centre(matrix, (height, width)) - _centre(transmission[k], (height, width))) / times[k]
-        for k, matrix in enumerate(second)
-        if matrix is not None and k != reference
-    ]
-    if slopes:
-        path = line(*np.median(slopes, axis=0))
-        homographies = [path[k] if matrix is None else matrix for k, matrix in enumerate(second)]
-        candidates += ("second homography", np.stack(homographies)), ("second homography", path)
+        moved = [matrix @ _translation(*offset) for matrix, offset in zip(transmission, offsets, strict=True)]
+        pairs.append(("Fourier", transmission, np.stack(moved)))
     for share in _SHIFTS if len(frames) >= _MIN_FRAMES_FOR_LARGE_SHIFTS else _SHIFTS[:-1]:
-        candidates += (("shift", line(sign * share * width, 0.0)) for sign in (-1, 1))
+        pairs += (("shift", transmission, line(sign * share * width, 0.0)) for sign in (-1, 1))
     scale = np.array([[2 / width, 0, 1 / width - 1], [0, 2 / height, 1 / height - 1], [0, 0, 1]])
 
     def normalised(matrices: Matrices) -> Matrices:
@@ -184,8 +268,8 @@ def motion_candidates(
         return inverse / inverse[:, 2:, 2:]
 
     return [
-        MotionCandidate(family, normalised(transmission), normalised(reflection), is_locked=number == 0)
-        for number, (family, reflection) in enumerate(candidates)
+        MotionCandidate(family, normalised(first), normalised(second), is_locked=number == 0)
+        for number, (family, first, second) in enumerate(pairs)
     ]
 
 
@@ -197,9 +281,9 @@ def _features(frame: Floats) -> Features:
     return np.array(cv2.KeyPoint.convert(keypoints), np.float32), np.array(descriptors, np.float32)
 
 
-def _likeliest(motions: Motions) -> Matrices:
-    """Returns the motion that is most likely that of T."""
-    return max(motions, key=lambda motion: motion[1])[0]
+def _likeliest(tracks: Sequence[Track], frame: int) -> Matrices | None:
+    """Returns the motion of a frame that is most likely that of T."""
+    return next((track.motions[frame] for track in tracks if track.motions[frame] is not None), None)
 
 
 def _aligned(frame: Floats, matrix: Matrices) -> Floats:
@@ -209,16 +293,22 @@ def _aligned(frame: Floats, matrix: Matrices) -> Floats:
     return warped
 
 
-def _fitted_motions(matches: Floats, share: Floats) -> Motions:
-    motions: Motions = []
-    while len(motions) < _MAX_MOTIONS and len(matches) >= _MIN_MATCHES:
-        matrix, inliers = _fit(matches)
-        if matrix is None or inliers.sum() < _MIN_MATCHES or not _is_camera_motion(matrix, share.shape):
-            break
-        x, y = matches[inliers, :2].astype(int).T
-        motions.append((matrix, float(share[y, x].sum())))
-        matches = matches[~inliers]
-    return motions
+def _camera_motion(points: Floats, size: tuple[int, ...], least: int) -> Fit | None:
+    """Returns the motion of at least so many of the matches (n, 4), and which follow it; None if there is none of a camera."""
+    if len(points) < least:
+        return None
+    matrix, inliers = _fit(points)
+    if matrix is None or inliers.sum() < least or not _is_camera_motion(matrix, size):
+        return None
+    return matrix, inliers
+
+
+def _distances(matrix: Matrices, points: Floats) -> Floats:
+    """Returns the distances in pixels between the second points of matches (n, 4) and the moved first ones."""
+    if not len(points):
+        return np.zeros(0, np.float32)
+    moved = cv2.perspectiveTransform(points[:, None, :2], matrix)[:, 0]
+    return np.asarray(np.linalg.norm(moved - points[:, 2:], axis=1), np.float32)
 
 
 def _is_camera_motion(matrix: Matrices, size: tuple[int, ...]) -> bool:
@@ -248,12 +338,12 @@ def _fit(matches: Floats) -> tuple[Matrices | None, NDArray[np.bool_]]:
     return matrix, inliers.ravel().astype(bool)
 
 
-def _matches(first: Features, second: Features) -> Floats:
-    """Returns matching points (n, 4): x, y in the first frame, and x, y in the second. A match is clearly nearer than the next best."""
+def _matches(first: Features, second: Features) -> Matches:
+    """Returns the features of the first frame in the second. A match is clearly nearer than the next best."""
     points, descriptors = first
     others, other_descriptors = second
     if len(points) < 1 or len(others) < 2:
-        return np.zeros((0, 4), np.float32)
+        return Matches(np.zeros(0, np.int64), np.zeros((0, 4), np.float32))
     distances = np.square(other_descriptors).sum(1) - 2 * (descriptors @ other_descriptors.T)
     best = distances.argmin(1)
     rows = np.arange(len(points))
@@ -261,23 +351,7 @@ def _matches(first: Features, second: Features) -> Floats:
     distances[rows, best] = np.inf
     lengths = np.square(descriptors).sum(1)
     good = nearest + lengths < _RATIO**2 * (distances.min(1) + lengths)
-    return np.concatenate([points[good], others[best[good]]], 1)
-
-
-def _second_motion(motions: Motions, transmission: Matrices, size: tuple[int, int]) -> Matrices | None:
-    """Returns the motion, other than that of T, with the most matches."""
-    height, width = size
-    y, x = np.mgrid[0:height:40, 0:width:40]
-    points = np.stack([x, y], -1).reshape(-1, 1, 2).astype(np.float64)
-
-    def distance(first: Matrices, second: Matrices) -> float:
-        moved = [cv2.perspectiveTransform(points, matrix) for matrix in (first, second)]
-        return float(np.linalg.norm(moved[0] - moved[1], axis=-1).mean()) / width
-
-    for matrix, _ in motions:  # those with the most matches are first
-        if distance(matrix, transmission) > _MIN_DIFFERENCE and distance(matrix, np.eye(3)) < 0.5:
-            return matrix
-    return None
+    return Matches(np.flatnonzero(good), np.concatenate([points[good], others[best[good]]], 1))
 
 
 def _transmission_share(reference: Floats, prior: Floats) -> Floats:

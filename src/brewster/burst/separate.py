@@ -19,7 +19,7 @@ import cv2
 import numpy as np
 
 from brewster.burst.joint_model import Floats
-from brewster.burst.registration import frame_motions, motion_candidates, path_order
+from brewster.burst.registration import layer_tracks, motion_candidates, path_order
 from brewster.burst.solver import MIN_SIDE_PX, Solution, solve
 from brewster.burst.threads import single_opencv_thread
 from brewster.errors import PhotoError, error_prefix
@@ -46,8 +46,6 @@ _MAX_COPY_MOTION_PX: Final = 30.0
 """With a larger motion, the second layer is no copy of the first, whatever the edges."""
 _MIN_CERTAIN_NAMING: Final = 0.08
 """Of 15 simulated bursts below, two had exchanged layers; of 30 above, one."""
-_MAX_OBJECT_SHARE: Final = 0.6
-"""If opaque objects have more of the light of the second layer, it is no reflection."""
 _HINTED_SHARE: Final = 0.3
 _HINTED_AREA: Final = 0.2
 """Where the measured reflection has more of the light, the model gets a hint, but in no larger area: its hints were trained on a tenth."""
@@ -276,15 +274,16 @@ def measure_layers(
         the frames that do not show it.
     """
     with single_opencv_thread():
-        motions = frame_motions(frames, reference, prior, lambda part: on_progress(0.07 * part))
-        used = path_order(frames, motions)
-        left_out = tuple(k for k, found in enumerate(motions) if not found)
+        tracks = layer_tracks(frames, reference, prior, lambda part: on_progress(0.07 * part))
+        used = path_order(frames, tracks) if tracks else []
+        left_out = tuple(k for k in range(len(frames)) if k not in used and k != reference)
         if len(used) < 2:
             return None, left_out
         if max(frames[reference].shape) < MIN_SIDE_PX:
             return None, ()
         chosen, middle = [frames[k] for k in used], used.index(reference)
-        candidates = motion_candidates(chosen, middle, [motions[k] for k in used], lambda: on_progress(0.07))
+        in_order = [track.reordered(used) for track in tracks]
+        candidates = motion_candidates(chosen, middle, in_order, lambda: on_progress(0.07))
         solution = solve(
             chosen,
             middle,
@@ -394,14 +393,11 @@ def burst_report(
         and solution.edge_correlation > _MAX_EDGE_CORRELATION
     )
     has_two_layers = explained >= _MIN_EXPLAINED and not is_copy
-    is_scene = solution is not None and solution.object_share > _MAX_OBJECT_SHARE
     advice = "Move the camera by 5 to 10 cm between the photos, best along a circle."
     if solution is None:
         message = "No other photo shows the same scene as the reference photo."
         if not left_out:
             message = f"Photos with less than {MIN_SIDE_PX} pixels are too small to show the motion."
-    elif has_two_layers and is_scene:
-        message = "Objects behind the glass move differently from the wall behind them, and hide the motion of the reflection."
     elif has_two_layers and motion >= (_USEFUL_MOTION_PX if is_doubted else _MIN_MOTION_PX):
         method, message = "burst", f"The layers moved {motion:.0f} px apart in a photo of 1,000 px."
         if solution.naming < _MIN_CERTAIN_NAMING:

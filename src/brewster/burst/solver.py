@@ -11,10 +11,9 @@ from typing import Final, final
 import cv2
 import numpy as np
 
-from brewster.burst.joint_model import Doubles, Floats, JointModel, with_fourth_channel
+from brewster.burst.joint_model import Doubles, Floats, JointModel, pixel_grid, with_fourth_channel
 from brewster.burst.kernels import OFFSET
-from brewster.burst.objects import STEPS as OBJECT_STEPS
-from brewster.burst.objects import with_objects
+from brewster.burst.objects import FINAL_STEPS, OPACITY_STEPS, SEARCH_STEPS, with_objects
 from brewster.burst.optimiser import Rates, Weights, optimise
 from brewster.burst.registration import MotionCandidate
 
@@ -71,6 +70,9 @@ LEVELS: Final = (
     Level(640, 35, (8, 12)),
 )
 """The levels of the best candidate."""
+_MIN_DIFFERENCE: Final = 0.008
+"""Two motions are different if they differ by this share of the frame's size."""
+_MAX_MOTIONS: Final = 5
 MIN_SIDE_PX: Final = math.ceil(LEVELS[0].long_side_px / _MAX_ENLARGEMENT)
 """The smallest long side of frames that have the levels at which candidates are compared and named: without these, wrong motions win."""
 
@@ -96,8 +98,8 @@ class Solution:
     """The mean error of the frames if both layers move together: the data term of the loss at 160 pixels."""
     two_layer_error: float
     """The same for the best candidate."""
-    object_share: float = 0.0
-    """The share of the light of the second layer that belongs to opaque objects, which are in the transmission."""
+    has_objects: bool = False
+    """Whether opaque objects in front of the wall move differently from it. They are a part of the transmission."""
 
     def swapped(self) -> Solution:
         """Returns the solution with both layers exchanged."""
@@ -133,7 +135,7 @@ def solve(
     )
     total = (
         sum(level.steps * level.long_side_px for level in (*search, *levels))
-        + OBJECT_STEPS * levels[0].long_side_px
+        + (OPACITY_STEPS + SEARCH_STEPS + FINAL_STEPS) * levels[0].long_side_px
     )
     done = 0.0
 
@@ -167,7 +169,8 @@ def solve(
     assert model
     one_layer, best = int(model.is_locked.argmax()), _best(model)
     errors = float(model.data_losses[one_layer]), float(model.data_losses[best])
-    model = model.selected([best])
+    other_motions = _other_motions(model, best, candidates)
+    model, has_objects = model.selected([best]), False
     refined = prior
     if refine_prior:
         refined = refine_prior(_reflection_share(model.reference_layers(*small.shape[1:3])))
@@ -179,39 +182,50 @@ def solve(
             model.resized(small, level.density, level.spline_size), level, small, small_refined[0]
         )
         if level is levels[0]:
-            named, layers, naming = _with_names(model, small, small_prior[0])
-            edge_correlation = _edge_correlation(layers)
-            if refine_prior and named is not model:  # the next levels correct the brightness of large areas
-                refined = refine_prior(_reflection_share(layers))
-            model = with_objects(
-                named,
+            found = with_objects(
+                model,
                 small,
                 small_refined[0],
+                other_motions,
+                density=level.density,
                 rates=level.rates,
                 weights=level.weights,
                 on_step=partial(on_step, level),
             )
+            named, layers, naming = _with_names(model, small, small_prior[0])
+            if found:
+                named, without_reflection = found
+                has_objects, errors = True, (without_reflection, float(named.data_losses[0]))
+                layers = named.reference_layers(*small.shape[1:3])
+                naming = _naming(layers, small[reference], small_prior[0])
+            elif refine_prior and named is not model:  # the next levels correct the brightness of large areas
+                refined = refine_prior(_reflection_share(layers))
+            model, edge_correlation = named, _edge_correlation(layers)
     layers = model.reference_layers(*small.shape[1:3])
-    motion, share = float(model.relative_motion(*_MOTION_SAMPLES)[0]), model.object_share(*small.shape[1:3])
+    motion = float(model.relative_motion(*_MOTION_SAMPLES)[0])
     return Solution(
-        layers[0], layers[1], model.confidence(small), motion, naming, edge_correlation, *errors, share
+        layers[0], layers[1], model.confidence(small), motion, naming, edge_correlation, *errors, has_objects
     )
 
 
 def _with_names(model: JointModel, frames: Floats, prior: Floats) -> tuple[JointModel, Floats, float]:
-    """Returns the model with exchanged layers if they have each other's names, the layers of the reference frame, (2, h, w, 3), and the
-    share of T in the prior's detail minus that of R."""
+    """Returns the model with exchanged layers if they have each other's names, the layers of the reference frame, (2, h, w, 3), and
+    their naming."""
     layers = model.reference_layers(*frames.shape[1:3])
-    images = [*layers, prior[..., :3]]
-    # The noise of light is proportional to its square root
-    noise = np.sqrt(frames[model.reference, ..., :3] + OFFSET)
-    details = np.stack([((image - _blurred(image)) / noise).ravel() for image in images]).astype(np.float64)
-    gram = details @ details.T
-    transmission, reflection = np.linalg.lstsq(gram[:2, :2] + 1e-6 * np.eye(2), gram[:2, 2])[0]
-    naming = float(transmission - reflection)
+    naming = _naming(layers, frames[model.reference], prior)
     if naming < -_MIN_NAMING:
         return model.exchanged(), layers[::-1], -naming
     return model, layers, naming
+
+
+def _naming(layers: Floats, frame: Floats, prior: Floats) -> float:
+    """Returns the share of the detail of T that the prior keeps, minus that of R. layers: (2, h, w, 3); frame, prior: (h, w, 4)."""
+    images = [*layers, prior[..., :3]]
+    noise = np.sqrt(frame[..., :3] + OFFSET)  # that of light is proportional to its square root
+    details = np.stack([((image - _blurred(image)) / noise).ravel() for image in images]).astype(np.float64)
+    gram = details @ details.T
+    transmission, reflection = np.linalg.lstsq(gram[:2, :2] + 1e-6 * np.eye(2), gram[:2, 2])[0]
+    return float(transmission - reflection)
 
 
 def _blurred(image: Floats) -> Floats:
@@ -259,6 +273,33 @@ def _best(model: JointModel) -> int:
 def _selection_losses(model: JointModel) -> Doubles:
     """Returns the losses, larger by 1 for implausible motions."""
     return model.losses + (model.relative_motion(*_MOTION_SAMPLES) > _MAX_RELATIVE_MOTION)
+
+
+def _other_motions(model: JointModel, best: int, candidates: Sequence[MotionCandidate]) -> list[Doubles]:
+    """Returns the motions (K, 3, 3) that differ from both motions of the best candidate, and from each other: those of features first."""
+    places = np.stack([*pixel_grid(3, 3).reshape(2, 9), np.ones(9)])
+
+    def moved(matrices: Doubles) -> Doubles:
+        x, y, denominator = (matrices @ places).swapaxes(0, 1)
+        centred: Doubles = np.stack([x, y]) / denominator
+        return centred
+
+    matrices = np.concatenate([model.homographies, np.ones_like(model.homographies[..., :1])], -1)
+    fitted = matrices.reshape(*matrices.shape[:3], 3, 3)
+    known = [moved(matrix) for matrix in fitted[best]]
+    found: list[Doubles] = []
+    measured = [candidate for candidate in candidates if candidate.family in ("features", "Fourier")]
+    for matrix in [
+        *(each.transmission for each in measured),
+        *(each.reflection for each in measured),
+        *fitted[:, -1],
+    ]:
+        places_here = moved(matrix)
+        differences = [np.linalg.norm(places_here - other, axis=0).mean(-1).max() / 2 for other in known]
+        if min(differences) > _MIN_DIFFERENCE and len(found) < _MAX_MOTIONS:
+            known.append(places_here)
+            found.append(matrix)
+    return found
 
 
 def resized(image: Floats, long_side_px: int) -> Floats:
