@@ -50,9 +50,10 @@ _MAX_RELATIVE_MOTION: Final = 0.2
 """As a share of the width. With a larger motion, the reflection becomes an offset of each frame, and explains all but edges."""
 _MOTION_SAMPLES: Final = (9, 12)
 _DETAIL_PX: Final = 9
-_MIN_NAMING: Final = 0.12
-"""If the single photo keeps this much more detail of R than of T, the layers are exchanged. With less, the layer with more matching features
-is T. Of the simulated bursts near this limit, one with .14 had exchanged layers, and one with .10 had not."""
+_MAX_DETAIL: Final = 0.5
+_BRIGHTNESS: Final = 0.25
+_MAX_BRIGHTNESS: Final = 2.0
+"""The cues that tell T from R, see `_naming`. Of 42 simulated and 10 real bursts, the sum named 47 right, and the detail alone 41."""
 _MAX_ENLARGEMENT: Final = 1.3
 """Levels that would enlarge the frames by more than this factor are left out."""
 _DENSITY: Final = 1.5
@@ -90,7 +91,7 @@ class Solution:
     relative_motion: float
     """The largest motion of R relative to T between two frames, as a share of the width of a frame."""
     naming: float
-    """The share of the detail of T that the prior keeps, minus that of R, at 160 pixels: 0 if the single photo does not tell the layers apart."""
+    """How clearly T and R are told apart, at 160 pixels: about 0 if they may have each other's names."""
     edge_correlation: float
     """The correlation of the strengths of the edges of both layers, at 160 pixels: about 0 for two scenes, and more if a wrong motion
     makes the second layer a copy of the first."""
@@ -213,19 +214,26 @@ def _with_names(model: JointModel, frames: Floats, prior: Floats) -> tuple[Joint
     their naming."""
     layers = model.reference_layers(*frames.shape[1:3])
     naming = _naming(layers, frames[model.reference], prior)
-    if naming < -_MIN_NAMING:
+    if naming < 0:
         return model.exchanged(), layers[::-1], -naming
     return model, layers, naming
 
 
 def _naming(layers: Floats, frame: Floats, prior: Floats) -> float:
-    """Returns the share of the detail of T that the prior keeps, minus that of R. layers: (2, h, w, 3); frame, prior: (h, w, 4)."""
+    """Returns how much more clearly the first of both layers is T than the second: layers are (2, h, w, 3), frame and prior (h, w, 4).
+
+    The sum of two cues: the share of the layer's detail that the prior keeps, and its brightness, because glass reflects 4 to 15 %.
+    """
     images = [*layers, prior[..., :3]]
     noise = np.sqrt(frame[..., :3] + OFFSET)  # that of light is proportional to its square root
     details = np.stack([((image - _blurred(image)) / noise).ravel() for image in images]).astype(np.float64)
     gram = details @ details.T
     transmission, reflection = np.linalg.lstsq(gram[:2, :2] + 1e-6 * np.eye(2), gram[:2, 2])[0]
-    return float(transmission - reflection)
+    brightness = np.log((layers[0].mean() + 1e-4) / (layers[1].mean() + 1e-4))
+    return float(
+        np.clip(transmission - reflection, -_MAX_DETAIL, _MAX_DETAIL)
+        + _BRIGHTNESS * np.clip(brightness, -_MAX_BRIGHTNESS, _MAX_BRIGHTNESS)
+    )
 
 
 def _blurred(image: Floats) -> Floats:
