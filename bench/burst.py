@@ -2,14 +2,16 @@
 
     .venv/bin/python bench/burst.py FOLDER              # a dataset of `brewster render --burst`, or folders as docs/evaluation.md says
     .venv/bin/python bench/burst.py FOLDER 320 0 5      # at most 320 px; only the first and the sixth burst
-    .venv/bin/python bench/burst.py                     # time and memory for five photos of 12 megapixels
+    .venv/bin/python bench/burst.py                     # time and memory for five photos, compared with the solver in torch
 
 Prints one row for each burst. "gain" is the PSNR of the layers by motion minus that of the single photo, after a gain for each
 channel; "exchanged" is that of the two layers with each other's names, "result" that of the method that was chosen. The second
 table counts results that are worse by more than 0.1 dB.
 """
 
+import os
 import resource
+import subprocess
 import sys
 import tempfile
 import time
@@ -17,6 +19,7 @@ from functools import partial
 from itertools import pairwise
 from pathlib import Path
 
+import cv2
 import numpy as np
 
 from brewster import Photo, Separator, separate_burst
@@ -27,6 +30,8 @@ from brewster.srgb import to_encoded
 
 BORDER_PX = 8
 EQUAL_DB = 0.1
+BEFORE = "903985e8"
+"""The last commit whose solver used torch."""
 BINS_PX = (0, 4, 10, 16, 32, np.inf)
 
 
@@ -99,16 +104,21 @@ def quality(folder, long_side_px, numbers):
         print(f"| {low:g} to {high:g} | {len(found)} | {counts} | {medians[0]} | {medians[1]} | {worse} |")
 
 
-def speed():
-    """Five photos of 12 megapixels, of two random textures that move differently."""
+def measure(width):
+    """Prints seconds and MiB for five photos of two random textures that move differently."""
     rng = np.random.default_rng(1)
-    layers = [np.kron(rng.random((80, 110, 3)), np.ones((50, 50, 1))).astype(np.float32) for _ in range(2)]
+    height, scale = width * 3 // 4, width / 4000
+    layers = [
+        cv2.resize(rng.random((80, 110, 3), np.float32), None, fx=50 * scale, fy=50 * scale, interpolation=0)
+        for _ in range(2)
+    ]
     with tempfile.TemporaryDirectory() as folder:
         paths = [Path(folder, f"{k}.jpg") for k in range(5)]
         for k, path in enumerate(paths):
+            starts = [round((400 + step * k) * scale) for step in (8, 40)]
             views = [
-                layer[100:3100, 400 + step * k : 4400 + step * k]
-                for layer, step in zip(layers, (8, 40), strict=True)
+                layer[: height + 1][1:, start : start + width]
+                for layer, start in zip(layers, starts, strict=True)
             ]
             light = 0.6 * views[0] + 0.3 * views[1]
             Photo.from_array(np.rint(255 * to_encoded(light)).astype(np.uint8), encoding="srgb").save(path)
@@ -116,12 +126,39 @@ def speed():
         started = time.perf_counter()
         result = separate_burst(paths)
         seconds = time.perf_counter() - started
-    mebibytes = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-    print(f"five photos of 12 megapixels: {seconds:.1f} s, {mebibytes:.0f} MiB ({result.burst.method})")
+    print(seconds, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024, result.burst.method)
+
+
+def speed():
+    """Compares this version with the last one whose solver used torch, in one run. The first run compiles the kernels."""
+    print("\n| five photos | solver | seconds | MiB | method | ratio |\n|---|---|---|---|---|---|")
+    with tempfile.TemporaryDirectory() as folder:
+        git = ["git", "-C", str(Path(__file__).parent)]
+        subprocess.run([*git, "worktree", "add", "--quiet", "--detach", folder, BEFORE], check=True)
+        try:
+            sources = {"torch": Path(folder, "src"), "numba": Path(__file__).parents[1] / "src"}
+            for width, size in ((640, ""), (4000, "12 megapixels"), (1154, "1 megapixel")):
+                first = 0.0
+                for name, source in sources.items():
+                    environment = os.environ | {"PYTHONPATH": str(source)}
+                    command = [sys.executable, __file__, "measure", str(width)]
+                    out = subprocess.run(command, env=environment, check=True, capture_output=True, text=True)
+                    seconds, mebibytes, method = out.stdout.split(maxsplit=2)
+                    first = first or float(seconds)
+                    if size:
+                        print(
+                            f"| {size} | {name} | {float(seconds):.1f} | {float(mebibytes):.0f} | {method.strip()}"
+                            f" | {first / float(seconds):.1f} |",
+                            flush=True,
+                        )
+        finally:
+            subprocess.run([*git, "worktree", "remove", "--force", folder], check=True)
 
 
 if __name__ == "__main__":
-    if len(sys.argv) > 1:
+    if sys.argv[1:2] == ["measure"]:
+        measure(int(sys.argv[2]))
+    elif len(sys.argv) > 1:
         folder, long_side_px, *numbers = [*sys.argv[1:], "640"] if len(sys.argv) == 2 else sys.argv[1:]
         quality(Path(folder), int(long_side_px), [*map(int, numbers)])
     else:

@@ -1,7 +1,7 @@
 """Runs all benchmarks. This is the script of `make bench`.
 
 The benchmarks measure the quality on the development pairs, compared with the unprocessed input and another method; the
-change of photos without reflection; the time and memory for a 12-megapixel photo; the speed of metrics, compared with other
+change of photos without reflection; the time and memory for a 12-megapixel photo and a burst; the speed of metrics, compared with other
 packages; a large evaluation; the renderer, compared with Mitsuba; and both servers under load.
 
     BREWSTER_DATA=../shared/data .venv/bin/python bench/run.py
@@ -11,6 +11,7 @@ import os
 import sys
 from pathlib import Path
 
+import burst
 import evaluate
 import metrics
 import quality
@@ -30,6 +31,7 @@ if __name__ == "__main__":
     quality.main(data)
     reflection_free.main(data)
     speed.main(data)
+    burst.speed()
     metrics.main(data)
     evaluate.main(data)
     render.main(data)
