@@ -61,7 +61,7 @@ def test_an_opaque_object_belongs_to_the_transmission_whichever_layer_it_is_in(i
 
 def test_a_reflection_with_a_third_motion_is_found_in_front_of_an_object():
     paint, path = texture(3) * (0.1, 0.2, 0.4), np.array([[8, -8], [-8, -8], [0, 0], [8, 8], [-8, 8.0]])
-    model, frames, truth, disc = fitted(1, added=[moved(paint, *offset) for offset in path])
+    model, frames, truth, _ = fitted(1, added=[moved(paint, *offset) for offset in path])
     motion = np.tile(np.eye(3), (5, 1, 1))
     motion[:, :2, 2] = path * 2 / (120, 90)
     found, without_reflection = objects_of(model, frames, [motion])

@@ -495,6 +495,12 @@ def test_measured_layers_can_be_forced_exchanged_and_left_aside(small_burst, few
     levels = [layer.linear().mean() for layer in (*forced, *reversed([*swapped]))]
     assert levels[:2] == pytest.approx(levels[2:], rel=0.2)
     assert np.array_equal(single.transmission.pixels, brewster.separate(photos[2]).transmission.pixels)
+    again, back = forced.swapped(), swapped.swapped()
+    assert (again.burst.is_swapped, back.burst.is_swapped) == (True, False)
+    assert np.array_equal(again.transmission.pixels, swapped.transmission.pixels)
+    assert np.array_equal(back.reflection.pixels, forced.reflection.pixels)
+    with pytest.raises(BrewsterError, match="no measured layers to exchange"):
+        single.swapped()
 
 
 def test_the_method_single_measures_nothing_and_motion_needs_a_measurement(small_burst, monkeypatch):

@@ -13,6 +13,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, Final, Literal, final
 
 import cv2
@@ -94,9 +95,8 @@ class FittedBurst:
                 message=f"The measured layers are used, as requested. {report.message}",
                 next_step=None,
             )
-        if swap and report.method == "burst":
-            report = replace(report, is_swapped=True, are_names_certain=True, next_step=None)
-        return replace(self, report=report, _requested=method)
+        fitted = replace(self, report=report, _requested=method)
+        return fitted._exchanged() if swap and report.method == "burst" else fitted
 
     @property
     def hints(self) -> Source | None:
@@ -132,9 +132,19 @@ class FittedBurst:
         """Computes the layers at full size. `options` are those of the call of a `Separator`, without hints."""
         separation = self.separator(self.photo, hints=self.hints, on_progress=on_progress, **options)
         seconds = {name: self.seconds.get(name, 0.0) + spent for name, spent in separation.seconds.items()}
+        exchange = partial(self._exchanged().separate, lambda _fraction: None, **options)
         return replace(
-            separation, burst=self.report, next_step=self.report.next_step, seconds=self.seconds | seconds
+            separation,
+            burst=self.report,
+            next_step=self.report.next_step,
+            seconds=self.seconds | seconds,
+            _exchange=exchange if self.report.method == "burst" else None,
         )
+
+    def _exchanged(self) -> FittedBurst:
+        is_swapped = not self.report.is_swapped
+        report = replace(self.report, is_swapped=is_swapped, are_names_certain=True, next_step=None)
+        return replace(self, report=report)
 
 
 def separate_burst(

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import final
 
 import numpy as np
 
+from brewster.errors import BrewsterError
 from brewster.inference.assessment import Assessment
 from brewster.inference.burst_report import BurstReport
 from brewster.inference.guided_upsampling import Floats, upsample_rows
@@ -45,6 +46,8 @@ class Separation:
     """What may help if little was removed, or which option shows the other result of a burst; or None."""
     burst: BurstReport | None = None
     """How a burst was separated; None for a single photo."""
+    _exchange: Callable[[], Separation] | None = field(default=None, repr=False, compare=False)
+    """Computes the layers of a burst with each other's names."""
 
     def __repr__(self) -> str:
         """Returns a short description: `Separation(4000 x 3000, compact, clear)`."""
@@ -58,6 +61,19 @@ class Separation:
     def _repr_png_(self) -> bytes:
         """For notebooks: photo, transmission and reflection side by side, as a PNG."""
         return Photo(side_by_side((self.photo, self.transmission, self.reflection))).encode("png")
+
+    def swapped(self) -> Separation:
+        """Returns the same photo of a burst with its measured layers exchanged: which one is behind the glass is not always certain.
+
+        The layers are computed at full size again, but not measured again. Raises BrewsterError if no measured layers are used.
+        """
+        if self._exchange is None:
+            raise BrewsterError(
+                f"there are no measured layers to exchange in {self!r}",
+                "expected the separation of a burst by its motion",
+                'separate several photos with separate_burst, and method="motion" if the motion was not used',
+            )
+        return self._exchange()
 
     @property
     def layered(self) -> LayeredImage:
