@@ -34,7 +34,7 @@ _T = TypeVar("_T")
 
 
 class RemoteFile(NamedTuple):
-    """A file to download: its URL, its size in bytes, and its expected digest in lower-case hexadecimal digits."""
+    """A file to download: its URL, its size in bytes, and its expected digest in lower-case hexadecimal digits, "" if unknown."""
 
     url: str
     size: int
@@ -56,12 +56,14 @@ class _RetryableError(Exception):
 class Downloader:
     """Downloads over http and https: one attempt, and one after each of the delays.
 
-    `timeout_s` is the longest time without received data. Tests replace `sleep`, which gets the delay.
+    `timeout_s` is the longest time without received data. Tests replace `sleep`, which gets the delay. `on_bytes` is called with
+    the number of received bytes of a file.
     """
 
     retry_delays_s: tuple[float, ...] = (1.0, 2.0, 4.0, 8.0)
     timeout_s: float = 30.0
     sleep: Callable[[float], object] = time.sleep
+    on_bytes: Callable[[int], object] = lambda _received: None
 
     def read(self, url: str) -> bytes:
         """Requests a URL and returns the body of the response. Raises DownloadError if the URL is invalid, the server refuses
@@ -73,17 +75,30 @@ class Downloader:
 
         return self._with_retries(url, attempt)
 
+    def size(self, url: str) -> int:
+        """Returns the size of a file in bytes, as the server states it. Raises DownloadError as `read`, and if it is not stated."""
+
+        def attempt() -> str:
+            with self._response(url) as response:
+                return response.headers.get("Content-Length", "")
+
+        stated = self._with_retries(url, attempt)
+        if not stated.isdecimal():
+            happened = f"the server does not state the size of {url}"
+            raise DownloadError(happened, "expected a file", "download the file with another program")
+        return int(stated)
+
     def fetch(self, remote: RemoteFile, target: Path) -> None:
         """Downloads a file to the path `target` and creates its folder.
 
-        The file gets the name `target` only after its digest is verified. Raises DownloadError as `read`, and if the digest is
+        The file gets the name `target` only after its digest is verified; an empty digest is unknown. Raises DownloadError as `read`, and if the digest is
         not the expected one; and OutputError if the folder cannot be written.
         """
         part = target.with_name(f"{target.name}.part")
         with output_errors(target):
             target.parent.mkdir(parents=True, exist_ok=True)
             self._with_retries(remote.url, lambda: self._fetch_rest(remote, part))
-            if (digest := file_digest(part, remote.algorithm)) != remote.digest:
+            if remote.digest and (digest := file_digest(part, remote.algorithm)) != remote.digest:
                 part.unlink()
                 happened = f"the file from {remote.url} has the {remote.algorithm.upper()} digest {digest} and was deleted"
                 cure = "run again to download the whole file"
@@ -141,6 +156,7 @@ class Downloader:
             with part.open("ab" if received else "wb") as file:
                 while block := _read(response, min(_BLOCK_BYTES, remote.size - received)):
                     received += file.write(block)
+                    self.on_bytes(received)
                 file.flush()
                 os.fsync(file.fileno())
         if received < remote.size:

@@ -16,6 +16,7 @@ from brewster.cli.batch_plan import listed
 from brewster.cli.terminal import interrupts, one_line, print_error, print_status, progress, write_out
 from brewster.errors import INSTALL_COMMAND, DiskFull, ModelError, counted
 from brewster.models import zoo
+from brewster.models.published_networks import PUBLISHED_NETWORKS
 from brewster.options import Options
 from brewster.remote_path import Location, location
 
@@ -70,6 +71,7 @@ class BatchReport:
         from brewster.batch.parallel import separate_in_parallel  # noqa: PLC0415
 
         self._bursts = {task.name: task.burst for task in tasks if task.burst}
+        self._announce_time(tasks)
         with ExitStack() as stack:
             stack.push(self._finish)
             if has_index and self.output and not self.dry_run:
@@ -98,6 +100,21 @@ class BatchReport:
                 self.add(result)
                 update_progress(self.counts.total(), result.source)
         return 1 if self.counts["failed"] else 0
+
+    def _announce_time(self, tasks: Sequence[SeparationTask]) -> None:
+        """With a published network, prints how long the photos without layers take."""
+        from brewster.files import exists  # noqa: PLC0415
+
+        network = PUBLISHED_NETWORKS.get(self.options.model)
+        if not network or self.quiet or self.dry_run:
+            return
+        has_layers = (
+            all(isinstance(path, Location) and exists(path) for path in task.outputs.values())
+            for task in tasks
+        )
+        left = len(tasks) if self.overwrite else sum(not done for done in has_layers)
+        seconds, measured = network.seconds_per_photo(self.options.quality)
+        print_status(f"{counted(left, 'photo')}, about {_duration(left * seconds)} ({measured})")
 
     def _executor(self, workers: int | None, cluster: str | None) -> Executor[FileResult]:
         from brewster.batch.parallel import SeparationRunner  # noqa: PLC0415

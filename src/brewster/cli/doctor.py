@@ -175,7 +175,7 @@ def _try_format(format_name: str) -> Check:
 
 
 def _models() -> Iterator[Check]:
-    for row in map(describe, zoo.MODELS.values()):
+    for row in map(describe, zoo.installed_models().values()):
         if row["error"]:
             cure = f"git restore src/brewster/models/weights; {INSTALL_COMMAND} ."
             yield Check("models", row["name"], "broken", row["error"], cure)

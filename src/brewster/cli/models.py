@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
@@ -11,12 +12,19 @@ import click
 
 from brewster.cli.extras import require_extra
 from brewster.cli.parameters import FILE, JSON, Number, flag
-from brewster.cli.terminal import print_error, print_out, print_status
+from brewster.cli.terminal import print_error, print_out, print_status, progress
 from brewster.errors import BrewsterError, ModelError
 from brewster.files import write_atomically
 from brewster.models import zoo
 from brewster.models.diffusion_models import DIFFUSION_MODELS, DiffusionModel
 from brewster.models.diffusion_resources import BACKBONE_COSTS, PAPER_GPU
+from brewster.models.published_networks import (
+    COMMIT,
+    PROTOCOL,
+    PUBLISHED_NETWORKS,
+    REPOSITORY,
+    PublishedNetwork,
+)
 from brewster.options import Options
 
 if TYPE_CHECKING:
@@ -39,19 +47,29 @@ def models() -> None:
 def list_models(*, as_json: bool) -> None:
     """List the models that are installed with brewster, and diffusion models that are downloaded at first use or imported.
 
-    An entry has the name, the size of the file or download, and the licence. A diffusion model has two more lines: the layers
+    An entry has the name, the size of the file or download, and the licence. A published network has more lines: its time and
+    memory, its published score, and whether it is installed. A diffusion model has two more lines: the layers
     that it predicts, its GPU memory (with the format of the weights, and with the weights offloaded to host memory), the
     download of its text encoder, and how to get it. Sizes and memory of diffusion models are estimates for a photo of 12
     megapixels on an RTX 4090; --plan estimates them for another photo or GPU."""
     rows = [describe(model) for model in zoo.MODELS.values()]
     if as_json:
-        print_out(
-            json.dumps([*rows, *(asdict(model) | _resources(model) for model in DIFFUSION_MODELS.values())])
-        )
+        networks = map(_describe_network, PUBLISHED_NETWORKS.values())
+        diffusion = (asdict(model) | _resources(model) for model in DIFFUSION_MODELS.values())
+        print_out(json.dumps([*rows, *networks, *diffusion]))
         return
     for row in rows:
         size = f"{row['bytes'] / 1e6:.1f} MB" if row["error"] is None else "damaged"
         print_out(f"{row['name']:20} {size:>10}  {row['licence']}")
+    for network in map(_describe_network, PUBLISHED_NETWORKS.values()):
+        print_out(f"{network['name']:20} {network['model_mb']:>7} MB  {network['licence']}")
+        print_out(
+            f"{'':33}{network['seconds']:.0f} s for a photo of 12 megapixels ({network['measured']}), "
+            f"{network['memory_gib']:g} GiB memory"
+        )
+        print_out(f"{'':33}published: {network['psnr']} dB, {PROTOCOL}")
+        state = "installed" if network["is_installed"] else f"brewster models install {network['name']}"
+        print_out(f"{'':33}{state}")
     for model in DIFFUSION_MODELS.values():
         needs = _resources(model)
         size = needs["text_encoder_gb"]
@@ -85,6 +103,85 @@ def _resources(model: DiffusionModel) -> dict[str, Any]:
         "weight_format": plan.placement.quantization or "bf16",
         "offloaded_memory_gib": round(offloaded.total_gib, 1),
     }
+
+
+def _describe_network(network: PublishedNetwork) -> dict[str, Any]:
+    """Returns the properties of a published network as JSON values."""
+    facts, (seconds, measured) = network.installed() or {}, network.seconds_per_photo()
+    return asdict(network) | {
+        "licence": network.licence,
+        "seconds": round(seconds, 1),
+        "measured": measured,
+        "memory_gib": facts.get("memory_gib") or network.memory_gib,
+        "is_installed": bool(facts),
+    }
+
+
+_NETWORKS = click.argument("names", nargs=-1, required=True, type=click.Choice([*PUBLISHED_NETWORKS]))
+
+
+@models.command
+@_NETWORKS
+@flag("--yes", help="Do not ask.")
+@click.option(
+    "--checkpoint",
+    metavar="FILE",
+    type=FILE,
+    help="The checkpoint of the publishers, if it is on this machine.",
+)
+@click.option(
+    "--source",
+    metavar="FOLDER",
+    type=FILE,
+    help=f"A checkout of XReflection at commit {COMMIT[:12]}; by default, it is downloaded.",
+)
+@click.option(
+    "--python",
+    metavar="FILE",
+    type=FILE,
+    help="A Python that has the packages of brewster/models/xreflection_requirements.txt; by default, they are installed into a "
+    "temporary environment.",
+)
+def install(*, names: tuple[str, ...], yes: bool, **options: Path | None) -> None:
+    """Download published networks and convert them to ONNX: dsrnet, rdnet, dsit.
+
+    Prints the source, the size and the licence, and asks once. The code of the authors, XReflection, and torch are installed into
+    a temporary environment. Each network is compared with the code of its authors, and measured on this machine. The same
+    command resumes an interrupted installation."""
+    from brewster.inference.network_install import DISK_GIB, install, work_folder  # noqa: PLC0415  (imports ONNX Runtime)
+
+    if options["checkpoint"] and len(names) > 1:
+        raise click.UsageError("--checkpoint is for one network.")
+    for network in (PUBLISHED_NETWORKS[name] for name in names):
+        print_status(
+            f"{network.name}: {network.url}, converted {network.model_mb} MB; licence: {network.licence}"
+        )
+    print_status(
+        f"with the code {REPOSITORY} and torch, all in {work_folder()} until then: up to {DISK_GIB:g} GiB"
+    )
+    if not yes:
+        click.confirm("Download and install?", abort=True, err=True)
+    for network in (PUBLISHED_NETWORKS[name] for name in names):
+        with progress(1, shown=True) as update:
+            install(
+                network,
+                **options,
+                status=print_status,
+                on_bytes=lambda received, size: update(received / size, network.url),
+            )
+        print_status(f"{network.name} is installed; use it with: --model {network.name}")
+    shutil.rmtree(work_folder())
+
+
+@models.command
+@_NETWORKS
+def remove(*, names: tuple[str, ...]) -> None:
+    """Remove installed networks, and the files of interrupted installations."""
+    folder = PUBLISHED_NETWORKS[names[0]].folder.parent
+    for name in (*names, "installing"):
+        if (folder / name).exists():
+            shutil.rmtree(folder / name)
+            print_status(f"{folder / name} was removed")
 
 
 @models.command("import")
@@ -167,7 +264,7 @@ def card(*, name: str, scores: Path | None) -> None:
     """Print the model card of a model or of a LoRA folder: licence, training data, scores, limitations."""
     if scores:
         _update_scores(Path(name), scores)
-    is_folder = name not in zoo.MODELS and Path(name).is_dir()
+    is_folder = name not in (*zoo.MODELS, *PUBLISHED_NETWORKS) and Path(name).is_dir()
     print_out(_read_card(Path(name)) if is_folder else zoo.find_model(name).card())
 
 
@@ -186,7 +283,7 @@ def path(*, name: str) -> None:
 @click.pass_context
 def verify(context: click.Context, *, names: tuple[str, ...], as_json: bool) -> None:
     """Verify the checksums of the model files, by default of all models."""
-    rows = [describe(zoo.find_model(name)) for name in names or zoo.MODELS]
+    rows = [describe(zoo.find_model(name)) for name in names or zoo.installed_models()]
     if as_json:
         print_out(json.dumps(rows))
     for row in rows:

@@ -22,6 +22,7 @@ from brewster.errors import BrewsterError, OutputError
 from brewster.files import absolute, check_output_folder
 from brewster.image_formats import FormatName, canonical_format, format_of
 from brewster.models import zoo
+from brewster.models.published_networks import PUBLISHED_NETWORKS
 from brewster.options import BurstOptions, Options
 from brewster.remote_path import Location, location
 
@@ -72,7 +73,7 @@ class _FormatChoice(click.Choice[str]):
 def _complete_model(
     _context: click.Context, _param: click.Parameter, incomplete: str
 ) -> list[CompletionItem]:
-    names = [name for name in (*zoo.MODELS, *zoo.DIFFUSION_NAMES) if name.startswith(incomplete)]
+    names = [name for name in (*zoo.installed_models(), *zoo.DIFFUSION_NAMES) if name.startswith(incomplete)]
     return [*map(CompletionItem, names), CompletionItem(incomplete, type="file")]
 
 
@@ -208,7 +209,7 @@ def separate(
             output and absolute(location(output)),
         )
         contact_sheet = contact_sheet and contact_sheet.absolute()
-        names = {*zoo.MODELS, *zoo.DIFFUSION_NAMES, None}
+        names = {*zoo.installed_models(), *zoo.DIFFUSION_NAMES, None}
         models = {
             name: getattr(options, name) for name in ("model", "base_model", "transformer", "fast_lora")
         }
@@ -219,6 +220,9 @@ def separate(
             hints=options.hints and options.hints.absolute(),
             **{name: os.path.abspath(path) for name, path in files.items()},  # noqa: PTH100
         )
+    if workers and not cluster and options.model in PUBLISHED_NETWORKS:
+        workers = None
+        print_status(f"one photo at a time, with all processors, because {options.model} needs much memory")
     # An unknown name is an error, even if no photo needs the model. Nothing is loaded.
     zoo.model_name(options.model)
     skipped: list[Location] = []

@@ -21,6 +21,7 @@ from brewster.benchmarks.image_files import Case
 from brewster.errors import BrewsterError, PhotoError
 from brewster.files import is_image_file, normalised, walk, write_atomically
 from brewster.inference import Separator
+from brewster.models.published_networks import PUBLISHED_NETWORKS
 from brewster.models.zoo import find_model, is_diffusion_model
 from brewster.options import Device, Quality
 from brewster.photo import Photo
@@ -123,8 +124,8 @@ class ModelMethod:
 
     @property
     def exclusive(self) -> bool:
-        """True for diffusion models, because a GPU has memory for only one of them."""
-        return is_diffusion_model(self.model)
+        """True for diffusion models and published networks, because there is memory for only one of them."""
+        return is_diffusion_model(self.model) or self.model in PUBLISHED_NETWORKS
 
     def about(self) -> dict[str, str]:
         """Returns the kind of method, the digest of the model file, and the quality."""
@@ -171,7 +172,7 @@ class ModelMethod:
 
     @cached_property
     def _sha256(self) -> str:
-        if not self.exclusive:
+        if not is_diffusion_model(self.model):
             return find_model(self.model).verify()
         from brewster.models.diffusion.pipeline import fingerprint  # noqa: PLC0415  (imports numba)
 

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import os
+from contextlib import nullcontext
 from pathlib import Path
+from threading import Lock
 from typing import Final, final
 
 import numpy as np
@@ -38,13 +40,15 @@ class OnnxBackend:
     `reflection`. Thread-safe.
 
     `takes_hints` tells whether it has a second input `hints` (1, 2, H, W), see `brewster.photo.Hints`.
+    With `is_large`, one tile at a time is computed, and the file is not read into memory as a whole.
     `device` is a name from `DEVICES`; "auto" selects the first one that starts, in order of preference.
     Raises ModelError if the file is not an ONNX model, or has other inputs and outputs, and
     DeviceError if the device is unknown, not available, or does not start with this model.
     """
 
-    def __init__(self, model: Path, device: str = "auto") -> None:
-        data, reason = model.read_bytes(), ""
+    def __init__(self, model: Path, device: str = "auto", *, is_large: bool = False) -> None:
+        self._one_at_a_time = Lock() if is_large else nullcontext()
+        data, reason = str(model) if is_large else model.read_bytes(), ""
         for candidate in _candidates(device):
             try:
                 session = _create_session(model, data, candidate)
@@ -77,7 +81,8 @@ class OnnxBackend:
             padded = np.pad(image, [*margins, (0, 0)], mode="symmetric")
             feed[name] = np.ascontiguousarray(padded.transpose(2, 0, 1)[None], dtype=np.float32)
         try:
-            outputs = self._session.run(["transmission", "reflection"], feed)
+            with self._one_at_a_time:
+                outputs = self._session.run(["transmission", "reflection"], feed)
         except Exception as error:
             raise ModelError(
                 f"the model failed on a tile of {width}x{height} pixels ({_first_line(error)})",
@@ -114,7 +119,7 @@ def _first_line(error: Exception) -> str:
     return str(error).splitlines()[0][:120] if str(error) else type(error).__name__
 
 
-def _create_session(model: Path, data: bytes, device: str) -> ort.InferenceSession:
+def _create_session(model: Path, data: bytes | str, device: str) -> ort.InferenceSession:
     """Creates a session on the device. If the libraries of the device do not load, ONNX Runtime uses the CPU."""
     options = ort.SessionOptions()
     options.log_severity_level = 3

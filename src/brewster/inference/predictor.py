@@ -94,18 +94,32 @@ class Predictor(ABC):
 class MultiScalePredictor(Predictor):
     """Runs a `Backend` at several input scales, with and without a horizontal flip, and averages the outputs."""
 
-    def __init__(self, backend: Backend) -> None:
+    def __init__(
+        self,
+        backend: Backend,
+        scales: tuple[int, ...] | None = None,
+        *,
+        flips: bool = True,
+        tile_px: int = _TILE_PX,
+    ) -> None:
+        """By default, the input scales are `QUALITIES`, each with a flip. With given `scales` in pixels, as for a large network,
+        standard runs all of them, and draft only the smallest, once and without a flip."""
         self._backend = backend
+        self._scales: dict[Quality, tuple[int, ...]] = (
+            {"draft": scales[:1], "standard": scales} if scales else QUALITIES
+        )
+        self._flipped_qualities = [name for name in QUALITIES if flips and (name == "standard" or not scales)]
+        self._tile_px = tile_px
         self.takes_hints = getattr(backend, "takes_hints", False)
 
     def input_sizes(self, size: tuple[int, int], quality: Quality) -> list[tuple[int, int]]:
-        """Returns the sizes of the inputs with the numbers of pixels in `QUALITIES`. No input is larger than the photo.
+        """Returns the sizes of the inputs with the numbers of pixels of the scales. No input is larger than the photo.
 
         Inputs whose short side would be below 160 px are enlarged to 160 px, by a factor of at most 3.
         """
         width, height = size
         sizes = []
-        for pixels in QUALITIES[quality]:
+        for pixels in self._scales[quality]:
             scale = math.sqrt(pixels / (width * height))
             scale = min(1.0, max(scale, min(_MAX_ENLARGEMENT * scale, _MIN_SHORT_SIDE_PX / min(size))))
             sizes.append((max(1, round(width * scale)), max(1, round(height * scale))))
@@ -114,30 +128,31 @@ class MultiScalePredictor(Predictor):
     def __call__(
         self,
         inputs: Sequence[Floats],
-        quality: Quality,  # noqa: ARG002
+        quality: Quality,
         on_progress: ProgressCallback,
     ) -> Prediction:
-        """Returns the mean over input scales and flips. The confidence is high where the outputs agree."""
+        """Returns the mean over input scales and flips. The confidence is high where the outputs agree, and 0 for one output."""
         size = inputs[-1].shape[:2]
         changes, reflections = [], []
-        for scaled_input, direction in product(
-            inputs, (1, -1)
-        ):  # -1 flips the input, and flips the outputs back
+        # -1 flips the input, and flips the outputs back
+        passes = list(product(inputs, (1, -1) if quality in self._flipped_qualities else (1,)))
+        for scaled_input, direction in passes:
             layers = run_tiled(
                 self._run_backend,
                 np.ascontiguousarray(scaled_input[:, ::direction]),
-                tile_px=_TILE_PX,
+                tile_px=self._tile_px,
                 overlap_px=_OVERLAP_PX,
             )
             transmission, reflection = (layer[:, ::direction] for layer in layers)
             changes.append(upsample_rows(transmission - scaled_input[..., :3], 0, size[0], size))
             reflections.append(upsample_rows(reflection, 0, size[0], size))
-            on_progress(len(changes) / (2 * len(inputs)))
+            on_progress(len(changes) / len(passes))
         transmissions_encoded = to_encoded(np.maximum(inputs[-1][..., :3] + np.stack(changes), 0))
+        confidence = confidence_from_spread(np.ptp(transmissions_encoded, axis=0))
         return Prediction(
             np.mean(changes, axis=0),
             np.mean(reflections, axis=0),
-            confidence_from_spread(np.ptp(transmissions_encoded, axis=0)),
+            confidence if len(passes) > 1 else np.zeros_like(confidence),
         )
 
     def _run_backend(self, tile: Floats) -> tuple[Floats, Floats]:

@@ -124,10 +124,18 @@ class Separator:
             )
         model_file = find_model(model)
         digest = model_file.verify()
-        backend = OnnxBackend(model_file.path, options.get("device", Options.device))
-        is_shipped = model_file.sha256 is not None
+        network = model_file.network
+        backend = OnnxBackend(
+            model_file.path, options.get("device", Options.device), is_large=network is not None
+        )
+        predictor = MultiScalePredictor(backend)
+        if network:
+            predictor = MultiScalePredictor(
+                backend, network.scales, flips=network.flips, tile_px=network.tile_px
+            )
+        is_shipped = model_file.sha256 is not None and not network
         return cls(
-            backend, name=model_file.name, sha256=digest, device=backend.device, is_calibrated=is_shipped
+            predictor, name=model_file.name, sha256=digest, device=backend.device, is_calibrated=is_shipped
         )
 
     @classmethod

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import difflib
-import hashlib
 import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, final
 
+from brewster.download import file_digest
 from brewster.errors import ModelError
 from brewster.models.diffusion_models import DIFFUSION_MODELS, check_is_converted
+from brewster.models.published_networks import PUBLISHED_NETWORKS, PublishedNetwork
 
 _WEIGHTS: Final = Path(__file__).parent / "weights"
 
@@ -24,24 +25,30 @@ class ModelFile:
     path: Path
     sha256: str | None
     licence: str
+    network: PublishedNetwork | None = None
+    """The row of an installed network."""
 
     def verify(self) -> str:
         """Checks that the file has its expected digest, and returns its SHA-256."""
         try:
-            digest = hashlib.sha256(self.path.read_bytes()).hexdigest()
+            digest = file_digest(self.path, "sha256")
         except OSError as error:
             raise ModelError(
                 f"{self.path} cannot be read ({error.strerror})",
                 f"expected the file of model {self.name}",
-                "check its permissions, or reinstall brewster",
+                f"check its permissions, or {self._reinstall}",
             ) from error
         if self.sha256 not in (None, digest):
             raise ModelError(
                 f"{self.path} has SHA-256 {digest[:12]}...",
                 f"expected {(self.sha256 or '')[:12]}...",
-                "reinstall brewster",
+                self._reinstall,
             )
         return digest
+
+    @property
+    def _reinstall(self) -> str:
+        return f"run: brewster models install {self.name}" if self.network else "reinstall brewster"
 
     def card(self) -> str:
         """The text of the model card, Markdown. It is the file next to the model file with the suffix .md."""
@@ -75,7 +82,7 @@ TINY_PREFIX: Final = "tiny:"
 
 def is_diffusion_model(name: str) -> bool:
     """Whether `name` is that of a diffusion model or LoRA: a registered name, "tiny:" and a name, a folder, or a hub id."""
-    if name in MODELS or Path(name).is_file() or _run_model(name):
+    if name in MODELS or name in PUBLISHED_NETWORKS or Path(name).is_file() or _run_model(name):
         return False
     if name in DIFFUSION_NAMES or name.startswith(TINY_PREFIX) or Path(name).is_dir():
         return True
@@ -110,10 +117,26 @@ def _run_model(name: str) -> Path | None:
     return path if path.is_file() else None
 
 
+def installed_models() -> dict[str, ModelFile]:
+    """The models of this machine by name: the shipped ones, and the published networks that are installed."""
+    networks = {
+        name: ModelFile(name, network.folder / MODEL_FILE, facts["sha256"], network.licence, network)
+        for name, network in PUBLISHED_NETWORKS.items()
+        if (facts := network.installed())
+    }
+    return MODELS | networks
+
+
 def find_model(name: str) -> ModelFile:
     """The model file with this registered name or path. A diffusion model has no single file."""
-    if name in MODELS:
-        return MODELS[name]
+    if found := installed_models().get(name):
+        return found
+    if name in PUBLISHED_NETWORKS:
+        raise ModelError(
+            f"{name} is not installed",
+            "expected a published network, which is downloaded and converted once",
+            f"run: brewster models install {name}",
+        )
     if is_diffusion_model(name):
         raise ModelError(
             f"{name} is a diffusion model, which has no model file",
@@ -133,10 +156,11 @@ def find_model(name: str) -> ModelFile:
     if exported := _run_model(name):
         return ModelFile(path.resolve().name, exported, None, "unknown")
     check_is_converted(name)
-    close = difflib.get_close_matches(name, (*MODELS, *DIFFUSION_MODELS), n=1) if path.name == name else []
+    names = (*MODELS, *PUBLISHED_NETWORKS, *DIFFUSION_MODELS)
+    close = difflib.get_close_matches(name, names, n=1) if path.name == name else []
     raise ModelError(
         f"there is no model {name!r}",
-        f"expected one of {', '.join((*MODELS, *DIFFUSION_MODELS))}, an .onnx file, the folder of a training run, or the folder or hub id of a LoRA",
+        f"expected one of {', '.join(names)}, an .onnx file, the folder of a training run, or the folder or hub id of a LoRA",
         f"did you mean {close[0]}?"
         if close
         else "check the path, or print all models with: brewster models list",

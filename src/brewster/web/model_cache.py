@@ -24,6 +24,8 @@ class ModelRow(BaseModel):
     sha256: str | None
     card: str | None
     """The model card in Markdown: training data, scores, limits."""
+    seconds: float | None = None
+    """The time for a photo of 12 megapixels, for large networks."""
 
 
 @final
@@ -36,7 +38,7 @@ class ModelCache:
 
     def __init__(self, models: Sequence[str] = (), *, device: Device = "auto") -> None:
         self._sources: dict[str, str] = {}
-        for source in dict.fromkeys((*models, *zoo.MODELS)):
+        for source in dict.fromkeys((*models, *zoo.installed_models())):
             name = zoo.model_name(source)
             if name in self._sources:
                 raise ModelError(
@@ -57,13 +59,14 @@ class ModelCache:
         """Returns the name, licence, digest and card of each model."""
         rows = []
         for name, source in self._sources.items():
-            licence, sha256, card = "the licence of its base model", None, None
+            licence, sha256, card, seconds = "the licence of its base model", None, None, None
             if not zoo.is_diffusion_model(source):
                 model = zoo.find_model(source)
                 licence, sha256 = model.licence, model.sha256
+                seconds = model.network.seconds_per_photo()[0] if model.network else None
                 with contextlib.suppress(ModelError):  # a model file that is not in the zoo has no card
                     card = model.card()
-            rows.append(ModelRow(name=name, licence=licence, sha256=sha256, card=card))
+            rows.append(ModelRow(name=name, licence=licence, sha256=sha256, card=card, seconds=seconds))
         return rows
 
     def separator(self, name: str) -> Separator:

@@ -6,24 +6,20 @@ import logging
 import warnings
 from pathlib import Path
 
-import numpy as np
 import onnx
 import torch
-from onnx import ModelProto, TensorProto, helper, numpy_helper
+from onnx import numpy_helper
 from torch import Tensor, nn
 
 from brewster.errors import ModelError
 from brewster.files import write_atomically
 from brewster.models.compact import LinearSeparator
+from brewster.models.half_weights import HALF_SUFFIX, with_half_weights
 from brewster.models.networks import MAX_STRIDE, NetworkEntry
 
 _OPSET = 18
 _PREFIX = "network."
 """The prefix of the weights' names: `LinearSeparator` contains the network."""
-_HALF = "_half"
-"""The suffix of the names of weights in half precision."""
-_MIN_HALF_SIZE = 16
-"""Tensors with fewer values stay float32: they are constants of the graph, such as the coefficients of the sRGB curve."""
 
 
 def export_onnx(network: nn.Module, path: Path, entry: NetworkEntry) -> None:
@@ -56,28 +52,7 @@ def export_onnx(network: nn.Module, path: Path, entry: NetworkEntry) -> None:
     logger.setLevel(level)
     assert program is not None
     model = with_half_weights(program.model_proto)
-    for node in model.graph.node:
-        del node.metadata_props[:]  # stack traces with the paths of this machine
     write_atomically(path, model.SerializeToString(), overwrite=True)
-
-
-def with_half_weights(model: ModelProto) -> ModelProto:
-    """Stores the weights as float16, with casts to float32 before use. Changes `model` in place and returns it.
-
-    ONNX Runtime folds the casts when it loads the file, so that inference takes no extra time.
-    """
-    graph = model.graph
-    casts = []
-    for index, weight in enumerate(graph.initializer):
-        values = numpy_helper.to_array(weight)
-        if values.dtype == np.float32 and values.size >= _MIN_HALF_SIZE:
-            half = weight.name + _HALF
-            casts.append(helper.make_node("Cast", [half], [weight.name], to=TensorProto.FLOAT))
-            graph.initializer[index].CopyFrom(numpy_helper.from_array(values.astype(np.float16), half))
-    nodes = [*casts, *graph.node]
-    del graph.node[:]
-    graph.node.extend(nodes)
-    return model
 
 
 def read_weights(path: Path) -> dict[str, Tensor]:
@@ -92,7 +67,7 @@ def read_weights(path: Path) -> dict[str, Tensor]:
             "check the file",
         ) from error
     return {
-        tensor.name.removeprefix(_PREFIX).removesuffix(_HALF): torch.tensor(
+        tensor.name.removeprefix(_PREFIX).removesuffix(HALF_SUFFIX): torch.tensor(
             numpy_helper.to_array(tensor)
         ).float()
         for tensor in graph.initializer

@@ -70,7 +70,7 @@ async function saveMask() {
 async function loadModels() {
   for (;;) {
     try {
-      byId("model").append(...(await models()).map(({ name }) => new Option(name)));
+      byId("model").append(...(await models()).map(({ name, seconds }) => new Option(seconds ? `${name}, about ${Math.round(seconds)} s a photo` : name, name)));
       break;
     } catch {
       announce("The server does not respond. The page tries again.");

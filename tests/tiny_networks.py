@@ -1,0 +1,87 @@
+"""Tiny networks in the form of XReflection's (folder tiny_xreflection), their checkpoints, and a Python that imports them."""
+
+import os
+import sys
+from pathlib import Path
+
+import torch
+
+TINY_SOURCE = Path(__file__).with_name("tiny_xreflection")
+OPTIONS = {
+    "rdnet": {
+        "type": "RDNet",
+        "channels": [8, 16],
+        "save_memory": True,
+        "pretrained_models": {"cls_model": "cls_model.pth"},
+    },
+    "dsrnet": {"type": "DSRNet", "width": 4},
+}
+
+
+def tiny_module(name):
+    """Returns the tiny network with random weights, and its features or None."""
+    sys.path.insert(0, str(TINY_SOURCE))
+    try:
+        from xreflection.archs import build_network
+        from xreflection.losses import vgg
+    finally:
+        sys.path.remove(str(TINY_SOURCE))
+    torch.manual_seed(3)
+    options = dict(OPTIONS[name])
+    if name == "rdnet":
+        options |= {"channels": list(options["channels"]), "save_memory": False, "pretrained_models": {}}
+        return build_network(options), None
+    features = torch.nn.Module.__new__(vgg.Vgg19)
+    torch.nn.Module.__init__(features)
+    features.features = vgg.models.vgg19(weights=None)
+    return build_network(options), features
+
+
+def tiny_checkpoint(name, path):
+    """Writes a checkpoint as XReflection's trainer (Lightning) does, with the state of Adam."""
+    network, features = tiny_module(name)
+    optimizer = torch.optim.Adam(network.parameters(), lr=0)
+    sum(weights.sum() for weights in network.parameters()).backward()
+    optimizer.step()
+    weights = {f"net_g.{key}": value for key, value in network.state_dict().items()}
+    if features:
+        weights |= {f"vgg.{key}": value for key, value in features.state_dict().items()}
+    reversed_options = OPTIONS[name] | ({"channels": [16, 8]} if name == "rdnet" else {})
+    saved = {
+        "epoch": 1,
+        "global_step": 1,
+        "pytorch-lightning_version": "2.6.6",
+        "state_dict": weights,
+        "optimizer_states": [optimizer.state_dict()],
+        "lr_schedulers": [],
+        "hyper_parameters": {
+            "opt": {"network_g": reversed_options, "model_type": f"{OPTIONS[name]['type']}Model"}
+        },
+    }
+    torch.save(saved, path)
+    return path
+
+
+def tiny_python(path):
+    """Writes a program that is this Python with the tiny networks' modules in place of an environment's."""
+    path.write_text(f'#!/bin/sh\nshift\nPYTHONPATH={TINY_SOURCE} exec {sys.executable} "$@"\n')
+    path.chmod(0o755)
+    return path
+
+
+def install_arguments(name, folder):
+    """Returns the arguments of `brewster models install` that install a tiny network without a connection."""
+    python = tiny_python(folder / "tiny-python")
+    checkpoint = tiny_checkpoint(name, folder / f"{name}.ckpt")
+    return [
+        "models",
+        "install",
+        name,
+        "--yes",
+        "--checkpoint",
+        checkpoint,
+        "--source",
+        TINY_SOURCE,
+        "--python",
+        python,
+    ]

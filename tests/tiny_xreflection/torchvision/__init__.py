@@ -1,0 +1,3 @@
+"""Only what XReflection needs of torchvision, which has no build for the torch of these tests."""
+
+from torchvision import models  # noqa: F401

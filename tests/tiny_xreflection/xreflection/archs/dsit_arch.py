@@ -1,0 +1,1 @@
+from xreflection.archs.swin_det import window_reverse  # noqa: F401
