@@ -1,6 +1,5 @@
 """Tiny networks in the form of XReflection's (folder tiny_xreflection), their checkpoints, and a Python that imports them."""
 
-import os
 import sys
 from pathlib import Path
 
@@ -22,8 +21,8 @@ def tiny_module(name):
     """Returns the tiny network with random weights, and its features or None."""
     sys.path.insert(0, str(TINY_SOURCE))
     try:
-        from xreflection.archs import build_network
-        from xreflection.losses import vgg
+        from xreflection.archs import build_network  # noqa: PLC0415
+        from xreflection.losses import vgg  # noqa: PLC0415
     finally:
         sys.path.remove(str(TINY_SOURCE))
     torch.manual_seed(3)

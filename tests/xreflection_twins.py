@@ -21,10 +21,10 @@ SCALES = ("a", "b", "a_l", "a_r", "b_l", "b_r", "beta", "gamma", "gamma_1", "gam
 def build(xreflection, name):
     """Returns XReflection's own Lightning module with random weights."""
     sys.path[:0] = [str(ROOT / "src/brewster/models"), str(xreflection)]
-    from xreflection_converter import import_torchvision
+    from xreflection_converter import import_torchvision  # noqa: PLC0415
 
     library = import_torchvision()
-    import torchvision
+    import torchvision  # noqa: PLC0415
 
     options = yaml.safe_load((xreflection / "options" / OPTIONS[name]).read_text())
     options["path"]["visualization"] = "visualization"
@@ -33,9 +33,9 @@ def build(xreflection, name):
         del options["network_g"]["pretrained_models"]
     torch.manual_seed(5)
     random_vgg19 = torchvision.models.vgg19
-    import xreflection.archs.dsit_arch as dsit
-    import xreflection.archs.swin_det as swin
-    from xreflection.models import build_model
+    import xreflection.archs.dsit_arch as dsit  # noqa: PLC0415
+    import xreflection.archs.swin_det as swin  # noqa: PLC0415
+    from xreflection.models import build_model  # noqa: PLC0415
 
     def random_swin(_):
         heads = [6, 12, 24, 48]
@@ -59,7 +59,7 @@ def build(xreflection, name):
 
 
 def save(model, path):
-    import lightning
+    import lightning  # noqa: PLC0415
 
     trainer = lightning.Trainer(
         accelerator="cpu", logger=False, enable_checkpointing=False, enable_progress_bar=False, max_epochs=1
