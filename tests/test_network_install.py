@@ -287,7 +287,8 @@ def test_the_server_offers_installed_networks_with_their_time(installed):
 def test_evaluation_scores_a_network_beside_ours(run_without_model, installed, tmp_path):
     for folder, seed in (("blended", 1), ("transmission_layer", 2)):
         (tmp_path / "pairs" / folder).mkdir(parents=True)
-        (tmp_path / "pairs" / folder / "a.png").write_bytes(image_bytes(100, 70, "png", seed))
+        pixels = Photo.open(image_bytes(100, 70, "png", seed)).pixels // 4 * 3  # no clipped light
+        Photo.from_array(pixels, encoding="srgb").save(tmp_path / "pairs" / folder / "a.png")
     arguments = (
         "evaluate",
         "--benchmark",
@@ -309,8 +310,7 @@ def test_evaluation_scores_a_network_beside_ours(run_without_model, installed, t
         next((tmp_path / "out" / "predictions" / "rdnet").rglob("a.transmission.png"))
     ).pixels
     expected, _ = authors_layers("rdnet", resized)
-    is_dark = (resized.max(axis=2) < 230)[..., None]
-    assert np.abs((written / 255 - expected) * is_dark).max() < 6e-3  # half weights, and 8 bits
+    assert np.abs(written / 255 - expected).max() < 6e-3  # half weights, and 8 bits
 
 
 def test_a_burst_takes_the_network_as_its_prior(installed, rng):
