@@ -5,20 +5,22 @@ The slow test does the same with XReflection's own code, at full size."""
 import dataclasses
 import json
 import os
+import shutil
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
 from brewster import Photo, Separator, separate_burst
-from brewster.download import Downloader
+from brewster.download import Downloader, file_digest
 from brewster.errors import BrewsterError
 from brewster.inference import network_install
 from brewster.inference.onnx_backend import OnnxBackend
 from brewster.models import zoo
 from brewster.models.published_networks import COMMIT, PUBLISHED_NETWORKS
 from brewster.options import Options
-from brewster.srgb import to_encoded
+from brewster.srgb import to_encoded, to_linear
 from brewster.web.application import create_app
 from brewster.web.job_queue import JobQueue
 from brewster.web.middleware import AccessPolicy
@@ -30,7 +32,8 @@ from other_processes import finished
 from tiny_networks import TINY_SOURCE, install_arguments, tiny_checkpoint, tiny_module, tiny_python
 from web_servers import form, request
 
-CONVERTER = "models/xreflection_converter"
+CONVERTER = Path(network_install.__file__).parents[1] / "models" / "xreflection_converter.py"
+pytestmark = pytest.mark.timeout(300)  # torch is imported, and networks are exported, in other processes
 SIZES = ((64, 96), (301, 215), (75, 33))
 """(height, width); two are no multiples of 32."""
 
@@ -84,11 +87,7 @@ def test_the_converted_network_computes_the_layers_of_its_authors(installed, cac
     if not zoo.installed_models().get(name):
         install_tiny(name, cache)
     kind, checkpoint = PUBLISHED_NETWORKS[name].kind, cache / f"{name}.ckpt"
-    converter = [
-        cache / "tiny-python",
-        "-I",
-        network_install.__file__.replace("inference/network_install", CONVERTER),
-    ]
+    converter = [cache / "tiny-python", "-I", CONVERTER]
     process = finished([*converter, TINY_SOURCE, checkpoint, kind, tmp_path])
     assert process.returncode == 0, process.stderr
     full = OnnxBackend(tmp_path / "full.onnx", "cpu", is_large=True)
@@ -325,3 +324,81 @@ def test_an_option_of_a_diffusion_model_is_refused(installed):
     with pytest.raises(BrewsterError, match="expected a diffusion model"):
         Separator.load("rdnet", steps=4)
     assert not Options(model="rdnet").steps
+
+
+@pytest.fixture(scope="session")
+def xreflection(tmp_path_factory):
+    """The checkout of XReflection, and a Python with its packages."""
+    source = Path(os.environ.get("BREWSTER_XREFLECTION", "no-folder"))
+    if not source.is_dir() or network_install.code_digest(source) != network_install.CODE_DIGEST:
+        pytest.skip(
+            f"no code of the authors: set BREWSTER_XREFLECTION to a checkout of XReflection at {COMMIT}"
+        )
+    python = os.environ.get("BREWSTER_XREFLECTION_PYTHON")
+    if not python:
+        try:
+            python = network_install._environment(tmp_path_factory.mktemp("environment"), print)
+        except BrewsterError as error:
+            pytest.skip(f"no packages for XReflection: {error}")
+    return source, python
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(5400)
+@pytest.mark.parametrize("name", ["rdnet", "dsrnet", "dsit"])
+def test_twins_of_the_published_networks_compute_what_the_test_loop_of_their_authors_computes(
+    xreflection, run_without_model, tmp_path, monkeypatch, rng, name
+):
+    """Full size, random weights, three sizes of which two are no multiples of 32 (their loader resizes them)."""
+    (source, python), network, pairs = xreflection, PUBLISHED_NETWORKS[name], tmp_path / "pairs"
+    for index, (height, width) in enumerate(((160, 224), (301, 215), (270, 320))):
+        small = rng.uniform(
+            0, 0.55, (height // 8 + 1, width // 8 + 1, 3)
+        )  # no clipped light, for which brewster has a rule
+        pixels = (255 * np.kron(small, np.ones((8, 8, 1)))[:height, :width]).astype(np.uint8)
+        for folder in ("blended", "transmission_layer"):
+            Photo.from_array(pixels, encoding="srgb").save(pairs / folder / f"{index}.png")
+    twins = [python, Path(__file__).with_name("xreflection_twins.py")]
+    for command in (
+        [*twins, "save", source, name, tmp_path / "twin.ckpt"],
+        [*twins, "test", source, name, tmp_path / "twin.ckpt", pairs, tmp_path / "loop.npz"],
+        [python, "-I", CONVERTER, source, tmp_path / "twin.ckpt", network.kind, tmp_path],
+    ):
+        process = finished(command)
+        assert process.returncode == 0, process.stderr
+    loop = dict(np.load(tmp_path / "loop.npz"))
+    full = OnnxBackend(tmp_path / "full.onnx", "cpu", is_large=True)
+    for index in range(3):
+        layers = [to_encoded(layer) for layer in full(to_linear(loop[f"I_{index}"]))]
+        errors = [
+            float(np.abs(layer - loop[f"{kind}_{index}"]).max())
+            for kind, layer in zip("TR", layers, strict=True)
+        ]
+        print(name, loop[f"I_{index}"].shape, errors)
+        assert max(errors) < 1e-3
+        assert np.abs(layers[0] - loop[f"R_{index}"]).max() > 0.05
+    del full
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    network.folder.mkdir(parents=True)
+    shutil.move(tmp_path / "half.onnx", network.folder / zoo.MODEL_FILE)
+    facts = {"sha256": file_digest(network.folder / zoo.MODEL_FILE, "sha256")}
+    network_install._write_facts(network, network.folder, facts)
+    arguments = (
+        "evaluate",
+        "--benchmark",
+        f"pairs={pairs}",
+        "--protocol",
+        "xreflection",
+        "-o",
+        tmp_path / "out",
+    )
+    code, _, err = run_without_model(*arguments, "--model", name, "--quality", "draft")
+    assert code == 0, err
+    for index in range(3):  # the files that brewster scores
+        read = Photo.open(next((tmp_path / "out" / "inputs").rglob(f"{index}.png"))).pixels
+        assert np.abs(read / 255 - loop[f"I_{index}"]).max() < 1e-6
+        written = Photo.open(
+            next((tmp_path / "out" / "predictions").rglob(f"{index}.transmission.png"))
+        ).pixels
+        print(name, "half weights, 8 bits:", np.abs(written / 255 - loop[f"T_{index}"]).max())
+        assert np.abs(written / 255 - loop[f"T_{index}"]).mean() < 4e-3

@@ -1,6 +1,7 @@
-"""Writes a twin of a published checkpoint: random weights, in the form in which XReflection's trainer saves them.
+"""Twins of the published checkpoints: random weights, in the form in which XReflection's trainer saves them; and its test loop.
 
-    ENVIRONMENT/bin/python tests/xreflection_twins.py XREFLECTION rdnet|dsrnet|dsit twin.ckpt
+    ENVIRONMENT/bin/python tests/xreflection_twins.py save XREFLECTION rdnet|dsrnet|dsit twin.ckpt
+    ENVIRONMENT/bin/python tests/xreflection_twins.py test XREFLECTION rdnet|dsrnet|dsit twin.ckpt PAIRS layers.npz
 
 The environment is that of `brewster models install`. The residual scales, which start at zero, are random too: otherwise, a test
 would compare identities. With the Adam state of one step, as in the published files.
@@ -10,6 +11,7 @@ import sys
 from pathlib import Path
 from unittest.mock import patch
 
+import numpy as np
 import torch
 import yaml
 
@@ -55,6 +57,8 @@ def build(xreflection, name):
                 weights.copy_(0.3 * torch.randn_like(weights))
             elif leaf.startswith("alpha"):
                 weights.copy_(0.5 + 0.2 * torch.randn_like(weights))
+            elif path.startswith("out."):  # the layers of DSRNet and DSIT would be nearly black
+                weights.copy_(10 * weights if leaf == "weight" else torch.full_like(weights, 0.5))
     return model, library
 
 
@@ -77,6 +81,40 @@ def save(model, path):
     trainer.save_checkpoint(path)
 
 
+def run_test_loop(model, checkpoint, pairs, target):
+    """Runs the test loop of XReflection, as its train.py does with --test_only. Writes the photos that its loader reads, and the
+    layers that it scores: (H, W, 3) sRGB in 0..1."""
+    import lightning  # noqa: PLC0415
+    from xreflection.data import build_dataloader, build_dataset  # noqa: PLC0415
+
+    options = dict(model.opt["datasets"]["val_datasets"][0]) | {
+        "datadir": str(pairs),
+        "phase": "test",
+        "num_worker_per_gpu": 0,
+    }
+    loader = build_dataloader(build_dataset(options), options)
+    model.opt["val"]["save_img"] = False
+    found, step = {}, model.validation_step
+
+    def recorded(batch, *arguments):
+        outputs = step(batch, *arguments)
+        layers = (batch["input"], outputs["output_clean"], outputs["output_reflection"])
+        for kind, image in zip("ITR", layers, strict=True):
+            found[f"{kind}_{outputs['img_name']}"] = image[0].permute(1, 2, 0).clamp(0, 1).numpy()
+        return outputs
+
+    model.validation_step = recorded
+    trainer = lightning.Trainer(
+        accelerator="cpu", logger=False, enable_checkpointing=False, enable_progress_bar=False
+    )
+    trainer.test(model, dataloaders=[loader], ckpt_path=checkpoint)
+    np.savez(target, **found)
+
+
 if __name__ == "__main__":
-    module, _library = build(Path(sys.argv[1]), sys.argv[2])
-    save(module, sys.argv[3])
+    task, source, network, path, *others = sys.argv[1:]
+    module, _library = build(Path(source), network)
+    if task == "save":
+        save(module, path)
+    else:
+        run_test_loop(module, path, *others)
