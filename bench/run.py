@@ -1,7 +1,7 @@
 """Runs all benchmarks. This is the script of `make bench`.
 
 The benchmarks measure the quality on the development pairs, compared with the unprocessed input and another method; the
-change of photos without reflection; the time and memory for a 12-megapixel photo and a burst; the speed of metrics, compared with other
+change of photos without reflection; the time and memory for a 12-megapixel photo, a burst and installed published networks; the speed of metrics, compared with other
 packages; a large evaluation; the renderer, compared with Mitsuba; and both servers under load.
 
     BREWSTER_DATA=../shared/data .venv/bin/python bench/run.py
@@ -14,6 +14,7 @@ from pathlib import Path
 import burst
 import evaluate
 import metrics
+import networks
 import quality
 import reflection_free
 import render
@@ -32,6 +33,7 @@ if __name__ == "__main__":
     reflection_free.main(data)
     speed.main(data)
     burst.speed()
+    networks.main(data)
     metrics.main(data)
     evaluate.main(data)
     render.main(data)
