@@ -161,15 +161,15 @@ def install(*, names: tuple[str, ...], yes: bool, **options: Path | None) -> Non
     )
     if not yes:
         click.confirm("Download and install?", abort=True, err=True)
-    for network in (PUBLISHED_NETWORKS[name] for name in names):
+    for name in names:
         with progress(1, shown=True) as update:
             install(
-                network,
+                PUBLISHED_NETWORKS[name],
                 **options,
                 status=print_status,
-                on_bytes=lambda received, size: update(received / size, network.url),
+                on_bytes=lambda received, size: update(received / size, "download"),  # noqa: B023
             )
-        print_status(f"{network.name} is installed; use it with: --model {network.name}")
+        print_status(f"{name} is installed; use it with: --model {name}")
     shutil.rmtree(work_folder())
 
 

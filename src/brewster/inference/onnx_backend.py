@@ -123,6 +123,8 @@ def _create_session(model: Path, data: bytes | str, device: str) -> ort.Inferenc
     """Creates a session on the device. If the libraries of the device do not load, ONNX Runtime uses the CPU."""
     options = ort.SessionOptions()
     options.log_severity_level = 3
+    if isinstance(data, str):  # a large model: the arena grew from run to run, for RDNet from 3.7 to 5.2 GiB
+        options.enable_cpu_mem_arena = options.enable_mem_pattern = False
     # Ray and our workers limit the number of threads with this variable. ONNX Runtime does not read it.
     threads = os.environ.get("OMP_NUM_THREADS", "").partition(",")[0]
     options.intra_op_num_threads = int(threads) if threads.isdigit() else 0  # 0: one thread per core

@@ -45,7 +45,7 @@ def main(xreflection: Path, checkpoint: Path, kind: str, folder: Path) -> None:
     reference = {
         f"{kind}{i}": image.numpy() for i in (0, 1) for kind, image in zip("ITR", images[i], strict=True)
     }
-    np.savez(folder / "reference.npz", **reference)  # type: ignore[arg-type]
+    np.savez(folder / "reference.npz", **reference)
     make_exportable(separator)
     rows, columns = (32 * torch.export.Dim(name, min=2, max=64) for name in ("rows", "columns"))
     program = torch.onnx.export(
@@ -70,7 +70,7 @@ def import_torchvision() -> Any:  # noqa: ANN401
     """Imports torchvision. If its compiled part does not fit torch, defines the two operators that its import needs. They last as
     long as the result."""
     try:
-        import torchvision  # noqa: F401, PLC0415
+        import torchvision  # noqa: PLC0415
     except RuntimeError:
         for name in [name for name in sys.modules if name.startswith("torchvision")]:
             del sys.modules[name]
