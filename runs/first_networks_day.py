@@ -44,13 +44,18 @@ def tiny(out):
 
 def mean_psnr(results, method):
     """Returns the mean over all pictures, each with the same weight, as XReflection; and their number."""
-    scores = [case["scores"][method]["psnr_channels"] for case in results["cases"] if method in case["scores"]]
+    scores = [
+        case["scores"][method]["psnr_channels"] for case in results["cases"] if method in case["scores"]
+    ]
     return float(np.mean(scores)), len(scores)
 
 
 def report(out, networks):
     lines = ["# The first run on published weights", "", f"Published: {PROTOCOL}.", ""]
-    lines += ["| method | quality | PSNR, dB | pictures | published | difference | papers |", "|---|---|---|---|---|---|---|"]
+    lines += [
+        "| method | quality | PSNR, dB | pictures | published | difference | papers |",
+        "|---|---|---|---|---|---|---|",
+    ]
     for quality in ("draft", "standard"):
         results = json.loads((out / f"evaluate-{quality}" / "results.json").read_text())
         for method in results["methods"]:
@@ -58,12 +63,21 @@ def report(out, networks):
             network = PUBLISHED_NETWORKS.get(method)
             published = float(network.psnr) if network else None
             cells = [published, f"{score - published:+.2f}", PAPERS[method]] if network else ["", "", ""]
-            lines.append(f"| {method} | {quality} | {score:.2f} | {count} | " + " | ".join(map(str, cells)) + " |")
-    lines += ["", f"A difference of less than {AGREEMENT_DB} dB at quality draft, over the same 494 pictures, is agreement.", ""]
+            lines.append(
+                f"| {method} | {quality} | {score:.2f} | {count} | " + " | ".join(map(str, cells)) + " |"
+            )
+    lines += [
+        "",
+        f"A difference of less than {AGREEMENT_DB} dB at quality draft, over the same 494 pictures, is agreement.",
+        "",
+    ]
     for name in networks:
         facts = json.dumps(PUBLISHED_NETWORKS[name].installed())
         lines.append(f"- {name}: {facts}")
-    lines += ["", "Pictures: evaluate-draft/report.html and evaluate-standard/report.html; scores per set: tables.md beside them."]
+    lines += [
+        "",
+        "Pictures: evaluate-draft/report.html and evaluate-standard/report.html; scores per set: tables.md beside them.",
+    ]
     (out / "report.md").write_text("\n".join(lines) + "\n")
     print(f"the report is {out / 'report.md'}")
 

@@ -13,6 +13,7 @@ from brewster.cli import doctor, extras
 from brewster.cli.extras import CORE, EXTRAS
 from brewster.models import zoo
 from brewster.models.diffusion_models import DIFFUSION_MODELS
+from brewster.models.published_networks import PUBLISHED_NETWORKS
 
 ROOT = Path(__file__).parents[1]
 
@@ -33,12 +34,17 @@ def test_models_are_listed_with_licence_and_damage(run_without_model, model_zoo)
     code, out, _ = run_without_model("models", "list")
     assert code == 0
     lines = [line for line in out.decode().splitlines() if not line.startswith(" ")]
-    assert [line.split()[0] for line in lines] == ["compact", "research", *DIFFUSION_MODELS]
+    assert [line.split()[0] for line in lines] == [
+        "compact",
+        "research",
+        *PUBLISHED_NETWORKS,
+        *DIFFUSION_MODELS,
+    ]
     assert b"damaged" in out
     rows = json.loads(run_without_model("models", "list", "--json")[1])
     assert rows[0]["licence"] == "Apache-2.0"
     assert rows[1]["error"]
-    assert [row["name"] for row in rows[2:]] == list(DIFFUSION_MODELS)
+    assert [row["name"] for row in rows[2:]] == [*PUBLISHED_NETWORKS, *DIFFUSION_MODELS]
 
 
 def test_a_model_has_a_card_and_a_path(run_without_model, model_zoo):

@@ -167,7 +167,7 @@ def install(*, names: tuple[str, ...], yes: bool, **options: Path | None) -> Non
                 PUBLISHED_NETWORKS[name],
                 **options,
                 status=print_status,
-                on_bytes=lambda received, size: update(received / size, "download"),  # noqa: B023
+                on_bytes=lambda received, size: update(received / size, "download"),
             )
         print_status(f"{name} is installed; use it with: --model {name}")
     shutil.rmtree(work_folder())
