@@ -6,7 +6,7 @@ import { MAX_PHOTOS, describeAdded, readList, readTransfer, watchTransfers } fro
 import { exportAll, exportLayer, save } from "./export.js";
 import { Layers, draw, readPreview } from "./light.js";
 import { SeparationQueue } from "./queue.js";
-import { maskCodes, maskFile } from "./regions.js";
+import { hintsFile, maskCodes, maskFile } from "./marks.js";
 import { createThumbnail, fraction, progressText, setBar, showDecoded, showFile, showOneScene, statusText, summarise, updateThumbnail, watchScrolling } from "./filmstrip.js";
 import { TileSet } from "./tiles.js";
 import { createTools } from "./tools.js";
@@ -35,7 +35,7 @@ const chosen = (name) => document.querySelector(`input[name=${name}]:checked`).v
 const settings = () => ({ quality: chosen("quality"), model: byId("model").value });
 const queue = new SeparationQueue(settings, { onChange: refresh, onEnd: finish });
 const exportSettings = () => ({ ...settings(), takesHints: queue.hintModels.has(byId("model").value) });
-const tools = createTools({ onEdit: () => onEdit(), onPaint: () => compare.paint(), saveMask, announce });
+const tools = createTools({ onEdit: () => onEdit(), onPaint: () => compare.paint(), saveMarks, announce });
 compare.editor = tools.editor;
 
 function applySettings() {
@@ -60,10 +60,14 @@ function edit(values) {
   onEdit();
 }
 
-async function saveMask() {
+// Saves the marks in the form of the options --mask and --hints of the command line.
+async function saveMarks() {
   const { file, edits, size } = queue.current;
   const stem = isImage(file.name) ? file.name.replace(/\.[^.]*$/, "") : file.name;
-  save(`${stem}.mask.png`, await maskFile(edits.list, ...size));
+  for (const [kind, createFile] of [["mask", maskFile], ["hints", hintsFile]]) {
+    const png = await createFile(edits.list, ...size);
+    if (png) save(`${stem}.${kind}.png`, png);
+  }
 }
 
 // Repeats the request until the server responds, because no photo can be separated before.
@@ -240,7 +244,7 @@ async function show() {
   compare.fullSize = preview.full;
   if (preview.full[0] > preview.width) compare.tiles = tilesOf(photo, preview);
   tools.offerHints(queue.takesHints(photo));
-  if (!isUpdate) tools.show(photo.edits, preview.full); // a region that is being drawn goes on
+  if (!isUpdate) tools.show(photo.edits, preview.full); // a mark that is being drawn goes on
   refresh();
   paint();
 }
@@ -259,7 +263,7 @@ function tilesOf(photo, preview) {
   });
 }
 
-// Returns the mask of the regions at the size of the reduced photo.
+// Returns the mask of the marks at the size of the reduced photo.
 function currentMask() {
   const { list } = queue.current.edits;
   const { width, height } = shown.preview;

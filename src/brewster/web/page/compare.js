@@ -1,6 +1,6 @@
 // <glass-compare>: shows a photo and one of its layers with the same zoom and pan, separated by a movable line, next to each other,
 // or one at a time. Set `fullSize`, draw the reduced images on the canvases `left` and `right`, set `tiles` (a TileSet, or null),
-// and call `show(...)`; call `paint()` after each change. `editor` draws regions: see editor.js.
+// and call `show(...)`; call `paint()` after each change. `editor` draws marks: see editor.js.
 
 const MAX_PIXEL_SIZE = 16; // maximum size of a photo pixel in screen pixels
 const SHARP_PIXEL_SIZE = 2; // photo pixels of at least this size are drawn as squares
@@ -20,7 +20,7 @@ class GlassCompare extends HTMLElement {
   #centre = { x: 0.5, y: 0.5 }; // the image point in the middle of the view, as fractions of width and height
   #missingTiles = 0; // visible parts that are shown reduced until their tiles arrive
   #pointers = new Map();
-  #dragged = null; // what the pointer drags: "line", "image" or "region"
+  #dragged = null; // what the pointer drags: "line", "image" or "mark"
 
   connectedCallback() {
     this.tabIndex = 0;
@@ -170,7 +170,7 @@ class GlassCompare extends HTMLElement {
     this.#describe(isSlider, line, placement);
   }
 
-  // Draws one image in a pane, from `from` to `to` of its width: the reduced image, the tiles above it, and the regions.
+  // Draws one image in a pane, from `from` to `to` of its width: the reduced image, the tiles above it, and the marks.
   #paintSide(context, side, pane, placement, from, to) {
     const density = this.#density;
     const [x0, x1] = [Math.round((pane.x + from) * density), Math.round((pane.x + to) * density)];
@@ -250,12 +250,12 @@ class GlassCompare extends HTMLElement {
     return [(x - placement.left) / longer, (y - placement.top) / longer];
   }
 
-  // Returns what a pointer drags after it is pressed at a point. While regions are drawn, only the handle of the line drags the line.
+  // Returns what a pointer drags after it is pressed at a point. While marks are drawn, only the handle of the line drags the line.
   #draggedAt(point, target) {
     const hasLine = this.#mode === "slider" && !this.#isBefore;
     const isNear = hasLine && Math.abs(point.x - this.#visible().line) < GRAB_DISTANCE_PX;
     if (this.editor?.isActive) {
-      return target === this.line && Math.abs(point.y - this.clientHeight / 2) < GRAB_DISTANCE_PX ? "line" : "region";
+      return target === this.line && Math.abs(point.y - this.clientHeight / 2) < GRAB_DISTANCE_PX ? "line" : "mark";
     }
     return hasLine && (this.#zoom <= 1 || isNear) ? "line" : "image";
   }
@@ -267,7 +267,7 @@ class GlassCompare extends HTMLElement {
     this.#pointers.set(event.pointerId, point);
     if (this.#pointers.size > 1) return this.editor?.cancel(); // two fingers zoom
     this.#dragged = this.#draggedAt(point, event.target);
-    if (this.#dragged === "region") this.editor.start(this.#inPhoto(point));
+    if (this.#dragged === "mark") this.editor.start(this.#inPhoto(point));
     else if (this.#dragged === "line" && event.pointerType === "mouse") this.#moveLine(point.x);
   }
 
@@ -280,7 +280,7 @@ class GlassCompare extends HTMLElement {
     }
     this.#pointers.set(event.pointerId, now);
     if (this.#pointers.size === 2) this.#pinch(event.pointerId, before, now);
-    else if (this.#dragged === "region") this.editor.move(this.#inPhoto(now));
+    else if (this.#dragged === "mark") this.editor.move(this.#inPhoto(now));
     else if (this.#dragged === "line") this.#moveLine(now.x);
     else this.#pan(now.x - before.x, now.y - before.y);
   }
@@ -294,11 +294,11 @@ class GlassCompare extends HTMLElement {
   }
 
   _pointerup(event) {
-    if (this.#pointers.delete(event.pointerId) && this.#dragged === "region") this.editor.end();
+    if (this.#pointers.delete(event.pointerId) && this.#dragged === "mark") this.editor.end();
   }
 
   _pointercancel(event) {
-    if (this.#pointers.delete(event.pointerId) && this.#dragged === "region") this.editor.cancel();
+    if (this.#pointers.delete(event.pointerId) && this.#dragged === "mark") this.editor.cancel();
   }
 
   _pointerleave(event) {

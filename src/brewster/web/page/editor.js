@@ -1,31 +1,31 @@
-// Draws regions on <glass-compare> with a pointer or with the keyboard, and a tint: dark over the areas that are not separated, with a white
+// Draws marks on <glass-compare> with a pointer or with the keyboard, and a tint: dark over the protected areas, with a white
 // outline, and red and green over hints. The tint is visible while the pointer or the keyboard cursor is on the photo; a finger that is
 // lifted leaves it visible.
 
-import { hintCodes, maskCodes } from "./regions.js";
+import { hintCodes, maskCodes } from "./marks.js";
 
 const KEY_STEP = 0.01; // of the longer side of the photo; five times as much with Shift
 const TINT_OPACITY = 0.3;
 const TINT_MAX_PX = 800; // longer side of the image of the tint
 const MIN_STEP = 0.2; // minimum distance of the points of a stroke, as a fraction of the brush radius
 
-export class RegionEditor {
+export class MarkEditor {
   isActive = false;
-  #drawn = null; // the region that is being drawn
+  #drawn = null; // the mark that is being drawn
   #cursor = null; // position of the pointer or of the keyboard cursor, in fractions of the longer side
   #isTintVisible = true;
   #tint = document.createElement("canvas");
-  #tintKey = null; // the regions and the size of the tint, as text
+  #tintKey = null; // the marks and the size of the tint, as text
 
-  // `tool()` returns {shape, value, hint, radius, feather} of the next region. `onChange()` is called when `list` or the cursor
-  // has changed, `onAdd(region)` with each finished region, and `announce(text)` to tell screen readers what happened.
+  // `tool()` returns {shape, kind, radius, feather} of the next mark. `onChange()` is called when `list` or the cursor
+  // has changed, `onAdd(mark)` with each finished mark, and `announce(text)` to tell screen readers what happened.
   constructor({ tool, onChange, onAdd, announce }) {
     Object.assign(this, { tool, onChange, onAdd, announce });
     this.edits = null; // the Edits of the current photo
     this.size = [1, 1]; // width and height of the photo
   }
 
-  // All regions, including the region that is being drawn.
+  // All marks, including the mark that is being drawn.
   get list() {
     const list = this.edits?.list ?? [];
     return this.#drawn ? [...list, this.#drawn] : list;
@@ -49,9 +49,9 @@ export class RegionEditor {
   }
 
   end() {
-    const region = this.#drawn;
+    const mark = this.#drawn;
     this.#drawn = null;
-    if (region && isVisible(region)) this.onAdd(region);
+    if (mark && isVisible(mark)) this.onAdd(mark);
     else this.onChange();
   }
 
@@ -68,7 +68,7 @@ export class RegionEditor {
     this.onChange();
   }
 
-  // Handles a key: arrows move the cursor, space or Enter starts and ends a region, Escape cancels it. Returns whether the key was handled.
+  // Handles a key: arrows move the cursor, space or Enter starts and ends a mark, Escape cancels it. Returns whether the key was handled.
   press(event) {
     const step = KEY_STEP * (event.shiftKey ? 5 : 1);
     const steps = { ArrowLeft: [-step, 0], ArrowRight: [step, 0], ArrowUp: [0, -step], ArrowDown: [0, step] };
@@ -81,7 +81,7 @@ export class RegionEditor {
     } else if (event.key === " " || event.key === "Enter") {
       const isEnd = this.#drawn !== null;
       isEnd ? this.end() : this.start(this.#cursor);
-      this.announce(isEnd ? "The region ends." : "The region begins. Move with the arrow keys, and press space again to end it.");
+      this.announce(isEnd ? "The mark ends." : "The mark begins. Move with the arrow keys, and press space again to end it.");
     } else if (event.key === "Escape" && this.#drawn) this.cancel();
     else return false;
     return true;
@@ -120,14 +120,13 @@ export class RegionEditor {
     const context = this.#tint.getContext("2d");
     const image = context.createImageData(width, height);
     const mask = maskCodes(list, width, height);
-    const marks = maskCodes(list.map((region) => ({ ...region, value: region.value && 1 })), width, height); // at full strength
-    const isMarked = (i) => marks[i] > 127;
+    const isMarked = (i) => mask[i] > 127;
     const [red, green] = ["reflection", "scene"].map((kind) => hintCodes(list, kind, width, height));
     for (let i = 0; i < red.length; i++) {
       const hint = Math.max(red[i], green[i]);
       if (hint) image.data.set([red[i] >= green[i] ? 255 : 0, red[i] >= green[i] ? 0 : 200, 60], 4 * i);
       image.data[4 * i + 3] = TINT_OPACITY * Math.max(hint, mask ? 255 - mask[i] : 0);
-      const isEdge = marks && ((i % width && isMarked(i) !== isMarked(i - 1)) || (i >= width && isMarked(i) !== isMarked(i - width)));
+      const isEdge = mask && ((i % width && isMarked(i) !== isMarked(i - 1)) || (i >= width && isMarked(i) !== isMarked(i - width)));
       if (isEdge) image.data.fill(255, 4 * i, 4 * i + 4);
     }
     context.putImageData(image, 0, 0);

@@ -2,7 +2,7 @@
 
 import { send } from "./api.js";
 import { burstOptions } from "./queue.js";
-import { hintsFile, maskFile } from "./regions.js";
+import { hintsFile, maskFile } from "./marks.js";
 import { verdictOf } from "./verdict.js";
 import { createZip, crc32, readZip, withUniqueNames } from "./zip.js";
 
@@ -59,7 +59,7 @@ function describeResults(results, files, { model, quality }) {
     if (!own.length) return `${photo.file.name}: ${error ? `failed. ${error}` : "not separated yet"}`;
     const { list, strength, swap } = photo.edits.now;
     const facts = [verdictOf(photo), `strength ${Math.round(100 * strength)} %`];
-    if (list.length) facts.push("with regions");
+    if (list.length) facts.push("with marks");
     if (swap) facts.push("layers exchanged");
     const message = photo.result.message ? `. ${photo.result.message}` : "";
     return `${photo.file.name} -> ${names.splice(0, own.length).join(", ")} (${facts.join(", ")})${message}`;

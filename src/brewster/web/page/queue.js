@@ -2,7 +2,7 @@
 
 import { send } from "./api.js";
 import { isVideo } from "./drop.js";
-import { Edits, hintsFile } from "./regions.js";
+import { Edits, hintsFile, isHint } from "./marks.js";
 
 const MAX_CONCURRENT = 2; // one photo is separated while the next photo is uploaded
 
@@ -60,8 +60,8 @@ export class SeparationQueue {
 
   #mapSettings(photo) {
     const { list, method, swap } = photo.edits.now;
-    const marks = this.takesHints(photo) ? list.filter(({ hint, value }) => hint || value === null) : [];
-    return JSON.stringify([this.settings(), marks.some(({ hint }) => hint) ? marks : [], method, swap === true]);
+    const hints = this.takesHints(photo) && list.some(isHint) ? list : [];
+    return JSON.stringify([this.settings(), hints, method, swap === true]);
   }
 
   // Call this after a change of the settings. A photo is separated again unless its maps were computed with the new settings.

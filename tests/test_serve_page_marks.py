@@ -1,4 +1,4 @@
-"""Regions on the page: pointer, touch and keyboard, and the same mask as on the command line."""
+"""Marks on the page: pointer, touch and keyboard, and the same mask and hints as on the command line."""
 
 import math
 
@@ -42,7 +42,7 @@ def screen_point(page, point):
 
 
 def saved_mask(page):
-    name, data = downloaded(page, page.get_by_role("button", name="Save the mask").click)
+    name, data = downloaded(page, page.get_by_role("button", name="Save the marks").click)
     assert name == "window.mask.png"
     mask = Photo.open(data)
     assert (mask.size, mask.pixels.shape[2], mask.file_info.bits) == (SIZE, 1, 8)
@@ -54,7 +54,7 @@ def set_slider(page, name, value):
 
 
 def test_a_protected_rectangle_stays_the_photo_and_the_command_line_makes_the_same_bytes(page, run, tmp_path):
-    page.get_by_label("Not here").check()
+    page.get_by_label("Leave as it is").check()
     page.get_by_label("Rectangle").check()
     set_slider(page, "Feather", 0)
     drag(page, (60, 50), (150, 120))
@@ -74,24 +74,42 @@ def test_a_protected_rectangle_stays_the_photo_and_the_command_line_makes_the_sa
     assert (Photo.open(made).pixels[54:116, 64:146] == Photo.open(data).pixels[54:116, 64:146]).all()
 
 
-def test_here_separates_only_the_brushed_region_with_its_own_strength(page):
-    page.get_by_label("Here", exact=True).check()
-    set_slider(page, "Strength in the region", 0.5)
+def test_the_edge_of_a_stroke_is_smooth(page):
+    page.get_by_label("Leave as it is").check()
     set_slider(page, "Brush size", 0.1)
     set_slider(page, "Feather", 0.04)
     drag(page, (80, 100), (220, 100))
     _, values = saved_mask(page)
-    assert values[100, 80:220].min() == values.max() == 128  # half of 255, rounded up
-    assert not values[:70].any()
+    assert values[100, 80:220].max() == 0
+    assert values[:70].min() == 255
     edge = values[70:100, 150].astype(int)  # from outside to inside
-    assert (np.diff(edge) >= 0).all()
-    assert len(np.unique(edge)) > 8  # a smooth edge, 12 pixels wide
+    assert (np.diff(edge) <= 0).all()
+    assert len(np.unique(edge)) > 8  # 12 pixels wide
     radius = 0.05 * SIZE[0]
-    assert abs(edge[round(30 - radius)] - 64) <= 8  # half of the strength on the edge of the brush
+    assert abs(edge[round(30 - radius)] - 128) <= 16  # half on the edge of the brush
+
+
+def test_strength_and_reset_are_undone_and_redone_like_marks(page):
+    page.get_by_label("Leave as it is").check()
+    drag(page, (60, 60), (120, 60))
+    strength = page.get_by_label("Strength", exact=True)
+    strength.focus()
+    for _ in range(3):
+        page.keyboard.press("ArrowLeft")
+    shown = canvas(page, "right")
+    page.get_by_role("button", name="Reset").click()
+    amounts = []
+    for keys in ("Control+z", "Control+z", "Control+z", "Control+z", "Control+y"):
+        page.keyboard.press(keys)
+        amounts.append(page.locator("#amount").inner_text())
+        settle(page)
+        if len(amounts) == 1:
+            assert (canvas(page, "right") == shown).all()
+    assert amounts == ["97 %", "98 %", "99 %", "100 %", "99 %"]
 
 
 def test_the_eraser_and_undo_and_redo_restore_the_mask(page):
-    page.get_by_label("Not here").check()
+    page.get_by_label("Leave as it is").check()
     drag(page, (60, 60), (120, 60))
     _, first = saved_mask(page)
     page.get_by_label("Eraser").check()
@@ -106,16 +124,15 @@ def test_the_eraser_and_undo_and_redo_restore_the_mask(page):
     for _ in range(2):
         page.get_by_role("button", name="Undo", exact=True).click()
     assert page.get_by_role("button", name="Undo", exact=True).is_disabled()
-    assert page.get_by_role("button", name="Save the mask").is_disabled()
+    assert page.get_by_role("button", name="Save the marks").is_disabled()
     page.keyboard.press("Control+y")
     page.get_by_role("button", name="Clear").click()
-    assert page.get_by_role("button", name="Save the mask").is_disabled()
+    assert page.get_by_role("button", name="Save the marks").is_disabled()
 
 
 def test_marks_have_a_white_outline_while_the_pointer_is_on_the_photo(page):
-    page.get_by_label("Here", exact=True).check()
+    page.get_by_label("Leave as it is").check()
     page.get_by_label("Rectangle").check()
-    set_slider(page, "Strength in the region", 0.05)
     drag(page, (60, 50), (150, 120))
     view = Photo.open(page.locator("glass-compare").screenshot()).pixels.min(axis=2)
     stage = page.locator("glass-compare").bounding_box()
@@ -129,7 +146,7 @@ def test_marks_have_a_white_outline_while_the_pointer_is_on_the_photo(page):
 
 
 def test_regions_are_drawn_with_the_keyboard(page):
-    page.get_by_label("Not here").check()
+    page.get_by_label("Leave as it is").check()
     page.get_by_label("Rectangle").check()
     page.locator("glass-compare").focus()
     page.keyboard.press("Space")  # in the middle of the photo
@@ -149,7 +166,7 @@ def test_regions_are_drawn_with_the_keyboard(page):
 def test_regions_are_drawn_with_a_finger_and_two_fingers_zoom(open_page):
     page = open_page(viewport={"width": 390, "height": 844}, has_touch=True)
     upload(page, ("window.png", image_bytes(*SIZE, "png")))
-    page.get_by_label("Not here").check()
+    page.get_by_label("Leave as it is").check()
     finger = page.context.new_cdp_session(page)
 
     def touch(kind, *points):
@@ -176,21 +193,21 @@ def test_regions_are_drawn_with_a_finger_and_two_fingers_zoom(open_page):
 
 
 def test_regions_are_copied_to_photos_of_other_sizes_and_reset(page):
-    page.get_by_label("Not here").check()
+    page.get_by_label("Leave as it is").check()
     drag(page, (100, 60), (100, 60))
     upload(page, ("other.png", image_bytes(600, 400, "png")))
     page.get_by_role("button", name="Copy to all photos").click()
     page.locator(".pick").nth(1).click()
     page.wait_for_selector("glass-compare:not([hidden])")
     settle(page)
-    _, data = downloaded(page, page.get_by_role("button", name="Save the mask").click)
+    _, data = downloaded(page, page.get_by_role("button", name="Save the marks").click)
     values = Photo.open(data).pixels[..., 0]
     assert values.shape == (400, 600)
     covered = (255 - values.astype(float)).sum() / 255
     radius = 0.05 * 600
     assert covered == pytest.approx(math.pi * radius**2, rel=0.1)
     page.get_by_role("button", name="Reset").click()
-    assert page.get_by_role("button", name="Save the mask").is_disabled()
+    assert page.get_by_role("button", name="Save the marks").is_disabled()
 
 
 @pytest.fixture
@@ -213,15 +230,17 @@ def hint_page(chromium, tmp_path):
         page.context.close()
 
 
-def test_a_hint_on_the_page_separates_again_and_reaches_the_file_together_with_a_mask(hint_page):
+def test_a_hint_on_the_page_separates_again_and_reaches_the_file_together_with_a_mask(
+    hint_page, run_without_model, tmp_path
+):
     page = hint_page
     assert (canvas(page, "left") == canvas(page, "right")).all()
-    page.get_by_label("Reflection is here").check()
+    page.get_by_label("Mark as reflection").check()
     page.get_by_label("Rectangle").check()
     drag(page, (60, 50), (200, 150))
     page.wait_for_function("() => !document.querySelector('#photos .working, #photos .waiting')")
     settle(page)
-    page.get_by_label("Not here").check()
+    page.get_by_label("Leave as it is").check()
     drag(page, (140, 50), (220, 160))
     settle(page)
     _, made = downloaded(page, page.get_by_role("button", name="Download transmission").click)
@@ -230,3 +249,21 @@ def test_a_hint_on_the_page_separates_again_and_reaches_the_file_together_with_a
         assert pixels[80:120, 80:120].mean() < 0.85 * photo[80:120, 80:120].mean()  # hint: half of the light
         assert (pixels[80:120, 150:190] == photo[80:120, 150:190]).all()  # hint, but protected by the mask
         assert (pixels[170:, :] == photo[170:, :]).all()
+    files = []
+    page.on("download", lambda download: files.append(download))  # noqa: PLW0108  (playwright takes no builtin)
+    page.get_by_role("button", name="Save the marks").click()
+    while len(files) < 2:
+        page.wait_for_timeout(20)
+    for file in files:
+        file.save_as(tmp_path / file.suggested_filename)
+    assert sorted(file.suggested_filename for file in files) == ["window.hints.png", "window.mask.png"]
+    (tmp_path / "window.png").write_bytes(image_bytes(*SIZE, "png"))
+    marks = ("--mask", tmp_path / "window.mask.png", "--hints", tmp_path / "window.hints.png")
+    options = (*marks, "--model", tmp_path / "hinted.onnx", "--device", "cpu", "--layers", "transmission")
+    run_without_model(tmp_path / "window.png", *options)
+    assert (tmp_path / "window.transmission.png").read_bytes() == made
+
+
+def test_a_model_without_hints_offers_no_marks_for_them(page):
+    assert not page.get_by_label("Mark as reflection").is_visible()
+    assert page.get_by_label("Leave as it is").is_visible()

@@ -1,22 +1,29 @@
-// The regions of a photo: brush strokes and rectangles that define where, and how strongly, it is separated, or hints for the model.
-// They are drawn into a mask of any size. The values of the mask scale the strength, like those of `--mask FILE` on the command line.
-// Hints are drawn into an image like that of `--hints FILE`.
+// The marks of a photo: brush strokes and rectangles. Marks of the kind "protect" are drawn into a mask like that of `--mask FILE` on the
+// command line: what they cover stays as it is. Marks of the kinds "reflection" and "scene" are drawn into an image like that of `--hints FILE`.
 //
-// A region is {shape: "brush" | "rectangle", value, hint, points, radius, feather}. `value` is the strength in the region, 0 to 1, or
-// null for the eraser, which also erases hints. `hint` is "reflection" or "scene" for a hint, otherwise null. Positions and lengths are fractions of the longer side of the photo. The points of a rectangle are two opposite
-// corners.
+// A mark is {shape: "brush" | "rectangle", kind, points, radius, feather}. A mark replaces earlier ones at the same place; the kind "erase"
+// does nothing else. Positions and lengths are fractions of the longer side of the photo. The points of a rectangle are two opposite corners.
 
 import { crc32 } from "./zip.js";
 
 const BAND_ROWS = 256; // number of rows of a mask that are computed at once for a file
 const PNG_SIGNATURE = [0x89, 0x50, 0x4e, 0x47, 0x0d, 0x0a, 0x1a, 0x0a];
 
-// The edits of a photo with their history: its regions, `list`; its strength, 0 to 1; and for a burst the method, "auto" or "motion",
+// The edits of a photo with their history: its marks, `list`; its strength, 0 to 1; and for a burst the method, "auto" or "motion",
 // and whether the layers are exchanged, `swap`: null until the user has decided.
 export class Edits {
-  #states = [{ list: [], strength: 1, method: "auto", swap: null }];
-  #at = 0;
+  #states;
+  #at;
   #isAdjusting = false;
+
+  constructor({ states, at } = { states: [{ list: [], strength: 1, method: "auto", swap: null }], at: 0 }) {
+    [this.#states, this.#at] = [states, at];
+  }
+
+  // The value for the constructor of a copy.
+  get history() {
+    return { states: this.#states, at: this.#at };
+  }
 
   get now() {
     return this.#states[this.#at];
@@ -38,8 +45,8 @@ export class Edits {
     return this.#at < this.#states.length - 1;
   }
 
-  add(region) {
-    this.change({ list: [...this.list, region] });
+  add(mark) {
+    this.change({ list: [...this.list, mark] });
   }
 
   change(values) {
@@ -69,36 +76,33 @@ export class Edits {
   }
 }
 
-// Returns the value of the mask outside all regions: 0 if the first region has a strength above 0 (only regions are separated), otherwise 1.
-const outsideValue = (list) => (list.length && list[0].value > 0 ? 0 : 1);
+export const isHint = ({ kind }) => kind === "reflection" || kind === "scene";
+const isProtection = ({ kind }) => kind === "protect";
 
-// Returns the mask of regions as codes, 0 to 255, or null if there are no regions. The mask of the whole photo has `width` x `height`
-// pixels; `part` selects a part of it: {left, top, columns, rows}.
+// Returns the mask of the marks as codes, 0 (protected) to 255, or null if nothing is protected. The mask of the whole photo has `width` x
+// `height` pixels; `part` selects a part of it: {left, top, columns, rows}.
 export function maskCodes(list, width, height, part = { left: 0, top: 0, columns: width, rows: height }) {
-  const scaling = list.filter(({ hint }) => !hint);
-  if (!scaling.length) return null;
-  const outside = outsideValue(scaling);
-  return toCodes(scaling.map((region) => [region, region.value ?? outside]), outside, width, height, part);
+  if (!list.some(isProtection)) return null;
+  return toCodes(list.map((mark) => [mark, Number(!isProtection(mark))]), 1, width, height, part);
 }
 
-// Returns where the regions are hints of this kind, as codes like those of `maskCodes`. Later regions replace earlier ones.
+// Returns where the marks are hints of this kind, as codes like those of `maskCodes`.
 export function hintCodes(list, kind, width, height, part = { left: 0, top: 0, columns: width, rows: height }) {
-  const marks = list.filter(({ hint, value }) => hint || value === null);
-  return toCodes(marks.map((region) => [region, Number(region.hint === kind)]), 0, width, height, part);
+  return toCodes(list.map((mark) => [mark, Number(mark.kind === kind)]), 0, width, height, part);
 }
 
 function toCodes(drawn, outside, width, height, part) {
   const mask = new Float32Array(part.columns * part.rows).fill(outside);
-  for (const [region, value] of drawn) drawRegion(mask, region, value, Math.max(width, height), part);
+  for (const [mark, value] of drawn) drawMark(mask, mark, value, Math.max(width, height), part);
   const codes = new Uint8Array(mask.length);
   for (let i = 0; i < codes.length; i++) codes[i] = 255 * mask[i] + 0.5;
   return codes;
 }
 
-function drawRegion(mask, region, value, scale, { left, top, columns, rows }) {
-  const points = region.points.map(([x, y]) => [x * scale - left - 0.5, y * scale - top - 0.5]);
-  const feather = Math.max(1, region.feather * scale); // at least one pixel, so that the edge is smooth
-  const radius = region.shape === "brush" ? region.radius * scale : 0;
+function drawMark(mask, mark, value, scale, { left, top, columns, rows }) {
+  const points = mark.points.map(([x, y]) => [x * scale - left - 0.5, y * scale - top - 0.5]);
+  const feather = Math.max(1, mark.feather * scale); // at least one pixel, so that the edge is smooth
+  const radius = mark.shape === "brush" ? mark.radius * scale : 0;
   const reach = radius + feather / 2 + 1;
   const limit = (values, end) => [
     Math.max(0, Math.floor(Math.min(...values) - reach)), Math.min(end - 1, Math.ceil(Math.max(...values) + reach))];
@@ -108,7 +112,7 @@ function drawRegion(mask, region, value, scale, { left, top, columns, rows }) {
   const width = x1 - x0 + 1;
   const distances = new Float32Array(width * (y1 - y0 + 1)).fill(Infinity); // to the line or the rectangle, negative inside
   const box = { x0, y0, x1, y1, width };
-  if (region.shape === "rectangle") measureRectangle(distances, points, box);
+  if (mark.shape === "rectangle") measureRectangle(distances, points, box);
   else for (let i = 0; i < points.length; i++) measureSegment(distances, points[Math.max(0, i - 1)], points[i], reach, box);
   for (let y = y0, at = 0; y <= y1; y++) {
     for (let x = x0, to = y * columns + x0; x <= x1; x++, to++, at++) {
@@ -147,15 +151,15 @@ function measureRectangle(distances, [[ax, ay], [bx, by]], { x0, y0, x1, y1 }) {
   }
 }
 
-// Returns the mask of regions as a grey 8-bit PNG file of the size of the photo, or null if there are none.
+// Returns the mask as a grey 8-bit PNG file of the size of the photo, or null if nothing is protected.
 export async function maskFile(list, width, height) {
-  if (list.every(({ hint }) => hint)) return null;
+  if (!list.some(isProtection)) return null;
   return pngFile(width, height, (part) => [maskCodes(list, width, height, part)]);
 }
 
 // Returns the hints as an 8-bit PNG file of the size of the photo, red for the reflection and green for the scene, or null if there are none.
 export async function hintsFile(list, width, height) {
-  if (!list.some(({ hint }) => hint)) return null;
+  if (!list.some(isHint)) return null;
   const codes = (kind, part) => hintCodes(list, kind, width, height, part);
   return pngFile(width, height, (part) => [codes("reflection", part), codes("scene", part), new Uint8Array(part.columns * part.rows)]);
 }
