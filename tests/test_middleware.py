@@ -193,6 +193,15 @@ def test_requests_without_the_token_are_refused(app_with_token, headers):
     assert request(app_with_token, "GET", "/?token=wrong").status_code == 401
 
 
+def test_a_browser_without_the_token_gets_a_page_and_a_program_gets_json(app_with_token):
+    for accept, kind in (("text/html,*/*;q=0.8", "text/html"), ("*/*", "application/json")):
+        response = request(app_with_token, "GET", "/", headers={"accept": accept})
+        assert response.status_code == 401
+        assert response.headers["content-type"].startswith(kind)
+        assert "default-src 'none'" in response.headers["content-security-policy"]
+    assert post(app_with_token, headers={"accept": "text/html"}).json()["error"]
+
+
 def test_a_bearer_token_is_accepted(app_with_token):
     assert post(app_with_token, headers={"authorization": f"Bearer {TOKEN}"}).json() == 0
 

@@ -239,7 +239,10 @@ def test_a_photo_that_fails_is_left_out_of_the_zip_and_its_error_is_shown(open_p
     assert "b.png: failed. Its layers cannot be written." in text
     assert "none.png: failed. This file is not a photo, or it is damaged." in text
     alert = page.locator("#export-error")
-    assert alert.inner_text() == "b.png is not in the zip. Its layers cannot be written."
+    assert (
+        alert.inner_text()
+        == "2 of 4 photos are in the zip. b.png is not in the zip. Its layers cannot be written."
+    )
     page.locator(".pick").nth(1).click()
     page.get_by_role("button", name="Download transmission").click()
     page.get_by_text("Its layers cannot be written.", exact=True).wait_for()
@@ -273,3 +276,31 @@ def test_text_has_contrast_in_light_and_dark_and_every_control_has_a_name(open_p
         .filter((one) => one.checkVisibility() && !(one.getAttribute("aria-label") || one.textContent.trim() || one.labels?.length))
         .map((one) => one.outerHTML)""")
     assert nameless == []
+
+
+def test_the_zip_waits_for_photos_that_are_not_separated_yet(open_page):
+    page, held, is_open = open_page(), [], []
+    page.route("**/preview?*", lambda route: route.continue_() if is_open else held.append(route))
+    files = [
+        {"name": f"{name}.png", "mimeType": "", "buffer": image_bytes(90, 60, "png", seed)}
+        for seed, name in enumerate("abc")
+    ]
+    page.set_input_files("#files", files)
+    page.get_by_role("button", name="Download all").click()
+    page.get_by_text("Waiting for 3 of 3 photos").wait_for()
+    is_open.append(True)
+    _, data = downloaded(page, lambda: [route.continue_() for route in held])
+    names = zipfile.ZipFile(io.BytesIO(data)).namelist()
+    assert [name[0] for name in names] == [*"aabbcc", "b"]
+    assert page.locator("#export-error").is_hidden()
+
+
+def test_photos_that_failed_while_the_server_was_away_are_retried_together(open_page):
+    page = open_page()
+    page.route("**/preview?*", lambda route: route.abort())
+    photos = [(f"{name}.png", image_bytes(90, 60, "png", seed)) for seed, name in enumerate("ab")]
+    upload(page, *photos, ("none.png", b"no photo"))
+    page.unroute("**/preview?*")
+    page.get_by_role("button", name="Retry all").click()
+    page.wait_for_selector("li.done >> nth=1")
+    assert not page.get_by_role("button", name="Retry all").is_visible()

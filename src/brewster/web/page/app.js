@@ -18,6 +18,7 @@ const LAYER_DESCRIPTIONS = {
   confidence: "How certain the separation is. The file that you download is grey: white is certain.",
 };
 const EXAMPLE = "page/example.jpg";
+const WAIT_MS = 200; // how often a zip checks whether all photos are separated
 const RETRY_MODELS_MS = 3000;
 const MAX_BURST_PHOTOS = 15;
 
@@ -290,7 +291,8 @@ function paint() {
 function refresh(photo = null) {
   for (const one of photo ? [photo] : queue.photos) if (one.thumbnail) updateThumbnail(one);
   const { current } = queue;
-  enable("all", exporting === null && queue.count("done") > 0 && zipLayers().length > 0);
+  enable("all", exporting === null && queue.count("done") + queue.pendingCount > 0 && zipLayers().length > 0);
+  byId("retry-all").hidden = queue.retriable.length < 2;
   byId("summary").textContent = queue.photos.length ? summarise(queue) : "";
   if (photo && photo !== current) return;
   const hasPhoto = current !== null;
@@ -388,7 +390,14 @@ const downloadLayer = (signal) =>
 
 const zipLayers = () => [...document.querySelectorAll("input[name=zip]:checked")].map(({ value }) => value);
 
-function downloadAll(signal) {
+// Waits until all photos are separated, and creates the zip.
+async function downloadAll(signal) {
+  for (let count; (count = queue.pendingCount); await new Promise((resolve) => setTimeout(resolve, WAIT_MS))) {
+    signal.throwIfAborted();
+    const total = queue.photos.length;
+    byId("export-status").textContent = `Waiting for ${count} of ${total} photos`;
+    setBar(byId("export-progress"), 1 - count / total);
+  }
   let which = "";
   const onPhoto = (index, count) => (which = count > 1 ? `Photo ${index + 1} of ${count}: ` : "");
   const onProgress = (progress) => showExportProgress(progress, which);
@@ -447,6 +456,7 @@ for (const input of document.querySelectorAll("input[name=view]")) input.addEven
 for (const input of document.querySelectorAll("input[name=quality], #model")) input.addEventListener("change", applySettings);
 byId("cancel").addEventListener("click", () => queue.cancel(queue.current));
 byId("retry").addEventListener("click", () => queue.retry(queue.current));
+byId("retry-all").addEventListener("click", () => queue.retriable.forEach((photo) => queue.retry(photo)));
 byId("discard").addEventListener("click", () => remove(queue.current));
 byId("undo-remove").addEventListener("click", undoRemove);
 byId("burst-yes").addEventListener("click", joinBurst);

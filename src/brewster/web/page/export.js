@@ -42,7 +42,11 @@ export async function exportAll(photos, layers, settings, { onPhoto, ...context 
     }
   }
   const failed = separated.filter(({ error }) => error);
-  const problem = failed.map(({ photo, error }) => `${photo.file.name} is not in the zip. ${error}`).join(" ");
+  const doneCount = separated.length - failed.length;
+  const problem = [
+    ...(doneCount < results.length ? [`${doneCount} of ${results.length} photos are in the zip.`] : []),
+    ...failed.map(({ photo, error }) => `${photo.file.name} is not in the zip. ${error}`),
+  ].join(" ");
   if (failed.length === separated.length) throw new Error(problem);
   const files = withUniqueNames(results.flatMap((result) => result.files));
   const report = new TextEncoder().encode(describeResults(results, files, settings));

@@ -79,6 +79,15 @@ export class SeparationQueue {
     this.startNext();
   }
 
+  // The photos that may succeed if they are sent again, for example because the server was away.
+  get retriable() {
+    return this.photos.filter(({ state, error }) => state === "failed" && error && !error.isFinal);
+  }
+
+  get pendingCount() {
+    return this.count("waiting") + this.count("working");
+  }
+
   cancel(photo) {
     if (photo.controller) photo.controller.abort();
     else Object.assign(photo, { state: "failed", isUpdating: false });

@@ -6,7 +6,7 @@ const byId = (id) => document.getElementById(id);
 const chosen = (name) => document.querySelector(`input[name=${name}]:checked`).value;
 const DESCRIPTIONS = {
   move: "Is something wrong? Choose a mark, and paint on the photo.",
-  reflection: "Paint roughly over a reflection that remains. It is removed when you stop painting.",
+  reflection: "Paint roughly over a reflection that remains. When you stop painting, the photo is separated again.",
   scene: "Paint roughly over things behind the glass that were taken for a reflection.",
   protect: "What you mark stays exactly as it is in the photo.",
   erase: "Removes marks.",
