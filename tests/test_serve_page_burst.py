@@ -79,6 +79,7 @@ def film(tmp_path_factory):
     return write_video(tmp_path_factory.mktemp("film") / "window.mp4", burst.frames)
 
 
+@pytest.mark.timeout(300)  # it measures a burst, and compiles the solver if its cache is empty
 def test_a_film_is_separated_swapped_undone_and_downloaded_with_its_verdict_in_the_zip(open_page, film):
     page = open_page()
     upload(page, (film.name, film.read_bytes()))
