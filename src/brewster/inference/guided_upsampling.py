@@ -172,7 +172,11 @@ def box_mean(map_: Floats, radius: int = _RADIUS) -> Floats:
     for axis in (0, 1):
         padding = [(0, 0)] * 3
         padding[axis] = (radius, radius)
-        padded = np.pad(map_, padding, mode="edge")
-        shifted = [np.take(padded, range(i, i + map_.shape[axis]), axis=axis) for i in range(2 * radius + 1)]
-        map_ = np.mean(shifted, axis=0, dtype=np.float32)
-    return map_
+        padded = np.moveaxis(np.pad(map_, padding, mode="edge"), axis, 0)
+        length = map_.shape[axis]
+        total = padded[:length].copy(order="K")
+        for i in range(1, 2 * radius + 1):
+            total += padded[i : i + length]
+        total /= np.float32(2 * radius + 1)
+        map_ = np.moveaxis(total, 0, axis)
+    return np.ascontiguousarray(map_)
