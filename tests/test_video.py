@@ -10,7 +10,7 @@ import pytest
 
 from brewster.burst import read_video
 from brewster.burst.film import best_part, choose, measure_film
-from brewster.burst.video import _decoded
+from brewster.burst.video import decoded
 from brewster.burst.video_colour import to_picture
 from brewster.errors import PhotoTooLarge, UnreadablePhoto
 
@@ -146,10 +146,10 @@ def test_pixels_become_square(tmp_path, pictures):
 def test_slow_motion_and_long_videos_are_read_to_the_20th_second_with_30_frames_each(tmp_path, pictures):
     frame = film_of(pictures[0], 1, (64, 48))
     write_video(tmp_path / "slow.mp4", frame * 480, rate=240)
-    assert len(list(_decoded(tmp_path / "slow.mp4", 10**6))) == pytest.approx(60, abs=2)
+    assert len(list(decoded(tmp_path / "slow.mp4", 10**6))) == pytest.approx(60, abs=2)
     # One frame in a second, for a minute
     write_video(tmp_path / "long.mp4", frame * 60, times=range(0, 1800, 30))
-    assert len(list(_decoded(tmp_path / "long.mp4", 10**6))) == 21
+    assert len(list(decoded(tmp_path / "long.mp4", 10**6))) == 21
 
 
 def test_a_video_with_a_variable_rate_and_odd_sizes_is_read(tmp_path, pictures):

@@ -19,7 +19,7 @@ from typing import Any, Final, Literal, final
 import cv2
 import numpy as np
 
-from brewster.burst.joint_model import Floats
+from brewster.burst.joint_model import Floats, JointModel
 from brewster.burst.registration import layer_tracks, motion_candidates, path_order
 from brewster.burst.solver import MIN_SIDE_PX, Solution, solve
 from brewster.burst.threads import single_opencv_thread
@@ -123,6 +123,13 @@ class FittedBurst:
             requested=self._requested,
             swapped="yes" if self.report.is_swapped else "no",
         )
+
+    @property
+    def model(self) -> JointModel:
+        """The measured layers and motions. Raises ValueError if there are none."""
+        if self._solution is None or self._solution.model is None:
+            raise ValueError("no layers were measured; expected a report with is_measured; check it first")
+        return self._solution.model
 
     def _layers(self) -> Solution:
         assert self._solution
@@ -473,9 +480,16 @@ class _FixedPredictor(Predictor):
         """Returns the layers, with the detail of the reference photo."""
         (photo,) = inputs
         solution = self._solution
-        total = np.maximum(solution.transmission + solution.reflection, np.float32(1e-4))
-        detail = np.clip(photo / total, *_DETAIL_LIMITS)
-        transmission, reflection = solution.transmission * detail, solution.reflection * detail
-        # At full size, edges of a strong reflection would remain in the transmission: there it takes no detail of the photo
-        override = GeneratedOverride.weighted_by_detail(solution.transmission, solution.reflection)
-        return Prediction(transmission - photo, np.minimum(reflection, photo), solution.confidence, override)
+        change, reflection, override = measured_change(photo, solution.transmission, solution.reflection)
+        return Prediction(change, reflection, solution.confidence, override)
+
+
+def measured_change(
+    photo: Floats, transmission: Floats, reflection: Floats
+) -> tuple[Floats, Floats, GeneratedOverride]:
+    """Returns measured layers as `GuidedUpsampler.fit` takes them, with the detail of the photo. All are (h, w, 3), with one exposure."""
+    total = np.maximum(transmission + reflection, np.float32(1e-4))
+    detail = np.clip(photo / total, *_DETAIL_LIMITS)
+    # At full size, edges of a strong reflection would remain in the transmission: there it takes no detail of the photo
+    override = GeneratedOverride.weighted_by_detail(transmission, reflection)
+    return transmission * detail - photo, np.minimum(reflection * detail, photo), override

@@ -101,6 +101,8 @@ class Solution:
     """The same for the best candidate."""
     has_objects: bool = False
     """Whether opaque objects in front of the wall move differently from it. They are a part of the transmission."""
+    model: JointModel | None = None
+    """The layers on their canvases and the motions of the frames, in the order in which they were solved. Not exchanged by `swapped`."""
 
     def swapped(self) -> Solution:
         """Returns the solution with both layers exchanged."""
@@ -205,7 +207,15 @@ def solve(
     layers = model.reference_layers(*small.shape[1:3])
     motion = float(model.relative_motion(*_MOTION_SAMPLES)[0])
     return Solution(
-        layers[0], layers[1], model.confidence(small), motion, naming, edge_correlation, *errors, has_objects
+        layers[0],
+        layers[1],
+        model.confidence(small),
+        motion,
+        naming,
+        edge_correlation,
+        *errors,
+        has_objects,
+        model,
     )
 
 

@@ -67,7 +67,7 @@ def read_video(
         )
 
     def thumbnails() -> Iterator[NDArray[np.uint8]]:
-        for index, (frame, _) in enumerate(_decoded(path, max_pixels)):
+        for index, (_, frame, _) in enumerate(decoded(path, max_pixels)):
             on_progress(0.5 * min(1, index / (_MAX_SECONDS * _FRAMES_PER_SECOND)))
             yield _thumbnail(frame)
 
@@ -76,14 +76,11 @@ def read_video(
         raise _unreadable(path, f"{counted(len(film.positions), 'frame')} can be decoded")
     chosen = choose(film, frames)
     photos = []
-    for index, (frame, stream) in enumerate(_decoded(path, max_pixels)):
+    for index, (_, frame, stream) in enumerate(decoded(path, max_pixels)):
         on_progress(0.5 + 0.5 * index / chosen[-1])
         if index in chosen:
-            context = stream.codec_context
-            picture = to_picture(frame, _pixel_aspect(stream), context.color_trc, context.color_primaries)
-            photo = Photo.from_array(picture, encoding="srgb")
-            if name := HDR_NAMES.get(context.color_trc):
-                note = f"the HDR video ({name}) was converted to SDR"
+            photo = Photo.from_array(displayed(frame, stream), encoding="srgb")
+            if note := conversion_note(stream):
                 photo = replace(photo, file_info=with_notes(photo.file_info, note))
             photos.append(photo)
         if index >= chosen[-1]:
@@ -91,32 +88,49 @@ def read_video(
     return photos
 
 
+def displayed(frame: av.VideoFrame, stream: av.VideoStream) -> NDArray[np.uint8]:
+    """Returns a frame as a player shows it, (h, w, 3) sRGB: upright, with square pixels; HDR is converted."""
+    context = stream.codec_context
+    return to_picture(frame, _pixel_aspect(stream), context.color_trc, context.color_primaries)
+
+
+def conversion_note(stream: av.VideoStream) -> str | None:
+    """Returns what `displayed` changes, or None."""
+    name = HDR_NAMES.get(stream.codec_context.color_trc)
+    if stream.codec_context.name == "gif":
+        return "a GIF has at most 256 colours: a video gives better layers"
+    return f"the HDR video ({name}) was converted to SDR" if name else None
+
+
 def _thumbnail(frame: av.VideoFrame) -> NDArray[np.uint8]:
     height = min(4 * _THUMBNAIL_PX, max(16, round(_THUMBNAIL_PX * frame.height / frame.width)))
     return frame.to_ndarray(width=_THUMBNAIL_PX, height=height, format="gray").astype(np.uint8)
 
 
-def _decoded(path: VideoFile, max_pixels: int) -> Iterator[tuple[av.VideoFrame, av.VideoStream]]:
-    """Yields the frames of the first seconds with their stream, up to the first damaged one, at most 30 for each second.
+def decoded(
+    path: VideoFile, max_pixels: int, *, is_complete: bool = False
+) -> Iterator[tuple[float, av.VideoFrame, av.VideoStream]]:
+    """Yields the frames of the first 20 seconds with their time in seconds and their stream, up to the first damaged one.
 
-    If the size changes, only the frames of the first size are yielded."""
+    There are at most 30 frames for each second, unless `is_complete`. If the size changes, only the frames of the first size are yielded.
+    For the errors, see `read_video`."""
     try:
         file = io.BytesIO(path) if isinstance(path, bytes) else os.fspath(path)
         with av.open(file, "r") as container:
             stream = _video_stream(path, container)
             _check_size(path, displayed_size(stream.width, stream.height, _pixel_aspect(stream)), max_pixels)
-            size = None
-            yielded = 0
+            start, size, yielded = None, None, 0
             with contextlib.suppress(av.FFmpegError):  # a video that was cut off ends here
-                for index, (seconds, frame) in enumerate(_timed(container, stream)):
-                    if seconds > _MAX_SECONDS or index >= _MAX_DECODED:
+                for index, (time, frame) in enumerate(_timed(container, stream)):
+                    start = time if start is None else start
+                    if time - start > _MAX_SECONDS or index >= _MAX_DECODED:
                         return
                     size = size or (frame.width, frame.height)
-                    is_due = yielded <= _FRAMES_PER_SECOND * seconds + 0.5
+                    is_due = is_complete or yielded <= _FRAMES_PER_SECOND * (time - start) + 0.5
                     if is_due and (frame.width, frame.height) == size:
                         _check_size(path, displayed_size(*size, _pixel_aspect(stream)), max_pixels)
                         yielded += 1
-                        yield frame, stream
+                        yield time, frame, stream
     except (av.FFmpegError, OSError) as error:
         raise _unreadable(path, str(error)) from error
 
@@ -134,12 +148,9 @@ def _video_stream(path: VideoFile, container: av.container.InputContainer) -> av
 def _timed(
     container: av.container.InputContainer, stream: av.VideoStream
 ) -> Iterator[tuple[float, av.VideoFrame]]:
-    """Yields the frames with their time in seconds, which begins at 0."""
-    start = None
+    """Yields the frames with their time in seconds."""
     for index, frame in enumerate(container.decode(stream)):
-        time = index / float(stream.average_rate or _FRAMES_PER_SECOND) if frame.time is None else frame.time
-        start = time if start is None else start
-        yield time - start, frame
+        yield index / float(stream.average_rate or _FRAMES_PER_SECOND) if frame.time is None else frame.time, frame
 
 
 def _pixel_aspect(stream: av.VideoStream) -> float:

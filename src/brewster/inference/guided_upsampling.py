@@ -141,6 +141,24 @@ class GuidedUpsampler:
                 reflection *= strength_mask
         return transmission, np.clip(reflection, 0, np.maximum(photo, 0), out=reflection)
 
+    def as_linear(self, mask: Floats) -> list[tuple[Floats, Floats]]:
+        """Returns (slope, offset) of transmission and reflection at low resolution: layer = slope * photo + offset. Enlarged, they give the
+        layers of a photo of any size, up to rounding as `apply` does, without its limits.
+
+        `mask` (h, w, 1) in 0..1 scales the strength, also at low resolution. Raises ValueError if the reflection is derived.
+        """
+        if self.reflection is None:
+            raise ValueError("the reflection is derived; expected a reflection; use apply")
+        slope, offset = self.change.slope, self.change.offset
+        if self.override:
+            weight = self.override.weight
+            slope = slope - weight * (slope + np.float32(self.override.strength))
+            offset = offset + weight * (np.float32(self.override.strength) * self.override.transmission - offset)
+        return [
+            (1 + mask * slope, mask * offset),
+            (mask * self.reflection.slope, mask * self.reflection.offset),
+        ]
+
 
 def upsample_rows(map_: Floats, top: int, rows: int, size: tuple[int, int]) -> Floats:
     """Returns `rows` rows, from the row `top`, of `map_` (h, w, C) upsampled to `size` (H, W) by bilinear interpolation."""

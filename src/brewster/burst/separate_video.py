@@ -1,0 +1,284 @@
+"""Separates every frame of a film with the layers of one solution.
+
+    separate_video("window.mp4", "clear.mp4", "clear.reflection.mp4")
+
+1. The layers are measured in some frames of the film, as in a burst (separate.py).
+2. A first pass makes small copies of all frames, through which the motions of the layers are followed (tracking.py).
+3. A second pass moves the layers into each frame. Their shares of its light are applied to the frame at full size, as in a single photo.
+4. Both layers are encoded as they come, with the sound of the film (video_writer.py). A few frames at full size are in memory.
+
+Where the layers are not known, or do not explain the frame, the transmission fades to the frame itself.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from collections import deque
+from collections.abc import Sequence
+from concurrent.futures import Future
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final, final
+
+import av
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from brewster.burst.joint_model import Doubles, Floats, compose
+from brewster.burst.separate import FittedBurst, fit_burst, measured_change
+from brewster.burst.threads import POOL, THREADS, single_opencv_thread
+from brewster.burst.tracking import Tracker, coverage, followed, linear_light
+from brewster.burst.video import conversion_note, decoded, displayed, read_video
+from brewster.burst.video_writer import VIDEO_FORMATS, VideoWriter
+from brewster.errors import OutputError, PhotoError
+from brewster.files import atomic_path
+from brewster.inference.burst_report import BurstReport
+from brewster.inference.guided_upsampling import GuidedUpsampler
+from brewster.inference.predictor import ProgressCallback
+from brewster.inference.separator import Separator
+from brewster.options import DEFAULT_FRAMES, BurstMethod, Options, Quality
+from brewster.photo import Source
+from brewster.srgb import to_encoded
+
+_TRACKED_PX: Final = 160
+"""The long side of the copies in which the motion is followed."""
+_LAYER_PX: Final = 640
+"""The largest long side at which the shares of the layers are computed."""
+_ERRORS: Final = 0.06, 0.12
+"""Where the layers explain a frame with the first error, they are used; with the second one, not at all."""
+_ERROR_BLUR_PX: Final = 4
+_ENCODED: Final = np.rint(255 * to_encoded(np.arange(16_385) / 16_384)).astype(np.uint8)
+_MEASURED, _FOLLOWED = 0.3, 0.5
+"""The completed fractions after these steps."""
+
+
+@final
+@dataclass(frozen=True)
+class VideoSeparation:
+    """What `separate_video` wrote."""
+
+    burst: BurstReport
+    frames: int
+    """The number of frames of each video."""
+    note: str | None
+    """What was changed or left out, or None."""
+    seconds: dict[str, float]
+    """The wall time of each step."""
+
+
+def separate_video(
+    video: str | os.PathLike[str],
+    transmission: str | os.PathLike[str] | None,
+    reflection: str | os.PathLike[str] | None = None,
+    *,
+    frames: int = DEFAULT_FRAMES,
+    reference: int | None = None,
+    separator: Separator | None = None,
+    method: BurstMethod = "auto",
+    swap: bool = False,
+    strength: float = Options.strength,
+    quality: Quality = Options.quality,
+    hints: Source | None = Options.hints,
+    max_pixels: int = Options.max_pixels,
+    overwrite: bool = False,
+    on_progress: ProgressCallback = lambda _fraction: None,
+) -> VideoSeparation:
+    """Separates every frame of a film of one window, and writes the layers as videos.
+
+    The videos are H.264 (.mp4, .m4v, .mov or .mkv), with the size, the orientation and the times of the frames of the film, and its
+    sound. HDR becomes SDR. The first 20 seconds are used. Where the layers are not known, as outside of the view of the frames from which they were
+    measured, the transmission is the film itself.
+
+    Args:
+        video: the film.
+        transmission, reflection: the videos to write; None for none.
+        frames: the number of frames from which the layers are measured, 2 to 15.
+        overwrite: whether files that exist are replaced.
+        reference, separator, method, swap, strength, quality, hints, max_pixels, on_progress: see `separate_burst`. The reference is one
+            of the `frames`, and so is the picture that the hints belong to.
+
+    Raises:
+        PhotoError: the film cannot be read, or the motion in it does not separate the layers.
+        OutputError: a video exists or cannot be written, or has another suffix.
+        BrewsterError: see `separate_burst`.
+    """
+    outputs = [None if path is None else Path(path) for path in (transmission, reflection)]
+    for path in outputs:
+        check_video_output(path, overwrite=overwrite)
+    strength = Options(strength=strength).strength
+    started = time.perf_counter()
+    fitted = fit_burst(
+        read_video(video, frames, max_pixels=max_pixels),
+        reference=reference,
+        separator=separator,
+        quality=quality,
+        hints=hints,
+        max_pixels=max_pixels,
+        on_progress=lambda done: on_progress(_MEASURED * done),
+    ).chosen(method, swap=swap)
+    _check_method(video, fitted.report)
+    seconds, started = {"motion": time.perf_counter() - started}, time.perf_counter()
+    with single_opencv_thread():
+        film = _Film.follow(
+            video, fitted, max_pixels, lambda done: on_progress(_MEASURED + (_FOLLOWED - _MEASURED) * done)
+        )
+        seconds["following"], started = time.perf_counter() - started, time.perf_counter()
+        notes = film.write(outputs, strength, lambda done: on_progress(_FOLLOWED + (1 - _FOLLOWED) * done))
+    seconds["frames"] = time.perf_counter() - started
+    return VideoSeparation(fitted.report, len(film.times), "; ".join(notes) or None, seconds)
+
+
+def check_video_output(path: Path | None, *, overwrite: bool) -> None:
+    """Checks that a video can be written. Raises OutputError if the suffix is none of `VIDEO_FORMATS`, or the file exists."""
+    if path is None:
+        return
+    if path.suffix.lower() not in VIDEO_FORMATS:
+        raise OutputError(
+            f"{path} ends in {path.suffix or 'no suffix'}",
+            f"expected a video: {', '.join(VIDEO_FORMATS)}",
+            "choose another name, such as clear.mp4",
+        )
+    if path.exists() and not overwrite:
+        raise OutputError(
+            f"{path} exists", "expected a path that does not exist", "pass overwrite=True, or choose another name"
+        )
+
+
+def _check_method(video: str | os.PathLike[str], report: BurstReport) -> None:
+    if report.method == "burst":
+        return
+    again = "film the window again while the camera moves along a circle of 5 to 10 cm"
+    raise PhotoError(
+        f"the motion does not separate the layers of {os.fspath(video)}: {report.message.removesuffix('.')}",
+        "expected a film in which the transmission and the reflection move differently",
+        f'use the measured layers anyway with --method motion (in Python method="motion"), or {again}'
+        if report.is_measured
+        else again,
+    )
+
+
+@final
+@dataclass(frozen=True)
+class _Film:
+    """A film, and the motions of the measured layers in all of its frames."""
+
+    video: str | os.PathLike[str]
+    max_pixels: int
+    fitted: FittedBurst
+    times: list[float]
+    """The time of each frame in seconds."""
+    motions: list[Doubles]
+    size: tuple[int, int]
+    """Height and width, as a player shows the film."""
+    notes: list[str]
+
+    @classmethod
+    def follow(
+        cls, video: str | os.PathLike[str], fitted: FittedBurst, max_pixels: int, on_progress: ProgressCallback
+    ) -> _Film:
+        """The first pass."""
+        pictures, times, notes = [], [], []
+        for at, frame, stream in decoded(video, max_pixels, is_complete=True):
+            picture = displayed(frame, stream)
+            if not times:
+                size, notes = picture.shape[:2], [conversion_note(stream)]
+                duration = _duration(stream)
+            pictures.append(cv2.resize(picture, _scaled(size, _TRACKED_PX), interpolation=cv2.INTER_AREA))
+            times.append(at)
+            on_progress(0.0)
+        if duration and times[-1] - times[0] < duration - 0.5:
+            notes.append(f"only the first {times[-1] - times[0]:.1f} of {duration:.1f} seconds were written")
+        if size[0] % 2 or size[1] % 2:
+            notes.append(f"the film has {size[1]} x {size[0]} pixels, and the videos have even sizes, as H.264 needs")
+        motions = followed(fitted.model, pictures, on_progress)
+        return cls(video, max_pixels, fitted, times, motions, size, [note for note in notes if note])
+
+    def write(self, outputs: Sequence[Path | None], strength: float, on_progress: ProgressCallback) -> list[str]:
+        """The second pass. Writes the videos of both layers, and returns the notes."""
+        layers = _FrameLayers(self.fitted, self.size, strength)
+        ends = [*self.times[1:], 2 * self.times[-1] - self.times[-2]]
+        notes, waiting = dict.fromkeys(self.notes), deque[tuple[int, Future[list[NDArray[np.uint8]]]]]()
+        with ExitStack() as stack:
+            parts = [path and stack.enter_context(atomic_path(path)) for path in outputs]
+            writers: list[VideoWriter | None] = []
+
+            def write_next() -> None:
+                k, future = waiting.popleft()
+                for writer, picture in zip(writers, future.result(), strict=True):
+                    if writer:
+                        writer.write(picture, self.times[k], ends[k] - self.times[k])
+                on_progress((k + 1) / len(self.times))
+
+            for k, (_, frame, stream) in enumerate(decoded(self.video, self.max_pixels, is_complete=True)):
+                if not writers:
+                    writers = [
+                        part and stack.enter_context(VideoWriter(part, path.suffix.lower(), self.video, stream, self.times[0], self.size))
+                        for path, part in zip(outputs, parts, strict=True)
+                    ]
+                waiting.append((k, POOL.submit(layers.of, displayed(frame, stream), self.motions[k])))
+                if len(waiting) > THREADS:
+                    write_next()
+            while waiting:
+                write_next()
+            notes |= {writer.note: None for writer in writers if writer and writer.note}
+        return list(notes)
+
+
+@final
+class _FrameLayers:
+    """Moves the measured layers into frames, and applies their shares of the light to the frames at full size."""
+
+    def __init__(self, fitted: FittedBurst, size: tuple[int, int], strength: float) -> None:
+        model = fitted.model
+        self._coarse = Tracker(model, _scaled(size, _TRACKED_PX)[::-1])
+        self._fine = Tracker(model, _scaled(size, _LAYER_PX)[::-1])
+        self._coverage = coverage(model)
+        self._is_swapped, self._strength = fitted.report.is_swapped, np.float32(strength)
+
+    def of(self, picture: NDArray[np.uint8], motion: Doubles) -> list[NDArray[np.uint8]]:
+        """Returns T and R of a frame (h, w, 3), in 8-bit sRGB. Thread-safe."""
+        photo = linear_light(picture)
+        small, tracked = (
+            cv2.resize(photo, size[::-1], interpolation=cv2.INTER_AREA) for size in (self._fine.size, self._coarse.size)
+        )
+        gains, errors = self._coarse.fit(tracked, motion)
+        layers = compose(self._fine.samples(motion)) * gains
+        mask = self._strength * self._mask(errors, motion)
+        fitted = GuidedUpsampler.fit(small, *measured_change(small, *(layers[::-1] if self._is_swapped else layers)))
+        return [self._applied(photo, slope, offset) for slope, offset in fitted.as_linear(mask)]
+
+    def _mask(self, errors: Floats, motion: Doubles) -> Floats:
+        """Returns how far the layers are used, (h, w, 1) in 0..1: where they are known, and explain the frame."""
+        first, last = _ERRORS
+        agreement = np.clip((last - cv2.GaussianBlur(errors, (0, 0), _ERROR_BLUR_PX)) / (last - first), 0, 1)
+        agreement = cv2.resize(agreement, self._fine.size[::-1])
+        known = self._fine.samples(motion, self._coverage).min(0)
+        return (agreement * known)[..., None]
+
+    @staticmethod
+    def _applied(photo: Floats, slope: Floats, offset: Floats) -> NDArray[np.uint8]:
+        size = photo.shape[1::-1]
+        layer = cv2.resize(slope, size)
+        layer *= photo
+        layer += cv2.resize(offset, size)
+        np.clip(layer, 0, 1, out=layer)
+        layer *= len(_ENCODED) - 1
+        encoded: NDArray[np.uint8] = _ENCODED[layer.astype(np.uint16)]
+        return encoded
+
+
+def _scaled(size: Sequence[int], long_side_px: int) -> tuple[int, int]:
+    """Returns width and height for a picture of this height and width, which is not enlarged."""
+    scale = min(1.0, long_side_px / max(size))
+    return max(8, round(size[1] * scale)), max(8, round(size[0] * scale))
+
+
+def _duration(stream: av.VideoStream) -> float | None:
+    """Returns the duration of a video in seconds, if its file contains it."""
+    if stream.duration and stream.time_base:
+        return float(stream.duration * stream.time_base)
+    duration = stream.container.duration
+    return duration / av.time_base if duration else None

@@ -1,0 +1,118 @@
+"""Writes a layer of a film as a video: H.264 with the times of the film, and with its sound, whose packets are copied unchanged."""
+
+from __future__ import annotations
+
+import os
+from contextlib import ExitStack
+from fractions import Fraction
+from pathlib import Path
+from types import TracebackType
+from typing import Final, Self, final
+
+import av
+import numpy as np
+from av.video.reformatter import ColorRange, Colorspace
+from numpy.typing import NDArray
+
+from brewster.errors import OutputError
+
+VIDEO_FORMATS: Final = {".mp4": "mp4", ".m4v": "mp4", ".mov": "mov", ".mkv": "matroska"}
+"""The suffixes of the videos that brewster writes, and their formats in FFmpeg."""
+_BT709: Final = 1
+"""The code of BT.709 in H.273: primaries, transfer and matrix."""
+_OPTIONS: Final = {"crf": "16", "preset": "fast"}
+
+
+@final
+class VideoWriter:
+    """Writes 8-bit sRGB pictures of one size. A context manager.
+
+    Args:
+        path: the file to write; its name needs no suffix.
+        suffix: that of the video, from `VIDEO_FORMATS`.
+        source: the film, whose first sound track is copied.
+        stream: the video stream of the film.
+        start_s: the time of the first picture of the film in seconds, which is 0 in the new video.
+        size: height and width of the pictures. Odd sides lose a row or a column, because H.264 with yuv420p has even sizes.
+
+    Raises:
+        OutputError: the video cannot be written.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        suffix: str,
+        source: str | os.PathLike[str],
+        stream: av.VideoStream,
+        start_s: float,
+        size: tuple[int, int],
+    ) -> None:
+        self._stack, self._start_s = ExitStack(), start_s
+        self._height, self._width = (side // 2 * 2 for side in size)
+        options = {"movflags": "+faststart"} if suffix != ".mkv" else {}
+        self._container = self._stack.enter_context(av.open(str(path), "w", format=VIDEO_FORMATS[suffix], options=options))
+        try:
+            self._video = self._container.add_stream("libx264", rate=stream.average_rate or 30, options=_OPTIONS)
+        except av.codec.codec.UnknownCodecError as error:
+            raise OutputError(
+                "PyAV has no encoder for H.264 (libx264)",
+                "expected the PyAV of the Python package index, which contains it",
+                "run: pip install --force-reinstall av",
+            ) from error
+        self._time_base, self._last = stream.time_base or Fraction(1, 90_000), -1
+        context = self._video.codec_context
+        context.width, context.height, context.pix_fmt = self._width, self._height, "yuv420p"
+        context.time_base = self._time_base
+        context.color_primaries = context.color_trc = context.colorspace = _BT709
+        context.color_range = ColorRange.MPEG
+        self._audio = None
+        self.note: str | None = None
+        """What is missing in the video, or None."""
+        sound = self._stack.enter_context(av.open(os.fspath(source)))
+        if sound.streams.audio:
+            track = sound.streams.audio[0]
+            name = track.codec_context.name if track.codec_context else "an unknown codec"
+            if name in self._container.supported_codecs:
+                self._audio = self._container.add_stream_from_template(track)
+                self._packets = sound.demux(track)
+                self._packet = next(self._packets, None)
+            else:
+                self.note = f"the sound ({name}) was left out, because {suffix} cannot contain it"
+
+    def __enter__(self) -> Self:
+        """Returns the writer itself."""
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Completes the file if there was no error."""
+        with self._stack:
+            if kind is None:
+                self._container.mux(self._video.encode())
+
+    def write(self, picture: NDArray[np.uint8], time_s: float, duration_s: float) -> None:
+        """Appends a picture (h, w, 3), and the sound up to its end. `time_s` and `duration_s` are those of the frame of the film."""
+        even = np.ascontiguousarray(picture[: self._height, : self._width])
+        frame = av.VideoFrame.from_ndarray(even, format="rgb24")
+        frame = frame.reformat(
+            format="yuv420p", dst_colorspace=Colorspace.ITU709, src_color_range=ColorRange.JPEG, dst_color_range=ColorRange.MPEG
+        )
+        self._last = max(self._last + 1, round((time_s - self._start_s) / self._time_base))
+        frame.pts, frame.time_base, frame.duration = self._last, self._time_base, round(duration_s / self._time_base)
+        self._container.mux(self._video.encode(frame))
+        self._copy_sound(time_s + duration_s)
+
+    def _copy_sound(self, end_s: float) -> None:
+        """Copies the packets that begin before a time of the film."""
+        while self._audio and self._packet and self._packet.dts is not None:
+            packet = self._packet
+            if packet.dts * packet.time_base >= end_s:
+                return
+            shift = round(self._start_s / packet.time_base)
+            packet.dts -= shift
+            packet.pts = packet.dts if packet.pts is None else packet.pts - shift
+            packet.stream = self._audio
+            self._container.mux(packet)
+            self._packet = next(self._packets, None)
