@@ -246,17 +246,23 @@ class _FrameLayers:
         )
         gains, errors = self._coarse.fit(tracked, motion)
         layers = compose(self._fine.samples(motion)) * gains
-        mask = self._strength * self._mask(errors, motion)
-        fitted = GuidedUpsampler.fit(small, *measured_change(small, *(layers[::-1] if self._is_swapped else layers)))
+        known = self._fine.samples(motion, self._coverage)[..., None]
+        # An unknown layer is what the other one leaves of the frame; if both are unknown, the frame is T
+        others = [np.maximum(small - known[1 - n] * layers[1 - n], 0) for n in (0, 1)]
+        others[1] *= known[0]
+        layers = known * layers + (1 - known) * others
+        if self._is_swapped:
+            layers = layers[::-1]
+        is_known = cv2.resize(known.min(0), self._coarse.size[::-1], interpolation=cv2.INTER_AREA)
+        mask = self._strength * self._agreement(errors * is_known)
+        fitted = GuidedUpsampler.fit(small, *measured_change(small, *layers))
         return [self._applied(photo, slope, offset) for slope, offset in fitted.as_linear(mask)]
 
-    def _mask(self, errors: Floats, motion: Doubles) -> Floats:
-        """Returns how far the layers are used, (h, w, 1) in 0..1: where they are known, and explain the frame."""
+    def _agreement(self, errors: Floats) -> Floats:
+        """Returns how far the layers are used, (h, w, 1) in 0..1: where they explain the frame."""
         first, last = _ERRORS
         agreement = np.clip((last - cv2.GaussianBlur(errors, (0, 0), _ERROR_BLUR_PX)) / (last - first), 0, 1)
-        agreement = cv2.resize(agreement, self._fine.size[::-1])
-        known = self._fine.samples(motion, self._coverage).min(0)
-        return (agreement * known)[..., None]
+        return cv2.resize(agreement, self._fine.size[::-1])[..., None]
 
     @staticmethod
     def _applied(photo: Floats, slope: Floats, offset: Floats) -> NDArray[np.uint8]:

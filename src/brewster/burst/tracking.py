@@ -57,25 +57,29 @@ class Tracker:
         interpolation = cv2.INTER_AREA if canvas[0] < model.layers.shape[2] else cv2.INTER_LINEAR
         light = np.square(model.layers[0])
         self._canvases = [cv2.resize(layer, canvas[::-1], interpolation=interpolation) for layer in light]
-        self._grid = pixel_grid(*size)
-        self._rows, self._columns = (bicubic_weights(side, knots) for side, knots in zip(size, _KNOTS, strict=True))
-        self._row_pairs, self._column_pairs = (
-            (weights[:, :, None] * weights[:, None]).reshape(len(weights), -1) for weights in (self._rows, self._columns)
+        self._grid = pixel_grid(*size).astype(np.float32)
+        self._rows, self._columns = (
+            bicubic_weights(side, knots).astype(np.float32) for side, knots in zip(size, _KNOTS, strict=True)
+        )
+        self._across = np.ascontiguousarray(self._columns.T)
+        self._row_pairs, self._column_pairs = (  # of every second row and column, which suffice for the curvature of the loss
+            (2 * weights[::2, :, None] * weights[::2, None]).reshape(len(weights[::2]), -1)
+            for weights in (self._rows, self._columns)
         )
         bends = [np.kron(np.diff(np.eye(_KNOTS[0]), 2, 0), np.eye(_KNOTS[1]))]
         bends.append(np.kron(np.eye(_KNOTS[0]), np.diff(np.eye(_KNOTS[1]), 2, 0)))
         self._stiffness = _CURVATURE * sum(bend.T @ bend for bend in bends)
 
-    def positions(self, knots: Doubles) -> Doubles:
-        """Returns the coordinates (2, h, w) in the reference frame of each pixel, for the knots of one layer."""
-        moved: Doubles = self._grid + self._rows @ knots @ self._columns.T
-        return moved
-
     def samples(self, motion: Doubles, canvases: Sequence[Floats] | None = None) -> Floats:
         """Returns the layers, or other images on their canvases, at the places that a frame with this motion shows: (L, h, w, ...)."""
         images = []
         for canvas, knots in zip(canvases or self._canvases, motion, strict=True):
-            x, y = to_pixels(self.positions(knots) / (1 + 2 * MARGIN), canvas.shape)
+            x, y = (
+                # Not a matrix product of NumPy, whose threads wait for each other on a busy machine
+                (axis + np.einsum("hr,rw->hw", self._rows, offsets @ self._across)) * np.float32(length / (2 + 4 * MARGIN))
+                + np.float32(length / 2 - 0.5)
+                for axis, offsets, length in zip(self._grid, knots.astype(np.float32), canvas.shape[1::-1], strict=True)
+            )
             images.append(cv2.remap(canvas, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))
         return np.stack(images)
 
@@ -99,14 +103,15 @@ class Tracker:
         weights = _planes(1 / np.sqrt(np.square(errors) + CHARBONNIER**2) / errors.size)
         slopes = self._slopes(samples) * _planes(0.5 * gains / np.sqrt(gains * total + OFFSET))
         weighted = slopes * weights
-        blocks = self._row_pairs.T @ np.einsum("achw,bchw->abhw", weighted, slopes) @ self._column_pairs
+        products = np.einsum("achw,bchw->abhw", weighted[..., ::2, ::2], slopes[..., ::2, ::2])
+        blocks = self._row_pairs.T @ products @ self._column_pairs
         count, (rows, columns) = len(slopes), _KNOTS
         blocks = blocks.reshape(count, count, rows, rows, columns, columns).transpose(0, 2, 4, 1, 3, 5)
         forces = self._rows.T @ np.einsum("achw,chw->ahw", weighted, _planes(errors)) @ self._columns
         forces = forces.reshape(count, -1) + motion.reshape(count, -1) @ self._stiffness
         matrix = blocks.reshape(forces.size, -1) + np.kron(np.eye(count), self._stiffness)
         matrix[np.diag_indices_from(matrix)] += _DAMPING
-        # Not NumPy's solve, whose threads wait for each other on a busy machine
+        # Nor NumPy's solve
         _, step = cv2.solve(matrix, forces.reshape(-1, 1), flags=cv2.DECOMP_CHOLESKY)
         return np.asarray(step.reshape(motion.shape))
 
